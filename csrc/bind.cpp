@@ -1,0 +1,190 @@
+// The compiled module linprim_geo._core: checks shapes, releases the interpreter lock, calls the core. No arithmetic here.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <tuple>
+#include <vector>
+
+#include "linprim.h"
+#include "parallel.h"
+
+namespace nb = nanobind;
+
+namespace {
+
+template <class T>
+using In = nb::ndarray<const T, nb::c_contig, nb::device::cpu>;
+template <class T>
+using Out = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
+using Pose = nb::ndarray<const double, nb::shape<3, 4>, nb::c_contig, nb::device::cpu>;
+
+template <class Array>
+auto checked(const Array& array, std::initializer_list<int64_t> shape, const char* name) {
+  bool same = array.ndim() == shape.size();
+  size_t axis = 0;
+  for (int64_t size : shape) {
+    if (same && int64_t(array.shape(axis)) != size) same = false;
+    ++axis;
+  }
+  if (!same) {
+    std::string wanted, found;
+    for (int64_t size : shape) wanted += (wanted.empty() ? "" : ", ") + std::to_string(size);
+    for (size_t a = 0; a < array.ndim(); ++a) found += (a ? ", " : "") + std::to_string(array.shape(a));
+    throw std::invalid_argument(std::string(name) + " has shape (" + found + "), wanted (" + wanted + ")");
+  }
+  return array.data();
+}
+
+linprim::View make_view(const Pose& pose, const std::tuple<double, double, double, double>& intrinsics, int width, int height, double near,
+                        double stop, double level) {
+  linprim::View view{};
+  for (int i = 0; i < 12; ++i) view.world_to_camera[i] = pose.data()[i];
+  std::tie(view.fx, view.fy, view.cx, view.cy) = intrinsics;
+  view.width = width, view.height = height, view.near = near, view.stop = stop, view.level = level;
+  if (width < 1 || height < 1 || int64_t(width) * height > (int64_t(1) << 31)) throw std::invalid_argument("the image size is not positive, or above 2^31 pixels");
+  if (!(near > 0) || !(view.fx > 0) || !(view.fy > 0)) throw std::invalid_argument("near and the focal lengths have to be positive");
+  return view;
+}
+
+template <class Real>
+linprim::Primitives<Real> make_primitives(const In<Real>& center, const In<Real>& rotation, const In<Real>& extent, const In<Real>& density,
+                                          const In<Real>& sh) {
+  const int64_t n = center.ndim() ? int64_t(center.shape(0)) : 0;
+  const int64_t count = sh.ndim() == 3 ? int64_t(sh.shape(1)) : 0;
+  if (count != 1 && count != 4 && count != 9 && count != 16) throw std::invalid_argument("sh has to have shape (N, 1 | 4 | 9 | 16, 3)");
+  if (n >= (int64_t(1) << 31)) throw std::invalid_argument("more than 2^31 primitives");
+  return {n,
+          checked(center, {n, 3}, "center"),
+          checked(rotation, {n, 4}, "rotation"),
+          checked(extent, {n, 3}, "extent"),
+          checked(density, {n}, "density"),
+          checked(sh, {n, count, 3}, "sh"),
+          int(count)};
+}
+
+// Planes in the order rgb, opacity, depth_expected, depth_median, depth_first, distortion, normal, normal_median, state.
+template <class Real, class Array>
+linprim::Planes<Real> make_planes(const std::vector<std::optional<Array>>& arrays, int64_t height, int64_t width) {
+  constexpr const char* kNames[] = {"rgb", "opacity", "depth_expected", "depth_median", "depth_first", "distortion", "normal", "normal_median", "state"};
+  constexpr int kChannels[] = {3, 0, 0, 0, 0, 0, 3, 3, 4};
+  Real* planes[9] = {};
+  for (size_t i = 0; i < arrays.size() && i < 9; ++i)
+    if (arrays[i]) {
+      auto data = kChannels[i] ? checked(*arrays[i], {kChannels[i], height, width}, kNames[i]) : checked(*arrays[i], {height, width}, kNames[i]);
+      planes[i] = const_cast<Real*>(data);
+    }
+  return {planes[0], planes[1], planes[2], planes[3], planes[4], planes[5], planes[6], planes[7], planes[8]};
+}
+
+template <class Real>
+void require_planes(const linprim::Planes<Real>& p, bool geometry) {
+  bool all = p.rgb && p.opacity;
+  if (geometry) all = all && p.depth_expected && p.depth_median && p.depth_first && p.distortion && p.normal && p.normal_median && p.state;
+  if (!all) throw std::invalid_argument("an output plane is missing");
+}
+
+template <class Real>
+void bind_real(nb::module_& m, const char* suffix) {
+  using namespace nb::literals;
+  using Array = In<Real>;
+  m.def(
+      (std::string("rasterize_") + suffix).c_str(),
+      [](Array center, Array rotation, Array extent, Array density, Array sh, Array background, Pose pose,
+         std::tuple<double, double, double, double> intrinsics, int width, int height, double near, double stop, double level, bool geometry,
+         std::vector<std::optional<Out<Real>>> planes, Out<Real> color, Out<Real> max_weight, Out<int32_t> pixels) {
+        const linprim::View view = make_view(pose, intrinsics, width, height, near, stop, level);
+        const auto primitives = make_primitives<Real>(center, rotation, extent, density, sh);
+        const auto out = make_planes<Real, Out<Real>>(planes, height, width);
+        require_planes(out, geometry);
+        const int64_t stats = geometry ? primitives.n : 0;
+        const Real* bg = checked(background, {3}, "background");
+        Real* colors = checked(color, {primitives.n, 3}, "color");
+        Real* weights = checked(max_weight, {stats}, "max_weight");
+        int32_t* counts = checked(pixels, {stats}, "pixels");
+        nb::gil_scoped_release release;
+        linprim::rasterize<Real>(view, primitives, bg, geometry, out, colors, weights, counts);
+      });
+  m.def(
+      (std::string("rasterize_grad_") + suffix).c_str(),
+      [](Array center, Array rotation, Array extent, Array density, Array sh, Array background, Pose pose,
+         std::tuple<double, double, double, double> intrinsics, int width, int height, double near, double stop, double level, bool geometry,
+         std::vector<std::optional<Array>> planes, Array color, std::vector<std::optional<Array>> grads, Out<Real> center_grad,
+         Out<Real> rotation_grad, Out<Real> extent_grad, Out<Real> density_grad, Out<Real> sh_grad, Out<Real> background_grad,
+         Out<Real> screen_grad) {
+        const linprim::View view = make_view(pose, intrinsics, width, height, near, stop, level);
+        const auto primitives = make_primitives<Real>(center, rotation, extent, density, sh);
+        const auto out = make_planes<Real, Array>(planes, height, width);
+        require_planes(out, geometry);
+        const auto grad = make_planes<Real, Array>(grads, height, width);
+        const Real* bg = checked(background, {3}, "background");
+        const Real* colors = checked(color, {primitives.n, 3}, "color");
+        const linprim::PrimitiveGradients<Real> gradients{checked(center_grad, {primitives.n, 3}, "center_grad"),
+                                                          checked(rotation_grad, {primitives.n, 4}, "rotation_grad"),
+                                                          checked(extent_grad, {primitives.n, 3}, "extent_grad"),
+                                                          checked(density_grad, {primitives.n}, "density_grad"),
+                                                          checked(sh_grad, {primitives.n, primitives.sh_count, 3}, "sh_grad"),
+                                                          checked(screen_grad, {primitives.n, 2}, "screen_grad")};
+        Real* bg_grad = checked(background_grad, {3}, "background_grad");
+        nb::gil_scoped_release release;
+        linprim::rasterize_grad<Real>(view, primitives, bg, geometry, out, colors, grad, gradients, bg_grad);
+      });
+  m.def((std::string("first_non_finite_") + suffix).c_str(), [](Array values) {
+    const Real* data = values.data();
+    const int64_t n = int64_t(values.size());
+    nb::gil_scoped_release release;
+    return linprim::first_non_finite<Real>(data, n);
+  });
+}
+
+}  // namespace
+
+NB_MODULE(_core, m) {
+  bind_real<float>(m, "f32");
+  bind_real<double>(m, "f64");
+  m.def("photometric_loss", [](In<float> image, In<float> target, std::optional<In<float>> weight, float dssim, Out<float> gradient) {
+    if (image.ndim() != 3) throw std::invalid_argument("image has to have shape (3, H, W)");
+    const int64_t height = int64_t(image.shape(1)), width = int64_t(image.shape(2));
+    const float* a = checked(image, {3, height, width}, "image");
+    const float* b = checked(target, {3, height, width}, "target");
+    const float* w = weight ? checked(*weight, {height, width}, "weight") : nullptr;
+    float* g = checked(gradient, {3, height, width}, "gradient");
+    if (height < 1 || width < 1) throw std::invalid_argument("the image is empty");
+    linprim::Photometric result;
+    {
+      nb::gil_scoped_release release;
+      result = linprim::photometric_loss(a, b, w, int(width), int(height), dssim, g);
+    }
+    return std::make_tuple(result.loss, result.l1, result.ssim);
+  });
+  m.def("adam_step", [](Out<float> value, In<float> gradient, Out<float> first, Out<float> second, float rate, float beta1, float beta2,
+                        float epsilon, int64_t step) {
+    const int64_t n = int64_t(value.size());
+    if (int64_t(gradient.size()) != n || int64_t(first.size()) != n || int64_t(second.size()) != n)
+      throw std::invalid_argument("value, gradient and moments differ in size");
+    if (step < 1) throw std::invalid_argument("step counts from 1");
+    float *v = value.data(), *m1 = first.data(), *m2 = second.data();
+    const float* g = gradient.data();
+    nb::gil_scoped_release release;
+    linprim::adam_step(v, g, m1, m2, n, rate, beta1, beta2, epsilon, step);
+  });
+  m.def("set_threads", &linprim::set_threads);
+  m.def("threads", &linprim::threads);
+  m.def("set_instruction_set", [](const std::string& name) { return linprim::set_instruction_set(name.c_str()); });
+  m.def("instruction_set", [] { return std::string(linprim::instruction_set()); });
+  m.def("statistics", [] {
+    const linprim::Statistics s = linprim::statistics();
+    nb::dict d;
+    d["primitives"] = s.primitives, d["visible"] = s.visible, d["pairs"] = s.pairs;
+    d["visited_lanes"] = s.visited_lanes, d["hit_lanes"] = s.hit_lanes, d["working_set_bytes"] = s.working_set_bytes;
+    d["project_ms"] = s.project_ms, d["sort_ms"] = s.sort_ms, d["bin_ms"] = s.bin_ms, d["forward_ms"] = s.forward_ms;
+    d["backward_ms"] = s.backward_ms, d["chain_ms"] = s.chain_ms;
+    return d;
+  });
+}

@@ -1,0 +1,58 @@
+// The core's interface: an exact, differentiable rasterizer of transparent polyhedra, an image loss and an optimiser step.
+//
+// Plain functions over plain arrays; no Python, no torch, no exceptions. Preconditions are asserted by the caller (bind.cpp checks them).
+// All functions use every thread of the pool (parallel.h) and give bitwise the same result for any number of threads.
+#pragma once
+
+#include <cstdint>
+
+#include "kernels.h"
+
+namespace linprim {
+
+// Picks the vector kernels: "scalar", "v2", "v3", "v4", "neon", or "auto" for the best this processor has.
+// Returns false, and changes nothing, where the processor or the build has no such kernels. Double precision is always scalar.
+bool set_instruction_set(const char* name);
+const char* instruction_set();
+
+// What the last forward and backward pass did.
+struct Statistics {
+  int64_t primitives, visible, pairs, visited_lanes, hit_lanes, working_set_bytes;
+  double project_ms, sort_ms, bin_ms, forward_ms, backward_ms, chain_ms;
+};
+Statistics statistics();
+
+// Renders `primitives`, ordered by the depth of their centres, by exact perspective intersection with every pixel's ray.
+//
+// out.rgb and out.opacity are always written; with `geometry`, so are the other planes, max_weight (n) and pixels (n): the largest
+// weight T alpha a primitive reaches in any pixel, and the number of pixels that hit it. color (n,3) receives the view-dependent
+// colour of each primitive that may be visible, 0 for the others. `background` is 3 values.
+template <class Real>
+void rasterize(const View& view, const Primitives<Real>& primitives, const Real* background, bool geometry, const Planes<Real>& out,
+               Real* color, Real* max_weight, int32_t* pixels);
+
+// Adjoint of rasterize for the same arguments: `out` and `color` as that call wrote them, `grad` the gradients to its planes (null
+// where zero). Writes every row of `gradients` and the 3 values of background_grad. Tile lists are taken from the forward pass if
+// it is among the last few and had the same content, else they are made again.
+template <class Real>
+void rasterize_grad(const View& view, const Primitives<Real>& primitives, const Real* background, bool geometry,
+                    const Planes<Real>& out, const Real* color, const Planes<Real>& grad, const PrimitiveGradients<Real>& gradients,
+                    Real* background_grad);
+
+// loss = (1 - dssim) L1 + dssim (1 - SSIM) of two (3,H,W) images and its gradient to the first, written to `gradient` (3,H,W).
+// `weight` (H,W) or null multiplies both maps; means are over the weight. Returns the loss, and the two parts.
+struct Photometric {
+  double loss, l1, ssim;
+};
+Photometric photometric_loss(const float* image, const float* target, const float* weight, int width, int height, float dssim,
+                             float* gradient);
+
+// One Adam step (Kingma and Ba 2015, algorithm 1) on n values in place; `step` counts from 1.
+void adam_step(float* value, const float* gradient, float* first, float* second, int64_t n, float rate, float beta1, float beta2,
+               float epsilon, int64_t step);
+
+// Index of the first value that is NaN or infinite, or -1.
+template <class Real>
+int64_t first_non_finite(const Real* values, int64_t n);
+
+}  // namespace linprim

@@ -1,0 +1,19 @@
+// A pool of threads that sleep between jobs, and one loop over it.
+//
+// Results never depend on the number of threads: a job's items are independent and each writes its own place.
+#pragma once
+
+#include <cstdint>
+#include <functional>
+
+namespace linprim {
+
+// Number of threads that jobs use, at least 1. 0 asks for one per core. Not safe while a job runs.
+void set_threads(int count);
+int threads();
+
+// Calls body(item, thread) once for each item in [0, items), on up to threads() threads; returns when all are done.
+// `thread` is below threads(). Items are handed out in order. Calls from several threads take turns.
+void parallel_for(int64_t items, const std::function<void(int64_t item, int thread)>& body);
+
+}  // namespace linprim

@@ -1,0 +1,467 @@
+// The tile kernels: blend the primitives of one 16x16 tile in order, and the adjoint of that.
+//
+// W lanes cover a part of a 4x4 block of pixels (all of it for W = 16). Per-pixel state lives in arrays of 256, block after
+// block. Included by kernels.cpp only.
+#pragma once
+
+#include <algorithm>
+#include <bit>
+#include <cmath>
+
+#include "kernels.h"
+#include "simd.h"
+
+namespace linprim::LINPRIM_ISA {
+
+// Entry index of a ray that enters through the near plane; faces are 0-7.
+constexpr int kNearPlane = 8;
+// The lowest inverse depth a ray can leave at: keeps 1 / w finite.
+constexpr double kFarInverse = 1e-12;
+
+template <class Real, int W>
+struct Tile {
+  using V = Vec<Real, W>;
+  using M = Mask<Real, W>;
+  using I = Index<Real, W>;
+  static constexpr int kPartWidth = W < kBlock ? W : kBlock;
+  static constexpr int kPartHeight = W / kPartWidth;
+  static constexpr int kParts = kBlock * kBlock / W;
+
+  // Position of part `part` in its block.
+  static int part_x(int part) { return W < kBlock ? part % kBlock : 0; }
+  static int part_y(int part) { return W < kBlock ? part / kBlock : part * kPartHeight; }
+
+  struct Lanes {
+    V x, y;
+    Lanes() {
+      alignas(64) Real lx[W], ly[W];
+      for (int i = 0; i < W; ++i) lx[i] = Real(i % kPartWidth), ly[i] = Real(i / kPartWidth);
+      x = V::load(lx), y = V::load(ly);
+    }
+  };
+
+  // A record moved to one tile: face values at the tile's first pixel, and each face's slope over the lanes of a part.
+  struct Faces {
+    Real corner[8], bx[8], cy[8];
+    V slope[8];
+    V w0, near_w, far_w;
+    uint32_t flags;
+    void set(const Record<Real>& r, int tile_x, int tile_y, const Lanes& lanes, const View& view) {
+      const Real dx = Real(tile_x - r.ref_x), dy = Real(tile_y - r.ref_y);
+      for (int f = 0; f < 8; ++f) {
+        bx[f] = r.b[f], cy[f] = r.c[f];
+        corner[f] = r.a[f] + (r.b[f] * dx + r.c[f] * dy);
+      }
+      for (int f = 0; f < 8; ++f) slope[f] = fma(V::set(r.b[f]), lanes.x, V::set(r.c[f]) * lanes.y);
+      w0 = V::set(r.w0);
+      flags = r.flags;
+      near_w = V::set(Real(1 / view.near) - r.w0);
+      far_w = V::set(Real(kFarInverse) - r.w0);
+    }
+    // Inverse depths, relative to w0, where the rays of a part whose first pixel lies (x, y) pixels into the tile enter and leave.
+    template <bool kTrack>
+    void intersect(Real x, Real y, V& in, V& out, I& in_face, I& out_face) const {
+      alignas(64) Real at[8];
+      for (int f = 0; f < 8; ++f) at[f] = corner[f] + (bx[f] * x + cy[f] * y);
+      auto value = [&](int f) { return V::set(at[f]) + slope[f]; };
+      auto enter = [&](V w, int f) {
+        if constexpr (kTrack) in_face = select(w < in, I::set(f), in_face);
+        in = min(w, in);
+      };
+      auto leave = [&](V w, int f) {
+        if constexpr (kTrack) out_face = select(out < w, I::set(f), out_face);
+        out = max(w, out);
+      };
+      if (!(flags & kGeneral)) [[likely]] {
+        in = value(0), out = value(4);
+        if constexpr (kTrack) in_face = I::set(0), out_face = I::set(4);
+        for (int f = 1; f < 4; ++f) enter(value(f), f), leave(value(4 + f), 4 + f);
+      } else {
+        in = near_w, out = far_w;
+        if constexpr (kTrack) in_face = I::set(kNearPlane), out_face = I::set(kNearPlane);
+        for (int f = 0; f < 8; ++f) {
+          if (f < 4 && (flags >> f & 1)) {
+            enter(value(f), f);
+          } else {
+            leave(value(f), f);
+          }
+        }
+      }
+    }
+  };
+
+  // Length of the ray (u, v, 1) through each pixel of the tile.
+  static void ray_lengths(const View& view, int tile_x, int tile_y, Real* out) {
+    for (int i = 0; i < kTilePixels; ++i) {
+      int x, y;
+      pixel_of(i, x, y);
+      const double u = (tile_x + x + 0.5 - view.cx) / view.fx, v = (tile_y + y + 0.5 - view.cy) / view.fy;
+      out[i] = Real(std::sqrt(1.0 + u * u + v * v));
+    }
+  }
+  // Position in the tile of state entry i.
+  static void pixel_of(int i, int& x, int& y) {
+    const int block = i / 16, inside = i % 16;
+    x = 4 * (block % 4) + inside % 4, y = 4 * (block / 4) + inside / 4;
+  }
+};
+
+// Mean position, in units of the slice, of what is absorbed in a slice of optical thickness tau, and its derivative:
+// g = 1/tau - 1/(e^tau - 1), from 1/2 (thin) to 0 (opaque); a series below 0.3, where the difference would cancel.
+template <class Real, int W>
+inline void mean_in_slice(Vec<Real, W> tau, Vec<Real, W> alpha, Vec<Real, W> through, Vec<Real, W>& g, Vec<Real, W>& slope) {
+  using V = Vec<Real, W>;
+  const V t2 = tau * tau;
+  const Mask<Real, W> thin = tau < V::set(Real(0.3));
+  // Next terms of the series: tau^7/1209600 (g) and tau^6/172800 (slope), below 2e-10 and 5e-9 at 0.3.
+  const V thin_g = fma(tau, fma(t2, fma(t2, V::set(Real(-1.0 / 30240)), V::set(Real(1.0 / 720))), V::set(Real(-1.0 / 12))), V::set(Real(0.5)));
+  const V thin_slope = fma(t2, fma(t2, V::set(Real(-1.0 / 6048)), V::set(Real(1.0 / 240))), V::set(Real(-1.0 / 12)));
+  const V safe = select(thin, V::set(1), tau), inverse = rcp(safe), over = through * rcp(select(thin, V::set(1), alpha));
+  g = select(thin, thin_g, inverse - over);
+  slope = select(thin, thin_slope, fma(over * rcp(select(thin, V::set(1), alpha)), V::set(1), V::set(0) - inverse * inverse));
+}
+
+template <class Real, int W, bool kGeometry>
+Counts forward_tile(const RasterParams<Real>& P, int tile) {
+  using T = Tile<Real, W>;
+  using V = typename T::V;
+  using M = typename T::M;
+  using I = typename T::I;
+  const View& view = P.view;
+  const int tile_x = tile % P.tiles_x * kTile, tile_y = tile / P.tiles_x * kTile;
+  const typename T::Lanes lanes;
+  const Real stop = Real(view.stop), level = Real(view.level);
+  const V zero = V::set(0), v_stop = V::set(stop), v_level = V::set(level);
+  Counts counts{0, 0, 0};
+
+  alignas(64) Real length[kTilePixels], through[kTilePixels], red[kTilePixels], green[kTilePixels], blue[kTilePixels];
+  constexpr int kStates = 13;  // first, reference, moment 1, moment 2, median, 1/(density |v|) there, normal 3, median normal 3, seen
+  alignas(64) Real geo[kGeometry ? kStates : 1][kGeometry ? kTilePixels : 1];
+  T::ray_lengths(view, tile_x, tile_y, length);
+  unsigned alive = 0;
+  for (int i = 0; i < kTilePixels; ++i) {
+    int x, y;
+    T::pixel_of(i, x, y);
+    const bool inside = tile_x + x < view.width && tile_y + y < view.height;
+    through[i] = inside ? Real(1) : Real(-1);  // never at or above `stop`: a pixel outside the image is never hit
+    red[i] = green[i] = blue[i] = 0;
+    if (inside) alive |= 1u << (i / 16);
+  }
+  if constexpr (kGeometry)
+    for (auto& plane : geo) std::fill(plane, plane + kTilePixels, Real(0));
+
+  for (uint32_t e = P.tile_begin[tile]; e < P.tile_begin[tile + 1]; ++e) {
+    Pair& pair = P.pairs[e];
+    unsigned todo = pair.blocks & alive, touched = 0;
+    if constexpr (kGeometry) P.pair_weight[pair.slot] = 0, P.pair_pixels[pair.slot] = 0;
+    if (alive == 0) {
+      pair.blocks = 0;
+      if constexpr (kGeometry) continue;  // the statistics of the remaining pairs have to be cleared too
+      for (; e < P.tile_begin[tile + 1]; ++e) P.pairs[e].blocks = 0;
+      break;
+    }
+    if (todo == 0) {
+      pair.blocks = 0;
+      continue;
+    }
+    if (e + 2 < P.tile_begin[tile + 1]) {
+      const char* next = reinterpret_cast<const char*>(&P.records[P.pairs[e + 2].primitive]);
+      __builtin_prefetch(next), __builtin_prefetch(next + 64);
+    }
+    const Record<Real>& record = P.records[pair.primitive];
+    typename T::Faces faces;
+    faces.set(record, tile_x, tile_y, lanes, view);
+    const V density = V::set(record.density), cr = V::set(record.rgb[0]), cg = V::set(record.rgb[1]), cb = V::set(record.rgb[2]);
+    V largest = zero;
+    uint32_t pixels = 0;
+    while (todo) {
+      const int block = std::countr_zero(todo);
+      todo &= todo - 1;
+      unsigned open = 0, hits = 0;
+      for (int part = 0; part < T::kParts; ++part) {
+        const int at = block * 16 + part * W;
+        V in, out, t = V::load(through + at);
+        I in_face, out_face;
+        faces.template intersect<kGeometry>(Real(4 * (block & 3) + T::part_x(part)), Real(4 * (block >> 2) + T::part_y(part)), in, out,
+                                            in_face, out_face);
+        const M hit = (out < in) & (t >= v_stop);
+        const unsigned bits = hit.bits();
+        hits += unsigned(std::popcount(bits));
+        if (bits) {
+          const V w_in = in + faces.w0, w_out = out + faces.w0;
+          const V inverse = rcp(w_in * w_out), v_length = V::load(length + at);
+          const V tau = density * select(hit, v_length * (in - out) * inverse, zero);
+          V alpha, e_tau;
+          exp_neg(tau, alpha, e_tau);
+          const V weight = select(hit, t * alpha, zero);  // t is -1 outside the image
+          fma(weight, cr, V::load(red + at)).store(red + at);
+          fma(weight, cg, V::load(green + at)).store(green + at);
+          fma(weight, cb, V::load(blue + at)).store(blue + at);
+          const V after = t * e_tau;
+          if constexpr (kGeometry) {
+            largest = max(largest, weight);
+            pixels += unsigned(std::popcount(bits));
+            const V t_in = w_out * inverse, t_out = w_in * inverse;
+            V mean, slope;
+            mean_in_slice(tau, alpha, e_tau, mean, slope);
+            const V z = fma(t_out - t_in, mean, t_in);
+            const M fresh = hit & (V::load(geo[12] + at) < V::set(Real(0.5)));
+            select(fresh, V::set(1), V::load(geo[12] + at)).store(geo[12] + at);
+            select(fresh, t_in, V::load(geo[0] + at)).store(geo[0] + at);
+            const V origin = select(fresh, z, V::load(geo[1] + at));
+            origin.store(geo[1] + at);
+            const V dz = select(hit, z - origin, zero), wz = weight * dz;
+            (V::load(geo[2] + at) + wz).store(geo[2] + at);
+            fma(wz, dz, V::load(geo[3] + at)).store(geo[3] + at);
+            const M crossing = hit & (v_level < t) & (v_level >= after);
+            const M facing = hit & is_face(in_face);
+            V normal[3] = {zero, zero, zero};
+            for (int f = 0; f < 4; ++f) {
+              const M here = facing & equal(in_face, f);
+              for (int k = 0; k < 3; ++k) normal[k] = select(here, V::set(P.normals[pair.primitive][f][k]), normal[k]);
+            }
+            for (int k = 0; k < 3; ++k) fma(weight, normal[k], V::load(geo[6 + k] + at)).store(geo[6 + k] + at);
+            if (crossing.bits()) {
+              const V slowness = rcp(density * v_length);
+              const V inside = log(select(crossing, t * V::set(1 / level), V::set(1))) * slowness;
+              select(crossing, min(t_in + inside, t_out), V::load(geo[4] + at)).store(geo[4] + at);
+              select(crossing, slowness, V::load(geo[5] + at)).store(geo[5] + at);
+              for (int k = 0; k < 3; ++k) select(crossing, normal[k], V::load(geo[9 + k] + at)).store(geo[9 + k] + at);
+            }
+          }
+          t = select(hit, after, t);
+          t.store(through + at);
+        }
+        open |= (t >= v_stop).bits();
+      }
+      counts.visited_blocks += 1;
+      counts.hit_lanes += hits;
+      if (hits) touched |= 1u << block;
+      if (!open) alive &= ~(1u << block);
+    }
+    pair.blocks = touched;
+    if constexpr (kGeometry) P.pair_weight[pair.slot] = max_lane(largest), P.pair_pixels[pair.slot] = pixels;
+  }
+  counts.visited_lanes = counts.visited_blocks * 16;
+
+  const int64_t plane = int64_t(view.width) * view.height;
+  for (int i = 0; i < kTilePixels; ++i) {
+    int x, y;
+    T::pixel_of(i, x, y);
+    if (tile_x + x >= view.width || tile_y + y >= view.height) continue;
+    const int64_t to = int64_t(tile_y + y) * view.width + tile_x + x;
+    P.out.rgb[to] = red[i] + through[i] * P.background[0];
+    P.out.rgb[plane + to] = green[i] + through[i] * P.background[1];
+    P.out.rgb[2 * plane + to] = blue[i] + through[i] * P.background[2];
+    P.out.opacity[to] = 1 - through[i];
+    if constexpr (kGeometry) {
+      const Real opacity = 1 - through[i], m1 = geo[2][i], m2 = geo[3][i];
+      P.out.depth_first[to] = geo[0][i];
+      P.out.depth_expected[to] = m1 + geo[1][i] * opacity;
+      P.out.depth_median[to] = geo[4][i];
+      P.out.distortion[to] = opacity * m2 - m1 * m1;
+      for (int k = 0; k < 3; ++k) {
+        P.out.normal[k * plane + to] = geo[6 + k][i];
+        P.out.normal_median[k * plane + to] = geo[9 + k][i];
+      }
+      P.out.state[to] = geo[1][i], P.out.state[plane + to] = m1, P.out.state[2 * plane + to] = m2, P.out.state[3 * plane + to] = geo[5][i];
+    }
+  }
+  return counts;
+}
+
+// Sums of `count` accumulators over their lanes.
+template <class Real, int W>
+inline void reduce(const Vec<Real, W>* sums, int count, Real* out) {
+  for (int i = 0; i < count; ++i) out[i] = sum(sums[i]);
+}
+#if defined(LINPRIM_ISA_V4)
+// Sixteen accumulators at a time by a tree of half-adds: 45 instructions for 16 sums.
+template <>
+inline void reduce<float, 16>(const F16* a, int count, float* out) {
+  for (int group = 0; group < count; group += 16, a += 16, out += 16) {
+    __m512 z[4];
+    for (int i = 0; i < 4; ++i) {
+      const __m512 x = _mm512_add_ps(_mm512_shuffle_f32x4(a[i].v, a[i + 4].v, 0x44), _mm512_shuffle_f32x4(a[i].v, a[i + 4].v, 0xee));
+      const __m512 y = _mm512_add_ps(_mm512_shuffle_f32x4(a[i + 8].v, a[i + 12].v, 0x44), _mm512_shuffle_f32x4(a[i + 8].v, a[i + 12].v, 0xee));
+      z[i] = _mm512_add_ps(_mm512_shuffle_f32x4(x, y, 0x88), _mm512_shuffle_f32x4(x, y, 0xdd));
+    }
+    const __m512 u = _mm512_add_ps(_mm512_unpacklo_ps(z[0], z[1]), _mm512_unpackhi_ps(z[0], z[1]));
+    const __m512 v = _mm512_add_ps(_mm512_unpacklo_ps(z[2], z[3]), _mm512_unpackhi_ps(z[2], z[3]));
+    _mm512_storeu_ps(out, _mm512_add_ps(_mm512_shuffle_ps(u, v, 0x44), _mm512_shuffle_ps(u, v, 0xee)));
+  }
+}
+#endif
+#if defined(LINPRIM_ISA_V3)
+// Eight accumulators at a time: horizontal adds inside the halves, then the halves.
+template <>
+inline void reduce<float, 8>(const F8* a, int count, float* out) {
+  for (int group = 0; group < count; group += 8, a += 8, out += 8) {
+    const __m256 p = _mm256_hadd_ps(_mm256_hadd_ps(a[0].v, a[1].v), _mm256_hadd_ps(a[2].v, a[3].v));
+    const __m256 q = _mm256_hadd_ps(_mm256_hadd_ps(a[4].v, a[5].v), _mm256_hadd_ps(a[6].v, a[7].v));
+    _mm256_storeu_ps(out, _mm256_add_ps(_mm256_permute2f128_ps(p, q, 0x20), _mm256_permute2f128_ps(p, q, 0x31)));
+  }
+}
+#endif
+
+template <class Real, int W, bool kGeometry>
+void backward_tile(const RasterParams<Real>& P, int tile) {
+  using T = Tile<Real, W>;
+  using V = typename T::V;
+  using M = typename T::M;
+  using I = typename T::I;
+  const View& view = P.view;
+  const int tile_x = tile % P.tiles_x * kTile, tile_y = tile / P.tiles_x * kTile;
+  const typename T::Lanes lanes;
+  const V zero = V::set(0), v_stop = V::set(Real(view.stop)), v_level = V::set(Real(view.level));
+  constexpr int kSums = kGeometry ? kGeometrySums : kColorSums;
+
+  // remaining = sum over what is still in front of us (background included) of its weight times (its value . gradient).
+  alignas(64) Real length[kTilePixels], through[kTilePixels], remaining[kTilePixels], g_red[kTilePixels], g_green[kTilePixels],
+      g_blue[kTilePixels], g_one[kTilePixels];
+  // gradient to moment 1, moment 2, first depth, median depth, normal 3, median normal 3; reference depth; 1/(density |v|); seen
+  constexpr int kStates = 13;
+  alignas(64) Real geo[kGeometry ? kStates : 1][kGeometry ? kTilePixels : 1];
+  T::ray_lengths(view, tile_x, tile_y, length);
+  const int64_t plane = int64_t(view.width) * view.height;
+  Real background_sum[3] = {0, 0, 0};
+  for (int i = 0; i < kTilePixels; ++i) {
+    int x, y;
+    T::pixel_of(i, x, y);
+    through[i] = -1;
+    remaining[i] = g_red[i] = g_green[i] = g_blue[i] = g_one[i] = 0;
+    if constexpr (kGeometry)
+      for (auto& state : geo) state[i] = 0;
+    if (tile_x + x >= view.width || tile_y + y >= view.height) continue;
+    const int64_t at = int64_t(tile_y + y) * view.width + tile_x + x;
+    auto read = [&](const Real* p, int channel = 0) { return p ? p[channel * plane + at] : Real(0); };
+    through[i] = 1;
+    const Real opacity = P.out.opacity[at];
+    g_red[i] = read(P.grad.rgb, 0), g_green[i] = read(P.grad.rgb, 1), g_blue[i] = read(P.grad.rgb, 2), g_one[i] = read(P.grad.opacity);
+    remaining[i] = g_red[i] * P.out.rgb[at] + g_green[i] * P.out.rgb[plane + at] + g_blue[i] * P.out.rgb[2 * plane + at];
+    background_sum[0] += (1 - opacity) * g_red[i], background_sum[1] += (1 - opacity) * g_green[i], background_sum[2] += (1 - opacity) * g_blue[i];
+    if constexpr (kGeometry) {
+      const Real origin = P.out.state[at], m1 = P.out.state[plane + at], m2 = P.out.state[2 * plane + at];
+      const Real g_expected = read(P.grad.depth_expected), g_distortion = read(P.grad.distortion);
+      g_one[i] += g_expected * origin + g_distortion * m2;
+      geo[0][i] = g_expected - 2 * m1 * g_distortion;
+      geo[1][i] = g_distortion * opacity;
+      geo[2][i] = read(P.grad.depth_first), geo[3][i] = read(P.grad.depth_median);
+      remaining[i] += geo[0][i] * m1 + geo[1][i] * m2;
+      for (int k = 0; k < 3; ++k) {
+        geo[4 + k][i] = read(P.grad.normal, k), geo[7 + k][i] = read(P.grad.normal_median, k);
+        remaining[i] += geo[4 + k][i] * P.out.normal[k * plane + at];
+      }
+      geo[10][i] = origin, geo[11][i] = P.out.state[3 * plane + at];
+    }
+    remaining[i] += g_one[i] * opacity;
+  }
+  for (int k = 0; k < 3; ++k) P.background_sums[3 * tile + k] = background_sum[k];
+
+  for (uint32_t e = P.tile_begin[tile]; e < P.tile_begin[tile + 1]; ++e) {
+    const Pair& pair = P.pairs[e];
+    Real* slot = P.sums + int64_t(pair.slot) * kSums;
+    unsigned todo = pair.blocks;
+    if (todo == 0) {
+      std::fill(slot, slot + kSums, Real(0));
+      continue;
+    }
+    if (e + 2 < P.tile_begin[tile + 1]) {
+      const char* next = reinterpret_cast<const char*>(&P.records[P.pairs[e + 2].primitive]);
+      __builtin_prefetch(next), __builtin_prefetch(next + 64), __builtin_prefetch(next + 128), __builtin_prefetch(next + 192);
+    }
+    const Record<Real>& record = P.records[pair.primitive];
+    typename T::Faces faces;
+    faces.set(record, tile_x, tile_y, lanes, view);
+    const V density = V::set(record.density), cr = V::set(record.rgb[0]), cg = V::set(record.rgb[1]), cb = V::set(record.rgb[2]);
+    V sums[kSums];
+    for (V& s : sums) s = zero;
+    while (todo) {
+      const int block = std::countr_zero(todo);
+      todo &= todo - 1;
+      for (int part = 0; part < T::kParts; ++part) {
+        const int at = block * 16 + part * W;
+        const int x = 4 * (block & 3) + T::part_x(part), y = 4 * (block >> 2) + T::part_y(part);
+        V in, out;
+        const V t = V::load(through + at);
+        I in_face, out_face;
+        faces.template intersect<true>(Real(x), Real(y), in, out, in_face, out_face);
+        const M hit = (out < in) & (t >= v_stop);
+        if (T::kParts > 1 && !hit.bits()) continue;
+        const V w_in = in + faces.w0, w_out = out + faces.w0;
+        const V inverse = rcp(w_in * w_out), v_length = V::load(length + at);
+        const V chord = select(hit, v_length * (in - out) * inverse, zero), tau = density * chord;
+        V alpha, e_tau;
+        exp_neg(tau, alpha, e_tau);
+        const V after = t * e_tau, weight = select(hit, t * alpha, zero);
+        const V gr = V::load(g_red + at), gg = V::load(g_green + at), gb = V::load(g_blue + at);
+        V value = fma(cr, gr, fma(cg, gg, fma(cb, gb, V::load(g_one + at))));
+        const V t_in = w_out * inverse, t_out = w_in * inverse;
+        V d_in = zero, d_out = zero, d_tau_direct = zero, d_density_direct = zero;  // gradients to t_in, t_out, tau, density
+        if constexpr (kGeometry) {
+          V mean, slope;
+          mean_in_slice(tau, alpha, e_tau, mean, slope);
+          const V thick = t_out - t_in;
+          const V dz = select(hit, fma(thick, mean, t_in) - V::load(geo[10] + at), zero);
+          const V g1 = V::load(geo[0] + at), g2 = V::load(geo[1] + at);
+          value = value + dz * fma(dz, g2, g1);
+          const V g_z = weight * fma(dz + dz, g2, g1);
+          d_in = g_z * (V::set(1) - mean), d_out = g_z * mean, d_tau_direct = g_z * thick * slope;
+
+          const M fresh = hit & (V::load(geo[12] + at) < V::set(Real(0.5)));
+          select(fresh, V::set(1), V::load(geo[12] + at)).store(geo[12] + at);
+          d_in = d_in + select(fresh, V::load(geo[2] + at), zero);
+
+          const V g_median = V::load(geo[3] + at), slowness = V::load(geo[11] + at);
+          const M crossing = hit & (v_level < t) & (v_level >= after), before = hit & (v_level < after);
+          d_in = d_in + select(crossing, g_median, zero);
+          d_tau_direct = d_tau_direct - select(before, g_median * slowness, zero);
+          if (crossing.bits()) {
+            const V inside = log(select(crossing, t * V::set(Real(1 / view.level)), V::set(1))) * slowness;
+            d_density_direct = zero - select(crossing, g_median * inside * rcp(density), zero);
+          }
+          for (int f = 0; f < 4; ++f) {
+            const M here = hit & equal(in_face, f);
+            if (!here.bits()) continue;
+            const M median_here = here & crossing;
+            for (int k = 0; k < 3; ++k) {
+              const V g_normal = V::load(geo[4 + k] + at);
+              value = fma(select(here, V::set(P.normals[pair.primitive][f][k]), zero), g_normal, value);
+              V& s = sums[16 + 3 * f + k];
+              s = fma(select(here, weight, zero), g_normal, s);
+              s = s + select(median_here, V::load(geo[7 + k] + at), zero);
+            }
+          }
+        }
+        const V rest = V::load(remaining + at) - weight * value;
+        const V d_tau = select(hit, fma(after, value, d_tau_direct - rest), zero);
+        sums[13] = fma(weight, gr, sums[13]);
+        sums[14] = fma(weight, gg, sums[14]);
+        sums[15] = fma(weight, gb, sums[15]);
+        sums[12] = fma(d_tau, chord, sums[12] + d_density_direct);
+        const V d_chord = d_tau * density * v_length;
+        // chord = |v| (t_out - t_in); w = 1/t, so dL/dw = -t^2 dL/dt. A ray that entered through the near plane moves with no face.
+        const V g_in = select(hit & is_face(in_face), t_in * t_in * (d_chord - d_in), zero);
+        const V g_out = select(hit & is_face(out_face), zero - t_out * t_out * (d_chord + d_out), zero);
+        const V g_in_w = g_in * in, g_out_w = g_out * out;
+        const V px = lanes.x + V::set(Real(x)), py = lanes.y + V::set(Real(y));
+        for (int k = 0; k < 3; ++k) {
+          const V s_in = lookup8(record.face[k], in_face), s_out = lookup8(record.face[k], out_face);
+          const V g = fma(g_in, s_in, g_out * s_out);
+          sums[k] = sums[k] + g;
+          sums[3 + k] = fma(g, px, sums[3 + k]);
+          sums[6 + k] = fma(g, py, sums[6 + k]);
+          sums[9 + k] = fma(g_in_w, s_in, fma(g_out_w, s_out, sums[9 + k]));
+        }
+        rest.store(remaining + at);
+        select(hit, after, t).store(through + at);
+      }
+    }
+    reduce(sums, kSums, slot);
+    // Positions were counted from the tile's corner: move them to the reference pixel.
+    const Real dx = Real(tile_x - record.ref_x), dy = Real(tile_y - record.ref_y);
+    for (int k = 0; k < 3; ++k) slot[3 + k] += dx * slot[k], slot[6 + k] += dy * slot[k];
+  }
+}
+
+}  // namespace linprim::LINPRIM_ISA

@@ -1,0 +1,302 @@
+// The rasterizer's pipeline: project, sort by depth, bin into tiles, blend; and back: tiles, reduction per primitive, chain.
+#include <algorithm>
+#include <array>
+#include <bit>
+#include <chrono>
+#include <cstring>
+#include <memory>
+#include <mutex>
+#include <utility>
+#include <vector>
+
+#include "instruction_set.h"
+#include "linprim.h"
+#include "parallel.h"
+
+namespace linprim {
+namespace {
+
+constexpr int64_t kPrimitivesPerTask = 512;
+constexpr int kBinChunks = 32;  // fixed, so that nothing depends on the number of threads
+
+class Stopwatch {
+ public:
+  double lap() {
+    const auto now = std::chrono::steady_clock::now();
+    const double ms = std::chrono::duration<double, std::milli>(now - last_).count();
+    last_ = now;
+    return ms;
+  }
+
+ private:
+  std::chrono::steady_clock::time_point last_ = std::chrono::steady_clock::now();
+};
+
+Statistics last_statistics{};
+
+// 64-bit content hash: four interleaved multiply-xor lanes over 8-byte words (the finaliser is Stafford's variant 13).
+uint64_t hash_bytes(uint64_t seed, const void* data, size_t bytes) {
+  constexpr uint64_t kOdd = 0x9e3779b97f4a7c15ull;
+  const char* p = static_cast<const char*>(data);
+  uint64_t lane[4] = {seed ^ kOdd, seed + 1, seed + 2, seed + 3};
+  size_t i = 0;
+  for (; i + 32 <= bytes; i += 32)
+    for (int l = 0; l < 4; ++l) {
+      uint64_t word;
+      std::memcpy(&word, p + i + 8 * l, 8);
+      lane[l] = std::rotl(lane[l] ^ word, 29) * kOdd;
+    }
+  uint64_t h = bytes;
+  for (uint64_t l : lane) h = (std::rotl(h, 17) ^ l) * kOdd;
+  for (; i < bytes; ++i) h = (h ^ uint8_t(p[i])) * 0x100000001b3ull;
+  h = (h ^ (h >> 30)) * 0xbf58476d1ce4e5b9ull;
+  h = (h ^ (h >> 27)) * 0x94d049bb133111ebull;
+  return h ^ (h >> 31);
+}
+
+template <class Real>
+uint64_t content_hash(const View& view, const Primitives<Real>& p, bool geometry, const Real* color) {
+  const double numbers[] = {view.fx, view.fy, view.cx, view.cy, double(view.width), double(view.height), view.near, view.stop,
+                            view.level, double(p.n), double(geometry), double(sizeof(Real))};
+  uint64_t h = hash_bytes(1, view.world_to_camera, sizeof view.world_to_camera);
+  h = hash_bytes(h, numbers, sizeof numbers);
+  h = hash_bytes(h, p.center, size_t(p.n) * 3 * sizeof(Real));
+  h = hash_bytes(h, p.rotation, size_t(p.n) * 4 * sizeof(Real));
+  h = hash_bytes(h, p.extent, size_t(p.n) * 3 * sizeof(Real));
+  h = hash_bytes(h, p.density, size_t(p.n) * sizeof(Real));
+  return hash_bytes(h, color, size_t(p.n) * 3 * sizeof(Real));
+}
+
+// Everything between the primitives and the pixels of one view. Buffers only grow, so a view after the first allocates nothing.
+template <class Real>
+struct Frame {
+  uint64_t hash = 0, used = 0;
+  int tiles_x = 0, tiles_y = 0;
+  int64_t visible = 0, pair_count = 0;
+  std::vector<Record<Real>> records;
+  std::vector<std::array<std::array<Real, 3>, 4>> normals;
+  std::vector<Footprint> footprints;
+  std::vector<float> depth;
+  std::vector<uint32_t> order, order_swap, keys, keys_swap;
+  std::vector<LoosePair> loose[kBinChunks];
+  int64_t loose_count[kBinChunks];
+  std::vector<uint32_t> chunk_tile;  // chunks x tiles: counts, then write positions
+  std::vector<uint32_t> tile_begin, first_slot, slot_count;
+  std::vector<Pair> pairs;
+  std::vector<Real> pair_weight, sums, background_sums;
+  std::vector<uint32_t> pair_pixels;
+
+  int tiles() const { return tiles_x * tiles_y; }
+
+  void build(const View& view, const Primitives<Real>& p, bool geometry, Real* color, Statistics& stats) {
+    Stopwatch watch;
+    tiles_x = (view.width + kTile - 1) / kTile, tiles_y = (view.height + kTile - 1) / kTile;
+    grow(records, p.n), grow(footprints, p.n), grow(depth, p.n), grow(first_slot, p.n), grow(slot_count, p.n);
+    if (geometry) grow(normals, p.n);
+    const ProjectParams<Real> project{view, p, records.data(), footprints.data(), depth.data(), color,
+                                      geometry ? reinterpret_cast<Real(*)[4][3]>(normals.data()) : nullptr};
+    parallel_for((p.n + kPrimitivesPerTask - 1) / kPrimitivesPerTask, [&](int64_t task, int) {
+      const int64_t begin = task * kPrimitivesPerTask, end = std::min(p.n, begin + kPrimitivesPerTask);
+      kernels<Real>().project(project, begin, end);
+      std::fill(slot_count.begin() + begin, slot_count.begin() + end, 0u);
+    });
+    stats.project_ms = watch.lap();
+    sort(p.n);
+    stats.sort_ms = watch.lap();
+    bin();
+    stats.bin_ms = watch.lap();
+    stats.primitives = p.n, stats.visible = visible, stats.pairs = pair_count;
+    stats.working_set_bytes = bytes();
+  }
+
+  // Visible primitives by ascending depth of their centres; ties keep the order of input.
+  void sort(int64_t n) {
+    grow(order, n), grow(order_swap, n), grow(keys, n), grow(keys_swap, n);
+    visible = 0;
+    constexpr int kBits = 11, kPasses = 3, kBuckets = 1 << kBits;
+    static thread_local uint32_t histogram[kPasses][kBuckets];
+    std::memset(histogram, 0, sizeof histogram);
+    for (int64_t i = 0; i < n; ++i) {
+      if (footprints[i].x1 < footprints[i].x0) continue;
+      uint32_t key = std::bit_cast<uint32_t>(depth[i] + 0.0f);  // -0 sorts as 0
+      key ^= (key >> 31) ? 0xffffffffu : 0x80000000u;           // ascending as unsigned
+      keys[visible] = key, order[visible] = uint32_t(i), ++visible;
+      for (int pass = 0; pass < kPasses; ++pass) ++histogram[pass][key >> (kBits * pass) & (kBuckets - 1)];
+    }
+    for (int pass = 0; pass < kPasses; ++pass) {
+      uint32_t total = 0;
+      for (uint32_t& h : histogram[pass]) total += std::exchange(h, total);
+      for (int64_t i = 0; i < visible; ++i) {
+        const uint32_t to = histogram[pass][keys[i] >> (kBits * pass) & (kBuckets - 1)]++;
+        keys_swap[to] = keys[i], order_swap[to] = order[i];
+      }
+      keys.swap(keys_swap), order.swap(order_swap);
+    }
+  }
+
+  // Tile lists, each in the order of `order`; the gradient slots of a primitive are consecutive.
+  void bin() {
+    const BinParams params{footprints.data(), order.data(), tiles_x, tiles_y};
+    grow(chunk_tile, int64_t(kBinChunks) * tiles()), grow(tile_begin, tiles() + 1);
+    auto begin_of = [&](int64_t chunk) { return visible * chunk / kBinChunks; };
+    parallel_for(kBinChunks, [&](int64_t chunk, int) {
+      std::vector<LoosePair>& list = loose[chunk];
+      int64_t at = begin_of(chunk), count = 0;
+      for (;;) {
+        int64_t written = 0;
+        at = kernels<Real>().bin(params, at, begin_of(chunk + 1), list.data() + count, int64_t(list.size()) - count, &written);
+        count += written;
+        if (at == begin_of(chunk + 1)) break;
+        list.resize(list.size() * 2 + 2 * size_t(tiles()));
+      }
+      loose_count[chunk] = count;
+      uint32_t* counts = &chunk_tile[chunk * tiles()];
+      std::fill(counts, counts + tiles(), 0u);
+      for (int64_t i = 0; i < count; ++i) ++counts[list[i].tile];
+    });
+    uint32_t total = 0;
+    for (int tile = 0; tile < tiles(); ++tile) {
+      tile_begin[tile] = total;
+      for (int chunk = 0; chunk < kBinChunks; ++chunk) total += std::exchange(chunk_tile[int64_t(chunk) * tiles() + tile], total);
+    }
+    tile_begin[tiles()] = total;
+    pair_count = total;
+    grow(pairs, pair_count);
+    parallel_for(kBinChunks, [&](int64_t chunk, int) {
+      uint32_t slot = 0;
+      for (int64_t c = 0; c < chunk; ++c) slot += uint32_t(loose_count[c]);
+      uint32_t* position = &chunk_tile[chunk * tiles()];
+      for (int64_t i = 0; i < loose_count[chunk]; ++i, ++slot) {
+        const LoosePair& pair = loose[chunk][i];
+        pairs[position[pair.tile]++] = {pair.primitive, slot, pair.blocks};
+        if (slot_count[pair.primitive]++ == 0) first_slot[pair.primitive] = slot;
+      }
+    });
+  }
+
+  RasterParams<Real> raster(const View& view, const Real* background, const Planes<Real>& out) {
+    return {view, tiles_x, tiles_y, records.data(), reinterpret_cast<const Real(*)[4][3]>(normals.data()), tile_begin.data(),
+            pairs.data(), background, out, pair_weight.data(), pair_pixels.data(), {}, sums.data(), background_sums.data()};
+  }
+
+  template <class T>
+  static void grow(std::vector<T>& v, int64_t size) {
+    if (int64_t(v.size()) < size) v.resize(size);
+  }
+  int64_t bytes() const {
+    auto of = [](const auto& v) { return int64_t(v.capacity() * sizeof(v[0])); };
+    int64_t total = of(records) + of(normals) + of(footprints) + of(depth) + of(order) + of(order_swap) + of(keys) + of(keys_swap) +
+                    of(chunk_tile) + of(tile_begin) + of(first_slot) + of(slot_count) + of(pairs) + of(pair_weight) + of(sums) +
+                    of(background_sums) + of(pair_pixels);
+    for (const auto& list : loose) total += of(list);
+    return total;
+  }
+};
+
+// The last few frames, so that a backward pass finds the tile lists of its forward pass.
+template <class Real>
+struct Cache {
+  std::mutex mutex;
+  uint64_t clock = 0;
+  std::array<std::unique_ptr<Frame<Real>>, 2> frames;
+
+  Frame<Real>* find(uint64_t hash) {
+    for (auto& frame : frames)
+      if (frame && frame->hash == hash) return frame->used = ++clock, frame.get();
+    return nullptr;
+  }
+  Frame<Real>& oldest() {
+    std::unique_ptr<Frame<Real>>* chosen = &frames[0];
+    for (auto& frame : frames)
+      if (!frame || (*chosen && frame->used < (*chosen)->used)) chosen = &frame;
+    if (!*chosen) *chosen = std::make_unique<Frame<Real>>();
+    (*chosen)->used = ++clock;
+    (*chosen)->hash = 0;
+    return **chosen;
+  }
+};
+template <class Real>
+Cache<Real>& cache() {
+  static auto* instance = new Cache<Real>;
+  return *instance;
+}
+
+}  // namespace
+
+Statistics statistics() { return last_statistics; }
+
+template <class Real>
+void rasterize(const View& view, const Primitives<Real>& primitives, const Real* background, bool geometry, const Planes<Real>& out,
+               Real* color, Real* max_weight, int32_t* pixels) {
+  std::lock_guard lock(cache<Real>().mutex);
+  Statistics stats{};
+  Frame<Real>& frame = cache<Real>().oldest();
+  frame.build(view, primitives, geometry, color, stats);
+  Stopwatch watch;
+  if (geometry) frame.grow(frame.pair_weight, frame.pair_count), frame.grow(frame.pair_pixels, frame.pair_count);
+  const RasterParams<Real> params = frame.raster(view, background, out);
+  std::vector<Counts> counts(threads(), Counts{});
+  parallel_for(frame.tiles(), [&](int64_t tile, int thread) {
+    const Counts c = kernels<Real>().forward(params, int(tile), geometry);
+    counts[thread].visited_lanes += c.visited_lanes, counts[thread].hit_lanes += c.hit_lanes;
+  });
+  for (const Counts& c : counts) stats.visited_lanes += int64_t(c.visited_lanes), stats.hit_lanes += int64_t(c.hit_lanes);
+  if (geometry) {
+    for (int64_t i = 0; i < primitives.n; ++i) {
+      Real largest = 0;
+      uint32_t sum = 0;
+      for (uint32_t s = 0; s < frame.slot_count[i]; ++s) {
+        largest = std::max(largest, frame.pair_weight[frame.first_slot[i] + s]);
+        sum += frame.pair_pixels[frame.first_slot[i] + s];
+      }
+      max_weight[i] = largest, pixels[i] = int32_t(sum);
+    }
+  }
+  stats.forward_ms = watch.lap();
+  frame.hash = content_hash(view, primitives, geometry, color);
+  last_statistics = stats;
+}
+
+template <class Real>
+void rasterize_grad(const View& view, const Primitives<Real>& primitives, const Real* background, bool geometry,
+                    const Planes<Real>& out, const Real* color, const Planes<Real>& grad, const PrimitiveGradients<Real>& gradients,
+                    Real* background_grad) {
+  std::lock_guard lock(cache<Real>().mutex);
+  Statistics stats = last_statistics;
+  const uint64_t hash = content_hash(view, primitives, geometry, color);
+  Frame<Real>* frame = cache<Real>().find(hash);
+  if (!frame) {
+    frame = &cache<Real>().oldest();
+    std::vector<Real> scratch(size_t(primitives.n) * 3);
+    frame->build(view, primitives, geometry, scratch.data(), stats);
+    frame->hash = hash;
+  }
+  Stopwatch watch;
+  const int per_slot = geometry ? kGeometrySums : kColorSums;
+  frame->grow(frame->sums, frame->pair_count * per_slot), frame->grow(frame->background_sums, int64_t(frame->tiles()) * 3);
+  RasterParams<Real> params = frame->raster(view, background, out);
+  params.grad = grad;
+  parallel_for(frame->tiles(), [&](int64_t tile, int) { kernels<Real>().backward(params, int(tile), geometry); });
+  double total[3] = {0, 0, 0};
+  for (int tile = 0; tile < frame->tiles(); ++tile)
+    for (int k = 0; k < 3; ++k) total[k] += double(frame->background_sums[3 * tile + k]);
+  for (int k = 0; k < 3; ++k) background_grad[k] = Real(total[k]);
+  stats.backward_ms = watch.lap();
+  const ChainParams<Real> chain{view,     primitives, frame->footprints.data(), color, frame->first_slot.data(), frame->slot_count.data(),
+                                frame->sums.data(), per_slot, gradients};
+  parallel_for((primitives.n + kPrimitivesPerTask - 1) / kPrimitivesPerTask, [&](int64_t task, int) {
+    const int64_t begin = task * kPrimitivesPerTask;
+    kernels<Real>().chain(chain, begin, std::min(primitives.n, begin + kPrimitivesPerTask));
+  });
+  stats.chain_ms = watch.lap();
+  last_statistics = stats;
+}
+
+#define LINPRIM_INSTANTIATE(Real)                                                                                                    \
+  template void rasterize<Real>(const View&, const Primitives<Real>&, const Real*, bool, const Planes<Real>&, Real*, Real*, int32_t*); \
+  template void rasterize_grad<Real>(const View&, const Primitives<Real>&, const Real*, bool, const Planes<Real>&, const Real*,       \
+                                     const Planes<Real>&, const PrimitiveGradients<Real>&, Real*);
+LINPRIM_INSTANTIATE(float)
+LINPRIM_INSTANTIATE(double)
+
+}  // namespace linprim

@@ -1,0 +1,96 @@
+"""Pinhole cameras and the similarity between the data set's frame and the one that training works in.
+
+Conventions, said once: the camera looks along +z, x is right and y is down; pixel (row i, column j) has its
+centre at (x, y) = (j + 0.5, i + 0.5); `depth` is z along the optical axis and `distance` is along the unit ray.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera: size in pixels, focal lengths and principal point in pixels, and a rigid pose.
+
+    `world_to_camera` is (4, 4) float64 with an orthonormal rotation: x_camera = R x_world + t.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_to_camera: np.ndarray
+
+    @property
+    def K(self) -> np.ndarray:
+        """The (3, 3) matrix of intrinsics, in pixels."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """(3, 3), world to camera."""
+        return self.world_to_camera[:3, :3]
+
+    @property
+    def center(self) -> np.ndarray:
+        """(3,) position of the camera in the world."""
+        return -self.rotation.T @ self.world_to_camera[:3, 3]
+
+    @property
+    def camera_to_world(self) -> np.ndarray:
+        """(4, 4), the inverse of `world_to_camera`."""
+        pose = np.eye(4)
+        pose[:3, :3] = self.rotation.T
+        pose[:3, 3] = self.center
+        return pose
+
+    def ray_grid(self) -> np.ndarray:
+        """(H, W, 3) camera-space rays through the pixel centres, scaled so that z = 1: a point is depth * ray."""
+        x = (np.arange(self.width) + 0.5 - self.cx) / self.fx
+        y = (np.arange(self.height) + 0.5 - self.cy) / self.fy
+        rays = np.ones((self.height, self.width, 3))
+        rays[..., 0] = x[None, :]
+        rays[..., 1] = y[:, None]
+        return rays
+
+    def world_rays(self) -> np.ndarray:
+        """(H, W, 3) the same rays in the world's axes; a point is `center + depth * ray`."""
+        return self.ray_grid() @ self.rotation
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Projects (P, 3) world points to ((P, 2) pixel positions, (P,) depths); behind the camera gives NaN pixels."""
+        local = points @ self.rotation.T + self.world_to_camera[:3, 3]
+        depth = local[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = np.where(depth > 0, 1.0 / depth, np.nan)
+        pixels = np.stack([local[:, 0] * scale * self.fx + self.cx, local[:, 1] * scale * self.fy + self.cy], 1)
+        return pixels, depth
+
+    def transformed(self, similarity: Similarity) -> Camera:
+        """The same camera seen from the frame that `similarity` maps to."""
+        pose = np.eye(4)
+        pose[:3, :3] = self.rotation
+        pose[:3, 3] = -self.rotation @ similarity.apply(self.center)
+        return replace(self, world_to_camera=pose)
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x_out = scale * (x_in - offset). Depths and lengths are multiplied by `scale`."""
+
+    scale: float = 1.0
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Maps (..., 3) points."""
+        return self.scale * (np.asarray(points, dtype=np.float64) - np.asarray(self.offset))
+
+    def inverse(self) -> Similarity:
+        """The similarity that undoes this one."""
+        offset = -self.scale * np.asarray(self.offset)
+        return Similarity(1.0 / self.scale, tuple(float(x) for x in offset))

@@ -1,0 +1,151 @@
+#!/usr/bin/env python3
+"""Times the rasterizer on a furnished room of N octahedra made by code: ns per (pixel, primitive) hit, forward and backward.
+
+    python tools/bench.py --primitives 50000 --threads 1 --json
+
+Primitives lie on the surfaces of a 6 x 3 x 5 m room with boxes and spheres, sized so that the number over a surface point does
+not depend on N; the camera looks in from the open front. Forward and backward runs alternate; figures are medians.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+
+import numpy as np
+
+
+def room(count: int, seed: int = 0, overlap: float = 0.60) -> dict[str, np.ndarray]:
+    """`count` flat octahedra on the room's surfaces: half-axes 2.6 s with s = overlap sqrt(area / count) in the surface, 0.15 s across."""
+    rng = np.random.default_rng(seed)
+    walls: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+
+    def box(center, half, faces="xXyYzZ"):
+        center, half = np.array(center, float), np.array(half, float)
+        for face in faces:
+            axis, side = "xyz".index(face.lower()), -1 if face.islower() else 1
+            origin, u, v = center - half, np.zeros(3), np.zeros(3)
+            origin[axis] = center[axis] + side * half[axis]
+            u[(axis + 1) % 3], v[(axis + 2) % 3] = 2 * half[(axis + 1) % 3], 2 * half[(axis + 2) % 3]
+            walls.append((origin, u, v))
+
+    box([0, 0, 4.5], [3, 1.5, 2.5], "xXyYZ")
+    box([-1.5, 0.9, 5.0], [0.6, 0.6, 0.6])
+    box([1.4, 0.7, 4.4], [0.5, 0.8, 0.4])
+    box([0.1, 1.2, 3.6], [0.8, 0.3, 0.4])
+    balls = [(np.array([0.2, 0.4, 5.2]), 0.7), (np.array([-1.3, -0.5, 4.2]), 0.45), (np.array([1.6, -0.7, 5.6]), 0.6)]
+    areas = np.array([np.linalg.norm(np.cross(u, v)) for _, u, v in walls] + [4 * np.pi * r * r for _, r in balls])
+    which = rng.choice(len(areas), count, p=areas / areas.sum())
+    center, normal = np.zeros((count, 3)), np.zeros((count, 3))
+    for k, (origin, u, v) in enumerate(walls):
+        mine = which == k
+        a, b = rng.random((2, mine.sum(), 1))
+        center[mine] = origin + a * u + b * v
+        normal[mine] = np.cross(u, v) / np.linalg.norm(np.cross(u, v))
+    for k, (middle, radius) in enumerate(balls):
+        mine = which == len(walls) + k
+        direction = rng.normal(size=(mine.sum(), 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        center[mine], normal[mine] = middle + radius * direction, direction
+    s = overlap * np.sqrt(areas.sum() / count)
+    extent = 2.6 * np.stack([s * np.exp(rng.uniform(-0.5, 0.5, count)), s * np.exp(rng.uniform(-0.5, 0.5, count)), np.full(count, 0.15 * s)], 1)
+    # Quaternion that turns z to the normal, after a random spin about z.
+    spin = rng.uniform(0, 2 * np.pi, count) / 2
+    turn = np.concatenate([(1 + normal[:, 2])[:, None], np.cross([0.0, 0.0, 1.0], normal)], 1)
+    turn[normal[:, 2] < -0.999999] = [0, 1, 0, 0]
+    turn /= np.linalg.norm(turn, axis=1, keepdims=True)
+    (w, x, y, z), (c, d) = turn.T, (np.cos(spin), np.sin(spin))
+    rotation = np.stack([w * c - z * d, x * c + y * d, y * c - x * d, w * d + z * c], 1)
+    opacity = rng.uniform(0.1, 0.95, count)
+    rgb = 0.5 + 0.35 * np.sin(2.3 * center + np.array([0, 2, 4])) + rng.normal(0, 0.05, (count, 3))
+    sh = rng.normal(0, 0.05, (count, 16, 3))
+    sh[:, 0] = (rgb - 0.5) / 0.28209479177387814
+    density = -np.log1p(-opacity) / (2 * extent.min(1))
+    return {k: np.ascontiguousarray(v, np.float32) for k, v in
+            dict(center=center, rotation=rotation, extent=extent, density=density, sh=sh).items()}
+
+
+def median_spread(values: list[float]) -> dict[str, float]:
+    """Median, and the range that holds the middle half."""
+    low, middle, high = np.percentile(values, [25, 50, 75])
+    return {"median": float(middle), "low": float(low), "high": float(high)}
+
+
+def measure(count: int, threads: int, runs: int, geometry: bool, width: int = 800, height: int = 600) -> dict:
+    """Alternates forward, backward, loss and optimiser `runs` times after two warm-ups."""
+    import torch
+
+    from linprim_geo import ops
+    from linprim_geo.camera import Camera
+
+    torch.set_num_threads(threads)
+    ops.set_threads(threads)
+    parameters = [torch.from_numpy(v).requires_grad_() for v in room(count).values()]
+    background = torch.zeros(3, requires_grad=True)
+    moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in parameters]
+    camera = Camera(width, height, 0.75 * width, 0.75 * width, width / 2, height / 2, np.eye(4))
+    target = torch.rand(3, height, width, generator=torch.Generator().manual_seed(0))
+    times: dict[str, list[float]] = {}
+
+    def note(name: str, ms: float) -> None:
+        times.setdefault(name, []).append(ms)
+
+    stats = {}
+    for run in range(runs + 2):
+        marks = [time.perf_counter()]
+        out = ops.rasterize(*parameters, background, camera, geometry=geometry)
+        marks.append(time.perf_counter())
+        loss = ops.photometric_loss(out.rgb, target)[0]
+        marks.append(time.perf_counter())
+        grads = torch.autograd.grad(loss, parameters)
+        marks.append(time.perf_counter())
+        for p, g, (first, second) in zip(parameters, grads, moments, strict=True):
+            ops.adam_step(p, g, first, second, 0.0, run + 1)
+        marks.append(time.perf_counter())
+        if run < 2:
+            continue
+        stats = ops.statistics()
+        for stage in ("project", "sort", "bin", "forward", "backward", "chain"):
+            note(stage, stats[f"{stage}_ms"])
+        for name, a, b in (("call_forward", 0, 1), ("loss", 1, 2), ("call_backward", 2, 3), ("optimiser", 3, 4), ("iteration", 0, 4)):
+            note(name, 1e3 * (marks[b] - marks[a]))
+    stages = {name: median_spread(values) for name, values in times.items()}
+    hits = stats["hit_lanes"]
+    return {
+        "primitives": count, "threads": threads, "instruction_set": ops.instruction_set(), "geometry": geometry,
+        "image": [width, height], "visible": stats["visible"], "hits": hits, "pairs": stats["pairs"],
+        "visited_per_hit": stats["visited_lanes"] / hits, "pairs_per_tile": stats["pairs"] / (-(-width // 16) * -(-height // 16)),
+        "forward_ns_per_hit": 1e6 * sum(stages[s]["median"] for s in ("project", "sort", "bin", "forward")) / hits,
+        "backward_ns_per_hit": 1e6 * sum(stages[s]["median"] for s in ("backward", "chain")) / hits,
+        "raster_forward_ns_per_hit": 1e6 * stages["forward"]["median"] / hits,
+        "raster_backward_ns_per_hit": 1e6 * stages["backward"]["median"] / hits,
+        "iteration_ms": stages["iteration"]["median"], "stages_ms": stages,
+        "working_set_mib": stats["working_set_bytes"] / 2**20, "load": os.getloadavg()[0],
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--primitives", type=int, nargs="+", default=[10_000, 50_000, 200_000], metavar="N")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--runs", type=int, default=15, help="measured repetitions")
+    parser.add_argument("--geometry", action="store_true", help="also depths, normals, distortion")
+    parser.add_argument("--json", action="store_true", help="print one JSON object (a list for several N)")
+    args = parser.parse_args()
+    results = [measure(n, args.threads, args.runs, args.geometry) for n in args.primitives]
+    if args.json:
+        print(json.dumps(results[0] if len(results) == 1 else results, indent=2))
+        return
+    for r in results:
+        s = {k: v["median"] for k, v in r["stages_ms"].items()}
+        print(f"{r['primitives']:>7} primitives, {r['threads']} thread(s), {r['instruction_set']}: {r['hits'] / 1e6:.2f} M hits, "
+              f"{r['visited_per_hit']:.2f} visited per hit, {r['pairs']} pairs")
+        print(f"        forward {r['forward_ns_per_hit']:.2f} ns/hit (tiles alone {r['raster_forward_ns_per_hit']:.2f}), "
+              f"backward {r['backward_ns_per_hit']:.2f} ({r['raster_backward_ns_per_hit']:.2f}), iteration {r['iteration_ms']:.1f} ms")
+        print("        ms: " + ", ".join(f"{k} {v:.2f}" for k, v in s.items()) + f"; working set {r['working_set_mib']:.0f} MiB")
+
+
+if __name__ == "__main__":
+    main()
