@@ -1,0 +1,175 @@
+"""A run's folder: what a training leaves behind, and rendering from it.
+
+    config.json       scene, options, versions: how the run was made
+    transform.json    training frame <-> data-set frame, unit
+    run.json          what the last save holds: iteration, primitives, background
+    training_frame.npz   primitives in the training frame, bit for bit as trained
+    scene.npz, scene.ply the same in the data set's frame, ours and in LinPrim's format
+    metrics.jsonl     loss, PSNR, ... over time                        checkpoints/step_*.pt, latest
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from . import __version__
+from .camera import Similarity
+from .errors import LinprimError
+from .files import write_json
+from .options import SceneOptions, TrainOptions
+from .primitives import Octahedra, load_octahedra, save_octahedra
+from .scene import Scene, View, load_scene
+
+
+@dataclass(frozen=True)
+class Run:
+    """An opened run folder. Everything it hands out is in the data set's frame and unit unless it says otherwise."""
+
+    path: Path
+    scene_path: Path
+    scene_options: SceneOptions
+    train_options: TrainOptions
+    similarity: Similarity  # data-set frame -> training frame
+    unit: str = "unit of the data set"
+
+    @staticmethod
+    def create(path: Path, scene: Scene, scene_path: Path, scene_options: SceneOptions, options: TrainOptions, similarity: Similarity) -> Run:
+        """Makes the folder and writes its configuration.
+
+        Raises:
+            LinprimError: the folder exists and is not empty, or cannot be written.
+        """
+        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            raise LinprimError(f"{path}: exists already; give another folder with -o, or go on with --resume")
+        run = Run(path, scene_path.resolve(), scene_options, options, similarity, scene.unit)
+        config = {
+            "linprim_geo": __version__, "scene": str(run.scene_path), "scene_options": asdict(scene_options),
+            "train_options": asdict(options), "python": platform.python_version(), "machine": platform.platform(),
+        }
+        write_json(path / "config.json", config)
+        write_json(path / "transform.json", {
+            "about": "training = scale * (data_set - offset)", "scale": similarity.scale, "offset": similarity.offset, "unit": scene.unit,
+        })
+        return run
+
+    @staticmethod
+    def open(path: str | os.PathLike) -> Run:
+        """Opens an existing run.
+
+        Raises:
+            LinprimError: not a run folder, or a file in it is damaged.
+        """
+        path = Path(path)
+        config, transform = _read_json(path / "config.json", path), _read_json(path / "transform.json", path)
+        try:
+            similarity = Similarity(float(transform["scale"]), tuple(float(x) for x in transform["offset"]))
+            return Run(
+                path, Path(config["scene"]), _known(SceneOptions, config["scene_options"]),
+                _known(TrainOptions, config["train_options"]), similarity, transform["unit"],
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise LinprimError(f"{path}: config.json or transform.json lacks what a run needs ({error})") from None
+
+    def scene(self) -> Scene:
+        """The capture it was trained on."""
+        return self._scene
+
+    @cached_property
+    def _scene(self) -> Scene:
+        options = self.scene_options
+        return load_scene(self.scene_path, downscale=options.downscale, masks=options.masks or None, sparse=options.sparse or None)
+
+    @cached_property
+    def state(self) -> dict:
+        """Contents of run.json: `iteration`, `primitives`, `background`, `seconds`."""
+        state = _read_json(self.path / "run.json", self.path)
+        if not isinstance(state.get("background"), list) or len(state["background"]) != 3:
+            raise LinprimError(f"{self.path / 'run.json'}: has no background colour of three numbers")
+        return state
+
+    @property
+    def background(self) -> np.ndarray:
+        """(3,) float64 colour in [0, 1] behind everything."""
+        return np.asarray(self.state["background"], dtype=np.float64)
+
+    def save(self, octahedra: Octahedra, state: dict) -> None:
+        """Replaces the saved primitives (training frame) and run.json, each atomically."""
+        from .ply import write_linprim_ply
+
+        save_octahedra(self.path / "training_frame.npz", octahedra)
+        exported = to_data_set(octahedra, self.similarity)
+        save_octahedra(self.path / "scene.npz", exported)
+        write_linprim_ply(self.path / "scene.ply", exported)
+        write_json(self.path / "run.json", state)
+
+    def training_primitives(self) -> Octahedra:
+        """The saved primitives in the training frame, bit for bit as trained."""
+        return load_octahedra(self.path / "training_frame.npz")
+
+    def primitives(self) -> Octahedra:
+        """The saved primitives in the data set's frame."""
+        return to_data_set(self.training_primitives(), self.similarity)
+
+    def render_views(self, views: Iterable[View], geometry: bool = True, level: float = 0.5) -> Iterator[tuple[View, dict[str, np.ndarray]]]:
+        """Renders views over the run's background, one at a time.
+
+        Yields: (view, images) with float32 `rgb` (3, H, W), `opacity` (H, W) and, with `geometry`, the z-depths `depth_median`
+            (at transmittance `level`), `depth_first`, `depth_expected` (mean of what is there, divided by the opacity), each (H, W) in
+            the data set's unit with 0 where there is none, and `normal` (H, W, 3), the entry normal at the median depth in world axes.
+        """
+        import torch
+
+        from . import ops
+
+        ops.set_threads(self.train_options.threads)
+        octahedra = self.training_primitives()
+        tensors = [torch.from_numpy(a) for a in (octahedra.center, octahedra.rotation, octahedra.extent, octahedra.density, octahedra.sh)]
+        background = torch.tensor(self.background, dtype=torch.float32)
+        for view in views:
+            with torch.no_grad():
+                out = ops.rasterize(*tensors, background, view.camera.transformed(self.similarity), stop=self.train_options.stop,
+                                    level=level, geometry=geometry)
+            images = {"rgb": out.rgb.numpy(), "opacity": out.opacity.numpy()}
+            if geometry:
+                unit = 1.0 / self.similarity.scale
+                opacity = np.maximum(images["opacity"], 1e-6)
+                images["depth_median"] = (out.depth_median.numpy() * unit).astype(np.float32)
+                images["depth_first"] = (out.depth_first.numpy() * unit).astype(np.float32)
+                images["depth_expected"] = (out.depth_expected.numpy() * unit / opacity).astype(np.float32)
+                images["normal"] = (out.normal_median.numpy().transpose(1, 2, 0) @ view.camera.rotation).astype(np.float32)
+            yield view, images
+
+
+def to_data_set(octahedra: Octahedra, similarity: Similarity) -> Octahedra:
+    """Primitives of the training frame in the data set's: lengths divided by the scale, densities multiplied by it."""
+    inverse = similarity.inverse()
+    return replace(
+        octahedra, center=inverse.apply(octahedra.center), extent=octahedra.extent / similarity.scale,
+        density=octahedra.density * similarity.scale,
+    )
+
+
+def _known(cls, values: dict):
+    """The dataclass from a saved dict; options that this version no longer has are ignored."""
+    names = cls.__dataclass_fields__
+    return cls(**{k: v for k, v in values.items() if k in names})
+
+
+def _read_json(file: Path, run: Path) -> dict:
+    try:
+        value = json.loads(file.read_text())
+    except FileNotFoundError:
+        raise LinprimError(f"{run}: {file.name} is missing, so this is not the folder of a run that has saved something") from None
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise LinprimError(f"{file}: cannot be read ({error})") from None
+    if not isinstance(value, dict):
+        raise LinprimError(f"{file}: holds no JSON object")
+    return value

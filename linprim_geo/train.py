@@ -1,0 +1,477 @@
+"""Training: photographs and a first guess of primitives in, optimised primitives out.
+
+One view per step: render, L1 + D-SSIM, Adam, and now and then the population grows (population.py). Whatever is random is
+drawn from a generator seeded by (seed, purpose, step), so a checkpoint needs no generator state and a resumed run repeats
+the interrupted one bit for bit.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from . import ops, population
+from .camera import Camera
+from .errors import LinprimError
+from .options import SceneOptions, TrainOptions
+from .primitives import SH_Y0, Octahedra
+from .progress import Progress, duration, memory_gib
+from .run import Run
+from .scene import PointCloud, Scene, View, load_scene
+
+# Learning rates at the start of a run, for the training frame, where cameras see their subject from a distance of 3; all fall
+# exponentially to the given part of themselves.
+RATES = {
+    "center": (1.5e-3, 0.02), "rotation": (7e-3, 0.1), "log_extent": (1.5e-2, 0.1), "raw_opacity": (5e-2, 0.1),
+    "sh_dc": (5e-3, 0.1), "sh_rest": (5e-4, 0.1), "background": (5e-3, 0.1),
+}
+# Half-axes stay within these: a part of a pixel at the distance of the subject, and of the scene's radius.
+SMALLEST_PX, LARGEST_PART = 0.35, 0.5
+# Share of the run after which each further degree of view-dependent colour joins.
+DEGREE_EVERY = 0.07
+# Held-out views scored during training; all of them are at the end.
+QUICK_VIEWS = 16
+KEPT_CHECKPOINTS = 2
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A view in memory: `rgb` (3, H, W) uint8, `alpha` (H, W) uint8 or None, and its camera in the training frame."""
+
+    name: str
+    camera: Camera
+    rgb: torch.Tensor
+    alpha: torch.Tensor | None
+
+    def over(self, background: torch.Tensor) -> torch.Tensor:
+        """(3, H, W) float32 in [0, 1], over `background` (3,) where alpha lets it through."""
+        rgb = self.rgb.to(torch.float32).mul_(1 / 255)
+        if self.alpha is None:
+            return rgb
+        alpha = self.alpha.to(torch.float32).mul_(1 / 255)
+        return rgb.mul_(alpha).add_(background[:, None, None] * (1 - alpha))
+
+
+def load_shots(views: tuple[View, ...], similarity) -> list[Shot]:
+    """Decodes views into memory, keeping their order."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    def load(view: View) -> Shot:
+        photo = view.load()
+        alpha = None if photo.alpha is None else torch.from_numpy(np.ascontiguousarray(photo.alpha))
+        rgb = torch.from_numpy(np.ascontiguousarray(photo.rgb.transpose(2, 0, 1)))
+        return Shot(view.name, view.camera.transformed(similarity), rgb, alpha)
+
+    with ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
+        return list(pool.map(load, views))
+
+
+def initial_cloud(scene: Scene, count: int, seed: int) -> PointCloud:
+    """Points to start from, at most `count`, in the data set's frame: the scene's own, triangulated ones, or random ones.
+
+    A scene with an alpha channel and no points starts from random points inside the visual hull; without alpha, features are
+    matched and triangulated under the known poses, and random points in the common field of view fill up.
+    """
+    from .initial_points import frusta_points, visual_hull_points
+    from .triangulate import triangulate_points
+
+    cloud = scene.points
+    if cloud is None or len(cloud.xyz) == 0:
+        if scene.has_alpha:
+            return visual_hull_points(scene, count, seed)
+        try:
+            cloud = triangulate_points(scene, seed=seed)
+        except LinprimError:
+            cloud = None
+        found = 0 if cloud is None else len(cloud.xyz)
+        if found < min(500, count):
+            extra = frusta_points(scene, count - found, seed)
+            return extra if found == 0 else PointCloud(np.concatenate([cloud.xyz, extra.xyz]), np.concatenate([cloud.rgb, extra.rgb]))
+    if len(cloud.xyz) > count:
+        keep = np.sort(np.random.default_rng([seed, 1]).choice(len(cloud.xyz), count, replace=False))
+        cloud = PointCloud(cloud.xyz[keep], cloud.rgb[keep])
+    return cloud
+
+
+def initial_parameters(xyz: np.ndarray, rgb: np.ndarray, degree: int, seed: int, bounds: tuple[float, float]) -> dict[str, torch.Tensor]:
+    """One octahedron per point: half-axes the mean distance to the 3 nearest points, opacity 0.5, random rotation.
+
+    `xyz` (P, 3) in the training frame, `rgb` (P, 3) uint8, `bounds` the least and largest half-axis.
+    """
+    from scipy.spatial import cKDTree
+
+    count = len(xyz)
+    rng = np.random.default_rng([seed, 2])
+    neighbours = min(4, count)
+    distance = cKDTree(xyz).query(xyz, k=neighbours)[0].reshape(count, -1)[:, 1:]
+    size = distance.mean(1) if distance.shape[1] else np.full(count, bounds[1])
+    rotation = rng.normal(size=(count, 4))
+    values = {
+        "center": xyz, "rotation": rotation / np.linalg.norm(rotation, axis=1, keepdims=True),
+        "log_extent": np.repeat(np.log(np.clip(size, *bounds))[:, None], 3, 1), "raw_opacity": np.zeros(count),
+        "sh_dc": ((rgb / 255.0 - 0.5) / SH_Y0)[:, None, :], "sh_rest": np.zeros((count, (degree + 1) ** 2 - 1, 3)),
+    }
+    return {name: torch.from_numpy(np.ascontiguousarray(value, dtype=np.float32)) for name, value in values.items()}
+
+
+def activate(parameters: dict[str, torch.Tensor], degree: int) -> tuple[torch.Tensor, ...]:
+    """Raw parameters to what the rasterizer takes: center, rotation, extent, density, sh.
+
+    extent = exp(log_extent); density = softplus(raw_opacity) / (2 min extent), so that a ray along the shortest diagonal has
+    alpha = 1 - exp(-softplus(raw)) = sigmoid(raw), with no cap and no logarithm of 0.
+    """
+    extent = torch.exp(parameters["log_extent"])
+    density = torch.nn.functional.softplus(parameters["raw_opacity"]) / (2 * extent.amin(1))
+    count = (degree + 1) ** 2 - 1
+    sh = parameters["sh_dc"] if count == 0 else torch.cat([parameters["sh_dc"], parameters["sh_rest"][:, :count]], 1)
+    return parameters["center"], parameters["rotation"], extent, density, sh
+
+
+class Trainer:
+    """The state of a training and one step of it. `parameters`, `first` and `second` (Adam's moments) share their keys."""
+
+    def __init__(self, shots: list[Shot], parameters: dict[str, torch.Tensor], options: TrainOptions, bounds: tuple[float, float],
+                 background: torch.Tensor, fitted: bool, random_background: bool):
+        self.shots, self.options, self.bounds = shots, options, bounds
+        self.parameters = dict(parameters)
+        self.fitted, self.random_background = fitted, random_background
+        self.background = background
+        if fitted:
+            self.parameters["background"] = background
+        self.first = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
+        self.second = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
+        self.pull = torch.zeros(len(self))
+        self.step = 0
+        self.growth = population.Growth.plan(options.iterations, len(self), options.max_primitives)
+
+    def __len__(self) -> int:
+        return len(self.parameters["center"])
+
+    @property
+    def degree(self) -> int:
+        """Degree of the view-dependent colour at this step."""
+        return min(self.options.sh_degree, int(self.step / (DEGREE_EVERY * self.options.iterations)))
+
+    def view_of(self, step: int) -> int:
+        """Index of the view of a step: every view once per round, in an order drawn per round."""
+        turn, place = divmod(step, len(self.shots))
+        return int(np.random.default_rng([self.options.seed, 3, turn]).permutation(len(self.shots))[place])
+
+    def advance(self) -> tuple[float, float]:
+        """One training step. Returns its loss and PSNR."""
+        shot = self.shots[self.view_of(self.step)]
+        background = self.background
+        if self.fitted:
+            background = self.parameters["background"]
+        elif self.random_background:
+            background = torch.from_numpy(np.random.default_rng([self.options.seed, 4, self.step]).random(3, dtype=np.float32))
+        target = shot.over(background.detach())
+        leaves = {k: v.requires_grad_() for k, v in self.parameters.items()}
+        screen = torch.zeros(len(self), 2, requires_grad=True)
+        out = ops.rasterize(*activate(leaves, self.degree), background, shot.camera, stop=self.options.stop, screen=screen)
+        loss = ops.photometric_loss(out.rgb, target, self.options.dssim)[0]
+        *grads, screen_grad = torch.autograd.grad(loss, [*leaves.values(), screen], allow_unused=True)
+        with torch.no_grad():
+            error = float(torch.nn.functional.mse_loss(out.rgb.detach(), target))
+            self._update(dict(zip(leaves, grads, strict=True)))
+            # In units of the image's size, so that views of different resolution pull alike.
+            scale = torch.tensor([shot.camera.width, shot.camera.height], dtype=torch.float32)
+            self.pull += torch.linalg.vector_norm(screen_grad * scale, dim=1)
+        self.step += 1
+        if self.growth.is_due(self.step):
+            self._grow()
+        return float(loss.detach()), -10 * math.log10(max(error, 1e-12))
+
+    def _update(self, grads: dict[str, torch.Tensor | None]) -> None:
+        part = self.step / self.options.iterations
+        for name, value in self.parameters.items():
+            value.requires_grad_(False)
+            if grads[name] is None:
+                continue
+            rate, final = RATES[name]
+            ops.adam_step(value, grads[name], self.first[name], self.second[name], rate * final**part, self.step + 1)
+        rotation = self.parameters["rotation"]
+        rotation /= torch.linalg.vector_norm(rotation, dim=1, keepdim=True).clamp_min(1e-12)
+        self.parameters["log_extent"].clamp_(math.log(self.bounds[0]), math.log(self.bounds[1]))
+        if self.fitted:
+            self.parameters["background"].clamp_(0, 1)
+
+    def _grow(self) -> None:
+        rng = np.random.default_rng([self.options.seed, 5, self.step])
+        parents, children, halves = population.grow(self.parameters, self.pull, self.growth, math.log(self.bounds[0]), rng)
+        total = max(len(self), int(children.max(initial=-1)) + 1)
+        for name in self.parameters:
+            if name == "background":
+                continue
+            for table in (self.parameters, self.first, self.second):
+                old = table[name]
+                new = old.new_zeros((total, *old.shape[1:]))
+                new[: len(old)] = old
+                # A child is its parent, moments and all, but for what a half has of its own.
+                new[children] = new[parents]
+                table[name] = new
+            if name in halves:
+                self.parameters[name][parents] = torch.from_numpy(halves[name][0].astype(np.float32))
+                self.parameters[name][children] = torch.from_numpy(halves[name][1].astype(np.float32))
+            self.first[name][parents] = 0
+            self.first[name][children] = 0
+        self.pull = torch.zeros(total)
+
+    @torch.no_grad()
+    def render(self, camera: Camera, background: torch.Tensor) -> torch.Tensor:
+        """(3, H, W) colour of a camera in the training frame."""
+        return ops.rasterize(*activate(self.parameters, self.degree), background, camera, stop=self.options.stop).rgb
+
+    def shown_background(self) -> torch.Tensor:
+        """(3,) the background that renders and scores use."""
+        return self.parameters["background"].detach() if self.fitted else self.background
+
+    def octahedra(self) -> Octahedra:
+        """The primitives as plain arrays, in the training frame."""
+        with torch.no_grad():
+            return Octahedra(*(t.numpy().copy() for t in activate(self.parameters, self.options.sh_degree)))
+
+    def state(self) -> dict:
+        """Everything a resumed run needs, as tensors and numbers."""
+        return {"parameters": self.parameters, "first": self.first, "second": self.second, "pull": self.pull, "step": self.step,
+                "bounds": list(self.bounds), "growth": [self.growth.first, self.growth.last, self.growth.every, self.growth.rate, self.growth.cap]}
+
+    def restore(self, state: dict) -> None:
+        """Takes back what `state` returned."""
+        for name in ("parameters", "first", "second"):
+            if set(state[name]) != set(getattr(self, name)):
+                raise LinprimError(f"the checkpoint holds {sorted(state[name])}, wanted {sorted(getattr(self, name))}")
+            setattr(self, name, dict(state[name]))
+        self.pull, self.step = state["pull"], int(state["step"])
+        self.bounds = (float(state["bounds"][0]), float(state["bounds"][1]))
+        first, last, every, rate, cap = state["growth"]
+        self.growth = population.Growth(int(first), int(last), int(every), float(rate), int(cap))
+
+
+def train(scene: str | os.PathLike, run: str | os.PathLike, scene_options: SceneOptions | None = None, options: TrainOptions | None = None,
+          *, resume: bool = False, quiet: bool = False, json: bool = False) -> dict:
+    """Trains a scene into a run folder.
+
+    With `resume` the folder's own options are used, except that a larger number of iterations is not possible: learning rates and
+    growth depend on it. Interrupted (Ctrl-C), it finishes the step, saves, and raises KeyboardInterrupt.
+
+    Returns: `run`, `iterations`, `seconds` (of training steps alone), `primitives`, `psnr` (mean over held-out views), `views`.
+
+    Raises:
+        LinprimError: the scene or an option cannot be used, or the folder exists already.
+    """
+    from .initial_points import scene_normalization
+
+    run_path = Path(run)
+    _check(options := options or TrainOptions())
+    if resume:
+        opened = Run.open(run_path)
+        if Path(scene).resolve() != opened.scene_path:
+            raise LinprimError(f"{run_path}: was trained on {opened.scene_path}, not on {Path(scene).resolve()}")
+        options = replace(opened.train_options, threads=options.threads)
+        loaded = opened.scene()
+    else:
+        scene_options = scene_options or SceneOptions()
+        loaded = load_scene(scene, downscale=scene_options.downscale, masks=scene_options.masks or None, sparse=scene_options.sparse or None)
+        if run_path.exists() and (not run_path.is_dir() or any(run_path.iterdir())):
+            raise LinprimError(f"{run_path}: exists already; give another folder with -o, or go on with --resume")
+        opened = Run(run_path, Path(scene), scene_options, options, scene_normalization(loaded), loaded.unit)
+    ops.set_threads(options.threads)
+    torch.set_num_threads(ops.threads())
+    progress = Progress("train", options.iterations, quiet=quiet)
+    shots = load_shots(loaded.train, opened.similarity)
+    if all(shot.alpha is not None and int(shot.alpha.max()) == 0 for shot in shots):
+        raise LinprimError(f"{loaded.root}: the masks leave no pixel of any training image")
+    trainer = _start(loaded, opened, shots, options, resume)
+    if not resume:
+        Run.create(run_path, loaded, Path(scene), scene_options, options, opened.similarity)
+    seconds = _load_checkpoint(trainer, run_path) if resume else 0.0
+    progress.start = trainer.step
+    progress.note(
+        f"{loaded.root}: {loaded.kind}, {len(loaded.train)} training and {len(loaded.test)} held-out views of "
+        f"{shots[0].camera.width}x{shots[0].camera.height}; {len(trainer)} primitives, {ops.instruction_set()}, {ops.threads()} threads"
+    )
+    held_out = load_shots(loaded.test, opened.similarity)
+    seconds, score = _loop(trainer, opened, held_out, progress, seconds)
+    result = {"run": str(run_path), "iterations": trainer.step, "seconds": seconds, "primitives": len(trainer), "psnr": score,
+              "views": len(held_out)}
+    progress.note(f"{run_path}: {trainer.step} steps in {duration(seconds)}, {len(trainer)} primitives"
+                  + (f", held-out PSNR {score:.2f} dB over {len(held_out)} views" if held_out else ""))
+    return result
+
+
+def _check(options: TrainOptions) -> None:
+    for name, low, high in (("iterations", 1, 10**8), ("max_primitives", 1, 2**30), ("initial_primitives", 0, 2**30), ("seed", 0, 2**63),
+                            ("threads", 0, 4096), ("dssim", 0, 1), ("stop", 0, 0.5), ("checkpoint_every", 1, 10**9),
+                            ("evaluate_every", 0, 10**9), ("sh_degree", 0, 3)):
+        value = getattr(options, name)
+        if not low <= value <= high:
+            raise LinprimError(f"--{name.replace('_', '-')} is {value}, wanted {low} to {high}")
+
+
+def _background(text: str, has_alpha: bool) -> tuple[torch.Tensor, bool, bool]:
+    """(colour, whether it is fitted, whether training draws a random one) of the option's text."""
+    named = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+    if text == "auto":
+        text = "random" if has_alpha else "fitted"
+    if text == "random":
+        if not has_alpha:
+            raise LinprimError("--background random needs images with an alpha channel or masks; this scene has none")
+        return torch.ones(3), False, True
+    if text == "fitted":
+        return torch.full((3,), 0.5), True, False
+    try:
+        color = named[text] if text in named else tuple(float(x) for x in text.split(","))
+    except ValueError:
+        color = ()
+    if len(color) != 3 or not all(0 <= x <= 1 for x in color):
+        raise LinprimError(f"--background is {text!r}, wanted auto, fitted, random, black, white, or three numbers in [0,1] such as 0.5,0.5,1")
+    return torch.tensor(color, dtype=torch.float32), False, False
+
+
+def _start(scene: Scene, run: Run, shots: list[Shot], options: TrainOptions, resume: bool) -> Trainer:
+    """A trainer at step 0 (with `resume`, one whose parameters are about to be replaced)."""
+    focal = float(np.median([max(s.camera.fx, s.camera.fy) for s in shots]))
+    centers = np.stack([s.camera.center for s in shots])
+    if resume:
+        xyz, rgb, radius = np.zeros((4, 3)), np.zeros((4, 3)), 1.0
+    else:
+        wanted = options.initial_primitives or max(1, min(options.max_primitives, max(500, options.max_primitives // 4)))
+        cloud = initial_cloud(scene, wanted, options.seed)
+        xyz, rgb = run.similarity.apply(cloud.xyz), cloud.rgb
+        middle = np.median(xyz, 0)
+        reach = np.linalg.norm(xyz - middle, axis=1)
+        radius = max(float(np.percentile(reach, 98)), 0.2 * float(np.linalg.norm(centers - middle, axis=1).max()), 1e-3)
+    smallest = SMALLEST_PX * 3.0 / focal
+    bounds = (smallest, max(LARGEST_PART * radius, 4 * smallest))
+    background, fitted, random_background = _background(options.background, scene.has_alpha)
+    parameters = initial_parameters(xyz, rgb, options.sh_degree, options.seed, bounds)
+    return Trainer(shots, parameters, options, bounds, background, fitted, random_background)
+
+
+def _loop(trainer: Trainer, run: Run, held_out: list[Shot], progress: Progress, seconds: float) -> tuple[float, float | None]:
+    """Steps until the end; returns the seconds spent in steps and the final held-out PSNR."""
+    import json
+
+    options = trainer.options
+    metrics = run.path / "metrics.jsonl"
+    kept = [line for line in metrics.read_text().splitlines() if json.loads(line)["step"] <= trainer.step] if metrics.exists() else []
+    metrics.write_text("".join(line + "\n" for line in kept))
+    score = None
+    smooth_loss = smooth_psnr = None
+    saved = trainer.step if trainer.step else -1
+    with open(metrics, "a") as log, _interrupt_flag() as interrupted:
+        while trainer.step < options.iterations and not interrupted:
+            begin = time.perf_counter()
+            loss, psnr = trainer.advance()
+            seconds += time.perf_counter() - begin
+            if not math.isfinite(loss):
+                raise LinprimError(f"training diverged at step {trainer.step}: the loss is {loss}; the last checkpoint is intact")
+            smooth_loss = loss if smooth_loss is None else 0.98 * smooth_loss + 0.02 * loss
+            smooth_psnr = psnr if smooth_psnr is None else 0.98 * smooth_psnr + 0.02 * psnr
+            last = trainer.step == options.iterations
+            if options.evaluate_every and (last or trainer.step % options.evaluate_every == 0) or last:
+                score = evaluate(trainer, held_out if last else held_out[:: max(1, len(held_out) // QUICK_VIEWS)])
+            else:
+                score = None
+            if trainer.step % 100 == 0 or last or score is not None:
+                entry = {"step": trainer.step, "seconds": round(seconds, 3), "loss": round(smooth_loss, 6), "train_psnr": round(smooth_psnr, 3),
+                         "primitives": len(trainer), "memory_gib": round(memory_gib(), 3)}
+                if score is not None:
+                    entry["psnr"] = round(score, 4)
+                    progress.note(f"  step {trainer.step}: held-out PSNR {score:.2f} dB, {len(trainer)} primitives, {duration(seconds)}")
+                log.write(json.dumps(entry) + "\n")
+                log.flush()
+            if last or trainer.step % options.checkpoint_every == 0:
+                _save(trainer, run, seconds)
+                saved = trainer.step
+            progress.update(trainer.step, f"loss {smooth_loss:.4f}  PSNR {smooth_psnr:.2f}  {len(trainer)} primitives  {memory_gib():.1f} GiB")
+        progress.clear()
+        if interrupted:
+            if saved != trainer.step:
+                _save(trainer, run, seconds)
+            progress.note(f"interrupted: {run.path} holds step {trainer.step}; go on with --resume")
+            raise KeyboardInterrupt
+    if score is None and trainer.step == options.iterations:
+        score = evaluate(trainer, held_out)
+    return seconds, score
+
+
+def evaluate(trainer: Trainer, shots: list[Shot]) -> float | None:
+    """Mean PSNR over views, renders clamped and rounded to 8 bits as saved images are; None without views."""
+    from .eval.images import psnr, to_8bit
+
+    background = trainer.shown_background()
+    scores = [psnr(to_8bit(trainer.render(shot.camera, background).numpy()), to_8bit(shot.over(background).numpy())) for shot in shots]
+    return float(np.mean(scores)) if scores else None
+
+
+@contextmanager
+def _interrupt_flag() -> Iterator[list]:
+    """A list that becomes non-empty on the first Ctrl-C, so that a step is never torn; a second one interrupts at once."""
+    flag: list[int] = []
+
+    def note(number, frame):
+        if flag:
+            raise KeyboardInterrupt
+        flag.append(number)
+
+    try:
+        before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    except ValueError:  # not in the main thread: no handlers there
+        before = {}
+    try:
+        yield flag
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _save(trainer: Trainer, run: Run, seconds: float) -> None:
+    """Writes a checkpoint and the exported scene; every file replaces its predecessor only when it is complete."""
+    from .files import atomic_write
+
+    folder = run.path / "checkpoints"
+    name = f"step_{trainer.step:06d}.pt"
+    state = trainer.state() | {"seconds": seconds}
+    with atomic_write(folder / name) as temporary:
+        torch.save(state, temporary)
+    with atomic_write(folder / "latest") as temporary:
+        temporary.write_text(name + "\n")
+    for old in sorted(folder.glob("step_*.pt"))[:-KEPT_CHECKPOINTS]:
+        old.unlink()
+    run.save(trainer.octahedra(), {
+        "iteration": trainer.step, "iterations": trainer.options.iterations, "primitives": len(trainer),
+        "background": [float(x) for x in trainer.shown_background()], "seconds": seconds,
+    })
+
+
+def _load_checkpoint(trainer: Trainer, path: Path) -> float:
+    """Restores the latest checkpoint; returns the seconds trained so far."""
+    folder = path / "checkpoints"
+    try:
+        name = (folder / "latest").read_text().strip()
+    except FileNotFoundError:
+        raise LinprimError(f"{path}: has no checkpoint to go on from; train it anew into another folder") from None
+    if Path(name).name != name:
+        raise LinprimError(f"{folder / 'latest'}: names {name!r}, which is not a file in this folder")
+    try:
+        state = torch.load(folder / name, weights_only=True)
+    except FileNotFoundError:
+        raise LinprimError(f"{folder / name}: the latest checkpoint is missing") from None
+    except Exception as error:  # torch raises many kinds for a damaged file
+        raise LinprimError(f"{folder / name}: is damaged and cannot be read ({type(error).__name__})") from None
+    try:
+        trainer.restore(state)
+        return float(state["seconds"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise LinprimError(f"{folder / name}: lacks what a checkpoint holds ({error})") from None
