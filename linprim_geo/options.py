@@ -35,5 +35,17 @@ class TrainOptions:
     )
     dssim: float = option(0.2, "weight of D-SSIM in the loss; L1 has the rest")
     stop: float = option(1e-3, "transmittance below which a ray ends", metavar="T")
+    samples: int = option(1, "K by K rays per pixel: 1 is fastest, 2 resolves edges that cut through pixels", metavar="K")
     checkpoint_every: int = option(1000, "steps between checkpoints", metavar="STEPS")
     evaluate_every: int = option(1000, "steps between scores on the held-out views; 0 scores only at the end", metavar="STEPS")
+
+
+@dataclass(frozen=True)
+class ExtractOptions:
+    """How a surface is taken out of a run."""
+
+    level: float = option(0.5, "transmittance at which the surface is taken, between 0 and 1")
+    voxel_size: float = option(0.0, "grid spacing in the data set's unit; 0 chooses from the views", metavar="LENGTH")
+    truncation: float = option(3.0, "truncation distance in voxels")
+    memory_limit: float = option(0.0, "memory the grid may take, in GiB; 0 allows 60 % of what is free", metavar="GIB")
+    smallest_part: float = option(0.01, "drop components with less than this share of the largest one's area")

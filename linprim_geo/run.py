@@ -134,10 +134,11 @@ class Run:
         tensors = [torch.from_numpy(a) for a in (octahedra.center, octahedra.rotation, octahedra.extent, octahedra.density, octahedra.sh)]
         background = torch.tensor(self.background, dtype=torch.float32)
         for view in views:
+            camera, options = view.camera.transformed(self.similarity), self.train_options
             with torch.no_grad():
-                out = ops.rasterize(*tensors, background, view.camera.transformed(self.similarity), stop=self.train_options.stop,
-                                    level=level, geometry=geometry)
-            images = {"rgb": out.rgb.numpy(), "opacity": out.opacity.numpy()}
+                color = ops.rasterize(*tensors, background, camera, stop=options.stop, samples=options.samples)
+                out = ops.rasterize(*tensors, background, camera, stop=options.stop, level=level, geometry=True) if geometry else color
+            images = {"rgb": color.rgb.numpy(), "opacity": out.opacity.numpy()}
             if geometry:
                 unit = 1.0 / self.similarity.scale
                 opacity = np.maximum(images["opacity"], 1e-6)

@@ -177,7 +177,8 @@ class Trainer:
         target = shot.over(background.detach())
         leaves = {k: v.requires_grad_() for k, v in self.parameters.items()}
         screen = torch.zeros(len(self), 2, requires_grad=True)
-        out = ops.rasterize(*activate(leaves, self.degree), background, shot.camera, stop=self.options.stop, screen=screen)
+        out = ops.rasterize(*activate(leaves, self.degree), background, shot.camera, stop=self.options.stop,
+                            samples=self.options.samples, screen=screen)
         loss = ops.photometric_loss(out.rgb, target, self.options.dssim)[0]
         *grads, screen_grad = torch.autograd.grad(loss, [*leaves.values(), screen], allow_unused=True)
         with torch.no_grad():
@@ -229,7 +230,8 @@ class Trainer:
     @torch.no_grad()
     def render(self, camera: Camera, background: torch.Tensor) -> torch.Tensor:
         """(3, H, W) colour of a camera in the training frame."""
-        return ops.rasterize(*activate(self.parameters, self.degree), background, camera, stop=self.options.stop).rgb
+        return ops.rasterize(*activate(self.parameters, self.degree), background, camera, stop=self.options.stop,
+                             samples=self.options.samples).rgb
 
     def shown_background(self) -> torch.Tensor:
         """(3,) the background that renders and scores use."""
@@ -311,7 +313,7 @@ def train(scene: str | os.PathLike, run: str | os.PathLike, scene_options: Scene
 
 def _check(options: TrainOptions) -> None:
     for name, low, high in (("iterations", 1, 10**8), ("max_primitives", 1, 2**30), ("initial_primitives", 0, 2**30), ("seed", 0, 2**63),
-                            ("threads", 0, 4096), ("dssim", 0, 1), ("stop", 0, 0.5), ("checkpoint_every", 1, 10**9),
+                            ("threads", 0, 4096), ("samples", 1, 8), ("dssim", 0, 1), ("stop", 0, 0.5), ("checkpoint_every", 1, 10**9),
                             ("evaluate_every", 0, 10**9), ("sh_degree", 0, 3)):
         value = getattr(options, name)
         if not low <= value <= high:

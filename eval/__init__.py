@@ -1,0 +1,58 @@
+"""Scores of a run: surfaces, depth and normals against truth, renders against held-out photographs.
+
+Here: opening a run, choosing its views, writing `results.json` and `per_view.csv`.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from linprim_geo.errors import LinprimError
+from linprim_geo.files import atomic_write, write_json
+
+SPLITS = ("test", "train", "all")
+
+
+def write_results(folder: str | os.PathLike, results: Mapping, rows: Sequence[Mapping] | None = None) -> None:
+    """Writes `results.json` and, where there are rows, one line for each to `per_view.csv`, into `folder`.
+
+    NaN and infinity become null in the JSON, and stay `nan` and `inf` in the CSV. Both files are replaced
+    atomically; the columns of the CSV are the keys of the first row.
+
+    Raises:
+        LinprimError: the folder cannot be written.
+    """
+    folder = Path(folder)
+    if rows:
+        with atomic_write(folder / "per_view.csv") as temporary:
+            with open(temporary, "w", newline="", encoding="utf-8") as file:
+                writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+                writer.writeheader()
+                writer.writerows(rows)
+    write_json(folder / "results.json", results)
+
+
+def open_run(run):
+    """Returns `run` itself if it is already open, else opens the run folder of that path."""
+    if isinstance(run, (str, os.PathLike)):
+        from linprim_geo.run import Run
+
+        return Run.open(run)
+    return run
+
+
+def views_of(scene, split: str) -> tuple:
+    """The views of `scene` in `split` ("test", "train" or "all").
+
+    Raises:
+        LinprimError: the split has another name, or no view is in it.
+    """
+    if split not in SPLITS:
+        raise LinprimError(f"split '{split}' is unknown; expected one of {', '.join(SPLITS)}")
+    views = {"test": scene.test, "train": scene.train, "all": (*scene.train, *scene.test)}[split]
+    if not views:
+        raise LinprimError(f"{scene.root}: the {split} split has no views; expected at least one to score")
+    return tuple(views)

@@ -1,0 +1,458 @@
+"""The command `linprim-geo`: what each subcommand accepts, and how its result or its failure is reported.
+
+Only the standard library is imported here, the rest where a subcommand runs, so that `--help` stays instant.
+Exit status: 0 the thing asked for was made, 1 the input cannot be used, 2 the arguments are wrong, 70 an
+error in this program, 130 interrupted, 141 the reader of the output went away.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import errno
+import json
+import os
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from . import __version__
+from .errors import LinprimError
+
+EXIT_UNUSABLE, EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_PIPE = 1, 70, 130, 141
+
+SPLITS = ("train", "test", "all")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command line and returns its exit status; argparse itself leaves with 0 (--help) or 2."""
+    # The two flags are known before and after the subcommand, so neither parser may set a default for them.
+    parsed = build_parser().parse_args(arguments)
+    parsed.json, parsed.debug = getattr(parsed, "json", False), getattr(parsed, "debug", False)
+    try:
+        with _stdout_for_result(parsed.json) as print_result:
+            result = parsed.handler(parsed)
+            print_result(result)
+        return int(result.pop("_status", 0)) if isinstance(result, dict) else 0
+    except BrokenPipeError:
+        # Nothing more can be printed; without this the interpreter would complain while it closes stdout.
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_PIPE
+    except (Exception, KeyboardInterrupt) as error:
+        if parsed.debug:
+            traceback.print_exc()
+        sentence, status = explain(error)
+        with contextlib.suppress(OSError):
+            print(f"linprim-geo: error: {sentence}", file=sys.stderr, flush=True)
+        return status
+
+
+def explain(error: BaseException) -> tuple[str, int]:
+    """The one sentence and the exit status for an error."""
+    if isinstance(error, LinprimError):
+        return " ".join(str(error).split()), EXIT_UNUSABLE
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted", EXIT_INTERRUPTED
+    if isinstance(error, MemoryError):
+        return (
+            "out of memory: try --downscale, fewer primitives, or a machine with more memory",
+            EXIT_UNUSABLE,
+        )
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        where = f" while writing {error.filename}" if error.filename else ""
+        return f"the disk is full{where}: free some space and run again", EXIT_UNUSABLE
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}", EXIT_UNUSABLE
+    if isinstance(error, ModuleNotFoundError) and not str(error.name or "").startswith("linprim_geo"):
+        return (
+            f"the library {error.name} is not installed: run make env, or pip install linprim-geo",
+            EXIT_UNUSABLE,
+        )
+    text = " ".join(f"{type(error).__name__}: {error}".split())
+    return f"internal error: {text}; run again with --debug", EXIT_INTERNAL
+
+
+@contextlib.contextmanager
+def _stdout_for_result(as_json: bool) -> Iterator[Callable[[Any], None]]:
+    """Yields a function that prints the result; with `as_json` whatever else goes to stdout goes to stderr.
+
+    Libraries print from C as well, so the file descriptor is redirected, not only Python's stream.
+    """
+    if not as_json:
+        yield _print_for_people
+        sys.stdout.flush()
+        return
+    results: list[Any] = []
+    stdout = sys.stdout
+    stdout.flush()
+    try:
+        descriptor = stdout.fileno()
+        saved = os.dup(descriptor)
+    except (OSError, ValueError):
+        descriptor = saved = None
+    try:
+        if descriptor is not None:
+            os.dup2(sys.stderr.fileno(), descriptor)
+        with contextlib.redirect_stdout(sys.stderr):
+            yield results.append
+    finally:
+        if descriptor is not None:
+            os.dup2(saved, descriptor)
+            os.close(saved)
+    from .files import _finite
+
+    shown = {key: value for key, value in (results[0] or {}).items() if not key.startswith("_")}
+    stdout.write(json.dumps(_finite(shown), allow_nan=False) + "\n")
+    stdout.flush()
+
+
+def _print_for_people(result: dict | None) -> None:
+    """One `name: value` line per plain value; a handler that has words of its own puts them under `_text`."""
+    if result is None:
+        return
+    if "_text" in result:
+        print(result["_text"])
+        return
+    for key, value in result.items():
+        if isinstance(value, bool | int | str) and not key.startswith("_"):
+            print(f"{key}: {value}")
+        elif isinstance(value, float):
+            print(f"{key}: {value:.6g}")
+
+
+# --- options ---------------------------------------------------------------------------------------------
+
+
+def add_options(parser: argparse._ActionsContainer, options: type) -> None:
+    """Adds one `--field-name` per field of the dataclass `options`: its type and default, its metadata's
+    help,
+    choices and metavar. A bool becomes `--field` and `--no-field`."""
+    for field in dataclasses.fields(options):
+        flag = "--" + field.name.replace("_", "-")
+        text = field.metadata.get("help", "").replace("%", "%%")
+        shown = "" if field.default in ("", None) else f" (default {field.default})"
+        settings: dict[str, Any] = {"dest": field.name, "default": field.default, "help": text + shown}
+        if isinstance(field.default, bool):
+            settings["action"] = argparse.BooleanOptionalAction
+        else:
+            settings["type"] = str if field.default is None else type(field.default)
+            settings["choices"] = field.metadata.get("choices") or None
+            settings["metavar"] = field.metadata.get("metavar")
+            if settings["metavar"] is None and settings["choices"] is None:
+                settings["metavar"] = {int: "N", float: "X"}.get(settings["type"], "TEXT")
+        parser.add_argument(flag, **settings)
+
+
+def from_args(options: type, parsed: argparse.Namespace):
+    """The dataclass `options` filled from the arguments that `add_options` has added."""
+    return options(**{field.name: getattr(parsed, field.name) for field in dataclasses.fields(options)})
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not positive")
+    return value
+
+
+def _whole(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is negative")
+    return value
+
+
+def _not_negative(text: str) -> float:
+    value = float(text)
+    if not 0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not a number from 0 on")
+    return value
+
+
+def _length(text: str) -> float:
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not a positive length")
+    return value
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, cross, height = text.lower().partition("x")
+    height = height if cross else width
+    if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size in pixels, such as 640x480 or 320")
+    return int(width), int(height)
+
+
+# argparse names the type in its message: "invalid count value", not "invalid _positive value".
+_positive.__name__ = _whole.__name__ = "count"
+_not_negative.__name__ = _length.__name__ = "number"
+_size.__name__ = "size"
+
+
+# --- subcommands -----------------------------------------------------------------------------------------
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The whole command line."""
+    from .options import ExtractOptions, SceneOptions, TrainOptions
+
+    common = argparse.ArgumentParser(add_help=False)
+    group = common.add_argument_group("output")
+    hidden = argparse.SUPPRESS
+    group.add_argument(
+        "--json", action="store_true", default=hidden, help="print one JSON object and nothing else"
+    )
+    group.add_argument("--debug", action="store_true", default=hidden, help="show the traceback of an error")
+
+    parser = argparse.ArgumentParser(
+        prog="linprim-geo",
+        description="From posed photographs to a scored mesh, through transparent polyhedra, on a CPU.",
+        epilog="linprim-geo COMMAND --help explains a command.",
+        parents=[common],
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"linprim-geo {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+
+    def command(
+        name: str, handler: Callable[[argparse.Namespace], dict], text: str
+    ) -> argparse.ArgumentParser:
+        sub = commands.add_parser(
+            name,
+            parents=[common],
+            help=text,
+            description=text[0].upper() + text[1:] + ".",
+            allow_abbrev=False,
+        )
+        sub.set_defaults(handler=handler, command=name)
+        return sub
+
+    sub = command("train", _train, "train a scene: posed photographs to primitives")
+    sub.add_argument(
+        "scene", nargs="?", metavar="SCENE", help="folder with a COLMAP model or transforms*.json"
+    )
+    sub.add_argument(
+        "-s", "--source", "--source_path", dest="source", metavar="SCENE", help="the same, as in 3DGS"
+    )
+    sub.add_argument(
+        "-o",
+        "--output",
+        "-m",
+        "--model_path",
+        dest="run",
+        metavar="RUN",
+        help="folder to make (default runs/SCENE)",
+    )
+    sub.add_argument("--resume", action="store_true", help="go on from the latest checkpoint in RUN")
+    sub.add_argument("--quiet", action="store_true", help="no progress")
+    sub.add_argument("-r", "--resolution", type=int, metavar="K", help="the same as --downscale, as in 3DGS")
+    sub.add_argument("--eval", action="store_true", help="accepted as in 3DGS: views are always held out")
+    add_options(sub.add_argument_group("scene"), SceneOptions)
+    add_options(sub.add_argument_group("training"), TrainOptions)
+
+    sub = command("render", _render, "render colour, depth, normals and opacity of a run's views")
+    sub.add_argument("run", metavar="RUN", help="folder that train has made")
+    sub.add_argument("--split", choices=SPLITS, default="test", help="which views (default test)")
+    sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/renders)")
+
+    sub = command("extract-mesh", _extract_mesh, "extract a triangle mesh from a run")
+    sub.add_argument("run", metavar="RUN", help="folder that train has made")
+    sub.add_argument("--method", choices=("tsdf",), default="tsdf", help="tsdf: fuse depth maps (default)")
+    sub.add_argument(
+        "-o", "--output", metavar="FILE", help=".ply .obj .glb .stl (default RUN/mesh/METHOD/mesh.ply)"
+    )
+    add_options(sub.add_argument_group("extraction"), ExtractOptions)
+
+    sub = command(
+        "eval-depth", _eval_depth, "score a run's depth and normals against a mesh or the data set's depth"
+    )
+    sub.add_argument("run", metavar="RUN", help="folder that train has made")
+    sub.add_argument(
+        "--reference", metavar="MESH", help="mesh in the data set's frame (default: its depth images)"
+    )
+    sub.add_argument("--split", choices=SPLITS, default="test", help="which views (default test)")
+    sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/eval/depth)")
+
+    sub = command("eval-images", _eval_images, "score a run's colours: PSNR and SSIM on held-out views")
+    sub.add_argument("run", metavar="RUN", help="folder that train has made")
+    sub.add_argument("--split", choices=SPLITS, default="test", help="which views (default test)")
+    sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/eval/images)")
+
+    sub = command(
+        "eval-mesh", _eval_mesh, "score a mesh against a reference mesh: Chamfer distance and the rest"
+    )
+    sub.add_argument("mesh", metavar="MESH", help="mesh to score")
+    sub.add_argument("reference", metavar="REFERENCE", help="mesh that is taken as the truth")
+    sub.add_argument(
+        "--samples", type=_positive, default=200_000, metavar="N", help="points per mesh (default 200000)"
+    )
+    sub.add_argument(
+        "--tau", type=_length, metavar="LENGTH", help="threshold of the rates, in the meshes' unit"
+    )
+    sub.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the points (default 0)")
+    sub.add_argument("--run", metavar="RUN", help="also score what the training cameras of this run see")
+    sub.add_argument(
+        "-o", "--output", metavar="DIR", help="folder for results.json and error-coloured meshes"
+    )
+
+    sub = command(
+        "synth", _synth, "render posed images, depth, normals and points of a mesh or a built-in scene"
+    )
+    sub.add_argument("output", metavar="OUT", help="folder to make")
+    shape = sub.add_mutually_exclusive_group()
+    shape.add_argument("--scene", choices=("cad", "smooth", "room", "wires"), help="built-in (default cad)")
+    shape.add_argument("--mesh", metavar="FILE", help="any mesh with a texture or vertex colours")
+    sub.add_argument("--views", type=_positive, default=60, metavar="N", help="training views (default 60)")
+    sub.add_argument("--test-views", type=_whole, default=12, metavar="N", help="held-out views (default 12)")
+    sub.add_argument("--size", type=_size, default=(320, 320), metavar="WxH", help="pixels (default 320x320)")
+    paths = ("orbit", "hemisphere", "sphere", "inside-out")
+    sub.add_argument("--path", choices=paths, help="of the cameras (default: what suits the scene)")
+    sub.add_argument("--fov", type=_length, metavar="DEGREES", help="horizontal (default 45, inside 75)")
+    sub.add_argument("--distance", type=_length, metavar="LENGTH", help="from the middle, in the mesh's unit")
+    sub.add_argument("--shading", choices=("albedo", "shaded"), default="albedo", help="default albedo")
+    sub.add_argument("--background", metavar="COLOR", help="transparent, black, white or r,g,b in [0,1]")
+    sub.add_argument("--points", type=_whole, default=20_000, metavar="N", help="on it (default 20000)")
+    noise = "standard deviation per axis of the points, in the mesh's unit (default 0)"
+    sub.add_argument("--point-noise", type=_not_negative, default=0.0, metavar="LENGTH", help=noise)
+    sub.add_argument(
+        "--supersample", type=_positive, default=3, metavar="K", help="K*K rays a pixel (default 3)"
+    )
+    sub.add_argument("--depth-format", choices=("png", "npy"), default="png", help="default png")
+    sub.add_argument(
+        "--seed", type=_whole, default=0, metavar="N", help="seed of everything random (default 0)"
+    )
+    sub.add_argument("--threads", type=_whole, default=0, metavar="N", help="0 uses every core (default)")
+    sub.add_argument("--overwrite", action="store_true", help="replace OUT if synth has made it")
+
+    sub = command(
+        "convert", _convert, "convert primitives (npz, LinPrim's ply) and meshes (ply, obj, glb, stl)"
+    )
+    sub.add_argument("source", metavar="IN", help="run folder, .npz, .ply, .obj, .glb or .stl")
+    sub.add_argument("target", metavar="OUT", help="file to write; its suffix says the format")
+    sub.add_argument(
+        "--as", dest="write_as", choices=("auto", "primitives", "mesh"), default="auto",
+        help="what a .ply of primitives holds: LinPrim's properties (default) or triangles for MeshLab",
+    )  # fmt: skip
+
+    sub = command(
+        "doctor", _doctor, "check versions, libraries, cores and memory; exit 1 if something is missing"
+    )
+
+    sub = command("demo", _demo, "synthesize, train, extract and score a built-in scene")
+    sub.add_argument(
+        "-o", "--output", default="runs/demo", metavar="RUN", help="folder to make (default runs/demo)"
+    )
+    sub.add_argument(
+        "--size", choices=("small", "normal"), default="normal", help="small: a quick check of it all"
+    )
+    return parser
+
+
+def _train(parsed: argparse.Namespace) -> dict:
+    from .options import SceneOptions, TrainOptions
+
+    scene = parsed.scene or parsed.source
+    if scene is None or (parsed.scene and parsed.source):
+        raise LinprimError("train wants one scene: its folder, or -s and its folder")
+    if parsed.resolution is not None:
+        # 3DGS writes -1 for "as it is".
+        parsed.downscale = 1 if parsed.resolution == -1 else parsed.resolution
+    from .train import train
+
+    return train(
+        scene,
+        parsed.run or Path("runs") / Path(scene).resolve().name,
+        from_args(SceneOptions, parsed),
+        from_args(TrainOptions, parsed),
+        resume=parsed.resume,
+        quiet=parsed.quiet,
+        json=parsed.json,
+    )
+
+
+def _render(parsed: argparse.Namespace) -> dict:
+    from .render import render_run
+
+    return render_run(parsed.run, split=parsed.split, output=parsed.output)
+
+
+def _extract_mesh(parsed: argparse.Namespace) -> dict:
+    from .extract import extract_mesh
+    from .options import ExtractOptions
+
+    options = from_args(ExtractOptions, parsed)
+    return extract_mesh(parsed.run, method=parsed.method, output=parsed.output, options=options)
+
+
+def _eval_depth(parsed: argparse.Namespace) -> dict:
+    from .eval.depth import eval_depth_run
+
+    return eval_depth_run(parsed.run, parsed.reference, split=parsed.split, output=parsed.output)
+
+
+def _eval_images(parsed: argparse.Namespace) -> dict:
+    from .eval.images import eval_images_run
+
+    return eval_images_run(parsed.run, split=parsed.split, output=parsed.output)
+
+
+def _eval_mesh(parsed: argparse.Namespace) -> dict:
+    from .eval.mesh import eval_mesh_files
+
+    return eval_mesh_files(
+        parsed.mesh,
+        parsed.reference,
+        output=parsed.output,
+        samples=parsed.samples,
+        tau=parsed.tau,
+        seed=parsed.seed,
+        run=parsed.run,
+    )
+
+
+def _synth(parsed: argparse.Namespace) -> dict:
+    from .synth import synthesize
+
+    # What is not said is left to `synthesize`, which knows what suits the scene.
+    chosen = {"shape": parsed.scene, "mesh": parsed.mesh, "path": parsed.path, "fov": parsed.fov}
+    chosen |= {"distance": parsed.distance, "background": parsed.background}
+    return synthesize(
+        parsed.output,
+        views=parsed.views,
+        test_views=parsed.test_views,
+        size=parsed.size,
+        shading=parsed.shading,
+        points=parsed.points,
+        point_noise=parsed.point_noise,
+        supersample=parsed.supersample,
+        depth_format=parsed.depth_format,
+        seed=parsed.seed,
+        threads=parsed.threads,
+        overwrite=parsed.overwrite,
+        **{name: value for name, value in chosen.items() if value is not None},
+    )
+
+
+def _convert(parsed: argparse.Namespace) -> dict:
+    from .convert import convert, describe
+
+    report = convert(parsed.source, parsed.target, parsed.write_as)
+    return report | {"_text": describe(report)}
+
+
+def _doctor(parsed: argparse.Namespace) -> dict:
+    from .doctor import describe, doctor
+
+    report = doctor()
+    return report | {"_text": describe(report), "_status": EXIT_UNUSABLE if report["problems"] else 0}
+
+
+def _demo(parsed: argparse.Namespace) -> dict:
+    from .demo import run_demo
+
+    return run_demo(parsed.output, parsed.size)

@@ -1,0 +1,183 @@
+"""Files of primitives and of meshes, each into the other formats of its kind, and primitives into meshes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .errors import LinprimError
+from .files import atomic_write
+from .ply import read_linprim_ply, read_ply_header, write_linprim_ply
+from .primitives import Octahedra, load_octahedra, save_octahedra
+
+if TYPE_CHECKING:
+    from .mesh import Mesh
+
+MESH_SUFFIXES = (".ply", ".obj", ".glb", ".stl")
+AS_CHOICES = ("auto", "primitives", "mesh")
+
+
+def convert(source: str | os.PathLike, target: str | os.PathLike, write_as: str = "auto") -> dict:
+    """Reads `source`, writes `target`; the formats follow from the files.
+
+    Primitives are read from a run's folder (its scene.npz), LinPrim's model folder (its latest iteration),
+    .npz or LinPrim's .ply, and written as .npz, as LinPrim's .ply, or as a triangle mesh: .obj, .glb and .stl
+    always, .ply with `write_as="mesh"`. In a mesh every vertex has its primitive's colour without the
+    view-dependent part, and in .ply and .glb its alpha: the share of light taken along the shortest diagonal.
+    Meshes are read and written as .ply, .obj, .glb and .stl.
+
+    Returns:
+        What was read and written: `source`, `target`, `read`, `wrote`, `count`; for primitives also `dropped`
+        (rows without volume) and `clamped` (rows thicker than LinPrim's file can hold), where there are any.
+
+    Raises:
+        LinprimError: the input cannot be read, or the formats do not fit.
+    """
+    target = Path(target)
+    if write_as not in AS_CHOICES:
+        raise LinprimError(f"--as is {write_as!r}, wanted one of {', '.join(AS_CHOICES)}")
+    suffix = target.suffix.lower()
+    if suffix not in (".npz", *MESH_SUFFIXES):
+        raise LinprimError(f"{target}: the suffix is {suffix!r}, wanted .npz, {', '.join(MESH_SUFFIXES)}")
+    source = find_scene_file(source)
+    if target.exists() and source.samefile(target):
+        raise LinprimError(f"{target}: is the file that is read, wanted another name to write to")
+    report = {"source": str(source), "target": str(target)}
+
+    if not holds_primitives(source):
+        if suffix == ".npz" or write_as == "primitives":
+            raise LinprimError(f"{source}: is a mesh, which cannot be written as primitives to {target}")
+        from .mesh import load_mesh, save_mesh
+
+        mesh = load_mesh(source)
+        save_mesh(target, mesh)
+        return report | {"read": "mesh", "wrote": "mesh", "count": len(mesh.faces)}
+
+    if suffix == ".npz" and write_as == "mesh":
+        raise LinprimError(
+            f"{target}: an .npz holds primitives, wanted {', '.join(MESH_SUFFIXES)} with --as mesh"
+        )
+    if suffix in (".obj", ".glb", ".stl") and write_as == "primitives":
+        raise LinprimError(f"{target}: {suffix} holds a mesh, wanted .npz or .ply with --as primitives")
+    octahedra, found = read_primitives(source)
+    report |= {"read": "octahedra", "count": len(octahedra)} | {
+        k: v for k, v in found.items() if k == "dropped" and v
+    }
+    if suffix == ".npz":
+        save_octahedra(target, octahedra)
+        return report | {"wrote": "octahedra"}
+    if suffix == ".ply" and write_as != "mesh":
+        written = write_linprim_ply(target, octahedra)
+        report |= {"wrote": "LinPrim's octahedra"}
+        return report | ({"clamped": written["clamped"]} if written["clamped"] else {})
+    save_primitive_mesh(target, octahedra)
+    return report | {"wrote": "mesh", "faces": 8 * len(octahedra)}
+
+
+def describe(report: dict) -> str:
+    """The report of `convert` as one sentence for a person."""
+    unit = "faces" if report["read"] == "mesh" else "primitives"
+    text = f"{report['target']}: {report['wrote']}, {report['count']} {unit}"
+    if report.get("dropped"):
+        text += f"; {report['dropped']} rows without a volume were left out"
+    if report.get("clamped"):
+        text += f"; {report['clamped']} are thicker than LinPrim's file can hold and got its largest opacity"
+    return text
+
+
+def find_scene_file(source: str | os.PathLike) -> Path:
+    """The file to read: `source`, a run's scene.npz, or the latest point_cloud.ply of LinPrim's folder."""
+    source = Path(source)
+    if not source.exists():
+        raise LinprimError(f"{source}: no such file or folder")
+    if not source.is_dir():
+        return source
+    if (source / "scene.npz").is_file():
+        return source / "scene.npz"
+    iterations = []
+    for file in source.glob("point_cloud/iteration_*/point_cloud.ply"):
+        number = file.parent.name.removeprefix("iteration_")
+        if number.isdigit():
+            iterations.append((int(number), file))
+    if iterations:
+        return max(iterations)[1]
+    raise LinprimError(
+        f"{source}: has neither scene.npz nor point_cloud/iteration_*/point_cloud.ply, wanted a run"
+    )
+
+
+def holds_primitives(path: Path) -> bool:
+    """Whether a file holds primitives rather than a mesh, by its suffix and, for .ply, its header.
+
+    Raises:
+        LinprimError: it is neither.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        return True
+    if suffix != ".ply":
+        if suffix in MESH_SUFFIXES:
+            return False
+        raise LinprimError(f"{path}: the suffix is {suffix!r}, wanted .npz, {', '.join(MESH_SUFFIXES)}")
+    kind = read_ply_header(path).kind
+    if kind == "points":
+        raise LinprimError(
+            f"{path}: holds points alone, wanted LinPrim's octahedra (dist_0..2) or a mesh with faces"
+        )
+    return kind != "mesh"
+
+
+def read_primitives(path: str | os.PathLike) -> tuple[Octahedra, dict]:
+    """Octahedra from .npz or LinPrim's .ply, and what was found on the way (see `read_linprim_ply`)."""
+    path = Path(path)
+    if path.suffix.lower() == ".npz":
+        return load_octahedra(path), {}
+    return read_linprim_ply(path)
+
+
+def save_primitive_mesh(path: str | os.PathLike, octahedra: Octahedra) -> None:
+    """Writes `octahedra` as triangles with vertex colours; .ply and .glb carry alpha too, .obj cannot, .stl
+    has none."""
+    from .mesh import save_mesh
+
+    path = Path(path)
+    mesh = octahedra.triangle_mesh()
+    alpha = np.repeat(np.rint(octahedra.alpha * 255.0).astype(np.uint8), 6)
+    suffix = path.suffix.lower()
+    if suffix == ".ply":
+        _save_ply(path, mesh, alpha)
+    elif suffix == ".glb":
+        _save_glb(path, mesh, alpha)
+    else:
+        save_mesh(path, mesh)
+
+
+def _save_ply(path: Path, mesh: Mesh, alpha: np.ndarray) -> None:
+    vertices = np.empty(len(mesh.vertices), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3), ("alpha", "u1")])
+    vertices["xyz"], vertices["rgb"], vertices["alpha"] = mesh.vertices, mesh.colors, alpha
+    faces = np.empty(len(mesh.faces), dtype=[("corners", "u1"), ("vertices", "<i4", 3)])
+    faces["corners"], faces["vertices"] = 3, mesh.faces
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    header += [f"property float {name}" for name in "xyz"]
+    header += [f"property uchar {name}" for name in ("red", "green", "blue", "alpha")]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        file.write("\n".join(header).encode("ascii"))
+        file.write(vertices.data)
+        file.write(faces.data)
+
+
+def _save_glb(path: Path, mesh: Mesh, alpha: np.ndarray) -> None:
+    import trimesh
+    from trimesh.visual.material import PBRMaterial
+
+    colors = np.column_stack([mesh.colors, alpha])
+    body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    # A material says that the alpha of the vertices is meant; the exporter takes it from a texture's visuals.
+    body.visual = trimesh.visual.TextureVisuals(material=PBRMaterial(alphaMode="BLEND", doubleSided=False))
+    body.visual.vertex_attributes["color"] = colors
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(trimesh.Scene(body).export(file_type="glb"))

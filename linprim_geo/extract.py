@@ -1,0 +1,104 @@
+"""From a trained run to triangle meshes: render depth at a transmittance level, fuse it, clean and colour the surface."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from .errors import LinprimError
+from .files import write_json
+from .options import ExtractOptions
+from .progress import Progress, memory_gib
+from .run import Run
+
+# A ray with less opacity than this has seen through the scene: it votes for free space.
+SEEN_THROUGH = 0.5
+
+
+def extract_mesh(run: str | os.PathLike, method: str = "tsdf", output: str | os.PathLike | None = None,
+                 options: ExtractOptions | None = None, *, quiet: bool = False) -> dict:
+    """Extracts the surface of a run and writes it, the part that cameras see, and statistics.
+
+    RUN/mesh/METHOD holds mesh.ply, mesh_visible.ply and stats.json; with `output` the two meshes go to OUTPUT and its sibling
+    *_visible, in the format of the suffix (.ply, .obj, .glb, .stl). Vertices have normals and colours; everything is in the data set's
+    frame and unit.
+
+    Returns: what stats.json holds: topology of both meshes, options, seconds per stage, peak memory, and the paths.
+
+    Raises:
+        LinprimError: nothing was trained, no ray crosses the level, or the grid would not fit into memory.
+    """
+    from .fuse import auto_voxel_size, fuse_tsdf
+    from .mesh import remove_small_components, save_mesh, select_faces, topology, topology_line, vertex_normals
+    from .visibility import color_vertices, visible_faces
+
+    options = options or ExtractOptions()
+    if method != "tsdf":
+        raise LinprimError(f"--method is {method!r}, wanted tsdf")
+    if not 0 < options.level < 1:
+        raise LinprimError(f"--level is {options.level}, wanted a transmittance between 0 and 1")
+    opened = Run.open(run)
+    scene = opened.scene()
+    folder = opened.path / "mesh" / method
+    target = Path(output) if output else folder / "mesh.ply"
+    if target.suffix.lower() not in (".ply", ".obj", ".glb", ".stl"):
+        raise LinprimError(f"{target}: the suffix is {target.suffix!r}, wanted .ply, .obj, .glb or .stl")
+    progress = Progress("extract", 5, quiet=quiet)
+    seconds: dict[str, float] = {}
+    clock = time.perf_counter()
+
+    def lap(name: str) -> None:
+        nonlocal clock
+        now = time.perf_counter()
+        seconds[name], clock = round(now - clock, 3), now
+
+    frames = depth_frames(opened, options.level)
+    if not any((frame.depth > 0).any() for frame in frames):
+        raise LinprimError(f"{opened.path}: no ray of any training view crosses transmittance {options.level}, so there is no surface")
+    lap("render")
+    # Fused in the training frame, which is centred and of moderate size, whatever the data set's coordinates are.
+    scale = opened.similarity.scale
+    voxel = options.voxel_size * scale if options.voxel_size > 0 else auto_voxel_size(frames)
+    limit = int(options.memory_limit * 2**30) if options.memory_limit > 0 else None
+    mesh = fuse_tsdf(frames, voxel_size=voxel, truncation_voxels=options.truncation, memory_limit=limit,
+                     report=lambda text: progress.note("  " + text))
+    mesh = remove_small_components(mesh, options.smallest_part)
+    lap("fuse")
+    cameras = [frame.camera for frame in frames]
+    seen = visible_faces(mesh, cameras)
+    lap("visibility")
+    mesh = replace(mesh, normals=vertex_normals(mesh), colors=color_vertices(mesh, cameras, [frame.color for frame in frames]))
+    lap("color")
+    mesh = replace(mesh, vertices=opened.similarity.inverse().apply(mesh.vertices))
+    visible = select_faces(mesh, seen)
+    visible_target = target.with_name(f"{target.stem}_visible{target.suffix}")
+    save_mesh(target, mesh)
+    save_mesh(visible_target, visible)
+    lap("write")
+    stats = {
+        "mesh": str(target), "mesh_visible": str(visible_target), "method": method, "level": options.level, "voxel_size": voxel / scale,
+        "truncation_voxels": options.truncation, "unit": opened.unit, "views": len(frames), "primitives": opened.state.get("primitives"),
+        **topology(mesh), "visible": topology(visible), "seconds": {**seconds, "total": round(sum(seconds.values()), 3)},
+        "memory_gib": round(memory_gib(), 3),
+    }
+    write_json(folder / "stats.json", stats)
+    progress.note(f"{target}: {topology_line(stats)}")
+    return stats
+
+
+def depth_frames(run: Run, level: float) -> list:
+    """`fuse.DepthFrame`s of the training views in the training frame: depth at `level`, the photographs' colours, free background."""
+    from .fuse import DepthFrame
+
+    scale = run.similarity.scale
+    frames = []
+    for view, images in run.render_views(run.scene().train, geometry=True, level=level):
+        photo = view.load()
+        free = images["opacity"] < SEEN_THROUGH
+        depth = np.where(free, 0, images["depth_median"] * np.float32(scale)).astype(np.float32)
+        frames.append(DepthFrame(view.camera.transformed(run.similarity), depth, color=photo.rgb, background=free))
+    return frames

@@ -1,0 +1,437 @@
+"""A capture as the rest of the package sees it: posed views, their photographs, and the points that come with
+them.
+
+`load_scene` finds out how a folder is laid out and checks everything that can be checked without decoding
+pixels; `View.load` decodes, undistorts and averages down.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from . import photos
+from .camera import Camera
+from .errors import LinprimError
+from .lens import Intrinsics, Lens, check_lens, undistorted
+
+# Of the images sorted by name, those whose index is a multiple of this are held out if the data set does
+# not say.
+HOLD_OUT_EVERY = 8
+# Largest entry of R^T R - 1 that is still taken for rounding of the file's digits; such poses are made
+# orthonormal.
+_RIGID_TOLERANCE = 5e-3
+# Images decoded at load time to see whether an alpha channel holds anything but 255.
+_ALPHA_SAMPLES = 6
+
+
+@dataclass(frozen=True)
+class Photo:
+    """The decoded pixels of one view: `rgb` (H, W, 3) uint8 and, where there is one, `alpha` (H, W) uint8.
+
+    Where alpha is below 255 the colours are straight, not premultiplied.
+    """
+
+    rgb: np.ndarray
+    alpha: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points in the data set's frame: `xyz` (P, 3) float64, `rgb` (P, 3) uint8, `error_px` (P,) float32 or
+    None."""
+
+    xyz: np.ndarray
+    rgb: np.ndarray
+    error_px: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class View:
+    """One posed photograph. `camera` is a pinhole (already undistorted) of the size that `load` returns.
+
+    The file itself may be larger (`downscale`) or distorted (`lens`); `file_size` is its (width, height),
+    None if it is the camera's. `has_alpha` says whether `load` returns an alpha channel: all views of a scene
+    do, or none.
+    """
+
+    name: str
+    camera: Camera
+    image_path: Path
+    mask_path: Path | None = None
+    depth_path: Path | None = None
+    depth_scale: float = 1.0
+    file_size: tuple[int, int] | None = None
+    lens: Lens | None = None
+    downscale: int = 1
+    has_alpha: bool = False
+    cache: Path | None = None
+
+    def load(self) -> Photo:
+        """Decodes the photograph at the camera's size; undistorted ones are kept in the cache folder.
+
+        A mask file replaces an alpha channel. Safe to call from several threads.
+
+        Raises:
+            LinprimError: a file is missing, damaged or of another size than at load time.
+        """
+        store = None
+        if self.lens is not None and self.cache is not None:
+            flavour = "mask" if self.mask_path else "alpha" if self.has_alpha else "rgb"
+            sources = (self.image_path, self.mask_path)
+            store = photos.UndistortedCache(self.cache, self.lens, self._full_target(), sources, flavour)
+        found = store.get() if store is not None else None
+        if found is not None:
+            return Photo(*photos.box_downscale(*found, self.downscale))
+        rgb, alpha = photos.read_photo(self.image_path, self._file_size())
+        if self.mask_path is not None:
+            alpha = photos.read_mask(self.mask_path, self._file_size())
+        elif not self.has_alpha:
+            alpha = None
+        elif alpha is None:
+            alpha = np.full(rgb.shape[:2], 255, dtype=np.uint8)
+        if self.lens is not None:
+            rgb, alpha = photos.undistort_photo(rgb, alpha, self.lens, self._full_target())
+            if store is not None:
+                store.put(rgb, alpha)
+        return Photo(*photos.box_downscale(rgb, alpha, self.downscale))
+
+    def load_depth(self) -> np.ndarray | None:
+        """(H, W) float32 z-depth at the camera's pixel centres in the data set's unit, 0 = none; None without
+        a file.
+
+        Raises:
+            LinprimError: the file is missing, damaged, or not of the image's size.
+        """
+        if self.depth_path is None:
+            return None
+        depth = photos.read_depth(self.depth_path, self.depth_scale, self._file_size())
+        if self.lens is not None:
+            depth = photos.undistort_depth(depth, self.lens, self._full_target())
+        return photos.downscale_depth(depth, self.downscale)
+
+    def _file_size(self) -> tuple[int, int]:
+        return self.file_size or (self.camera.width * self.downscale, self.camera.height * self.downscale)
+
+    def _full_target(self) -> Intrinsics:
+        """The pinhole before averaging down, without the rows and columns that averaging crops."""
+        c, k = self.camera, self.downscale
+        return Intrinsics(c.width * k, c.height * k, c.fx * k, c.fy * k, c.cx * k, c.cy * k)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A capture in the data set's own frame and unit, split into training and held-out views."""
+
+    root: Path
+    kind: str
+    train: tuple[View, ...]
+    test: tuple[View, ...]
+    points: PointCloud | None = None
+    unit: str = "unit of the data set"
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """Training and held-out views, in this order."""
+        return self.train + self.test
+
+    @property
+    def has_alpha(self) -> bool:
+        """Whether the views come with an alpha channel or a foreground mask."""
+        return any(view.has_alpha for view in self.views)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a reader found out about one photograph; `where` names its place in the data set's file, for
+    messages.
+
+    `relative` is the image's path as the data set writes it; `split` is "test" for a held-out one, if that is
+    said.
+    """
+
+    where: str
+    relative: str
+    image_path: Path
+    lens: Lens
+    world_to_camera: np.ndarray
+    split: str | None = None
+    mask_path: Path | None = None
+    depth_path: Path | None = None
+    depth_scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class Listing:
+    """What a reader found in a folder, before images are looked at."""
+
+    kind: str
+    frames: tuple[Frame, ...]
+    points: PointCloud | None
+    unit: str | None = None
+
+
+def load_scene(
+    path: str | os.PathLike,
+    *,
+    downscale: int = 1,
+    masks: str | os.PathLike | None = None,
+    sparse: str | os.PathLike | None = None,
+    cache: str | os.PathLike | None = None,
+) -> Scene:
+    """Reads a posed capture: `transforms*.json` (NeRF-synthetic, nerfstudio, instant-ngp), else a COLMAP
+    model.
+
+    Held out are the frames that the data set names so (`transforms_test.json`, else `_val`;
+    `test_filenames`), else every 8th of the images sorted by name. Points come with the transforms
+    (`ply_file_path`) or from a COLMAP model in the folder whose poses agree with them. Image headers are
+    read, pixels are not (but for a few with alpha).
+
+    Args:
+        path: the data set's folder, or a `.json` in it.
+        downscale: average this many pixels squared into one; cameras are scaled exactly.
+        masks: folder of foreground masks named as the images; found by itself if it is `masks` or `mask`.
+        sparse: folder of the COLMAP model, if it is not `sparse/0`, `sparse`, `colmap/sparse/0` or the folder
+            itself.
+        cache: where undistorted images are kept, see `photos.cache_folder`.
+
+    Raises:
+        LinprimError: one sentence about the first thing that is missing, damaged or does not fit together.
+    """
+    from . import read_colmap, read_transforms
+
+    if isinstance(downscale, bool) or int(downscale) != downscale or downscale < 1:
+        raise LinprimError(f"downscale is {downscale}, wanted a whole number from 1")
+    root, json_file = _root(Path(path))
+    sparse_folder = _option_folder(sparse, root, "--sparse")
+    masks_folder = _option_folder(masks, root, "--masks")
+    if json_file is not None or read_transforms.is_there(root):
+        listing = read_transforms.read_transforms(root, json_file, sparse_folder)
+    elif (model := read_colmap.find_model(root, sparse_folder)) is not None:
+        listing = read_colmap.read_colmap(root, model)
+    else:
+        raise LinprimError(
+            f"{root}: no camera poses found ({_contents(root)}), wanted transforms.json,"
+            " transforms_train.json or a COLMAP model in sparse/0"
+        )
+    if len(listing.frames) < 2:
+        raise LinprimError(f"{root}: {len(listing.frames)} posed image found, wanted at least two")
+    frames = _with_masks(listing.frames, root, masks_folder)
+    names = _names(frames)
+    alphas = _header_checks(frames)
+    has_alpha = any(frame.mask_path for frame in frames) or _alpha_says_something(frames, alphas)
+    folder = photos.cache_folder(cache)
+    pinholes: dict[Lens, Intrinsics] = {}
+    views = []
+    for frame, name in zip(frames, names, strict=True):
+        views.append(_view(frame, name, int(downscale), has_alpha, folder, pinholes))
+    train, test = _split(frames, views)
+    return Scene(root, listing.kind, train, test, listing.points, listing.unit or "unit of the data set")
+
+
+def check_pose(matrix: np.ndarray, where: str) -> np.ndarray:
+    """The (4, 4) float64 rigid transform nearest to a (3, 4) or (4, 4) matrix that is one but for rounding.
+
+    Raises:
+        LinprimError: not finite, mirrored, singular, or scaled.
+    """
+    if not np.isfinite(matrix).all():
+        raise LinprimError(
+            f"{where}: the pose has entries that are not finite numbers, wanted a rotation and a position"
+        )
+    rotation = matrix[:3, :3]
+    u, singular, vt = np.linalg.svd(rotation)
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > _RIGID_TOLERANCE:
+        sizes = ", ".join(f"{value:.4g}" for value in singular)
+        raise LinprimError(
+            f"{where}: the 3x3 part of the pose is not a rotation (it scales by {sizes}), wanted 1, 1, 1"
+        )
+    if np.linalg.det(rotation) < 0:
+        raise LinprimError(f"{where}: the 3x3 part of the pose mirrors (determinant -1), wanted a rotation")
+    if matrix.shape[0] == 4 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > _RIGID_TOLERANCE:
+        raise LinprimError(f"{where}: the last row of the pose is {matrix[3].tolist()}, wanted 0, 0, 0, 1")
+    pose = np.eye(4)
+    pose[:3, :3] = u @ vt
+    pose[:3, 3] = matrix[:3, 3]
+    return pose
+
+
+def _root(path: Path) -> tuple[Path, Path | None]:
+    if path.is_dir():
+        return path, None
+    if path.is_file() and path.suffix == ".json":
+        return path.parent, path
+    if path.exists():
+        raise LinprimError(f"{path}: a file, wanted the folder of a capture or its transforms.json")
+    raise LinprimError(f"{path}: no such folder, wanted the folder of a capture")
+
+
+def _option_folder(value: str | os.PathLike | None, root: Path, option: str) -> Path | None:
+    """A folder given as an option, relative to the working folder or else to the scene."""
+    if not value:
+        return None
+    for folder in (Path(value), root / value):
+        if folder.is_dir():
+            return folder
+    raise LinprimError(f"{option} {value}: no such folder, neither here nor in {root}")
+
+
+def _contents(root: Path) -> str:
+    entries = sorted(entry.name for entry in root.iterdir())
+    images = sum(1 for entry in root.rglob("*") if entry.suffix.lower() in photos.IMAGE_SUFFIXES)
+    if not entries:
+        return "the folder is empty"
+    shown = ", ".join(entries[:6]) + (", ..." if len(entries) > 6 else "")
+    return f"{images} images; it holds {shown}" if images else f"it holds {shown}"
+
+
+def _with_masks(frames: Sequence[Frame], root: Path, folder: Path | None) -> list[Frame]:
+    """Gives every frame its mask file; a folder found by itself that fits no frame at all is left alone."""
+    if folder is None and any(frame.mask_path for frame in frames):
+        return list(frames)
+    candidates = (
+        [folder]
+        if folder is not None
+        else [root / name for name in ("masks", "mask") if (root / name).is_dir()]
+    )
+    for candidate in candidates:
+        found = [_mask_of(frame, candidate) for frame in frames]
+        missing = [frame.relative for frame, mask in zip(frames, found, strict=True) if mask is None]
+        if not missing:
+            return [replace(frame, mask_path=mask) for frame, mask in zip(frames, found, strict=True)]
+        if folder is not None or len(missing) < len(frames):
+            raise LinprimError(
+                f"{candidate}: no mask for {len(missing)} of {len(frames)} images, the first is"
+                f" {missing[0]}, wanted {Path(missing[0]).stem}.png or {Path(missing[0]).name}.png"
+            )
+    return list(frames)
+
+
+def _mask_of(frame: Frame, folder: Path) -> Path | None:
+    relative = Path(frame.relative)
+    inner = Path(*relative.parts[1:]) if len(relative.parts) > 1 else relative
+    for base in dict.fromkeys((relative, inner, Path(relative.name))):
+        image_name = frame.image_path.name
+        for name in (
+            f"{base.name}.png",
+            f"{base.stem}.png",
+            f"{image_name}.png",
+            image_name,
+            f"{base.stem}.jpg",
+        ):
+            if (folder / base.parent / name).is_file():
+                return folder / base.parent / name
+    return None
+
+
+def _names(frames: Sequence[Frame]) -> list[str]:
+    """A name for every frame, unique and fit for a file: the image's stem, else as much of its path as it
+    takes."""
+    paths = [Path(frame.relative.replace("\\", "/")) for frame in frames]
+    options = (
+        [path.stem for path in paths],
+        [
+            "_".join(part for part in path.with_suffix("").parts if part not in ("..", "/", "."))
+            for path in paths
+        ],
+        ["_".join(part for part in path.parts if part not in ("..", "/", ".")) for path in paths],
+    )
+    for names in options:
+        if len(set(names)) == len(names):
+            return names
+    return [f"{i:05d}_{name}" for i, name in enumerate(options[-1])]
+
+
+def _header_checks(frames: Sequence[Frame]) -> list[bool]:
+    """Compares every image, mask and depth file with its camera; returns which images have an alpha
+    channel."""
+    missing = [frame for frame in frames if not frame.image_path.is_file()]
+    if missing:
+        raise LinprimError(
+            f"{missing[0].where}: {len(missing)} of {len(frames)} images are not on disk, the first is"
+            f" {missing[0].image_path}"
+        )
+    for frame in frames:
+        for kind, path in (("mask", frame.mask_path), ("depth map", frame.depth_path)):
+            if path is not None and not path.is_file():
+                raise LinprimError(f"{frame.where}: the {kind} {path} is not on disk")
+    alphas = []
+    for frame in frames:
+        width, height, alpha = photos.image_header(frame.image_path)
+        alphas.append(alpha)
+        wanted = (frame.lens.width, frame.lens.height)
+        if (width, height) != wanted and not photos.fits(frame.image_path, wanted):
+            raise LinprimError(
+                f"{frame.image_path}: the image is {width}x{height}, wanted {wanted[0]}x{wanted[1]} as its"
+                f" camera in {frame.where} says"
+            )
+        if frame.mask_path is not None and photos.image_header(frame.mask_path)[:2] != wanted:
+            found = photos.image_header(frame.mask_path)
+            raise LinprimError(
+                f"{frame.mask_path}: the mask is {found[0]}x{found[1]},"
+                f" wanted {wanted[0]}x{wanted[1]} as its image"
+            )
+    return alphas
+
+
+def _alpha_says_something(frames: Sequence[Frame], alphas: Sequence[bool]) -> bool:
+    candidates = [frame for frame, alpha in zip(frames, alphas, strict=True) if alpha]
+    step = max(1, len(candidates) // _ALPHA_SAMPLES)
+    for frame in candidates[::step]:
+        _, alpha = photos.read_photo(frame.image_path)
+        if alpha is not None and alpha.min() < 255:
+            return True
+    return False
+
+
+def _view(
+    frame: Frame, name: str, factor: int, has_alpha: bool, cache: Path, pinholes: dict[Lens, Intrinsics]
+) -> View:
+    lens = frame.lens
+    if lens not in pinholes:
+        check_lens(lens, frame.where)
+        pinholes[lens] = undistorted(lens, frame.where)
+    full = pinholes[lens]
+    width, height = full.width // factor, full.height // factor
+    if width < 1 or height < 1:
+        raise LinprimError(
+            f"downscale {factor} leaves nothing of {frame.image_path}, which is {full.width}x{full.height}"
+        )
+    pose = check_pose(frame.world_to_camera, frame.where)
+    camera = Camera(
+        width, height, full.fx / factor, full.fy / factor, full.cx / factor, full.cy / factor, pose
+    )
+    return View(
+        name=name,
+        camera=camera,
+        image_path=frame.image_path,
+        mask_path=frame.mask_path,
+        depth_path=frame.depth_path,
+        depth_scale=frame.depth_scale,
+        file_size=(lens.width, lens.height),
+        lens=None if lens.is_pinhole else lens,
+        downscale=factor,
+        has_alpha=has_alpha,
+        cache=cache,
+    )
+
+
+def _split(frames: Sequence[Frame], views: Sequence[View]) -> tuple[tuple[View, ...], tuple[View, ...]]:
+    """By what the frames say, else every 8th by name; never fewer than two training views."""
+    if any(frame.split == "test" for frame in frames):
+        train = tuple(view for frame, view in zip(frames, views, strict=True) if frame.split != "test")
+        test = tuple(view for frame, view in zip(frames, views, strict=True) if frame.split == "test")
+        if len(train) < 2:
+            raise LinprimError(
+                f"{frames[0].where}: {len(train)} of {len(views)} images are for training,"
+                " wanted at least two"
+            )
+        return train, test
+    order = sorted(range(len(views)), key=lambda i: frames[i].relative)
+    held_out = order[::HOLD_OUT_EVERY] if len(views) > 2 else []
+    chosen = set(held_out)
+    return tuple(views[i] for i in order if i not in chosen), tuple(views[i] for i in held_out)

@@ -1,0 +1,278 @@
+"""What cameras see of a mesh: visible faces, vertex colours out of photographs, and a picture of the mesh
+itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from .camera import Camera
+from .errors import LinprimError
+from .mesh import Mesh, vertex_normals
+
+SAMPLES = np.array([[1 / 3, 1 / 3, 1 / 3], [0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8]])
+"""Barycentric coordinates of the points of a face that are tested: the middle, and one near each corner."""
+
+SURFACE_GAP = 1e-5
+"""Rays towards a point of the mesh end this share of the diagonal before it: ten times Embree's rounding."""
+
+KEPT_SAMPLES = 8
+"""Views a vertex takes its colour from: the best ones, enough for a median that three bad ones cannot
+move."""
+
+COLOR_SPREAD = 24.0
+"""Samples further than this from the median in any channel (of 255) are left out of the average: highlights,
+things in the way, misaligned views."""
+
+LEAST_FACING = 0.1
+"""Views flatter than this (cosine, 84 degrees) onto a vertex are used only if there is no other."""
+
+FAR = 1e3
+"""Depth of a ray that hits nothing, in diagonals: finite, so that differences stay numbers."""
+
+OUTLINE_PENALTY = 1e-3
+"""Factor on the weight of a sample in a pixel on the outline of something, whose colour is a mixture."""
+
+
+def visible_faces(mesh: Mesh, cameras: Sequence[Camera]) -> np.ndarray:
+    """Which faces any of the cameras sees, from either side.
+
+    A face is seen if the ray through the centre of a pixel hits it first, or if one of four points on it lies
+    in the image of a camera with nothing in between.
+
+    Returns:
+        (F,) bool.
+    Raises:
+        LinprimError: the mesh is empty or not finite.
+    """
+    from .raycast import RayCaster
+
+    caster = RayCaster(mesh.vertices, mesh.faces)
+    seen = np.zeros(len(mesh.faces), dtype=bool)
+    for camera in cameras:
+        _, face, _ = caster.render_depth(camera)
+        seen[face[face >= 0]] = True
+    gap = SURFACE_GAP * caster.diagonal
+    for camera in cameras:
+        left = np.flatnonzero(~seen)
+        corners = mesh.vertices[mesh.faces[left]]
+        for sample in SAMPLES:
+            points = np.einsum("k,fkd->fd", sample, corners)
+            rows = np.flatnonzero(_project(camera, points.T)[2] & ~seen[left])
+            if len(rows) == 0:
+                continue
+            ray = points[rows] - camera.center
+            reach = 1.0 - gap / np.maximum(np.linalg.norm(ray, axis=1), 2.0 * gap)
+            seen[left[rows[~caster.occluded(camera.center, ray, reach)]]] = True
+    return seen
+
+
+def _project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(2, P) pixel positions of (3, P) world points, their (P,) depths, and which of them lie in the
+    image.""" x, y, z = np.einsum("ij,jp->ip", camera.rotation, points) + camera.world_to_camera[:3, 3, None]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        pixels = np.stack([x / z * camera.fx + camera.cx, y / z * camera.fy + camera.cy])
+        inside = (z > 0) & (pixels >= 0).all(0) & (pixels[0] < camera.width) & (pixels[1] < camera.height)
+    return pixels, z, inside
+
+
+def _facing(points: np.ndarray, normals: np.ndarray, eye: np.ndarray) -> np.ndarray:
+    """(P,) cosine between the normals (3, P) and the directions from the points (3, P) to `eye`."""
+    view = eye[:, None] - points
+    length = np.sqrt((view * view).sum(0))
+    return (view * normals).sum(0) / np.maximum(length, np.finfo(np.float64).tiny)
+
+
+def color_vertices(mesh: Mesh, cameras: Sequence[Camera], images: Iterable[np.ndarray]) -> np.ndarray:
+    """Vertex colours from the photographs that see each vertex.
+
+    Each view that looks onto a vertex with nothing in front gives its bilinear colour there, weighted by the
+    cosine of the angle and by the resolution; the eight best per vertex are reduced to the average of those
+    near their weighted median, so a highlight or a misaligned view does not show. Vertices that no view sees
+    take the colour of their neighbours; if no vertex is seen, all are mid-grey.
+
+    Args:
+        images: one (H, W, 3) uint8, or float in [0, 1], per camera; iterated once, one in memory at a time.
+    Returns:
+        (V, 3) uint8.
+    Raises:
+        LinprimError: an image does not have the size of its camera.
+    """
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    from .raycast import RayCaster
+
+    caster = RayCaster(mesh.vertices, mesh.faces)
+    normals = vertex_normals(mesh) if mesh.normals is None else mesh.normals
+    points, across = np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(normals.T, dtype=np.float64)
+    edge = mesh.vertices[mesh.faces[:, 1]] - mesh.vertices[mesh.faces[:, 0]]
+    slack = float(np.median(np.linalg.norm(edge, axis=1)))
+    best = np.zeros((len(mesh.vertices), KEPT_SAMPLES), dtype=np.float32)
+    shade = np.zeros((len(mesh.vertices), KEPT_SAMPLES, 3), dtype=np.float32)
+    for camera, image in zip(cameras, images, strict=True):
+        if image.shape[:2] != (camera.height, camera.width):
+            raise LinprimError(
+                f"image is {image.shape[1]}x{image.shape[0]} pixels, its camera
+                {camera.width}x{camera.height}"
+            )
+        rays = camera.world_rays().reshape(-1, 3)
+        # Single precision is plenty here: the comparison below has a slack of an edge.
+        depth = caster.cast_single(camera.center, rays)[0].astype(np.float64).reshape(camera.height,
+        camera.width) depth = np.minimum(depth, FAR * caster.diagonal)
+        near, far = (f(depth, size=3, mode="nearest") for f in (minimum_filter, maximum_filter))
+        facing = _facing(points, across, camera.center)
+        rows = np.flatnonzero(facing > 0)
+        pixels, z, inside = _project(camera, points[:, rows])
+        rows, pixels, z = rows[inside], pixels[:, inside], z[inside]
+        facing = facing[rows]
+        j, i = pixels.astype(np.int64)
+        # On a plane the depth changes by one pixel's footprint times the tangent from one pixel to the next.
+        step = z / min(camera.fx, camera.fy)
+        slope = slack + step * np.sqrt(1.0 / np.maximum(facing, LEAST_FACING) ** 2 - 1.0)
+        visible = z <= depth[i, j] + slope
+        outline = (far[i, j] - near[i, j] > 4.0 * slope) | (z > near[i, j] + 2.0 * slope)
+        weight = np.maximum(facing, LEAST_FACING**2) / step**2
+        weight *= np.where(outline, OUTLINE_PENALTY, 1.0) * np.where(facing < LEAST_FACING, OUTLINE_PENALTY,
+        1.0) rows, pixels, weight = rows[visible], pixels[:, visible], weight[visible].astype(np.float32)
+        _keep_best(best, shade, rows, weight, _bilinear(image, pixels))
+    return _fill_unseen(mesh, _robust_mean(best, shade), best[:, 0] > 0)
+
+
+def _keep_best(best, shade, rows, weight, color):
+    """Inserts samples into the descending lists of the best per vertex."""
+    slot = (best[rows] >= weight[:, None]).sum(1)
+    for k in range(KEPT_SAMPLES - 1, -1, -1):
+        move = rows[slot < k]
+        best[move, k], shade[move, k] = best[move, k - 1], shade[move, k - 1]
+        here = slot == k
+        best[rows[here], k], shade[rows[here], k] = weight[here], color[here]
+
+
+def _bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """(P, 3) float32 colours, 0 to 255, at (2, P) pixel positions."""
+    scale = 1.0 if image.dtype == np.uint8 else 255.0
+    height, width = image.shape[:2]
+    x = np.clip(pixels[0] - 0.5, 0, width - 1)
+    y = np.clip(pixels[1] - 0.5, 0, height - 1)
+    j, i = np.minimum(x.astype(np.int64), max(width - 2, 0)), np.minimum(y.astype(np.int64), max(height - 2,
+    0)) x, y = (x - j)[:, None], (y - i)[:, None]
+    right, below = np.minimum(j + 1, width - 1), np.minimum(i + 1, height - 1)
+    image = image[..., :3]
+    top = image[i, j] * (1 - x) + image[i, right] * x
+    bottom = image[below, j] * (1 - x) + image[below, right] * x
+    return (scale * (top * (1 - y) + bottom * y)).astype(np.float32)
+
+
+def _robust_mean(best: np.ndarray, shade: np.ndarray) -> np.ndarray:
+    """(V, 3) float32: weighted mean of the samples near the weighted median of each channel."""
+    total = best.sum(1)
+    median = np.empty((len(best), 3), dtype=np.float32)
+    for channel in range(3):
+        order = np.argsort(shade[:, :, channel], axis=1, kind="stable")
+        weights = np.cumsum(np.take_along_axis(best, order, axis=1), axis=1)
+        middle = np.argmax(weights >= 0.5 * total[:, None], axis=1)
+        picked = np.take_along_axis(order, middle[:, None], axis=1)
+        median[:, channel] = np.take_along_axis(shade[:, :, channel], picked, axis=1)[:, 0]
+    near = (np.abs(shade - median[:, None]) <= COLOR_SPREAD).all(2)
+    weights = best * near
+    total = weights.sum(1, keepdims=True)
+    mean = np.einsum("vk,vkc->vc", weights, shade)
+    return np.where(total > 0, mean / np.maximum(total, np.finfo(np.float32).tiny), median)
+
+
+def _fill_unseen(mesh: Mesh, colors: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Spreads colours along edges into unseen vertices; pieces without any seen vertex get the mean of
+    all.""" from scipy.sparse import coo_matrix
+
+    colors = colors.astype(np.float64)
+    colors[~known] = colors[known].mean(0) if known.any() else 128.0
+    if known.any() and not known.all():
+        ends = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+        ends = np.concatenate([ends, ends[:, ::-1]])
+        count = len(known)
+        graph = coo_matrix((np.ones(len(ends)), ends.T), shape=(count, count)).tocsr()
+        while True:
+            around = graph @ known.astype(np.float64)
+            new = (around > 0) & ~known
+            if not new.any():
+                break
+            colors[new] = (graph @ (colors * known[:, None]))[new] / around[new, None]
+            known = known | new
+    return np.clip(np.round(colors), 0, 255).astype(np.uint8)
+
+
+# Anchors of the colours of a scalar, from low to high.
+SCALE = np.array([[48, 40, 120], [40, 120, 200], [60, 190, 120], [235, 210, 60], [215, 50, 40]],
+dtype=np.float64)
+
+
+def color_scale(values: np.ndarray, top: float | None = None) -> np.ndarray:
+    """(V, 3) uint8 from blue (0) over green and yellow to red (`top`, default the 95 % quantile); NaN is
+    grey.""" values = np.asarray(values, dtype=np.float64)
+    finite = np.isfinite(values)
+    if top is None:
+        top = float(np.quantile(values[finite], 0.95)) if finite.any() else 1.0
+    place = np.clip(np.where(finite, values, 0.0) / (top or 1.0), 0.0, 1.0) * (len(SCALE) - 1)
+    low = np.minimum(place.astype(np.int64), len(SCALE) - 2)
+    share = (place - low)[:, None]
+    colors = SCALE[low] * (1 - share) + SCALE[low + 1] * share
+    colors[~finite] = 128.0
+    return np.round(colors).astype(np.uint8)
+
+
+def render_preview(
+    mesh: Mesh,
+    camera: Camera,
+    *,
+    colors: np.ndarray | None = None,
+    smooth: bool = False,
+    supersample: int = 2,
+    background: tuple[int, int, int] = (255, 255, 255),
+) -> np.ndarray:
+    """A picture of a mesh by rays, without a graphics library: Lambert shading with the light at the camera.
+
+    Args:
+        colors: (V, 3) uint8 vertex colours; the mesh's own by default, light grey if it has none. For an
+        error per
+            vertex give `color_scale(error)`.
+        smooth: interpolate vertex normals; else each face is flat, which shows the triangulation. Faces seen
+        from
+            behind are drawn bluish, so holes and inverted parts can be told.
+        supersample: rays per pixel along each axis.
+
+    Returns:
+        (H, W, 3) uint8.
+    """
+    from .raycast import RayCaster
+
+    k = supersample
+    fine = Camera(
+        camera.width * k, camera.height * k, camera.fx * k, camera.fy * k, camera.cx * k, camera.cy * k,
+        camera.world_to_camera,
+    )  # fmt: skip
+    rays = fine.world_rays().reshape(-1, 3)
+    caster = RayCaster(mesh.vertices, mesh.faces)
+    _, face, bary = caster.cast(camera.center, rays)
+    hit = face >= 0
+    corners = mesh.faces[face[hit]]
+    weights = np.concatenate([1.0 - bary[hit].sum(1, keepdims=True), bary[hit]], axis=1)
+    colors = mesh.colors if colors is None else colors
+    base = np.full((len(corners), 3), 210.0)
+    if colors is not None:
+        base = np.einsum("rk,rkc->rc", weights, np.asarray(colors)[corners].astype(np.float64))
+    flat = caster.face_normals()[face[hit]]
+    direction = rays[hit] / np.linalg.norm(rays[hit], axis=1, keepdims=True)
+    behind = np.einsum("ij,ij->i", flat, direction) > 0
+    normal = flat
+    if smooth:
+        normals = vertex_normals(mesh) if mesh.normals is None else mesh.normals.astype(np.float64)
+        normal = np.einsum("rk,rkc->rc", weights, normals[corners])
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    light = 0.25 + 0.75 * np.abs(np.einsum("ij,ij->i", normal, direction))
+    base = np.where(behind[:, None], 0.4 * base + 0.6 * np.array([90.0, 110.0, 200.0]), base)
+    picture = np.empty((len(rays), 3))
+    picture[:] = background
+    picture[hit] = base * light[:, None]
+    picture = picture.reshape(camera.height, k, camera.width, k, 3).mean((1, 3))
+    return np.clip(np.round(picture), 0, 255).astype(np.uint8)

@@ -1,0 +1,320 @@
+"""The command line: options, exit statuses, what goes to which stream, and that help imports no library."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import importlib
+import inspect
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import types
+
+import pytest
+
+from linprim_geo import cli, doctor, system
+from linprim_geo.errors import LinprimError
+from linprim_geo.options import ExtractOptions, SceneOptions, TrainOptions, option
+
+HEAVY = {
+    "torch",
+    "open3d",
+    "pymeshlab",
+    "trimesh",
+    "igl",
+    "pycolmap",
+    "embreex",
+    "manifold3d",
+    "scipy",
+    "PIL",
+    "numpy",
+}
+COMMANDS = (
+    "train render extract-mesh eval-depth eval-images eval-mesh synth convert doctor demo".split()
+)  # fmt: skip
+
+
+def run_python(code: str, *flags: str, **settings) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, *flags, "-c", code], capture_output=True, text=True, timeout=60, **settings
+    )
+
+
+def run_with_convert(body: str, *arguments: str) -> str:
+    """Source of a program that runs `linprim-geo convert a b` with `body` in the place of the conversion."""
+    return (
+        "import os, sys, time\nimport linprim_geo.convert as module\nfrom linprim_geo.cli import main\n"
+        "module.describe = str\n"
+        f"def convert(*_):\n    {body}\nmodule.convert = convert\n"
+        f"sys.exit(main(['convert', 'a', 'b', *{arguments!r}]))"
+    )
+
+
+@pytest.fixture
+def failing_convert(monkeypatch):
+    def replace(error):
+        def convert(*_):
+            raise error
+
+        monkeypatch.setattr("linprim_geo.convert.convert", convert)
+
+    return replace
+
+
+@pytest.fixture
+def recorded_train(monkeypatch):
+    """Stands in for the training itself and keeps what it was called with."""
+    calls = []
+
+    def train(scene, run, scene_options, train_options, **settings):
+        calls.append((str(scene), str(run), scene_options, train_options, settings))
+        return {"psnr": float("nan"), "primitives": 7}
+
+    monkeypatch.setitem(sys.modules, "linprim_geo.train", types.SimpleNamespace(train=train))
+    return calls
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["train", "--help"], ["--version"]])
+def test_help_imports_no_library(arguments):
+    done = run_python(f"from linprim_geo.cli import main; main({arguments!r})", "-X", "importtime")
+    assert done.returncode == 0 and done.stdout
+    imported = {line.split("|")[-1].strip().split(".")[0] for line in done.stderr.splitlines()}
+    assert "argparse" in imported
+    assert not imported & HEAVY
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(command, capsys):
+    with pytest.raises(SystemExit) as leaving:
+        cli.main([command, "--help"])
+    assert leaving.value.code == 0
+    text = capsys.readouterr().out
+    assert "--json" in text and "--debug" in text
+
+
+def test_every_field_of_the_training_options_is_an_option(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["train", "--help"])
+    text = capsys.readouterr().out
+    for field in (*dataclasses.fields(SceneOptions), *dataclasses.fields(TrainOptions)):
+        assert f"--{field.name.replace('_', '-')} " in text
+
+
+def test_options_become_the_dataclass_they_come_from():
+    @dataclasses.dataclass(frozen=True)
+    class Options:
+        step_size: float = option(0.5, "share, up to 100%")
+        kind: str = option("a", "which", choices=("a", "b"))
+        count: int = option(3, "how many", metavar="COUNT")
+        fast: bool = option(False, "hurry")
+
+    parser = cli.argparse.ArgumentParser()
+    cli.add_options(parser, Options)
+    assert "100%" in parser.format_help() and "COUNT" in parser.format_help()
+    assert cli.from_args(Options, parser.parse_args([])) == Options()
+    given = parser.parse_args("--step-size 2 --kind b --count 9 --fast".split())
+    assert cli.from_args(Options, given) == Options(2.0, "b", 9, True)
+    for wrong in ("--kind c", "--count 1.5", "--step-size x"):
+        with pytest.raises(SystemExit) as leaving:
+            parser.parse_args(wrong.split())
+        assert leaving.value.code == 2
+
+
+def test_train_gets_what_was_said(recorded_train, capsys):
+    assert cli.main("train data/lego -o out --iterations 12 --downscale 4 --resume --quiet".split()) == 0
+    assert cli.main(["train", "data/lego/"]) == 0
+    (scene, run, scene_options, train_options, settings), (_, default_run, *_) = recorded_train
+    assert (scene, run, default_run) == ("data/lego", "out", os.path.join("runs", "lego"))
+    assert scene_options == SceneOptions(downscale=4)
+    assert train_options == TrainOptions(iterations=12)
+    assert settings == {"resume": True, "quiet": True, "json": False}
+    assert "primitives: 7" in capsys.readouterr().out
+
+
+def test_options_of_3dgs_are_understood(recorded_train):
+    assert cli.main("train -s data/lego -m out -r 2 --eval --iterations 5".split()) == 0
+    assert cli.main("train --source_path data/lego --model_path out -r -1".split()) == 0
+    for (scene, run, scene_options, *_), downscale in zip(recorded_train, (2, 1), strict=True):
+        assert (scene, run, scene_options) == ("data/lego", "out", SceneOptions(downscale=downscale))
+
+
+@pytest.mark.parametrize("arguments", ["train", "train a -s b"])
+def test_train_wants_exactly_one_scene(arguments, capsys):
+    assert cli.main(arguments.split()) == 1
+    assert "one scene" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    ["", "nonsense", "train a --iter 5", "train a --iterations x", "eval-mesh a", "eval-mesh a b --tau -1",
+     "synth out --size 3x", "synth out --views 0", "synth out --scene cad --mesh x.ply", "convert a",
+     "render run --split x"],
+)  # fmt: skip
+def test_wrong_arguments_exit_with_2(arguments, capsys):
+    with pytest.raises(SystemExit) as leaving:
+        cli.main(arguments.split())
+    assert leaving.value.code == 2
+    assert "error:" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "sentence"),
+    [
+        (LinprimError("photos: no images\nwere found"), 1, "photos: no images were found"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (
+            OSError(errno.ENOSPC, "No space left on device", "x.ply"),
+            1,
+            "the disk is full while writing x.ply",
+        ),
+        (PermissionError(errno.EACCES, "Permission denied", "x.ply"), 1, "x.ply: Permission denied"),
+        (MemoryError(), 1, "out of memory"),
+        (
+            ModuleNotFoundError("No module named 'open3d'", name="open3d"),
+            1,
+            "the library open3d is not installed",
+        ),
+        (ZeroDivisionError("division\nby zero"), 70, "internal error: ZeroDivisionError: division by zero"),
+    ],
+)
+def test_an_error_is_one_sentence(error, status, sentence, failing_convert, capsys):
+    failing_convert(error)
+    assert cli.main(["convert", "a", "b"]) == status
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith(f"linprim-geo: error: {sentence}")
+    assert captured.err.count("\n") == 1
+    if status == 70:
+        assert "--debug" in captured.err
+    assert cli.main(["convert", "a", "b", "--debug"]) == status
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_json_is_all_there_is_on_stdout():
+    noise = "os.write(1, b'from C'); print('from Python')"
+    result = "return {'x': float('nan'), 'y': [1, 2.5], '_hidden': 1}"
+    done = run_python(run_with_convert(f"{noise}; {result}", "--json"))
+    assert done.returncode == 0
+    assert json.loads(done.stdout) == {"x": None, "y": [1, 2.5]} and done.stdout.count("\n") == 1
+    assert "from C" in done.stderr and "from Python" in done.stderr
+
+
+def test_json_prints_nothing_on_stdout_after_an_error():
+    done = run_python(run_with_convert("raise ValueError('no')", "--json"))
+    assert (done.returncode, done.stdout) == (70, "")
+
+
+def test_json_may_stand_before_the_command(recorded_train, capsys):
+    assert cli.main(["--json", "train", "a"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"psnr": None, "primitives": 7}
+    assert recorded_train[0][-1]["json"] is True
+
+
+def test_a_reader_that_goes_away_is_no_traceback():
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        code = run_with_convert("return {'text': 'x' * 200000}")
+        done = subprocess.run(
+            [sys.executable, "-c", code], stdout=writing, stderr=subprocess.PIPE, text=True, timeout=60
+        )
+    finally:
+        os.close(writing)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_ctrl_c_is_one_sentence():
+    code = run_with_convert("print('ready', flush=True); time.sleep(30)")
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline() == "ready\n"
+    process.send_signal(signal.SIGINT)
+    _, shown = process.communicate(timeout=30)
+    assert (process.returncode, shown) == (130, "linprim-geo: error: interrupted\n")
+
+
+def test_python_m_runs_the_same_program():
+    done = subprocess.run(
+        [sys.executable, "-m", "linprim_geo", "--version"], capture_output=True, text=True, timeout=60
+    )
+    assert re.fullmatch(r"linprim-geo \d+\.\d+\.\d+\n", done.stdout)
+
+
+def test_synth_leaves_what_is_not_said_to_the_library(monkeypatch, capsys):
+    calls = []
+    stand_in = types.SimpleNamespace(synthesize=lambda out, **settings: calls.append((out, settings)) or {})
+    monkeypatch.setitem(sys.modules, "linprim_geo.synth", stand_in)
+    room = "synth out --scene room --size 64x48 --fov 60 --background 0,0.5,1 --overwrite"
+    for line in ("synth out", room, "synth out --mesh x.glb --size 64 --point-noise 0.01"):
+        assert cli.main(line.split()) == 0
+    (_, plain), (_, room), (_, mesh) = calls
+    assert not plain.keys() & {"shape", "mesh", "path", "fov", "distance", "background"}
+    assert (room["shape"], room["size"], room["fov"], room["overwrite"]) == ("room", (64, 48), 60.0, True)
+    assert room["background"] == "0,0.5,1" and "mesh" not in room
+    assert (mesh["mesh"], mesh["size"], mesh["point_noise"]) == (
+        "x.glb",
+        (64, 64),
+        0.01,
+    ) and "shape" not in mesh
+
+
+# The function behind each command whose arguments are passed on by name, and the names that differ.
+PASSED_ON = {
+    "synth out": ("synth.synthesize", {"output": "out", "scene": "shape"}),
+    "render run": ("render.render_run", {}),
+    "extract-mesh run": ("extract.extract_mesh", {}),
+    "eval-depth run": ("eval.depth.eval_depth_run", {}),
+    "eval-images run": ("eval.images.eval_images_run", {}),
+    "eval-mesh a b": (
+        "eval.mesh.eval_mesh_files",
+        {"mesh": "prediction_path", "reference": "reference_path"},
+    ),
+}
+
+
+@pytest.mark.parametrize("line", PASSED_ON)
+def test_the_functions_have_the_arguments_that_the_commands_pass(line):
+    path, renamed = PASSED_ON[line]
+    module, _, name = path.rpartition(".")
+    function = getattr(importlib.import_module(f"linprim_geo.{module}"), name)
+    options = (
+        {field.name for field in dataclasses.fields(ExtractOptions)} if line.startswith("extract") else set()
+    )
+    passed = vars(cli.build_parser().parse_args(line.split())).keys() - {"handler", "command"} - options
+    assert {renamed.get(key, key) for key in passed} <= set(inspect.signature(function).parameters)
+
+
+def test_doctor_names_what_is_missing(monkeypatch, capsys):
+    monkeypatch.setattr(
+        doctor, "LIBRARIES", (("numpy", ("numpy",)), ("no_such_module", ("no-such-package",)))
+    )
+    assert cli.main(["doctor", "--json"]) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert report["libraries"]["numpy"] and report["libraries"]["no_such_module"] is None
+    assert any("no_such_module is not installed" in problem for problem in report["problems"])
+    assert report["cores"] >= 1 and report["memory_bytes"] > 0
+    cli.main(["doctor"])
+    assert "no_such_module MISSING" in capsys.readouterr().out
+
+
+def test_missing_system_libraries_come_with_the_line_that_installs_them(monkeypatch):
+    absent = system.SystemLibrary("libnosuch.so.9", "libnosuch9", "nosuch", "nothing")
+    monkeypatch.setattr(system, "LINUX_LIBRARIES", (absent,))
+    monkeypatch.setattr(sys, "platform", "linux")
+    assert system.missing_libraries() == [absent]
+    monkeypatch.setattr(system.shutil, "which", lambda name: name if name == "apt-get" else None)
+    assert system.install_command([absent])[-1] == "libnosuch9"
+    monkeypatch.setattr(system.shutil, "which", lambda name: name if name == "dnf" else None)
+    assert system.install_command([absent])[-1] == "nosuch"
+    monkeypatch.setattr(system.shutil, "which", lambda name: None)
+    assert system.install_command([absent]) is None
+
+
+def test_a_compiler_that_cannot_do_cxx20_is_named(monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    assert "no-such-compiler does not compile C++20" in system.compiler_problem()

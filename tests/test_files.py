@@ -1,0 +1,119 @@
+"""Writing files: what was there stays until what is new is complete, and nothing half-written is left."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import stat
+
+import pytest
+
+from linprim_geo.errors import LinprimError
+from linprim_geo.files import atomic_write, write_json
+
+
+@pytest.fixture
+def old(tmp_path):
+    path = tmp_path / "mesh.ply"
+    path.write_text("old")
+    return path
+
+
+def assert_untouched(old):
+    assert old.read_text() == "old"
+    assert [entry.name for entry in old.parent.iterdir()] == ["mesh.ply"]
+
+
+def test_the_new_file_replaces_the_old_one(old):
+    with atomic_write(old) as temporary:
+        assert temporary.suffix == ".ply" and temporary.parent == old.parent and temporary != old
+        temporary.write_text("new")
+        assert old.read_text() == "old"
+    assert old.read_text() == "new"
+    assert [entry.name for entry in old.parent.iterdir()] == ["mesh.ply"]
+
+
+def test_folders_are_made(tmp_path):
+    with atomic_write(tmp_path / "a" / "b" / "c.json") as temporary:
+        temporary.write_text("new")
+    assert (tmp_path / "a" / "b" / "c.json").read_text() == "new"
+
+
+def test_permissions_follow_the_umask(tmp_path):
+    before = os.umask(0o027)
+    try:
+        with atomic_write(tmp_path / "x.txt") as temporary:
+            temporary.write_text("new")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "x.txt").stat().st_mode) == 0o640
+
+
+@pytest.mark.parametrize("error", [ValueError("wrong"), KeyboardInterrupt(), SystemExit(3), MemoryError()])
+def test_an_error_inside_keeps_the_old_file(old, error):
+    with pytest.raises(type(error)), atomic_write(old) as temporary:
+        temporary.write_text("half")
+        raise error
+    assert_untouched(old)
+
+
+def test_an_error_without_an_old_file_leaves_nothing(tmp_path):
+    with pytest.raises(ValueError), atomic_write(tmp_path / "new.ply") as temporary:
+        temporary.write_text("half")
+        raise ValueError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_while_writing_is_one_sentence(old):
+    with (
+        pytest.raises(LinprimError, match=r"mesh\.ply.*(disk is full|no space)"),
+        atomic_write(old) as temporary,
+    ):
+        temporary.write_text("half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert_untouched(old)
+
+
+@pytest.mark.parametrize("function", ["fsync", "replace"])
+def test_a_disk_that_fills_up_at_the_end_is_one_sentence(old, function, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, function, full)
+    with (
+        pytest.raises(LinprimError, match=r"mesh\.ply.*(disk is full|no space)"),
+        atomic_write(old) as temporary,
+    ):
+        temporary.write_text("new")
+    monkeypatch.undo()
+    assert_untouched(old)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
+def test_a_truly_full_device_is_one_sentence(old):
+    with pytest.raises(LinprimError, match=r"(disk is full|no space)"), atomic_write(old):
+        with open("/dev/full", "wb") as file:
+            file.write(b"x" * 100_000)
+    assert_untouched(old)
+
+
+def test_a_folder_that_is_a_file_is_one_sentence(old):
+    with pytest.raises(LinprimError, match="mesh.ply"), atomic_write(old / "inside.json") as temporary:
+        temporary.write_text("new")
+    assert_untouched(old)
+
+
+def test_json_holds_what_json_cannot(tmp_path):
+    np = pytest.importorskip("numpy")
+    value = {
+        "nan": float("nan"),
+        "inf": [np.float32("inf")],
+        "array": np.arange(3),
+        "path": tmp_path,
+        1: "key",
+    }
+    write_json(tmp_path / "x.json", value)
+    text = (tmp_path / "x.json").read_text()
+    read = json.loads(text, parse_constant=pytest.fail)
+    assert read == {"nan": None, "inf": [None], "array": [0, 1, 2], "path": str(tmp_path), "1": "key"}
