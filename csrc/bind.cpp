@@ -161,7 +161,7 @@ NB_MODULE(_core, m) {
       nb::gil_scoped_release release;
       result = linprim::photometric_loss(a, b, w, int(width), int(height), dssim, g);
     }
-    return std::make_tuple(result.loss, result.l1, result.ssim);
+    return std::make_tuple(result.loss, result.l1, result.ssim, result.mse);
   });
   m.def("adam_step", [](Out<float> value, In<float> gradient, Out<float> first, Out<float> second, float rate, float beta1, float beta2,
                         float epsilon, int64_t step) {

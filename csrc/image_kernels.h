@@ -8,6 +8,7 @@
 #include <cmath>
 
 #include "kernels.h"
+#include "simd.h"
 
 namespace linprim::LINPRIM_ISA {
 
@@ -34,109 +35,138 @@ inline void blur_column(const float* const* rows, float* __restrict out, int wid
              kWindow[4] * (r1[x] + r9[x]) + kWindow[5] * (r0[x] + r10[x]);
 }
 
-// Blurs kMaps maps over rows [begin, end): `fill(row, out)` writes the padded rows of the maps, `use(row, blurred)` takes the
-// result. Rows outside [0, height) are zero. `buffer` holds photometric_buffer_size(width) floats.
-template <int kMaps, class Fill, class Use>
-inline void blur_strip(int width, int height, int begin, int end, float* buffer, Fill fill, Use use) {
-  constexpr int kSpan = 2 * kSsimRadius + 1;
-  const int pitch = width + 2 * kSsimRadius;
-  float* padded[kMaps];
-  float* ring[kMaps];
-  float* blurred[kMaps];
-  float* next = buffer;
-  for (int m = 0; m < kMaps; ++m) {
-    padded[m] = next, next += pitch;
-    ring[m] = next, next += kSpan * width;
-    blurred[m] = next, next += width;
-    std::fill(padded[m], padded[m] + kSsimRadius, 0.0f);
-    std::fill(padded[m] + kSsimRadius + width, padded[m] + pitch, 0.0f);
-  }
-  float* inner[kMaps];
-  for (int m = 0; m < kMaps; ++m) inner[m] = padded[m] + kSsimRadius;
-  for (int row = begin - kSsimRadius; row < end + kSsimRadius; ++row) {
-    const int at = (row + kSpan) % kSpan;
-    if (row < 0 || row >= height) {
-      for (int m = 0; m < kMaps; ++m) std::fill(ring[m] + at * width, ring[m] + (at + 1) * width, 0.0f);
-    } else {
-      fill(row, inner);
-      for (int m = 0; m < kMaps; ++m) blur_row(padded[m], ring[m] + at * width, width);
+// A blur in two halves over a stream of rows: `push` blurs a row of each of kMaps maps along x, `column` gives the maps blurred both
+// ways once the row kSsimRadius further down has been pushed. Rows outside the image are pushed as zeros.
+template <int kMaps>
+struct RowBlur {
+  static constexpr int kSpan = 2 * kSsimRadius + 1;
+  int width;
+  float* padded[kMaps];   // input row with kSsimRadius zeros on both sides
+  float* ring[kMaps];     // kSpan rows
+  float* blurred[kMaps];  // output row
+
+  // Takes its rows from `memory`, and returns where they end.
+  float* place(float* memory, int image_width) {
+    width = image_width;
+    const int pitch = width + 2 * kSsimRadius;
+    for (int m = 0; m < kMaps; ++m) {
+      padded[m] = memory, memory += pitch;
+      ring[m] = memory, memory += kSpan * width;
+      blurred[m] = memory, memory += width;
+      std::fill(padded[m], padded[m] + pitch, 0.0f);
     }
-    const int center = row - kSsimRadius;
-    if (center < begin) continue;
+    return memory;
+  }
+  float* input(int m) { return padded[m] + kSsimRadius; }
+  float* slot(int m, int row) { return ring[m] + (row + 2 * kSpan) % kSpan * width; }
+  void push(int row) {
+    for (int m = 0; m < kMaps; ++m) blur_row(padded[m], slot(m, row), width);
+  }
+  void push_zeros(int row) {
+    for (int m = 0; m < kMaps; ++m) std::fill_n(slot(m, row), width, 0.0f);
+  }
+  void column(int row) {
     for (int m = 0; m < kMaps; ++m) {
       const float* rows[kSpan];
-      for (int k = 0; k < kSpan; ++k) rows[k] = ring[m] + (center - kSsimRadius + k + kSpan) % kSpan * width;
+      for (int k = 0; k < kSpan; ++k) rows[k] = slot(m, row - kSsimRadius + k);
       blur_column(rows, blurred[m], width);
     }
-    use(center, blurred);
   }
+};
+
+inline void products_row(const float* __restrict a, const float* __restrict b, float* __restrict aa, float* __restrict bb,
+                         float* __restrict ab, int width) {
+  for (int x = 0; x < width; ++x) aa[x] = a[x] * a[x], bb[x] = b[x] * b[x], ab[x] = a[x] * b[x];
 }
 
-inline void photometric_maps(const PhotometricParams& P, int channel, int begin, int end, float* buffer, double* l1, double* ssim) {
-  const int width = P.width, height = P.height;
-  const int64_t plane = int64_t(width) * height;
-  const float *image = P.image + channel * plane, *target = P.target + channel * plane;
-  float* maps[3];
-  for (int m = 0; m < 3; ++m) maps[m] = P.scratch + (3 * channel + m) * plane;
-  blur_strip<5>(
-      width, height, begin, end, buffer,
-      [&](int row, float* const* out) {
-        const float *a = image + int64_t(row) * width, *b = target + int64_t(row) * width;
-        float *__restrict o0 = out[0], *__restrict o1 = out[1], *__restrict o2 = out[2], *__restrict o3 = out[3], *__restrict o4 = out[4];
-        for (int x = 0; x < width; ++x) o0[x] = a[x], o1[x] = b[x], o2[x] = a[x] * a[x], o3[x] = b[x] * b[x], o4[x] = a[x] * b[x];
-      },
-      [&](int row, float* const* blurred) {
-        const float *a = image + int64_t(row) * width, *b = target + int64_t(row) * width;
-        const float* weight = P.weight ? P.weight + int64_t(row) * width : nullptr;
-        float *__restrict d_mean = maps[0] + int64_t(row) * width, *__restrict d_square = maps[1] + int64_t(row) * width,
-              *__restrict d_cross = maps[2] + int64_t(row) * width;
-        const float *m1 = blurred[0], *m2 = blurred[1], *xx = blurred[2], *yy = blurred[3], *xy = blurred[4];
-        double sum_l1 = 0, sum_ssim = 0;
-        constexpr int kChunk = 64;  // float partial sums of short runs, then double
-        for (int x0 = 0; x0 < width; x0 += kChunk) {
-          float part_l1[kChunk], part_ssim[kChunk];
-          const int n = std::min(kChunk, width - x0);
-          for (int i = 0; i < n; ++i) {
-            const int x = x0 + i;
-            const float w = weight ? weight[x] : 1.0f, u = m1[x], v = m2[x];
-            const float a1 = 2 * u * v + kC1, a2 = 2 * (xy[x] - u * v) + kC2;
-            const float b1 = u * u + v * v + kC1, b2 = (xx[x] - u * u) + (yy[x] - v * v) + kC2;
-            const float inverse = 1.0f / (b1 * b2), s = a1 * a2 * inverse;
-            part_l1[i] = w * std::fabs(a[x] - b[x]);
-            part_ssim[i] = w * s;
-            d_mean[x] = w * (2 * v * (a2 - a1) * inverse + 2 * u * s * (b1 - b2) * inverse);
-            d_square[x] = -w * s * b1 * inverse;
-            d_cross[x] = w * 2 * a1 * inverse;
-          }
-          for (int i = 0; i < n; ++i) sum_l1 += part_l1[i], sum_ssim += part_ssim[i];
-        }
-        l1[row] = sum_l1, ssim[row] = sum_ssim;
-      });
+// One row of the loss: `blurred` holds the blurred image, target, image^2, target^2 and image target; writes the derivatives of
+// weight * SSIM to the blurred image, image^2 and image target from pixel `begin` on while W pixels are left, and adds the row's sums.
+// Returns where it stopped.
+template <int W, bool kWeighted>
+inline int ssim_row(const float* a, const float* b, const float* weight, float* const* blurred, float* const* derivative, int begin,
+                    int width, double sums[3]) {
+  using V = Vec<float, W>;
+  const V two = V::set(2), c1 = V::set(kC1), c2 = V::set(kC2), zero = V::set(0);
+  V l1 = zero, square = zero, ssim = zero;
+  int x = begin;
+  for (; x + W <= width; x += W) {
+    const V w = kWeighted ? V::load(weight + x) : V::set(1), u = V::load(blurred[0] + x), v = V::load(blurred[1] + x);
+    const V uu = u * u, vv = v * v, uv = u * v;
+    const V a1 = fma(two, uv, c1), a2 = fma(two, V::load(blurred[4] + x) - uv, c2);
+    const V b1 = uu + vv + c1, b2 = (V::load(blurred[2] + x) - uu) + (V::load(blurred[3] + x) - vv) + c2;
+    const V inverse = rcp(b1 * b2), scaled = w * inverse, s = a1 * a2 * scaled;
+    const V d = V::load(a + x) - V::load(b + x);
+    l1 = fma(w, max(d, zero - d), l1);
+    square = fma(w * d, d, square);
+    ssim = ssim + s;
+    (two * (v * (a2 - a1) * scaled + u * s * (b1 - b2) * inverse)).store(derivative[0] + x);
+    (zero - s * b1 * inverse).store(derivative[1] + x);
+    (two * a1 * scaled).store(derivative[2] + x);
+  }
+  sums[0] += sum(l1), sums[1] += sum(square), sums[2] += sum(ssim);
+  return x;
 }
 
-// Adjoint of photometric_maps for rows [begin, end) of a channel: the window is symmetric and zeros lie beyond the border, so
-// the adjoint of the blur is the blur.
-inline void photometric_gradient(const PhotometricParams& P, int channel, int begin, int end, float* buffer) {
+inline void gradient_row(const float* __restrict a, const float* __restrict b, const float* weight, const float* const* blurred,
+                         float l1_scale, float ssim_scale, float* __restrict out, int width) {
+  const float *d_mean = blurred[0], *d_square = blurred[1], *d_cross = blurred[2];
+  for (int x = 0; x < width; ++x) {
+    const float d = a[x] - b[x], sign = d > 0 ? 1.0f : d < 0 ? -1.0f : 0.0f;
+    out[x] = l1_scale * sign + ssim_scale * (d_mean[x] + 2 * a[x] * d_square[x] + b[x] * d_cross[x]);
+  }
+  if (weight)  // the SSIM part carries its weight already
+    for (int x = 0; x < width; ++x) {
+      const float d = a[x] - b[x], sign = d > 0 ? 1.0f : d < 0 ? -1.0f : 0.0f;
+      out[x] += l1_scale * sign * (weight[x] - 1);
+    }
+}
+
+// Loss sums and gradient of rows [begin, end) of a channel in one sweep: blur, SSIM and its derivatives, and their blur again (the
+// window is symmetric and zeros lie beyond the border, so the blur is its own adjoint). Rows around the strip are computed twice.
+template <int W>
+inline void photometric(const PhotometricParams& P, int channel, int begin, int end, float* buffer, double* sums) {
   const int width = P.width, height = P.height;
   const int64_t plane = int64_t(width) * height;
   const float *image = P.image + channel * plane, *target = P.target + channel * plane;
   const float l1_scale = float((1.0 - P.dssim) / P.weight_sum), ssim_scale = float(-P.dssim / P.weight_sum);
-  blur_strip<3>(
-      width, height, begin, end, buffer,
-      [&](int row, float* const* out) {
-        for (int m = 0; m < 3; ++m) std::copy_n(P.scratch + (3 * channel + m) * plane + int64_t(row) * width, width, out[m]);
-      },
-      [&](int row, float* const* blurred) {
-        const float *a = image + int64_t(row) * width, *b = target + int64_t(row) * width;
-        const float* weight = P.weight ? P.weight + int64_t(row) * width : nullptr;
-        float* __restrict out = P.gradient + channel * plane + int64_t(row) * width;
-        const float *d_mean = blurred[0], *d_square = blurred[1], *d_cross = blurred[2];
-        for (int x = 0; x < width; ++x) {
-          const float w = weight ? weight[x] : 1.0f, d = a[x] - b[x];
-          const float sign = d > 0 ? w : d < 0 ? -w : 0.0f;
-          out[x] = l1_scale * sign + ssim_scale * (d_mean[x] + 2 * a[x] * d_square[x] + b[x] * d_cross[x]);
-        }
-      });
+  RowBlur<5> moments;
+  RowBlur<3> derivatives;
+  derivatives.place(moments.place(buffer, width), width);
+  float* derivative[3] = {derivatives.input(0), derivatives.input(1), derivatives.input(2)};
+  for (int row = begin - 2 * kSsimRadius; row < end + 2 * kSsimRadius; ++row) {
+    if (row >= 0 && row < height) {
+      const float *a = image + int64_t(row) * width, *b = target + int64_t(row) * width;
+      std::copy_n(a, width, moments.input(0));
+      std::copy_n(b, width, moments.input(1));
+      products_row(a, b, moments.input(2), moments.input(3), moments.input(4), width);
+      moments.push(row);
+    } else {
+      moments.push_zeros(row);
+    }
+    const int middle = row - kSsimRadius;
+    if (middle < begin - kSsimRadius) continue;
+    if (middle >= 0 && middle < height) {
+      moments.column(middle);
+      const int64_t at = int64_t(middle) * width;
+      const float *a = image + at, *b = target + at, *weight = P.weight ? P.weight + at : nullptr;
+      double row_sums[3] = {0, 0, 0};
+      const int rest = weight ? ssim_row<W, true>(a, b, weight, moments.blurred, derivative, 0, width, row_sums)
+                              : ssim_row<W, false>(a, b, weight, moments.blurred, derivative, 0, width, row_sums);
+      weight ? ssim_row<1, true>(a, b, weight, moments.blurred, derivative, rest, width, row_sums)
+             : ssim_row<1, false>(a, b, weight, moments.blurred, derivative, rest, width, row_sums);
+      if (middle >= begin && middle < end)
+        for (int k = 0; k < 3; ++k) sums[k] += row_sums[k];
+      derivatives.push(middle);
+    } else {
+      derivatives.push_zeros(middle);
+    }
+    const int out = middle - kSsimRadius;
+    if (out < begin) continue;
+    derivatives.column(out);
+    const int64_t at = int64_t(out) * width;
+    gradient_row(image + at, target + at, P.weight ? P.weight + at : nullptr, derivatives.blurred, l1_scale, ssim_scale,
+                 P.gradient + channel * plane + at, width);
+  }
 }
 
 // Adam with bias correction (Kingma and Ba 2015, algorithm 1) on elements [begin, end).

@@ -39,7 +39,7 @@ void backward(const RasterParams<Real>& P, int tile, bool geometry) {
 template <class Real>
 const Kernels<Real> table = {LINPRIM_STRING(LINPRIM_ISA), kWidth,         project<Real>, chain<Real>,
                              bin<kWidth>,                 forward<Real>, backward<Real>};
-const ImageKernels image_table = {photometric_maps, photometric_gradient, adam};
+const ImageKernels image_table = {photometric<kWidth>, adam};
 
 }  // namespace LINPRIM_ISA
 

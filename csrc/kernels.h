@@ -137,7 +137,6 @@ struct PhotometricParams {
   float dssim;                  // weight of D-SSIM; L1 has the rest
   double weight_sum;            // sum of weight over pixels, times 3
   float* gradient;              // (3,H,W), written
-  float* scratch;               // 9 H W floats: derivatives of SSIM, handed from phase 1 to phase 2
 };
 
 struct AdamParams {
@@ -162,15 +161,14 @@ struct Kernels {
 };
 
 struct ImageKernels {
-  // Phase 1 writes per-row loss sums and the SSIM derivative maps, phase 2 turns them into the gradient; rows of one channel.
-  // `buffer` is the calling thread's own, photometric_buffer_size(width) floats.
-  void (*photometric_maps)(const PhotometricParams&, int channel, int row_begin, int row_end, float* buffer, double* l1, double* ssim);
-  void (*photometric_gradient)(const PhotometricParams&, int channel, int row_begin, int row_end, float* buffer);
+  // Gradient of rows [begin, end) of a channel, and their sums of |d|, d^2 and SSIM, added to `sums`. `buffer` is the calling
+  // thread's own, photometric_buffer_size(width) floats.
+  void (*photometric)(const PhotometricParams&, int channel, int begin, int end, float* buffer, double* sums);
   void (*adam)(const AdamParams&, int64_t begin, int64_t end);
 };
 
 constexpr int kSsimRadius = 5;
-inline int64_t photometric_buffer_size(int width) { return 5 * int64_t(width + 2 * kSsimRadius + (2 * kSsimRadius + 2) * width); }
+inline int64_t photometric_buffer_size(int width) { return 8 * int64_t(width + 2 * kSsimRadius + (2 * kSsimRadius + 2) * width); }
 
 template <class Real>
 const Kernels<Real>& kernels_scalar();

@@ -40,9 +40,10 @@ void rasterize_grad(const View& view, const Primitives<Real>& primitives, const 
                     Real* background_grad);
 
 // loss = (1 - dssim) L1 + dssim (1 - SSIM) of two (3,H,W) images and its gradient to the first, written to `gradient` (3,H,W).
-// `weight` (H,W) or null multiplies both maps; means are over the weight. Returns the loss, and the two parts.
+// `weight` (H,W) or null multiplies both maps; means are over the weight. Returns the loss, its
+// two parts and the mean squared error.
 struct Photometric {
-  double loss, l1, ssim;
+  double loss, l1, ssim, mse;
 };
 Photometric photometric_loss(const float* image, const float* target, const float* weight, int width, int height, float dssim,
                              float* gradient);

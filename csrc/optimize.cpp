@@ -1,5 +1,6 @@
 // The parallel drivers of the image loss, the optimiser step and the check for non-finite values.
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <mutex>
 #include <vector>
@@ -12,40 +13,28 @@ namespace linprim {
 
 Photometric photometric_loss(const float* image, const float* target, const float* weight, int width, int height, float dssim,
                              float* gradient) {
-  constexpr int kStripRows = 32;
+  constexpr int kStripRows = 96;  // fixed, so that sums do not depend on the number of threads
   static std::mutex mutex;
-  static auto* scratch = new std::vector<float>;
+  static auto* buffers = new std::vector<float>;
   std::lock_guard lock(mutex);
   const int64_t plane = int64_t(width) * height, buffer_size = photometric_buffer_size(width);
-  const int64_t needed = 9 * plane + threads() * buffer_size;
-  if (int64_t(scratch->size()) < needed) scratch->resize(size_t(needed));
-  PhotometricParams params{image, target, weight, width, height, dssim, 0, gradient, scratch->data()};
-  double weight_sum = double(plane);
+  if (int64_t(buffers->size()) < threads() * buffer_size) buffers->resize(size_t(threads() * buffer_size));
+  PhotometricParams params{image, target, weight, width, height, dssim, double(plane), gradient};
   if (weight) {
-    weight_sum = 0;
-    for (int64_t i = 0; i < plane; ++i) weight_sum += weight[i];
+    params.weight_sum = 0;
+    for (int64_t i = 0; i < plane; ++i) params.weight_sum += weight[i];
   }
-  params.weight_sum = std::max(3 * weight_sum, 1e-12);
-  std::vector<double> l1(size_t(height) * 3), ssim(size_t(height) * 3);
+  params.weight_sum = std::max(3 * params.weight_sum, 1e-12);
   const int strips = (height + kStripRows - 1) / kStripRows;
-  auto rows = [&](int64_t task, int thread, auto&& call) {
-    const int channel = int(task / strips), begin = int(task % strips) * kStripRows;
-    call(channel, begin, std::min(height, begin + kStripRows), scratch->data() + 9 * plane + thread * buffer_size);
-  };
+  std::vector<std::array<double, 3>> sums(size_t(strips) * 3, std::array<double, 3>{0, 0, 0});
   parallel_for(3 * strips, [&](int64_t task, int thread) {
-    rows(task, thread, [&](int channel, int begin, int end, float* buffer) {
-      image_kernels().photometric_maps(params, channel, begin, end, buffer, &l1[size_t(channel) * height], &ssim[size_t(channel) * height]);
-    });
+    const int begin = int(task % strips) * kStripRows;
+    image_kernels().photometric(params, int(task / strips), begin, std::min(height, begin + kStripRows),
+                                buffers->data() + thread * buffer_size, sums[size_t(task)].data());
   });
-  parallel_for(3 * strips, [&](int64_t task, int thread) {
-    rows(task, thread, [&](int channel, int begin, int end, float* buffer) {
-      image_kernels().photometric_gradient(params, channel, begin, end, buffer);
-    });
-  });
-  Photometric result{0, 0, 0};
-  for (double x : l1) result.l1 += x;
-  for (double x : ssim) result.ssim += x;
-  result.l1 /= params.weight_sum, result.ssim /= params.weight_sum;
+  Photometric result{0, 0, 0, 0};
+  for (const auto& [l1, square, ssim] : sums) result.l1 += l1, result.mse += square, result.ssim += ssim;
+  result.l1 /= params.weight_sum, result.mse /= params.weight_sum, result.ssim /= params.weight_sum;
   result.loss = (1.0 - dssim) * result.l1 + dssim * (1.0 - result.ssim);
   return result;
 }

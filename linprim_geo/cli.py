@@ -180,6 +180,13 @@ def _length(text: str) -> float:
     return value
 
 
+def _pair(text: str) -> tuple[float, float]:
+    x, y = (float(part) for part in text.split(","))
+    if not (abs(x) < float("inf") and abs(y) < float("inf")):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a pair of numbers, such as 5,-3")
+    return x, y
+
+
 def _size(text: str) -> tuple[int, int]:
     width, cross, height = text.lower().partition("x")
     height = height if cross else width
@@ -191,7 +198,7 @@ def _size(text: str) -> tuple[int, int]:
 # argparse names the type in its message: "invalid count value", not "invalid _positive value".
 _positive.__name__ = _whole.__name__ = "count"
 _not_negative.__name__ = _length.__name__ = "number"
-_size.__name__ = "size"
+_size.__name__, _pair.__name__ = "size", "pair X,Y"
 
 
 # --- subcommands -----------------------------------------------------------------------------------------
@@ -276,6 +283,8 @@ def build_parser() -> argparse.ArgumentParser:
         "--reference", metavar="MESH", help="mesh in the data set's frame (default: its depth images)"
     )
     sub.add_argument("--split", choices=SPLITS, default="test", help="which views (default test)")
+    depth = "which rendered depth: at half transmittance (default), the mean, or the first surface"
+    sub.add_argument("--depth", choices=("median", "expected", "first"), default="median", help=depth)
     sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/eval/depth)")
 
     sub = command("eval-images", _eval_images, "score a run's colours: PSNR and SSIM on held-out views")
@@ -314,6 +323,8 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--path", choices=paths, help="of the cameras (default: what suits the scene)")
     sub.add_argument("--fov", type=_length, metavar="DEGREES", help="horizontal (default 45, inside 75)")
     sub.add_argument("--distance", type=_length, metavar="LENGTH", help="from the middle, in the mesh's unit")
+    offset = "from the middle of the image, in pixels (default 0,0); a negative one is written --...=-5,3"
+    sub.add_argument("--principal-point-offset", type=_pair, default=(0.0, 0.0), metavar="X,Y", help=offset)
     sub.add_argument("--shading", choices=("albedo", "shaded"), default="albedo", help="default albedo")
     sub.add_argument("--background", metavar="COLOR", help="transparent, black, white or r,g,b in [0,1]")
     sub.add_argument("--points", type=_whole, default=20_000, metavar="N", help="on it (default 20000)")
@@ -323,6 +334,8 @@ def build_parser() -> argparse.ArgumentParser:
         "--supersample", type=_positive, default=3, metavar="K", help="K*K rays a pixel (default 3)"
     )
     sub.add_argument("--depth-format", choices=("png", "npy"), default="png", help="default png")
+    detail = "contrast of a built-in scene's texture (default 1)"
+    sub.add_argument("--detail", type=_not_negative, default=1.0, metavar="X", help=detail)
     sub.add_argument(
         "--seed", type=_whole, default=0, metavar="N", help="seed of everything random (default 0)"
     )
@@ -392,7 +405,8 @@ def _extract_mesh(parsed: argparse.Namespace) -> dict:
 def _eval_depth(parsed: argparse.Namespace) -> dict:
     from .eval.depth import eval_depth_run
 
-    return eval_depth_run(parsed.run, parsed.reference, split=parsed.split, output=parsed.output)
+    depth = f"depth_{parsed.depth}"
+    return eval_depth_run(parsed.run, parsed.reference, split=parsed.split, depth=depth, output=parsed.output)
 
 
 def _eval_images(parsed: argparse.Namespace) -> dict:
@@ -431,6 +445,8 @@ def _synth(parsed: argparse.Namespace) -> dict:
         point_noise=parsed.point_noise,
         supersample=parsed.supersample,
         depth_format=parsed.depth_format,
+        principal_point_offset=parsed.principal_point_offset,
+        detail=parsed.detail,
         seed=parsed.seed,
         threads=parsed.threads,
         overwrite=parsed.overwrite,

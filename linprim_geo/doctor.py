@@ -41,9 +41,11 @@ def doctor() -> dict:
 
     Returns:
         `version`, `python`, `platform`, `cores` (that this process may use), `memory_bytes`,
-        `memory_available_bytes`, `disk_free_bytes`, `compiler`, `instruction_set` (None without the core),
-        `libraries` ({module: version, or None if it cannot be imported}), `missing_system_libraries`, and
-        `problems`: one sentence each that says what to do; empty if everything works.
+        `memory_available_bytes`, `disk_free_bytes`, `cache` (folder of undistorted images and triangulated
+        points; None without numpy), `cache_bytes` (what it holds), `compiler`, `instruction_set` (None
+        without the core), `libraries` ({module: version, or None if it cannot be imported}),
+        `missing_system_libraries`, and `problems`: one sentence each that says what to do; empty if
+        everything works.
     """
     problems = [problem for problem in (python_problem(),) if problem]
     missing = missing_libraries()
@@ -68,6 +70,9 @@ def doctor() -> dict:
         problems.append(f"only {free} of memory are free; train with --downscale, or close other programs")
     if disk < LITTLE_DISK:
         problems.append(f"only {_gigabytes(disk)} are free on the disk of {Path.cwd()}; free some space")
+    cache = _cache_folder()
+    if cache is not None and not _can_be_written(cache):
+        problems.append(f"the cache folder {cache} cannot be written; set LINPRIM_GEO_CACHE to one that can")
     return {
         "version": __version__,
         "python": platform.python_version(),
@@ -76,6 +81,8 @@ def doctor() -> dict:
         "memory_bytes": memory,
         "memory_available_bytes": available,
         "disk_free_bytes": disk,
+        "cache": None if cache is None else str(cache),
+        "cache_bytes": None if cache is None else _size_of(cache),
         "compiler": find_compiler(),
         "instruction_set": instruction_set,
         "libraries": versions,
@@ -94,6 +101,7 @@ def describe(report: dict) -> str:
         f"{_gigabytes(report['disk_free_bytes'])} free on this disk",
         f"instruction set: {report['instruction_set'] or 'unknown, the core is not built'}",
         f"C++20 compiler: {report['compiler'] or 'none'}",
+        f"cache: {report['cache'] or '?'}, {_gigabytes(report['cache_bytes'])} (may be deleted at any time)",
         f"libraries: {', '.join(libraries)}",
     ]
     if report["problems"]:
@@ -154,6 +162,29 @@ def _instruction_set() -> tuple[str | None, str | None]:
         reason = " ".join(str(error).split())
         do = "run make env, or pip install . in the source"
         return None, f"the compiled core cannot be imported ({reason}); {do}"
+
+
+def _cache_folder() -> Path | None:
+    try:
+        from .photos import cache_folder
+    except ImportError:
+        return None
+    return cache_folder()
+
+
+def _can_be_written(folder: Path) -> bool:
+    """Whether files can be made in `folder`, or the folder itself where its first existing parent is."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
+
+
+def _size_of(folder: Path) -> int:
+    total = 0
+    for file in folder.rglob("*"):
+        with contextlib.suppress(OSError):
+            total += file.lstat().st_size
+    return total
 
 
 def _gigabytes(count: int | None) -> str:

@@ -1,111 +1,24 @@
-"""Depth maps to a surface: a block-sparse truncated signed distance field fused from all views, then meshed.
-
-Every pixel is a small plane (a surfel): for a plane, 1/z is linear in the pixel, so position and tilt follow
-in closed form from the inverse depths around it. A voxel takes its distance from the plane of the pixel it
-falls on, which is exact on flat surfaces at any angle and resolution; `VoxelBlockGrid.integrate` takes the
-difference of depths at the nearest pixel instead, which is a staircase across the pixels and grows with the
-angle. What the views say is combined knowing what each statement is worth: a distance in front of a surface
-bounds the true one from above, so near ones count more; a view knows nothing of what lies far behind the
-surface it sees. Open3D holds the blocks and runs marching cubes.
-"""
+"""Depth maps to a mesh: which blocks of space, whether they fit in memory, and the steps of fusing them."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from .camera import Camera
 from .errors import LinprimError
-from .mesh import Mesh, merge_vertices, remove_small_components, select_faces, vertex_normals
-
-NEAR_VOXELS = 1.5
-"""Votes in front of a surface weigh 1 / (1 + (distance / this)^2): the surface that is close decides."""
-
-BEHIND_VOXELS = 0.75
-"""Votes behind a surface keep their weight this far along the ray and lose it over as much again. Sheets
-thinner than this many voxels still come out with two sides; noise in the depths above it roughens the
-surface."""
-
-BEHIND_WEIGHT = 0.05
-"""What is left of their weight up to the truncation: decides only where no view says anything better."""
-
-FREE_WEIGHT = 0.3
-"""Weight of "this ray passes here and goes on", against 1 for a surface right here: ten views that see free
-space overrule a few wrong depths, one view whose depth is too deep does not pierce a wall that many agree
-on."""
-
-FAR_FRONT_WEIGHT = 0.15
-"""Least weight of a vote in front of a surface, so that free space close to it stays free."""
-
-COSINE_POWER = 0.5
-"""Weight of a pixel by the cosine between its ray and its surface normal."""
-
-GRAZED_WEIGHT = 1e-3
-GRAZED_VOXELS = 1.25
-GRAZED_REACH = 4.0
-"""A surface that is only ever seen at a low angle has no voxel within a truncation behind it along the ray.
-So votes hold up to this many truncations along the ray, as long as the plane is within so many voxels, with a
-weight that loses against anything that any view says."""
-
-LEAST_COSINE = 0.05
-"""Planes tilted further than this (87 degrees) are jumps between surfaces; such a pixel is made to face its
-ray."""
-
-SLOPE_RATIO = 3.0
-"""The slopes towards two neighbours are averaged if they differ by no more than this; else the flatter one
-holds."""
-
-ZERO_GAP = 2e-3
-"""Field values are kept this far from 0 (in truncations), so no vertex falls onto a voxel corner where
-several would coincide. Moves the surface by at most 0.006 voxel at a truncation of 3."""
-
-LEAST_SUPPORT = 1e-6
-"""Voxels with less weight than this were seen by no view; far below the smallest weight a vote can have."""
+from .mesh import Mesh, remove_small_components, select_faces, vertex_normals
+from .tsdf import BEHIND_VOXELS, DepthFrame, Grid, Rules, measure_spread
 
 BYTES_PER_VOXEL = 56
 """8 for the field and its weights, 8 for Open3D's copy of them, the rest for marching cubes and the mesh: 50
 measured on a room of 53,000 blocks that gave 3.6 million faces."""
 
 KEY_BITS = 21
-CHUNK_BLOCKS = 64
-CHUNK_POINTS = 16_384
-"""Work per task: small enough for the cache, large enough to hide the cost of a task."""
-
-
-@dataclass(frozen=True)
-class DepthFrame:
-    """One view's depth map.
-
-    `depth` (H, W) float is z along the optical axis at the pixel centres, in scene units; 0, negative, NaN
-    and inf mean that there is no surface. `background` (H, W) bool marks those of them through which the ray
-    is known to be free; the others are unknown. `color` (H, W, 3) uint8, or float in [0, 1]. `confidence` (H,
-    W) multiplies the weight of each pixel.
-    """
-
-    camera: Camera
-    depth: np.ndarray
-    color: np.ndarray | None = None
-    background: np.ndarray | None = None
-    confidence: np.ndarray | None = None
-
-    def __post_init__(self):
-        wanted = (self.camera.height, self.camera.width)
-        for name in ("depth", "color", "background", "confidence"):
-            value = getattr(self, name)
-            if value is not None and np.shape(value)[:2] != wanted:
-                raise LinprimError(f"depth frame: {name} is {np.shape(value)}, but its camera has {wanted}
-                pixels")
-
-    def surface(self) -> tuple[np.ndarray, np.ndarray]:
-        """(P, 3) float64 world points of the pixels that see a surface, and their (P,) depths."""
-        depth = np.asarray(self.depth, dtype=np.float64)
-        valid = np.isfinite(depth) & (depth > 0)
-        depth = depth[valid]
-        return self.camera.world_rays()[valid] * depth[:, None] + self.camera.center, depth
+"""Bits per axis of the key of a block or voxel: three fit into an int64."""
 
 
 def fuse_tsdf(
@@ -134,17 +47,16 @@ def fuse_tsdf(
     Args:
         voxel_size: edge of a voxel, in scene units.
         truncation_voxels: reach of the field on both sides of a surface; below 2 the surface gets holes,
-        above 4
-            thin parts swell.
+            above 4 thin parts swell.
         bounds: (2, 3) box; samples and faces outside are dropped.
         memory_limit: bytes the field may take; default 60 % of what is available.
         colors: colour the vertices from the frames that have `color`.
         block_resolution: voxels along the edge of a block.
         min_component: pieces with less than this share of the largest piece's area are dropped; 0 keeps all.
-        behind_voxels: see `BEHIND_VOXELS`.
+        behind_voxels: see `tsdf.BEHIND_VOXELS`; 1.5 makes a sheet without thickness a closed shell, at the
+            price of swollen thin parts.
         occluded_vote: weight of a vote "inside" from every view in which a voxel lies further behind the
-        surface
-            than the truncation; 0.01 to 0.02 closes tunnels that too deep pixels dig into solids.
+            surface than the truncation; 0.01 to 0.02 closes tunnels that too deep pixels dig into solids.
         threads: 0 uses every core.
         log: called with lines such as the memory that will be taken.
 
@@ -153,10 +65,9 @@ def fuse_tsdf(
         surfels of the views that see it, in scene units.
     Raises:
         LinprimError: no frame has a depth, the field would not fit in memory, or nothing comes out.
-    Accuracy: 60 exact depth maps of 320x320 with a voxel of 1/200 of the diagonal: Chamfer 0.003 % of the
-    diagonal
-        on smooth bodies (nearest-pixel projective integration: 0.043 %), 0.01 to 0.02 % on parts with sharp
-        edges.
+    Accuracy: Chamfer of 60 exact depth maps of 320x320 with a voxel of 1/200 of the diagonal, against what
+        `VoxelBlockGrid.integrate` makes of them, in % of the diagonal: smooth body 0.006 (0.045), part with
+        thin ribs and sharp edges 0.015 (0.046); a room, 80 maps of 400x300: 0.032 (0.050).
     """
     _check_options(voxel_size, truncation_voxels, block_resolution, bounds)
     bounds = None if bounds is None else np.asarray(bounds, dtype=np.float64)
@@ -164,7 +75,7 @@ def fuse_tsdf(
     workers = threads or os.cpu_count() or 1
     say = log or (lambda line: None)
 
-    blocks, origin, largest = _find_blocks(
+    blocks, origin, largest, colored = _find_blocks(
         frames, voxel_size, truncation_voxels, bounds, block_resolution, limit
     )
     need = estimate_memory(len(blocks), block_resolution, largest)
@@ -172,26 +83,25 @@ def fuse_tsdf(
         f"fusing: {len(blocks)} blocks of {block_resolution}^3 voxels of {voxel_size:.4g}, "
         f"{need / 2**20:.0f} MiB of {limit / 2**20:.0f} MiB"
     )
-    grid = _Grid(blocks, origin, voxel_size, truncation_voxels * voxel_size, block_resolution)
-    rules = _Rules(truncation_voxels, behind_voxels, occluded_vote)
+    grid = Grid(blocks, origin, voxel_size, truncation_voxels * voxel_size, block_resolution)
+    rules = Rules(truncation_voxels, behind_voxels, occluded_vote)
     with ThreadPoolExecutor(workers) as pool:
         for frame in frames:
             grid.integrate(frame, rules, pool)
         mesh = _trimmed(grid.extract(), bounds, min_component)
         if len(mesh.faces) == 0:
             raise LinprimError(
-                f"fusing {len(blocks)} blocks at voxel size {voxel_size:.4g} gave no surface: the views'
-                depths " "disagree by more than the truncation, or all of it lies outside the bounds; try a
-                larger voxel size"
+                f"fusing {len(blocks)} blocks at voxel size {voxel_size:.4g} gave no surface: the views' "
+                "depths disagree by more than the truncation, or all of it lies outside the bounds; "
+                "try a larger voxel size"
             )
         mesh = replace(mesh, normals=vertex_normals(mesh))
-        mesh = replace(mesh, quality=_spread(mesh, frames, grid, pool))
-    if colors:
+        mesh = replace(mesh, quality=measure_spread(mesh, frames, grid, pool))
+    if colors and colored:
         from .visibility import color_vertices
 
-        colored = _Colored(frames)
-        if any(True for _ in colored):
-            mesh = replace(mesh, colors=color_vertices(mesh, colored.cameras(), colored.images()))
+        images = (frame.color for frame in frames if frame.color is not None)
+        mesh = replace(mesh, colors=color_vertices(mesh, colored, images))
     return mesh
 
 
@@ -204,8 +114,8 @@ def estimate_memory(blocks: int, block_resolution: int = 8, frame_pixels: int = 
 
 
 def available_memory() -> int:
-    """Bytes of memory that can be taken without swapping, within the limit of the container if there is
-    one.""" free = 4 * 2**30  # where the system does not tell
+    """Bytes of memory that can be taken without swapping, within the limit of the container if any."""
+    free = 4 * 2**30  # where the system does not tell
     try:
         with open("/proc/meminfo") as file:
             rows = dict(line.split(":", 1) for line in file)
@@ -262,8 +172,7 @@ def _trimmed(mesh: Mesh, bounds: np.ndarray | None, min_component: float) -> Mes
     return remove_small_components(mesh, min_component)
 
 
-# --- which blocks
-# ------------------------------------------------------------------------------------------------
+# --- which blocks ----------------------------------------------------------------------------------------
 
 
 def _check_options(voxel_size, truncation_voxels, block_resolution, bounds):
@@ -291,11 +200,16 @@ def _unpack(key: np.ndarray) -> np.ndarray:
 
 
 def _find_blocks(frames, voxel, truncation, bounds, resolution, limit):
-    """Blocks within a truncation of any depth sample: sorted (B, 3) indices, the world point that block (0,
-    0, 0) starts at, and the pixels of the largest frame. Refuses what does not fit in memory."""
-    keys, origin, largest, done = np.zeros(0, dtype=np.int64), None, 0, 0
+    """Blocks within a truncation of any depth sample; refuses what does not fit in memory.
+
+    Returns sorted (B, 3) indices, the world point that block (0, 0, 0) starts at, the pixels of the largest
+    frame, and the cameras of the frames that have colour.
+    """
+    keys, origin, largest, done, colored = np.zeros(0, dtype=np.int64), None, 0, 0, []
     for frame in frames:
         done += 1
+        if frame.color is not None:
+            colored.append(frame.camera)
         points, depth = frame.surface()
         if bounds is not None:
             inside = ((points >= bounds[0]) & (points <= bounds[1])).all(1)
@@ -317,7 +231,7 @@ def _find_blocks(frames, voxel, truncation, bounds, resolution, limit):
     blocks = _unpack(keys)
     # Coordinates are float32 from here on, so they are counted from the middle.
     middle = (blocks.min(0) + blocks.max(0)) // 2
-    return blocks - middle, origin + middle * (resolution * voxel), largest
+    return blocks - middle, origin + middle * (resolution * voxel), largest, colored
 
 
 def _blocks_of(points, voxel, truncation, footprint, resolution):
@@ -325,18 +239,16 @@ def _blocks_of(points, voxel, truncation, footprint, resolution):
     index = points / voxel
     if np.abs(index).max() / resolution >= (1 << (KEY_BITS - 1)) - reach - 2:
         raise LinprimError(
-            f"voxel size {voxel:.4g} is too small for a scene in which depths reach {np.abs(points).max():.4g}
-            from " "the middle, wanted at most a few million voxels across: give bounds, or a larger voxel
-            size"
+            f"voxel size {voxel:.4g} is too small for a scene in which depths reach "
+            f"{np.abs(points).max():.4g} from the middle, wanted at most a few million voxels across: "
+            "give bounds, or a larger voxel size"
         )
     # Pairs of voxels first: far fewer than samples.
     pairs = np.unique(_pack(np.floor(index).astype(np.int64) >> 1))
     low = 2 * _unpack(pairs) - reach
     width = 2 * reach + 1
     steps = np.append(np.arange(0, width, resolution), width)
-    found = [
-        np.unique(_pack((low + [x, y, z]) // resolution)) for x in steps for y in steps for z in steps
-    ]
+    found = [np.unique(_pack((low + [x, y, z]) // resolution)) for x in steps for y in steps for z in steps]
     return np.unique(np.concatenate(found))
 
 
@@ -351,265 +263,3 @@ def _refuse(need: float, limit: float, voxel: float, done: int, total: int):
         f"voxel size {voxel:.4g} needs up to {need / 2**30:.2g} GiB, {limit / 2**30:.2g} GiB are allowed: "
         f"a voxel size of {fits:.2g} fits"
     )
-
-
-# --- surfels and votes
-# -------------------------------------------------------------------------------------------
-
-# Columns of a frame's table, one row per pixel. The signed distance of a point x of the grid's frame, in
-# truncations, is table[:, OFFSET] - table[:, :3] . x.
-OFFSET, WEIGHT, COSINE, NEAREST, FREE = 3, 4, 5, 6, 7
-
-
-def _slope(inverse: np.ndarray, tolerance: np.ndarray, axis: int) -> np.ndarray:
-    """Derivative of the inverse depth along rows or columns, taken on the side that belongs to the same
-    surface.""" step = np.diff(inverse, axis=axis)
-    gap = np.full_like(np.take(inverse, [0], axis=axis), np.nan)
-    after = np.concatenate([step, gap], axis=axis)
-    before = np.concatenate([gap, step], axis=axis)
-    size_after, size_before = np.abs(after), np.abs(before)
-    similar = np.fmax(size_after, size_before) <= SLOPE_RATIO * np.fmin(size_after, size_before) + tolerance
-    flatter = np.where((size_after <= size_before) | np.isnan(before), after, before)
-    slope = np.where(similar & np.isfinite(after + before), 0.5 * (after + before), flatter)
-    return np.nan_to_num(slope)
-
-
-def _surfels(frame: DepthFrame, voxel: float, truncation: float, origin: np.ndarray) -> np.ndarray:
-    """(H*W, 8) float32 table of a frame: plane, weight, cosine, nearest inverse depth around, weight of free
-    votes.
-
-    A plane a X + b Y + c Z = 1 in camera space has the inverse depth a rx + b ry + c along the ray (rx, ry,
-    1), so a and b are the slopes of the inverse depth times the focal lengths, and the signed distance of a
-    point is (1 - a X - b Y - c Z) / |(a, b, c)|, positive on the camera's side.
-    """
-    from scipy.ndimage import maximum_filter
-
-    camera = frame.camera
-    depth = np.asarray(frame.depth, dtype=np.float64)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        valid = np.isfinite(depth) & (depth > 0)
-        inverse = np.where(valid, 1.0 / depth, np.nan)
-    rays = camera.ray_grid()
-    rx, ry = rays[..., 0], rays[..., 1]
-    square = rx * rx + ry * ry + 1.0
-    # Half a voxel of depth between neighbours is no sign of an edge.
-    tolerance = 0.5 * voxel * inverse * inverse
-    a = _slope(inverse, tolerance, 1) * camera.fx
-    b = _slope(inverse, tolerance, 0) * camera.fy
-    c = inverse - a * rx - b * ry
-    with np.errstate(invalid="ignore"):
-        cosine = inverse / np.sqrt((a * a + b * b + c * c) * square)
-        steep = valid & ~(cosine > LEAST_COSINE)
-    a = np.where(steep, inverse * rx / square, a)
-    b = np.where(steep, inverse * ry / square, b)
-    c = np.where(steep, inverse / square, c)
-    cosine = np.where(steep, LEAST_COSINE, cosine)
-    scale = 1.0 / (np.sqrt(a * a + b * b + c * c) * truncation)
-    plane = np.stack([a * scale, b * scale, c * scale], axis=-1)
-    offset = scale - plane @ (camera.rotation @ origin + camera.world_to_camera[:3, 3])
-    plane = plane @ camera.rotation
-
-    background = np.zeros_like(valid) if frame.background is None else np.asarray(frame.background, bool) &
-    ~valid confidence = 1.0 if frame.confidence is None else np.nan_to_num(np.clip(frame.confidence, 0.0,
-    None)) table = np.zeros((*depth.shape, 8), dtype=np.float32)
-    table[..., :3] = np.where(valid[..., None], plane, 0.0)
-    table[..., OFFSET] = np.where(valid, offset, np.float32(1e9))  # background: far in front of anything
-    table[..., WEIGHT] = np.where(valid, cosine**COSINE_POWER, 0.0) * confidence
-    table[..., COSINE] = np.where(valid, cosine, 1.0)
-    # A pixel beside the outline of something nearer says nothing about what is level with that: its free
-    # votes hold only in front of all its neighbours.
-    table[..., NEAREST] = maximum_filter(np.nan_to_num(inverse), size=3, mode="nearest")
-    table[..., FREE] = (valid | background) * confidence
-    return table.reshape(-1, 8)
-
-
-@dataclass(frozen=True)
-class _Rules:
-    """How much a vote weighs by its distance from the surfel, lengths in voxels."""
-
-    truncation: float
-    behind: float
-    occluded: float
-
-    def weigh(self, value, rows, inverse_depth):
-        """Clamped values and weights of votes with signed distances `value` (truncations) in place of raw
-        ones.""" along = value / rows[..., COSINE]  # along the ray
-        ahead = value * np.float32(self.truncation / NEAR_VOXELS)
-        front = np.maximum(1.0 / (1.0 + ahead * ahead), np.float32(FAR_FRONT_WEIGHT))
-        ramp = 2.0 + along * np.float32(self.truncation / self.behind)
-        weight = rows[..., WEIGHT] * np.where(value > 0, front, np.clip(ramp, BEHIND_WEIGHT, 1.0))
-        free = np.where(inverse_depth > rows[..., NEAREST], rows[..., FREE] * np.float32(FREE_WEIGHT), 0.0)
-        weight = np.where(value > 1.0, free, weight)
-        grazed = (value > -GRAZED_VOXELS / self.truncation) & (along > -GRAZED_REACH)
-        hidden = along < -1.0
-        if self.occluded:
-            value = np.where(hidden & ~grazed, np.float32(-1.0), value)
-        beyond = np.where(grazed, rows[..., WEIGHT] * np.float32(GRAZED_WEIGHT), np.float32(0.0))
-        beyond = np.maximum(beyond, rows[..., FREE] * np.float32(self.occluded))
-        weight = np.where(hidden, beyond, weight)
-        value = np.clip(value, -1.0, 1.0)
-        return value, weight
-
-
-class _Grid:
-    """The field in its blocks. Coordinates are float32, relative to `origin`."""
-
-    def __init__(self, blocks, origin, voxel, truncation, resolution):
-        self.blocks, self.origin = blocks, origin
-        self.voxel, self.truncation, self.resolution = voxel, truncation, resolution
-        size = resolution**3
-        self.total = np.zeros((len(blocks), size), dtype=np.float32)
-        self.weight = np.zeros((len(blocks), size), dtype=np.float32)
-        self.corner = blocks * (resolution * voxel)
-        # Open3D's order: x runs fastest.
-        z, y, x = np.meshgrid(*[np.arange(resolution) * voxel] * 3, indexing="ij")
-        self.local = np.stack([x.ravel(), y.ravel(), z.ravel()])
-
-    def integrate(self, frame: DepthFrame, rules: _Rules, pool: ThreadPoolExecutor) -> None:
-        """Adds the votes of one frame to every block in its frustum."""
-        camera = frame.camera
-        ids = self._in_view(camera)
-        if len(ids) == 0:
-            return
-        table = _surfels(frame, self.voxel, self.truncation, self.origin)
-        project = camera.K @ camera.rotation
-        shift = camera.K @ (camera.rotation @ self.origin + camera.world_to_camera[:3, 3])
-        image = (self.corner @ project.T + shift).astype(np.float32)
-        corner = self.corner.astype(np.float32)
-        local = self.local.astype(np.float32)
-        spread = (project @ self.local).astype(np.float32)
-
-        def vote(rows):
-            x, y, z = (image[rows, k, None] + spread[k] for k in range(3))
-            pixel, inverse, inside = _pixels(x, y, z, camera)
-            values = table[pixel]
-            value = values[..., OFFSET].copy()
-            for k in range(3):
-                value -= values[..., k] * (corner[rows, k, None] + local[k])
-            value, weight = rules.weigh(value, values, inverse)
-            weight *= inside
-            self.weight[rows] += weight
-            weight *= value
-            self.total[rows] += weight
-
-        # Each task owns its blocks, so sums are taken in the order of the frames whoever does them.
-        list(pool.map(vote, (ids[k : k + CHUNK_BLOCKS] for k in range(0, len(ids), CHUNK_BLOCKS))))
-
-    def _in_view(self, camera: Camera) -> np.ndarray:
-        """Blocks whose bounding sphere meets the frustum."""
-        middle = 0.5 * (self.resolution - 1) * self.voxel
-        centers = (self.corner + middle + self.origin) @ camera.rotation.T + camera.world_to_camera[:3, 3]
-        radius = np.sqrt(3.0) * middle
-        seen = centers[:, 2] > -radius
-        width, height = camera.width, camera.height
-        for side in (
-            (camera.fx, 0.0, camera.cx),
-            (-camera.fx, 0.0, width - camera.cx),
-            (0.0, camera.fy, camera.cy),
-            (0.0, -camera.fy, height - camera.cy),
-        ):
-            seen &= centers @ (np.array(side) / np.linalg.norm(side)) > -radius
-        return np.flatnonzero(seen)
-
-    def extract(self) -> Mesh:
-        """Marching cubes between voxels that any view has voted on; empty if the field never changes sign."""
-        import open3d
-
-        core = open3d.core
-        known = self.weight > LEAST_SUPPORT
-        field = np.divide(self.total, self.weight, out=np.ones_like(self.total), where=known)
-        np.copyto(field, np.where(field < 0, np.float32(-ZERO_GAP), np.float32(ZERO_GAP)),
-                  where=np.abs(field) < ZERO_GAP)
-        grid = open3d.t.geometry.VoxelBlockGrid(
-            ("tsdf", "weight"), (core.float32, core.float32), ((1,), (1,)),
-            self.voxel, self.resolution, len(self.blocks), core.Device("CPU:0"),
-        )  # fmt: skip
-        keys = core.Tensor(np.ascontiguousarray(self.blocks.astype(np.int32)))
-        grid.hashmap().activate(keys)
-        slots, _ = grid.hashmap().find(keys)
-        slots = slots.numpy().astype(np.int64)
-        # The arrays alias the grid's memory.
-        grid.attribute("tsdf").numpy().reshape(-1, field.shape[1])[slots] = field
-        grid.attribute("weight").numpy().reshape(-1, field.shape[1])[slots] = known
-        try:
-            raw = grid.extract_triangle_mesh(0.5)
-            vertices = raw.vertex.positions.numpy().astype(np.float64)
-            faces = raw.triangle.indices.numpy().astype(np.int64)
-        except RuntimeError:  # what Open3D raises where there is no surface
-            return Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
-        mesh = _canonical(Mesh(vertices, faces))
-        return replace(mesh, vertices=mesh.vertices + self.origin)
-
-
-def _pixels(x, y, z, camera: Camera):
-    """Index of the pixel that each homogeneous image point falls on, 1/z, and whether there is one."""
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        inverse = np.float32(1.0) / z
-        column, row = x * inverse, y * inverse
-        inside = (z > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    column = np.where(inside, column, np.float32(0.0)).astype(np.int32)
-    row = np.where(inside, row, np.float32(0.0)).astype(np.int32)
-    return row * np.int32(camera.width) + column, inverse, inside
-
-
-def _canonical(mesh: Mesh) -> Mesh:
-    """Vertices in the order of their coordinates, faces in the order of their vertices, coincident ones
-    merged.
-
-    Open3D's threads number vertices as they come; the set of them is always the same.
-    """
-    order = np.lexsort(mesh.vertices.T[::-1])
-    rank = np.empty(len(order), dtype=np.int64)
-    rank[order] = np.arange(len(order))
-    mesh = merge_vertices(Mesh(mesh.vertices[order], rank[mesh.faces]))
-    faces = mesh.faces
-    first = np.argmin(faces, axis=1)
-    faces = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
-    return replace(mesh, faces=faces[np.lexsort(faces.T[::-1])])
-
-
-def _spread(mesh: Mesh, frames: Iterable[DepthFrame], grid: _Grid, pool: ThreadPoolExecutor) -> np.ndarray:
-    """(V,) root mean square distance of each vertex from the surfels of the views that face it, in scene
-    units.""" points = np.ascontiguousarray((mesh.vertices - grid.origin).T)
-    normals = np.ascontiguousarray(mesh.normals.T, dtype=np.float64)
-    square, weight = np.zeros(points.shape[1]), np.zeros(points.shape[1])
-    parts = [slice(k, k + CHUNK_POINTS) for k in range(0, points.shape[1], CHUNK_POINTS)]
-    for frame in frames:
-        camera = frame.camera
-        table = _surfels(frame, grid.voxel, grid.truncation, grid.origin)
-        project = camera.K @ camera.rotation
-        shift = camera.K @ (camera.rotation @ grid.origin + camera.world_to_camera[:3, 3])
-        eye = camera.center - grid.origin
-
-        def measure(part, camera=camera, table=table, project=project, shift=shift, eye=eye):
-            x, n = points[:, part], normals[:, part]
-            facing = np.flatnonzero(sum(n[k] * (eye[k] - x[k]) for k in range(3)) > 0)
-            x = x[:, facing]
-            image = np.einsum("ij,jn->in", project, x) + shift[:, None]
-            pixel, _, inside = _pixels(*image, camera)
-            rows = table[pixel]
-            value = rows[:, OFFSET] - sum(rows[:, k] * x[k] for k in range(3))
-            use = np.where(inside & (np.abs(value) <= rows[:, COSINE]), rows[:, WEIGHT], 0.0)
-            square[part.start + facing] += use * value**2
-            weight[part.start + facing] += use
-
-        list(pool.map(measure, parts))
-    # Where no view comes near, the truncation is the least it can be.
-    spread = np.sqrt(np.divide(square, weight, out=np.ones_like(square), where=weight > 0))
-    return (spread * grid.truncation).astype(np.float32)
-
-
-class _Colored:
-    """The frames that have colour, as the two sequences `color_vertices` takes."""
-
-    def __init__(self, frames: Iterable[DepthFrame]):
-        self.frames = frames
-
-    def __iter__(self) -> Iterator[DepthFrame]:
-        return (frame for frame in self.frames if frame.color is not None)
-
-    def cameras(self) -> list[Camera]:
-        return [frame.camera for frame in self]
-
-    def images(self) -> Iterator[np.ndarray]:
-        return (frame.color for frame in self)

@@ -135,8 +135,7 @@ def _loaded_colors(loaded) -> np.ndarray | None:
         if visual.kind in ("vertex", "face"):
             colors = np.asarray(visual.vertex_colors)[:, :3]
             return colors.astype(np.uint8) if len(colors) == len(loaded.vertices) else None
-    except Exception:  # a material without an image, or a texture that cannot be sampled: the shape is still
-    good
+    except Exception:  # a material without an image, or one that cannot be sampled: the shape is still good
         return None
     return None
 
@@ -206,8 +205,7 @@ def _write_obj(path: Path, mesh: Mesh) -> None:
     digits = "%.15g" if _needs_double(mesh) else "%.9g"
     line, columns = "v" + f" {digits}" * 3, [mesh.vertices]
     if mesh.colors is not None:
-        # Readers turn x into a byte by round(255 x) or, as MeshLab, by cutting 255 x off: both get the same
-        # byte.
+        # Readers make a byte by round(255 x) or, as MeshLab, by cutting 255 x off: both get the same one.
         shades = np.minimum((mesh.colors + 0.2) / 255.0, 1.0)
         line, columns = line + " %.5f" * 3, [mesh.vertices, shades]
     corner = "%d"
@@ -274,8 +272,8 @@ def clean_mesh(mesh: Mesh, name: str = "mesh") -> tuple[Mesh, dict[str, int]]:
     """
     if len(mesh.vertices) == 0 or len(mesh.faces) == 0:
         raise LinprimError(
-            f"{name}: the mesh is empty ({len(mesh.vertices)} vertices, {len(mesh.faces)} faces), wanted a
-            surface"
+            f"{name}: the mesh is empty ({len(mesh.vertices)} vertices, {len(mesh.faces)} faces), "
+            "wanted a surface"
         )
     _check_indices(mesh.vertices, mesh.faces, name)
     finite = np.isfinite(mesh.vertices).all(1)[mesh.faces].all(1)
@@ -301,8 +299,8 @@ def _check_indices(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         row = int(np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(1))[0])
         raise LinprimError(
-            f"{name}: face {row} uses vertices {faces[row].tolist()}, but the mesh has {len(vertices)}
-            vertices"
+            f"{name}: face {row} uses vertices {faces[row].tolist()}, "
+            f"but the mesh has {len(vertices)} vertices"
         )
 
 
@@ -489,8 +487,7 @@ def _edges(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def _fans_and_bodies(faces: np.ndarray) -> tuple[int, int]:
-    """Number of (vertex, fan of faces joined by edges at it) and of pieces joined by edges, of a watertight
-    mesh.
+    """Number of fans (faces around a vertex, joined by edges) and of pieces joined by edges, if watertight.
 
     Where bodies touch in a vertex it has several fans, and a manifold would hold it once for each.
     """
@@ -501,8 +498,7 @@ def _fans_and_bodies(faces: np.ndarray) -> tuple[int, int]:
         graph = coo_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(size, size))
         return int(connected_components(graph, directed=False, return_labels=False))
 
-    # Corner 3f+k is face f at its k-th vertex; corners of two faces join where they share an edge at that
-    # vertex.
+    # Corner 3f+k is face f at its k-th vertex; corners of two faces join where they share an edge there.
     corner = np.arange(faces.size).reshape(faces.shape)
     start, end = faces, np.roll(faces, -1, axis=1)
     low = np.where(start < end, corner, np.roll(corner, -1, axis=1)).ravel()

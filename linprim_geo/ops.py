@@ -211,7 +211,7 @@ def _photometric(image: Tensor, target: Tensor, dssim: float, weight: Tensor | N
 
 @_photometric.register_fake
 def _(image, target, dssim, weight):
-    return image.new_empty(3, dtype=torch.float64), torch.empty_like(image, memory_format=torch.contiguous_format)
+    return image.new_empty(4, dtype=torch.float64), torch.empty_like(image, memory_format=torch.contiguous_format)
 
 
 def _photometric_setup(ctx, inputs, output):
@@ -222,7 +222,8 @@ def _photometric_setup(ctx, inputs, output):
 
 def _photometric_backward(ctx, grad_parts, _):
     (gradient,) = ctx.saved_tensors
-    return (None if grad_parts is None else gradient * grad_parts[0].to(gradient.dtype)), None, None, None
+    scale = 0.0 if grad_parts is None else float(grad_parts[0])
+    return (gradient if scale == 1.0 else gradient * scale), None, None, None
 
 
 _photometric.register_autograd(_photometric_backward, setup_context=_photometric_setup)
@@ -234,7 +235,7 @@ def photometric_loss(image: Tensor, target: Tensor, dssim: float = 0.2, weight: 
     SSIM: 11x11 Gaussian window of sigma 1.5, zeros beyond the border, C1 = 0.01^2, C2 = 0.03^2. `weight` (H, W) multiplies
     both maps, whose means are over the weight.
 
-    Returns: (3,) float64: the loss, L1 and SSIM. Only the loss has a gradient, to `image`, once.
+    Returns: (4,) float64: the loss, L1, SSIM and the mean squared error. Only the loss has a gradient, to `image`, once.
 
     Accuracy: loss within 1e-6, gradient within 1e-4 relative of `reference.photometric_loss` in float64.
     """

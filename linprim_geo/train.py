@@ -179,10 +179,9 @@ class Trainer:
         screen = torch.zeros(len(self), 2, requires_grad=True)
         out = ops.rasterize(*activate(leaves, self.degree), background, shot.camera, stop=self.options.stop,
                             samples=self.options.samples, screen=screen)
-        loss = ops.photometric_loss(out.rgb, target, self.options.dssim)[0]
-        *grads, screen_grad = torch.autograd.grad(loss, [*leaves.values(), screen], allow_unused=True)
+        parts = ops.photometric_loss(out.rgb, target, self.options.dssim)
+        *grads, screen_grad = torch.autograd.grad(parts[0], [*leaves.values(), screen], allow_unused=True)
         with torch.no_grad():
-            error = float(torch.nn.functional.mse_loss(out.rgb.detach(), target))
             self._update(dict(zip(leaves, grads, strict=True)))
             # In units of the image's size, so that views of different resolution pull alike.
             scale = torch.tensor([shot.camera.width, shot.camera.height], dtype=torch.float32)
@@ -190,7 +189,8 @@ class Trainer:
         self.step += 1
         if self.growth.is_due(self.step):
             self._grow()
-        return float(loss.detach()), -10 * math.log10(max(error, 1e-12))
+        loss, _, _, error = parts.detach().tolist()
+        return loss, -10 * math.log10(max(error, 1e-12))
 
     def _update(self, grads: dict[str, torch.Tensor | None]) -> None:
         part = self.step / self.options.iterations
@@ -288,7 +288,8 @@ def train(scene: str | os.PathLike, run: str | os.PathLike, scene_options: Scene
             raise LinprimError(f"{run_path}: exists already; give another folder with -o, or go on with --resume")
         opened = Run(run_path, Path(scene), scene_options, options, scene_normalization(loaded), loaded.unit)
     ops.set_threads(options.threads)
-    torch.set_num_threads(ops.threads())
+    # torch only does small element-wise work here; its own threads would wait for each other longer than they compute.
+    torch.set_num_threads(1)
     progress = Progress("train", options.iterations, quiet=quiet)
     shots = load_shots(loaded.train, opened.similarity)
     if all(shot.alpha is not None and int(shot.alpha.max()) == 0 for shot in shots):

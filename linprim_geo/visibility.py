@@ -69,8 +69,8 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def _project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(2, P) pixel positions of (3, P) world points, their (P,) depths, and which of them lie in the
-    image.""" x, y, z = np.einsum("ij,jp->ip", camera.rotation, points) + camera.world_to_camera[:3, 3, None]
+    """(2, P) pixel positions of (3, P) world points, their (P,) depths, and which lie in the image."""
+    x, y, z = np.einsum("ij,jp->ip", camera.rotation, points) + camera.world_to_camera[:3, 3, None]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         pixels = np.stack([x / z * camera.fx + camera.cx, y / z * camera.fy + camera.cy])
         inside = (z > 0) & (pixels >= 0).all(0) & (pixels[0] < camera.width) & (pixels[1] < camera.height)
@@ -113,13 +113,13 @@ def color_vertices(mesh: Mesh, cameras: Sequence[Camera], images: Iterable[np.nd
     for camera, image in zip(cameras, images, strict=True):
         if image.shape[:2] != (camera.height, camera.width):
             raise LinprimError(
-                f"image is {image.shape[1]}x{image.shape[0]} pixels, its camera
-                {camera.width}x{camera.height}"
+                f"image is {image.shape[1]}x{image.shape[0]} pixels, "
+                f"its camera {camera.width}x{camera.height}"
             )
         rays = camera.world_rays().reshape(-1, 3)
         # Single precision is plenty here: the comparison below has a slack of an edge.
-        depth = caster.cast_single(camera.center, rays)[0].astype(np.float64).reshape(camera.height,
-        camera.width) depth = np.minimum(depth, FAR * caster.diagonal)
+        depth = caster.cast_single(camera.center, rays)[0].astype(np.float64)
+        depth = np.minimum(depth, FAR * caster.diagonal).reshape(camera.height, camera.width)
         near, far = (f(depth, size=3, mode="nearest") for f in (minimum_filter, maximum_filter))
         facing = _facing(points, across, camera.center)
         rows = np.flatnonzero(facing > 0)
@@ -133,8 +133,9 @@ def color_vertices(mesh: Mesh, cameras: Sequence[Camera], images: Iterable[np.nd
         visible = z <= depth[i, j] + slope
         outline = (far[i, j] - near[i, j] > 4.0 * slope) | (z > near[i, j] + 2.0 * slope)
         weight = np.maximum(facing, LEAST_FACING**2) / step**2
-        weight *= np.where(outline, OUTLINE_PENALTY, 1.0) * np.where(facing < LEAST_FACING, OUTLINE_PENALTY,
-        1.0) rows, pixels, weight = rows[visible], pixels[:, visible], weight[visible].astype(np.float32)
+        weight[outline] *= OUTLINE_PENALTY
+        weight[facing < LEAST_FACING] *= OUTLINE_PENALTY
+        rows, pixels, weight = rows[visible], pixels[:, visible], weight[visible].astype(np.float32)
         _keep_best(best, shade, rows, weight, _bilinear(image, pixels))
     return _fill_unseen(mesh, _robust_mean(best, shade), best[:, 0] > 0)
 
@@ -155,8 +156,9 @@ def _bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     height, width = image.shape[:2]
     x = np.clip(pixels[0] - 0.5, 0, width - 1)
     y = np.clip(pixels[1] - 0.5, 0, height - 1)
-    j, i = np.minimum(x.astype(np.int64), max(width - 2, 0)), np.minimum(y.astype(np.int64), max(height - 2,
-    0)) x, y = (x - j)[:, None], (y - i)[:, None]
+    j = np.minimum(x.astype(np.int64), max(width - 2, 0))
+    i = np.minimum(y.astype(np.int64), max(height - 2, 0))
+    x, y = (x - j)[:, None], (y - i)[:, None]
     right, below = np.minimum(j + 1, width - 1), np.minimum(i + 1, height - 1)
     image = image[..., :3]
     top = image[i, j] * (1 - x) + image[i, right] * x
@@ -182,8 +184,8 @@ def _robust_mean(best: np.ndarray, shade: np.ndarray) -> np.ndarray:
 
 
 def _fill_unseen(mesh: Mesh, colors: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Spreads colours along edges into unseen vertices; pieces without any seen vertex get the mean of
-    all.""" from scipy.sparse import coo_matrix
+    """Spreads colours along edges into unseen vertices; pieces that nobody sees get the mean of all."""
+    from scipy.sparse import coo_matrix
 
     colors = colors.astype(np.float64)
     colors[~known] = colors[known].mean(0) if known.any() else 128.0
@@ -203,13 +205,14 @@ def _fill_unseen(mesh: Mesh, colors: np.ndarray, known: np.ndarray) -> np.ndarra
 
 
 # Anchors of the colours of a scalar, from low to high.
-SCALE = np.array([[48, 40, 120], [40, 120, 200], [60, 190, 120], [235, 210, 60], [215, 50, 40]],
-dtype=np.float64)
+SCALE = np.array(
+    [[48, 40, 120], [40, 120, 200], [60, 190, 120], [235, 210, 60], [215, 50, 40]], dtype=np.float64
+)
 
 
 def color_scale(values: np.ndarray, top: float | None = None) -> np.ndarray:
-    """(V, 3) uint8 from blue (0) over green and yellow to red (`top`, default the 95 % quantile); NaN is
-    grey.""" values = np.asarray(values, dtype=np.float64)
+    """(V, 3) uint8 from blue (0) over green to red (`top`, default the 95 % quantile); NaN is grey."""
+    values = np.asarray(values, dtype=np.float64)
     finite = np.isfinite(values)
     if top is None:
         top = float(np.quantile(values[finite], 0.95)) if finite.any() else 1.0
