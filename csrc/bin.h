@@ -8,6 +8,9 @@
 
 namespace linprim::LINPRIM_ISA {
 
+// How far ahead of its use, in primitives, a footprint is fetched: they are visited in the order of depth, not of memory.
+constexpr int64_t kAhead = 8;
+
 template <int W>
 int64_t bin(const BinParams& P, int64_t begin, int64_t end, LoosePair* out, int64_t capacity, int64_t* written) {
   using V = Vec<float, W>;
@@ -18,6 +21,10 @@ int64_t bin(const BinParams& P, int64_t begin, int64_t end, LoosePair* out, int6
   int64_t count = 0, i = begin;
   for (; i < end; ++i) {
     const uint32_t primitive = P.order[i];
+    if (i + kAhead < end) {
+      const char* next = reinterpret_cast<const char*>(&P.footprints[P.order[i + kAhead]]);
+      __builtin_prefetch(next), __builtin_prefetch(next + 64);
+    }
     const Footprint& f = P.footprints[primitive];
     const int tx0 = f.x0 / kTile, tx1 = f.x1 / kTile, ty0 = f.y0 / kTile, ty1 = f.y1 / kTile;
     if (count + int64_t(tx1 - tx0 + 1) * (ty1 - ty0 + 1) > capacity) break;

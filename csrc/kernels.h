@@ -121,7 +121,7 @@ struct RasterParams {
 
 // Counts of one tile's forward pass.
 struct Counts {
-  uint64_t visited_lanes, hit_lanes, visited_blocks;
+  uint64_t visited_lanes, hit_lanes;
 };
 
 struct BinParams {

@@ -334,6 +334,8 @@ void chain(const ChainParams<Real>& P, int64_t begin, int64_t end) {
     const int lanes = int(std::min<int64_t>(kLanes, end - first));
     int64_t rows[kLanes];
     for (int l = 0; l < kLanes; ++l) rows[l] = first + std::min(l, lanes - 1);
+    for (int64_t next = first + 2 * kLanes; next < std::min(end, first + 3 * kLanes); ++next)  // slots lie in the order of depth
+      if (P.slot_count[next]) __builtin_prefetch(P.sums + int64_t(P.first_slot[next]) * P.sums_per_slot);
     bool any = false;
     double sums[kLanes][kGeometrySums] = {};
     for (int l = 0; l < lanes; ++l) {

@@ -42,7 +42,8 @@ struct Tile {
 
   // A record moved to one tile: face values at the tile's first pixel, and each face's slope over the lanes of a part.
   struct Faces {
-    Real corner[8], bx[8], cy[8];
+    typedef Real Eight __attribute__((vector_size(8 * sizeof(Real))));
+    alignas(64) Real corner[8], bx[8], cy[8];
     V slope[8];
     V w0, near_w, far_w;
     uint32_t flags;
@@ -62,7 +63,14 @@ struct Tile {
     template <bool kTrack>
     void intersect(Real x, Real y, V& in, V& out, I& in_face, I& out_face) const {
       alignas(64) Real at[8];
-      for (int f = 0; f < 8; ++f) at[f] = corner[f] + (bx[f] * x + cy[f] * y);
+      if constexpr (W >= 8) {
+        // Eight sums as one vector, then eight loads that broadcast: cheaper than eight scalar sums.
+        *reinterpret_cast<Eight*>(at) = *reinterpret_cast<const Eight*>(corner) +
+                                        (*reinterpret_cast<const Eight*>(bx) * x + *reinterpret_cast<const Eight*>(cy) * y);
+        asm("" : "+m"(at));  // keeps the compiler from taking the vector apart in registers
+      } else {
+        for (int f = 0; f < 8; ++f) at[f] = corner[f] + (bx[f] * x + cy[f] * y);
+      }
       auto value = [&](int f) { return V::set(at[f]) + slope[f]; };
       auto enter = [&](V w, int f) {
         if constexpr (kTrack) in_face = select(w < in, I::set(f), in_face);
@@ -90,19 +98,56 @@ struct Tile {
     }
   };
 
-  // Length of the ray (u, v, 1) through each pixel of the tile.
+  // Length of the ray (u, v, 1) through each pixel of the tile, in the order of the state arrays.
   static void ray_lengths(const View& view, int tile_x, int tile_y, Real* out) {
-    for (int i = 0; i < kTilePixels; ++i) {
-      int x, y;
-      pixel_of(i, x, y);
-      const double u = (tile_x + x + 0.5 - view.cx) / view.fx, v = (tile_y + y + 0.5 - view.cy) / view.fy;
-      out[i] = Real(std::sqrt(1.0 + u * u + v * v));
+    Real uu[kTile], vv[kTile];
+    const double fx = 1 / view.fx, fy = 1 / view.fy;
+    for (int i = 0; i < kTile; ++i) {
+      const double u = (tile_x + i + 0.5 - view.cx) * fx, v = (tile_y + i + 0.5 - view.cy) * fy;
+      uu[i] = Real(1 + u * u), vv[i] = Real(v * v);
+    }
+    for (int block = 0; block < kBlocks; ++block)
+      for (int y = 0; y < kBlock; ++y)
+        for (int x = 0; x < kBlock; ++x)
+          out[16 * block + 4 * y + x] = std::sqrt(uu[4 * (block & 3) + x] + vv[4 * (block >> 2) + y]);
+  }
+  // A tile's part of an image plane into the order of the state arrays, 0 outside the image (and where there is no plane).
+  static void load(const View& view, int tile_x, int tile_y, const Real* plane, Real* state) {
+    if (!plane) {
+      std::fill(state, state + kTilePixels, Real(0));
+      return;
+    }
+    each_row_of_four(view, tile_x, tile_y, [&](int64_t at, int to, int count) {
+      for (int x = 0; x < kBlock; ++x) state[to + x] = x < count ? plane[at + x] : Real(0);
+    });
+  }
+  static void store(const View& view, int tile_x, int tile_y, const Real* state, Real* plane) {
+    each_row_of_four(view, tile_x, tile_y, [&](int64_t at, int from, int count) {
+      for (int x = 0; x < count; ++x) plane[at + x] = state[from + x];
+    });
+  }
+  // Calls row(index into a plane, index into a state array, pixels inside the image, 0 to 4) for the 64 rows of the 16 blocks.
+  template <class Row>
+  static void each_row_of_four(const View& view, int tile_x, int tile_y, Row row) {
+    const bool inside = tile_x + kTile <= view.width && tile_y + kTile <= view.height;
+    for (int i = 0; i < kTilePixels; i += kBlock) {
+      const int block = i / 16, x = tile_x + 4 * (block & 3), y = tile_y + 4 * (block >> 2) + i % 16 / 4;
+      const int64_t at = int64_t(y) * view.width + x;
+      if (inside) {
+        row(at, i, kBlock);
+      } else {
+        row(at, i, y < view.height ? std::clamp(view.width - x, 0, kBlock) : 0);
+      }
     }
   }
-  // Position in the tile of state entry i.
-  static void pixel_of(int i, int& x, int& y) {
-    const int block = i / 16, inside = i % 16;
-    x = 4 * (block % 4) + inside % 4, y = 4 * (block / 4) + inside / 4;
+  // 1 for pixels of the image, -1 (a transmittance never at or above `stop`, so never hit) for the others; returns the blocks with any.
+  static unsigned start(const View& view, int tile_x, int tile_y, Real* through) {
+    unsigned alive = 0;
+    each_row_of_four(view, tile_x, tile_y, [&](int64_t, int to, int count) {
+      for (int x = 0; x < kBlock; ++x) through[to + x] = x < count ? Real(1) : Real(-1);
+      if (count) alive |= 1u << (to / 16);
+    });
+    return alive;
   }
 };
 
@@ -132,21 +177,14 @@ Counts forward_tile(const RasterParams<Real>& P, int tile) {
   const typename T::Lanes lanes;
   const Real stop = Real(view.stop), level = Real(view.level);
   const V zero = V::set(0), v_stop = V::set(stop), v_level = V::set(level);
-  Counts counts{0, 0, 0};
+  uint64_t visited_blocks = 0, hit_lanes = 0;
 
   alignas(64) Real length[kTilePixels], through[kTilePixels], red[kTilePixels], green[kTilePixels], blue[kTilePixels];
   constexpr int kStates = 13;  // first, reference, moment 1, moment 2, median, 1/(density |v|) there, normal 3, median normal 3, seen
   alignas(64) Real geo[kGeometry ? kStates : 1][kGeometry ? kTilePixels : 1];
   T::ray_lengths(view, tile_x, tile_y, length);
-  unsigned alive = 0;
-  for (int i = 0; i < kTilePixels; ++i) {
-    int x, y;
-    T::pixel_of(i, x, y);
-    const bool inside = tile_x + x < view.width && tile_y + y < view.height;
-    through[i] = inside ? Real(1) : Real(-1);  // never at or above `stop`: a pixel outside the image is never hit
-    red[i] = green[i] = blue[i] = 0;
-    if (inside) alive |= 1u << (i / 16);
-  }
+  unsigned alive = T::start(view, tile_x, tile_y, through);
+  for (Real* channel : {red, green, blue}) std::fill(channel, channel + kTilePixels, Real(0));
   if constexpr (kGeometry)
     for (auto& plane : geo) std::fill(plane, plane + kTilePixels, Real(0));
 
@@ -234,40 +272,36 @@ Counts forward_tile(const RasterParams<Real>& P, int tile) {
         }
         open |= (t >= v_stop).bits();
       }
-      counts.visited_blocks += 1;
-      counts.hit_lanes += hits;
+      visited_blocks += 1;
+      hit_lanes += hits;
       if (hits) touched |= 1u << block;
       if (!open) alive &= ~(1u << block);
     }
     pair.blocks = touched;
     if constexpr (kGeometry) P.pair_weight[pair.slot] = max_lane(largest), P.pair_pixels[pair.slot] = pixels;
   }
-  counts.visited_lanes = counts.visited_blocks * 16;
 
   const int64_t plane = int64_t(view.width) * view.height;
+  auto store = [&](const Real* state, Real* to) { T::store(view, tile_x, tile_y, state, to); };
+  const Real background[3] = {P.background[0], P.background[1], P.background[2]};
   for (int i = 0; i < kTilePixels; ++i) {
-    int x, y;
-    T::pixel_of(i, x, y);
-    if (tile_x + x >= view.width || tile_y + y >= view.height) continue;
-    const int64_t to = int64_t(tile_y + y) * view.width + tile_x + x;
-    P.out.rgb[to] = red[i] + through[i] * P.background[0];
-    P.out.rgb[plane + to] = green[i] + through[i] * P.background[1];
-    P.out.rgb[2 * plane + to] = blue[i] + through[i] * P.background[2];
-    P.out.opacity[to] = 1 - through[i];
-    if constexpr (kGeometry) {
-      const Real opacity = 1 - through[i], m1 = geo[2][i], m2 = geo[3][i];
-      P.out.depth_first[to] = geo[0][i];
-      P.out.depth_expected[to] = m1 + geo[1][i] * opacity;
-      P.out.depth_median[to] = geo[4][i];
-      P.out.distortion[to] = opacity * m2 - m1 * m1;
-      for (int k = 0; k < 3; ++k) {
-        P.out.normal[k * plane + to] = geo[6 + k][i];
-        P.out.normal_median[k * plane + to] = geo[9 + k][i];
-      }
-      P.out.state[to] = geo[1][i], P.out.state[plane + to] = m1, P.out.state[2 * plane + to] = m2, P.out.state[3 * plane + to] = geo[5][i];
-    }
+    red[i] += through[i] * background[0], green[i] += through[i] * background[1], blue[i] += through[i] * background[2];
+    through[i] = 1 - through[i];
   }
-  return counts;
+  store(red, P.out.rgb), store(green, P.out.rgb + plane), store(blue, P.out.rgb + 2 * plane), store(through, P.out.opacity);
+  if constexpr (kGeometry) {
+    alignas(64) Real expected[kTilePixels], distortion[kTilePixels];
+    for (int i = 0; i < kTilePixels; ++i) {
+      expected[i] = geo[2][i] + geo[1][i] * through[i];
+      distortion[i] = through[i] * geo[3][i] - geo[2][i] * geo[2][i];
+    }
+    store(geo[0], P.out.depth_first), store(expected, P.out.depth_expected), store(geo[4], P.out.depth_median);
+    store(distortion, P.out.distortion);
+    for (int k = 0; k < 3; ++k) store(geo[6 + k], P.out.normal + k * plane), store(geo[9 + k], P.out.normal_median + k * plane);
+    store(geo[1], P.out.state), store(geo[2], P.out.state + plane), store(geo[3], P.out.state + 2 * plane);
+    store(geo[5], P.out.state + 3 * plane);
+  }
+  return {visited_blocks * 16, hit_lanes};
 }
 
 // Sums of `count` accumulators over their lanes.
@@ -324,38 +358,35 @@ void backward_tile(const RasterParams<Real>& P, int tile) {
   alignas(64) Real geo[kGeometry ? kStates : 1][kGeometry ? kTilePixels : 1];
   T::ray_lengths(view, tile_x, tile_y, length);
   const int64_t plane = int64_t(view.width) * view.height;
+  T::start(view, tile_x, tile_y, through);
+  auto load = [&](const Real* from, int channel, Real* state) {
+    T::load(view, tile_x, tile_y, from ? from + channel * plane : nullptr, state);
+  };
+  alignas(64) Real opacity[kTilePixels], value[3][kTilePixels];
+  load(P.out.opacity, 0, opacity);
+  for (int k = 0; k < 3; ++k) load(P.out.rgb, k, value[k]);
+  load(P.grad.rgb, 0, g_red), load(P.grad.rgb, 1, g_green), load(P.grad.rgb, 2, g_blue), load(P.grad.opacity, 0, g_one);
+  for (int i = 0; i < kTilePixels; ++i) remaining[i] = g_red[i] * value[0][i] + g_green[i] * value[1][i] + g_blue[i] * value[2][i];
   Real background_sum[3] = {0, 0, 0};
   for (int i = 0; i < kTilePixels; ++i) {
-    int x, y;
-    T::pixel_of(i, x, y);
-    through[i] = -1;
-    remaining[i] = g_red[i] = g_green[i] = g_blue[i] = g_one[i] = 0;
-    if constexpr (kGeometry)
-      for (auto& state : geo) state[i] = 0;
-    if (tile_x + x >= view.width || tile_y + y >= view.height) continue;
-    const int64_t at = int64_t(tile_y + y) * view.width + tile_x + x;
-    auto read = [&](const Real* p, int channel = 0) { return p ? p[channel * plane + at] : Real(0); };
-    through[i] = 1;
-    const Real opacity = P.out.opacity[at];
-    g_red[i] = read(P.grad.rgb, 0), g_green[i] = read(P.grad.rgb, 1), g_blue[i] = read(P.grad.rgb, 2), g_one[i] = read(P.grad.opacity);
-    remaining[i] = g_red[i] * P.out.rgb[at] + g_green[i] * P.out.rgb[plane + at] + g_blue[i] * P.out.rgb[2 * plane + at];
-    background_sum[0] += (1 - opacity) * g_red[i], background_sum[1] += (1 - opacity) * g_green[i], background_sum[2] += (1 - opacity) * g_blue[i];
-    if constexpr (kGeometry) {
-      const Real origin = P.out.state[at], m1 = P.out.state[plane + at], m2 = P.out.state[2 * plane + at];
-      const Real g_expected = read(P.grad.depth_expected), g_distortion = read(P.grad.distortion);
-      g_one[i] += g_expected * origin + g_distortion * m2;
-      geo[0][i] = g_expected - 2 * m1 * g_distortion;
-      geo[1][i] = g_distortion * opacity;
-      geo[2][i] = read(P.grad.depth_first), geo[3][i] = read(P.grad.depth_median);
-      remaining[i] += geo[0][i] * m1 + geo[1][i] * m2;
-      for (int k = 0; k < 3; ++k) {
-        geo[4 + k][i] = read(P.grad.normal, k), geo[7 + k][i] = read(P.grad.normal_median, k);
-        remaining[i] += geo[4 + k][i] * P.out.normal[k * plane + at];
-      }
-      geo[10][i] = origin, geo[11][i] = P.out.state[3 * plane + at];
-    }
-    remaining[i] += g_one[i] * opacity;
+    const Real t = 1 - opacity[i];  // outside the image this is 1, but the gradients there are 0
+    background_sum[0] += t * g_red[i], background_sum[1] += t * g_green[i], background_sum[2] += t * g_blue[i];
   }
+  if constexpr (kGeometry) {
+    alignas(64) Real m1[kTilePixels], m2[kTilePixels], g_distortion[kTilePixels], normal[3][kTilePixels];
+    load(P.out.state, 0, geo[10]), load(P.out.state, 1, m1), load(P.out.state, 2, m2), load(P.out.state, 3, geo[11]);
+    load(P.grad.depth_expected, 0, geo[0]), load(P.grad.distortion, 0, g_distortion);
+    load(P.grad.depth_first, 0, geo[2]), load(P.grad.depth_median, 0, geo[3]);
+    for (int k = 0; k < 3; ++k) load(P.grad.normal, k, geo[4 + k]), load(P.grad.normal_median, k, geo[7 + k]), load(P.out.normal, k, normal[k]);
+    std::fill(geo[12], geo[12] + kTilePixels, Real(0));
+    for (int i = 0; i < kTilePixels; ++i) {
+      g_one[i] += geo[0][i] * geo[10][i] + g_distortion[i] * m2[i];
+      geo[0][i] -= 2 * m1[i] * g_distortion[i];
+      geo[1][i] = g_distortion[i] * opacity[i];
+      remaining[i] += geo[0][i] * m1[i] + geo[1][i] * m2[i] + geo[4][i] * normal[0][i] + geo[5][i] * normal[1][i] + geo[6][i] * normal[2][i];
+    }
+  }
+  for (int i = 0; i < kTilePixels; ++i) remaining[i] += g_one[i] * opacity[i];
   for (int k = 0; k < 3; ++k) P.background_sums[3 * tile + k] = background_sum[k];
 
   for (uint32_t e = P.tile_begin[tile]; e < P.tile_begin[tile + 1]; ++e) {

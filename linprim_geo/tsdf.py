@@ -33,9 +33,8 @@ BEHIND_WEIGHT = 0.05
 """What is left of their weight up to the truncation: decides only where no view says anything better."""
 
 FREE_WEIGHT = 0.3
-"""Weight of "this ray passes here and goes on", against 1 for a surface right here: ten views that see free
-space overrule a few wrong depths, one view whose depth is too deep does not pierce a wall that many agree
-on."""
+"""Weight of "this ray passes here and goes on" against 1 for a surface right here. It speaks up only where
+the others say "behind": a few wrong depths are overruled, and free space does not push surfaces away."""
 
 FAR_FRONT_WEIGHT = 0.15
 """Least weight of a vote in front of a surface, so that free space close to it stays free."""
@@ -180,7 +179,7 @@ class Rules:
     occluded: float
 
     def weigh(self, value, rows, inverse_depth):
-        """Clamped values and weights of votes that are signed distances `value` in truncations, and free votes."""
+        """Values and weights of votes at signed distances `value` (truncations), and the free votes."""
         along = value / rows[..., COSINE]  # along the ray
         ahead = value * np.float32(self.truncation / NEAR_VOXELS)
         front = np.maximum(1.0 / (1.0 + ahead * ahead), np.float32(FAR_FRONT_WEIGHT))
@@ -264,20 +263,27 @@ class Grid:
         return np.flatnonzero(seen)
 
     def extract(self) -> Mesh:
-        """Marching cubes between voxels that any view has voted on; empty if the field never changes sign."""
+        """Marching cubes between voxels that any view has voted on; empty if the field never changes sign.
+
+        Uses the field up, to have its memory for the mesh.
+        """
         import open3d
 
         core = open3d.core
+        field, weight, free = self.total, self.weight, self.free
+        self.total = self.weight = self.free = None
+        known = weight + free > LEAST_SUPPORT
         # Free votes say on which side a voxel is, not how far: they only speak up against "behind".
-        free = np.where(self.total < 0, np.float32(FREE_WEIGHT) * self.free, np.float32(0.0))
-        weight = self.weight + free
-        known = weight + self.free > LEAST_SUPPORT
-        field = np.divide(self.total + free, weight, out=np.ones_like(weight), where=weight > LEAST_SUPPORT)
-        np.copyto(
-            field,
-            np.where(field < 0, np.float32(-ZERO_GAP), np.float32(ZERO_GAP)),
-            where=np.abs(field) < ZERO_GAP,
-        )
+        free *= np.float32(FREE_WEIGHT)
+        free[field >= 0] = 0.0
+        field += free
+        weight += free
+        voted = weight > LEAST_SUPPORT
+        np.divide(field, weight, out=field, where=voted)
+        field[~voted] = 1.0
+        gap = np.where(field < 0, np.float32(-ZERO_GAP), np.float32(ZERO_GAP))
+        np.copyto(field, gap, where=np.abs(field) < ZERO_GAP)
+        del weight, free, gap, voted
         grid = open3d.t.geometry.VoxelBlockGrid(
             ("tsdf", "weight"), (core.float32, core.float32), ((1,), (1,)),
             self.voxel, self.resolution, len(self.blocks), core.Device("CPU:0"),
@@ -287,8 +293,9 @@ class Grid:
         slots, _ = grid.hashmap().find(keys)
         slots = slots.numpy().astype(np.int64)
         # The arrays alias the grid's memory.
-        grid.attribute("tsdf").numpy().reshape(-1, field.shape[1])[slots] = field
-        grid.attribute("weight").numpy().reshape(-1, field.shape[1])[slots] = known
+        grid.attribute("tsdf").numpy().reshape(-1, self.resolution**3)[slots] = field
+        grid.attribute("weight").numpy().reshape(-1, self.resolution**3)[slots] = known
+        del field, known
         try:
             raw = grid.extract_triangle_mesh(0.5)
             vertices = raw.vertex.positions.numpy().astype(np.float64)

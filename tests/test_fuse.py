@@ -81,7 +81,7 @@ def radial_error(mesh: Mesh) -> np.ndarray:
 def test_a_sphere_comes_out_round_and_closed(ball):
     error = radial_error(ball) / 0.05
     # The chord between two voxels bends away from the sphere by h^2 / 8 = 0.006 voxel; pixels are 0.25 voxel.
-    assert np.sqrt((error**2).mean()) < 0.03 and np.abs(error).max() < 0.2
+    assert np.sqrt((error**2).mean()) < 0.02 and np.abs(error).max() < 0.1
     assert abs(error.mean()) < 0.02
     stats = topology(ball)
     assert stats["watertight"] and stats["genus"] == 0 and stats["components"] == 1
@@ -106,7 +106,7 @@ def test_a_slanted_plane_is_exact_whatever_the_pixels():
     distance = (mesh.vertices - [0, 0, 3.0]) @ normal
     assert len(mesh.faces) > 1000
     assert np.abs(distance).max() < 0.02 * 0.02
-    assert (mesh.normals @ normal < -0.99).mean() > 0.99  # towards the camera
+    assert (mesh.normals @ normal > 0.99).mean() > 0.99  # towards the camera
 
 
 def test_edges_and_faces_of_a_box():
@@ -116,7 +116,7 @@ def test_edges_and_faces_of_a_box():
     half = np.array([0.8, 0.5, 0.3])
     outside = np.abs(mesh.vertices) - half
     distance = np.where((outside < 0).all(1), outside.max(1), np.linalg.norm(np.maximum(outside, 0), axis=1))
-    assert np.median(np.abs(distance)) < 0.02 * 0.04
+    assert np.median(np.abs(distance)) < 1e-3 * 0.04
     assert np.abs(distance).mean() < 0.1 * 0.04  # marching cubes cuts edges off
     assert stats["volume"] == pytest.approx(8 * half.prod(), rel=0.01)
 
@@ -157,15 +157,15 @@ def pieces(mesh: Mesh) -> int:
     return face_components(mesh)[0]
 
 
-def test_background_carves_what_one_view_imagines(ball):
-    frames = with_phantom(sphere_frames(around(24)), 3.0)
+def test_background_carves_what_one_view_imagines():
+    frames = with_phantom(sphere_frames(around(10)), 3.0)
     mesh = fuse_tsdf(frames, voxel_size=0.05, min_component=0)
     np.testing.assert_array_equal(mesh.vertices, fuse_tsdf(frames, voxel_size=0.05).vertices)
     assert pieces(mesh) == 1 and np.abs(radial_error(mesh)).max() < 0.25 * 0.05
 
 
 def test_unknown_pixels_carve_nothing():
-    frames = [replace(f, background=None) for f in with_phantom(sphere_frames(around(24)), 3.0)]
+    frames = [replace(f, background=None) for f in with_phantom(sphere_frames(around(10)), 3.0)]
     assert pieces(fuse_tsdf(frames, voxel_size=0.05, min_component=0)) > 1
     assert pieces(fuse_tsdf(frames, voxel_size=0.05, min_component=0.5)) == 1
 
@@ -173,7 +173,7 @@ def test_unknown_pixels_carve_nothing():
 def test_depth_far_behind_carves_too():
     # Instead of background there is a wall (a large sphere seen from inside) behind everything.
     frames = []
-    for frame in with_phantom(sphere_frames(around(24)), 3.0):
+    for frame in with_phantom(sphere_frames(around(10)), 3.0):
         rays = frame.camera.world_rays()
         eye = frame.camera.center
         a, b = (rays**2).sum(-1), rays @ eye
@@ -192,8 +192,8 @@ def test_invalid_depths_of_every_kind_are_no_surface(ball):
     np.testing.assert_array_equal(mesh.faces, ball.faces)
 
 
-def test_pixels_without_confidence_do_not_count(ball):
-    frames = with_phantom(sphere_frames(around(24)), 3.0)
+def test_pixels_without_confidence_do_not_count():
+    frames = with_phantom(sphere_frames(around(10)), 3.0)
     confidence = np.ones((SIZE, SIZE))
     confidence[:32, :32] = 0.0
     frames = [replace(f, background=None) for f in frames]

@@ -1,0 +1,97 @@
+"""What several test files share: a cache of their own, a tiny capture, one run trained on it, and a run whose
+surface is known exactly."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+# Half-axes and rotation (w, x, y, z) of the one octahedron of `solid`, whose middle is at CENTER.
+EXTENT, ROTATION, CENTER = (0.9, 0.6, 0.7), (0.8, 0.2, -0.4, 0.4), (3.0, -2.0, 1.0)
+# So dense that half of the light is gone 1e-5 behind the surface.
+DENSITY = 7e4
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cache_folder(tmp_path_factory):
+    """Tests neither read nor fill the user's cache."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LINPRIM_GEO_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="session")
+def tiny_scene(tmp_path_factory) -> Path:
+    """The built-in part with transparent background: 12 + 3 views of 48x48, 400 points, depth, reference.ply."""
+    from linprim_geo.synth import synthesize
+
+    out = tmp_path_factory.mktemp("tiny") / "scene"
+    synthesize(out, shape="cad", views=12, test_views=3, size=48, points=400, supersample=2)
+    return out
+
+
+@pytest.fixture(scope="session")
+def tiny_options():
+    """Options of `tiny_run`: it grows from 200 to 300 primitives and has two checkpoints."""
+    from linprim_geo.options import TrainOptions
+
+    return TrainOptions(
+        iterations=400, max_primitives=300, initial_primitives=200, sh_degree=1, threads=1,
+        checkpoint_every=150, evaluate_every=200,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def tiny_run(tiny_scene, tiny_options, tmp_path_factory) -> Path:
+    """A run trained on `tiny_scene`. Tests that change it copy it."""
+    from linprim_geo.train import train
+
+    out = tmp_path_factory.mktemp("tiny_run") / "run"
+    train(tiny_scene, out, options=tiny_options, quiet=True)
+    return out
+
+
+@pytest.fixture
+def run_copy(tiny_run, tmp_path) -> Path:
+    """A copy of `tiny_run` that a test may damage."""
+    return Path(shutil.copytree(tiny_run, tmp_path / "run"))
+
+
+def octahedron_run(folder: Path, density: float = DENSITY, views: int = 24, size: int = 64) -> Path:
+    """A run that holds the one octahedron of this module, photographed from all around, without training."""
+    from linprim_geo.initial_points import scene_normalization
+    from linprim_geo.options import SceneOptions, TrainOptions
+    from linprim_geo.primitives import Octahedra
+    from linprim_geo.run import Run
+    from linprim_geo.scene import load_scene
+    from linprim_geo.synth import synthesize
+    from linprim_geo.textured import TexturedMesh
+
+    one = Octahedra(
+        np.array([CENTER]), np.array([ROTATION]), np.array([EXTENT]), np.array([density]), np.full((1, 1, 3), 0.7)
+    )
+    shape = one.triangle_mesh()
+
+    def albedo(points, face, bary):
+        return np.full((len(points), 3), one.base_color[0] / 255, dtype=np.float32)
+
+    mesh = TexturedMesh("octahedron", shape.vertices, shape.faces, np.zeros(8, np.int32), albedo, "sphere")
+    scene_path = folder / "scene"
+    synthesize(scene_path, mesh=mesh, views=views, test_views=2, size=size, points=300, supersample=1)
+    scene = load_scene(scene_path)
+    similarity = scene_normalization(scene)
+    run = Run.create(folder / "run", scene, scene_path, SceneOptions(), TrainOptions(threads=1), similarity)
+    scaled = Octahedra(
+        similarity.apply(one.center), one.rotation, one.extent * similarity.scale, one.density / similarity.scale, one.sh
+    )
+    run.save(scaled, {"iteration": 1, "iterations": 1, "primitives": 1, "background": [1, 1, 1], "seconds": 0})
+    return run.path
+
+
+@pytest.fixture(scope="session")
+def solid(tmp_path_factory) -> Path:
+    """A run of one opaque octahedron; its scene's reference.ply is the same surface."""
+    return octahedron_run(tmp_path_factory.mktemp("solid"))

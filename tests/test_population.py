@@ -1,0 +1,170 @@
+"""Growth of the population: who is cut, what the halves are, when it happens, and that the cap holds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from linprim_geo import population
+from linprim_geo.population import DEAD_OPACITY, Growth, grow
+from linprim_geo.primitives import Octahedra
+
+SMALLEST = math.log(1e-3)
+
+
+def parameters(count: int, seed: int = 0) -> dict[str, torch.Tensor]:
+    rng = np.random.default_rng(seed)
+    values = {
+        "center": rng.normal(size=(count, 3)),
+        "rotation": rng.normal(size=(count, 4)),
+        "log_extent": np.log(rng.uniform(0.05, 0.3, (count, 3))),
+        "raw_opacity": rng.normal(size=count),
+    }
+    return {name: torch.from_numpy(value.astype(np.float32)) for name, value in values.items()}
+
+
+def event(table, pull, cap=10_000, rate=0.05, seed=0):
+    return grow(table, pull, Growth(0, 100, 1, rate, cap), SMALLEST, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize(
+    ("iterations", "start", "cap"),
+    [(7000, 1250, 5000), (7000, 5000, 20_000), (1500, 500, 2000), (30_000, 1000, 100_000), (600, 100, 150)],
+)
+def test_the_plan_reaches_the_cap_before_growth_ends(iterations, start, cap):
+    growth = Growth.plan(iterations, start, cap)
+    count, reached = start, None
+    steps = [step for step in range(1, iterations + 1) if growth.is_due(step)]
+    for step in steps:
+        count += min(cap - count, math.ceil(growth.rate * count))
+        if count == cap and reached is None:
+            reached = step
+    assert reached is not None and reached <= 0.6 * iterations
+    # Not all at once either: the second half of the growth phase still adds.
+    assert reached >= 0.3 * iterations
+    assert steps[0] >= 0.03 * iterations and steps[-1] <= 0.6 * iterations
+
+
+@pytest.mark.parametrize(("iterations", "start", "cap"), [(1, 1, 1), (5, 10, 10), (20, 1, 1000), (10**6, 1, 10**6), (100, 50, 20)])
+def test_a_plan_exists_for_every_run(iterations, start, cap):
+    growth = Growth.plan(iterations, start, cap)
+    assert growth.every >= 1 and growth.first >= 1 and 0 < growth.rate <= 0.25 and growth.cap == cap
+    assert not growth.is_due(0)
+
+
+def test_halves_stay_inside_the_box_of_the_parent_and_along_the_axis_that_is_cut():
+    table = parameters(200)
+    pull = torch.ones(200)
+    parents, children, halves = event(table, pull, rate=0.25)
+    assert len(parents) == 50 and list(children) == list(range(200, 250))
+    parent = np.exp(table["log_extent"].numpy().astype(np.float64))[parents]
+    whole = Octahedra(*(table[name].numpy()[parents] for name in ("center", "rotation")), parent, np.ones(50), np.zeros((50, 1, 3)))
+    axes = whole.axes
+    shifts = []
+    for half in (0, 1):
+        center, extent = halves["center"][half], np.exp(halves["log_extent"][half])
+        local = np.einsum("pji,pj->pi", axes, center - whole.center) / parent
+        cut = np.argmax(np.abs(local), axis=1)
+        rows = np.arange(50)
+        shifts.append((cut, local[rows, cut]))
+        assert np.abs(np.abs(local[rows, cut]) - 0.4).max() < 1e-5
+        assert np.abs(np.delete(local.reshape(-1), rows * 3 + cut)).max() < 1e-5
+        share = extent / parent
+        assert np.abs(share[rows, cut] - 0.6).max() < 1e-6
+        assert np.abs(np.delete(share.reshape(-1), rows * 3 + cut) - 0.8).max() < 1e-6
+        corners = np.abs(local[:, None, :] + share[:, None, :] * np.vstack([np.eye(3), -np.eye(3)]))
+        assert corners.max() <= 1 + 1e-5
+    assert (shifts[0][0] == shifts[1][0]).all() and np.allclose(shifts[0][1], -shifts[1][1])
+
+
+def test_long_axes_are_cut_in_proportion_to_their_square():
+    table = parameters(4000)
+    table["log_extent"] = torch.log(torch.tensor([0.1, 0.2, 0.3])).repeat(4000, 1)
+    parents, _, halves = event(table, torch.ones(4000), rate=1.0)
+    cut = np.argmin(halves["log_extent"][0] - table["log_extent"].numpy()[parents], axis=1)
+    share = np.bincount(cut, minlength=3) / len(cut)
+    # Three standard deviations of a share of 4000 draws: at most 3 * 0.5 / sqrt(4000) = 0.024.
+    assert np.abs(share - np.array([1, 4, 9]) / 14).max() < 0.024
+
+
+def test_parents_are_drawn_in_proportion_to_the_pull():
+    table = parameters(400)
+    pull = torch.zeros(400)
+    pull[100:300] = 1
+    pull[200:300] = 3
+    counts = np.zeros(400)
+    for seed in range(300):
+        parents, *_ = event(table, pull, rate=0.01, seed=seed)
+        assert len(set(parents)) == len(parents) == 4
+        counts[parents] += 1
+    assert counts[:100].sum() == counts[300:].sum() == 0
+    # 1200 draws, nearly with replacement: 3/4 of them, 3 standard deviations = 0.0375.
+    assert abs(counts[200:300].sum() / 1200 - 0.75) < 0.0375
+
+
+def test_dead_primitives_become_halves_of_others_and_are_never_parents():
+    table = parameters(100)
+    table["raw_opacity"][10:15] = math.log(DEAD_OPACITY / (1 - DEAD_OPACITY)) - 0.1
+    table["log_extent"][20:23, 1] = SMALLEST
+    parents, children, _ = event(table, torch.ones(100), cap=100)
+    dead = [*range(10, 15), 20, 21, 22]
+    assert list(children) == dead and len(parents) == 8
+    assert not set(parents) & set(dead)
+    # Just above the threshold lives on.
+    table["raw_opacity"][10:15] = math.log(DEAD_OPACITY / (1 - DEAD_OPACITY)) + 0.1
+    assert list(event(table, torch.ones(100), cap=100)[1]) == [20, 21, 22]
+
+
+def test_the_cap_holds_at_every_event():
+    table, cap = parameters(90), 100
+    for seed in range(10):
+        count = len(table["center"])
+        _, children, _ = event(table, torch.ones(count), cap=cap, rate=0.25, seed=seed)
+        total = max(count, int(children.max(initial=-1)) + 1)
+        assert total <= cap
+        table = parameters(total)
+    assert total == cap
+    assert len(event(parameters(120), torch.ones(120), cap=cap)[0]) == 0
+
+
+def test_draws_depend_on_the_generator_alone():
+    table, pull = parameters(300), torch.rand(300, generator=torch.Generator().manual_seed(1))
+    before = {name: value.clone() for name, value in table.items()}
+    first, again, other = (event(table, pull, rate=0.1, seed=seed) for seed in (7, 7, 8))
+    assert (first[0] == again[0]).all() and (first[1] == again[1]).all()
+    assert all((first[2][name] == again[2][name]).all() for name in ("center", "log_extent"))
+    assert len(first[0]) != len(other[0]) or (first[0] != other[0]).any()
+    assert all(torch.equal(before[name], table[name]) for name in table)
+
+
+def test_a_population_of_one_can_be_cut():
+    parents, children, halves = event(parameters(1), torch.ones(1), cap=2)
+    assert list(parents) == [0] and list(children) == [1] and halves["center"].shape == (2, 1, 3)
+    assert len(event(parameters(1), torch.ones(1), cap=1)[0]) == 0
+
+
+def test_nothing_is_cut_where_nothing_pulls():
+    assert len(event(parameters(50), torch.zeros(50))[0]) == 0
+    # No more parents than are pulled at, however large the rate.
+    pull = torch.zeros(50)
+    pull[3] = 1
+    assert list(event(parameters(50), pull, rate=1.0)[0]) == [3]
+
+
+def test_all_dead_leaves_all_as_they_are():
+    table = parameters(20)
+    table["raw_opacity"][:] = -20
+    assert len(event(table, torch.ones(20))[0]) == 0
+
+
+def test_halves_of_a_population_together_hold_most_of_its_volume():
+    # Each half has 0.6 * 0.8^2 = 0.384 of the parent's volume, at unchanged opacity.
+    along, across = population.SPLIT_ALONG, population.SPLIT_ACROSS
+    table = parameters(10)
+    parents, _, halves = event(table, torch.ones(10), rate=1.0)
+    parent = table["log_extent"].numpy().astype(np.float64)[parents].sum(1)
+    assert np.allclose(halves["log_extent"].sum(2) - parent, math.log(along * across**2), atol=1e-5)
+    assert 2 * along * across**2 == pytest.approx(0.768)

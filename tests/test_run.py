@@ -1,0 +1,148 @@
+"""A run's folder: what is written comes back, damage is one sentence, and the data set's frame is kept."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from linprim_geo.camera import Similarity
+from linprim_geo.errors import LinprimError
+from linprim_geo.options import SceneOptions, TrainOptions
+from linprim_geo.ply import read_linprim_ply
+from linprim_geo.primitives import Octahedra, load_octahedra
+from linprim_geo.run import Run, to_data_set
+from linprim_geo.scene import load_scene
+
+
+def edit(path, change):
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def some_octahedra(count=5):
+    rng = np.random.default_rng(3)
+    rotation = rng.normal(size=(count, 4))
+    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+    extent, density = rng.uniform(0.1, 1, (count, 3)), rng.uniform(1, 9, count)
+    return Octahedra(rng.normal(size=(count, 3)), rotation, extent, density, rng.normal(size=(count, 4, 3)))
+
+
+def test_a_created_run_opens_as_it_was(tiny_scene, tmp_path):
+    scene, similarity = load_scene(tiny_scene), Similarity(0.25, (1.0, 2.0, -3.5))
+    scene_options, options = SceneOptions(downscale=2), TrainOptions(iterations=3, background="1,0,0.5")
+    made = Run.create(tmp_path / "run", scene, tiny_scene, scene_options, options, similarity)
+    opened = Run.open(tmp_path / "run")
+    assert opened == made
+    assert opened.scene_path.is_absolute() and opened.unit == scene.unit
+    assert opened.scene().train[0].camera.width == 24
+    state = {"iteration": 3, "primitives": 5, "background": [1, 0, 0.5], "seconds": 1.0}
+    opened.save(some_octahedra(), state)
+    assert Run.open(tmp_path / "run").state == state
+    assert np.allclose(opened.background, [1, 0, 0.5])
+
+
+def test_an_existing_folder_is_refused_and_an_empty_one_is_not(tiny_scene, tmp_path):
+    scene = load_scene(tiny_scene)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("years of work")
+    (tmp_path / "file").write_text("x")
+    for path in (tmp_path / "full", tmp_path / "file"):
+        with pytest.raises(LinprimError, match="exists already.*-o.*--resume"):
+            Run.create(path, scene, tiny_scene, SceneOptions(), TrainOptions(), Similarity())
+    assert [path.name for path in (tmp_path / "full").iterdir()] == ["thesis.tex"]
+    (tmp_path / "empty").mkdir()
+    Run.create(tmp_path / "empty", scene, tiny_scene, SceneOptions(), TrainOptions(), Similarity())
+
+
+def test_every_export_holds_the_same_primitives(tmp_path):
+    octahedra, similarity = some_octahedra(), Similarity(4.0, (10.0, 20.0, 30.0))
+    run = Run(tmp_path, tmp_path, SceneOptions(), TrainOptions(), similarity)
+    run.save(octahedra, {"background": [0, 0, 0]})
+    trained, exported = run.training_primitives(), load_octahedra(tmp_path / "scene.npz")
+    for name in ("center", "rotation", "extent", "density", "sh"):
+        assert np.array_equal(getattr(trained, name), getattr(octahedra, name))
+        assert np.array_equal(getattr(run.primitives(), name), getattr(exported, name))
+    assert np.abs(exported.center - (octahedra.center / 4 + [10, 20, 30])).max() < 1e-5
+    ply, _ = read_linprim_ply(tmp_path / "scene.ply")
+    assert np.abs(ply.center - exported.center).max() == 0
+    # LinPrim's files hold the opacity capped at 0.99; these are below it.
+    assert exported.alpha.max() < 1 and np.allclose(ply.extent, exported.extent, rtol=1e-6)
+
+
+def test_lengths_and_densities_change_with_the_frame_and_opacity_does_not():
+    octahedra = some_octahedra()
+    moved = to_data_set(octahedra, Similarity(0.01, (1.0, 2.0, 3.0)))
+    assert np.allclose(moved.extent, octahedra.extent * 100, rtol=1e-6)
+    assert np.allclose(moved.density, octahedra.density / 100, rtol=1e-6)
+    assert np.allclose(moved.alpha, octahedra.alpha, rtol=1e-5)
+    assert np.allclose(moved.center, octahedra.center * 100 + [1, 2, 3], rtol=1e-6)
+    assert np.array_equal(moved.rotation, octahedra.rotation) and np.array_equal(moved.sh, octahedra.sh)
+
+
+def test_options_of_another_version_are_left_out(run_copy):
+    edit(run_copy / "config.json", lambda c: c["train_options"].update(warp_drive=True))
+    assert Run.open(run_copy).train_options.iterations == 400
+
+
+def test_a_run_can_be_moved_and_read_from_elsewhere(run_copy, tmp_path, monkeypatch):
+    moved = shutil.move(run_copy, tmp_path / "elsewhere")
+    monkeypatch.chdir(tmp_path)
+    run = Run.open("elsewhere")
+    assert len(run.primitives()) == run.state["primitives"] == 300
+    assert len(run.scene().test) == 3 and str(moved)
+
+
+DAMAGE = {
+    "no config": lambda run: (run / "config.json").unlink(),
+    "no transform": lambda run: (run / "transform.json").unlink(),
+    "no state": lambda run: (run / "run.json").unlink(),
+    "no primitives": lambda run: (run / "training_frame.npz").unlink(),
+    "config cut": lambda run: (run / "config.json").write_text('{"scene": "/a'),
+    "config empty": lambda run: (run / "config.json").write_text(""),
+    "config binary": lambda run: (run / "config.json").write_bytes(b"\xff\xfe\x00"),
+    "config a list": lambda run: (run / "config.json").write_text("[1]"),
+    "config without scene": lambda run: edit(run / "config.json", lambda c: c.pop("scene")),
+    "scene a number": lambda run: edit(run / "config.json", lambda c: c.update(scene=3)),
+    "options a list": lambda run: edit(run / "config.json", lambda c: c.update(scene_options=[])),
+    "options a word": lambda run: edit(run / "config.json", lambda c: c.update(train_options="fast")),
+    "offset of two": lambda run: edit(run / "transform.json", lambda c: c.update(offset=[1, 2])),
+    "offset a word": lambda run: edit(run / "transform.json", lambda c: c.update(offset="abc")),
+    "scale zero": lambda run: edit(run / "transform.json", lambda c: c.update(scale=0)),
+    "scale negative": lambda run: edit(run / "transform.json", lambda c: c.update(scale=-2.0)),
+    "scale NaN": lambda run: edit(run / "transform.json", lambda c: c.update(scale=float("nan"))),
+    "no background": lambda run: edit(run / "run.json", lambda c: c.pop("background")),
+    "background of two": lambda run: edit(run / "run.json", lambda c: c.update(background=[1, 1])),
+    "background a word": lambda run: edit(run / "run.json", lambda c: c.update(background=["x", 1, 1])),
+    "state cut": lambda run: (run / "run.json").write_text('{"iteration": 3, '),
+    "primitives cut": lambda run: (run / "training_frame.npz").write_bytes(
+        (run / "training_frame.npz").read_bytes()[:1500]
+    ),
+    "primitives empty": lambda run: (run / "training_frame.npz").write_bytes(b""),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_run_is_one_sentence(damage, run_copy):
+    DAMAGE[damage](run_copy)
+    with pytest.raises(LinprimError) as caught:
+        run = Run.open(run_copy)
+        list(run.render_views(run.scene().test[:1], geometry=False))
+    assert str(run_copy) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_scene_that_was_moved_away_is_named(run_copy, tmp_path):
+    edit(run_copy / "config.json", lambda c: c.update(scene=str(tmp_path / "gone")))
+    run = Run.open(run_copy)
+    assert len(run.primitives()) == 300
+    with pytest.raises(LinprimError, match="gone"):
+        run.scene()
+
+
+def test_a_folder_that_is_no_run_is_one_sentence(tmp_path):
+    for path in (tmp_path, tmp_path / "missing"):
+        with pytest.raises(LinprimError, match="config.json is missing"):
+            Run.open(path)
