@@ -135,6 +135,15 @@ void bind_real(nb::module_& m, const char* suffix) {
         nb::gil_scoped_release release;
         linprim::rasterize_grad<Real>(view, primitives, bg, geometry, out, colors, grad, gradients, bg_grad);
       });
+  m.def((std::string("level_depth_") + suffix).c_str(),
+        [](Array center, Array rotation, Array extent, Array density, Array sh, Pose pose, std::tuple<double, double, double, double> intrinsics,
+           int width, int height, double near, double level, Out<Real> depth) {
+          const linprim::View view = make_view(pose, intrinsics, width, height, near, 0, level);
+          const auto primitives = make_primitives<Real>(center, rotation, extent, density, sh);
+          Real* out = checked(depth, {height, width}, "depth");
+          nb::gil_scoped_release release;
+          linprim::level_depth<Real>(view, primitives, out);
+        });
   m.def((std::string("first_non_finite_") + suffix).c_str(), [](Array values) {
     const Real* data = values.data();
     const int64_t n = int64_t(values.size());

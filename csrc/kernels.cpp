@@ -38,7 +38,8 @@ void backward(const RasterParams<Real>& P, int tile, bool geometry) {
 
 template <class Real>
 const Kernels<Real> table = {LINPRIM_STRING(LINPRIM_ISA), kWidth,         project<Real>, chain<Real>,
-                             bin<kWidth>,                 forward<Real>, backward<Real>};
+                             bin<kWidth>,                 forward<Real>, backward<Real>,
+                             level_depth_tile<Real, kWidth>};
 const ImageKernels image_table = {photometric<kWidth>, adam};
 
 }  // namespace LINPRIM_ISA

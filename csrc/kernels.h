@@ -158,6 +158,8 @@ struct Kernels {
   int64_t (*bin)(const BinParams&, int64_t begin, int64_t end, LoosePair* out, int64_t capacity, int64_t* written);
   Counts (*forward)(const RasterParams<Real>&, int tile, bool geometry);
   void (*backward)(const RasterParams<Real>&, int tile, bool geometry);
+  // Depth at the view's transmittance level by exact overlap, into out.depth_median; scratch: 3 * kBlocks values per pair of the tile.
+  void (*level_depth)(const RasterParams<Real>&, int tile, Real* scratch);
 };
 
 struct ImageKernels {

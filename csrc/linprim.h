@@ -39,6 +39,11 @@ void rasterize_grad(const View& view, const Primitives<Real>& primitives, const 
                     const Planes<Real>& out, const Real* color, const Planes<Real>& grad, const PrimitiveGradients<Real>& gradients,
                     Real* background_grad);
 
+// Z-depth (H,W) at which the transmittance of each pixel's ray falls to view.level, primitives absorbing where they are, overlaps
+// included, independent of any order; 0 where it never does.
+template <class Real>
+void level_depth(const View& view, const Primitives<Real>& primitives, Real* depth);
+
 // loss = (1 - dssim) L1 + dssim (1 - SSIM) of two (3,H,W) images and its gradient to the first, written to `gradient` (3,H,W).
 // `weight` (H,W) or null multiplies both maps; means are over the weight. Returns the loss, its
 // two parts and the mean squared error.

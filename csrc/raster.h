@@ -495,4 +495,63 @@ void backward_tile(const RasterParams<Real>& P, int tile) {
   }
 }
 
+// Where the transmittance of one tile's rays falls to `level`, all primitives absorbing where they are, overlaps included:
+// sum_i density_i |v| clamp(t - t_in_i, 0, t_out_i - t_in_i) = ln(1 / level). The sum does not depend on any order and grows with t,
+// so it is bisected. `scratch` holds 3 * 16 values per pair of the longest tile list. Writes out.depth_median, 0 where never.
+template <class Real, int W>
+void level_depth_tile(const RasterParams<Real>& P, int tile, Real* scratch) {
+  using T = Tile<Real, W>;
+  using V = typename T::V;
+  using M = typename T::M;
+  using I = typename T::I;
+  constexpr int kHalvings = sizeof(Real) == 4 ? 26 : 55;  // from the whole bracket to a rounding error
+  const View& view = P.view;
+  const int tile_x = tile % P.tiles_x * kTile, tile_y = tile / P.tiles_x * kTile;
+  const typename T::Lanes lanes;
+  const V zero = V::set(0), half = V::set(Real(0.5)), wanted = V::set(Real(-std::log(view.level)));
+  alignas(64) Real length[kTilePixels], depth[kTilePixels];
+  T::ray_lengths(view, tile_x, tile_y, length);
+  for (int block = 0; block < kBlocks; ++block)
+    for (int part = 0; part < T::kParts; ++part) {
+      const int at = block * 16 + part * W;
+      int count = 0;
+      V low = V::set(Real(1e30)), high = zero;
+      for (uint32_t e = P.tile_begin[tile]; e < P.tile_begin[tile + 1]; ++e) {
+        if (!(P.pairs[e].blocks >> block & 1)) continue;
+        const Record<Real>& record = P.records[P.pairs[e].primitive];
+        typename T::Faces faces;
+        faces.set(record, tile_x, tile_y, lanes, view);
+        V in, out;
+        I in_face, out_face;
+        faces.template intersect<false>(Real(4 * (block & 3) + T::part_x(part)), Real(4 * (block >> 2) + T::part_y(part)), in, out, in_face,
+                                        out_face);
+        const M hit = out < in;
+        if (!hit.bits()) continue;
+        const V w_in = in + faces.w0, w_out = out + faces.w0, inverse = rcp(w_in * w_out);
+        const V t_in = select(hit, w_out * inverse, zero);
+        const V thick = select(hit, (in - out) * inverse, zero), rate = V::set(record.density) * V::load(length + at);
+        low = min(low, select(hit, t_in, low)), high = max(high, t_in + thick);
+        Real* slot = scratch + int64_t(count++) * 3 * W;
+        t_in.store(slot), thick.store(slot + W), rate.store(slot + 2 * W);
+      }
+      auto thickness = [&](V t) {
+        V sum = zero;
+        for (int i = 0; i < count; ++i) {
+          const Real* slot = scratch + int64_t(i) * 3 * W;
+          sum = fma(V::load(slot + 2 * W), min(max(t - V::load(slot), zero), V::load(slot + W)), sum);
+        }
+        return sum;
+      };
+      const M crosses = thickness(high) >= wanted;
+      if (crosses.bits())
+        for (int k = 0; k < kHalvings; ++k) {
+          const V middle = half * (low + high);
+          const M behind = thickness(middle) >= wanted;
+          high = select(behind, middle, high), low = select(behind, low, middle);
+        }
+      select(crosses, high, zero).store(depth + at);
+    }
+  T::store(view, tile_x, tile_y, depth, P.out.depth_median);
+}
+
 }  // namespace linprim::LINPRIM_ISA

@@ -292,8 +292,28 @@ void rasterize_grad(const View& view, const Primitives<Real>& primitives, const 
   last_statistics = stats;
 }
 
+template <class Real>
+void level_depth(const View& view, const Primitives<Real>& primitives, Real* depth) {
+  std::lock_guard lock(cache<Real>().mutex);
+  Statistics stats{};
+  Frame<Real>& frame = cache<Real>().oldest();
+  std::vector<Real> color(size_t(primitives.n) * 3);
+  frame.build(view, primitives, false, color.data(), stats);
+  uint32_t longest = 0;
+  for (int tile = 0; tile < frame.tiles(); ++tile) longest = std::max(longest, frame.tile_begin[tile + 1] - frame.tile_begin[tile]);
+  const size_t scratch_size = size_t(longest) * 3 * kBlocks;
+  std::vector<Real> scratch(scratch_size * threads());
+  Planes<Real> out{};
+  out.depth_median = depth;
+  const RasterParams<Real> params = frame.raster(view, nullptr, out);
+  parallel_for(frame.tiles(), [&](int64_t tile, int thread) {
+    kernels<Real>().level_depth(params, int(tile), scratch.data() + scratch_size * thread);
+  });
+}
+
 #define LINPRIM_INSTANTIATE(Real)                                                                                                    \
   template void rasterize<Real>(const View&, const Primitives<Real>&, const Real*, bool, const Planes<Real>&, Real*, Real*, int32_t*); \
+  template void level_depth<Real>(const View&, const Primitives<Real>&, Real*);                                                       \
   template void rasterize_grad<Real>(const View&, const Primitives<Real>&, const Real*, bool, const Planes<Real>&, const Real*,       \
                                      const Planes<Real>&, const PrimitiveGradients<Real>&, Real*);
 LINPRIM_INSTANTIATE(float)

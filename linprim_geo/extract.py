@@ -24,7 +24,8 @@ def extract_mesh(run: str | os.PathLike, method: str = "tsdf", output: str | os.
     """Extracts the surface of a run and writes it, the part that cameras see, and statistics.
 
     RUN/mesh/METHOD holds mesh.ply, mesh_visible.ply and stats.json; with `output` the two meshes go to OUTPUT and its sibling
-    *_visible, in the format of the suffix (.ply, .obj, .glb, .stl). Vertices have normals and colours; everything is in the data set's
+    *_visible, in the format of the suffix (.ply, .obj, .glb, .stl). Vertices have normals, colours and, as `quality`,
+    the spread of the views' surfaces in the data set's unit; everything is in the data set's
     frame and unit.
 
     Returns: what stats.json holds: topology of both meshes, options, seconds per stage, peak memory, and the paths.
@@ -33,8 +34,8 @@ def extract_mesh(run: str | os.PathLike, method: str = "tsdf", output: str | os.
         LinprimError: nothing was trained, no ray crosses the level, or the grid would not fit into memory.
     """
     from .fuse import auto_voxel_size, fuse_tsdf
-    from .mesh import remove_small_components, save_mesh, select_faces, topology, topology_line, vertex_normals
-    from .visibility import color_vertices, visible_faces
+    from .mesh import save_mesh, select_faces, topology, topology_line
+    from .visibility import visible_faces
 
     options = options or ExtractOptions()
     if method != "tsdf":
@@ -64,16 +65,13 @@ def extract_mesh(run: str | os.PathLike, method: str = "tsdf", output: str | os.
     scale = opened.similarity.scale
     voxel = options.voxel_size * scale if options.voxel_size > 0 else auto_voxel_size(frames)
     limit = int(options.memory_limit * 2**30) if options.memory_limit > 0 else None
-    mesh = fuse_tsdf(frames, voxel_size=voxel, truncation_voxels=options.truncation, memory_limit=limit,
-                     report=lambda text: progress.note("  " + text))
-    mesh = remove_small_components(mesh, options.smallest_part)
+    mesh = fuse_tsdf(frames, voxel_size=voxel, truncation_voxels=options.truncation, memory_limit=limit, min_component=options.smallest_part,
+                     threads=opened.train_options.threads, log=lambda text: progress.note("  " + text))
     lap("fuse")
-    cameras = [frame.camera for frame in frames]
-    seen = visible_faces(mesh, cameras)
+    seen = visible_faces(mesh, [frame.camera for frame in frames])
     lap("visibility")
-    mesh = replace(mesh, normals=vertex_normals(mesh), colors=color_vertices(mesh, cameras, [frame.color for frame in frames]))
-    lap("color")
-    mesh = replace(mesh, vertices=opened.similarity.inverse().apply(mesh.vertices))
+    quality = None if mesh.quality is None else (mesh.quality / scale).astype(np.float32)
+    mesh = replace(mesh, vertices=opened.similarity.inverse().apply(mesh.vertices), quality=quality)
     visible = select_faces(mesh, seen)
     visible_target = target.with_name(f"{target.stem}_visible{target.suffix}")
     save_mesh(target, mesh)
@@ -94,11 +92,9 @@ def depth_frames(run: Run, level: float) -> list:
     """`fuse.DepthFrame`s of the training views in the training frame: depth at `level`, the photographs' colours, free background."""
     from .fuse import DepthFrame
 
-    scale = run.similarity.scale
+    scale = np.float32(run.similarity.scale)
     frames = []
-    for view, images in run.render_views(run.scene().train, geometry=True, level=level):
-        photo = view.load()
-        free = images["opacity"] < SEEN_THROUGH
-        depth = np.where(free, 0, images["depth_median"] * np.float32(scale)).astype(np.float32)
-        frames.append(DepthFrame(view.camera.transformed(run.similarity), depth, color=photo.rgb, background=free))
+    for view, depth, opacity in run.surface_depths(run.scene().train, level):
+        free = opacity < SEEN_THROUGH
+        frames.append(DepthFrame(view.camera.transformed(run.similarity), np.where(free, 0, depth * scale), color=view.load().rgb, background=free))
     return frames

@@ -69,6 +69,8 @@ def fuse_tsdf(
         `VoxelBlockGrid.integrate` makes of them, in % of the diagonal: smooth body 0.003 (0.045), part with
         thin ribs and sharp edges 0.015 (0.046); a room, 80 maps of 400x300: 0.031 (0.050).
     """
+    if iter(frames) is frames:
+        raise TypeError("frames can be iterated only once, but fusing goes over them several times")
     _check_options(voxel_size, truncation_voxels, block_resolution, bounds)
     bounds = None if bounds is None else np.asarray(bounds, dtype=np.float64)
     limit = memory_limit or int(0.6 * available_memory())

@@ -202,6 +202,29 @@ def rasterize(
     return Rendering(*out[:8], max_weight=out[10], pixels=out[11])
 
 
+def level_depth(center: Tensor, rotation: Tensor, extent: Tensor, density: Tensor, sh: Tensor, camera: Camera, *, level: float,
+                near: float = 0.01) -> Tensor:
+    """(H, W) z-depth at which the transmittance of each pixel's ray falls to `level`, 0 where it never does; no gradient.
+
+    Unlike `rasterize`'s depths it depends on no order: primitives absorb where they are, overlaps included, so the depth solves
+    sum_i density_i |v| clamp(t - t_in_i, 0, t_out_i - t_in_i) = ln(1 / level). Arguments as for `rasterize`; 0 < level < 1.
+
+    Raises: as `rasterize`.
+
+    Accuracy: float64 to 1e-13, float32 to 1e-6, of the depth.
+    """
+    suffix = _suffix(center.dtype)
+    _check_finite(suffix, center=center, rotation=rotation, extent=extent, density=density)
+    if not 0 < level < 1:
+        raise ValueError(f"level is {level}, wanted a transmittance between 0 and 1")
+    depth = center.new_empty((camera.height, camera.width), requires_grad=False)
+    getattr(_core, f"level_depth_{suffix}")(
+        _array(center), _array(rotation), _array(extent), _array(density), _array(sh), camera.world_to_camera[:3].astype(float).copy(),
+        (camera.fx, camera.fy, camera.cx, camera.cy), camera.width, camera.height, near, level, depth.numpy(),
+    )
+    return depth
+
+
 @torch.library.custom_op("linprim_geo::photometric_loss", mutates_args=())
 def _photometric(image: Tensor, target: Tensor, dssim: float, weight: Tensor | None) -> tuple[Tensor, Tensor]:
     gradient = torch.empty_like(image, memory_format=torch.contiguous_format)

@@ -129,10 +129,7 @@ class Run:
 
         from . import ops
 
-        ops.set_threads(self.train_options.threads)
-        octahedra = self.training_primitives()
-        tensors = [torch.from_numpy(a) for a in (octahedra.center, octahedra.rotation, octahedra.extent, octahedra.density, octahedra.sh)]
-        background = torch.tensor(self.background, dtype=torch.float32)
+        tensors, background = self._tensors()
         for view in views:
             camera, options = view.camera.transformed(self.similarity), self.train_options
             with torch.no_grad():
@@ -147,6 +144,33 @@ class Run:
                 images["depth_expected"] = (out.depth_expected.numpy() * unit / opacity).astype(np.float32)
                 images["normal"] = (out.normal_median.numpy().transpose(1, 2, 0) @ view.camera.rotation).astype(np.float32)
             yield view, images
+
+    def surface_depths(self, views: Iterable[View], level: float) -> Iterator[tuple[View, np.ndarray, np.ndarray]]:
+        """Where the transmittance of every ray falls to `level`, overlaps counted exactly (`ops.level_depth`).
+
+        Yields: (view, depth, opacity), each (H, W) float32; z-depth in the data set's unit, 0 where it never does.
+        """
+        import torch
+
+        from . import ops
+
+        tensors, background = self._tensors()
+        for view in views:
+            camera = view.camera.transformed(self.similarity)
+            with torch.no_grad():
+                depth = ops.level_depth(*tensors, camera, level=level).numpy()
+                opacity = ops.rasterize(*tensors, background, camera, stop=self.train_options.stop).opacity.numpy()
+            yield view, (depth / self.similarity.scale).astype(np.float32), opacity
+
+    def _tensors(self):
+        import torch
+
+        from . import ops
+
+        ops.set_threads(self.train_options.threads)
+        octahedra = self.training_primitives()
+        arrays = (octahedra.center, octahedra.rotation, octahedra.extent, octahedra.density, octahedra.sh)
+        return [torch.from_numpy(a) for a in arrays], torch.tensor(self.background, dtype=torch.float32)
 
 
 def to_data_set(octahedra: Octahedra, similarity: Similarity) -> Octahedra:

@@ -31,8 +31,13 @@ LEAST_FACING = 0.1
 FAR = 1e3
 """Depth of a ray that hits nothing, in diagonals: finite, so that differences stay numbers."""
 
-OUTLINE_PENALTY = 1e-3
-"""Factor on the weight of a sample in a pixel on the outline of something, whose colour is a mixture."""
+POOR_SHARE = 1e-3
+"""Factor on the weight of a sample in a pixel on the outline of something, whose colour is a mixture, and of
+one seen too flatly."""
+
+POOR_RINGS = 3
+"""Vertices with poor samples only take the colour of well seen ones up to so many edges away: a pixel or two.
+Wires, which are nothing but outline, keep their own."""
 
 
 def visible_faces(mesh: Mesh, cameras: Sequence[Camera]) -> np.ndarray:
@@ -110,6 +115,7 @@ def color_vertices(mesh: Mesh, cameras: Sequence[Camera], images: Iterable[np.nd
     slack = float(np.median(np.linalg.norm(edge, axis=1)))
     best = np.zeros((len(mesh.vertices), KEPT_SAMPLES), dtype=np.float32)
     shade = np.zeros((len(mesh.vertices), KEPT_SAMPLES, 3), dtype=np.float32)
+    good = np.zeros(len(mesh.vertices), dtype=bool)
     for camera, image in zip(cameras, images, strict=True):
         if image.shape[:2] != (camera.height, camera.width):
             raise LinprimError(
@@ -133,11 +139,12 @@ def color_vertices(mesh: Mesh, cameras: Sequence[Camera], images: Iterable[np.nd
         visible = z <= depth[i, j] + slope
         outline = (far[i, j] - near[i, j] > 4.0 * slope) | (z > near[i, j] + 2.0 * slope)
         weight = np.maximum(facing, LEAST_FACING**2) / step**2
-        weight[outline] *= OUTLINE_PENALTY
-        weight[facing < LEAST_FACING] *= OUTLINE_PENALTY
+        poor = outline | (facing < LEAST_FACING)
+        weight[poor] *= POOR_SHARE
+        good[rows[visible & ~poor]] = True
         rows, pixels, weight = rows[visible], pixels[:, visible], weight[visible].astype(np.float32)
         _keep_best(best, shade, rows, weight, _bilinear(image, pixels))
-    return _fill_unseen(mesh, _robust_mean(best, shade), best[:, 0] > 0)
+    return _fill_unseen(mesh, _robust_mean(best, shade), good, best[:, 0] > 0)
 
 
 def _keep_best(best, shade, rows, weight, color):
@@ -183,24 +190,31 @@ def _robust_mean(best: np.ndarray, shade: np.ndarray) -> np.ndarray:
     return np.where(total > 0, mean / np.maximum(total, np.finfo(np.float32).tiny), median)
 
 
-def _fill_unseen(mesh: Mesh, colors: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Spreads colours along edges into unseen vertices; pieces that nobody sees get the mean of all."""
+def _fill_unseen(mesh: Mesh, colors: np.ndarray, good: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Spreads colours along edges: from well seen vertices a little way, then into those that nobody sees.
+
+    Pieces that nobody sees get the mean of all.
+    """
     from scipy.sparse import coo_matrix
 
     colors = colors.astype(np.float64)
-    colors[~known] = colors[known].mean(0) if known.any() else 128.0
-    if known.any() and not known.all():
+    colors[~seen] = colors[seen].mean(0) if seen.any() else 128.0
+    if seen.any() and not good.all():
         ends = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
         ends = np.concatenate([ends, ends[:, ::-1]])
-        count = len(known)
-        graph = coo_matrix((np.ones(len(ends)), ends.T), shape=(count, count)).tocsr()
-        while True:
+        graph = coo_matrix((np.ones(len(ends)), ends.T), shape=(len(seen), len(seen))).tocsr()
+
+        def grow(known, among):
             around = graph @ known.astype(np.float64)
-            new = (around > 0) & ~known
-            if not new.any():
-                break
+            new = (around > 0) & ~known & among
             colors[new] = (graph @ (colors * known[:, None]))[new] / around[new, None]
-            known = known | new
+            return known | new, new.any()
+
+        for _ in range(POOR_RINGS):
+            good, _ = grow(good, seen)
+        known, more = seen, True
+        while more:
+            known, more = grow(known, ~seen)
     return np.clip(np.round(colors), 0, 255).astype(np.uint8)
 
 

@@ -255,6 +255,11 @@ def test_what_cannot_be_fused_is_one_sentence():
             wrong()
 
 
+def test_an_iterator_is_refused_because_it_ends():
+    with pytest.raises(TypeError, match="only once"):
+        fuse_tsdf(iter(sphere_frames(around(3))), voxel_size=0.1)
+
+
 def test_a_surface_that_every_other_view_denies_is_no_surface():
     frames = with_phantom(sphere_frames(around(24)), 3.0)
     blind = [replace(frames[0], depth=np.where(frames[0].depth == 3.0, 3.0, 0.0), background=None)]
@@ -319,6 +324,24 @@ def test_unseen_vertices_take_the_colour_of_their_neighbours(ball):
     assert (visibility.color_vertices(ball, [away], [red]) == 128).all()
     with pytest.raises(LinprimError, match="64x64"):
         visibility.color_vertices(ball, [camera], [red[:64, :64]])
+
+
+def test_what_stands_in_front_does_not_colour_what_is_behind(ball):
+    both = Mesh(
+        np.concatenate([ball.vertices, 0.5 * ball.vertices + [2.0, 0, 0]]),
+        np.concatenate([ball.faces, ball.faces + len(ball.vertices)]),
+    )
+    # From +x the small green ball hides the middle of the large red one; from the side it does not.
+    cameras, pictures = [look_at([6, 0, 0]), look_at([3, 4, 1])], []
+    for camera in cameras:
+        large, small = sphere_depth(camera), sphere_depth(camera, 0.5, (2.0, 0, 0))
+        green = (small > 0) & ((large == 0) | (small < large))
+        pictures.append(np.where(green[..., None], [0, 200, 0], [200, 0, 0]).astype(np.uint8))
+    hidden = np.flatnonzero(ball.vertices[:, 0] > 0.9)
+    assert len(hidden) > 100
+    for count in (1, 2):  # with the first view alone, red comes from the neighbours
+        colors = visibility.color_vertices(both, cameras[:count], pictures[:count])
+        assert (colors[hidden] == [200, 0, 0]).all(1).mean() > 0.95
 
 
 def test_visible_faces_are_those_in_view_and_not_hidden(ball):

@@ -145,6 +145,7 @@ def test_a_split_without_views_is_refused(run_copy, tmp_path):
     from linprim_geo.synth import synthesize
 
     synthesize(scene, views=2, test_views=0, size=16, points=10, supersample=1)
+    (scene / "transforms_test.json").unlink(missing_ok=True)
     assert len(load_scene(scene).test) == 0
     config = json.loads((run_copy / "config.json").read_text()) | {"scene": str(scene)}
     (run_copy / "config.json").write_text(json.dumps(config))

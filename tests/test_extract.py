@@ -1,0 +1,167 @@
+"""Meshes out of runs: against a surface that is known exactly, in every format, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import CENTER, octahedron_run
+
+from linprim_geo.errors import LinprimError
+from linprim_geo.eval.mesh import score_mesh
+from linprim_geo.extract import depth_frames, extract_mesh
+from linprim_geo.mesh import load_mesh, topology, validate_mesh
+from linprim_geo.options import ExtractOptions
+from linprim_geo.run import Run
+
+STATS = {
+    "mesh", "mesh_visible", "method", "level", "voxel_size", "truncation_voxels", "unit", "views", "primitives",
+    "vertices", "faces", "components", "boundary_edges", "non_manifold_edges", "genus", "watertight", "area", "volume",
+    "visible", "seconds", "memory_gib",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def extracted(solid):
+    """(what extract_mesh returned for the opaque octahedron, its folder)"""
+    return extract_mesh(solid, quiet=True), solid / "mesh" / "tsdf"
+
+
+def outputs(folder):
+    return sorted(path.name for path in folder.rglob("*") if path.is_file())
+
+
+def test_what_is_written(extracted, solid):
+    stats, folder = extracted
+    assert outputs(folder) == ["mesh.ply", "mesh_visible.ply", "stats.json"]
+    assert STATS <= stats.keys()
+    assert json.loads((folder / "stats.json").read_text()) == json.loads(json.dumps(stats))
+    assert stats["mesh"] == str(folder / "mesh.ply") and stats["mesh_visible"] == str(folder / "mesh_visible.ply")
+    assert stats["views"] == 24 and stats["primitives"] == 1
+    assert stats["seconds"].keys() == {"render", "fuse", "visibility", "color", "write", "total"}
+    assert stats["visible"].keys() == topology(load_mesh(folder / "mesh.ply")).keys()
+
+
+def test_the_mesh_is_the_surface(extracted, solid):
+    stats, folder = extracted
+    mesh, reference = load_mesh(folder / "mesh.ply"), load_mesh(solid.parent / "scene" / "reference.ply")
+    scores = score_mesh(mesh, reference, samples=20_000)
+    # Edges and corners are rounded within a voxel; the faces themselves are exact.
+    assert scores["accuracy"] < 0.5 * stats["voxel_size"] and scores["completeness"] < 0.5 * stats["voxel_size"]
+    assert scores["chamfer_percent_diagonal"] < 0.6 and scores["normal_consistency"] > 0.97
+    truth = topology(reference)
+    assert stats["components"] == 1 and stats["genus"] == 0
+    assert stats["volume"] == pytest.approx(truth["volume"], rel=0.05)
+    assert stats["area"] == pytest.approx(truth["area"], rel=0.05)
+    assert np.abs(mesh.vertices.mean(0) - np.array(CENTER)).max() < 0.05
+
+
+def test_normals_point_outward_and_colours_are_those_of_the_photographs(extracted):
+    mesh = load_mesh(extracted[1] / "mesh.ply")
+    outward = mesh.vertices - np.array(CENTER)
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    assert np.abs(np.linalg.norm(mesh.normals, axis=1) - 1).max() < 1e-3
+    assert (np.einsum("vc,vc->v", mesh.normals, outward) > 0).mean() > 0.98
+    colors = mesh.colors.astype(float)
+    # One flat colour, 0.5 + 0.7 Y0 = 0.697 of 255 in every channel.
+    assert np.abs(np.median(colors, 0) - 178).max() <= 2
+    assert (np.abs(colors - 178).max(1) < 20).mean() > 0.95
+
+
+def test_what_no_camera_sees_is_not_in_the_visible_mesh(extracted):
+    stats, folder = extracted
+    whole, visible = (load_mesh(folder / name) for name in ("mesh.ply", "mesh_visible.ply"))
+    assert 0.9 * len(whole.faces) <= len(visible.faces) == stats["visible"]["faces"] <= len(whole.faces)
+    triangles = {tuple(np.sort(row)) for row in np.round(whole.vertices[whole.faces].sum(2), 4)}
+    seen = {tuple(np.sort(row)) for row in np.round(visible.vertices[visible.faces].sum(2), 4)}
+    assert seen <= triangles
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".glb", ".stl", ".PLY"])
+def test_every_format_holds_the_same_surface(suffix, solid, extracted, tmp_path):
+    options = ExtractOptions(voxel_size=0.08)
+    stats = extract_mesh(solid, output=tmp_path / f"part{suffix}", options=options, quiet=True)
+    assert outputs(tmp_path) == sorted([f"part{suffix}", f"part_visible{suffix}"])
+    mesh = load_mesh(tmp_path / f"part{suffix}")
+    assert stats["voxel_size"] == pytest.approx(0.08) and len(mesh.faces) == stats["faces"]
+    assert np.abs(mesh.vertices.mean(0) - np.array(CENTER)).max() < 0.1
+    assert topology(validate_mesh(mesh, "part"))["area"] == pytest.approx(stats["area"], rel=1e-3)
+
+
+def test_a_coarser_grid_gives_fewer_triangles(solid, extracted, tmp_path):
+    fine, coarse = (
+        extract_mesh(solid, output=tmp_path / f"{size}.ply", options=ExtractOptions(voxel_size=size), quiet=True)
+        for size in (0.05, 0.1)
+    )
+    assert 2.5 < fine["faces"] / coarse["faces"] < 6
+
+
+def test_the_level_moves_the_surface_of_a_soft_body(tmp_path):
+    run = octahedron_run(tmp_path, density=6.0, views=16, size=48)
+    volumes = [
+        extract_mesh(run, options=ExtractOptions(level=level, voxel_size=0.06), quiet=True)["volume"]
+        for level in (0.9, 0.5)
+    ]
+    # Half of the light is gone ln 2 / 6 = 0.12 behind the surface, of an octahedron some 0.7 in radius.
+    assert volumes[1] < 0.85 * volumes[0]
+
+
+def test_the_same_run_gives_the_same_mesh(tiny_run, tmp_path):
+    for name in ("a", "b"):
+        extract_mesh(tiny_run, output=tmp_path / f"{name}.ply", quiet=True)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_a_trained_part_is_near_the_truth(tiny_run, tiny_scene, tmp_path):
+    stats = extract_mesh(tiny_run, output=tmp_path / "m.ply", quiet=True)
+    scores = score_mesh(load_mesh(stats["mesh"]), load_mesh(tiny_scene / "reference.ply"), samples=20_000)
+    # 12 photographs of 48 pixels: a pixel is 2 % of the diagonal.
+    assert scores["chamfer_percent_diagonal"] < 4 and scores["f1"] > 0.1
+
+
+def test_no_surface_at_the_level_writes_nothing(tmp_path):
+    run = octahedron_run(tmp_path, density=0.1, views=4, size=32)
+    with pytest.raises(LinprimError, match="no ray.*crosses transmittance 0.5"):
+        extract_mesh(run, quiet=True)
+    assert not (run / "mesh").exists()
+    assert not [path for path in tmp_path.rglob("*.tmp*")]
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [({"level": 0.0}, "--level"), ({"level": 1.0}, "--level"), ({"level": float("nan")}, "--level"),
+     ({"voxel_size": 1e-5}, "memory|voxel"), ({"memory_limit": 1e-4, "voxel_size": 0.005}, "memory|GiB"),
+     ({"voxel_size": -1.0}, "voxel"), ({"truncation": 0.0}, "truncation"), ({"smallest_part": 2.0}, "smallest")],
+)  # fmt: skip
+def test_options_that_cannot_be_used_are_refused(change, match, solid, tmp_path):
+    with pytest.raises(LinprimError, match=match):
+        extract_mesh(solid, output=tmp_path / "m.ply", options=replace(ExtractOptions(), **change), quiet=True)
+    assert outputs(tmp_path) == []
+
+
+def test_a_wrong_suffix_or_method_is_refused_before_anything_is_rendered(solid, tmp_path, monkeypatch):
+    monkeypatch.setattr(Run, "render_views", lambda *_, **__: pytest.fail("rendered"))
+    with pytest.raises(LinprimError, match="suffix.*'.xyz'"):
+        extract_mesh(solid, output=tmp_path / "m.xyz", quiet=True)
+    with pytest.raises(LinprimError, match="--method"):
+        extract_mesh(solid, method="magic", quiet=True)
+
+
+def test_a_run_that_saved_nothing_is_one_sentence(run_copy):
+    (run_copy / "run.json").unlink()
+    with pytest.raises(LinprimError, match="run.json is missing"):
+        extract_mesh(run_copy, quiet=True)
+
+
+def test_frames_are_in_the_frame_of_training(solid):
+    run = Run.open(solid)
+    frames = depth_frames(run, 0.5)
+    scale = run.similarity.scale
+    view, images = next(run.render_views(run.scene().train[:1]))
+    hit = frames[0].depth > 0
+    assert np.allclose(frames[0].depth[hit], images["depth_median"][hit] * scale, rtol=1e-5)
+    assert np.array_equal(frames[0].background, images["opacity"] < 0.5)
+    assert np.allclose(frames[0].camera.center, run.similarity.apply(view.camera.center))
+    assert not (frames[0].background & hit).any()
