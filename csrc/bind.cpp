@@ -6,6 +6,7 @@
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <cmath>
 #include <optional>
 #include <stdexcept>
 #include <string>
@@ -49,6 +50,10 @@ linprim::View make_view(const Pose& pose, const std::tuple<double, double, doubl
   std::tie(view.fx, view.fy, view.cx, view.cy) = intrinsics;
   view.width = width, view.height = height, view.near = near, view.stop = stop, view.level = level;
   if (width < 1 || height < 1 || int64_t(width) * height > (int64_t(1) << 31)) throw std::invalid_argument("the image size is not positive, or above 2^31 pixels");
+  bool finite = std::isfinite(view.fx) && std::isfinite(view.fy) && std::isfinite(view.cx) && std::isfinite(view.cy);
+  for (double x : view.world_to_camera) finite = finite && std::isfinite(x);
+  if (!finite) throw std::invalid_argument("the camera's pose or intrinsics are not finite");
+  if (!(stop >= 0 && stop < 1)) throw std::invalid_argument("stop has to be in [0, 1)");
   if (!(near > 0) || !(view.fx > 0) || !(view.fy > 0)) throw std::invalid_argument("near and the focal lengths have to be positive");
   return view;
 }

@@ -75,7 +75,7 @@ struct ProjectParams {
   Primitives<Real> primitives;
   Record<Real>* records;    // n
   Footprint* footprints;    // n
-  float* depth;             // n: depth of the centre, the key of the order
+  Real* depth;              // n: depth of the centre, the key of the order
   Real* color;              // (n, 3), 0 where not visible
   Real (*normals)[4][3];    // n: outward unit normals of slots 0-3 in camera space; null without geometry
 };

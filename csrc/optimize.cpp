@@ -13,6 +13,7 @@ namespace linprim {
 
 Photometric photometric_loss(const float* image, const float* target, const float* weight, int width, int height, float dssim,
                              float* gradient) {
+  constexpr double kNoWeight = 1e-12;
   constexpr int kStripRows = 96;  // fixed, so that sums do not depend on the number of threads
   static std::mutex mutex;
   static auto* buffers = new std::vector<float>;
@@ -24,7 +25,7 @@ Photometric photometric_loss(const float* image, const float* target, const floa
     params.weight_sum = 0;
     for (int64_t i = 0; i < plane; ++i) params.weight_sum += weight[i];
   }
-  params.weight_sum = std::max(3 * params.weight_sum, 1e-12);
+  params.weight_sum = std::max(3 * params.weight_sum, kNoWeight);
   const int strips = (height + kStripRows - 1) / kStripRows;
   std::vector<std::array<double, 3>> sums(size_t(strips) * 3, std::array<double, 3>{0, 0, 0});
   parallel_for(3 * strips, [&](int64_t task, int thread) {
@@ -35,6 +36,7 @@ Photometric photometric_loss(const float* image, const float* target, const floa
   Photometric result{0, 0, 0, 0};
   for (const auto& [l1, square, ssim] : sums) result.l1 += l1, result.mse += square, result.ssim += ssim;
   result.l1 /= params.weight_sum, result.mse /= params.weight_sum, result.ssim /= params.weight_sum;
+  if (params.weight_sum <= kNoWeight) return {0, 0, 1, 0};  // no pixel counts, and the gradient is 0 already
   result.loss = (1.0 - dssim) * result.l1 + dssim * (1.0 - result.ssim);
   return result;
 }

@@ -14,6 +14,8 @@ namespace linprim::LINPRIM_ISA {
 
 // A face seen edge-on divides by h = 0; |h| is kept above this part of the largest term in it.
 constexpr double kEdgeOn = 1e-6;
+// Densities above this, opaque over any length that floats resolve, are taken as this: products with it stay finite.
+constexpr double kLargestDensity = 1e20;
 // Slack, in pixels, of screen bounds and silhouette lines: covers the float rounding of the planes the tile kernels evaluate.
 constexpr double kPixelSlack = 1e-3;
 
@@ -189,7 +191,7 @@ void project(const ProjectParams<Real>& P, int64_t begin, int64_t end) {
       print[l].y1 = int(std::floor(std::clamp(hi_y[l] + kPixelSlack, -1.0, view.height - 1.0)));
       if (!(visible[l] && print[l].x0 <= print[l].x1 && print[l].y0 <= print[l].y1)) print[l].x1 = -1, print[l].x0 = 0, visible[l] = 0;
       any |= visible[l] != 0;
-      P.depth[first + l] = float(f.center[2][l]);
+      P.depth[first + l] = Real(f.center[2][l]);
       Real* color = P.color + 3 * (first + l);
       color[0] = color[1] = color[2] = 0;
     }
@@ -262,7 +264,7 @@ void project(const ProjectParams<Real>& P, int64_t begin, int64_t end) {
         for (int k = 0; k < 3; ++k) record.face[k][s] = Real(face[k][s][l]);
       }
       record.w0 = Real(ref.w0[l]);
-      record.density = P.primitives.density[row];
+      record.density = std::clamp(P.primitives.density[row], Real(0), Real(kLargestDensity));
       record.ref_x = int(ref.x[l]), record.ref_y = int(ref.y[l]);
       record.flags = (front[0][l] ? 1u : 0u) | (front[1][l] ? 2u : 0u) | (front[2][l] ? 4u : 0u) | (front[3][l] ? 8u : 0u) |
                      (general[l] ? kGeneral : 0u);
@@ -291,7 +293,8 @@ void project(const ProjectParams<Real>& P, int64_t begin, int64_t end) {
       double rgb[3] = {0.5, 0.5, 0.5};
       for (int i = 0; i < count; ++i)
         for (int k = 0; k < 3; ++k) rgb[k] += basis[i][l] * double(sh[3 * i + k]);
-      for (int k = 0; k < 3; ++k) record.rgb[k] = P.color[3 * row + k] = Real(std::max(rgb[k], 0.0));
+      // A colour that is not finite is handed on as it is, for the caller to find.
+      for (int k = 0; k < 3; ++k) record.rgb[k] = P.color[3 * row + k] = Real(std::isfinite(rgb[k]) ? std::max(rgb[k], 0.0) : rgb[k]);
       if (P.normals) {
         for (int j = 0; j < 4; ++j) {
           double n[3], length2 = 0;

@@ -474,7 +474,8 @@ void backward_tile(const RasterParams<Real>& P, int tile) {
         // chord = |v| (t_out - t_in); w = 1/t, so dL/dw = -t^2 dL/dt. A ray that entered through the near plane moves with no face.
         const V g_in = select(hit & is_face(in_face), t_in * t_in * (d_chord - d_in), zero);
         const V g_out = select(hit & is_face(out_face), zero - t_out * t_out * (d_chord + d_out), zero);
-        const V g_in_w = g_in * in, g_out_w = g_out * out;
+        // A lane that does not hit may hold an infinity, and 0 times that is no number.
+        const V g_in_w = g_in * select(hit, in, zero), g_out_w = g_out * select(hit, out, zero);
         const V px = lanes.x + V::set(Real(x)), py = lanes.y + V::set(Real(y));
         for (int k = 0; k < 3; ++k) {
           const V s_in = lookup8(record.face[k], in_face), s_out = lookup8(record.face[k], out_face);

@@ -76,7 +76,7 @@ struct Frame {
   std::vector<Record<Real>> records;
   std::vector<std::array<std::array<Real, 3>, 4>> normals;
   std::vector<Footprint> footprints;
-  std::vector<float> depth;
+  std::vector<Real> depth;
   std::vector<uint32_t> order, order_swap, keys, keys_swap;
   std::vector<LoosePair> loose[kBinChunks];
   int64_t loose_count[kBinChunks];
@@ -113,12 +113,18 @@ struct Frame {
   void sort(int64_t n) {
     grow(order, n), grow(order_swap, n), grow(keys, n), grow(keys_swap, n);
     visible = 0;
+    if constexpr (sizeof(Real) == 8) {
+      for (int64_t i = 0; i < n; ++i)
+        if (footprints[i].x0 <= footprints[i].x1) order[visible++] = uint32_t(i);
+      std::stable_sort(order.begin(), order.begin() + visible, [&](uint32_t a, uint32_t b) { return depth[a] < depth[b]; });
+      return;
+    }
     constexpr int kBits = 11, kPasses = 3, kBuckets = 1 << kBits;
     static thread_local uint32_t histogram[kPasses][kBuckets];
     std::memset(histogram, 0, sizeof histogram);
     for (int64_t i = 0; i < n; ++i) {
       if (footprints[i].x1 < footprints[i].x0) continue;
-      uint32_t key = std::bit_cast<uint32_t>(depth[i] + 0.0f);  // -0 sorts as 0
+      uint32_t key = std::bit_cast<uint32_t>(float(depth[i]) + 0.0f);  // -0 sorts as 0
       key ^= (key >> 31) ? 0xffffffffu : 0x80000000u;           // ascending as unsigned
       keys[visible] = key, order[visible] = uint32_t(i), ++visible;
       for (int pass = 0; pass < kPasses; ++pass) ++histogram[pass][key >> (kBits * pass) & (kBuckets - 1)];

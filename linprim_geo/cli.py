@@ -384,7 +384,6 @@ def _train(parsed: argparse.Namespace) -> dict:
         from_args(TrainOptions, parsed),
         resume=parsed.resume,
         quiet=parsed.quiet,
-        json=parsed.json,
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -61,24 +60,20 @@ def extract_mesh(run: str | os.PathLike, method: str = "tsdf", output: str | os.
     if not any((frame.depth > 0).any() for frame in frames):
         raise LinprimError(f"{opened.path}: no ray of any training view crosses transmittance {options.level}, so there is no surface")
     lap("render")
-    # Fused in the training frame, which is centred and of moderate size, whatever the data set's coordinates are.
-    scale = opened.similarity.scale
-    voxel = options.voxel_size * scale if options.voxel_size > 0 else auto_voxel_size(frames)
+    voxel = options.voxel_size if options.voxel_size > 0 else auto_voxel_size(frames)
     limit = int(options.memory_limit * 2**30) if options.memory_limit > 0 else None
     mesh = fuse_tsdf(frames, voxel_size=voxel, truncation_voxels=options.truncation, memory_limit=limit, min_component=options.smallest_part,
                      threads=opened.train_options.threads, log=lambda text: progress.note("  " + text))
     lap("fuse")
     seen = visible_faces(mesh, [frame.camera for frame in frames])
     lap("visibility")
-    quality = None if mesh.quality is None else (mesh.quality / scale).astype(np.float32)
-    mesh = replace(mesh, vertices=opened.similarity.inverse().apply(mesh.vertices), quality=quality)
     visible = select_faces(mesh, seen)
     visible_target = target.with_name(f"{target.stem}_visible{target.suffix}")
     save_mesh(target, mesh)
     save_mesh(visible_target, visible)
     lap("write")
     stats = {
-        "mesh": str(target), "mesh_visible": str(visible_target), "method": method, "level": options.level, "voxel_size": voxel / scale,
+        "mesh": str(target), "mesh_visible": str(visible_target), "method": method, "level": options.level, "voxel_size": voxel,
         "truncation_voxels": options.truncation, "unit": opened.unit, "views": len(frames), "primitives": opened.state.get("primitives"),
         **topology(mesh), "visible": topology(visible), "seconds": {**seconds, "total": round(sum(seconds.values()), 3)},
         "memory_gib": round(memory_gib(), 3),
@@ -89,12 +84,11 @@ def extract_mesh(run: str | os.PathLike, method: str = "tsdf", output: str | os.
 
 
 def depth_frames(run: Run, level: float) -> list:
-    """`fuse.DepthFrame`s of the training views in the training frame: depth at `level`, the photographs' colours, free background."""
+    """`fuse.DepthFrame`s of the training views: depth at transmittance `level`, the photographs' colours, free background."""
     from .fuse import DepthFrame
 
-    scale = np.float32(run.similarity.scale)
     frames = []
     for view, depth, opacity in run.surface_depths(run.scene().train, level):
         free = opacity < SEEN_THROUGH
-        frames.append(DepthFrame(view.camera.transformed(run.similarity), np.where(free, 0, depth * scale), color=view.load().rgb, background=free))
+        frames.append(DepthFrame(view.camera, np.where(free, np.float32(0), depth), color=view.load().rgb, background=free))
     return frames

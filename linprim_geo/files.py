@@ -6,6 +6,7 @@ import contextlib
 import errno
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -41,6 +42,12 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
             raise LinprimError(f"{path}: no space left on the device; the previous file is untouched") from error
         if error.errno in (errno.EACCES, errno.EROFS, errno.EPERM, errno.ENOTDIR, errno.EEXIST):
             raise LinprimError(f"{path}: cannot be written ({os.strerror(error.errno)})") from error
+        if _disk_is_full(path.parent):
+            raise LinprimError(f"{path}: no space left on the device; the previous file is untouched") from error
+        raise
+    except RuntimeError as error:  # how torch reports a write that failed
+        if _disk_is_full(path.parent):
+            raise LinprimError(f"{path}: no space left on the device; the previous file is untouched") from error
         raise
     finally:
         if temporary is not None:
@@ -52,6 +59,14 @@ def write_json(path: str | os.PathLike, value: object) -> None:
     """Writes `value` as indented JSON, atomically. NaN and infinity become null, which JSON can hold."""
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(_finite(value), indent=2) + "\n")
+
+
+def _disk_is_full(folder: Path) -> bool:
+    """Whether less than a MiB is left; asked while the file that failed is still there."""
+    try:
+        return shutil.disk_usage(folder).free < 2**20
+    except OSError:
+        return False
 
 
 def _finite(value):

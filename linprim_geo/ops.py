@@ -40,6 +40,12 @@ def _planes(like: Tensor, width: int, height: int, geometry: bool) -> list[Tenso
     return [like.new_empty(shape if i < 2 or geometry else (0,)) for i, shape in enumerate(shapes)]
 
 
+def _check_dtypes(wanted: torch.dtype, **tensors: Tensor) -> None:
+    for name, tensor in tensors.items():
+        if tensor.dtype != wanted:
+            raise ValueError(f"{name} is {tensor.dtype}, wanted {wanted}")
+
+
 def _check_finite(suffix: str, **tensors: Tensor) -> None:
     check = getattr(_core, f"first_non_finite_{suffix}")
     for name, tensor in tensors.items():
@@ -56,6 +62,7 @@ def _rasterize(
     near: float, stop: float, level: float, geometry: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     suffix = _suffix(center.dtype)
+    _check_dtypes(center.dtype, rotation=rotation, extent=extent, density=density, sh=sh, background=background)
     _check_finite(suffix, center=center, rotation=rotation, extent=extent, density=density, background=background)
     planes = _planes(center, width, height, geometry)
     count = center.shape[0]
@@ -161,7 +168,7 @@ def rasterize(
         center: (N, 3) world positions. float32 or float64; all tensors alike.
         rotation: (N, 4) quaternions w, x, y, z of any length but 0, which means no rotation.
         extent: (N, 3) half-axes, world units. A primitive with one that is not positive is not drawn.
-        density: (N,) optical thickness per world unit, >= 0.
+        density: (N,) optical thickness per world unit; below 0 counts as 0.
         sh: (N, K, 3) spherical harmonics, K = 1, 4, 9 or 16; colour = max(0, 0.5 + their sum at the direction from the camera
             to the centre).
         background: (3,) colour behind everything.
@@ -175,8 +182,9 @@ def rasterize(
         screen: (N, 2) zeros; their gradient is that of the loss to the projected centres, per pixel.
 
     Raises:
-        LinprimError: a non-finite input (naming tensor and row) or a dtype other than float32, float64.
-        ValueError: shapes that do not fit.
+        LinprimError: a non-finite input (naming tensor and row; in sh, of primitives that are in view) or a dtype other than
+            float32, float64.
+        ValueError: shapes, dtypes or a camera that do not fit.
 
     Gradient: to center, rotation, extent, density, sh, background and screen, of every image; once.
 
@@ -214,6 +222,7 @@ def level_depth(center: Tensor, rotation: Tensor, extent: Tensor, density: Tenso
     Accuracy: float64 to 1e-13, float32 to 1e-6, of the depth.
     """
     suffix = _suffix(center.dtype)
+    _check_dtypes(center.dtype, rotation=rotation, extent=extent, density=density, sh=sh)
     _check_finite(suffix, center=center, rotation=rotation, extent=extent, density=density)
     if not 0 < level < 1:
         raise ValueError(f"level is {level}, wanted a transmittance between 0 and 1")
@@ -227,6 +236,7 @@ def level_depth(center: Tensor, rotation: Tensor, extent: Tensor, density: Tenso
 
 @torch.library.custom_op("linprim_geo::photometric_loss", mutates_args=())
 def _photometric(image: Tensor, target: Tensor, dssim: float, weight: Tensor | None) -> tuple[Tensor, Tensor]:
+    _check_dtypes(torch.float32, image=image, target=target, **({} if weight is None else {"weight": weight}))
     gradient = torch.empty_like(image, memory_format=torch.contiguous_format)
     parts = _core.photometric_loss(_array(image), _array(target), None if weight is None else _array(weight), dssim, gradient.numpy())
     return torch.tensor(parts, dtype=torch.float64), gradient
@@ -271,6 +281,9 @@ def adam_step(value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, ra
 
     Source: Kingma and Ba, ICLR 2015, algorithm 1.
     """
+    _check_dtypes(torch.float32, value=value, gradient=gradient, first=first, second=second)
+    if not (value.is_contiguous() and first.is_contiguous() and second.is_contiguous()):
+        raise ValueError("value, first and second are changed in place and have to be contiguous")
     _core.adam_step(value.detach().numpy(), _array(gradient), first.numpy(), second.numpy(), rate, beta1, beta2, epsilon, step)
 
 

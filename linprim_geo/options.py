@@ -3,12 +3,43 @@ the Python functions and a run's config.json cannot disagree."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+
+from .errors import LinprimError
 
 
 def option(default, text: str, choices: tuple = (), metavar: str | None = None):
     """A dataclass field that the command line turns into `--field-name` with `text` as its help."""
     return field(default=default, metadata={"help": text, "choices": choices, "metavar": metavar})
+
+
+def from_saved(cls: type, values: object, where: str):
+    """An options dataclass from what a file holds. Options that this version no longer has are ignored.
+
+    Raises:
+        LinprimError: not a table, or a value of another type than the option's.
+    """
+    if not isinstance(values, dict):
+        raise LinprimError(f"{where}: holds {type(values).__name__} in place of options")
+    taken = {}
+    for entry in fields(cls):
+        if entry.name not in values:
+            continue
+        value, wanted = values[entry.name], type(entry.default)
+        if isinstance(value, bool) != (wanted is bool) or not isinstance(value, (int, float) if wanted is float else wanted):
+            raise LinprimError(f"{where}: {entry.name} is {value!r}, wanted {wanted.__name__}")
+        taken[entry.name] = wanted(value)
+    return cls(**taken)
+
+
+def check_train_options(options: TrainOptions) -> None:
+    """Raises LinprimError for a value outside its range."""
+    ranges = {"iterations": (1, 10**8), "max_primitives": (1, 2**30), "initial_primitives": (0, options.max_primitives), "seed": (0, 2**63),
+              "threads": (0, 4096), "samples": (1, 8), "dssim": (0, 1), "stop": (0, 0.5), "checkpoint_every": (1, 10**9),
+              "evaluate_every": (0, 10**9), "sh_degree": (0, 3)}
+    for name, (low, high) in ranges.items():
+        if not low <= getattr(options, name) <= high:
+            raise LinprimError(f"--{name.replace('_', '-')} is {getattr(options, name)}, wanted {low} to {high}")
 
 
 @dataclass(frozen=True)
@@ -44,7 +75,7 @@ class TrainOptions:
 class ExtractOptions:
     """How a surface is taken out of a run."""
 
-    level: float = option(0.5, "transmittance at which the surface is taken, between 0 and 1")
+    level: float = option(0.75, "transmittance at which the surface is taken, between 0 and 1; nearer to 1 is nearer to the camera")
     voxel_size: float = option(0.0, "grid spacing in the data set's unit; 0 chooses from the views", metavar="LENGTH")
     truncation: float = option(3.0, "truncation distance in voxels")
     memory_limit: float = option(0.0, "memory the grid may take, in GiB; 0 allows 60 % of what is free", metavar="GIB")

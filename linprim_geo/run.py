@@ -24,7 +24,7 @@ from . import __version__
 from .camera import Similarity
 from .errors import LinprimError
 from .files import write_json
-from .options import SceneOptions, TrainOptions
+from .options import SceneOptions, TrainOptions, check_train_options, from_saved
 from .primitives import Octahedra, load_octahedra, save_octahedra
 from .scene import Scene, View, load_scene
 
@@ -71,12 +71,17 @@ class Run:
         config, transform = _read_json(path / "config.json", path), _read_json(path / "transform.json", path)
         try:
             similarity = Similarity(float(transform["scale"]), tuple(float(x) for x in transform["offset"]))
-            return Run(
-                path, Path(config["scene"]), _known(SceneOptions, config["scene_options"]),
-                _known(TrainOptions, config["train_options"]), similarity, transform["unit"],
-            )
+            scene, unit = Path(config["scene"]), str(transform["unit"])
+            saved = config["scene_options"], config["train_options"]
         except (KeyError, TypeError, ValueError) as error:
             raise LinprimError(f"{path}: config.json or transform.json lacks what a run needs ({error})") from None
+        numbers = (similarity.scale, *similarity.offset)
+        if len(numbers) != 4 or not np.isfinite(numbers).all() or similarity.scale <= 0:
+            raise LinprimError(f"{path / 'transform.json'}: holds no positive scale with an offset of three numbers")
+        where = str(path / "config.json")
+        options = from_saved(TrainOptions, saved[1], where)
+        check_train_options(options)
+        return Run(path, scene, from_saved(SceneOptions, saved[0], where), options, similarity, unit)
 
     def scene(self) -> Scene:
         """The capture it was trained on."""
@@ -91,8 +96,9 @@ class Run:
     def state(self) -> dict:
         """Contents of run.json: `iteration`, `primitives`, `background`, `seconds`."""
         state = _read_json(self.path / "run.json", self.path)
-        if not isinstance(state.get("background"), list) or len(state["background"]) != 3:
-            raise LinprimError(f"{self.path / 'run.json'}: has no background colour of three numbers")
+        color = state.get("background")
+        if not isinstance(color, list) or len(color) != 3 or not all(isinstance(x, (int, float)) and 0 <= x <= 1 for x in color):
+            raise LinprimError(f"{self.path / 'run.json'}: has no background colour of three numbers in [0, 1]")
         return state
 
     @property
@@ -180,12 +186,6 @@ def to_data_set(octahedra: Octahedra, similarity: Similarity) -> Octahedra:
         octahedra, center=inverse.apply(octahedra.center), extent=octahedra.extent / similarity.scale,
         density=octahedra.density * similarity.scale,
     )
-
-
-def _known(cls, values: dict):
-    """The dataclass from a saved dict; options that this version no longer has are ignored."""
-    names = cls.__dataclass_fields__
-    return cls(**{k: v for k, v in values.items() if k in names})
 
 
 def _read_json(file: Path, run: Path) -> dict:

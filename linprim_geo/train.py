@@ -7,13 +7,14 @@ the interrupted one bit for bit.
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,8 @@ import torch
 from . import ops, population
 from .camera import Camera
 from .errors import LinprimError
-from .options import SceneOptions, TrainOptions
+from .files import atomic_write
+from .options import SceneOptions, TrainOptions, check_train_options
 from .primitives import SH_Y0, Octahedra
 from .progress import Progress, duration, memory_gib
 from .run import Run
@@ -36,6 +38,10 @@ RATES = {
 }
 # Half-axes stay within these: a part of a pixel at the distance of the subject, and of the scene's radius.
 SMALLEST_PX, LARGEST_PART = 0.35, 0.5
+# Primitives at the start, as a share of the most there may be: from points on surfaces, and from random ones.
+SFM_START, RANDOM_START = 0.8, 0.25
+# Triangulated points fewer than this leave too much of a scene empty.
+FEW_POINTS = 500
 # Share of the run after which each further degree of view-dependent colour joins.
 DEGREE_EVERY = 0.07
 # Held-out views scored during training; all of them are at the end.
@@ -75,31 +81,42 @@ def load_shots(views: tuple[View, ...], similarity) -> list[Shot]:
         return list(pool.map(load, views))
 
 
-def initial_cloud(scene: Scene, count: int, seed: int) -> PointCloud:
-    """Points to start from, at most `count`, in the data set's frame: the scene's own, triangulated ones, or random ones.
+def with_points(scene: Scene, options: TrainOptions, log: Callable[[str], None]) -> Scene:
+    """The scene with points to start from: its own, triangulated under the known poses, or random where cameras look.
 
-    A scene with an alpha channel and no points starts from random points inside the visual hull; without alpha, features are
-    matched and triangulated under the known poses, and random points in the common field of view fill up.
+    A scene with alpha and no points starts inside the visual hull. Without alpha, features are matched and triangulated; if they
+    are few, random points in the common field of view fill up.
     """
     from .initial_points import frusta_points, visual_hull_points
     from .triangulate import triangulate_points
 
-    cloud = scene.points
-    if cloud is None or len(cloud.xyz) == 0:
-        if scene.has_alpha:
-            return visual_hull_points(scene, count, seed)
-        try:
-            cloud = triangulate_points(scene, seed=seed)
-        except LinprimError:
-            cloud = None
-        found = 0 if cloud is None else len(cloud.xyz)
-        if found < min(500, count):
-            extra = frusta_points(scene, count - found, seed)
-            return extra if found == 0 else PointCloud(np.concatenate([cloud.xyz, extra.xyz]), np.concatenate([cloud.rgb, extra.rgb]))
-    if len(cloud.xyz) > count:
-        keep = np.sort(np.random.default_rng([seed, 1]).choice(len(cloud.xyz), count, replace=False))
-        cloud = PointCloud(cloud.xyz[keep], cloud.rgb[keep])
-    return cloud
+    if scene.points is not None and len(scene.points.xyz):
+        return scene
+    count = _initial_count(options, RANDOM_START)
+    if scene.has_alpha:
+        return replace(scene, points=visual_hull_points(scene, count, options.seed))
+    try:
+        cloud = triangulate_points(scene, seed=options.seed, log=log)
+    except LinprimError as error:
+        log(f"no points could be triangulated ({error}); starting from random ones")
+        return replace(scene, points=frusta_points(scene, count, options.seed))
+    if len(cloud.xyz) < min(FEW_POINTS, count):
+        extra = frusta_points(scene, count - len(cloud.xyz), options.seed)
+        cloud = PointCloud(np.concatenate([cloud.xyz, extra.xyz]), np.concatenate([cloud.rgb, extra.rgb]))
+    return replace(scene, points=cloud)
+
+
+def initial_cloud(cloud: PointCloud, options: TrainOptions) -> PointCloud:
+    """At most as many of the points as the population starts with, drawn without replacement."""
+    count = _initial_count(options, SFM_START)
+    if len(cloud.xyz) <= count:
+        return cloud
+    keep = np.sort(np.random.default_rng([options.seed, 1]).choice(len(cloud.xyz), count, replace=False))
+    return PointCloud(cloud.xyz[keep], cloud.rgb[keep])
+
+
+def _initial_count(options: TrainOptions, share: float) -> int:
+    return min(options.max_primitives, options.initial_primitives or max(500, round(share * options.max_primitives)))
 
 
 def initial_parameters(xyz: np.ndarray, rgb: np.ndarray, degree: int, seed: int, bounds: tuple[float, float]) -> dict[str, torch.Tensor]:
@@ -151,6 +168,8 @@ class Trainer:
         self.second = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
         self.pull = torch.zeros(len(self))
         self.step = 0
+        self.seconds = 0.0
+        self.loss = self.psnr = math.nan  # running means
         self.growth = population.Growth.plan(options.iterations, len(self), options.max_primitives)
 
     def __len__(self) -> int:
@@ -166,8 +185,13 @@ class Trainer:
         turn, place = divmod(step, len(self.shots))
         return int(np.random.default_rng([self.options.seed, 3, turn]).permutation(len(self.shots))[place])
 
-    def advance(self) -> tuple[float, float]:
-        """One training step. Returns its loss and PSNR."""
+    def advance(self) -> None:
+        """One training step.
+
+        Raises:
+            LinprimError: a parameter or the loss is no longer finite.
+        """
+        begin = time.perf_counter()
         shot = self.shots[self.view_of(self.step)]
         background = self.background
         if self.fitted:
@@ -190,7 +214,12 @@ class Trainer:
         if self.growth.is_due(self.step):
             self._grow()
         loss, _, _, error = parts.detach().tolist()
-        return loss, -10 * math.log10(max(error, 1e-12))
+        psnr = -10 * math.log10(max(error, 1e-12)) if math.isfinite(error) else math.nan
+        self.loss = 0.98 * self.loss + 0.02 * loss if self.step > 1 else loss
+        self.psnr = 0.98 * self.psnr + 0.02 * psnr if self.step > 1 else psnr
+        self.seconds += time.perf_counter() - begin
+        if not math.isfinite(loss):
+            raise LinprimError(f"the loss is {loss}")
 
     def _update(self, grads: dict[str, torch.Tensor | None]) -> None:
         part = self.step / self.options.iterations
@@ -245,26 +274,26 @@ class Trainer:
     def state(self) -> dict:
         """Everything a resumed run needs, as tensors and numbers."""
         return {"parameters": self.parameters, "first": self.first, "second": self.second, "pull": self.pull, "step": self.step,
-                "bounds": list(self.bounds), "growth": [self.growth.first, self.growth.last, self.growth.every, self.growth.rate, self.growth.cap]}
+                "bounds": list(self.bounds), "seconds": self.seconds, "loss": self.loss, "psnr": self.psnr, "growth": [self.growth.first, self.growth.last, self.growth.every, self.growth.rate, self.growth.cap]}
 
     def restore(self, state: dict) -> None:
         """Takes back what `state` returned."""
         for name in ("parameters", "first", "second"):
             if set(state[name]) != set(getattr(self, name)):
-                raise LinprimError(f"the checkpoint holds {sorted(state[name])}, wanted {sorted(getattr(self, name))}")
+                raise ValueError(f"{name} has {sorted(state[name])}, wanted {sorted(getattr(self, name))}")
             setattr(self, name, dict(state[name]))
         self.pull, self.step = state["pull"], int(state["step"])
         self.bounds = (float(state["bounds"][0]), float(state["bounds"][1]))
+        self.seconds, self.loss, self.psnr = float(state["seconds"]), float(state["loss"]), float(state["psnr"])
         first, last, every, rate, cap = state["growth"]
         self.growth = population.Growth(int(first), int(last), int(every), float(rate), int(cap))
 
 
 def train(scene: str | os.PathLike, run: str | os.PathLike, scene_options: SceneOptions | None = None, options: TrainOptions | None = None,
-          *, resume: bool = False, quiet: bool = False, json: bool = False) -> dict:
+          *, resume: bool = False, quiet: bool = False) -> dict:
     """Trains a scene into a run folder.
 
-    With `resume` the folder's own options are used, except that a larger number of iterations is not possible: learning rates and
-    growth depend on it. Interrupted (Ctrl-C), it finishes the step, saves, and raises KeyboardInterrupt.
+    With `resume` the folder's own options are used (but for `threads`): learning rates and growth depend on them. Interrupted (Ctrl-C), it finishes the step, saves, and raises KeyboardInterrupt.
 
     Returns: `run`, `iterations`, `seconds` (of training steps alone), `primitives`, `psnr` (mean over held-out views), `views`.
 
@@ -274,37 +303,45 @@ def train(scene: str | os.PathLike, run: str | os.PathLike, scene_options: Scene
     from .initial_points import scene_normalization
 
     run_path = Path(run)
-    _check(options := options or TrainOptions())
+    check_train_options(options := options or TrainOptions())
+    progress = Progress("train", options.iterations, quiet=quiet)
     if resume:
         opened = Run.open(run_path)
         if Path(scene).resolve() != opened.scene_path:
             raise LinprimError(f"{run_path}: was trained on {opened.scene_path}, not on {Path(scene).resolve()}")
+        ignored = [f.name for f in fields(options) if getattr(options, f.name) not in (f.default, getattr(opened.train_options, f.name))]
+        if set(ignored) - {"threads"}:
+            progress.note(f"--resume goes on with the run's own options: {', '.join(sorted(set(ignored) - {'threads'}))} ignored")
         options = replace(opened.train_options, threads=options.threads)
+        progress.total = options.iterations
         loaded = opened.scene()
     else:
         scene_options = scene_options or SceneOptions()
         loaded = load_scene(scene, downscale=scene_options.downscale, masks=scene_options.masks or None, sparse=scene_options.sparse or None)
         if run_path.exists() and (not run_path.is_dir() or any(run_path.iterdir())):
             raise LinprimError(f"{run_path}: exists already; give another folder with -o, or go on with --resume")
+        _threads(options)
+        loaded = with_points(loaded, options, progress.note)
         opened = Run(run_path, Path(scene), scene_options, options, scene_normalization(loaded), loaded.unit)
-    ops.set_threads(options.threads)
-    # torch only does small element-wise work here; its own threads would wait for each other longer than they compute.
-    torch.set_num_threads(1)
-    progress = Progress("train", options.iterations, quiet=quiet)
+    _threads(options)
     shots = load_shots(loaded.train, opened.similarity)
     if all(shot.alpha is not None and int(shot.alpha.max()) == 0 for shot in shots):
         raise LinprimError(f"{loaded.root}: the masks leave no pixel of any training image")
-    trainer = _start(loaded, opened, shots, options, resume)
+    # A run that was stopped before its first checkpoint begins again: nothing random depends on when.
+    resume_state = _read_checkpoint(run_path) if resume else None
+    if resume and resume_state is None:
+        _threads(options)
+        loaded = with_points(loaded, options, progress.note)
+    trainer = _start(loaded, opened, shots, options, resume_state)
     if not resume:
         Run.create(run_path, loaded, Path(scene), scene_options, options, opened.similarity)
-    seconds = _load_checkpoint(trainer, run_path) if resume else 0.0
     progress.start = trainer.step
     progress.note(
         f"{loaded.root}: {loaded.kind}, {len(loaded.train)} training and {len(loaded.test)} held-out views of "
         f"{shots[0].camera.width}x{shots[0].camera.height}; {len(trainer)} primitives, {ops.instruction_set()}, {ops.threads()} threads"
     )
     held_out = load_shots(loaded.test, opened.similarity)
-    seconds, score = _loop(trainer, opened, held_out, progress, seconds)
+    seconds, score = _loop(trainer, opened, held_out, progress)
     result = {"run": str(run_path), "iterations": trainer.step, "seconds": seconds, "primitives": len(trainer), "psnr": score,
               "views": len(held_out)}
     progress.note(f"{run_path}: {trainer.step} steps in {duration(seconds)}, {len(trainer)} primitives"
@@ -312,13 +349,10 @@ def train(scene: str | os.PathLike, run: str | os.PathLike, scene_options: Scene
     return result
 
 
-def _check(options: TrainOptions) -> None:
-    for name, low, high in (("iterations", 1, 10**8), ("max_primitives", 1, 2**30), ("initial_primitives", 0, 2**30), ("seed", 0, 2**63),
-                            ("threads", 0, 4096), ("samples", 1, 8), ("dssim", 0, 1), ("stop", 0, 0.5), ("checkpoint_every", 1, 10**9),
-                            ("evaluate_every", 0, 10**9), ("sh_degree", 0, 3)):
-        value = getattr(options, name)
-        if not low <= value <= high:
-            raise LinprimError(f"--{name.replace('_', '-')} is {value}, wanted {low} to {high}")
+def _threads(options: TrainOptions) -> None:
+    ops.set_threads(options.threads)
+    # torch only does small element-wise work here; its own threads would wait for each other longer than they compute.
+    torch.set_num_threads(1)
 
 
 def _background(text: str, has_alpha: bool) -> tuple[torch.Tensor, bool, bool]:
@@ -341,15 +375,14 @@ def _background(text: str, has_alpha: bool) -> tuple[torch.Tensor, bool, bool]:
     return torch.tensor(color, dtype=torch.float32), False, False
 
 
-def _start(scene: Scene, run: Run, shots: list[Shot], options: TrainOptions, resume: bool) -> Trainer:
-    """A trainer at step 0 (with `resume`, one whose parameters are about to be replaced)."""
+def _start(scene: Scene, run: Run, shots: list[Shot], options: TrainOptions, state: dict | None) -> Trainer:
+    """A trainer at step 0, or at the step of a checkpoint's `state`."""
     focal = float(np.median([max(s.camera.fx, s.camera.fy) for s in shots]))
     centers = np.stack([s.camera.center for s in shots])
-    if resume:
-        xyz, rgb, radius = np.zeros((4, 3)), np.zeros((4, 3)), 1.0
+    if state is not None:
+        xyz, rgb, radius = np.zeros((4, 3)), np.zeros((4, 3)), 1.0  # replaced below
     else:
-        wanted = options.initial_primitives or max(1, min(options.max_primitives, max(500, options.max_primitives // 4)))
-        cloud = initial_cloud(scene, wanted, options.seed)
+        cloud = initial_cloud(scene.points, options)
         xyz, rgb = run.similarity.apply(cloud.xyz), cloud.rgb
         middle = np.median(xyz, 0)
         reach = np.linalg.norm(xyz - middle, axis=1)
@@ -358,55 +391,64 @@ def _start(scene: Scene, run: Run, shots: list[Shot], options: TrainOptions, res
     bounds = (smallest, max(LARGEST_PART * radius, 4 * smallest))
     background, fitted, random_background = _background(options.background, scene.has_alpha)
     parameters = initial_parameters(xyz, rgb, options.sh_degree, options.seed, bounds)
-    return Trainer(shots, parameters, options, bounds, background, fitted, random_background)
+    trainer = Trainer(shots, parameters, options, bounds, background, fitted, random_background)
+    if state is not None:
+        try:
+            trainer.restore(state)
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise LinprimError(f"{run.path / 'checkpoints'}: the latest checkpoint lacks what a run needs ({error})") from None
+    return trainer
 
 
-def _loop(trainer: Trainer, run: Run, held_out: list[Shot], progress: Progress, seconds: float) -> tuple[float, float | None]:
+def _loop(trainer: Trainer, run: Run, held_out: list[Shot], progress: Progress) -> tuple[float, float | None]:
     """Steps until the end; returns the seconds spent in steps and the final held-out PSNR."""
-    import json
-
     options = trainer.options
-    metrics = run.path / "metrics.jsonl"
-    kept = [line for line in metrics.read_text().splitlines() if json.loads(line)["step"] <= trainer.step] if metrics.exists() else []
-    metrics.write_text("".join(line + "\n" for line in kept))
-    score = None
-    smooth_loss = smooth_psnr = None
-    saved = trainer.step if trainer.step else -1
-    with open(metrics, "a") as log, _interrupt_flag() as interrupted:
+    _cut_metrics(run.path / "metrics.jsonl", trainer.step)
+    score, saved = None, -1
+    with open(run.path / "metrics.jsonl", "a") as log, _interrupt_flag() as interrupted:
         while trainer.step < options.iterations and not interrupted:
-            begin = time.perf_counter()
-            loss, psnr = trainer.advance()
-            seconds += time.perf_counter() - begin
-            if not math.isfinite(loss):
-                raise LinprimError(f"training diverged at step {trainer.step}: the loss is {loss}; the last checkpoint is intact")
-            smooth_loss = loss if smooth_loss is None else 0.98 * smooth_loss + 0.02 * loss
-            smooth_psnr = psnr if smooth_psnr is None else 0.98 * smooth_psnr + 0.02 * psnr
+            try:
+                trainer.advance()
+            except LinprimError as error:
+                raise LinprimError(f"{run.path}: training diverged at step {trainer.step} ({error}); what was saved before is intact") from None
             last = trainer.step == options.iterations
-            if options.evaluate_every and (last or trainer.step % options.evaluate_every == 0) or last:
+            score = None
+            if last or (options.evaluate_every and trainer.step % options.evaluate_every == 0):
                 score = evaluate(trainer, held_out if last else held_out[:: max(1, len(held_out) // QUICK_VIEWS)])
-            else:
-                score = None
-            if trainer.step % 100 == 0 or last or score is not None:
-                entry = {"step": trainer.step, "seconds": round(seconds, 3), "loss": round(smooth_loss, 6), "train_psnr": round(smooth_psnr, 3),
-                         "primitives": len(trainer), "memory_gib": round(memory_gib(), 3)}
+            if trainer.step % 100 == 0 or score is not None:
+                entry = {"step": trainer.step, "seconds": round(trainer.seconds, 3), "loss": round(trainer.loss, 6),
+                         "train_psnr": round(trainer.psnr, 3), "primitives": len(trainer), "memory_gib": round(memory_gib(), 3)}
                 if score is not None:
                     entry["psnr"] = round(score, 4)
-                    progress.note(f"  step {trainer.step}: held-out PSNR {score:.2f} dB, {len(trainer)} primitives, {duration(seconds)}")
+                    progress.note(f"  step {trainer.step}: held-out PSNR {score:.2f} dB, {len(trainer)} primitives, {duration(trainer.seconds)}")
                 log.write(json.dumps(entry) + "\n")
                 log.flush()
             if last or trainer.step % options.checkpoint_every == 0:
-                _save(trainer, run, seconds)
+                _save(trainer, run)
                 saved = trainer.step
-            progress.update(trainer.step, f"loss {smooth_loss:.4f}  PSNR {smooth_psnr:.2f}  {len(trainer)} primitives  {memory_gib():.1f} GiB")
+            progress.update(trainer.step, f"loss {trainer.loss:.4f}  PSNR {trainer.psnr:.2f}  {len(trainer)} primitives  {memory_gib():.1f} GiB")
         progress.clear()
+        if saved != trainer.step:  # interrupted between checkpoints, or stopped after the last one and before the export
+            _save(trainer, run)
         if interrupted:
-            if saved != trainer.step:
-                _save(trainer, run, seconds)
             progress.note(f"interrupted: {run.path} holds step {trainer.step}; go on with --resume")
             raise KeyboardInterrupt
-    if score is None and trainer.step == options.iterations:
-        score = evaluate(trainer, held_out)
-    return seconds, score
+    return trainer.seconds, evaluate(trainer, held_out) if score is None else score
+
+
+def _cut_metrics(path: Path, step: int) -> None:
+    """Drops lines after `step`, and one that was torn when the run was killed."""
+    if not path.exists():
+        return
+    kept = []
+    for line in path.read_text(errors="replace").splitlines():
+        try:
+            if json.loads(line)["step"] <= step:
+                kept.append(line + "\n")
+        except (ValueError, KeyError, TypeError):
+            continue
+    with atomic_write(path) as temporary:
+        temporary.write_text("".join(kept))
 
 
 def evaluate(trainer: Trainer, shots: list[Shot]) -> float | None:
@@ -439,42 +481,42 @@ def _interrupt_flag() -> Iterator[list]:
             signal.signal(number, handler)
 
 
-def _save(trainer: Trainer, run: Run, seconds: float) -> None:
+def _save(trainer: Trainer, run: Run) -> None:
     """Writes a checkpoint and the exported scene; every file replaces its predecessor only when it is complete."""
-    from .files import atomic_write
-
+    for name, value in trainer.parameters.items():
+        if not bool(torch.isfinite(value).all()):
+            raise LinprimError(f"{run.path}: training diverged at step {trainer.step} ({name} is not finite); what was saved before is intact")
     folder = run.path / "checkpoints"
     name = f"step_{trainer.step:06d}.pt"
-    state = trainer.state() | {"seconds": seconds}
     with atomic_write(folder / name) as temporary:
-        torch.save(state, temporary)
+        torch.save(trainer.state(), temporary)
     with atomic_write(folder / "latest") as temporary:
         temporary.write_text(name + "\n")
     for old in sorted(folder.glob("step_*.pt"))[:-KEPT_CHECKPOINTS]:
         old.unlink()
     run.save(trainer.octahedra(), {
         "iteration": trainer.step, "iterations": trainer.options.iterations, "primitives": len(trainer),
-        "background": [float(x) for x in trainer.shown_background()], "seconds": seconds,
+        "background": [float(x) for x in trainer.shown_background()], "seconds": trainer.seconds,
     })
 
 
-def _load_checkpoint(trainer: Trainer, path: Path) -> float:
-    """Restores the latest checkpoint; returns the seconds trained so far."""
+def _read_checkpoint(path: Path) -> dict | None:
+    """The latest checkpoint of a run, None where it has none yet."""
     folder = path / "checkpoints"
     try:
         name = (folder / "latest").read_text().strip()
     except FileNotFoundError:
-        raise LinprimError(f"{path}: has no checkpoint to go on from; train it anew into another folder") from None
-    if Path(name).name != name:
-        raise LinprimError(f"{folder / 'latest'}: names {name!r}, which is not a file in this folder")
+        return None
+    except (OSError, UnicodeDecodeError) as error:
+        raise LinprimError(f"{folder / 'latest'}: cannot be read ({error})") from None
+    if not name or Path(name).name != name:
+        raise LinprimError(f"{folder / 'latest'}: names {name!r}, wanted a checkpoint in this folder")
     try:
         state = torch.load(folder / name, weights_only=True)
     except FileNotFoundError:
         raise LinprimError(f"{folder / name}: the latest checkpoint is missing") from None
     except Exception as error:  # torch raises many kinds for a damaged file
         raise LinprimError(f"{folder / name}: is damaged and cannot be read ({type(error).__name__})") from None
-    try:
-        trainer.restore(state)
-        return float(state["seconds"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise LinprimError(f"{folder / name}: lacks what a checkpoint holds ({error})") from None
+    if not isinstance(state, dict):
+        raise LinprimError(f"{folder / name}: holds no checkpoint")
+    return state

@@ -1,0 +1,124 @@
+"""Trains and scores every capture found in a folder and prints one table: what the README's figures come from.
+
+    python -m linprim_geo.eval.real_data --data DIR -o runs/real
+
+A capture is any sub-folder that `load_scene` reads. Its reference is a mesh `reference.ply` in it, or `DIR/meshes/NAME.*` whose NAME
+the folder's name begins with; depth is scored where the held-out views bring depth maps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+from pathlib import Path
+
+from linprim_geo.errors import LinprimError
+from linprim_geo.files import write_json
+from linprim_geo.options import ExtractOptions, SceneOptions, TrainOptions
+
+
+def captures(data: Path, only: list[str]) -> list[Path]:
+    """Sub-folders of `data` (or `data` itself) that hold posed images, by name; `only` names those wanted."""
+    from linprim_geo.scene import load_scene
+
+    found = []
+    for folder in [data, *sorted(p for p in data.iterdir() if p.is_dir())]:
+        if only and folder.name not in only:
+            continue
+        try:
+            load_scene(folder)
+        except LinprimError:
+            if folder.name in only:
+                raise
+            continue
+        found.append(folder)
+    missing = sorted(set(only) - {f.name for f in found})
+    if missing:
+        raise LinprimError(f"{data}: has no capture named {', '.join(missing)}")
+    if not found:
+        raise LinprimError(f"{data}: holds no folder with posed images")
+    return found
+
+
+def reference_of(capture: Path, data: Path) -> Path | None:
+    """The mesh a capture is scored against, if there is one."""
+    own = capture / "reference.ply"
+    if own.exists():
+        return own
+    fitting = [m for m in sorted((data / "meshes").glob("*")) if m.suffix in (".ply", ".glb", ".obj") and capture.name.startswith(m.stem)]
+    return max(fitting, key=lambda m: len(m.stem), default=None)
+
+
+def run_capture(capture: Path, data: Path, output: Path, options: TrainOptions, scene_options: SceneOptions) -> dict:
+    """Trains, meshes and scores one capture; every key of the result is a column of the table or a file."""
+    from linprim_geo.eval.depth import eval_depth_run
+    from linprim_geo.eval.images import eval_images_run
+    from linprim_geo.eval.mesh import eval_mesh_files
+    from linprim_geo.extract import extract_mesh
+    from linprim_geo.scene import load_scene
+    from linprim_geo.train import train
+
+    scene = load_scene(capture, downscale=scene_options.downscale)
+    folder = output / capture.name
+    if folder.exists():
+        shutil.rmtree(folder)
+    camera = scene.train[0].camera
+    trained = train(capture, folder, scene_options, options)
+    row = {"name": capture.name, "views": f"{len(scene.train)}+{len(scene.test)}", "size": f"{camera.width}x{camera.height}",
+           "seconds": trained["seconds"], "iterations": trained["iterations"], "primitives": trained["primitives"]}
+    images = eval_images_run(folder)
+    row |= {"psnr": images["psnr"], "ssim": images["ssim"]}
+    reference = reference_of(capture, data)
+    if any(view.depth_path for view in scene.test):
+        row["abs_rel"] = eval_depth_run(folder)["abs_rel"]
+    stats = extract_mesh(folder, options=ExtractOptions())
+    row |= {"mesh_seconds": stats["seconds"]["total"], "faces": stats["faces"], "mesh": stats["mesh"]}
+    if reference is not None:
+        score = eval_mesh_files(stats["mesh"], reference, run=folder)
+        visible = score.get("visible") or score
+        row |= {"chamfer_percent_diagonal": score["chamfer_percent_diagonal"], "visible_chamfer_percent_diagonal": visible["chamfer_percent_diagonal"],
+                "f1": visible["f1"]}
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    row["curve"] = [(line["seconds"], line["psnr"]) for line in lines if "psnr" in line]
+    return row
+
+
+def table(rows: list[dict]) -> str:
+    """The rows as a Markdown table; figures without a truth to compare with are dashes."""
+    columns = [("capture", "name", "{}"), ("views", "views", "{}"), ("pixels", "size", "{}"), ("primitives", "primitives", "{}"),
+               ("training s", "seconds", "{:.0f}"), ("PSNR dB", "psnr", "{:.2f}"), ("SSIM", "ssim", "{:.4f}"), ("depth AbsRel", "abs_rel", "{:.4f}"),
+               ("Chamfer, seen part, % diag.", "visible_chamfer_percent_diagonal", "{:.3f}"), ("mesh s", "mesh_seconds", "{:.0f}")]
+    lines = ["| " + " | ".join(c[0] for c in columns) + " |", "|" + "---|" * len(columns)]
+    for row in rows:
+        lines.append("| " + " | ".join(form.format(row[key]) if key in row else "–" for _, key, form in columns) + " |")
+    return "\n".join(lines)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="a capture, or a folder of captures")
+    parser.add_argument("--only", nargs="*", default=[], metavar="NAME", help="only these captures")
+    parser.add_argument("-o", "--output", type=Path, default=Path("runs/real"), metavar="DIR")
+    parser.add_argument("--iterations", type=int, default=TrainOptions.iterations)
+    parser.add_argument("--max-primitives", type=int, default=TrainOptions.max_primitives)
+    parser.add_argument("--sh-degree", type=int, default=TrainOptions.sh_degree)
+    parser.add_argument("--samples", type=int, default=TrainOptions.samples)
+    parser.add_argument("--downscale", type=int, default=1)
+    parser.add_argument("--evaluate-every", type=int, default=TrainOptions.evaluate_every)
+    args = parser.parse_args(arguments)
+    options = TrainOptions(iterations=args.iterations, max_primitives=args.max_primitives, sh_degree=args.sh_degree, samples=args.samples,
+                           evaluate_every=args.evaluate_every)
+    try:
+        rows = [run_capture(c, args.data, args.output, options, SceneOptions(downscale=args.downscale)) for c in captures(args.data, args.only)]
+    except LinprimError as error:
+        raise SystemExit(f"real_data: error: {error}") from None
+    write_json(args.output / "real_data.json", rows)
+    (args.output / "real_data.md").write_text(table(rows) + "\n")
+    print(table(rows))
+    for row in rows:
+        print(f"{row['name']}: " + ", ".join(f"{psnr:.2f} dB after {seconds:.0f} s" for seconds, psnr in row["curve"]))
+
+
+if __name__ == "__main__":
+    main()
