@@ -6,6 +6,7 @@
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <cmath>
 #include <optional>
 #include <stdexcept>
@@ -149,6 +150,21 @@ void bind_real(nb::module_& m, const char* suffix) {
           nb::gil_scoped_release release;
           linprim::level_depth<Real>(view, primitives, out);
         });
+  auto bind_average = [&](const char* name, auto function) {
+    m.def((std::string(name) + suffix).c_str(), [function](Array from, int height, int width, int factor, Out<Real> to) {
+      const int64_t coarse = int64_t(height) * width, fine = coarse * factor * factor;
+      if (factor < 1 || coarse < 1) throw std::invalid_argument("sizes have to be positive");
+      const int64_t planes = int64_t(std::min(from.size(), to.size())) / coarse;
+      if (std::min<int64_t>(from.size(), to.size()) != planes * coarse || std::max<int64_t>(from.size(), to.size()) != planes * fine)
+        throw std::invalid_argument("the two images do not fit the sizes");
+      const Real* in = from.data();
+      Real* out = to.data();
+      nb::gil_scoped_release release;
+      function(in, int(planes), width, height, factor, out);
+    });
+  };
+  bind_average("average_pixels_", &linprim::average_pixels<Real>);
+  bind_average("average_pixels_grad_", &linprim::average_pixels_grad<Real>);
   m.def((std::string("first_non_finite_") + suffix).c_str(), [](Array values) {
     const Real* data = values.data();
     const int64_t n = int64_t(values.size());

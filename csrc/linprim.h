@@ -53,6 +53,13 @@ struct Photometric {
 Photometric photometric_loss(const float* image, const float* target, const float* weight, int width, int height, float dssim,
                              float* gradient);
 
+// Means over `factor` x `factor` pixels of `planes` images (height factor) x (width factor) -> height x width, and the adjoint, which
+// gives each pixel 1 / factor^2 of its mean's gradient. Sizes are those of the small image.
+template <class Real>
+void average_pixels(const Real* fine, int planes, int width, int height, int factor, Real* coarse);
+template <class Real>
+void average_pixels_grad(const Real* coarse_grad, int planes, int width, int height, int factor, Real* fine_grad);
+
 // One Adam step (Kingma and Ba 2015, algorithm 1) on n values in place; `step` counts from 1.
 void adam_step(float* value, const float* gradient, float* first, float* second, int64_t n, float rate, float beta1, float beta2,
                float epsilon, int64_t step);

@@ -1,4 +1,4 @@
-// The parallel drivers of the image loss, the optimiser step and the check for non-finite values.
+// The parallel drivers of the image loss, pixel averaging, the optimiser step and the check for non-finite values.
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -49,6 +49,60 @@ void adam_step(float* value, const float* gradient, float* first, float* second,
   parallel_for((n + kPerTask - 1) / kPerTask,
                [&](int64_t task, int) { image_kernels().adam(params, task * kPerTask, std::min(n, (task + 1) * kPerTask)); });
 }
+
+namespace {
+
+// One row of means; factor 2, the usual one, as a loop that the compiler can vectorise.
+template <class Real>
+void average_row(const Real* fine, int width, int factor, Real* __restrict out) {
+  const int64_t pitch = int64_t(width) * factor;
+  if (factor == 2) {
+    const Real *a = fine, *b = fine + pitch;
+    for (int x = 0; x < width; ++x) out[x] = ((a[2 * x] + a[2 * x + 1]) + (b[2 * x] + b[2 * x + 1])) * Real(0.25);
+    return;
+  }
+  for (int x = 0; x < width; ++x) {
+    Real sum = 0;
+    for (int j = 0; j < factor; ++j)
+      for (int i = 0; i < factor; ++i) sum += fine[j * pitch + int64_t(x) * factor + i];
+    out[x] = sum / Real(factor * factor);
+  }
+}
+
+template <class Real>
+void spread_row(const Real* coarse, int width, int factor, Real* __restrict fine) {
+  const int64_t pitch = int64_t(width) * factor;
+  const Real part = Real(1) / Real(factor * factor);
+  for (int x = 0; x < width; ++x)
+    for (int i = 0; i < factor; ++i) fine[int64_t(x) * factor + i] = coarse[x] * part;
+  for (int j = 1; j < factor; ++j) std::copy_n(fine, pitch, fine + j * pitch);
+}
+
+constexpr int kRowsPerTask = 16;
+
+}  // namespace
+
+template <class Real>
+void average_pixels(const Real* fine, int planes, int width, int height, int factor, Real* coarse) {
+  const int64_t rows = int64_t(planes) * height;
+  parallel_for((rows + kRowsPerTask - 1) / kRowsPerTask, [&](int64_t task, int) {
+    for (int64_t row = task * kRowsPerTask; row < std::min(rows, (task + 1) * kRowsPerTask); ++row)
+      average_row(fine + row * width * factor * factor, width, factor, coarse + row * width);
+  });
+}
+
+template <class Real>
+void average_pixels_grad(const Real* coarse_grad, int planes, int width, int height, int factor, Real* fine_grad) {
+  const int64_t rows = int64_t(planes) * height;
+  parallel_for((rows + kRowsPerTask - 1) / kRowsPerTask, [&](int64_t task, int) {
+    for (int64_t row = task * kRowsPerTask; row < std::min(rows, (task + 1) * kRowsPerTask); ++row)
+      spread_row(coarse_grad + row * width, width, factor, fine_grad + row * width * factor * factor);
+  });
+}
+template void average_pixels<float>(const float*, int, int, int, int, float*);
+template void average_pixels<double>(const double*, int, int, int, int, double*);
+template void average_pixels_grad<float>(const float*, int, int, int, int, float*);
+template void average_pixels_grad<double>(const double*, int, int, int, int, double*);
 
 template <class Real>
 int64_t first_non_finite(const Real* values, int64_t n) {

@@ -449,7 +449,8 @@ void chain(const ChainParams<Real>& P, int64_t begin, int64_t end) {
         P.out.extent[3 * row + i] = Real(extent_grad[i][l]);
       }
       for (int k = 0; k < 4; ++k) P.out.rotation[4 * row + k] = Real(q_grad[k][l]);
-      P.out.density[row] = Real(sums[l][Sum::density]);
+      const double density = double(P.primitives.density[row]);
+      P.out.density[row] = density < 0 || density > kLargestDensity ? Real(0) : Real(sums[l][Sum::density]);
     }
   }
 }

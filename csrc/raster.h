@@ -158,9 +158,13 @@ inline void mean_in_slice(Vec<Real, W> tau, Vec<Real, W> alpha, Vec<Real, W> thr
   using V = Vec<Real, W>;
   const V t2 = tau * tau;
   const Mask<Real, W> thin = tau < V::set(Real(0.3));
-  // Next terms of the series: tau^7/1209600 (g) and tau^6/172800 (slope), below 2e-10 and 5e-9 at 0.3.
-  const V thin_g = fma(tau, fma(t2, fma(t2, V::set(Real(-1.0 / 30240)), V::set(Real(1.0 / 720))), V::set(Real(-1.0 / 12))), V::set(Real(0.5)));
-  const V thin_slope = fma(t2, fma(t2, V::set(Real(-1.0 / 6048)), V::set(Real(1.0 / 240))), V::set(Real(-1.0 / 12)));
+  // Next terms of the series: 691 tau^11 / 1.3e12 (g) and its derivative, below 1e-15 and 4e-14 at 0.3.
+  auto series = [&](Real c0, Real c1, Real c2, Real c3, Real c4) {
+    return fma(t2, fma(t2, fma(t2, fma(t2, V::set(c4), V::set(c3)), V::set(c2)), V::set(c1)), V::set(c0));
+  };
+  const V thin_g = fma(tau, series(Real(-1.0 / 12), Real(1.0 / 720), Real(-1.0 / 30240), Real(1.0 / 1209600), Real(-1.0 / 47900160)),
+                       V::set(Real(0.5)));
+  const V thin_slope = series(Real(-1.0 / 12), Real(1.0 / 240), Real(-1.0 / 6048), Real(1.0 / 172800), Real(-1.0 / 5322240));
   const V safe = select(thin, V::set(1), tau), inverse = rcp(safe), over = through * rcp(select(thin, V::set(1), alpha));
   g = select(thin, thin_g, inverse - over);
   slope = select(thin, thin_slope, fma(over * rcp(select(thin, V::set(1), alpha)), V::set(1), V::set(0) - inverse * inverse));

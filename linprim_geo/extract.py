@@ -39,8 +39,10 @@ def extract_mesh(run: str | os.PathLike, method: str = "tsdf", output: str | os.
     options = options or ExtractOptions()
     if method != "tsdf":
         raise LinprimError(f"--method is {method!r}, wanted tsdf")
-    if not 0 < options.level < 1:
-        raise LinprimError(f"--level is {options.level}, wanted a transmittance between 0 and 1")
+    for name, low, high in (("level", 1e-6, 1 - 1e-6), ("voxel_size", 0, 1e30), ("truncation", 1, 100), ("memory_limit", 0, 1e9),
+                            ("smallest_part", 0, 1)):
+        if not low <= getattr(options, name) <= high:
+            raise LinprimError(f"--{name.replace('_', '-')} is {getattr(options, name)}, wanted {low:g} to {high:g}")
     opened = Run.open(run)
     scene = opened.scene()
     folder = opened.path / "mesh" / method

@@ -17,6 +17,9 @@ BYTES_PER_VOXEL = 44
 """12 for the votes; when they are done, 5 for the field, 8 for Open3D's copy of it, and marching cubes: 37
 measured on a room of 53,000 blocks that gave 3.6 million faces."""
 
+FINEST_PART = 8
+"""A voxel smaller than this part of a pixel's footprint holds nothing that a pixel has seen."""
+
 KEY_BITS = 21
 """Bits per axis of the key of a block or voxel: three fit into an int64."""
 
@@ -237,6 +240,11 @@ def _find_blocks(frames, voxel, truncation, bounds, resolution, limit):
 
 
 def _blocks_of(points, voxel, truncation, footprint, resolution):
+    if footprint > FINEST_PART * voxel:
+        raise LinprimError(
+            f"voxel size {voxel:.4g} is less than 1/{FINEST_PART} of what a pixel covers on the surface ({footprint:.3g}), which no view "
+            f"can fill: wanted at least {footprint / FINEST_PART:.2g}"
+        )
     reach = int(np.ceil(max(truncation, footprint / voxel)))
     index = points / voxel
     if np.abs(index).max() / resolution >= (1 << (KEY_BITS - 1)) - reach - 2:

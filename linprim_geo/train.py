@@ -415,7 +415,7 @@ def _loop(trainer: Trainer, run: Run, held_out: list[Shot], progress: Progress) 
             score = None
             if last or (options.evaluate_every and trainer.step % options.evaluate_every == 0):
                 score = evaluate(trainer, held_out if last else held_out[:: max(1, len(held_out) // QUICK_VIEWS)])
-            if trainer.step % 100 == 0 or score is not None:
+            if trainer.step % 100 == 0 or last or score is not None:
                 entry = {"step": trainer.step, "seconds": round(trainer.seconds, 3), "loss": round(trainer.loss, 6),
                          "train_psnr": round(trainer.psnr, 3), "primitives": len(trainer), "memory_gib": round(memory_gib(), 3)}
                 if score is not None:

@@ -71,7 +71,11 @@ def octahedron_run(folder: Path, density: float = DENSITY, views: int = 24, size
     from linprim_geo.textured import TexturedMesh
 
     one = Octahedra(
-        np.array([CENTER]), np.array([ROTATION]), np.array([EXTENT]), np.array([density]), np.full((1, 1, 3), 0.7)
+        np.array([CENTER]),
+        np.array([ROTATION]),
+        np.array([EXTENT]),
+        np.array([density]),
+        np.full((1, 1, 3), 0.7),
     )
     shape = one.triangle_mesh()
 
@@ -85,9 +89,15 @@ def octahedron_run(folder: Path, density: float = DENSITY, views: int = 24, size
     similarity = scene_normalization(scene)
     run = Run.create(folder / "run", scene, scene_path, SceneOptions(), TrainOptions(threads=1), similarity)
     scaled = Octahedra(
-        similarity.apply(one.center), one.rotation, one.extent * similarity.scale, one.density / similarity.scale, one.sh
+        similarity.apply(one.center),
+        one.rotation,
+        one.extent * similarity.scale,
+        one.density / similarity.scale,
+        one.sh,
     )
-    run.save(scaled, {"iteration": 1, "iterations": 1, "primitives": 1, "background": [1, 1, 1], "seconds": 0})
+    run.save(
+        scaled, {"iteration": 1, "iterations": 1, "primitives": 1, "background": [1, 1, 1], "seconds": 0}
+    )
     return run.path
 
 

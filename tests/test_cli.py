@@ -131,7 +131,7 @@ def test_train_gets_what_was_said(recorded_train, capsys):
     assert (scene, run, default_run) == ("data/lego", "out", os.path.join("runs", "lego"))
     assert scene_options == SceneOptions(downscale=4)
     assert train_options == TrainOptions(iterations=12)
-    assert settings == {"resume": True, "quiet": True, "json": False}
+    assert settings == {"resume": True, "quiet": True}
     assert "primitives: 7" in capsys.readouterr().out
 
 
@@ -211,7 +211,7 @@ def test_json_prints_nothing_on_stdout_after_an_error():
 def test_json_may_stand_before_the_command(recorded_train, capsys):
     assert cli.main(["--json", "train", "a"]) == 0
     assert json.loads(capsys.readouterr().out) == {"psnr": None, "primitives": 7}
-    assert recorded_train[0][-1]["json"] is True
+    assert len(recorded_train) == 1
 
 
 def test_a_reader_that_goes_away_is_no_traceback():
@@ -253,6 +253,7 @@ def test_synth_leaves_what_is_not_said_to_the_library(monkeypatch, capsys):
     for line in ("synth out", room, "synth out --mesh x.glb --size 64 --point-noise 0.01"):
         assert cli.main(line.split()) == 0
     (_, plain), (_, room), (_, mesh) = calls
+    assert (plain["principal_point_offset"], plain["detail"]) == ((0.0, 0.0), 1.0)
     assert not plain.keys() & {"shape", "mesh", "path", "fov", "distance", "background"}
     assert (room["shape"], room["size"], room["fov"], room["overwrite"]) == ("room", (64, 48), 60.0, True)
     assert room["background"] == "0,0.5,1" and "mesh" not in room
@@ -287,6 +288,105 @@ def test_the_functions_have_the_arguments_that_the_commands_pass(line):
     )
     passed = vars(cli.build_parser().parse_args(line.split())).keys() - {"handler", "command"} - options
     assert {renamed.get(key, key) for key in passed} <= set(inspect.signature(function).parameters)
+
+
+def test_principal_point_and_detail_reach_synth(monkeypatch):
+    calls = []
+    stand_in = types.SimpleNamespace(synthesize=lambda out, **settings: calls.append(settings) or {})
+    monkeypatch.setitem(sys.modules, "linprim_geo.synth", stand_in)
+    assert cli.main("synth out --principal-point-offset=-5,3.5 --detail 0.5 --distance 4".split()) == 0
+    assert cli.main("synth out --principal-point-offset 5,-3".split()) == 0
+    assert [call["principal_point_offset"] for call in calls] == [(-5.0, 3.5), (5.0, -3.0)]
+    assert (calls[0]["detail"], calls[0]["distance"]) == (0.5, 4.0)
+    for wrong in ("1", "1,2,3", "a,b", "inf,0", "nan,1", ","):
+        with pytest.raises(SystemExit) as leaving:
+            cli.main(["synth", "out", "--principal-point-offset", wrong])
+        assert leaving.value.code == 2
+    assert len(calls) == 2
+
+
+@pytest.fixture
+def result(capfd):
+    """Runs a command with --json and returns what it printed, after making sure that it is one object."""
+
+    def run(line: str, status: int = 0) -> dict:
+        capfd.readouterr()
+        assert cli.main([*line.split(), "--json"]) == status
+        shown = capfd.readouterr()
+        assert shown.out.count("\n") == 1 and shown.out.endswith("\n"), shown
+        assert "Traceback" not in shown.err
+        found = json.loads(shown.out)
+        assert isinstance(found, dict) and found and not [key for key in found if key.startswith("_")]
+        return found
+
+    return run
+
+
+def test_every_command_prints_one_object_and_does_what_it_says(result, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made = result("synth s --scene cad --size 48x40 --views 10 --test-views 2 --points 300 --supersample 1")
+    assert (made["views"], made["test_views"], made["width"], made["height"]) == (10, 2, 48, 40)
+    trained = result(
+        "train s -o r --iterations 150 --max-primitives 200 --sh-degree 0 --threads 1 --checkpoint-every 100"
+    )
+    assert (trained["iterations"], trained["views"]) == (150, 2) and trained["primitives"] <= 200
+    assert trained["psnr"] > 15
+    assert result("train s -o r --resume")["psnr"] == pytest.approx(trained["psnr"], abs=1e-6)
+    rendered = result("render r")
+    assert rendered["views"] == 2 and os.path.isdir("r/renders/test/depth_median")
+    meshed = result("extract-mesh r")
+    assert meshed["faces"] > 100 and os.path.isfile("r/mesh/tsdf/stats.json")
+    for suffix in ("obj", "glb", "stl"):
+        result(f"extract-mesh r -o m.{suffix}")
+        assert os.path.getsize(f"m.{suffix}") > 1000 and os.path.isfile(f"m_visible.{suffix}")
+    images = result("eval-images r")
+    assert images["psnr"] == pytest.approx(trained["psnr"], abs=1e-3) and images["views"] == 2
+    depths = {kind: result(f"eval-depth r --depth {kind}") for kind in ("median", "expected", "first")}
+    assert [depths[kind]["depth"] for kind in depths] == ["depth_median", "depth_expected", "depth_first"]
+    assert len({depths[kind]["abs_rel"] for kind in depths}) == 3
+    against_mesh = result("eval-depth r --reference s/reference.ply")
+    # The data set's depth is that of the same mesh, rounded to its unit.
+    assert against_mesh["abs_rel"] == pytest.approx(depths["median"]["abs_rel"], rel=0.02)
+    assert against_mesh["normal_mean_deg"] > 0 and depths["median"]["normal_mean_deg"] is None
+    scores = result("eval-mesh r/mesh/tsdf/mesh.ply s/reference.ply --samples 20000 --run r")
+    assert {"accuracy", "completeness", "chamfer", "precision", "recall", "f1", "visible"} <= scores.keys()
+    assert 0 < scores["chamfer_percent_diagonal"] < 10
+    assert json.loads(open("r/eval/mesh/results.json").read())["chamfer"] == scores["chamfer"]
+    assert result("convert r p.ply")["count"] == trained["primitives"]
+    assert result("convert p.ply p.glb")["faces"] == 8 * trained["primitives"]
+    assert result("convert m.obj m.ply")["wrote"] == "mesh"
+    assert {"problems", "cache", "instruction_set"} <= result("doctor").keys()
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["synth .", "train gone", "train . -o x", "render gone", "extract-mesh gone", "eval-images gone", "eval-depth gone",
+     "eval-mesh gone.ply gone.ply", "convert gone a.ply", "convert here b.xyz", "train gone -o here --resume",
+     "synth x --mesh gone.glb", "synth x --size 4", "synth x --background pink", "extract-mesh . --level 2", "demo -o ."],
+)  # fmt: skip
+def test_input_that_cannot_be_used_is_one_sentence_and_leaves_nothing(line, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "here").write_text("mine")
+    assert cli.main([*line.split(), "--json"]) == 1
+    shown = capfd.readouterr()
+    assert shown.out == "" and shown.err.startswith("linprim-geo: error: ") and shown.err.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["here"]
+
+
+def test_doctor_shows_the_cache(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(doctor, "LIBRARIES", (("numpy", ("numpy",)),))
+    (tmp_path / "cache").mkdir()
+    (tmp_path / "cache" / "kept.npz").write_bytes(b"x" * 1000)
+    monkeypatch.setenv("LINPRIM_GEO_CACHE", str(tmp_path / "cache"))
+    cli.main(["doctor", "--json"])
+    report = json.loads(capsys.readouterr().out)
+    assert (report["cache"], report["cache_bytes"]) == (str(tmp_path / "cache"), 1000)
+    cli.main(["doctor"])
+    assert f"cache: {tmp_path / 'cache'}" in capsys.readouterr().out
+    monkeypatch.setenv("LINPRIM_GEO_CACHE", str(tmp_path / "cache" / "kept.npz" / "inside"))
+    cli.main(["doctor", "--json"])
+    problems = json.loads(capsys.readouterr().out)["problems"]
+    assert any("LINPRIM_GEO_CACHE" in problem for problem in problems)
 
 
 def test_doctor_names_what_is_missing(monkeypatch, capsys):

@@ -39,6 +39,19 @@ def test_rendering_does_not_depend_on_threads(dtype, isa, geometry):
         assert_identical(results[0], other)
 
 
+@pytest.mark.parametrize("dtype,isa", BUILDS)
+def test_level_depth_does_not_depend_on_threads(dtype, isa):
+    scene, view = random_scene(4, 300, 1, 100, 70, spread=1.0)
+    scene = [p.to(getattr(torch, dtype)) for p in scene]
+    results = []
+    for count in COUNTS:
+        with kernels(isa, count):
+            results.append([ops.level_depth(*scene[:5], view, level=0.5)])
+    assert (results[0][0] > 0).float().mean() > 0.1
+    for other in results[1:]:
+        assert_identical(results[0], other)
+
+
 @pytest.mark.parametrize("isa", KERNELS)
 def test_the_image_loss_does_not_depend_on_threads(isa):
     rng = torch.Generator().manual_seed(2)

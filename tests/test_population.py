@@ -48,7 +48,9 @@ def test_the_plan_reaches_the_cap_before_growth_ends(iterations, start, cap):
     assert steps[0] >= 0.03 * iterations and steps[-1] <= 0.6 * iterations
 
 
-@pytest.mark.parametrize(("iterations", "start", "cap"), [(1, 1, 1), (5, 10, 10), (20, 1, 1000), (10**6, 1, 10**6), (100, 50, 20)])
+@pytest.mark.parametrize(
+    ("iterations", "start", "cap"), [(1, 1, 1), (5, 10, 10), (20, 1, 1000), (10**6, 1, 10**6), (100, 50, 20)]
+)
 def test_a_plan_exists_for_every_run(iterations, start, cap):
     growth = Growth.plan(iterations, start, cap)
     assert growth.every >= 1 and growth.first >= 1 and 0 < growth.rate <= 0.25 and growth.cap == cap
@@ -61,7 +63,12 @@ def test_halves_stay_inside_the_box_of_the_parent_and_along_the_axis_that_is_cut
     parents, children, halves = event(table, pull, rate=0.25)
     assert len(parents) == 50 and list(children) == list(range(200, 250))
     parent = np.exp(table["log_extent"].numpy().astype(np.float64))[parents]
-    whole = Octahedra(*(table[name].numpy()[parents] for name in ("center", "rotation")), parent, np.ones(50), np.zeros((50, 1, 3)))
+    whole = Octahedra(
+        *(table[name].numpy()[parents] for name in ("center", "rotation")),
+        parent,
+        np.ones(50),
+        np.zeros((50, 1, 3)),
+    )
     axes = whole.axes
     shifts = []
     for half in (0, 1):

@@ -1,0 +1,68 @@
+"""The demo, made tiny: it scores, a second one replaces the first, and it touches nobody else's folder."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+
+from linprim_geo import demo
+from linprim_geo.errors import LinprimError
+
+SCORES = (
+    "psnr",
+    "ssim",
+    "chamfer_percent_diagonal",
+    "f1",
+    "abs_rel",
+    "normal_mean_deg",
+    "seconds",
+    "primitives",
+)
+
+
+@pytest.fixture
+def tiny_size(monkeypatch):
+    monkeypatch.setitem(demo.SIZES, "small", (10, 40, 120, 120))
+
+
+def test_the_demo_makes_a_scored_mesh_and_a_second_one_replaces_it(tiny_size, tmp_path, capsys, monkeypatch):
+    root = tmp_path / "demo"
+    first = demo.run_demo(str(root), "small")
+    shown = capsys.readouterr()
+    assert shown.out == "" and [line[:3] for line in shown.err.splitlines() if line[1:3] == "/5"] == [
+        f"{i}/5" for i in range(1, 6)
+    ]
+    assert all(math.isfinite(first[name]) for name in SCORES)
+    assert first["psnr"] > 15 and first["chamfer_percent_diagonal"] < 10 and first["primitives"] <= 120
+    for file in (
+        "scene/reference.ply", "run/mesh/tsdf/mesh.ply", "run/mesh/tsdf/mesh_visible.ply", "run/renders/test/rgb",
+        "run/eval/images/results.json", "run/eval/depth/results.json", "run/eval/mesh/error_pred.ply", "demo.json",
+    ):  # fmt: skip
+        assert (root / file).exists(), file
+    for name in ("run", "mesh", "renders", "reference"):
+        assert first[name] in first["_text"] or name == "run"
+    written = json.loads((root / "demo.json").read_text())
+    assert written["psnr"] == pytest.approx(first["psnr"])
+    assert (
+        json.loads((root / "run" / "eval" / "images" / "results.json").read_text())["psnr"] == written["psnr"]
+    )
+
+    # A second one, stopped early: nothing of the first is left to be taken for its result.
+    def stop(*_, **__):
+        raise LinprimError("stopped")
+
+    (root / "left over").write_text("from the first")
+    monkeypatch.setattr("linprim_geo.synth.synthesize", stop)
+    with pytest.raises(LinprimError, match="stopped"):
+        demo.run_demo(str(root), "small")
+    assert [path.name for path in root.iterdir()] == ["demo.json"]
+    assert json.loads((root / "demo.json").read_text()).keys() == {"size"}
+
+
+def test_a_folder_of_somebody_else_is_refused(tiny_size, tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(LinprimError, match="not made by the demo.*-o"):
+        demo.run_demo(str(tmp_path), "small")
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
