@@ -38,9 +38,9 @@ def run_demo(output: str = "runs/demo", size: str = "normal") -> dict:
     write_json(marker, {"size": size})
     print(f"1/5 photographing the built-in part: {views} views of {pixels}x{pixels}", file=sys.stderr)
     scene, run = root / "scene", root / "run"
-    synthesize(scene, shape="cad", views=views, test_views=12, size=(pixels, pixels))
+    synthesize(scene, shape="cad", views=views, test_views=12, size=pixels, path="sphere")
     print("2/5 training", file=sys.stderr)
-    trained = train(scene, run, SceneOptions(), TrainOptions(iterations=iterations, max_primitives=primitives, sh_degree=0))
+    trained = train(scene, run, SceneOptions(), TrainOptions(iterations=iterations, max_primitives=primitives, sh_degree=0, samples=2))
     print("3/5 rendering held-out views", file=sys.stderr)
     render_run(run, quiet=True)
     print("4/5 extracting the surface", file=sys.stderr)
