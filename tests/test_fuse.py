@@ -247,7 +247,7 @@ def test_what_cannot_be_fused_is_one_sentence():
         (lambda: fuse_tsdf(frames, voxel_size=0.1, bounds=[[5] * 3, [6] * 3]), "inside the bounds"),
         (lambda: fuse_tsdf(frames, voxel_size=0.1, bounds=[[1] * 3, [0] * 3]), "bounds are"),
         (lambda: fuse_tsdf(frames, voxel_size=float("nan")), "voxel size is nan"),
-        (lambda: fuse_tsdf(frames, voxel_size=1e-8), "too small"),
+        (lambda: fuse_tsdf(frames, voxel_size=1e-8), "what a pixel covers"),
         (lambda: fuse_tsdf(frames, voxel_size=0.1, truncation_voxels=0.5), "truncation is 0.5"),
         (lambda: replace(frames[0], depth=np.zeros((3, 4))), r"depth is \(3, 4\)"),
     ):
