@@ -46,11 +46,17 @@ def reference_of(capture: Path, data: Path) -> Path | None:
     own = capture / "reference.ply"
     if own.exists():
         return own
-    fitting = [m for m in sorted((data / "meshes").glob("*")) if m.suffix in (".ply", ".glb", ".obj") and capture.name.startswith(m.stem)]
+    fitting = [
+        m
+        for m in sorted((data / "meshes").glob("*"))
+        if m.suffix in (".ply", ".glb", ".obj") and capture.name.startswith(m.stem)
+    ]
     return max(fitting, key=lambda m: len(m.stem), default=None)
 
 
-def run_capture(capture: Path, data: Path, output: Path, options: TrainOptions, scene_options: SceneOptions) -> dict:
+def run_capture(
+    capture: Path, data: Path, output: Path, options: TrainOptions, scene_options: SceneOptions
+) -> dict:
     """Trains, meshes and scores one capture; every key of the result is a column of the table or a file."""
     from linprim_geo.eval.depth import eval_depth_run
     from linprim_geo.eval.images import eval_images_run
@@ -65,8 +71,14 @@ def run_capture(capture: Path, data: Path, output: Path, options: TrainOptions, 
         shutil.rmtree(folder)
     camera = scene.train[0].camera
     trained = train(capture, folder, scene_options, options)
-    row = {"name": capture.name, "views": f"{len(scene.train)}+{len(scene.test)}", "size": f"{camera.width}x{camera.height}",
-           "seconds": trained["seconds"], "iterations": trained["iterations"], "primitives": trained["primitives"]}
+    row = {
+        "name": capture.name,
+        "views": f"{len(scene.train)}+{len(scene.test)}",
+        "size": f"{camera.width}x{camera.height}",
+        "seconds": trained["seconds"],
+        "iterations": trained["iterations"],
+        "primitives": trained["primitives"],
+    }
     images = eval_images_run(folder)
     row |= {"psnr": images["psnr"], "ssim": images["ssim"]}
     reference = reference_of(capture, data)
@@ -77,8 +89,11 @@ def run_capture(capture: Path, data: Path, output: Path, options: TrainOptions, 
     if reference is not None:
         score = eval_mesh_files(stats["mesh"], reference, run=folder)
         visible = score.get("visible") or score
-        row |= {"chamfer_percent_diagonal": score["chamfer_percent_diagonal"], "visible_chamfer_percent_diagonal": visible["chamfer_percent_diagonal"],
-                "f1": visible["f1"]}
+        row |= {
+            "chamfer_percent_diagonal": score["chamfer_percent_diagonal"],
+            "visible_chamfer_percent_diagonal": visible["chamfer_percent_diagonal"],
+            "f1": visible["f1"],
+        }
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     row["curve"] = [(line["seconds"], line["psnr"]) for line in lines if "psnr" in line]
     return row
@@ -86,18 +101,31 @@ def run_capture(capture: Path, data: Path, output: Path, options: TrainOptions, 
 
 def table(rows: list[dict]) -> str:
     """The rows as a Markdown table; figures without a truth to compare with are dashes."""
-    columns = [("capture", "name", "{}"), ("views", "views", "{}"), ("pixels", "size", "{}"), ("primitives", "primitives", "{}"),
-               ("training s", "seconds", "{:.0f}"), ("PSNR dB", "psnr", "{:.2f}"), ("SSIM", "ssim", "{:.4f}"), ("depth AbsRel", "abs_rel", "{:.4f}"),
-               ("Chamfer, seen part, % diag.", "visible_chamfer_percent_diagonal", "{:.3f}"), ("mesh s", "mesh_seconds", "{:.0f}")]
+    columns = [
+        ("capture", "name", "{}"),
+        ("views", "views", "{}"),
+        ("pixels", "size", "{}"),
+        ("primitives", "primitives", "{}"),
+        ("training s", "seconds", "{:.0f}"),
+        ("PSNR dB", "psnr", "{:.2f}"),
+        ("SSIM", "ssim", "{:.4f}"),
+        ("depth AbsRel", "abs_rel", "{:.4f}"),
+        ("Chamfer, seen part, % diag.", "visible_chamfer_percent_diagonal", "{:.3f}"),
+        ("mesh s", "mesh_seconds", "{:.0f}"),
+    ]
     lines = ["| " + " | ".join(c[0] for c in columns) + " |", "|" + "---|" * len(columns)]
     for row in rows:
-        lines.append("| " + " | ".join(form.format(row[key]) if key in row else "–" for _, key, form in columns) + " |")
+        lines.append(
+            "| " + " | ".join(form.format(row[key]) if key in row else "–" for _, key, form in columns) + " |"
+        )
     return "\n".join(lines)
 
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="a capture, or a folder of captures")
+    parser.add_argument(
+        "--data", type=Path, required=True, metavar="DIR", help="a capture, or a folder of captures"
+    )
     parser.add_argument("--only", nargs="*", default=[], metavar="NAME", help="only these captures")
     parser.add_argument("-o", "--output", type=Path, default=Path("runs/real"), metavar="DIR")
     parser.add_argument("--iterations", type=int, default=TrainOptions.iterations)
@@ -107,17 +135,28 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--evaluate-every", type=int, default=TrainOptions.evaluate_every)
     args = parser.parse_args(arguments)
-    options = TrainOptions(iterations=args.iterations, max_primitives=args.max_primitives, sh_degree=args.sh_degree, samples=args.samples,
-                           evaluate_every=args.evaluate_every)
+    options = TrainOptions(
+        iterations=args.iterations,
+        max_primitives=args.max_primitives,
+        sh_degree=args.sh_degree,
+        samples=args.samples,
+        evaluate_every=args.evaluate_every,
+    )
     try:
-        rows = [run_capture(c, args.data, args.output, options, SceneOptions(downscale=args.downscale)) for c in captures(args.data, args.only)]
+        rows = [
+            run_capture(c, args.data, args.output, options, SceneOptions(downscale=args.downscale))
+            for c in captures(args.data, args.only)
+        ]
     except LinprimError as error:
         raise SystemExit(f"real_data: error: {error}") from None
     write_json(args.output / "real_data.json", rows)
     (args.output / "real_data.md").write_text(table(rows) + "\n")
     print(table(rows))
     for row in rows:
-        print(f"{row['name']}: " + ", ".join(f"{psnr:.2f} dB after {seconds:.0f} s" for seconds, psnr in row["curve"]))
+        print(
+            f"{row['name']}: "
+            + ", ".join(f"{psnr:.2f} dB after {seconds:.0f} s" for seconds, psnr in row["curve"])
+        )
 
 
 if __name__ == "__main__":

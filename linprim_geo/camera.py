@@ -68,14 +68,21 @@ class Camera:
         depth = local[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = np.where(depth > 0, 1.0 / depth, np.nan)
-        pixels = np.stack([local[:, 0] * scale * self.fx + self.cx, local[:, 1] * scale * self.fy + self.cy], 1)
+        pixels = np.stack(
+            [local[:, 0] * scale * self.fx + self.cx, local[:, 1] * scale * self.fy + self.cy], 1
+        )
         return pixels, depth
 
     def magnified(self, factor: int) -> Camera:
         """The same view with `factor` by `factor` pixels in place of each one."""
         return replace(
-            self, width=self.width * factor, height=self.height * factor, fx=self.fx * factor, fy=self.fy * factor,
-            cx=self.cx * factor, cy=self.cy * factor,
+            self,
+            width=self.width * factor,
+            height=self.height * factor,
+            fx=self.fx * factor,
+            fy=self.fy * factor,
+            cx=self.cx * factor,
+            cy=self.cy * factor,
         )
 
     def transformed(self, similarity: Similarity) -> Camera:

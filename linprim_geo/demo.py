@@ -33,14 +33,21 @@ def run_demo(output: str = "runs/demo", size: str = "normal") -> dict:
     root, marker = Path(output), Path(output) / "demo.json"
     if root.exists() and any(root.iterdir()):
         if not marker.exists():
-            raise LinprimError(f"{root}: exists already and was not made by the demo; give another folder with -o")
+            raise LinprimError(
+                f"{root}: exists already and was not made by the demo; give another folder with -o"
+            )
         shutil.rmtree(root)
     write_json(marker, {"size": size})
     print(f"1/5 photographing the built-in part: {views} views of {pixels}x{pixels}", file=sys.stderr)
     scene, run = root / "scene", root / "run"
     synthesize(scene, shape="cad", views=views, test_views=12, size=pixels, path="sphere")
     print("2/5 training", file=sys.stderr)
-    trained = train(scene, run, SceneOptions(), TrainOptions(iterations=iterations, max_primitives=primitives, sh_degree=0, samples=2))
+    trained = train(
+        scene,
+        run,
+        SceneOptions(),
+        TrainOptions(iterations=iterations, max_primitives=primitives, sh_degree=0, samples=2),
+    )
     print("3/5 rendering held-out views", file=sys.stderr)
     render_run(run, quiet=True)
     print("4/5 extracting the surface", file=sys.stderr)
@@ -51,14 +58,23 @@ def run_demo(output: str = "runs/demo", size: str = "normal") -> dict:
     depth = eval_depth_run(run, reference)
     mesh = eval_mesh_files(stats["mesh"], reference, run=run)
     result = {
-        "psnr": images["psnr"], "ssim": images["ssim"], "chamfer_percent_diagonal": mesh["chamfer_percent_diagonal"], "f1": mesh["f1"],
-        "abs_rel": depth["abs_rel"], "normal_mean_deg": depth["normal_mean_deg"], "seconds": trained["seconds"],
-        "primitives": trained["primitives"], "run": str(run), "mesh": stats["mesh"], "renders": str(run / "renders"), "reference": str(reference),
+        "psnr": images["psnr"],
+        "ssim": images["ssim"],
+        "chamfer_percent_diagonal": mesh["chamfer_percent_diagonal"],
+        "f1": mesh["f1"],
+        "abs_rel": depth["abs_rel"],
+        "normal_mean_deg": depth["normal_mean_deg"],
+        "seconds": trained["seconds"],
+        "primitives": trained["primitives"],
+        "run": str(run),
+        "mesh": stats["mesh"],
+        "renders": str(run / "renders"),
+        "reference": str(reference),
     }
     write_json(marker, {"size": size, **result})
     result["_text"] = (
-        f"\nPSNR {images['psnr']:.2f} dB, SSIM {images['ssim']:.4f} on {images['views']} held-out views; depth AbsRel {depth['abs_rel']:.4f}, "
-        f"normals {depth['normal_mean_deg']:.1f} degrees off\n"
+        f"\nPSNR {images['psnr']:.2f} dB, SSIM {images['ssim']:.4f} on {images['views']} held-out views; "
+        f"depth AbsRel {depth['abs_rel']:.4f}, normals {depth['normal_mean_deg']:.1f} degrees off\n"
         f"mesh: Chamfer {mesh['chamfer_percent_diagonal']:.3f} % of the diagonal, F1 {mesh['f1']:.3f} at 1 %; "
         f"{trained['primitives']} primitives, {trained['seconds']:.0f} s of training\n\n"
         f"open {stats['mesh']} and {reference} in MeshLab; pictures are in {run / 'renders'}, figures in {run / 'eval'}"

@@ -18,8 +18,14 @@ from .run import Run
 SEEN_THROUGH = 0.5
 
 
-def extract_mesh(run: str | os.PathLike, method: str = "tsdf", output: str | os.PathLike | None = None,
-                 options: ExtractOptions | None = None, *, quiet: bool = False) -> dict:
+def extract_mesh(
+    run: str | os.PathLike,
+    method: str = "tsdf",
+    output: str | os.PathLike | None = None,
+    options: ExtractOptions | None = None,
+    *,
+    quiet: bool = False,
+) -> dict:
     """Extracts the surface of a run and writes it, the part that cameras see, and statistics.
 
     RUN/mesh/METHOD holds mesh.ply, mesh_visible.ply and stats.json; with `output` the two meshes go to OUTPUT and its sibling
@@ -39,12 +45,18 @@ def extract_mesh(run: str | os.PathLike, method: str = "tsdf", output: str | os.
     options = options or ExtractOptions()
     if method != "tsdf":
         raise LinprimError(f"--method is {method!r}, wanted tsdf")
-    for name, low, high in (("level", 1e-6, 1 - 1e-6), ("voxel_size", 0, 1e30), ("truncation", 1, 100), ("memory_limit", 0, 1e9),
-                            ("smallest_part", 0, 1)):
+    for name, low, high in (
+        ("level", 1e-6, 1 - 1e-6),
+        ("voxel_size", 0, 1e30),
+        ("truncation", 1, 100),
+        ("memory_limit", 0, 1e9),
+        ("smallest_part", 0, 1),
+    ):
         if not low <= getattr(options, name) <= high:
-            raise LinprimError(f"--{name.replace('_', '-')} is {getattr(options, name)}, wanted {low:g} to {high:g}")
+            raise LinprimError(
+                f"--{name.replace('_', '-')} is {getattr(options, name)}, wanted {low:g} to {high:g}"
+            )
     opened = Run.open(run)
-    scene = opened.scene()
     folder = opened.path / "mesh" / method
     target = Path(output) if output else folder / "mesh.ply"
     if target.suffix.lower() not in (".ply", ".obj", ".glb", ".stl"):
@@ -60,12 +72,21 @@ def extract_mesh(run: str | os.PathLike, method: str = "tsdf", output: str | os.
 
     frames = depth_frames(opened, options.level)
     if not any((frame.depth > 0).any() for frame in frames):
-        raise LinprimError(f"{opened.path}: no ray of any training view crosses transmittance {options.level}, so there is no surface")
+        raise LinprimError(
+            f"{opened.path}: no ray of any training view crosses transmittance {options.level}, so there is no surface"
+        )
     lap("render")
     voxel = options.voxel_size if options.voxel_size > 0 else auto_voxel_size(frames)
     limit = int(options.memory_limit * 2**30) if options.memory_limit > 0 else None
-    mesh = fuse_tsdf(frames, voxel_size=voxel, truncation_voxels=options.truncation, memory_limit=limit, min_component=options.smallest_part,
-                     threads=opened.train_options.threads, log=lambda text: progress.note("  " + text))
+    mesh = fuse_tsdf(
+        frames,
+        voxel_size=voxel,
+        truncation_voxels=options.truncation,
+        memory_limit=limit,
+        min_component=options.smallest_part,
+        threads=opened.train_options.threads,
+        log=lambda text: progress.note("  " + text),
+    )
     lap("fuse")
     seen = visible_faces(mesh, [frame.camera for frame in frames])
     lap("visibility")
@@ -75,9 +96,18 @@ def extract_mesh(run: str | os.PathLike, method: str = "tsdf", output: str | os.
     save_mesh(visible_target, visible)
     lap("write")
     stats = {
-        "mesh": str(target), "mesh_visible": str(visible_target), "method": method, "level": options.level, "voxel_size": voxel,
-        "truncation_voxels": options.truncation, "unit": opened.unit, "views": len(frames), "primitives": opened.state.get("primitives"),
-        **topology(mesh), "visible": topology(visible), "seconds": {**seconds, "total": round(sum(seconds.values()), 3)},
+        "mesh": str(target),
+        "mesh_visible": str(visible_target),
+        "method": method,
+        "level": options.level,
+        "voxel_size": voxel,
+        "truncation_voxels": options.truncation,
+        "unit": opened.unit,
+        "views": len(frames),
+        "primitives": opened.state.get("primitives"),
+        **topology(mesh),
+        "visible": topology(visible),
+        "seconds": {**seconds, "total": round(sum(seconds.values()), 3)},
         "memory_gib": round(memory_gib(), 3),
     }
     write_json(folder / "stats.json", stats)
@@ -92,5 +122,9 @@ def depth_frames(run: Run, level: float) -> list:
     frames = []
     for view, depth, opacity in run.surface_depths(run.scene().train, level):
         free = opacity < SEEN_THROUGH
-        frames.append(DepthFrame(view.camera, np.where(free, np.float32(0), depth), color=view.load().rgb, background=free))
+        frames.append(
+            DepthFrame(
+                view.camera, np.where(free, np.float32(0), depth), color=view.load().rgb, background=free
+            )
+        )
     return frames

@@ -39,15 +39,21 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
         temporary = None
     except OSError as error:
         if error.errno == errno.ENOSPC:
-            raise LinprimError(f"{path}: no space left on the device; the previous file is untouched") from error
+            raise LinprimError(
+                f"{path}: no space left on the device; the previous file is untouched"
+            ) from error
         if error.errno in (errno.EACCES, errno.EROFS, errno.EPERM, errno.ENOTDIR, errno.EEXIST):
             raise LinprimError(f"{path}: cannot be written ({os.strerror(error.errno)})") from error
         if _disk_is_full(path.parent):
-            raise LinprimError(f"{path}: no space left on the device; the previous file is untouched") from error
+            raise LinprimError(
+                f"{path}: no space left on the device; the previous file is untouched"
+            ) from error
         raise
     except RuntimeError as error:  # how torch reports a write that failed
         if _disk_is_full(path.parent):
-            raise LinprimError(f"{path}: no space left on the device; the previous file is untouched") from error
+            raise LinprimError(
+                f"{path}: no space left on the device; the previous file is untouched"
+            ) from error
         raise
     finally:
         if temporary is not None:

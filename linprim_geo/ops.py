@@ -18,7 +18,15 @@ from .errors import LinprimError
 
 # Planes in the order the core wants them; the last one is private state for the backward pass.
 _PLANES = (
-    "rgb", "opacity", "depth_expected", "depth_median", "depth_first", "distortion", "normal", "normal_median", "state",
+    "rgb",
+    "opacity",
+    "depth_expected",
+    "depth_median",
+    "depth_first",
+    "distortion",
+    "normal",
+    "normal_median",
+    "state",
 )
 _CHANNELS = (3, 0, 0, 0, 0, 0, 3, 3, 4)
 
@@ -52,35 +60,89 @@ def _check_finite(suffix: str, **tensors: Tensor) -> None:
         at = check(_array(tensor))
         if at >= 0:
             row = at // max(1, tensor[0].numel()) if tensor.dim() else 0
-            raise LinprimError(f"{name}: row {row} holds {tensor.reshape(-1)[at].item()}, finite numbers were wanted")
+            raise LinprimError(
+                f"{name}: row {row} holds {tensor.reshape(-1)[at].item()}, finite numbers were wanted"
+            )
 
 
 @torch.library.custom_op("linprim_geo::rasterize", mutates_args=())
 def _rasterize(
-    center: Tensor, rotation: Tensor, extent: Tensor, density: Tensor, sh: Tensor, background: Tensor, screen: Tensor | None,
-    world_to_camera: Tensor, fx: float, fy: float, cx: float, cy: float, width: int, height: int,
-    near: float, stop: float, level: float, geometry: bool,
+    center: Tensor,
+    rotation: Tensor,
+    extent: Tensor,
+    density: Tensor,
+    sh: Tensor,
+    background: Tensor,
+    screen: Tensor | None,
+    world_to_camera: Tensor,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    width: int,
+    height: int,
+    near: float,
+    stop: float,
+    level: float,
+    geometry: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     suffix = _suffix(center.dtype)
-    _check_dtypes(center.dtype, rotation=rotation, extent=extent, density=density, sh=sh, background=background)
-    _check_finite(suffix, center=center, rotation=rotation, extent=extent, density=density, background=background)
+    _check_dtypes(
+        center.dtype, rotation=rotation, extent=extent, density=density, sh=sh, background=background
+    )
+    _check_finite(
+        suffix, center=center, rotation=rotation, extent=extent, density=density, background=background
+    )
     planes = _planes(center, width, height, geometry)
     count = center.shape[0]
     color = center.new_empty((count, 3))
     max_weight = center.new_empty(count if geometry else 0)
     pixels = torch.empty(count if geometry else 0, dtype=torch.int32)
     getattr(_core, f"rasterize_{suffix}")(
-        _array(center), _array(rotation), _array(extent), _array(density), _array(sh), _array(background),
-        _array(world_to_camera[:3].double()), (fx, fy, cx, cy), width, height, near, stop, level, geometry,
-        [p.numpy() if p.numel() else None for p in planes], color.numpy(), max_weight.numpy(), pixels.numpy(),
+        _array(center),
+        _array(rotation),
+        _array(extent),
+        _array(density),
+        _array(sh),
+        _array(background),
+        _array(world_to_camera[:3].double()),
+        (fx, fy, cx, cy),
+        width,
+        height,
+        near,
+        stop,
+        level,
+        geometry,
+        [p.numpy() if p.numel() else None for p in planes],
+        color.numpy(),
+        max_weight.numpy(),
+        pixels.numpy(),
     )
     _check_finite(suffix, sh=color)
     return (*planes, color, max_weight, pixels)
 
 
 @_rasterize.register_fake
-def _(center, rotation, extent, density, sh, background, screen, world_to_camera, fx, fy, cx, cy, width, height,
-      near, stop, level, geometry):
+def _(
+    center,
+    rotation,
+    extent,
+    density,
+    sh,
+    background,
+    screen,
+    world_to_camera,
+    fx,
+    fy,
+    cx,
+    cy,
+    width,
+    height,
+    near,
+    stop,
+    level,
+    geometry,
+):
     count = center.shape[0]
     return (
         *_planes(center, width, height, geometry),
@@ -92,26 +154,83 @@ def _(center, rotation, extent, density, sh, background, screen, world_to_camera
 
 @torch.library.custom_op("linprim_geo::rasterize_grad", mutates_args=())
 def _rasterize_grad(
-    center: Tensor, rotation: Tensor, extent: Tensor, density: Tensor, sh: Tensor, background: Tensor,
-    world_to_camera: Tensor, fx: float, fy: float, cx: float, cy: float, width: int, height: int,
-    near: float, stop: float, level: float, geometry: bool, color: Tensor, planes: list[Tensor], grads: list[Tensor | None],
+    center: Tensor,
+    rotation: Tensor,
+    extent: Tensor,
+    density: Tensor,
+    sh: Tensor,
+    background: Tensor,
+    world_to_camera: Tensor,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    width: int,
+    height: int,
+    near: float,
+    stop: float,
+    level: float,
+    geometry: bool,
+    color: Tensor,
+    planes: list[Tensor],
+    grads: list[Tensor | None],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    out = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in (center, rotation, extent, density, sh, background)]
+    out = [
+        torch.empty_like(t, memory_format=torch.contiguous_format)
+        for t in (center, rotation, extent, density, sh, background)
+    ]
     out.append(center.new_empty((center.shape[0], 2)))
     getattr(_core, f"rasterize_grad_{_suffix(center.dtype)}")(
-        _array(center), _array(rotation), _array(extent), _array(density), _array(sh), _array(background),
-        _array(world_to_camera[:3].double()), (fx, fy, cx, cy), width, height, near, stop, level, geometry,
-        [_array(p) if p.numel() else None for p in planes], _array(color),
-        [None if g is None or not g.numel() else _array(g) for g in grads], *[t.numpy() for t in out],
+        _array(center),
+        _array(rotation),
+        _array(extent),
+        _array(density),
+        _array(sh),
+        _array(background),
+        _array(world_to_camera[:3].double()),
+        (fx, fy, cx, cy),
+        width,
+        height,
+        near,
+        stop,
+        level,
+        geometry,
+        [_array(p) if p.numel() else None for p in planes],
+        _array(color),
+        [None if g is None or not g.numel() else _array(g) for g in grads],
+        *[t.numpy() for t in out],
     )
     return tuple(out)
 
 
 @_rasterize_grad.register_fake
-def _(center, rotation, extent, density, sh, background, world_to_camera, fx, fy, cx, cy, width, height,
-      near, stop, level, geometry, color, planes, grads):
+def _(
+    center,
+    rotation,
+    extent,
+    density,
+    sh,
+    background,
+    world_to_camera,
+    fx,
+    fy,
+    cx,
+    cy,
+    width,
+    height,
+    near,
+    stop,
+    level,
+    geometry,
+    color,
+    planes,
+    grads,
+):
     inputs = (center, rotation, extent, density, sh, background)
-    return (*[torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs], center.new_empty((center.shape[0], 2)))
+    return (
+        *[torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs],
+        center.new_empty((center.shape[0], 2)),
+    )
 
 
 def _rasterize_setup(ctx, inputs, output):
@@ -127,7 +246,17 @@ def _rasterize_setup(ctx, inputs, output):
 def _rasterize_backward(ctx, *grads):
     center, rotation, extent, density, sh, background, world_to_camera, color, *planes = ctx.saved_tensors
     *parameters, screen = torch.ops.linprim_geo.rasterize_grad(
-        center, rotation, extent, density, sh, background, world_to_camera, *ctx.numbers, color, planes, list(grads[:8])
+        center,
+        rotation,
+        extent,
+        density,
+        sh,
+        background,
+        world_to_camera,
+        *ctx.numbers,
+        color,
+        planes,
+        list(grads[:8]),
     )
     return (*parameters, screen if ctx.has_screen else None, *[None] * (1 + len(ctx.numbers)))
 
@@ -144,7 +273,9 @@ class Rendering:
 
     rgb: Tensor  # (3, H, W) colour over the background
     opacity: Tensor  # (H, W) 1 - transmittance behind everything
-    depth_expected: Tensor | None = None  # sum of weight * mean depth inside the primitive; divide by opacity for a mean
+    depth_expected: Tensor | None = (
+        None  # sum of weight * mean depth inside the primitive; divide by opacity for a mean
+    )
     depth_median: Tensor | None = None  # where the transmittance crosses `level`, solved inside the primitive
     depth_first: Tensor | None = None  # entry into the first primitive
     distortion: Tensor | None = None  # sum over pairs i < j of w_i w_j (z_i - z_j)^2
@@ -155,8 +286,19 @@ class Rendering:
 
 
 def rasterize(
-    center: Tensor, rotation: Tensor, extent: Tensor, density: Tensor, sh: Tensor, background: Tensor, camera: Camera, *,
-    near: float = 0.01, stop: float = 1e-3, level: float = 0.5, geometry: bool = False, samples: int = 1,
+    center: Tensor,
+    rotation: Tensor,
+    extent: Tensor,
+    density: Tensor,
+    sh: Tensor,
+    background: Tensor,
+    camera: Camera,
+    *,
+    near: float = 0.01,
+    stop: float = 1e-3,
+    level: float = 0.5,
+    geometry: bool = False,
+    samples: int = 1,
     screen: Tensor | None = None,
 ) -> Rendering:
     """Renders octahedra, blended front to back in the order of their centres' depth, by exact perspective.
@@ -197,13 +339,43 @@ def rasterize(
     if samples < 1 or (samples > 1 and geometry):
         raise ValueError("samples has to be 1 with geometry, and at least 1 without")
     if samples > 1:
-        fine = rasterize(center, rotation, extent, density, sh, background, camera.magnified(samples), near=near, stop=stop, level=level,
-                         screen=screen)
-        return Rendering(torch.ops.linprim_geo.average_pixels(fine.rgb, samples), torch.ops.linprim_geo.average_pixels(fine.opacity, samples))
+        fine = rasterize(
+            center,
+            rotation,
+            extent,
+            density,
+            sh,
+            background,
+            camera.magnified(samples),
+            near=near,
+            stop=stop,
+            level=level,
+            screen=screen,
+        )
+        return Rendering(
+            torch.ops.linprim_geo.average_pixels(fine.rgb, samples),
+            torch.ops.linprim_geo.average_pixels(fine.opacity, samples),
+        )
     pose = torch.from_numpy(camera.world_to_camera.copy())
     out = torch.ops.linprim_geo.rasterize(
-        center, rotation, extent, density, sh, background, screen, pose, float(camera.fx), float(camera.fy), float(camera.cx),
-        float(camera.cy), camera.width, camera.height, near, stop, level, geometry,
+        center,
+        rotation,
+        extent,
+        density,
+        sh,
+        background,
+        screen,
+        pose,
+        float(camera.fx),
+        float(camera.fy),
+        float(camera.cx),
+        float(camera.cy),
+        camera.width,
+        camera.height,
+        near,
+        stop,
+        level,
+        geometry,
     )
     if not geometry:
         return Rendering(out[0], out[1])
@@ -214,7 +386,9 @@ def rasterize(
 def _average(image: Tensor, factor: int) -> Tensor:
     height, width = image.shape[-2] // factor, image.shape[-1] // factor
     coarse = image.new_empty((*image.shape[:-2], height, width))
-    getattr(_core, f"average_pixels_{_suffix(image.dtype)}")(_array(image), height, width, factor, coarse.numpy())
+    getattr(_core, f"average_pixels_{_suffix(image.dtype)}")(
+        _array(image), height, width, factor, coarse.numpy()
+    )
     return coarse
 
 
@@ -227,7 +401,9 @@ def _(image, factor):
 def _average_grad(grad: Tensor, factor: int) -> Tensor:
     height, width = grad.shape[-2:]
     fine = grad.new_empty((*grad.shape[:-2], height * factor, width * factor))
-    getattr(_core, f"average_pixels_grad_{_suffix(grad.dtype)}")(_array(grad), height, width, factor, fine.numpy())
+    getattr(_core, f"average_pixels_grad_{_suffix(grad.dtype)}")(
+        _array(grad), height, width, factor, fine.numpy()
+    )
     return fine
 
 
@@ -240,11 +416,23 @@ def _average_setup(ctx, inputs, output):
     ctx.factor = inputs[1]
 
 
-_average.register_autograd(lambda ctx, grad: (torch.ops.linprim_geo.average_pixels_grad(grad, ctx.factor), None), setup_context=_average_setup)
+_average.register_autograd(
+    lambda ctx, grad: (torch.ops.linprim_geo.average_pixels_grad(grad, ctx.factor), None),
+    setup_context=_average_setup,
+)
 
 
-def level_depth(center: Tensor, rotation: Tensor, extent: Tensor, density: Tensor, sh: Tensor, camera: Camera, *, level: float,
-                near: float = 0.01) -> Tensor:
+def level_depth(
+    center: Tensor,
+    rotation: Tensor,
+    extent: Tensor,
+    density: Tensor,
+    sh: Tensor,
+    camera: Camera,
+    *,
+    level: float,
+    near: float = 0.01,
+) -> Tensor:
     """(H, W) z-depth at which the transmittance of each pixel's ray falls to `level`, 0 where it never does; no gradient.
 
     Unlike `rasterize`'s depths it depends on no order: primitives absorb where they are, overlaps included, so the depth solves
@@ -261,8 +449,18 @@ def level_depth(center: Tensor, rotation: Tensor, extent: Tensor, density: Tenso
         raise ValueError(f"level is {level}, wanted a transmittance between 0 and 1")
     depth = center.new_empty((camera.height, camera.width), requires_grad=False)
     getattr(_core, f"level_depth_{suffix}")(
-        _array(center), _array(rotation), _array(extent), _array(density), _array(sh), camera.world_to_camera[:3].astype(float).copy(),
-        (camera.fx, camera.fy, camera.cx, camera.cy), camera.width, camera.height, near, level, depth.numpy(),
+        _array(center),
+        _array(rotation),
+        _array(extent),
+        _array(density),
+        _array(sh),
+        camera.world_to_camera[:3].astype(float).copy(),
+        (camera.fx, camera.fy, camera.cx, camera.cy),
+        camera.width,
+        camera.height,
+        near,
+        level,
+        depth.numpy(),
     )
     return depth
 
@@ -271,13 +469,17 @@ def level_depth(center: Tensor, rotation: Tensor, extent: Tensor, density: Tenso
 def _photometric(image: Tensor, target: Tensor, dssim: float, weight: Tensor | None) -> tuple[Tensor, Tensor]:
     _check_dtypes(torch.float32, image=image, target=target, **({} if weight is None else {"weight": weight}))
     gradient = torch.empty_like(image, memory_format=torch.contiguous_format)
-    parts = _core.photometric_loss(_array(image), _array(target), None if weight is None else _array(weight), dssim, gradient.numpy())
+    parts = _core.photometric_loss(
+        _array(image), _array(target), None if weight is None else _array(weight), dssim, gradient.numpy()
+    )
     return torch.tensor(parts, dtype=torch.float64), gradient
 
 
 @_photometric.register_fake
 def _(image, target, dssim, weight):
-    return image.new_empty(4, dtype=torch.float64), torch.empty_like(image, memory_format=torch.contiguous_format)
+    return image.new_empty(4, dtype=torch.float64), torch.empty_like(
+        image, memory_format=torch.contiguous_format
+    )
 
 
 def _photometric_setup(ctx, inputs, output):
@@ -294,7 +496,9 @@ def _photometric_backward(ctx, grad_parts, _):
 _photometric.register_autograd(_photometric_backward, setup_context=_photometric_setup)
 
 
-def photometric_loss(image: Tensor, target: Tensor, dssim: float = 0.2, weight: Tensor | None = None) -> Tensor:
+def photometric_loss(
+    image: Tensor, target: Tensor, dssim: float = 0.2, weight: Tensor | None = None
+) -> Tensor:
     """(1 - dssim) L1 + dssim (1 - SSIM) of two float32 images (3, H, W), with its analytic gradient to `image`.
 
     SSIM: 11x11 Gaussian window of sigma 1.5, zeros beyond the border, C1 = 0.01^2, C2 = 0.03^2. `weight` (H, W) multiplies
@@ -308,8 +512,17 @@ def photometric_loss(image: Tensor, target: Tensor, dssim: float = 0.2, weight: 
     return torch.ops.linprim_geo.photometric_loss(image, target, dssim, weight)[0]
 
 
-def adam_step(value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, step: int,
-              beta1: float = 0.9, beta2: float = 0.999, epsilon: float = 1e-15) -> None:
+def adam_step(
+    value: Tensor,
+    gradient: Tensor,
+    first: Tensor,
+    second: Tensor,
+    rate: float,
+    step: int,
+    beta1: float = 0.9,
+    beta2: float = 0.999,
+    epsilon: float = 1e-15,
+) -> None:
     """One Adam step with bias correction on float32 tensors, in place; `step` counts from 1.
 
     Source: Kingma and Ba, ICLR 2015, algorithm 1.
@@ -317,7 +530,17 @@ def adam_step(value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, ra
     _check_dtypes(torch.float32, value=value, gradient=gradient, first=first, second=second)
     if not (value.is_contiguous() and first.is_contiguous() and second.is_contiguous()):
         raise ValueError("value, first and second are changed in place and have to be contiguous")
-    _core.adam_step(value.detach().numpy(), _array(gradient), first.numpy(), second.numpy(), rate, beta1, beta2, epsilon, step)
+    _core.adam_step(
+        value.detach().numpy(),
+        _array(gradient),
+        first.numpy(),
+        second.numpy(),
+        rate,
+        beta1,
+        beta2,
+        epsilon,
+        step,
+    )
 
 
 def set_threads(count: int) -> None:

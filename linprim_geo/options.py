@@ -26,7 +26,9 @@ def from_saved(cls: type, values: object, where: str):
         if entry.name not in values:
             continue
         value, wanted = values[entry.name], type(entry.default)
-        if isinstance(value, bool) != (wanted is bool) or not isinstance(value, (int, float) if wanted is float else wanted):
+        if isinstance(value, bool) != (wanted is bool) or not isinstance(
+            value, (int, float) if wanted is float else wanted
+        ):
             raise LinprimError(f"{where}: {entry.name} is {value!r}, wanted {wanted.__name__}")
         taken[entry.name] = wanted(value)
     return cls(**taken)
@@ -34,12 +36,24 @@ def from_saved(cls: type, values: object, where: str):
 
 def check_train_options(options: TrainOptions) -> None:
     """Raises LinprimError for a value outside its range."""
-    ranges = {"iterations": (1, 10**8), "max_primitives": (1, 2**30), "initial_primitives": (0, options.max_primitives), "seed": (0, 2**63),
-              "threads": (0, 4096), "samples": (1, 8), "dssim": (0, 1), "stop": (0, 0.5), "checkpoint_every": (1, 10**9),
-              "evaluate_every": (0, 10**9), "sh_degree": (0, 3)}
+    ranges = {
+        "iterations": (1, 10**8),
+        "max_primitives": (1, 2**30),
+        "initial_primitives": (0, options.max_primitives),
+        "seed": (0, 2**63),
+        "threads": (0, 4096),
+        "samples": (1, 8),
+        "dssim": (0, 1),
+        "stop": (0, 0.5),
+        "checkpoint_every": (1, 10**9),
+        "evaluate_every": (0, 10**9),
+        "sh_degree": (0, 3),
+    }
     for name, (low, high) in ranges.items():
         if not low <= getattr(options, name) <= high:
-            raise LinprimError(f"--{name.replace('_', '-')} is {getattr(options, name)}, wanted {low} to {high}")
+            raise LinprimError(
+                f"--{name.replace('_', '-')} is {getattr(options, name)}, wanted {low} to {high}"
+            )
 
 
 @dataclass(frozen=True)
@@ -47,8 +61,12 @@ class SceneOptions:
     """How a capture is read."""
 
     downscale: int = option(1, "average K by K pixels into one", metavar="K")
-    masks: str = option("", "folder of foreground masks, if they are not where data sets usually keep them", metavar="DIR")
-    sparse: str = option("", "COLMAP model to take points from, if it is not where data sets usually keep it", metavar="DIR")
+    masks: str = option(
+        "", "folder of foreground masks, if they are not where data sets usually keep them", metavar="DIR"
+    )
+    sparse: str = option(
+        "", "COLMAP model to take points from, if it is not where data sets usually keep it", metavar="DIR"
+    )
 
 
 @dataclass(frozen=True)
@@ -57,7 +75,9 @@ class TrainOptions:
 
     iterations: int = option(7000, "training steps, one view each")
     max_primitives: int = option(20_000, "the population never grows past this")
-    initial_primitives: int = option(0, "primitives at the start; 0 chooses from the points and --max-primitives")
+    initial_primitives: int = option(
+        0, "primitives at the start; 0 chooses from the points and --max-primitives"
+    )
     sh_degree: int = option(2, "degree of the view-dependent colour, 0 to 3", choices=(0, 1, 2, 3))
     seed: int = option(0, "seed of everything random")
     threads: int = option(0, "worker threads; 0 uses every core; the result does not depend on it")
@@ -66,17 +86,28 @@ class TrainOptions:
     )
     dssim: float = option(0.2, "weight of D-SSIM in the loss; L1 has the rest")
     stop: float = option(1e-3, "transmittance below which a ray ends", metavar="T")
-    samples: int = option(1, "K by K rays per pixel: 1 is fastest, 2 resolves edges that cut through pixels", metavar="K")
+    samples: int = option(
+        1, "K by K rays per pixel: 1 is fastest, 2 resolves edges that cut through pixels", metavar="K"
+    )
     checkpoint_every: int = option(1000, "steps between checkpoints", metavar="STEPS")
-    evaluate_every: int = option(1000, "steps between scores on the held-out views; 0 scores only at the end", metavar="STEPS")
+    evaluate_every: int = option(
+        1000, "steps between scores on the held-out views; 0 scores only at the end", metavar="STEPS"
+    )
 
 
 @dataclass(frozen=True)
 class ExtractOptions:
     """How a surface is taken out of a run."""
 
-    level: float = option(0.75, "transmittance at which the surface is taken, between 0 and 1; nearer to 1 is nearer to the camera")
-    voxel_size: float = option(0.0, "grid spacing in the data set's unit; 0 chooses from the views", metavar="LENGTH")
+    level: float = option(
+        0.75,
+        "transmittance at which the surface is taken, between 0 and 1; nearer to 1 is nearer to the camera",
+    )
+    voxel_size: float = option(
+        0.0, "grid spacing in the data set's unit; 0 chooses from the views", metavar="LENGTH"
+    )
     truncation: float = option(3.0, "truncation distance in voxels")
-    memory_limit: float = option(0.0, "memory the grid may take, in GiB; 0 allows 60 % of what is free", metavar="GIB")
+    memory_limit: float = option(
+        0.0, "memory the grid may take, in GiB; 0 allows 60 % of what is free", metavar="GIB"
+    )
     smallest_part: float = option(0.01, "drop components with less than this share of the largest one's area")

@@ -42,7 +42,11 @@ class Growth:
 
 
 def grow(
-    parameters: dict[str, torch.Tensor], pull: torch.Tensor, growth: Growth, smallest_log_extent: float, rng: np.random.Generator
+    parameters: dict[str, torch.Tensor],
+    pull: torch.Tensor,
+    growth: Growth,
+    smallest_log_extent: float,
+    rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Draws the parents of one event and computes their halves.
 
@@ -75,12 +79,20 @@ def grow(
     children = np.concatenate([recycled, count + np.arange(wanted - len(recycled))])
 
     extent = np.exp(log_extent[parents])
-    axis = (rng.random((wanted, 1)) > np.cumsum(extent**2, 1)[:, :2] / (extent**2).sum(1, keepdims=True)).sum(1)
+    axis = (rng.random((wanted, 1)) > np.cumsum(extent**2, 1)[:, :2] / (extent**2).sum(1, keepdims=True)).sum(
+        1
+    )
     chosen = np.eye(3)[axis]
-    offset = _rotate(parameters["rotation"].detach().numpy()[parents].astype(np.float64), SPLIT_OFFSET * extent * chosen)
+    offset = _rotate(
+        parameters["rotation"].detach().numpy()[parents].astype(np.float64), SPLIT_OFFSET * extent * chosen
+    )
     center = parameters["center"].detach().numpy()[parents].astype(np.float64)
     shrunk = log_extent[parents] + np.log(np.where(chosen == 1, SPLIT_ALONG, SPLIT_ACROSS))
-    return parents, children, {"center": np.stack([center + offset, center - offset]), "log_extent": np.stack([shrunk, shrunk])}
+    return (
+        parents,
+        children,
+        {"center": np.stack([center + offset, center - offset]), "log_extent": np.stack([shrunk, shrunk])},
+    )
 
 
 def _rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:

@@ -15,7 +15,13 @@ from .run import Run
 DEPTHS = ("depth_median", "depth_expected", "depth_first")
 
 
-def render_run(run: str | os.PathLike, *, split: str = "test", output: str | os.PathLike | None = None, quiet: bool = False) -> dict:
+def render_run(
+    run: str | os.PathLike,
+    *,
+    split: str = "test",
+    output: str | os.PathLike | None = None,
+    quiet: bool = False,
+) -> dict:
     """Renders the views of a split to `output` (default RUN/renders).
 
     Writes SPLIT/rgb/NAME.png, and for depth_median, depth_expected, depth_first, opacity (H, W) and normal (H, W, 3; world axes)
@@ -43,7 +49,10 @@ def render_run(run: str | os.PathLike, *, split: str = "test", output: str | os.
 
 
 def _write_view(folder: Path, name: str, images: dict[str, np.ndarray]) -> int:
-    _png(folder / "rgb" / f"{name}.png", np.rint(np.clip(images["rgb"], 0, 1) * 255).astype(np.uint8).transpose(1, 2, 0))
+    _png(
+        folder / "rgb" / f"{name}.png",
+        np.rint(np.clip(images["rgb"], 0, 1) * 255).astype(np.uint8).transpose(1, 2, 0),
+    )
     shown = {kind: depth_preview(images[kind]) for kind in DEPTHS}
     shown["opacity"] = np.rint(np.clip(images["opacity"], 0, 1) * 255).astype(np.uint8)
     shown["normal"] = np.rint(np.clip(images["normal"] * 0.5 + 0.5, 0, 1) * 255).astype(np.uint8)
@@ -63,7 +72,9 @@ def depth_preview(depth: np.ndarray) -> np.ndarray:
     low, high = np.percentile(inverse[valid], [1, 99])
     value = np.clip((inverse - low) / max(high - low, 1e-12), 0, 1)
     # Control colours from dark blue over green to yellow, evenly spaced in lightness.
-    stops = np.array([[30, 20, 80], [40, 70, 140], [30, 125, 140], [60, 175, 110], [150, 215, 70], [250, 240, 60]], float)
+    stops = np.array(
+        [[30, 20, 80], [40, 70, 140], [30, 125, 140], [60, 175, 110], [150, 215, 70], [250, 240, 60]], float
+    )
     position = value * (len(stops) - 1)
     index = np.minimum(position.astype(int), len(stops) - 2)
     part = (position - index)[..., None]

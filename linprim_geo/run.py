@@ -1,11 +1,11 @@
 """A run's folder: what a training leaves behind, and rendering from it.
 
-    config.json       scene, options, versions: how the run was made
-    transform.json    training frame <-> data-set frame, unit
-    run.json          what the last save holds: iteration, primitives, background
-    training_frame.npz   primitives in the training frame, bit for bit as trained
-    scene.npz, scene.ply the same in the data set's frame, ours and in LinPrim's format
-    metrics.jsonl     loss, PSNR, ... over time                        checkpoints/step_*.pt, latest
+config.json       scene, options, versions: how the run was made
+transform.json    training frame <-> data-set frame, unit
+run.json          what the last save holds: iteration, primitives, background
+training_frame.npz   primitives in the training frame, bit for bit as trained
+scene.npz, scene.ply the same in the data set's frame, ours and in LinPrim's format
+metrics.jsonl     loss, PSNR, ... over time                        checkpoints/step_*.pt, latest
 """
 
 from __future__ import annotations
@@ -41,7 +41,14 @@ class Run:
     unit: str = "unit of the data set"
 
     @staticmethod
-    def create(path: Path, scene: Scene, scene_path: Path, scene_options: SceneOptions, options: TrainOptions, similarity: Similarity) -> Run:
+    def create(
+        path: Path,
+        scene: Scene,
+        scene_path: Path,
+        scene_options: SceneOptions,
+        options: TrainOptions,
+        similarity: Similarity,
+    ) -> Run:
         """Makes the folder and writes its configuration.
 
         Raises:
@@ -51,13 +58,23 @@ class Run:
             raise LinprimError(f"{path}: exists already; give another folder with -o, or go on with --resume")
         run = Run(path, scene_path.resolve(), scene_options, options, similarity, scene.unit)
         config = {
-            "linprim_geo": __version__, "scene": str(run.scene_path), "scene_options": asdict(scene_options),
-            "train_options": asdict(options), "python": platform.python_version(), "machine": platform.platform(),
+            "linprim_geo": __version__,
+            "scene": str(run.scene_path),
+            "scene_options": asdict(scene_options),
+            "train_options": asdict(options),
+            "python": platform.python_version(),
+            "machine": platform.platform(),
         }
         write_json(path / "config.json", config)
-        write_json(path / "transform.json", {
-            "about": "training = scale * (data_set - offset)", "scale": similarity.scale, "offset": similarity.offset, "unit": scene.unit,
-        })
+        write_json(
+            path / "transform.json",
+            {
+                "about": "training = scale * (data_set - offset)",
+                "scale": similarity.scale,
+                "offset": similarity.offset,
+                "unit": scene.unit,
+            },
+        )
         return run
 
     @staticmethod
@@ -74,10 +91,14 @@ class Run:
             scene, unit = Path(config["scene"]), str(transform["unit"])
             saved = config["scene_options"], config["train_options"]
         except (KeyError, TypeError, ValueError) as error:
-            raise LinprimError(f"{path}: config.json or transform.json lacks what a run needs ({error})") from None
+            raise LinprimError(
+                f"{path}: config.json or transform.json lacks what a run needs ({error})"
+            ) from None
         numbers = (similarity.scale, *similarity.offset)
         if len(numbers) != 4 or not np.isfinite(numbers).all() or similarity.scale <= 0:
-            raise LinprimError(f"{path / 'transform.json'}: holds no positive scale with an offset of three numbers")
+            raise LinprimError(
+                f"{path / 'transform.json'}: holds no positive scale with an offset of three numbers"
+            )
         where = str(path / "config.json")
         options = from_saved(TrainOptions, saved[1], where)
         check_train_options(options)
@@ -90,15 +111,26 @@ class Run:
     @cached_property
     def _scene(self) -> Scene:
         options = self.scene_options
-        return load_scene(self.scene_path, downscale=options.downscale, masks=options.masks or None, sparse=options.sparse or None)
+        return load_scene(
+            self.scene_path,
+            downscale=options.downscale,
+            masks=options.masks or None,
+            sparse=options.sparse or None,
+        )
 
     @cached_property
     def state(self) -> dict:
         """Contents of run.json: `iteration`, `primitives`, `background`, `seconds`."""
         state = _read_json(self.path / "run.json", self.path)
         color = state.get("background")
-        if not isinstance(color, list) or len(color) != 3 or not all(isinstance(x, (int, float)) and 0 <= x <= 1 for x in color):
-            raise LinprimError(f"{self.path / 'run.json'}: has no background colour of three numbers in [0, 1]")
+        if (
+            not isinstance(color, list)
+            or len(color) != 3
+            or not all(isinstance(x, (int, float)) and 0 <= x <= 1 for x in color)
+        ):
+            raise LinprimError(
+                f"{self.path / 'run.json'}: has no background colour of three numbers in [0, 1]"
+            )
         return state
 
     @property
@@ -124,7 +156,9 @@ class Run:
         """The saved primitives in the data set's frame."""
         return to_data_set(self.training_primitives(), self.similarity)
 
-    def render_views(self, views: Iterable[View], geometry: bool = True, level: float = 0.5) -> Iterator[tuple[View, dict[str, np.ndarray]]]:
+    def render_views(
+        self, views: Iterable[View], geometry: bool = True, level: float = 0.5
+    ) -> Iterator[tuple[View, dict[str, np.ndarray]]]:
         """Renders views over the run's background, one at a time.
 
         Yields: (view, images) with float32 `rgb` (3, H, W), `opacity` (H, W) and, with `geometry`, the z-depths `depth_median`
@@ -139,8 +173,14 @@ class Run:
         for view in views:
             camera, options = view.camera.transformed(self.similarity), self.train_options
             with torch.no_grad():
-                color = ops.rasterize(*tensors, background, camera, stop=options.stop, samples=options.samples)
-                out = ops.rasterize(*tensors, background, camera, stop=options.stop, level=level, geometry=True) if geometry else color
+                color = ops.rasterize(
+                    *tensors, background, camera, stop=options.stop, samples=options.samples
+                )
+                out = (
+                    ops.rasterize(*tensors, background, camera, stop=options.stop, level=level, geometry=True)
+                    if geometry
+                    else color
+                )
             images = {"rgb": color.rgb.numpy(), "opacity": out.opacity.numpy()}
             if geometry:
                 unit = 1.0 / self.similarity.scale
@@ -148,10 +188,14 @@ class Run:
                 images["depth_median"] = (out.depth_median.numpy() * unit).astype(np.float32)
                 images["depth_first"] = (out.depth_first.numpy() * unit).astype(np.float32)
                 images["depth_expected"] = (out.depth_expected.numpy() * unit / opacity).astype(np.float32)
-                images["normal"] = (out.normal_median.numpy().transpose(1, 2, 0) @ view.camera.rotation).astype(np.float32)
+                images["normal"] = (
+                    out.normal_median.numpy().transpose(1, 2, 0) @ view.camera.rotation
+                ).astype(np.float32)
             yield view, images
 
-    def surface_depths(self, views: Iterable[View], level: float) -> Iterator[tuple[View, np.ndarray, np.ndarray]]:
+    def surface_depths(
+        self, views: Iterable[View], level: float
+    ) -> Iterator[tuple[View, np.ndarray, np.ndarray]]:
         """Where the transmittance of every ray falls to `level`, overlaps counted exactly (`ops.level_depth`).
 
         Yields: (view, depth, opacity), each (H, W) float32; z-depth in the data set's unit, 0 where it never does.
@@ -165,7 +209,9 @@ class Run:
             camera = view.camera.transformed(self.similarity)
             with torch.no_grad():
                 depth = ops.level_depth(*tensors, camera, level=level).numpy()
-                opacity = ops.rasterize(*tensors, background, camera, stop=self.train_options.stop).opacity.numpy()
+                opacity = ops.rasterize(
+                    *tensors, background, camera, stop=self.train_options.stop
+                ).opacity.numpy()
             yield view, (depth / self.similarity.scale).astype(np.float32), opacity
 
     def _tensors(self):
@@ -183,7 +229,9 @@ def to_data_set(octahedra: Octahedra, similarity: Similarity) -> Octahedra:
     """Primitives of the training frame in the data set's: lengths divided by the scale, densities multiplied by it."""
     inverse = similarity.inverse()
     return replace(
-        octahedra, center=inverse.apply(octahedra.center), extent=octahedra.extent / similarity.scale,
+        octahedra,
+        center=inverse.apply(octahedra.center),
+        extent=octahedra.extent / similarity.scale,
         density=octahedra.density * similarity.scale,
     )
 
@@ -192,7 +240,9 @@ def _read_json(file: Path, run: Path) -> dict:
     try:
         value = json.loads(file.read_text())
     except FileNotFoundError:
-        raise LinprimError(f"{run}: {file.name} is missing, so this is not the folder of a run that has saved something") from None
+        raise LinprimError(
+            f"{run}: {file.name} is missing, so this is not the folder of a run that has saved something"
+        ) from None
     except (OSError, UnicodeDecodeError, ValueError) as error:
         raise LinprimError(f"{file}: cannot be read ({error})") from None
     if not isinstance(value, dict):

@@ -1,84 +1,38 @@
-"""Training: photographs and a first guess of primitives in, optimised primitives out.
+"""Training: photographs and a first guess of primitives in, a run folder with optimised primitives out.
 
-One view per step: render, L1 + D-SSIM, Adam, and now and then the population grows (population.py). Whatever is random is
-drawn from a generator seeded by (seed, purpose, step), so a checkpoint needs no generator state and a resumed run repeats
-the interrupted one bit for bit.
+One view per step (trainer.py): render, L1 + D-SSIM, Adam, and now and then the population grows (population.py). This file is
+what surrounds the steps: where to start, scores on held-out views, checkpoints, interruption, resuming.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import os
 import signal
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from . import ops, population
-from .camera import Camera
+from . import ops
 from .errors import LinprimError
 from .files import atomic_write
 from .options import SceneOptions, TrainOptions, check_train_options
-from .primitives import SH_Y0, Octahedra
 from .progress import Progress, duration, memory_gib
 from .run import Run
-from .scene import PointCloud, Scene, View, load_scene
+from .scene import PointCloud, Scene, load_scene
+from .trainer import LARGEST_PART, SMALLEST_PX, Shot, Trainer, initial_parameters, load_shots
 
-# Learning rates at the start of a run, for the training frame, where cameras see their subject from a distance of 3; all fall
-# exponentially to the given part of themselves.
-RATES = {
-    "center": (1.5e-3, 0.02), "rotation": (7e-3, 0.1), "log_extent": (1.5e-2, 0.1), "raw_opacity": (5e-2, 0.1),
-    "sh_dc": (5e-3, 0.1), "sh_rest": (5e-4, 0.1), "background": (5e-3, 0.1),
-}
-# Half-axes stay within these: a part of a pixel at the distance of the subject, and of the scene's radius.
-SMALLEST_PX, LARGEST_PART = 0.35, 0.5
 # Primitives at the start, as a share of the most there may be: from points on surfaces, and from random ones.
 SFM_START, RANDOM_START = 0.8, 0.25
 # Triangulated points fewer than this leave too much of a scene empty.
 FEW_POINTS = 500
-# Share of the run after which each further degree of view-dependent colour joins.
-DEGREE_EVERY = 0.07
 # Held-out views scored during training; all of them are at the end.
 QUICK_VIEWS = 16
 KEPT_CHECKPOINTS = 2
-
-
-@dataclass(frozen=True)
-class Shot:
-    """A view in memory: `rgb` (3, H, W) uint8, `alpha` (H, W) uint8 or None, and its camera in the training frame."""
-
-    name: str
-    camera: Camera
-    rgb: torch.Tensor
-    alpha: torch.Tensor | None
-
-    def over(self, background: torch.Tensor) -> torch.Tensor:
-        """(3, H, W) float32 in [0, 1], over `background` (3,) where alpha lets it through."""
-        rgb = self.rgb.to(torch.float32).mul_(1 / 255)
-        if self.alpha is None:
-            return rgb
-        alpha = self.alpha.to(torch.float32).mul_(1 / 255)
-        return rgb.mul_(alpha).add_(background[:, None, None] * (1 - alpha))
-
-
-def load_shots(views: tuple[View, ...], similarity) -> list[Shot]:
-    """Decodes views into memory, keeping their order."""
-    from concurrent.futures import ThreadPoolExecutor
-
-    def load(view: View) -> Shot:
-        photo = view.load()
-        alpha = None if photo.alpha is None else torch.from_numpy(np.ascontiguousarray(photo.alpha))
-        rgb = torch.from_numpy(np.ascontiguousarray(photo.rgb.transpose(2, 0, 1)))
-        return Shot(view.name, view.camera.transformed(similarity), rgb, alpha)
-
-    with ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
-        return list(pool.map(load, views))
 
 
 def with_points(scene: Scene, options: TrainOptions, log: Callable[[str], None]) -> Scene:
@@ -116,184 +70,24 @@ def initial_cloud(cloud: PointCloud, options: TrainOptions) -> PointCloud:
 
 
 def _initial_count(options: TrainOptions, share: float) -> int:
-    return min(options.max_primitives, options.initial_primitives or max(500, round(share * options.max_primitives)))
+    return min(
+        options.max_primitives, options.initial_primitives or max(500, round(share * options.max_primitives))
+    )
 
 
-def initial_parameters(xyz: np.ndarray, rgb: np.ndarray, degree: int, seed: int, bounds: tuple[float, float]) -> dict[str, torch.Tensor]:
-    """One octahedron per point: half-axes the mean distance to the 3 nearest points, opacity 0.5, random rotation.
-
-    `xyz` (P, 3) in the training frame, `rgb` (P, 3) uint8, `bounds` the least and largest half-axis.
-    """
-    from scipy.spatial import cKDTree
-
-    count = len(xyz)
-    rng = np.random.default_rng([seed, 2])
-    neighbours = min(4, count)
-    distance = cKDTree(xyz).query(xyz, k=neighbours)[0].reshape(count, -1)[:, 1:]
-    size = distance.mean(1) if distance.shape[1] else np.full(count, bounds[1])
-    rotation = rng.normal(size=(count, 4))
-    values = {
-        "center": xyz, "rotation": rotation / np.linalg.norm(rotation, axis=1, keepdims=True),
-        "log_extent": np.repeat(np.log(np.clip(size, *bounds))[:, None], 3, 1), "raw_opacity": np.zeros(count),
-        "sh_dc": ((rgb / 255.0 - 0.5) / SH_Y0)[:, None, :], "sh_rest": np.zeros((count, (degree + 1) ** 2 - 1, 3)),
-    }
-    return {name: torch.from_numpy(np.ascontiguousarray(value, dtype=np.float32)) for name, value in values.items()}
-
-
-def activate(parameters: dict[str, torch.Tensor], degree: int) -> tuple[torch.Tensor, ...]:
-    """Raw parameters to what the rasterizer takes: center, rotation, extent, density, sh.
-
-    extent = exp(log_extent); density = softplus(raw_opacity) / (2 min extent), so that a ray along the shortest diagonal has
-    alpha = 1 - exp(-softplus(raw)) = sigmoid(raw), with no cap and no logarithm of 0.
-    """
-    extent = torch.exp(parameters["log_extent"])
-    density = torch.nn.functional.softplus(parameters["raw_opacity"]) / (2 * extent.amin(1))
-    count = (degree + 1) ** 2 - 1
-    sh = parameters["sh_dc"] if count == 0 else torch.cat([parameters["sh_dc"], parameters["sh_rest"][:, :count]], 1)
-    return parameters["center"], parameters["rotation"], extent, density, sh
-
-
-class Trainer:
-    """The state of a training and one step of it. `parameters`, `first` and `second` (Adam's moments) share their keys."""
-
-    def __init__(self, shots: list[Shot], parameters: dict[str, torch.Tensor], options: TrainOptions, bounds: tuple[float, float],
-                 background: torch.Tensor, fitted: bool, random_background: bool):
-        self.shots, self.options, self.bounds = shots, options, bounds
-        self.parameters = dict(parameters)
-        self.fitted, self.random_background = fitted, random_background
-        self.background = background
-        if fitted:
-            self.parameters["background"] = background
-        self.first = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
-        self.second = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
-        self.pull = torch.zeros(len(self))
-        self.step = 0
-        self.seconds = 0.0
-        self.loss = self.psnr = math.nan  # running means
-        self.growth = population.Growth.plan(options.iterations, len(self), options.max_primitives)
-
-    def __len__(self) -> int:
-        return len(self.parameters["center"])
-
-    @property
-    def degree(self) -> int:
-        """Degree of the view-dependent colour at this step."""
-        return min(self.options.sh_degree, int(self.step / (DEGREE_EVERY * self.options.iterations)))
-
-    def view_of(self, step: int) -> int:
-        """Index of the view of a step: every view once per round, in an order drawn per round."""
-        turn, place = divmod(step, len(self.shots))
-        return int(np.random.default_rng([self.options.seed, 3, turn]).permutation(len(self.shots))[place])
-
-    def advance(self) -> None:
-        """One training step.
-
-        Raises:
-            LinprimError: a parameter or the loss is no longer finite.
-        """
-        begin = time.perf_counter()
-        shot = self.shots[self.view_of(self.step)]
-        background = self.background
-        if self.fitted:
-            background = self.parameters["background"]
-        elif self.random_background:
-            background = torch.from_numpy(np.random.default_rng([self.options.seed, 4, self.step]).random(3, dtype=np.float32))
-        target = shot.over(background.detach())
-        leaves = {k: v.requires_grad_() for k, v in self.parameters.items()}
-        screen = torch.zeros(len(self), 2, requires_grad=True)
-        out = ops.rasterize(*activate(leaves, self.degree), background, shot.camera, stop=self.options.stop,
-                            samples=self.options.samples, screen=screen)
-        parts = ops.photometric_loss(out.rgb, target, self.options.dssim)
-        *grads, screen_grad = torch.autograd.grad(parts[0], [*leaves.values(), screen], allow_unused=True)
-        with torch.no_grad():
-            self._update(dict(zip(leaves, grads, strict=True)))
-            # In units of the image's size, so that views of different resolution pull alike.
-            scale = torch.tensor([shot.camera.width, shot.camera.height], dtype=torch.float32)
-            self.pull += torch.linalg.vector_norm(screen_grad * scale, dim=1)
-        self.step += 1
-        if self.growth.is_due(self.step):
-            self._grow()
-        loss, _, _, error = parts.detach().tolist()
-        psnr = -10 * math.log10(max(error, 1e-12)) if math.isfinite(error) else math.nan
-        self.loss = 0.98 * self.loss + 0.02 * loss if self.step > 1 else loss
-        self.psnr = 0.98 * self.psnr + 0.02 * psnr if self.step > 1 else psnr
-        self.seconds += time.perf_counter() - begin
-        if not math.isfinite(loss):
-            raise LinprimError(f"the loss is {loss}")
-
-    def _update(self, grads: dict[str, torch.Tensor | None]) -> None:
-        part = self.step / self.options.iterations
-        for name, value in self.parameters.items():
-            value.requires_grad_(False)
-            if grads[name] is None:
-                continue
-            rate, final = RATES[name]
-            ops.adam_step(value, grads[name], self.first[name], self.second[name], rate * final**part, self.step + 1)
-        rotation = self.parameters["rotation"]
-        rotation /= torch.linalg.vector_norm(rotation, dim=1, keepdim=True).clamp_min(1e-12)
-        self.parameters["log_extent"].clamp_(math.log(self.bounds[0]), math.log(self.bounds[1]))
-        if self.fitted:
-            self.parameters["background"].clamp_(0, 1)
-
-    def _grow(self) -> None:
-        rng = np.random.default_rng([self.options.seed, 5, self.step])
-        parents, children, halves = population.grow(self.parameters, self.pull, self.growth, math.log(self.bounds[0]), rng)
-        total = max(len(self), int(children.max(initial=-1)) + 1)
-        for name in self.parameters:
-            if name == "background":
-                continue
-            for table in (self.parameters, self.first, self.second):
-                old = table[name]
-                new = old.new_zeros((total, *old.shape[1:]))
-                new[: len(old)] = old
-                # A child is its parent, moments and all, but for what a half has of its own.
-                new[children] = new[parents]
-                table[name] = new
-            if name in halves:
-                self.parameters[name][parents] = torch.from_numpy(halves[name][0].astype(np.float32))
-                self.parameters[name][children] = torch.from_numpy(halves[name][1].astype(np.float32))
-            self.first[name][parents] = 0
-            self.first[name][children] = 0
-        self.pull = torch.zeros(total)
-
-    @torch.no_grad()
-    def render(self, camera: Camera, background: torch.Tensor) -> torch.Tensor:
-        """(3, H, W) colour of a camera in the training frame."""
-        return ops.rasterize(*activate(self.parameters, self.degree), background, camera, stop=self.options.stop,
-                             samples=self.options.samples).rgb
-
-    def shown_background(self) -> torch.Tensor:
-        """(3,) the background that renders and scores use."""
-        return self.parameters["background"].detach() if self.fitted else self.background
-
-    def octahedra(self) -> Octahedra:
-        """The primitives as plain arrays, in the training frame."""
-        with torch.no_grad():
-            return Octahedra(*(t.numpy().copy() for t in activate(self.parameters, self.options.sh_degree)))
-
-    def state(self) -> dict:
-        """Everything a resumed run needs, as tensors and numbers."""
-        return {"parameters": self.parameters, "first": self.first, "second": self.second, "pull": self.pull, "step": self.step,
-                "bounds": list(self.bounds), "seconds": self.seconds, "loss": self.loss, "psnr": self.psnr, "growth": [self.growth.first, self.growth.last, self.growth.every, self.growth.rate, self.growth.cap]}
-
-    def restore(self, state: dict) -> None:
-        """Takes back what `state` returned."""
-        for name in ("parameters", "first", "second"):
-            if set(state[name]) != set(getattr(self, name)):
-                raise ValueError(f"{name} has {sorted(state[name])}, wanted {sorted(getattr(self, name))}")
-            setattr(self, name, dict(state[name]))
-        self.pull, self.step = state["pull"], int(state["step"])
-        self.bounds = (float(state["bounds"][0]), float(state["bounds"][1]))
-        self.seconds, self.loss, self.psnr = float(state["seconds"]), float(state["loss"]), float(state["psnr"])
-        first, last, every, rate, cap = state["growth"]
-        self.growth = population.Growth(int(first), int(last), int(every), float(rate), int(cap))
-
-
-def train(scene: str | os.PathLike, run: str | os.PathLike, scene_options: SceneOptions | None = None, options: TrainOptions | None = None,
-          *, resume: bool = False, quiet: bool = False) -> dict:
+def train(
+    scene: str | os.PathLike,
+    run: str | os.PathLike,
+    scene_options: SceneOptions | None = None,
+    options: TrainOptions | None = None,
+    *,
+    resume: bool = False,
+    quiet: bool = False,
+) -> dict:
     """Trains a scene into a run folder.
 
-    With `resume` the folder's own options are used (but for `threads`): learning rates and growth depend on them. Interrupted (Ctrl-C), it finishes the step, saves, and raises KeyboardInterrupt.
+    With `resume` the folder's own options are used (but for `threads`): learning rates and growth depend on them. Interrupted
+    (Ctrl-C), it finishes the step, saves, and raises KeyboardInterrupt.
 
     Returns: `run`, `iterations`, `seconds` (of training steps alone), `primitives`, `psnr` (mean over held-out views), `views`.
 
@@ -308,18 +102,33 @@ def train(scene: str | os.PathLike, run: str | os.PathLike, scene_options: Scene
     if resume:
         opened = Run.open(run_path)
         if Path(scene).resolve() != opened.scene_path:
-            raise LinprimError(f"{run_path}: was trained on {opened.scene_path}, not on {Path(scene).resolve()}")
-        ignored = [f.name for f in fields(options) if getattr(options, f.name) not in (f.default, getattr(opened.train_options, f.name))]
+            raise LinprimError(
+                f"{run_path}: was trained on {opened.scene_path}, not on {Path(scene).resolve()}"
+            )
+        ignored = [
+            f.name
+            for f in fields(options)
+            if getattr(options, f.name) not in (f.default, getattr(opened.train_options, f.name))
+        ]
         if set(ignored) - {"threads"}:
-            progress.note(f"--resume goes on with the run's own options: {', '.join(sorted(set(ignored) - {'threads'}))} ignored")
+            progress.note(
+                f"--resume goes on with the run's own options: {', '.join(sorted(set(ignored) - {'threads'}))} ignored"
+            )
         options = replace(opened.train_options, threads=options.threads)
         progress.total = options.iterations
         loaded = opened.scene()
     else:
         scene_options = scene_options or SceneOptions()
-        loaded = load_scene(scene, downscale=scene_options.downscale, masks=scene_options.masks or None, sparse=scene_options.sparse or None)
+        loaded = load_scene(
+            scene,
+            downscale=scene_options.downscale,
+            masks=scene_options.masks or None,
+            sparse=scene_options.sparse or None,
+        )
         if run_path.exists() and (not run_path.is_dir() or any(run_path.iterdir())):
-            raise LinprimError(f"{run_path}: exists already; give another folder with -o, or go on with --resume")
+            raise LinprimError(
+                f"{run_path}: exists already; give another folder with -o, or go on with --resume"
+            )
         _threads(options)
         loaded = with_points(loaded, options, progress.note)
         opened = Run(run_path, Path(scene), scene_options, options, scene_normalization(loaded), loaded.unit)
@@ -342,10 +151,18 @@ def train(scene: str | os.PathLike, run: str | os.PathLike, scene_options: Scene
     )
     held_out = load_shots(loaded.test, opened.similarity)
     seconds, score = _loop(trainer, opened, held_out, progress)
-    result = {"run": str(run_path), "iterations": trainer.step, "seconds": seconds, "primitives": len(trainer), "psnr": score,
-              "views": len(held_out)}
-    progress.note(f"{run_path}: {trainer.step} steps in {duration(seconds)}, {len(trainer)} primitives"
-                  + (f", held-out PSNR {score:.2f} dB over {len(held_out)} views" if held_out else ""))
+    result = {
+        "run": str(run_path),
+        "iterations": trainer.step,
+        "seconds": seconds,
+        "primitives": len(trainer),
+        "psnr": score,
+        "views": len(held_out),
+    }
+    progress.note(
+        f"{run_path}: {trainer.step} steps in {duration(seconds)}, {len(trainer)} primitives"
+        + (f", held-out PSNR {score:.2f} dB over {len(held_out)} views" if held_out else "")
+    )
     return result
 
 
@@ -362,7 +179,9 @@ def _background(text: str, has_alpha: bool) -> tuple[torch.Tensor, bool, bool]:
         text = "random" if has_alpha else "fitted"
     if text == "random":
         if not has_alpha:
-            raise LinprimError("--background random needs images with an alpha channel or masks; this scene has none")
+            raise LinprimError(
+                "--background random needs images with an alpha channel or masks; this scene has none"
+            )
         return torch.ones(3), False, True
     if text == "fitted":
         return torch.full((3,), 0.5), True, False
@@ -371,7 +190,9 @@ def _background(text: str, has_alpha: bool) -> tuple[torch.Tensor, bool, bool]:
     except ValueError:
         color = ()
     if len(color) != 3 or not all(0 <= x <= 1 for x in color):
-        raise LinprimError(f"--background is {text!r}, wanted auto, fitted, random, black, white, or three numbers in [0,1] such as 0.5,0.5,1")
+        raise LinprimError(
+            f"--background is {text!r}, wanted auto, fitted, random, black, white, or three numbers in [0,1] such as 0.5,0.5,1"
+        )
     return torch.tensor(color, dtype=torch.float32), False, False
 
 
@@ -386,7 +207,9 @@ def _start(scene: Scene, run: Run, shots: list[Shot], options: TrainOptions, sta
         xyz, rgb = run.similarity.apply(cloud.xyz), cloud.rgb
         middle = np.median(xyz, 0)
         reach = np.linalg.norm(xyz - middle, axis=1)
-        radius = max(float(np.percentile(reach, 98)), 0.2 * float(np.linalg.norm(centers - middle, axis=1).max()), 1e-3)
+        radius = max(
+            float(np.percentile(reach, 98)), 0.2 * float(np.linalg.norm(centers - middle, axis=1).max()), 1e-3
+        )
     smallest = SMALLEST_PX * 3.0 / focal
     bounds = (smallest, max(LARGEST_PART * radius, 4 * smallest))
     background, fitted, random_background = _background(options.background, scene.has_alpha)
@@ -396,7 +219,9 @@ def _start(scene: Scene, run: Run, shots: list[Shot], options: TrainOptions, sta
         try:
             trainer.restore(state)
         except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise LinprimError(f"{run.path / 'checkpoints'}: the latest checkpoint lacks what a run needs ({error})") from None
+            raise LinprimError(
+                f"{run.path / 'checkpoints'}: the latest checkpoint lacks what a run needs ({error})"
+            ) from None
     return trainer
 
 
@@ -410,25 +235,42 @@ def _loop(trainer: Trainer, run: Run, held_out: list[Shot], progress: Progress) 
             try:
                 trainer.advance()
             except LinprimError as error:
-                raise LinprimError(f"{run.path}: training diverged at step {trainer.step} ({error}); what was saved before is intact") from None
+                raise LinprimError(
+                    f"{run.path}: training diverged at step {trainer.step} ({error}); what was saved before is intact"
+                ) from None
             last = trainer.step == options.iterations
             score = None
             if last or (options.evaluate_every and trainer.step % options.evaluate_every == 0):
-                score = evaluate(trainer, held_out if last else held_out[:: max(1, len(held_out) // QUICK_VIEWS)])
+                score = evaluate(
+                    trainer, held_out if last else held_out[:: max(1, len(held_out) // QUICK_VIEWS)]
+                )
             if trainer.step % 100 == 0 or last or score is not None:
-                entry = {"step": trainer.step, "seconds": round(trainer.seconds, 3), "loss": round(trainer.loss, 6),
-                         "train_psnr": round(trainer.psnr, 3), "primitives": len(trainer), "memory_gib": round(memory_gib(), 3)}
+                entry = {
+                    "step": trainer.step,
+                    "seconds": round(trainer.seconds, 3),
+                    "loss": round(trainer.loss, 6),
+                    "train_psnr": round(trainer.psnr, 3),
+                    "primitives": len(trainer),
+                    "memory_gib": round(memory_gib(), 3),
+                }
                 if score is not None:
                     entry["psnr"] = round(score, 4)
-                    progress.note(f"  step {trainer.step}: held-out PSNR {score:.2f} dB, {len(trainer)} primitives, {duration(trainer.seconds)}")
+                    progress.note(
+                        f"  step {trainer.step}: held-out PSNR {score:.2f} dB, {len(trainer)} primitives, {duration(trainer.seconds)}"
+                    )
                 log.write(json.dumps(entry) + "\n")
                 log.flush()
             if last or trainer.step % options.checkpoint_every == 0:
                 _save(trainer, run)
                 saved = trainer.step
-            progress.update(trainer.step, f"loss {trainer.loss:.4f}  PSNR {trainer.psnr:.2f}  {len(trainer)} primitives  {memory_gib():.1f} GiB")
+            progress.update(
+                trainer.step,
+                f"loss {trainer.loss:.4f}  PSNR {trainer.psnr:.2f}  {len(trainer)} primitives  {memory_gib():.1f} GiB",
+            )
         progress.clear()
-        if saved != trainer.step:  # interrupted between checkpoints, or stopped after the last one and before the export
+        if (
+            saved != trainer.step
+        ):  # interrupted between checkpoints, or stopped after the last one and before the export
             _save(trainer, run)
         if interrupted:
             progress.note(f"interrupted: {run.path} holds step {trainer.step}; go on with --resume")
@@ -456,7 +298,10 @@ def evaluate(trainer: Trainer, shots: list[Shot]) -> float | None:
     from .eval.images import psnr, to_8bit
 
     background = trainer.shown_background()
-    scores = [psnr(to_8bit(trainer.render(shot.camera, background).numpy()), to_8bit(shot.over(background).numpy())) for shot in shots]
+    scores = [
+        psnr(to_8bit(trainer.render(shot.camera, background).numpy()), to_8bit(shot.over(background).numpy()))
+        for shot in shots
+    ]
     return float(np.mean(scores)) if scores else None
 
 
@@ -485,7 +330,9 @@ def _save(trainer: Trainer, run: Run) -> None:
     """Writes a checkpoint and the exported scene; every file replaces its predecessor only when it is complete."""
     for name, value in trainer.parameters.items():
         if not bool(torch.isfinite(value).all()):
-            raise LinprimError(f"{run.path}: training diverged at step {trainer.step} ({name} is not finite); what was saved before is intact")
+            raise LinprimError(
+                f"{run.path}: training diverged at step {trainer.step} ({name} is not finite); what was saved before is intact"
+            )
     folder = run.path / "checkpoints"
     name = f"step_{trainer.step:06d}.pt"
     with atomic_write(folder / name) as temporary:
@@ -494,10 +341,16 @@ def _save(trainer: Trainer, run: Run) -> None:
         temporary.write_text(name + "\n")
     for old in sorted(folder.glob("step_*.pt"))[:-KEPT_CHECKPOINTS]:
         old.unlink()
-    run.save(trainer.octahedra(), {
-        "iteration": trainer.step, "iterations": trainer.options.iterations, "primitives": len(trainer),
-        "background": [float(x) for x in trainer.shown_background()], "seconds": trainer.seconds,
-    })
+    run.save(
+        trainer.octahedra(),
+        {
+            "iteration": trainer.step,
+            "iterations": trainer.options.iterations,
+            "primitives": len(trainer),
+            "background": [float(x) for x in trainer.shown_background()],
+            "seconds": trainer.seconds,
+        },
+    )
 
 
 def _read_checkpoint(path: Path) -> dict | None:
@@ -516,7 +369,9 @@ def _read_checkpoint(path: Path) -> dict | None:
     except FileNotFoundError:
         raise LinprimError(f"{folder / name}: the latest checkpoint is missing") from None
     except Exception as error:  # torch raises many kinds for a damaged file
-        raise LinprimError(f"{folder / name}: is damaged and cannot be read ({type(error).__name__})") from None
+        raise LinprimError(
+            f"{folder / name}: is damaged and cannot be read ({type(error).__name__})"
+        ) from None
     if not isinstance(state, dict):
         raise LinprimError(f"{folder / name}: holds no checkpoint")
     return state

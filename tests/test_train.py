@@ -20,6 +20,7 @@ from PIL import Image
 
 from linprim_geo import ops
 from linprim_geo import train as training
+from linprim_geo import trainer as training_step
 from linprim_geo.errors import LinprimError
 from linprim_geo.eval.depth import eval_depth_run
 from linprim_geo.eval.images import eval_images_run
@@ -29,7 +30,8 @@ from linprim_geo.run import Run
 from linprim_geo.scene import load_scene
 from linprim_geo.synth import synthesize
 from linprim_geo.textured import TexturedMesh
-from linprim_geo.train import Trainer, train
+from linprim_geo.train import train
+from linprim_geo.trainer import Trainer
 
 QUICK = TrainOptions(iterations=12, max_primitives=60, sh_degree=0, threads=1)
 # What time and memory may change in a line of metrics.jsonl.
@@ -146,7 +148,7 @@ def test_only_the_last_checkpoints_are_kept_and_they_hold_tensors_alone(tiny_run
 
 def test_the_checkpoint_and_the_exported_primitives_agree(tiny_run):
     with torch.no_grad():
-        tensors = training.activate(checkpoint(tiny_run)["parameters"], 1)
+        tensors = training_step.activate(checkpoint(tiny_run)["parameters"], 1)
     saved = load_octahedra(tiny_run / "training_frame.npz")
     for name, tensor in zip(("center", "rotation", "extent", "density", "sh"), tensors, strict=True):
         assert np.array_equal(getattr(saved, name), tensor.numpy()), name
@@ -161,7 +163,7 @@ def test_activation_gives_the_opacity_of_the_raw_value():
         "log_extent": torch.log(torch.tensor([0.2, 0.05, 3.0])).repeat(5, 1), "sh_dc": torch.zeros(5, 1, 3),
         "sh_rest": torch.zeros(5, 8, 3),
     }  # fmt: skip
-    _, _, extent, density, sh = training.activate(parameters, 1)
+    _, _, extent, density, sh = training_step.activate(parameters, 1)
     # Along the shortest diagonal, 2 * 0.05 long, the light that is left is exp(-density * 0.1).
     expected = torch.sigmoid(raw.double())
     assert torch.allclose(-torch.expm1(-0.1 * density.double()), expected, rtol=1e-5, atol=0)
@@ -605,10 +607,10 @@ def test_a_full_disk_leaves_the_last_checkpoint(how, tiny_scene, tmp_path, monke
 
 @pytest.mark.parametrize("rate", [float("nan"), float("inf")])
 def test_divergence_is_one_sentence_and_spoils_no_checkpoint(rate, tiny_scene, tmp_path, monkeypatch):
-    run, healthy = tmp_path / "run", training.RATES["center"]
+    run, healthy = tmp_path / "run", training_step.RATES["center"]
 
     def advance(self, original=Trainer.advance):
-        monkeypatch.setitem(training.RATES, "center", (rate, 1.0) if self.step == 7 else healthy)
+        monkeypatch.setitem(training_step.RATES, "center", (rate, 1.0) if self.step == 7 else healthy)
         return original(self)
 
     monkeypatch.setattr(Trainer, "advance", advance)
@@ -636,9 +638,9 @@ def trainer(tiny_scene):
 
     scene = load_scene(tiny_scene)
     similarity = scene_normalization(scene)
-    shots = training.load_shots(scene.train, similarity)
+    shots = training_step.load_shots(scene.train, similarity)
     xyz = similarity.apply(scene.points.xyz[:40])
-    parameters = training.initial_parameters(xyz, scene.points.rgb[:40], 1, 0, (1e-3, 1.0))
+    parameters = training_step.initial_parameters(xyz, scene.points.rgb[:40], 1, 0, (1e-3, 1.0))
     options = TrainOptions(iterations=100, max_primitives=50, sh_degree=1, threads=1)
     return Trainer(shots, parameters, options, (1e-3, 1.0), torch.ones(3), False, True)
 
@@ -694,24 +696,24 @@ def test_a_child_has_its_parents_state_but_no_momentum(trainer):
 def test_the_start_follows_the_points():
     xyz = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 1.5]])
     rgb = np.array([[255, 0, 128]] * 5, dtype=np.uint8)
-    start = training.initial_parameters(xyz, rgb, 2, 0, (1e-3, 0.9))
+    start = training_step.initial_parameters(xyz, rgb, 2, 0, (1e-3, 0.9))
     assert torch.equal(start["center"], torch.from_numpy(xyz.astype(np.float32)))
     # The mean distance to the three nearest: 1 for the first, which the largest half-axis cuts to 0.9.
     nearest = (0.5 + np.sqrt(2) * 2) / 3
     assert torch.allclose(torch.exp(start["log_extent"][0]), torch.tensor(0.9))
     assert nearest > 0.9 and start["log_extent"].max() <= np.log(0.9) + 1e-6
-    small = training.initial_parameters(xyz * 0.1, rgb, 2, 0, (1e-3, 0.9))
+    small = training_step.initial_parameters(xyz * 0.1, rgb, 2, 0, (1e-3, 0.9))
     assert torch.allclose(torch.exp(small["log_extent"][0]), torch.tensor(0.1))
-    _, _, _, _, sh = training.activate(start, 2)
+    _, _, _, _, sh = training_step.activate(start, 2)
     assert torch.allclose(
-        0.5 + training.SH_Y0 * sh[:, 0], torch.tensor([1.0, 0.0, 128 / 255]).repeat(5, 1), atol=1e-6
+        0.5 + training_step.SH_Y0 * sh[:, 0], torch.tensor([1.0, 0.0, 128 / 255]).repeat(5, 1), atol=1e-6
     )
     assert sh.shape == (5, 9, 3) and sh[:, 1:].abs().max() == 0
-    one = training.initial_parameters(xyz[:1], rgb[:1], 0, 0, (1e-3, 0.9))
+    one = training_step.initial_parameters(xyz[:1], rgb[:1], 0, 0, (1e-3, 0.9))
     assert torch.allclose(torch.exp(one["log_extent"]), torch.tensor(0.9)) and one["sh_rest"].shape == (
         1,
         0,
         3,
     )
-    twins = training.initial_parameters(np.zeros((5, 3)), rgb, 0, 0, (1e-3, 0.9))
+    twins = training_step.initial_parameters(np.zeros((5, 3)), rgb, 0, 0, (1e-3, 0.9))
     assert torch.allclose(torch.exp(twins["log_extent"]), torch.tensor(1e-3))

@@ -35,8 +35,14 @@ def room(count: int, seed: int = 0, overlap: float = 0.60) -> dict[str, np.ndarr
     box([-1.5, 0.9, 5.0], [0.6, 0.6, 0.6])
     box([1.4, 0.7, 4.4], [0.5, 0.8, 0.4])
     box([0.1, 1.2, 3.6], [0.8, 0.3, 0.4])
-    balls = [(np.array([0.2, 0.4, 5.2]), 0.7), (np.array([-1.3, -0.5, 4.2]), 0.45), (np.array([1.6, -0.7, 5.6]), 0.6)]
-    areas = np.array([np.linalg.norm(np.cross(u, v)) for _, u, v in walls] + [4 * np.pi * r * r for _, r in balls])
+    balls = [
+        (np.array([0.2, 0.4, 5.2]), 0.7),
+        (np.array([-1.3, -0.5, 4.2]), 0.45),
+        (np.array([1.6, -0.7, 5.6]), 0.6),
+    ]
+    areas = np.array(
+        [np.linalg.norm(np.cross(u, v)) for _, u, v in walls] + [4 * np.pi * r * r for _, r in balls]
+    )
     which = rng.choice(len(areas), count, p=areas / areas.sum())
     center, normal = np.zeros((count, 3)), np.zeros((count, 3))
     for k, (origin, u, v) in enumerate(walls):
@@ -50,7 +56,14 @@ def room(count: int, seed: int = 0, overlap: float = 0.60) -> dict[str, np.ndarr
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         center[mine], normal[mine] = middle + radius * direction, direction
     s = overlap * np.sqrt(areas.sum() / count)
-    extent = 2.6 * np.stack([s * np.exp(rng.uniform(-0.5, 0.5, count)), s * np.exp(rng.uniform(-0.5, 0.5, count)), np.full(count, 0.15 * s)], 1)
+    extent = 2.6 * np.stack(
+        [
+            s * np.exp(rng.uniform(-0.5, 0.5, count)),
+            s * np.exp(rng.uniform(-0.5, 0.5, count)),
+            np.full(count, 0.15 * s),
+        ],
+        1,
+    )
     # Quaternion that turns z to the normal, after a random spin about z.
     spin = rng.uniform(0, 2 * np.pi, count) / 2
     turn = np.concatenate([(1 + normal[:, 2])[:, None], np.cross([0.0, 0.0, 1.0], normal)], 1)
@@ -63,8 +76,10 @@ def room(count: int, seed: int = 0, overlap: float = 0.60) -> dict[str, np.ndarr
     sh = rng.normal(0, 0.05, (count, 16, 3))
     sh[:, 0] = (rgb - 0.5) / 0.28209479177387814
     density = -np.log1p(-opacity) / (2 * extent.min(1))
-    return {k: np.ascontiguousarray(v, np.float32) for k, v in
-            dict(center=center, rotation=rotation, extent=extent, density=density, sh=sh).items()}
+    return {
+        k: np.ascontiguousarray(v, np.float32)
+        for k, v in dict(center=center, rotation=rotation, extent=extent, density=density, sh=sh).items()
+    }
 
 
 def median_spread(values: list[float]) -> dict[str, float]:
@@ -109,20 +124,37 @@ def measure(count: int, threads: int, runs: int, geometry: bool, width: int = 80
         stats = ops.statistics()
         for stage in ("project", "sort", "bin", "forward", "backward", "chain"):
             note(stage, stats[f"{stage}_ms"])
-        for name, a, b in (("call_forward", 0, 1), ("loss", 1, 2), ("call_backward", 2, 3), ("optimiser", 3, 4), ("iteration", 0, 4)):
+        for name, a, b in (
+            ("call_forward", 0, 1),
+            ("loss", 1, 2),
+            ("call_backward", 2, 3),
+            ("optimiser", 3, 4),
+            ("iteration", 0, 4),
+        ):
             note(name, 1e3 * (marks[b] - marks[a]))
     stages = {name: median_spread(values) for name, values in times.items()}
     hits = stats["hit_lanes"]
     return {
-        "primitives": count, "threads": threads, "instruction_set": ops.instruction_set(), "geometry": geometry,
-        "image": [width, height], "visible": stats["visible"], "hits": hits, "pairs": stats["pairs"],
-        "visited_per_hit": stats["visited_lanes"] / hits, "pairs_per_tile": stats["pairs"] / (-(-width // 16) * -(-height // 16)),
-        "forward_ns_per_hit": 1e6 * sum(stages[s]["median"] for s in ("project", "sort", "bin", "forward")) / hits,
+        "primitives": count,
+        "threads": threads,
+        "instruction_set": ops.instruction_set(),
+        "geometry": geometry,
+        "image": [width, height],
+        "visible": stats["visible"],
+        "hits": hits,
+        "pairs": stats["pairs"],
+        "visited_per_hit": stats["visited_lanes"] / hits,
+        "pairs_per_tile": stats["pairs"] / (-(-width // 16) * -(-height // 16)),
+        "forward_ns_per_hit": 1e6
+        * sum(stages[s]["median"] for s in ("project", "sort", "bin", "forward"))
+        / hits,
         "backward_ns_per_hit": 1e6 * sum(stages[s]["median"] for s in ("backward", "chain")) / hits,
         "raster_forward_ns_per_hit": 1e6 * stages["forward"]["median"] / hits,
         "raster_backward_ns_per_hit": 1e6 * stages["backward"]["median"] / hits,
-        "iteration_ms": stages["iteration"]["median"], "stages_ms": stages,
-        "working_set_mib": stats["working_set_bytes"] / 2**20, "load": os.getloadavg()[0],
+        "iteration_ms": stages["iteration"]["median"],
+        "stages_ms": stages,
+        "working_set_mib": stats["working_set_bytes"] / 2**20,
+        "load": os.getloadavg()[0],
     }
 
 
@@ -140,11 +172,19 @@ def main() -> None:
         return
     for r in results:
         s = {k: v["median"] for k, v in r["stages_ms"].items()}
-        print(f"{r['primitives']:>7} primitives, {r['threads']} thread(s), {r['instruction_set']}: {r['hits'] / 1e6:.2f} M hits, "
-              f"{r['visited_per_hit']:.2f} visited per hit, {r['pairs']} pairs")
-        print(f"        forward {r['forward_ns_per_hit']:.2f} ns/hit (tiles alone {r['raster_forward_ns_per_hit']:.2f}), "
-              f"backward {r['backward_ns_per_hit']:.2f} ({r['raster_backward_ns_per_hit']:.2f}), iteration {r['iteration_ms']:.1f} ms")
-        print("        ms: " + ", ".join(f"{k} {v:.2f}" for k, v in s.items()) + f"; working set {r['working_set_mib']:.0f} MiB")
+        print(
+            f"{r['primitives']:>7} primitives, {r['threads']} thread(s), {r['instruction_set']}: {r['hits'] / 1e6:.2f} M hits, "
+            f"{r['visited_per_hit']:.2f} visited per hit, {r['pairs']} pairs"
+        )
+        print(
+            f"        forward {r['forward_ns_per_hit']:.2f} ns/hit (tiles alone {r['raster_forward_ns_per_hit']:.2f}), "
+            f"backward {r['backward_ns_per_hit']:.2f} ({r['raster_backward_ns_per_hit']:.2f}), iteration {r['iteration_ms']:.1f} ms"
+        )
+        print(
+            "        ms: "
+            + ", ".join(f"{k} {v:.2f}" for k, v in s.items())
+            + f"; working set {r['working_set_mib']:.0f} MiB"
+        )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The README's picture of a run: held-out photographs beside the render, its depth and normals, and the extracted mesh.
 
-    python tools/picture.py runs/demo/run tools/demo.png
+python tools/picture.py runs/demo/run tools/demo.png
 """
 
 from __future__ import annotations
@@ -28,7 +28,13 @@ def picture(run_path: Path, views: list[int], mesh_path: Path | None) -> np.ndar
         normal = np.where(images["opacity"][..., None] > 0.5, images["normal"] * 0.5 + 0.5, 1.0)
         depth = np.where(images["depth_median"][..., None] > 0, depth_preview(images["depth_median"]), 255)
         shape = render_preview(mesh, view.camera, colors=np.full(mesh.vertices.shape, 205, np.uint8))
-        columns = [composite(view.load(), run.background), to_bytes(images["rgb"].transpose(1, 2, 0)), depth, to_bytes(normal), shape]
+        columns = [
+            composite(view.load(), run.background),
+            to_bytes(images["rgb"].transpose(1, 2, 0)),
+            depth,
+            to_bytes(normal),
+            shape,
+        ]
         rows.append(np.concatenate(columns, 1))
     return np.concatenate(rows, 0).astype(np.uint8)
 
@@ -44,7 +50,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("run", type=Path, help="folder of a trained and meshed run")
     parser.add_argument("output", type=Path, help=".png to write")
-    parser.add_argument("--views", type=int, nargs="+", default=[1, 5], help="which held-out views (default 1 5)")
+    parser.add_argument(
+        "--views", type=int, nargs="+", default=[1, 5], help="which held-out views (default 1 5)"
+    )
     parser.add_argument("--mesh", type=Path, help="mesh to show (default RUN/mesh/tsdf/mesh.ply)")
     args = parser.parse_args()
     Image.fromarray(picture(args.run, args.views, args.mesh)).save(args.output)
