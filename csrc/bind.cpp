@@ -136,19 +136,19 @@ void bind_real(nb::module_& m, const char* suffix) {
                                                           checked(extent_grad, {primitives.n, 3}, "extent_grad"),
                                                           checked(density_grad, {primitives.n}, "density_grad"),
                                                           checked(sh_grad, {primitives.n, primitives.sh_count, 3}, "sh_grad"),
-                                                          checked(screen_grad, {primitives.n, 2}, "screen_grad")};
+                                                          checked(screen_grad, {primitives.n, 3}, "screen_grad")};
         Real* bg_grad = checked(background_grad, {3}, "background_grad");
         nb::gil_scoped_release release;
         linprim::rasterize_grad<Real>(view, primitives, bg, geometry, out, colors, grad, gradients, bg_grad);
       });
   m.def((std::string("level_depth_") + suffix).c_str(),
         [](Array center, Array rotation, Array extent, Array density, Array sh, Pose pose, std::tuple<double, double, double, double> intrinsics,
-           int width, int height, double near, double level, Out<Real> depth) {
+           int width, int height, double near, double level, Out<Real> depth, Out<Real> opacity) {
           const linprim::View view = make_view(pose, intrinsics, width, height, near, 0, level);
           const auto primitives = make_primitives<Real>(center, rotation, extent, density, sh);
-          Real* out = checked(depth, {height, width}, "depth");
+          Real *depths = checked(depth, {height, width}, "depth"), *opacities = checked(opacity, {height, width}, "opacity");
           nb::gil_scoped_release release;
-          linprim::level_depth<Real>(view, primitives, out);
+          linprim::level_depth<Real>(view, primitives, depths, opacities);
         });
   auto bind_average = [&](const char* name, auto function) {
     m.def((std::string(name) + suffix).c_str(), [function](Array from, int height, int width, int factor, Out<Real> to) {

@@ -33,7 +33,8 @@ struct Primitives {
   int sh_count;
 };
 
-// Gradients with the layout of Primitives; screen (n,2) is the gradient to the centre's position in pixels.
+// Gradients with the layout of Primitives. screen (n,3): the gradient to the centre's position in pixels, and the sum over tiles of the
+// lengths of each tile's part of it, which does not cancel where a texture pulls a large primitive both ways.
 template <class Real>
 struct PrimitiveGradients {
   Real *center, *rotation, *extent, *density, *sh, *screen;
@@ -50,7 +51,7 @@ struct alignas(64) Record {
   uint32_t flags;  // bits 0-3: slot 0-3 is a front face; bit 4: take the general path (not all are, or the near plane is crossed)
   Real face[3][8];  // s_k / h_s: derivative of the face's inverse depth with respect to the local form p_k
 };
-constexpr uint32_t kAllFront = 15, kGeneral = 16;
+constexpr uint32_t kGeneral = 16;
 
 // Where a primitive can be seen: the inclusive box of pixels (empty: x1 < x0) and half-planes
 // a + b (x - ref_x) + c (y - ref_y) > 0 whose intersection with the box holds its silhouette. `a` is already raised
@@ -158,7 +159,7 @@ struct Kernels {
   int64_t (*bin)(const BinParams&, int64_t begin, int64_t end, LoosePair* out, int64_t capacity, int64_t* written);
   Counts (*forward)(const RasterParams<Real>&, int tile, bool geometry);
   void (*backward)(const RasterParams<Real>&, int tile, bool geometry);
-  // Depth at the view's transmittance level by exact overlap, into out.depth_median; scratch: 3 * kBlocks values per pair of the tile.
+  // Depth at the view's transmittance level by exact overlap, into out.depth_median and out.opacity; scratch: 3 * kBlocks values per pair of the tile.
   void (*level_depth)(const RasterParams<Real>&, int tile, Real* scratch);
 };
 

@@ -1,6 +1,7 @@
 // The core's interface: an exact, differentiable rasterizer of transparent polyhedra, an image loss and an optimiser step.
 //
-// Plain functions over plain arrays; no Python, no torch, no exceptions. Preconditions are asserted by the caller (bind.cpp checks them).
+// Plain functions over plain arrays; no Python, no torch, no exceptions of its own (std::bad_alloc passes through). Preconditions are
+// the caller's (bind.cpp checks them).
 // All functions use every thread of the pool (parallel.h) and give bitwise the same result for any number of threads.
 #pragma once
 
@@ -40,9 +41,9 @@ void rasterize_grad(const View& view, const Primitives<Real>& primitives, const 
                     Real* background_grad);
 
 // Z-depth (H,W) at which the transmittance of each pixel's ray falls to view.level, primitives absorbing where they are, overlaps
-// included, independent of any order; 0 where it never does.
+// included, independent of any order; 0 where it never does. opacity (H,W): 1 - transmittance behind everything.
 template <class Real>
-void level_depth(const View& view, const Primitives<Real>& primitives, Real* depth);
+void level_depth(const View& view, const Primitives<Real>& primitives, Real* depth, Real* opacity);
 
 // loss = (1 - dssim) L1 + dssim (1 - SSIM) of two (3,H,W) images and its gradient to the first, written to `gradient` (3,H,W).
 // `weight` (H,W) or null multiplies both maps; means are over the weight. Returns the loss, its

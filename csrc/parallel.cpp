@@ -4,10 +4,16 @@
 #include <algorithm>
 #include <atomic>
 #include <condition_variable>
+#include <exception>
 #include <memory>
 #include <mutex>
 #include <thread>
+#include <utility>
 #include <vector>
+
+#if !defined(_WIN32)
+#include <unistd.h>
+#endif
 
 namespace linprim {
 namespace {
@@ -40,11 +46,18 @@ class Pool {
     drain(0);
     std::unique_lock lock(mutex_);
     done_.wait(lock, [this] { return busy_ == 0; });
+    if (failure_) std::rethrow_exception(std::exchange(failure_, nullptr));
   }
 
  private:
   void drain(int thread) {
-    for (int64_t i; (i = next_.fetch_add(1, std::memory_order_relaxed)) < items_;) (*body_)(i, thread);
+    try {
+      for (int64_t i; (i = next_.fetch_add(1, std::memory_order_relaxed)) < items_;) (*body_)(i, thread);
+    } catch (...) {  // out of memory: the others finish, and run() throws it on the caller's thread
+      next_ = items_;
+      std::lock_guard lock(mutex_);
+      if (!failure_) failure_ = std::current_exception();
+    }
   }
   void work(int thread) {
     uint64_t seen = 0;
@@ -67,34 +80,54 @@ class Pool {
   const std::function<void(int64_t, int)>* body_ = nullptr;
   std::atomic<int64_t> next_{0};
   int64_t items_ = 0;
+  std::exception_ptr failure_;
   int busy_ = 0;
   uint64_t job_ = 0;
   bool stop_ = false;
 };
 
-std::mutex pool_mutex;
-std::unique_ptr<Pool>& pool() {
-  // Deliberately leaked: joining threads while the process unloads its libraries can hang.
-  static auto* instance = new std::unique_ptr<Pool>(new Pool(int(std::max(1u, std::thread::hardware_concurrency()))));
-  return *instance;
+int cores() { return int(std::max(1u, std::thread::hardware_concurrency())); }
+
+// The pool and its lock. Deliberately leaked: joining threads while the process unloads its libraries can hang.
+struct Shared {
+  std::mutex mutex;
+  std::unique_ptr<Pool> pool = std::make_unique<Pool>(cores());
+};
+Shared*& shared_pointer() {
+  static Shared* instance = new Shared;
+  return instance;
+}
+Shared& shared() {
+#if !defined(_WIN32)
+  // A forked child has the pool's memory but none of its threads, and perhaps a lock that nobody will release: it gets new ones.
+  static pid_t owner = getpid();
+  if (owner != getpid()) {
+    owner = getpid();
+    shared_pointer() = new Shared;
+  }
+#endif
+  return *shared_pointer();
 }
 
 }  // namespace
 
 void set_threads(int count) {
-  std::lock_guard lock(pool_mutex);
-  if (count <= 0) count = int(std::max(1u, std::thread::hardware_concurrency()));
-  if (count != pool()->count()) pool() = std::make_unique<Pool>(count);
+  Shared& s = shared();
+  std::lock_guard lock(s.mutex);
+  if (count <= 0) count = cores();
+  if (count != s.pool->count()) s.pool = std::make_unique<Pool>(count);
 }
 
 int threads() {
-  std::lock_guard lock(pool_mutex);
-  return pool()->count();
+  Shared& s = shared();
+  std::lock_guard lock(s.mutex);
+  return s.pool->count();
 }
 
 void parallel_for(int64_t items, const std::function<void(int64_t, int)>& body) {
-  std::lock_guard lock(pool_mutex);
-  pool()->run(items, body);
+  Shared& s = shared();
+  std::lock_guard lock(s.mutex);
+  s.pool->run(items, body);
 }
 
 }  // namespace linprim

@@ -319,7 +319,7 @@ template <class Real>
 inline void zero_row(const PrimitiveGradients<Real>& out, int64_t row, int sh_count) {
   for (int k = 0; k < 3; ++k) out.center[3 * row + k] = out.extent[3 * row + k] = 0;
   for (int k = 0; k < 4; ++k) out.rotation[4 * row + k] = 0;
-  for (int k = 0; k < 2; ++k) out.screen[2 * row + k] = 0;
+  for (int k = 0; k < 3; ++k) out.screen[3 * row + k] = 0;
   out.density[row] = 0;
   std::memset(out.sh + row * sh_count * 3, 0, sizeof(Real) * sh_count * 3);
 }
@@ -442,8 +442,19 @@ void chain(const ChainParams<Real>& P, int64_t begin, int64_t end) {
       double radial_part = 0;
       for (int t = 0; t < 3; ++t) radial_part += direction_grad[t] * direction[t][l];
       const double z = ref.crosses_near[l] ? 0.0 : f.center[2][l];
-      P.out.screen[2 * row] = Real(center_grad[0][l] * z / view.fx);
-      P.out.screen[2 * row + 1] = Real(center_grad[1][l] * z / view.fy);
+      P.out.screen[3 * row] = Real(center_grad[0][l] * z / view.fx);
+      P.out.screen[3 * row + 1] = Real(center_grad[1][l] * z / view.fy);
+      double pull = 0;
+      const Real* slot = P.sums + int64_t(P.first_slot[row]) * P.sums_per_slot;
+      for (uint32_t s = 0; s < P.slot_count[row]; ++s, slot += P.sums_per_slot) {
+        double x = 0, y = 0;
+        for (int k = 0; k < 3; ++k) {
+          const double m_grad = -(ref.w0[l] * double(slot[Sum::g + k]) + double(slot[Sum::gw + k]));
+          x += m_grad * f.n[k][0][l], y += m_grad * f.n[k][1][l];
+        }
+        pull += z * std::sqrt((x / view.fx) * (x / view.fx) + (y / view.fy) * (y / view.fy));
+      }
+      P.out.screen[3 * row + 2] = Real(pull);
       for (int i = 0; i < 3; ++i) {
         P.out.center[3 * row + i] = Real(world[i] + (direction_grad[i] - radial_part * direction[i][l]) * inverse[l]);
         P.out.extent[3 * row + i] = Real(extent_grad[i][l]);

@@ -7,6 +7,7 @@
 #include <algorithm>
 #include <bit>
 #include <cmath>
+#include <limits>
 
 #include "kernels.h"
 #include "simd.h"
@@ -502,19 +503,21 @@ void backward_tile(const RasterParams<Real>& P, int tile) {
 
 // Where the transmittance of one tile's rays falls to `level`, all primitives absorbing where they are, overlaps included:
 // sum_i density_i |v| clamp(t - t_in_i, 0, t_out_i - t_in_i) = ln(1 / level). The sum does not depend on any order and grows with t,
-// so it is bisected. `scratch` holds 3 * 16 values per pair of the longest tile list. Writes out.depth_median, 0 where never.
+// so it is bisected. `scratch` holds 3 * 16 values per pair of the longest tile list. Writes out.depth_median, 0 where never, and
+// out.opacity, which does not depend on the order either.
 template <class Real, int W>
 void level_depth_tile(const RasterParams<Real>& P, int tile, Real* scratch) {
   using T = Tile<Real, W>;
   using V = typename T::V;
   using M = typename T::M;
   using I = typename T::I;
-  constexpr int kHalvings = sizeof(Real) == 4 ? 26 : 55;  // from the whole bracket to a rounding error
+  constexpr int kMostHalvings = sizeof(Real) == 4 ? 80 : 140;  // enough from any bracket; far fewer are the rule
+  const V resolution = V::set(Real(2) * std::numeric_limits<Real>::epsilon());
   const View& view = P.view;
   const int tile_x = tile % P.tiles_x * kTile, tile_y = tile / P.tiles_x * kTile;
   const typename T::Lanes lanes;
   const V zero = V::set(0), half = V::set(Real(0.5)), wanted = V::set(Real(-std::log(view.level)));
-  alignas(64) Real length[kTilePixels], depth[kTilePixels];
+  alignas(64) Real length[kTilePixels], depth[kTilePixels], opacity[kTilePixels];
   T::ray_lengths(view, tile_x, tile_y, length);
   for (int block = 0; block < kBlocks; ++block)
     for (int part = 0; part < T::kParts; ++part) {
@@ -547,16 +550,19 @@ void level_depth_tile(const RasterParams<Real>& P, int tile, Real* scratch) {
         }
         return sum;
       };
-      const M crosses = thickness(high) >= wanted;
-      if (crosses.bits())
-        for (int k = 0; k < kHalvings; ++k) {
-          const V middle = half * (low + high);
-          const M behind = thickness(middle) >= wanted;
-          high = select(behind, middle, high), low = select(behind, low, middle);
-        }
+      const V total = thickness(high);
+      V alpha, through;
+      exp_neg(total, alpha, through);
+      alpha.store(opacity + at);
+      const M crosses = total >= wanted;
+      for (int k = 0; k < kMostHalvings && (crosses & (resolution * high < high - low)).bits(); ++k) {
+        const V middle = half * (low + high);
+        const M behind = thickness(middle) >= wanted;
+        high = select(behind, middle, high), low = select(behind, low, middle);
+      }
       select(crosses, high, zero).store(depth + at);
     }
-  T::store(view, tile_x, tile_y, depth, P.out.depth_median);
+  T::store(view, tile_x, tile_y, depth, P.out.depth_median), T::store(view, tile_x, tile_y, opacity, P.out.opacity);
 }
 
 }  // namespace linprim::LINPRIM_ISA

@@ -6,6 +6,7 @@
 #include <cstring>
 #include <memory>
 #include <mutex>
+#include <new>
 #include <utility>
 #include <vector>
 
@@ -160,6 +161,9 @@ struct Frame {
       std::fill(counts, counts + tiles(), 0u);
       for (int64_t i = 0; i < count; ++i) ++counts[list[i].tile];
     });
+    int64_t pairs_in_all = 0;
+    for (int64_t count : loose_count) pairs_in_all += count;
+    if (pairs_in_all >= int64_t(1) << 32) throw std::bad_alloc();  // slots are counted in 32 bits; this is above 200 GiB of them
     uint32_t total = 0;
     for (int tile = 0; tile < tiles(); ++tile) {
       tile_begin[tile] = total;
@@ -299,7 +303,7 @@ void rasterize_grad(const View& view, const Primitives<Real>& primitives, const 
 }
 
 template <class Real>
-void level_depth(const View& view, const Primitives<Real>& primitives, Real* depth) {
+void level_depth(const View& view, const Primitives<Real>& primitives, Real* depth, Real* opacity) {
   std::lock_guard lock(cache<Real>().mutex);
   Statistics stats{};
   Frame<Real>& frame = cache<Real>().oldest();
@@ -310,7 +314,7 @@ void level_depth(const View& view, const Primitives<Real>& primitives, Real* dep
   const size_t scratch_size = size_t(longest) * 3 * kBlocks;
   std::vector<Real> scratch(scratch_size * threads());
   Planes<Real> out{};
-  out.depth_median = depth;
+  out.depth_median = depth, out.opacity = opacity;
   const RasterParams<Real> params = frame.raster(view, nullptr, out);
   parallel_for(frame.tiles(), [&](int64_t tile, int thread) {
     kernels<Real>().level_depth(params, int(tile), scratch.data() + scratch_size * thread);
@@ -319,7 +323,7 @@ void level_depth(const View& view, const Primitives<Real>& primitives, Real* dep
 
 #define LINPRIM_INSTANTIATE(Real)                                                                                                    \
   template void rasterize<Real>(const View&, const Primitives<Real>&, const Real*, bool, const Planes<Real>&, Real*, Real*, int32_t*); \
-  template void level_depth<Real>(const View&, const Primitives<Real>&, Real*);                                                       \
+  template void level_depth<Real>(const View&, const Primitives<Real>&, Real*, Real*);                                                \
   template void rasterize_grad<Real>(const View&, const Primitives<Real>&, const Real*, bool, const Planes<Real>&, const Real*,       \
                                      const Planes<Real>&, const PrimitiveGradients<Real>&, Real*);
 LINPRIM_INSTANTIATE(float)

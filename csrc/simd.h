@@ -4,7 +4,8 @@
 // inline function built for one instruction set can be linked into the path of another.
 //
 //   Vec<T, W>   W lanes of T        + - * fma min max rcp exp_neg
-//   Mask<T, W>  W booleans          & | andnot any bits count
+//   Mask<T, W>  W booleans          & | bits
+//   Index<T, W> W small integers    select lookup8 equal is_face
 #pragma once
 
 #include <cmath>
@@ -55,8 +56,6 @@ template <class T>
 inline Vec<T, 1> select(Mask<T, 1> m, Vec<T, 1> a, Vec<T, 1> b) { return m.m ? a : b; }
 template <class T>
 inline Vec<T, 1> rcp(Vec<T, 1> a) { return {T(1) / a.v}; }
-template <class T>
-inline Vec<T, 1> sqrt(Vec<T, 1> a) { return {std::sqrt(a.v)}; }
 template <class T>
 inline Vec<T, 1> log(Vec<T, 1> a) { return {std::log(a.v)}; }
 template <class T>

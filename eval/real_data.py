@@ -14,7 +14,7 @@ import shutil
 from pathlib import Path
 
 from linprim_geo.errors import LinprimError
-from linprim_geo.files import write_json
+from linprim_geo.files import atomic_write, write_json
 from linprim_geo.options import ExtractOptions, SceneOptions, TrainOptions
 
 
@@ -68,6 +68,8 @@ def run_capture(
     scene = load_scene(capture, downscale=scene_options.downscale)
     folder = output / capture.name
     if folder.exists():
+        if folder.resolve() == capture.resolve() or not (folder / "config.json").is_file():
+            raise LinprimError(f"{folder}: exists and is not an earlier run; give another folder with -o")
         shutil.rmtree(folder)
     camera = scene.train[0].camera
     trained = train(capture, folder, scene_options, options)
@@ -121,6 +123,15 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
+def curves(rows: list[dict]) -> str:
+    """One line per capture: held-out PSNR over seconds of training (during it, of a part of the held-out views)."""
+    return "\n".join(
+        f"* {row['name']}: "
+        + ", ".join(f"{psnr:.2f} dB after {seconds:.0f} s" for seconds, psnr in row["curve"])
+        for row in rows
+    )
+
+
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
@@ -142,21 +153,24 @@ def main(arguments: list[str] | None = None) -> None:
         samples=args.samples,
         evaluate_every=args.evaluate_every,
     )
+    rows, failed = [], []
     try:
-        rows = [
-            run_capture(c, args.data, args.output, options, SceneOptions(downscale=args.downscale))
-            for c in captures(args.data, args.only)
-        ]
+        found = captures(args.data, args.only)
     except LinprimError as error:
         raise SystemExit(f"real_data: error: {error}") from None
-    write_json(args.output / "real_data.json", rows)
-    (args.output / "real_data.md").write_text(table(rows) + "\n")
-    print(table(rows))
-    for row in rows:
-        print(
-            f"{row['name']}: "
-            + ", ".join(f"{psnr:.2f} dB after {seconds:.0f} s" for seconds, psnr in row["curve"])
-        )
+    for capture in found:
+        try:
+            rows.append(
+                run_capture(capture, args.data, args.output, options, SceneOptions(downscale=args.downscale))
+            )
+        except LinprimError as error:
+            failed.append(f"{capture.name}: {error}")
+        write_json(args.output / "real_data.json", rows)
+        with atomic_write(args.output / "real_data.md") as temporary:
+            temporary.write_text(table(rows) + "\n\n" + curves(rows) + "\n")
+    print(table(rows) + "\n\n" + curves(rows))
+    if failed:
+        raise SystemExit("real_data: error: " + "; ".join(failed))
 
 
 if __name__ == "__main__":

@@ -374,7 +374,9 @@ def _train(parsed: argparse.Namespace) -> dict:
         raise LinprimError("train wants one scene: its folder, or -s and its folder")
     if parsed.resolution is not None:
         # 3DGS writes -1 for "as it is".
-        parsed.downscale = 1 if parsed.resolution == -1 else parsed.resolution
+        if parsed.resolution not in (-1, 1, 2, 4, 8) or parsed.downscale not in (1, parsed.resolution):
+            raise LinprimError(f"-r is {parsed.resolution}, wanted -1, 1, 2, 4 or 8, and no other --downscale beside it")
+        parsed.downscale = max(1, parsed.resolution)
     from .train import train
 
     return train(

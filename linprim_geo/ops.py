@@ -7,6 +7,7 @@ Arrays cross as `tensor.detach().numpy()`: no copy where a tensor is contiguous.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +16,13 @@ from torch import Tensor
 from . import _core
 from .camera import Camera
 from .errors import LinprimError
+
+# The core takes the environment's choice by itself where it can; a choice it cannot take should not pass unseen.
+if os.environ.get("LINPRIM_GEO_ISA", "auto") not in ("auto", _core.instruction_set()):
+    raise LinprimError(
+        f"LINPRIM_GEO_ISA is {os.environ['LINPRIM_GEO_ISA']!r}, which this processor or build does not have;"
+        f" unset, {_core.instruction_set()} is used"
+    )
 
 # Planes in the order the core wants them; the last one is private state for the backward pass.
 _PLANES = (
@@ -179,7 +187,7 @@ def _rasterize_grad(
         torch.empty_like(t, memory_format=torch.contiguous_format)
         for t in (center, rotation, extent, density, sh, background)
     ]
-    out.append(center.new_empty((center.shape[0], 2)))
+    out.append(center.new_empty((center.shape[0], 3)))
     getattr(_core, f"rasterize_grad_{_suffix(center.dtype)}")(
         _array(center),
         _array(rotation),
@@ -229,7 +237,7 @@ def _(
     inputs = (center, rotation, extent, density, sh, background)
     return (
         *[torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs],
-        center.new_empty((center.shape[0], 2)),
+        center.new_empty((center.shape[0], 3)),
     )
 
 
@@ -321,7 +329,9 @@ def rasterize(
         geometry: also compute depths, normals, distortion and the per-primitive statistics (about twice the time).
         samples: render this many by this many rays per pixel and average: photographs average over a pixel, so edges need it. The
             geometry has no meaningful average, so it goes with 1 only.
-        screen: (N, 2) zeros; their gradient is that of the loss to the projected centres, per pixel.
+        screen: (N, 3) zeros. The gradient of the first two is that of the loss to the projected centres, per pixel; the third is no
+            gradient but the sum over 16x16 tiles of the length of each tile's part of it: how hard the image pulls, without
+            cancelling.
 
     Raises:
         LinprimError: a non-finite input (naming tensor and row; in sh, of primitives that are in view) or a dtype other than
@@ -350,7 +360,7 @@ def rasterize(
             near=near,
             stop=stop,
             level=level,
-            screen=screen,
+            screen=None if screen is None else screen * samples,
         )
         return Rendering(
             torch.ops.linprim_geo.average_pixels(fine.rgb, samples),
@@ -432,8 +442,9 @@ def level_depth(
     *,
     level: float,
     near: float = 0.01,
-) -> Tensor:
-    """(H, W) z-depth at which the transmittance of each pixel's ray falls to `level`, 0 where it never does; no gradient.
+) -> tuple[Tensor, Tensor]:
+    """(H, W) z-depth at which the transmittance of each ray falls to `level`, 0 where it never does, and (H, W) opacity behind
+    everything; no gradients.
 
     Unlike `rasterize`'s depths it depends on no order: primitives absorb where they are, overlaps included, so the depth solves
     sum_i density_i |v| clamp(t - t_in_i, 0, t_out_i - t_in_i) = ln(1 / level). Arguments as for `rasterize`; 0 < level < 1.
@@ -448,6 +459,7 @@ def level_depth(
     if not 0 < level < 1:
         raise ValueError(f"level is {level}, wanted a transmittance between 0 and 1")
     depth = center.new_empty((camera.height, camera.width), requires_grad=False)
+    opacity = torch.empty_like(depth)
     getattr(_core, f"level_depth_{suffix}")(
         _array(center),
         _array(rotation),
@@ -461,8 +473,9 @@ def level_depth(
         near,
         level,
         depth.numpy(),
+        opacity.numpy(),
     )
-    return depth
+    return depth, opacity
 
 
 @torch.library.custom_op("linprim_geo::photometric_loss", mutates_args=())

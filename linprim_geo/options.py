@@ -82,7 +82,7 @@ class TrainOptions:
     seed: int = option(0, "seed of everything random")
     threads: int = option(0, "worker threads; 0 uses every core; the result does not depend on it")
     background: str = option(
-        "auto", "auto, fitted, random, black, white, or r,g,b in [0,1]; auto: random with alpha, else fitted"
+        "auto", "auto, fitted, random, black, white, or r,g,b in [0,1]; auto: fitted before a plain backdrop, else random"
     )
     dssim: float = option(0.2, "weight of D-SSIM in the loss; L1 has the rest")
     stop: float = option(1e-3, "transmittance below which a ray ends", metavar="T")

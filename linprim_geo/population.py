@@ -29,7 +29,10 @@ class Growth:
 
     @staticmethod
     def plan(iterations: int, start: int, cap: int) -> Growth:
-        """Events every 100 steps from 3 % to 60 % of the run, at the rate that brings `start` to `cap` a little before the end."""
+        """Events every 100 steps (60 in all of a shorter run) from 3 % to 60 % of the run.
+
+        The rate brings `start` to `cap` a little before the last event.
+        """
         every = max(10, min(100, iterations // 60))
         first, last = max(every, round(0.03 * iterations)), round(0.6 * iterations)
         events = max(1, (last - first) // every)

@@ -48,8 +48,9 @@ class Run:
         scene_options: SceneOptions,
         options: TrainOptions,
         similarity: Similarity,
+        instruction_set: str = "",
     ) -> Run:
-        """Makes the folder and writes its configuration.
+        """Makes the folder and writes its configuration. `instruction_set` is noted because results depend on it in their last bits.
 
         Raises:
             LinprimError: the folder exists and is not empty, or cannot be written.
@@ -64,6 +65,7 @@ class Run:
             "train_options": asdict(options),
             "python": platform.python_version(),
             "machine": platform.platform(),
+            "instruction_set": instruction_set,
         }
         write_json(path / "config.json", config)
         write_json(
@@ -103,6 +105,25 @@ class Run:
         options = from_saved(TrainOptions, saved[1], where)
         check_train_options(options)
         return Run(path, scene, from_saved(SceneOptions, saved[0], where), options, similarity, unit)
+
+    def with_scene_at(self, scene_path: Path) -> Run:
+        """The same run with its capture at another place, written down as well; for data that was moved.
+
+        Raises:
+            LinprimError: the capture is still where it was, so this would be another one.
+        """
+        if self.scene_path.exists():
+            raise LinprimError(
+                f"{self.path}: was trained on {self.scene_path}, not on {scene_path.resolve()}"
+            )
+        config = _read_json(self.path / "config.json", self.path)
+        write_json(self.path / "config.json", config | {"scene": str(scene_path.resolve())})
+        return replace(self, scene_path=scene_path.resolve())
+
+    @cached_property
+    def instruction_set(self) -> str:
+        """Vector kernels it was begun with, "" if that was not noted."""
+        return str(_read_json(self.path / "config.json", self.path).get("instruction_set", ""))
 
     def scene(self) -> Scene:
         """The capture it was trained on."""
@@ -204,22 +225,16 @@ class Run:
 
         from . import ops
 
-        tensors, background = self._tensors()
+        tensors, _ = self._tensors()
         for view in views:
             camera = view.camera.transformed(self.similarity)
             with torch.no_grad():
-                depth = ops.level_depth(*tensors, camera, level=level).numpy()
-                opacity = ops.rasterize(
-                    *tensors, background, camera, stop=self.train_options.stop
-                ).opacity.numpy()
-            yield view, (depth / self.similarity.scale).astype(np.float32), opacity
+                depth, opacity = ops.level_depth(*tensors, camera, level=level)
+            yield view, (depth.numpy() / self.similarity.scale).astype(np.float32), opacity.numpy()
 
     def _tensors(self):
         import torch
 
-        from . import ops
-
-        ops.set_threads(self.train_options.threads)
         octahedra = self.training_primitives()
         arrays = (octahedra.center, octahedra.rotation, octahedra.extent, octahedra.density, octahedra.sh)
         return [torch.from_numpy(a) for a in arrays], torch.tensor(self.background, dtype=torch.float32)

@@ -20,6 +20,7 @@ import torch
 from . import ops
 from .errors import LinprimError
 from .files import atomic_write
+from .initial_points import CAMERA_DISTANCE, frusta_points, scene_normalization, visual_hull_points
 from .options import SceneOptions, TrainOptions, check_train_options
 from .progress import Progress, duration, memory_gib
 from .run import Run
@@ -30,6 +31,8 @@ from .trainer import LARGEST_PART, SMALLEST_PX, Shot, Trainer, initial_parameter
 SFM_START, RANDOM_START = 0.8, 0.25
 # Triangulated points fewer than this leave too much of a scene empty.
 FEW_POINTS = 500
+# A backdrop is plain where this share of all border pixels lies this near to their median colour, per channel.
+BACKDROP_SHARE, BACKDROP_TOLERANCE = 0.8, 0.1
 # Held-out views scored during training; all of them are at the end.
 QUICK_VIEWS = 16
 KEPT_CHECKPOINTS = 2
@@ -41,7 +44,6 @@ def with_points(scene: Scene, options: TrainOptions, log: Callable[[str], None])
     A scene with alpha and no points starts inside the visual hull. Without alpha, features are matched and triangulated; if they
     are few, random points in the common field of view fill up.
     """
-    from .initial_points import frusta_points, visual_hull_points
     from .triangulate import triangulate_points
 
     if scene.points is not None and len(scene.points.xyz):
@@ -86,73 +88,103 @@ def train(
 ) -> dict:
     """Trains a scene into a run folder.
 
-    With `resume` the folder's own options are used (but for `threads`): learning rates and growth depend on them. Interrupted
-    (Ctrl-C), it finishes the step, saves, and raises KeyboardInterrupt.
+    With `resume` the folder's own options are used (but for `threads`): learning rates and growth depend on them. A capture that is no
+    longer where it was is looked for at `scene`. Interrupted (Ctrl-C), it finishes the step, saves, and raises KeyboardInterrupt.
 
     Returns: `run`, `iterations`, `seconds` (of training steps alone), `primitives`, `psnr` (mean over held-out views), `views`.
 
     Raises:
         LinprimError: the scene or an option cannot be used, or the folder exists already.
     """
-    from .initial_points import scene_normalization
-
     run_path = Path(run)
     check_train_options(options := options or TrainOptions())
+    scene_options = scene_options or SceneOptions()
     progress = Progress("train", options.iterations, quiet=quiet)
-    if resume:
-        opened = Run.open(run_path)
-        if Path(scene).resolve() != opened.scene_path:
-            raise LinprimError(
-                f"{run_path}: was trained on {opened.scene_path}, not on {Path(scene).resolve()}"
-            )
-        ignored = [
-            f.name
-            for f in fields(options)
-            if getattr(options, f.name) not in (f.default, getattr(opened.train_options, f.name))
-        ]
-        if set(ignored) - {"threads"}:
-            progress.note(
-                f"--resume goes on with the run's own options: {', '.join(sorted(set(ignored) - {'threads'}))} ignored"
-            )
-        options = replace(opened.train_options, threads=options.threads)
-        progress.total = options.iterations
-        loaded = opened.scene()
-    else:
-        scene_options = scene_options or SceneOptions()
-        loaded = load_scene(
-            scene,
-            downscale=scene_options.downscale,
-            masks=scene_options.masks or None,
-            sparse=scene_options.sparse or None,
+    before = torch.get_num_threads()
+    try:
+        # torch only does small element-wise work here; its own threads would wait for each other longer than they compute.
+        torch.set_num_threads(1)
+        ops.set_threads(options.threads)
+        if resume:
+            opened, loaded = _reopen(Path(scene), run_path, scene_options, options, progress)
+        else:
+            opened, loaded = _begin(Path(scene), run_path, scene_options, options, progress)
+        return _train(opened, loaded, _read_checkpoint(run_path) if resume else None, progress)
+    finally:
+        torch.set_num_threads(before)
+
+
+def _begin(
+    scene: Path, run_path: Path, scene_options: SceneOptions, options: TrainOptions, progress: Progress
+) -> tuple[Run, Scene]:
+    """A new run, whose folder is not made yet, and its scene with points to start from."""
+    loaded = load_scene(
+        scene,
+        downscale=scene_options.downscale,
+        masks=scene_options.masks or None,
+        sparse=scene_options.sparse or None,
+    )
+    if run_path.exists() and (not run_path.is_dir() or any(run_path.iterdir())):
+        raise LinprimError(f"{run_path}: exists already; give another folder with -o, or go on with --resume")
+    loaded = with_points(loaded, options, progress.note)
+    return Run(run_path, scene, scene_options, options, scene_normalization(loaded), loaded.unit), loaded
+
+
+def _reopen(
+    scene: Path, run_path: Path, scene_options: SceneOptions, options: TrainOptions, progress: Progress
+) -> tuple[Run, Scene]:
+    """An existing run and its scene; options that were given and differ from the run's are named as ignored."""
+    opened = Run.open(run_path)
+    if scene.resolve() != opened.scene_path:
+        opened = opened.with_scene_at(scene)
+    ignored = [
+        "--" + field.name.replace("_", "-")
+        for given, own in ((scene_options, opened.scene_options), (options, opened.train_options))
+        for field in fields(given)
+        if field.name != "threads"
+        and getattr(given, field.name) not in (field.default, getattr(own, field.name))
+    ]
+    if ignored:
+        progress.note(f"--resume goes on with the run's own options: {', '.join(ignored)} ignored")
+    if opened.instruction_set not in ("", ops.instruction_set()):
+        progress.note(
+            f"begun with {opened.instruction_set} kernels and going on with {ops.instruction_set()}: the last bits will differ"
         )
-        if run_path.exists() and (not run_path.is_dir() or any(run_path.iterdir())):
-            raise LinprimError(
-                f"{run_path}: exists already; give another folder with -o, or go on with --resume"
-            )
-        _threads(options)
-        loaded = with_points(loaded, options, progress.note)
-        opened = Run(run_path, Path(scene), scene_options, options, scene_normalization(loaded), loaded.unit)
-    _threads(options)
-    shots = load_shots(loaded.train, opened.similarity)
+    progress.total = opened.train_options.iterations
+    return replace(
+        opened, train_options=replace(opened.train_options, threads=options.threads)
+    ), opened.scene()
+
+
+def _train(run: Run, scene: Scene, state: dict | None, progress: Progress) -> dict:
+    """Trains from a checkpoint's `state`, or from the start: what is random does not depend on when a run was stopped."""
+    if state is None:
+        scene = with_points(scene, run.train_options, progress.note)
+    shots = load_shots(scene.train, run.similarity)
     if all(shot.alpha is not None and int(shot.alpha.max()) == 0 for shot in shots):
-        raise LinprimError(f"{loaded.root}: the masks leave no pixel of any training image")
-    # A run that was stopped before its first checkpoint begins again: nothing random depends on when.
-    resume_state = _read_checkpoint(run_path) if resume else None
-    if resume and resume_state is None:
-        _threads(options)
-        loaded = with_points(loaded, options, progress.note)
-    trainer = _start(loaded, opened, shots, options, resume_state)
-    if not resume:
-        Run.create(run_path, loaded, Path(scene), scene_options, options, opened.similarity)
+        raise LinprimError(f"{scene.root}: the masks leave no pixel of any training image")
+    trainer = _start(scene, run, shots, run.train_options, state)
+    if not (run.path / "config.json").exists():
+        Run.create(
+            run.path,
+            scene,
+            run.scene_path,
+            run.scene_options,
+            run.train_options,
+            run.similarity,
+            ops.instruction_set(),
+        )
+    for torn in (run.path / "checkpoints").glob(".step_*.tmp*"):  # what a kill left half-written
+        torn.unlink()
     progress.start = trainer.step
     progress.note(
-        f"{loaded.root}: {loaded.kind}, {len(loaded.train)} training and {len(loaded.test)} held-out views of "
+        f"{scene.root}: {scene.kind}, {len(scene.train)} training and {len(scene.test)} held-out views of "
         f"{shots[0].camera.width}x{shots[0].camera.height}; {len(trainer)} primitives, {ops.instruction_set()}, {ops.threads()} threads"
     )
-    held_out = load_shots(loaded.test, opened.similarity)
-    seconds, score = _loop(trainer, opened, held_out, progress)
+    held_out = load_shots(scene.test, run.similarity)
+    seconds, score = _loop(trainer, run, held_out, progress)
     result = {
-        "run": str(run_path),
+        "run": str(run.path),
         "iterations": trainer.step,
         "seconds": seconds,
         "primitives": len(trainer),
@@ -160,31 +192,27 @@ def train(
         "views": len(held_out),
     }
     progress.note(
-        f"{run_path}: {trainer.step} steps in {duration(seconds)}, {len(trainer)} primitives"
+        f"{run.path}: {trainer.step} steps in {duration(seconds)}, {len(trainer)} primitives"
         + (f", held-out PSNR {score:.2f} dB over {len(held_out)} views" if held_out else "")
     )
     return result
 
 
-def _threads(options: TrainOptions) -> None:
-    ops.set_threads(options.threads)
-    # torch only does small element-wise work here; its own threads would wait for each other longer than they compute.
-    torch.set_num_threads(1)
+def _background(text: str, shots: list[Shot]) -> tuple[torch.Tensor, bool, bool]:
+    """(colour that renders show, whether it is fitted, whether training draws a random one) of the option's text.
 
-
-def _background(text: str, has_alpha: bool) -> tuple[torch.Tensor, bool, bool]:
-    """(colour, whether it is fitted, whether training draws a random one) of the option's text."""
+    Without alpha a random background makes everything opaque: a fitted one would let a wall of its colour become transparent. It is
+    fitted only where photographs have a plain backdrop.
+    """
     named = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+    has_alpha = shots[0].alpha is not None
     if text == "auto":
-        text = "random" if has_alpha else "fitted"
+        text = "fitted" if not has_alpha and _plain_backdrop(shots) else "random"
     if text == "random":
-        if not has_alpha:
-            raise LinprimError(
-                "--background random needs images with an alpha channel or masks; this scene has none"
-            )
-        return torch.ones(3), False, True
+        shown = torch.ones(3) if has_alpha else torch.from_numpy(_mean_color(shots))
+        return shown, False, True
     if text == "fitted":
-        return torch.full((3,), 0.5), True, False
+        return torch.from_numpy(np.median(_border_colors(shots), 0).astype(np.float32)), True, False
     try:
         color = named[text] if text in named else tuple(float(x) for x in text.split(","))
     except ValueError:
@@ -194,6 +222,22 @@ def _background(text: str, has_alpha: bool) -> tuple[torch.Tensor, bool, bool]:
             f"--background is {text!r}, wanted auto, fitted, random, black, white, or three numbers in [0,1] such as 0.5,0.5,1"
         )
     return torch.tensor(color, dtype=torch.float32), False, False
+
+
+def _border_colors(shots: list[Shot]) -> np.ndarray:
+    """(P, 3) colours in [0, 1] of the outermost pixels of all views."""
+    edges = [edge for s in shots for edge in (s.rgb[:, 0], s.rgb[:, -1], s.rgb[:, :, 0], s.rgb[:, :, -1])]
+    return np.concatenate([edge.numpy().T for edge in edges]).astype(np.float64) / 255
+
+
+def _plain_backdrop(shots: list[Shot]) -> bool:
+    """Whether the outermost pixels of nearly all views have one colour."""
+    colors = _border_colors(shots)
+    return bool(np.mean(np.abs(colors - np.median(colors, 0)).max(1) < BACKDROP_TOLERANCE) > BACKDROP_SHARE)
+
+
+def _mean_color(shots: list[Shot]) -> np.ndarray:
+    return np.mean([s.rgb.numpy().mean((1, 2)) for s in shots], 0).astype(np.float32) / np.float32(255)
 
 
 def _start(scene: Scene, run: Run, shots: list[Shot], options: TrainOptions, state: dict | None) -> Trainer:
@@ -210,9 +254,9 @@ def _start(scene: Scene, run: Run, shots: list[Shot], options: TrainOptions, sta
         radius = max(
             float(np.percentile(reach, 98)), 0.2 * float(np.linalg.norm(centers - middle, axis=1).max()), 1e-3
         )
-    smallest = SMALLEST_PX * 3.0 / focal
+    smallest = SMALLEST_PX * CAMERA_DISTANCE / focal
     bounds = (smallest, max(LARGEST_PART * radius, 4 * smallest))
-    background, fitted, random_background = _background(options.background, scene.has_alpha)
+    background, fitted, random_background = _background(options.background, shots)
     parameters = initial_parameters(xyz, rgb, options.sh_degree, options.seed, bounds)
     trainer = Trainer(shots, parameters, options, bounds, background, fitted, random_background)
     if state is not None:
@@ -339,8 +383,11 @@ def _save(trainer: Trainer, run: Run) -> None:
         torch.save(trainer.state(), temporary)
     with atomic_write(folder / "latest") as temporary:
         temporary.write_text(name + "\n")
-    for old in sorted(folder.glob("step_*.pt"))[:-KEPT_CHECKPOINTS]:
-        old.unlink()
+    for old in sorted(folder.glob("step_*.pt"), key=lambda file: (len(file.name), file.name))[
+        :-KEPT_CHECKPOINTS
+    ]:
+        if old.name != name:
+            old.unlink()
     run.save(
         trainer.octahedra(),
         {

@@ -173,7 +173,7 @@ class Trainer:
             )
         target = shot.over(background.detach())
         leaves = {k: v.requires_grad_() for k, v in self.parameters.items()}
-        screen = torch.zeros(len(self), 2, requires_grad=True)
+        screen = torch.zeros(len(self), 3, requires_grad=True)
         out = ops.rasterize(
             *activate(leaves, self.degree),
             background,
@@ -187,8 +187,7 @@ class Trainer:
         with torch.no_grad():
             self._update(dict(zip(leaves, grads, strict=True)))
             # In units of the image's size, so that views of different resolution pull alike.
-            scale = torch.tensor([shot.camera.width, shot.camera.height], dtype=torch.float32)
-            self.pull += torch.linalg.vector_norm(screen_grad * scale, dim=1)
+            self.pull += screen_grad[:, 2] * max(shot.camera.width, shot.camera.height)
         self.step += 1
         if self.growth.is_due(self.step):
             self._grow()

@@ -174,7 +174,7 @@ def gradients(images, inputs, weights) -> list[torch.Tensor]:
 def everything(parameters, view: Camera, geometry=True, **options) -> list[torch.Tensor]:
     """All outputs and all gradients of one rendering, for comparisons bit by bit."""
     inputs = leaves(parameters)
-    screen = torch.zeros(len(inputs[0]), 2, dtype=inputs[0].dtype, requires_grad=True)
+    screen = torch.zeros(len(inputs[0]), 3, dtype=inputs[0].dtype, requires_grad=True)
     out = ops.rasterize(*inputs, view, geometry=geometry, screen=screen, **options)
     images = fields(out, IMAGES if geometry else COLOR)
     grads = gradients(images, [*inputs, screen], cotangents(images))

@@ -6,6 +6,8 @@ import errno
 import json
 import os
 import stat
+import subprocess
+import sys
 
 import pytest
 
@@ -41,13 +43,10 @@ def test_folders_are_made(tmp_path):
 
 
 def test_permissions_follow_the_umask(tmp_path):
-    before = os.umask(0o027)
-    try:
-        with atomic_write(tmp_path / "x.txt") as temporary:
-            temporary.write_text("new")
-    finally:
-        os.umask(before)
-    assert stat.S_IMODE((tmp_path / "x.txt").stat().st_mode) == 0o640
+    # In a process of its own: the mask is read once, when the module is imported.
+    code = "import os, sys; os.umask(0o027); from linprim_geo.files import write_json; write_json(sys.argv[1], {})"
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "x.json")], check=True)
+    assert stat.S_IMODE((tmp_path / "x.json").stat().st_mode) == 0o640
 
 
 @pytest.mark.parametrize("error", [ValueError("wrong"), KeyboardInterrupt(), SystemExit(3), MemoryError()])

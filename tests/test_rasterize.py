@@ -357,7 +357,7 @@ def test_gradients_by_finite_differences(seed, coefficients, depth, geometry):
 def operator_arguments(dtype=torch.float32, geometry=False, screen=True, requires_grad=True):
     scene, view = random_scene(61, 4, 4, 7, 5)
     inputs = leaves(scene, dtype) if requires_grad else [p.to(dtype) for p in scene]
-    zeros = torch.zeros(4, 2, dtype=dtype, requires_grad=requires_grad) if screen else None
+    zeros = torch.zeros(4, 3, dtype=dtype, requires_grad=requires_grad) if screen else None
     pose = torch.from_numpy(view.world_to_camera)
     return (*inputs, zeros, pose, view.fx, view.fy, view.cx, view.cy, view.width, view.height, 0.01, 1e-3, 0.5, geometry)
 
@@ -434,21 +434,23 @@ def test_gradient_to_the_background_is_the_transmittance():
 def test_screen_gradient_is_that_of_moving_a_centre_by_a_pixel(samples):
     # Degree 0: the colour does not turn with the centre. The loss's own third derivative bounds the difference quotient.
     scene, view = random_scene(65, 4, 1, 25, 21, depth=4.0, spread=0.3)
-    screen = torch.zeros(4, 2, dtype=torch.float64, requires_grad=True)
+    screen = torch.zeros(4, 3, dtype=torch.float64, requires_grad=True)
     weight = torch.rand(3, view.height, view.width, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
 
     def loss(center):
         return (ops.rasterize(center, *scene[1:], view, samples=samples, screen=screen).rgb * weight).sum()
 
     (grad,) = torch.autograd.grad(loss(scene[0]), screen)
-    assert (grad.abs() > 1e-3).sum() >= 4
+    assert (grad[:, :2].abs() > 1e-3).sum() >= 4
+    # The third column adds lengths tile by tile, so it is at least the length of the sum.
+    assert (grad[:, 2] >= grad[:, :2].norm(dim=1) * (1 - 1e-12)).all()
     depth = scene[0].numpy() @ view.rotation[2] + view.world_to_camera[2, 3]
     assert (depth > 1.0).all()
     step = 1e-5
     for i in range(4):
         for axis, focal in ((0, view.fx), (1, view.fy)):
             move = torch.zeros_like(scene[0])
-            move[i] = torch.from_numpy(view.rotation[axis] * depth[i] / focal) * step / samples
+            move[i] = torch.from_numpy(view.rotation[axis] * depth[i] / focal) * step
             quotient = (loss(scene[0] + move) - loss(scene[0] - move)) / (2 * step)
             assert grad[i, axis].item() == pytest.approx(quotient.item(), rel=1e-3, abs=1e-4)
 
@@ -561,8 +563,8 @@ def test_level_depth_equals_the_sum_of_the_twins_intervals(seed, depth, near, le
         wanted = overlap_depth(inputs, view, near, level)
         assert (wanted > 0).sum() > 30
         with kernels(isa):
-            got = ops.level_depth(*inputs[:5], view, level=level, near=near).double()
-            again = ops.level_depth(*[p.flip(0) for p in inputs[:5]], view, level=level, near=near).double()
+            got = ops.level_depth(*inputs[:5], view, level=level, near=near)[0].double()
+            again = ops.level_depth(*[p.flip(0) for p in inputs[:5]], view, level=level, near=near)[0].double()
         # Thickness is good to 400 eps (above); the depth to that over density |v|, at least 0.1 in sum where little is behind.
         eps = torch.finfo(getattr(torch, dtype)).eps
         for image in (got, again):
@@ -578,9 +580,31 @@ def test_impossible_levels_are_refused(level):
         ops.level_depth(*scene[:5], view, level=level)
 
 
+@pytest.mark.parametrize("isa", KERNELS)
+def test_level_depth_keeps_its_digits_before_a_far_background(isa):
+    near = ([0.0, 0.0, 3.0], 2.0, 1.0)
+    results = []
+    for far in (None, 1e5):
+        rows = [near] if far is None else [near, ([0.0, 0.0, far], far / 4, 10.0 / far)]
+        center, extent, density = (torch.tensor(x) for x in zip(*rows, strict=True))
+        turn = torch.tensor([[1.0, 0, 0, 0]] * len(rows))
+        with kernels(isa):
+            results.append(
+                ops.level_depth(
+                    center, turn, extent[:, None].repeat(1, 3), density, torch.zeros(len(rows), 1, 3), camera(8, 8), level=0.6
+                )
+            )
+    (alone, alone_opacity), (before, opacity) = results
+    hit = alone > 0
+    assert hit.sum() > 8
+    # The bracket reaches 40,000 times as far, and the depth keeps float32's digits: 4 roundings.
+    torch.testing.assert_close(before[hit], alone[hit], rtol=4 * 1.2e-7, atol=0)
+    assert (opacity >= alone_opacity).all() and (opacity > alone_opacity).any()
+
+
 def test_no_primitives_have_no_level_depth():
     scene = hard("nothing", torch.float64)[0]
-    assert not ops.level_depth(*scene[:5], camera(5, 3), level=0.5).any()
+    assert not any(image.any() for image in ops.level_depth(*scene[:5], camera(5, 3), level=0.5))
 
 
 # --- invariants ---
@@ -628,7 +652,7 @@ def test_a_part_of_an_image_is_the_image_of_that_part():
 def assert_finite_everywhere(scene, view, options):
     """All outputs and gradients are finite and the opacity is a share; returns whether anything was hit."""
     inputs = leaves(scene)
-    screen = torch.zeros(len(inputs[0]), 2, dtype=inputs[0].dtype, requires_grad=True)
+    screen = torch.zeros(len(inputs[0]), 3, dtype=inputs[0].dtype, requires_grad=True)
     out = ops.rasterize(*inputs, view, geometry=True, screen=screen, **options)
     images = fields(out)
     total = sum((image * torch.linspace(-1, 1, image.numel(), dtype=image.dtype).view_as(image)).sum() for image in images.values())
@@ -747,7 +771,7 @@ def test_inputs_of_any_layout_give_the_same_and_stay_as_they_are(dtype):
     for layout in (strided, transposed):
         before = [p.clone() for p in layout]
         inputs = [p.detach().requires_grad_() for p in layout]
-        screen = torch.zeros(7, 2, dtype=dtype, requires_grad=True)
+        screen = torch.zeros(7, 3, dtype=dtype, requires_grad=True)
         out = ops.rasterize(*inputs, view, geometry=True, screen=screen)
         images = fields(out)
         grads = gradients(images, [*inputs, screen], cotangents(images))
