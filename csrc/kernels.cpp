@@ -24,13 +24,16 @@ constexpr int kWidth = 4;
 #endif
 
 template <class Real>
+using Solid = Octahedron<Real, kWidth, RayModel::kExact>;
+
+template <class Real>
 Counts forward(const RasterParams<Real>& P, int tile, bool geometry) {
-  return geometry ? forward_tile<Real, kWidth, true>(P, tile) : forward_tile<Real, kWidth, false>(P, tile);
+  return geometry ? forward_tile<Solid<Real>, Order::kCenter, true>(P, tile) : forward_tile<Solid<Real>, Order::kCenter, false>(P, tile);
 }
 
 template <class Real>
 void backward(const RasterParams<Real>& P, int tile, bool geometry) {
-  geometry ? backward_tile<Real, kWidth, true>(P, tile) : backward_tile<Real, kWidth, false>(P, tile);
+  geometry ? backward_tile<Solid<Real>, Order::kCenter, true>(P, tile) : backward_tile<Solid<Real>, Order::kCenter, false>(P, tile);
 }
 
 #define LINPRIM_STRING_(x) #x
@@ -39,7 +42,7 @@ void backward(const RasterParams<Real>& P, int tile, bool geometry) {
 template <class Real>
 const Kernels<Real> table = {LINPRIM_STRING(LINPRIM_ISA), kWidth,         project<Real>, chain<Real>,
                              bin<kWidth>,                 forward<Real>, backward<Real>,
-                             level_depth_tile<Real, kWidth>};
+                             level_depth_tile<Solid<Real>>};
 const ImageKernels image_table = {photometric<kWidth>, adam};
 
 }  // namespace LINPRIM_ISA

@@ -14,6 +14,10 @@ constexpr int kMaxShCoefficients = 16;          // degree 3
 constexpr int kColorSums = 16;                  // gradient sums per (tile, primitive) pair, see Sum
 constexpr int kGeometrySums = 32;               // the same with the entry normals' sums (28 used)
 
+// What the tile kernels are compiled for, beside the primitive kind, the scalar and the set of outputs.
+enum class RayModel { kExact };
+enum class Order { kCenter };
+
 // A pinhole camera and what a ray does. Pixel (row, column) has its centre at (column + 0.5, row + 0.5).
 struct View {
   double world_to_camera[12];  // 3x4, row major, rigid
@@ -52,6 +56,12 @@ struct alignas(64) Record {
   Real face[3][8];  // s_k / h_s: derivative of the face's inverse depth with respect to the local form p_k
 };
 constexpr uint32_t kGeneral = 16;
+
+// Order of the gradient sums of a pair. Form k: sums of g, g (x - ref_x), g (y - ref_y) and g (w - w0) over hits, g being the
+// gradient to the local form p_k; then density, colour, and, with geometry, the gradient to the unit normals of slots 0-3.
+struct Sum {
+  static constexpr int g = 0, gx = 3, gy = 6, gw = 9, density = 12, rgb = 13, normal = 16;
+};
 
 // Where a primitive can be seen: the inclusive box of pixels (empty: x1 < x0) and half-planes
 // a + b (x - ref_x) + c (y - ref_y) > 0 whose intersection with the box holds its silhouette. `a` is already raised

@@ -309,12 +309,6 @@ void project(const ProjectParams<Real>& P, int64_t begin, int64_t end) {
   }
 }
 
-// Order of the gradient sums of a pair. Form k: sums of g, g (x - ref_x), g (y - ref_y) and g (w - w0) over hits, g being the
-// gradient to the local form p_k; then density, colour, and, with geometry, the gradient to the unit normals of slots 0-3.
-struct Sum {
-  static constexpr int g = 0, gx = 3, gy = 6, gw = 9, density = 12, rgb = 13, normal = 16;
-};
-
 template <class Real>
 inline void zero_row(const PrimitiveGradients<Real>& out, int64_t row, int sh_count) {
   for (int k = 0; k < 3; ++k) out.center[3 * row + k] = out.extent[3 * row + k] = 0;

@@ -10,14 +10,10 @@
 #include <limits>
 
 #include "kernels.h"
+#include "octahedron.h"
 #include "simd.h"
 
 namespace linprim::LINPRIM_ISA {
-
-// Entry index of a ray that enters through the near plane; faces are 0-7.
-constexpr int kNearPlane = 8;
-// The lowest inverse depth a ray can leave at: keeps 1 / w finite.
-constexpr double kFarInverse = 1e-12;
 
 template <class Real, int W>
 struct Tile {
@@ -31,73 +27,6 @@ struct Tile {
   // Position of part `part` in its block.
   static int part_x(int part) { return W < kBlock ? part % kBlock : 0; }
   static int part_y(int part) { return W < kBlock ? part / kBlock : part * kPartHeight; }
-
-  struct Lanes {
-    V x, y;
-    Lanes() {
-      alignas(64) Real lx[W], ly[W];
-      for (int i = 0; i < W; ++i) lx[i] = Real(i % kPartWidth), ly[i] = Real(i / kPartWidth);
-      x = V::load(lx), y = V::load(ly);
-    }
-  };
-
-  // A record moved to one tile: face values at the tile's first pixel, and each face's slope over the lanes of a part.
-  struct Faces {
-    typedef Real Eight __attribute__((vector_size(8 * sizeof(Real))));
-    alignas(64) Real corner[8], bx[8], cy[8];
-    V slope[8];
-    V w0, near_w, far_w;
-    uint32_t flags;
-    void set(const Record<Real>& r, int tile_x, int tile_y, const Lanes& lanes, const View& view) {
-      const Real dx = Real(tile_x - r.ref_x), dy = Real(tile_y - r.ref_y);
-      for (int f = 0; f < 8; ++f) {
-        bx[f] = r.b[f], cy[f] = r.c[f];
-        corner[f] = r.a[f] + (r.b[f] * dx + r.c[f] * dy);
-      }
-      for (int f = 0; f < 8; ++f) slope[f] = fma(V::set(r.b[f]), lanes.x, V::set(r.c[f]) * lanes.y);
-      w0 = V::set(r.w0);
-      flags = r.flags;
-      near_w = V::set(Real(1 / view.near) - r.w0);
-      far_w = V::set(Real(kFarInverse) - r.w0);
-    }
-    // Inverse depths, relative to w0, where the rays of a part whose first pixel lies (x, y) pixels into the tile enter and leave.
-    template <bool kTrack>
-    void intersect(Real x, Real y, V& in, V& out, I& in_face, I& out_face) const {
-      alignas(64) Real at[8];
-      if constexpr (W >= 8) {
-        // Eight sums as one vector, then eight loads that broadcast: cheaper than eight scalar sums.
-        *reinterpret_cast<Eight*>(at) = *reinterpret_cast<const Eight*>(corner) +
-                                        (*reinterpret_cast<const Eight*>(bx) * x + *reinterpret_cast<const Eight*>(cy) * y);
-        asm("" : "+m"(at));  // keeps the compiler from taking the vector apart in registers
-      } else {
-        for (int f = 0; f < 8; ++f) at[f] = corner[f] + (bx[f] * x + cy[f] * y);
-      }
-      auto value = [&](int f) { return V::set(at[f]) + slope[f]; };
-      auto enter = [&](V w, int f) {
-        if constexpr (kTrack) in_face = select(w < in, I::set(f), in_face);
-        in = min(w, in);
-      };
-      auto leave = [&](V w, int f) {
-        if constexpr (kTrack) out_face = select(out < w, I::set(f), out_face);
-        out = max(w, out);
-      };
-      if (!(flags & kGeneral)) [[likely]] {
-        in = value(0), out = value(4);
-        if constexpr (kTrack) in_face = I::set(0), out_face = I::set(4);
-        for (int f = 1; f < 4; ++f) enter(value(f), f), leave(value(4 + f), 4 + f);
-      } else {
-        in = near_w, out = far_w;
-        if constexpr (kTrack) in_face = I::set(kNearPlane), out_face = I::set(kNearPlane);
-        for (int f = 0; f < 8; ++f) {
-          if (f < 4 && (flags >> f & 1)) {
-            enter(value(f), f);
-          } else {
-            leave(value(f), f);
-          }
-        }
-      }
-    }
-  };
 
   // Length of the ray (u, v, 1) through each pixel of the tile, in the order of the state arrays.
   static void ray_lengths(const View& view, int tile_x, int tile_y, Real* out) {
@@ -171,15 +100,19 @@ inline void mean_in_slice(Vec<Real, W> tau, Vec<Real, W> alpha, Vec<Real, W> thr
   slope = select(thin, thin_slope, fma(over * rcp(select(thin, V::set(1), alpha)), V::set(1), V::set(0) - inverse * inverse));
 }
 
-template <class Real, int W, bool kGeometry>
-Counts forward_tile(const RasterParams<Real>& P, int tile) {
+// Solid is the primitive kind and ray model, kOrder the order of blending, kGeometry the set of outputs: all that is off is not here.
+template <class Solid, Order kOrder, bool kGeometry>
+Counts forward_tile(const RasterParams<typename Solid::Real>& P, int tile) {
+  static_assert(kOrder == Order::kCenter);  // tile lists come in the order of the centres
+  using Real = typename Solid::Real;
+  constexpr int W = Solid::kWidth;
   using T = Tile<Real, W>;
   using V = typename T::V;
   using M = typename T::M;
   using I = typename T::I;
   const View& view = P.view;
   const int tile_x = tile % P.tiles_x * kTile, tile_y = tile / P.tiles_x * kTile;
-  const typename T::Lanes lanes;
+  const Lanes<Real, W> lanes;
   const Real stop = Real(view.stop), level = Real(view.level);
   const V zero = V::set(0), v_stop = V::set(stop), v_level = V::set(level);
   uint64_t visited_blocks = 0, hit_lanes = 0;
@@ -212,7 +145,7 @@ Counts forward_tile(const RasterParams<Real>& P, int tile) {
       __builtin_prefetch(next), __builtin_prefetch(next + 64);
     }
     const Record<Real>& record = P.records[pair.primitive];
-    typename T::Faces faces;
+    Solid faces;
     faces.set(record, tile_x, tile_y, lanes, view);
     const V density = V::set(record.density), cr = V::set(record.rgb[0]), cg = V::set(record.rgb[1]), cb = V::set(record.rgb[2]);
     V largest = zero;
@@ -343,15 +276,18 @@ inline void reduce<float, 8>(const F8* a, int count, float* out) {
 }
 #endif
 
-template <class Real, int W, bool kGeometry>
-void backward_tile(const RasterParams<Real>& P, int tile) {
+template <class Solid, Order kOrder, bool kGeometry>
+void backward_tile(const RasterParams<typename Solid::Real>& P, int tile) {
+  static_assert(kOrder == Order::kCenter);
+  using Real = typename Solid::Real;
+  constexpr int W = Solid::kWidth;
   using T = Tile<Real, W>;
   using V = typename T::V;
   using M = typename T::M;
   using I = typename T::I;
   const View& view = P.view;
   const int tile_x = tile % P.tiles_x * kTile, tile_y = tile / P.tiles_x * kTile;
-  const typename T::Lanes lanes;
+  const Lanes<Real, W> lanes;
   const V zero = V::set(0), v_stop = V::set(Real(view.stop)), v_level = V::set(Real(view.level));
   constexpr int kSums = kGeometry ? kGeometrySums : kColorSums;
 
@@ -407,7 +343,7 @@ void backward_tile(const RasterParams<Real>& P, int tile) {
       __builtin_prefetch(next), __builtin_prefetch(next + 64), __builtin_prefetch(next + 128), __builtin_prefetch(next + 192);
     }
     const Record<Real>& record = P.records[pair.primitive];
-    typename T::Faces faces;
+    Solid faces;
     faces.set(record, tile_x, tile_y, lanes, view);
     const V density = V::set(record.density), cr = V::set(record.rgb[0]), cg = V::set(record.rgb[1]), cb = V::set(record.rgb[2]);
     V sums[kSums];
@@ -463,7 +399,7 @@ void backward_tile(const RasterParams<Real>& P, int tile) {
             for (int k = 0; k < 3; ++k) {
               const V g_normal = V::load(geo[4 + k] + at);
               value = fma(select(here, V::set(P.normals[pair.primitive][f][k]), zero), g_normal, value);
-              V& s = sums[16 + 3 * f + k];
+              V& s = sums[Sum::normal + 3 * f + k];
               s = fma(select(here, weight, zero), g_normal, s);
               s = s + select(median_here, V::load(geo[7 + k] + at), zero);
             }
@@ -471,10 +407,10 @@ void backward_tile(const RasterParams<Real>& P, int tile) {
         }
         const V rest = V::load(remaining + at) - weight * value;
         const V d_tau = select(hit, fma(after, value, d_tau_direct - rest), zero);
-        sums[13] = fma(weight, gr, sums[13]);
-        sums[14] = fma(weight, gg, sums[14]);
-        sums[15] = fma(weight, gb, sums[15]);
-        sums[12] = fma(d_tau, chord, sums[12] + d_density_direct);
+        sums[Sum::rgb] = fma(weight, gr, sums[Sum::rgb]);
+        sums[Sum::rgb + 1] = fma(weight, gg, sums[Sum::rgb + 1]);
+        sums[Sum::rgb + 2] = fma(weight, gb, sums[Sum::rgb + 2]);
+        sums[Sum::density] = fma(d_tau, chord, sums[Sum::density] + d_density_direct);
         const V d_chord = d_tau * density * v_length;
         // chord = |v| (t_out - t_in); w = 1/t, so dL/dw = -t^2 dL/dt. A ray that entered through the near plane moves with no face.
         const V g_in = select(hit & is_face(in_face), t_in * t_in * (d_chord - d_in), zero);
@@ -482,22 +418,13 @@ void backward_tile(const RasterParams<Real>& P, int tile) {
         // A lane that does not hit may hold an infinity, and 0 times that is no number.
         const V g_in_w = g_in * select(hit, in, zero), g_out_w = g_out * select(hit, out, zero);
         const V px = lanes.x + V::set(Real(x)), py = lanes.y + V::set(Real(y));
-        for (int k = 0; k < 3; ++k) {
-          const V s_in = lookup8(record.face[k], in_face), s_out = lookup8(record.face[k], out_face);
-          const V g = fma(g_in, s_in, g_out * s_out);
-          sums[k] = sums[k] + g;
-          sums[3 + k] = fma(g, px, sums[3 + k]);
-          sums[6 + k] = fma(g, py, sums[6 + k]);
-          sums[9 + k] = fma(g_in_w, s_in, fma(g_out_w, s_out, sums[9 + k]));
-        }
+        faces.add_gradient(record, in_face, out_face, g_in, g_out, g_in_w, g_out_w, px, py, sums);
         rest.store(remaining + at);
         select(hit, after, t).store(through + at);
       }
     }
     reduce(sums, kSums, slot);
-    // Positions were counted from the tile's corner: move them to the reference pixel.
-    const Real dx = Real(tile_x - record.ref_x), dy = Real(tile_y - record.ref_y);
-    for (int k = 0; k < 3; ++k) slot[3 + k] += dx * slot[k], slot[6 + k] += dy * slot[k];
+    Solid::recenter(record, tile_x, tile_y, slot);
   }
 }
 
@@ -505,8 +432,10 @@ void backward_tile(const RasterParams<Real>& P, int tile) {
 // sum_i density_i |v| clamp(t - t_in_i, 0, t_out_i - t_in_i) = ln(1 / level). The sum does not depend on any order and grows with t,
 // so it is bisected. `scratch` holds 3 * 16 values per pair of the longest tile list. Writes out.depth_median, 0 where never, and
 // out.opacity, which does not depend on the order either.
-template <class Real, int W>
-void level_depth_tile(const RasterParams<Real>& P, int tile, Real* scratch) {
+template <class Solid>
+void level_depth_tile(const RasterParams<typename Solid::Real>& P, int tile, typename Solid::Real* scratch) {
+  using Real = typename Solid::Real;
+  constexpr int W = Solid::kWidth;
   using T = Tile<Real, W>;
   using V = typename T::V;
   using M = typename T::M;
@@ -515,7 +444,7 @@ void level_depth_tile(const RasterParams<Real>& P, int tile, Real* scratch) {
   const V resolution = V::set(Real(2) * std::numeric_limits<Real>::epsilon());
   const View& view = P.view;
   const int tile_x = tile % P.tiles_x * kTile, tile_y = tile / P.tiles_x * kTile;
-  const typename T::Lanes lanes;
+  const Lanes<Real, W> lanes;
   const V zero = V::set(0), half = V::set(Real(0.5)), wanted = V::set(Real(-std::log(view.level)));
   alignas(64) Real length[kTilePixels], depth[kTilePixels], opacity[kTilePixels];
   T::ray_lengths(view, tile_x, tile_y, length);
@@ -527,7 +456,7 @@ void level_depth_tile(const RasterParams<Real>& P, int tile, Real* scratch) {
       for (uint32_t e = P.tile_begin[tile]; e < P.tile_begin[tile + 1]; ++e) {
         if (!(P.pairs[e].blocks >> block & 1)) continue;
         const Record<Real>& record = P.records[P.pairs[e].primitive];
-        typename T::Faces faces;
+        Solid faces;
         faces.set(record, tile_x, tile_y, lanes, view);
         V in, out;
         I in_face, out_face;

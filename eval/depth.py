@@ -115,7 +115,7 @@ def eval_depth_run(
         run: a run folder, or an open run.
         reference: path of a mesh, or a `Mesh`; None takes the depth images of the views.
         split: "test", "train" or "all".
-        depth: which rendered depth is scored, "depth_median" (the headline) or "depth_expected".
+        depth: which rendered depth is scored, "depth_median" (the headline), "depth_expected" or "depth_first".
 
     Returns:
         the scores of `aggregate`, lengths in the data set's unit and each also as `*_percent_diagonal`;

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,13 @@ import numpy as np
 from .errors import LinprimError
 from .files import write_json
 from .options import ExtractOptions
-from .progress import Progress, memory_gib
+from .progress import Progress, peak_memory_gib
 from .run import Run
 
 # A ray with less opacity than this has seen through the scene: it votes for free space.
 SEEN_THROUGH = 0.5
+# Depth, colour and background of a pixel; frames of more than this in all are not kept.
+BYTES_PER_PIXEL, KEPT_BYTES = 8, 2**30
 
 
 def extract_mesh(
@@ -70,7 +73,7 @@ def extract_mesh(
         now = time.perf_counter()
         seconds[name], clock = round(now - clock, 3), now
 
-    frames = depth_frames(opened, options.level)
+    frames = DepthFrames(opened, options.level)
     if not any((frame.depth > 0).any() for frame in frames):
         raise LinprimError(
             f"{opened.path}: no ray of any training view crosses transmittance {options.level}, so there is no surface"
@@ -88,7 +91,7 @@ def extract_mesh(
         log=lambda text: progress.note("  " + text),
     )
     lap("fuse")
-    seen = visible_faces(mesh, [frame.camera for frame in frames])
+    seen = visible_faces(mesh, [view.camera for view in frames.views])
     lap("visibility")
     visible = select_faces(mesh, seen)
     visible_target = target.with_name(f"{target.stem}_visible{target.suffix}")
@@ -108,23 +111,39 @@ def extract_mesh(
         **topology(mesh),
         "visible": topology(visible),
         "seconds": {**seconds, "total": round(sum(seconds.values()), 3)},
-        "memory_gib": round(memory_gib(), 3),
+        "peak_memory_gib": round(peak_memory_gib(), 3),
     }
     write_json(folder / "stats.json", stats)
     progress.note(f"{target}: {topology_line(stats)}")
     return stats
 
 
-def depth_frames(run: Run, level: float) -> list:
-    """`fuse.DepthFrame`s of the training views: depth at transmittance `level`, the photographs' colours, free background."""
-    from .fuse import DepthFrame
+class DepthFrames(Sequence):
+    """`fuse.DepthFrame`s of the training views: depth at transmittance `level`, the photographs' colours, free background.
 
-    frames = []
-    for view, depth, opacity in run.surface_depths(run.scene().train, level):
-        free = opacity < SEEN_THROUGH
-        frames.append(
-            DepthFrame(
+    Kept in memory if they are at most KEPT_BYTES in all, else rendered whenever they are asked for.
+    """
+
+    def __init__(self, run: Run, level: float):
+        self.run, self.level = run, level
+        self.views = run.scene().train
+        size = sum(view.camera.width * view.camera.height * BYTES_PER_PIXEL for view in self.views)
+        self.kept = list(self._render(self.views)) if size <= KEPT_BYTES else None
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __getitem__(self, index):
+        return self.kept[index] if self.kept is not None else next(self._render([self.views[index]]))
+
+    def __iter__(self):
+        return iter(self.kept) if self.kept is not None else self._render(self.views)
+
+    def _render(self, views):
+        from .fuse import DepthFrame
+
+        for view, depth, opacity in self.run.surface_depths(views, self.level):
+            free = opacity < SEEN_THROUGH
+            yield DepthFrame(
                 view.camera, np.where(free, np.float32(0), depth), color=view.load().rgb, background=free
             )
-        )
-    return frames

@@ -11,7 +11,7 @@ from conftest import CENTER, octahedron_run
 
 from linprim_geo.errors import LinprimError
 from linprim_geo.eval.mesh import score_mesh
-from linprim_geo.extract import depth_frames, extract_mesh
+from linprim_geo.extract import DepthFrames, extract_mesh
 from linprim_geo.mesh import load_mesh, topology, validate_mesh
 from linprim_geo.options import ExtractOptions
 from linprim_geo.raycast import RayCaster
@@ -20,7 +20,7 @@ from linprim_geo.run import Run
 STATS = {
     "mesh", "mesh_visible", "method", "level", "voxel_size", "truncation_voxels", "unit", "views", "primitives",
     "vertices", "faces", "components", "boundary_edges", "non_manifold_edges", "genus", "watertight", "area", "volume",
-    "visible", "seconds", "memory_gib",
+    "visible", "seconds", "peak_memory_gib",
 }  # fmt: skip
 
 
@@ -166,7 +166,7 @@ def test_a_run_that_saved_nothing_is_one_sentence(run_copy):
 
 def test_frames_are_in_the_frame_of_the_data_set(solid):
     run = Run.open(solid)
-    frames = depth_frames(run, 0.5)
+    frames = DepthFrames(run, 0.5)
     shape = run.primitives().triangle_mesh()
     depth, face, _ = RayCaster(shape.vertices, shape.faces, threads=1).render_depth(frames[0].camera)
     assert len(frames) == 24 and frames[0].camera == run.scene().train[0].camera
@@ -177,3 +177,10 @@ def test_frames_are_in_the_frame_of_the_data_set(solid):
     assert hit[inner].all() and inner.sum() > 200
     assert np.abs(frames[0].depth[inner] - depth[inner]).max() < 2e-4
     assert not (frames[0].background & hit).any() and frames[0].background[~hit].all()
+
+
+def test_frames_that_are_rendered_on_demand_give_the_same_mesh(tiny_run, tmp_path, monkeypatch):
+    extract_mesh(tiny_run, output=tmp_path / "kept.ply", quiet=True)
+    monkeypatch.setattr("linprim_geo.extract.KEPT_BYTES", 0)
+    extract_mesh(tiny_run, output=tmp_path / "rendered.ply", quiet=True)
+    assert (tmp_path / "kept.ply").read_bytes() == (tmp_path / "rendered.ply").read_bytes()

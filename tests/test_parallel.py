@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -113,3 +116,25 @@ def test_both_precisions_at_once():
     with ThreadPoolExecutor(6) as pool:
         for i, got in enumerate(pool.map(lambda w: everything(w, view), work)):
             assert_identical(got, wanted[i % 2])
+
+
+FORK = """
+import os, sys, torch
+from linprim_geo import ops
+torch.set_num_threads(1)  # torch itself cannot fork with more
+ops.set_threads(2)
+def step():
+    value = torch.ones(100_000)
+    ops.adam_step(value, torch.ones(100_000), torch.zeros(100_000), torch.zeros(100_000), 0.5, 1)
+    return value[0].item()
+first = step()
+child = os.fork()
+if child == 0:
+    os._exit(0 if step() == first else 1)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+def test_a_forked_child_has_threads_of_its_own():
+    subprocess.run([sys.executable, "-c", FORK], check=True, timeout=60)

@@ -717,3 +717,28 @@ def test_the_start_follows_the_points():
     )
     twins = training_step.initial_parameters(np.zeros((5, 3)), rgb, 0, 0, (1e-3, 0.9))
     assert torch.allclose(torch.exp(twins["log_extent"]), torch.tensor(1e-3))
+
+
+def test_data_that_was_moved_is_found_where_the_command_line_says(tiny_scene, run_copy, tmp_path):
+    # Only where the old place is empty: another capture is no continuation.
+    with pytest.raises(LinprimError, match="was trained on"):
+        train(shutil.copytree(tiny_scene, tmp_path / "other"), run_copy, resume=True, quiet=True)
+    config = json.loads((run_copy / "config.json").read_text())
+    (run_copy / "config.json").write_text(json.dumps(config | {"scene": str(tmp_path / "gone")}))
+    train(tmp_path / "other", run_copy, resume=True, quiet=True)
+    assert Run.open(run_copy).scene_path == (tmp_path / "other").resolve()
+
+
+def test_the_newest_checkpoint_is_kept_when_its_number_gets_a_digit_more(tiny_run, run_copy):
+    folder = run_copy / "checkpoints"
+    for step in (998_000, 999_000):
+        (folder / f"step_{step}.pt").touch()
+    octahedra = Run.open(tiny_run).training_primitives()
+
+    class Late:
+        parameters, step, state, options, seconds = {}, 1_000_000, dict, QUICK, 0.0
+        octahedra, shown_background, __len__ = lambda _: octahedra, lambda _: torch.zeros(3), lambda _: 1
+
+    training._save(Late(), Run.open(run_copy))
+    assert sorted(p.name for p in folder.glob("step_*")) == ["step_1000000.pt", "step_999000.pt"]
+    assert (folder / "latest").read_text() == "step_1000000.pt\n"

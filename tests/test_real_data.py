@@ -1,0 +1,54 @@
+"""The script that trains and scores a folder of captures: what it finds, and that it deletes nothing of the user's."""
+
+import json
+
+import pytest
+
+from linprim_geo.errors import LinprimError
+from linprim_geo.eval import real_data
+from linprim_geo.options import SceneOptions, TrainOptions
+from linprim_geo.synth import synthesize
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data")
+    synthesize(folder / "part_small", shape="cad", views=10, test_views=2, size=40, points=300, supersample=1, threads=1)
+    (folder / "notes").mkdir()
+    return folder
+
+
+def test_captures_are_the_folders_that_hold_posed_images(data):
+    assert [c.name for c in real_data.captures(data, [])] == ["part_small"]
+    with pytest.raises(LinprimError, match="no capture named other"):
+        real_data.captures(data, ["other"])
+    with pytest.raises(LinprimError, match="no folder with posed images"):
+        real_data.captures(data / "notes", [])
+
+
+def test_the_reference_is_the_captures_own_or_the_longest_name_that_fits(data, tmp_path):
+    assert real_data.reference_of(data / "part_small", data).name == "reference.ply"
+    (tmp_path / "meshes").mkdir()
+    for name in ("part.ply", "part_b.obj", "other.ply"):
+        (tmp_path / "meshes" / name).touch()
+    assert real_data.reference_of(tmp_path / "part_b_small", tmp_path).name == "part_b.obj"
+    assert real_data.reference_of(tmp_path / "room", tmp_path) is None
+
+
+def test_photographs_are_never_deleted(data):
+    before = sorted(p.name for p in (data / "part_small").rglob("*"))
+    with pytest.raises(LinprimError, match="is not an earlier run"):
+        real_data.run_capture(data / "part_small", data, data, TrainOptions(iterations=1), SceneOptions())
+    assert sorted(p.name for p in (data / "part_small").rglob("*")) == before
+
+
+def test_a_table_is_written(data, tmp_path, capsys):
+    options = ["--iterations", "40", "--max-primitives", "150", "--sh-degree", "0", "--evaluate-every", "20"]
+    for _ in range(2):  # an earlier run is replaced
+        real_data.main(["--data", str(data), "-o", str(tmp_path), *options])
+    (row,) = json.loads((tmp_path / "real_data.json").read_text())
+    assert row["name"] == "part_small" and row["views"] == "10+2" and row["iterations"] == 40 and row["psnr"] > 10
+    assert row["visible_chamfer_percent_diagonal"] < 10 and row["abs_rel"] < 0.5
+    assert [len(point) for point in row["curve"]] == [2, 2]
+    text = (tmp_path / "real_data.md").read_text()
+    assert text.strip() in capsys.readouterr().out and "| part_small | 10+2 | 40x40 |" in text and "* part_small: " in text
