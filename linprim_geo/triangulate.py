@@ -19,7 +19,7 @@ from .photos import cache_folder
 from .scene import PointCloud, Scene, View
 
 # Changed whenever the points come out differently, so that old cache entries are not found any more.
-_CACHE_VERSION = 1
+_CACHE_VERSION = 2
 # Each view is matched with this many others, those that look most alike in place and direction.
 _PARTNERS = 12
 # Views whose axes differ by more are not matched: SIFT finds little beyond 60 degrees.
@@ -41,6 +41,10 @@ _NEIGHBOURS = 8
 _MAX_ISOLATION = 4.0
 _ISOLATION_ROUNDS = 3
 _MIN_POINTS = 16
+
+
+# Per image. Every keypoint is compared with every one of the other image, about 0.1 s for a pair of images with this many.
+MOST_KEYPOINTS = 4096
 
 
 def triangulate_points(
@@ -132,6 +136,7 @@ def _triangulate(views: Sequence[View], seed: int, threads: int):
         _write_images(views, images)
         reconstruction = _posed(views, database_path)
         extraction = pycolmap.FeatureExtractionOptions(num_threads=threads)
+        extraction.sift.max_num_features = MOST_KEYPOINTS
         extraction.sift.max_num_features = _MAX_FEATURES
         extraction.sift.peak_threshold = _PEAK_THRESHOLD
         pycolmap.extract_features(
@@ -143,6 +148,8 @@ def _triangulate(views: Sequence[View], seed: int, threads: int):
         pair_file = folder / "pairs.txt"
         pair_file.write_text("".join(f"{_file_name(i)} {_file_name(j)}\n" for i, j in pairs))
         matching = pycolmap.FeatureMatchingOptions(num_threads=threads, skip_geometric_verification=True)
+        # The approximate matcher draws random numbers that its threads share, so that now and then a match differs.
+        matching.sift.cpu_brute_force_matcher = True
         pycolmap.match_image_pairs(
             database_path,
             matching_options=matching,
