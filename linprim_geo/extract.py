@@ -87,7 +87,6 @@ def extract_mesh(
         truncation_voxels=options.truncation,
         memory_limit=limit,
         min_component=options.smallest_part,
-        threads=opened.train_options.threads,
         log=lambda text: progress.note("  " + text),
     )
     lap("fuse")
