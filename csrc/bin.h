@@ -9,7 +9,7 @@
 namespace linprim::LINPRIM_ISA {
 
 // How far ahead of its use, in primitives, a footprint is fetched: they are visited in the order of depth, not of memory.
-constexpr int64_t kAhead = 8;
+constexpr int64_t kFetchAhead = 8;
 
 template <int W>
 int64_t bin(const BinParams& P, int64_t begin, int64_t end, LoosePair* out, int64_t capacity, int64_t* written) {
@@ -21,8 +21,8 @@ int64_t bin(const BinParams& P, int64_t begin, int64_t end, LoosePair* out, int6
   int64_t count = 0, i = begin;
   for (; i < end; ++i) {
     const uint32_t primitive = P.order[i];
-    if (i + kAhead < end) {
-      const char* next = reinterpret_cast<const char*>(&P.footprints[P.order[i + kAhead]]);
+    if (i + kFetchAhead < end) {
+      const char* next = reinterpret_cast<const char*>(&P.footprints[P.order[i + kFetchAhead]]);
       __builtin_prefetch(next), __builtin_prefetch(next + 64);
     }
     const Footprint& f = P.footprints[primitive];

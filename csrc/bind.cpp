@@ -27,6 +27,9 @@ template <class T>
 using Out = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
 using Pose = nb::ndarray<const double, nb::shape<3, 4>, nb::c_contig, nb::device::cpu>;
 
+// Ray model, order, screen filter.
+using Rung = std::tuple<int, int, double>;
+
 template <class Array>
 auto checked(const Array& array, std::initializer_list<int64_t> shape, const char* name) {
   bool same = array.ndim() == shape.size();
@@ -45,8 +48,12 @@ auto checked(const Array& array, std::initializer_list<int64_t> shape, const cha
 }
 
 linprim::View make_view(const Pose& pose, const std::tuple<double, double, double, double>& intrinsics, int width, int height, double near,
-                        double stop, double level) {
+                        double stop, double level, const Rung& rung) {
   linprim::View view{};
+  const auto [rays, order, screen_filter] = rung;
+  if (rays < 0 || rays >= linprim::kRayModels || order < 0 || order >= linprim::kOrders) throw std::invalid_argument("unknown ray model or order");
+  if (!(screen_filter >= 0) || !std::isfinite(screen_filter)) throw std::invalid_argument("screen_filter has to be 0 or positive");
+  view.rays = linprim::RayModel(rays), view.order = linprim::Order(order), view.screen_filter = screen_filter;
   for (int i = 0; i < 12; ++i) view.world_to_camera[i] = pose.data()[i];
   std::tie(view.fx, view.fy, view.cx, view.cy) = intrinsics;
   view.width = width, view.height = height, view.near = near, view.stop = stop, view.level = level;
@@ -60,16 +67,19 @@ linprim::View make_view(const Pose& pose, const std::tuple<double, double, doubl
 }
 
 template <class Real>
-linprim::Primitives<Real> make_primitives(const In<Real>& center, const In<Real>& rotation, const In<Real>& extent, const In<Real>& density,
+linprim::Primitives<Real> make_primitives(int kind, const In<Real>& center, const In<Real>& rotation, const In<Real>& extent, const In<Real>& density,
                                           const In<Real>& sh) {
   const int64_t n = center.ndim() ? int64_t(center.shape(0)) : 0;
   const int64_t count = sh.ndim() == 3 ? int64_t(sh.shape(1)) : 0;
   if (count != 1 && count != 4 && count != 9 && count != 16) throw std::invalid_argument("sh has to have shape (N, 1 | 4 | 9 | 16, 3)");
   if (n >= (int64_t(1) << 31)) throw std::invalid_argument("more than 2^31 primitives");
-  return {n,
+  if (kind < 0 || kind >= linprim::kKinds) throw std::invalid_argument("unknown kind of primitive");
+  const int64_t extents = linprim::PrimitiveKind(kind) == linprim::PrimitiveKind::kTetrahedron ? 4 : 3;
+  return {linprim::PrimitiveKind(kind),
+          n,
           checked(center, {n, 3}, "center"),
           checked(rotation, {n, 4}, "rotation"),
-          checked(extent, {n, 3}, "extent"),
+          checked(extent, {n, extents}, "extent"),
           checked(density, {n}, "density"),
           checked(sh, {n, count, 3}, "sh"),
           int(count)};
@@ -97,16 +107,23 @@ void require_planes(const linprim::Planes<Real>& p, bool geometry) {
 }
 
 template <class Real>
+void require_kernels(const linprim::View& view, const linprim::Primitives<Real>& primitives) {
+  if (!linprim::has_kernels<Real>(primitives.kind, view.rays, view.order))
+    throw std::invalid_argument("these primitives cannot be blended in this order: a Gaussian has no entry and no exit");
+}
+
+template <class Real>
 void bind_real(nb::module_& m, const char* suffix) {
   using namespace nb::literals;
   using Array = In<Real>;
   m.def(
       (std::string("rasterize_") + suffix).c_str(),
-      [](Array center, Array rotation, Array extent, Array density, Array sh, Array background, Pose pose,
-         std::tuple<double, double, double, double> intrinsics, int width, int height, double near, double stop, double level, bool geometry,
+      [](int kind, Array center, Array rotation, Array extent, Array density, Array sh, Array background, Pose pose,
+         std::tuple<double, double, double, double> intrinsics, int width, int height, double near, double stop, double level, Rung rung, bool geometry,
          std::vector<std::optional<Out<Real>>> planes, Out<Real> color, Out<Real> max_weight, Out<int32_t> pixels) {
-        const linprim::View view = make_view(pose, intrinsics, width, height, near, stop, level);
-        const auto primitives = make_primitives<Real>(center, rotation, extent, density, sh);
+        const linprim::View view = make_view(pose, intrinsics, width, height, near, stop, level, rung);
+        const auto primitives = make_primitives<Real>(kind, center, rotation, extent, density, sh);
+        require_kernels<Real>(view, primitives);
         const auto out = make_planes<Real, Out<Real>>(planes, height, width);
         require_planes(out, geometry);
         const int64_t stats = geometry ? primitives.n : 0;
@@ -119,13 +136,14 @@ void bind_real(nb::module_& m, const char* suffix) {
       });
   m.def(
       (std::string("rasterize_grad_") + suffix).c_str(),
-      [](Array center, Array rotation, Array extent, Array density, Array sh, Array background, Pose pose,
-         std::tuple<double, double, double, double> intrinsics, int width, int height, double near, double stop, double level, bool geometry,
+      [](int kind, Array center, Array rotation, Array extent, Array density, Array sh, Array background, Pose pose,
+         std::tuple<double, double, double, double> intrinsics, int width, int height, double near, double stop, double level, Rung rung, bool geometry,
          std::vector<std::optional<Array>> planes, Array color, std::vector<std::optional<Array>> grads, Out<Real> center_grad,
          Out<Real> rotation_grad, Out<Real> extent_grad, Out<Real> density_grad, Out<Real> sh_grad, Out<Real> background_grad,
          Out<Real> screen_grad) {
-        const linprim::View view = make_view(pose, intrinsics, width, height, near, stop, level);
-        const auto primitives = make_primitives<Real>(center, rotation, extent, density, sh);
+        const linprim::View view = make_view(pose, intrinsics, width, height, near, stop, level, rung);
+        const auto primitives = make_primitives<Real>(kind, center, rotation, extent, density, sh);
+        require_kernels<Real>(view, primitives);
         const auto out = make_planes<Real, Array>(planes, height, width);
         require_planes(out, geometry);
         const auto grad = make_planes<Real, Array>(grads, height, width);
@@ -133,7 +151,7 @@ void bind_real(nb::module_& m, const char* suffix) {
         const Real* colors = checked(color, {primitives.n, 3}, "color");
         const linprim::PrimitiveGradients<Real> gradients{checked(center_grad, {primitives.n, 3}, "center_grad"),
                                                           checked(rotation_grad, {primitives.n, 4}, "rotation_grad"),
-                                                          checked(extent_grad, {primitives.n, 3}, "extent_grad"),
+                                                          checked(extent_grad, {primitives.n, primitives.extents()}, "extent_grad"),
                                                           checked(density_grad, {primitives.n}, "density_grad"),
                                                           checked(sh_grad, {primitives.n, primitives.sh_count, 3}, "sh_grad"),
                                                           checked(screen_grad, {primitives.n, 3}, "screen_grad")};
@@ -142,10 +160,11 @@ void bind_real(nb::module_& m, const char* suffix) {
         linprim::rasterize_grad<Real>(view, primitives, bg, geometry, out, colors, grad, gradients, bg_grad);
       });
   m.def((std::string("level_depth_") + suffix).c_str(),
-        [](Array center, Array rotation, Array extent, Array density, Array sh, Pose pose, std::tuple<double, double, double, double> intrinsics,
-           int width, int height, double near, double level, Out<Real> depth, Out<Real> opacity) {
-          const linprim::View view = make_view(pose, intrinsics, width, height, near, 0, level);
-          const auto primitives = make_primitives<Real>(center, rotation, extent, density, sh);
+        [](int kind, Array center, Array rotation, Array extent, Array density, Array sh, Pose pose, std::tuple<double, double, double, double> intrinsics,
+           int width, int height, double near, double level, Rung rung, Out<Real> depth, Out<Real> opacity) {
+          const linprim::View view = make_view(pose, intrinsics, width, height, near, 0, level, rung);
+          const auto primitives = make_primitives<Real>(kind, center, rotation, extent, density, sh);
+          if (primitives.kind == linprim::PrimitiveKind::kGaussian) throw std::invalid_argument("a Gaussian has no entry and no exit");
           Real *depths = checked(depth, {height, width}, "depth"), *opacities = checked(opacity, {height, width}, "opacity");
           nb::gil_scoped_release release;
           linprim::level_depth<Real>(view, primitives, depths, opacities);
@@ -165,6 +184,10 @@ void bind_real(nb::module_& m, const char* suffix) {
   };
   bind_average("average_pixels_", &linprim::average_pixels<Real>);
   bind_average("average_pixels_grad_", &linprim::average_pixels_grad<Real>);
+  m.def((std::string("has_kernels_") + suffix).c_str(), [](int kind, int rays, int order) {
+    if (kind < 0 || kind >= linprim::kKinds || rays < 0 || rays >= linprim::kRayModels || order < 0 || order >= linprim::kOrders) return false;
+    return linprim::has_kernels<Real>(linprim::PrimitiveKind(kind), linprim::RayModel(rays), linprim::Order(order));
+  });
   m.def((std::string("first_non_finite_") + suffix).c_str(), [](Array values) {
     const Real* data = values.data();
     const int64_t n = int64_t(values.size());

@@ -6,9 +6,14 @@
 #endif
 
 #include "bin.h"
+#include "blend_center.h"
+#include "gaussian_project.h"
 #include "image_kernels.h"
-#include "project.h"
-#include "raster.h"
+#include "level_depth.h"
+#include "octahedron.h"
+#include "octahedron_project.h"
+#include "tetrahedron.h"
+#include "tetrahedron_project.h"
 
 namespace linprim {
 namespace LINPRIM_ISA {
@@ -23,26 +28,39 @@ constexpr int kWidth = 1;
 constexpr int kWidth = 4;
 #endif
 
-template <class Real>
-using Solid = Octahedron<Real, kWidth, RayModel::kExact>;
+inline int64_t no_scratch(Order, bool, int64_t) { return 0; }
 
-template <class Real>
-Counts forward(const RasterParams<Real>& P, int tile, bool geometry) {
-  return geometry ? forward_tile<Solid<Real>, Order::kCenter, true>(P, tile) : forward_tile<Solid<Real>, Order::kCenter, false>(P, tile);
+template <class Solid>
+constexpr SolidKernels<typename Solid::Real> solid_kernels(void (*project)(const ProjectParams<typename Solid::Real>&, int64_t, int64_t),
+                                                           void (*chain)(const ChainParams<typename Solid::Real>&, int64_t, int64_t)) {
+  SolidKernels<typename Solid::Real> k{};
+  k.record_bytes = sizeof(typename Solid::Record);
+  k.project = project, k.chain = chain;
+  k.forward[0][0] = forward_center<Solid, false>, k.forward[0][1] = forward_center<Solid, true>;
+  k.backward[0][0] = backward_center<Solid, false>, k.backward[0][1] = backward_center<Solid, true>;
+  k.scratch_bytes = no_scratch;
+  if constexpr (Solid::kVolume) k.level_depth = level_depth_tile<Solid>;
+  return k;
 }
 
 template <class Real>
-void backward(const RasterParams<Real>& P, int tile, bool geometry) {
-  geometry ? backward_tile<Solid<Real>, Order::kCenter, true>(P, tile) : backward_tile<Solid<Real>, Order::kCenter, false>(P, tile);
+constexpr Kernels<Real> all_kernels(const char* name) {
+  constexpr RayModel kExact = RayModel::kExact, kAffine = RayModel::kAffine;
+  Kernels<Real> k{};
+  k.name = name, k.width = kWidth, k.bin = bin<kWidth>;
+  k.solids[0][0] = solid_kernels<Octahedron<Real, kWidth, kExact>>(project_octahedra<Real, kExact>, chain_octahedra<Real, kExact>);
+  k.solids[0][1] = solid_kernels<Octahedron<Real, kWidth, kAffine>>(project_octahedra<Real, kAffine>, chain_octahedra<Real, kAffine>);
+  k.solids[1][0] = solid_kernels<Tetrahedron<Real, kWidth, kExact>>(project_tetrahedra<Real, kExact>, chain_tetrahedra<Real, kExact>);
+  k.solids[1][1] = solid_kernels<Tetrahedron<Real, kWidth, kAffine>>(project_tetrahedra<Real, kAffine>, chain_tetrahedra<Real, kAffine>);
+  k.solids[2][0] = k.solids[2][1] = solid_kernels<Gaussian<Real, kWidth, kAffine>>(project_gaussians<Real>, chain_gaussians<Real>);
+  return k;
 }
 
 #define LINPRIM_STRING_(x) #x
 #define LINPRIM_STRING(x) LINPRIM_STRING_(x)
 
 template <class Real>
-const Kernels<Real> table = {LINPRIM_STRING(LINPRIM_ISA), kWidth,         project<Real>, chain<Real>,
-                             bin<kWidth>,                 forward<Real>, backward<Real>,
-                             level_depth_tile<Solid<Real>>};
+constexpr Kernels<Real> table = all_kernels<Real>(LINPRIM_STRING(LINPRIM_ISA));
 const ImageKernels image_table = {photometric<kWidth>, adam};
 
 }  // namespace LINPRIM_ISA

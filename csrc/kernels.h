@@ -14,9 +14,16 @@ constexpr int kMaxShCoefficients = 16;          // degree 3
 constexpr int kColorSums = 16;                  // gradient sums per (tile, primitive) pair, see Sum
 constexpr int kGeometrySums = 32;               // the same with the entry normals' sums (28 used)
 
-// What the tile kernels are compiled for, beside the primitive kind, the scalar and the set of outputs.
-enum class RayModel { kExact };
-enum class Order { kCenter };
+// What the tile kernels are compiled for, beside the scalar and the set of outputs. Numbers cross into Python.
+enum class PrimitiveKind : int { kOctahedron, kTetrahedron, kGaussian };
+constexpr int kKinds = 3;
+// Exact perspective, or the rays of one primitive parallel in the ray space of its centre (EWA). A Gaussian knows only the latter.
+enum class RayModel : int { kExact, kAffine };
+constexpr int kRayModels = 2;
+// Primitives blended one after another by the depth of their centres, or by each ray's entry; or absorbing where they are, overlaps
+// included.
+enum class Order : int { kCenter, kEntry, kOverlap };
+constexpr int kOrders = 3;
 
 // A pinhole camera and what a ray does. Pixel (row, column) has its centre at (column + 0.5, row + 0.5).
 struct View {
@@ -26,15 +33,20 @@ struct View {
   double near;                 // depth where rays begin, > 0
   double stop;                 // a ray ends when its transmittance is below this; 0 = never
   double level;                // transmittance at which the median depth is taken
+  double screen_filter;        // pixels (polyhedra) or pixels^2 (Gaussians); 0 = none
+  RayModel rays;
+  Order order;
 };
 
-// Arrays of n primitives, row major: center (n,3), rotation (n,4) as w,x,y,z of any length, extent (n,3) half-axes,
-// density (n) per world unit, sh (n, sh_count, 3) with sh_count 1, 4, 9 or 16.
+// Arrays of n primitives, row major: center (n,3), rotation (n,4) as w,x,y,z of any length, extent (n, extents()): half-axes, vertex
+// distances or standard deviations; density (n) per world unit, or a Gaussian's peak opacity; sh (n, sh_count, 3) with sh_count 1, 4, 9 or 16.
 template <class Real>
 struct Primitives {
+  PrimitiveKind kind;
   int64_t n;
   const Real *center, *rotation, *extent, *density, *sh;
   int sh_count;
+  int extents() const { return kind == PrimitiveKind::kTetrahedron ? 4 : 3; }
 };
 
 // Gradients with the layout of Primitives. screen (n,3): the gradient to the centre's position in pixels, and the sum over tiles of the
@@ -44,23 +56,42 @@ struct PrimitiveGradients {
   Real *center, *rotation, *extent, *density, *sh, *screen;
 };
 
-// One projected primitive, as the tile kernels read it. The faces are inverse-depth planes relative to the inverse depth w0 at
-// the reference pixel: w_f(x, y) - w0 = a_f + b_f (x - ref_x) + c_f (y - ref_y) with x, y counted in pixels.
-// Slots 0-3 hold, of each pair of opposite faces, the one turned to the camera; slots 4-7 their opposites, always back faces.
+// Projected primitives, as the tile kernels read them, one type per kind.
+//
+// The faces of a polyhedron are planes w_f(x, y) = a_f + b_f (x - ref_x) + c_f (y - ref_y), x and y counted in pixels, with w the
+// inverse depth less w0, the inverse depth of the reference (exact rays), or the centre's distance w0 less the distance
+// (affine rays): either way a ray is inside for w from the largest of the back faces to the smallest of the front faces.
+//
+// An octahedron's slots 0-3 hold, of each pair of opposite faces, the one turned to the camera; slots 4-7 their opposites,
+// always back faces.
 template <class Real>
-struct alignas(64) Record {
+struct alignas(64) OctahedronRecord {
   Real a[8], b[8], c[8];
   Real w0, density, rgb[3];
-  int32_t ref_x, ref_y;
-  uint32_t flags;  // bits 0-3: slot 0-3 is a front face; bit 4: take the general path (not all are, or the near plane is crossed)
-  Real face[3][8];  // s_k / h_s: derivative of the face's inverse depth with respect to the local form p_k
+  Real ref_x, ref_y;  // integers
+  uint32_t flags;     // bits 0-3: slot 0-3 is a front face; bit 4: take the general path (not all are, or the near plane is crossed)
+  Real face[3][8];    // s_k / h_s: derivative of the face's w with respect to the local form p_k
 };
 constexpr uint32_t kGeneral = 16;
+template <class Real>
+struct alignas(16) TetrahedronRecord {
+  Real a[4], b[4], c[4];
+  Real w0, density, rgb[3];
+  Real ref_x, ref_y;
+  uint32_t flags;  // bits 0-3: face 0-3 is a front face
+};
+template <class Real>
+struct alignas(16) GaussianRecord {
+  Real xx, xy, yy;  // inverse covariance, 1 / pixel^2
+  Real mean_x, mean_y;  // projected centre, relative to the reference
+  Real w0, density, rgb[3];  // depth of the centre, peak opacity, colour
+  Real ref_x, ref_y;
+};
 
-// Order of the gradient sums of a pair. Form k: sums of g, g (x - ref_x), g (y - ref_y) and g (w - w0) over hits, g being the
-// gradient to the local form p_k; then density, colour, and, with geometry, the gradient to the unit normals of slots 0-3.
+// Order of the gradient sums of a pair. The first twelve are the kind's own (see its add_gradient); then density and colour; with
+// geometry also the gradient to the unit normals of slots 0-3 and to the distance of the centre that depths count from.
 struct Sum {
-  static constexpr int g = 0, gx = 3, gy = 6, gw = 9, density = 12, rgb = 13, normal = 16;
+  static constexpr int g = 0, density = 12, rgb = 13, normal = 16, distance = 28;
 };
 
 // Where a primitive can be seen: the inclusive box of pixels (empty: x1 < x0) and half-planes
@@ -71,11 +102,13 @@ struct Footprint {
   float a[6], b[6], c[6];
 };
 
-// One primitive in one tile: which blocks it may touch (after the forward pass: does touch), and the slot of its gradient sums.
-struct Pair {
-  uint32_t primitive, slot, blocks;
+// The primitives of all tiles, tile after tile, each tile's in order: which blocks of the tile a primitive may touch (after a centre-ordered
+// forward pass: does touch) and the slot of its gradient sums. tile_begin has tiles + 1 entries.
+struct TileLists {
+  const uint32_t *tile_begin, *primitive, *slot;
+  uint32_t* blocks;
 };
-// A pair before it is put into its tile's list.
+// A (primitive, tile) pair before it is put into its tile's list.
 struct LoosePair {
   uint32_t tile, primitive, blocks;
 };
@@ -84,11 +117,11 @@ template <class Real>
 struct ProjectParams {
   View view;
   Primitives<Real> primitives;
-  Record<Real>* records;    // n
+  void* records;            // n of the kind's records
   Footprint* footprints;    // n
-  Real* depth;              // n: depth of the centre, the key of the order
+  Real* key;                // n: depth of the centre; for the other orders a lower bound of all the primitive's depths
   Real* color;              // (n, 3), 0 where not visible
-  Real (*normals)[4][3];    // n: outward unit normals of slots 0-3 in camera space; null without geometry
+  Real (*normals)[4][3];    // n: outward unit normals of slots 0-3 in camera space (a Gaussian has one); null without geometry
 };
 
 template <class Real>
@@ -116,10 +149,10 @@ template <class Real>
 struct RasterParams {
   View view;
   int tiles_x, tiles_y;
-  const Record<Real>* records;
+  const void* records;         // of the kind
+  const Real* key;             // per primitive, see ProjectParams
   const Real (*normals)[4][3];
-  const uint32_t* tile_begin;  // tiles + 1
-  Pair* pairs;
+  TileLists lists;
   const Real* background;      // 3
   Planes<Real> out;
   Real* pair_weight;           // geometry only, per slot: largest weight
@@ -158,19 +191,30 @@ struct AdamParams {
   float correction1, correction2;  // 1 - beta^step
 };
 
+// What one primitive kind under one ray model is compiled to.
+template <class Real>
+struct SolidKernels {
+  int64_t record_bytes;
+  void (*project)(const ProjectParams<Real>&, int64_t begin, int64_t end);
+  void (*chain)(const ChainParams<Real>&, int64_t begin, int64_t end);
+  // Per order and set of outputs (colour; colour and geometry); null where a kind has no such order. `scratch` is the calling
+  // thread's own, scratch_bytes(longest tile list) bytes, 64-byte aligned.
+  Counts (*forward[kOrders][2])(const RasterParams<Real>&, int tile, void* scratch);
+  void (*backward[kOrders][2])(const RasterParams<Real>&, int tile, void* scratch);
+  int64_t (*scratch_bytes)(Order, bool geometry, int64_t longest_list);
+  // Depth at the view's transmittance level by exact overlap, into out.depth_median and out.opacity; scratch: 3 * kBlocks values per
+  // pair of the tile. Null for Gaussians.
+  void (*level_depth)(const RasterParams<Real>&, int tile, Real* scratch);
+};
+
 template <class Real>
 struct Kernels {
   const char* name;
   int width;
-  void (*project)(const ProjectParams<Real>&, int64_t begin, int64_t end);
-  void (*chain)(const ChainParams<Real>&, int64_t begin, int64_t end);
+  SolidKernels<Real> solids[kKinds][kRayModels];
   // Appends the pairs of order[begin..end) to `out`, which has room for `capacity`; returns the index of the first primitive
   // that no longer fitted (or `end`), and the number of pairs in `written`.
   int64_t (*bin)(const BinParams&, int64_t begin, int64_t end, LoosePair* out, int64_t capacity, int64_t* written);
-  Counts (*forward)(const RasterParams<Real>&, int tile, bool geometry);
-  void (*backward)(const RasterParams<Real>&, int tile, bool geometry);
-  // Depth at the view's transmittance level by exact overlap, into out.depth_median and out.opacity; scratch: 3 * kBlocks values per pair of the tile.
-  void (*level_depth)(const RasterParams<Real>&, int tile, Real* scratch);
 };
 
 struct ImageKernels {

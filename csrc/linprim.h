@@ -23,7 +23,11 @@ struct Statistics {
 };
 Statistics statistics();
 
-// Renders `primitives`, ordered by the depth of their centres, by exact perspective intersection with every pixel's ray.
+// Whether primitives of this kind can be rendered by this ray model in this order (a Gaussian has no entry, so only by centre).
+template <class Real>
+bool has_kernels(PrimitiveKind kind, RayModel rays, Order order);
+
+// Renders `primitives` by the view's ray model and in its order.
 //
 // out.rgb and out.opacity are always written; with `geometry`, so are the other planes, max_weight (n) and pixels (n): the largest
 // weight T alpha a primitive reaches in any pixel, and the number of pixels that hit it. color (n,3) receives the view-dependent

@@ -58,15 +58,21 @@ uint64_t hash_bytes(uint64_t seed, const void* data, size_t bytes) {
 template <class Real>
 uint64_t content_hash(const View& view, const Primitives<Real>& p, bool geometry, const Real* color) {
   const double numbers[] = {view.fx, view.fy, view.cx, view.cy, double(view.width), double(view.height), view.near, view.stop,
-                            view.level, double(p.n), double(geometry), double(sizeof(Real))};
+                            view.level, double(p.n), double(geometry), double(sizeof(Real)), view.screen_filter, double(view.rays),
+                            double(view.order), double(p.kind)};
   uint64_t h = hash_bytes(1, view.world_to_camera, sizeof view.world_to_camera);
   h = hash_bytes(h, numbers, sizeof numbers);
   h = hash_bytes(h, p.center, size_t(p.n) * 3 * sizeof(Real));
   h = hash_bytes(h, p.rotation, size_t(p.n) * 4 * sizeof(Real));
-  h = hash_bytes(h, p.extent, size_t(p.n) * 3 * sizeof(Real));
+  h = hash_bytes(h, p.extent, size_t(p.n) * p.extents() * sizeof(Real));
   h = hash_bytes(h, p.density, size_t(p.n) * sizeof(Real));
   return hash_bytes(h, color, size_t(p.n) * 3 * sizeof(Real));
 }
+
+// Memory for records of any kind.
+struct alignas(64) Line {
+  char bytes[64];
+};
 
 // Everything between the primitives and the pixels of one view. Buffers only grow, so a view after the first allocates nothing.
 template <class Real>
@@ -74,31 +80,35 @@ struct Frame {
   uint64_t hash = 0, used = 0;
   int tiles_x = 0, tiles_y = 0;
   int64_t visible = 0, pair_count = 0;
-  std::vector<Record<Real>> records;
+  const SolidKernels<Real>* solid = nullptr;
+  std::vector<Line> records;
   std::vector<std::array<std::array<Real, 3>, 4>> normals;
   std::vector<Footprint> footprints;
-  std::vector<Real> depth;
+  std::vector<Real> key;
   std::vector<uint32_t> order, order_swap, keys, keys_swap;
   std::vector<LoosePair> loose[kBinChunks];
   int64_t loose_count[kBinChunks];
   std::vector<uint32_t> chunk_tile;  // chunks x tiles: counts, then write positions
   std::vector<uint32_t> tile_begin, first_slot, slot_count;
-  std::vector<Pair> pairs;
+  std::vector<uint32_t> pair_primitive, pair_slot, pair_blocks;
   std::vector<Real> pair_weight, sums, background_sums;
   std::vector<uint32_t> pair_pixels;
+  std::vector<Line> scratch;  // of every thread
 
   int tiles() const { return tiles_x * tiles_y; }
 
   void build(const View& view, const Primitives<Real>& p, bool geometry, Real* color, Statistics& stats) {
     Stopwatch watch;
     tiles_x = (view.width + kTile - 1) / kTile, tiles_y = (view.height + kTile - 1) / kTile;
-    grow(records, p.n), grow(footprints, p.n), grow(depth, p.n), grow(first_slot, p.n), grow(slot_count, p.n);
+    solid = &kernels<Real>().solids[int(p.kind)][int(view.rays)];
+    grow(records, (p.n * solid->record_bytes + 63) / 64);
+    grow(footprints, p.n), grow(key, p.n), grow(first_slot, p.n), grow(slot_count, p.n);
     if (geometry) grow(normals, p.n);
-    const ProjectParams<Real> project{view, p, records.data(), footprints.data(), depth.data(), color,
+    const ProjectParams<Real> project{view, p, records.data(), footprints.data(), key.data(), color,
                                       geometry ? reinterpret_cast<Real(*)[4][3]>(normals.data()) : nullptr};
     parallel_for((p.n + kPrimitivesPerTask - 1) / kPrimitivesPerTask, [&](int64_t task, int) {
       const int64_t begin = task * kPrimitivesPerTask, end = std::min(p.n, begin + kPrimitivesPerTask);
-      kernels<Real>().project(project, begin, end);
+      solid->project(project, begin, end);
       std::fill(slot_count.begin() + begin, slot_count.begin() + end, 0u);
     });
     stats.project_ms = watch.lap();
@@ -110,14 +120,14 @@ struct Frame {
     stats.working_set_bytes = bytes();
   }
 
-  // Visible primitives by ascending depth of their centres; ties keep the order of input.
+  // Visible primitives by ascending key; ties keep the order of input.
   void sort(int64_t n) {
     grow(order, n), grow(order_swap, n), grow(keys, n), grow(keys_swap, n);
     visible = 0;
     if constexpr (sizeof(Real) == 8) {
       for (int64_t i = 0; i < n; ++i)
         if (footprints[i].x0 <= footprints[i].x1) order[visible++] = uint32_t(i);
-      std::stable_sort(order.begin(), order.begin() + visible, [&](uint32_t a, uint32_t b) { return depth[a] < depth[b]; });
+      std::stable_sort(order.begin(), order.begin() + visible, [&](uint32_t a, uint32_t b) { return key[a] < key[b]; });
       return;
     }
     constexpr int kBits = 11, kPasses = 3, kBuckets = 1 << kBits;
@@ -125,10 +135,10 @@ struct Frame {
     std::memset(histogram, 0, sizeof histogram);
     for (int64_t i = 0; i < n; ++i) {
       if (footprints[i].x1 < footprints[i].x0) continue;
-      uint32_t key = std::bit_cast<uint32_t>(float(depth[i]) + 0.0f);  // -0 sorts as 0
-      key ^= (key >> 31) ? 0xffffffffu : 0x80000000u;           // ascending as unsigned
-      keys[visible] = key, order[visible] = uint32_t(i), ++visible;
-      for (int pass = 0; pass < kPasses; ++pass) ++histogram[pass][key >> (kBits * pass) & (kBuckets - 1)];
+      uint32_t bits = std::bit_cast<uint32_t>(float(key[i]) + 0.0f);  // -0 sorts as 0
+      bits ^= (bits >> 31) ? 0xffffffffu : 0x80000000u;           // ascending as unsigned
+      keys[visible] = bits, order[visible] = uint32_t(i), ++visible;
+      for (int pass = 0; pass < kPasses; ++pass) ++histogram[pass][bits >> (kBits * pass) & (kBuckets - 1)];
     }
     for (int pass = 0; pass < kPasses; ++pass) {
       uint32_t total = 0;
@@ -171,22 +181,36 @@ struct Frame {
     }
     tile_begin[tiles()] = total;
     pair_count = total;
-    grow(pairs, pair_count);
+    grow(pair_primitive, pair_count), grow(pair_slot, pair_count), grow(pair_blocks, pair_count);
     parallel_for(kBinChunks, [&](int64_t chunk, int) {
       uint32_t slot = 0;
       for (int64_t c = 0; c < chunk; ++c) slot += uint32_t(loose_count[c]);
       uint32_t* position = &chunk_tile[chunk * tiles()];
       for (int64_t i = 0; i < loose_count[chunk]; ++i, ++slot) {
         const LoosePair& pair = loose[chunk][i];
-        pairs[position[pair.tile]++] = {pair.primitive, slot, pair.blocks};
+        const uint32_t at = position[pair.tile]++;
+        pair_primitive[at] = pair.primitive, pair_slot[at] = slot, pair_blocks[at] = pair.blocks;
         if (slot_count[pair.primitive]++ == 0) first_slot[pair.primitive] = slot;
       }
     });
   }
 
+  // Calls body(tile, thread, scratch) for every tile; each thread has scratch of its own.
+  template <class Body>
+  void each_tile(int64_t scratch_bytes, Body body) {
+    const int64_t lines = (scratch_bytes + 63) / 64;
+    grow(scratch, lines * threads());
+    parallel_for(tiles(), [&](int64_t tile, int thread) { body(int(tile), thread, scratch.data() + lines * thread); });
+  }
+  int64_t longest_list() const {
+    uint32_t longest = 0;
+    for (int tile = 0; tile < tiles(); ++tile) longest = std::max(longest, tile_begin[tile + 1] - tile_begin[tile]);
+    return longest;
+  }
+
   RasterParams<Real> raster(const View& view, const Real* background, const Planes<Real>& out) {
-    return {view, tiles_x, tiles_y, records.data(), reinterpret_cast<const Real(*)[4][3]>(normals.data()), tile_begin.data(),
-            pairs.data(), background, out, pair_weight.data(), pair_pixels.data(), {}, sums.data(), background_sums.data()};
+    return {view, tiles_x, tiles_y, records.data(), key.data(), reinterpret_cast<const Real(*)[4][3]>(normals.data()),
+            {tile_begin.data(), pair_primitive.data(), pair_slot.data(), pair_blocks.data()}, background, out, pair_weight.data(), pair_pixels.data(), {}, sums.data(), background_sums.data()};
   }
 
   template <class T>
@@ -195,8 +219,8 @@ struct Frame {
   }
   int64_t bytes() const {
     auto of = [](const auto& v) { return int64_t(v.capacity() * sizeof(v[0])); };
-    int64_t total = of(records) + of(normals) + of(footprints) + of(depth) + of(order) + of(order_swap) + of(keys) + of(keys_swap) +
-                    of(chunk_tile) + of(tile_begin) + of(first_slot) + of(slot_count) + of(pairs) + of(pair_weight) + of(sums) +
+    int64_t total = of(records) + of(normals) + of(footprints) + of(key) + of(order) + of(order_swap) + of(keys) + of(keys_swap) +
+                    of(chunk_tile) + of(tile_begin) + of(first_slot) + of(slot_count) + of(pair_primitive) + of(pair_slot) + of(pair_blocks) + of(scratch) + of(pair_weight) + of(sums) +
                     of(background_sums) + of(pair_pixels);
     for (const auto& list : loose) total += of(list);
     return total;
@@ -246,8 +270,8 @@ void rasterize(const View& view, const Primitives<Real>& primitives, const Real*
   if (geometry) frame.grow(frame.pair_weight, frame.pair_count), frame.grow(frame.pair_pixels, frame.pair_count);
   const RasterParams<Real> params = frame.raster(view, background, out);
   std::vector<Counts> counts(threads(), Counts{});
-  parallel_for(frame.tiles(), [&](int64_t tile, int thread) {
-    const Counts c = kernels<Real>().forward(params, int(tile), geometry);
+  frame.each_tile(frame.solid->scratch_bytes(view.order, geometry, frame.longest_list()), [&](int tile, int thread, void* scratch) {
+    const Counts c = frame.solid->forward[int(view.order)][geometry](params, tile, scratch);
     counts[thread].visited_lanes += c.visited_lanes, counts[thread].hit_lanes += c.hit_lanes;
   });
   for (const Counts& c : counts) stats.visited_lanes += int64_t(c.visited_lanes), stats.hit_lanes += int64_t(c.hit_lanes);
@@ -286,7 +310,8 @@ void rasterize_grad(const View& view, const Primitives<Real>& primitives, const 
   frame->grow(frame->sums, frame->pair_count * per_slot), frame->grow(frame->background_sums, int64_t(frame->tiles()) * 3);
   RasterParams<Real> params = frame->raster(view, background, out);
   params.grad = grad;
-  parallel_for(frame->tiles(), [&](int64_t tile, int) { kernels<Real>().backward(params, int(tile), geometry); });
+  frame->each_tile(frame->solid->scratch_bytes(view.order, geometry, frame->longest_list()),
+                   [&](int tile, int, void* scratch) { frame->solid->backward[int(view.order)][geometry](params, tile, scratch); });
   double total[3] = {0, 0, 0};
   for (int tile = 0; tile < frame->tiles(); ++tile)
     for (int k = 0; k < 3; ++k) total[k] += double(frame->background_sums[3 * tile + k]);
@@ -296,7 +321,7 @@ void rasterize_grad(const View& view, const Primitives<Real>& primitives, const 
                                 frame->sums.data(), per_slot, gradients};
   parallel_for((primitives.n + kPrimitivesPerTask - 1) / kPrimitivesPerTask, [&](int64_t task, int) {
     const int64_t begin = task * kPrimitivesPerTask;
-    kernels<Real>().chain(chain, begin, std::min(primitives.n, begin + kPrimitivesPerTask));
+    frame->solid->chain(chain, begin, std::min(primitives.n, begin + kPrimitivesPerTask));
   });
   stats.chain_ms = watch.lap();
   last_statistics = stats;
@@ -309,20 +334,21 @@ void level_depth(const View& view, const Primitives<Real>& primitives, Real* dep
   Frame<Real>& frame = cache<Real>().oldest();
   std::vector<Real> color(size_t(primitives.n) * 3);
   frame.build(view, primitives, false, color.data(), stats);
-  uint32_t longest = 0;
-  for (int tile = 0; tile < frame.tiles(); ++tile) longest = std::max(longest, frame.tile_begin[tile + 1] - frame.tile_begin[tile]);
-  const size_t scratch_size = size_t(longest) * 3 * kBlocks;
-  std::vector<Real> scratch(scratch_size * threads());
   Planes<Real> out{};
   out.depth_median = depth, out.opacity = opacity;
   const RasterParams<Real> params = frame.raster(view, nullptr, out);
-  parallel_for(frame.tiles(), [&](int64_t tile, int thread) {
-    kernels<Real>().level_depth(params, int(tile), scratch.data() + scratch_size * thread);
-  });
+  frame.each_tile(frame.longest_list() * 3 * kBlocks * int64_t(sizeof(Real)),
+                  [&](int tile, int, void* scratch) { frame.solid->level_depth(params, tile, static_cast<Real*>(scratch)); });
+}
+
+template <class Real>
+bool has_kernels(PrimitiveKind kind, RayModel rays, Order order) {
+  return kernels<Real>().solids[int(kind)][int(rays)].forward[int(order)][0] != nullptr;
 }
 
 #define LINPRIM_INSTANTIATE(Real)                                                                                                    \
   template void rasterize<Real>(const View&, const Primitives<Real>&, const Real*, bool, const Planes<Real>&, Real*, Real*, int32_t*); \
+  template bool has_kernels<Real>(PrimitiveKind, RayModel, Order);                                                                     \
   template void level_depth<Real>(const View&, const Primitives<Real>&, Real*, Real*);                                                \
   template void rasterize_grad<Real>(const View&, const Primitives<Real>&, const Real*, bool, const Planes<Real>&, const Real*,       \
                                      const Planes<Real>&, const PrimitiveGradients<Real>&, Real*);

@@ -4,7 +4,7 @@
 // inline function built for one instruction set can be linked into the path of another.
 //
 //   Vec<T, W>   W lanes of T        + - * fma min max rcp exp_neg
-//   Mask<T, W>  W booleans          & | bits
+//   Mask<T, W>  W booleans          & | bits all
 //   Index<T, W> W small integers    select lookup8 equal is_face
 #pragma once
 
@@ -29,6 +29,7 @@ struct Vec;
 template <class T>
 struct Mask<T, 1> {
   bool m;
+  static Mask all(bool on) { return {on}; }
   friend Mask operator&(Mask a, Mask b) { return {a.m && b.m}; }
   friend Mask operator|(Mask a, Mask b) { return {a.m || b.m}; }
   unsigned bits() const { return m ? 1u : 0u; }
@@ -56,6 +57,8 @@ template <class T>
 inline Vec<T, 1> select(Mask<T, 1> m, Vec<T, 1> a, Vec<T, 1> b) { return m.m ? a : b; }
 template <class T>
 inline Vec<T, 1> rcp(Vec<T, 1> a) { return {T(1) / a.v}; }
+template <class T>
+inline Vec<T, 1> sqrt(Vec<T, 1> a) { return {std::sqrt(a.v)}; }
 template <class T>
 inline Vec<T, 1> log(Vec<T, 1> a) { return {std::log(a.v)}; }
 template <class T>
@@ -93,6 +96,10 @@ template <>
 struct Mask<float, 4> {
   typedef int32_t native __attribute__((vector_size(16)));
   native m;
+  static Mask all(bool on) {
+    const int32_t x = -int32_t(on);
+    return {native{x, x, x, x}};
+  }
   friend Mask operator&(Mask a, Mask b) { return {a.m & b.m}; }
   friend Mask operator|(Mask a, Mask b) { return {a.m | b.m}; }
   unsigned bits() const {
@@ -127,6 +134,10 @@ inline F4 min(F4 a, F4 b) { return {a.v < b.v ? a.v : b.v}; }
 inline F4 max(F4 a, F4 b) { return {a.v > b.v ? a.v : b.v}; }
 inline F4 select(M4 m, F4 a, F4 b) { return {m.m ? a.v : b.v}; }
 inline F4 rcp(F4 a) { return {1.0f / a.v}; }
+inline F4 sqrt(F4 a) {
+  for (int i = 0; i < 4; ++i) a.v[i] = std::sqrt(a.v[i]);
+  return a;
+}
 inline float sum(F4 a) { return (a.v[0] + a.v[2]) + (a.v[1] + a.v[3]); }
 inline float max_lane(F4 a) { return std::fmax(std::fmax(a.v[0], a.v[2]), std::fmax(a.v[1], a.v[3])); }
 inline F4 log(F4 a) {
@@ -160,6 +171,7 @@ inline F4 exp2_int(F4 n) {
 template <>
 struct Mask<float, 8> {
   __m256 m;
+  static Mask all(bool on) { return {_mm256_castsi256_ps(_mm256_set1_epi32(-int32_t(on)))}; }
   friend Mask operator&(Mask a, Mask b) { return {_mm256_and_ps(a.m, b.m)}; }
   friend Mask operator|(Mask a, Mask b) { return {_mm256_or_ps(a.m, b.m)}; }
   unsigned bits() const { return unsigned(_mm256_movemask_ps(m)); }
@@ -187,6 +199,7 @@ inline F8 rcp(F8 a) {
   const __m256 r = _mm256_rcp_ps(a.v);
   return {_mm256_mul_ps(r, _mm256_fnmadd_ps(a.v, r, _mm256_set1_ps(2.0f)))};
 }
+inline F8 sqrt(F8 a) { return {_mm256_sqrt_ps(a.v)}; }
 inline float sum(F8 a) {
   const __m128 h = _mm_add_ps(_mm256_castps256_ps128(a.v), _mm256_extractf128_ps(a.v, 1));
   const __m128 q = _mm_add_ps(h, _mm_movehl_ps(h, h));
@@ -227,6 +240,7 @@ inline F8 exp2_int(F8 n) {
 template <>
 struct Mask<float, 16> {
   __mmask16 m;
+  static Mask all(bool on) { return {__mmask16(-int32_t(on))}; }
   friend Mask operator&(Mask a, Mask b) { return {__mmask16(a.m & b.m)}; }
   friend Mask operator|(Mask a, Mask b) { return {__mmask16(a.m | b.m)}; }
   unsigned bits() const { return unsigned(m); }
@@ -254,6 +268,7 @@ inline F16 rcp(F16 a) {
   const __m512 r = _mm512_rcp14_ps(a.v);
   return {_mm512_mul_ps(r, _mm512_fnmadd_ps(a.v, r, _mm512_set1_ps(2.0f)))};
 }
+inline F16 sqrt(F16 a) { return {_mm512_sqrt_ps(a.v)}; }
 inline float sum(F16 a) { return _mm512_reduce_add_ps(a.v); }
 inline float max_lane(F16 a) { return _mm512_reduce_max_ps(a.v); }
 inline F16 log(F16 a) {
@@ -299,6 +314,21 @@ inline void exp_neg(V x, V& alpha, V& transmittance) {
   const V sf = s * f;
   transmittance = s + sf;
   alpha = (V::set(1.0f) - s) - sf;
+}
+
+// Which of up to 32 masks have bit `bit`, as bits of the result.
+inline uint32_t column(const uint32_t* masks, int count, int bit) {
+#if defined(LINPRIM_ISA_V4)
+  const __m512i wanted = _mm512_set1_epi32(1 << bit);
+  const uint32_t all = count == 32 ? ~0u : (1u << count) - 1;
+  const __mmask16 low = __mmask16(all), high = __mmask16(all >> 16);
+  return uint32_t(_mm512_mask_test_epi32_mask(low, _mm512_maskz_loadu_epi32(low, masks), wanted)) |
+         uint32_t(_mm512_mask_test_epi32_mask(high, _mm512_maskz_loadu_epi32(high, masks + 16), wanted)) << 16;
+#else
+  uint32_t result = 0;
+  for (int i = 0; i < count; ++i) result |= (masks[i] >> bit & 1u) << i;
+  return result;
+#endif
 }
 
 }  // namespace linprim::LINPRIM_ISA

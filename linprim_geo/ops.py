@@ -73,6 +73,31 @@ def _check_finite(suffix: str, **tensors: Tensor) -> None:
             )
 
 
+# What the two operators take beside tensors. `numbers`: fx, fy, cx, cy, near, stop, level, screen_filter; `choices`: width, height,
+# and the indices of primitive, ray model and order in these lists, and whether the geometry is wanted.
+KINDS = ("octahedron", "tetrahedron", "gaussian")
+RAY_MODELS = ("exact", "affine")
+ORDERS = ("center", "entry", "overlap")
+
+
+def _core_arguments(tensors: list[Tensor], pose: Tensor, numbers: list[float], choices: list[int]) -> list:
+    fx, fy, cx, cy, near, stop, level, screen_filter = numbers
+    width, height, kind, rays, order, geometry = choices
+    return [
+        kind,
+        *[_array(t) for t in tensors],
+        _array(pose[:3].double()),
+        (fx, fy, cx, cy),
+        width,
+        height,
+        near,
+        stop,
+        level,
+        (rays, order, screen_filter),
+        bool(geometry),
+    ]
+
+
 @torch.library.custom_op("linprim_geo::rasterize", mutates_args=())
 def _rasterize(
     center: Tensor,
@@ -83,44 +108,18 @@ def _rasterize(
     background: Tensor,
     screen: Tensor | None,
     world_to_camera: Tensor,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    width: int,
-    height: int,
-    near: float,
-    stop: float,
-    level: float,
-    geometry: bool,
+    numbers: list[float],
+    choices: list[int],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     suffix = _suffix(center.dtype)
-    _check_dtypes(
-        center.dtype, rotation=rotation, extent=extent, density=density, sh=sh, background=background
-    )
-    _check_finite(
-        suffix, center=center, rotation=rotation, extent=extent, density=density, background=background
-    )
-    planes = _planes(center, width, height, geometry)
-    count = center.shape[0]
-    color = center.new_empty((count, 3))
-    max_weight = center.new_empty(count if geometry else 0)
-    pixels = torch.empty(count if geometry else 0, dtype=torch.int32)
+    given = dict(center=center, rotation=rotation, extent=extent, density=density, background=background)
+    _check_dtypes(center.dtype, sh=sh, **given)
+    _check_finite(suffix, **given)
+    planes, color, max_weight, pixels = _outputs(center, choices)
     getattr(_core, f"rasterize_{suffix}")(
-        _array(center),
-        _array(rotation),
-        _array(extent),
-        _array(density),
-        _array(sh),
-        _array(background),
-        _array(world_to_camera[:3].double()),
-        (fx, fy, cx, cy),
-        width,
-        height,
-        near,
-        stop,
-        level,
-        geometry,
+        *_core_arguments(
+            [center, rotation, extent, density, sh, background], world_to_camera, numbers, choices
+        ),
         [p.numpy() if p.numel() else None for p in planes],
         color.numpy(),
         max_weight.numpy(),
@@ -130,34 +129,22 @@ def _rasterize(
     return (*planes, color, max_weight, pixels)
 
 
-@_rasterize.register_fake
-def _(
-    center,
-    rotation,
-    extent,
-    density,
-    sh,
-    background,
-    screen,
-    world_to_camera,
-    fx,
-    fy,
-    cx,
-    cy,
-    width,
-    height,
-    near,
-    stop,
-    level,
-    geometry,
-):
+def _outputs(center: Tensor, choices: list[int]) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
+    width, height, *_, geometry = choices
     count = center.shape[0]
+    statistics = count if geometry else 0
     return (
-        *_planes(center, width, height, geometry),
+        _planes(center, width, height, bool(geometry)),
         center.new_empty((count, 3)),
-        center.new_empty(count if geometry else 0),
-        center.new_empty(count if geometry else 0, dtype=torch.int32),
+        center.new_empty(statistics),
+        center.new_empty(statistics, dtype=torch.int32),
     )
+
+
+@_rasterize.register_fake
+def _(center, rotation, extent, density, sh, background, screen, world_to_camera, numbers, choices):
+    planes, *others = _outputs(center, choices)
+    return (*planes, *others)
 
 
 @torch.library.custom_op("linprim_geo::rasterize_grad", mutates_args=())
@@ -169,40 +156,16 @@ def _rasterize_grad(
     sh: Tensor,
     background: Tensor,
     world_to_camera: Tensor,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    width: int,
-    height: int,
-    near: float,
-    stop: float,
-    level: float,
-    geometry: bool,
+    numbers: list[float],
+    choices: list[int],
     color: Tensor,
     planes: list[Tensor],
     grads: list[Tensor | None],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    out = [
-        torch.empty_like(t, memory_format=torch.contiguous_format)
-        for t in (center, rotation, extent, density, sh, background)
-    ]
-    out.append(center.new_empty((center.shape[0], 3)))
+    inputs = [center, rotation, extent, density, sh, background]
+    out = _gradients(inputs)
     getattr(_core, f"rasterize_grad_{_suffix(center.dtype)}")(
-        _array(center),
-        _array(rotation),
-        _array(extent),
-        _array(density),
-        _array(sh),
-        _array(background),
-        _array(world_to_camera[:3].double()),
-        (fx, fy, cx, cy),
-        width,
-        height,
-        near,
-        stop,
-        level,
-        geometry,
+        *_core_arguments(inputs, world_to_camera, numbers, choices),
         [_array(p) if p.numel() else None for p in planes],
         _array(color),
         [None if g is None or not g.numel() else _array(g) for g in grads],
@@ -211,62 +174,34 @@ def _rasterize_grad(
     return tuple(out)
 
 
+def _gradients(inputs: list[Tensor]) -> list[Tensor]:
+    out = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs]
+    return [*out, inputs[0].new_empty((inputs[0].shape[0], 3))]
+
+
 @_rasterize_grad.register_fake
 def _(
-    center,
-    rotation,
-    extent,
-    density,
-    sh,
-    background,
-    world_to_camera,
-    fx,
-    fy,
-    cx,
-    cy,
-    width,
-    height,
-    near,
-    stop,
-    level,
-    geometry,
-    color,
-    planes,
-    grads,
+    center, rotation, extent, density, sh, background, world_to_camera, numbers, choices, color, planes, grads
 ):
-    inputs = (center, rotation, extent, density, sh, background)
-    return (
-        *[torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs],
-        center.new_empty((center.shape[0], 3)),
-    )
+    return tuple(_gradients([center, rotation, extent, density, sh, background]))
 
 
 def _rasterize_setup(ctx, inputs, output):
-    center, rotation, extent, density, sh, background, screen, world_to_camera, *numbers = inputs
-    ctx.numbers = numbers
+    *tensors, screen, pose, numbers, choices = inputs
+    ctx.numbers, ctx.choices = numbers, choices
     ctx.has_screen = screen is not None
     ctx.set_materialize_grads(False)
     *planes, color, max_weight, pixels = output
     ctx.mark_non_differentiable(planes[-1], color, max_weight, pixels)
-    ctx.save_for_backward(center, rotation, extent, density, sh, background, world_to_camera, color, *planes)
+    ctx.save_for_backward(*tensors, pose, color, *planes)
 
 
 def _rasterize_backward(ctx, *grads):
-    center, rotation, extent, density, sh, background, world_to_camera, color, *planes = ctx.saved_tensors
+    tensors, (pose, color, *planes) = ctx.saved_tensors[:6], ctx.saved_tensors[6:]
     *parameters, screen = torch.ops.linprim_geo.rasterize_grad(
-        center,
-        rotation,
-        extent,
-        density,
-        sh,
-        background,
-        world_to_camera,
-        *ctx.numbers,
-        color,
-        planes,
-        list(grads[:8]),
+        *tensors, pose, ctx.numbers, ctx.choices, color, planes, list(grads[:8])
     )
-    return (*parameters, screen if ctx.has_screen else None, *[None] * (1 + len(ctx.numbers)))
+    return (*parameters, screen if ctx.has_screen else None, None, None, None)
 
 
 _rasterize.register_autograd(_rasterize_backward, setup_context=_rasterize_setup)
@@ -302,6 +237,10 @@ def rasterize(
     background: Tensor,
     camera: Camera,
     *,
+    primitive: str = "octahedron",
+    ray_model: str = "exact",
+    order: str = "center",
+    screen_filter: float = 0.0,
     near: float = 0.01,
     stop: float = 1e-3,
     level: float = 0.5,
@@ -309,20 +248,30 @@ def rasterize(
     samples: int = 1,
     screen: Tensor | None = None,
 ) -> Rendering:
-    """Renders octahedra, blended front to back in the order of their centres' depth, by exact perspective.
+    """Renders transparent primitives, by default octahedra blended front to back in the order of their centres' depth, by exact
+    perspective.
 
-    A ray of direction (u, v, 1) is inside an octahedron for z-depths t_in < t < t_out; its optical thickness there is
+    A ray of direction (u, v, 1) is inside a polyhedron for z-depths t_in < t < t_out; its optical thickness there is
     tau = density |(u, v, 1)| (t_out - t_in), its weight T (1 - exp(-tau)), and T is multiplied by exp(-tau).
 
     Args:
         center: (N, 3) world positions. float32 or float64; all tensors alike.
         rotation: (N, 4) quaternions w, x, y, z of any length but 0, which means no rotation.
-        extent: (N, 3) half-axes, world units. A primitive with one that is not positive is not drawn.
-        density: (N,) optical thickness per world unit; below 0 counts as 0.
+        extent: (N, 3) half-axes of octahedra, (N, 4) distances of a tetrahedron's vertices along (1, 1, 1), (1, -1, -1), (-1, 1, -1) and
+            (-1, -1, 1), or (N, 3) standard deviations of Gaussians; world units. A primitive with one that is not positive is not drawn.
+        density: (N,) optical thickness per world unit; below 0 counts as 0. Of Gaussians the peak opacity, 0 to 1.
         sh: (N, K, 3) spherical harmonics, K = 1, 4, 9 or 16; colour = max(0, 0.5 + their sum at the direction from the camera
             to the centre).
         background: (3,) colour behind everything.
         camera: pinhole camera in the frame of the centres.
+        primitive: "octahedron", "tetrahedron", or "gaussian": 3D Gaussian splatting's, projected, alpha at most 0.99 and nothing below
+            1/255, one depth each.
+        ray_model: "exact" perspective, or "affine": inside one primitive rays are parallel in the ray space of its centre, nothing is cut
+            at the near plane, and a primitive whose centre is before it is not drawn. Gaussians are always affine.
+        order: "center": blended by the depth of their centres; "entry": by each ray's own entry depth; "overlap": absorbing where they are,
+            overlaps included, which depends on no order: the integral itself. Gaussians go with "center" only.
+        screen_filter: enlarges a polyhedron's box on the screen by half this many pixels on every side and thins it in proportion; to a
+            Gaussian's variance it is added, in square pixels. 0 is off.
         near: z-depth at which rays begin, world units.
         stop: a ray ends when its transmittance is below this; 0 = never.
         level: transmittance at which `depth_median` is taken.
@@ -336,7 +285,7 @@ def rasterize(
     Raises:
         LinprimError: a non-finite input (naming tensor and row; in sh, of primitives that are in view) or a dtype other than
             float32, float64.
-        ValueError: shapes, dtypes or a camera that do not fit.
+        ValueError: shapes, dtypes, a camera or choices that do not fit.
 
     Gradient: to center, rotation, extent, density, sh, background and screen, of every image; once.
 
@@ -346,6 +295,13 @@ def rasterize(
 
     Source: LinPrim (von Luetzow and Niessner, arXiv 2501.16312) for the primitive and its density.
     """
+    for name, value, known in (
+        ("primitive", primitive, KINDS),
+        ("ray_model", ray_model, RAY_MODELS),
+        ("order", order, ORDERS),
+    ):
+        if value not in known:
+            raise ValueError(f"{name} is {value!r}, wanted {', '.join(known)}")
     if samples < 1 or (samples > 1 and geometry):
         raise ValueError("samples has to be 1 with geometry, and at least 1 without")
     if samples > 1:
@@ -357,6 +313,10 @@ def rasterize(
             sh,
             background,
             camera.magnified(samples),
+            primitive=primitive,
+            ray_model=ray_model,
+            order=order,
+            screen_filter=screen_filter * (samples**2 if primitive == "gaussian" else samples),
             near=near,
             stop=stop,
             level=level,
@@ -376,20 +336,24 @@ def rasterize(
         background,
         screen,
         pose,
-        float(camera.fx),
-        float(camera.fy),
-        float(camera.cx),
-        float(camera.cy),
-        camera.width,
-        camera.height,
-        near,
-        stop,
-        level,
-        geometry,
+        [camera.fx, camera.fy, camera.cx, camera.cy, near, stop, level, screen_filter],
+        [
+            camera.width,
+            camera.height,
+            KINDS.index(primitive),
+            RAY_MODELS.index(ray_model),
+            ORDERS.index(order),
+            int(geometry),
+        ],
     )
     if not geometry:
         return Rendering(out[0], out[1])
     return Rendering(*out[:8], max_weight=out[10], pixels=out[11])
+
+
+def has_kernels(primitive: str, ray_model: str, order: str) -> bool:
+    """Whether `rasterize` takes this combination: a Gaussian has no entry, so it knows the order of centres only."""
+    return _core.has_kernels_f32(KINDS.index(primitive), RAY_MODELS.index(ray_model), ORDERS.index(order))
 
 
 @torch.library.custom_op("linprim_geo::average_pixels", mutates_args=())
@@ -441,13 +405,16 @@ def level_depth(
     camera: Camera,
     *,
     level: float,
+    primitive: str = "octahedron",
+    ray_model: str = "exact",
+    screen_filter: float = 0.0,
     near: float = 0.01,
 ) -> tuple[Tensor, Tensor]:
     """(H, W) z-depth at which the transmittance of each ray falls to `level`, 0 where it never does, and (H, W) opacity behind
     everything; no gradients.
 
     Unlike `rasterize`'s depths it depends on no order: primitives absorb where they are, overlaps included, so the depth solves
-    sum_i density_i |v| clamp(t - t_in_i, 0, t_out_i - t_in_i) = ln(1 / level). Arguments as for `rasterize`; 0 < level < 1.
+    sum_i density_i |v| clamp(t - t_in_i, 0, t_out_i - t_in_i) = ln(1 / level). Arguments as for `rasterize`, of polyhedra; 0 < level < 1.
 
     Raises: as `rasterize`.
 
@@ -460,7 +427,10 @@ def level_depth(
         raise ValueError(f"level is {level}, wanted a transmittance between 0 and 1")
     depth = center.new_empty((camera.height, camera.width), requires_grad=False)
     opacity = torch.empty_like(depth)
+    if primitive == "gaussian":
+        raise ValueError("a Gaussian has no entry and no exit, so no depth at a level")
     getattr(_core, f"level_depth_{suffix}")(
+        KINDS.index(primitive),
         _array(center),
         _array(rotation),
         _array(extent),
@@ -472,6 +442,7 @@ def level_depth(
         camera.height,
         near,
         level,
+        (RAY_MODELS.index(ray_model), 0, screen_filter),
         depth.numpy(),
         opacity.numpy(),
     )

@@ -1,25 +1,26 @@
 """The slow twin of the compiled rasterizer and of the photometric loss: what they compute, from torch alone.
 
-Nothing here shares a formula with the kernel where another one exists: rays are clipped in the octahedron's
-own frame, one half-space after another, gradients come from autograd, and there are no tiles, bounds or
-culling to be wrong in the same way. Speed is no aim: time grows with primitives x pixels, memory with hits.
+Nothing here shares a formula with the kernel where another one exists: rays are clipped in the primitive's
+own frame (`reference_shapes`), blended without tiles, bounds or culling (`reference_blend`), and gradients
+come from autograd. Speed is no aim: time grows with primitives x pixels, memory with hits.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-FACE_SIGNS = tuple(itertools.product((1.0, -1.0), repeat=3))
-"""The eight faces of |y0| + |y1| + |y2| <= 1, as the s of s . y <= 1."""
+from .reference_blend import blend_in_order, blend_overlapping
+from .reference_blend import mean_depth_fraction as mean_depth_fraction
+from .reference_shapes import FACE_SIGNS as FACE_SIGNS
+from .reference_shapes import clip_to_octahedron as clip_to_octahedron
+from .reference_shapes import gaussian_chords, polyhedron_chords
 
-MEAN_DEPTH_SERIES_BELOW = 0.25
-"""Thickness under which `mean_depth_fraction` uses its series: the next term, 691 tau^11 / 1.3e12, is below
-2e-16 there; above it the closed form loses no more than a factor 1 / tau of its digits."""
+PRIMITIVES, RAY_MODELS = ("octahedron", "tetrahedron", "gaussian"), ("exact", "affine")
+ORDERS = ("center", "entry", "overlap")
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
@@ -93,72 +94,12 @@ def primitive_color(center: Tensor, sh: Tensor, camera_position: Tensor) -> Tens
     return torch.relu((basis[..., None] * sh).sum(1) + 0.5)
 
 
-def mean_depth_fraction(tau: Tensor) -> Tensor:
-    """Returns g(tau) = 1/tau - exp(-tau)/(1 - exp(-tau)): where thickness tau absorbs light on average.
-
-    0 is its entry and 1 its exit; g(0) = 1/2 and g -> 1/tau. Accuracy: 8 eps, relative.
-    """
-    thin = tau < MEAN_DEPTH_SERIES_BELOW
-    small = torch.where(thin, tau, torch.zeros_like(tau))
-    square = small * small
-    series = -1 / 47900160
-    for coefficient in (1 / 1209600, -1 / 30240, 1 / 720, -1 / 12):
-        series = series * square + coefficient
-    large = torch.where(thin, torch.ones_like(tau), tau)
-    return torch.where(thin, 0.5 + small * series, 1 / large + torch.exp(-large) / torch.expm1(-large))
-
-
 def pixel_rays(width: int, height: int, fx: float, fy: float, cx: float, cy: float, like: Tensor) -> Tensor:
     """Returns (H * W, 3) rays v = ((u - cx)/fx, (v - cy)/fy, 1) through the pixel centres, row after row."""
     x = (torch.arange(width, dtype=like.dtype, device=like.device) + 0.5 - cx) / fx
     y = (torch.arange(height, dtype=like.dtype, device=like.device) + 0.5 - cy) / fy
     y, x = torch.meshgrid(y, x, indexing="ij")
     return torch.stack([x, y, torch.ones_like(x)], -1).reshape(-1, 3)
-
-
-def _dot(a: Tensor, b: Tensor) -> Tensor:
-    """Dot product over the last axis, rounded the same in every batch: a subset of rays repeats the whole."""
-    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
-
-
-def _add(image: Tensor, pixels: Tensor, value: Tensor) -> Tensor:
-    """`image` (..., P) plus `value` (..., M) at M distinct pixels. Not index_add, which walks them singly."""
-    return image.index_copy(-1, pixels, image[..., pixels] + value)
-
-
-def _to_local(vector: Tensor, rotation: Tensor, extent: Tensor) -> Tensor:
-    """(R^T x) / extent for one primitive."""
-    return torch.stack([_dot(vector, rotation[:, k]) for k in range(3)], -1) / extent
-
-
-@torch.no_grad()
-def clip_to_octahedron(direction: Tensor, origin: Tensor, near: float) -> tuple[Tensor, ...]:
-    """Clips the half-lines y(t) = origin + t direction, t >= near, to |y0| + |y1| + |y2| <= 1.
-
-    One half-space s . y <= 1 after another: t (s . direction) <= 1 - s . origin bounds t from above, from
-    below or, where s . direction is exactly zero, not at all or to nothing.
-
-    Args:
-        direction: (P, 3), in the octahedron's unit frame.
-        origin: (3,), the camera in the same frame.
-
-    Returns:
-        t_in, t_out (P,): empty where t_out <= t_in; and the indices into FACE_SIGNS of the faces they lie on,
-        (P,) each, -1 where t_in is the near plane. The first of several faces met at the same t is named.
-    """
-    t_in = torch.full_like(direction[:, 0], near)
-    t_out = torch.full_like(t_in, math.inf)
-    entry = torch.full_like(t_in, -1, dtype=torch.long)
-    leave = entry
-    for face, signs in enumerate(FACE_SIGNS):
-        normal = direction.new_tensor(signs)
-        slope, room = _dot(direction, normal), 1 - _dot(origin, normal)
-        t = room / slope
-        later, sooner = (slope < 0) & (t > t_in), (slope > 0) & (t < t_out)
-        t_in, entry = torch.where(later, t, t_in), torch.where(later, face, entry)
-        t_out, leave = torch.where(sooner, t, t_out), torch.where(sooner, face, leave)
-        t_out = torch.where((slope == 0) & (room < 0), -math.inf, t_out)
-    return t_in, t_out, entry, leave
 
 
 def rasterize(
@@ -176,32 +117,51 @@ def rasterize(
     cy: float,
     width: int,
     height: int,
+    primitive: str = "octahedron",
+    ray_model: str = "exact",
+    order: str = "center",
+    screen_filter: float = 0.0,
     near: float = 0.01,
     stop: float = 1e-3,
     level: float = 0.5,
     geometry: bool = True,
 ) -> dict[str, Tensor]:
-    """Renders homogeneous octahedra front to back, with every output that training may need a gradient of.
+    """Renders homogeneous octahedra or tetrahedra, or Gaussians, with every output that may need a gradient.
 
-    Primitives are blended by ascending camera-space z of their centres (ties by index, negative z allowed),
-    in the same order for every pixel. A ray is x = t v, v = ((px - cx)/fx, (py - cy)/fy, 1), so t is depth.
-    With [t_in, t_out] the part of it inside a primitive and beyond `near`, and T = 1 at first:
+    A ray is x = t v, v = ((px - cx)/fx, (py - cy)/fy, 1), so t is depth. With [t_in, t_out] the part of it
+    inside a primitive, T = 1 at first, and primitives taken in their order:
 
         hit    t_out > t_in and T >= stop, T as it is before this primitive; otherwise it is skipped entirely
         tau    = density |v| (t_out - t_in)       alpha = 1 - exp(-tau)
         w      = T alpha                          T <- T exp(-tau)
         z      = t_in + (t_out - t_in) g(tau)     the mean depth of what it absorbs, g = mean_depth_fraction
 
+    primitive: an octahedron has the vertices center +- extent_k R e_k; a tetrahedron center + extent_j R b_j,
+    sqrt(3) b = (1,1,1), (1,-1,-1), (-1,1,-1), (-1,-1,1); a Gaussian the covariance R diag(extent^2) R^T and
+    density for its peak's opacity, see `gaussian_chords`, with t_in = t_out = z the depth of its centre.
+    ray_model: exact rays start at t = near; affine ones cross the primitive as a line in ray space, see
+    `polyhedron_chords`. To a Gaussian both are the same. order: see below. screen_filter: a polyhedron's least
+    size on the screen, see `polyhedron_chords`; for a Gaussian a variance.
+
+        center    ascending camera-space z of the centres (ties by index, negative z allowed), for all pixels
+        entry     ascending t_in (ties by index), for each pixel
+        overlap   none: T' = -T |v| sum of density over the primitives that hold the point t v. w is the
+                  integral of T density |v| dt over the primitive's part, z that of t with this weight. The ray
+                  ends at the first t_in or t_out with T < stop
+
     Args:
         center: (N, 3), world.
         rotation: (N, 4) quaternions w x y z of any length but zero, primitive to world.
-        extent: (N, 3) > 0, half-axes, world units.
-        density: (N,) >= 0, 1 / world unit.
+        extent: (N, 3) > 0, half-axes of octahedra, or >= 0, standard deviations of Gaussians; (N, 4) distances
+            of a tetrahedron's vertices, which is left out if one is not positive. World units.
+        density: (N,) >= 0, 1 / world unit; for Gaussians opacity, 0 to 1.
         sh: (N, K, 3), K = 1, 4, 9 or 16; see `primitive_color`.
         background: (3,).
         world_to_camera: (4, 4), rigid.
         fx, fy, cx, cy: pixels; pixel (i, j) has its centre at (j + 0.5, i + 0.5).
-        near: depth > 0 at which every ray starts.
+        screen_filter: >= 0, pixels; for Gaussians square pixels.
+        near: depth > 0 at which every exact ray starts; an affine primitive or a Gaussian whose centre is not
+            beyond it is left out.
         stop: transmittance below which a ray ends; 0 means never.
         level: transmittance whose crossing defines the median depth.
         geometry: False computes only rgb, opacity, max_weight and pixels.
@@ -211,18 +171,22 @@ def rasterize(
         opacity (H, W): 1 - T.
         depth_expected (H, W): sum of w z, not divided by the opacity.
         depth_median (H, W): where T reaches `level`: t_in + ln(T / level) / (density |v|), at most t_out, in
-            the first primitive with T > level before it and T <= level after it; 0 if there is none.
+            the first primitive with T > level before it and T <= level after it; 0 if there is none. With
+            overlap, the t with T = level.
         depth_first (H, W): t_in of the first hit in blending order; 0 if there is none.
         normal (3, H, W): sum of w n, n the unit outward normal of the entry face, camera frame; n = 0 where
             the ray enters through the near plane.
-        normal_median (3, H, W): n of the primitive that depth_median lies in; 0 if there is none.
+        normal_median (3, H, W): n of the primitive that depth_median lies in; 0 if there is none. With overlap,
+            the mean n of the primitives there, weighted by density.
         distortion (H, W): A M2 - M1^2, A = sum w, M1 = sum w z, M2 = sum w z^2 (half the sum over all pairs
             of w w' (z - z')^2), taken about the first hit's z, which does not change it but keeps its digits.
+            With overlap, the same of the measure T density |v| dt: one primitive alone has some.
         max_weight (N,): the largest w over the pixels, 0 if never hit; no gradient.
-        pixels (N,) int64: number of pixels hit.
+        pixels (N,) int64: number of pixels hit; with overlap, in which T >= stop at its t_in.
 
     Raises:
-        ValueError: K is not 1, 4, 9 or 16, or an extent is not positive.
+        ValueError: K is not 1, 4, 9 or 16, an octahedron's extent is not positive, the width of `extent` is not
+            that of the primitive, a Gaussian is to be ordered by its entry, or a keyword is none of those above.
 
     Gradient:
         By autograd, to the six tensors and to `world_to_camera`; finite for every ray, a one-sided value
@@ -231,93 +195,57 @@ def rasterize(
     Accuracy:
         A chord's relative error is about eps t / (t_out - t_in): nothing is recentred on a primitive's depth.
         Use float64 for truth.
+
+    Source:
+        LinPrim (von Luetzow & Niessner 2025) for polyhedra, order center and affine rays; EVER (Mai et al. 2024) for
+        overlap; 3D Gaussian Splatting (Kerbl et al. 2023) for Gaussians.
     """
-    if not bool((extent > 0).all()):
+    for name, value, known in (
+        ("primitive", primitive, PRIMITIVES),
+        ("ray_model", ray_model, RAY_MODELS),
+        ("order", order, ORDERS),
+    ):
+        if value not in known:
+            raise ValueError(f"{name} is {value!r}, wanted one of {', '.join(known)}")
+    if primitive == "gaussian" and order != "center":
+        raise ValueError(f"a Gaussian has no entry, so its order is center, not {order}")
+    if not screen_filter >= 0:
+        raise ValueError(f"screen_filter is {screen_filter}, wanted a number of pixels >= 0")
+    if extent.shape[1] != (4 if primitive == "tetrahedron" else 3):
+        raise ValueError(f"extent has {extent.shape[1]} columns, which is not a {primitive}")
+    if primitive == "octahedron" and not bool((extent > 0).all()):
         raise ValueError("extent holds a half-axis that is not positive")
+
     pose = torch.as_tensor(world_to_camera, dtype=center.dtype, device=center.device)
     to_camera, translation = pose[:3, :3], pose[:3, 3]
     color = primitive_color(center, sh, -to_camera.T @ translation)
     center_camera = center @ to_camera.T + translation
     rotation_camera = to_camera @ rotation_matrix(rotation)
     rays = pixel_rays(width, height, fx, fy, cx, cy, center)
-    ray_length = rays.norm(dim=-1)
-    signs = center.new_tensor(FACE_SIGNS)
 
-    count, zeros = len(rays), torch.zeros_like(ray_length)
-    transmittance = torch.ones_like(zeros)
-    rgb = center.new_zeros(3, count)
-    a = m1 = m2 = depth_expected = depth_median = depth_first = zeros
-    normal = normal_median = center.new_zeros(3, count)
-    reference, seen = zeros, torch.zeros_like(zeros, dtype=torch.bool)
-    max_weight = center.new_zeros(len(center))
-    pixels = torch.zeros(len(center), dtype=torch.long, device=center.device)
+    shape = (center_camera, rotation_camera, extent, density, rays)
+    if primitive == "gaussian":
+        chords = gaussian_chords(*shape, screen_filter=screen_filter, focal=(fx, fy), near=near)
+    else:
+        chords = polyhedron_chords(
+            *shape,
+            primitive=primitive,
+            ray_model=ray_model,
+            screen_filter=screen_filter,
+            focal=(fx, fy),
+            near=near,
+        )
 
-    for i in torch.sort(center_camera[:, 2].detach(), stable=True).indices.tolist():
-        # Which pixels are hit, and through which faces: constant under small changes, so without gradient.
-        with torch.no_grad():
-            origin = -_to_local(center_camera[i], rotation_camera[i], extent[i])
-            direction = _to_local(rays, rotation_camera[i], extent[i])
-            t_in, t_out, entry, leave = clip_to_octahedron(direction, origin, near)
-            hit = ((t_out > t_in) & (transmittance >= stop)).nonzero()[:, 0]
-            entry, leave = entry[hit], leave[hit]
-
-        # The two ends again, as functions of the parameters, for the rays that hit and no other: a face that
-        # a ray is parallel to bounds nothing, so no division below is by zero and no gradient can be NaN.
-        origin = -_to_local(center_camera[i], rotation_camera[i], extent[i])
-        direction = _to_local(rays[hit], rotation_camera[i], extent[i])
-        at_near = entry < 0
-        face = signs[entry.clamp(min=0)]
-        slope = torch.where(at_near, torch.ones_like(ray_length[hit]), _dot(direction, face))
-        t_in = torch.where(at_near, near, (1 - _dot(origin, face)) / slope)
-        t_out = (1 - _dot(origin, signs[leave])) / _dot(direction, signs[leave])
-
-        before = transmittance[hit]
-        rate = density[i] * ray_length[hit]
-        tau = rate * (t_out - t_in)
-        weight = before * -torch.expm1(-tau)
-        after = before * torch.exp(-tau)
-        transmittance = transmittance.index_copy(-1, hit, after)
-        rgb = _add(rgb, hit, color[i][:, None] * weight)
-        pixels[i] = len(hit)
-        if len(hit):
-            max_weight[i] = weight.detach().max()
-        if not geometry:
-            continue
-
-        mean = t_in + (t_out - t_in) * mean_depth_fraction(tau)
-        depth_expected = _add(depth_expected, hit, weight * mean)
-
-        new = ~seen[hit]
-        depth_first = depth_first.index_copy(-1, hit[new], t_in[new])
-        reference = reference.index_copy(-1, hit[new], mean[new].detach())
-        seen = seen.index_fill(0, hit, True)
-        offset = mean - reference[hit]
-        a = _add(a, hit, weight)
-        m1 = _add(m1, hit, weight * offset)
-        m2 = _add(m2, hit, weight * offset * offset)
-
-        outward = face / extent[i]
-        outward = (outward / outward.norm(dim=-1, keepdim=True)) @ rotation_camera[i].T
-        outward = torch.where(at_near[:, None], torch.zeros_like(outward), outward).T
-        normal = _add(normal, hit, weight * outward)
-
-        cross = (before > level) & (after <= level)
-        crossing = t_in[cross] + torch.log(before[cross] / level) / rate[cross]
-        depth_median = depth_median.index_copy(-1, hit[cross], torch.minimum(crossing, t_out[cross]))
-        normal_median = normal_median.index_copy(-1, hit[cross], outward[:, cross])
-
-    flat = {"rgb": rgb + transmittance * background[:, None], "opacity": 1 - transmittance}
-    if geometry:
-        flat |= {
-            "depth_expected": depth_expected,
-            "depth_median": depth_median,
-            "depth_first": depth_first,
-            "normal": normal,
-            "normal_median": normal_median,
-            "distortion": a * m2 - m1 * m1,
-        }
-    images = {name: value.reshape(*value.shape[:-1], height, width) for name, value in flat.items()}
-    return images | {"max_weight": max_weight, "pixels": pixels}
+    options = dict(stop=stop, level=level, geometry=geometry)
+    if order == "overlap":
+        flat = blend_overlapping(chords, color, background, len(rays), **options)
+    else:
+        key = chords.t_in if order == "entry" else center_camera[chords.primitive, 2]
+        flat = blend_in_order(chords, key, color, background, len(rays), **options)
+    statistics = {name: flat.pop(name) for name in ("max_weight", "pixels")}
+    return {
+        name: value.reshape(*value.shape[:-1], height, width) for name, value in flat.items()
+    } | statistics
 
 
 @torch.no_grad()

@@ -1,0 +1,871 @@
+"""The torch twin's other primitives, ray models, orders and screen filter: closed forms, invariants, quadrature."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import brentq
+from test_reference import (
+    EXACT,
+    IMAGES,
+    assert_same,
+    axis_camera,
+    gray,
+    octahedra,
+    one_thread,  # noqa: F401 -- a fixture that acts here too
+    random_scene,
+    tensor,
+)
+
+from linprim_geo import reference, reference_blend, reference_shapes
+from linprim_geo.reference import rasterize
+
+POLYHEDRA, MODELS, ORDERS = ("octahedron", "tetrahedron"), ("exact", "affine"), ("center", "entry", "overlap")
+RUNGS = list(itertools.product(POLYHEDRA, MODELS, ORDERS))
+FINITE_DIFFERENCES = dict(eps=1e-6, rtol=1e-5, check_undefined_grad=False)
+BASIS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
+
+
+def scene(primitive, seed, count, coefficients=4, **more):
+    """`random_scene` of any primitive."""
+    parameters, camera = random_scene(seed, count, coefficients, **more)
+    g = torch.Generator().manual_seed(1000 + seed)
+    uniform = torch.rand(count, 5, generator=g, dtype=torch.float64)
+    if primitive == "tetrahedron":
+        parameters[2] = 0.5 + uniform[:, :4]
+    elif primitive == "gaussian":
+        parameters[2] = 0.1 + 0.4 * uniform[:, :3]
+        parameters[3] = 0.2 + 0.8 * uniform[:, 3]
+    return parameters, camera
+
+
+def pixel_of(result, row, column):
+    return {name: value[..., row, column] for name, value in result.items() if value.ndim > 1}
+
+
+# --- an independent program: whether a point is inside, and nothing else about the shapes ---
+
+
+class Body:
+    """One primitive as a convex function of camera space that is below 0 inside it."""
+
+    def __init__(self, primitive, center, rotation, extent):
+        self.primitive, self.center, self.rotation, self.extent = primitive, center, rotation, extent
+        if primitive == "octahedron":
+            self.vertices = (
+                np.array([s * extent[k] * rotation[:, k] for k in range(3) for s in (1, -1)]) + center
+            )
+        else:
+            self.vertices = center + extent[:, None] * (BASIS @ rotation.T)
+            self.barycentric = np.linalg.inv(np.concatenate([self.vertices, np.ones((4, 1))], 1))
+
+    def __call__(self, p):
+        if self.primitive == "octahedron":
+            return np.abs((p - self.center) @ self.rotation / self.extent).sum(-1) - 1
+        return -(np.concatenate([p, np.ones_like(p[..., :1])], -1) @ self.barycentric).min(-1)
+
+    def outward(self, p):
+        """Gradient of the linear piece that holds at p, normalised."""
+        if self.primitive == "octahedron":
+            slope = np.sign((p - self.center) @ self.rotation) / self.extent @ self.rotation.T
+        else:
+            value = np.concatenate([p, np.ones_like(p[..., :1])], -1) @ self.barycentric
+            slope = -self.barycentric.T[value.argmin(-1), :3]
+        return slope / np.linalg.norm(slope, axis=-1, keepdims=True)
+
+
+def ray_space(p):
+    return torch.stack([p[0] / p[2], p[1] / p[2], p.norm()])
+
+
+def where(body, model, camera, pixels, k, near):
+    """The function from z-depths (P,) to points (P, 3) of the rays of `pixels` (P, 2), and the density's factor."""
+    focal = np.array([camera["fx"], camera["fy"]])
+    principal = np.array([camera["cx"], camera["cy"]])
+    length = np.linalg.norm(np.c_[(pixels - principal) / focal, np.ones(len(pixels))], axis=1)
+    center = tensor(body.center)
+    jacobian = torch.autograd.functional.jacobian(ray_space, center).numpy()
+    middle, factor = focal * body.center[:2] / body.center[2] + principal, 1.0
+    if k > 0 and (model == "affine" or (body.vertices[:, 2] > near).all()):
+        corners = (body.vertices - body.center) @ jacobian[:2].T
+        if model == "exact":
+            corners = body.vertices[:, :2] / body.vertices[:, 2:]
+        half = np.ptp(corners * focal, axis=0) / 2
+        scale = half / (half + k / 2)
+        pixels, factor = middle + scale * (pixels - middle), scale.prod()
+    xy = (pixels - principal) / focal
+    if model == "exact":
+        return (lambda t: t[:, None] * np.c_[xy, np.ones(len(xy))]), factor
+    start = ray_space(center).numpy()
+    return (lambda t: body.center + np.linalg.solve(jacobian, (np.c_[xy, t * length] - start).T).T), factor
+
+
+def interval(body, points, count, low, high):
+    """t_in and t_out (P,) in [low, high] by ternary search and bisection of a convex function; t_in > t_out: none."""
+
+    def value(t):
+        return body(points(t))
+
+    a, b = np.full(count, low), np.full(count, high)
+    for _ in range(110):
+        p, q = a + (b - a) / 3, b - (b - a) / 3
+        left = value(p) <= value(q)
+        a, b = np.where(left, a, p), np.where(left, q, b)
+    deepest = (a + b) / 2
+    ends = []
+    for end in (low, high):
+        inside, outside = deepest.copy(), np.full(count, end)
+        for _ in range(70):
+            middle = (inside + outside) / 2
+            within = value(middle) <= 0
+            inside, outside = np.where(within, middle, inside), np.where(within, outside, middle)
+        ends.append(np.where(value(np.full(count, end)) <= 0, end, (inside + outside) / 2))
+    met = value(deepest) < 0
+    return np.where(met, ends[0], np.inf), np.where(met, ends[1], -np.inf)
+
+
+def segments(chords):
+    """Neighbouring ends along one ray, and who fills the space between, by asking at its middle."""
+    ends = sorted({t for t_in, t_out in chords.values() for t in (t_in, t_out)})
+    for a, b in itertools.pairwise(ends):
+        yield a, b, [n for n, (t_in, t_out) in chords.items() if t_in < (a + b) / 2 < t_out]
+
+
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(30)
+
+
+def literal_render(
+    parameters, camera, primitive, model, order, k=0.0, near=0.01, stop=1e-3, level=0.5, far=40.0
+):
+    """Every output by the words of its definition, in numpy; overlap by Gauss-Legendre in each segment."""
+    center, quaternion, extent, density, sh, background = (p.detach().numpy() for p in parameters)
+    pose = camera["world_to_camera"].numpy()
+    turn, shift, height, width = pose[:3, :3], pose[:3, 3], camera["height"], camera["width"]
+    color = reference.primitive_color(parameters[0], parameters[4], tensor(-turn.T @ shift)).numpy()
+    center = center @ turn.T + shift
+    rotation = turn @ reference.rotation_matrix(tensor(quaternion)).numpy()
+    rows, columns = np.mgrid[:height, :width]
+    pixels = np.stack([columns, rows], -1).reshape(-1, 2) + 0.5
+    count, total = len(pixels), len(center)
+    rays = (pixels - [camera["cx"], camera["cy"]]) / [camera["fx"], camera["fy"]]
+    length = np.sqrt((rays**2).sum(1) + 1)
+
+    entry, leave, outward = {}, {}, np.zeros((total, count, 3))
+    sigma = density.copy()
+    for n in range(total):
+        if model == "affine" and center[n, 2] <= near:
+            continue
+        body = Body(primitive, center[n], rotation[n], extent[n])
+        points, factor = where(body, model, camera, pixels, k, near)
+        sigma[n] *= factor
+        low = near if model == "exact" else -far
+        entry[n], leave[n] = interval(body, points, count, low, far)
+        outward[n] = body.outward(points(np.where(np.isfinite(entry[n]), entry[n], 1.0)))
+        outward[n][entry[n] == near] = 0
+
+    out = {
+        name: np.zeros((3, count) if name in ("rgb", "normal", "normal_median") else count) for name in IMAGES
+    }
+    out |= {"max_weight": np.zeros(total), "pixels": np.zeros(total, dtype=np.int64)}
+    for p in range(count):
+        chords = {n: (entry[n][p], leave[n][p]) for n in entry if entry[n][p] < leave[n][p]}
+        left, terms, weight = 1.0, [], dict.fromkeys(chords, 0.0)
+        first = min((c[0] for c in chords.values()), default=0.0)
+        if order == "overlap":
+            out["depth_first"][p] = first
+            ended = math.inf
+            for a, b, inside in segments(chords):
+                if left < stop:
+                    ended = min(ended, a)
+                    continue
+                rate = sum(sigma[n] for n in inside) * length[p]
+                t = (a + b) / 2 + (b - a) / 2 * NODES
+                absorbed = left * np.exp(-rate * (t - a)) * WEIGHTS * (b - a) / 2  # times a rate, integrated
+                for n in inside:
+                    weight[n] += sigma[n] * length[p] * absorbed.sum()
+                terms += zip(rate * absorbed, t, strict=True)
+                after = left * math.exp(-rate * (b - a))
+                if left > level >= after:
+                    median = brentq(
+                        lambda t, a=a, x=left, r=rate: x * math.exp(-r * (t - a)) - level, a, b, xtol=1e-15
+                    )
+                    out["depth_median"][p] = median
+                    out["normal_median"][:, p] = sum(sigma[n] * outward[n, p] for n in inside) / (
+                        rate / length[p]
+                    )
+                left = after
+            hits = [n for n in chords if chords[n][0] < ended]
+        else:
+            hits = []
+            keys = {n: chords[n][0] if order == "entry" else center[n, 2] for n in chords}
+            for n in sorted(chords, key=lambda n: (keys[n], n)):
+                if left < stop:
+                    break
+                a, b = chords[n]
+                rate = sigma[n] * length[p]
+                after = left * math.exp(-rate * (b - a))
+                weight[n] = left - after
+                terms.append((weight[n], a + 1 / rate - (b - a) * after / weight[n]))
+                if not hits:
+                    out["depth_first"][p] = a
+                if left > level >= after:
+                    out["depth_median"][p] = a + math.log(left / level) / rate
+                    out["normal_median"][:, p] = outward[n, p]
+                left = after
+                hits.append(n)
+        for n in hits:
+            out["pixels"][n] += 1
+            out["max_weight"][n] = max(out["max_weight"][n], weight[n])
+        out["rgb"][:, p] = sum((weight[n] * color[n] for n in chords), left * background)
+        out["normal"][:, p] = sum((weight[n] * outward[n, p] for n in chords), np.zeros(3))
+        out["opacity"][p] = 1 - left
+        w, z = np.array(terms).T if terms else np.zeros((2, 0))
+        out["depth_expected"][p] = w @ z
+        out["distortion"][p] = w.sum() * (w @ (z - first) ** 2) - (w @ (z - first)) ** 2
+    for name in IMAGES:
+        out[name] = out[name].reshape(*out[name].shape[:-1], height, width)
+    return {name: torch.from_numpy(value) for name, value in out.items()}
+
+
+@pytest.mark.parametrize(
+    "more",
+    [{}, {"depth": 1.2, "near": 0.3, "fx": 6.0, "fy": 7.0, "level": 0.8}, {"stop": 0.3, "level": 0.4}],
+    ids=("far", "near", "stop"),
+)
+@pytest.mark.parametrize("k", [0.0, 0.7])
+@pytest.mark.parametrize("primitive,model,order", RUNGS)
+def test_equals_a_program_that_only_asks_whether_points_are_inside(primitive, model, order, k, more):
+    seed = 40 + RUNGS.index((primitive, model, order))
+    parameters, camera = scene(primitive, seed, 9, width=7, height=6, **more)
+    definition = {name: camera[name] for name in ("near", "stop", "level") if name in camera}
+    result = rasterize(
+        *parameters, **camera, primitive=primitive, ray_model=model, order=order, screen_filter=k
+    )
+    expected = literal_render(parameters, camera, primitive, model, order, k, **definition)
+    assert (expected["pixels"] > 0).sum() >= 3 and (expected["depth_median"] != 0).any()
+    # The search stops at 1e-15 of 40 times a slope of up to 1e2 where a ray grazes.
+    assert_same(result, expected, rtol=1e-9, atol=1e-10)
+
+
+# --- tetrahedra ---
+
+
+def moeller_trumbore(ray, a, b, c):
+    """Depth at which the ray from the origin meets the triangle, or None."""
+    e1, e2 = b - a, c - a
+    h = np.cross(ray, e2)
+    det = e1 @ h
+    u, k = -(a @ h) / det, np.cross(-a, e1)
+    v = (ray @ k) / det
+    return (e2 @ k) / det if u >= 0 and v >= 0 and u + v <= 1 else None
+
+
+def test_tetrahedron_is_its_four_triangles():
+    quaternion, extent = [0.9, 0.3, -0.2, 0.4], [0.7, 1.4, 0.9, 1.1]
+    parameters = [
+        tensor(x) for x in ([[0.2, -0.1, 4.0]], [quaternion], [extent], [0.8], [gray(1.0)], [0.0] * 3)
+    ]
+    camera = axis_camera(24, 24, 26.0)
+    result = rasterize(*parameters, **camera, primitive="tetrahedron", stop=0.0)
+    turn = reference.rotation_matrix(tensor(quaternion)).numpy()
+    vertices = np.array([0.2, -0.1, 4.0]) + np.array(extent)[:, None] * (BASIS @ turn.T)
+    met = 0
+    for i, j in itertools.product(range(24), range(24)):
+        ray = np.array([(j - 11.5) / 26, (i - 11.5) / 26, 1.0])
+        t = [moeller_trumbore(ray, *vertices[list(f)]) for f in itertools.combinations(range(4), 3)]
+        t = [x for x in t if x is not None]
+        chord = max(t) - min(t) if t else 0.0
+        opacity = result["opacity"][i, j].item()
+        assert opacity == pytest.approx(-math.expm1(-0.8 * np.linalg.norm(ray) * chord), rel=1e-10, abs=1e-13)
+        if len(t) == 2:
+            met += 1
+            assert result["depth_first"][i, j].item() == pytest.approx(min(t), rel=1e-12)
+    assert 50 < met < 400
+
+
+def test_tetrahedron_on_the_axis():
+    # Turned so that b_0 is the axis: vertex 0 nearest at z - d, the face behind it at z + d/3.
+    b = BASIS[0]
+    axis = np.cross(b, [0, 0, -1])
+    angle = math.acos(-b[2])
+    axis = axis / np.linalg.norm(axis) * math.sin(angle / 2)
+    parameters = [
+        tensor(x)
+        for x in (
+            [[0.0, 0, 5]],
+            [[math.cos(angle / 2), *axis]],
+            [[0.6] * 4],
+            [0.9],
+            [gray(1.0)],
+            [0.0] * 3,
+        )
+    ]
+    parameters[0][0, :2] = tensor([1e-7, 2e-7])  # off the vertex, so that one face is entered and not three
+    for model in MODELS:
+        pixel = pixel_of(
+            rasterize(*parameters, **axis_camera(), primitive="tetrahedron", ray_model=model), 4, 4
+        )
+        assert pixel["depth_first"].item() == pytest.approx(5 - 0.6, abs=1e-5)
+        assert pixel["opacity"].item() == pytest.approx(-math.expm1(-0.9 * 0.8), abs=1e-5)
+        assert (pixel["normal"] / pixel["opacity"])[2].item() == pytest.approx(-1 / 3, abs=1e-6)
+
+
+def cut_tetrahedron():
+    """A regular tetrahedron, and the octahedron and the four tetrahedra that planes through its edges' middles cut it into."""
+    d, density = 1.2, 0.7
+    center, turn = np.array([0.1, -0.2, 4.0]), [0.8, 0.1, 0.5, -0.3]
+    vertices = d * BASIS @ reference.rotation_matrix(tensor(turn)).numpy().T
+
+    def shape(kind, centers, size):
+        n, columns = len(centers), 3 if kind == "octahedron" else 4
+        return [
+            tensor(x) for x in (centers, [turn] * n, [[size] * columns] * n, [density] * n, [gray(0.8)] * n)
+        ]
+
+    whole = shape("tetrahedron", center[None], d)
+    middle = shape("octahedron", center[None], d / math.sqrt(3))
+    corners = shape("tetrahedron", center + vertices / 2, d / 2)
+    return whole, middle, corners
+
+
+def test_thickness_of_a_tetrahedron_is_that_of_the_pieces_it_is_cut_into():
+    whole, middle, corners = cut_tetrahedron()
+    camera, background = axis_camera(20, 20, 24.0), torch.zeros(3, dtype=torch.float64)
+    tau = [
+        -torch.log1p(-rasterize(*x, background, **camera, primitive=kind, stop=0.0)["opacity"])
+        for x, kind in ((whole, "tetrahedron"), (middle, "octahedron"), (corners, "tetrahedron"))
+    ]
+    assert (tau[0] > 0).sum() > 50 and (tau[1] > 0).sum() > 20 and (tau[2] > 0).sum() > 50
+    torch.testing.assert_close(tau[0], tau[1] + tau[2], rtol=1e-10, atol=1e-12)
+
+
+def test_overlap_does_not_see_a_cut():
+    whole, middle, corners = cut_tetrahedron()
+    camera, background = axis_camera(20, 20, 24.0), tensor([0.1, 0.2, 0.3])
+    want = rasterize(*whole, background, **camera, primitive="tetrahedron", order="overlap", stop=0.0)
+    rays = reference.pixel_rays(20, 20, 24.0, 24.0, 10.0, 10.0, background)
+    options = dict(ray_model="exact", screen_filter=0.0, focal=(24.0, 24.0), near=0.01)
+    parts = [
+        reference_shapes.polyhedron_chords(
+            x[0], reference.rotation_matrix(x[1]), x[2], x[3], rays, primitive=kind, **options
+        )
+        for x, kind in ((middle, "octahedron"), (corners, "tetrahedron"))
+    ]
+    chords = reference_shapes.Chords(
+        *[
+            torch.cat([getattr(c, name) + (name == "primitive") * k for k, c in enumerate(parts)], -1)
+            for name in ("pixel", "primitive", "t_in", "t_out", "rate", "tau", "normal")
+        ]
+    )
+    got = reference_blend.blend_overlapping(
+        chords,
+        torch.full((5, 3), 0.8, dtype=torch.float64),
+        background,
+        400,
+        stop=0.0,
+        level=0.5,
+        geometry=True,
+    )
+    for name in ("rgb", "opacity", "depth_expected", "depth_first", "depth_median", "distortion"):
+        torch.testing.assert_close(got[name].reshape(want[name].shape), want[name], rtol=1e-9, atol=1e-11)
+    assert (want["depth_median"] > 0).any() and want["distortion"].max() > 0.01
+
+
+def test_primitive_without_size_is_not_drawn():
+    parameters, camera = scene("tetrahedron", 60, 3)
+    for order in ORDERS:
+        alone = rasterize(
+            *[p[::2] for p in parameters[:5]], parameters[5], **camera, primitive="tetrahedron", order=order
+        )
+        flat = [p.clone() for p in parameters]
+        for size in (0.0, -0.4):
+            flat[2][1, 3] = size
+            leaves = [p.requires_grad_() for p in flat]
+            result = rasterize(*leaves, **camera, primitive="tetrahedron", order=order)
+            assert_same(alone, result, IMAGES, rtol=0, atol=0)
+            assert result["pixels"][1] == 0
+            assert all(g.isfinite().all() for g in torch.autograd.grad(result["rgb"].sum(), leaves))
+            flat = [p.detach() for p in leaves]
+
+
+# --- orders ---
+
+
+@pytest.mark.parametrize("primitive,model", list(itertools.product(POLYHEDRA, MODELS)))
+def test_orders_agree_where_nothing_overlaps(primitive, model):
+    parameters, camera = scene(primitive, 61, 6, width=9, height=8)
+    turn, shift = camera["world_to_camera"][:3, :3], camera["world_to_camera"][:3, 3]
+    spaced = 0.3 * torch.randn(6, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    spaced[:, 2] = 3.0 + 3.2 * torch.arange(6)  # extents are below 1.5
+    parameters[0] = (spaced - shift) @ turn
+    parameters[2], parameters[3] = 0.8 * parameters[2] + 0.2, 0.4 * parameters[3]
+    a, b, c = (
+        rasterize(*parameters, **camera, primitive=primitive, ray_model=model, order=order)
+        for order in ORDERS
+    )
+    assert (a["pixels"] > 0).sum() >= 5 and (a["depth_median"] > 0).any()
+    assert_same(a, b, rtol=0, atol=0)
+    # Only the distortion of overlap counts the spread inside a primitive.
+    assert_same(a, c, [name for name in a if name != "distortion"], rtol=1e-10, atol=1e-12)
+    assert (c["distortion"] >= a["distortion"] - 1e-13).all() and (
+        c["distortion"] > a["distortion"] + 1e-4
+    ).any()
+
+
+def nested(order, **more):
+    """On the axis a big one fills 2 to 8 and a small one, whose centre is nearer, 3.5 to 4.5."""
+    parameters = octahedra(
+        [[0, 0, 5], [0, 0, 4]], [[1, 1, 3], [1, 1, 0.5]], [0.2, 0.9], color=[0.3, 0.9], background=(0.5,) * 3
+    )
+    result = rasterize(*parameters, **axis_camera(1, 1), order=order, **more)
+    return pixel_of(result, 0, 0) | {name: result[name] for name in ("max_weight", "pixels")}
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_nested_primitives_in_the_three_orders(model):
+    big, small = -math.expm1(-1.2), -math.expm1(-0.9)
+    end = math.exp(-2.1)
+    by_center, by_entry, overlap = (nested(order, ray_model=model) for order in ORDERS)
+    want = 0.9 * small + 0.3 * (1 - small) * big + 0.5 * end
+    assert by_center["rgb"][0].item() == pytest.approx(want, rel=1e-13)
+    assert by_center["depth_first"].item() == pytest.approx(3.5, rel=1e-14)
+    want = 0.3 * big + 0.9 * (1 - big) * small + 0.5 * end
+    assert by_entry["rgb"][0].item() == pytest.approx(want, rel=1e-13)
+    assert by_entry["depth_first"].item() == pytest.approx(2, rel=1e-14)
+    # 2 to 3.5 at 0.2, 3.5 to 4.5 at 1.1, 4.5 to 8 at 0.2
+    parts = [-math.expm1(-0.3), math.exp(-0.3) * -math.expm1(-1.1), math.exp(-1.4) * -math.expm1(-0.7)]
+    assert overlap["max_weight"].tolist() == pytest.approx(
+        [parts[0] + parts[1] * 0.2 / 1.1 + parts[2], parts[1] * 0.9 / 1.1], rel=1e-13
+    )
+    assert overlap["rgb"][0].item() == pytest.approx(
+        0.3 * overlap["max_weight"][0].item() + 0.9 * overlap["max_weight"][1].item() + 0.5 * end, rel=1e-13
+    )
+    assert overlap["opacity"].item() == pytest.approx(1 - end, rel=1e-13)
+    assert overlap["depth_first"].item() == pytest.approx(2, rel=1e-14)
+    assert overlap["depth_median"].item() == pytest.approx(3.5 + (math.log(2) - 0.3) / 1.1, rel=1e-13)
+    means = [
+        a + 1 / rate - (b - a) / math.expm1(rate * (b - a))
+        for a, b, rate in ((2, 3.5, 0.2), (3.5, 4.5, 1.1), (4.5, 8, 0.2))
+    ]
+    assert overlap["depth_expected"].item() == pytest.approx(np.dot(parts, means), rel=1e-12)
+
+
+def test_overlap_ends_at_the_first_event_below_stop():
+    # 4 to 6 and 5 to 9, each with a rate of 1; T at the events 4, 5, 6, 9 is 1, e^-1, e^-3, e^-6.
+    parameters = octahedra([[0, 0, 5], [0, 0, 7]], [[1, 1, 1], [1, 1, 2]], [1.0, 1.0])
+    for stop, thickness, pixels in (
+        (0.0, 6, [1, 1]),
+        (math.exp(-3.01), 6, [1, 1]),
+        (math.exp(-2.99), 3, [1, 1]),  # below it at 5.99, but a segment is not cut
+        (math.exp(-1.01), 3, [1, 1]),
+        (math.exp(-0.99), 1, [1, 0]),  # the second begins where the ray ends
+        (1.0, 1, [1, 0]),
+    ):
+        result = rasterize(*parameters, **axis_camera(1, 1), order="overlap", stop=stop, level=math.exp(-1.6))
+        assert (result["depth_median"] > 0).item() == (thickness > 1)  # not where the ray has ended
+        assert result["opacity"].item() == pytest.approx(-math.expm1(-thickness), rel=1e-13)
+        assert result["pixels"].tolist() == pixels
+        assert (result["max_weight"] > 0).tolist() == [bool(n) for n in pixels]
+
+
+def test_distortion_of_one_primitive_under_overlap():
+    # Thin: uniform over the chord, so A^2 L^2 / 12. Thick: exponential, so 1 / density^2.
+    for extent, density, want in ((0.7, 1e-5, (1.4e-5 * 1.4) ** 2 / 12), (3.0, 20.0, 1 / 400)):
+        parameters = octahedra([[0, 0, 5]], [[1, 1, extent]], [density])
+        value = rasterize(*parameters, **axis_camera(1, 1), order="overlap")["distortion"].item()
+        assert value == pytest.approx(want, rel=2e-5)
+
+
+@pytest.mark.parametrize("primitive,model", list(itertools.product(POLYHEDRA, MODELS)))
+def test_coincident_copies_share_the_density_under_overlap(primitive, model):
+    parameters, camera = scene(primitive, 62, 4, width=9, height=8)
+    options = dict(primitive=primitive, ray_model=model, order="overlap", screen_filter=0.4)
+    before = rasterize(*parameters, **camera, **options)
+    copies = [p.repeat(3, *[1] * (p.ndim - 1)).requires_grad_() for p in parameters[:5]]
+    split = [*copies[:3], copies[3] / 3, copies[4], parameters[5]]
+    after = rasterize(*split, **camera, **options)
+    assert_same(before, after, IMAGES, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(after["max_weight"], before["max_weight"].repeat(3) / 3, **EXACT)
+    assert (after["pixels"] == before["pixels"].repeat(3)).all() and (before["pixels"] > 0).all()
+    # Ends that coincide are no kink of a picture: no copy is worth more than another.
+    weights = torch.rand(3, 8, 9, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    for grad in torch.autograd.grad((after["rgb"] * weights).sum(), copies):
+        torch.testing.assert_close(grad[:4], grad[4:8], rtol=1e-9, atol=1e-12)
+        torch.testing.assert_close(grad[:4], grad[8:], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("order", ["entry", "overlap"])
+def test_order_of_the_list_does_not_matter_to_rays(order):
+    parameters, camera = scene("tetrahedron", 63, 8, width=9, height=8, stop=0.2)
+    shuffle = torch.tensor([3, 1, 7, 0, 5, 2, 6, 4])
+    before = rasterize(*parameters, **camera, primitive="tetrahedron", order=order)
+    after = rasterize(
+        *[p[shuffle] for p in parameters[:5]], parameters[5], **camera, primitive="tetrahedron", order=order
+    )
+    assert_same(before, after, IMAGES)
+    assert (after["pixels"] == before["pixels"][shuffle]).all()
+
+
+def test_ties_of_entry_are_by_index():
+    # Both are cut by the near plane, so both begin at it; the centres say the opposite.
+    parameters = octahedra(
+        [[0, 0, 0.4], [0, 0, 0.3], [0, 0, 3]], [[1, 1, 1]] * 3, [0.5, 0.7, 0.3], color=[0.1, 0.5, 0.9]
+    )
+    pixel = rasterize(*parameters, **axis_camera(1, 1, near=0.1), order="entry")["rgb"][0, 0, 0].item()
+    a, b, c = math.exp(-0.5 * 1.3), math.exp(-0.7 * 1.2), math.exp(-0.6)
+    assert pixel == pytest.approx(0.1 * (1 - a) + 0.5 * a * (1 - b) + 0.9 * a * b * (1 - c), rel=1e-13)
+
+
+@pytest.mark.parametrize("block", [1, 200])
+def test_blocks_of_rays_do_not_show(block, monkeypatch):
+    parameters, camera = scene("octahedron", 64, 10, width=9, height=8)
+    whole = rasterize(*parameters, **camera, order="overlap")
+    monkeypatch.setattr(reference_blend, "BLOCK", block)
+    assert_same(whole, rasterize(*parameters, **camera, order="overlap"), rtol=1e-13, atol=1e-14)
+
+
+def test_depth_variance_and_mean_transmittance():
+    mpmath = pytest.importorskip("mpmath")
+    with mpmath.workdps(60):
+        for tau in (1e-9, 1e-3, 0.1, 0.2499, 0.25, 0.3, 1.0, 5.0, 40.0, 1e3):
+            x = mpmath.mpf(tau)
+            variance = float(1 / x**2 - mpmath.exp(-x) / mpmath.expm1(-x) ** 2)
+            assert reference_blend.depth_variance_fraction(tensor(tau)).item() == pytest.approx(
+                variance, rel=4.5e-14
+            )
+            mean = float(-mpmath.expm1(-x) / x)
+            assert reference_blend.mean_transmittance(tensor(tau)).item() == pytest.approx(mean, rel=2e-15)
+    assert reference_blend.depth_variance_fraction(tensor(0.0)).item() == pytest.approx(1 / 12, rel=1e-15)
+    assert reference_blend.mean_transmittance(tensor(0.0)).item() == 1
+    tau = torch.logspace(-8, 2, 41, dtype=torch.float64).requires_grad_()
+    for f in (reference_blend.depth_variance_fraction, reference_blend.mean_transmittance):
+        assert torch.autograd.gradcheck(f, tau, eps=1e-9, atol=1e-6)
+
+
+# --- affine rays ---
+
+
+@pytest.mark.parametrize("primitive", POLYHEDRA)
+def test_affine_rays_become_exact_with_the_square_of_the_size(primitive):
+    g = torch.Generator().manual_seed(7)
+    center = tensor([[0.9, -0.6, 2.0]])
+    rotation = torch.randn(1, 4, generator=g, dtype=torch.float64)
+    extent = 0.4 + torch.rand(1, 4 if primitive == "tetrahedron" else 3, generator=g, dtype=torch.float64)
+    errors = []
+    for size in (0.04, 0.02, 0.01, 0.005):
+        # The same picture at every size; thickness, and depth less the centre's, shrink with it.
+        focal = 8.0 / size
+        camera = axis_camera(15, 15, focal) | dict(cx=7.5 - focal * 0.45, cy=7.5 + focal * 0.3)
+        parameters = [center, rotation, size * extent, tensor([1.0]), tensor([gray(1.0)]), tensor([0.0] * 3)]
+        exact, affine = (rasterize(*parameters, **camera, primitive=primitive, ray_model=m) for m in MODELS)
+        both = (exact["opacity"] > 0) & (affine["opacity"] > 0)
+        assert both.sum() > 20
+        errors.append(
+            [
+                (torch.log1p(-exact["opacity"]) - torch.log1p(-affine["opacity"])).abs().max().item(),
+                (exact["depth_first"] - affine["depth_first"])[both].abs().max().item(),
+            ]
+        )
+    errors = np.array(errors)
+    assert (errors > 1e-7).all()
+    order = np.log2(errors[:-1] / errors[1:])
+    assert (abs(order[-1] - 2) < 0.15).all(), order
+
+
+def test_affine_needs_the_centre_beyond_the_near_plane_and_knows_no_other():
+    parameters = octahedra([[0, 0, 0.5]], [[1, 1, 1]], [0.8])
+    inside = pixel_of(rasterize(*parameters, **axis_camera(near=0.4), ray_model="affine"), 4, 4)
+    assert inside["opacity"].item() == pytest.approx(-math.expm1(-1.6), rel=1e-14)
+    assert inside["depth_first"].item() == pytest.approx(-0.5, rel=1e-14)
+    for near in (0.5, 0.6):
+        leaves = [p.clone().requires_grad_() for p in parameters]
+        result = rasterize(*leaves, **axis_camera(near=near), ray_model="affine")
+        assert result["opacity"].max() == 0 and result["pixels"].item() == 0
+        assert torch.autograd.grad(result["rgb"].sum(), leaves[5])[0].tolist() == [81.0] * 3
+
+
+# --- screen filter ---
+
+
+def total_thickness(parameters, camera, **options):
+    return -torch.log1p(-rasterize(*parameters, **camera, stop=0.0, **options)["opacity"]).sum().item()
+
+
+@pytest.mark.parametrize("primitive,model", list(itertools.product(POLYHEDRA, MODELS)))
+def test_screen_filter_keeps_the_thickness_of_the_screen(primitive, model):
+    # Small, so that |v| hardly changes over it: exact thickness carries the |v| of the true pixel.
+    extent = [0.003, 0.004, 0.002] if primitive == "octahedron" else [0.003, 0.004, 0.002, 0.005]
+    parameters = [
+        tensor(x)
+        for x in ([[0.1, 0.2, 2.0]], [[0.9, 0.2, -0.4, 0.1]], [extent], [3.0], [gray(1.0)], [0.0] * 3)
+    ]
+    focal = 4e4
+    camera = axis_camera(300, 300, focal) | dict(cx=150.2 - focal * 0.05, cy=149.7 - focal * 0.1)
+    plain = total_thickness(parameters, camera, primitive=primitive, ray_model=model)
+    filtered = total_thickness(parameters, camera, primitive=primitive, ray_model=model, screen_filter=90.0)
+    options = dict(primitive=primitive, ray_model=model)
+    wide, narrow = (
+        [
+            np.ptp(
+                np.nonzero(rasterize(*parameters, **camera, **options, screen_filter=k)["opacity"].numpy())[
+                    axis
+                ]
+            )
+            for axis in (0, 1)
+        ]
+        for k in (90.0, 0.0)
+    )
+    # Riemann sums of continuous functions over 5e3 pixels or more.
+    assert filtered == pytest.approx(plain, rel=2e-3)
+    for a, b in zip(wide, narrow, strict=True):
+        assert a - b == pytest.approx(90, abs=2)  # pixels at either end; the corners are sharp
+        assert b > 60
+
+
+def test_screen_filter_on_the_axis():
+    parameters = octahedra([[0, 0, 5]], [[1.0, 0.5, 0.7]], [0.9])
+    k = 0.8
+    for model in MODELS:
+        pixel = pixel_of(rasterize(*parameters, **axis_camera(), ray_model=model, screen_filter=k), 4, 4)
+        sx, sy = (
+            8 * 1.0 / 5,
+            8 * 0.5 / 5,
+        )  # half width and height in px; the near and far vertex are on the axis
+        sx, sy = sx / (sx + k / 2), sy / (sy + k / 2)
+        assert pixel["opacity"].item() == pytest.approx(-math.expm1(-0.9 * sx * sy * 1.4), rel=1e-13)
+        assert pixel["depth_first"].item() == pytest.approx(4.3, rel=1e-14)
+        # Off the axis: as a lens of focal lengths f / s sees it.
+        camera = axis_camera()
+        wide = rasterize(*parameters, **camera | dict(fx=8 / sx, fy=8 / sy), ray_model="exact")
+        narrow = rasterize(*parameters, **camera, ray_model="exact", screen_filter=k)
+        assert (wide["depth_first"] > 0).sum() >= 5
+        torch.testing.assert_close(narrow["depth_first"], wide["depth_first"], **EXACT)
+
+
+def test_screen_filter_spares_what_crosses_the_near_plane():
+    parameters = octahedra([[0.1, 0, 1.0]], [[0.5, 0.5, 0.8]], [0.9])
+    for near, same in ((0.21, True), (0.19, False)):
+        a, b = (rasterize(*parameters, **axis_camera(near=near), screen_filter=k) for k in (0.0, 3.0))
+        assert torch.equal(a["opacity"], b["opacity"]) == same
+
+
+# --- Gaussians ---
+
+
+def literal_gaussians(parameters, camera, blur=0.0, near=0.01, stop=1e-3, level=0.5):
+    """rgb, depths, normal and distortion of Gaussians by 3DGS's formula, in numpy scalars."""
+    center, quaternion, extent, opacity, sh, background = (p.detach().numpy() for p in parameters)
+    pose = camera["world_to_camera"].numpy()
+    w, shift = pose[:3, :3], pose[:3, 3]
+    fx, fy, cx, cy, width, height = (camera[k] for k in ("fx", "fy", "cx", "cy", "width", "height"))
+    color = reference.primitive_color(parameters[0], parameters[4], tensor(-w.T @ shift)).numpy()
+    out = {
+        name: np.zeros((3, height, width) if name in ("rgb", "normal", "normal_median") else (height, width))
+        for name in IMAGES
+    }
+    out |= {"max_weight": np.zeros(len(center)), "pixels": np.zeros(len(center), dtype=np.int64)}
+    local = center @ w.T + shift
+    for i, j in itertools.product(range(height), range(width)):
+        left, terms = 1.0, []
+        for n in sorted(range(len(center)), key=lambda n: (local[n, 2], n)):
+            x, y, z = local[n]
+            if z <= near or left < stop:
+                continue
+            r = reference.rotation_matrix(tensor(quaternion[n])).numpy()
+            jacobian = np.array([[fx / z, 0, -fx * x / z**2], [0, fy / z, -fy * y / z**2]])
+            cov = jacobian @ w @ r @ np.diag(extent[n] ** 2) @ r.T @ w.T @ jacobian.T + blur * np.eye(2)
+            d = np.array([j + 0.5, i + 0.5]) - [fx * x / z + cx, fy * y / z + cy]
+            alpha = min(0.99, opacity[n] * math.exp(-0.5 * d @ np.linalg.inv(cov) @ d))
+            if alpha < 1 / 255:
+                continue
+            axis = (w @ r)[:, np.argmin(extent[n])]
+            axis = -axis if axis @ local[n] > 0 else axis
+            weight, after = left * alpha, left * (1 - alpha)
+            if not terms:
+                out["depth_first"][i, j] = z
+            if left > level >= after:
+                out["depth_median"][i, j], out["normal_median"][:, i, j] = z, axis
+            out["rgb"][:, i, j] += weight * color[n]
+            out["normal"][:, i, j] += weight * axis
+            out["depth_expected"][i, j] += weight * z
+            out["max_weight"][n] = max(out["max_weight"][n], weight)
+            out["pixels"][n] += 1
+            terms.append((weight, z))
+            left = after
+        out["rgb"][:, i, j] += left * background
+        out["opacity"][i, j] = 1 - left
+        out["distortion"][i, j] = 0.5 * sum(a * b * (y - z) ** 2 for a, y in terms for b, z in terms)
+    return {name: torch.from_numpy(value) for name, value in out.items()}
+
+
+@pytest.mark.parametrize(
+    "count,blur,more", [(1, 0.0, {}), (2, 0.3, {}), (12, 0.3, {"stop": 0.2}), (12, 0.0, {"depth": 1.0})]
+)
+def test_gaussians_equal_the_splatting_formula(count, blur, more):
+    parameters, camera = scene("gaussian", 70 + count, count, 9, width=9, height=8, **more)
+    definition = {name: camera[name] for name in ("stop",) if name in camera}
+    expected = literal_gaussians(parameters, camera, blur, **definition)
+    assert expected["opacity"].max() > 0.2 and (expected["pixels"] > 0).sum() > count / 2
+    for model in MODELS:
+        result = rasterize(*parameters, **camera, primitive="gaussian", ray_model=model, screen_filter=blur)
+        assert_same(result, expected, rtol=1e-10, atol=1e-12)
+
+
+def one_gaussian(extent, opacity=0.8, z=4.0, **more):
+    parameters = octahedra([[0, 0, z]], [extent], [opacity])
+    return rasterize(
+        *parameters, **axis_camera(**more), primitive="gaussian", screen_filter=more.pop("k", 0.0)
+    )
+
+
+def test_gaussian_on_the_axis_cap_and_floor():
+    result = one_gaussian([0.5, 0.25, 0.1])  # 1 px and 0.5 px
+    assert result["opacity"][4, 4].item() == pytest.approx(0.8, rel=1e-14)
+    assert result["opacity"][4, 5].item() == pytest.approx(0.8 * math.exp(-0.5), rel=1e-13)
+    assert result["opacity"][5, 4].item() == pytest.approx(0.8 * math.exp(-2), rel=1e-13)
+    assert result["opacity"][4, 7].item() == pytest.approx(0.8 * math.exp(-4.5), rel=1e-13)  # 0.0089
+    assert result["opacity"][4, 8].item() == 0  # 0.00027 < 1 / 255
+    assert result["normal"][:, 4, 4].tolist() == pytest.approx([0, 0, -0.8], abs=1e-15)
+    assert result["depth_median"][4, 4] == 4 and result["depth_first"][4, 7] == 4
+    assert one_gaussian([0.5, 0.25, 0.1], 1.0)["opacity"][4, 4].item() == pytest.approx(0.99, rel=1e-14)
+    for opacity, drawn in ((1.001 / 255, 1), (0.999 / 255, 0)):
+        assert one_gaussian([0.5, 0.5, 0.5], opacity)["pixels"].item() == drawn
+    for z, drawn in ((0.011, True), (0.01, False)):
+        assert (one_gaussian([0.5, 0.5, 0.5], 0.8, z)["pixels"].item() > 0) == drawn
+
+
+def test_flat_gaussians():
+    assert one_gaussian([0.5, 0.5, 0.0])["opacity"][4, 4].item() == pytest.approx(0.8, rel=1e-14)  # face on
+    for extent in ([0.5, 0.0, 0.5], [0.0, 0.0, 0.0]):  # edge on, and a point: nothing without a filter
+        parameters = [p.requires_grad_() for p in octahedra([[0, 0, 4]], [extent], [0.8])]
+        for blur, drawn in ((0.0, False), (0.3, True)):
+            result = rasterize(*parameters, **axis_camera(), primitive="gaussian", screen_filter=blur)
+            assert (result["pixels"].item() > 0) == drawn
+            for name in IMAGES:
+                if result[name].requires_grad:
+                    grads = torch.autograd.grad(
+                        result[name].sum(), parameters, retain_graph=True, allow_unused=True
+                    )
+                    assert all(g is None or g.isfinite().all() for g in grads)
+    # Ratios of standard deviations on either side of 1e-6, in float32 too.
+    for dtype in (torch.float64, torch.float32):
+        for ratio, drawn in ((1.01e-6, True), (0.99e-6, False)):
+            parameters = [p.to(dtype) for p in octahedra([[0, 0, 4]], [[0.5, 0.5 * ratio, 0.5]], [0.8])]
+            result = rasterize(*parameters, **axis_camera(), primitive="gaussian")
+            assert (result["pixels"].item() > 0) == drawn
+
+
+def test_normal_of_equal_extents_is_the_first_axis_towards_the_camera():
+    result = one_gaussian([0.2, 0.2, 0.3])
+    assert result["normal"][:, 4, 4].tolist() == pytest.approx([0.8, 0, 0], abs=1e-15)
+    parameters = octahedra([[1.0, 0, 4]], [[0.2, 0.2, 0.2]], [0.8])
+    result = rasterize(*parameters, **axis_camera(), primitive="gaussian")
+    assert result["normal_median"][:, 4, 6].tolist() == pytest.approx([-1, 0, 0], abs=1e-15)
+
+
+# --- gradients, precision, arguments ---
+
+
+@pytest.mark.parametrize("k", [0.0, 0.6])
+@pytest.mark.parametrize("primitive,model,order", [*RUNGS, ("gaussian", "affine", "center")])
+def test_gradients_along_random_directions(primitive, model, order, k):
+    seed = 80 + len(model) + len(order)
+    for more in ({}, {"stop": 0.35, "level": 0.6, "depth": 1.2}):
+        parameters, camera = scene(primitive, seed, 6, **more)
+        pose = camera.pop("world_to_camera")
+        inputs = [p.requires_grad_() for p in (*parameters, pose)]
+        options = dict(primitive=primitive, ray_model=model, order=order, screen_filter=k)
+
+        def run(*inputs, camera=camera, options=options):
+            result = rasterize(*inputs[:6], world_to_camera=inputs[6], **camera, **options)
+            return tuple(result[name] for name in IMAGES)
+
+        assert all((image != 0).any() for image in run(*inputs))
+        assert torch.autograd.gradcheck(run, inputs, **FINITE_DIFFERENCES, atol=1e-5, fast_mode=True)
+
+
+@pytest.mark.parametrize("primitive", POLYHEDRA)
+def test_every_gradient_of_overlap_with_a_filter(primitive):
+    parameters, camera = scene(primitive, 90, 3, 1, width=4, height=4)
+    inputs = [p.requires_grad_() for p in parameters]
+
+    def run(*inputs):
+        result = rasterize(*inputs, **camera, primitive=primitive, order="overlap", screen_filter=0.5)
+        return tuple(result[name] for name in IMAGES)
+
+    assert torch.autograd.gradcheck(run, inputs, **FINITE_DIFFERENCES, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize(
+    "center,near", [((0, 0, 2), 0.01), ((1, 0, 2), 0.01), ((0, 0, 2), 1), ((0.5, 0, 0.5), 0.01)]
+)
+def test_gradients_are_finite_everywhere(center, near, dtype):
+    # Through vertices and edges, parallel faces, coincident copies, no density, and an opaque one.
+    for (primitive, model, order), k in itertools.product(
+        [*RUNGS, ("gaussian", "exact", "center")], (0.0, 0.5)
+    ):
+        parameters = octahedra([center, center, (0, 0, 4), (0, 0, 5)], [[1, 1, 1]] * 4, [1.0, 1.0, 0.0, 1e6])
+        if primitive == "tetrahedron":
+            parameters[2] = torch.full((4, 4), math.sqrt(3), dtype=torch.float64)
+        if primitive == "gaussian":
+            parameters[3] = tensor([0.5, 0.5, 0.1, 1.0])
+        leaves = [p.to(dtype).requires_grad_() for p in parameters]
+        options = dict(primitive=primitive, ray_model=model, order=order, screen_filter=k, stop=0.0)
+        result = rasterize(*leaves, **axis_camera(5, 5, 1.0), near=near, **options)
+        assert (result["pixels"] > 0).any() and result["opacity"].max() > 0.5
+        for name in IMAGES:
+            assert result[name].isfinite().all(), (name, options)
+        grads = torch.autograd.grad(sum(result[name].sum() for name in IMAGES), leaves)
+        assert all(g.isfinite().all() for g in grads), options
+
+
+@pytest.mark.parametrize("primitive,model,order", [*RUNGS, ("gaussian", "affine", "center")])
+def test_float32_follows_float64(primitive, model, order):
+    parameters, camera = scene(primitive, 95, 30, width=16, height=12)
+    options = dict(primitive=primitive, ray_model=model, order=order, screen_filter=0.3, stop=0.0)
+    exact = rasterize(*parameters, **camera, **options)
+    single = rasterize(*[p.float() for p in parameters], **camera, **options)
+    assert all(value.dtype == torch.float32 for name, value in single.items() if name != "pixels")
+    for name in ("rgb", "opacity", "depth_expected", "distortion"):
+        assert (single[name] - exact[name]).abs().max() < 5e-5 * max(1.0, exact[name].abs().max().item())
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_no_primitives_and_no_hits(order):
+    parameters, camera = scene("tetrahedron", 96, 2)
+    background = parameters[5]
+    parameters[0] = parameters[0] + 100
+    for some in (parameters[:5], [p[:0] for p in parameters[:5]]):
+        result = rasterize(*some, background, **camera, primitive="tetrahedron", order=order)
+        assert (result["rgb"] == background[:, None, None]).all()
+        assert all((result[name] == 0).all() for name in (*IMAGES[1:], "max_weight", "pixels"))
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_without_geometry_the_picture_is_the_same(order):
+    parameters, camera = scene("tetrahedron", 97, 6)
+    options = dict(primitive="tetrahedron", order=order)
+    less = rasterize(*parameters, **camera, **options, geometry=False)
+    assert set(less) == {"rgb", "opacity", "max_weight", "pixels"}
+    assert_same(rasterize(*parameters, **camera, **options), less, set(less), rtol=0, atol=0)
+
+
+def test_rejects_what_it_does_not_know():
+    parameters, camera = scene("octahedron", 98, 2)
+    for options, message in (
+        ({"primitive": "gaussian", "order": "entry"}, "no entry"),
+        ({"primitive": "gaussian", "order": "overlap"}, "no entry"),
+        ({"primitive": "cube"}, "primitive is 'cube'"),
+        ({"ray_model": "straight"}, "ray_model is 'straight'"),
+        ({"order": "random"}, "order is 'random'"),
+        ({"primitive": "tetrahedron"}, "3 columns"),
+        ({"screen_filter": -1.0}, "screen_filter"),
+        ({"screen_filter": math.nan}, "screen_filter"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            rasterize(*parameters, **camera, **options)
