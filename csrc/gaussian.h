@@ -19,7 +19,6 @@ struct Gaussian {
   using M = Mask<Real, W>;
   using I = Index<Real, W>;
   using Record = GaussianRecord<Real>;
-  static constexpr PrimitiveKind kKind = PrimitiveKind::kGaussian;
   static constexpr int kWidth = W;
   static constexpr bool kVolume = false;
   static constexpr int kColorSums = 16, kGeometrySums = 32;
@@ -45,7 +44,7 @@ struct Gaussian {
   static void depths(const Record& r, V, const Meeting&, V& t_in, V& t_out) { t_in = t_out = V::set(r.w0); }
 
   // With g the gradient to the exponent: the sums of g dx dx, g dx dy, g dy dy, g dx, g dy at 0-4; d_tau is the gradient to -ln(1 - alpha).
-  template <class Solid, bool kGeometry>
+  template <class Solid, bool kDistance>
   static void add_gradient(const Record&, const Meeting& m, M hit, V, V through, V d_tau, V d_in, V d_out, V, V, V, V* sums) {
     const M free = hit & (m.alpha < V::set(Real(kLargestAlpha)));
     const V d_alpha = select(free, d_tau * rcp(through), V::set(0)), g = d_alpha * m.alpha;
@@ -53,7 +52,7 @@ struct Gaussian {
     sums[0] = fma(gx, m.dx, sums[0]), sums[1] = fma(gx, m.dy, sums[1]), sums[2] = fma(gy, m.dy, sums[2]);
     sums[3] = sums[3] + gx, sums[4] = sums[4] + gy;
     sums[Sum::density] = fma(d_alpha, m.falloff, sums[Sum::density]);
-    if constexpr (kGeometry) sums[Sum::distance] = sums[Sum::distance] + (d_in + d_out);
+    if constexpr (kDistance) sums[Sum::distance] = sums[Sum::distance] + (d_in + d_out);
   }
   static void recenter(const Record&, Real, Real, Real*) {}
 };

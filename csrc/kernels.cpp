@@ -7,6 +7,8 @@
 
 #include "bin.h"
 #include "blend_center.h"
+#include "blend_overlap.h"
+#include "blend_sorted.h"
 #include "gaussian_project.h"
 #include "image_kernels.h"
 #include "level_depth.h"
@@ -28,7 +30,15 @@ constexpr int kWidth = 1;
 constexpr int kWidth = 4;
 #endif
 
-inline int64_t no_scratch(Order, bool, int64_t) { return 0; }
+// Enough for the larger of the two passes.
+template <class Solid>
+int64_t scratch_bytes(Order order, bool geometry, int64_t longest_list) {
+  if (order == Order::kEntry)
+    return geometry ? Window<Solid, EntryCandidate<Solid, true, true>>::bytes(longest_list) : Window<Solid, EntryCandidate<Solid, true, false>>::bytes(longest_list);
+  if (order == Order::kOverlap)
+    return geometry ? Window<Solid, OverlapCandidate<Solid, true, true>>::bytes(longest_list) : Window<Solid, OverlapCandidate<Solid, true, false>>::bytes(longest_list);
+  return 0;
+}
 
 template <class Solid>
 constexpr SolidKernels<typename Solid::Real> solid_kernels(void (*project)(const ProjectParams<typename Solid::Real>&, int64_t, int64_t),
@@ -38,8 +48,16 @@ constexpr SolidKernels<typename Solid::Real> solid_kernels(void (*project)(const
   k.project = project, k.chain = chain;
   k.forward[0][0] = forward_center<Solid, false>, k.forward[0][1] = forward_center<Solid, true>;
   k.backward[0][0] = backward_center<Solid, false>, k.backward[0][1] = backward_center<Solid, true>;
-  k.scratch_bytes = no_scratch;
-  if constexpr (Solid::kVolume) k.level_depth = level_depth_tile<Solid>;
+  k.scratch_bytes = scratch_bytes<Solid>;
+  for (auto& sums : k.sums_per_slot) sums[0] = Solid::kColorSums, sums[1] = Solid::kGeometrySums;
+  if constexpr (Solid::kVolume) {
+    k.level_depth = level_depth_tile<Solid>;
+    k.sums_per_slot[2][0] = kOverlapSums<Solid, false>;
+    k.forward[1][0] = forward_entry<Solid, false>, k.forward[1][1] = forward_entry<Solid, true>;
+    k.backward[1][0] = backward_entry<Solid, false>, k.backward[1][1] = backward_entry<Solid, true>;
+    k.forward[2][0] = forward_overlap<Solid, false>, k.forward[2][1] = forward_overlap<Solid, true>;
+    k.backward[2][0] = backward_overlap<Solid, false>, k.backward[2][1] = backward_overlap<Solid, true>;
+  }
   return k;
 }
 

@@ -202,6 +202,7 @@ struct SolidKernels {
   Counts (*forward[kOrders][2])(const RasterParams<Real>&, int tile, void* scratch);
   void (*backward[kOrders][2])(const RasterParams<Real>&, int tile, void* scratch);
   int64_t (*scratch_bytes)(Order, bool geometry, int64_t longest_list);
+  int sums_per_slot[kOrders][2];
   // Depth at the view's transmittance level by exact overlap, into out.depth_median and out.opacity; scratch: 3 * kBlocks values per
   // pair of the tile. Null for Gaussians.
   void (*level_depth)(const RasterParams<Real>&, int tile, Real* scratch);

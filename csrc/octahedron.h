@@ -14,7 +14,6 @@ struct Octahedron : Polyhedron<RealType, W, kRays> {
   using M = typename Base::M;
   using I = typename Base::I;
   using Meeting = typename Base::Meeting;
-  static constexpr PrimitiveKind kKind = PrimitiveKind::kOctahedron;
 
   // Planes where the rays enter and leave; x and y are counted in pixels from the record's reference. kTrack: also which faces.
   template <bool kTrack>

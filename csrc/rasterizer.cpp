@@ -306,7 +306,7 @@ void rasterize_grad(const View& view, const Primitives<Real>& primitives, const 
     frame->hash = hash;
   }
   Stopwatch watch;
-  const int per_slot = geometry ? kGeometrySums : kColorSums;
+  const int per_slot = frame->solid->sums_per_slot[int(view.order)][geometry];
   frame->grow(frame->sums, frame->pair_count * per_slot), frame->grow(frame->background_sums, int64_t(frame->tiles()) * 3);
   RasterParams<Real> params = frame->raster(view, background, out);
   params.grad = grad;
