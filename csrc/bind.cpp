@@ -231,6 +231,17 @@ NB_MODULE(_core, m) {
   m.def("threads", &linprim::threads);
   m.def("set_instruction_set", [](const std::string& name) { return linprim::set_instruction_set(name.c_str()); });
   m.def("instruction_set", [] { return std::string(linprim::instruction_set()); });
+  m.def("limits", [] {
+    linprim::Limits limits;
+    {
+      nb::gil_scoped_release release;
+      limits = linprim::measure_limits();
+    }
+    nb::dict d;
+    d["fma_gflops"] = limits.fma_gflops, d["exp_ns"] = limits.exp_ns;
+    d["pair_forward_ns"] = limits.pair_forward_ns, d["pair_backward_ns"] = limits.pair_backward_ns;
+    return d;
+  });
   m.def("statistics", [] {
     const linprim::Statistics s = linprim::statistics();
     nb::dict d;

@@ -310,6 +310,14 @@ inline void blend_backward(const typename Solid::Record& record, const typename 
   select(hit, after, t).store(state.through + at);
 }
 
+// The same object, but the compiler does not know: keeps it from copying a record's fields to the stack before a loop over few entries.
+template <class T>
+inline const T& opaque(const T& object) {
+  const T* p = &object;
+  asm("" : "+r"(p));
+  return *p;
+}
+
 template <class Solid, bool kGeometry>
 void backward_center(const RasterParams<typename Solid::Real>& P, int tile, void*) {
   using Real = typename Solid::Real;
@@ -339,8 +347,8 @@ void backward_center(const RasterParams<typename Solid::Real>& P, int tile, void
       const char* next = reinterpret_cast<const char*>(&records[P.lists.primitive[e + kAhead]]);
       for (size_t line = 0; line < sizeof(typename Solid::Record); line += 64) __builtin_prefetch(next + line);
     }
-    const auto& record = records[P.lists.primitive[e]];
-    const V from_x = V::set(Real(tile_x) - record.ref_x), from_y = V::set(Real(tile_y) - record.ref_y);
+    const auto& record_of_pair = records[P.lists.primitive[e]];
+    const V from_x = V::set(Real(tile_x) - record_of_pair.ref_x), from_y = V::set(Real(tile_y) - record_of_pair.ref_y);
     V sums[kSums];
     for (V& s : sums) s = V::set(0);
     int part = 0;
@@ -350,6 +358,7 @@ void backward_center(const RasterParams<typename Solid::Real>& P, int tile, void
       M met[kReady];
       int places[kReady], count = 0;
       for (int k = 0; k < kReady && todo; ++k) {
+        const auto& record = opaque(record_of_pair);
         const int block = std::countr_zero(todo);
         const V px = lanes.x + V::set(Real(4 * (block & 3) + T::part_x(part))), py = lanes.y + V::set(Real(4 * (block >> 2) + T::part_y(part)));
         const int at = block * 16 + part * W;
@@ -361,6 +370,7 @@ void backward_center(const RasterParams<typename Solid::Real>& P, int tile, void
         if (++part == T::kParts) part = 0, todo &= todo - 1;
       }
       for (int k = 0; k < count; ++k) {
+        const auto& record = opaque(record_of_pair);
         const int at = places[k], block = at / 16, place = at % 16 / W;
         const V px = lanes.x + V::set(Real(4 * (block & 3) + T::part_x(place))), py = lanes.y + V::set(Real(4 * (block >> 2) + T::part_y(place)));
         blend_backward<Solid, kGeometry>(record, kGeometry ? P.normals[P.lists.primitive[e]] : nullptr, view, state, ready[k], met[k], taus[k], at, px,
@@ -368,7 +378,7 @@ void backward_center(const RasterParams<typename Solid::Real>& P, int tile, void
       }
     }
     reduce(sums, kSums, slot);
-    Solid::recenter(record, Real(tile_x), Real(tile_y), slot);
+    Solid::recenter(record_of_pair, Real(tile_x), Real(tile_y), slot);
   }
 }
 

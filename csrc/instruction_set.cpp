@@ -69,5 +69,6 @@ const Kernels<float>& kernels<float>() { return *current().load()->kernels; }
 template <>
 const Kernels<double>& kernels<double>() { return kernels_scalar<double>(); }
 const ImageKernels& image_kernels() { return *current().load()->image; }
+Limits measure_limits() { return image_kernels().limits(); }
 
 }  // namespace linprim

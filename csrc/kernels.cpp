@@ -12,6 +12,7 @@
 #include "gaussian_project.h"
 #include "image_kernels.h"
 #include "level_depth.h"
+#include "machine_limits.h"
 #include "octahedron.h"
 #include "octahedron_project.h"
 #include "tetrahedron.h"
@@ -79,7 +80,7 @@ constexpr Kernels<Real> all_kernels(const char* name) {
 
 template <class Real>
 constexpr Kernels<Real> table = all_kernels<Real>(LINPRIM_STRING(LINPRIM_ISA));
-const ImageKernels image_table = {photometric<kWidth>, adam};
+const ImageKernels image_table = {photometric<kWidth>, adam, measure_limits<kWidth>};
 
 }  // namespace LINPRIM_ISA
 

@@ -208,6 +208,13 @@ struct SolidKernels {
   void (*level_depth)(const RasterParams<Real>&, int tile, Real* scratch);
 };
 
+// What one core can do at this moment, see machine_limits.h.
+struct Limits {
+  double fma_gflops;                           // multiply-adds count as two
+  double exp_ns;                               // per value: alpha and transmittance
+  double pair_forward_ns, pair_backward_ns;    // per (pixel, primitive) of octahedra, exact rays
+};
+
 template <class Real>
 struct Kernels {
   const char* name;
@@ -223,6 +230,7 @@ struct ImageKernels {
   // thread's own, photometric_buffer_size(width) floats.
   void (*photometric)(const PhotometricParams&, int channel, int begin, int end, float* buffer, double* sums);
   void (*adam)(const AdamParams&, int64_t begin, int64_t end);
+  Limits (*limits)();
 };
 
 constexpr int kSsimRadius = 5;

@@ -27,6 +27,9 @@ Statistics statistics();
 template <class Real>
 bool has_kernels(PrimitiveKind kind, RayModel rays, Order order);
 
+// Times the calling thread's core for some milliseconds, with the instruction set in use.
+Limits measure_limits();
+
 // Renders `primitives` by the view's ray model and in its order.
 //
 // out.rgb and out.opacity are always written; with `geometry`, so are the other planes, max_weight (n) and pixels (n): the largest

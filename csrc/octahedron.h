@@ -29,9 +29,14 @@ struct Octahedron : Polyhedron<RealType, W, kRays> {
     };
     // Under affine rays each pair of opposite faces has one that is turned to the camera, and nothing is cut.
     if (kRays == RayModel::kAffine || !(r.flags & kGeneral)) [[likely]] {
-      m.in = value(0), m.out = value(4);
-      if constexpr (kTrack) m.in_face = I::set(0), m.out_face = I::set(4);
-      for (int f = 1; f < 4; ++f) enter(value(f), f), leave(value(4 + f), 4 + f);
+      if constexpr (kTrack) {
+        m.in = value(0), m.out = value(4);
+        m.in_face = I::set(0), m.out_face = I::set(4);
+        for (int f = 1; f < 4; ++f) enter(value(f), f), leave(value(4 + f), 4 + f);
+      } else {
+        m.in = min(min(value(0), value(1)), min(value(2), value(3)));
+        m.out = max(max(value(4), value(5)), max(value(6), value(7)));
+      }
     } else {
       m.in = V::set(Real(1 / view.near) - r.w0), m.out = V::set(Real(kFarInverse) - r.w0);
       if constexpr (kTrack) m.in_face = I::set(kNearPlane), m.out_face = I::set(kNearPlane);

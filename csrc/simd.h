@@ -304,12 +304,10 @@ inline void exp_neg(V x, V& alpha, V& transmittance) {
   const V n = round_to_int(limited * V::set(-1.44269504088896341f));
   V r = fma(n, V::set(-0.693145751953125f), V::set(0.0f) - limited);  // ln 2 in two parts
   r = fma(n, V::set(-1.42860682030941723e-6f), r);
-  V f = fma(r, V::set(1.0f / 5040), V::set(1.0f / 720));
-  f = fma(f, r, V::set(1.0f / 120));
-  f = fma(f, r, V::set(1.0f / 24));
-  f = fma(f, r, V::set(1.0f / 6));
-  f = fma(f, r, V::set(0.5f));
-  f = fma(f * r, r, r);
+  const V r2 = r * r;  // the polynomial in pairs of terms: half the chain of Horner's scheme
+  const V low = fma(r, V::set(1.0f / 6), V::set(0.5f)), middle = fma(r, V::set(1.0f / 120), V::set(1.0f / 24));
+  const V high = fma(r, V::set(1.0f / 5040), V::set(1.0f / 720));
+  const V f = fma(fma(fma(high, r2, middle), r2, low), r2, r);
   const V s = exp2_int(n);
   const V sf = s * f;
   transmittance = s + sf;

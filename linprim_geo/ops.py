@@ -8,6 +8,7 @@ Arrays cross as `tensor.detach().numpy()`: no copy where a tensor is contiguous.
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -527,6 +528,65 @@ def adam_step(
     )
 
 
+def adam_rows(
+    values: Sequence[Tensor],
+    gradients: Sequence[Tensor],
+    firsts: Sequence[Tensor],
+    seconds: Sequence[Tensor],
+    rates: Sequence[float],
+    steps: Tensor,
+    touched: Tensor | None = None,
+    beta1: float = 0.9,
+    beta2: float = 0.999,
+    epsilon: float = 1e-15,
+) -> None:
+    """One sparse Adam step on the touched rows of several float32 tensors, in place and in one sweep.
+
+    A touched row's count of steps t goes up by one and its moments are corrected by 1 - beta^t: every row goes through exactly the
+    Adam of the steps that touched it, however rare they are. Of the other rows nothing changes, neither value, moments nor
+    count, where `adam_step` would let them glide on by their first moment and shrink both. With all rows touched in every step
+    the two are the same.
+
+    Args:
+        values, gradients, firsts, seconds: as many tensors each, with N rows of any shape; the gradients of untouched rows do not count.
+        rates: learning rate of each tensor.
+        steps: (N,) int32, 0 for a row without a history. To forget a row's history, set it and both moments to 0.
+        touched: (N,) bool; None: the rows where any of the tensors has a gradient that is not 0, which costs reading the gradients of the
+            others as well. After `rasterize`, `screen_grad[:, 2] > 0` is a row's being seen, as long as only the image gives gradients.
+
+    Raises:
+        ValueError: shapes, dtypes or layouts that do not fit.
+
+    Source: Kingma and Ba, ICLR 2015, algorithm 1, by row. (The sparse Adam of 3DGS's later code freezes unseen rows alike, but corrects by
+        the global step, which takes a row seen rarely for one that has had zero gradients, and its first steps are too small or large.)
+    """
+    for name, tensors in (("value", values), ("gradient", gradients), ("first", firsts), ("second", seconds)):
+        for tensor in tensors:
+            _check_dtypes(torch.float32, **{name: tensor})
+            if tensor.shape[:1] != steps.shape:
+                raise ValueError(f"{name} has {tuple(tensor.shape[:1])} rows, steps has shape {tuple(steps.shape)}")
+            if name != "gradient" and not tensor.is_contiguous():
+                raise ValueError(f"{name} is changed in place and has to be contiguous")
+    _check_dtypes(torch.int32, steps=steps)
+    if not steps.is_contiguous():
+        raise ValueError("steps is changed in place and has to be contiguous")
+    if touched is not None:
+        _check_dtypes(torch.bool, touched=touched)
+        touched = touched.contiguous().view(torch.uint8)
+    _core.adam_rows(
+        [t.detach().numpy() for t in values],
+        [_array(t) for t in gradients],
+        [t.numpy() for t in firsts],
+        [t.numpy() for t in seconds],
+        list(rates),
+        steps.numpy(),
+        None if touched is None else touched.numpy(),
+        beta1,
+        beta2,
+        epsilon,
+    )
+
+
 def set_threads(count: int) -> None:
     """Threads of the core, 0 for one per core. No result depends on it. Not to be called while another thread renders."""
     _core.set_threads(count)
@@ -546,6 +606,15 @@ def set_instruction_set(name: str) -> None:
     """Chooses the vector kernels by name, or the best with "auto"."""
     if not _core.set_instruction_set(name):
         raise LinprimError(f"instruction set {name!r} is not available on this processor; scalar always is")
+
+
+def machine_limits() -> dict[str, float]:
+    """What one core does at this moment with the instruction set in use: `fma_gflops`, `exp_ns` per value, and `pair_forward_ns` and
+    `pair_backward_ns` per (pixel, primitive) of octahedra by exact rays with all data in the first cache and every pixel hit.
+
+    Takes some milliseconds on the calling thread; each is the shortest of fifteen.
+    """
+    return _core.limits()
 
 
 def statistics() -> dict[str, float]:

@@ -1,10 +1,13 @@
 #!/usr/bin/env python3
-"""Times the rasterizer on a furnished room of N octahedra made by code: ns per (pixel, primitive) hit, forward and backward.
+"""Times the rasterizer on a furnished room of N primitives made by code: ns per (pixel, primitive) hit, forward and backward, and what
+the core can do at that moment.
 
     python tools/bench.py --primitives 50000 --threads 1 --json
 
 Primitives lie on the surfaces of a 6 x 3 x 5 m room with boxes and spheres, sized so that the number over a surface point does
-not depend on N; the camera looks in from the open front. Forward and backward runs alternate; figures are medians.
+not depend on N; the camera looks in from the open front. Forward, backward and the limits alternate; figures are medians. The limits
+are of one thread and instruction set: peak multiply-adds, the vector exponential, and the bare pair kernels of octahedra with all data
+in the first cache and every pixel hit (csrc/machine_limits.h).
 """
 
 from __future__ import annotations
@@ -82,14 +85,31 @@ def room(count: int, seed: int = 0, overlap: float = 0.60) -> dict[str, np.ndarr
     }
 
 
+def as_kind(arrays: dict[str, np.ndarray], kind: str) -> dict[str, np.ndarray]:
+    """The same room of Gaussians (half-axes are 2.6 standard deviations, opacity along the shortest) or tetrahedra of equal volume."""
+    if kind == "gaussian":
+        opacity = -np.expm1(-2 * arrays["density"] * arrays["extent"].min(1))
+        return arrays | {"extent": arrays["extent"] / np.float32(2.6), "density": opacity}
+    if kind == "tetrahedron":
+        # 8 sqrt(3) / 27 r^3 of a regular tetrahedron of circumradius r against 4/3 a b c.
+        radius = np.cbrt(arrays["extent"].prod(1) * (4 / 3) * 27 / (8 * np.sqrt(3)))
+        return arrays | {"extent": np.repeat(radius[:, None], 4, 1).astype(np.float32)}
+    return arrays
+
+
 def median_spread(values: list[float]) -> dict[str, float]:
     """Median, and the range that holds the middle half."""
     low, middle, high = np.percentile(values, [25, 50, 75])
     return {"median": float(middle), "low": float(low), "high": float(high)}
 
 
-def measure(count: int, threads: int, runs: int, geometry: bool, width: int = 800, height: int = 600) -> dict:
-    """Alternates forward, backward, loss and optimiser `runs` times after two warm-ups."""
+def measure(
+    count: int, threads: int, runs: int, geometry: bool, rung: dict[str, str], width: int = 800, height: int = 600
+) -> dict:
+    """Alternates forward, backward, loss, optimiser and the machine's limits `runs` times after two warm-ups.
+
+    `rung` holds the keywords primitive, ray_model and order of `ops.rasterize`.
+    """
     import torch
 
     from linprim_geo import ops
@@ -97,12 +117,13 @@ def measure(count: int, threads: int, runs: int, geometry: bool, width: int = 80
 
     torch.set_num_threads(threads)
     ops.set_threads(threads)
-    parameters = [torch.from_numpy(v).requires_grad_() for v in room(count).values()]
+    parameters = [torch.from_numpy(v).requires_grad_() for v in as_kind(room(count), rung["primitive"]).values()]
     background = torch.zeros(3, requires_grad=True)
     moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in parameters]
     camera = Camera(width, height, 0.75 * width, 0.75 * width, width / 2, height / 2, np.eye(4))
     target = torch.rand(3, height, width, generator=torch.Generator().manual_seed(0))
     times: dict[str, list[float]] = {}
+    limits: dict[str, list[float]] = {}
 
     def note(name: str, ms: float) -> None:
         times.setdefault(name, []).append(ms)
@@ -110,7 +131,7 @@ def measure(count: int, threads: int, runs: int, geometry: bool, width: int = 80
     stats = {}
     for run in range(runs + 2):
         marks = [time.perf_counter()]
-        out = ops.rasterize(*parameters, background, camera, geometry=geometry)
+        out = ops.rasterize(*parameters, background, camera, geometry=geometry, **rung)
         marks.append(time.perf_counter())
         loss = ops.photometric_loss(out.rgb, target)[0]
         marks.append(time.perf_counter())
@@ -121,6 +142,8 @@ def measure(count: int, threads: int, runs: int, geometry: bool, width: int = 80
         marks.append(time.perf_counter())
         if run < 2:
             continue
+        for name, value in ops.machine_limits().items():
+            limits.setdefault(name, []).append(value)
         stats = ops.statistics()
         for stage in ("project", "sort", "bin", "forward", "backward", "chain"):
             note(stage, stats[f"{stage}_ms"])
@@ -134,7 +157,9 @@ def measure(count: int, threads: int, runs: int, geometry: bool, width: int = 80
             note(name, 1e3 * (marks[b] - marks[a]))
     stages = {name: median_spread(values) for name, values in times.items()}
     hits = stats["hit_lanes"]
+    limit = {name: median_spread(values) for name, values in limits.items()}
     return {
+        **rung,
         "primitives": count,
         "threads": threads,
         "instruction_set": ops.instruction_set(),
@@ -151,6 +176,11 @@ def measure(count: int, threads: int, runs: int, geometry: bool, width: int = 80
         "backward_ns_per_hit": 1e6 * sum(stages[s]["median"] for s in ("backward", "chain")) / hits,
         "raster_forward_ns_per_hit": 1e6 * stages["forward"]["median"] / hits,
         "raster_backward_ns_per_hit": 1e6 * stages["backward"]["median"] / hits,
+        "limit_forward_ns": limit["pair_forward_ns"]["median"],
+        "limit_backward_ns": limit["pair_backward_ns"]["median"],
+        "limit_exp_ns": limit["exp_ns"]["median"],
+        "limit_fma_gflops": limit["fma_gflops"]["median"],
+        "limits": limit,
         "iteration_ms": stages["iteration"]["median"],
         "stages_ms": stages,
         "working_set_mib": stats["working_set_bytes"] / 2**20,
@@ -163,10 +193,18 @@ def main() -> None:
     parser.add_argument("--primitives", type=int, nargs="+", default=[10_000, 50_000, 200_000], metavar="N")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--runs", type=int, default=15, help="measured repetitions")
+    parser.add_argument("--primitive", choices=("octahedron", "tetrahedron", "gaussian"), default="octahedron")
+    parser.add_argument("--ray-model", choices=("exact", "affine"), default="exact")
+    parser.add_argument("--order", choices=("center", "entry", "overlap"), default="center")
+    parser.add_argument("--instruction-set", default="auto", help="scalar, v2, v3, v4 or neon; auto takes the best")
     parser.add_argument("--geometry", action="store_true", help="also depths, normals, distortion")
     parser.add_argument("--json", action="store_true", help="print one JSON object (a list for several N)")
     args = parser.parse_args()
-    results = [measure(n, args.threads, args.runs, args.geometry) for n in args.primitives]
+    from linprim_geo import ops
+
+    ops.set_instruction_set(args.instruction_set)
+    rung = {"primitive": args.primitive, "ray_model": args.ray_model, "order": args.order}
+    results = [measure(n, args.threads, args.runs, args.geometry, rung) for n in args.primitives]
     if args.json:
         print(json.dumps(results[0] if len(results) == 1 else results, indent=2))
         return
@@ -179,6 +217,13 @@ def main() -> None:
         print(
             f"        forward {r['forward_ns_per_hit']:.2f} ns/hit (tiles alone {r['raster_forward_ns_per_hit']:.2f}), "
             f"backward {r['backward_ns_per_hit']:.2f} ({r['raster_backward_ns_per_hit']:.2f}), iteration {r['iteration_ms']:.1f} ms"
+        )
+        forward = r["raster_forward_ns_per_hit"] / r["visited_per_hit"] / r["limit_forward_ns"]
+        backward = r["raster_backward_ns_per_hit"] / r["limit_backward_ns"]
+        print(
+            f"        limits: pair {r['limit_forward_ns']:.2f} forward, {r['limit_backward_ns']:.2f} backward, "
+            f"exp {r['limit_exp_ns']:.2f} ns, {r['limit_fma_gflops']:.0f} GFLOP/s; "
+            f"tiles forward {forward:.2f} times that per visited lane, backward {backward:.2f} times per hit"
         )
         print(
             "        ms: "
