@@ -25,6 +25,8 @@ from .errors import LinprimError
 EXIT_UNUSABLE, EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_PIPE = 1, 70, 130, 141
 
 SPLITS = ("train", "test", "all")
+# 3DGS's -r -1 leaves images up to this width as they are.
+WIDEST = 1600
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -257,7 +259,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("--resume", action="store_true", help="go on from the latest checkpoint in RUN")
     sub.add_argument("--quiet", action="store_true", help="no progress")
-    sub.add_argument("-r", "--resolution", type=int, metavar="K", help="the same as --downscale, as in 3DGS")
+    resolution = "as in 3DGS: divide the size by 1, 2, 4 or 8, or a width to go down to; -1: to 1600 if it is more"
+    sub.add_argument("-r", "--resolution", type=int, metavar="K", help=resolution)
     sub.add_argument("--eval", action="store_true", help="accepted as in 3DGS: views are always held out")
     add_options(sub.add_argument_group("scene"), SceneOptions)
     add_options(sub.add_argument_group("training"), TrainOptions)
@@ -296,18 +299,30 @@ def build_parser() -> argparse.ArgumentParser:
         "eval-mesh", _eval_mesh, "score a mesh against a reference mesh: Chamfer distance and the rest"
     )
     sub.add_argument("mesh", metavar="MESH", help="mesh to score")
-    sub.add_argument("reference", metavar="REFERENCE", help="mesh that is taken as the truth")
     sub.add_argument(
-        "--samples", type=_positive, default=200_000, metavar="N", help="points per mesh (default 200000)"
+        "reference", metavar="REFERENCE", help="mesh taken as the truth (dtu, tnt: or a scan's points as PLY)"
     )
-    sub.add_argument(
-        "--tau", type=_length, metavar="LENGTH", help="threshold of the rates, in the meshes' unit"
-    )
-    sub.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the points (default 0)")
-    sub.add_argument("--run", metavar="RUN", help="also score what the training cameras of this run see")
-    sub.add_argument(
-        "-o", "--output", metavar="DIR", help="folder for results.json and error-coloured meshes"
-    )
+    named = ("headline", "linprim", "dtu", "tnt", "scannetpp")
+    text = "headline: exact point to surface (default); the others as in the tables of that name"
+    sub.add_argument("--protocol", choices=named, default="headline", help=text)
+    text = "points per mesh (headline 200000, linprim 5000)"
+    sub.add_argument("--samples", type=_positive, metavar="N", help=text)
+    text = "threshold of the rates, in the meshes' unit (default the protocol's, else 1 %% of the diagonal)"
+    sub.add_argument("--tau", type=_length, metavar="LENGTH", help=text)
+    sub.add_argument("--seed", type=_whole, default=0, metavar="N", help="seed of the points (default 0)")
+    sub.add_argument("--run", metavar="RUN", help="cull to what the training cameras of this run see")
+    sub.add_argument("--cameras", metavar="SCENE", help="the same with those of a scene's folder")
+    text = "metres in one unit of the meshes, for dtu, tnt and scannetpp (default 1, dtu 0.001)"
+    sub.add_argument("--meters-per-unit", type=_length, metavar="X", help=text)
+    text = "folder for results.json, error-coloured PLYs and plots (default RUN/eval/mesh)"
+    sub.add_argument("-o", "--output", metavar="DIR", help=text)
+    dtu, tnt = sub.add_argument_group("protocol dtu"), sub.add_argument_group("protocol tnt")
+    dtu.add_argument("--mask", metavar="FILE", help="ObsMask .mat of the scan")
+    dtu.add_argument("--box", metavar="X0,Y0,Z0,X1,Y1,Z1", help="the box alone; written --box=...")
+    dtu.add_argument("--plane", metavar="PLANE", help="Plane .mat, or --plane=A,B,C,D; above it counts")
+    tnt.add_argument("--scene", metavar="NAME", help="Barn, Truck, ...: sets the threshold")
+    tnt.add_argument("--crop", metavar="FILE", help="crop volume, .json")
+    tnt.add_argument("--transform", metavar="FILE", help="4x4 matrix as text, takes MESH to REFERENCE")
 
     sub = command(
         "synth", _synth, "render posed images, depth, normals and points of a mesh or a built-in scene"
@@ -343,13 +358,13 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--overwrite", action="store_true", help="replace OUT if synth has made it")
 
     sub = command(
-        "convert", _convert, "convert primitives (npz, LinPrim's ply) and meshes (ply, obj, glb, stl)"
+        "convert", _convert, "convert primitives (npz, LinPrim's and 3DGS's ply) and meshes (ply, obj, glb, stl)"
     )
     sub.add_argument("source", metavar="IN", help="run folder, .npz, .ply, .obj, .glb or .stl")
     sub.add_argument("target", metavar="OUT", help="file to write; its suffix says the format")
     sub.add_argument(
-        "--as", dest="write_as", choices=("auto", "primitives", "mesh"), default="auto",
-        help="what a .ply of primitives holds: LinPrim's properties (default) or triangles for MeshLab",
+        "--as", dest="write_as", choices=("auto", "primitives", "mesh", "gaussians"), default="auto",
+        help="what a .ply of primitives holds: their properties (default), triangles for MeshLab, or Gaussians like octahedra",
     )  # fmt: skip
 
     sub = command(
@@ -373,10 +388,9 @@ def _train(parsed: argparse.Namespace) -> dict:
     if scene is None or (parsed.scene and parsed.source):
         raise LinprimError("train wants one scene: its folder, or -s and its folder")
     if parsed.resolution is not None:
-        # 3DGS writes -1 for "as it is".
-        if parsed.resolution not in (-1, 1, 2, 4, 8) or parsed.downscale not in (1, parsed.resolution):
-            raise LinprimError(f"-r is {parsed.resolution}, wanted -1, 1, 2, 4 or 8, and no other --downscale beside it")
-        parsed.downscale = max(1, parsed.resolution)
+        if parsed.downscale != 1:
+            raise LinprimError(f"-r {parsed.resolution} stands beside --downscale {parsed.downscale}, wanted one of them")
+        parsed.downscale = _downscale_of(parsed.resolution, scene, parsed)
     from .train import train
 
     return train(
@@ -387,6 +401,19 @@ def _train(parsed: argparse.Namespace) -> dict:
         resume=parsed.resume,
         quiet=parsed.quiet,
     )
+
+
+def _downscale_of(resolution: int, scene: str, parsed: argparse.Namespace) -> int:
+    """3DGS's -r as --downscale. Where it names a width, the least whole divisor that does not exceed it: pixels are averaged."""
+    if resolution in (1, 2, 4, 8):
+        return resolution
+    width = WIDEST if resolution == -1 else resolution
+    if width < 1:
+        raise LinprimError(f"-r is {resolution}, wanted 1, 2, 4, 8, a width in pixels, or -1")
+    from .scene import load_scene
+
+    views = load_scene(scene, masks=parsed.masks or None, sparse=parsed.sparse or None).train
+    return -(-max(view.camera.width for view in views) // width)
 
 
 def _render(parsed: argparse.Namespace) -> dict:
@@ -419,15 +446,8 @@ def _eval_images(parsed: argparse.Namespace) -> dict:
 def _eval_mesh(parsed: argparse.Namespace) -> dict:
     from .eval.mesh import eval_mesh_files
 
-    return eval_mesh_files(
-        parsed.mesh,
-        parsed.reference,
-        output=parsed.output,
-        samples=parsed.samples,
-        tau=parsed.tau,
-        seed=parsed.seed,
-        run=parsed.run,
-    )
+    chosen = {k: v for k, v in vars(parsed).items() if k not in ("handler", "command", "json", "debug")}
+    return eval_mesh_files(chosen.pop("mesh"), chosen.pop("reference"), **chosen)
 
 
 def _synth(parsed: argparse.Namespace) -> dict:

@@ -10,24 +10,29 @@ import numpy as np
 
 from .errors import LinprimError
 from .files import atomic_write
-from .ply import read_linprim_ply, read_ply_header, write_linprim_ply
-from .primitives import Octahedra, load_octahedra, save_octahedra
+from .ply import read_ply_header, read_primitive_ply, write_primitive_ply
+from .primitives import KINDS, Primitives, load_primitives, save_primitives
 
 if TYPE_CHECKING:
     from .mesh import Mesh
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb", ".stl")
-AS_CHOICES = ("auto", "primitives", "mesh")
+AS_CHOICES = ("auto", "primitives", "mesh", "gaussians")
+# A Gaussian in a mesh is the ellipsoid one standard deviation large, where its opacity is 61 % of that of its middle: beyond
+# it neighbours would hide each other.
+MESH_SIGMAS = 1.0
 
 
 def convert(source: str | os.PathLike, target: str | os.PathLike, write_as: str = "auto") -> dict:
     """Reads `source`, writes `target`; the formats follow from the files.
 
-    Primitives are read from a run's folder (its scene.npz), LinPrim's model folder (its latest iteration),
-    .npz or LinPrim's .ply, and written as .npz, as LinPrim's .ply, or as a triangle mesh: .obj, .glb and .stl
-    always, .ply with `write_as="mesh"`. In a mesh every vertex has its primitive's colour without the
-    view-dependent part, and in .ply and .glb its alpha: the share of light taken along the shortest diagonal.
-    Meshes are read and written as .ply, .obj, .glb and .stl.
+    Primitives are read from a run's folder (its scene.npz), the model folder of LinPrim or 3DGS (its latest
+    iteration), .npz or .ply (LinPrim's octahedra and tetrahedra, 3DGS's Gaussians), and written as .npz, as .ply in the
+    layout of their kind, or as a triangle mesh: .obj, .glb and .stl always, .ply with `write_as="mesh"`. No kind becomes
+    another unless asked for: `write_as="gaussians"` writes octahedra as Gaussians for a 3DGS viewer (half-axes / 2.6).
+    In a mesh every vertex has its primitive's colour without the view-dependent part, and in .ply and .glb its alpha:
+    the share of light taken along the reference length, a Gaussian's opacity. Gaussians become ellipsoids one standard
+    deviation large. Meshes are read and written as .ply, .obj, .glb and .stl.
 
     Returns:
         What was read and written: `source`, `target`, `read`, `wrote`, `count`; for primitives also `dropped`
@@ -48,7 +53,7 @@ def convert(source: str | os.PathLike, target: str | os.PathLike, write_as: str 
     report = {"source": str(source), "target": str(target)}
 
     if not holds_primitives(source):
-        if suffix == ".npz" or write_as == "primitives":
+        if suffix == ".npz" or write_as in ("primitives", "gaussians"):
             raise LinprimError(f"{source}: is a mesh, which cannot be written as primitives to {target}")
         from .mesh import load_mesh, save_mesh
 
@@ -60,21 +65,23 @@ def convert(source: str | os.PathLike, target: str | os.PathLike, write_as: str 
         raise LinprimError(
             f"{target}: an .npz holds primitives, wanted {', '.join(MESH_SUFFIXES)} with --as mesh"
         )
-    if suffix in (".obj", ".glb", ".stl") and write_as == "primitives":
-        raise LinprimError(f"{target}: {suffix} holds a mesh, wanted .npz or .ply with --as primitives")
-    octahedra, found = read_primitives(source)
-    report |= {"read": "octahedra", "count": len(octahedra)} | {
+    if suffix in (".obj", ".glb", ".stl") and write_as in ("primitives", "gaussians"):
+        raise LinprimError(f"{target}: {suffix} holds a mesh, wanted .npz or .ply with --as {write_as}")
+    primitives, found = read_primitives(source)
+    report |= {"read": KINDS[primitives.kind].plural, "count": len(primitives)} | {
         k: v for k, v in found.items() if k == "dropped" and v
     }
+    if write_as == "gaussians" and primitives.kind != "gaussian":
+        primitives = primitives.as_gaussians()
+    kinds = KINDS[primitives.kind].plural
     if suffix == ".npz":
-        save_octahedra(target, octahedra)
-        return report | {"wrote": "octahedra"}
+        save_primitives(target, primitives)
+        return report | {"wrote": kinds}
     if suffix == ".ply" and write_as != "mesh":
-        written = write_linprim_ply(target, octahedra)
-        report |= {"wrote": "LinPrim's octahedra"}
+        written = write_primitive_ply(target, primitives)
+        report |= {"wrote": f"3DGS's {kinds}" if primitives.kind == "gaussian" else f"LinPrim's {kinds}"}
         return report | ({"clamped": written["clamped"]} if written["clamped"] else {})
-    save_primitive_mesh(target, octahedra)
-    return report | {"wrote": "mesh", "faces": 8 * len(octahedra)}
+    return report | {"wrote": "mesh", "faces": save_primitive_mesh(target, primitives)}
 
 
 def describe(report: dict) -> str:
@@ -89,7 +96,8 @@ def describe(report: dict) -> str:
 
 
 def find_scene_file(source: str | os.PathLike) -> Path:
-    """The file to read: `source`, a run's scene.npz, or the latest point_cloud.ply of LinPrim's folder."""
+    """The file to read: `source`, a run's scene.npz, or the latest point_cloud.ply of LinPrim's or
+    3DGS's folder."""
     source = Path(source)
     if not source.exists():
         raise LinprimError(f"{source}: no such file or folder")
@@ -125,27 +133,29 @@ def holds_primitives(path: Path) -> bool:
     kind = read_ply_header(path).kind
     if kind == "points":
         raise LinprimError(
-            f"{path}: holds points alone, wanted LinPrim's octahedra (dist_0..2) or a mesh with faces"
+            f"{path}: holds points alone, wanted primitives (dist_0.. or scale_0..) or a mesh with faces"
         )
     return kind != "mesh"
 
 
-def read_primitives(path: str | os.PathLike) -> tuple[Octahedra, dict]:
-    """Octahedra from .npz or LinPrim's .ply, and what was found on the way (see `read_linprim_ply`)."""
+def read_primitives(path: str | os.PathLike) -> tuple[Primitives, dict]:
+    """Primitives from .npz or .ply, and what was found on the way (see `read_primitive_ply`)."""
     path = Path(path)
     if path.suffix.lower() == ".npz":
-        return load_octahedra(path), {}
-    return read_linprim_ply(path)
+        return load_primitives(path), {}
+    return read_primitive_ply(path)
 
 
-def save_primitive_mesh(path: str | os.PathLike, octahedra: Octahedra) -> None:
-    """Writes `octahedra` as triangles with vertex colours; .ply and .glb carry alpha too, .obj cannot, .stl
-    has none."""
+def save_primitive_mesh(path: str | os.PathLike, primitives: Primitives) -> int:
+    """Writes `primitives` as triangles with vertex colours; .ply and .glb carry alpha too, .obj cannot, .stl
+    has none. Gaussians become ellipsoids of MESH_SIGMAS standard deviations. Returns the number of faces."""
     from .mesh import save_mesh
 
     path = Path(path)
-    mesh = octahedra.triangle_mesh()
-    alpha = np.repeat(np.rint(octahedra.alpha * 255.0).astype(np.uint8), 6)
+    mesh = primitives.triangle_mesh(sigmas=MESH_SIGMAS)
+    alpha = np.repeat(
+        np.rint(primitives.alpha * 255.0).astype(np.uint8), len(mesh.vertices) // len(primitives)
+    )
     suffix = path.suffix.lower()
     if suffix == ".ply":
         _save_ply(path, mesh, alpha)
@@ -153,6 +163,7 @@ def save_primitive_mesh(path: str | os.PathLike, octahedra: Octahedra) -> None:
         _save_glb(path, mesh, alpha)
     else:
         save_mesh(path, mesh)
+    return len(mesh.faces)
 
 
 def _save_ply(path: Path, mesh: Mesh, alpha: np.ndarray) -> None:

@@ -4,6 +4,7 @@ works in, and points to start from where no others are to be had."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -43,6 +44,45 @@ _FRUSTA_DEPTHS = (0.15, 4.0)
 _FRUSTA_SEEN = 3
 _FRUSTA_BATCHES = 20
 _COLOR_VIEWS = 24
+
+
+# The plane round a point is that of so many of its nearest, itself among them. Where they lie in a plane to within this share of
+# their spread, more is not believed: points have errors.
+_PLANE_POINTS = 10
+_THINNEST = 0.1
+
+
+@dataclass(frozen=True)
+class VolumePoints(PointCloud):
+    """Points that say where surfaces may be, not where they are."""
+
+
+def local_planes(xyz: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """How (P, 3) points lie in space: (P, 4) unit quaternions (w, x, y, z) whose third axis is the normal of the plane through a
+    point and its 9 nearest, turned about it at random, and (P,) how flat these are.
+
+    Flatness is the root of the smallest by the middle eigenvalue of their covariance: 0.1 (and not less) for a plane, about 0.6 for
+    points anywhere in a volume. Fewer than 4 points are no plane: 1.
+    """
+    from scipy.spatial import cKDTree
+    from scipy.spatial.transform import Rotation
+
+    rng = np.random.default_rng([seed, 7])
+    count = min(_PLANE_POINTS, len(xyz))
+    if count < 4:
+        rotation = rng.normal(size=(len(xyz), 4))
+        return rotation / np.linalg.norm(rotation, axis=1, keepdims=True), np.ones(len(xyz))
+    near = xyz[cKDTree(xyz).query(xyz, k=count)[1]]
+    near = near - near.mean(axis=1, keepdims=True)
+    spread, axes = np.linalg.eigh(np.einsum("pki,pkj->pij", near, near))
+    spread = np.maximum(spread, 0.0)
+    middle = np.maximum(spread[:, 1], np.finfo(float).tiny)
+    flat = np.clip(np.sqrt(spread[:, 0] / middle), _THINNEST, 1.0)
+    normal, across = axes[:, :, 0], axes[:, :, 1]
+    turn = rng.uniform(0.0, 2.0 * np.pi, (len(xyz), 1))
+    first = np.cos(turn) * across + np.sin(turn) * np.cross(normal, across)
+    frame = np.stack([first, np.cross(normal, first), normal], axis=2)
+    return np.roll(Rotation.from_matrix(frame).as_quat(), 1, axis=1), flat
 
 
 def scene_normalization(scene: Scene) -> Similarity:
@@ -106,7 +146,7 @@ def focus_point(centers: np.ndarray, axes: np.ndarray) -> np.ndarray | None:
     return focus
 
 
-def visual_hull_points(scene: Scene, count: int, seed: int) -> PointCloud:
+def visual_hull_points(scene: Scene, count: int, seed: int) -> VolumePoints:
     """`count` points, uniform in the volume that the masks of the training views leave, coloured from the
     images.
 
@@ -142,10 +182,10 @@ def visual_hull_points(scene: Scene, count: int, seed: int) -> PointCloud:
     xyz = np.concatenate(kept)[:count]
     if len(xyz) < count:  # a hull of hair-thin parts: what was found stands for the rest
         xyz = xyz[rng.integers(0, len(xyz), count)]
-    return PointCloud(xyz, _colors(xyz, looks))
+    return VolumePoints(xyz, _colors(xyz, looks))
 
 
-def frusta_points(scene: Scene, count: int, seed: int) -> PointCloud:
+def frusta_points(scene: Scene, count: int, seed: int) -> VolumePoints:
     """`count` points in the space that several training cameras see, with mean colours: the last resort.
 
     Drawn along pixels of random cameras with a depth that is uniform in its logarithm, from 0.15 to 4 times
@@ -173,7 +213,7 @@ def frusta_points(scene: Scene, count: int, seed: int) -> PointCloud:
         if sum(len(points) for points in found[-1]) >= count:
             break
     xyz = np.concatenate([np.concatenate(points) for points in reversed(found)])[:count]
-    return PointCloud(xyz, _colors(xyz, _looks(scene.train, _COLOR_VIEWS)))
+    return VolumePoints(xyz, _colors(xyz, _looks(scene.train, _COLOR_VIEWS)))
 
 
 class _Look:

@@ -35,7 +35,18 @@ def from_saved(cls: type, values: object, where: str):
 
 
 def check_train_options(options: TrainOptions) -> None:
-    """Raises LinprimError for a value outside its range."""
+    """Raises LinprimError for a value outside its range, or for two that exclude each other."""
+    for entry in fields(options):
+        choices = entry.metadata["choices"]
+        if choices and getattr(options, entry.name) not in choices:
+            raise LinprimError(
+                f"--{entry.name.replace('_', '-')} is {getattr(options, entry.name)!r},"
+                f" wanted one of {', '.join(map(str, choices))}"
+            )
+    if options.primitive == "gaussian" and options.order != "center":
+        raise LinprimError(
+            f"--order is {options.order!r}, but a Gaussian has no place where a ray enters it: wanted center with --primitive gaussian"
+        )
     ranges = {
         "iterations": (1, 10**8),
         "max_primitives": (1, 2**30),
@@ -56,6 +67,23 @@ def check_train_options(options: TrainOptions) -> None:
             )
 
 
+# Screen filter in pixels that goes with --filter 3d+screen: LinPrim's kernel_size, and 3DGS's, which is a variance in px^2.
+SCREEN_FILTER, SCREEN_FILTER_OF_GAUSSIANS = 0.1, 0.3
+
+
+def raster_options(options: TrainOptions) -> dict:
+    """The keywords of `ops.rasterize` that say what a run's primitives are and how they are blended."""
+    screen = 0.0
+    if options.filter == "3d+screen":
+        screen = SCREEN_FILTER_OF_GAUSSIANS if options.primitive == "gaussian" else SCREEN_FILTER
+    return {
+        "primitive": options.primitive,
+        "ray_model": options.ray_model,
+        "order": options.order,
+        "screen_filter": screen,
+    }
+
+
 @dataclass(frozen=True)
 class SceneOptions:
     """How a capture is read."""
@@ -74,6 +102,29 @@ class TrainOptions:
     """How a scene is trained."""
 
     iterations: int = option(7000, "training steps, one view each")
+    primitive: str = option(
+        "octahedron", "what the scene is made of", choices=("octahedron", "tetrahedron", "gaussian")
+    )
+    ray_model: str = option(
+        "exact",
+        "how rays meet them: exact perspective, or LinPrim's affine approximation at each centre (always so with gaussian)",
+        choices=("exact", "affine"),
+    )
+    order: str = option(
+        "center",
+        "order of blending: by the centres' depth, by each ray's entries, or none (overlap: densities add up exactly)",
+        choices=("center", "entry", "overlap"),
+    )
+    filter: str = option(
+        "none",
+        "against aliasing: 3d enlarges each by a part of a pixel of its nearest view, 3d+screen also on every screen",
+        choices=("none", "3d", "3d+screen"),
+    )
+    population: str = option(
+        "gradient",
+        "how their number grows: gradient splits where the image pulls, 3dgs and mcmc are those papers' rules",
+        choices=("gradient", "3dgs", "mcmc"),
+    )
     max_primitives: int = option(20_000, "the population never grows past this")
     initial_primitives: int = option(
         0, "primitives at the start; 0 chooses from the points and --max-primitives"
@@ -82,7 +133,8 @@ class TrainOptions:
     seed: int = option(0, "seed of everything random")
     threads: int = option(0, "worker threads; 0 uses every core; the result does not depend on it")
     background: str = option(
-        "auto", "auto, fitted, random, black, white, or r,g,b in [0,1]; auto: fitted before a plain backdrop, else random"
+        "auto",
+        "auto, fitted, random, black, white, or r,g,b in [0,1]; auto: fitted before a plain backdrop, else random",
     )
     dssim: float = option(0.2, "weight of D-SSIM in the loss; L1 has the rest")
     stop: float = option(1e-3, "transmittance below which a ray ends", metavar="T")

@@ -4,7 +4,7 @@ config.json       scene, options, versions: how the run was made
 transform.json    training frame <-> data-set frame, unit
 run.json          what the last save holds: iteration, primitives, background
 training_frame.npz   primitives in the training frame, bit for bit as trained
-scene.npz, scene.ply the same in the data set's frame, ours and in LinPrim's format
+scene.npz, scene.ply the same in the data set's frame, ours and in LinPrim's format (Gaussians: 3DGS's)
 metrics.jsonl     loss, PSNR, ... over time                        checkpoints/step_*.pt, latest
 """
 
@@ -24,8 +24,8 @@ from . import __version__
 from .camera import Similarity
 from .errors import LinprimError
 from .files import write_json
-from .options import SceneOptions, TrainOptions, check_train_options, from_saved
-from .primitives import Octahedra, load_octahedra, save_octahedra
+from .options import SceneOptions, TrainOptions, check_train_options, from_saved, raster_options
+from .primitives import ARRAYS, KINDS, Primitives, load_primitives, save_primitives
 from .scene import Scene, View, load_scene
 
 
@@ -159,21 +159,21 @@ class Run:
         """(3,) float64 colour in [0, 1] behind everything."""
         return np.asarray(self.state["background"], dtype=np.float64)
 
-    def save(self, octahedra: Octahedra, state: dict) -> None:
+    def save(self, primitives: Primitives, state: dict) -> None:
         """Replaces the saved primitives (training frame) and run.json, each atomically."""
-        from .ply import write_linprim_ply
+        from .ply import write_primitive_ply
 
-        save_octahedra(self.path / "training_frame.npz", octahedra)
-        exported = to_data_set(octahedra, self.similarity)
-        save_octahedra(self.path / "scene.npz", exported)
-        write_linprim_ply(self.path / "scene.ply", exported)
+        save_primitives(self.path / "training_frame.npz", primitives)
+        exported = to_data_set(primitives, self.similarity)
+        save_primitives(self.path / "scene.npz", exported)
+        write_primitive_ply(self.path / "scene.ply", exported)
         write_json(self.path / "run.json", state)
 
-    def training_primitives(self) -> Octahedra:
+    def training_primitives(self) -> Primitives:
         """The saved primitives in the training frame, bit for bit as trained."""
-        return load_octahedra(self.path / "training_frame.npz")
+        return load_primitives(self.path / "training_frame.npz")
 
-    def primitives(self) -> Octahedra:
+    def primitives(self) -> Primitives:
         """The saved primitives in the data set's frame."""
         return to_data_set(self.training_primitives(), self.similarity)
 
@@ -190,15 +190,17 @@ class Run:
 
         from . import ops
 
-        tensors, background = self._tensors()
+        tensors, background, how = self._tensors()
         for view in views:
             camera, options = view.camera.transformed(self.similarity), self.train_options
             with torch.no_grad():
                 color = ops.rasterize(
-                    *tensors, background, camera, stop=options.stop, samples=options.samples
+                    *tensors, background, camera, stop=options.stop, samples=options.samples, **how
                 )
                 out = (
-                    ops.rasterize(*tensors, background, camera, stop=options.stop, level=level, geometry=True)
+                    ops.rasterize(
+                        *tensors, background, camera, stop=options.stop, level=level, geometry=True, **how
+                    )
                     if geometry
                     else color
                 )
@@ -219,35 +221,46 @@ class Run:
     ) -> Iterator[tuple[View, np.ndarray, np.ndarray]]:
         """Where the transmittance of every ray falls to `level`, overlaps counted exactly (`ops.level_depth`).
 
+        A Gaussian has no inside, so theirs is the median depth of `ops.rasterize`: the centre at which the transmittance jumps
+        over `level`. No screen filter: it would thicken what the surface is made from.
+
         Yields: (view, depth, opacity), each (H, W) float32; z-depth in the data set's unit, 0 where it never does.
         """
         import torch
 
         from . import ops
 
-        tensors, _ = self._tensors()
+        tensors, background, how = self._tensors()
+        kind = {"primitive": how["primitive"], "ray_model": how["ray_model"]}
         for view in views:
             camera = view.camera.transformed(self.similarity)
             with torch.no_grad():
-                depth, opacity = ops.level_depth(*tensors, camera, level=level)
+                if KINDS[how["primitive"]].solid:
+                    depth, opacity = ops.level_depth(*tensors, camera, level=level, **kind)
+                else:
+                    out = ops.rasterize(*tensors, background, camera, level=level, geometry=True, **kind)
+                    depth, opacity = out.depth_median, out.opacity
             yield view, (depth.numpy() / self.similarity.scale).astype(np.float32), opacity.numpy()
 
     def _tensors(self):
+        """What `ops.rasterize` takes: tensors, background, keywords."""
         import torch
 
-        octahedra = self.training_primitives()
-        arrays = (octahedra.center, octahedra.rotation, octahedra.extent, octahedra.density, octahedra.sh)
-        return [torch.from_numpy(a) for a in arrays], torch.tensor(self.background, dtype=torch.float32)
+        primitives = self.training_primitives()
+        tensors = [torch.from_numpy(getattr(primitives, name)) for name in ARRAYS]
+        how = raster_options(self.train_options) | {"primitive": primitives.kind}
+        return tensors, torch.tensor(self.background, dtype=torch.float32), how
 
 
-def to_data_set(octahedra: Octahedra, similarity: Similarity) -> Octahedra:
-    """Primitives of the training frame in the data set's: lengths divided by the scale, densities multiplied by it."""
-    inverse = similarity.inverse()
+def to_data_set(primitives: Primitives, similarity: Similarity) -> Primitives:
+    """Primitives of the training frame in the data set's: lengths divided by the scale, densities multiplied by it; the
+    opacity of Gaussians stays."""
+    solid = KINDS[primitives.kind].solid
     return replace(
-        octahedra,
-        center=inverse.apply(octahedra.center),
-        extent=octahedra.extent / similarity.scale,
-        density=octahedra.density * similarity.scale,
+        primitives,
+        center=similarity.inverse().apply(primitives.center),
+        extent=primitives.extent / similarity.scale,
+        density=primitives.density * similarity.scale if solid else primitives.density,
     )
 
 

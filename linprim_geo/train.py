@@ -20,8 +20,17 @@ import torch
 from . import ops
 from .errors import LinprimError
 from .files import atomic_write
-from .initial_points import CAMERA_DISTANCE, frusta_points, scene_normalization, visual_hull_points
+from .fill_points import fill_points
+from .initial_points import (
+    CAMERA_DISTANCE,
+    VolumePoints,
+    frusta_points,
+    local_planes,
+    scene_normalization,
+    visual_hull_points,
+)
 from .options import SceneOptions, TrainOptions, check_train_options
+from .primitives import KINDS
 from .progress import Progress, duration, memory_gib
 from .run import Run
 from .scene import PointCloud, Scene, load_scene
@@ -58,7 +67,7 @@ def with_points(scene: Scene, options: TrainOptions, log: Callable[[str], None])
         return replace(scene, points=frusta_points(scene, count, options.seed))
     if len(cloud.xyz) < min(FEW_POINTS, count):
         extra = frusta_points(scene, count - len(cloud.xyz), options.seed)
-        cloud = PointCloud(np.concatenate([cloud.xyz, extra.xyz]), np.concatenate([cloud.rgb, extra.rgb]))
+        cloud = VolumePoints(np.concatenate([cloud.xyz, extra.xyz]), np.concatenate([cloud.rgb, extra.rgb]))
     return replace(scene, points=cloud)
 
 
@@ -244,10 +253,14 @@ def _start(scene: Scene, run: Run, shots: list[Shot], options: TrainOptions, sta
     """A trainer at step 0, or at the step of a checkpoint's `state`."""
     focal = float(np.median([max(s.camera.fx, s.camera.fy) for s in shots]))
     centers = np.stack([s.camera.center for s in shots])
+    background, fitted, random_background = _background(options.background, shots)
+    surface = state is None and not isinstance(scene.points, VolumePoints)
     if state is not None:
         xyz, rgb, radius = np.zeros((4, 3)), np.zeros((4, 3)), 1.0  # replaced below
     else:
-        cloud = initial_cloud(scene.points, options)
+        backdrop = background.numpy() if fitted else None
+        cloud = fill_points(scene, options.seed, backdrop) if surface else scene.points
+        cloud = initial_cloud(cloud, options)
         xyz, rgb = run.similarity.apply(cloud.xyz), cloud.rgb
         middle = np.median(xyz, 0)
         reach = np.linalg.norm(xyz - middle, axis=1)
@@ -255,9 +268,11 @@ def _start(scene: Scene, run: Run, shots: list[Shot], options: TrainOptions, sta
             float(np.percentile(reach, 98)), 0.2 * float(np.linalg.norm(centers - middle, axis=1).max()), 1e-3
         )
     smallest = SMALLEST_PX * CAMERA_DISTANCE / focal
-    bounds = (smallest, max(LARGEST_PART * radius, 4 * smallest))
-    background, fitted, random_background = _background(options.background, shots)
-    parameters = initial_parameters(xyz, rgb, options.sh_degree, options.seed, bounds)
+    like = KINDS[options.primitive].size
+    bounds = (like * smallest, like * max(LARGEST_PART * radius, 4 * smallest))
+    parameters = initial_parameters(xyz, rgb, options.sh_degree, options.seed, bounds, options.primitive)
+    if surface and parameters["log_extent"].shape[1] == 3:
+        _lay_down(parameters, xyz, options.seed, bounds[0])
     trainer = Trainer(shots, parameters, options, bounds, background, fitted, random_background)
     if state is not None:
         try:
@@ -267,6 +282,18 @@ def _start(scene: Scene, run: Run, shots: list[Shot], options: TrainOptions, sta
                 f"{run.path / 'checkpoints'}: the latest checkpoint lacks what a run needs ({error})"
             ) from None
     return trainer
+
+
+def _lay_down(parameters: dict[str, torch.Tensor], xyz: np.ndarray, seed: int, smallest: float) -> None:
+    """Lays primitives on the planes of their points, as thin across as these are flat, at least twice the smallest extent.
+
+    A ball round a point of a plain wall stands out from it by its radius, and no photograph says that it does not.
+    """
+    rotation, flat = local_planes(xyz, seed)
+    parameters["rotation"].copy_(torch.from_numpy(rotation))
+    across = parameters["log_extent"][:, 2]
+    thin = across + torch.from_numpy(np.log(flat)).float()
+    across.copy_(torch.maximum(thin, across.clamp_max(float(np.log(2 * smallest)))))
 
 
 def _loop(trainer: Trainer, run: Run, held_out: list[Shot], progress: Progress) -> tuple[float, float | None]:
@@ -389,7 +416,7 @@ def _save(trainer: Trainer, run: Run) -> None:
         if old.name != name:
             old.unlink()
     run.save(
-        trainer.octahedra(),
+        trainer.primitives(),
         {
             "iteration": trainer.step,
             "iterations": trainer.options.iterations,

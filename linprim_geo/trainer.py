@@ -1,4 +1,4 @@
-"""One training step and the state it changes: raw parameters, Adam's moments, what growth has gathered.
+"""One training step and the state it changes: raw parameters, Adam's moments, the 3D filter, what growth has gathered.
 
 Whatever is random is drawn from a generator seeded by (seed, purpose, step), so the state needs no generator and a resumed run
 repeats the interrupted one bit for bit.
@@ -14,12 +14,20 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from . import ops, population
+from . import ops
 from .camera import Camera, Similarity
 from .errors import LinprimError
-from .options import TrainOptions
-from .primitives import SH_Y0, Octahedra
+from .options import TrainOptions, raster_options
+from .population import Control, GradientControl
+from .population_papers import ClassicControl, McmcControl
+from .primitives import KINDS, SH_Y0, Primitives, reference_length
 from .scene import View
+
+CONTROLS: dict[str, type[Control]] = {
+    "gradient": GradientControl,
+    "3dgs": ClassicControl,
+    "mcmc": McmcControl,
+}
 
 # Learning rates at the start of a run, for the training frame, where cameras see their subject from a distance of 3; all fall
 # exponentially to the given part of themselves.
@@ -32,10 +40,16 @@ RATES = {
     "sh_rest": (5e-4, 0.1),
     "background": (5e-3, 0.1),
 }
-# Half-axes stay within these: a part of a pixel at the distance of the subject, and of the scene's radius.
+# An octahedron's half-axes, and as large extents of the other kinds (Kind.size), stay within these: a part of a pixel at the
+# distance of the subject, and of the scene's radius.
 SMALLEST_PX, LARGEST_PART = 0.35, 0.5
 # Share of the run after which each further degree of view-dependent colour joins.
 DEGREE_EVERY = 0.07
+# A Gaussian's standard deviation at the start, in mean distances to the 3 nearest points.
+GAUSSIAN_START = 0.5
+# The 3D filter: sqrt(0.2) of a pixel, from views in which the primitive is farther than 0.2 and at most 15 % of the image's size
+# outside of it (LinPrim's box_factor and Mip-Splatting's limits); made again after so many steps.
+FILTER_VARIANCE, FILTER_NEAR, FILTER_MARGIN, FILTER_EVERY = 0.2, 0.2, 0.15, 1000
 
 
 @dataclass(frozen=True)
@@ -71,24 +85,33 @@ def load_shots(views: tuple[View, ...], similarity: Similarity) -> list[Shot]:
 
 
 def initial_parameters(
-    xyz: np.ndarray, rgb: np.ndarray, degree: int, seed: int, bounds: tuple[float, float]
+    xyz: np.ndarray,
+    rgb: np.ndarray,
+    degree: int,
+    seed: int,
+    bounds: tuple[float, float],
+    kind: str = "octahedron",
 ) -> dict[str, torch.Tensor]:
-    """One octahedron per point: half-axes the mean distance to the 3 nearest points, opacity 0.5, random rotation.
+    """One primitive per point: opacity 0.5, random rotation, equal extents by the mean distance to the 3 nearest points.
 
-    `xyz` (P, 3) in the training frame, `rgb` (P, 3) uint8, `bounds` the least and largest half-axis.
+    Octahedra have it for half-axes, tetrahedra the same volume, Gaussians half of it for standard deviation. (3DGS's start,
+    the whole of it at opacity 0.1, scores 0.4 to 2 dB less under every rule of growth, and MCMC's noise tears it apart.)
+    `xyz` (P, 3) in the training frame, `rgb` (P, 3) uint8, `bounds` the least and largest extent.
     """
     from scipy.spatial import cKDTree
 
-    count = len(xyz)
+    count, what = len(xyz), KINDS[kind]
     rng = np.random.default_rng([seed, 2])
     neighbours = min(4, count)
     distance = cKDTree(xyz).query(xyz, k=neighbours)[0].reshape(count, -1)[:, 1:]
-    size = distance.mean(1) if distance.shape[1] else np.full(count, bounds[1])
+    size = np.full(count, bounds[1])
+    if distance.shape[1]:
+        size = distance.mean(1) * (what.size if what.solid else GAUSSIAN_START)
     rotation = rng.normal(size=(count, 4))
     values = {
         "center": xyz,
         "rotation": rotation / np.linalg.norm(rotation, axis=1, keepdims=True),
-        "log_extent": np.repeat(np.log(np.clip(size, *bounds))[:, None], 3, 1),
+        "log_extent": np.repeat(np.log(np.clip(size, *bounds))[:, None], what.extents, 1),
         "raw_opacity": np.zeros(count),
         "sh_dc": ((rgb / 255.0 - 0.5) / SH_Y0)[:, None, :],
         "sh_rest": np.zeros((count, (degree + 1) ** 2 - 1, 3)),
@@ -99,14 +122,25 @@ def initial_parameters(
     }
 
 
-def activate(parameters: dict[str, torch.Tensor], degree: int) -> tuple[torch.Tensor, ...]:
+def activate(
+    parameters: dict[str, torch.Tensor],
+    degree: int,
+    kind: str = "octahedron",
+    filter_3d: torch.Tensor | None = None,
+) -> tuple[torch.Tensor, ...]:
     """Raw parameters to what the rasterizer takes: center, rotation, extent, density, sh.
 
-    extent = exp(log_extent); density = softplus(raw_opacity) / (2 min extent), so that a ray along the shortest diagonal has
-    alpha = 1 - exp(-softplus(raw)) = sigmoid(raw), with no cap and no logarithm of 0.
+    extent = exp(log_extent), and with `filter_3d` f (N,), a constant, extent + f / 2, or sqrt(extent^2 + f^2) for Gaussians.
+    density = softplus(raw_opacity) / reference_length(extent), so that a ray along that length has alpha = 1 -
+    exp(-softplus(raw)) = sigmoid(raw), with no cap and no logarithm of 0; for Gaussians the opacity itself, sigmoid(raw).
     """
     extent = torch.exp(parameters["log_extent"])
-    density = torch.nn.functional.softplus(parameters["raw_opacity"]) / (2 * extent.amin(1))
+    if kind == "gaussian":
+        extent = extent if filter_3d is None else torch.sqrt(extent**2 + filter_3d[:, None] ** 2)
+        density = torch.sigmoid(parameters["raw_opacity"])
+    else:
+        extent = extent if filter_3d is None else extent + filter_3d[:, None] / 2
+        density = torch.nn.functional.softplus(parameters["raw_opacity"]) / reference_length(extent, kind)
     count = (degree + 1) ** 2 - 1
     sh = (
         parameters["sh_dc"]
@@ -114,6 +148,35 @@ def activate(parameters: dict[str, torch.Tensor], degree: int) -> tuple[torch.Te
         else torch.cat([parameters["sh_dc"], parameters["sh_rest"][:, :count]], 1)
     )
     return parameters["center"], parameters["rotation"], extent, density, sh
+
+
+def filter_lengths(center: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
+    """(N,) float32 f = sqrt(0.2) z / F: part of a pixel, at the nearest camera that sees each of the (N, 3) centres.
+
+    z is the least depth over those cameras, F the largest focal length of all. A centre that no camera sees has the distance of the
+    nearest camera for z. Source: Mip-Splatting (Yu et al. 2024), LinPrim's box_factor.
+    """
+    xyz = center.detach().numpy()
+    least = np.full(len(xyz), np.inf, np.float32)
+    for camera in cameras:
+        x, y, z = (
+            xyz @ camera.rotation.astype(np.float32).T + camera.world_to_camera[:3, 3].astype(np.float32)
+        ).T
+        seen = z > FILTER_NEAR
+        for along, focal, middle, size in (
+            (x, camera.fx, camera.cx, camera.width),
+            (y, camera.fy, camera.cy, camera.height),
+        ):
+            # -margin size < focal along / z + middle < (1 + margin) size
+            reach = (0.5 + FILTER_MARGIN) * size
+            seen &= np.abs(focal * along + (middle - size / 2) * z) < reach * z
+        np.minimum(least, z, out=least, where=seen)
+    unseen = ~np.isfinite(least)
+    centers = np.stack([camera.center for camera in cameras]).astype(np.float32)
+    for position in centers if unseen.any() else ():
+        least[unseen] = np.minimum(least[unseen], np.linalg.norm(xyz[unseen] - position, axis=1))
+    focal = max(max(camera.fx, camera.fy) for camera in cameras)
+    return torch.from_numpy((math.sqrt(FILTER_VARIANCE) / focal * least).astype(np.float32))
 
 
 class Trainer:
@@ -137,11 +200,15 @@ class Trainer:
             self.parameters["background"] = background
         self.first = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
         self.second = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
-        self.pull = torch.zeros(len(self))
         self.step = 0
         self.seconds = 0.0
         self.loss = self.psnr = math.nan  # running means
-        self.growth = population.Growth.plan(options.iterations, len(self), options.max_primitives)
+        self.kind, self.how = options.primitive, raster_options(options)
+        self.control = CONTROLS[options.population](
+            options, len(self), [shot.camera for shot in shots], bounds
+        )
+        self.filter_3d: torch.Tensor | None = None
+        self._refilter()
 
     def __len__(self) -> int:
         return len(self.parameters["center"])
@@ -175,22 +242,27 @@ class Trainer:
         leaves = {k: v.requires_grad_() for k, v in self.parameters.items()}
         screen = torch.zeros(len(self), 3, requires_grad=True)
         out = ops.rasterize(
-            *activate(leaves, self.degree),
+            *activate(leaves, self.degree, self.kind, self.filter_3d),
             background,
             shot.camera,
             stop=self.options.stop,
             samples=self.options.samples,
             screen=screen,
+            **self.how,
         )
         parts = ops.photometric_loss(out.rgb, target, self.options.dssim)
-        *grads, screen_grad = torch.autograd.grad(parts[0], [*leaves.values(), screen], allow_unused=True)
+        penalty = self.control.penalty(leaves)
+        objective = parts[0] if penalty is None else parts[0] + penalty
+        *grads, screen_grad = torch.autograd.grad(objective, [*leaves.values(), screen], allow_unused=True)
         with torch.no_grad():
             self._update(dict(zip(leaves, grads, strict=True)))
-            # In units of the image's size, so that views of different resolution pull alike.
-            self.pull += screen_grad[:, 2] * max(shot.camera.width, shot.camera.height)
+            self.control.disturb(self.parameters, self.step + 1)
+            self.control.gather(self.parameters, shot.camera, screen_grad)
         self.step += 1
-        if self.growth.is_due(self.step):
+        if self.control.is_due(self.step):
             self._grow()
+        elif self.step % FILTER_EVERY == 0:
+            self._refilter()
         loss, _, _, error = parts.detach().tolist()
         psnr = -10 * math.log10(max(error, 1e-12)) if math.isfinite(error) else math.nan
         self.loss = 0.98 * self.loss + 0.02 * loss if self.step > 1 else loss
@@ -216,47 +288,52 @@ class Trainer:
             self.parameters["background"].clamp_(0, 1)
 
     def _grow(self) -> None:
-        rng = np.random.default_rng([self.options.seed, 5, self.step])
-        parents, children, halves = population.grow(
-            self.parameters, self.pull, self.growth, math.log(self.bounds[0]), rng
-        )
-        total = max(len(self), int(children.max(initial=-1)) + 1)
+        event = self.control.change(self.parameters, self.step)
+        source = torch.from_numpy(event.source)
         for name in self.parameters:
             if name == "background":
                 continue
             for table in (self.parameters, self.first, self.second):
-                old = table[name]
-                new = old.new_zeros((total, *old.shape[1:]))
-                new[: len(old)] = old
-                # A child is its parent, moments and all, but for what a half has of its own.
-                new[children] = new[parents]
-                table[name] = new
-            if name in halves:
-                self.parameters[name][parents] = torch.from_numpy(halves[name][0].astype(np.float32))
-                self.parameters[name][children] = torch.from_numpy(halves[name][1].astype(np.float32))
-            self.first[name][parents] = 0
-            self.first[name][children] = 0
-        self.pull = torch.zeros(total)
+                table[name] = table[name][source]
+            if name in event.values:
+                rows, values = event.values[name]
+                self.parameters[name][torch.from_numpy(rows)] = torch.from_numpy(values.astype(np.float32))
+            moments = [(self.first, event.calm), (self.first, event.fresh), (self.second, event.fresh)]
+            if name == "raw_opacity" and event.calm_opacity:
+                moments += [(self.first, slice(None)), (self.second, slice(None))]
+            for table, rows in moments:
+                if rows is not None:
+                    table[name][rows] = 0
+        self.control.reset(len(self))
+        self._refilter()
+
+    def _refilter(self) -> None:
+        """Makes the 3D filter for where the primitives are now."""
+        if self.options.filter != "none":
+            cameras = [shot.camera for shot in self.shots]
+            self.filter_3d = filter_lengths(self.parameters["center"], cameras)
 
     @torch.no_grad()
     def render(self, camera: Camera, background: torch.Tensor) -> torch.Tensor:
         """(3, H, W) colour of a camera in the training frame."""
         return ops.rasterize(
-            *activate(self.parameters, self.degree),
+            *activate(self.parameters, self.degree, self.kind, self.filter_3d),
             background,
             camera,
             stop=self.options.stop,
             samples=self.options.samples,
+            **self.how,
         ).rgb
 
     def shown_background(self) -> torch.Tensor:
         """(3,) the background that renders and scores use."""
         return self.parameters["background"].detach() if self.fitted else self.background
 
-    def octahedra(self) -> Octahedra:
-        """The primitives as plain arrays, in the training frame."""
+    def primitives(self) -> Primitives:
+        """The primitives as the rasterizer takes them, the 3D filter included, in the training frame."""
         with torch.no_grad():
-            return Octahedra(*(t.numpy().copy() for t in activate(self.parameters, self.options.sh_degree)))
+            active = activate(self.parameters, self.options.sh_degree, self.kind, self.filter_3d)
+            return Primitives(*(tensor.numpy().copy() for tensor in active), kind=self.kind)
 
     def state(self) -> dict:
         """Everything a resumed run needs, as tensors and numbers."""
@@ -264,19 +341,14 @@ class Trainer:
             "parameters": self.parameters,
             "first": self.first,
             "second": self.second,
-            "pull": self.pull,
+            "gathered": self.control.gathered,
+            "filter_3d": self.filter_3d,
             "step": self.step,
             "bounds": list(self.bounds),
             "seconds": self.seconds,
             "loss": self.loss,
             "psnr": self.psnr,
-            "growth": [
-                self.growth.first,
-                self.growth.last,
-                self.growth.every,
-                self.growth.rate,
-                self.growth.cap,
-            ],
+            "control": self.control.state(),
         }
 
     def restore(self, state: dict) -> None:
@@ -285,12 +357,15 @@ class Trainer:
             if set(state[name]) != set(getattr(self, name)):
                 raise ValueError(f"{name} has {sorted(state[name])}, wanted {sorted(getattr(self, name))}")
             setattr(self, name, dict(state[name]))
-        self.pull, self.step = state["pull"], int(state["step"])
+        self.step, self.filter_3d = int(state["step"]), state["filter_3d"]
+        if set(state["gathered"]) != set(self.control.NAMES):
+            raise ValueError(f"gathered has {sorted(state['gathered'])}, wanted {sorted(self.control.NAMES)}")
+        self.control.gathered = dict(state["gathered"])
+        self.control.restore(state["control"])
         self.bounds = (float(state["bounds"][0]), float(state["bounds"][1]))
+        self.control.bounds = self.bounds
         self.seconds, self.loss, self.psnr = (
             float(state["seconds"]),
             float(state["loss"]),
             float(state["psnr"]),
         )
-        first, last, every, rate, cap = state["growth"]
-        self.growth = population.Growth(int(first), int(last), int(every), float(rate), int(cap))

@@ -64,13 +64,13 @@ def octahedron_run(folder: Path, density: float = DENSITY, views: int = 24, size
     """A run that holds the one octahedron of this module, photographed from all around, without training."""
     from linprim_geo.initial_points import scene_normalization
     from linprim_geo.options import SceneOptions, TrainOptions
-    from linprim_geo.primitives import Octahedra
+    from linprim_geo.primitives import Primitives
     from linprim_geo.run import Run
     from linprim_geo.scene import load_scene
     from linprim_geo.synth import synthesize
     from linprim_geo.textured import TexturedMesh
 
-    one = Octahedra(
+    one = Primitives(
         np.array([CENTER]),
         np.array([ROTATION]),
         np.array([EXTENT]),
@@ -88,7 +88,7 @@ def octahedron_run(folder: Path, density: float = DENSITY, views: int = 24, size
     scene = load_scene(scene_path)
     similarity = scene_normalization(scene)
     run = Run.create(folder / "run", scene, scene_path, SceneOptions(), TrainOptions(threads=1), similarity)
-    scaled = Octahedra(
+    scaled = Primitives(
         similarity.apply(one.center),
         one.rotation,
         one.extent * similarity.scale,

@@ -135,11 +135,34 @@ def test_train_gets_what_was_said(recorded_train, capsys):
     assert "primitives: 7" in capsys.readouterr().out
 
 
-def test_options_of_3dgs_are_understood(recorded_train):
+def test_options_of_3dgs_are_understood(recorded_train, tiny_scene):
     assert cli.main("train -s data/lego -m out -r 2 --eval --iterations 5".split()) == 0
-    assert cli.main("train --source_path data/lego --model_path out -r -1".split()) == 0
-    for (scene, run, scene_options, *_), downscale in zip(recorded_train, (2, 1), strict=True):
-        assert (scene, run, scene_options) == ("data/lego", "out", SceneOptions(downscale=downscale))
+    line = f"train --source_path {tiny_scene} --model_path out -r".split()
+    for resolution in ("-1", "48", "47", "16", "5"):
+        assert cli.main([*line, resolution]) == 0
+    assert [call[0] for call in recorded_train] == ["data/lego", *[str(tiny_scene)] * 5]
+    # Images are 48 wide; pixels are averaged, so a width is one that is at most what was asked for.
+    assert [call[2].downscale for call in recorded_train] == [2, 1, 1, 2, 3, 10]
+    assert {call[1] for call in recorded_train} == {"out"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [("-r 0", "-r is 0, wanted 1, 2, 4, 8"), ("-r -7", "-r is -7"), ("-r 2 --downscale 2", "wanted one of them"),
+     ("-r 300", "data/lego")],
+)  # fmt: skip
+def test_a_resolution_that_makes_no_sense_is_refused(arguments, sentence, recorded_train, capsys):
+    assert cli.main(["train", "-s", "data/lego", *arguments.split()]) == 1
+    error = capsys.readouterr().err
+    assert sentence in error and error.count("\n") == 1 and not recorded_train
+
+
+def test_kinds_and_rules_are_options(recorded_train):
+    line = "train a --primitive tetrahedron --ray-model affine --order overlap --filter 3d+screen --population mcmc"
+    assert cli.main(line.split()) == 0
+    options = recorded_train[0][3]
+    assert (options.primitive, options.ray_model, options.order) == ("tetrahedron", "affine", "overlap")
+    assert (options.filter, options.population) == ("3d+screen", "mcmc")
 
 
 @pytest.mark.parametrize("arguments", ["train", "train a -s b"])
@@ -151,7 +174,8 @@ def test_train_wants_exactly_one_scene(arguments, capsys):
 @pytest.mark.parametrize(
     "arguments",
     ["", "nonsense", "train a --iter 5", "train a --iterations x", "eval-mesh a", "eval-mesh a b --tau -1",
-     "synth out --size 3x", "synth out --views 0", "synth out --scene cad --mesh x.ply", "convert a",
+     "train a --primitive cube", "train a --filter 2d", "synth out --size 3x",
+     "synth out --views 0", "synth out --scene cad --mesh x.ply", "convert a",
      "render run --split x"],
 )  # fmt: skip
 def test_wrong_arguments_exit_with_2(arguments, capsys):

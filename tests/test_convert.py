@@ -7,6 +7,7 @@ import io
 import json
 import tracemalloc
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,8 +17,14 @@ from hypothesis import strategies as st
 from linprim_geo import cli
 from linprim_geo.convert import convert, find_scene_file, save_primitive_mesh
 from linprim_geo.errors import LinprimError
-from linprim_geo.ply import read_linprim_ply, read_ply_header, write_linprim_ply
-from linprim_geo.primitives import Octahedra, load_octahedra, save_octahedra, unit_quaternions
+from linprim_geo.ply import read_ply_header, read_primitive_ply, write_primitive_ply
+from linprim_geo.primitives import (
+    Primitives,
+    load_primitives,
+    reference_length,
+    save_primitives,
+    unit_quaternions,
+)
 
 FIELDS = ("center", "rotation", "extent", "density", "sh")
 
@@ -30,16 +37,43 @@ PROPERTIES = (
 
 
 def random_octahedra(count=50, coefficients=9, seed=0, thickness=None):
-    """Octahedra of any shape; `thickness` is the optical thickness of their shortest diagonals."""
+    """Primitives of any shape; `thickness` is the optical thickness of their shortest diagonals."""
     rng = np.random.default_rng(seed)
     extent = np.exp(rng.normal(-2, 1, (count, 3))).astype(np.float32)
     thickness = np.exp(rng.uniform(-7, 1.5, count)) if thickness is None else np.full(count, thickness)
-    return Octahedra(
+    return Primitives(
         center=rng.normal(size=(count, 3)),
         rotation=unit_quaternions(rng.normal(size=(count, 4))),
         extent=extent,
         density=thickness / (2.0 * extent.min(axis=1).astype(np.float64)),
         sh=rng.normal(size=(count, coefficients, 3)),
+    )
+
+
+def random_tetrahedra(count=50, coefficients=9, seed=0, thickness=None):
+    """Tetrahedra of any shape; `thickness` is that of the diameters of their inscribed spheres."""
+    rng = np.random.default_rng(seed)
+    extent = np.exp(rng.normal(-2, 1, (count, 4))).astype(np.float32)
+    thickness = np.exp(rng.uniform(-7, 1.5, count)) if thickness is None else np.full(count, thickness)
+    return Primitives(
+        center=rng.normal(size=(count, 3)),
+        rotation=unit_quaternions(rng.normal(size=(count, 4))),
+        extent=extent,
+        density=thickness / reference_length(extent.astype(np.float64), "tetrahedron"),
+        sh=rng.normal(size=(count, coefficients, 3)),
+        kind="tetrahedron",
+    )
+
+
+def random_gaussians(count=50, coefficients=9, seed=0):
+    rng = np.random.default_rng(seed)
+    return Primitives(
+        center=rng.normal(size=(count, 3)),
+        rotation=unit_quaternions(rng.normal(size=(count, 4))),
+        extent=np.exp(rng.normal(-4, 1, (count, 3))),
+        density=rng.uniform(0, 1, count),
+        sh=rng.normal(size=(count, coefficients, 3)),
+        kind="gaussian",
     )
 
 
@@ -76,7 +110,7 @@ def assert_same(a, b, fields=FIELDS):
 def test_import_follows_the_formulas_of_linprim(tmp_path):
     table = raw_table()
     (tmp_path / "in.ply").write_bytes(ply_bytes(table))
-    octahedra, report = read_linprim_ply(tmp_path / "in.ply")
+    octahedra, report = read_primitive_ply(tmp_path / "in.ply")
     assert report == {"rows": 4, "dropped": 0}
     for row, raw in zip(range(4), table, strict=True):
         extent = [abs(float(raw[f"dist_{k}"])) + float(raw["filter_3D"]) / 2 for k in range(3)]
@@ -95,7 +129,7 @@ def test_import_follows_the_formulas_of_linprim(tmp_path):
 
 
 def test_export_has_the_63_properties_in_order(tmp_path):
-    write_linprim_ply(tmp_path / "out.ply", random_octahedra(3))
+    write_primitive_ply(tmp_path / "out.ply", random_octahedra(3))
     header = read_ply_header(tmp_path / "out.ply")
     (vertex,) = header.elements
     assert [name for name, _ in vertex.properties] == PROPERTIES
@@ -106,8 +140,8 @@ def test_export_has_the_63_properties_in_order(tmp_path):
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
 def test_a_round_trip_through_linprims_file(tmp_path, coefficients):
     before = random_octahedra(200, coefficients, thickness=1.25)
-    assert write_linprim_ply(tmp_path / "x.ply", before) == {"rows": 200, "clamped": 0}
-    after, _ = read_linprim_ply(tmp_path / "x.ply")
+    assert write_primitive_ply(tmp_path / "x.ply", before) == {"rows": 200, "clamped": 0}
+    after, _ = read_primitive_ply(tmp_path / "x.ply")
     assert_same(before, after, ("center", "extent", "sh"))
     np.testing.assert_allclose(after.rotation, before.rotation, atol=2e-7)
     np.testing.assert_allclose(after.density, before.density, rtol=1e-6)
@@ -118,8 +152,8 @@ def test_a_round_trip_through_linprims_file(tmp_path, coefficients):
 def test_densities_survive_up_to_the_cap(tmp_path_factory, log_thickness):
     path = tmp_path_factory.getbasetemp() / "density.ply"
     before = random_octahedra(3, 1, thickness=np.exp(log_thickness))
-    report = write_linprim_ply(path, before)
-    after, _ = read_linprim_ply(path)
+    report = write_primitive_ply(path, before)
+    after, _ = read_primitive_ply(path)
     np.testing.assert_allclose(after.density, before.density, rtol=1e-5)
     if log_thickness < np.log(np.log(100.0)) - 1e-5:
         assert report["clamped"] == 0
@@ -127,16 +161,16 @@ def test_densities_survive_up_to_the_cap(tmp_path_factory, log_thickness):
 
 def test_what_linprim_cannot_hold_is_clamped_and_counted(tmp_path):
     thick, thin = random_octahedra(5, 1, thickness=20.0), random_octahedra(7, 1, thickness=4.6)
-    both = Octahedra(*(np.concatenate([getattr(thick, name), getattr(thin, name)]) for name in FIELDS))
-    assert write_linprim_ply(tmp_path / "x.ply", both) == {"rows": 12, "clamped": 5}
-    after, _ = read_linprim_ply(tmp_path / "x.ply")
+    both = Primitives(*(np.concatenate([getattr(thick, name), getattr(thin, name)]) for name in FIELDS))
+    assert write_primitive_ply(tmp_path / "x.ply", both) == {"rows": 12, "clamped": 5}
+    after, _ = read_primitive_ply(tmp_path / "x.ply")
     thickness = 2.0 * after.density.astype(np.float64) * after.extent.min(axis=1)
     np.testing.assert_allclose(thickness, [np.log(100.0)] * 5 + [4.6] * 7, rtol=1e-5)
 
 
 def test_an_empty_primitive_stays_invisible(tmp_path):
-    write_linprim_ply(tmp_path / "x.ply", random_octahedra(3, thickness=0.0))
-    after, _ = read_linprim_ply(tmp_path / "x.ply")
+    write_primitive_ply(tmp_path / "x.ply", random_octahedra(3, thickness=0.0))
+    after, _ = read_primitive_ply(tmp_path / "x.ply")
     assert np.isfinite(after.density).all() and (after.alpha < 1e-36).all()
 
 
@@ -144,8 +178,71 @@ def test_rows_without_volume_are_dropped_and_counted(tmp_path):
     table = raw_table()
     table["dist_1"][2] = table["filter_3D"][2] = 0
     (tmp_path / "x.ply").write_bytes(ply_bytes(table))
-    octahedra, report = read_linprim_ply(tmp_path / "x.ply")
+    octahedra, report = read_primitive_ply(tmp_path / "x.ply")
     assert len(octahedra) == 3 and report == {"rows": 4, "dropped": 1}
+
+
+def test_tetrahedra_are_linprims_layout_with_a_fourth_distance(tmp_path):
+    before = random_tetrahedra(200, 16, thickness=1.25)
+    assert write_primitive_ply(tmp_path / "x.ply", before) == {"rows": 200, "clamped": 0}
+    header = read_ply_header(tmp_path / "x.ply")
+    at = PROPERTIES.index("rot_0")
+    assert [n for n, _ in header.elements[0].properties] == [*PROPERTIES[:at], "dist_3", *PROPERTIES[at:]]
+    after, _ = read_primitive_ply(tmp_path / "x.ply")
+    assert after.kind == "tetrahedron"
+    assert_same(before, after, ("center", "extent", "sh"))
+    np.testing.assert_allclose(after.density, before.density, rtol=1e-6)
+    assert write_primitive_ply(tmp_path / "x.ply", random_tetrahedra(5, thickness=20.0))["clamped"] == 5
+
+
+def test_gaussians_follow_the_formulas_of_3dgs(tmp_path):
+    table = gaussian_table()
+    (tmp_path / "in.ply").write_bytes(ply_bytes(table))
+    gaussians, report = read_primitive_ply(tmp_path / "in.ply")
+    assert report == {"rows": 4, "dropped": 0} and gaussians.kind == "gaussian"
+    for row, raw in enumerate(table):
+        np.testing.assert_allclose(
+            gaussians.extent[row], [np.exp(float(raw[f"scale_{k}"])) for k in range(3)], rtol=1e-6
+        )
+        assert gaussians.density[row] == pytest.approx(1 / (1 + np.exp(-float(raw["opacity"]))), rel=1e-6)
+        quaternion = np.array([float(raw[f"rot_{k}"]) for k in range(4)])
+        np.testing.assert_allclose(
+            gaussians.rotation[row], quaternion / np.linalg.norm(quaternion), rtol=1e-6
+        )
+        for channel in range(3):
+            expected = [raw[f"f_dc_{channel}"], *(raw[f"f_rest_{15 * channel + k}"] for k in range(15))]
+            np.testing.assert_array_equal(gaussians.sh[row, :, channel], expected)
+
+
+def test_a_3d_filter_of_gaussians_keeps_their_mass(tmp_path):
+    table = gaussian_table()
+    filtered = np.zeros(4, dtype=[*table.dtype.descr, ("filter_3D", "<f4")])
+    for name in table.dtype.names:
+        filtered[name] = table[name]
+    filtered["filter_3D"] = 0.3
+    (tmp_path / "plain.ply").write_bytes(ply_bytes(table))
+    (tmp_path / "filtered.ply").write_bytes(ply_bytes(filtered))
+    plain, wide = (read_primitive_ply(tmp_path / f"{name}.ply")[0] for name in ("plain", "filtered"))
+    np.testing.assert_allclose(wide.extent, np.hypot(plain.extent, 0.3), rtol=1e-6)
+    np.testing.assert_allclose(
+        wide.density * wide.extent.prod(1), plain.density * plain.extent.prod(1), rtol=1e-5
+    )
+
+
+def test_a_round_trip_through_3dgs_file(tmp_path):
+    before = random_gaussians(200)
+    assert write_primitive_ply(tmp_path / "x.ply", before) == {"rows": 200, "clamped": 0}
+    (vertex,) = read_ply_header(tmp_path / "x.ply").elements
+    assert [name for name, _ in vertex.properties] == list(gaussian_table().dtype.names)
+    after, _ = read_primitive_ply(tmp_path / "x.ply")
+    assert_same(before, after, ("center", "sh"))
+    # Logarithms up to 8 and logits up to 8 in float32.
+    np.testing.assert_allclose(after.extent, before.extent, rtol=2e-6)
+    np.testing.assert_allclose(after.density, before.density, rtol=1e-5)
+    edges = replace(random_gaussians(2), density=np.array([0.0, 1.0]))
+    write_primitive_ply(tmp_path / "x.ply", edges)
+    after, _ = read_primitive_ply(tmp_path / "x.ply")
+    assert after.density[0] < 1e-36 and after.density[1] > 1 - 1e-7
 
 
 # --- our own file ----------------------------------------------------------------------------------------
@@ -153,8 +250,8 @@ def test_rows_without_volume_are_dropped_and_counted(tmp_path):
 
 def test_npz_is_exact(tmp_path):
     before = random_octahedra(100, 16)
-    save_octahedra(tmp_path / "x.npz", before)
-    after = load_octahedra(tmp_path / "x.npz")
+    save_primitives(tmp_path / "x.npz", before)
+    after = load_primitives(tmp_path / "x.npz")
     assert_same(before, after)
     assert after.sh_degree == 3
 
@@ -191,7 +288,7 @@ def enormous_npz():
         (b"", "not a complete .npz"),
         (b"PK\x03\x04 nonsense", "not a complete .npz"),
         (npz_bytes(**good_arrays())[:-100], "not a complete .npz"),
-        (npz_bytes(a=np.zeros(3)), "holds no octahedra"),
+        (npz_bytes(a=np.zeros(3)), "holds no primitives"),
         (npz_bytes(**good_arrays() | {"format": np.array("something else")}), "something else"),
         (npz_bytes(**{k: v for k, v in good_arrays().items() if k != "density"}), "density is missing"),
         (npz_bytes(**good_arrays() | {"density": np.zeros(3)}), "density has the shape"),
@@ -209,7 +306,7 @@ def test_a_bad_npz_is_one_sentence(tmp_path, data, sentence):
     (tmp_path / "x.npz").write_bytes(data)
     tracemalloc.start()
     with pytest.raises(LinprimError, match=rf"x\.npz: .*{sentence}"):
-        load_octahedra(tmp_path / "x.npz")
+        load_primitives(tmp_path / "x.npz")
     assert tracemalloc.get_traced_memory()[1] < 10e6
     tracemalloc.stop()
 
@@ -231,6 +328,26 @@ def with_value(name, value):
 def with_type(name, kind):
     table = raw_table()
     return table.astype([(other, kind if other == name else "<f4") for other in table.dtype.names])
+
+
+def gaussian_table(count=4, seed=1):
+    """Rows as 3DGS writes them."""
+    names = [name for name in PROPERTIES if not name.startswith(("dist", "filter"))]
+    at = names.index("rot_0")
+    names[at:at] = ["scale_0", "scale_1", "scale_2"]
+    rng = np.random.default_rng(seed)
+    table = np.zeros(count, dtype=[(name, "<f4") for name in names])
+    for name in names:
+        if not name.startswith("n"):
+            table[name] = rng.normal(size=count)
+    return table
+
+
+def gaussian_bytes(values):
+    table = gaussian_table()
+    for name, value in values.items():
+        table[name] = value
+    return ply_bytes(table)
 
 
 GOOD = ply_bytes(raw_table())
@@ -265,8 +382,21 @@ BAD_PLY = {
     "nan centre": (ply_bytes(with_value("y", np.nan)), "row 2 has a NaN or infinite x"),
     "inf extent": (ply_bytes(with_value("dist_2", np.inf)), "row 2 has a NaN or infinite dist_0"),
     "nan opacity": (ply_bytes(with_value("opacity", np.nan)), "row 2 has a NaN or infinite opacity"),
-    "gaussians": (ply_bytes(raw_table(), [("dist_0", "scale_0"), ("dist_1", "scale_1")]), "3D Gaussians"),
-    "tetrahedra": (ply_bytes(raw_table(), [("float nx", "float dist_3")]), "tetrahedra"),
+    "gaussians": (
+        ply_bytes(raw_table(), [("dist_0", "scale_0"), ("dist_1", "scale_1")]),
+        "scale_2 is missing, wanted 3DGS's 62",
+    ),
+    "tetrahedra": (
+        ply_bytes(raw_table(), [("float filter_3D", "float dist_3")]),
+        "filter_3D is missing, wanted LinPrim's 64",
+    ),
+    "mesh": (ply_bytes(raw_table(), [("float dist_0", "float other")]), "holds no primitives"),
+    "flat gaussians": (
+        gaussian_bytes({"scale_1": -np.inf}),
+        "row 0 has a NaN or infinite scale_0",
+    ),
+    "gaussians without size": (gaussian_bytes({"scale_1": -1e4}), "none of its 4 primitives has a volume"),
+    "huge gaussians": (gaussian_bytes({"scale_1": 1e4}), "none of its 4 primitives has a volume"),
 }
 
 
@@ -276,7 +406,7 @@ def test_a_bad_ply_is_one_sentence(tmp_path, name):
     (tmp_path / "x.ply").write_bytes(data)
     tracemalloc.start()
     with pytest.raises(LinprimError, match=rf"x\.ply: .*{sentence}"):
-        read_linprim_ply(tmp_path / "x.ply")
+        read_primitive_ply(tmp_path / "x.ply")
     assert tracemalloc.get_traced_memory()[1] < 10e6
     tracemalloc.stop()
 
@@ -293,7 +423,7 @@ def test_no_damage_ends_in_anything_but_a_sentence(tmp_path_factory, changes, le
         data[position] = value
     path.write_bytes(data[:length] if length % 3 == 0 else data)
     try:
-        octahedra, _ = read_linprim_ply(path)
+        octahedra, _ = read_primitive_ply(path)
     except LinprimError as error:
         assert "\n" not in str(error)
     else:
@@ -324,7 +454,7 @@ def test_the_mesh_of_the_primitives_is_the_primitives():
 
 def test_a_quarter_turn_about_z_takes_x_to_y():
     half = np.sqrt(0.5)
-    octahedra = Octahedra([[0, 0, 0]], [[half, 0, 0, half]], [[3, 2, 1]], [1.0], np.zeros((1, 1, 3)))
+    octahedra = Primitives([[0, 0, 0]], [[half, 0, 0, half]], [[3, 2, 1]], [1.0], np.zeros((1, 1, 3)))
     expected = [[0, -3, 0], [0, 3, 0], [2, 0, 0], [-2, 0, 0], [0, 0, -1], [0, 0, 1]]
     np.testing.assert_allclose(octahedra.vertices[0], expected, atol=1e-6)
 
@@ -333,7 +463,7 @@ def test_colours_and_alpha_of_the_mesh(tmp_path):
     import trimesh
 
     sh = np.array([[[0.0, 0.5 / 0.28209479177387814, -9.0]]])
-    octahedra = Octahedra([[1, 2, 3]], [[1, 0, 0, 0]], [[2, 1, 4]], [np.log(2) / 2], sh)
+    octahedra = Primitives([[1, 2, 3]], [[1, 0, 0, 0]], [[2, 1, 4]], [np.log(2) / 2], sh)
     np.testing.assert_allclose(octahedra.alpha, 0.5, rtol=1e-7)
     save_primitive_mesh(tmp_path / "x.ply", octahedra)
     mesh = trimesh.load(tmp_path / "x.ply", process=False)
@@ -347,6 +477,17 @@ def test_colours_and_alpha_of_the_mesh(tmp_path):
     assert description["accessors"][color]["type"] == "VEC4"
 
 
+def test_gaussians_become_ellipsoids(tmp_path):
+    import trimesh
+
+    gaussians = replace(random_gaussians(1), extent=np.array([[0.3, 0.2, 0.1]]))
+    assert save_primitive_mesh(tmp_path / "x.ply", gaussians) == 80
+    mesh = trimesh.load(tmp_path / "x.ply", process=False)
+    # An icosphere of 80 faces has 0.87 of its sphere's volume.
+    assert mesh.is_watertight and mesh.volume == pytest.approx(0.873 * 4 / 3 * np.pi * 0.006, rel=0.01)
+    assert np.unique(mesh.visual.vertex_colors[:, 3]) == np.rint(gaussians.density * 255)
+
+
 # --- the command -----------------------------------------------------------------------------------------
 
 
@@ -355,7 +496,7 @@ def test_primitives_become_meshes(tmp_path, suffix, capsys):
     import trimesh
 
     octahedra = random_octahedra(20)
-    save_octahedra(tmp_path / "x.npz", octahedra)
+    save_primitives(tmp_path / "x.npz", octahedra)
     target = tmp_path / f"y{suffix}"
     assert cli.main(["convert", str(tmp_path / "x.npz"), str(target), "--as", "mesh", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["wrote"] == "mesh"
@@ -375,22 +516,48 @@ def test_meshes_become_meshes(tmp_path, suffix):
 
 def test_a_run_and_a_model_folder_stand_for_their_primitives(tmp_path):
     run = tmp_path / "run"
-    save_octahedra(run / "scene.npz", random_octahedra(3))
+    save_primitives(run / "scene.npz", random_octahedra(3))
     assert find_scene_file(run) == run / "scene.npz"
     model = tmp_path / "model" / "point_cloud"
     for iteration in (7000, 30000, 900):
-        write_linprim_ply(
+        write_primitive_ply(
             model / f"iteration_{iteration}" / "point_cloud.ply", random_octahedra(iteration // 100)
         )
     assert find_scene_file(model.parent) == model / "iteration_30000" / "point_cloud.ply"
     assert convert(model.parent, tmp_path / "y.npz")["count"] == 300
-    assert len(load_octahedra(tmp_path / "y.npz")) == 300
+    assert len(load_primitives(tmp_path / "y.npz")) == 300
     with pytest.raises(LinprimError, match="neither scene.npz"):
         find_scene_file(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("make", "plural"), [(random_tetrahedra, "tetrahedra"), (random_gaussians, "Gaussians")]
+)
+def test_other_kinds_stay_what_they_are(make, plural, tmp_path):
+    before = make(20)
+    save_primitives(tmp_path / "x.npz", before)
+    assert convert(tmp_path / "x.npz", tmp_path / "y.ply")["wrote"].endswith(f"s {plural}")
+    report = convert(tmp_path / "y.ply", tmp_path / "z.npz")
+    assert (report["read"], report["wrote"], report["count"]) == (plural, plural, 20)
+    after = load_primitives(tmp_path / "z.npz")
+    assert after.kind == before.kind
+    np.testing.assert_allclose(after.extent, before.extent, rtol=2e-6)
+    assert convert(tmp_path / "x.npz", tmp_path / "y.glb")["faces"] == 20 * (4 if plural[0] == "t" else 80)
+
+
+def test_octahedra_become_gaussians_when_asked(tmp_path, capsys):
+    octahedra = random_octahedra(9)
+    save_primitives(tmp_path / "x.npz", octahedra)
+    line = ["convert", str(tmp_path / "x.npz"), str(tmp_path / "y.ply"), "--as", "gaussians"]
+    assert cli.main(line) == 0 and "3DGS's Gaussians" in capsys.readouterr().out
+    after, _ = read_primitive_ply(tmp_path / "y.ply")
+    assert after.kind == "gaussian"
+    np.testing.assert_allclose(after.extent, octahedra.extent / 2.6, rtol=2e-6)
+    np.testing.assert_allclose(after.density, octahedra.alpha, rtol=1e-5)
+
+
 def test_thick_rows_are_reported_by_the_command(tmp_path, capsys):
-    save_octahedra(tmp_path / "x.npz", random_octahedra(6, thickness=9.0))
+    save_primitives(tmp_path / "x.npz", random_octahedra(6, thickness=9.0))
     assert cli.main(["convert", str(tmp_path / "x.npz"), str(tmp_path / "y.ply")]) == 0
     assert "6 are thicker" in capsys.readouterr().out
 
@@ -407,12 +574,16 @@ def test_thick_rows_are_reported_by_the_command(tmp_path, capsys):
         ("mesh.ply", "y.npz", "auto", "is a mesh"),
         ("mesh.ply", "y.ply", "primitives", "is a mesh"),
         ("points.ply", "y.npz", "auto", "points alone"),
-        ("gaussians.ply", "y.npz", "auto", "3D Gaussians"),
+        ("gaussians.ply", "y.npz", "auto", "3DGS's 62 properties"),
+        ("x.npz", "y.obj", "gaussians", "holds a mesh"),
+        ("mesh.ply", "y.ply", "gaussians", "is a mesh"),
+        ("tetra.npz", "y.ply", "gaussians", "cannot be written as Gaussians"),
         ("short.ply", "y.npz", "auto", "truncated"),
     ],
 )
 def test_what_cannot_be_converted_writes_nothing(tmp_path, source, target, how, sentence, capsys):
-    save_octahedra(tmp_path / "x.npz", random_octahedra(3))
+    save_primitives(tmp_path / "x.npz", random_octahedra(3))
+    save_primitives(tmp_path / "tetra.npz", random_tetrahedra(3))
     (tmp_path / "x.txt").write_text("text")
     save_primitive_mesh(tmp_path / "mesh.ply", random_octahedra(3))
     points = np.zeros(2, dtype=[(name, "<f4") for name in "xyz"])

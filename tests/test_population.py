@@ -9,25 +9,41 @@ import pytest
 import torch
 
 from linprim_geo import population
-from linprim_geo.population import DEAD_OPACITY, Growth, grow
-from linprim_geo.primitives import Octahedra
+from linprim_geo.options import TrainOptions
+from linprim_geo.population import DEAD_OPACITY, GradientControl, Growth, grow
+from linprim_geo.primitives import KINDS, Primitives
 
 SMALLEST = math.log(1e-3)
 
 
-def parameters(count: int, seed: int = 0) -> dict[str, torch.Tensor]:
+def parameters(count: int, seed: int = 0, kind: str = "octahedron") -> dict[str, torch.Tensor]:
     rng = np.random.default_rng(seed)
+    columns = KINDS[kind].extents
     values = {
         "center": rng.normal(size=(count, 3)),
         "rotation": rng.normal(size=(count, 4)),
-        "log_extent": np.log(rng.uniform(0.05, 0.3, (count, 3))),
+        "log_extent": np.log(rng.uniform(0.05, 0.3, (count, columns))),
         "raw_opacity": rng.normal(size=count),
     }
     return {name: torch.from_numpy(value.astype(np.float32)) for name, value in values.items()}
 
 
-def event(table, pull, cap=10_000, rate=0.05, seed=0):
-    return grow(table, pull, Growth(0, 100, 1, rate, cap), SMALLEST, np.random.default_rng(seed))
+def event(table, pull, cap=10_000, rate=0.05, seed=0, kind="octahedron"):
+    return grow(table, pull, Growth(0, 100, 1, rate, cap), SMALLEST, np.random.default_rng(seed), kind)
+
+
+def shapes(table, kind, rows=slice(None), **changed) -> Primitives:
+    """Rows of a table as primitives; `changed` replaces center or log_extent."""
+    center = changed.get("center", table["center"].numpy()[rows])
+    log_extent = changed.get("log_extent", table["log_extent"].numpy().astype(np.float64)[rows])
+    rotation = table["rotation"].numpy()[rows]
+    count = len(center)
+    return Primitives(center, rotation, np.exp(log_extent), np.ones(count), np.zeros((count, 1, 3)), kind)
+
+
+def volumes(primitives: Primitives) -> np.ndarray:
+    v = primitives.vertices
+    return np.abs(np.linalg.det(v[:, 1:] - v[:, :1])) / 6
 
 
 @pytest.mark.parametrize(
@@ -63,7 +79,7 @@ def test_halves_stay_inside_the_box_of_the_parent_and_along_the_axis_that_is_cut
     parents, children, halves = event(table, pull, rate=0.25)
     assert len(parents) == 50 and list(children) == list(range(200, 250))
     parent = np.exp(table["log_extent"].numpy().astype(np.float64))[parents]
-    whole = Octahedra(
+    whole = Primitives(
         *(table[name].numpy()[parents] for name in ("center", "rotation")),
         parent,
         np.ones(50),
@@ -175,3 +191,89 @@ def test_halves_of_a_population_together_hold_most_of_its_volume():
     parent = table["log_extent"].numpy().astype(np.float64)[parents].sum(1)
     assert np.allclose(halves["log_extent"].sum(2) - parent, math.log(along * across**2), atol=1e-5)
     assert 2 * along * across**2 == pytest.approx(0.768)
+
+
+def barycentric(corners, points):
+    """(P, Q, 4) coordinates of (P, Q, 3) points in (P, 4, 3) tetrahedra."""
+    base = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    rest = np.einsum("pij,pqj->pqi", np.linalg.inv(base), points - corners[:, :1])
+    return np.concatenate([1 - rest.sum(2, keepdims=True), rest], axis=2)
+
+
+def test_halves_of_a_tetrahedron_stay_inside_it_and_share_its_longest_edge():
+    table = parameters(200, kind="tetrahedron")
+    parents, _, halves = event(table, torch.ones(200), rate=0.5, kind="tetrahedron")
+    whole = shapes(table, "tetrahedron", parents)
+    corners = whole.vertices
+    one, other = np.triu_indices(4, 1)
+    longest = np.linalg.norm(corners[:, one] - corners[:, other], axis=2).argmax(1)
+    rows, kept = np.arange(len(parents)), []
+    for half in (0, 1):
+        part = shapes(
+            table,
+            "tetrahedron",
+            parents,
+            center=halves["center"][half],
+            log_extent=halves["log_extent"][half],
+        )
+        inside = barycentric(corners, part.vertices)
+        assert inside.min() > -1e-5  # float32 arrays
+        kept.append((one, other)[half][longest])
+        np.testing.assert_allclose(part.vertices[rows, kept[-1]], corners[rows, kept[-1]], atol=1e-6)
+        assert (part.rotation == whole.rotation).all()
+    assert (kept[0] != kept[1]).all()
+
+
+def test_halves_of_a_tetrahedron_hold_most_of_its_volume_and_overlap_little():
+    table = parameters(200, kind="tetrahedron")
+    parents, _, halves = event(table, torch.ones(200), rate=0.5, kind="tetrahedron")
+    whole = shapes(table, "tetrahedron", parents)
+    parts = [
+        shapes(table, "tetrahedron", parents, center=halves["center"][i], log_extent=halves["log_extent"][i])
+        for i in (0, 1)
+    ]
+    share = sum(volumes(part) for part in parts) / volumes(whole)
+    assert share.min() > 0.8 and share.max() < 0.9
+    rng = np.random.default_rng(0)
+    weight = rng.exponential(size=(len(parents), 2000, 4))
+    points = np.einsum("pqk,pki->pqi", weight / weight.sum(2, keepdims=True), whole.vertices)
+    inside = sum((barycentric(part.vertices, points) >= 0).all(2).astype(int) for part in parts)
+    assert (inside == 0).mean() < 0.3 and (inside == 2).mean() < 0.15
+
+
+def test_halves_of_a_gaussian_keep_its_moments_and_its_thickness():
+    table = parameters(100, kind="gaussian")
+    parents, _, halves = event(table, torch.ones(100), rate=0.5, kind="gaussian")
+    rotation = shapes(table, "octahedron", parents).axes
+
+    def covariance(log_extent):
+        return np.einsum("pik,pk,pjk->pij", rotation, np.exp(2 * log_extent), rotation)
+
+    before = covariance(table["log_extent"].numpy().astype(np.float64)[parents])
+    middle = table["center"].numpy().astype(np.float64)[parents]
+    np.testing.assert_allclose(halves["center"].mean(0), middle, atol=1e-6)
+    away = halves["center"] - middle
+    after = np.einsum("hpi,hpj->pij", away, away) / 2 + covariance(halves["log_extent"][0])
+    np.testing.assert_allclose(after, before, atol=1e-6)
+    thickness = np.logaddexp(0, table["raw_opacity"].numpy().astype(np.float64)[parents])
+    both = np.logaddexp(0, halves["raw_opacity"])
+    size = np.exp(
+        halves["log_extent"].sum(2) - table["log_extent"].numpy().astype(np.float64)[parents].sum(1)
+    )
+    np.testing.assert_allclose((both * size).sum(0), thickness, rtol=1e-5)
+
+
+def test_an_event_copies_rows_and_moments():
+    options = TrainOptions(iterations=100, max_primitives=60)
+    control = GradientControl(options, 50, [], (1e-3, 1.0))
+    table = parameters(50)
+    control.gathered["pull"] += 1
+    event = control.change(table, 5)
+    new = np.arange(50, len(event.source))
+    assert 0 < len(new) <= 10 and (event.source[:50] == np.arange(50)).all()
+    rows, values = event.values["center"]
+    assert set(new) < set(rows) and set(event.source[new]) < set(rows) and len(values) == len(rows)
+    assert (np.sort(event.calm) == np.sort(rows)).all() and event.fresh is None
+    again = GradientControl(options, 7, [], (1e-3, 1.0))
+    again.restore(control.state())
+    assert again.growth == control.growth

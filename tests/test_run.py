@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,8 +12,8 @@ import pytest
 from linprim_geo.camera import Similarity
 from linprim_geo.errors import LinprimError
 from linprim_geo.options import SceneOptions, TrainOptions
-from linprim_geo.ply import read_linprim_ply
-from linprim_geo.primitives import Octahedra, load_octahedra
+from linprim_geo.ply import read_primitive_ply
+from linprim_geo.primitives import Primitives, load_primitives
 from linprim_geo.run import Run, to_data_set
 from linprim_geo.scene import load_scene
 
@@ -28,7 +29,7 @@ def some_octahedra(count=5):
     rotation = rng.normal(size=(count, 4))
     rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
     extent, density = rng.uniform(0.1, 1, (count, 3)), rng.uniform(1, 9, count)
-    return Octahedra(rng.normal(size=(count, 3)), rotation, extent, density, rng.normal(size=(count, 4, 3)))
+    return Primitives(rng.normal(size=(count, 3)), rotation, extent, density, rng.normal(size=(count, 4, 3)))
 
 
 def test_a_created_run_opens_as_it_was(tiny_scene, tmp_path):
@@ -62,12 +63,12 @@ def test_every_export_holds_the_same_primitives(tmp_path):
     octahedra, similarity = some_octahedra(), Similarity(4.0, (10.0, 20.0, 30.0))
     run = Run(tmp_path, tmp_path, SceneOptions(), TrainOptions(), similarity)
     run.save(octahedra, {"background": [0, 0, 0]})
-    trained, exported = run.training_primitives(), load_octahedra(tmp_path / "scene.npz")
+    trained, exported = run.training_primitives(), load_primitives(tmp_path / "scene.npz")
     for name in ("center", "rotation", "extent", "density", "sh"):
         assert np.array_equal(getattr(trained, name), getattr(octahedra, name))
         assert np.array_equal(getattr(run.primitives(), name), getattr(exported, name))
     assert np.abs(exported.center - (octahedra.center / 4 + [10, 20, 30])).max() < 1e-5
-    ply, _ = read_linprim_ply(tmp_path / "scene.ply")
+    ply, _ = read_primitive_ply(tmp_path / "scene.ply")
     assert np.abs(ply.center - exported.center).max() == 0
     # LinPrim's files hold the opacity capped at 0.99; these are below it.
     assert exported.alpha.max() < 1 and np.allclose(ply.extent, exported.extent, rtol=1e-6)
@@ -81,6 +82,19 @@ def test_lengths_and_densities_change_with_the_frame_and_opacity_does_not():
     assert np.allclose(moved.alpha, octahedra.alpha, rtol=1e-5)
     assert np.allclose(moved.center, octahedra.center * 100 + [1, 2, 3], rtol=1e-6)
     assert np.array_equal(moved.rotation, octahedra.rotation) and np.array_equal(moved.sh, octahedra.sh)
+
+
+def test_the_opacity_of_gaussians_is_the_same_in_every_frame(tmp_path):
+    octahedra = some_octahedra()
+    gaussians = replace(octahedra, density=np.linspace(0, 1, 5), kind="gaussian")
+    similarity = Similarity(0.01, (1.0, 2.0, 3.0))
+    moved = to_data_set(gaussians, similarity)
+    assert np.array_equal(moved.density, gaussians.density) and moved.kind == "gaussian"
+    assert np.allclose(moved.extent, gaussians.extent * 100, rtol=1e-6)
+    run = Run(tmp_path, tmp_path, SceneOptions(), TrainOptions(primitive="gaussian"), similarity)
+    run.save(gaussians, {"background": [0, 0, 0]})
+    assert run.training_primitives().kind == run.primitives().kind == "gaussian"
+    assert read_primitive_ply(tmp_path / "scene.ply")[0].kind == "gaussian"
 
 
 def test_options_of_another_version_are_left_out(run_copy):

@@ -25,7 +25,7 @@ from linprim_geo.errors import LinprimError
 from linprim_geo.eval.depth import eval_depth_run
 from linprim_geo.eval.images import eval_images_run
 from linprim_geo.options import SceneOptions, TrainOptions
-from linprim_geo.primitives import load_octahedra
+from linprim_geo.primitives import KINDS, Primitives, load_primitives
 from linprim_geo.run import Run
 from linprim_geo.scene import load_scene
 from linprim_geo.synth import synthesize
@@ -79,7 +79,7 @@ def assert_same_run(one, other):
         else:
             assert a[name] == b[name], name
     for file in ("training_frame.npz", "scene.npz"):
-        p, q = load_octahedra(one / file), load_octahedra(other / file)
+        p, q = load_primitives(one / file), load_primitives(other / file)
         for name in ("center", "rotation", "extent", "density", "sh"):
             assert getattr(p, name).tobytes() == getattr(q, name).tobytes(), (file, name)
     assert (one / "scene.ply").read_bytes() == (other / "scene.ply").read_bytes()
@@ -130,7 +130,7 @@ def test_a_run_learns_and_says_so(tiny_run, tiny_options):
     )
     assert no_temporary_files(tiny_run)
     state = json.loads((tiny_run / "run.json").read_text())
-    assert (state["iteration"], state["primitives"]) == (400, len(load_octahedra(tiny_run / "scene.npz")))
+    assert (state["iteration"], state["primitives"]) == (400, len(load_primitives(tiny_run / "scene.npz")))
 
 
 def test_the_score_is_the_one_that_eval_images_finds(tiny_run, tmp_path):
@@ -149,7 +149,7 @@ def test_only_the_last_checkpoints_are_kept_and_they_hold_tensors_alone(tiny_run
 def test_the_checkpoint_and_the_exported_primitives_agree(tiny_run):
     with torch.no_grad():
         tensors = training_step.activate(checkpoint(tiny_run)["parameters"], 1)
-    saved = load_octahedra(tiny_run / "training_frame.npz")
+    saved = load_primitives(tiny_run / "training_frame.npz")
     for name, tensor in zip(("center", "rotation", "extent", "density", "sh"), tensors, strict=True):
         assert np.array_equal(getattr(saved, name), tensor.numpy()), name
     run = Run.open(tiny_run)
@@ -230,7 +230,7 @@ def test_the_result_does_not_depend_on_the_number_of_threads(tiny_scene, tiny_ru
 def test_another_seed_is_another_run(tiny_scene, tmp_path):
     for seed in (0, 1):
         train(tiny_scene, tmp_path / str(seed), options=replace(QUICK, seed=seed), quiet=True)
-    first, second = (load_octahedra(tmp_path / str(seed) / "scene.npz") for seed in (0, 1))
+    first, second = (load_primitives(tmp_path / str(seed) / "scene.npz") for seed in (0, 1))
     assert not np.array_equal(first.rotation, second.rotation)
 
 
@@ -488,7 +488,7 @@ def test_the_population_never_exceeds_its_limit(tiny_scene, tmp_path):
         run = tmp_path / str(limit)
         options = replace(QUICK, iterations=80, max_primitives=limit, initial_primitives=initial)
         result = train(tiny_scene, run, options=options, quiet=True)
-        assert result["primitives"] == len(load_octahedra(run / "scene.npz")) <= limit
+        assert result["primitives"] == len(load_primitives(run / "scene.npz")) <= limit
         assert all(line["primitives"] <= limit for line in metrics(run))
 
 
@@ -496,7 +496,7 @@ def test_the_population_never_exceeds_its_limit(tiny_scene, tmp_path):
 def test_the_degree_of_the_colour_is_what_was_asked_for(degree, tiny_scene, tmp_path):
     options = replace(QUICK, iterations=40, sh_degree=degree)
     train(tiny_scene, tmp_path / "run", options=options, quiet=True)
-    octahedra = load_octahedra(tmp_path / "run" / "scene.npz")
+    octahedra = load_primitives(tmp_path / "run" / "scene.npz")
     assert octahedra.sh_degree == degree
     if degree:
         used = np.abs(octahedra.sh).max((0, 2)) > 0
@@ -513,6 +513,91 @@ def test_an_option_out_of_range_is_refused(wrong, tiny_scene, tmp_path):
     with pytest.raises(LinprimError, match=f"--{name} is "):
         train(tiny_scene, tmp_path / "run", options=replace(QUICK, **wrong), quiet=True)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [({"primitive": "cube"}, "--primitive is 'cube', wanted one of octahedron, tetrahedron, gaussian"),
+     ({"filter": "2d"}, "--filter is '2d'"), ({"population": ""}, "--population is ''"),
+     ({"primitive": "gaussian", "order": "overlap"}, "--order is 'overlap', but a Gaussian has no place"),
+     ({"primitive": "gaussian", "order": "entry"}, "wanted center with --primitive gaussian")],
+)  # fmt: skip
+def test_kinds_and_rules_that_do_not_go_together_are_refused(wrong, sentence, tiny_scene, tmp_path):
+    with pytest.raises(LinprimError, match=sentence):
+        train(tiny_scene, tmp_path / "run", options=replace(QUICK, **wrong), quiet=True)
+    assert not (tmp_path / "run").exists()
+
+
+# --- kinds of primitives and rules of growth --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("population", ["gradient", "3dgs", "mcmc"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_learns_under_every_rule_and_goes_on_bit_for_bit(kind, population, tiny_scene, tmp_path):
+    options = TrainOptions(
+        iterations=300, max_primitives=260, initial_primitives=200, sh_degree=1, threads=1, primitive=kind,
+        population=population, filter="3d", checkpoint_every=100, evaluate_every=100,
+    )  # fmt: skip
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    result = train(tiny_scene, whole, options=options, quiet=True)
+    lines = metrics(whole)
+    assert result["psnr"] > 18
+    # A reset of the opacities, at step 129, costs 3dgs most of what it had learnt.
+    assert population == "3dgs" or lines[-1]["loss"] < 0.8 * lines[0]["loss"]
+    assert 200 < result["primitives"] <= 260
+    # What is saved is what was rendered: the filter is in it.
+    state, saved = checkpoint(whole), load_primitives(whole / "training_frame.npz")
+    assert saved.kind == kind and len(saved) == len(state["filter_3d"])
+    with torch.no_grad():
+        active = training_step.activate(state["parameters"], 1, kind, state["filter_3d"])
+    for name, tensor in zip(("center", "rotation", "extent", "density", "sh"), active, strict=True):
+        assert np.array_equal(getattr(saved, name), tensor.numpy()), name
+    assert (saved.extent > np.exp(state["parameters"]["log_extent"].numpy())).all()
+    shutil.copytree(whole, cut)
+    (cut / "checkpoints" / "latest").write_text("step_000200.pt\n")
+    train(tiny_scene, cut, resume=True, quiet=True)
+    assert_same_run(whole, cut)
+
+
+HOW = [
+    ("octahedron", "exact", "entry", "3d+screen"), ("octahedron", "exact", "overlap", "none"),
+    ("octahedron", "affine", "center", "3d+screen"), ("octahedron", "affine", "overlap", "none"),
+    ("tetrahedron", "exact", "overlap", "3d"), ("tetrahedron", "affine", "center", "3d+screen"),
+    ("tetrahedron", "affine", "entry", "none"), ("gaussian", "affine", "center", "3d+screen"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "ray_model", "order", "smooth"), HOW)
+def test_every_way_of_rendering_trains_and_is_used_by_renders(
+    kind, ray_model, order, smooth, tiny_scene, tmp_path
+):
+    options = replace(
+        QUICK,
+        iterations=150,
+        max_primitives=150,
+        primitive=kind,
+        ray_model=ray_model,
+        order=order,
+        filter=smooth,
+    )
+    result = train(tiny_scene, tmp_path / "run", options=options, quiet=True)
+    assert result["psnr"] > 15
+    scored = eval_images_run(tmp_path / "run", output=tmp_path / "scores")
+    assert scored["psnr"] == pytest.approx(result["psnr"], abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "ray_model"), [("tetrahedron", "exact"), ("octahedron", "affine"), ("gaussian", "exact")]
+)
+def test_surfaces_of_every_kind_can_be_extracted(kind, ray_model, tiny_scene, tmp_path):
+    from linprim_geo.extract import extract_mesh
+
+    options = replace(QUICK, iterations=300, max_primitives=250, primitive=kind, ray_model=ray_model)
+    train(tiny_scene, tmp_path / "run", options=options, quiet=True)
+    mesh = extract_mesh(tmp_path / "run", quiet=True)
+    assert mesh["faces"] > 100
+    score = eval_depth_run(tmp_path / "run", tiny_scene / "reference.ply")
+    assert score["abs_rel"] < 0.2 and score["coverage"] > 0.7
 
 
 # --- the data set's frame ---------------------------------------------------------------------------------
@@ -541,7 +626,7 @@ def test_the_frame_of_the_data_set_comes_back(tmp_path):
         opened = Run.open(run)
         _, images = next(opened.render_views(opened.scene().test[:1]))
         depths.append(images["depth_median"])
-        clouds.append(load_octahedra(run / "scene.npz"))
+        clouds.append(load_primitives(run / "scene.npz"))
         score = eval_depth_run(run, scene / "reference.ply")
         assert score["abs_rel"] < 0.05 and score["coverage"] > 0.9
     # Not the same to the last bit: positions were rounded in other places.
@@ -688,7 +773,8 @@ def test_a_child_has_its_parents_state_but_no_momentum(trainer):
     for row in range(40, len(trainer)):
         assert (dc == trainer.parameters["sh_dc"][row]).all((1, 2)).any()
         assert (trainer.first["center"][row] == 0).all()
-    assert len(trainer.pull) == len(trainer) and trainer.pull.max() == 0
+    pull = trainer.control.gathered["pull"]
+    assert len(pull) == len(trainer) and pull.max() == 0
     for table in (trainer.parameters, trainer.first, trainer.second):
         assert all(len(value) == len(trainer) for value in table.values())
 
@@ -719,6 +805,53 @@ def test_the_start_follows_the_points():
     assert torch.allclose(torch.exp(twins["log_extent"]), torch.tensor(1e-3))
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_start_of_every_kind(kind):
+    xyz = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 1.5]])
+    start = training_step.initial_parameters(xyz, np.zeros((5, 3), np.uint8), 0, 0, (1e-3, 9.0), kind)
+    extent = np.exp(start["log_extent"].numpy())
+    assert extent.shape == (5, KINDS[kind].extents) and np.ptp(extent, axis=1).max() == 0
+    # The mean distance to the three nearest is 1.
+    assert extent[0, 0] == pytest.approx(0.5 if kind == "gaussian" else KINDS[kind].size)
+    assert start["raw_opacity"].abs().max() == 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_3d_filter_widens_what_is_rendered(kind):
+    columns, raw = KINDS[kind].extents, torch.tensor([-2.0, 0.0, 3.0])
+    parameters = {
+        "center": torch.zeros(3, 3), "rotation": torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1), "raw_opacity": raw,
+        "log_extent": torch.log(torch.full((3, columns), 0.2)), "sh_dc": torch.zeros(3, 1, 3), "sh_rest": torch.zeros(3, 0, 3),
+    }  # fmt: skip
+    length = torch.tensor([0.0, 0.1, 0.3])
+    _, _, extent, density, _ = training_step.activate(parameters, 0, kind, length)
+    wider = torch.sqrt(0.04 + length**2) if kind == "gaussian" else 0.2 + length / 2
+    assert torch.allclose(extent, wider[:, None].repeat(1, columns))
+    # Opacity refers to what is rendered.
+    saved = Primitives(*(x.numpy() for x in training_step.activate(parameters, 0, kind, length)), kind)
+    assert np.allclose(saved.alpha, torch.sigmoid(raw), rtol=1e-5)
+
+
+def test_the_length_of_the_3d_filter_is_that_of_the_nearest_view_that_sees(trainer):
+    cameras = [shot.camera for shot in trainer.shots]
+    rng = np.random.default_rng(0)
+    center = rng.normal(size=(300, 3)) * 4
+    found = training_step.filter_lengths(torch.from_numpy(center.astype(np.float32)), cameras).numpy()
+    focal = max(max(c.fx, c.fy) for c in cameras)
+    seen = 0
+    for point, length in zip(center, found, strict=True):
+        depths = []
+        for c in cameras:
+            x, y, z = c.rotation @ point + c.world_to_camera[:3, 3]
+            u, v = c.fx * x / z + c.cx, c.fy * y / z + c.cy
+            if z > 0.2 and -0.15 * c.width < u < 1.15 * c.width and -0.15 * c.height < v < 1.15 * c.height:
+                depths.append(z)
+        seen += bool(depths)
+        depth = min(depths or [np.linalg.norm(point - c.center) for c in cameras])
+        assert length == pytest.approx(np.sqrt(0.2) * depth / focal, rel=1e-5)
+    assert 50 < seen < 300
+
+
 def test_data_that_was_moved_is_found_where_the_command_line_says(tiny_scene, run_copy, tmp_path):
     # Only where the old place is empty: another capture is no continuation.
     with pytest.raises(LinprimError, match="was trained on"):
@@ -737,7 +870,7 @@ def test_the_newest_checkpoint_is_kept_when_its_number_gets_a_digit_more(tiny_ru
 
     class Late:
         parameters, step, state, options, seconds = {}, 1_000_000, dict, QUICK, 0.0
-        octahedra, shown_background, __len__ = lambda _: octahedra, lambda _: torch.zeros(3), lambda _: 1
+        primitives, shown_background, __len__ = lambda _: octahedra, lambda _: torch.zeros(3), lambda _: 1
 
     training._save(Late(), Run.open(run_copy))
     assert sorted(p.name for p in folder.glob("step_*")) == ["step_1000000.pt", "step_999000.pt"]

@@ -1,0 +1,185 @@
+"""Kinds of primitives: vertices, faces, volumes and reference lengths against geometry computed another way, and the file."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from linprim_geo.errors import LinprimError
+from linprim_geo.options import TrainOptions
+from linprim_geo.primitives import (
+    ARRAYS,
+    KINDS,
+    Primitives,
+    load_primitives,
+    reference_length,
+    save_primitives,
+)
+
+
+def some(kind: str, count: int = 20, seed: int = 0) -> Primitives:
+    rng = np.random.default_rng(seed)
+    rotation = rng.normal(size=(count, 4))
+    return Primitives(
+        rng.normal(size=(count, 3)),
+        rotation / np.linalg.norm(rotation, axis=1, keepdims=True),
+        np.exp(rng.normal(-1, 0.7, (count, KINDS[kind].extents))),
+        rng.uniform(0, 1, count),
+        rng.normal(size=(count, 4, 3)),
+        kind,
+    )
+
+
+def corners_of(primitives: Primitives) -> np.ndarray:
+    """(N, F, 3, 3) corners of the faces of the mesh."""
+    mesh = primitives.triangle_mesh()
+    return mesh.vertices[mesh.faces].reshape(len(primitives), -1, 3, 3)
+
+
+def test_the_kinds_are_those_of_the_options():
+    choices = {entry.name: entry.metadata["choices"] for entry in dataclasses.fields(TrainOptions)}
+    assert tuple(KINDS) == choices["primitive"]
+    assert all(name == kind.name for name, kind in KINDS.items())
+
+
+def test_vertices_of_a_tetrahedron_lie_where_its_definition_says():
+    primitives = some("tetrahedron")
+    for row in range(len(primitives)):
+        for j, b in enumerate([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]):
+            expected = primitives.center[row] + primitives.extent[row, j] * primitives.axes[row] @ np.array(
+                b
+            ) / math.sqrt(3)
+            np.testing.assert_allclose(primitives.vertices[row, j], expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["octahedron", "tetrahedron"])
+def test_faces_look_outward_and_close_the_solid(kind):
+    primitives = some(kind)
+    corners = corners_of(primitives)
+    normal = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
+    away = corners.mean(2) - primitives.center[:, None].astype(np.float64)
+    assert (np.einsum("nfi,nfi->nf", normal, away) > 0).all()
+    # The vector areas of a closed surface add up to nothing.
+    assert np.abs(normal.sum(1)).max() < 1e-12 * np.abs(normal).max() * len(primitives)
+    for j, face in enumerate(KINDS["tetrahedron"].faces):
+        assert j not in face
+
+
+def test_a_kinds_size_gives_it_the_volume_of_an_octahedron():
+    def volume(kind):
+        extent = np.full((1, KINDS[kind].extents), KINDS[kind].size)
+        one = Primitives(np.zeros((1, 3)), [[1, 0, 0, 0]], extent, [1.0], np.zeros((1, 1, 3)), kind)
+        corners = corners_of(one)[0]
+        return np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
+
+    # Extents are float32.
+    assert volume("octahedron") == pytest.approx(4 / 3, rel=1e-6)
+    assert volume("tetrahedron") == pytest.approx(4 / 3, rel=1e-6)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.floats(-5, 5), min_size=4, max_size=4))
+def test_the_reference_length_of_a_tetrahedron_is_its_inscribed_spheres_diameter(logs):
+    extent = np.exp([logs])
+    vertices = extent.T * KINDS["tetrahedron"].directions
+    volume = abs(np.linalg.det(vertices[1:] - vertices[0])) / 6
+    area = sum(
+        np.linalg.norm(np.cross(vertices[b] - vertices[a], vertices[c] - vertices[a])) / 2
+        for a, b, c in KINDS["tetrahedron"].faces
+    )
+    # The determinant loses what its products cancel: 1e-16 times the ratio of the largest to the smallest volume in it, e^15.
+    tolerance = 1e-9
+    assert reference_length(extent, "tetrahedron")[0] == pytest.approx(6 * volume / area, rel=tolerance)
+    # numpy and torch agree, and the length is homogeneous of degree 1.
+    tensor = torch.from_numpy(extent)
+    assert float(reference_length(tensor, "tetrahedron")[0]) == pytest.approx(
+        6 * volume / area, rel=tolerance
+    )
+    assert reference_length(3 * extent, "tetrahedron")[0] == pytest.approx(18 * volume / area, rel=tolerance)
+
+
+def test_reference_lengths_of_regular_solids_and_their_gradients():
+    assert reference_length(np.array([[2.0, 3, 1]]), "octahedron")[0] == 2
+    assert reference_length(np.full((1, 4), 3.0), "tetrahedron")[0] == pytest.approx(2)
+    extent = torch.tensor([[0.3, 0.5, 0.2, 0.9], [1.0, 1, 1, 1]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: reference_length(x, "tetrahedron"), extent)
+    with pytest.raises(LinprimError, match="no reference length"):
+        reference_length(np.ones((1, 3)), "gaussian")
+
+
+@pytest.mark.parametrize("kind", ["octahedron", "tetrahedron"])
+def test_alpha_is_the_light_taken_along_the_reference_length(kind):
+    primitives = some(kind)
+    length = reference_length(primitives.extent.astype(np.float64), kind)
+    np.testing.assert_allclose(primitives.alpha, 1 - np.exp(-primitives.density * length), rtol=1e-6)
+    assert (some("gaussian").alpha == some("gaussian").density).all()
+
+
+def test_a_gaussian_has_no_surface_unless_a_size_is_named():
+    gaussians = some("gaussian", 5)
+    for make in (lambda: gaussians.vertices, gaussians.triangle_mesh):
+        with pytest.raises(LinprimError, match="Gaussian has no vertices"):
+            make()
+    mesh = gaussians.triangle_mesh(sigmas=2.0)
+    assert mesh.vertices.shape == (5 * 42, 3) and mesh.faces.shape == (5 * 80, 3)
+    away = mesh.vertices.reshape(5, 42, 3) - gaussians.center[:, None]
+    local = np.einsum("nij,nvi->nvj", gaussians.axes, away) / gaussians.extent[:, None]
+    np.testing.assert_allclose(np.linalg.norm(local, axis=2), 2.0, rtol=1e-6)
+
+
+def test_octahedra_as_gaussians():
+    octahedra = some("octahedron")
+    gaussians = octahedra.as_gaussians()
+    assert gaussians.kind == "gaussian"
+    np.testing.assert_allclose(gaussians.extent, octahedra.extent / 2.6, rtol=1e-6)
+    np.testing.assert_allclose(gaussians.density, octahedra.alpha, rtol=1e-6)
+    with pytest.raises(LinprimError, match="tetrahedra cannot be written as Gaussians"):
+        some("tetrahedron").as_gaussians()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_file_keeps_every_bit_and_the_kind(kind, tmp_path):
+    before = some(kind)
+    save_primitives(tmp_path / "x.npz", before)
+    after = load_primitives(tmp_path / "x.npz")
+    assert after.kind == kind
+    for name in ARRAYS:
+        assert getattr(after, name).tobytes() == getattr(before, name).tobytes()
+
+
+def test_a_file_without_a_kind_holds_octahedra(tmp_path):
+    before = some("octahedron")
+    arrays = {name: getattr(before, name) for name in ARRAYS}
+    np.savez(tmp_path / "x.npz", format=np.array("linprim-geo octahedra 1"), **arrays)
+    after = load_primitives(tmp_path / "x.npz")
+    assert after.kind == "octahedron" and (after.extent == before.extent).all()
+    np.savez(tmp_path / "y.npz", format=np.array("linprim-geo primitives 2"), **arrays)
+    with pytest.raises(LinprimError, match="y.npz: the array kind is missing"):
+        load_primitives(tmp_path / "y.npz")
+    np.savez(tmp_path / "z.npz", format=np.array("linprim-geo primitives 2"), kind=np.array("cube"), **arrays)
+    with pytest.raises(LinprimError, match="z.npz: primitives are of the kind 'cube'"):
+        load_primitives(tmp_path / "z.npz")
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "sentence"),
+    [
+        ("tetrahedron", {"extent": np.ones((20, 3))}, r"tetrahedra: extent has the shape \(20, 3\), wanted \(20, 4\)"),
+        ("tetrahedron", {"extent": np.zeros((20, 4))}, "wanted four positive lengths"),
+        ("tetrahedron", {"density": np.full(20, -1.0)}, "not negative"),
+        ("gaussian", {"extent": np.ones((20, 4))}, r"Gaussians: extent has the shape \(20, 4\), wanted \(20, 3\)"),
+        ("gaussian", {"density": np.full(20, 1.1)}, "density of row 0 .*wanted an opacity from 0 to 1"),
+        ("gaussian", {"density": np.full(20, -0.1)}, "wanted an opacity from 0 to 1"),
+        ("octahedron", {"extent": np.ones((20, 4))}, "octahedra: extent has the shape"),
+        ("octahedron", {"kind": "cube"}, "of the kind 'cube', wanted one of octahedron, tetrahedron, gaussian"),
+    ],
+)  # fmt: skip
+def test_what_a_kind_cannot_be_is_one_sentence(kind, change, sentence):
+    with pytest.raises(LinprimError, match=sentence):
+        dataclasses.replace(some(kind), **change)
