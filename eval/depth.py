@@ -80,7 +80,8 @@ def aggregate(views: Sequence[dict]) -> dict:
 
     `l1_mean`, `l1_std`, `l2_mean`, `l2_std` are the mean and standard deviation over images of the per-image
     mean absolute and root-mean-square error (the LinPrim paper's table 9), the deviation that of the images
-    at hand (divided by their number). `views` counts the views, `scored_views` those with a pixel to compare,
+    at hand (divided by their number). `abs_rel_standard_error` is that of `abs_rel` as for independent views,
+    NaN of one. `views` counts the views, `scored_views` those with a pixel to compare,
     and `pixels` adds those pixels up. A score that no view has is NaN.
     """
     results = {
@@ -91,6 +92,9 @@ def aggregate(views: Sequence[dict]) -> dict:
         values = [view[key] for view in views if np.isfinite(view[key])]
         results[f"{name}_mean"] = _mean(values)
         results[f"{name}_std"] = float(np.std(values)) if values else float("nan")
+    errors = [view["abs_rel"] for view in views if np.isfinite(view["abs_rel"])]
+    spread = np.std(errors, ddof=1) / np.sqrt(len(errors)) if len(errors) > 1 else np.nan
+    results["abs_rel_standard_error"] = float(spread)
     results["pixels"] = sum(view["pixels"] for view in views)
     results["views"] = len(views)
     results["scored_views"] = sum(view["pixels"] > 0 for view in views)
@@ -166,6 +170,7 @@ def eval_depth_run(
         results[f"{key}_percent_diagonal"] = 100.0 * results[key] / diagonal if diagonal > 0 else float("nan")
     results |= {
         "protocol": "per-pixel, no alignment, mean over views",
+        "culling": "pixels where both have a surface: coverage is the kept share",
         "depth": depth,
         "reference": source,
         "reference_diagonal": diagonal,

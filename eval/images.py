@@ -115,8 +115,8 @@ def eval_images_run(run, *, split: str = "test", output: str | os.PathLike | Non
         split: "test", "train" or "all".
 
     Returns:
-        `psnr` in dB and `ssim`, means over the views; `views`, `split`, `protocol`, `background` and
-        `seconds`.
+        `psnr` in dB and `ssim`, means over the views, with `psnr_standard_error` and `ssim_standard_error`
+        as for independent views (NaN of one); `views`, `split`, `protocol`, `background` and `seconds`.
 
     Raises:
         LinprimError: the split is empty, or a render is not finite or of another size than its photograph.
@@ -141,6 +141,8 @@ def eval_images_run(run, *, split: str = "test", output: str | os.PathLike | Non
     results = {
         "psnr": float(np.mean([row["psnr"] for row in rows])),
         "ssim": float(np.mean([row["ssim"] for row in rows])),
+        "psnr_standard_error": _standard_error([row["psnr"] for row in rows]),
+        "ssim_standard_error": _standard_error([row["ssim"] for row in rows]),
         "views": len(rows),
         "split": split,
         "protocol": "8-bit renders and photographs, mean over views",
@@ -149,6 +151,13 @@ def eval_images_run(run, *, split: str = "test", output: str | os.PathLike | Non
     }
     write_results(Path(run.path) / "eval" / "images" if output is None else output, results, rows)
     return results
+
+
+def _standard_error(values: list[float]) -> float:
+    """NaN unless there are two values and all are finite (equal images have an infinite PSNR)."""
+    if len(values) < 2 or not np.isfinite(values).all():
+        return float("nan")
+    return float(np.std(values, ddof=1) / np.sqrt(len(values)))
 
 
 def _pair(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -108,6 +108,8 @@ def test_aggregate_is_the_mean_over_views_that_have_a_score():
     assert result["l2_mean"] == pytest.approx(0.2) and result["l2_std"] == pytest.approx(0.1)
     assert result["coverage"] == pytest.approx((1 + 0.25 + 0) / 3)
     assert (result["views"], result["scored_views"], result["pixels"]) == (3, 2, 5)
+    assert result["abs_rel_standard_error"] == pytest.approx((0.15 - 0.05) / 2)
+    assert math.isnan(aggregate(views[1:])["abs_rel_standard_error"])
     assert ISSUE_KEYS <= set(result)
     assert math.isnan(aggregate(views[2:])["mae"]) and aggregate(views[2:])["coverage"] == 0.0
 

@@ -184,7 +184,8 @@ def test_run_scores_and_files(tmp_path):
     # b is its photograph over the run's background, up to less than half an 8-bit step: rounded away. Only
     # the channel with 0.5 * 255 = 127.5 rounds halves up on both sides.
     assert rows[1]["psnr"] == "inf" and float(rows[1]["ssim"]) == pytest.approx(1.0)
-    assert results["views"] == 2
+    assert results["views"] == 2 and math.isnan(results["psnr_standard_error"])  # one of them is infinite
+    assert results["ssim_standard_error"] == pytest.approx((1 - float(rows[0]["ssim"])) / 2)
     assert results["ssim"] == pytest.approx((float(rows[0]["ssim"]) + 1) / 2)
     written = json.loads((tmp_path / "eval" / "images" / "results.json").read_text())
     assert written["psnr"] is None and written["ssim"] == results["ssim"]

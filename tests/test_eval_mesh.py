@@ -7,74 +7,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from surfaces import CONTEXT, SCORES, camera_above, grid, inradius, join, rotation, sphere, wavy
 
-from linprim_geo.camera import Camera
 from linprim_geo.errors import LinprimError
-from linprim_geo.eval.mesh import (
-    SurfaceDistance,
-    error_colors,
-    eval_mesh_files,
-    morton_order,
-    refine,
-    sample_surface,
-    score_mesh,
-)
+from linprim_geo.eval.figures import error_colors
+from linprim_geo.eval.mesh import eval_mesh_files, score_mesh
+from linprim_geo.eval.surfaces import SurfaceDistance, morton_order, refine, sample_surface
 from linprim_geo.mesh import Mesh, load_mesh, save_mesh
 
-ISSUE_KEYS = {
-    *("accuracy", "completeness", "chamfer", "precision", "recall", "f1", "normal_consistency", "hausdorff"),
-    *("protocol", "unit", "tau", "samples", "seed", "standard_error", "seconds"),
-}
 LENGTHS = ("accuracy", "completeness", "chamfer", "hausdorff", "tau", "standard_error", "accuracy_q90")
 # Rounding of a distance between points of a scene of size 1: a few float64 operations.
 ROUNDING = 1e-14
-
-
-def grid(columns=4, rows=3, size=(2.0, 1.0), height=0.0):
-    """A rectangle from the origin, facing +z, cut into columns x rows x 2 triangles."""
-    x, y = np.meshgrid(np.linspace(0, size[0], columns + 1), np.linspace(0, size[1], rows + 1))
-    vertices = np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], 1)
-    a = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()
-    b, c, d = a + 1, a + columns + 2, a + columns + 1
-    return Mesh(vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]))
-
-
-def sphere(radius=1.0, rounds=3, center=(0.0, 0.0, 0.0)):
-    """An octahedron whose faces are split into four `rounds` times, every vertex moved onto the sphere."""
-    vertices = np.concatenate([np.eye(3), -np.eye(3)])
-    faces = np.array([(a, b, c) for a in (0, 3) for b in (1, 4) for c in (2, 5)])
-    outward = np.linalg.det(vertices[faces]) > 0
-    mesh = Mesh(vertices, np.where(outward[:, None], faces, faces[:, ::-1]))
-    for _ in range(rounds):
-        mesh = refine(mesh, 0.0, max_faces=4 * len(mesh.faces))
-        mesh = Mesh(mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True), mesh.faces)
-    return replace(mesh, vertices=mesh.vertices * radius + np.asarray(center))
-
-
-def inradius(mesh):
-    """Smallest distance of the origin from a face: the faceted sphere lies between it and its radius."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    return float((np.einsum("ij,ij->i", normal, a) / np.linalg.norm(normal, axis=1)).min())
-
-
-def wavy():
-    """An open surface whose distance to the rectangle below it varies from place to place."""
-    mesh = grid(30, 20)
-    x, y, _ = mesh.vertices.T
-    return replace(mesh, vertices=np.stack([x, y, 0.05 * np.sin(7 * x) * np.cos(5 * y) + 0.02 * x], 1))
-
-
-def join(*meshes):
-    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets[:-1], strict=True)]
-    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
-
-
-def rotation(seed=0):
-    q, r = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))
-    q = q * np.sign(np.diag(r))
-    return q * np.sign(np.linalg.det(q))
 
 
 def scores_only(results):
@@ -320,67 +263,6 @@ def test_morton_order_is_a_permutation_that_keeps_neighbours_together():
     )
 
 
-# --- culling ------------------------------------------------------------------------------------------------
-
-
-def camera_above(height, focal=100.0, target=(0.0, 0.0)):
-    pose = np.eye(4)
-    pose[:3, :3] = np.diag([1.0, -1.0, -1.0])
-    pose[:3, 3] = -pose[:3, :3] @ np.array([*target, height])
-    return Camera(200, 200, focal, focal, 100.0, 100.0, pose)
-
-
-def test_a_camera_sees_the_cap_of_a_sphere():
-    result = score_mesh(sphere(1.1, 5), sphere(1.0, 5), samples=40_000, cameras=[camera_above(3.0)])
-    # A point is seen where its normal turns to the camera: cos > r / d, a cap of (1 - r / d) / 2 of the area.
-    # The faceted outline is off by up to an edge, 0.06, of its circumference at the silhouette.
-    assert result["visible"]["kept_prediction"] == pytest.approx((1 - 1.1 / 3.0) / 2, abs=0.004)
-    assert result["visible"]["kept_reference"] == pytest.approx((1 - 1.0 / 3.0) / 2, abs=0.004)
-    assert result["visible"]["chamfer"] == pytest.approx(0.1, abs=2e-3)
-    both = [
-        camera_above(3.0),
-        replace(camera_above(3.0), world_to_camera=np.diag([1.0, 1, 1, 1]) + 3.0 * E23),
-    ]
-    both = score_mesh(sphere(1.1, 5), sphere(1.0, 5), samples=40_000, cameras=both)["visible"]
-    assert both["kept_prediction"] == pytest.approx(2 * result["visible"]["kept_prediction"], abs=0.002)
-
-
-E23 = np.zeros((4, 4))
-E23[2, 3] = 1.0
-
-
-def test_junk_behind_the_surface_counts_only_without_culling():
-    front, behind = grid(20, 10), grid(20, 10, height=-0.4)
-    cameras = [camera_above(2.0, target=(1.0, 0.5))]
-    result = score_mesh(join(front, behind), front, samples=4000, cameras=cameras)
-    assert result["accuracy"] == pytest.approx(0.2, abs=1e-3) and result["precision"] == pytest.approx(
-        0.5, abs=1e-3
-    )
-    visible = result["visible"]
-    assert visible["accuracy"] < ROUNDING and visible["precision"] == 1.0 and visible["f1"] == 1.0
-    # Seen from 2 above, the junk 0.4 lower peeps out nowhere: the upper sheet hides 1.2 times its own size.
-    assert visible["kept_prediction"] == pytest.approx(0.5, abs=1e-3) and visible["kept_reference"] == 1.0
-    assert ISSUE_KEYS - {"protocol", "unit", "tau", "samples", "seed", "seconds"} <= set(visible)
-    assert {"chamfer_percent_diagonal", "standard_error_percent_diagonal"} <= set(visible)
-
-
-def test_only_what_falls_into_the_image_is_kept():
-    # The image shows x in [0, 1] of the [0, 2] x [0, 1] rectangle: half of it.
-    camera = camera_above(1.0, focal=200.0, target=(0.5, 0.5))
-    result = score_mesh(grid(height=0.0), grid(), samples=8000, cameras=[camera])
-    assert result["visible"]["kept_reference"] == pytest.approx(0.5, abs=2e-3)
-
-
-def test_cameras_that_see_nothing_give_no_scores_but_the_rest_stands():
-    away = [camera_above(-1.0)]  # looks down from below
-    result = score_mesh(grid(height=0.1), grid(), samples=500, cameras=away)
-    assert result["visible"]["kept_prediction"] == 0.0 and math.isnan(result["visible"]["chamfer"])
-    assert math.isnan(result["visible"]["f1"])
-    assert result["chamfer"] == pytest.approx(0.1)
-    assert score_mesh(grid(), grid(), samples=500, cameras=[])["visible"]["kept_reference"] == 0.0
-    assert "visible" not in score_mesh(grid(), grid(), samples=500)
-
-
 # --- meshes that break libraries ----------------------------------------------------------------------------
 
 
@@ -476,7 +358,7 @@ def test_files_are_scored_and_error_colours_written(tmp_path):
     )
     save_mesh(tmp_path / "b.obj", grid(2, 2, size=(1.0, 1.0)))
     result = eval_mesh_files(tmp_path / "a.ply", tmp_path / "b.obj", tmp_path / "out", samples=2000, seed=3)
-    assert ISSUE_KEYS <= set(result) and {f"{key}_percent_diagonal" for key in LENGTHS} <= set(result)
+    assert SCORES | CONTEXT <= set(result) and {f"{key}_percent_diagonal" for key in LENGTHS} <= set(result)
     assert result["seed"] == 3 and result["protocol"] == "headline" and result["samples"] == 2000
     written = json.loads((tmp_path / "out" / "results.json").read_text())
     assert written["chamfer"] == result["chamfer"] and written["f1"] == result["f1"]
@@ -501,7 +383,8 @@ def test_without_an_output_nothing_is_written_and_a_run_gives_cameras_unit_and_f
     result = eval_mesh_files(tmp_path / "a.ply", tmp_path / "a.ply", samples=100, run=run)
     assert result["unit"] == "cubit" and result["visible"]["kept_prediction"] == 1.0
     names = {path.name for path in (tmp_path / "run" / "eval" / "mesh").iterdir()}
-    assert names == {"results.json", "error_pred.ply", "error_ref.ply"}
+    plots = {"precision_recall.png", "error_histogram.png"}
+    assert names == {"results.json", "error_pred.ply", "error_ref.ply"} | plots
     assert result["color_max"] < ROUNDING  # identical meshes: nothing to colour, and no division by zero
 
 
