@@ -227,6 +227,28 @@ NB_MODULE(_core, m) {
     nb::gil_scoped_release release;
     linprim::adam_step(v, g, m1, m2, n, rate, beta1, beta2, epsilon, step);
   });
+  m.def("adam_rows", [](std::vector<Out<float>> values, std::vector<In<float>> gradients, std::vector<Out<float>> firsts,
+                        std::vector<Out<float>> seconds, std::vector<float> rates, Out<int32_t> steps, std::optional<In<uint8_t>> touched,
+                        float beta1, float beta2, float epsilon) {
+    const size_t count = values.size();
+    if (gradients.size() != count || firsts.size() != count || seconds.size() != count || rates.size() != count)
+      throw std::invalid_argument("there have to be as many gradients, moments and rates as values");
+    const int64_t n = int64_t(steps.size());
+    if (touched && int64_t(touched->size()) != n) throw std::invalid_argument("touched and steps differ in size");
+    if (!(beta1 >= 0 && beta1 < 1 && beta2 >= 0 && beta2 < 1)) throw std::invalid_argument("beta1 and beta2 have to be in [0, 1)");
+    std::vector<linprim::RowTensor> tensors;
+    for (size_t i = 0; i < count; ++i) {
+      const int64_t size = int64_t(values[i].size());
+      if (int64_t(gradients[i].size()) != size || int64_t(firsts[i].size()) != size || int64_t(seconds[i].size()) != size)
+        throw std::invalid_argument("value, gradient and moments differ in size");
+      if (n ? size % n != 0 : size != 0) throw std::invalid_argument("a value does not have as many rows as there are steps");
+      tensors.push_back({values[i].data(), firsts[i].data(), seconds[i].data(), gradients[i].data(), n ? size / n : 0, rates[i]});
+    }
+    int32_t* counts = steps.data();
+    const uint8_t* rows = touched ? touched->data() : nullptr;
+    nb::gil_scoped_release release;
+    linprim::adam_rows(tensors.data(), int(count), n, rows, counts, beta1, beta2, epsilon);
+  });
   m.def("set_threads", &linprim::set_threads);
   m.def("threads", &linprim::threads);
   m.def("set_instruction_set", [](const std::string& name) { return linprim::set_instruction_set(name.c_str()); });

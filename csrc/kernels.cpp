@@ -80,7 +80,7 @@ constexpr Kernels<Real> all_kernels(const char* name) {
 
 template <class Real>
 constexpr Kernels<Real> table = all_kernels<Real>(LINPRIM_STRING(LINPRIM_ISA));
-const ImageKernels image_table = {photometric<kWidth>, adam, measure_limits<kWidth>};
+const ImageKernels image_table = {photometric<kWidth>, adam, adam_rows<kWidth>, measure_limits<kWidth>};
 
 }  // namespace LINPRIM_ISA
 

@@ -110,7 +110,7 @@ struct TileLists {
 };
 // A (primitive, tile) pair before it is put into its tile's list.
 struct LoosePair {
-  uint32_t tile, primitive, blocks;
+  uint32_t tile, blocks;
 };
 
 template <class Real>
@@ -170,8 +170,10 @@ struct Counts {
 
 struct BinParams {
   const Footprint* footprints;
-  const uint32_t* order;
-  int tiles_x, tiles_y;
+  const uint32_t* visible;  // rows
+  int tiles_x;
+  uint32_t* slot_count;     // per row, written for the visible ones: number of pairs
+  uint32_t* tile_count;     // per tile, added to: number of pairs
 };
 
 struct PhotometricParams {
@@ -189,6 +191,25 @@ struct AdamParams {
   int64_t n;
   float rate, beta1, beta2, epsilon;
   float correction1, correction2;  // 1 - beta^step
+};
+
+constexpr int kAdamRows = 512;  // rows per call of adam_rows at most
+// One tensor of adam_rows: rows of `columns` floats.
+struct RowTensor {
+  float *value, *first, *second;
+  const float* gradient;
+  int64_t columns;
+  float rate;
+};
+struct AdamRowsParams {
+  const RowTensor* tensors;
+  int count;
+  const uint8_t* touched;  // per row, or null: the rows with a gradient that is not 0
+  int32_t* steps;          // per row, counted on where touched
+  float beta1, beta2, epsilon;
+  const float *inverse, *root;  // 1 / (1 - beta1^t), 1 / sqrt(1 - beta2^t) for t < table_size
+  int64_t table_size;
+  bool table_complete;  // beyond the table both are 1
 };
 
 // What one primitive kind under one ray model is compiled to.
@@ -220,21 +241,33 @@ struct Kernels {
   const char* name;
   int width;
   SolidKernels<Real> solids[kKinds][kRayModels];
-  // Appends the pairs of order[begin..end) to `out`, which has room for `capacity`; returns the index of the first primitive
-  // that no longer fitted (or `end`), and the number of pairs in `written`.
+  // Appends the pairs of visible[begin..end), each primitive's tile rows downwards, to `out`, which has room for `capacity`; returns the
+  // index of the first primitive that no longer fitted (or `end`), and the number of pairs in `written`.
   int64_t (*bin)(const BinParams&, int64_t begin, int64_t end, LoosePair* out, int64_t capacity, int64_t* written);
 };
 
 struct ImageKernels {
-  // Gradient of rows [begin, end) of a channel, and their sums of |d|, d^2 and SSIM, added to `sums`. `buffer` is the calling
-  // thread's own, photometric_buffer_size(width) floats.
-  void (*photometric)(const PhotometricParams&, int channel, int begin, int end, float* buffer, double* sums);
+  // Gradient of rows [begin, end) of a channel in one of its photometric_tiles(width) tiles of columns; adds each row's sums of weight
+  // times |d|, d^2 and 1 - SSIM to row_sums (H,3). No row's results depend on which rows a call takes. `buffer` is the calling thread's
+  // own, photometric_buffer_size(width) floats.
+  void (*photometric)(const PhotometricParams&, int channel, int tile, int begin, int end, float* buffer, double* row_sums);
   void (*adam)(const AdamParams&, int64_t begin, int64_t end);
+  void (*adam_rows)(const AdamRowsParams&, int64_t begin, int64_t end);
   Limits (*limits)();
 };
 
 constexpr int kSsimRadius = 5;
-inline int64_t photometric_buffer_size(int width) { return 8 * int64_t(width + 2 * kSsimRadius + (2 * kSsimRadius + 2) * width); }
+constexpr int kSsimRows = 8;           // blurred along y together
+constexpr int kSsimAlign = 16;         // floats of a cache line
+constexpr int kSsimMaxColumns = 1024;  // so that the rows of a tile's maps stay in the second-level cache
+inline int photometric_columns(int width) {
+  const int tiles = (width + kSsimMaxColumns - 1) / kSsimMaxColumns;
+  return ((width + tiles - 1) / tiles + kSsimAlign - 1) / kSsimAlign * kSsimAlign;
+}
+inline int photometric_tiles(int width) { return (width + photometric_columns(width) - 1) / photometric_columns(width); }
+// Floats of a row of a tile: two cache lines more on either side, and an odd number of lines, which spreads the rows over the cache.
+inline int64_t photometric_pitch(int width) { return ((photometric_columns(width) / kSsimAlign + 4) | 1) * kSsimAlign; }
+inline int64_t photometric_buffer_size(int width) { return ((4 + 3) * 3 * kSsimRows + 4 * kSsimRows + 2) * photometric_pitch(width) + kSsimAlign; }
 
 template <class Real>
 const Kernels<Real>& kernels_scalar();

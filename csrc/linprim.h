@@ -19,7 +19,7 @@ const char* instruction_set();
 // What the last forward and backward pass did.
 struct Statistics {
   int64_t primitives, visible, pairs, visited_lanes, hit_lanes, working_set_bytes;
-  double project_ms, sort_ms, bin_ms, forward_ms, backward_ms, chain_ms;
+  double project_ms, sort_ms, bin_ms, forward_ms, backward_ms, chain_ms;  // project: with the search for the tiles, bin: without
 };
 Statistics statistics();
 
@@ -71,6 +71,12 @@ void average_pixels_grad(const Real* coarse_grad, int planes, int width, int hei
 // One Adam step (Kingma and Ba 2015, algorithm 1) on n values in place; `step` counts from 1.
 void adam_step(float* value, const float* gradient, float* first, float* second, int64_t n, float rate, float beta1, float beta2,
                float epsilon, int64_t step);
+
+// One Adam step, in one sweep, on the touched rows of several tensors of n rows each. A touched row's count in `steps` (n) goes up by one
+// and is what its moments are corrected by: the row goes through exactly the Adam of the steps that touched it. The values, moments and
+// counts of the other rows stay as they are. `touched` (n) or null: rows where any tensor's gradient is not 0.
+void adam_rows(const RowTensor* tensors, int count, int64_t n, const uint8_t* touched, int32_t* steps, float beta1, float beta2,
+               float epsilon);
 
 // Index of the first value that is NaN or infinite, or -1.
 template <class Real>

@@ -14,7 +14,7 @@ namespace linprim {
 Photometric photometric_loss(const float* image, const float* target, const float* weight, int width, int height, float dssim,
                              float* gradient) {
   constexpr double kNoWeight = 1e-12;
-  constexpr int kStripRows = 96;  // fixed, so that sums do not depend on the number of threads
+  constexpr int kMinRows = 64;  // of a part: a part also computes most of what belongs to the 20 rows around it
   static std::mutex mutex;
   static auto* buffers = new std::vector<float>;
   std::lock_guard lock(mutex);
@@ -26,16 +26,22 @@ Photometric photometric_loss(const float* image, const float* target, const floa
     for (int64_t i = 0; i < plane; ++i) params.weight_sum += weight[i];
   }
   params.weight_sum = std::max(3 * params.weight_sum, kNoWeight);
-  const int strips = (height + kStripRows - 1) / kStripRows;
-  std::vector<std::array<double, 3>> sums(size_t(strips) * 3, std::array<double, 3>{0, 0, 0});
-  parallel_for(3 * strips, [&](int64_t task, int thread) {
-    const int begin = int(task % strips) * kStripRows;
-    image_kernels().photometric(params, int(task / strips), begin, std::min(height, begin + kStripRows),
-                                buffers->data() + thread * buffer_size, sums[size_t(task)].data());
+  // Sums are kept by row and tile, so that how the rows are divided among threads does not matter to them.
+  const int tiles = photometric_tiles(width), columns = 3 * tiles;
+  int parts = threads() == 1 ? 1 : (2 * threads() + columns - 1) / columns;
+  parts = std::clamp(parts, 1, std::max(1, height / kMinRows));
+  const int part_rows = ((height + parts - 1) / parts + kSsimRows - 1) / kSsimRows * kSsimRows;
+  parts = (height + part_rows - 1) / part_rows;
+  std::vector<std::array<double, 3>> sums(size_t(columns) * height, std::array<double, 3>{0, 0, 0});
+  parallel_for(int64_t(columns) * parts, [&](int64_t task, int thread) {
+    const int column = int(task / parts), begin = int(task % parts) * part_rows;
+    image_kernels().photometric(params, column / tiles, column % tiles, begin, std::min(height, begin + part_rows),
+                                buffers->data() + thread * buffer_size, sums[size_t(column) * height].data());
   });
   Photometric result{0, 0, 0, 0};
-  for (const auto& [l1, square, ssim] : sums) result.l1 += l1, result.mse += square, result.ssim += ssim;
-  result.l1 /= params.weight_sum, result.mse /= params.weight_sum, result.ssim /= params.weight_sum;
+  double lost = 0;
+  for (const auto& [l1, square, off] : sums) result.l1 += l1, result.mse += square, lost += off;
+  result.l1 /= params.weight_sum, result.mse /= params.weight_sum, result.ssim = 1.0 - lost / params.weight_sum;
   if (params.weight_sum <= kNoWeight) return {0, 0, 1, 0};  // no pixel counts, and the gradient is 0 already
   result.loss = (1.0 - dssim) * result.l1 + dssim * (1.0 - result.ssim);
   return result;
@@ -48,6 +54,43 @@ void adam_step(float* value, const float* gradient, float* first, float* second,
                           float(1.0 - std::pow(double(beta1), double(step))), float(1.0 - std::pow(double(beta2), double(step)))};
   parallel_for((n + kPerTask - 1) / kPerTask,
                [&](int64_t task, int) { image_kernels().adam(params, task * kPerTask, std::min(n, (task + 1) * kPerTask)); });
+}
+
+namespace {
+
+// Bias corrections of Adam by the number of steps, until both are 1 in single precision.
+struct Corrections {
+  float beta1 = -1, beta2 = -1;
+  std::vector<float> inverse, root;
+  bool complete = false;
+
+  void make(float b1, float b2) {
+    constexpr int kMost = 1 << 16;  // enough for beta2 = 0.9997; above that the kernel computes them beyond
+    if (b1 == beta1 && b2 == beta2) return;
+    beta1 = b1, beta2 = b2, complete = false;
+    inverse.assign(1, 1.0f), root.assign(1, 1.0f);  // step 0 does not happen
+    double power1 = 1, power2 = 1;
+    for (int t = 1; t < kMost && !complete; ++t) {
+      power1 *= double(b1), power2 *= double(b2);
+      inverse.push_back(float(1 / (1 - power1))), root.push_back(float(1 / std::sqrt(1 - power2)));
+      complete = inverse.back() == 1 && root.back() == 1;
+    }
+  }
+};
+
+}  // namespace
+
+void adam_rows(const RowTensor* tensors, int count, int64_t n, const uint8_t* touched, int32_t* steps, float beta1, float beta2,
+               float epsilon) {
+  constexpr int64_t kPerTask = kAdamRows;
+  static std::mutex mutex;
+  static auto* corrections = new Corrections;
+  std::lock_guard lock(mutex);
+  corrections->make(beta1, beta2);
+  const AdamRowsParams params{tensors, count, touched, steps, beta1, beta2, epsilon, corrections->inverse.data(), corrections->root.data(),
+                              int64_t(corrections->inverse.size()), corrections->complete};
+  parallel_for((n + kPerTask - 1) / kPerTask,
+               [&](int64_t task, int) { image_kernels().adam_rows(params, task * kPerTask, std::min(n, (task + 1) * kPerTask)); });
 }
 
 namespace {

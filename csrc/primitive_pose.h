@@ -204,9 +204,7 @@ inline void zero_row(const PrimitiveGradients<Real>& out, int64_t row, int exten
 
 // Adds up the slots of each lane's primitive; rows without a slot are written as zero. Returns whether any lane has one.
 template <class Real>
-inline bool gather_sums(const ChainParams<Real>& P, int64_t first, int lanes, int64_t end, double (*sums)[kGeometrySums]) {
-  for (int64_t next = first + 2 * kLanes; next < std::min(end, first + 3 * kLanes); ++next)  // slots lie in the order of depth
-    if (P.slot_count[next]) __builtin_prefetch(P.sums + int64_t(P.first_slot[next]) * P.sums_per_slot);
+inline bool gather_sums(const ChainParams<Real>& P, int64_t first, int lanes, double (*sums)[kGeometrySums]) {
   bool found = false;
   for (int l = 0; l < lanes; ++l) {
     const uint32_t count = P.slot_count[first + l];

@@ -18,7 +18,6 @@ namespace linprim {
 namespace {
 
 constexpr int64_t kPrimitivesPerTask = 512;
-constexpr int kBinChunks = 32;  // fixed, so that nothing depends on the number of threads
 
 class Stopwatch {
  public:
@@ -60,13 +59,18 @@ uint64_t content_hash(const View& view, const Primitives<Real>& p, bool geometry
   const double numbers[] = {view.fx, view.fy, view.cx, view.cy, double(view.width), double(view.height), view.near, view.stop,
                             view.level, double(p.n), double(geometry), double(sizeof(Real)), view.screen_filter, double(view.rays),
                             double(view.order), double(p.kind)};
-  uint64_t h = hash_bytes(1, view.world_to_camera, sizeof view.world_to_camera);
-  h = hash_bytes(h, numbers, sizeof numbers);
-  h = hash_bytes(h, p.center, size_t(p.n) * 3 * sizeof(Real));
-  h = hash_bytes(h, p.rotation, size_t(p.n) * 4 * sizeof(Real));
-  h = hash_bytes(h, p.extent, size_t(p.n) * p.extents() * sizeof(Real));
-  h = hash_bytes(h, p.density, size_t(p.n) * sizeof(Real));
-  return hash_bytes(h, color, size_t(p.n) * 3 * sizeof(Real));
+  constexpr int64_t kPerTask = 4096;
+  std::vector<uint64_t> parts(size_t((p.n + kPerTask - 1) / kPerTask) + 2);
+  parts[0] = hash_bytes(1, view.world_to_camera, sizeof view.world_to_camera);
+  parts[1] = hash_bytes(2, numbers, sizeof numbers);
+  parallel_for(int64_t(parts.size()) - 2, [&](int64_t task, int) {  // memory sets its time
+    const int64_t begin = task * kPerTask, rows = std::min(p.n - begin, kPerTask);
+    uint64_t h = 3;
+    auto add = [&](const Real* values, int columns) { h = hash_bytes(h, values + begin * columns, size_t(rows) * columns * sizeof(Real)); };
+    add(p.center, 3), add(p.rotation, 4), add(p.extent, p.extents()), add(p.density, 1), add(color, 3);
+    parts[size_t(task) + 2] = h;
+  });
+  return hash_bytes(4, parts.data(), parts.size() * sizeof parts[0]);
 }
 
 // Memory for records of any kind.
@@ -79,15 +83,23 @@ template <class Real>
 struct Frame {
   uint64_t hash = 0, used = 0;
   int tiles_x = 0, tiles_y = 0;
-  int64_t visible = 0, pair_count = 0;
+  int64_t rows = 0, visible = 0, pair_count = 0;
   const SolidKernels<Real>* solid = nullptr;
   std::vector<Line> records;
   std::vector<std::array<std::array<Real, 3>, 4>> normals;
   std::vector<Footprint> footprints;
   std::vector<Real> key;
   std::vector<uint32_t> order, order_swap, keys, keys_swap;
-  std::vector<LoosePair> loose[kBinChunks];
-  int64_t loose_count[kBinChunks];
+  // What a projection task found: its visible rows, and its pairs, in the list of the thread that ran it.
+  struct Task {
+    uint32_t visible, first_slot;
+    int thread;
+    int64_t pairs_begin, pairs;
+  };
+  std::vector<Task> tasks;
+  std::vector<std::vector<LoosePair>> loose;  // of every thread
+  std::vector<int64_t> loose_count;
+  std::vector<uint32_t> tile_count;  // threads x tiles
   std::vector<uint32_t> chunk_tile;  // chunks x tiles: counts, then write positions
   std::vector<uint32_t> tile_begin, first_slot, slot_count;
   std::vector<uint32_t> pair_primitive, pair_slot, pair_blocks;
@@ -106,13 +118,18 @@ struct Frame {
     if (geometry) grow(normals, p.n);
     const ProjectParams<Real> project{view, p, records.data(), footprints.data(), key.data(), color,
                                       geometry ? reinterpret_cast<Real(*)[4][3]>(normals.data()) : nullptr};
-    parallel_for((p.n + kPrimitivesPerTask - 1) / kPrimitivesPerTask, [&](int64_t task, int) {
+    rows = p.n;
+    grow(order, p.n), grow(order_swap, p.n), grow(keys, p.n), grow(keys_swap, p.n);
+    tasks.resize(size_t((p.n + kPrimitivesPerTask - 1) / kPrimitivesPerTask));
+    if (int(loose.size()) < threads()) loose.resize(threads());
+    loose_count.assign(threads(), 0), tile_count.assign(size_t(threads()) * tiles(), 0u);
+    parallel_for(int64_t(tasks.size()), [&](int64_t task, int thread) {
       const int64_t begin = task * kPrimitivesPerTask, end = std::min(p.n, begin + kPrimitivesPerTask);
       solid->project(project, begin, end);
-      std::fill(slot_count.begin() + begin, slot_count.begin() + end, 0u);
+      collect(task, begin, end, thread);
     });
     stats.project_ms = watch.lap();
-    sort(p.n);
+    sort();
     stats.sort_ms = watch.lap();
     bin();
     stats.bin_ms = watch.lap();
@@ -120,78 +137,126 @@ struct Frame {
     stats.working_set_bytes = bytes();
   }
 
+  // The bits of a key as an unsigned number of the same order; -0 as 0.
+  static uint32_t ordered_bits(float key) {
+    const uint32_t bits = std::bit_cast<uint32_t>(key + 0.0f);
+    return bits ^ ((bits >> 31) ? 0xffffffffu : 0x80000000u);
+  }
+
+  // The part of sorting and binning that belongs to the rows of one projection task, while their footprints are in the cache: the visible
+  // ones with their keys, at the beginning of the task's rows of `order` and `keys`, and their pairs.
+  void collect(int64_t index, int64_t begin, int64_t end, int thread) {
+    Task& task = tasks[index];
+    int64_t count = begin;
+    for (int64_t i = begin; i < end; ++i) {
+      slot_count[i] = 0;
+      order[count] = uint32_t(i);
+      if constexpr (sizeof(Real) == 4) keys[count] = ordered_bits(key[i]);
+      count += footprints[i].x0 <= footprints[i].x1;
+    }
+    std::vector<LoosePair>& list = loose[thread];
+    task.visible = uint32_t(count - begin), task.thread = thread, task.pairs_begin = loose_count[thread];
+    const BinParams params{footprints.data(), order.data(), tiles_x, slot_count.data(), &tile_count[int64_t(thread) * tiles()]};
+    for (int64_t at = begin;;) {
+      int64_t written = 0;
+      at = kernels<Real>().bin(params, at, count, list.data() + loose_count[thread], int64_t(list.size()) - loose_count[thread], &written);
+      loose_count[thread] += written;
+      if (at == count) break;
+      list.resize(list.size() * 2 + 2 * size_t(tiles()));
+    }
+    task.pairs = loose_count[thread] - task.pairs_begin;
+  }
+
   // Visible primitives by ascending key; ties keep the order of input.
-  void sort(int64_t n) {
-    grow(order, n), grow(order_swap, n), grow(keys, n), grow(keys_swap, n);
-    visible = 0;
+  void sort() {
+    int64_t at = 0;
+    for (int64_t t = 0; t < int64_t(tasks.size()); ++t) {  // close the gaps between the tasks
+      const int64_t begin = t * kPrimitivesPerTask;
+      std::copy_n(order.begin() + begin, tasks[t].visible, order.begin() + at);
+      if constexpr (sizeof(Real) == 4) std::copy_n(keys.begin() + begin, tasks[t].visible, keys.begin() + at);
+      at += tasks[t].visible;
+    }
+    visible = at;
     if constexpr (sizeof(Real) == 8) {
-      for (int64_t i = 0; i < n; ++i)
-        if (footprints[i].x0 <= footprints[i].x1) order[visible++] = uint32_t(i);
       std::stable_sort(order.begin(), order.begin() + visible, [&](uint32_t a, uint32_t b) { return key[a] < key[b]; });
       return;
     }
-    constexpr int kBits = 11, kPasses = 3, kBuckets = 1 << kBits;
-    static thread_local uint32_t histogram[kPasses][kBuckets];
-    std::memset(histogram, 0, sizeof histogram);
-    for (int64_t i = 0; i < n; ++i) {
-      if (footprints[i].x1 < footprints[i].x0) continue;
-      uint32_t bits = std::bit_cast<uint32_t>(float(key[i]) + 0.0f);  // -0 sorts as 0
-      bits ^= (bits >> 31) ? 0xffffffffu : 0x80000000u;           // ascending as unsigned
-      keys[visible] = bits, order[visible] = uint32_t(i), ++visible;
-      for (int pass = 0; pass < kPasses; ++pass) ++histogram[pass][bits >> (kBits * pass) & (kBuckets - 1)];
+    // Radix sort on the bits in which the keys differ, as many passes as they need of at most kMaxBits.
+    constexpr int kMaxBits = 11, kMaxPasses = 3;
+    uint32_t low = ~0u, high = 0;
+    for (int64_t i = 0; i < visible; ++i) low = std::min(low, keys[i]), high = std::max(high, keys[i]);
+    const int width = visible ? std::bit_width(high - low) : 0, passes = (width + kMaxBits - 1) / kMaxBits;
+    if (passes == 0) return;
+    const int bits = (width + passes - 1) / passes;
+    const uint32_t mask = (1u << bits) - 1;
+    static thread_local uint32_t histogram[kMaxPasses][1 << kMaxBits];
+    for (int pass = 0; pass < passes; ++pass) std::fill_n(histogram[pass], mask + 1, 0u);
+    for (int64_t i = 0; i < visible; ++i) {
+      keys[i] -= low;
+      for (int pass = 0; pass < passes; ++pass) ++histogram[pass][keys[i] >> (bits * pass) & mask];
     }
-    for (int pass = 0; pass < kPasses; ++pass) {
-      uint32_t total = 0;
-      for (uint32_t& h : histogram[pass]) total += std::exchange(h, total);
+    for (int pass = 0; pass < passes; ++pass) {
+      uint32_t total = 0, *next = histogram[pass];
+      for (uint32_t b = 0; b <= mask; ++b) total += std::exchange(next[b], total);
       for (int64_t i = 0; i < visible; ++i) {
-        const uint32_t to = histogram[pass][keys[i] >> (kBits * pass) & (kBuckets - 1)]++;
+        const uint32_t to = next[keys[i] >> (bits * pass) & mask]++;
         keys_swap[to] = keys[i], order_swap[to] = order[i];
       }
       keys.swap(keys_swap), order.swap(order_swap);
     }
   }
 
-  // Tile lists, each in the order of `order`; the gradient slots of a primitive are consecutive.
+  // Tile lists, each in the order of `order`; the gradient slots of a primitive are consecutive, in the order of input.
   void bin() {
-    const BinParams params{footprints.data(), order.data(), tiles_x, tiles_y};
-    grow(chunk_tile, int64_t(kBinChunks) * tiles()), grow(tile_begin, tiles() + 1);
-    auto begin_of = [&](int64_t chunk) { return visible * chunk / kBinChunks; };
-    parallel_for(kBinChunks, [&](int64_t chunk, int) {
-      std::vector<LoosePair>& list = loose[chunk];
-      int64_t at = begin_of(chunk), count = 0;
-      for (;;) {
-        int64_t written = 0;
-        at = kernels<Real>().bin(params, at, begin_of(chunk + 1), list.data() + count, int64_t(list.size()) - count, &written);
-        count += written;
-        if (at == begin_of(chunk + 1)) break;
-        list.resize(list.size() * 2 + 2 * size_t(tiles()));
-      }
-      loose_count[chunk] = count;
-      uint32_t* counts = &chunk_tile[chunk * tiles()];
-      std::fill(counts, counts + tiles(), 0u);
-      for (int64_t i = 0; i < count; ++i) ++counts[list[i].tile];
-    });
     int64_t pairs_in_all = 0;
-    for (int64_t count : loose_count) pairs_in_all += count;
+    for (const Task& task : tasks) pairs_in_all += task.pairs;
     if (pairs_in_all >= int64_t(1) << 32) throw std::bad_alloc();  // slots are counted in 32 bits; this is above 200 GiB of them
+    pair_count = pairs_in_all;
+    uint32_t slot = 0;
+    for (int64_t t = 0, i = 0; t < int64_t(tasks.size()); ++t) {
+      tasks[t].first_slot = slot;
+      for (const int64_t end = std::min(i + kPrimitivesPerTask, int64_t(rows)); i < end; ++i) first_slot[i] = slot, slot += slot_count[i];
+    }
+    // Chunks of the order are put in place at the same time: each begins in a tile's list where those before it end.
+    const int chunks = threads() == 1 ? 1 : 4 * threads();
+    auto begin_of = [&](int64_t chunk) { return visible * chunk / chunks; };
+    auto pairs_of = [&](uint32_t primitive) {
+      const Task& task = tasks[primitive / kPrimitivesPerTask];
+      return loose[task.thread].data() + task.pairs_begin + (first_slot[primitive] - task.first_slot);
+    };
+    auto each_pair = [&](int64_t chunk, auto body) {
+      constexpr int64_t kFar = 24, kNear = 12;  // how far ahead of its use, in primitives, memory is fetched: order is not order of input
+      const int64_t end = begin_of(chunk + 1);
+      for (int64_t i = begin_of(chunk); i < end; ++i) {
+        if (i + kFar < end) __builtin_prefetch(&first_slot[order[i + kFar]]), __builtin_prefetch(&slot_count[order[i + kFar]]);
+        if (i + kNear < end) __builtin_prefetch(pairs_of(order[i + kNear]));
+        const uint32_t primitive = order[i], first = first_slot[primitive], count = slot_count[primitive];
+        const LoosePair* pairs = pairs_of(primitive);
+        for (uint32_t k = 0; k < count; ++k) body(pairs[k], primitive, first + k);
+      }
+    };
+    grow(chunk_tile, int64_t(chunks) * tiles()), grow(tile_begin, tiles() + 1);
+    if (chunks > 1)
+      parallel_for(chunks, [&](int64_t chunk, int) {
+        uint32_t* counts = &chunk_tile[chunk * tiles()];
+        std::fill(counts, counts + tiles(), 0u);
+        each_pair(chunk, [&](const LoosePair& pair, uint32_t, uint32_t) { ++counts[pair.tile]; });
+      });
+    else
+      std::copy_n(tile_count.begin(), tiles(), chunk_tile.begin());
     uint32_t total = 0;
     for (int tile = 0; tile < tiles(); ++tile) {
       tile_begin[tile] = total;
-      for (int chunk = 0; chunk < kBinChunks; ++chunk) total += std::exchange(chunk_tile[int64_t(chunk) * tiles() + tile], total);
+      for (int chunk = 0; chunk < chunks; ++chunk) total += std::exchange(chunk_tile[int64_t(chunk) * tiles() + tile], total);
     }
     tile_begin[tiles()] = total;
-    pair_count = total;
     grow(pair_primitive, pair_count), grow(pair_slot, pair_count), grow(pair_blocks, pair_count);
-    parallel_for(kBinChunks, [&](int64_t chunk, int) {
-      uint32_t slot = 0;
-      for (int64_t c = 0; c < chunk; ++c) slot += uint32_t(loose_count[c]);
+    parallel_for(chunks, [&](int64_t chunk, int) {
       uint32_t* position = &chunk_tile[chunk * tiles()];
-      for (int64_t i = 0; i < loose_count[chunk]; ++i, ++slot) {
-        const LoosePair& pair = loose[chunk][i];
+      each_pair(chunk, [&](const LoosePair& pair, uint32_t primitive, uint32_t slot) {
         const uint32_t at = position[pair.tile]++;
-        pair_primitive[at] = pair.primitive, pair_slot[at] = slot, pair_blocks[at] = pair.blocks;
-        if (slot_count[pair.primitive]++ == 0) first_slot[pair.primitive] = slot;
-      }
+        pair_primitive[at] = primitive, pair_slot[at] = slot, pair_blocks[at] = pair.blocks;
+      });
     });
   }
 
@@ -220,7 +285,7 @@ struct Frame {
   int64_t bytes() const {
     auto of = [](const auto& v) { return int64_t(v.capacity() * sizeof(v[0])); };
     int64_t total = of(records) + of(normals) + of(footprints) + of(key) + of(order) + of(order_swap) + of(keys) + of(keys_swap) +
-                    of(chunk_tile) + of(tile_begin) + of(first_slot) + of(slot_count) + of(pair_primitive) + of(pair_slot) + of(pair_blocks) + of(scratch) + of(pair_weight) + of(sums) +
+                    of(tasks) + of(tile_count) + of(chunk_tile) + of(tile_begin) + of(first_slot) + of(slot_count) + of(pair_primitive) + of(pair_slot) + of(pair_blocks) + of(scratch) + of(pair_weight) + of(sums) +
                     of(background_sums) + of(pair_pixels);
     for (const auto& list : loose) total += of(list);
     return total;

@@ -153,7 +153,7 @@ void chain_tetrahedra(const ChainParams<Real>& P, int64_t begin, int64_t end) {
     int64_t rows[kLanes];
     for (int l = 0; l < kLanes; ++l) rows[l] = first + std::min(l, lanes - 1);
     double sums[kLanes][kGeometrySums];
-    if (!gather_sums(P, first, lanes, end, sums)) continue;
+    if (!gather_sums(P, first, lanes, sums)) continue;
     auto sum = [&](int t) {
       D r;
       for (int l = 0; l < kLanes; ++l) r[l] = sums[std::min(l, lanes - 1)][t];

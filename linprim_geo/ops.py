@@ -564,7 +564,9 @@ def adam_rows(
         for tensor in tensors:
             _check_dtypes(torch.float32, **{name: tensor})
             if tensor.shape[:1] != steps.shape:
-                raise ValueError(f"{name} has {tuple(tensor.shape[:1])} rows, steps has shape {tuple(steps.shape)}")
+                raise ValueError(
+                    f"{name} has {tuple(tensor.shape[:1])} rows, steps has shape {tuple(steps.shape)}"
+                )
             if name != "gradient" and not tensor.is_contiguous():
                 raise ValueError(f"{name} is changed in place and has to be contiguous")
     _check_dtypes(torch.int32, steps=steps)

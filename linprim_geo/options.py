@@ -136,6 +136,11 @@ class TrainOptions:
         "auto",
         "auto, fitted, random, black, white, or r,g,b in [0,1]; auto: fitted before a plain backdrop, else random",
     )
+    adam: str = option(
+        "dense",
+        "optimiser step over all primitives, or over those that a view touched (sparse: the others' moments rest)",
+        choices=("dense", "sparse"),
+    )
     dssim: float = option(0.2, "weight of D-SSIM in the loss; L1 has the rest")
     stop: float = option(1e-3, "transmittance below which a ray ends", metavar="T")
     samples: int = option(

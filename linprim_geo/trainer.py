@@ -201,6 +201,7 @@ class Trainer:
         self.first = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
         self.second = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
         self.step = 0
+        self.steps = torch.zeros(len(self), dtype=torch.int32)  # sparse Adam: updates of each primitive
         self.seconds = 0.0
         self.loss = self.psnr = math.nan  # running means
         self.kind, self.how = options.primitive, raster_options(options)
@@ -255,7 +256,9 @@ class Trainer:
         objective = parts[0] if penalty is None else parts[0] + penalty
         *grads, screen_grad = torch.autograd.grad(objective, [*leaves.values(), screen], allow_unused=True)
         with torch.no_grad():
-            self._update(dict(zip(leaves, grads, strict=True)))
+            # A penalty reaches every primitive, whether the view touched it or not.
+            touched = screen_grad[:, 2] > 0 if penalty is None else None
+            self._update(dict(zip(leaves, grads, strict=True)), touched)
             self.control.disturb(self.parameters, self.step + 1)
             self.control.gather(self.parameters, shot.camera, screen_grad)
         self.step += 1
@@ -271,15 +274,30 @@ class Trainer:
         if not math.isfinite(loss):
             raise LinprimError(f"the loss is {loss}")
 
-    def _update(self, grads: dict[str, torch.Tensor | None]) -> None:
+    def _update(self, grads: dict[str, torch.Tensor | None], touched: torch.Tensor | None) -> None:
         part = self.step / self.options.iterations
-        for name, value in self.parameters.items():
+        rates = {name: rate * final**part for name, (rate, final) in RATES.items()}
+        names = [name for name in self.parameters if grads[name] is not None]
+        for value in self.parameters.values():
             value.requires_grad_(False)
-            if grads[name] is None:
-                continue
-            rate, final = RATES[name]
+        if self.options.adam == "sparse":
+            rows = [name for name in names if name != "background"]
+            tables = (self.parameters, grads, self.first, self.second)
+            ops.adam_rows(
+                *([table[name] for name in rows] for table in tables),
+                [rates[name] for name in rows],
+                self.steps,
+                touched,
+            )
+            names = [name for name in names if name == "background"]
+        for name in names:
             ops.adam_step(
-                value, grads[name], self.first[name], self.second[name], rate * final**part, self.step + 1
+                self.parameters[name],
+                grads[name],
+                self.first[name],
+                self.second[name],
+                rates[name],
+                self.step + 1,
             )
         rotation = self.parameters["rotation"]
         rotation /= torch.linalg.vector_norm(rotation, dim=1, keepdim=True).clamp_min(1e-12)
@@ -304,6 +322,9 @@ class Trainer:
             for table, rows in moments:
                 if rows is not None:
                     table[name][rows] = 0
+        self.steps = self.steps[source]
+        if event.fresh is not None:
+            self.steps[event.fresh] = 0
         self.control.reset(len(self))
         self._refilter()
 
@@ -343,6 +364,7 @@ class Trainer:
             "second": self.second,
             "gathered": self.control.gathered,
             "filter_3d": self.filter_3d,
+            "steps": self.steps,
             "step": self.step,
             "bounds": list(self.bounds),
             "seconds": self.seconds,
@@ -357,7 +379,7 @@ class Trainer:
             if set(state[name]) != set(getattr(self, name)):
                 raise ValueError(f"{name} has {sorted(state[name])}, wanted {sorted(getattr(self, name))}")
             setattr(self, name, dict(state[name]))
-        self.step, self.filter_3d = int(state["step"]), state["filter_3d"]
+        self.step, self.steps, self.filter_3d = int(state["step"]), state["steps"], state["filter_3d"]
         if set(state["gathered"]) != set(self.control.NAMES):
             raise ValueError(f"gathered has {sorted(state['gathered'])}, wanted {sorted(self.control.NAMES)}")
         self.control.gathered = dict(state["gathered"])

@@ -531,12 +531,14 @@ def test_kinds_and_rules_that_do_not_go_together_are_refused(wrong, sentence, ti
 # --- kinds of primitives and rules of growth --------------------------------------------------------------
 
 
-@pytest.mark.parametrize("population", ["gradient", "3dgs", "mcmc"])
+@pytest.mark.parametrize(
+    ("population", "adam"), [("gradient", "dense"), ("gradient", "sparse"), ("3dgs", "dense"), ("mcmc", "sparse")]
+)
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_learns_under_every_rule_and_goes_on_bit_for_bit(kind, population, tiny_scene, tmp_path):
+def test_every_kind_learns_under_every_rule_and_goes_on_bit_for_bit(kind, population, adam, tiny_scene, tmp_path):
     options = TrainOptions(
         iterations=300, max_primitives=260, initial_primitives=200, sh_degree=1, threads=1, primitive=kind,
-        population=population, filter="3d", checkpoint_every=100, evaluate_every=100,
+        population=population, adam=adam, filter="3d", checkpoint_every=100, evaluate_every=100,
     )  # fmt: skip
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     result = train(tiny_scene, whole, options=options, quiet=True)
