@@ -310,6 +310,13 @@ inline void blend_backward(const typename Solid::Record& record, const typename 
   select(hit, after, t).store(state.through + at);
 }
 
+// Where, in a tile, the positions in a pair's sums count from: the reference pixel, or the tile's pixel nearest to it. Sums of what lies near
+// the reference then cancel nowhere.
+template <class Real>
+inline Real origin_in_tile(Real reference, int tile) {
+  return std::clamp(reference - Real(tile), Real(0), Real(kTile - 1));
+}
+
 // The same object, but the compiler does not know: keeps it from copying a record's fields to the stack before a loop over few entries.
 template <class T>
 inline const T& opaque(const T& object) {
@@ -348,7 +355,8 @@ void backward_center(const RasterParams<typename Solid::Real>& P, int tile, void
       for (size_t line = 0; line < sizeof(typename Solid::Record); line += 64) __builtin_prefetch(next + line);
     }
     const auto& record_of_pair = records[P.lists.primitive[e]];
-    const V from_x = V::set(Real(tile_x) - record_of_pair.ref_x), from_y = V::set(Real(tile_y) - record_of_pair.ref_y);
+    const Real origin_x = origin_in_tile(record_of_pair.ref_x, tile_x), origin_y = origin_in_tile(record_of_pair.ref_y, tile_y);
+    const V from_x = V::set(Real(tile_x) + origin_x - record_of_pair.ref_x), from_y = V::set(Real(tile_y) + origin_y - record_of_pair.ref_y);
     V sums[kSums];
     for (V& s : sums) s = V::set(0);
     int part = 0;
@@ -360,7 +368,8 @@ void backward_center(const RasterParams<typename Solid::Real>& P, int tile, void
       for (int k = 0; k < kReady && todo; ++k) {
         const auto& record = opaque(record_of_pair);
         const int block = std::countr_zero(todo);
-        const V px = lanes.x + V::set(Real(4 * (block & 3) + T::part_x(part))), py = lanes.y + V::set(Real(4 * (block >> 2) + T::part_y(part)));
+        const V px = lanes.x + V::set(Real(4 * (block & 3) + T::part_x(part)) - origin_x);
+        const V py = lanes.y + V::set(Real(4 * (block >> 2) + T::part_y(part)) - origin_y);
         const int at = block * 16 + part * W;
         const V v_length = V::load(state.length + at);
         met[count] = Solid::template meet<true>(record, view, px + from_x, py + from_y, v_length, ready[count]);
@@ -372,13 +381,14 @@ void backward_center(const RasterParams<typename Solid::Real>& P, int tile, void
       for (int k = 0; k < count; ++k) {
         const auto& record = opaque(record_of_pair);
         const int at = places[k], block = at / 16, place = at % 16 / W;
-        const V px = lanes.x + V::set(Real(4 * (block & 3) + T::part_x(place))), py = lanes.y + V::set(Real(4 * (block >> 2) + T::part_y(place)));
+        const V px = lanes.x + V::set(Real(4 * (block & 3) + T::part_x(place)) - origin_x);
+        const V py = lanes.y + V::set(Real(4 * (block >> 2) + T::part_y(place)) - origin_y);
         blend_backward<Solid, kGeometry>(record, kGeometry ? P.normals[P.lists.primitive[e]] : nullptr, view, state, ready[k], met[k], taus[k], at, px,
                                          py, sums);
       }
     }
     reduce(sums, kSums, slot);
-    Solid::recenter(record_of_pair, Real(tile_x), Real(tile_y), slot);
+    Solid::recenter(record_of_pair, Real(tile_x) + origin_x, Real(tile_y) + origin_y, slot);
   }
 }
 

@@ -272,7 +272,9 @@ void backward_overlap(const RasterParams<typename Solid::Real>& P, int tile, voi
             exp_neg(tau, alpha, e_tau);
             slice_moments<kMoments>(tau, alpha, e_tau, phi);
             V power = t * length_here;
-            for (int k = 0; k < kMoments; ++k) X[k] = power * phi[k], power = power * length_here;
+            // Powers of a length of 1e10 leave single precision; held at its end, 0 times them stays 0.
+            const V most = V::set(std::numeric_limits<Real>::max() / 1024);
+            for (int k = 0; k < kMoments; ++k) X[k] = power * phi[k], power = min(power * length_here, most);
             const V after = t * e_tau;
             V bulk = zero, front = emission * X[1];  // integral of T h; integral of what the segment itself still has in front
             V before_median = length_here;
@@ -347,7 +349,9 @@ void backward_overlap(const RasterParams<typename Solid::Real>& P, int tile, voi
                   sums[Sum::normal + 3 * f + k] = fma(select(equal(c.meeting.in_face, f), c.weight, zero), incoming(S::kNormal + k),
                                                       c.d_median[f] * incoming(S::kMedianNormal + k));
             Solid::template add_gradient<Solid, kSums == Solid::kGeometrySums>(*c.record, c.meeting, met, v_length, zero, zero, select(met, c.d_in, zero),
-                                                           select(met, c.d_out, zero), select(met, c.d_density * v_length, zero), part.px, part.py, sums);
+                                                           select(met, c.d_out, zero), select(met, c.d_density * v_length, zero),
+                                                                                          part.px - V::set(origin_in_tile(c.record->ref_x, tile_x)),
+                                                                                          part.py - V::set(origin_in_tile(c.record->ref_y, tile_y)), sums);
             add_to_slot<Solid, kSums>(*c.record, sums, tile_x, tile_y, slot_of(c.entry));
           });
     }

@@ -209,7 +209,8 @@ inline void add_to_slot(const typename Solid::Record& record, const Vec<typename
                         typename Solid::Real* slot) {
   alignas(64) typename Solid::Real own[kSums];
   reduce(sums, kSums, own);
-  Solid::recenter(record, typename Solid::Real(tile_x), typename Solid::Real(tile_y), own);
+  using Real = typename Solid::Real;
+  Solid::recenter(record, Real(tile_x) + origin_in_tile(record.ref_x, tile_x), Real(tile_y) + origin_in_tile(record.ref_y, tile_y), own);
   for (int i = 0; i < kSums; ++i) slot[i] += own[i];
 }
 
@@ -241,7 +242,8 @@ void backward_entry(const RasterParams<typename Solid::Real>& P, int tile, void*
           [&] { return V::load(state.through + part.at) >= V::set(Real(view.stop)); },
           [&](Candidate& c, M now) {
             blend_backward<Solid, kGeometry>(*c.record, kGeometry ? P.normals[P.lists.primitive[c.entry]] : nullptr, view, state, c.meeting, now, c.tau,
-                                             part.at, part.px, part.py, c.sums);
+                                             part.at, part.px - V::set(origin_in_tile(c.record->ref_x, tile_x)),
+                                             part.py - V::set(origin_in_tile(c.record->ref_y, tile_y)), c.sums);
           },
           [&](Candidate& c) { add_to_slot<Solid, kSums>(*c.record, c.sums, tile_x, tile_y, slot_of(c.entry)); });
     }

@@ -31,8 +31,9 @@ struct GaussianFrame {
     xx = yy = splat(view.screen_filter), xy = splat(0.0);
     D smallest = splat(1e300);
     for (int k = 0; k < 3; ++k) {
-      extent[k] = gather(p.extent + k, 3, rows);
-      smallest = vmin(smallest, extent[k]);
+      const D raw = gather(p.extent + k, 3, rows);
+      smallest = vmin(smallest, raw);
+      extent[k] = clamp(raw, 0.0, kLargestExtent);
       gx[k] = view.fx * (pose.axis[k][0] - u * pose.axis[k][2]) * inverse_z * extent[k];
       gy[k] = view.fy * (pose.axis[k][1] - v * pose.axis[k][2]) * inverse_z * extent[k];
       xx += gx[k] * gx[k], xy += gx[k] * gy[k], yy += gy[k] * gy[k];

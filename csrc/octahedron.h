@@ -52,7 +52,7 @@ struct Octahedron : Polyhedron<RealType, W, kRays> {
   }
 
   // Adds gradients to the planes of entry and exit (0 in lanes without a hit) to the sums of the three local forms p_k: with g the gradient
-  // to p_k, the sums of g, g x, g y and g w at 0, 3, 6 and 9; px and py are positions in the tile.
+  // to p_k, the sums of g, g x, g y and g w at 0, 3, 6 and 9; px and py are positions from the pair's origin.
   static void add_planes(const Record& r, const Meeting& m, M hit, V g_in, V g_out, V px, V py, V* sums) {
     // A lane that does not hit may hold an infinity, and 0 times that is no number.
     const V zero = V::set(0), g_in_w = g_in * select(hit, m.in, zero), g_out_w = g_out * select(hit, m.out, zero);
@@ -65,9 +65,9 @@ struct Octahedron : Polyhedron<RealType, W, kRays> {
       sums[9 + k] = fma(g_in_w, s_in, fma(g_out_w, s_out, sums[9 + k]));
     }
   }
-  // Positions were counted from the tile's corner: moves a slot's sums to the reference pixel.
-  static void recenter(const Record& r, Real tile_x, Real tile_y, Real* slot) {
-    const Real dx = tile_x - r.ref_x, dy = tile_y - r.ref_y;
+  // Moves a slot's sums from their origin, a pixel of the tile, to the reference pixel.
+  static void recenter(const Record& r, Real origin_x, Real origin_y, Real* slot) {
+    const Real dx = origin_x - r.ref_x, dy = origin_y - r.ref_y;
     for (int k = 0; k < 3; ++k) slot[3 + k] += dx * slot[k], slot[6 + k] += dy * slot[k];
   }
 };

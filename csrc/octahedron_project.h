@@ -11,12 +11,15 @@ struct OctahedronFrame {
   D extent[3], flip[3];
   D n[3][3];
   D arm[6][3];  // vertices from the centre: +-0, +-1, +-2
+  D smallest = splat(1e300);
 
   template <class Real>
   OctahedronFrame(const View& view, const Primitives<Real>& p, const int64_t* rows) {
     set_pose(view, p, rows, pose);
     for (int k = 0; k < 3; ++k) {
-      extent[k] = gather(p.extent + k, 3, rows);
+      const D raw = gather(p.extent + k, 3, rows);
+      smallest = vmin(smallest, raw);
+      extent[k] = clamp(raw, kSmallestExtent, kLargestExtent);
       flip[k] = dot(pose.axis[k], pose.center) < 0.0 ? splat(-1.0) : splat(1.0);
       const D inverse = flip[k] / extent[k];
       for (int i = 0; i < 3; ++i) {
@@ -82,7 +85,7 @@ void project_octahedra(const ProjectParams<Real>& P, int64_t begin, int64_t end)
       box.low_x = rays.crosses_near ? splat(0.0) : box.low_x, box.high_x = rays.crosses_near ? splat(1e9) : box.high_x;
       box.low_y = rays.crosses_near ? splat(0.0) : box.low_y, box.high_y = rays.crosses_near ? splat(1e9) : box.high_y;
     }
-    B visible = (B)(vmin(f.extent[0], vmin(f.extent[1], f.extent[2])) > 0.0) & (kExact ? (B)(center[2] + reach > view.near) : (B)(center[2] > view.near));
+    B visible = (B)(f.smallest > 0.0) & (kExact ? (B)(center[2] + reach > view.near) : (B)(center[2] > view.near));
     Footprint* print = P.footprints + first;
     set_boxes(view, box.low_x, box.high_x, box.low_y, box.high_y, lanes, visible, print);
     D nearest = center[2] - reach;

@@ -7,7 +7,7 @@
 //   attenuate     thickness to alpha and transmittance
 //   depths        z-depths of entry and exit
 //   add_gradient  from the gradients to thickness and depths to the pair's sums
-//   recenter      moves a finished slot's sums from the tile's corner to the record's reference
+//   recenter      moves a finished slot's sums from their origin to the record's reference
 #pragma once
 
 #include "kernels.h"

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <algorithm>
+#include <limits>
 
 #include "lanes.h"
 #include "spherical_harmonics.h"
@@ -10,6 +11,8 @@ namespace linprim::LINPRIM_ISA {
 
 // Densities above this, opaque over any length that floats resolve, are taken as this: products with it stay finite.
 constexpr double kLargestDensity = 1e20;
+// Extents outside of these are taken as these: their planes, and squares of depths, stay finite in single precision.
+constexpr double kSmallestExtent = 1e-15, kLargestExtent = 1e12;
 // Slack, in pixels, of screen bounds and silhouette lines: covers the float rounding of the planes the tile kernels evaluate.
 constexpr double kPixelSlack = 1e-3;
 // Slack, relative, of the depth that a primitive is promised not to reach before.
@@ -218,6 +221,13 @@ inline bool gather_sums(const ChainParams<Real>& P, int64_t first, int lanes, do
   return found;
 }
 
+// A gradient that is too large for Real is handed on as the largest.
+template <class Real>
+inline Real saturated(double x) {
+  constexpr double kMost = double(std::numeric_limits<Real>::max());
+  return Real(std::clamp(x, -kMost, kMost));
+}
+
 // What the chains write at the end: gradients in camera space of the visible lanes, to rows.
 struct RowGradients {
   D center[3];     // camera space
@@ -240,12 +250,13 @@ inline void write_rows(const ChainParams<Real>& P, const Eye& eye, const Pose& f
     if (P.slot_count[row] == 0) continue;
     double center[3] = {world[0][l], world[1][l], world[2][l]};
     color.add(P.primitives, row, l, P.color, sums[l] + Sum::rgb, P.out.sh + row * sh_count * 3, center);
-    for (int i = 0; i < 3; ++i) P.out.center[3 * row + i] = Real(center[i]);
-    for (int k = 0; k < extents; ++k) P.out.extent[extents * row + k] = Real(g.extent[k][l]);
-    for (int k = 0; k < 4; ++k) P.out.rotation[4 * row + k] = Real(q_grad[k][l]);
-    P.out.screen[3 * row] = Real(g.screen_x[l]), P.out.screen[3 * row + 1] = Real(g.screen_y[l]), P.out.screen[3 * row + 2] = Real(pull[l]);
+    for (int i = 0; i < 3; ++i) P.out.center[3 * row + i] = saturated<Real>(center[i]);
+    for (int k = 0; k < extents; ++k) P.out.extent[extents * row + k] = saturated<Real>(g.extent[k][l]);
+    for (int k = 0; k < 4; ++k) P.out.rotation[4 * row + k] = saturated<Real>(q_grad[k][l]);
+    P.out.screen[3 * row] = saturated<Real>(g.screen_x[l]), P.out.screen[3 * row + 1] = saturated<Real>(g.screen_y[l]);
+    P.out.screen[3 * row + 2] = saturated<Real>(pull[l]);
     const double density = double(P.primitives.density[row]);
-    P.out.density[row] = density < 0 || density > kLargestDensity ? Real(0) : Real(g.density[l]);
+    P.out.density[row] = density < 0 || density > kLargestDensity ? Real(0) : saturated<Real>(g.density[l]);
   }
 }
 

@@ -33,7 +33,7 @@ struct Tetrahedron : Polyhedron<RealType, W, kRays> {
   }
 
   // Adds gradients to the planes of entry and exit (0 in lanes without a hit): with g the gradient to face f's plane, the sums of g,
-  // g x and g y at f, 4 + f and 8 + f; px and py are positions in the tile.
+  // g x and g y at f, 4 + f and 8 + f; px and py are positions from the pair's origin.
   static void add_planes(const Record&, const Meeting& m, M, V g_in, V g_out, V px, V py, V* sums) {
     const V zero = V::set(0);
     for (int f = 0; f < 4; ++f) {
@@ -43,8 +43,8 @@ struct Tetrahedron : Polyhedron<RealType, W, kRays> {
       sums[8 + f] = fma(g, py, sums[8 + f]);
     }
   }
-  static void recenter(const Record& r, Real tile_x, Real tile_y, Real* slot) {
-    const Real dx = tile_x - r.ref_x, dy = tile_y - r.ref_y;
+  static void recenter(const Record& r, Real origin_x, Real origin_y, Real* slot) {
+    const Real dx = origin_x - r.ref_x, dy = origin_y - r.ref_y;
     for (int f = 0; f < 4; ++f) slot[4 + f] += dx * slot[f], slot[8 + f] += dy * slot[f];
   }
 };

@@ -1,7 +1,7 @@
 // Tetrahedra to records, and the adjoint: gradient sums of a record back to centre, rotation, vertex distances and density.
 //
 // Vertices are c + d_j e_j with e_j the four directions of a regular tetrahedron, turned. As sum e_j = 0 and e_i . e_j = -1/3, the face that
-// omits vertex j is n_j . (x - c) = 1 with n_j = 3/4 (sum_i u_i e_i - (sum_i u_i) e_j), u = 1/d.
+// omits vertex j is n_j . (x - c) = 1 with n_j = 3/4 sum_(i != j) u_i (e_i - e_j), u = 1/d, which does not know d_j.
 #pragma once
 
 #include "polyhedron_project.h"
@@ -13,7 +13,7 @@ constexpr double kDirection[4][3] = {{kCorner, kCorner, kCorner}, {kCorner, -kCo
 
 struct TetrahedronFrame {
   Pose pose;
-  D extent[4], u[4], u_sum{};
+  D extent[4], u[4];
   D e[4][3];    // directions of the vertices, camera space
   D n[4][3];    // faces
   D arm[4][3];  // vertices from the centre
@@ -22,21 +22,24 @@ struct TetrahedronFrame {
   template <class Real>
   TetrahedronFrame(const View& view, const Primitives<Real>& p, const int64_t* rows) {
     set_pose(view, p, rows, pose);
-    D total[3] = {};
     low_z = splat(1e300), high_z = splat(-1e300), smallest = splat(1e300);
     for (int j = 0; j < 4; ++j) {
-      extent[j] = gather(p.extent + j, 4, rows);
+      const D raw = gather(p.extent + j, 4, rows);
+      smallest = vmin(smallest, raw);
+      extent[j] = clamp(raw, kSmallestExtent, kLargestExtent);
       u[j] = 1.0 / extent[j];
-      u_sum += u[j];
       for (int i = 0; i < 3; ++i) {
         e[j][i] = kDirection[j][0] * pose.axis[0][i] + kDirection[j][1] * pose.axis[1][i] + kDirection[j][2] * pose.axis[2][i];
         arm[j][i] = e[j][i] * extent[j];
-        total[i] += u[j] * e[j][i];
       }
-      low_z = vmin(low_z, arm[j][2]), high_z = vmax(high_z, arm[j][2]), smallest = vmin(smallest, extent[j]);
+      low_z = vmin(low_z, arm[j][2]), high_z = vmax(high_z, arm[j][2]);
     }
     for (int j = 0; j < 4; ++j)
-      for (int i = 0; i < 3; ++i) n[j][i] = 0.75 * (total[i] - u_sum * e[j][i]);
+      for (int t = 0; t < 3; ++t) {
+        n[j][t] = splat(0.0);
+        for (int i = 0; i < 4; ++i)
+          if (i != j) n[j][t] += 0.75 * u[i] * (e[i][t] - e[j][t]);
+      }
   }
 };
 
@@ -185,14 +188,16 @@ void chain_tetrahedra(const ChainParams<Real>& P, int64_t begin, int64_t end) {
     if constexpr (kRays == RayModel::kAffine)
       if (geometry)
         for (int i = 0; i < 3; ++i) out.center[i] += sum(Sum::distance) * f.pose.center[i] * rays.inverse_length;
-    D total[3];
-    for (int i = 0; i < 3; ++i) total[i] = n_grad[0][i] + n_grad[1][i] + n_grad[2][i] + n_grad[3][i];
-    D own{};  // sum_j n_grad_j . e_j
-    for (int j = 0; j < 4; ++j) own += dot(n_grad[j], f.e[j]);
     D e_grad[4][3];
-    for (int j = 0; j < 4; ++j) {
-      out.extent[j] = -0.75 * (dot(total, f.e[j]) - own) * f.u[j] * f.u[j];
-      for (int i = 0; i < 3; ++i) e_grad[j][i] = 0.75 * (f.u[j] * total[i] - f.u_sum * n_grad[j][i]);
+    for (int i = 0; i < 4; ++i) {
+      D along{}, others[3] = {}, shares{};  // over the faces that know vertex i; shares: over the other vertices
+      for (int j = 0; j < 4; ++j) {
+        if (j == i) continue;
+        shares += f.u[j];
+        for (int t = 0; t < 3; ++t) along += n_grad[j][t] * (f.e[i][t] - f.e[j][t]), others[t] += n_grad[j][t];
+      }
+      out.extent[i] = -0.75 * along * f.u[i] * f.u[i];
+      for (int t = 0; t < 3; ++t) e_grad[i][t] = 0.75 * (f.u[i] * others[t] - shares * n_grad[i][t]);
     }
     out.density = sum(Sum::density);
     if (filtered) {

@@ -259,7 +259,8 @@ def rasterize(
         center: (N, 3) world positions. float32 or float64; all tensors alike.
         rotation: (N, 4) quaternions w, x, y, z of any length but 0, which means no rotation.
         extent: (N, 3) half-axes of octahedra, (N, 4) distances of a tetrahedron's vertices along (1, 1, 1), (1, -1, -1), (-1, 1, -1) and
-            (-1, -1, 1), or (N, 3) standard deviations of Gaussians; world units. A primitive with one that is not positive is not drawn.
+            (-1, -1, 1), or (N, 3) standard deviations of Gaussians; world units. A primitive with one that is not positive is not drawn;
+            those below 1e-15 or above 1e12 are taken as these.
         density: (N,) optical thickness per world unit; below 0 counts as 0. Of Gaussians the peak opacity, 0 to 1.
         sh: (N, K, 3) spherical harmonics, K = 1, 4, 9 or 16; colour = max(0, 0.5 + their sum at the direction from the camera
             to the centre).

@@ -19,7 +19,14 @@ RUNGS = [
 NAMES = ["-".join(rung) for rung in RUNGS]
 
 
-def scene_of(seed: int, rung: tuple[str, str, str], count: int = 14, coefficients: int = 4, size=(19, 14), dtype=torch.float64):
+def scene_of(
+    seed: int,
+    rung: tuple[str, str, str],
+    count: int = 14,
+    coefficients: int = 4,
+    size=(19, 14),
+    dtype=torch.float64,
+):
     """Tensors that require gradients, the camera, and the keywords of the rung."""
     primitive, ray_model, order = rung
     parameters, view = random_scene(seed, count, coefficients, *size)
@@ -31,7 +38,11 @@ def scene_of(seed: int, rung: tuple[str, str, str], count: int = 14, coefficient
         parameters[3] = torch.from_numpy(rng.uniform(0.05, 1.0, count))
     leaves = [p.to(dtype).requires_grad_() for p in parameters]
     # Where a ray stops inside an overlap, the twin's gradient knows which of the boundaries it stopped at, the core's does not.
-    return leaves, view, dict(primitive=primitive, ray_model=ray_model, order=order, stop=0.0 if order == "overlap" else 1e-3)
+    return (
+        leaves,
+        view,
+        dict(primitive=primitive, ray_model=ray_model, order=order, stop=0.0 if order == "overlap" else 1e-3),
+    )
 
 
 def both(leaves, view, options, geometry=True):
@@ -41,19 +52,34 @@ def both(leaves, view, options, geometry=True):
     for core in (True, False):
         inputs = [p.detach().to(p.dtype if core else torch.float64).requires_grad_() for p in leaves]
         if core:
-            images = fields(ops.rasterize(*inputs, view, geometry=geometry, **options), IMAGES if geometry else IMAGES[:2])
+            images = fields(
+                ops.rasterize(*inputs, view, geometry=geometry, **options), IMAGES if geometry else IMAGES[:2]
+            )
         else:
             out = reference.rasterize(
-                *inputs, world_to_camera=torch.from_numpy(view.world_to_camera), fx=view.fx, fy=view.fy, cx=view.cx, cy=view.cy,
-                width=view.width, height=view.height, geometry=geometry, **options,
+                *inputs,
+                world_to_camera=torch.from_numpy(view.world_to_camera),
+                fx=view.fx,
+                fy=view.fy,
+                cx=view.cx,
+                cy=view.cy,
+                width=view.width,
+                height=view.height,
+                geometry=geometry,
+                **options,
             )
             images = {name: out[name] for name in (IMAGES if geometry else IMAGES[:2])}
         if weights is None:
             generator = torch.Generator().manual_seed(3)
-            weights = {name: torch.rand(image.shape, generator=generator, dtype=torch.float64) - 0.3 for name, image in images.items()}
+            weights = {
+                name: torch.rand(image.shape, generator=generator, dtype=torch.float64) - 0.3
+                for name, image in images.items()
+            }
         loss = sum((image.double() * weights[name]).sum() for name, image in images.items())
         grads = torch.autograd.grad(loss, inputs, allow_unused=True)
-        results.append((images, [torch.zeros_like(p) if g is None else g for p, g in zip(inputs, grads, strict=True)]))
+        results.append(
+            (images, [torch.zeros_like(p) if g is None else g for p, g in zip(inputs, grads, strict=True)])
+        )
     return results
 
 
@@ -61,7 +87,7 @@ def assert_alike(leaves, view, options, geometry, value: float, gradient: float)
     (shown, grads), (wanted, wanted_grads) = both(leaves, view, options, geometry)
     for name, image in wanted.items():
         scale = max(float(image.detach().abs().max()), 1e-3)
-        off = float((shown[name].double() - image).abs().max())
+        off = float((shown[name].detach().double() - image).abs().max())
         assert off <= value * scale, f"{name} is off by {off / scale:.1e} of its range"
     for index, (found, truth) in enumerate(zip(grads, wanted_grads, strict=True)):
         off, scale = float((found.double() - truth).abs().max()), max(float(truth.abs().max()), 1e-6)

@@ -1,0 +1,154 @@
+"""Runs the core's tests under AddressSanitizer and UndefinedBehaviorSanitizer: `python tools/sanitize.py`.
+
+Builds the core with -DLINPRIM_SANITIZE=ON in a folder of its own (--keep FOLDER to build again faster next time), puts that
+module in the place of the installed one, and runs pytest with the sanitizers' runtimes preloaded. The first error ends the
+run. Exit status: pytest's, or 1 where the build fails or a sanitizer has spoken. Takes GCC or Clang on Linux, several
+minutes, and the environment that `make env` makes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+
+TESTS = (
+    "test_rasterize.py",
+    "test_parallel.py",
+    "test_ladder.py",
+    "test_stability.py",
+    "test_photometric.py",
+)
+# `opcheck` traces through a compiler of its own, and a forked child has none of the sanitizers' threads.
+SKIPPED = "not registered_correctly and not forked"
+
+# The sanitized module under the installed one's name, before anything imports the package: an editable install's finder
+# comes before PYTHONPATH, sys.modules before both.
+RUNNER = """
+import importlib.util, sys
+spec = importlib.util.spec_from_file_location("linprim_geo._core", sys.argv[1])
+module = importlib.util.module_from_spec(spec)
+sys.modules["linprim_geo._core"] = module
+spec.loader.exec_module(module)
+import linprim_geo
+linprim_geo._core = module
+from linprim_geo import ops
+assert ops._core.__file__ == sys.argv[1], ops._core.__file__
+print("testing", ops._core.__file__, "with the kernels", ops.instruction_set(), flush=True)
+import pytest
+sys.exit(pytest.main(sys.argv[2:]))
+"""
+
+
+def build(folder: Path, jobs: int) -> Path:
+    """Builds the sanitized core in `folder`; returns the module. Raises CalledProcessError where that fails."""
+    python = sys.executable
+    nanobind = subprocess.run(
+        [python, "-m", "nanobind", "--cmake_dir"], check=True, capture_output=True, text=True
+    ).stdout.strip()
+    tools = f"{Path(python).parent}{os.pathsep}{os.environ['PATH']}"
+    cmake = shutil.which("cmake", path=tools) or "cmake"
+    options = ["-DLINPRIM_SANITIZE=ON", f"-Dnanobind_DIR={nanobind}", f"-DPython_EXECUTABLE={python}"]
+    if shutil.which("ninja", path=tools):
+        options += ["-G", "Ninja", f"-DCMAKE_MAKE_PROGRAM={shutil.which('ninja', path=tools)}"]
+    subprocess.run([cmake, "-S", str(ROOT), "-B", str(folder), *options], check=True)
+    subprocess.run([cmake, "--build", str(folder), "--parallel", str(jobs)], check=True)
+    found = sorted(folder.glob("_core*.so"))
+    if len(found) != 1:
+        raise SystemExit(f"sanitize: expected one module _core*.so in {folder}, found {len(found)}")
+    return found[0]
+
+
+def runtimes(folder: Path) -> str:
+    """LD_PRELOAD of the sanitizers' runtimes of the compiler that built `folder`, and the C++ library they hook into."""
+    cache = (folder / "CMakeCache.txt").read_text()
+    compiler = next(
+        line.split("=", 1)[1] for line in cache.splitlines() if line.startswith("CMAKE_CXX_COMPILER:")
+    )
+    names = ("libasan.so", "libubsan.so", "libstdc++.so.6")
+    if "clang" in Path(compiler).name:
+        arch = sysconfig.get_platform().rsplit("-", 1)[1]
+        names = (f"libclang_rt.asan-{arch}.so", "libstdc++.so.6")
+    paths = []
+    for name in names:
+        path = subprocess.run(
+            [compiler, f"-print-file-name={name}"], check=True, capture_output=True, text=True
+        ).stdout.strip()
+        if os.sep not in path:
+            raise SystemExit(
+                f"sanitize: {compiler} has no {name}; on Debian the packages libasan and libubsan hold it"
+            )
+        paths.append(os.path.realpath(path))
+    return ":".join(paths)
+
+
+def test(module: Path, folder: Path, arguments: list[str]) -> int:
+    """Runs pytest on the module; returns its exit status."""
+    environment = os.environ | {
+        "LD_PRELOAD": runtimes(folder),
+        # Python leaves memory to the system at its end, so leaks say nothing; threads of torch outlive their stacks.
+        "ASAN_OPTIONS": "detect_leaks=0:halt_on_error=1:abort_on_error=0:exitcode=99:detect_stack_use_after_return=0",
+        "UBSAN_OPTIONS": "halt_on_error=1:print_stacktrace=1:exitcode=99",
+        "PYTHONPATH": os.pathsep.join([str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")]),
+        "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1"),
+    }
+    runner = folder / "run_tests.py"
+    runner.write_text(RUNNER)
+    return subprocess.run(
+        [sys.executable, str(runner), str(module), *arguments], env=environment, cwd=ROOT
+    ).returncode
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--keep", type=Path, metavar="FOLDER", help="build here and leave it (default: a temporary folder)"
+    )
+    parser.add_argument(
+        "--jobs", type=int, default=os.cpu_count() or 1, help="compilers at once (default: %(default)s)"
+    )
+    parser.add_argument(
+        "pytest", nargs="*", help="arguments of pytest in place of the core's test files, after --"
+    )
+    options = parser.parse_args(arguments)
+    if not sys.platform.startswith("linux"):
+        print("sanitize: this preloads the sanitizers the way of Linux only", file=sys.stderr)
+        return 1
+    chosen = options.pytest or [
+        *(str(ROOT / "tests" / t) for t in TESTS if (ROOT / "tests" / t).exists()),
+        "-k",
+        SKIPPED,
+    ]
+    begin = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="linprim-sanitize-") as temporary:
+        folder = options.keep.resolve() if options.keep else Path(temporary)
+        try:
+            module = build(folder, options.jobs)
+        except subprocess.CalledProcessError as error:
+            print(f"sanitize: the build failed: {error}", file=sys.stderr)
+            return 1
+        built = time.monotonic()
+        status = test(module, folder, ["-q", "-x", "-p", "no:cacheprovider", *chosen])
+    verdict = (
+        "no error"
+        if status == 0
+        else "a sanitizer's error, see above"
+        if status == 99
+        else f"pytest's exit status {status}"
+    )
+    print(f"sanitize: {verdict}; build {built - begin:.0f} s, tests {time.monotonic() - built:.0f} s")
+    return min(status, 1) if status == 99 else status
+
+
+if __name__ == "__main__":
+    sys.exit(main())
