@@ -1,7 +1,8 @@
 // Gaussians to records, and the adjoint: gradient sums of a record back to centre, rotation, standard deviations and opacity.
 //
 // The covariance sum_k arm_k arm_k^T (arm_k the local axis k times its standard deviation) is projected by the Jacobian of the pixel position
-// at the centre: with g_k = J arm_k, M = sum_k g_k g_k^T + filter I.  Source: Zwicker et al. 2002; Kerbl et al. 2023, equation 5.
+// at the centre, or, outside of 1.3 times the field of view, where it would run away, at that limit: with g_k = J arm_k,
+// M = sum_k g_k g_k^T + filter I.  Source: Zwicker et al. 2002; Kerbl et al. 2023, equation 5.
 #pragma once
 
 #include "gaussian.h"
@@ -9,6 +10,7 @@
 
 namespace linprim::LINPRIM_ISA {
 
+constexpr double kViewLimit = 1.3;
 // A covariance whose determinant is below this part of its squared trace is a line, and not drawn.
 constexpr double kFlat = 1e-12;
 
@@ -16,6 +18,7 @@ struct GaussianFrame {
   Pose pose;
   D extent[3];
   D inverse_z, u, v;  // of the centre; z = 1 where it lies before the near plane
+  D limit_u, limit_v;  // u and v held within 1.3 times half the image
   B in_front;
   D gx[3], gy[3];     // projected arms, pixels
   D xx, xy, yy;       // covariance, pixels^2
@@ -28,14 +31,16 @@ struct GaussianFrame {
     in_front = (B)(pose.center[2] > view.near);
     inverse_z = 1.0 / (in_front ? pose.center[2] : splat(1.0));
     u = pose.center[0] * inverse_z, v = pose.center[1] * inverse_z;
+    const double most_u = kViewLimit * 0.5 * view.width / view.fx, most_v = kViewLimit * 0.5 * view.height / view.fy;
+    limit_u = clamp(u, -most_u, most_u), limit_v = clamp(v, -most_v, most_v);
     xx = yy = splat(view.screen_filter), xy = splat(0.0);
     D smallest = splat(1e300);
     for (int k = 0; k < 3; ++k) {
       const D raw = gather(p.extent + k, 3, rows);
       smallest = vmin(smallest, raw);
       extent[k] = clamp(raw, 0.0, kLargestExtent);
-      gx[k] = view.fx * (pose.axis[k][0] - u * pose.axis[k][2]) * inverse_z * extent[k];
-      gy[k] = view.fy * (pose.axis[k][1] - v * pose.axis[k][2]) * inverse_z * extent[k];
+      gx[k] = view.fx * (pose.axis[k][0] - limit_u * pose.axis[k][2]) * inverse_z * extent[k];
+      gy[k] = view.fy * (pose.axis[k][1] - limit_v * pose.axis[k][2]) * inverse_z * extent[k];
       xx += gx[k] * gx[k], xy += gx[k] * gy[k], yy += gy[k] * gy[k];
     }
     // Cauchy and Binet: without the cancellation of xx yy - xy^2.
@@ -151,11 +156,11 @@ void chain_gaussians(const ChainParams<Real>& P, int64_t begin, int64_t end) {
     for (int k = 0; k < 3; ++k) {
       const D to_x = 2.0 * (mxx * f.gx[k] + mxy * f.gy[k]) * view.fx, to_y = 2.0 * (mxy * f.gx[k] + myy * f.gy[k]) * view.fy;
       const D* axis = f.pose.axis[k];
-      const D arm_x = (axis[0] - f.u * axis[2]) * f.extent[k], arm_y = (axis[1] - f.v * axis[2]) * f.extent[k];
+      const D arm_x = (axis[0] - f.limit_u * axis[2]) * f.extent[k], arm_y = (axis[1] - f.limit_v * axis[2]) * f.extent[k];
       const D ax = to_x * f.inverse_z, ay = to_y * f.inverse_z;
-      out.axis[k][0] = ax * f.extent[k], out.axis[k][1] = ay * f.extent[k], out.axis[k][2] = -(ax * f.u + ay * f.v) * f.extent[k];
-      out.extent[k] = ax * (axis[0] - f.u * axis[2]) + ay * (axis[1] - f.v * axis[2]);
-      g_u -= ax * axis[2] * f.extent[k], g_v -= ay * axis[2] * f.extent[k];
+      out.axis[k][0] = ax * f.extent[k], out.axis[k][1] = ay * f.extent[k], out.axis[k][2] = -(ax * f.limit_u + ay * f.limit_v) * f.extent[k];
+      out.extent[k] = ax * (axis[0] - f.limit_u * axis[2]) + ay * (axis[1] - f.limit_v * axis[2]);
+      g_u -= f.u == f.limit_u ? ax * axis[2] * f.extent[k] : splat(0.0), g_v -= f.v == f.limit_v ? ay * axis[2] * f.extent[k] : splat(0.0);
       g_inverse_z += to_x * arm_x + to_y * arm_y;
     }
     g_inverse_z += g_u * f.pose.center[0] + g_v * f.pose.center[1];

@@ -81,10 +81,7 @@ void project_octahedra(const ProjectParams<Real>& P, int64_t begin, int64_t end)
       filter.grow(rays, box);
       density *= filter.scale_x * filter.scale_y;
     }
-    if constexpr (kExact) {
-      box.low_x = rays.crosses_near ? splat(0.0) : box.low_x, box.high_x = rays.crosses_near ? splat(1e9) : box.high_x;
-      box.low_y = rays.crosses_near ? splat(0.0) : box.low_y, box.high_y = rays.crosses_near ? splat(1e9) : box.high_y;
-    }
+    if constexpr (kExact) clip_boxes<true>(view, center, f.arm, 6, rays.crosses_near, lanes, box);
     B visible = (B)(f.smallest > 0.0) & (kExact ? (B)(center[2] + reach > view.near) : (B)(center[2] > view.near));
     Footprint* print = P.footprints + first;
     set_boxes(view, box.low_x, box.high_x, box.low_y, box.high_y, lanes, visible, print);
@@ -153,7 +150,7 @@ void project_octahedra(const ProjectParams<Real>& P, int64_t begin, int64_t end)
         bool is_front[8];
         double signs[8][3];
         for (int s = 0; s < 8; ++s) {
-          is_front[s] = s < 4 && front[s][l] && !rays.crosses_near[l];  // nothing bounds what crosses the near plane
+          is_front[s] = s < 4 && front[s][l];
           for (int k = 0; k < 3; ++k) signs[s][k] = kSign[s & 3][k] * side[s & 3][l] * (s < 4 ? 1 : -1);
         }
         silhouette_lines(a, b, c, l, is_front, signs, line_a, line_b, line_c);

@@ -131,6 +131,33 @@ inline Box box_of(const RayFrame<kRays>& rays, const D (*arm)[3], int vertices) 
   return box;
 }
 
+// For lanes that cross the near plane: the box of what lies beyond it, from the vertices there and where edges pass through. Every two vertices
+// are joined by an edge but, with kOpposite, 2 k and 2 k + 1.
+template <bool kOpposite>
+inline void clip_boxes(const View& view, const D center[3], const D (*arm)[3], int vertices, B crosses, int lanes, Box& box) {
+  for (int l = 0; l < lanes; ++l) {
+    if (!crosses[l]) continue;
+    double low_x = 1e30, high_x = -1e30, low_y = 1e30, high_y = -1e30;
+    auto add = [&](double x, double y, double z) {
+      const double px = view.fx * x / z + (view.cx - 0.5), py = view.fy * y / z + (view.cy - 0.5);
+      low_x = std::min(low_x, px), high_x = std::max(high_x, px), low_y = std::min(low_y, py), high_y = std::max(high_y, py);
+    };
+    double at[6][3];
+    for (int i = 0; i < vertices; ++i)
+      for (int k = 0; k < 3; ++k) at[i][k] = center[k][l] + arm[i][k][l];
+    for (int i = 0; i < vertices; ++i) {
+      if (at[i][2] >= view.near) add(at[i][0], at[i][1], at[i][2]);
+      for (int j = i + 1; j < vertices; ++j) {
+        if ((kOpposite && i / 2 == j / 2) || (at[i][2] >= view.near) == (at[j][2] >= view.near)) continue;
+        const double part = (view.near - at[i][2]) / (at[j][2] - at[i][2]);
+        add(at[i][0] + part * (at[j][0] - at[i][0]), at[i][1] + part * (at[j][1] - at[i][1]), view.near);
+      }
+    }
+    // Planes of what crosses the near plane count from inverse depth 0: a pixel for their rounding.
+    box.low_x[l] = low_x - 1, box.high_x[l] = high_x + 1, box.low_y[l] = low_y - 1, box.high_y[l] = high_y + 1;
+  }
+}
+
 // Screen filter: a pixel's ray meets the primitive where the ray of (pixel - projected centre) * scale would, so its box grows by half the
 // filter on every side; density is multiplied by scale_x scale_y, which keeps the optical thickness summed over the screen.
 template <RayModel kRays>

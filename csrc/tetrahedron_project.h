@@ -89,10 +89,7 @@ void project_tetrahedra(const ProjectParams<Real>& P, int64_t begin, int64_t end
       filter.grow(rays, box);
       density *= filter.scale_x * filter.scale_y;
     }
-    if constexpr (kExact) {
-      box.low_x = rays.crosses_near ? splat(0.0) : box.low_x, box.high_x = rays.crosses_near ? splat(1e9) : box.high_x;
-      box.low_y = rays.crosses_near ? splat(0.0) : box.low_y, box.high_y = rays.crosses_near ? splat(1e9) : box.high_y;
-    }
+    if constexpr (kExact) clip_boxes<false>(view, center, f.arm, 4, rays.crosses_near, lanes, box);
     B visible = (B)(f.smallest > 0.0) & (kExact ? (B)(center[2] + f.high_z > view.near) : (B)(center[2] > view.near));
     Footprint* print = P.footprints + first;
     set_boxes(view, box.low_x, box.high_x, box.low_y, box.high_y, lanes, visible, print);
@@ -113,12 +110,12 @@ void project_tetrahedra(const ProjectParams<Real>& P, int64_t begin, int64_t end
     const TetrahedronPlanes<kRays> planes(f, rays, filter);
     B front[4];
     for (int j = 0; j < 4; ++j) front[j] = (B)(planes.h[j] < 0.0);
-    // Silhouette: every edge between a front and a back face; nothing bounds what crosses the near plane.
+    // Silhouette: every edge between a front and a back face.
     D line_a[6], line_b[6], line_c[6];
     for (int i = 0, at = 0; i < 4; ++i)
       for (int j = i + 1; j < 4; ++j, ++at) {
         const D side = front[i] ? splat(1.0) : splat(-1.0);
-        const B edge = (front[i] ^ front[j]) & ~rays.crosses_near;
+        const B edge = front[i] ^ front[j];
         line_a[at] = edge ? side * (planes.a[i] - planes.a[j]) : splat(1.0);
         line_b[at] = edge ? side * (planes.b[i] - planes.b[j]) : splat(0.0);
         line_c[at] = edge ? side * (planes.c[i] - planes.c[j]) : splat(0.0);

@@ -245,11 +245,13 @@ def gaussian_ellipse(
     s: Scenes, center: Tensor, axes: Tensor
 ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, ...]]:
     """The rows of H (B, M, 3), px, with the covariance M = H H^T; and M's xx, xy, yy, its determinant by Cauchy and Binet, and the
-    projected centre x/z, y/z; (B, M)."""
+    projected centre x/z, y/z; (B, M). H is taken where the centre is, but within 1.3 times half the image."""
     z = center[..., 2:]
     place = center[..., :2] / z
+    limit = 1.3 * 0.5 * s.center.new_tensor([s.width, s.height]) / s.focal[:, None]
+    held = torch.minimum(torch.maximum(place, -limit), limit)
     half = (
-        (axes[..., :2, :] - place[..., None] * axes[..., 2:, :])
+        (axes[..., :2, :] - held[..., None] * axes[..., 2:, :])
         / z[..., None]
         * s.extent[..., None, :]
         * s.focal[:, None, :, None]

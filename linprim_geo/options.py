@@ -69,6 +69,9 @@ def check_train_options(options: TrainOptions) -> None:
 
 # Screen filter in pixels that goes with --filter 3d+screen: LinPrim's kernel_size, and 3DGS's, which is a variance in px^2.
 SCREEN_FILTER, SCREEN_FILTER_OF_GAUSSIANS = 0.1, 0.3
+# Depths, in the training frame, before which rays do not begin and Gaussians are not drawn. Projected near the camera's plane a
+# Gaussian would cover everything; 0.2 is 3DGS's. A polyhedron is cut exactly.
+NEAR, NEAR_OF_GAUSSIANS = 0.01, 0.2
 
 
 def raster_options(options: TrainOptions) -> dict:
@@ -81,6 +84,7 @@ def raster_options(options: TrainOptions) -> dict:
         "ray_model": options.ray_model,
         "order": options.order,
         "screen_filter": screen,
+        "near": NEAR_OF_GAUSSIANS if options.primitive == "gaussian" else NEAR,
     }
 
 

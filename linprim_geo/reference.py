@@ -225,7 +225,9 @@ def rasterize(
 
     shape = (center_camera, rotation_camera, extent, density, rays)
     if primitive == "gaussian":
-        chords = gaussian_chords(*shape, screen_filter=screen_filter, focal=(fx, fy), near=near)
+        chords = gaussian_chords(
+            *shape, screen_filter=screen_filter, focal=(fx, fy), size=(width, height), near=near
+        )
     else:
         chords = polyhedron_chords(
             *shape,

@@ -244,14 +244,16 @@ def gaussian_chords(
     *,
     screen_filter: float,
     focal: tuple[float, float],
+    size: tuple[int, int],
     near: float,
 ) -> Chords:
     """Returns the splats of all rays in all Gaussians as chords of no length, at the depth of the centre.
 
     M = J2 S J2^T + screen_filter I, S = A A^T the covariance in camera axes, J2 the first two rows of
-    `ray_space_jacobian` in px; alpha = min(0.99, opacity exp(-1/2 d^T M^-1 d)), d from the projected centre to
-    the pixel, skipped below 1/255; tau = -ln(1 - alpha). The normal is the axis of the smallest extent (the
-    first of equal ones), turned towards the camera. Left out: z <= near, and det M <= 1e-12 trace(M)^2.
+    `ray_space_jacobian` in px, taken where the centre is but within 1.3 times half the image; alpha = min(0.99,
+    opacity exp(-1/2 d^T M^-1 d)), d from the projected centre to the pixel, skipped below 1/255; tau = -ln(1 - alpha).
+    The normal is the axis of the smallest extent (the first of equal ones), turned towards the camera. Left out:
+    z <= near, and det M <= 1e-12 trace(M)^2.
 
     Args:
         extent: (N, 3) standard deviations >= 0; the rest as for `polyhedron_chords`.
@@ -261,15 +263,17 @@ def gaussian_chords(
     Accuracy:
         M and alpha are double whatever the dtype, so that the test of det means the same everywhere.
 
-    Source: Kerbl et al., 3D Gaussian Splatting (2023), without the clamp of J at 1.3 times the field of view.
+    Source: Kerbl et al., 3D Gaussian Splatting (2023).
     """
     pixel_scale = rays.new_tensor(focal).double()
+    limit = 1.3 * 0.5 * rays.new_tensor(size).double() / pixel_scale
     parts = []
     for i in range(len(center)):
         c = center[i].double()
         if not c[2] > near:
             continue
-        half = pixel_scale[:, None] * ray_space_jacobian(c)[:2] @ (rotation[i] * extent[i]).double()
+        held = torch.cat([torch.minimum(torch.maximum(c[:2] / c[2], -limit), limit) * c[2], c[2:]])
+        half = pixel_scale[:, None] * ray_space_jacobian(held)[:2] @ (rotation[i] * extent[i]).double()
         # det of half half^T by Cauchy-Binet: the squared area between its rows, without cancellation.
         area = torch.linalg.cross(half[0], half[1])
         xx, xy, yy = (half[0] ** 2).sum(), (half[0] * half[1]).sum(), (half[1] ** 2).sum()
