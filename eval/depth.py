@@ -106,7 +106,7 @@ def eval_depth_run(
     reference=None,
     *,
     split: str = "test",
-    depth: str = "depth_median",
+    depth: str = "depth_overlap",
     output: str | os.PathLike | None = None,
 ) -> dict:
     """Renders depth and normals of a run and scores them against a mesh or the data set's depth images.
@@ -119,7 +119,9 @@ def eval_depth_run(
         run: a run folder, or an open run.
         reference: path of a mesh, or a `Mesh`; None takes the depth images of the views.
         split: "test", "train" or "all".
-        depth: which rendered depth is scored, "depth_median" (the headline), "depth_expected" or "depth_first".
+        depth: which depth is scored. "depth_overlap" (the headline): where the transmittance falls to one half, overlaps counted
+            exactly (`Run.surface_depths`), the depth that surfaces are made of but at a level of one half. Or one that is rendered,
+            "depth_median" (the same in the run's own order of blending), "depth_expected" or "depth_first".
 
     Returns:
         the scores of `aggregate`, lengths in the data set's unit and each also as `*_percent_diagonal`;
@@ -142,9 +144,10 @@ def eval_depth_run(
             )
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     rows = []
+    surfaces = run.surface_depths(views, 0.5) if depth == "depth_overlap" else None
     for view, rendered in run.render_views(views, geometry=True):
         truth, truth_normal = _reference_maps(view, caster)
-        predicted = np.asarray(rendered[depth])
+        predicted = next(surfaces)[1] if surfaces else np.asarray(rendered[depth])
         if predicted.shape != truth.shape:
             raise LinprimError(
                 f"view {view.name}: the reference depth is {truth.shape[1]}x{truth.shape[0]}, "
