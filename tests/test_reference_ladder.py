@@ -676,7 +676,12 @@ def literal_gaussians(parameters, camera, blur=0.0, near=0.01, stop=1e-3, level=
             if z <= near or left < stop:
                 continue
             r = reference.rotation_matrix(tensor(quaternion[n])).numpy()
-            jacobian = np.array([[fx / z, 0, -fx * x / z**2], [0, fy / z, -fy * y / z**2]])
+            # Beyond 1.3 times half the image, the Jacobian is the one there.
+            u, v = (
+                np.clip(x / z, *np.array([-0.65, 0.65]) * width / fx),
+                np.clip(y / z, *np.array([-0.65, 0.65]) * height / fy),
+            )
+            jacobian = np.array([[fx / z, 0, -fx * u / z], [0, fy / z, -fy * v / z]])
             cov = jacobian @ w @ r @ np.diag(extent[n] ** 2) @ r.T @ w.T @ jacobian.T + blur * np.eye(2)
             d = np.array([j + 0.5, i + 0.5]) - [fx * x / z + cx, fy * y / z + cy]
             alpha = min(0.99, opacity[n] * math.exp(-0.5 * d @ np.linalg.inv(cov) @ d))
