@@ -98,8 +98,6 @@ def assert_alike(leaves, view, options, geometry, value: float, gradient: float)
 @pytest.mark.parametrize("geometry", [False, True], ids=["colour", "geometry"])
 @pytest.mark.parametrize("screen_filter", [0.0, 0.7], ids=["plain", "filtered"])
 def test_double_precision_equals_the_twin(rung, geometry, screen_filter):
-    if not ops.has_kernels(*rung):
-        pytest.skip("not in the core")
     for seed in range(4):
         leaves, view, options = scene_of(100 + seed, rung)
         assert_alike(leaves, view, options | {"screen_filter": screen_filter}, geometry, 1e-9, 1e-7)
@@ -108,8 +106,6 @@ def test_double_precision_equals_the_twin(rung, geometry, screen_filter):
 @pytest.mark.parametrize("rung", RUNGS, ids=NAMES)
 @pytest.mark.parametrize("isa", KERNELS)
 def test_single_precision_is_near_the_twin(rung, isa):
-    if not ops.has_kernels(*rung):
-        pytest.skip("not in the core")
     with kernels(isa):
         for seed in range(2):
             leaves, view, options = scene_of(200 + seed, rung, dtype=torch.float32)

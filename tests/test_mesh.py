@@ -75,7 +75,8 @@ def test_a_written_mesh_comes_back(tmp_path, suffix):
 
 @pytest.mark.parametrize("suffix", lm.SUFFIXES)
 def test_meshlab_reads_what_is_written(tmp_path, suffix):
-    pymeshlab = pytest.importorskip("pymeshlab")
+    import pymeshlab
+
     mesh = painted()
     lm.save_mesh(tmp_path / f"m{suffix}", mesh)
     meshes = pymeshlab.MeshSet()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 
+import mpmath
 import numpy as np
 import pytest
 import torch
@@ -529,7 +530,6 @@ def test_blocks_of_rays_do_not_show(block, monkeypatch):
 
 
 def test_depth_variance_and_mean_transmittance():
-    mpmath = pytest.importorskip("mpmath")
     with mpmath.workdps(60):
         for tau in (1e-9, 1e-3, 0.1, 0.2499, 0.25, 0.3, 1.0, 5.0, 40.0, 1e3):
             x = mpmath.mpf(tau)
