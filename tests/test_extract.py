@@ -11,16 +11,17 @@ from conftest import CENTER, octahedron_run
 
 from linprim_geo.errors import LinprimError
 from linprim_geo.eval.mesh import score_mesh
-from linprim_geo.extract import DepthFrames, extract_mesh
+from linprim_geo.extract import extract_mesh
 from linprim_geo.mesh import load_mesh, topology, validate_mesh
 from linprim_geo.options import ExtractOptions
 from linprim_geo.raycast import RayCaster
 from linprim_geo.run import Run
+from linprim_geo.surface_tsdf import DepthFrames
 
 STATS = {
     "mesh", "mesh_visible", "method", "level", "voxel_size", "truncation_voxels", "unit", "views", "primitives",
     "vertices", "faces", "components", "boundary_edges", "non_manifold_edges", "genus", "watertight", "area", "volume",
-    "visible", "seconds", "peak_memory_gib",
+    "visible", "seconds", "peak_gib",
 }  # fmt: skip
 
 
@@ -181,6 +182,6 @@ def test_frames_are_in_the_frame_of_the_data_set(solid):
 
 def test_frames_that_are_rendered_on_demand_give_the_same_mesh(tiny_run, tmp_path, monkeypatch):
     extract_mesh(tiny_run, output=tmp_path / "kept.ply", quiet=True)
-    monkeypatch.setattr("linprim_geo.extract.KEPT_BYTES", 0)
+    monkeypatch.setattr("linprim_geo.surface_tsdf.KEPT_BYTES", 0)
     extract_mesh(tiny_run, output=tmp_path / "rendered.ply", quiet=True)
     assert (tmp_path / "kept.ply").read_bytes() == (tmp_path / "rendered.ply").read_bytes()
