@@ -272,7 +272,10 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("extract-mesh", _extract_mesh, "extract a triangle mesh from a run")
     sub.add_argument("run", metavar="RUN", help="folder that train has made")
-    sub.add_argument("--method", choices=("tsdf",), default="tsdf", help="tsdf: fuse depth maps (default)")
+    sub.add_argument(
+        "--method", choices=("tsdf", "polyhedra"), default="tsdf",
+        help="tsdf: fuse depth maps (default); polyhedra: unite the primitives, cut to the surface",
+    )
     sub.add_argument(
         "-o", "--output", metavar="FILE", help=".ply .obj .glb .stl (default RUN/mesh/METHOD/mesh.ply)"
     )
@@ -286,8 +289,8 @@ def build_parser() -> argparse.ArgumentParser:
         "--reference", metavar="MESH", help="mesh in the data set's frame (default: its depth images)"
     )
     sub.add_argument("--split", choices=SPLITS, default="test", help="which views (default test)")
-    depth = "which rendered depth: at half transmittance (default), the mean, or the first surface"
-    sub.add_argument("--depth", choices=("median", "expected", "first"), default="median", help=depth)
+    depth = "which depth: at half transmittance by exact overlap (default), or in the order of blending, the mean, the first surface"
+    sub.add_argument("--depth", choices=("overlap", "median", "expected", "first"), default="overlap", help=depth)
     sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/eval/depth)")
 
     sub = command("eval-images", _eval_images, "score a run's colours: PSNR and SSIM on held-out views")

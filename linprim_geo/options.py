@@ -59,7 +59,9 @@ def check_train_options(options: TrainOptions) -> None:
         "checkpoint_every": (1, 10**9),
         "evaluate_every": (0, 10**9),
         "sh_degree": (0, 3),
-    }
+        "order_from": (0, 1),
+        "geometry_from": (0, 1),
+    } | dict.fromkeys(GEOMETRY_WEIGHTS, (0, 1e6))
     for name, (low, high) in ranges.items():
         if not low <= getattr(options, name) <= high:
             raise LinprimError(
@@ -67,6 +69,16 @@ def check_train_options(options: TrainOptions) -> None:
             )
 
 
+# Weights of the terms of geometry_terms.py.
+GEOMETRY_WEIGHTS = (
+    "normal_consistency",
+    "distortion",
+    "binarisation",
+    "point_depth",
+    "sensor_depth",
+    "sensor_normals",
+    "patches",
+)
 # Screen filter in pixels that goes with --filter 3d+screen: LinPrim's kernel_size, and 3DGS's, which is a variance in px^2.
 SCREEN_FILTER, SCREEN_FILTER_OF_GAUSSIANS = 0.1, 0.3
 # Depths, in the training frame, before which rays do not begin and Gaussians are not drawn. Projected near the camera's plane a
@@ -145,7 +157,18 @@ class TrainOptions:
         "optimiser step over all primitives, or over those that a view touched (sparse: the others' moments rest)",
         choices=("dense", "sparse"),
     )
+    order_from: float = option(
+        0.0, "part of the run after which --order holds; before it, training blends in the faster order of the centres"
+    )
     dssim: float = option(0.2, "weight of D-SSIM in the loss; L1 has the rest")
+    geometry_from: float = option(0.7, "part of the run after which the terms with the weights below join the loss")
+    normal_consistency: float = option(0.0, "weight: faces point as the surface that they make up")
+    distortion: float = option(0.0, "weight: what a ray sees lies together in depth")
+    binarisation: float = option(0.0, "weight: primitives are opaque or nothing")
+    point_depth: float = option(0.0, "weight: surfaces pass through the scene's points, by their errors")
+    sensor_depth: float = option(0.0, "weight: surfaces lie at the depths that the data set brings")
+    sensor_normals: float = option(0.0, "weight: faces point as the normals that the data set brings")
+    patches: float = option(0.0, "weight: small planes look alike in neighbouring views")
     stop: float = option(1e-3, "transmittance below which a ray ends", metavar="T")
     samples: int = option(
         1, "K by K rays per pixel: 1 is fastest, 2 resolves edges that cut through pixels", metavar="K"
@@ -172,3 +195,12 @@ class ExtractOptions:
         0.0, "memory the grid may take, in GiB; 0 allows 60 % of what is free", metavar="GIB"
     )
     smallest_part: float = option(0.01, "drop components with less than this share of the largest one's area")
+    close_holes: int = option(0, "fill holes with at most N edges around them; 0 fills none")
+    smooth: int = option(0, "iterations of smoothing that keeps the volume; 0 leaves the surface as it is")
+    remesh: float = option(
+        0.0, "even triangles with edges of this length, in the data set's unit; 0 keeps them", metavar="LENGTH"
+    )
+    target_faces: int = option(0, "simplify to N faces; 0 keeps all")
+    texture: int = option(
+        0, "give .obj and .glb a texture of SIZE by SIZE texels out of the photographs; 0 gives vertex colours", metavar="SIZE"
+    )

@@ -177,6 +177,33 @@ def box_downscale(
     return _round(np.where(total > 0, weighted, plain)), _round(total[..., 0] / factor**2)
 
 
+def read_normals(path: Path, size: tuple[int, int]) -> np.ndarray:
+    """(H, W, 3) float32 unit normals as they are stored, in whatever axes; 0 where there is none.
+
+    Reads 8-bit images, in which a byte b stands for 2 b / 255 - 1 and black for nothing, and .npy of three numbers per pixel.
+
+    Raises:
+        LinprimError: unreadable, not three numbers per pixel, or not of `size` (width, height).
+    """
+    if not path.is_file():
+        raise LinprimError(f"{path}: no such file, wanted normals")
+    if path.suffix == ".npy":
+        try:
+            values = np.load(path, allow_pickle=False)
+        except Exception as error:  # numpy raises half a dozen kinds for damaged files
+            raise LinprimError(f"{path}: cannot be read as normals ({error}), wanted a complete .npy") from error
+        normals = values.astype(np.float32) if values.ndim == 3 and values.dtype.kind == "f" else values
+    else:
+        with _opened(path) as image:
+            values = np.asarray(image.convert("RGB"))
+        normals = np.where(values.any(-1, keepdims=True), values.astype(np.float32) * (2 / 255) - 1, np.float32(0))
+    if normals.shape != (size[1], size[0], 3):
+        raise LinprimError(f"{path}: the normals have shape {values.shape}, wanted {(size[1], size[0], 3)}")
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    usable = np.isfinite(length) & (length > 0.5)
+    return np.divide(normals, length, out=np.zeros_like(normals, np.float32), where=usable)
+
+
 def downscale_depth(depth: np.ndarray, factor: int) -> np.ndarray:
     """(H // factor, W // factor) float32 depth at the new pixel centres.
 

@@ -39,6 +39,7 @@ _PERSPECTIVE_MODELS = (
 _AGREE_POSITION = 0.01
 # ... and turned by no more than this many degrees.
 _AGREE_DEGREES = 1.0
+_NORMAL_FRAMES = ("world", "camera", "camera_opengl")
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -142,6 +143,10 @@ def _frame(folder: Path, header: dict, entry: dict, where: str, image: Path, spl
         found = "missing" if matrix is None else "not a table of 4x4 numbers"
         raise LinprimError(f"{where}: 'transform_matrix' is {found}, wanted the 4x4 camera-to-world matrix")
     depth = _side_file(folder, entry, "depth_file_path", where)
+    # Nothing but the file itself can say what axes its normals have.
+    axes = values.get("normal_frame")
+    if axes not in (None, *_NORMAL_FRAMES):
+        raise LinprimError(f"{where}: 'normal_frame' is {axes!r}, wanted one of {', '.join(_NORMAL_FRAMES)}")
     return Frame(
         where=where,
         relative=entry["file_path"].replace("\\", "/"),
@@ -152,6 +157,8 @@ def _frame(folder: Path, header: dict, entry: dict, where: str, image: Path, spl
         mask_path=_side_file(folder, entry, "mask_path", where),
         depth_path=depth,
         depth_scale=_depth_scale(values, depth, where),
+        normal_path=_side_file(folder, entry, "normal_file_path", where) if axes else None,
+        normal_frame=axes or "world",
     )
 
 

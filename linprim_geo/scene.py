@@ -65,6 +65,8 @@ class View:
     mask_path: Path | None = None
     depth_path: Path | None = None
     depth_scale: float = 1.0
+    normal_path: Path | None = None
+    normal_frame: str = "world"
     file_size: tuple[int, int] | None = None
     lens: Lens | None = None
     downscale: int = 1
@@ -113,6 +115,29 @@ class View:
         if self.lens is not None:
             depth = photos.undistort_depth(depth, self.lens, self._full_target())
         return photos.downscale_depth(depth, self.downscale)
+
+    def load_normals(self) -> np.ndarray | None:
+        """(H, W, 3) float32 unit normals at the camera's pixel centres in its axes (x right, y down, z forward), 0 = none; None without
+        a file. `normal_frame` says what axes the file has: "world", "camera", or "camera_opengl" (x right, y up, z back).
+
+        Averaging down takes the normal of the pixel at, or just above and left of, the new centre.
+
+        Raises:
+            LinprimError: the file is missing, damaged, or not of the image's size.
+        """
+        if self.normal_path is None:
+            return None
+        normals = photos.read_normals(self.normal_path, self._file_size())
+        if self.normal_frame == "world":
+            normals = normals @ self.camera.rotation.T.astype(np.float32)
+        elif self.normal_frame == "camera_opengl":
+            normals = normals * np.array([1, -1, -1], np.float32)
+        if self.lens is not None:
+            axes = [photos.undistort_depth(normals[..., k], self.lens, self._full_target()) for k in range(3)]
+            normals = np.stack(axes, -1)
+        k, c = self.downscale, self.camera
+        first = (k - 1) // 2
+        return np.ascontiguousarray(normals[first :: k, first :: k][: c.height, : c.width])
 
     def _file_size(self) -> tuple[int, int]:
         return self.file_size or (self.camera.width * self.downscale, self.camera.height * self.downscale)
@@ -163,6 +188,8 @@ class Frame:
     mask_path: Path | None = None
     depth_path: Path | None = None
     depth_scale: float = 1.0
+    normal_path: Path | None = None
+    normal_frame: str = "world"
 
 
 @dataclass(frozen=True)
@@ -356,7 +383,7 @@ def _header_checks(frames: Sequence[Frame]) -> list[bool]:
             f" {missing[0].image_path}"
         )
     for frame in frames:
-        for kind, path in (("mask", frame.mask_path), ("depth map", frame.depth_path)):
+        for kind, path in (("mask", frame.mask_path), ("depth map", frame.depth_path), ("normal map", frame.normal_path)):
             if path is not None and not path.is_file():
                 raise LinprimError(f"{frame.where}: the {kind} {path} is not on disk")
     alphas = []
@@ -411,6 +438,8 @@ def _view(
         image_path=frame.image_path,
         mask_path=frame.mask_path,
         depth_path=frame.depth_path,
+        normal_path=frame.normal_path,
+        normal_frame=frame.normal_frame,
         depth_scale=frame.depth_scale,
         file_size=(lens.width, lens.height),
         lens=None if lens.is_pinhole else lens,

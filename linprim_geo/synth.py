@@ -424,6 +424,7 @@ def _shared_keys(camera: Camera, unit: float, options: _Options, name_of_unit: s
         "depth_unit_scale_factor": unit,
         "ply_file_path": "points3D.ply",
         "unit": name_of_unit,
+        "normal_frame": "world",
     }
 
 

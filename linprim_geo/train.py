@@ -21,6 +21,7 @@ from . import ops
 from .errors import LinprimError
 from .files import atomic_write
 from .fill_points import fill_points
+from .geometry_terms import GeometryTerms, gather_evidence
 from .initial_points import (
     CAMERA_DISTANCE,
     VolumePoints,
@@ -29,7 +30,7 @@ from .initial_points import (
     scene_normalization,
     visual_hull_points,
 )
-from .options import SceneOptions, TrainOptions, check_train_options
+from .options import GEOMETRY_WEIGHTS, SceneOptions, TrainOptions, check_train_options
 from .primitives import KINDS
 from .progress import Progress, duration, memory_gib
 from .run import Run
@@ -167,12 +168,18 @@ def _reopen(
 
 def _train(run: Run, scene: Scene, state: dict | None, progress: Progress) -> dict:
     """Trains from a checkpoint's `state`, or from the start: what is random does not depend on when a run was stopped."""
-    if state is None:
-        scene = with_points(scene, run.train_options, progress.note)
+    options = run.train_options
+    wanted = [name for name in GEOMETRY_WEIGHTS if getattr(options, name) > 0]
+    if state is None or wanted:
+        scene = with_points(scene, options, progress.note)
     shots = load_shots(scene.train, run.similarity)
     if all(shot.alpha is not None and int(shot.alpha.max()) == 0 for shot in shots):
         raise LinprimError(f"{scene.root}: the masks leave no pixel of any training image")
-    trainer = _start(scene, run, shots, run.train_options, state)
+    trainer = _start(scene, run, shots, options, state)
+    if wanted:
+        trainer.terms = GeometryTerms(
+            options, shots, gather_evidence(scene, options, run.similarity, progress.note), run.similarity.apply(scene.points.xyz)
+        )
     if not (run.path / "config.json").exists():
         Run.create(
             run.path,

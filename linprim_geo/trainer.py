@@ -17,6 +17,7 @@ import torch
 from . import ops
 from .camera import Camera, Similarity
 from .errors import LinprimError
+from .geometry_terms import GeometryTerms
 from .options import TrainOptions, raster_options
 from .population import Control, GradientControl
 from .population_papers import ClassicControl, McmcControl
@@ -191,8 +192,9 @@ class Trainer:
         background: torch.Tensor,
         fitted: bool,
         random_background: bool,
+        terms: GeometryTerms | None = None,
     ):
-        self.shots, self.options, self.bounds = shots, options, bounds
+        self.shots, self.options, self.bounds, self.terms = shots, options, bounds, terms
         self.parameters = dict(parameters)
         self.fitted, self.random_background = fitted, random_background
         self.background = background
@@ -219,6 +221,11 @@ class Trainer:
         """Degree of the view-dependent colour at this step."""
         return min(self.options.sh_degree, int(self.step / (DEGREE_EVERY * self.options.iterations)))
 
+    def how_at(self, step: int) -> dict:
+        """The keywords of `ops.rasterize` at a step: until --order-from blending takes the order of the centres."""
+        early = step < self.options.order_from * self.options.iterations
+        return self.how | {"order": "center"} if early else self.how
+
     def view_of(self, step: int) -> int:
         """Index of the view of a step: every view once per round, in an order drawn per round."""
         turn, place = divmod(step, len(self.shots))
@@ -231,7 +238,8 @@ class Trainer:
             LinprimError: a parameter or the loss is no longer finite.
         """
         begin = time.perf_counter()
-        shot = self.shots[self.view_of(self.step)]
+        index = self.view_of(self.step)
+        shot = self.shots[index]
         background = self.background
         if self.fitted:
             background = self.parameters["background"]
@@ -242,22 +250,30 @@ class Trainer:
         target = shot.over(background.detach())
         leaves = {k: v.requires_grad_() for k, v in self.parameters.items()}
         screen = torch.zeros(len(self), 3, requires_grad=True)
-        out = ops.rasterize(
-            *activate(leaves, self.degree, self.kind, self.filter_3d),
-            background,
-            shot.camera,
-            stop=self.options.stop,
-            samples=self.options.samples,
-            screen=screen,
-            **self.how,
-        )
+        active = activate(leaves, self.degree, self.kind, self.filter_3d)
+        terms = self.terms if self.step >= self.options.geometry_from * self.options.iterations else None
+        # Geometry has no average over the rays of a pixel: with several of them it is rendered by itself.
+        shared = terms is not None and self.options.samples == 1
+        how = {"stop": self.options.stop, **self.how_at(self.step)}
+        samples = self.options.samples
+        out = ops.rasterize(*active, background, shot.camera, samples=samples, geometry=shared, screen=screen, **how)
         parts = ops.photometric_loss(out.rgb, target, self.options.dssim)
         penalty = self.control.penalty(leaves)
         objective = parts[0] if penalty is None else parts[0] + penalty
+        if terms is not None:
+
+            def surface(camera: Camera, tensors: tuple[torch.Tensor, ...]) -> ops.Rendering:
+                return ops.rasterize(*tensors, background, camera, geometry=True, **how)
+
+            def depth_of(camera: Camera) -> torch.Tensor:
+                return surface(camera, tuple(tensor.detach() for tensor in active)).depth_median
+
+            geometry = out if shared else surface(shot.camera, active)
+            objective = objective + terms.loss(geometry, index, self.step, leaves["raw_opacity"], depth_of)
         *grads, screen_grad = torch.autograd.grad(objective, [*leaves.values(), screen], allow_unused=True)
         with torch.no_grad():
-            # A penalty reaches every primitive, whether the view touched it or not.
-            touched = screen_grad[:, 2] > 0 if penalty is None else None
+            # A penalty or a term on opacities reaches every primitive, whether the view touched it or not.
+            touched = screen_grad[:, 2] > 0 if penalty is None and terms is None else None
             self._update(dict(zip(leaves, grads, strict=True)), touched)
             self.control.disturb(self.parameters, self.step + 1)
             self.control.gather(self.parameters, shot.camera, screen_grad)

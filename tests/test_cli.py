@@ -365,13 +365,14 @@ def test_every_command_prints_one_object_and_does_what_it_says(result, tmp_path,
         assert os.path.getsize(f"m.{suffix}") > 1000 and os.path.isfile(f"m_visible.{suffix}")
     images = result("eval-images r")
     assert images["psnr"] == pytest.approx(trained["psnr"], abs=1e-3) and images["views"] == 2
-    depths = {kind: result(f"eval-depth r --depth {kind}") for kind in ("median", "expected", "first")}
-    assert [depths[kind]["depth"] for kind in depths] == ["depth_median", "depth_expected", "depth_first"]
-    assert len({depths[kind]["abs_rel"] for kind in depths}) == 3
+    depths = {kind: result(f"eval-depth r --depth {kind}") for kind in ("overlap", "median", "expected", "first")}
+    assert [depths[kind]["depth"] for kind in depths] == [f"depth_{kind}" for kind in depths]
+    assert len({depths[kind]["abs_rel"] for kind in depths}) == 4
+    assert result("eval-depth r")["abs_rel"] == depths["overlap"]["abs_rel"]
     against_mesh = result("eval-depth r --reference s/reference.ply")
     # The data set's depth is that of the same mesh, rounded to its unit.
-    assert against_mesh["abs_rel"] == pytest.approx(depths["median"]["abs_rel"], rel=0.02)
-    assert against_mesh["normal_mean_deg"] > 0 and depths["median"]["normal_mean_deg"] is None
+    assert against_mesh["abs_rel"] == pytest.approx(depths["overlap"]["abs_rel"], rel=0.02)
+    assert against_mesh["normal_mean_deg"] > 0 and depths["overlap"]["normal_mean_deg"] is None
     scores = result("eval-mesh r/mesh/tsdf/mesh.ply s/reference.ply --samples 20000 --run r")
     assert {"accuracy", "completeness", "chamfer", "precision", "recall", "f1", "visible"} <= scores.keys()
     assert 0 < scores["chamfer_percent_diagonal"] < 10

@@ -1,0 +1,270 @@
+"""Terms of the training loss beside the photographs: closed forms, gradients that point the right way, and runs that use them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from conftest import octahedron_run
+
+from linprim_geo import geometry_terms as terms
+from linprim_geo import ops
+from linprim_geo.camera import Camera
+from linprim_geo.errors import LinprimError
+from linprim_geo.ops import Rendering
+from linprim_geo.options import GEOMETRY_WEIGHTS, TrainOptions, check_train_options
+
+
+def camera(x: float = 0.0, size: int = 64) -> Camera:
+    """Looks along +z from (x, 0, 0)."""
+    pose = np.eye(4)
+    pose[0, 3] = -x
+    return Camera(size, size - 8, 70.0, 72.0, size / 2 + 1, size / 2 - 5, pose)
+
+
+def plane_depth(cam: Camera, normal, offset: float) -> torch.Tensor:
+    """z-depth of the plane normal . x = offset, in the world's axes, float64."""
+    rays = cam.world_rays()
+    return torch.from_numpy((offset - cam.center @ normal) / (rays @ normal))
+
+
+NORMAL = np.array([0.3, -0.2, -1.0]) / np.linalg.norm([0.3, -0.2, -1.0])
+OFFSET = float(NORMAL @ [0, 0, 2.0])
+
+
+def rendering(depth: torch.Tensor, normal: torch.Tensor, opacity: float = 1.0) -> Rendering:
+    return Rendering(None, torch.full_like(depth, opacity), depth_median=depth, normal=normal)
+
+
+def constant_normals(normal, like: torch.Tensor) -> torch.Tensor:
+    return torch.as_tensor(normal, dtype=like.dtype)[:, None, None].expand(3, *like.shape)
+
+
+def test_the_normals_of_a_plane_are_its_own():
+    depth = plane_depth(camera(), NORMAL, OFFSET)
+    found, valid = terms.depth_normals(depth, camera())
+    assert valid[1:-1, 1:-1].all() and valid.sum() == (depth.shape[0] - 2) * (depth.shape[1] - 2)
+    assert (found[:, valid] - torch.from_numpy(NORMAL)[:, None]).abs().max() < 1e-12
+    depth[20, 30] = 0  # a pixel without depth takes itself and its four neighbours away
+    assert int(valid.sum() - terms.depth_normals(depth, camera())[1].sum()) == 5
+    assert not terms.depth_normals(torch.zeros(5, 5), replace(camera(), width=5, height=5))[0].any()
+
+
+def test_normal_consistency_is_one_minus_the_cosine():
+    depth = plane_depth(camera(), NORMAL, OFFSET)
+    assert float(terms.normal_consistency(rendering(depth, constant_normals(NORMAL, depth)), camera())) == pytest.approx(0, abs=1e-12)
+    tilted = np.array([0.0, 0.0, -1.0])
+    wanted = 1 - float(NORMAL @ tilted)
+    assert float(terms.normal_consistency(rendering(depth, constant_normals(tilted, depth)), camera())) == pytest.approx(wanted)
+    empty = torch.zeros_like(depth)
+    assert float(terms.normal_consistency(rendering(empty, constant_normals(tilted, depth), 0.0), camera())) == 0
+
+
+def test_normal_consistency_has_the_gradient_of_its_differences():
+    small = replace(camera(), width=6, height=5)
+    depth = plane_depth(small, NORMAL, OFFSET) + 0.05 * torch.rand(5, 6, dtype=torch.float64, generator=torch.manual_seed(0))
+    normal = torch.randn(3, 5, 6, dtype=torch.float64, generator=torch.manual_seed(1))
+    inputs = (depth.requires_grad_(), normal.requires_grad_())
+    assert torch.autograd.gradcheck(lambda d, n: terms.normal_consistency(rendering(d, n), small), inputs)
+
+
+def test_binarisation_is_the_entropy():
+    raw = torch.tensor([0.0, math.log(3.0), 60.0, -60.0], dtype=torch.float64)
+    entropies = [math.log(2), -(0.75 * math.log(0.75) + 0.25 * math.log(0.25)), 0, 0]
+    for one, wanted in zip(raw, entropies, strict=True):
+        assert float(terms.binarisation(one[None])) == pytest.approx(wanted, abs=1e-12)
+    assert float(terms.binarisation(raw)) == pytest.approx(np.mean(entropies), abs=1e-12)
+
+
+def test_depth_error_is_relative_capped_and_weighted():
+    wanted = torch.tensor([2.0, 2.0, 2.0, 0.0, 2.0])
+    depth = torch.tensor([2.1, 1.96, 9.0, 5.0, 0.0], requires_grad=True)
+    error = terms.depth_error(depth, wanted)
+    assert float(error.detach()) == pytest.approx((0.05 + 0.02 + terms.DEPTH_CAP) / 3)
+    (gradient,) = torch.autograd.grad(error, depth)
+    assert gradient[0] > 0 > gradient[1] and not gradient[2:].any()
+    weight = torch.tensor([1.0, 3.0, 0.0, 1.0, 1.0])
+    assert float(terms.depth_error(depth, wanted, weight).detach()) == pytest.approx((0.05 + 3 * 0.02) / 4)
+    assert float(terms.depth_error(torch.zeros(2), torch.ones(2))) == 0
+
+
+def test_normal_error_counts_pixels_that_have_a_normal():
+    depth = torch.ones(4, 4)
+    wanted = torch.zeros(3, 4, 4)
+    wanted[2, :2] = -1
+    found = constant_normals([0.0, 0.6, -0.8], depth)
+    assert float(terms.normal_error(found, wanted, depth)) == pytest.approx(0.2)
+    assert float(terms.normal_error(found, 0 * wanted, depth)) == 0
+
+
+def textured(points: np.ndarray) -> np.ndarray:
+    """A smooth texture on the plane z = 2: grey values in [0, 1] of (..., 3) points."""
+    x, y = points[..., 0], points[..., 1]
+    return 0.5 + 0.2 * np.sin(9 * x + 2 * y) + 0.2 * np.cos(7 * y - 3 * x) + 0.1 * np.sin(23 * x * y)
+
+
+def two_views(normal, offset):
+    """(camera, grey) of two views of the textured plane, and the second one's depth."""
+    views = []
+    for x in (0.0, 0.35):
+        cam = camera(x, 96)
+        depth = plane_depth(cam, normal, offset)
+        points = cam.center + cam.world_rays() * depth.numpy()[..., None]
+        views.append((cam, torch.from_numpy(textured(points)).float()))
+    return views, depth.float()
+
+
+def patch_loss(shift: float, tilt: float = 0.0) -> tuple[float, float]:
+    """(loss, its derivative by a shift of all depths) where the surface is rendered `shift` too deep and its normal tilted."""
+    (one, grey), (other, other_grey) = two_views(NORMAL, OFFSET)[0]
+    other_depth = two_views(NORMAL, OFFSET)[1]
+    moved = torch.tensor(shift, requires_grad=True)
+    depth = plane_depth(one, NORMAL, OFFSET).float() + moved
+    normal = NORMAL + np.array([tilt, 0, 0])
+    normals = constant_normals(normal / np.linalg.norm(normal), depth)
+    pixels = terms.patch_pixels(torch.ones_like(grey, dtype=torch.bool), np.random.default_rng(0))
+    loss = terms.patch_consistency(rendering(depth, normals), one, grey, other, other_grey, other_depth, pixels)
+    return float(loss.detach()), float(torch.autograd.grad(loss, moved)[0])
+
+
+def test_patches_look_alike_where_the_surface_is_and_pull_towards_it():
+    right, _ = patch_loss(0.0)
+    (deep, pull_up), (near, pull_down) = patch_loss(0.1), patch_loss(-0.1)
+    assert right < 2e-3 < 5e-3 < min(deep, near)
+    assert pull_up > 0 > pull_down
+    assert patch_loss(0.0, tilt=0.6)[0] > 3 * right
+
+
+def test_patches_that_the_other_view_does_not_see_say_nothing():
+    (one, grey), (other, other_grey) = two_views(NORMAL, OFFSET)[0]
+    depth = plane_depth(one, NORMAL, OFFSET).float()
+    out = rendering(depth, constant_normals(NORMAL, depth))
+    pixels = terms.patch_pixels(torch.ones_like(grey, dtype=torch.bool), np.random.default_rng(0))
+    hidden = torch.full_like(depth, 0.7)  # something in front of all of it
+    assert float(terms.patch_consistency(out, one, grey, other, other_grey, hidden, pixels)) == 0
+    plain = torch.full_like(grey, 0.4)
+    assert float(terms.patch_consistency(out, one, plain, other, plain, depth, pixels)) == 0
+    none = torch.zeros(0, 2, dtype=torch.int64)
+    assert float(terms.patch_consistency(out, one, grey, other, other_grey, depth, none)) == 0
+
+
+def test_patch_pixels_keep_whole_patches_inside():
+    opaque = torch.zeros(20, 30, dtype=torch.bool)
+    opaque[:5, :5] = True
+    found = terms.patch_pixels(opaque, np.random.default_rng(0))
+    assert sorted(map(tuple, found.tolist())) == [(3, 3), (3, 4), (4, 3), (4, 4)]
+    assert len(terms.patch_pixels(torch.ones(100, 100, dtype=torch.bool), np.random.default_rng(0))) == terms.PATCHES
+    assert terms.patch_pixels(torch.ones(6, 6, dtype=torch.bool), np.random.default_rng(0)).shape == (0, 2)
+
+
+def test_sources_see_the_same_points_from_another_angle():
+    points = np.random.default_rng(0).uniform([-0.3, -0.3, 1.9], [0.3, 0.3, 2.1], (300, 3))
+    away = camera(0.5)
+    turned = away.world_to_camera @ np.diag([-1.0, 1, -1, 1])
+    cameras = [camera(0.0), camera(0.02), camera(0.3), camera(-0.5), replace(away, world_to_camera=turned)]
+    assert sorted(terms.source_views(cameras, points)[0]) == [2, 3]  # the second is too near, the last looks away
+    assert terms.source_views(cameras[:1], points) == [[]]
+
+
+@pytest.fixture(scope="module")
+def options(tiny_options):
+    return replace(tiny_options, iterations=120, checkpoint_every=60, evaluate_every=0, geometry_from=0.5)
+
+
+def trained(scene, folder, options, **more):
+    from linprim_geo.run import Run
+    from linprim_geo.train import train
+
+    train(scene, folder, options=options, quiet=True, **more)
+    return Run.open(folder).training_primitives()
+
+
+@pytest.fixture(scope="module")
+def plain(tiny_scene, options, tmp_path_factory):
+    return trained(tiny_scene, tmp_path_factory.mktemp("plain") / "run", options)
+
+
+def test_without_weights_the_renderer_is_not_asked_for_geometry(tiny_scene, options, tmp_path, monkeypatch):
+    asked = []
+    rasterize = ops.rasterize
+    monkeypatch.setattr(ops, "rasterize", lambda *a, **k: asked.append(k.get("geometry", False)) or rasterize(*a, **k))
+    trained(tiny_scene, tmp_path / "plain", replace(options, iterations=20))
+    assert asked and not any(asked)
+    asked.clear()
+    trained(tiny_scene, tmp_path / "late", replace(options, iterations=20, distortion=1.0))
+    assert asked[:20] == [False] * 10 + [True] * 10
+
+
+@pytest.mark.parametrize("name", GEOMETRY_WEIGHTS)
+def test_every_term_changes_the_run(name, tiny_scene, options, plain, tmp_path):
+    found = trained(tiny_scene, tmp_path / "run", replace(options, **{name: 1.0}))
+    assert len(found) == len(plain) and not np.array_equal(found.center, plain.center)
+    assert all(np.isfinite(getattr(found, key)).all() for key in ("center", "extent", "density"))
+
+
+def test_a_run_with_every_term_resumes_to_the_last_bit(tiny_scene, options, tmp_path):
+    from linprim_geo.train import train
+
+    every = replace(options, order="overlap", order_from=0.6, **dict.fromkeys(GEOMETRY_WEIGHTS, 0.05))
+    whole = trained(tiny_scene, tmp_path / "whole", every)
+    trained(tiny_scene, tmp_path / "part", every)
+    for name in ("step_000120.pt",):
+        (tmp_path / "part" / "checkpoints" / name).unlink()
+    (tmp_path / "part" / "checkpoints" / "latest").write_text("step_000060.pt\n")
+    train(tiny_scene, tmp_path / "part", options=every, resume=True, quiet=True)
+    from linprim_geo.run import Run
+
+    again = Run.open(tmp_path / "part").training_primitives()
+    assert all(np.array_equal(getattr(whole, key), getattr(again, key)) for key in ("center", "rotation", "extent", "density", "sh"))
+
+
+def test_sensor_depth_brings_the_surface_to_it(tiny_scene, options, tmp_path):
+    from linprim_geo.eval.depth import eval_depth_run
+
+    longer = replace(options, iterations=300)
+    trained(tiny_scene, tmp_path / "plain", longer)
+    trained(tiny_scene, tmp_path / "depth", replace(longer, sensor_depth=2.0))
+    errors = {name: eval_depth_run(tmp_path / name)["abs_rel"] for name in ("plain", "depth")}
+    assert errors["depth"] < 0.8 * errors["plain"], errors
+
+
+def test_normals_of_the_data_set_are_those_of_its_surface(tiny_scene):
+    from linprim_geo.mesh import load_mesh
+    from linprim_geo.raycast import RayCaster
+    from linprim_geo.scene import load_scene
+
+    mesh = load_mesh(tiny_scene / "reference.ply")
+    caster = RayCaster(mesh.vertices, mesh.faces)
+    for downscale in (1, 2):
+        view = load_scene(tiny_scene, downscale=downscale).train[3]
+        full = load_scene(tiny_scene).train[3].camera
+        _, face, normal = caster.render_depth(full)
+        found, wanted = view.load_normals(), (normal @ full.rotation.T)[::downscale, ::downscale]
+        wanted, hit = wanted[: len(found), : found.shape[1]], (face >= 0)[::downscale, ::downscale][: len(found), : found.shape[1]]
+        assert found.shape[:2] == (view.camera.height, view.camera.width) and not found[~hit].any()
+        assert (np.einsum("pc,pc->p", found[hit], wanted[hit]) > 0.999).mean() > 0.99
+        assert (found[hit][:, 2] < 0.1).all()  # towards the camera
+
+
+def test_a_term_without_evidence_says_so(tmp_path):
+    from linprim_geo.camera import Similarity
+    from linprim_geo.scene import load_scene
+
+    run = octahedron_run(tmp_path, views=4, size=24)
+    scene = load_scene(run.parent / "scene")
+    bare = replace(scene, points=None, train=tuple(replace(view, depth_path=None) for view in scene.train))
+    said = []
+    weights = TrainOptions(sensor_depth=1.0)
+    gathered = terms.gather_evidence(bare, weights, Similarity(), said.append)
+    assert len(gathered) == 4 and said == ["--sensor-depth: the data set has no depth, so it does nothing"]
+
+
+def test_weights_out_of_range_are_refused():
+    for name in GEOMETRY_WEIGHTS:
+        with pytest.raises(LinprimError, match=name.replace("_", "-")):
+            check_train_options(replace(TrainOptions(), **{name: -0.1}))
+    with pytest.raises(LinprimError, match="geometry-from"):
+        check_train_options(replace(TrainOptions(), geometry_from=1.5))
