@@ -142,6 +142,8 @@ def add_options(parser: argparse._ActionsContainer, options: type) -> None:
             settings["action"] = argparse.BooleanOptionalAction
         else:
             settings["type"] = str if field.default is None else type(field.default)
+            if field.metadata.get("number_or"):
+                settings["type"] = _number_or(field.metadata["number_or"])
             settings["choices"] = field.metadata.get("choices") or None
             settings["metavar"] = field.metadata.get("metavar")
             if settings["metavar"] is None and settings["choices"] is None:
@@ -152,6 +154,14 @@ def add_options(parser: argparse._ActionsContainer, options: type) -> None:
 def from_args(options: type, parsed: argparse.Namespace):
     """The dataclass `options` filled from the arguments that `add_options` has added."""
     return options(**{field.name: getattr(parsed, field.name) for field in dataclasses.fields(options)})
+
+
+def _number_or(word: str) -> Callable[[str], float | str]:
+    def parse(text: str) -> float | str:
+        return word if text == word else float(text)
+
+    parse.__name__ = f"number, or {word}:"  # as argparse puts it into its message
+    return parse
 
 
 def _positive(text: str) -> int:

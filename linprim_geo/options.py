@@ -8,9 +8,13 @@ from dataclasses import dataclass, field, fields
 from .errors import LinprimError
 
 
-def option(default, text: str, choices: tuple = (), metavar: str | None = None):
-    """A dataclass field that the command line turns into `--field-name` with `text` as its help."""
-    return field(default=default, metadata={"help": text, "choices": choices, "metavar": metavar})
+def option(default, text: str, choices: tuple = (), metavar: str | None = None, number_or: str | None = None):
+    """A dataclass field that the command line turns into `--field-name` with `text` as its help.
+
+    With `number_or` it holds a number or that word.
+    """
+    metadata = {"help": text, "choices": choices, "metavar": metavar, "number_or": number_or}
+    return field(default=default, metadata=metadata)
 
 
 def from_saved(cls: type, values: object, where: str):
@@ -183,9 +187,12 @@ class TrainOptions:
 class ExtractOptions:
     """How a surface is taken out of a run."""
 
-    level: float = option(
-        0.75,
-        "transmittance at which the surface is taken, between 0 and 1; nearer to 1 is nearer to the camera",
+    level: float | str = option(
+        "auto",
+        "transmittance at which the surface is taken, between 0 and 1, nearer to 1 is nearer to the cameras;"
+        " auto: where the photographs agree best with each other",
+        metavar="T",
+        number_or="auto",
     )
     voxel_size: float = option(
         0.0, "grid spacing in the data set's unit; 0 chooses from the views", metavar="LENGTH"

@@ -1,0 +1,112 @@
+"""The transmittance level of a run's surface, chosen by the photographs' agreement with each other: no reference is looked at.
+
+At the right level a place of one photograph, sent to where the surface has it in another one, finds its own colour there; at a level
+too near to the cameras, or too far from them, it lands beside it, the more so the larger the angle between the views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .camera import Camera
+from .geometry_terms import source_views
+from .run import Run
+from .scene import Photo
+
+LEVELS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+# What is taken where photographs do not say: plain ones, or too few views of the same places. The middle of what is best over scenes.
+USUAL_LEVEL = 0.75
+# Views that are looked at, each in so many others, and pixels of each pair; fewer pixels in all than the least decide nothing.
+VIEWS, SOURCES, PIXELS, LEAST_PIXELS = 10, 3, 20_000, 2000
+# Colours that differ by more than this, of 255, count as much as this: something else stands in between.
+LARGEST_DIFFERENCE = 40.0
+# A pixel whose depth in the other view differs from its own by more than this share is hidden there.
+SAME_SURFACE = 0.03
+# The best level has to be better than the worst by this part, or the photographs are too plain to tell.
+LEAST_CONTRAST = 0.02
+
+
+def choose_level(run: Run) -> tuple[float, dict[float, float]]:
+    """Returns the level, between the first and the last of LEVELS, and the mean colour difference (of 255) at each level.
+
+    The differences are those of the same pixels at every level, so that none is favoured by what it leaves out. The parabola through
+    the least and its neighbours gives the level; without enough to compare, USUAL_LEVEL and no differences.
+    """
+    views = run.scene().train
+    cameras = [view.camera for view in views]
+    sources = source_views(cameras, run.primitives().center)
+    chosen = [k for k in range(0, len(views), -(-len(views) // VIEWS)) if sources[k]]
+    pairs = [(k, other) for k in chosen for other in sources[k][:SOURCES]]
+    wanted = sorted({k for pair in pairs for k in pair})
+    photos = {k: views[k].load() for k in wanted}
+    depths = {
+        level: {k: depth for k, (_, depth, _) in zip(wanted, run.surface_depths([views[k] for k in wanted], level), strict=True)}
+        for level in LEVELS
+    }
+    differences = [
+        color_differences(cameras[k], photos[k], cameras[o], photos[o], [(depths[level][k], depths[level][o]) for level in LEVELS])
+        for k, o in pairs
+    ]
+    count = sum(part.shape[1] for part in differences)
+    if count < LEAST_PIXELS:
+        return USUAL_LEVEL, {}
+    errors = sum(part.sum(1) for part in differences) / count
+    found = dict(zip(LEVELS, map(float, errors), strict=True))
+    if errors.min() > (1 - LEAST_CONTRAST) * errors.max():
+        return USUAL_LEVEL, found
+    return round(least_of(LEVELS, errors), 3), found
+
+
+def color_differences(
+    camera: Camera, photo: Photo, other: Camera, other_photo: Photo, depths: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> np.ndarray:
+    """(L, P) mean absolute colour difference, at most LARGEST_DIFFERENCE, of the pixels that both views see at all L levels.
+
+    Args:
+        depths: per level the (H, W) z-depths of the two views, 0 where there is none.
+    """
+    usable = np.all([depth > 0 for depth, _ in depths], axis=0)
+    if photo.alpha is not None:
+        usable &= photo.alpha == 255
+    rows, columns = np.nonzero(usable)
+    step = -(-len(rows) // PIXELS) or 1
+    rows, columns = rows[::step], columns[::step]
+    rays, own = camera.world_rays()[rows, columns], photo.rgb[rows, columns].astype(np.float32)
+    seen = np.ones(len(rows), dtype=bool)
+    found = []
+    for depth, other_depth in depths:
+        pixels, z = other.project(camera.center + rays * depth[rows, columns, None])
+        with np.errstate(invalid="ignore"):
+            inside = (z > 0) & (pixels >= 1).all(1) & (pixels < (other.width - 1, other.height - 1)).all(1)
+        pixels = np.where(inside[:, None], pixels, 1.0)
+        there = other_depth[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
+        seen &= inside & (there > 0) & (np.abs(there - z) < SAME_SURFACE * np.abs(z))
+        colors, opaque = _bilinear(other_photo, pixels - 0.5)
+        seen &= opaque
+        found.append(np.minimum(np.abs(colors - own).mean(1), LARGEST_DIFFERENCE))
+    return np.stack(found)[:, seen]
+
+
+def least_of(places: Sequence[float], values: np.ndarray) -> float:
+    """Where the parabola through the least value and its two neighbours has its vertex; an end of `places` if the least is there."""
+    k = int(np.argmin(values))
+    if k in (0, len(values) - 1):
+        return float(places[k])
+    a, b, _ = np.polyfit(places[k - 1 : k + 2], values[k - 1 : k + 2], 2)
+    return float(-b / (2 * a)) if a > 0 else float(places[k])
+
+
+def _bilinear(photo: Photo, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(P, 3) float32 colours at (P, 2) positions, pixel centres at whole numbers, and whether all four pixels are opaque."""
+    column, row = np.floor(pixels).astype(np.int64).T
+    across, down = (pixels - np.floor(pixels)).astype(np.float32).T[:, :, None]
+    c = photo.rgb
+    top = c[row, column] * (1 - across) + c[row, column + 1] * across
+    bottom = c[row + 1, column] * (1 - across) + c[row + 1, column + 1] * across
+    opaque = np.ones(len(row), dtype=bool)
+    if photo.alpha is not None:
+        for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            opaque &= photo.alpha[row + i, column + j] == 255
+    return top * (1 - down) + bottom * down, opaque

@@ -1,0 +1,66 @@
+"""The level of a surface chosen by photographs: found where the depth is true, left alone where photographs do not say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from linprim_geo.auto_level import LEVELS, USUAL_LEVEL, choose_level, color_differences, least_of
+from linprim_geo.scene import load_scene
+from linprim_geo.synth import synthesize
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("level") / "scene"
+    synthesize(folder, shape="smooth", views=24, test_views=2, size=96, points=400, supersample=1)
+    return load_scene(folder)
+
+
+def run_of(scene, true_level: float, share: float = 0.04):
+    """A run whose surface at `true_level` is the true one, and at other levels lies off by `share` of the depth per level."""
+
+    def surface_depths(views, level):
+        for view in views:
+            yield view, view.load_depth() * np.float32(1 + share * (true_level - level)), None
+
+    primitives = SimpleNamespace(center=scene.points.xyz)
+    return SimpleNamespace(scene=lambda: scene, primitives=lambda: primitives, surface_depths=surface_depths)
+
+
+@pytest.mark.parametrize("true_level", [0.45, 0.6, 0.85])
+def test_the_true_surface_is_found(scene, true_level):
+    level, differences = choose_level(run_of(scene, true_level))
+    assert level == pytest.approx(true_level, abs=0.06)
+    assert tuple(differences) == LEVELS and choose_level(run_of(scene, true_level)) == (level, differences)
+
+
+def test_beyond_the_levels_the_nearest_is_taken(scene):
+    assert choose_level(run_of(scene, 0.1))[0] == LEVELS[0]
+    assert choose_level(run_of(scene, 1.2))[0] == LEVELS[-1]
+
+
+def test_photographs_that_do_not_say_leave_the_usual_level(scene):
+    few = replace(scene, train=scene.train[:1])
+    assert choose_level(run_of(few, 0.6)) == (USUAL_LEVEL, {})
+    level, differences = choose_level(run_of(scene, 0.6, share=0.0))  # the same surface at all levels
+    assert level == USUAL_LEVEL and len(set(differences.values())) == 1
+
+
+def test_pixels_that_are_hidden_in_the_other_view_do_not_count(scene):
+    one, other = scene.train[0], scene.train[1]
+    depth, other_depth = one.load_depth(), other.load_depth()
+    photos = one.load(), other.load()
+    seen = color_differences(one.camera, photos[0], other.camera, photos[1], [(depth, other_depth)])
+    hidden = color_differences(one.camera, photos[0], other.camera, photos[1], [(depth, 0.5 * other_depth)])
+    assert seen.shape[1] > 200 and hidden.shape == (1, 0)
+    assert seen.mean() < 8  # of 255: the same places have the same colours
+
+
+def test_a_parabola_has_its_least_value_at_its_vertex():
+    places = np.array(LEVELS)
+    assert least_of(LEVELS, (places - 0.63) ** 2) == pytest.approx(0.63)
+    assert least_of(LEVELS, places) == LEVELS[0] and least_of(LEVELS, -places) == LEVELS[-1]
