@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
+from .auto_level import choose_level
 from .errors import LinprimError
 from .files import write_json
-from .mesh import SUFFIXES, save_mesh, select_faces, topology, topology_line
+from .mesh import SUFFIXES, manifold_status, save_mesh, select_faces, topology, topology_line
+from .mesh_process import process_mesh
 from .options import ExtractOptions
 from .progress import Progress
 from .run import Run
 from .stages import Stages
+from .texture import LARGEST as LARGEST_TEXTURE
+from .texture import check_texture, make_texture, save_textured
 from .visibility import visible_faces
 
 # Each is a function (run, options, stages) -> (mesh, statistics of its own), found when it is wanted: their libraries are large.
-METHODS = {"tsdf": "surface_tsdf.tsdf_surface"}
+METHODS = {"tsdf": "surface_tsdf.tsdf_surface", "polyhedra": "surface_polyhedra.polyhedra_surface"}
 
 RANGES = {
     "level": (1e-6, 1 - 1e-6),
@@ -24,6 +29,11 @@ RANGES = {
     "truncation": (1, 100),
     "memory_limit": (0, 1e9),
     "smallest_part": (0, 1),
+    "close_holes": (0, 10**9),
+    "smooth": (0, 10_000),
+    "remesh": (0, 1e30),
+    "target_faces": (0, 10**9),
+    "texture": (0, LARGEST_TEXTURE),
 }
 
 
@@ -40,9 +50,11 @@ def extract_mesh(
     RUN/mesh/METHOD holds mesh.ply, mesh_visible.ply and stats.json; with `output` the two meshes go to OUTPUT and its sibling
     *_visible, in the format of the suffix (.ply, .obj, .glb, .stl). Vertices have normals, colours and, as `quality`,
     the spread of the views' surfaces in the data set's unit; everything is in the data set's
-    frame and unit.
+    frame and unit. Holes are closed, the surface smoothed, remeshed and simplified as the options ask (`mesh_process`); with
+    `texture` .obj and .glb have a texture out of the photographs in place of vertex colours.
 
-    Returns: what stats.json holds: topology of both meshes, options, seconds and peak memory per stage, and the paths.
+    Returns: what stats.json holds: topology of both meshes, options, `processing` step by step, `texture`, what manifold3d says of
+    a watertight mesh (`manifold_status`), seconds and peak memory per stage, and the paths.
 
     Raises:
         LinprimError: nothing was trained, no ray crosses the level, or the grid would not fit into memory.
@@ -51,40 +63,69 @@ def extract_mesh(
     if method not in METHODS:
         raise LinprimError(f"--method is {method!r}, wanted {' or '.join(METHODS)}")
     for name, (low, high) in RANGES.items():
-        if not low <= getattr(options, name) <= high:
-            raise LinprimError(
-                f"--{name.replace('_', '-')} is {getattr(options, name)}, wanted {low:g} to {high:g}"
-            )
+        value = getattr(options, name)
+        if name == "level" and value == "auto":
+            continue
+        if isinstance(value, str) or not low <= value <= high:
+            also = "auto, or " if name == "level" else ""
+            raise LinprimError(f"--{name.replace('_', '-')} is {value}, wanted {also}{low:g} to {high:g}")
     opened = Run.open(run)
     folder = opened.path / "mesh" / method
     target = Path(output) if output else folder / "mesh.ply"
     if target.suffix.lower() not in SUFFIXES:
         raise LinprimError(f"{target}: the suffix is {target.suffix!r}, wanted .ply, .obj, .glb or .stl")
+    if options.texture:
+        check_texture(options.texture, target)
     progress = Progress("extract", 1, quiet=quiet)
     stages = Stages(progress)
 
+    agreement = None
+    if options.level == "auto":
+        level, agreement = choose_level(opened)
+        options = replace(options, level=level)
+        said = "the photographs agree best there" if agreement else "too little of the photographs overlaps to choose it"
+        stages.note(f"level {level:g}: {said}")
+        stages.lap("level")
     module, function = METHODS[method].split(".")
     surface = getattr(import_module(f".{module}", __package__), function)
     mesh, about = surface(opened, options, stages)
-    cameras = [view.camera for view in opened.scene().train]
-    visible = select_faces(mesh, visible_faces(mesh, cameras))
+    mesh, processing = process_mesh(mesh, options, stages.note)
+    if processing:
+        stages.lap("process")
+    views = opened.scene().train
+    cameras = [view.camera for view in views]
+    seen = visible_faces(mesh, cameras)
+    visible = select_faces(mesh, seen)
     stages.lap("visibility")
     visible_target = target.with_name(f"{target.stem}_visible{target.suffix}")
-    save_mesh(target, mesh)
-    save_mesh(visible_target, visible)
+    texture = None
+    if options.texture:
+        texture = make_texture(mesh, options.texture, views, stages.note)
+        stages.lap("texture")
+        save_textured(target, mesh, texture)
+        save_textured(visible_target, visible, texture.select(seen))
+    else:
+        save_mesh(target, mesh)
+        save_mesh(visible_target, visible)
     stages.lap("write")
+    shape = topology(mesh)
     stats = {
         "mesh": str(target),
         "mesh_visible": str(visible_target),
         "method": method,
         **about,
+        "level_differences": agreement,
         "unit": opened.unit,
         "views": len(cameras),
         "primitives": opened.state.get("primitives"),
-        **topology(mesh),
+        **shape,
+        "manifold_status": manifold_status(mesh) if shape["watertight"] else None,
+        "processing": processing,
+        "texture": texture.about if texture else None,
         "visible": topology(visible),
         **stages.report(),
     }
     write_json(folder / "stats.json", stats)
     progress.note(f"{target}: {topology_line(stats)}")
+    stages.note(stages.line())
     return stats

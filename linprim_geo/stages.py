@@ -29,6 +29,11 @@ class Stages:
         self._begin = now
         _forget_peak()
 
+    def line(self) -> str:
+        """One printed line of what `report` returns."""
+        both = self.report()
+        return ", ".join(f"{name} {both['seconds'][name]:.1f} s {both['peak_gib'][name]:.2f} GiB" for name in both["seconds"])
+
     def report(self) -> dict:
         """`seconds` and `peak_gib` per stage, each with the `total`: their sum and their largest."""
         return {

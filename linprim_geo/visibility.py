@@ -4,12 +4,17 @@ itself."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .camera import Camera
 from .errors import LinprimError
 from .mesh import Mesh, vertex_normals
+
+if TYPE_CHECKING:
+    from .raycast import RayCaster
 
 SAMPLES = np.array([[1 / 3, 1 / 3, 1 / 3], [0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8]])
 """Barycentric coordinates of the points of a face that are tested: the middle, and one near each corner."""
@@ -34,6 +39,12 @@ FAR = 1e3
 POOR_SHARE = 1e-3
 """Factor on the weight of a sample in a pixel on the outline of something, whose colour is a mixture, and of
 one seen too flatly."""
+
+OPAQUE = 0.98
+"""Pixels with less alpha than this show some of what is behind."""
+
+POINTS_PER_TASK = 32_768
+"""Points whose samples of one view are taken at a time: their temporaries stay in cache. Results do not depend on it."""
 
 POOR_RINGS = 3
 """Vertices with poor samples only take the colour of well seen ones up to so many edges away: a pixel or two.
@@ -98,53 +109,109 @@ def color_vertices(mesh: Mesh, cameras: Sequence[Camera], images: Iterable[np.nd
     take the colour of their neighbours; if no vertex is seen, all are mid-grey.
 
     Args:
-        images: one (H, W, 3) uint8, or float in [0, 1], per camera; iterated once, one in memory at a time.
+        images: one (H, W, 3), or with alpha (H, W, 4), uint8, or float in [0, 1], per camera; iterated once, one in memory at a
+            time.
     Returns:
         (V, 3) uint8.
     Raises:
         LinprimError: an image does not have the size of its camera.
     """
-    from scipy.ndimage import maximum_filter, minimum_filter
-
     from .raycast import RayCaster
 
     caster = RayCaster(mesh.vertices, mesh.faces)
     normals = vertex_normals(mesh) if mesh.normals is None else mesh.normals
-    points, across = np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(normals.T, dtype=np.float64)
     edge = mesh.vertices[mesh.faces[:, 1]] - mesh.vertices[mesh.faces[:, 0]]
     slack = float(np.median(np.linalg.norm(edge, axis=1)))
-    best = np.zeros((len(mesh.vertices), KEPT_SAMPLES), dtype=np.float32)
-    shade = np.zeros((len(mesh.vertices), KEPT_SAMPLES, 3), dtype=np.float32)
-    good = np.zeros(len(mesh.vertices), dtype=bool)
-    for camera, image in zip(cameras, images, strict=True):
-        if image.shape[:2] != (camera.height, camera.width):
-            raise LinprimError(
-                f"image is {image.shape[1]}x{image.shape[0]} pixels, "
-                f"its camera {camera.width}x{camera.height}"
-            )
-        rays = camera.world_rays().reshape(-1, 3)
-        # Single precision is plenty here: the comparison below has a slack of an edge.
-        depth = caster.cast_single(camera.center, rays)[0].astype(np.float64)
-        depth = np.minimum(depth, FAR * caster.diagonal).reshape(camera.height, camera.width)
-        near, far = (f(depth, size=3, mode="nearest") for f in (minimum_filter, maximum_filter))
-        facing = _facing(points, across, camera.center)
-        rows = np.flatnonzero(facing > 0)
-        pixels, z, inside = _project(camera, points[:, rows])
-        rows, pixels, z = rows[inside], pixels[:, inside], z[inside]
-        facing = facing[rows]
-        j, i = pixels.astype(np.int64)
-        # On a plane the depth changes by one pixel's footprint times the tangent from one pixel to the next.
-        step = z / min(camera.fx, camera.fy)
-        slope = slack + step * np.sqrt(1.0 / np.maximum(facing, LEAST_FACING) ** 2 - 1.0)
-        visible = z <= depth[i, j] + slope
-        outline = (far[i, j] - near[i, j] > 4.0 * slope) | (z > near[i, j] + 2.0 * slope)
-        weight = np.maximum(facing, LEAST_FACING**2) / step**2
-        poor = outline | (facing < LEAST_FACING)
-        weight[poor] *= POOR_SHARE
-        good[rows[visible & ~poor]] = True
-        rows, pixels, weight = rows[visible], pixels[:, visible], weight[visible].astype(np.float32)
-        _keep_best(best, shade, rows, weight, _bilinear(image, pixels))
-    return _fill_unseen(mesh, _robust_mean(best, shade), good, best[:, 0] > 0)
+    colors, good, seen = photographed(caster, mesh.vertices, normals, cameras, images, slack)
+    return _fill_unseen(mesh, colors, good, seen)
+
+
+def photographed(
+    caster: RayCaster,
+    points: np.ndarray,
+    normals: np.ndarray,
+    cameras: Sequence[Camera],
+    images: Iterable[np.ndarray],
+    slack: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Colours of surface points (P, 3) with normals (P, 3), as `color_vertices` takes them from photographs.
+
+    Memory: some 400 bytes per point.
+
+    Args:
+        caster: of the mesh that hides points.
+        images: one (H, W, 3 or 4) uint8, or float in [0, 1], per camera; iterated once. With a fourth channel, alpha, pixels of
+            less than one half show what is behind, and those between are taken for an outline.
+        slack: a point this far behind the surface of a pixel is not hidden, beside what the slope explains; at least a pixel's
+            footprint.
+    Returns:
+        colors (P, 3) float32 from 0 to 255, good (P,) bool: some view sees it well, seen (P,) bool: some view sees it at all.
+    Raises:
+        LinprimError: an image does not have the size of its camera.
+    """
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    points, across = np.ascontiguousarray(points.T), np.ascontiguousarray(normals.T, dtype=np.float64)
+    count = points.shape[1]
+    best = np.zeros((count, KEPT_SAMPLES), dtype=np.float32)
+    shade = np.zeros((count, KEPT_SAMPLES, 3), dtype=np.float32)
+    good = np.zeros(count, dtype=bool)
+    parts = [slice(start, min(start + POINTS_PER_TASK, count)) for start in range(0, count, POINTS_PER_TASK)]
+    with ThreadPoolExecutor(min(caster.threads, max(len(parts), 1))) as pool:
+        for camera, image in zip(cameras, images, strict=True):
+            if image.shape[:2] != (camera.height, camera.width):
+                raise LinprimError(
+                    f"image is {image.shape[1]}x{image.shape[0]} pixels, "
+                    f"its camera {camera.width}x{camera.height}"
+                )
+            if image.shape[2] == 4:
+                # Premultiplied, so that transparent pixels have no colour in a sample beside them.
+                image = image / np.float32(255 if image.dtype == np.uint8 else 1)
+                image[..., :3] *= image[..., 3:]
+            rays = camera.world_rays().reshape(-1, 3)
+            # Single precision is plenty here: the comparison below has a slack.
+            depth = caster.cast_single(camera.center, rays)[0].astype(np.float64)
+            depth = np.minimum(depth, FAR * caster.diagonal).reshape(camera.height, camera.width)
+            near, far = (f(depth, size=3, mode="nearest") for f in (minimum_filter, maximum_filter))
+
+            def look(part, camera=camera, image=image, depth=depth, near=near, far=far):
+                rows, weight, color, well = _samples(
+                    camera, image, depth, near, far, points[:, part], across[:, part], slack
+                )
+                good[part][rows[well]] = True
+                _keep_best(best[part], shade[part], rows, weight, color)
+
+            list(pool.map(look, parts))
+        colors = np.concatenate([np.zeros((0, 3), np.float32), *pool.map(lambda k: _robust_mean(best[k], shade[k]), parts)])
+    return colors, good, best[:, 0] > 0
+
+
+def _samples(camera, image, depth, near, far, points, normals, slack):
+    """What one view says of points (3, P): rows of those that it sees, their weights, colours, and which are seen well.
+
+    A fourth channel of `image` is alpha, and the others are premultiplied by it. `depth` (H, W) is that of the mesh, `near` and
+    `far` the least and largest around each pixel.
+    """
+    facing = _facing(points, normals, camera.center)
+    rows = np.flatnonzero(facing > 0)
+    pixels, z, inside = _project(camera, points[:, rows])
+    rows, pixels, z = rows[inside], pixels[:, inside], z[inside]
+    facing = facing[rows]
+    j, i = pixels.astype(np.int64)
+    # On a plane the depth changes by one pixel's footprint times the tangent from one pixel to the next.
+    step = z / min(camera.fx, camera.fy)
+    slope = np.maximum(slack, step) + step * np.sqrt(1.0 / np.maximum(facing, LEAST_FACING) ** 2 - 1.0)
+    visible = z <= depth[i, j] + slope
+    poor = (far[i, j] - near[i, j] > 4.0 * slope) | (z > near[i, j] + 2.0 * slope) | (facing < LEAST_FACING)
+    color = _bilinear(image, pixels)
+    if image.shape[2] == 4:
+        alpha = color[:, 3] / np.float32(255.0)
+        visible &= alpha >= 0.5
+        poor |= alpha < OPAQUE
+        color = color[:, :3] / np.maximum(alpha, np.float32(0.5))[:, None]
+    weight = np.maximum(facing, LEAST_FACING**2) / step**2
+    weight[poor] *= POOR_SHARE
+    return rows[visible], weight[visible].astype(np.float32), color[visible], ~poor[visible]
 
 
 def _keep_best(best, shade, rows, weight, color):
@@ -158,7 +225,7 @@ def _keep_best(best, shade, rows, weight, color):
 
 
 def _bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """(P, 3) float32 colours, 0 to 255, at (2, P) pixel positions."""
+    """(P, C) float32 colours, 0 to 255, at (2, P) pixel positions."""
     scale = 1.0 if image.dtype == np.uint8 else 255.0
     height, width = image.shape[:2]
     x = np.clip(pixels[0] - 0.5, 0, width - 1)
@@ -167,7 +234,6 @@ def _bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     i = np.minimum(y.astype(np.int64), max(height - 2, 0))
     x, y = (x - j)[:, None], (y - i)[:, None]
     right, below = np.minimum(j + 1, width - 1), np.minimum(i + 1, height - 1)
-    image = image[..., :3]
     top = image[i, j] * (1 - x) + image[i, right] * x
     bottom = image[below, j] * (1 - x) + image[below, right] * x
     return (scale * (top * (1 - y) + bottom * y)).astype(np.float32)
