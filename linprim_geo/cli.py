@@ -185,6 +185,15 @@ def _not_negative(text: str) -> float:
     return value
 
 
+def _seconds(text: str) -> float:
+    """90, 90s, 5m or 1.5h as seconds."""
+    units = {"s": 1, "m": 60, "h": 3600}
+    value = float(text[:-1]) * units[text[-1]] if text[-1:] in units else float(text)
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not a time such as 90s, 5m or 1h")
+    return value
+
+
 def _length(text: str) -> float:
     value = float(text)
     if not 0 < value < float("inf"):
@@ -210,7 +219,7 @@ def _size(text: str) -> tuple[int, int]:
 # argparse names the type in its message: "invalid count value", not "invalid _positive value".
 _positive.__name__ = _whole.__name__ = "count"
 _not_negative.__name__ = _length.__name__ = "number"
-_size.__name__, _pair.__name__ = "size", "pair X,Y"
+_size.__name__, _pair.__name__, _seconds.__name__ = "size", "pair X,Y", "time such as 90s, 5m or 1h"
 
 
 # --- subcommands -----------------------------------------------------------------------------------------
@@ -269,6 +278,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("--resume", action="store_true", help="go on from the latest checkpoint in RUN")
     sub.add_argument("--quiet", action="store_true", help="no progress")
+    text = "choose steps and primitives so that everything takes this long, by what a step costs here; one of the two may be given"
+    sub.add_argument("--time-budget", type=_seconds, metavar="TIME", help=text)
     resolution = "as in 3DGS: divide the size by 1, 2, 4 or 8, or a width to go down to; -1: to 1600 if it is more"
     sub.add_argument("-r", "--resolution", type=int, metavar="K", help=resolution)
     sub.add_argument("--eval", action="store_true", help="accepted as in 3DGS: views are always held out")
@@ -289,6 +300,8 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument(
         "-o", "--output", metavar="FILE", help=".ply .obj .glb .stl (default RUN/mesh/METHOD/mesh.ply)"
     )
+    text = "choose the voxel size so that everything takes this long, by what coarse passes take"
+    sub.add_argument("--time-budget", type=_seconds, metavar="TIME", help=text)
     add_options(sub.add_argument_group("extraction"), ExtractOptions)
 
     sub = command(
@@ -336,6 +349,19 @@ def build_parser() -> argparse.ArgumentParser:
     tnt.add_argument("--scene", metavar="NAME", help="Barn, Truck, ...: sets the threshold")
     tnt.add_argument("--crop", metavar="FILE", help="crop volume, .json")
     tnt.add_argument("--transform", metavar="FILE", help="4x4 matrix as text, takes MESH to REFERENCE")
+
+    sub = command("tradeoff", _tradeoff, "sweep every knob that trades time for accuracy: tables, plots, and a sentence for each")
+    sub.add_argument("scene", metavar="SCENE", help="folder with a COLMAP model or transforms*.json")
+    sub.add_argument("-o", "--output", metavar="DIR", help="folder to make, or to go on with (default runs/SCENE_tradeoff)")
+    text = "knobs to sweep; a wrong name lists them (default all)"
+    sub.add_argument("--knobs", nargs="+", default=[], metavar="NAME", help=text)
+    text = "run of this scene that knobs of rendering, extraction and evaluation are measured on (default: trains one of modest size)"
+    sub.add_argument("--run", metavar="RUN", help=text)
+    text = "mesh in the data set's frame (default: reference.ply in the scene, if there)"
+    sub.add_argument("--reference", metavar="MESH", help=text)
+    sub.add_argument("--quick", action="store_true", help="a tiny size, to see that all of it runs")
+    sub.add_argument("--rounds", type=_positive, metavar="N", help="how often everything is timed, in turn (default 3, quick 2)")
+    sub.add_argument("--threads", type=_whole, default=0, metavar="N", help="0 uses every core (default)")
 
     sub = command(
         "synth", _synth, "render posed images, depth, normals and points of a mesh or a built-in scene"
@@ -395,6 +421,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _train(parsed: argparse.Namespace) -> dict:
+    budget = _budget(parsed)
     from .options import SceneOptions, TrainOptions
 
     scene = parsed.scene or parsed.source
@@ -413,7 +440,17 @@ def _train(parsed: argparse.Namespace) -> dict:
         from_args(TrainOptions, parsed),
         resume=parsed.resume,
         quiet=parsed.quiet,
+        **budget,
     )
+
+
+def _budget(parsed: argparse.Namespace) -> dict:
+    """`time_budget` from --time-budget as a keyword, counted from now, before large libraries are loaded; nothing without it."""
+    if parsed.time_budget is None:
+        return {}
+    from .time_budget import Budget
+
+    return {"time_budget": Budget(parsed.time_budget)}
 
 
 def _downscale_of(resolution: int, scene: str, parsed: argparse.Namespace) -> int:
@@ -436,11 +473,12 @@ def _render(parsed: argparse.Namespace) -> dict:
 
 
 def _extract_mesh(parsed: argparse.Namespace) -> dict:
+    budget = _budget(parsed)
     from .extract import extract_mesh
     from .options import ExtractOptions
 
     options = from_args(ExtractOptions, parsed)
-    return extract_mesh(parsed.run, method=parsed.method, output=parsed.output, options=options)
+    return extract_mesh(parsed.run, method=parsed.method, output=parsed.output, options=options, **budget)
 
 
 def _eval_depth(parsed: argparse.Namespace) -> dict:
@@ -461,6 +499,24 @@ def _eval_mesh(parsed: argparse.Namespace) -> dict:
 
     chosen = {k: v for k, v in vars(parsed).items() if k not in ("handler", "command", "json", "debug")}
     return eval_mesh_files(chosen.pop("mesh"), chosen.pop("reference"), **chosen)
+
+
+def _tradeoff(parsed: argparse.Namespace) -> dict:
+    from .eval.tradeoff import tradeoff
+
+    output = Path(parsed.output or Path("runs") / f"{Path(parsed.scene).resolve().name}_tradeoff")
+    results = tradeoff(
+        parsed.scene,
+        output,
+        knobs=parsed.knobs,
+        run=parsed.run,
+        reference=parsed.reference,
+        quick=parsed.quick,
+        rounds=parsed.rounds,
+        threads=parsed.threads,
+    )
+    files = [str(output / f"tradeoff.{suffix}") for suffix in ("html", "csv", "json")]
+    return results | {"files": files, "_text": "\n".join([*results["sentences"].values(), "", results["rule"], "", *files])}
 
 
 def _synth(parsed: argparse.Namespace) -> dict:

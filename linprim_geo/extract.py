@@ -18,6 +18,7 @@ from .run import Run
 from .stages import Stages
 from .texture import LARGEST as LARGEST_TEXTURE
 from .texture import check_texture, make_texture, save_textured
+from .time_budget import Budget, choose_voxel
 from .visibility import visible_faces
 
 # Each is a function (run, options, stages) -> (mesh, statistics of its own), found when it is wanted: their libraries are large.
@@ -43,6 +44,7 @@ def extract_mesh(
     output: str | os.PathLike | None = None,
     options: ExtractOptions | None = None,
     *,
+    time_budget: Budget | float | None = None,
     quiet: bool = False,
 ) -> dict:
     """Extracts the surface of a run and writes it, the part that cameras see, and statistics.
@@ -53,13 +55,17 @@ def extract_mesh(
     frame and unit. Holes are closed, the surface smoothed, remeshed and simplified as the options ask (`mesh_process`); with
     `texture` .obj and .glb have a texture out of the photographs in place of vertex colours.
 
+    With `time_budget`, in seconds, the voxel size is the smallest with which everything takes that time at most, by what coarse passes
+    take (`time_budget.choose_voxel`); stats.json has `time_budget`: what was chosen and why, and the seconds that it took.
+
     Returns: what stats.json holds: topology of both meshes, options, `processing` step by step, `texture`, what manifold3d says of
     a watertight mesh (`manifold_status`), seconds and peak memory per stage, and the paths.
 
     Raises:
-        LinprimError: nothing was trained, no ray crosses the level, or the grid would not fit into memory.
+        LinprimError: nothing was trained, no ray crosses the level, the grid would not fit into memory, or the time is too little for
+            the coarsest surface.
     """
-    options = options or ExtractOptions()
+    options, budget = options or ExtractOptions(), Budget.of(time_budget)
     if method not in METHODS:
         raise LinprimError(f"--method is {method!r}, wanted {' or '.join(METHODS)}")
     for name, (low, high) in RANGES.items():
@@ -69,6 +75,10 @@ def extract_mesh(
         if isinstance(value, str) or not low <= value <= high:
             also = "auto, or " if name == "level" else ""
             raise LinprimError(f"--{name.replace('_', '-')} is {value}, wanted {also}{low:g} to {high:g}")
+    if budget and method != "tsdf":
+        raise LinprimError(f"--time-budget chooses a voxel size, which --method {method} has none of: wanted --method tsdf")
+    if budget and options.voxel_size > 0:
+        raise LinprimError("--time-budget chooses the voxel size: wanted one of it and --voxel-size")
     opened = Run.open(run)
     folder = opened.path / "mesh" / method
     target = Path(output) if output else folder / "mesh.ply"
@@ -88,7 +98,11 @@ def extract_mesh(
         stages.lap("level")
     module, function = METHODS[method].split(".")
     surface = getattr(import_module(f".{module}", __package__), function)
-    mesh, about = surface(opened, options, stages)
+    kept, chosen = (), None
+    if budget:
+        options, frames, chosen = choose_voxel(opened, options, target, stages, budget)
+        kept = (frames,)
+    mesh, about = surface(opened, options, stages, *kept)
     mesh, processing = process_mesh(mesh, options, stages.note)
     if processing:
         stages.lap("process")
@@ -125,6 +139,9 @@ def extract_mesh(
         "visible": topology(visible),
         **stages.report(),
     }
+    if budget:
+        stats["time_budget"] = chosen | {"actual_seconds": budget.elapsed()}
+        stages.note(f"{budget.elapsed():.1f} s of the {budget.seconds:.3g} s")
     write_json(folder / "stats.json", stats)
     progress.note(f"{target}: {topology_line(stats)}")
     stages.note(stages.line())

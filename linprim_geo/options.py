@@ -115,6 +115,7 @@ class SceneOptions:
     sparse: str = option(
         "", "COLMAP model to take points from, if it is not where data sets usually keep it", metavar="DIR"
     )
+    views: int = option(0, "train with N of the training views, evenly spread over them; 0 takes all")
 
 
 @dataclass(frozen=True)

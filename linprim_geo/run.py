@@ -120,6 +120,15 @@ class Run:
         write_json(self.path / "config.json", config | {"scene": str(scene_path.resolve())})
         return replace(self, scene_path=scene_path.resolve())
 
+    @property
+    def notes(self) -> dict:
+        """Contents of config.json."""
+        return _read_json(self.path / "config.json", self.path)
+
+    def note(self, name: str, value: object) -> None:
+        """Writes an entry of config.json beside the options."""
+        write_json(self.path / "config.json", self.notes | {name: value})
+
     @cached_property
     def instruction_set(self) -> str:
         """Vector kernels it was begun with, "" if that was not noted."""
@@ -137,7 +146,7 @@ class Run:
             downscale=options.downscale,
             masks=options.masks or None,
             sparse=options.sparse or None,
-        )
+        ).with_training_views(options.views)
 
     @cached_property
     def state(self) -> dict:

@@ -169,6 +169,13 @@ class Scene:
         """Whether the views come with an alpha channel or a foreground mask."""
         return any(view.has_alpha for view in self.views)
 
+    def with_training_views(self, count: int) -> Scene:
+        """The same with `count` of the training views, evenly spread over them; with all of them for 0, or where there are fewer."""
+        if not 0 < count < len(self.train):
+            return self
+        kept = np.linspace(0, len(self.train), count, endpoint=False).astype(int)
+        return replace(self, train=tuple(self.train[k] for k in kept))
+
 
 @dataclass(frozen=True)
 class Frame:

@@ -20,13 +20,17 @@ SEEN_THROUGH = 0.5
 BYTES_PER_PIXEL, KEPT_BYTES = 8, 2**30
 
 
-def tsdf_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[Mesh, dict]:
+def tsdf_surface(
+    run: Run, options: ExtractOptions, stages: Stages, frames: DepthFrames | None = None
+) -> tuple[Mesh, dict]:
     """Returns the fused mesh, with `quality` and colours, and `level`, `voxel_size` and `truncation_voxels` for the statistics.
+
+    `frames` of the same level, if there are any already, are taken in place of new ones.
 
     Raises:
         LinprimError: no ray crosses the level, or the grid would not fit into memory.
     """
-    frames = DepthFrames(run, options.level)
+    frames = DepthFrames(run, options.level) if frames is None else frames
     if not any((frame.depth > 0).any() for frame in frames):
         raise LinprimError(
             f"{run.path}: no ray of any training view crosses transmittance {options.level}, so there is no surface"

@@ -31,10 +31,12 @@ from .initial_points import (
     visual_hull_points,
 )
 from .options import GEOMETRY_WEIGHTS, SceneOptions, TrainOptions, check_train_options
+from .pacing import Pace, plan_run
 from .primitives import KINDS
 from .progress import Progress, duration, memory_gib
 from .run import Run
 from .scene import PointCloud, Scene, load_scene
+from .time_budget import Budget
 from .trainer import LARGEST_PART, SMALLEST_PX, Shot, Trainer, initial_parameters, load_shots
 
 # Primitives at the start, as a share of the most there may be: from points on surfaces, and from random ones.
@@ -93,6 +95,7 @@ def train(
     scene_options: SceneOptions | None = None,
     options: TrainOptions | None = None,
     *,
+    time_budget: Budget | float | None = None,
     resume: bool = False,
     quiet: bool = False,
 ) -> dict:
@@ -100,6 +103,11 @@ def train(
 
     With `resume` the folder's own options are used (but for `threads`): learning rates and growth depend on them. A capture that is no
     longer where it was is looked for at `scene`. Interrupted (Ctrl-C), it finishes the step, saves, and raises KeyboardInterrupt.
+
+    With `time_budget`, in seconds from now for everything, a calibration of some dozen steps says what a step costs, and
+    `time_budget.plan_training` chooses `iterations` and `max_primitives` from it; one of the two that differs from its default is
+    kept. When growth has ended the steps that are left are counted anew, once, from the pace so far. Both are in config.json under
+    `time_budget`, so that a resumed run repeats them, with the seconds that the run took.
 
     Returns: `run`, `iterations`, `seconds` (of training steps alone), `primitives`, `psnr` (mean over held-out views), `views`.
 
@@ -111,6 +119,12 @@ def train(
     scene_options = scene_options or SceneOptions()
     progress = Progress("train", options.iterations, quiet=quiet)
     before = torch.get_num_threads()
+    budget = Budget.of(time_budget)
+    if resume and budget:
+        progress.note("--resume goes on with the run's own options: --time-budget ignored")
+        budget = None
+    if budget and all(getattr(options, name) != getattr(TrainOptions, name) for name in ("iterations", "max_primitives")):
+        raise LinprimError("--time-budget leaves nothing to choose beside --iterations and --max-primitives: wanted at most one of the two")
     try:
         # torch only does small element-wise work here; its own threads would wait for each other longer than they compute.
         torch.set_num_threads(1)
@@ -119,7 +133,7 @@ def train(
             opened, loaded = _reopen(Path(scene), run_path, scene_options, options, progress)
         else:
             opened, loaded = _begin(Path(scene), run_path, scene_options, options, progress)
-        return _train(opened, loaded, _read_checkpoint(run_path) if resume else None, progress)
+        return _train(opened, loaded, _read_checkpoint(run_path) if resume else None, progress, budget)
     finally:
         torch.set_num_threads(before)
 
@@ -133,7 +147,9 @@ def _begin(
         downscale=scene_options.downscale,
         masks=scene_options.masks or None,
         sparse=scene_options.sparse or None,
-    )
+    ).with_training_views(scene_options.views)
+    if scene_options.views < 0:
+        raise LinprimError(f"--views is {scene_options.views}, wanted a number of training views, or 0 for all")
     if run_path.exists() and (not run_path.is_dir() or any(run_path.iterdir())):
         raise LinprimError(f"{run_path}: exists already; give another folder with -o, or go on with --resume")
     loaded = with_points(loaded, options, progress.note)
@@ -166,7 +182,7 @@ def _reopen(
     ), opened.scene()
 
 
-def _train(run: Run, scene: Scene, state: dict | None, progress: Progress) -> dict:
+def _train(run: Run, scene: Scene, state: dict | None, progress: Progress, budget: Budget | None = None) -> dict:
     """Trains from a checkpoint's `state`, or from the start: what is random does not depend on when a run was stopped."""
     options = run.train_options
     wanted = [name for name in GEOMETRY_WEIGHTS if getattr(options, name) > 0]
@@ -175,11 +191,28 @@ def _train(run: Run, scene: Scene, state: dict | None, progress: Progress) -> di
     shots = load_shots(scene.train, run.similarity)
     if all(shot.alpha is not None and int(shot.alpha.max()) == 0 for shot in shots):
         raise LinprimError(f"{scene.root}: the masks leave no pixel of any training image")
-    trainer = _start(scene, run, shots, options, state)
-    if wanted:
-        trainer.terms = GeometryTerms(
-            options, shots, gather_evidence(scene, options, run.similarity, progress.note), run.similarity.apply(scene.points.xyz)
+    held_out = load_shots(scene.test, run.similarity) if budget else None
+    pace = None
+    if budget:
+        volume = isinstance(scene.points, VolumePoints)
+        run, pace = plan_run(
+            run,
+            shots,
+            held_out,
+            _terms(run, scene, shots, progress),
+            budget,
+            progress,
+            start=lambda options: _start(scene, run, shots, options, None),
+            score=evaluate,
+            # The smaller limit that is chosen leaves too many points, not too few, and volumes are filled anew.
+            start_share=0.0 if volume else SFM_START,
+            quick_views=len(held_out[:: max(1, len(held_out) // QUICK_VIEWS)]),
         )
+        options, progress.total = run.train_options, run.train_options.iterations
+        if volume:  # as many as the population begins with
+            scene = with_points(replace(scene, points=None), options, progress.note)
+    trainer = _start(scene, run, shots, options, state)
+    trainer.terms = _terms(run, scene, shots, progress)
     if not (run.path / "config.json").exists():
         Run.create(
             run.path,
@@ -190,6 +223,10 @@ def _train(run: Run, scene: Scene, state: dict | None, progress: Progress) -> di
             run.similarity,
             ops.instruction_set(),
         )
+        if pace:
+            run.note("time_budget", pace.record)
+    elif "time_budget" in run.notes:
+        pace = Pace.resumed(run, trainer)
     for torn in (run.path / "checkpoints").glob(".step_*.tmp*"):  # what a kill left half-written
         torn.unlink()
     progress.start = trainer.step
@@ -197,8 +234,8 @@ def _train(run: Run, scene: Scene, state: dict | None, progress: Progress) -> di
         f"{scene.root}: {scene.kind}, {len(scene.train)} training and {len(scene.test)} held-out views of "
         f"{shots[0].camera.width}x{shots[0].camera.height}; {len(trainer)} primitives, {ops.instruction_set()}, {ops.threads()} threads"
     )
-    held_out = load_shots(scene.test, run.similarity)
-    seconds, score = _loop(trainer, run, held_out, progress)
+    held_out = load_shots(scene.test, run.similarity) if held_out is None else held_out
+    seconds, score = _loop(trainer, run, held_out, progress, pace)
     result = {
         "run": str(run.path),
         "iterations": trainer.step,
@@ -211,7 +248,18 @@ def _train(run: Run, scene: Scene, state: dict | None, progress: Progress) -> di
         f"{run.path}: {trainer.step} steps in {duration(seconds)}, {len(trainer)} primitives"
         + (f", held-out PSNR {score:.2f} dB over {len(held_out)} views" if held_out else "")
     )
+    if pace:
+        result["time_budget"] = pace.close(run, progress)
     return result
+
+
+def _terms(run: Run, scene: Scene, shots: list[Shot], progress: Progress) -> GeometryTerms | None:
+    """The late terms for geometry that have a weight, None if none has."""
+    options = run.train_options
+    if not any(getattr(options, name) > 0 for name in GEOMETRY_WEIGHTS):
+        return None
+    evidence = gather_evidence(scene, options, run.similarity, progress.note)
+    return GeometryTerms(options, shots, evidence, run.similarity.apply(scene.points.xyz))
 
 
 def _background(text: str, shots: list[Shot]) -> tuple[torch.Tensor, bool, bool]:
@@ -303,20 +351,24 @@ def _lay_down(parameters: dict[str, torch.Tensor], xyz: np.ndarray, seed: int, s
     across.copy_(torch.maximum(thin, across.clamp_max(float(np.log(2 * smallest)))))
 
 
-def _loop(trainer: Trainer, run: Run, held_out: list[Shot], progress: Progress) -> tuple[float, float | None]:
+def _loop(
+    trainer: Trainer, run: Run, held_out: list[Shot], progress: Progress, pace: Pace | None = None
+) -> tuple[float, float | None]:
     """Steps until the end; returns the seconds spent in steps and the final held-out PSNR."""
     options = trainer.options
     _cut_metrics(run.path / "metrics.jsonl", trainer.step)
     score, saved = None, -1
     with open(run.path / "metrics.jsonl", "a") as log, _interrupt_flag() as interrupted:
-        while trainer.step < options.iterations and not interrupted:
+        while trainer.step < trainer.iterations and not interrupted:
+            if pace:
+                pace.watch(trainer, run, progress, save=lambda: _save(trainer, run))
             try:
                 trainer.advance()
             except LinprimError as error:
                 raise LinprimError(
                     f"{run.path}: training diverged at step {trainer.step} ({error}); what was saved before is intact"
                 ) from None
-            last = trainer.step == options.iterations
+            last = trainer.step == trainer.iterations
             score = None
             if last or (options.evaluate_every and trainer.step % options.evaluate_every == 0):
                 score = evaluate(
@@ -426,7 +478,7 @@ def _save(trainer: Trainer, run: Run) -> None:
         trainer.primitives(),
         {
             "iteration": trainer.step,
-            "iterations": trainer.options.iterations,
+            "iterations": trainer.iterations,
             "primitives": len(trainer),
             "background": [float(x) for x in trainer.shown_background()],
             "seconds": trainer.seconds,

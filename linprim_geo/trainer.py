@@ -203,6 +203,8 @@ class Trainer:
         self.first = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
         self.second = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
         self.step = 0
+        # (step, iterations): from this step on the run is to end after so many, what is left of its schedules stretched to fit.
+        self.correction: tuple[int, int] | None = None
         self.steps = torch.zeros(len(self), dtype=torch.int32)  # sparse Adam: updates of each primitive
         self.seconds = 0.0
         self.loss = self.psnr = math.nan  # running means
@@ -217,14 +219,34 @@ class Trainer:
         return len(self.parameters["center"])
 
     @property
+    def iterations(self) -> int:
+        """Steps of the whole run, as far as this step knows."""
+        if self.correction is None or self.step < self.correction[0]:
+            return self.options.iterations
+        return self.correction[1]
+
+    def part(self) -> float:
+        """Share of the run's schedules, 0 to 1, that lies behind this step: of learning rates, and of what begins late."""
+        if self.correction is None or self.step < self.correction[0]:
+            return self.step / self.options.iterations
+        bend, last = self.correction
+        begun = bend / self.options.iterations
+        return begun + (1 - begun) * (self.step - bend) / (last - bend)
+
+    def has_reached(self, share: float) -> bool:
+        """Whether this step lies in what follows the first `share` of the run."""
+        if self.correction is None or self.step < self.correction[0]:
+            return self.step >= share * self.options.iterations
+        return self.part() >= share
+
+    @property
     def degree(self) -> int:
         """Degree of the view-dependent colour at this step."""
         return min(self.options.sh_degree, int(self.step / (DEGREE_EVERY * self.options.iterations)))
 
-    def how_at(self, step: int) -> dict:
-        """The keywords of `ops.rasterize` at a step: until --order-from blending takes the order of the centres."""
-        early = step < self.options.order_from * self.options.iterations
-        return self.how | {"order": "center"} if early else self.how
+    def how_now(self) -> dict:
+        """The keywords of `ops.rasterize` at this step: until --order-from blending takes the order of the centres."""
+        return self.how if self.has_reached(self.options.order_from) else self.how | {"order": "center"}
 
     def view_of(self, step: int) -> int:
         """Index of the view of a step: every view once per round, in an order drawn per round."""
@@ -251,10 +273,10 @@ class Trainer:
         leaves = {k: v.requires_grad_() for k, v in self.parameters.items()}
         screen = torch.zeros(len(self), 3, requires_grad=True)
         active = activate(leaves, self.degree, self.kind, self.filter_3d)
-        terms = self.terms if self.step >= self.options.geometry_from * self.options.iterations else None
+        terms = self.terms if self.has_reached(self.options.geometry_from) else None
         # Geometry has no average over the rays of a pixel: with several of them it is rendered by itself.
         shared = terms is not None and self.options.samples == 1
-        how = {"stop": self.options.stop, **self.how_at(self.step)}
+        how = {"stop": self.options.stop, **self.how_now()}
         samples = self.options.samples
         out = ops.rasterize(*active, background, shot.camera, samples=samples, geometry=shared, screen=screen, **how)
         parts = ops.photometric_loss(out.rgb, target, self.options.dssim)
@@ -291,7 +313,7 @@ class Trainer:
             raise LinprimError(f"the loss is {loss}")
 
     def _update(self, grads: dict[str, torch.Tensor | None], touched: torch.Tensor | None) -> None:
-        part = self.step / self.options.iterations
+        part = self.part()
         rates = {name: rate * final**part for name, (rate, final) in RATES.items()}
         names = [name for name in self.parameters if grads[name] is not None]
         for value in self.parameters.values():

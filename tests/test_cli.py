@@ -34,7 +34,7 @@ HEAVY = {
     "numpy",
 }
 COMMANDS = (
-    "train render extract-mesh eval-depth eval-images eval-mesh synth convert doctor demo".split()
+    "train render extract-mesh eval-depth eval-images eval-mesh tradeoff synth convert doctor demo".split()
 )  # fmt: skip
 
 

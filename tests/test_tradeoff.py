@@ -1,0 +1,305 @@
+"""The sweep of knobs: every rung sets something that runs, the frontier and the sentences follow their rules, the files agree."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import xml.etree.ElementTree as ElementTree
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from linprim_geo.errors import LinprimError
+from linprim_geo.eval import knobs, tradeoff_page
+from linprim_geo.eval import tradeoff as sweeping
+from linprim_geo.eval.frontier import frontier, pays, verdict
+from linprim_geo.eval.knobs import ERRORS, GROUPS, KNOBS, Knob, Rung, settings, training_options
+from linprim_geo.eval.tradeoff import tradeoff
+from linprim_geo.options import SceneOptions, TrainOptions, check_train_options
+
+# What the design lists: every knob that trades time for accuracy.
+LISTED = {
+    "rays", "order", "scalar", "stop", "degree", "trained-degree", "primitive", "primitives", "iterations", "scale", "views",
+    "extraction", "samples",
+}  # fmt: skip
+
+
+def row(rung, seconds, error, name="depth_percent", spread=0.0, rounds=3):
+    low, high = seconds * (1 - spread), seconds * (1 + spread)
+    return {"rung": rung, "seconds": seconds, "low": low, "high": high, "rounds": rounds, "default": False, name: error}
+
+
+def knob(*names, error="depth_percent"):
+    return Knob("rays", "ray model", "render", tuple(Rung(name) for name in names), names[0], (error,))
+
+
+# --- the registry ----------------------------------------------------------------------------------------
+
+
+def test_the_registry_is_complete():
+    assert set(KNOBS) == LISTED
+    for name, each in KNOBS.items():
+        assert each.name == name and each.group in GROUPS and set(each.errors) <= set(ERRORS) and each.errors
+        names = [r.name for r in each.rungs]
+        assert len(set(names)) == len(names) >= 2 and each.default in names
+    shown = [json.dumps(settings(each, r), sort_keys=True) for each in KNOBS.values() for r in each.rungs if r.name != each.default]
+    assert len(set(shown)) == len(shown), "two rungs that are not the default set the same"
+
+
+def test_defaults_of_the_registry_are_those_of_the_options():
+    assert settings(KNOBS["rays"], knobs.rung(KNOBS["rays"], "exact")) == knobs.RENDER_DEFAULTS
+    options = TrainOptions()
+    for name, value in (("ray_model", options.ray_model), ("order", options.order), ("stop", options.stop), ("degree", options.sh_degree)):
+        assert knobs.RENDER_DEFAULTS[name] == value
+    assert settings(KNOBS["primitive"], knobs.rung(KNOBS["primitive"], "octahedron")) == {} and options.primitive == "octahedron"
+    assert KNOBS["trained-degree"].default == str(options.sh_degree)
+    for name in ("order", "stop", "scalar", "degree", "extraction", "samples"):
+        each = KNOBS[name]
+        base = knobs.RENDER_DEFAULTS | knobs.EXTRACT_DEFAULTS | knobs.EVALUATE_DEFAULTS
+        assert knobs.rung(each, each.default).changes.items() <= base.items(), name
+
+
+def test_every_training_rung_changes_an_option_that_is_allowed():
+    options, scene = TrainOptions(iterations=100, max_primitives=80), SceneOptions(downscale=2)
+    for each in KNOBS.values():
+        if each.group != "train":
+            continue
+        found = [training_options(options, scene, 24, settings(each, r)) for r in each.rungs if "equal_time" not in r.changes]
+        assert len({(str(a), str(b)) for a, b in found}) == len(found), each.name
+        for changed, _ in found:
+            check_train_options(changed)
+    changed = {name: training_options(options, scene, 24, change) for name, change in {
+        "half": {"iterations_times": 0.5}, "cap": {"max_primitives_times": 2.0}, "scale": {"downscale_times": 4}, "views": {"views": 0.25},
+    }.items()}  # fmt: skip
+    assert (changed["half"][0].iterations, changed["cap"][0].max_primitives) == (50, 160)
+    assert (changed["scale"][1].downscale, changed["views"][1].views) == (8, 6)
+
+
+# --- the rules -------------------------------------------------------------------------------------------
+
+
+def test_the_frontier_of_known_points():
+    points = [(1.0, 5.0), (2.0, 3.0), (2.5, 3.0), (3.0, 4.0), (4.0, 1.0), (0.5, 9.0), (4.0, 2.0), (math.nan, 0.0), (9.0, math.nan)]
+    assert frontier(points) == [5, 0, 1, 4]
+    assert frontier([(1.0, 1.0), (1.0, 1.0)]) == [0] and frontier([]) == []
+    rng = np.random.default_rng(0)
+    points = [tuple(p) for p in rng.integers(1, 9, (60, 2)).astype(float)]
+    on = frontier(points)
+    for k, (t, e) in enumerate(points):
+        beaten = any(a <= t and b <= e and (a, b) != (t, e) for a, b in points)
+        assert (not beaten) == ((t, e) in [points[i] for i in on]), k
+
+
+def test_a_step_pays_if_the_error_falls_with_the_root_of_the_time():
+    assert pays(row("a", 1.0, 1.0), row("b", 4.0, 0.5), "depth_percent")
+    assert not pays(row("a", 1.0, 1.0), row("b", 4.0, 0.51), "depth_percent")
+    assert not pays(row("a", 1.0, 1.0), row("b", 1.0, 0.995), "depth_percent")  # less than 1 % is nothing
+    assert pays(row("a", 1.0, 1.0, spread=0.2), row("b", 1.3, 0.95, spread=0.2), "depth_percent")  # equal within the spread
+    assert not pays(row("a", 1.0, 1.0, spread=0.01), row("b", 1.3, 0.95, spread=0.01), "depth_percent")
+    assert pays(row("a", 1.0, 1.0), row("b", 99.0, 0.0), "depth_percent")
+
+
+def test_the_sentences_follow_the_rule():
+    said = verdict(knob("affine", "exact"), [row("affine", 1.0, 1.0), row("exact", 1.18, 0.8)])
+    assert said["sentence"] == (
+        "Ray model: exact costs 1.18x the time of affine and removes 20 % of the depth error (1 to 0.8 %): worth it."
+    )
+    assert (said["cheapest"], said["taken"], said["most_accurate"]) == ("affine", "exact", "exact")
+    said = verdict(knob("a", "b"), [row("a", 1.0, 1.0), row("b", 4.0, 0.9)])
+    assert said["sentence"].endswith("b costs 4.00x the time of a and removes 10 % of the depth error (1 to 0.9 %): not worth it.")
+    said = verdict(knob("a", "b", "c"), [row("a", 1.0, 1.0), row("b", 1.5, 0.5), row("c", 9.0, 0.45)])
+    assert "worth it; c would cost 6.00x the time of b and remove 10 %" in said["sentence"] and said["taken"] == "b"
+    said = verdict(knob("a", "b", "c"), [row("a", 1.0, 1.0), row("b", 2.0, 0.9), row("c", 3.0, 0.1)])
+    assert said["taken"] == "c"  # a step that does not pay is no obstacle to the next one
+    said = verdict(knob("a", "b"), [row("a", 1.0, 0.5), row("b", 4.0, 0.9)])
+    assert "a is the fastest, and no other removes any of the depth error (b costs 4.00x)" in said["sentence"]
+    said = verdict(knob("a", "b"), [row("a", 1.0, 1.0, spread=0.3), row("b", 1.2, 0.9, spread=0.3)])
+    assert "1.20x (within the spread of the timings)" in said["sentence"] and said["taken"] == "b"
+    assert verdict(knob("a", "b"), [row("a", 1.0, math.nan), row("b", 2.0, math.nan)])["error"] is None
+    assert verdict(knob("a", "b"), [])["error"] is None
+
+
+def test_what_only_some_rows_have_does_not_decide():
+    each = Knob("x", "x", "train", (Rung("a"), Rung("b")), "a", ("chamfer_percent", "photo_percent"))
+    rows = [row("a", 1.0, math.nan, "chamfer_percent"), row("b", 2.0, 1.0, "chamfer_percent")]
+    rows[0]["photo_percent"], rows[1]["photo_percent"] = 2.0, 1.0
+    assert verdict(each, rows)["error"] == "photo_percent"
+
+
+# --- a sweep ---------------------------------------------------------------------------------------------
+
+RENDERED = ("rays", "order", "scalar", "stop", "degree")
+MEASURED = (*RENDERED, "extraction", "samples")
+
+
+@pytest.fixture(scope="module")
+def swept(tiny_scene, tiny_run, tmp_path_factory):
+    """Everything that needs no training, on `tiny_run`."""
+    out = tmp_path_factory.mktemp("tradeoff") / "sweep"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sweeping, "POINTS", 3000)
+        tradeoff(tiny_scene, out, knobs=RENDERED, run=tiny_run, quick=True, threads=1, quiet=True)
+        return out, tradeoff(tiny_scene, out, knobs=MEASURED, run=tiny_run, quick=True, rounds=1, threads=1, quiet=True)
+
+
+def test_every_rung_was_timed_and_judged(swept, tiny_run):
+    out, results = swept
+    assert "failed" not in (out / "measured.json").read_text()
+    assert not (tiny_run / "mesh" / "polyhedra").exists(), "the given run was changed"
+    for name in MEASURED:
+        rows = [row for row in results["rows"] if row["knob"] == name]
+        degree = 1  # of the run
+        wanted = [r.name for r in KNOBS[name].rungs if name != "degree" or int(r.name) <= degree]
+        assert [row["rung"] for row in rows] == wanted and sum(row["default"] for row in rows) == 1
+        assert any(row["frontier"] for row in rows) and results["sentences"][name].endswith("worth it.")
+        for row in rows:
+            assert row["rounds"] == (2 if name in RENDERED else 1) and row["peak_gib"] > 0
+            assert 0 < row["low"] <= row["seconds"] <= row["high"]
+            assert all(row[error] is not None and row[error] >= 0 for error in KNOBS[name].errors), row
+
+
+def test_the_errors_are_those_of_the_knob(swept):
+    rows = {(row["knob"], row["rung"]): row for row in swept[1]["rows"]}
+    # The integral itself differs from the reference by rounding and the early stop alone, the order of centres by more.
+    assert rows["order", "overlap"]["image_percent"] < 0.2 * rows["order", "center"]["image_percent"]
+    assert rows["stop", "0"]["alone_percent"] < 0.1 * rows["stop", "1e-2"]["alone_percent"]
+    assert rows["scalar", "float32"]["alone_percent"] > rows["scalar", "float64"]["alone_percent"] > 0  # both stop early
+    assert rows["order", "overlap"]["popping_percent"] < 0.5 * rows["order", "center"]["popping_percent"]
+    assert rows["degree", "1"]["image_percent"] < rows["degree", "0"]["image_percent"]
+    # Settings in common are measured once.
+    assert rows["rays", "exact"]["seconds"] == rows["order", "center"]["seconds"] == rows["stop", "1e-3"]["seconds"]
+    assert rows["samples", "200,000"]["standard_error_percent"] < 0.2 * rows["samples", "1,000"]["standard_error_percent"]
+    assert rows["extraction", "tsdf x1"]["chamfer_percent"] < rows["extraction", "tsdf x4"]["chamfer_percent"]
+
+
+def test_csv_and_json_agree(swept):
+    out, results = swept
+    assert json.loads((out / "tradeoff.json").read_text()) == results
+    with open(out / "tradeoff.csv", newline="", encoding="utf-8") as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == len(results["rows"])
+    for line, row in zip(lines, results["rows"], strict=True):
+        for name, value in row.items():
+            assert (line[name] == "") if value is None else (line[name] == str(value)), name
+
+
+class Tags(HTMLParser):
+    """Checks that every tag is closed in its turn."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.seen = [], []
+
+    def handle_starttag(self, tag, attributes):
+        self.open.append(tag)
+        self.seen.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.seen.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_page_is_well_formed_and_stands_alone(swept):
+    out, results = swept
+    text = (out / "tradeoff.html").read_text(encoding="utf-8")
+    tags = Tags()
+    tags.feed(text)
+    assert not tags.open and tags.seen.count("svg") == tags.seen.count("table") == len(MEASURED)
+    assert not {"script", "link", "img", "iframe"} & set(tags.seen)
+    assert "http" not in text and "url(" not in text and "@import" not in text
+    tree = ElementTree.fromstring(text.removeprefix("<!DOCTYPE html>\n"))
+    shown = [" ".join(element.itertext()) for element in tree.iter("svg")]
+    for name, svg in zip([each for each in KNOBS if each in MEASURED], shown, strict=True):
+        assert all(row["rung"] in svg for row in results["rows"] if row["knob"] == name), name
+    words = " ".join(tree.itertext())
+    assert all(sentence in words for sentence in results["sentences"].values()) and results["rule"] in words
+
+
+def test_what_was_measured_is_taken_from_the_folder(swept, tiny_scene, tiny_run, monkeypatch):
+    out, results = swept
+    for name in ("_render", "_extract", "_evaluate", "_train"):
+        monkeypatch.setattr(sweeping.Sweep, name, lambda *_: pytest.fail("measured again"))
+    again = tradeoff(tiny_scene, out, knobs=("rays", "samples"), run=tiny_run, quick=True, rounds=1, threads=1, quiet=True)
+    assert again["rows"] == [row for row in results["rows"] if row["knob"] in ("rays", "samples")]
+
+
+def test_training_knobs_run_on_every_rung(tiny_scene, tmp_path, monkeypatch):
+    """A few steps each; how runs are scored is tested by the ones that score."""
+    monkeypatch.setattr(sweeping, "QUICK", {"iterations": 8, "max_primitives": 60})
+    scored = []
+
+    def score(self, folder):
+        from linprim_geo.run import Run
+
+        run = Run.open(folder)
+        scored.append(run)
+        return {"photo_percent": 1.0 / run.state["iteration"], "psnr": 20.0}
+
+    monkeypatch.setattr(sweeping.Sweep, "_train_errors", score)
+    chosen = [name for name, each in KNOBS.items() if each.group == "train"]
+    results = tradeoff(tiny_scene, tmp_path / "sweep", knobs=chosen, quick=True, rounds=1, threads=1, quiet=True)
+    assert len(results["rows"]) == sum(len(KNOBS[name].rungs) for name in chosen)
+    assert {run.train_options.primitive for run in scored} == {"octahedron", "tetrahedron", "gaussian"}
+    assert {run.train_options.sh_degree for run in scored} == {0, 1, 2, 3}
+    assert {run.train_options.iterations for run in scored} >= {2, 4, 8, 16}
+    assert {run.scene_options.downscale for run in scored} == {1, 2, 4}
+    assert {len(run.scene().train) for run in scored} == {12, 6, 3}
+    store = json.loads((tmp_path / "sweep" / "measured.json").read_text())["measured"]
+    base, other = (np.median(store[key]["times"]) for key in ("train {}", 'train {"primitive": "gaussian"}'))
+    equal = store['train {"equal_time": true, "primitive": "gaussian"}']["options"][0]["iterations"]
+    assert equal == max(1, round(8 * base / other))
+
+
+def test_a_trained_run_is_scored_by_image_depth_and_surface(swept, tiny_scene, tiny_run, tmp_path):
+    sweep = sweeping.Sweep(tiny_scene, tmp_path / "x", tiny_run, None, True, None, 1, True)
+    found = sweep._train_errors(swept[0] / "runs" / "given")
+    assert 22 < found["psnr"] < 40 and found["photo_percent"] == pytest.approx(100 * 10 ** (-found["psnr"] / 20))
+    assert 0 < found["depth_percent"] < 10 and 0 < found["chamfer_percent"] < 5
+
+
+# --- drawing ---------------------------------------------------------------------------------------------
+
+
+def test_names_of_near_points_do_not_cover_each_other():
+    rows = [row(f"rung number {k}", 1.0 + 0.02 * k, 1.0 - 0.005 * k) | {"frontier": True} for k in range(5)]
+    tree = ElementTree.fromstring(tradeoff_page.plot(rows, "depth_percent"))
+    labels = [(float(t.get("x")), float(t.get("y")), t.text) for t in tree.iter("text") if (t.text or "").startswith("rung")]
+    assert len(labels) == 5
+    for i, (x, y, text) in enumerate(labels):
+        width = len(text) * tradeoff_page.LETTER
+        assert tradeoff_page.LEFT <= x and x + width <= tradeoff_page.WIDTH - tradeoff_page.RIGHT
+        for u, v, _ in labels[:i]:
+            assert abs(x - u) >= width - 1 or abs(y - v) >= tradeoff_page.LINE - 1
+
+
+def test_an_error_of_zero_and_a_single_point_can_be_drawn():
+    for rows in ([row("a", 1.0, 0.0)], [row("a", 1.0, 0.0), row("b", 1e-6, 3.0)]):
+        ElementTree.fromstring(tradeoff_page.plot([each | {"frontier": True} for each in rows], "depth_percent"))
+
+
+# --- errors ----------------------------------------------------------------------------------------------
+
+
+def test_what_cannot_be_swept_is_one_sentence(swept, tiny_scene, tiny_run, tmp_path):
+    out, _ = swept
+    with pytest.raises(LinprimError, match="--knobs nonsense is unknown, wanted some of rays, order"):
+        tradeoff(tiny_scene, tmp_path / "x", knobs=("nonsense",), quiet=True)
+    with pytest.raises(LinprimError, match="holds a sweep of another run"):
+        tradeoff(tiny_scene, out, quick=True, threads=1, quiet=True)
+    with pytest.raises(LinprimError, match="--rounds is 0"):
+        tradeoff(tiny_scene, tmp_path / "x", rounds=0, quiet=True)
+    with pytest.raises(LinprimError, match="no such file, wanted a reference mesh"):
+        tradeoff(tiny_scene, tmp_path / "x", reference=tmp_path / "none.ply", quiet=True)
+    with pytest.raises(LinprimError, match="not the folder of a run"):
+        tradeoff(tiny_scene, tmp_path / "y", knobs=("rays",), run=tmp_path / "none", quick=True, quiet=True)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").write_text("mine")
+    with pytest.raises(LinprimError, match="holds no sweep"):
+        tradeoff(tiny_scene, tmp_path / "full", quiet=True)
+    (tmp_path / "full" / "measured.json").write_text("{")
+    with pytest.raises(LinprimError, match="measured.json: is damaged"):
+        tradeoff(tiny_scene, tmp_path / "full", quiet=True)
