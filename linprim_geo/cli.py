@@ -137,7 +137,8 @@ def add_options(parser: argparse._ActionsContainer, options: type) -> None:
         flag = "--" + field.name.replace("_", "-")
         text = field.metadata.get("help", "").replace("%", "%%")
         shown = "" if field.default in ("", None) else f" (default {field.default})"
-        settings: dict[str, Any] = {"dest": field.name, "default": field.default, "help": text + shown}
+        # No default here: what is not given is told from what is given as it would be by default.
+        settings: dict[str, Any] = {"dest": field.name, "default": argparse.SUPPRESS, "help": text + shown}
         if isinstance(field.default, bool):
             settings["action"] = argparse.BooleanOptionalAction
         else:
@@ -151,9 +152,32 @@ def add_options(parser: argparse._ActionsContainer, options: type) -> None:
         parser.add_argument(flag, **settings)
 
 
+def add_effects(parser: argparse._ActionsContainer, default: str) -> None:
+    """Adds --effects and --effect, by which options are chosen that were not given."""
+    text = "none: the options as they are (default of train); auto: what the data call for (default of inspect); all: everything on."
+    text += " An option that is given stays"
+    parser.add_argument("--effects", choices=("auto", "none", "all"), default=default, help=text)
+    text = "decide about one by hand, such as exposure=on; may be repeated; linprim-geo inspect SCENE names them"
+    parser.add_argument("--effect", action="append", default=[], metavar="NAME=on|off", help=text)
+
+
+def _choice(parsed: argparse.Namespace):
+    """What the command line says about effects."""
+    from .effects import Choice, parse_asked
+    from .options import SceneOptions, TrainOptions
+
+    given = given_options(SceneOptions, parsed) + given_options(TrainOptions, parsed)
+    return Choice(parsed.effects, parse_asked(parsed.effect), frozenset(given))
+
+
 def from_args(options: type, parsed: argparse.Namespace):
     """The dataclass `options` filled from the arguments that `add_options` has added."""
-    return options(**{field.name: getattr(parsed, field.name) for field in dataclasses.fields(options)})
+    return options(**{name: getattr(parsed, name) for name in given_options(options, parsed)})
+
+
+def given_options(options: type, parsed: argparse.Namespace) -> list[str]:
+    """Names of the fields of `options` that the command line sets."""
+    return [field.name for field in dataclasses.fields(options) if hasattr(parsed, field.name)]
 
 
 def _number_or(word: str) -> Callable[[str], float | str]:
@@ -283,6 +307,13 @@ def build_parser() -> argparse.ArgumentParser:
     resolution = "as in 3DGS: divide the size by 1, 2, 4 or 8, or a width to go down to; -1: to 1600 if it is more"
     sub.add_argument("-r", "--resolution", type=int, metavar="K", help=resolution)
     sub.add_argument("--eval", action="store_true", help="accepted as in 3DGS: views are always held out")
+    add_effects(sub.add_argument_group("effects"), "none")
+    add_options(sub.add_argument_group("scene"), SceneOptions)
+    add_options(sub.add_argument_group("training"), TrainOptions)
+
+    sub = command("inspect", _inspect, "say which effects a scene calls for, by which evidence, and what they cost")
+    sub.add_argument("scene", metavar="SCENE", help="folder with a COLMAP model or transforms*.json")
+    add_effects(sub.add_argument_group("effects"), "auto")
     add_options(sub.add_argument_group("scene"), SceneOptions)
     add_options(sub.add_argument_group("training"), TrainOptions)
 
@@ -390,6 +421,14 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--depth-format", choices=("png", "npy"), default="png", help="default png")
     detail = "contrast of a built-in scene's texture (default 1)"
     sub.add_argument("--detail", type=_not_negative, default=1.0, metavar="X", help=detail)
+    drift = "gains of the training photographs vary by up to exp(X) each way (default 0)"
+    sub.add_argument("--exposure-drift", type=_not_negative, default=0.0, metavar="X", help=drift)
+    lens = "k1 of a lens with radial distortion (default 0); a negative one is written --...=-0.1"
+    sub.add_argument("--distortion", type=float, default=0.0, metavar="K1", help=lens)
+    text = "strength of highlights that move with the camera (default 0)"
+    sub.add_argument("--specular", type=_not_negative, default=0.0, metavar="X", help=text)
+    text = "every third camera has X times the focal length (default 1)"
+    sub.add_argument("--zoom", type=_length, default=1.0, metavar="X", help=text)
     sub.add_argument(
         "--seed", type=_whole, default=0, metavar="N", help="seed of everything random (default 0)"
     )
@@ -428,7 +467,7 @@ def _train(parsed: argparse.Namespace) -> dict:
     if scene is None or (parsed.scene and parsed.source):
         raise LinprimError("train wants one scene: its folder, or -s and its folder")
     if parsed.resolution is not None:
-        if parsed.downscale != 1:
+        if getattr(parsed, "downscale", 1) != 1:
             raise LinprimError(f"-r {parsed.resolution} stands beside --downscale {parsed.downscale}, wanted one of them")
         parsed.downscale = _downscale_of(parsed.resolution, scene, parsed)
     from .train import train
@@ -440,6 +479,7 @@ def _train(parsed: argparse.Namespace) -> dict:
         from_args(TrainOptions, parsed),
         resume=parsed.resume,
         quiet=parsed.quiet,
+        effects=_choice(parsed),
         **budget,
     )
 
@@ -453,6 +493,17 @@ def _budget(parsed: argparse.Namespace) -> dict:
     return {"time_budget": Budget(parsed.time_budget)}
 
 
+def _inspect(parsed: argparse.Namespace) -> dict:
+    from .effects import inspect_scene
+    from .options import SceneOptions, TrainOptions
+
+    def log(text: str) -> None:
+        print(text, file=sys.stderr)
+
+    options = from_args(SceneOptions, parsed), from_args(TrainOptions, parsed)
+    return inspect_scene(parsed.scene, *options, _choice(parsed), log)
+
+
 def _downscale_of(resolution: int, scene: str, parsed: argparse.Namespace) -> int:
     """3DGS's -r as --downscale. Where it names a width, the least whole divisor that does not exceed it: pixels are averaged."""
     if resolution in (1, 2, 4, 8):
@@ -462,7 +513,7 @@ def _downscale_of(resolution: int, scene: str, parsed: argparse.Namespace) -> in
         raise LinprimError(f"-r is {resolution}, wanted 1, 2, 4, 8, a width in pixels, or -1")
     from .scene import load_scene
 
-    views = load_scene(scene, masks=parsed.masks or None, sparse=parsed.sparse or None).train
+    views = load_scene(scene, masks=getattr(parsed, "masks", None), sparse=getattr(parsed, "sparse", None)).train
     return -(-max(view.camera.width for view in views) // width)
 
 
@@ -537,6 +588,10 @@ def _synth(parsed: argparse.Namespace) -> dict:
         depth_format=parsed.depth_format,
         principal_point_offset=parsed.principal_point_offset,
         detail=parsed.detail,
+        exposure_drift=parsed.exposure_drift,
+        distortion=parsed.distortion,
+        specular=parsed.specular,
+        zoom=parsed.zoom,
         seed=parsed.seed,
         threads=parsed.threads,
         overwrite=parsed.overwrite,

@@ -133,6 +133,33 @@ def undistorted(lens: Lens, where: str = "camera") -> Intrinsics:
     return result
 
 
+def largest_displacement(lens: Lens) -> float:
+    """By how many pixels, at most, a lens puts a ray beside where the pinhole of its focal lengths and principal point would have it, over
+    the image; infinite where the lens does not show what that pinhole shows."""
+    if lens.is_pinhole:
+        return 0.0
+    camera = _camera(lens)
+    fx, fy, cx, cy = _pinhole_numbers(camera)
+    steps = np.linspace(0.0, 1.0, _CHECK_GRID)
+    x, y = np.meshgrid(steps * lens.width, steps * lens.height)
+    plain = np.stack([x.ravel(), y.ravel()], 1)
+    rays = np.concatenate([(plain - [cx, cy]) / [fx, fy], np.ones((len(plain), 1))], 1)
+    pixels = np.asarray(camera.img_from_cam(rays)).reshape(-1, 2)
+    if not np.isfinite(pixels).all():
+        return float("inf")
+    return float(np.linalg.norm(pixels - plain, axis=1).max())
+
+
+def straightened(lens: Lens, below: float) -> Lens:
+    """The pinhole that a lens nearly is, if it shifts no ray by `below` pixels; else the lens itself."""
+    known = model_parameter_counts()
+    if lens.is_pinhole or lens.model not in known or len(lens.params) != known[lens.model][1]:
+        return lens
+    if not largest_displacement(lens) < below:
+        return lens
+    return Lens("PINHOLE", lens.width, lens.height, _pinhole_numbers(_camera(lens)))
+
+
 @lru_cache(maxsize=64)
 def _undistorted(lens: Lens) -> Intrinsics:
     import pycolmap

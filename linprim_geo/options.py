@@ -73,6 +73,13 @@ def check_train_options(options: TrainOptions) -> None:
             )
 
 
+def initial_count(options: TrainOptions, share: float) -> int:
+    """Primitives at the start, `share` of the most there may be unless --initial-primitives says."""
+    return min(
+        options.max_primitives, options.initial_primitives or max(500, round(share * options.max_primitives))
+    )
+
+
 # Weights of the terms of geometry_terms.py.
 GEOMETRY_WEIGHTS = (
     "normal_consistency",
@@ -108,9 +115,13 @@ def raster_options(options: TrainOptions) -> dict:
 class SceneOptions:
     """How a capture is read."""
 
+    pinhole_below: float = option(
+        0.0, "lenses that shift no ray by as many pixels count as pinholes and are not undistorted", metavar="PX"
+    )
+
     downscale: int = option(1, "average K by K pixels into one", metavar="K")
     masks: str = option(
-        "", "folder of foreground masks, if they are not where data sets usually keep them", metavar="DIR"
+        "", "folder of foreground masks, if they are not where data sets usually keep them; none: no masks and no alpha", metavar="DIR"
     )
     sparse: str = option(
         "", "COLMAP model to take points from, if it is not where data sets usually keep it", metavar="DIR"
@@ -156,6 +167,16 @@ class TrainOptions:
     background: str = option(
         "auto",
         "auto, fitted, random, black, white, or r,g,b in [0,1]; auto: fitted before a plain backdrop, else random",
+    )
+    exposure: str = option(
+        "none",
+        "gain fits a factor per channel for every training photograph, of geometric mean 1; renders have the mean exposure",
+        choices=("none", "gain"),
+    )
+    scalar: str = option(
+        "float32",
+        "numbers that rendering computes in, in training too; parameters are kept in float32 either way",
+        choices=("float32", "float64"),
     )
     adam: str = option(
         "dense",

@@ -49,8 +49,10 @@ class Run:
         options: TrainOptions,
         similarity: Similarity,
         instruction_set: str = "",
+        effects: list[dict] | None = None,
     ) -> Run:
-        """Makes the folder and writes its configuration. `instruction_set` is noted because results depend on it in their last bits.
+        """Makes the folder and writes its configuration. `instruction_set` is noted because results depend on it in their last bits, and
+        `effects`, what was decided about the scene (`effects.Decision`), to be read.
 
         Raises:
             LinprimError: the folder exists and is not empty, or cannot be written.
@@ -67,6 +69,8 @@ class Run:
             "machine": platform.platform(),
             "instruction_set": instruction_set,
         }
+        if effects is not None:
+            config["effects"] = effects
         write_json(path / "config.json", config)
         write_json(
             path / "transform.json",
@@ -146,6 +150,7 @@ class Run:
             downscale=options.downscale,
             masks=options.masks or None,
             sparse=options.sparse or None,
+            pinhole_below=options.pinhole_below,
         ).with_training_views(options.views)
 
     @cached_property
@@ -213,7 +218,7 @@ class Run:
                     if geometry
                     else color
                 )
-            images = {"rgb": color.rgb.numpy(), "opacity": out.opacity.numpy()}
+            images = {"rgb": color.rgb.float().numpy(), "opacity": out.opacity.float().numpy()}
             if geometry:
                 unit = 1.0 / self.similarity.scale
                 opacity = np.maximum(images["opacity"], 1e-6)
@@ -249,16 +254,17 @@ class Run:
                 else:
                     out = ops.rasterize(*tensors, background, camera, level=level, geometry=True, **kind)
                     depth, opacity = out.depth_median, out.opacity
-            yield view, (depth.numpy() / self.similarity.scale).astype(np.float32), opacity.numpy()
+            yield view, (depth.numpy() / self.similarity.scale).astype(np.float32), opacity.float().numpy()
 
     def _tensors(self):
         """What `ops.rasterize` takes: tensors, background, keywords."""
         import torch
 
         primitives = self.training_primitives()
-        tensors = [torch.from_numpy(getattr(primitives, name)) for name in ARRAYS]
+        dtype = getattr(torch, self.train_options.scalar)
+        tensors = [torch.from_numpy(getattr(primitives, name)).to(dtype) for name in ARRAYS]
         how = raster_options(self.train_options) | {"primitive": primitives.kind}
-        return tensors, torch.tensor(self.background, dtype=torch.float32), how
+        return tensors, torch.tensor(self.background, dtype=torch.float32).to(dtype), how
 
 
 def to_data_set(primitives: Primitives, similarity: Similarity) -> Primitives:

@@ -17,7 +17,7 @@ import numpy as np
 from . import photos
 from .camera import Camera
 from .errors import LinprimError
-from .lens import Intrinsics, Lens, check_lens, undistorted
+from .lens import Intrinsics, Lens, check_lens, straightened, undistorted
 
 # Of the images sorted by name, those whose index is a multiple of this are held out if the data set does
 # not say.
@@ -216,6 +216,7 @@ def load_scene(
     masks: str | os.PathLike | None = None,
     sparse: str | os.PathLike | None = None,
     cache: str | os.PathLike | None = None,
+    pinhole_below: float = 0.0,
 ) -> Scene:
     """Reads a posed capture: `transforms*.json` (NeRF-synthetic, nerfstudio, instant-ngp), else a COLMAP
     model.
@@ -228,10 +229,13 @@ def load_scene(
     Args:
         path: the data set's folder, or a `.json` in it.
         downscale: average this many pixels squared into one; cameras are scaled exactly.
-        masks: folder of foreground masks named as the images; found by itself if it is `masks` or `mask`.
+        masks: folder of foreground masks named as the images; found by itself if it is `masks` or `mask`. With "none" neither masks
+            nor alpha channels are used.
         sparse: folder of the COLMAP model, if it is not `sparse/0`, `sparse`, `colmap/sparse/0` or the folder
             itself.
         cache: where undistorted images are kept, see `photos.cache_folder`.
+        pinhole_below: a lens that shifts no ray by this many pixels (of the averaged image) from where the pinhole of its focal lengths and
+            principal point has it is taken for that pinhole, and its photographs as they are.
 
     Raises:
         LinprimError: one sentence about the first thing that is missing, damaged or does not fit together.
@@ -242,7 +246,8 @@ def load_scene(
         raise LinprimError(f"downscale is {downscale}, wanted a whole number from 1")
     root, json_file = _root(Path(path))
     sparse_folder = _option_folder(sparse, root, "--sparse")
-    masks_folder = _option_folder(masks, root, "--masks")
+    unmasked = masks == "none"
+    masks_folder = None if unmasked else _option_folder(masks, root, "--masks")
     if json_file is not None or read_transforms.is_there(root):
         listing = read_transforms.read_transforms(root, json_file, sparse_folder)
     elif (model := read_colmap.find_model(root, sparse_folder)) is not None:
@@ -254,12 +259,18 @@ def load_scene(
         )
     if len(listing.frames) < 2:
         raise LinprimError(f"{root}: {len(listing.frames)} posed image found, wanted at least two")
-    frames = _with_masks(listing.frames, root, masks_folder)
+    frames = [replace(frame, mask_path=None) for frame in listing.frames]
+    if not unmasked:
+        frames = _with_masks(listing.frames, root, masks_folder)
     names = _names(frames)
     alphas = _header_checks(frames)
     has_alpha = any(frame.mask_path for frame in frames) or _alpha_says_something(frames, alphas)
+    has_alpha = has_alpha and not unmasked
     folder = photos.cache_folder(cache)
     pinholes: dict[Lens, Intrinsics] = {}
+    if pinhole_below > 0:
+        straight = {lens: straightened(lens, pinhole_below * downscale) for lens in {frame.lens for frame in frames}}
+        frames = [replace(frame, lens=straight[frame.lens]) for frame in frames]
     views = []
     for frame, name in zip(frames, names, strict=True):
         views.append(_view(frame, name, int(downscale), has_alpha, folder, pinholes))

@@ -19,7 +19,7 @@ from .errors import LinprimError
 from .files import write_json
 from .raycast import RayCaster
 from .shapes import SHAPES
-from .synth_points import sample_points, write_colmap, write_points
+from .synth_points import camera_rays, sample_points, write_colmap, write_points
 from .textured import TexturedMesh, load_textured
 
 RAYS_AT_ONCE = 16_384
@@ -28,6 +28,9 @@ RAYS_AT_ONCE = 16_384
 AMBIENT = 0.42
 LIGHTS = (((0.5, -0.35, 0.8), 0.48), ((-0.7, 0.6, 0.1), 0.22))
 """Light of `shaded`: ambient, and (direction towards the light, strength) of two lamps at infinity."""
+
+SHININESS = 12
+"""Phong's exponent of the highlights: wide enough for spherical harmonics of low degree to follow."""
 
 REFINE = 0.01
 """Edges of reference.ply in units of the diagonal: its vertices carry the colours."""
@@ -52,6 +55,10 @@ def synthesize(
     point_noise: float = 0.0,
     depth_format: str = "png",
     detail: float = 1.0,
+    exposure_drift: float = 0.0,
+    distortion: float = 0.0,
+    specular: float = 0.0,
+    zoom: float = 1.0,
     seed: int = 0,
     threads: int = 0,
     overwrite: bool = False,
@@ -93,7 +100,13 @@ def synthesize(
             points' error is their mean reprojection error in pixels.
         depth_format: `png` or `npy`.
         detail: contrast of the built-in texture's bands, blotches and grain.
-        seed: of the points, the noise and the inside-out path.
+        exposure_drift: every training photograph is multiplied by a gain per channel, exp of a uniform number within this of 0, the same
+            for the channels, and a quarter of it for each; the geometric mean over the photographs is 1 per channel, as the gain of the
+            held-out ones is. What exceeds white is cut, as in a camera. The gains are in `synth.json`.
+        distortion: k1 of OpenCV's radial distortion; images, depth, normals and masks are those of that lens.
+        specular: strength of highlights of the two lamps (Phong's, exponent 12), added to either shading.
+        zoom: every third camera has a focal length so many times as long.
+        seed: of the points, the noise, the gains and the inside-out path.
         threads: 0 uses every core; the files do not depend on it.
         overwrite: replace `out` if it was made by `synth` before.
 
@@ -116,6 +129,10 @@ def synthesize(
         shading=_choice("shading", shading, ("albedo", "shaded")),
         depth_format=_choice("depth_format", depth_format, ("png", "npy")),
         seed=_integer("seed", seed, 0),
+        exposure_drift=_number("exposure_drift", exposure_drift, 0.0, 2.0),
+        distortion=_number("distortion", distortion, -0.5, 0.5),
+        specular=_number("specular", specular, 0.0, 10.0),
+        zoom=_number("zoom", zoom, 0.1, 10.0),
     )
     surface = _surface(shape, mesh, detail)
     path = _choice("path", path or surface.path, campath.PATHS)
@@ -125,6 +142,8 @@ def synthesize(
     caster = RayCaster(surface.vertices, surface.faces, threads=workers)
     field = _number("fov", fov if fov is not None else (75.0 if inside else 45.0), 1.0, 170.0)
     train, test, distance = _cameras(surface, caster, options, path, field, distance, principal_point_offset)
+    train, test = (_zoomed(cameras, options.zoom) for cameras in (train, test))
+    gains = _gains(options)
 
     temporary = _prepare(out, overwrite)
     try:
@@ -137,7 +156,7 @@ def synthesize(
         }:
             (temporary / folder).mkdir(parents=True, exist_ok=True)
         single = _without_threads(caster)
-        renderer = _Renderer(surface, single, options, color, unit, masks, temporary)
+        renderer = _Renderer(surface, single, options, color, unit, masks, temporary, gains)
         with ThreadPoolExecutor(workers) as pool:
             covered = list(pool.map(lambda job: renderer.write(*job), jobs))
         cloud = sample_points(
@@ -148,8 +167,9 @@ def synthesize(
             count=options.points,
             noise=options.point_noise,
             seed=options.seed,
+            distortion=options.distortion,
         )
-        write_colmap(temporary / "sparse" / "0", train, cloud)
+        write_colmap(temporary / "sparse" / "0", train, cloud, options.distortion)
         write_points(temporary / "points3D.ply", cloud)
         _write_reference(temporary / "reference.ply", surface)
         shared = _shared_keys(train[0], unit, options, surface.unit)
@@ -177,6 +197,11 @@ def synthesize(
             "depth_format": options.depth_format,
             "depth_unit_scale_factor": unit,
             "detail": detail,
+            "exposure_drift": options.exposure_drift,
+            "gains": gains.tolist() if options.exposure_drift else [],
+            "distortion": options.distortion,
+            "specular": options.specular,
+            "zoom": options.zoom,
             "seed": options.seed,
             "faces": len(surface.faces),
             "diagonal": surface.diagonal,
@@ -206,6 +231,10 @@ class _Options:
     shading: str
     depth_format: str
     seed: int
+    exposure_drift: float
+    distortion: float
+    specular: float
+    zoom: float
 
 
 # What was asked for
@@ -263,6 +292,18 @@ def _surface(shape, mesh, detail) -> TexturedMesh:
     return SHAPES[_choice("shape", shape or "cad", tuple(SHAPES))](detail=detail)
 
 
+def _zoomed(cameras: list[Camera], zoom: float) -> list[Camera]:
+    """The cameras, every third one with `zoom` times the focal length."""
+    return [replace(c, fx=c.fx * zoom, fy=c.fy * zoom) if i % 3 == 1 else c for i, c in enumerate(cameras)]
+
+
+def _gains(options: _Options) -> np.ndarray:
+    """(views, 3) gains of the training photographs, of geometric mean 1 per channel."""
+    rng = np.random.default_rng([options.seed, 5])
+    log = rng.uniform(-1.0, 1.0, (options.views, 1)) + 0.25 * rng.uniform(-1.0, 1.0, (options.views, 3))
+    return np.exp(options.exposure_drift * (log - log.mean(0)))
+
+
 def _without_threads(caster: RayCaster) -> RayCaster:
     """The same caster without threads of its own, to be called from many, with its own counter."""
     single = object.__new__(RayCaster)
@@ -305,23 +346,25 @@ def _cameras(surface, caster, options, path, fov, distance, offset):
 class _Renderer:
     """Renders views and writes their files; `write` may run in several threads at once."""
 
-    def __init__(self, surface, caster, options, background, unit, masks, folder):
-        self.surface, self.caster, self.options = surface, caster, options
+    def __init__(self, surface, caster, options, background, unit, masks, folder, gains):
+        self.surface, self.caster, self.options, self.gains = surface, caster, options, gains
         self.background, self.unit, self.masks, self.folder = background, unit, masks, folder
         self.normals = caster.face_normals().astype(np.float32)
         self.center = surface.center
 
     def write(self, split: str, number: int, camera: Camera) -> float:
         """Renders one view into its files and returns the share of pixels that show the surface."""
-        depth, face, normal = self.caster.render_depth(camera)
+        depth, face, normal = self.render_depth(camera)
         color, alpha = self.render(camera)
+        gain = self.gains[number].astype(np.float32) if split == "train" else np.ones(3, np.float32)
         name = f"{split}/{number:03d}"
         coverage = _bytes(alpha)
         if self.background is None:
-            straight = color / np.maximum(alpha, 1e-6)[..., None]
+            straight = gain * color / np.maximum(alpha, 1e-6)[..., None]
             pixels = np.concatenate([_bytes(straight), coverage[..., None]], axis=2)
         else:
-            pixels = _bytes(color + (1.0 - alpha)[..., None] * np.array(self.background, dtype=np.float32))
+            shown = color + (1.0 - alpha)[..., None] * np.array(self.background, dtype=np.float32)
+            pixels = _bytes(gain * shown)
         _save_png(self.folder / f"{name}.png", pixels)
         _save_png(self.folder / self.masks / f"{name}.png", coverage)
         hit = face >= 0
@@ -345,20 +388,31 @@ class _Renderer:
         rotation = camera.rotation.astype(np.float32)
         rows_at_once = max(1, RAYS_AT_ONCE // width)
         steps = (np.arange(n) + 0.5) / n
-        columns = ((np.arange(width)[None, :] + steps[:, None] - camera.cx) / camera.fx).astype(np.float32)
+        columns = np.arange(width)[None, :] + steps[:, None]
         for top in range(0, height, rows_at_once):
             rows = np.arange(top, min(top + rows_at_once, height))
             part = slice(top * width, (rows[-1] + 1) * width)
             for step in steps:
-                y = ((rows + step - camera.cy) / camera.fy).astype(np.float32)
-                for x in columns:
-                    rays = np.ones((len(rows), width, 3), dtype=np.float32)
-                    rays[..., 0], rays[..., 1] = x[None, :], y[:, None]
+                for column in columns:
+                    rays = camera_rays(camera, column, rows + step, self.options.distortion).astype(np.float32)
                     seen, shades = self.shade(camera.center, rays.reshape(-1, 3) @ rotation)
                     color[part][seen] += shades
                     alpha[part][seen] += 1.0
         count = np.float32(1.0 / (n * n))
         return (color * count).reshape(height, width, 3), (alpha * count).reshape(height, width)
+
+    def render_depth(self, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """`RayCaster.render_depth` through the lens."""
+        if not self.options.distortion:
+            return self.caster.render_depth(camera)
+        columns, rows = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
+        rays = camera_rays(camera, columns, rows, self.options.distortion).reshape(-1, 3) @ camera.rotation
+        depth, face, _ = self.caster.cast(camera.center, rays)
+        normal = self.normals[face]
+        normal[(normal * rays).sum(1) > 0] *= -1.0
+        normal[face < 0] = 0.0
+        shape = (camera.height, camera.width)
+        return depth.reshape(shape), face.reshape(shape), normal.reshape(*shape, 3)
 
     def shade(self, origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Which rays (R, 3) hit, as indices (N,), and the colours (N, 3) float32 there."""
@@ -371,17 +425,25 @@ class _Renderer:
 
     def light(self, color: np.ndarray, face: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """The colours (N, 3) as seen along `direction` (N, 3) under the lamps of the chosen shading."""
-        if self.options.shading == "albedo":
+        shaded, specular = self.options.shading == "shaded", self.options.specular
+        if not shaded and not specular:
             return color
         normal = self.normals[face]
         away = np.einsum("nc,nc->n", normal, direction) > 0
         normal[away] *= -1.0
-        strength = np.full(len(face), AMBIENT, dtype=np.float32)
+        strength = np.full(len(face), AMBIENT if shaded else 1.0, dtype=np.float32)
+        highlight = np.zeros(len(face), dtype=np.float32)
+        if specular:
+            towards_eye = -direction / np.linalg.norm(direction, axis=1, keepdims=True)
+            mirrored = 2.0 * (normal * towards_eye).sum(1, keepdims=True) * normal - towards_eye
         for towards, power in LIGHTS:
             lamp = np.array(towards, dtype=np.float32)
             lamp /= np.linalg.norm(lamp)
-            strength += np.float32(power) * np.maximum(normal @ lamp, 0.0)
-        return np.minimum(color * strength[:, None], 1.0)
+            if shaded:
+                strength += np.float32(power) * np.maximum(normal @ lamp, 0.0)
+            if specular:
+                highlight += np.float32(specular * power) * np.maximum(mirrored @ lamp, 0.0) ** SHININESS
+        return np.minimum(color * strength[:, None] + highlight[:, None], 1.0).astype(np.float32)
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:
@@ -412,8 +474,9 @@ def _depth_unit(surface: TexturedMesh, cameras: list[Camera]) -> float:
 
 
 def _shared_keys(camera: Camera, unit: float, options: _Options, name_of_unit: str) -> dict:
+    lens = {"camera_model": "OPENCV", "k1": options.distortion} if options.distortion else {"camera_model": "PINHOLE"}
     return {
-        "camera_model": "PINHOLE",
+        **lens,
         "w": camera.width,
         "h": camera.height,
         "fl_x": camera.fx,
@@ -431,7 +494,9 @@ def _shared_keys(camera: Camera, unit: float, options: _Options, name_of_unit: s
 def _frame(split: str, number: int, camera: Camera, options: _Options) -> dict:
     name = f"{split}/{number:03d}"
     opengl = camera.camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])
+    zoomed = {"fl_x": camera.fx, "fl_y": camera.fy, "camera_angle_x": 2.0 * float(np.arctan(0.5 * camera.width / camera.fx))}
     return {
+        **(zoomed if options.zoom != 1 else {}),
         "file_path": f"{name}.png",
         "depth_file_path": f"depth/{name}.{options.depth_format}",
         "normal_file_path": f"normal/{name}.png",

@@ -12,6 +12,7 @@ import numpy as np
 
 from .camera import Camera
 from .campath import surface_samples
+from .errors import LinprimError
 from .raycast import RayCaster
 from .textured import TexturedMesh
 
@@ -48,6 +49,7 @@ def sample_points(
     count: int,
     noise: float,
     seed: int,
+    distortion: float = 0.0,
 ) -> Cloud:
     """Area-uniform surface points, each seen by at least three of the cameras (two if there are no more).
 
@@ -64,7 +66,7 @@ def sample_points(
             break
         batch = int(1.3 * (wanted - found)) + 64
         xyz, normal, face, bary = surface_samples(caster, batch, rng)
-        seen = np.stack([sees(caster, camera, xyz, normal) for camera in cameras], axis=1)
+        seen = np.stack([sees(caster, camera, xyz, normal, distortion) for camera in cameras], axis=1)
         keep = seen.sum(axis=1) >= needed
         batches.append((xyz[keep], normal[keep], face[keep], bary[keep], seen[keep]))
         found += int(keep.sum())
@@ -87,16 +89,49 @@ def sample_points(
     pixel, error = np.zeros((len(point), 2)), np.zeros(len(point))
     for number, camera in enumerate(cameras):
         rows = np.flatnonzero(image == number)
-        pixel[rows] = camera.project(xyz[point[rows]])[0]
-        error[rows] = np.linalg.norm(camera.project(given[point[rows]])[0] - pixel[rows], axis=1)
+        pixel[rows] = project(camera, xyz[point[rows]], distortion)[0]
+        error[rows] = np.linalg.norm(project(camera, given[point[rows]], distortion)[0] - pixel[rows], axis=1)
     total = np.bincount(point, weights=error, minlength=len(xyz))
     mean = (total / np.bincount(point, minlength=len(xyz))).astype(np.float32)
     return Cloud(given, (np.clip(color, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8), mean, point, image, pixel)
 
 
-def sees(caster: RayCaster, camera: Camera, xyz: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """(P,) bool: the point is in the picture, not hidden, and not at a grazing angle."""
+def project(camera: Camera, xyz: np.ndarray, distortion: float) -> tuple[np.ndarray, np.ndarray]:
+    """`Camera.project` through a lens of radial distortion k1: pixels (P, 2), depths (P,)."""
     pixel, depth = camera.project(xyz)
+    if not distortion:
+        return pixel, depth
+    focal, middle = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    plain = (pixel - middle) / focal
+    squared = (plain**2).sum(1, keepdims=True)
+    # Beyond the radius where it stops growing the lens folds over: nothing of that is in the picture.
+    folded = 1.0 + 3.0 * distortion * squared <= 0
+    return np.where(folded, np.nan, plain * (1.0 + distortion * squared) * focal + middle), depth
+
+
+def camera_rays(camera: Camera, columns: np.ndarray, rows: np.ndarray, distortion: float) -> np.ndarray:
+    """(len(rows), len(columns), 3) camera-space rays with z = 1 through positions in the image, through a lens of distortion k1.
+
+    Raises:
+        LinprimError: the lens folds over inside the image.
+    """
+    x, y = np.meshgrid((columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy)
+    scale = np.ones_like(x)
+    if distortion:
+        # r' = r (1 + k1 r^2), solved for r / r' by Newton's method.
+        squared = distortion * (x**2 + y**2)
+        if squared.min() < -4.0 / 27.0:
+            raise LinprimError(f"distortion is {distortion:g}, with which the lens folds over inside the image; a smaller one is wanted")
+        for _ in range(30):
+            scale -= (scale + squared * scale**3 - 1.0) / (1.0 + 3.0 * squared * scale**2)
+    return np.stack([x * scale, y * scale, np.ones_like(x)], axis=-1)
+
+
+def sees(
+    caster: RayCaster, camera: Camera, xyz: np.ndarray, normal: np.ndarray, distortion: float = 0.0
+) -> np.ndarray:
+    """(P,) bool: the point is in the picture, not hidden, and not at a grazing angle."""
+    pixel, depth = project(camera, xyz, distortion)
     towards = xyz - camera.center
     seen = depth > 0
     seen &= np.abs((towards * normal).sum(1)) > MIN_FACING * np.linalg.norm(towards, axis=1)
@@ -110,28 +145,36 @@ def sees(caster: RayCaster, camera: Camera, xyz: np.ndarray, normal: np.ndarray)
     return seen
 
 
-def write_colmap(folder: Path, cameras: list[Camera], cloud: Cloud) -> None:
+def write_colmap(folder: Path, cameras: list[Camera], cloud: Cloud, distortion: float = 0.0) -> None:
     """A COLMAP model (binary) of the training views, with the points and their observations."""
     import pycolmap
 
     folder.mkdir(parents=True)
     model = pycolmap.Reconstruction()
-    first = cameras[0]
-    params = [first.fx, first.fy, first.cx, first.cy]
-    lens = pycolmap.Camera(
-        camera_id=1,
-        model=pycolmap.CameraModelId.PINHOLE,
-        width=first.width,
-        height=first.height,
-        params=params,
-    )
-    model.add_camera_with_trivial_rig(lens)
+    numbers: dict[tuple, int] = {}
+    for camera in cameras:
+        params = (camera.fx, camera.fy, camera.cx, camera.cy, *([distortion, 0.0, 0.0, 0.0] if distortion else []))
+        if params in numbers:
+            continue
+        numbers[params] = len(numbers) + 1
+        lens = pycolmap.Camera(
+            camera_id=numbers[params],
+            model=pycolmap.CameraModelId.OPENCV if distortion else pycolmap.CameraModelId.PINHOLE,
+            width=camera.width,
+            height=camera.height,
+            params=list(params),
+        )
+        model.add_camera_with_trivial_rig(lens)
+    lens_of = {params[:4]: number for params, number in numbers.items()}
     slot = np.zeros(len(cloud.point), dtype=np.int64)
     for number, camera in enumerate(cameras):
         rows = np.flatnonzero(cloud.image == number)
         slot[rows] = np.arange(len(rows))
         image = pycolmap.Image(
-            name=f"train/{number:03d}.png", keypoints=cloud.pixel[rows], camera_id=1, image_id=number + 1
+            name=f"train/{number:03d}.png",
+            keypoints=cloud.pixel[rows],
+            camera_id=lens_of[(camera.fx, camera.fy, camera.cx, camera.cy)],
+            image_id=number + 1,
         )
         pose = pycolmap.Rigid3d(camera.world_to_camera[:3])
         model.add_image_with_trivial_frame(image, pose)

@@ -9,16 +9,19 @@ from __future__ import annotations
 import json
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from . import ops
+from .effects import Choice, Decision, decide, settle, summary
 from .errors import LinprimError
+from .evidence import observe
+from .exposure import with_best_gain
 from .files import atomic_write
 from .fill_points import fill_points
 from .geometry_terms import GeometryTerms, gather_evidence
@@ -30,7 +33,7 @@ from .initial_points import (
     scene_normalization,
     visual_hull_points,
 )
-from .options import GEOMETRY_WEIGHTS, SceneOptions, TrainOptions, check_train_options
+from .options import GEOMETRY_WEIGHTS, SceneOptions, TrainOptions, check_train_options, initial_count
 from .pacing import Pace, plan_run
 from .primitives import KINDS
 from .progress import Progress, duration, memory_gib
@@ -60,7 +63,7 @@ def with_points(scene: Scene, options: TrainOptions, log: Callable[[str], None])
 
     if scene.points is not None and len(scene.points.xyz):
         return scene
-    count = _initial_count(options, RANDOM_START)
+    count = initial_count(options, RANDOM_START)
     if scene.has_alpha:
         return replace(scene, points=visual_hull_points(scene, count, options.seed))
     try:
@@ -76,17 +79,45 @@ def with_points(scene: Scene, options: TrainOptions, log: Callable[[str], None])
 
 def initial_cloud(cloud: PointCloud, options: TrainOptions) -> PointCloud:
     """At most as many of the points as the population starts with, drawn without replacement."""
-    count = _initial_count(options, SFM_START)
+    count = initial_count(options, SFM_START)
     if len(cloud.xyz) <= count:
         return cloud
     keep = np.sort(np.random.default_rng([options.seed, 1]).choice(len(cloud.xyz), count, replace=False))
     return PointCloud(cloud.xyz[keep], cloud.rgb[keep])
 
 
-def _initial_count(options: TrainOptions, share: float) -> int:
-    return min(
-        options.max_primitives, options.initial_primitives or max(500, round(share * options.max_primitives))
-    )
+def decided_scene(
+    path: Path, scene_options: SceneOptions, options: TrainOptions, choice: Choice, log: Callable[[str], None]
+) -> tuple[list[Decision], Scene, SceneOptions, TrainOptions]:
+    """Reads a scene, decides about its effects, and reads it again if that changes how.
+
+    Returns: the decisions, the scene with points to start from, and both options with what was decided put in.
+    """
+
+    def read(how: SceneOptions) -> Scene:
+        loaded = load_scene(
+            path,
+            downscale=how.downscale,
+            masks=how.masks or None,
+            sparse=how.sparse or None,
+            pinhole_below=how.pinhole_below,
+        ).with_training_views(how.views)
+        return with_points(loaded, options, log)
+
+    if scene_options.views < 0:
+        raise LinprimError(f"--views is {scene_options.views}, wanted a number of training views, or 0 for all")
+    scene = read(scene_options)
+    if choice.mode == "none" and not choice.asked:
+        return [], scene, scene_options, options
+    decisions = decide(scene, scene_options, options, choice)
+    settled, options = settle(scene_options, options, decisions)
+    check_train_options(options)
+    distorted = any(view.lens is not None for view in scene.views)
+    if replace(settled, pinhole_below=scene_options.pinhole_below) != scene_options or (
+        distorted and settled.pinhole_below != scene_options.pinhole_below
+    ):
+        scene = read(settled)
+    return decisions, scene, settled, options
 
 
 def train(
@@ -98,6 +129,7 @@ def train(
     time_budget: Budget | float | None = None,
     resume: bool = False,
     quiet: bool = False,
+    effects: Choice | None = None,
 ) -> dict:
     """Trains a scene into a run folder.
 
@@ -109,7 +141,11 @@ def train(
     kept. When growth has ended the steps that are left are counted anew, once, from the pace so far. Both are in config.json under
     `time_budget`, so that a resumed run repeats them, with the seconds that the run took.
 
-    Returns: `run`, `iterations`, `seconds` (of training steps alone), `primitives`, `psnr` (mean over held-out views), `views`.
+    With `effects` the options that the scene calls for take the place of those that were not given (effects.py); without, all are taken as
+    they are. What was decided is in config.json, and a resumed run keeps it.
+
+    Returns: `run`, `iterations`, `seconds` (of training steps alone), `primitives`, `psnr` (mean over held-out views), `views`; with
+    `--exposure gain` also `psnr_gain`, each render times the gain per channel that brings it nearest to its photograph.
 
     Raises:
         LinprimError: the scene or an option cannot be used, or the folder exists already.
@@ -131,29 +167,31 @@ def train(
         ops.set_threads(options.threads)
         if resume:
             opened, loaded = _reopen(Path(scene), run_path, scene_options, options, progress)
-        else:
-            opened, loaded = _begin(Path(scene), run_path, scene_options, options, progress)
-        return _train(opened, loaded, _read_checkpoint(run_path) if resume else None, progress, budget)
+            return _train(opened, loaded, _read_checkpoint(run_path), progress)
+        opened, loaded, decisions = _begin(
+            Path(scene), run_path, scene_options, options, effects or Choice("none"), progress
+        )
+        return _train(opened, loaded, None, progress, decisions, budget)
     finally:
         torch.set_num_threads(before)
 
 
 def _begin(
-    scene: Path, run_path: Path, scene_options: SceneOptions, options: TrainOptions, progress: Progress
-) -> tuple[Run, Scene]:
-    """A new run, whose folder is not made yet, and its scene with points to start from."""
-    loaded = load_scene(
-        scene,
-        downscale=scene_options.downscale,
-        masks=scene_options.masks or None,
-        sparse=scene_options.sparse or None,
-    ).with_training_views(scene_options.views)
-    if scene_options.views < 0:
-        raise LinprimError(f"--views is {scene_options.views}, wanted a number of training views, or 0 for all")
+    scene: Path,
+    run_path: Path,
+    scene_options: SceneOptions,
+    options: TrainOptions,
+    effects: Choice,
+    progress: Progress,
+) -> tuple[Run, Scene, list[Decision]]:
+    """A new run, whose folder is not made yet, its scene with points to start from, and what was decided about its effects."""
     if run_path.exists() and (not run_path.is_dir() or any(run_path.iterdir())):
         raise LinprimError(f"{run_path}: exists already; give another folder with -o, or go on with --resume")
-    loaded = with_points(loaded, options, progress.note)
-    return Run(run_path, scene, scene_options, options, scene_normalization(loaded), loaded.unit), loaded
+    decisions, loaded, scene_options, options = decided_scene(scene, scene_options, options, effects, progress.note)
+    if decisions:
+        progress.note(summary(decisions))
+    run = Run(run_path, scene, scene_options, options, scene_normalization(loaded), loaded.unit)
+    return run, loaded, decisions
 
 
 def _reopen(
@@ -182,7 +220,14 @@ def _reopen(
     ), opened.scene()
 
 
-def _train(run: Run, scene: Scene, state: dict | None, progress: Progress, budget: Budget | None = None) -> dict:
+def _train(
+    run: Run,
+    scene: Scene,
+    state: dict | None,
+    progress: Progress,
+    decisions: Sequence[Decision] = (),
+    budget: Budget | None = None,
+) -> dict:
     """Trains from a checkpoint's `state`, or from the start: what is random does not depend on when a run was stopped."""
     options = run.train_options
     wanted = [name for name in GEOMETRY_WEIGHTS if getattr(options, name) > 0]
@@ -222,6 +267,7 @@ def _train(run: Run, scene: Scene, state: dict | None, progress: Progress, budge
             run.train_options,
             run.similarity,
             ops.instruction_set(),
+            [asdict(decision) for decision in decisions],
         )
         if pace:
             run.note("time_budget", pace.record)
@@ -235,7 +281,7 @@ def _train(run: Run, scene: Scene, state: dict | None, progress: Progress, budge
         f"{shots[0].camera.width}x{shots[0].camera.height}; {len(trainer)} primitives, {ops.instruction_set()}, {ops.threads()} threads"
     )
     held_out = load_shots(scene.test, run.similarity) if held_out is None else held_out
-    seconds, score = _loop(trainer, run, held_out, progress, pace)
+    seconds, score, score_gain = _loop(trainer, run, held_out, progress, pace)
     result = {
         "run": str(run.path),
         "iterations": trainer.step,
@@ -244,9 +290,12 @@ def _train(run: Run, scene: Scene, state: dict | None, progress: Progress, budge
         "psnr": score,
         "views": len(held_out),
     }
+    if trainer.exposure is not None:
+        result["psnr_gain"] = score_gain
     progress.note(
         f"{run.path}: {trainer.step} steps in {duration(seconds)}, {len(trainer)} primitives"
         + (f", held-out PSNR {score:.2f} dB over {len(held_out)} views" if held_out else "")
+        + (f", {score_gain:.2f} dB with the best gain of each" if held_out and score_gain is not None else "")
     )
     if pace:
         result["time_budget"] = pace.close(run, progress)
@@ -271,7 +320,7 @@ def _background(text: str, shots: list[Shot]) -> tuple[torch.Tensor, bool, bool]
     named = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
     has_alpha = shots[0].alpha is not None
     if text == "auto":
-        text = "fitted" if not has_alpha and _plain_backdrop(shots) else "random"
+        text = "fitted" if not has_alpha and plain_border(shots) > BACKDROP_SHARE else "random"
     if text == "random":
         shown = torch.ones(3) if has_alpha else torch.from_numpy(_mean_color(shots))
         return shown, False, True
@@ -294,10 +343,10 @@ def _border_colors(shots: list[Shot]) -> np.ndarray:
     return np.concatenate([edge.numpy().T for edge in edges]).astype(np.float64) / 255
 
 
-def _plain_backdrop(shots: list[Shot]) -> bool:
-    """Whether the outermost pixels of nearly all views have one colour."""
+def plain_border(shots: list[Shot]) -> float:
+    """Share of the outermost pixels of all views that lie near their median colour."""
     colors = _border_colors(shots)
-    return bool(np.mean(np.abs(colors - np.median(colors, 0)).max(1) < BACKDROP_TOLERANCE) > BACKDROP_SHARE)
+    return float(np.mean(np.abs(colors - np.median(colors, 0)).max(1) < BACKDROP_TOLERANCE))
 
 
 def _mean_color(shots: list[Shot]) -> np.ndarray:
@@ -328,7 +377,11 @@ def _start(scene: Scene, run: Run, shots: list[Shot], options: TrainOptions, sta
     parameters = initial_parameters(xyz, rgb, options.sh_degree, options.seed, bounds, options.primitive)
     if surface and parameters["log_extent"].shape[1] == 3:
         _lay_down(parameters, xyz, options.seed, bounds[0])
-    trainer = Trainer(shots, parameters, options, bounds, background, fitted, random_background)
+    log_gain = None
+    if options.exposure == "gain" and state is None:
+        seen = observe(scene, options.seed, views=len(shots))
+        log_gain = None if seen is None else seen.log_gains[0]
+    trainer = Trainer(shots, parameters, options, bounds, background, fitted, random_background, log_gain=log_gain)
     if state is not None:
         try:
             trainer.restore(state)
@@ -353,11 +406,12 @@ def _lay_down(parameters: dict[str, torch.Tensor], xyz: np.ndarray, seed: int, s
 
 def _loop(
     trainer: Trainer, run: Run, held_out: list[Shot], progress: Progress, pace: Pace | None = None
-) -> tuple[float, float | None]:
-    """Steps until the end; returns the seconds spent in steps and the final held-out PSNR."""
+) -> tuple[float, float | None, float | None]:
+    """Steps until the end; returns the seconds spent in steps, and the final held-out PSNR as rendered and with gains."""
     options = trainer.options
     _cut_metrics(run.path / "metrics.jsonl", trainer.step)
-    score, saved = None, -1
+    score = score_gain = None
+    saved = -1
     with open(run.path / "metrics.jsonl", "a") as log, _interrupt_flag() as interrupted:
         while trainer.step < trainer.iterations and not interrupted:
             if pace:
@@ -371,9 +425,9 @@ def _loop(
             last = trainer.step == trainer.iterations
             score = None
             if last or (options.evaluate_every and trainer.step % options.evaluate_every == 0):
-                score = evaluate(
-                    trainer, held_out if last else held_out[:: max(1, len(held_out) // QUICK_VIEWS)]
-                )
+                views = held_out if last else held_out[:: max(1, len(held_out) // QUICK_VIEWS)]
+                score = evaluate(trainer, views)
+                score_gain = None if trainer.exposure is None else evaluate(trainer, views, gains=True)
             if trainer.step % 100 == 0 or last or score is not None:
                 entry = {
                     "step": trainer.step,
@@ -385,6 +439,8 @@ def _loop(
                 }
                 if score is not None:
                     entry["psnr"] = round(score, 4)
+                    if score_gain is not None:
+                        entry["psnr_gain"] = round(score_gain, 4)
                     progress.note(
                         f"  step {trainer.step}: held-out PSNR {score:.2f} dB, {len(trainer)} primitives, {duration(trainer.seconds)}"
                     )
@@ -405,7 +461,10 @@ def _loop(
         if interrupted:
             progress.note(f"interrupted: {run.path} holds step {trainer.step}; go on with --resume")
             raise KeyboardInterrupt
-    return trainer.seconds, evaluate(trainer, held_out) if score is None else score
+    if score is None:
+        score = evaluate(trainer, held_out)
+        score_gain = None if trainer.exposure is None else evaluate(trainer, held_out, gains=True)
+    return trainer.seconds, score, score_gain
 
 
 def _cut_metrics(path: Path, step: int) -> None:
@@ -423,15 +482,22 @@ def _cut_metrics(path: Path, step: int) -> None:
         temporary.write_text("".join(kept))
 
 
-def evaluate(trainer: Trainer, shots: list[Shot]) -> float | None:
-    """Mean PSNR over views, renders clamped and rounded to 8 bits as saved images are; None without views."""
+def evaluate(trainer: Trainer, shots: list[Shot], gains: bool = False) -> float | None:
+    """Mean PSNR over views, renders clamped and rounded to 8 bits as saved images are; None without views.
+
+    With `gains` each render is first multiplied by the gain per channel that brings it nearest to its photograph: what a photograph of
+    unknown exposure can say about it.
+    """
     from .eval.images import psnr, to_8bit
 
     background = trainer.shown_background()
-    scores = [
-        psnr(to_8bit(trainer.render(shot.camera, background).numpy()), to_8bit(shot.over(background).numpy()))
-        for shot in shots
-    ]
+    scores = []
+    for shot in shots:
+        render, photo = trainer.render(shot.camera, background).numpy(), shot.over(background).numpy()
+        if gains:
+            alpha = None if shot.alpha is None else shot.alpha.numpy() / 255
+            render = with_best_gain(render.transpose(1, 2, 0), photo.transpose(1, 2, 0), alpha).transpose(2, 0, 1)
+        scores.append(psnr(to_8bit(render), to_8bit(photo)))
     return float(np.mean(scores)) if scores else None
 
 
@@ -482,8 +548,14 @@ def _save(trainer: Trainer, run: Run) -> None:
             "primitives": len(trainer),
             "background": [float(x) for x in trainer.shown_background()],
             "seconds": trainer.seconds,
-        },
+        }
+        | ({} if trainer.exposure is None else {"gains": _gains(trainer)}),
     )
+
+
+def _gains(trainer: Trainer) -> dict[str, list[float]]:
+    """{name of a training view: its gain per channel}."""
+    return {shot.name: gain.tolist() for shot, gain in zip(trainer.shots, trainer.exposure.gains, strict=True)}
 
 
 def _read_checkpoint(path: Path) -> dict | None:

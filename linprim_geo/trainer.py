@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ import torch
 from . import ops
 from .camera import Camera, Similarity
 from .errors import LinprimError
+from .exposure import Exposure, exposed
 from .geometry_terms import GeometryTerms
 from .options import TrainOptions, raster_options
 from .population import Control, GradientControl
@@ -180,6 +181,16 @@ def filter_lengths(center: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
     return torch.from_numpy((math.sqrt(FILTER_VARIANCE) / focal * least).astype(np.float32))
 
 
+def _single(out: ops.Rendering) -> ops.Rendering:
+    """The rendering in float32, in which the loss and the optimiser work."""
+    if out.rgb.dtype == torch.float32:
+        return out
+    planes = {field.name: getattr(out, field.name) for field in fields(out)}
+    return ops.Rendering(
+        **{name: v if v is None or not v.is_floating_point() else v.float() for name, v in planes.items()}
+    )
+
+
 class Trainer:
     """The state of a training and one step of it. `parameters`, `first` and `second` (Adam's moments) share their keys."""
 
@@ -193,7 +204,9 @@ class Trainer:
         fitted: bool,
         random_background: bool,
         terms: GeometryTerms | None = None,
+        log_gain: np.ndarray | None = None,
     ):
+        """`log_gain` (V, 3): where the gains of the photographs begin, with `--exposure gain`."""
         self.shots, self.options, self.bounds, self.terms = shots, options, bounds, terms
         self.parameters = dict(parameters)
         self.fitted, self.random_background = fitted, random_background
@@ -202,6 +215,7 @@ class Trainer:
             self.parameters["background"] = background
         self.first = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
         self.second = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
+        self.exposure = Exposure(len(shots), log_gain) if options.exposure == "gain" else None
         self.step = 0
         # (step, iterations): from this step on the run is to end after so many, what is left of its schedules stretched to fit.
         self.correction: tuple[int, int] | None = None
@@ -271,29 +285,42 @@ class Trainer:
             )
         target = shot.over(background.detach())
         leaves = {k: v.requires_grad_() for k, v in self.parameters.items()}
-        screen = torch.zeros(len(self), 3, requires_grad=True)
-        active = activate(leaves, self.degree, self.kind, self.filter_3d)
+        active = self._cast(activate(leaves, self.degree, self.kind, self.filter_3d))
+        screen = torch.zeros(len(self), 3, dtype=active[0].dtype, requires_grad=True)
+        (behind,) = self._cast((background,))
         terms = self.terms if self.has_reached(self.options.geometry_from) else None
         # Geometry has no average over the rays of a pixel: with several of them it is rendered by itself.
         shared = terms is not None and self.options.samples == 1
         how = {"stop": self.options.stop, **self.how_now()}
         samples = self.options.samples
-        out = ops.rasterize(*active, background, shot.camera, samples=samples, geometry=shared, screen=screen, **how)
-        parts = ops.photometric_loss(out.rgb, target, self.options.dssim)
+        out = _single(ops.rasterize(*active, behind, shot.camera, samples=samples, geometry=shared, screen=screen, **how))
+        shown, log_gain = out.rgb, None
+        if self.exposure is not None:
+            log_gain = self.exposure.row(index)
+            # A colour that was drawn, or that stands for what a mask left out, is not in the photograph.
+            drawn = self.random_background or shot.alpha is not None
+            rest = background[:, None, None] * (1 - out.opacity) if drawn else None
+            shown = exposed(out.rgb, log_gain, target, rest)
+        parts = ops.photometric_loss(shown, target, self.options.dssim)
         penalty = self.control.penalty(leaves)
         objective = parts[0] if penalty is None else parts[0] + penalty
         if terms is not None:
 
             def surface(camera: Camera, tensors: tuple[torch.Tensor, ...]) -> ops.Rendering:
-                return ops.rasterize(*tensors, background, camera, geometry=True, **how)
+                return _single(ops.rasterize(*tensors, behind, camera, geometry=True, **how))
 
             def depth_of(camera: Camera) -> torch.Tensor:
                 return surface(camera, tuple(tensor.detach() for tensor in active)).depth_median
 
             geometry = out if shared else surface(shot.camera, active)
             objective = objective + terms.loss(geometry, index, self.step, leaves["raw_opacity"], depth_of)
-        *grads, screen_grad = torch.autograd.grad(objective, [*leaves.values(), screen], allow_unused=True)
+        wanted = [*leaves.values(), screen] + ([] if log_gain is None else [log_gain])
+        grads = torch.autograd.grad(objective, wanted, allow_unused=True)
+        screen_grad = grads[len(leaves)].float()
         with torch.no_grad():
+            if log_gain is not None:
+                self.exposure.update(index, grads[-1], self.part())
+            grads = grads[: len(leaves)]
             # A penalty or a term on opacities reaches every primitive, whether the view touched it or not.
             touched = screen_grad[:, 2] > 0 if penalty is None and terms is None else None
             self._update(dict(zip(leaves, grads, strict=True)), touched)
@@ -374,15 +401,19 @@ class Trainer:
 
     @torch.no_grad()
     def render(self, camera: Camera, background: torch.Tensor) -> torch.Tensor:
-        """(3, H, W) colour of a camera in the training frame."""
+        """(3, H, W) colour of a camera in the training frame, at the photographs' mean exposure."""
+        active = activate(self.parameters, self.degree, self.kind, self.filter_3d)
         return ops.rasterize(
-            *activate(self.parameters, self.degree, self.kind, self.filter_3d),
-            background,
+            *self._cast((*active, background)),
             camera,
             stop=self.options.stop,
             samples=self.options.samples,
             **self.how,
-        ).rgb
+        ).rgb.float()
+
+    def _cast(self, tensors: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, ...]:
+        """What the kernels take: with `--scalar float64` the same numbers in double."""
+        return tuple(tensor.double() for tensor in tensors) if self.options.scalar == "float64" else tensors
 
     def shown_background(self) -> torch.Tensor:
         """(3,) the background that renders and scores use."""
@@ -409,7 +440,7 @@ class Trainer:
             "loss": self.loss,
             "psnr": self.psnr,
             "control": self.control.state(),
-        }
+        } | ({} if self.exposure is None else {"exposure": self.exposure.state()})
 
     def restore(self, state: dict) -> None:
         """Takes back what `state` returned."""
@@ -417,6 +448,8 @@ class Trainer:
             if set(state[name]) != set(getattr(self, name)):
                 raise ValueError(f"{name} has {sorted(state[name])}, wanted {sorted(getattr(self, name))}")
             setattr(self, name, dict(state[name]))
+        if self.exposure is not None:
+            self.exposure.restore(state["exposure"])
         self.step, self.steps, self.filter_3d = int(state["step"]), state["steps"], state["filter_3d"]
         if set(state["gathered"]) != set(self.control.NAMES):
             raise ValueError(f"gathered has {sorted(state['gathered'])}, wanted {sorted(self.control.NAMES)}")

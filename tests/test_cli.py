@@ -34,7 +34,7 @@ HEAVY = {
     "numpy",
 }
 COMMANDS = (
-    "train render extract-mesh eval-depth eval-images eval-mesh tradeoff synth convert doctor demo".split()
+    "train inspect render extract-mesh eval-depth eval-images eval-mesh tradeoff synth convert doctor demo".split()
 )  # fmt: skip
 
 
@@ -131,6 +131,8 @@ def test_train_gets_what_was_said(recorded_train, capsys):
     assert (scene, run, default_run) == ("data/lego", "out", os.path.join("runs", "lego"))
     assert scene_options == SceneOptions(downscale=4)
     assert train_options == TrainOptions(iterations=12)
+    choice = settings.pop("effects")
+    assert (choice.mode, choice.asked, choice.given) == ("none", {}, {"iterations", "downscale"})
     assert settings == {"resume": True, "quiet": True}
     assert "primitives: 7" in capsys.readouterr().out
 

@@ -1,0 +1,450 @@
+"""Which effects a scene calls for: for each one the evidence in the data, the threshold, what it costs, and the options that it stands for.
+
+Evidence comes from photographs, cameras, points and what else the data set brings, never from a reference surface. What cannot be told
+keeps its usual setting. An option that the user has given is never changed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from .errors import LinprimError
+from .evidence import Observations, observe
+from .initial_points import CAMERA_DISTANCE, VolumePoints, scene_normalization
+from .lens import largest_displacement
+from .options import SceneOptions, TrainOptions, initial_count
+from .primitives import KINDS
+from .scene import Scene
+from .trainer import SMALLEST_PX, initial_parameters, load_shots
+
+MODES = ("auto", "none", "all")
+# An effect that makes a step of training dearer by less than this costs nothing worth saving.
+FREE = 1.05
+# Points, and views, that are enough for what is measured on the primitives of the start.
+START_POINTS, START_VIEWS, START_PX = 4000, 3, 96
+# Depth maps may differ from the points' depths by this factor; beyond, their unit is another one.
+DEPTH_AGREES = 1.1
+
+
+class Data:
+    """A scene as the detectors see it: what they share is measured once."""
+
+    def __init__(self, scene: Scene, options: TrainOptions):
+        """`scene` with points to start from, as `train.with_points` gives."""
+        self.scene, self.options = scene, options
+
+    @cached_property
+    def observations(self) -> Observations | None:
+        """The scene's points in its photographs; None without points on surfaces."""
+        return observe(self.scene, self.options.seed)
+
+    @cached_property
+    def similarity(self):
+        """From the data set's frame to that of training."""
+        return scene_normalization(self.scene)
+
+    @cached_property
+    def start(self) -> tuple[np.ndarray, np.ndarray]:
+        """(N, 3) points in the training frame, as many as primitives at the start, and their mean distance to the three nearest."""
+        from scipy.spatial import cKDTree
+
+        xyz = self.scene.points.xyz
+        count = initial_count(self.options, 0.8)
+        if len(xyz) > count:
+            rng = np.random.default_rng([self.options.seed, 1])
+            xyz = xyz[np.sort(rng.choice(len(xyz), count, replace=False))]
+        xyz = self.similarity.apply(xyz)
+        near = cKDTree(xyz).query(xyz, k=min(4, len(xyz)))[0].reshape(len(xyz), -1)[:, 1:]
+        return xyz, near.mean(1) if near.shape[1] else np.full(len(xyz), CAMERA_DISTANCE)
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One entry of the registry.
+
+    `measure` returns a figure in `unit`, larger the more the effect is needed, or None where the data do not say; the effect is on from
+    `threshold` upwards. `cost` is the time of a training step with the effect by that without: for exact-rays and overlap from README's
+    prices, for the others an estimate. `on` and `off` are the options that it stands for. `needs` returns why a scene or the options rule
+    it out, "" if they do not.
+    """
+
+    name: str
+    what: str
+    evidence: str
+    unit: str
+    threshold: float
+    cost: float
+    measure: Callable[[Data], float | None]
+    on: dict[str, object]
+    off: dict[str, object]
+    usually: bool = False
+    needs: Callable[[Data], str] = field(default=lambda data: "")
+
+    @property
+    def options(self) -> set[str]:
+        """Names of the options that it stands for."""
+        return set(self.on) | set(self.off)
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What was decided about an effect and why: `reason` is one of REASONS. `options` are the settings that follow."""
+
+    name: str
+    what: str
+    evidence: str
+    value: float | None
+    unit: str
+    threshold: float
+    on: bool
+    reason: str
+    cost: float
+    options: dict[str, object]
+    note: str = ""
+
+
+REASONS = {
+    "data": "the data say so",
+    "free": "it costs nothing",
+    "unknown": "the data do not say; the usual setting",
+    "asked": "--effect asks for it",
+    "all": "--effects all",
+    "option": "the option was given",
+    "impossible": "the scene or the options rule it out",
+}
+
+
+@dataclass(frozen=True)
+class Choice:
+    """How effects are decided: `mode` "auto" by the data, "all" on, "none" left as the options are; `asked` {name: on} comes before
+    that, and `given`, names of options that the user has set, before everything."""
+
+    mode: str = "auto"
+    asked: dict[str, bool] = field(default_factory=dict)
+    given: frozenset[str] = frozenset()
+
+    def __post_init__(self):
+        if self.mode not in MODES:
+            raise LinprimError(f"--effects is {self.mode!r}, wanted one of {', '.join(MODES)}")
+        for name in self.asked:
+            if name not in EFFECTS:
+                raise LinprimError(f"--effect {name}: no such effect, wanted one of {', '.join(EFFECTS)}")
+
+
+def parse_asked(words: Iterable[str]) -> dict[str, bool]:
+    """{name: on} of words such as "exposure=on".
+
+    Raises:
+        LinprimError: not NAME=on or NAME=off, or an unknown name.
+    """
+    asked = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        if name not in EFFECTS:
+            raise LinprimError(f"--effect {word}: no effect {name!r}, wanted one of {', '.join(EFFECTS)}")
+        if value not in ("on", "off"):
+            raise LinprimError(f"--effect {word}: wanted {name}=on or {name}=off")
+        asked[name] = value == "on"
+    return asked
+
+
+def decide(scene: Scene, scene_options: SceneOptions, options: TrainOptions, choice: Choice) -> list[Decision]:
+    """What the registry says about a scene, in its order.
+
+    `scene` as `scene_options` read it but for `pinhole_below` 0, with points to start from. Takes seconds; the same at every call.
+    """
+    data = Data(scene, options)
+    decisions = []
+    for effect in EFFECTS.values():
+        if choice.mode == "none" and effect.name not in choice.asked:
+            continue
+        decisions.append(_decide(effect, data, {**vars(scene_options), **vars(options)}, choice))
+    return decisions
+
+
+def _decide(effect: Effect, data: Data, settings: dict, choice: Choice) -> Decision:
+    ruled_out = effect.needs(data)
+    value = None if ruled_out else effect.measure(data)
+    given = sorted(effect.options & choice.given)
+    note = ""
+    if given:
+        on = any(settings[name] != effect.off.get(name, settings[name]) for name in given)
+        reason = "option"
+        note = ", ".join(f"--{name.replace('_', '-')} {settings[name]}" for name in given)
+        if effect.name in choice.asked and choice.asked[effect.name] != on:
+            note += f" overrules --effect {effect.name}={'on' if choice.asked[effect.name] else 'off'}"
+    elif ruled_out:
+        on, reason, note = False, "impossible", ruled_out
+    elif effect.name in choice.asked:
+        on, reason = choice.asked[effect.name], "asked"
+    elif choice.mode == "all":
+        on, reason = True, "all"
+    elif value is None:
+        on, reason = effect.usually, "unknown"
+    elif effect.usually and effect.cost < FREE and value < effect.threshold:
+        on, reason = True, "free"
+    else:
+        on, reason = value >= effect.threshold, "data"
+    return Decision(
+        name=effect.name,
+        what=effect.what,
+        evidence=effect.evidence,
+        value=None if value is None else float(value),
+        unit=effect.unit,
+        threshold=effect.threshold,
+        on=bool(on),
+        reason=reason,
+        cost=effect.cost,
+        options={} if reason == "option" else dict(effect.on if on else effect.off),
+        note=note,
+    )
+
+
+def settle(
+    scene_options: SceneOptions, options: TrainOptions, decisions: Iterable[Decision]
+) -> tuple[SceneOptions, TrainOptions]:
+    """The options with what was decided put in."""
+    chosen: dict[str, object] = {}
+    for decision in decisions:
+        chosen |= decision.options
+    of_scene = {name: value for name, value in chosen.items() if name in vars(scene_options)}
+    of_training = {name: value for name, value in chosen.items() if name in vars(options)}
+    return replace(scene_options, **of_scene), replace(options, **of_training)
+
+
+def inspect_scene(path, scene_options: SceneOptions, options: TrainOptions, choice: Choice, log=None) -> dict:
+    """Reads a scene and decides: `effects`, a list of decisions as tables, `options` that follow from them, and a `_text` for people.
+
+    Raises:
+        LinprimError: the scene or an option cannot be used.
+    """
+    from .train import decided_scene
+
+    decisions, scene, scene_options, options = decided_scene(path, scene_options, options, choice, log or (lambda text: None))
+    chosen = {name: value for decision in decisions for name, value in decision.options.items()}
+    result = {
+        "scene": str(path),
+        "views": len(scene.train),
+        "held_out_views": len(scene.test),
+        "points": 0 if scene.points is None else len(scene.points.xyz),
+        "effects": [asdict(decision) for decision in decisions],
+        "options": chosen,
+    }
+    return result | {"_text": describe(decisions)}
+
+
+def describe(decisions: Iterable[Decision]) -> str:
+    """A block per effect: on or off and why, what it costs, and the evidence."""
+    lines = []
+    for d in decisions:
+        cost = "no time" if d.cost < FREE else f"about {d.cost:.2f} times the time of a step"
+        why = f"{REASONS[d.reason]}{': ' + d.note if d.note else ''}"
+        lines.append(f"{d.name:<15} {'on ' if d.on else 'off'}  {why}. Costs {cost}: {d.what}")
+        value = "not measured" if d.value is None else f"{d.value:.3g} {d.unit}"
+        lines.append(f"{'':<20}{d.evidence}: {value}; on from {d.threshold:g} {d.unit}")
+    return "\n".join(lines)
+
+
+def summary(decisions: Iterable[Decision]) -> str:
+    """One line for the log of a training."""
+    decisions = list(decisions)
+    shown = [f"{d.name} {'on' if d.on else 'off'}{' (as given)' if d.reason == 'option' else ''}" for d in decisions]
+    return "effects: " + ", ".join(shown)
+
+
+# Detectors
+
+
+def _view_dependence(data: Data) -> float | None:
+    found = data.observations
+    return None if found is None or found.view_dependence is None else 100 * found.view_dependence
+
+
+def _affine_error(data: Data) -> float | None:
+    """Of the primitives of the start, the 90th percentile over them and the views that they are in.
+
+    With z and u the depth and the image-plane position (x / z) of a centre, a point at distance e from it is drawn by the affine
+    approximation off by at most F (e / z)^2 (|u| + sqrt(1 + u^2)) / 2, to second order in e / z.
+    """
+    xyz, spacing = data.start
+    errors = []
+    for view in data.scene.train[:: max(1, len(data.scene.train) // 12)]:
+        camera = view.camera.transformed(data.similarity)
+        local = xyz @ camera.rotation.T + camera.world_to_camera[:3, 3]
+        x, y, z = local.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+            inside = (z > spacing) & (column > 0) & (column < camera.width) & (row > 0) & (row < camera.height)
+        if inside.any():
+            z, u = z[inside], np.hypot(x[inside], y[inside]) / z[inside]
+            errors.append(camera.fx * (spacing[inside] / z) ** 2 * (u + np.sqrt(1 + u * u)) / 2)
+    return float(np.percentile(np.concatenate(errors), 90)) if errors else None
+
+
+def _overlap_change(data: Data) -> float | None:
+    """Root mean square difference of a few small renderings of the start, blended by centres and by exact overlap."""
+    import torch
+
+    from . import ops
+    from .trainer import activate
+
+    xyz = data.start[0]
+    if len(xyz) < 4:
+        return None
+    rng = np.random.default_rng([data.options.seed, 12])
+    rows = np.sort(rng.choice(len(xyz), min(START_POINTS, len(xyz)), replace=False))
+    rgb = data.scene.points.rgb
+    rgb = rgb[np.linspace(0, len(rgb) - 1, len(rows)).astype(int)] if len(rgb) != len(xyz) else rgb[rows]
+    bounds = (1e-4, CAMERA_DISTANCE)
+    kind = data.options.primitive
+    tensors = activate(initial_parameters(xyz[rows], rgb, 0, data.options.seed, bounds, kind), 0, kind)
+    total = []
+    for view in data.scene.train[:: max(1, len(data.scene.train) // START_VIEWS)][:START_VIEWS]:
+        camera = view.camera.transformed(data.similarity)
+        scale = START_PX / max(camera.width, camera.height)
+        small = replace(
+            camera,
+            width=max(1, round(camera.width * scale)),
+            height=max(1, round(camera.height * scale)),
+            fx=camera.fx * scale,
+            fy=camera.fy * scale,
+            cx=camera.cx * scale,
+            cy=camera.cy * scale,
+        )
+        with torch.no_grad():
+            images = [
+                ops.rasterize(*tensors, torch.zeros(3), small, primitive=kind, order=order).rgb
+                for order in ("center", "overlap")
+            ]
+        total.append(float(((images[0] - images[1]) ** 2).mean()))
+    return 100 * math.sqrt(np.mean(total))
+
+
+def _no_entry(data: Data) -> str:
+    return "" if KINDS[data.options.primitive].solid else "a Gaussian has no place where a ray enters it"
+
+
+def _scale_ratio(data: Data) -> float | None:
+    return None if data.observations is None else data.observations.scale_ratio
+
+
+def _displacement(data: Data) -> float:
+    lenses = {(view.lens, view.downscale) for view in data.scene.views if view.lens is not None}
+    return max((largest_displacement(lens) / factor for lens, factor in lenses), default=0.0)
+
+
+def _gain_spread(data: Data) -> float | None:
+    found = data.observations
+    return None if found is None or found.gain_spread is None else 100 * found.gain_spread
+
+
+def _plain_border(data: Data) -> float:
+    from .train import plain_border
+
+    views = data.scene.train[:: max(1, len(data.scene.train) // 60)]
+    return 100 * plain_border(load_shots(views, data.similarity))
+
+
+def _masked(data: Data) -> str:
+    return "masks or alpha say what is background" if data.scene.has_alpha else ""
+
+
+def _share(data: Data, name: str) -> float:
+    return 100 * float(np.mean([getattr(view, name) not in (None, False) for view in data.scene.train]))
+
+
+def _depth_share(data: Data) -> float:
+    """Share of the views with depth; 0 where its unit is not that of the points."""
+    share = _share(data, "depth_path")
+    points = data.scene.points
+    if share == 0 or points is None or isinstance(points, VolumePoints):
+        return share
+    ratios = []
+    for view in [v for v in data.scene.train if v.depth_path is not None][:4]:
+        depth = view.load_depth()
+        pixels, along = view.camera.project(points.xyz)
+        with np.errstate(invalid="ignore"):
+            inside = (along > 0) & (pixels >= 0).all(1) & (pixels < [view.camera.width, view.camera.height]).all(1)
+        column, row = pixels[inside].astype(np.int64).T
+        there = depth[row, column] > 0
+        ratios.append(depth[row, column][there] / along[inside][there])
+    ratio = np.concatenate(ratios)
+    # Hidden points are behind what the map shows, so most ratios, but not all, are 1.
+    right = np.abs(np.log(ratio)) < math.log(DEPTH_AGREES) if len(ratio) else np.zeros(1)
+    return share if not len(ratio) or right.mean() > 0.2 else 0.0
+
+
+def _extent_ratio(data: Data) -> float:
+    centers = np.stack([view.camera.transformed(data.similarity).center for view in data.scene.train])
+    xyz = np.concatenate([data.start[0], centers])
+    focal = np.median([max(view.camera.fx, view.camera.fy) for view in data.scene.train])
+    return float(np.abs(xyz).max() / (SMALLEST_PX * CAMERA_DISTANCE / focal))
+
+
+def _absent(name: str, what: str) -> Callable[[Data], str]:
+    return lambda data: "" if _share(data, name) else f"the data set has no {what}"
+
+
+_REGISTRY = (
+    Effect(
+        "view-dependence", "colour that depends on the direction it is seen from",
+        "change of the points' colour that neighbouring points share", "% of white", 0.4, 1.15, _view_dependence,
+        {"sh_degree": 2}, {"sh_degree": 0}, usually=True,
+    ),
+    Effect(
+        "exact-rays", "exact perspective within a primitive, in place of LinPrim's affine approximation",
+        "bound on what the approximation shifts at the start", "px", 0.02, 1.02, _affine_error,
+        {"ray_model": "exact"}, {"ray_model": "affine"}, usually=True,
+    ),
+    Effect(
+        "overlap", "densities add up where primitives overlap, in place of blending by centres",
+        "change of the image of the start", "% of white", 10.0, 3.3, _overlap_change,
+        {"order": "overlap"}, {"order": "center"}, needs=_no_entry,
+    ),
+    Effect(
+        "filter", "primitives are at least a part of a pixel of their nearest view",
+        "largest by smallest pixel over the views that see a point; a quarter of the points exceed it", "times", 2.5, 1.02, _scale_ratio,
+        {"filter": "3d"}, {"filter": "none"},
+    ),
+    Effect(
+        "lens", "photographs are undistorted",
+        "largest shift of a ray by the lens", "px", 0.1, 1.0, _displacement,
+        {"pinhole_below": 0.0}, {"pinhole_below": 1e6},
+    ),
+    Effect(
+        "exposure", "a gain per channel for every training photograph",
+        "spread of how bright the photographs show the same points", "%", 3.0, 1.03, _gain_spread,
+        {"exposure": "gain"}, {"exposure": "none"},
+    ),
+    Effect(
+        "background", "one colour behind everything is fitted; without it a random one makes everything opaque",
+        "border pixels of one colour", "%", 80.0, 1.0, _plain_border,
+        {"background": "fitted"}, {"background": "random"}, needs=_masked,
+    ),
+    Effect(
+        "masks", "background that masks or alpha channels mark is kept out",
+        "training views with a mask or alpha", "%", 1.0, 1.0, lambda data: _share(data, "has_alpha"),
+        {}, {"masks": "none"}, needs=_absent("has_alpha", "masks and no alpha"),
+    ),
+    Effect(
+        "depth", "surfaces lie at the depths that the data set brings",
+        "training views with depth that agrees with the points", "%", 1.0, 1.3, _depth_share,
+        {"sensor_depth": 1.0}, {"sensor_depth": 0.0}, needs=_absent("depth_path", "depth"),
+    ),
+    Effect(
+        "normals", "faces point as the normals that the data set brings",
+        "training views with normals", "%", 1.0, 1.3, lambda data: _share(data, "normal_path"),
+        {"sensor_normals": 0.1}, {"sensor_normals": 0.0}, needs=_absent("normal_path", "normals whose axes are known"),
+    ),
+    Effect(
+        "double", "rendering in float64; parameters and the optimiser stay in float32",
+        "largest coordinate by the smallest primitive", "times", 5e5, 2.5, _extent_ratio,
+        {"scalar": "float64"}, {"scalar": "float32"},
+    ),
+)  # fmt: skip
+EFFECTS: dict[str, Effect] = {effect.name: effect for effect in _REGISTRY}

@@ -1,0 +1,262 @@
+"""Effects: what the detectors find in scenes with and without each of them, who decides, and what is written down."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from linprim_geo import cli
+from linprim_geo.effects import EFFECTS, Choice, Data, decide, inspect_scene, parse_asked, settle
+from linprim_geo.errors import LinprimError
+from linprim_geo.lens import Lens, largest_displacement, straightened
+from linprim_geo.options import SceneOptions, TrainOptions
+from linprim_geo.run import Run
+from linprim_geo.scene import load_scene
+from linprim_geo.synth import synthesize
+from linprim_geo.train import train
+
+SMALL = {"shape": "smooth", "shading": "shaded", "views": 30, "test_views": 2, "size": 80, "points": 3000, "supersample": 1, "detail": 0.4}
+SCENES = {
+    "plain": {},
+    "highlights": {"specular": 0.5},
+    "exposure": {"exposure_drift": 0.3},
+    "zoom": {"zoom": 4.0},
+    "lens": {"distortion": -0.1},
+    "slight": {"distortion": -1e-4},
+    "white": {"background": "white"},
+}
+OPTIONS = TrainOptions(max_primitives=500, threads=1)
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    """Makes scenes by name, each once."""
+    folder = tmp_path_factory.mktemp("effects")
+
+    def get(name):
+        if not (folder / name).exists():
+            synthesize(folder / name, **SMALL, **SCENES[name])
+        return folder / name
+
+    return get
+
+
+@pytest.fixture
+def own_points(monkeypatch):
+    """Trainings start from the scene's points alone: looking for more is slow, and no matter of effects."""
+    monkeypatch.setattr("linprim_geo.train.fill_points", lambda scene, *_: scene.points)
+
+
+def decisions(scene, choice=None, options=OPTIONS, scene_options=None):
+    loaded = load_scene(scene) if not hasattr(scene, "train") else scene
+    found = decide(loaded, scene_options or SceneOptions(), options, choice or Choice())
+    return {decision.name: decision for decision in found}
+
+
+def test_a_plain_scene_calls_for_what_its_files_bring_alone(scenes):
+    found = decisions(scenes("plain"))
+    assert list(found) == list(EFFECTS)
+    assert {name for name, d in found.items() if d.on} == {"exact-rays", "masks", "depth", "normals"}
+    assert found["background"].reason == "impossible" and found["background"].value is None
+    assert found["view-dependence"].value < 0.2 and found["exposure"].value < 0.5
+    assert 1 < found["filter"].value < 1.6 and found["lens"].value == 0
+    assert 10 < found["double"].value < 1e5
+
+
+@pytest.mark.parametrize(
+    ("scene", "name", "least"),
+    [("highlights", "view-dependence", 0.6), ("exposure", "exposure", 10), ("zoom", "filter", 3), ("lens", "lens", 0.4),
+     ("white", "background", 90)],
+)  # fmt: skip
+def test_each_effect_is_seen_where_it_is(scene, name, least, scenes):
+    found = decisions(scenes(scene))
+    assert found[name].on and found[name].value > least and found[name].reason == "data"
+    others = {"view-dependence", "exposure", "filter", "lens", "background", "overlap", "double"} - {name}
+    # Where too few points are seen often enough, the usual setting stays: that says nothing about the detector.
+    assert not [other for other in others if found[other].on and found[other].reason != "unknown"]
+    assert {**found[name].options} == dict(EFFECTS[name].on)
+
+
+def test_exposure_is_as_large_as_it_was_made(scenes):
+    gains = np.array(json.loads((scenes("exposure") / "synth.json").read_text())["gains"])
+    value = decisions(scenes("exposure"))["exposure"].value / 100
+    assert value == pytest.approx(np.log(gains).std(0).max(), rel=0.15)
+
+
+def test_points_that_say_nothing_leave_the_usual_setting(scenes):
+    loaded = load_scene(scenes("plain"))
+    from linprim_geo.initial_points import VolumePoints
+
+    anywhere = replace(loaded, points=VolumePoints(loaded.points.xyz, loaded.points.rgb))
+    found = decisions(anywhere)
+    for name, on in (("view-dependence", True), ("exposure", False), ("filter", False)):
+        assert (found[name].on, found[name].reason, found[name].value) == (on, "unknown", None)
+
+
+def test_depth_in_another_unit_is_not_used(scenes):
+    loaded = load_scene(scenes("plain"))
+    assert decisions(loaded)["depth"].value == 100
+    wrong = replace(loaded, train=tuple(replace(view, depth_scale=3 * view.depth_scale) for view in loaded.train))
+    assert not decisions(wrong)["depth"].on
+    without = replace(loaded, train=tuple(replace(view, depth_path=None) for view in loaded.train))
+    assert decisions(without)["depth"].reason == "impossible"
+    half = tuple(replace(view, depth_path=None) if i % 2 else view for i, view in enumerate(loaded.train))
+    assert decisions(replace(loaded, train=half))["depth"].value == 50
+
+
+def test_what_is_asked_comes_before_the_data_and_what_is_given_before_all(scenes):
+    options = replace(OPTIONS, sh_degree=3, order="overlap")
+    choice = Choice("auto", {"view-dependence": False, "filter": True}, frozenset({"sh_degree", "order"}))
+    found = decisions(scenes("plain"), choice, options)
+    assert (found["filter"].on, found["filter"].reason) == (True, "asked")
+    degree = found["view-dependence"]
+    assert (degree.on, degree.reason, degree.options) == (True, "option", {})
+    assert degree.note == "--sh-degree 3 overrules --effect view-dependence=off"
+    assert found["overlap"].on and found["overlap"].note == "--order overlap"
+    _, settled = settle(SceneOptions(), options, found.values())
+    assert (settled.sh_degree, settled.order, settled.filter, settled.exposure) == (3, "overlap", "3d", "none")
+    everything = decisions(scenes("plain"), Choice("all"))
+    assert {name for name, d in everything.items() if not d.on} == {"background"}
+    assert set(decisions(scenes("plain"), Choice("none", {"double": True}))) == {"double"}
+
+
+def test_a_gaussian_has_no_overlap(scenes):
+    found = decisions(scenes("plain"), Choice("all"), replace(OPTIONS, primitive="gaussian"))
+    assert (found["overlap"].on, found["overlap"].reason) == (False, "impossible")
+
+
+def test_the_affine_bound_bounds(scenes):
+    """A point that far from a centre is off by no more than the formula says, but for third order."""
+    rng = np.random.default_rng(0)
+    data = Data(load_scene(scenes("plain")), OPTIONS)
+    xyz, spacing = data.start
+    camera = data.scene.train[0].camera.transformed(data.similarity)
+    offset = rng.normal(size=xyz.shape)
+    offset *= (0.3 * spacing / np.linalg.norm(offset, axis=1))[:, None]
+    local = xyz @ camera.rotation.T + camera.world_to_camera[:3, 3]
+    z, u = local[:, 2:], local[:, :2] / local[:, 2:]
+    exact = (local + offset)[:, :2] / (local + offset)[:, 2:]
+    affine = u + (offset[:, :2] - u * offset[:, 2:]) / z
+    slope = np.linalg.norm(u, axis=1)
+    bound = (0.3 * spacing / z[:, 0]) ** 2 * (slope + np.sqrt(1 + slope**2)) / 2
+    ratio = np.linalg.norm(exact - affine, axis=1) / bound
+    assert ratio.max() < 1.1 and np.median(ratio) > 0.3
+
+
+def test_a_lens_that_is_nearly_a_pinhole_is_taken_for_one(scenes):
+    slight = load_scene(scenes("slight"))
+    assert all(view.lens is not None for view in slight.views)
+    found = decisions(slight)["lens"]
+    assert not found.on and 0 < found.value < 0.1
+    straight = load_scene(scenes("slight"), pinhole_below=0.1)
+    assert all(view.lens is None for view in straight.views)
+    plain, camera = load_scene(scenes("plain")).train[0].camera, straight.train[0].camera
+    assert (camera.width, camera.fx, camera.cx) == (80, pytest.approx(plain.fx), pytest.approx(plain.cx))
+    assert all(view.lens is not None for view in load_scene(scenes("lens"), pinhole_below=0.1).views)
+
+
+def test_the_shift_of_a_lens_is_that_of_its_corner():
+    lens = Lens("OPENCV", 200, 100, (100.0, 100.0, 100.0, 50.0, 0.1, 0.0, 0.0, 0.0))
+    radius = np.hypot(1.0, 0.5)
+    assert largest_displacement(lens) == pytest.approx(100 * 0.1 * radius**3)
+    assert largest_displacement(Lens("PINHOLE", 200, 100, (100.0, 100.0, 100.0, 50.0))) == 0
+    assert straightened(lens, 14.1) == Lens("PINHOLE", 200, 100, (100.0, 100.0, 100.0, 50.0))
+    assert straightened(lens, 13.9) is lens
+
+
+def test_the_lens_of_synth_is_opencvs(scenes):
+    """Undistorted by the reader, photographs and depth of the lens agree with those of the pinhole."""
+    bent, plain = load_scene(scenes("lens")).train[3], load_scene(scenes("plain")).train[3]
+    depth, truth = bent.load_depth(), plain.load_depth()
+    rays = bent.camera.ray_grid()[..., :2] * [plain.camera.fx, plain.camera.fy] + [plain.camera.cx, plain.camera.cy]
+    column, row = np.floor(rays).astype(int).transpose(2, 0, 1)
+    inside = (column >= 1) & (row >= 1) & (column < 79) & (row < 79)
+    both = inside & (depth > 0)
+    both[inside] &= truth[row[inside], column[inside]] > 0
+    assert both.sum() > 500
+    assert np.median(np.abs(depth[both] / truth[row[both], column[both]] - 1)) < 0.01
+    assert "k1" in (scenes("lens") / "transforms_train.json").read_text()
+
+
+def test_training_decides_records_and_resumes_by_it(scenes, tmp_path, own_points):
+    options = replace(OPTIONS, iterations=12, evaluate_every=0, checkpoint_every=6, max_primitives=100)
+    given = frozenset({"iterations", "max_primitives"})
+    train(scenes("exposure"), tmp_path / "run", options=options, quiet=True, effects=Choice("auto", {"normals": False}, given))
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    recorded = {entry["name"]: entry for entry in config["effects"]}
+    assert recorded["exposure"]["on"] and recorded["exposure"]["value"] > 10 and recorded["normals"]["reason"] == "asked"
+    chosen = Run.open(tmp_path / "run").train_options
+    assert (chosen.exposure, chosen.sh_degree, chosen.sensor_depth, chosen.sensor_normals) == ("gain", 0, 1.0, 0.0)
+    again = train(scenes("exposure"), tmp_path / "run", resume=True, quiet=True, effects=Choice("all"))
+    assert again["iterations"] == 12 and Run.open(tmp_path / "run").train_options == chosen
+    train(scenes("exposure"), tmp_path / "python", options=options, quiet=True)
+    assert Run.open(tmp_path / "python").train_options == options
+    assert json.loads((tmp_path / "python" / "config.json").read_text())["effects"] == []
+
+
+def test_masks_can_be_left_out(scenes):
+    assert load_scene(scenes("plain")).has_alpha
+    scene = load_scene(scenes("plain"), masks="none")
+    assert not scene.has_alpha and scene.train[0].load().alpha is None and scene.train[0].mask_path is None
+    found = decisions(scene)
+    assert found["masks"].reason == "impossible"
+
+
+def test_double_precision_renders_nearly_the_same(scenes, tmp_path, own_points):
+    options = replace(OPTIONS, iterations=6, max_primitives=60, evaluate_every=0)
+    for scalar in ("float32", "float64"):
+        train(scenes("plain"), tmp_path / scalar, options=replace(options, scalar=scalar), quiet=True)
+    one, other = (Run.open(tmp_path / scalar) for scalar in ("float32", "float64"))
+    tensors, background, _ = other._tensors()
+    assert str(tensors[0].dtype) == str(background.dtype) == "torch.float64"
+    view = one.scene().test[0]
+    images = [next(run.render_views([view]))[1] for run in (one, other)]
+    for name in images[0]:
+        assert images[1][name].dtype == np.float32
+    assert np.abs(images[0]["rgb"] - images[1]["rgb"]).max() < 0.02
+
+
+def test_inspect_prints_and_gives_json(scenes, capsys):
+    assert cli.main(["inspect", str(scenes("exposure")), "--max-primitives", "500", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert [entry["name"] for entry in report["effects"]] == list(EFFECTS)
+    assert report["options"]["exposure"] == "gain" and report["views"] == 30
+    result = inspect_scene(scenes("exposure"), SceneOptions(), OPTIONS, Choice())
+    for effect in EFFECTS.values():
+        assert effect.name in result["_text"] and effect.evidence in result["_text"]
+    assert "exposure        on   the data say so" in result["_text"]
+
+
+@pytest.mark.parametrize(
+    ("word", "sentence"),
+    [("glare=on", "no effect 'glare', wanted one of view-dependence, exact-rays"), ("exposure", "wanted exposure=on or exposure=off"),
+     ("exposure=yes", "wanted exposure=on or exposure=off"), ("=on", "no effect ''")],
+)  # fmt: skip
+def test_an_effect_that_makes_no_sense_is_refused(word, sentence, capsys, tmp_path):
+    with pytest.raises(LinprimError, match="--effect"):
+        parse_asked([word])
+    assert cli.main(["train", str(tmp_path), "--effect", word]) == 1
+    error = capsys.readouterr().err
+    assert sentence in error and error.count("\n") == 1
+
+
+def test_every_effect_names_options_that_exist():
+    known = {**vars(SceneOptions()), **vars(TrainOptions())}
+    for effect in EFFECTS.values():
+        assert effect.options <= set(known) and effect.off and effect.cost >= 1
+    with pytest.raises(LinprimError, match="wanted one of auto, none, all"):
+        Choice("some")
+    with pytest.raises(LinprimError, match="no such effect"):
+        Choice("auto", {"glare": True})
+
+
+def test_synth_without_effects_is_as_before(scenes, tmp_path):
+    """The switches, left alone, change no file."""
+    synthesize(tmp_path / "again", **SMALL, exposure_drift=0.0, distortion=0.0, specular=0.0, zoom=1.0)
+    for name in ("train/003.png", "depth/train/003.png", "normal/test/001.png", "transforms_train.json", "points3D.ply"):
+        assert (tmp_path / "again" / name).read_bytes() == (scenes("plain") / name).read_bytes()
+    shutil.rmtree(tmp_path / "again")
