@@ -16,6 +16,7 @@
 
 #include "linprim.h"
 #include "parallel.h"
+#include "segment_depth.h"
 
 namespace nb = nanobind;
 
@@ -196,11 +197,40 @@ void bind_real(nb::module_& m, const char* suffix) {
   });
 }
 
+template <class Real>
+void bind_tree(nb::class_<linprim::SolidTree>& tree) {
+  tree.def("__init__", [](linprim::SolidTree* self, int kind, In<Real> center, In<Real> rotation, In<Real> extent, In<Real> density) {
+    const int64_t n = center.ndim() ? int64_t(center.shape(0)) : 0;
+    if (n >= (int64_t(1) << 31)) throw std::invalid_argument("more than 2^31 primitives");
+    if (kind != int(linprim::PrimitiveKind::kOctahedron) && kind != int(linprim::PrimitiveKind::kTetrahedron))
+      throw std::invalid_argument("segments have an optical depth in octahedra and tetrahedra only");
+    const auto solid = linprim::PrimitiveKind(kind);
+    const int64_t extents = solid == linprim::PrimitiveKind::kTetrahedron ? 4 : 3;
+    const Real *c = checked(center, {n, 3}, "center"), *r = checked(rotation, {n, 4}, "rotation");
+    const Real *e = checked(extent, {n, extents}, "extent"), *d = checked(density, {n}, "density");
+    nb::gil_scoped_release release;
+    new (self) linprim::SolidTree(solid, n, c, r, e, d);
+  });
+}
+
 }  // namespace
 
 NB_MODULE(_core, m) {
   bind_real<float>(m, "f32");
   bind_real<double>(m, "f64");
+  auto tree = nb::class_<linprim::SolidTree>(m, "SolidTree");
+  bind_tree<float>(tree), bind_tree<double>(tree);
+  tree.def("__len__", &linprim::SolidTree::size);
+  tree.def("optical_depth", [](const linprim::SolidTree& self, In<double> origin, In<double> ends, std::optional<In<double>> begin, double most,
+                               Out<double> depth) {
+    const int64_t count = int64_t(depth.size());
+    const double *from = checked(origin, {3}, "origin"), *to = checked(ends, {count, 3}, "ends");
+    const double* start = begin ? checked(*begin, {count}, "begin") : nullptr;
+    double* sums = checked(depth, {count}, "depth");
+    if (!(most > 0)) throw std::invalid_argument("most has to be positive");
+    nb::gil_scoped_release release;
+    self.optical_depth(from, to, start, count, most, sums);
+  });
   m.def("photometric_loss", [](In<float> image, In<float> target, std::optional<In<float>> weight, float dssim, Out<float> gradient) {
     if (image.ndim() != 3) throw std::invalid_argument("image has to have shape (3, H, W)");
     const int64_t height = int64_t(image.shape(1)), width = int64_t(image.shape(2));

@@ -324,10 +324,9 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("extract-mesh", _extract_mesh, "extract a triangle mesh from a run")
     sub.add_argument("run", metavar="RUN", help="folder that train has made")
-    sub.add_argument(
-        "--method", choices=("tsdf", "polyhedra"), default="tsdf",
-        help="tsdf: fuse depth maps (default); polyhedra: unite the primitives, cut to the surface",
-    )
+    text = "tsdf: fuse depth maps (default); polyhedra: unite the primitives, cut back to the surface, closed and manifold;"
+    text += " opacity-field: where light stops reaching the cameras, closed and without a grid"
+    sub.add_argument("--method", choices=("tsdf", "polyhedra", "opacity-field"), default="tsdf", help=text)
     sub.add_argument(
         "-o", "--output", metavar="FILE", help=".ply .obj .glb .stl (default RUN/mesh/METHOD/mesh.ply)"
     )

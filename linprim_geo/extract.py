@@ -22,7 +22,11 @@ from .time_budget import Budget, choose_voxel
 from .visibility import visible_faces
 
 # Each is a function (run, options, stages) -> (mesh, statistics of its own), found when it is wanted: their libraries are large.
-METHODS = {"tsdf": "surface_tsdf.tsdf_surface", "polyhedra": "surface_polyhedra.polyhedra_surface"}
+METHODS = {
+    "tsdf": "surface_tsdf.tsdf_surface",
+    "polyhedra": "surface_polyhedra.polyhedra_surface",
+    "opacity-field": "surface_opacity.opacity_surface",
+}
 
 RANGES = {
     "level": (1e-6, 1 - 1e-6),
