@@ -250,7 +250,8 @@ def patch_consistency(
         again = point[:, :2] / point[:, 2:].clamp_min(1e-3) * focal + middle
         miss = torch.linalg.vector_norm(again - pixels - 0.5, dim=1)
         usable = usable & (back > 0) & (miss < ROUND_TRIP_PX)
-        usable = usable & (own.std(1, correction=0) > PLAIN) & (theirs.std(1, correction=0) > PLAIN)
+        for values in (own, theirs):
+            usable = usable & (torch.linalg.vector_norm(values - values.mean(1, keepdim=True), dim=1) > PATCH * PLAIN)
         weight = torch.where(usable, torch.exp(-miss), torch.zeros_like(miss))
     own, theirs = own - own.mean(1, keepdim=True), theirs - theirs.mean(1, keepdim=True)
     scale = torch.linalg.vector_norm(own, dim=1) * torch.linalg.vector_norm(theirs, dim=1)

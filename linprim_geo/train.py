@@ -308,7 +308,10 @@ def _terms(run: Run, scene: Scene, shots: list[Shot], progress: Progress) -> Geo
     if not any(getattr(options, name) > 0 for name in GEOMETRY_WEIGHTS):
         return None
     evidence = gather_evidence(scene, options, run.similarity, progress.note)
-    return GeometryTerms(options, shots, evidence, run.similarity.apply(scene.points.xyz))
+    terms = GeometryTerms(options, shots, evidence, run.similarity.apply(scene.points.xyz))
+    if terms.sources is not None and not any(terms.sources):
+        progress.note("--patches: no two views see the same places from angles that suit it, so it does nothing")
+    return terms
 
 
 def _background(text: str, shots: list[Shot]) -> tuple[torch.Tensor, bool, bool]:

@@ -198,11 +198,26 @@ def test_without_weights_the_renderer_is_not_asked_for_geometry(tiny_scene, opti
     assert asked[:20] == [False] * 10 + [True] * 10
 
 
-@pytest.mark.parametrize("name", GEOMETRY_WEIGHTS)
+@pytest.mark.parametrize("name", [name for name in GEOMETRY_WEIGHTS if name != "patches"])
 def test_every_term_changes_the_run(name, tiny_scene, options, plain, tmp_path):
     found = trained(tiny_scene, tmp_path / "run", replace(options, **{name: 1.0}))
     assert len(found) == len(plain) and not np.array_equal(found.center, plain.center)
     assert all(np.isfinite(getattr(found, key)).all() for key in ("center", "extent", "density"))
+
+
+def test_patches_change_a_run_of_views_that_overlap_and_say_when_none_do(tiny_scene, options, plain, tmp_path, capsys):
+    from linprim_geo.synth import synthesize
+    from linprim_geo.train import train
+
+    synthesize(tmp_path / "scene", shape="smooth", views=30, test_views=2, size=48, points=300, supersample=1)
+    found = [trained(tmp_path / "scene", tmp_path / f"{weight}", replace(options, patches=weight)) for weight in (0.0, 1.0)]
+    assert not np.array_equal(found[0].center, found[1].center)
+    # The tiny scene's views are too far apart from each other.
+    train(tiny_scene, tmp_path / "far", options=replace(options, patches=1.0))
+    assert "--patches: no two views see the same places" in capsys.readouterr().err
+    from linprim_geo.run import Run
+
+    assert np.array_equal(Run.open(tmp_path / "far").training_primitives().center, plain.center)
 
 
 def test_a_run_with_every_term_resumes_to_the_last_bit(tiny_scene, options, tmp_path):
@@ -224,7 +239,7 @@ def test_a_run_with_every_term_resumes_to_the_last_bit(tiny_scene, options, tmp_
 def test_sensor_depth_brings_the_surface_to_it(tiny_scene, options, tmp_path):
     from linprim_geo.eval.depth import eval_depth_run
 
-    longer = replace(options, iterations=300)
+    longer = replace(options, iterations=300, geometry_from=0.1)
     trained(tiny_scene, tmp_path / "plain", longer)
     trained(tiny_scene, tmp_path / "depth", replace(longer, sensor_depth=2.0))
     errors = {name: eval_depth_run(tmp_path / name)["abs_rel"] for name in ("plain", "depth")}
