@@ -871,7 +871,7 @@ def test_the_newest_checkpoint_is_kept_when_its_number_gets_a_digit_more(tiny_ru
     octahedra = Run.open(tiny_run).training_primitives()
 
     class Late:
-        parameters, step, state, options, seconds = {}, 1_000_000, dict, QUICK, 0.0
+        parameters, step, iterations, state, options, seconds, exposure = {}, 1_000_000, 1_000_000, dict, QUICK, 0.0, None
         primitives, shown_background, __len__ = lambda _: octahedra, lambda _: torch.zeros(3), lambda _: 1
 
     training._save(Late(), Run.open(run_copy))
