@@ -14,6 +14,7 @@ from .camera import Camera
 from .geometry_terms import source_views
 from .run import Run
 from .scene import Photo
+from .visibility import bilinear
 
 LEVELS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 # What is taken where photographs do not say: plain ones, or too few views of the same places. The middle of what is best over scenes.
@@ -83,9 +84,9 @@ def color_differences(
         pixels = np.where(inside[:, None], pixels, 1.0)
         there = other_depth[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
         seen &= inside & (there > 0) & (np.abs(there - z) < SAME_SURFACE * np.abs(z))
-        colors, opaque = _bilinear(other_photo, pixels - 0.5)
-        seen &= opaque
-        found.append(np.minimum(np.abs(colors - own).mean(1), LARGEST_DIFFERENCE))
+        if other_photo.alpha is not None:
+            seen &= bilinear(other_photo.alpha[..., None], pixels.T)[:, 0] > 254.5  # opaque, all four pixels around
+        found.append(np.minimum(np.abs(bilinear(other_photo.rgb, pixels.T) - own).mean(1), LARGEST_DIFFERENCE))
     return np.stack(found)[:, seen]
 
 
@@ -96,17 +97,3 @@ def least_of(places: Sequence[float], values: np.ndarray) -> float:
         return float(places[k])
     a, b, _ = np.polyfit(places[k - 1 : k + 2], values[k - 1 : k + 2], 2)
     return float(-b / (2 * a)) if a > 0 else float(places[k])
-
-
-def _bilinear(photo: Photo, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(P, 3) float32 colours at (P, 2) positions, pixel centres at whole numbers, and whether all four pixels are opaque."""
-    column, row = np.floor(pixels).astype(np.int64).T
-    across, down = (pixels - np.floor(pixels)).astype(np.float32).T[:, :, None]
-    c = photo.rgb
-    top = c[row, column] * (1 - across) + c[row, column + 1] * across
-    bottom = c[row + 1, column] * (1 - across) + c[row + 1, column + 1] * across
-    opaque = np.ones(len(row), dtype=bool)
-    if photo.alpha is not None:
-        for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            opaque &= photo.alpha[row + i, column + j] == 255
-    return top * (1 - down) + bottom * down, opaque

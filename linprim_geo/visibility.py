@@ -203,7 +203,7 @@ def _samples(camera, image, depth, near, far, points, normals, slack):
     slope = np.maximum(slack, step) + step * np.sqrt(1.0 / np.maximum(facing, LEAST_FACING) ** 2 - 1.0)
     visible = z <= depth[i, j] + slope
     poor = (far[i, j] - near[i, j] > 4.0 * slope) | (z > near[i, j] + 2.0 * slope) | (facing < LEAST_FACING)
-    color = _bilinear(image, pixels)
+    color = bilinear(image, pixels)
     if image.shape[2] == 4:
         alpha = color[:, 3] / np.float32(255.0)
         visible &= alpha >= 0.5
@@ -224,7 +224,7 @@ def _keep_best(best, shade, rows, weight, color):
         best[rows[here], k], shade[rows[here], k] = weight[here], color[here]
 
 
-def _bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+def bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """(P, C) float32 colours, 0 to 255, at (2, P) pixel positions."""
     scale = 1.0 if image.dtype == np.uint8 else 255.0
     height, width = image.shape[:2]
