@@ -282,7 +282,8 @@ void backward_overlap(const RasterParams<typename Solid::Real>& P, int tile, voi
             if constexpr (kGeometry) {
               const V from = select(V::set(-kNever<Real>) < now, now - origin, zero), p0 = from * fma(from, g2, g1), p1 = fma(from + from, g2, g1);
               bulk = fma(p0, X[0], fma(p1, X[1], g2 * X[2]));
-              front = fma(sigma, fma(p0, X[1], fma(p1, X[2], g2 * X[3])), front);
+              // Density first: a factor of depth times the cube of a length of 1e12 would leave single precision.
+              front = fma(p0, sigma * X[1], fma(p1, sigma * X[2], fma(g2, sigma * X[3], front)));
               crossing = steps & (v_level < t) & (v_level >= after);
               const V inside = log(select(crossing, t * V::set(Real(1 / view.level)), V::set(1))) * V::load(state.geo[S::kSlowness] + at);
               before_median = select(crossed < V::set(Real(0.5)), select(crossing, min(inside, length_here), length_here), zero);

@@ -433,3 +433,16 @@ def test_the_number_of_threads_changes_no_bit(rung, dtype, seed, threads):
         ops.set_threads(count)
         results.append(everything(parameters, view, **options))
     assert_identical(*results)
+
+
+def test_the_distortion_of_a_length_of_1e12_has_a_finite_gradient():
+    pose = np.eye(4)
+    pose[:3] = [[0.2375, 0.9251, -0.2964, 0.4593], [0.9511, -0.1594, 0.2647, -1.8639], [0.1977, -0.3448, -0.9176, 0.0787]]
+    view = Camera(4, 4, 86.0239, 82.3206, 153.2871, -79.6595, pose)
+    rows = ([[239230.375, 152163.4375, -1350907.875]], [[-0.7587, -0.9164, 0.1832, -0.441]], [[1.2543e25, 1.0934e28, 1.7432e36]])
+    values = [torch.tensor(row, requires_grad=True) for row in (*rows, [1.1603e-17], [[[0.2104, 0.328, 0.5226]]])]
+    out = ops.rasterize(*values, torch.zeros(3), view, order="overlap", geometry=True, stop=0.0)
+    cotangent = torch.linspace(-1, 1, out.distortion.numel()).view_as(out.distortion)
+    gradients = torch.autograd.grad(out.distortion, values, cotangent, allow_unused=True)
+    assert float(out.distortion.max()) > 1e12
+    assert all(bool(torch.isfinite(g).all()) for g in gradients if g is not None) and float(gradients[3].abs()) > 0
