@@ -256,7 +256,11 @@ def test_a_reader_that_goes_away_is_no_traceback():
 def test_ctrl_c_is_one_sentence():
     code = run_with_convert("print('ready', flush=True); time.sleep(30)")
     process = subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell's background job ignores it
     )
     assert process.stdout.readline() == "ready\n"
     process.send_signal(signal.SIGINT)
