@@ -38,7 +38,7 @@ from linprim_geo.eval import hard_cases, many_scenes
 from linprim_geo.eval.many_scenes import PARAMETERS, Scenes
 
 SCALARS = {"float32": torch.float32, "float64": torch.float64}
-BOUND = 1.25  # times the rounding of `many_scenes.rounding`; the worst of 10,000 rays of each class was 1.09
+BOUND = 1.0  # times the rounding of `many_scenes.rounding`
 CLOSE, SHARE_CLOSE = 1e-3, 0.999
 RESOLUTION = 16
 FACES_TIED = 4  # faces that meet in a vertex of an octahedron

@@ -17,7 +17,7 @@ from torch import Tensor
 from .camera import Camera, Similarity
 from .initial_points import VolumePoints
 from .ops import Rendering
-from .options import TrainOptions
+from .options import GEOMETRY_WEIGHTS, TrainOptions
 from .scene import Scene
 
 # Depths that miss a point or a measured depth by more than this share of it count as much as this: they belong to another surface.
@@ -48,15 +48,17 @@ class Evidence:
 
 
 class GeometryTerms:
-    """The weighted sum of the terms for a view at a step; `wanted` says whether any has a weight."""
+    """The weighted sum of the terms for a view at a step. `needs_geometry` says whether one looks at the renderer's."""
 
     def __init__(self, options: TrainOptions, shots: list, evidence: list[Evidence], points: np.ndarray):
         """`shots` as the trainer has them, an `evidence` each; `points` (P, 3) of the scene in the training frame."""
         self.options, self.shots, self.evidence = options, shots, evidence
         self.sources = source_views([shot.camera for shot in shots], points) if options.patches > 0 else None
+        self.needs_geometry = any(getattr(options, name) > 0 for name in GEOMETRY_WEIGHTS if name != "binarisation")
 
     def loss(self, out: Rendering, index: int, step: int, raw_opacity: Tensor, render_depth) -> Tensor:
-        """Scalar. `out` is the rendering of view `index` with geometry; `render_depth(camera)` gives the (H, W) depth of another view."""
+        """Scalar. `out` is the rendering of view `index`, with its geometry where that is needed; `render_depth(camera)` gives the (H, W)
+        depth of another view."""
         o, shot, evidence = self.options, self.shots[index], self.evidence[index]
         total = raw_opacity.new_zeros(())
         if o.binarisation > 0:
@@ -87,12 +89,12 @@ class GeometryTerms:
 
 def gather_evidence(scene: Scene, options: TrainOptions, similarity: Similarity, log: Callable[[str], None]) -> list[Evidence]:
     """What the terms in use need of each training view. A term that finds nothing of its kind is named by `log`."""
-    points, weight = None, None
+    points = certainty = None
     if options.point_depth > 0 and not isinstance(scene.points, VolumePoints):
         points = similarity.apply(scene.points.xyz)
-        weight = np.ones(len(points))
+        certainty = np.ones(len(points))
         if scene.points.error_px is not None:
-            weight = 1 / (1 + (scene.points.error_px / max(float(np.median(scene.points.error_px)), 1e-6)) ** 2)
+            certainty = 1 / (1 + (scene.points.error_px / max(float(np.median(scene.points.error_px)), 1e-6)) ** 2)
     gathered = []
     for view in scene.train:
         depth = view.load_depth() if options.sensor_depth > 0 else None
@@ -104,7 +106,7 @@ def gather_evidence(scene: Scene, options: TrainOptions, similarity: Similarity,
             inside, pixels, along = visible_pixels(view.camera.transformed(similarity), points)
             found["pixels"] = torch.from_numpy(pixels)
             found["point_depth"] = torch.from_numpy(along.astype(np.float32))
-            found["point_weight"] = torch.from_numpy(weight[inside].astype(np.float32))
+            found["point_weight"] = torch.from_numpy(certainty[inside].astype(np.float32))
         gathered.append(Evidence(**found))
     for weight, name, what in (
         (options.point_depth, "pixels", "--point-depth: the scene has no points on surfaces"),

@@ -15,12 +15,15 @@ def duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{whole % 60:02d}" if hours else f"{minutes}:{whole % 60:02d}"
 
 
-def memory_gib() -> float:
-    """Resident memory of this process in GiB; 0 where the system does not tell."""
+def memory_gib(entry: str = "VmRSS") -> float:
+    """Resident memory of this process in GiB; 0 where the system does not tell.
+
+    `entry` of Linux's /proc/self/status: VmRSS now, VmHWM the most since the peak was last forgotten; elsewhere the most ever.
+    """
     try:
         with open("/proc/self/status") as status:
             for line in status:
-                if line.startswith("VmRSS:"):
+                if line.startswith(entry + ":"):
                     return int(line.split()[1]) / 2**20
     except OSError:
         pass

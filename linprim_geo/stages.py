@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from .progress import Progress, peak_memory_gib
+from .progress import Progress, memory_gib
 
 
 class Stages:
@@ -25,7 +25,7 @@ class Stages:
         """Ends the stage `name`: its seconds, and the largest resident memory of this process during it (0 where unknown)."""
         now = time.perf_counter()
         self.seconds[name] = round(self.seconds.get(name, 0.0) + now - self._begin, 3)
-        self.peak_gib[name] = round(max(self.peak_gib.get(name, 0.0), _peak_gib()), 3)
+        self.peak_gib[name] = round(max(self.peak_gib.get(name, 0.0), memory_gib("VmHWM")), 3)
         self._begin = now
         _forget_peak()
 
@@ -49,14 +49,3 @@ def _forget_peak() -> None:
             file.write("5")
     except OSError:
         pass
-
-
-def _peak_gib() -> float:
-    try:
-        with open("/proc/self/status") as status:
-            for line in status:
-                if line.startswith("VmHWM:"):
-                    return int(line.split()[1]) / 2**20
-    except OSError:
-        pass
-    return peak_memory_gib()

@@ -290,7 +290,8 @@ class Trainer:
         (behind,) = self._cast((background,))
         terms = self.terms if self.has_reached(self.options.geometry_from) else None
         # Geometry has no average over the rays of a pixel: with several of them it is rendered by itself.
-        shared = terms is not None and self.options.samples == 1
+        needed = terms is not None and terms.needs_geometry
+        shared = needed and self.options.samples == 1
         how = {"stop": self.options.stop, **self.how_now()}
         samples = self.options.samples
         out = _single(ops.rasterize(*active, behind, shot.camera, samples=samples, geometry=shared, screen=screen, **how))
@@ -312,7 +313,7 @@ class Trainer:
             def depth_of(camera: Camera) -> torch.Tensor:
                 return surface(camera, tuple(tensor.detach() for tensor in active)).depth_median
 
-            geometry = out if shared else surface(shot.camera, active)
+            geometry = surface(shot.camera, active) if needed and not shared else out
             objective = objective + terms.loss(geometry, index, self.step, leaves["raw_opacity"], depth_of)
         wanted = [*leaves.values(), screen] + ([] if log_gain is None else [log_gain])
         grads = torch.autograd.grad(objective, wanted, allow_unused=True)

@@ -196,6 +196,9 @@ def test_without_weights_the_renderer_is_not_asked_for_geometry(tiny_scene, opti
     asked.clear()
     trained(tiny_scene, tmp_path / "late", replace(options, iterations=20, distortion=1.0))
     assert asked[:20] == [False] * 10 + [True] * 10
+    asked.clear()
+    trained(tiny_scene, tmp_path / "opaque", replace(options, iterations=20, binarisation=1.0))  # looks at opacities alone
+    assert asked and not any(asked[:20])
 
 
 @pytest.mark.parametrize("name", [name for name in GEOMETRY_WEIGHTS if name != "patches"])
