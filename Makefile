@@ -2,11 +2,13 @@
 # make test   environment, then the tests                                    (make test PYTEST="-k mesh")
 # make env    the environment alone, in .venv                                (make env PYTHON=/path/to/python3.12)
 # make lint   the linter
+# make browser-check   a report and a view in a headless Chromium (make browser-check PAGE=runs/demo/report.html)
 # Nothing is done again unless what it depends on has changed.
 
 PYTHON ?=
 DEMO ?=
 PYTEST ?=
+PAGE ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -14,7 +16,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3
 CORE := CMakeLists.txt csrc $(wildcard csrc/*)
 
-.PHONY: env demo test lint clean
+.PHONY: env demo test lint browser-check clean
 
 demo: env
 	$(BIN)/python -m linprim_geo demo $(DEMO)
@@ -24,6 +26,9 @@ test: env
 
 lint: env
 	$(BIN)/ruff check .
+
+browser-check: env
+	$(BIN)/python tools/browser_check.py $(PAGE)
 
 env: $(VENV)/.core
 

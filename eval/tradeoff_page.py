@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from html import escape
 
+from linprim_geo import svg
 from linprim_geo.eval.knobs import ERRORS, Knob
+from linprim_geo.svg import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Axis
 
-WIDTH, HEIGHT = 560, 340
-LEFT, RIGHT, TOP, BOTTOM = 74, 24, 30, 52
 # Labels: pixels of a letter, and of a line.
 LETTER, LINE = 6.4, 13
 STYLE = """
@@ -21,7 +20,6 @@ th, td { padding: 0.25em 0.7em; text-align: right; border-bottom: 1px solid #e6e
 th:first-child, td:first-child { text-align: left; }
 tr.on td:first-child { font-weight: 600; color: #1f63b2; }
 p.verdict { font-weight: 600; } .small { color: #59636e; font-size: 0.86em; }
-svg text { font: 11px system-ui, sans-serif; fill: #1b1f24; }
 """
 
 
@@ -30,7 +28,7 @@ def page(results: dict, knobs: dict[str, Knob]) -> str:
     about = results["about"]
     parts = [
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/><title>What accuracy costs in time</title>',
-        f"<style>{STYLE}</style></head><body><h1>What accuracy costs in time</h1>",
+        f"<style>{STYLE}{svg.STYLE}</style></head><body><h1>What accuracy costs in time</h1>",
         f'<p class="small">Scene {escape(about["scene"])}, {about["options"]["iterations"]} steps and {about["options"]["max_primitives"]} '
         f"primitives where a knob does not say otherwise; {about['rounds']} rounds, load {about['load']:.1f} on {about['cores']} cores. "
         "Times are medians with their quartiles; blue points lie on the frontier, which no other setting beats in both time and error; a "
@@ -83,22 +81,8 @@ def plot(rows: Sequence[dict], error: str) -> str:
     x_axis = Axis([row["low"] for row in rows] + [row["high"] for row in rows], LEFT, WIDTH - RIGHT)
     y_axis = Axis(values, HEIGHT - BOTTOM, TOP)
     what = ERRORS[error]
-    out = [
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" height="{HEIGHT}" role="img">',
-        f'<rect x="{LEFT}" y="{TOP}" width="{WIDTH - LEFT - RIGHT}" height="{HEIGHT - TOP - BOTTOM}" fill="#fafbfc" stroke="#c8ced6"/>',
-    ]
-    for value in x_axis.ticks():
-        x = x_axis.at(value)
-        out.append(f'<line x1="{x:.1f}" x2="{x:.1f}" y1="{TOP}" y2="{HEIGHT - BOTTOM}" stroke="#e3e7ec"/>')
-        out.append(f'<text x="{x:.1f}" y="{HEIGHT - BOTTOM + 16}" text-anchor="middle">{_tick(value)}</text>')
-    for value in y_axis.ticks():
-        y = y_axis.at(value)
-        out.append(f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}" stroke="#e3e7ec"/>')
-        out.append(f'<text x="{LEFT - 7}" y="{y + 4:.1f}" text-anchor="end">{_tick(value)}</text>')
-    out.append(f'<text x="{(LEFT + WIDTH - RIGHT) / 2}" y="{HEIGHT - 12}" text-anchor="middle">seconds</text>')
     label = what.title + (f", {what.unit}" if what.unit else "")
-    middle = (TOP + HEIGHT - BOTTOM) / 2
-    out.append(f'<text x="15" y="{middle}" text-anchor="middle" transform="rotate(-90 15 {middle})">{escape(label)}</text>')
+    out = svg.frame(x_axis, y_axis, "seconds", label, f"{label} over seconds")
     places = [(x_axis.at(row["seconds"]), y_axis.at(value)) for row, value in zip(rows, values, strict=True)]
     on = sorted((place for place, row in zip(places, rows, strict=True) if row["frontier"]), key=lambda p: p[0])
     if on:
@@ -124,30 +108,6 @@ def plot(rows: Sequence[dict], error: str) -> str:
     return "".join(out) + "</svg>"
 
 
-class Axis:
-    """A logarithmic axis over positive values, from pixel `start` to pixel `end`."""
-
-    def __init__(self, values: Sequence[float], start: float, end: float):
-        low, high = min(values), max(values)
-        room = max(0.15 * math.log10(high / low), 0.06)
-        self.low, self.high = math.log10(low) - room, math.log10(high) + room
-        self.start, self.end = start, end
-
-    def at(self, value: float) -> float:
-        """The pixel of a value."""
-        return self.start + (self.end - self.start) * (math.log10(value) - self.low) / (self.high - self.low)
-
-    def ticks(self) -> list[float]:
-        """Three to seven round values, or fewer of a short axis."""
-        decades = range(math.floor(self.low), math.ceil(self.high) + 1)
-        for steps in ((1,), (1, 3), (1, 2, 5), (1, 1.5, 2, 3, 4, 5, 6, 8), tuple(1 + k / 10 for k in range(90))):
-            found = [step * 10.0**decade for decade in decades for step in steps]
-            found = [value for value in found if self.low <= math.log10(value) <= self.high]
-            if len(found) >= 3:
-                break
-        return found[:: -(-len(found) // 7) or 1]
-
-
 def _free_place(x: float, y: float, width: float, boxes: Sequence[tuple[float, float, float, float]]) -> tuple[float, float]:
     """Left and top of a label near a point, where it covers the least of other labels and points, and stays inside."""
     middle = y - LINE / 2
@@ -165,10 +125,6 @@ def _free_place(x: float, y: float, width: float, boxes: Sequence[tuple[float, f
         )
 
     return min(places, key=covered)
-
-
-def _tick(value: float) -> str:
-    return f"{value:g}" if 1e-3 <= value < 1e5 else f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e")
 
 
 def _short(value: float | None) -> str:

@@ -304,6 +304,7 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--quiet", action="store_true", help="no progress")
     text = "choose steps and primitives so that everything takes this long, by what a step costs here; one of the two may be given"
     sub.add_argument("--time-budget", type=_seconds, metavar="TIME", help=text)
+    sub.add_argument("--view", action="store_true", help="show the run in a browser meanwhile, as linprim-geo view RUN --follow does")
     resolution = "as in 3DGS: divide the size by 1, 2, 4 or 8, or a width to go down to; -1: to 1600 if it is more"
     sub.add_argument("-r", "--resolution", type=int, metavar="K", help=resolution)
     sub.add_argument("--eval", action="store_true", help="accepted as in 3DGS: views are always held out")
@@ -379,6 +380,20 @@ def build_parser() -> argparse.ArgumentParser:
     tnt.add_argument("--scene", metavar="NAME", help="Barn, Truck, ...: sets the threshold")
     tnt.add_argument("--crop", metavar="FILE", help="crop volume, .json")
     tnt.add_argument("--transform", metavar="FILE", help="4x4 matrix as text, takes MESH to REFERENCE")
+
+    sub = command("report", _report, "write one self-contained HTML page about a run")
+    sub.add_argument("run", metavar="RUN", help="folder that train has made")
+    sub.add_argument("-o", "--output", metavar="FILE", help="page to write (default RUN/report.html)")
+    text = "mesh in the data set's frame to score depth and meshes against (default: what RUN/eval holds, and the data set's depth)"
+    sub.add_argument("--reference", metavar="MESH", help=text)
+
+    sub = command("view", _view, "show a run in a browser: primitives, meshes, cameras")
+    sub.add_argument("run", metavar="RUN", help="folder that train has made")
+    sub.add_argument("--follow", action="store_true", help="wait for a run's first save, and show every save and mesh as it comes")
+    sub.add_argument("--reference", metavar="MESH", help="mesh in the data set's frame, for the true error of meshes")
+    text = "port on this machine, which alone can reach it (default 8080; 0: any that is free)"
+    sub.add_argument("--port", type=_whole, default=8080, metavar="N", help=text)
+    sub.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
 
     sub = command("tradeoff", _tradeoff, "sweep every knob that trades time for accuracy: tables, plots, and a sentence for each")
     sub.add_argument("scene", metavar="SCENE", help="folder with a COLMAP model or transforms*.json")
@@ -471,16 +486,23 @@ def _train(parsed: argparse.Namespace) -> dict:
         parsed.downscale = _downscale_of(parsed.resolution, scene, parsed)
     from .train import train
 
-    return train(
-        scene,
-        parsed.run or Path("runs") / Path(scene).resolve().name,
-        from_args(SceneOptions, parsed),
-        from_args(TrainOptions, parsed),
-        resume=parsed.resume,
-        quiet=parsed.quiet,
-        effects=_choice(parsed),
-        **budget,
-    )
+    run = parsed.run or Path("runs") / Path(scene).resolve().name
+    shown = contextlib.nullcontext()
+    if parsed.view:
+        from .view import watched
+
+        shown = watched(run)
+    with shown:
+        return train(
+            scene,
+            run,
+            from_args(SceneOptions, parsed),
+            from_args(TrainOptions, parsed),
+            resume=parsed.resume,
+            quiet=parsed.quiet,
+            effects=_choice(parsed),
+            **budget,
+        )
 
 
 def _budget(parsed: argparse.Namespace) -> dict:
@@ -549,6 +571,19 @@ def _eval_mesh(parsed: argparse.Namespace) -> dict:
 
     chosen = {k: v for k, v in vars(parsed).items() if k not in ("handler", "command", "json", "debug")}
     return eval_mesh_files(chosen.pop("mesh"), chosen.pop("reference"), **chosen)
+
+
+def _report(parsed: argparse.Namespace) -> dict:
+    from .report import report_run
+
+    made = report_run(parsed.run, parsed.output, parsed.reference)
+    return made | {"_text": "\n".join([f"{made['report']}: {made['bytes'] / 2**20:.1f} MiB", *made["missing"]])}
+
+
+def _view(parsed: argparse.Namespace) -> dict:
+    from .view import view_run
+
+    return view_run(parsed.run, parsed.port, browser=parsed.browser, follow=parsed.follow, reference=parsed.reference)
 
 
 def _tradeoff(parsed: argparse.Namespace) -> dict:

@@ -15,7 +15,7 @@ SIZES = {"small": (40, 160, 1500, 2000), "normal": (60, 320, 7000, 5000)}
 
 
 def run_demo(output: str = "runs/demo", size: str = "normal") -> dict:
-    """Makes OUTPUT/scene (images, depth, reference mesh) and OUTPUT/run (trained, meshed, scored) and prints the scores.
+    """Makes OUTPUT/scene (images, depth, reference mesh), OUTPUT/run (trained, meshed, scored) and OUTPUT/report.html, prints the scores.
 
     Replaces what an earlier demo left in `output`; any other folder there is refused.
 
@@ -26,6 +26,7 @@ def run_demo(output: str = "runs/demo", size: str = "normal") -> dict:
     from .eval.mesh import eval_mesh_files
     from .extract import extract_mesh
     from .render import render_run
+    from .report import report_run
     from .synth import synthesize
     from .train import train
 
@@ -38,25 +39,27 @@ def run_demo(output: str = "runs/demo", size: str = "normal") -> dict:
             )
         shutil.rmtree(root)
     write_json(marker, {"size": size})
-    print(f"1/5 photographing the built-in part: {views} views of {pixels}x{pixels}", file=sys.stderr)
+    print(f"1/6 photographing the built-in part: {views} views of {pixels}x{pixels}", file=sys.stderr)
     scene, run = root / "scene", root / "run"
     synthesize(scene, shape="cad", views=views, test_views=12, size=pixels, path="sphere")
-    print("2/5 training", file=sys.stderr)
+    print("2/6 training", file=sys.stderr)
     trained = train(
         scene,
         run,
         SceneOptions(),
         TrainOptions(iterations=iterations, max_primitives=primitives, sh_degree=0, samples=2),
     )
-    print("3/5 rendering held-out views", file=sys.stderr)
+    print("3/6 rendering held-out views", file=sys.stderr)
     render_run(run, quiet=True)
-    print("4/5 extracting the surface", file=sys.stderr)
+    print("4/6 extracting the surface", file=sys.stderr)
     stats = extract_mesh(run, options=ExtractOptions())
-    print("5/5 scoring against the exact mesh", file=sys.stderr)
+    print("5/6 scoring against the exact mesh", file=sys.stderr)
     reference = scene / "reference.ply"
     images = eval_images_run(run)
     depth = eval_depth_run(run, reference)
     mesh = eval_mesh_files(stats["mesh"], reference, run=run)
+    print("6/6 writing the report", file=sys.stderr)
+    report = report_run(run, root / "report.html")
     result = {
         "psnr": images["psnr"],
         "ssim": images["ssim"],
@@ -70,6 +73,7 @@ def run_demo(output: str = "runs/demo", size: str = "normal") -> dict:
         "mesh": stats["mesh"],
         "renders": str(run / "renders"),
         "reference": str(reference),
+        "report": report["report"],
     }
     write_json(marker, {"size": size, **result})
     result["_text"] = (
@@ -77,6 +81,7 @@ def run_demo(output: str = "runs/demo", size: str = "normal") -> dict:
         f"depth AbsRel {depth['abs_rel']:.4f}, normals {depth['normal_mean_deg']:.1f} degrees off\n"
         f"mesh: Chamfer {mesh['chamfer_percent_diagonal']:.3f} % of the diagonal, F1 {mesh['f1']:.3f} at 1 %; "
         f"{trained['primitives']} primitives, {trained['seconds']:.0f} s of training\n\n"
+        f"all of it on one page: {report['report']}\n"
         f"open {stats['mesh']} and {reference} in MeshLab; pictures are in {run / 'renders'}, figures in {run / 'eval'}"
     )
     return result

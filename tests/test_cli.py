@@ -32,9 +32,10 @@ HEAVY = {
     "scipy",
     "PIL",
     "numpy",
+    "viser",
 }
 COMMANDS = (
-    "train inspect render extract-mesh eval-depth eval-images eval-mesh tradeoff synth convert doctor demo".split()
+    "train inspect render extract-mesh eval-depth eval-images eval-mesh report view tradeoff synth convert doctor demo".split()
 )  # fmt: skip
 
 
@@ -300,6 +301,8 @@ PASSED_ON = {
     "render run": ("render.render_run", {}),
     "extract-mesh run": ("extract.extract_mesh", {}),
     "eval-depth run": ("eval.depth.eval_depth_run", {}),
+    "report run": ("report.report_run", {}),
+    "view run": ("view.view_run", {}),
     "eval-images run": ("eval.images.eval_images_run", {}),
     "eval-mesh a b": (
         "eval.mesh.eval_mesh_files",

@@ -31,17 +31,17 @@ def test_the_demo_makes_a_scored_mesh_and_a_second_one_replaces_it(tiny_size, tm
     root = tmp_path / "demo"
     first = demo.run_demo(str(root), "small")
     shown = capsys.readouterr()
-    assert shown.out == "" and [line[:3] for line in shown.err.splitlines() if line[1:3] == "/5"] == [
-        f"{i}/5" for i in range(1, 6)
+    assert shown.out == "" and [line[:3] for line in shown.err.splitlines() if line[1:3] == "/6"] == [
+        f"{i}/6" for i in range(1, 7)
     ]
     assert all(math.isfinite(first[name]) for name in SCORES)
     assert first["psnr"] > 15 and first["chamfer_percent_diagonal"] < 10 and first["primitives"] <= 120
     for file in (
         "scene/reference.ply", "run/mesh/tsdf/mesh.ply", "run/mesh/tsdf/mesh_visible.ply", "run/renders/test/rgb",
-        "run/eval/images/results.json", "run/eval/depth/results.json", "run/eval/mesh/error_pred.ply", "demo.json",
+        "run/eval/images/results.json", "run/eval/depth/results.json", "run/eval/mesh/error_pred.ply", "demo.json", "report.html",
     ):  # fmt: skip
         assert (root / file).exists(), file
-    for name in ("run", "mesh", "renders", "reference"):
+    for name in ("run", "mesh", "renders", "reference", "report"):
         assert first[name] in first["_text"] or name == "run"
     written = json.loads((root / "demo.json").read_text())
     assert written["psnr"] == pytest.approx(first["psnr"])

@@ -1,0 +1,325 @@
+#!/usr/bin/env python3
+"""Opens pages in a headless Chromium and fails on errors in the console, requests to elsewhere, and canvases that stay blank.
+
+python tools/browser_check.py                       makes a tiny run, and checks its report and its view
+python tools/browser_check.py PAGE -o shot.png      checks a file or an address
+
+Wants Chromium (on Debian: apt-get install -y chromium) and, of Python, websockets.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import io
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.parse
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+# WebGL is computed by the processor, so that no graphics card is needed.
+FLAGS = (
+    "--headless=new", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--remote-debugging-port=0",
+    "--no-first-run", "--disable-extensions", "--disable-background-networking", "--disable-component-update", "--hide-scrollbars",
+)  # fmt: skip
+START_SECONDS, ANSWER_SECONDS = 60, 120
+# A canvas with fewer colours than this shows nothing.
+LEAST_COLORS = 12
+LONGEST_PX = 8000
+# A view's page builds its scene after it has loaded.
+VIEW_SECONDS = 10
+PHONE, DESK = (390, 844), (1280, 900)
+
+
+class Browser:
+    """A headless Chromium and one page of it, driven by its debugging protocol."""
+
+    def __init__(self, folder: Path):
+        program = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+        if program is None:
+            raise SystemExit(
+                f"browser_check: no browser was found (tried {', '.join(BROWSERS)}); on Debian: apt-get install -y chromium"
+            )
+        try:
+            from websockets.sync.client import connect
+        except ModuleNotFoundError:
+            raise SystemExit(
+                "browser_check: the library websockets is not installed: pip install websockets"
+            ) from None
+        root = ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
+        words = [program, *FLAGS, *root, f"--user-data-dir={folder}", "about:blank"]
+        self.process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        port_file, until = folder / "DevToolsActivePort", time.monotonic() + START_SECONDS
+        while not port_file.exists() or not port_file.read_text().strip():
+            if self.process.poll() is not None or time.monotonic() > until:
+                raise SystemExit(f"browser_check: {program} did not start")
+            time.sleep(0.1)
+        port = port_file.read_text().split()[0]
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as answer:
+            page = next(each for each in json.load(answer) if each["type"] == "page")
+        self.socket = connect(page["webSocketDebuggerUrl"], max_size=None, compression=None)
+        self.count, self.events = 0, []
+        for domain in ("Page", "Runtime", "Network", "Log"):
+            self.call(f"{domain}.enable")
+
+    def call(self, method: str, **parameters) -> dict:
+        """One call of the protocol; events that come meanwhile are kept."""
+        self.count += 1
+        self.socket.send(json.dumps({"id": self.count, "method": method, "params": parameters}))
+        until = time.monotonic() + ANSWER_SECONDS
+        while True:
+            message = json.loads(self.socket.recv(timeout=max(0.1, until - time.monotonic())))
+            if message.get("id") == self.count:
+                if "error" in message:
+                    raise RuntimeError(f"{method}: {message['error']}")
+                return message["result"]
+            self.events.append(message)
+
+    def value(self, expression: str):
+        """What a JavaScript expression, or the promise it makes, comes to."""
+        answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        if "exceptionDetails" in answer:
+            raise RuntimeError(f"{expression[:80]}: {answer['exceptionDetails']}")
+        return answer["result"].get("value")
+
+    def open(self, address: str, size: tuple[int, int], dark: bool, seconds: float) -> None:
+        """Loads a page of so many pixels and lets it run so many seconds longer."""
+        self.events.clear()
+        width, height = size
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=size == PHONE,
+        )
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.call("Emulation.setEmulatedMedia", features=[scheme])
+        self.call("Page.navigate", url=address)
+        until = time.monotonic() + ANSWER_SECONDS
+        while self.value("document.readyState") != "complete":
+            if time.monotonic() > until:
+                raise RuntimeError(f"{address}: did not load")
+            time.sleep(0.1)
+        time.sleep(seconds)
+        self.value("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+    def complaints(self, address: str) -> list[str]:
+        """Errors and warnings of the console, exceptions, failed requests and requests to elsewhere, so far."""
+        self.value("1")
+        home, found = urllib.parse.urlsplit(address), []
+        for event in self.events:
+            kind, what = event.get("method"), event.get("params", {})
+            if kind == "Runtime.exceptionThrown":
+                details = what["exceptionDetails"]
+                found.append("exception: " + details.get("exception", {}).get("description", details["text"]))
+            elif kind == "Runtime.consoleAPICalled" and what["type"] in ("error", "assert"):
+                found.append(
+                    "console: "
+                    + " ".join(str(each.get("value", each.get("description"))) for each in what["args"])
+                )
+            elif kind == "Log.entryAdded" and what["entry"]["level"] == "error":
+                found.append(f"log: {what['entry']['text']} {what['entry'].get('url', '')}")
+            elif kind == "Network.requestWillBeSent":
+                asked = urllib.parse.urlsplit(what["request"]["url"])
+                if asked.scheme not in ("data", "blob") and (asked.scheme, asked.netloc) != (
+                    home.scheme,
+                    home.netloc,
+                ):
+                    found.append(f"request to elsewhere: {what['request']['url'][:120]}")
+                elif home.scheme == "file" and asked.scheme == "file" and asked.path != home.path:
+                    found.append(f"request of another file: {what['request']['url'][:120]}")
+        return found
+
+    def screenshot(self, whole: bool = False) -> bytes:
+        """PNG of the window, or of the whole page, smaller if that is longer than what Chromium draws in one piece."""
+        settings = {"format": "png"}
+        if whole:
+            self.value("window.scrollTo(0, 0)")
+            width, height = self.value("[window.innerWidth, document.documentElement.scrollHeight]")
+            clip = {"x": 0, "y": 0, "width": width, "height": height, "scale": min(1.0, LONGEST_PX / height)}
+            settings |= {"captureBeyondViewport": True, "clip": clip}
+        return base64.b64decode(self.call("Page.captureScreenshot", **settings)["data"])
+
+    def colors_of(self, element: int) -> int:
+        """How many colours the canvas of that number shows."""
+        import numpy as np
+        from PIL import Image
+
+        self.value(f"document.querySelectorAll('canvas')[{element}].scrollIntoView({{block: 'center'}})")
+        self.value(
+            "new Promise(done => setTimeout(() => requestAnimationFrame(() => requestAnimationFrame(done)), 300))"
+        )
+        box = self.value(f"(() => {{ const b = document.querySelectorAll('canvas')[{element}].getBoundingClientRect();"
+                         " return [b.x, b.y, b.right, b.bottom]; })()")  # fmt: skip
+        image = Image.open(io.BytesIO(self.screenshot())).convert("RGB").crop([round(side) for side in box])
+        # The middle, where controls that lie over a canvas do not count.
+        width, height = image.size
+        middle = np.asarray(image.crop((width // 4, height // 4, 3 * width // 4, 3 * height // 4)))
+        return len(np.unique(middle.reshape(-1, 3), axis=0))
+
+    def close(self) -> None:
+        """Ends the page's browser."""
+        self.socket.close()
+        self.process.terminate()
+        try:
+            self.process.wait(20)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+
+
+@contextmanager
+def browser() -> Iterator[Browser]:
+    """A `Browser` with a profile of its own."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        opened = Browser(Path(folder))
+        try:
+            yield opened
+        finally:
+            opened.close()
+
+
+def check(opened: Browser, address: str, *, size=DESK, dark: bool = False, seconds: float = 1.0, canvas: bool | None = None,
+          shot: Path | None = None, whole: bool = False) -> list[str]:  # fmt: skip
+    """What is wrong with a page: complaints, wider than its window, blank canvases; none at all if `canvas` asks for one."""
+    opened.open(address, size, dark, seconds)
+    found = []
+    for element in range(opened.value("document.querySelectorAll('canvas').length")):
+        if (colors := opened.colors_of(element)) < LEAST_COLORS:
+            found.append(f"canvas {element} is blank: {colors} colours")
+    if canvas and not opened.value("document.querySelectorAll('canvas').length"):
+        found.append("there is no canvas")
+    if (over := opened.value("document.documentElement.scrollWidth - window.innerWidth")) > 0:
+        found.append(f"the page is {over} px wider than its window of {size[0]}")
+    found += opened.complaints(address)
+    if shot:
+        shot.parent.mkdir(parents=True, exist_ok=True)
+        shot.write_bytes(opened.screenshot(whole))
+    return found
+
+
+def use_viewer(opened: Browser) -> list[str]:
+    """Turns the mesh of a report that is open, and switches its colours; what did not change the picture is a fault."""
+    found, canvas = [], "document.getElementById('view')"
+    picture = (
+        f"new Promise(done => setTimeout(() => requestAnimationFrame(() => done({canvas}.toDataURL())), 100))"
+    )
+    before = opened.value(picture)
+    opened.value(
+        f"{canvas}.focus(); {canvas}.dispatchEvent(new KeyboardEvent('keydown', {{key: 'ArrowLeft'}}))"
+    )
+    if (turned := opened.value(picture)) == before:
+        found.append("an arrow key does not turn the mesh")
+    box = opened.value(
+        f"(() => {{ const b = {canvas}.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; }})()"
+    )
+    for kind, shift, buttons in (("mousePressed", 0, 1), ("mouseMoved", 60, 1), ("mouseReleased", 60, 0)):
+        place = {"x": box[0] + shift, "y": box[1] + shift / 3}
+        opened.call(
+            "Input.dispatchMouseEvent", type=kind, button="left", buttons=buttons, clickCount=1, **place
+        )
+    if (dragged := opened.value(picture)) == turned:
+        found.append("dragging does not turn the mesh")
+    layers = opened.value("[...document.querySelectorAll('#view-layers input')].map(each => each.value)")
+    seen = {dragged}
+    for number in range(1, len(layers)):
+        opened.value(f"document.querySelectorAll('#view-layers input')[{number}].click()")
+        seen.add(opened.value(picture))
+    if len(seen) != len(layers):
+        found.append(f"{len(layers)} ways to colour the mesh show {len(seen)} pictures")
+    return found
+
+
+def check_report(opened: Browser, page: Path, folder: Path) -> list[str]:
+    """A report in light, dark, on a phone and on paper."""
+    address, found = page.resolve().as_uri(), []
+    for name, size, dark in (("light", DESK, False), ("dark", DESK, True), ("phone", PHONE, False)):
+        faults = check(
+            opened, address, size=size, dark=dark, canvas=True, shot=folder / f"report_{name}.png", whole=True
+        )
+        faults += use_viewer(opened) + opened.complaints(address)
+        found += [f"{page} ({name}): {fault}" for fault in dict.fromkeys(faults)]
+    (folder / "report.pdf").write_bytes(
+        base64.b64decode(opened.call("Page.printToPDF", printBackground=True)["data"])
+    )
+    return found
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "page", nargs="?", help="file or address (default: a tiny run's report and view, made for it)"
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        default=Path("runs/browser_check"),
+        help="folder of screenshots, or .png of a page",
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=1.0, help="to wait after a page has loaded (default 1)"
+    )
+    args = parser.parse_args()
+    with browser() as opened:
+        if args.page is None:
+            faults = check_all(opened, args.output)
+        elif Path(args.page).is_file() and args.output.suffix != ".png":
+            faults = check_report(opened, Path(args.page), args.output)
+        else:
+            address = Path(args.page).resolve().as_uri() if Path(args.page).is_file() else args.page
+            faults = check(opened, address, seconds=args.seconds, shot=args.output)
+    for fault in faults:
+        print(f"browser_check: {fault}", file=sys.stderr)
+    print(f"{len(faults)} faults; screenshots in {args.output}")
+    return 1 if faults else 0
+
+
+def check_all(opened: Browser, folder: Path) -> list[str]:
+    """Makes a tiny run with a mesh, its report and its view, and checks both."""
+    from linprim_geo.extract import extract_mesh
+    from linprim_geo.options import TrainOptions
+    from linprim_geo.report import report_run
+    from linprim_geo.synth import synthesize
+    from linprim_geo.train import train
+
+    with tempfile.TemporaryDirectory() as scratch:
+        scene, run = Path(scratch) / "scene", Path(scratch) / "run"
+        synthesize(scene, shape="cad", views=20, test_views=3, size=64, points=500, supersample=2)
+        train(scene, run, options=TrainOptions(iterations=400, max_primitives=400, sh_degree=1), quiet=True)
+        extract_mesh(run, quiet=True)
+        found = check_report(
+            opened, Path(report_run(run, reference=scene / "reference.ply")["report"]), folder
+        )
+        return found + check_view(opened, run, scene / "reference.ply", folder)
+
+
+def check_view(opened: Browser, run: Path, reference: Path, folder: Path) -> list[str]:
+    """The view of a run: primitives, then its mesh by true error with all cameras."""
+    from linprim_geo.view import Viewer
+
+    viewer = Viewer(run, 0, reference=reference)
+    try:
+        found = check(opened, viewer.address, seconds=VIEW_SECONDS, canvas=True, shot=folder / "view.png")
+        viewer._primitives.value, viewer._mesh.value, viewer._layer.value = False, "tsdf", "true error"
+        viewer._train.value = viewer._test.value = True
+        time.sleep(VIEW_SECONDS)
+        (folder / "view_mesh.png").write_bytes(opened.screenshot())
+        if (folder / "view_mesh.png").read_bytes() == (folder / "view.png").read_bytes():
+            found.append("the controls change nothing")
+        return [f"view: {fault}" for fault in dict.fromkeys(found + opened.complaints(viewer.address))]
+    finally:
+        viewer.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
