@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from linprim_geo.errors import LinprimError
+from linprim_geo.eval.mat_files import read_arrays
 from linprim_geo.mesh import Mesh, clean_mesh, load_mesh
 
 
@@ -96,9 +97,10 @@ def read_observed_volume(mask: str | os.PathLike | None, box: str | None) -> Obs
         return ObservedVolume(*corners)
     if mask is None:
         return None
-    values = _read_mat(mask, ("ObsMask", "BB", "Res"))
-    cells, bounds, edge = values["ObsMask"], np.asarray(values["BB"], float), np.ravel(values["Res"])
-    if cells.ndim != 3 or bounds.shape != (2, 3) or edge.size != 1 or not float(edge[0]) > 0:
+    values = read_arrays(mask, ("ObsMask", "BB", "Res"))
+    cells, bounds, edge = values["ObsMask"], values["BB"].astype(np.float64), np.ravel(values["Res"]).astype(np.float64)
+    usable = cells.ndim == 3 and bounds.shape == (2, 3) and edge.size == 1
+    if not usable or not (np.isfinite(bounds).all() and 0 < edge[0] < np.inf):
         raise LinprimError(
             f"{mask}: ObsMask is {cells.shape}, BB {bounds.shape} and Res {edge.shape}, "
             "expected a grid, two corners and one positive length"
@@ -114,7 +116,7 @@ def read_plane(plane: str | os.PathLike) -> np.ndarray:
     """
     text = os.fspath(plane)
     if Path(text).suffix.lower() == ".mat" or not _is_number(text.split(",")[0]):
-        values = np.ravel(_read_mat(text, ("P",))["P"]).astype(float)
+        values = np.ravel(read_arrays(text, ("P",))["P"]).astype(np.float64)
     else:
         values = np.array(_numbers(text, 4, "--plane"))
     if values.size != 4 or not np.isfinite(values).all() or not values[:3].any():
@@ -140,13 +142,13 @@ def read_crop(path: str | os.PathLike) -> CropVolume:
         raise LinprimError(f"{path}: cannot be read as a crop volume ({error.strerror})") from error
     except KeyError as error:
         raise LinprimError(f"{path}: has no {error.args[0]}, expected a crop volume") from error
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise LinprimError(f"{path}: is not a crop volume in JSON ({error})") from error
     if polygon.ndim != 2 or polygon.shape[1] != 3 or len(polygon) < 3 or not np.isfinite(polygon).all():
         raise LinprimError(
             f"{path}: bounding_polygon is {polygon.shape}, expected at least three points (x, y, z)"
         )
-    if not low < high:
+    if not -np.inf < low < high < np.inf:
         raise LinprimError(f"{path}: axis_min is {low:g} and axis_max {high:g}, expected an interval")
     return CropVolume(axis, low, high, np.delete(polygon, axis, axis=1))
 
@@ -173,21 +175,6 @@ def read_transform(path: str | os.PathLike) -> np.ndarray:
             f"{path}: is {matrix.shape}, expected an invertible 4x4 matrix with last row 0 0 0 1"
         )
     return matrix
-
-
-def _read_mat(path: str | os.PathLike, names: tuple[str, ...]) -> dict:
-    from scipy.io import loadmat
-
-    try:
-        values = loadmat(path, appendmat=False, variable_names=names)
-    except OSError as error:
-        raise LinprimError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except Exception as error:  # every damage has its own error; version 7.3 is NotImplementedError
-        raise LinprimError(f"{path}: is not a MATLAB file up to version 7 ({error})") from error
-    missing = [name for name in names if name not in values]
-    if missing:
-        raise LinprimError(f"{path}: has no {' and no '.join(missing)}, expected {', '.join(names)}")
-    return values
 
 
 def _numbers(text: str, count: int, option: str) -> list[float]:

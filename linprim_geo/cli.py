@@ -302,6 +302,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("--resume", action="store_true", help="go on from the latest checkpoint in RUN")
     sub.add_argument("--quiet", action="store_true", help="no progress")
+    text = "say what would be trained, how long it takes and how much memory, by timing a few steps; nothing but the cache is written"
+    sub.add_argument("--dry-run", action="store_true", help=text)
     text = "choose steps and primitives so that everything takes this long, by what a step costs here; one of the two may be given"
     sub.add_argument("--time-budget", type=_seconds, metavar="TIME", help=text)
     sub.add_argument("--view", action="store_true", help="show the run in a browser meanwhile, as linprim-geo view RUN --follow does")
@@ -484,9 +486,16 @@ def _train(parsed: argparse.Namespace) -> dict:
         if getattr(parsed, "downscale", 1) != 1:
             raise LinprimError(f"-r {parsed.resolution} stands beside --downscale {parsed.downscale}, wanted one of them")
         parsed.downscale = _downscale_of(parsed.resolution, scene, parsed)
+    run = parsed.run or Path("runs") / Path(scene).resolve().name
+    options = from_args(SceneOptions, parsed), from_args(TrainOptions, parsed)
+    if parsed.dry_run:
+        from .dry_run import dry_run
+
+        if parsed.resume:
+            raise LinprimError("--dry-run says what a new training would take: wanted without --resume")
+        return dry_run(scene, run, *options, quiet=parsed.quiet, effects=_choice(parsed), **budget)
     from .train import train
 
-    run = parsed.run or Path("runs") / Path(scene).resolve().name
     shown = contextlib.nullcontext()
     if parsed.view:
         from .view import watched
@@ -496,8 +505,7 @@ def _train(parsed: argparse.Namespace) -> dict:
         return train(
             scene,
             run,
-            from_args(SceneOptions, parsed),
-            from_args(TrainOptions, parsed),
+            *options,
             resume=parsed.resume,
             quiet=parsed.quiet,
             effects=_choice(parsed),

@@ -20,7 +20,8 @@ from .lens import largest_displacement
 from .options import SceneOptions, TrainOptions, initial_count
 from .primitives import KINDS
 from .scene import Scene
-from .trainer import SMALLEST_PX, initial_parameters, load_shots
+from .shots import load_shots
+from .trainer import SMALLEST_PX, initial_parameters
 
 MODES = ("auto", "none", "all")
 # An effect that makes a step of training dearer by less than this costs nothing worth saving.

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+from contextlib import ExitStack
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
 from .auto_level import choose_level
 from .errors import LinprimError
-from .files import write_json
+from .files import locked, remove_torn, write_json
 from .mesh import SUFFIXES, manifold_status, save_mesh, select_faces, topology, topology_line
 from .mesh_process import process_mesh
 from .options import ExtractOptions
@@ -90,7 +91,23 @@ def extract_mesh(
         raise LinprimError(f"{target}: the suffix is {target.suffix!r}, wanted .ply, .obj, .glb or .stl")
     if options.texture:
         check_texture(options.texture, target)
-    progress = Progress("extract", 1, quiet=quiet)
+    with ExitStack() as held:
+        held.enter_context(locked(folder, "extracted into"))
+        if output:
+            held.enter_context(locked(target.parent, "written", target.name))
+        return _extract(opened, method, folder, target, options, budget, Progress("extract", 1, quiet=quiet))
+
+
+def _extract(
+    opened: Run, method: str, folder: Path, target: Path, options: ExtractOptions, budget: Budget | None, progress: Progress
+) -> dict:
+    """What `extract_mesh` does when everything is in order and its folder is held."""
+    visible_target = target.with_name(f"{target.stem}_visible{target.suffix}")
+    written = [target, visible_target, folder / "stats.json"]
+    if options.texture:
+        written += [file.with_suffix(suffix) for file in (target, visible_target) for suffix in (".png", ".mtl")]
+    for file in written:
+        remove_torn(file)
     stages = Stages(progress)
 
     agreement = None
@@ -115,7 +132,6 @@ def extract_mesh(
     seen = visible_faces(mesh, cameras)
     visible = select_faces(mesh, seen)
     stages.lap("visibility")
-    visible_target = target.with_name(f"{target.stem}_visible{target.suffix}")
     texture = None
     if options.texture:
         texture = make_texture(mesh, options.texture, views, stages.note)

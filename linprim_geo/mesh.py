@@ -93,23 +93,32 @@ def load_mesh(path: str | Path) -> Mesh:
     path = Path(path)
     if not path.is_file():
         raise LinprimError(f"{path}: no such mesh file")
+    try:
+        return _load_mesh(path)
+    except LinprimError:
+        raise
+    except Exception as error:  # every reader of every format has its own errors
+        raise LinprimError(f"{path}: cannot be read as a mesh ({error or type(error).__name__})") from error
+
+
+def _load_mesh(path: Path) -> Mesh:
+    """`load_mesh` with whatever errors trimesh and numpy raise for damaged files."""
     import trimesh
 
-    try:
-        loaded = trimesh.load(path, process=False, maintain_order=True)
-        pose = np.eye(4)
-        if isinstance(loaded, trimesh.Scene):
-            nodes = loaded.graph.nodes_geometry
-            if len(nodes) == 1:
-                pose, name = loaded.graph[nodes[0]]
-                loaded = loaded.geometry[name]
-            else:
-                loaded = loaded.to_mesh()
-    except Exception as error:  # every reader of every format has its own errors
-        raise LinprimError(f"{path}: cannot be read as a mesh ({error})") from error
+    loaded = trimesh.load(path, process=False, maintain_order=True)
+    pose = np.eye(4)
+    if isinstance(loaded, trimesh.Scene):
+        nodes = loaded.graph.nodes_geometry
+        if len(nodes) == 1:
+            pose, name = loaded.graph[nodes[0]]
+            loaded = loaded.geometry[name]
+        else:
+            loaded = loaded.to_mesh()
     if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
         raise LinprimError(f"{path}: holds no triangles, wanted a surface mesh")
     vertices, faces = np.array(loaded.vertices, dtype=np.float64), np.array(loaded.faces)
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.dtype.kind not in "iu":
+        raise LinprimError(f"{path}: holds vertices of shape {vertices.shape}, faces of shape {faces.shape}, wanted three numbers for each")
     _check_indices(vertices, faces, str(path))
     # Normals that the file stored sit in trimesh's cache; asking for the property would compute its own.
     normals = loaded._cache.cache.get("vertex_normals")
@@ -121,7 +130,8 @@ def load_mesh(path: str | Path) -> Mesh:
     quality = np.ravel(row["quality"]) if "quality" in names else None
     if quality is not None and len(quality) != len(vertices):
         quality = None
-    vertices = vertices @ pose[:3, :3].T + pose[:3, 3]
+    with np.errstate(invalid="ignore", over="ignore"):  # `clean_mesh` drops what is not finite
+        vertices = vertices @ pose[:3, :3].T + pose[:3, 3]
     mesh = Mesh(vertices, faces, normals, _loaded_colors(loaded), quality)
     return merge_vertices(replace(mesh, normals=None)) if path.suffix.lower() == ".stl" else mesh
 

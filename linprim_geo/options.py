@@ -33,8 +33,11 @@ def from_saved(cls: type, values: object, where: str):
         if isinstance(value, bool) != (wanted is bool) or not isinstance(
             value, (int, float) if wanted is float else wanted
         ):
-            raise LinprimError(f"{where}: {entry.name} is {value!r}, wanted {wanted.__name__}")
-        taken[entry.name] = wanted(value)
+            raise LinprimError(f"{where}: {entry.name} is {value!r:.100}, wanted {wanted.__name__}")
+        try:
+            taken[entry.name] = wanted(value)
+        except OverflowError:
+            raise LinprimError(f"{where}: {entry.name} is too large for a {wanted.__name__}") from None
     return cls(**taken)
 
 

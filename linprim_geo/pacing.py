@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -14,6 +15,7 @@ from .geometry_terms import GeometryTerms
 from .options import TrainOptions
 from .progress import Progress
 from .run import Run
+from .shots import Shot
 from .time_budget import (
     AIM,
     GROWTH_END,
@@ -25,7 +27,7 @@ from .time_budget import (
     least_training,
     plan_training,
 )
-from .trainer import Shot, Trainer
+from .trainer import Trainer
 
 # A calibration: steps of each of two populations, the smaller one this part of the larger, in turn after the
 # warm-up, and the share of the budget after which no further ones are timed.
@@ -46,12 +48,20 @@ class Pace:
     @staticmethod
     def resumed(run: Run, trainer: Trainer) -> Pace:
         """From config.json, with the seconds that the steps until now have taken; the correction that was made is repeated."""
-        record = dict(run.notes["time_budget"])
-        correction = record.get("correction")
-        if correction:
-            trainer.correction = (int(correction["step"]), int(correction["iterations"]))
-        spent = trainer.seconds + float(record.get("before_seconds", 0.0))
-        return Pace(Budget(float(record["seconds"]), time.monotonic() - spent), record, float(record.get("finish_seconds", 0.0)))
+        try:
+            record = dict(run.notes["time_budget"])
+            correction = record.get("correction")
+            if correction:
+                bend, last = int(correction["step"]), int(correction["iterations"])
+                if not 0 < bend < last:
+                    raise ValueError(f"corrected at step {bend} to {last}")
+                trainer.correction = (bend, last)
+            spent, finish = (float(record.get(name, 0.0)) for name in ("before_seconds", "finish_seconds"))
+            if not (math.isfinite(spent) and math.isfinite(finish)):
+                raise ValueError(f"seconds are {spent} and {finish}")
+            return Pace(Budget(float(record["seconds"]), time.monotonic() - trainer.seconds - spent), record, finish)
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise LinprimError(f"{run.path / 'config.json'}: its time_budget lacks what a run needs ({error})") from None
 
     def watch(self, trainer: Trainer, run: Run, progress: Progress, save: Callable[[], None]) -> None:
         """Called before every step: notes the pace, and when growth has ended corrects the number of steps, once."""

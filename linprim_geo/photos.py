@@ -41,9 +41,13 @@ def _opened(path: Path):
         raise LinprimError(f"{path}: no such file, wanted an image") from error
     except Image.DecompressionBombError as error:
         raise LinprimError(f"{path}: {error}") from error
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
+    except LinprimError:
+        raise
+    except Exception as error:  # Pillow raises a dozen kinds for damaged files
         if isinstance(error, PermissionError):
             reason = "no permission to read it"
+        elif isinstance(error, MemoryError):
+            reason = "its pixels take more memory than there is"
         elif path.is_file() and path.stat().st_size == 0:
             reason = "the file is empty"
         elif isinstance(error, Image.UnidentifiedImageError):
@@ -153,8 +157,9 @@ def read_depth(path: Path, scale: float, size: tuple[int, int]) -> np.ndarray:
             f"{path}: the depth map is {values.shape[1]}x{values.shape[0]},"
             f" wanted {size[0]}x{size[1]} as its image"
         )
-    depth = values.astype(np.float64) * scale
-    return np.where(np.isfinite(depth) & (depth > 0), depth, 0.0).astype(np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        depth = (values.astype(np.float64) * scale).astype(np.float32)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
 def box_downscale(
@@ -192,7 +197,10 @@ def read_normals(path: Path, size: tuple[int, int]) -> np.ndarray:
             values = np.load(path, allow_pickle=False)
         except Exception as error:  # numpy raises half a dozen kinds for damaged files
             raise LinprimError(f"{path}: cannot be read as normals ({error}), wanted a complete .npy") from error
-        normals = values.astype(np.float32) if values.ndim == 3 and values.dtype.kind == "f" else values
+        if values.dtype.kind not in "uif":
+            raise LinprimError(f"{path}: the normals are of the type {values.dtype}, wanted three numbers per pixel")
+        with np.errstate(over="ignore"):
+            normals = values.astype(np.float32)
     else:
         with _opened(path) as image:
             values = np.asarray(image.convert("RGB"))

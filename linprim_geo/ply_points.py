@@ -28,9 +28,9 @@ def read_points_ply(path: Path) -> PointCloud | None:
     if vertex is None or header.elements[0] is not vertex:
         raise LinprimError(f"{path}: the PLY file does not begin with vertices, wanted a file of points")
     kinds = dict(vertex.properties)
-    if not {"x", "y", "z"} <= set(kinds) or None in kinds.values():
-        found = ", ".join(kinds) or "no properties"
-        raise LinprimError(f"{path}: vertices have {found}, wanted x, y, z and no lists")
+    if not {"x", "y", "z"} <= set(kinds) or None in kinds.values() or len(kinds) < len(vertex.properties):
+        found = ", ".join(name for name, _ in vertex.properties) or "no properties"
+        raise LinprimError(f"{path}: vertices have {found}, wanted x, y, z, no lists and nothing twice")
     with open(path, "rb") as file:
         file.seek(header.data_start)
         data = file.read()

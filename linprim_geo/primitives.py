@@ -24,6 +24,8 @@ SH_COEFFICIENTS = (1, 4, 9, 16)
 
 # Files before there were other kinds than octahedra have the first format and no array `kind`.
 FORMAT_OF_OCTAHEDRA, FORMAT = "linprim-geo octahedra 1", "linprim-geo primitives 2"
+# No zip packs more bytes than this into one.
+_DENSEST = 1032
 ARRAYS = ("center", "rotation", "extent", "density", "sh")
 
 # An octahedron of half-axes d stands for a Gaussian of standard deviations d / 2.6: LinPrim's constant, chosen by eye
@@ -126,7 +128,7 @@ class Primitives:
     gaussian     extent (N, 3) standard deviations along the local axes; `density` is the opacity of its middle, 0 to 1.
 
     Raises:
-        LinprimError: a shape is wrong, or a row holds NaN, infinity, a zero quaternion, an extent that is not
+        LinprimError: there is no row, a shape is wrong, or a row holds NaN, infinity, a zero quaternion, an extent that is not
             positive or a density out of its range. The message names the first such row.
     """
 
@@ -141,7 +143,9 @@ class Primitives:
         if self.kind not in KINDS:
             raise LinprimError(f"primitives are of the kind {self.kind!r}, wanted one of {', '.join(KINDS)}")
         what, lengths = KINDS[self.kind], {3: "three", 4: "four"}
-        count = len(self.center)
+        count = len(self.center) if np.ndim(self.center) else 0
+        if count == 0:
+            raise LinprimError(f"{what.plural}: there are none, wanted at least one")
         shapes = {
             "center": (count, 3),
             "rotation": (count, 4),
@@ -320,7 +324,9 @@ def load_primitives(path: str | os.PathLike) -> Primitives:
         raise LinprimError(f"{path}: no such file, wanted an .npz of primitives") from None
     except IsADirectoryError:
         raise LinprimError(f"{path}: is a folder, wanted an .npz of primitives") from None
-    except (zipfile.BadZipFile, EOFError, ValueError, NotImplementedError) as error:
+    except LinprimError:
+        raise
+    except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds for damaged files
         raise LinprimError(f"{path}: not a complete .npz file ({error})") from None
     try:
         return Primitives(**arrays, kind=kind)
@@ -332,7 +338,8 @@ def _read_member(path: Path, archive: zipfile.ZipFile, members: dict, name: str)
     info = members.get(f"{name}.npy")
     if info is None:
         raise LinprimError(f"{path}: the array {name} is missing")
-    if info.compress_type == zipfile.ZIP_STORED and info.file_size > path.stat().st_size:
+    packed = 1 if info.compress_type == zipfile.ZIP_STORED else _DENSEST
+    if info.file_size > packed * path.stat().st_size:
         raise LinprimError(f"{path}: {name} claims {info.file_size} bytes, more than the file has")
     with archive.open(info) as file:
         version = np.lib.format.read_magic(file)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from .errors import LinprimError
+from .files import is_file
 from .lens import Lens, check_lens, model_parameter_counts
 from .scene import Frame, Listing, PointCloud
 
@@ -81,7 +82,7 @@ def read_colmap(root: Path, model: Path) -> Listing:
     for folder in dict.fromkeys(
         [root / name for name in _IMAGE_FOLDERS] + [model.parent / "images", model.parent.parent / "images"]
     ):
-        absent = [image.name for image in colmap.images if not (folder / image.name).is_file()]
+        absent = [image.name for image in colmap.images if not is_file(folder / image.name)]
         if missing is None or len(absent) < len(missing):
             best, missing = folder, absent
         if not absent:
@@ -128,7 +129,11 @@ def read_model(folder: Path) -> ColmapModel:
             lenses[image.camera_id] = lens
         pose = np.eye(4)
         pose[:3] = image.cam_from_world().matrix()
-        images.append(PosedImage(image.name, lenses[image.camera_id], pose))
+        try:
+            name = image.name
+        except UnicodeDecodeError:
+            raise LinprimError(f"{folder / ('images' + suffix)}: the name of image {number} is not UTF-8") from None
+        images.append(PosedImage(name, lenses[image.camera_id], pose))
     return ColmapModel(folder, tuple(images), _points(reconstruction))
 
 
@@ -167,7 +172,7 @@ def _check_files(folder: Path) -> str:
         )
     for table in _TABLES + ("rigs", "frames"):
         file = folder / f"{table}{suffix}"
-        if not file.is_file():
+        if not is_file(file):
             continue
         if suffix == ".bin":
             _check_binary(file, table)

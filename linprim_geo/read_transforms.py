@@ -15,6 +15,7 @@ import numpy as np
 
 from . import photos, read_colmap
 from .errors import LinprimError
+from .files import is_file
 from .lens import Lens
 from .ply_points import read_points_ply
 from .scene import Frame, Listing, PointCloud, check_pose
@@ -39,6 +40,8 @@ _PERSPECTIVE_MODELS = (
 _AGREE_POSITION = 0.01
 # ... and turned by no more than this many degrees.
 _AGREE_DEGREES = 1.0
+# Numbers beyond this are no lengths or pixels, and their squares overflow.
+LARGEST = 1e30
 _NORMAL_FRAMES = ("world", "camera", "camera_opengl")
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -97,7 +100,7 @@ def _read_json(path: Path) -> dict:
             f"{path}: not valid JSON at line {error.lineno}, column {error.colno} ({error.msg}),"
             " wanted a complete file"
         ) from error
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise LinprimError(f"{path}: cannot be read ({error}), wanted a JSON file") from error
     if not isinstance(header, dict) or not isinstance(header.get("frames"), list):
         raise LinprimError(f"{path}: no list 'frames', wanted one entry per image")
@@ -137,7 +140,7 @@ def _frame(folder: Path, header: dict, entry: dict, where: str, image: Path, spl
     matrix = entry.get("transform_matrix")
     try:
         pose = np.array(matrix, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         pose = np.empty(0)
     if matrix is None or pose.shape not in ((3, 4), (4, 4)):
         found = "missing" if matrix is None else "not a table of 4x4 numbers"
@@ -174,13 +177,13 @@ def _world_to_camera(camera_to_world: np.ndarray, where: str) -> np.ndarray:
 
 def _find_image(folder: Path, file_path: str) -> Path | None:
     path = folder / file_path.replace("\\", "/")
-    if path.is_file() and path.suffix:
+    if is_file(path) and path.suffix:
         return path
-    for suffix in _SUFFIXES:
+    for suffix in _SUFFIXES if path.name else ():
         candidate = path.with_name(path.name + suffix)
-        if candidate.is_file():
+        if is_file(candidate):
             return candidate
-    return path if path.is_file() else None
+    return path if is_file(path) else None
 
 
 def _side_file(folder: Path, entry: dict, key: str, where: str) -> Path | None:
@@ -190,7 +193,7 @@ def _side_file(folder: Path, entry: dict, key: str, where: str) -> Path | None:
     if not isinstance(value, str):
         raise LinprimError(f"{where}: '{key}' is {value!r}, wanted a path")
     path = folder / value.replace("\\", "/")
-    if not path.is_file():
+    if not is_file(path):
         raise LinprimError(f"{where}: '{key}' {path} is not on disk")
     return path
 
@@ -210,8 +213,8 @@ def _number(values: dict, key: str, where: str, default: float | None = None) ->
     value = values.get(key, default)
     if value is None and default is not None:
         value = default
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        found = "missing" if value is None else repr(value)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST:
+        found = "missing" if value is None else f"{value!r:.40}" if isinstance(value, (int, float, str)) else "no number"
         raise LinprimError(f"{where}: '{key}' is {found}, wanted a finite number")
     return float(value)
 
@@ -298,7 +301,7 @@ def _points(root: Path, headers: list, frames: list[Frame], sparse: Path | None)
         name = header.get("ply_file_path")
         if name:
             file = path.parent / str(name).replace("\\", "/")
-            if not file.is_file():
+            if not is_file(file):
                 raise LinprimError(f"{path}: 'ply_file_path' {file} is not on disk")
             return read_points_ply(file)
     found = []
@@ -318,7 +321,7 @@ def _applied_transform(headers: list) -> np.ndarray | None:
         if header.get("applied_transform") is not None:
             try:
                 matrix = np.array(header["applied_transform"], dtype=np.float64)[:3]
-            except (TypeError, ValueError, IndexError):
+            except (TypeError, ValueError, IndexError, OverflowError):
                 matrix = np.empty(0)
             if matrix.shape != (3, 4) or not np.isfinite(matrix).all():
                 raise LinprimError(f"{path}: 'applied_transform' is not a table of 3x4 numbers")

@@ -23,7 +23,7 @@ import numpy as np
 from . import __version__
 from .camera import Similarity
 from .errors import LinprimError
-from .files import write_json
+from .files import is_remains, write_json
 from .options import SceneOptions, TrainOptions, check_train_options, from_saved, raster_options
 from .primitives import ARRAYS, KINDS, Primitives, load_primitives, save_primitives
 from .scene import Scene, View, load_scene
@@ -50,15 +50,17 @@ class Run:
         similarity: Similarity,
         instruction_set: str = "",
         effects: list[dict] | None = None,
+        time_budget: dict | None = None,
     ) -> Run:
-        """Makes the folder and writes its configuration. `instruction_set` is noted because results depend on it in their last bits, and
-        `effects`, what was decided about the scene (`effects.Decision`), to be read.
+        """Makes the folder and writes its configuration. `instruction_set` is noted because results depend on it in their last bits,
+        `effects`, what was decided about the scene (`effects.Decision`), to be read, and `time_budget`, a plan (`pacing.Pace`).
+
+        config.json comes last: without it nothing has begun, see `is_unused`.
 
         Raises:
             LinprimError: the folder exists and is not empty, or cannot be written.
         """
-        if path.exists() and (not path.is_dir() or any(path.iterdir())):
-            raise LinprimError(f"{path}: exists already; give another folder with -o, or go on with --resume")
+        refuse_used(path)
         run = Run(path, scene_path.resolve(), scene_options, options, similarity, scene.unit)
         config = {
             "linprim_geo": __version__,
@@ -71,7 +73,8 @@ class Run:
         }
         if effects is not None:
             config["effects"] = effects
-        write_json(path / "config.json", config)
+        if time_budget is not None:
+            config["time_budget"] = time_budget
         write_json(
             path / "transform.json",
             {
@@ -81,6 +84,7 @@ class Run:
                 "unit": scene.unit,
             },
         )
+        write_json(path / "config.json", config)
         return run
 
     @staticmethod
@@ -95,8 +99,9 @@ class Run:
         try:
             similarity = Similarity(float(transform["scale"]), tuple(float(x) for x in transform["offset"]))
             scene, unit = Path(config["scene"]), str(transform["unit"])
+            scene.exists()  # raises for what no path can be
             saved = config["scene_options"], config["train_options"]
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError, OSError) as error:
             raise LinprimError(
                 f"{path}: config.json or transform.json lacks what a run needs ({error})"
             ) from None
@@ -279,14 +284,27 @@ def to_data_set(primitives: Primitives, similarity: Similarity) -> Primitives:
     )
 
 
+def is_unused(path: Path) -> bool:
+    """Whether a run can be made at `path`: nothing is there, or no more than a run leaves that was killed before it began."""
+    if not path.exists():
+        return True
+    return path.is_dir() and all(is_remains(entry) or entry.name == "transform.json" for entry in path.iterdir())
+
+
+def refuse_used(path: Path) -> None:
+    """Raises LinprimError where something is in the way of a new run."""
+    if not is_unused(path):
+        raise LinprimError(f"{path}: exists already; give another folder with -o, or go on with --resume")
+
+
 def _read_json(file: Path, run: Path) -> dict:
     try:
-        value = json.loads(file.read_text())
+        value = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise LinprimError(
             f"{run}: {file.name} is missing, so this is not the folder of a run that has saved something"
         ) from None
-    except (OSError, UnicodeDecodeError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise LinprimError(f"{file}: cannot be read ({error})") from None
     if not isinstance(value, dict):
         raise LinprimError(f"{file}: holds no JSON object")

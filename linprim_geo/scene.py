@@ -17,6 +17,7 @@ import numpy as np
 from . import photos
 from .camera import Camera
 from .errors import LinprimError
+from .files import is_file
 from .lens import Intrinsics, Lens, check_lens, straightened, undistorted
 
 # Of the images sorted by name, those whose index is a multiple of this are held out if the data set does
@@ -368,7 +369,7 @@ def _mask_of(frame: Frame, folder: Path) -> Path | None:
             image_name,
             f"{base.stem}.jpg",
         ):
-            if (folder / base.parent / name).is_file():
+            if is_file(folder / base.parent / name):
                 return folder / base.parent / name
     return None
 
@@ -394,7 +395,7 @@ def _names(frames: Sequence[Frame]) -> list[str]:
 def _header_checks(frames: Sequence[Frame]) -> list[bool]:
     """Compares every image, mask and depth file with its camera; returns which images have an alpha
     channel."""
-    missing = [frame for frame in frames if not frame.image_path.is_file()]
+    missing = [frame for frame in frames if not is_file(frame.image_path)]
     if missing:
         raise LinprimError(
             f"{missing[0].where}: {len(missing)} of {len(frames)} images are not on disk, the first is"
@@ -402,7 +403,7 @@ def _header_checks(frames: Sequence[Frame]) -> list[bool]:
         )
     for frame in frames:
         for kind, path in (("mask", frame.mask_path), ("depth map", frame.depth_path), ("normal map", frame.normal_path)):
-            if path is not None and not path.is_file():
+            if path is not None and not is_file(path):
                 raise LinprimError(f"{frame.where}: the {kind} {path} is not on disk")
     alphas = []
     for frame in frames:

@@ -18,11 +18,12 @@ import numpy as np
 import torch
 
 from . import ops
+from .checkpoint import read_checkpoint, restore, write_checkpoint
 from .effects import Choice, Decision, decide, settle, summary
 from .errors import LinprimError
 from .evidence import observe
 from .exposure import with_best_gain
-from .files import atomic_write
+from .files import atomic_write, is_remains, locked, writing
 from .fill_points import fill_points
 from .geometry_terms import GeometryTerms, gather_evidence
 from .initial_points import (
@@ -37,10 +38,11 @@ from .options import GEOMETRY_WEIGHTS, SceneOptions, TrainOptions, check_train_o
 from .pacing import Pace, plan_run
 from .primitives import KINDS
 from .progress import Progress, duration, memory_gib
-from .run import Run
+from .run import Run, is_unused, refuse_used
 from .scene import PointCloud, Scene, load_scene
+from .shots import Shot, UnreadablePhoto, load_shots
 from .time_budget import Budget
-from .trainer import LARGEST_PART, SMALLEST_PX, Shot, Trainer, initial_parameters, load_shots
+from .trainer import LARGEST_PART, SMALLEST_PX, Trainer, initial_parameters
 
 # Primitives at the start, as a share of the most there may be: from points on surfaces, and from random ones.
 SFM_START, RANDOM_START = 0.8, 0.25
@@ -50,7 +52,6 @@ FEW_POINTS = 500
 BACKDROP_SHARE, BACKDROP_TOLERANCE = 0.8, 0.1
 # Held-out views scored during training; all of them are at the end.
 QUICK_VIEWS = 16
-KEPT_CHECKPOINTS = 2
 
 
 def with_points(scene: Scene, options: TrainOptions, log: Callable[[str], None]) -> Scene:
@@ -156,6 +157,12 @@ def train(
     progress = Progress("train", options.iterations, quiet=quiet)
     before = torch.get_num_threads()
     budget = Budget.of(time_budget)
+    if run_path.is_file():
+        refuse_used(run_path)
+    # Killed before anything was saved, there is nothing to go on from but the options that are given again.
+    resume = resume and not (_has_remains(run_path) and is_unused(run_path))
+    if resume:
+        Run.open(run_path)
     if resume and budget:
         progress.note("--resume goes on with the run's own options: --time-budget ignored")
         budget = None
@@ -164,16 +171,22 @@ def train(
     try:
         # torch only does small element-wise work here; its own threads would wait for each other longer than they compute.
         torch.set_num_threads(1)
-        ops.set_threads(options.threads)
-        if resume:
-            opened, loaded = _reopen(Path(scene), run_path, scene_options, options, progress)
-            return _train(opened, loaded, _read_checkpoint(run_path), progress)
-        opened, loaded, decisions = _begin(
-            Path(scene), run_path, scene_options, options, effects or Choice("none"), progress
-        )
-        return _train(opened, loaded, None, progress, decisions, budget)
+        with locked(run_path, "trained into"):
+            ops.set_threads(options.threads)
+            if resume:
+                opened, loaded = _reopen(Path(scene), run_path, scene_options, options, progress)
+                return _train(opened, loaded, read_checkpoint(run_path), progress)
+            opened, loaded, decisions = _begin(
+                Path(scene), run_path, scene_options, options, effects or Choice("none"), progress
+            )
+            return _train(opened, loaded, None, progress, decisions, budget)
     finally:
         torch.set_num_threads(before)
+
+
+def _has_remains(path: Path) -> bool:
+    """Whether a training that was killed has left something."""
+    return path.is_dir() and any(is_remains(entry) for entry in path.iterdir())
 
 
 def _begin(
@@ -185,8 +198,7 @@ def _begin(
     progress: Progress,
 ) -> tuple[Run, Scene, list[Decision]]:
     """A new run, whose folder is not made yet, its scene with points to start from, and what was decided about its effects."""
-    if run_path.exists() and (not run_path.is_dir() or any(run_path.iterdir())):
-        raise LinprimError(f"{run_path}: exists already; give another folder with -o, or go on with --resume")
+    refuse_used(run_path)
     decisions, loaded, scene_options, options = decided_scene(scene, scene_options, options, effects, progress.note)
     if decisions:
         progress.note(summary(decisions))
@@ -268,12 +280,11 @@ def _train(
             run.similarity,
             ops.instruction_set(),
             [asdict(decision) for decision in decisions],
+            pace.record if pace else None,
         )
-        if pace:
-            run.note("time_budget", pace.record)
     elif "time_budget" in run.notes:
         pace = Pace.resumed(run, trainer)
-    for torn in (run.path / "checkpoints").glob(".step_*.tmp*"):  # what a kill left half-written
+    for torn in [*run.path.glob(".*.tmp*"), *run.path.glob("checkpoints/.*.tmp*")]:  # what a kill left half-written
         torn.unlink()
     progress.start = trainer.step
     progress.note(
@@ -342,8 +353,10 @@ def _background(text: str, shots: list[Shot]) -> tuple[torch.Tensor, bool, bool]
 
 def _border_colors(shots: list[Shot]) -> np.ndarray:
     """(P, 3) colours in [0, 1] of the outermost pixels of all views."""
-    edges = [edge for s in shots for edge in (s.rgb[:, 0], s.rgb[:, -1], s.rgb[:, :, 0], s.rgb[:, :, -1])]
-    return np.concatenate([edge.numpy().T for edge in edges]).astype(np.float64) / 255
+    edges = []
+    for rgb in (shot.rgb.numpy() for shot in shots):
+        edges.append(np.concatenate([edge.T for edge in (rgb[:, 0], rgb[:, -1], rgb[:, :, 0], rgb[:, :, -1])]))
+    return np.concatenate(edges).astype(np.float64) / 255
 
 
 def plain_border(shots: list[Shot]) -> float:
@@ -386,12 +399,7 @@ def _start(scene: Scene, run: Run, shots: list[Shot], options: TrainOptions, sta
         log_gain = None if seen is None else seen.log_gains[0]
     trainer = Trainer(shots, parameters, options, bounds, background, fitted, random_background, log_gain=log_gain)
     if state is not None:
-        try:
-            trainer.restore(state)
-        except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise LinprimError(
-                f"{run.path / 'checkpoints'}: the latest checkpoint lacks what a run needs ({error})"
-            ) from None
+        restore(trainer, state, run.path / "checkpoints")
     return trainer
 
 
@@ -412,15 +420,18 @@ def _loop(
 ) -> tuple[float, float | None, float | None]:
     """Steps until the end; returns the seconds spent in steps, and the final held-out PSNR as rendered and with gains."""
     options = trainer.options
-    _cut_metrics(run.path / "metrics.jsonl", trainer.step)
+    table = run.path / "metrics.jsonl"
+    _cut_metrics(table, trainer.step)
     score = score_gain = None
     saved = -1
-    with open(run.path / "metrics.jsonl", "a") as log, _interrupt_flag() as interrupted:
+    with writing(table), open(table, "a") as log, _interrupt_flag() as interrupted:
         while trainer.step < trainer.iterations and not interrupted:
             if pace:
                 pace.watch(trainer, run, progress, save=lambda: _save(trainer, run))
             try:
                 trainer.advance()
+            except UnreadablePhoto:
+                raise
             except LinprimError as error:
                 raise LinprimError(
                     f"{run.path}: training diverged at step {trainer.step} ({error}); what was saved before is intact"
@@ -449,6 +460,7 @@ def _loop(
                     )
                 log.write(json.dumps(entry) + "\n")
                 log.flush()
+                os.fsync(log.fileno())  # before the checkpoint that follows it
             if last or trainer.step % options.checkpoint_every == 0:
                 _save(trainer, run)
                 saved = trainer.step
@@ -532,17 +544,7 @@ def _save(trainer: Trainer, run: Run) -> None:
             raise LinprimError(
                 f"{run.path}: training diverged at step {trainer.step} ({name} is not finite); what was saved before is intact"
             )
-    folder = run.path / "checkpoints"
-    name = f"step_{trainer.step:06d}.pt"
-    with atomic_write(folder / name) as temporary:
-        torch.save(trainer.state(), temporary)
-    with atomic_write(folder / "latest") as temporary:
-        temporary.write_text(name + "\n")
-    for old in sorted(folder.glob("step_*.pt"), key=lambda file: (len(file.name), file.name))[
-        :-KEPT_CHECKPOINTS
-    ]:
-        if old.name != name:
-            old.unlink()
+    write_checkpoint(run.path / "checkpoints", trainer)
     run.save(
         trainer.primitives(),
         {
@@ -559,27 +561,3 @@ def _save(trainer: Trainer, run: Run) -> None:
 def _gains(trainer: Trainer) -> dict[str, list[float]]:
     """{name of a training view: its gain per channel}."""
     return {shot.name: gain.tolist() for shot, gain in zip(trainer.shots, trainer.exposure.gains, strict=True)}
-
-
-def _read_checkpoint(path: Path) -> dict | None:
-    """The latest checkpoint of a run, None where it has none yet."""
-    folder = path / "checkpoints"
-    try:
-        name = (folder / "latest").read_text().strip()
-    except FileNotFoundError:
-        return None
-    except (OSError, UnicodeDecodeError) as error:
-        raise LinprimError(f"{folder / 'latest'}: cannot be read ({error})") from None
-    if not name or Path(name).name != name:
-        raise LinprimError(f"{folder / 'latest'}: names {name!r}, wanted a checkpoint in this folder")
-    try:
-        state = torch.load(folder / name, weights_only=True)
-    except FileNotFoundError:
-        raise LinprimError(f"{folder / name}: the latest checkpoint is missing") from None
-    except Exception as error:  # torch raises many kinds for a damaged file
-        raise LinprimError(
-            f"{folder / name}: is damaged and cannot be read ({type(error).__name__})"
-        ) from None
-    if not isinstance(state, dict):
-        raise LinprimError(f"{folder / name}: holds no checkpoint")
-    return state

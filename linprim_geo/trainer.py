@@ -7,15 +7,14 @@ repeats the interrupted one bit for bit.
 from __future__ import annotations
 
 import math
-import os
 import time
-from dataclasses import dataclass, fields
+from dataclasses import fields
 
 import numpy as np
 import torch
 
 from . import ops
-from .camera import Camera, Similarity
+from .camera import Camera
 from .errors import LinprimError
 from .exposure import Exposure, exposed
 from .geometry_terms import GeometryTerms
@@ -23,7 +22,7 @@ from .options import TrainOptions, raster_options
 from .population import Control, GradientControl
 from .population_papers import ClassicControl, McmcControl
 from .primitives import KINDS, SH_Y0, Primitives, reference_length
-from .scene import View
+from .shots import Shot
 
 CONTROLS: dict[str, type[Control]] = {
     "gradient": GradientControl,
@@ -52,38 +51,6 @@ GAUSSIAN_START = 0.5
 # The 3D filter: sqrt(0.2) of a pixel, from views in which the primitive is farther than 0.2 and at most 15 % of the image's size
 # outside of it (LinPrim's box_factor and Mip-Splatting's limits); made again after so many steps.
 FILTER_VARIANCE, FILTER_NEAR, FILTER_MARGIN, FILTER_EVERY = 0.2, 0.2, 0.15, 1000
-
-
-@dataclass(frozen=True)
-class Shot:
-    """A view in memory: `rgb` (3, H, W) uint8, `alpha` (H, W) uint8 or None, and its camera in the training frame."""
-
-    name: str
-    camera: Camera
-    rgb: torch.Tensor
-    alpha: torch.Tensor | None
-
-    def over(self, background: torch.Tensor) -> torch.Tensor:
-        """(3, H, W) float32 in [0, 1], over `background` (3,) where alpha lets it through."""
-        rgb = self.rgb.to(torch.float32).mul_(1 / 255)
-        if self.alpha is None:
-            return rgb
-        alpha = self.alpha.to(torch.float32).mul_(1 / 255)
-        return rgb.mul_(alpha).add_(background[:, None, None] * (1 - alpha))
-
-
-def load_shots(views: tuple[View, ...], similarity: Similarity) -> list[Shot]:
-    """Decodes views into memory, keeping their order."""
-    from concurrent.futures import ThreadPoolExecutor
-
-    def load(view: View) -> Shot:
-        photo = view.load()
-        alpha = None if photo.alpha is None else torch.from_numpy(np.ascontiguousarray(photo.alpha))
-        rgb = torch.from_numpy(np.ascontiguousarray(photo.rgb.transpose(2, 0, 1)))
-        return Shot(view.name, view.camera.transformed(similarity), rgb, alpha)
-
-    with ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
-        return list(pool.map(load, views))
 
 
 def initial_parameters(

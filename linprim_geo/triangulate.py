@@ -323,7 +323,9 @@ def _stored(path: Path) -> PointCloud | None:
     """What an earlier run kept; None if there is nothing or it is damaged."""
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            return PointCloud(arrays["xyz"], arrays["rgb"], arrays["error_px"])
+            xyz, rgb, error_px = (arrays[name] for name in ("xyz", "rgb", "error_px"))
+        usable = xyz.shape == (len(error_px), 3) == rgb.shape and rgb.dtype == np.uint8 and error_px.ndim == 1
+        return PointCloud(xyz, rgb, error_px) if usable and np.isfinite(xyz).all() and np.isfinite(error_px).all() else None
     except Exception:  # noqa: BLE001 - a cache entry that cannot be read is made again
         return None
 

@@ -12,7 +12,7 @@ import sys
 import pytest
 
 from linprim_geo.errors import LinprimError
-from linprim_geo.files import atomic_write, write_json
+from linprim_geo.files import atomic_write, remove_torn, write_json
 
 
 @pytest.fixture
@@ -95,6 +95,46 @@ def test_a_truly_full_device_is_one_sentence(old):
         with open("/dev/full", "wb") as file:
             file.write(b"x" * 100_000)
     assert_untouched(old)
+
+
+def test_a_file_that_may_not_grow_is_one_sentence(old):
+    """As a quota says it, whether Python or torch writes."""
+    import resource
+
+    import torch
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for write in (lambda file: file.write(bytes(100_000)), lambda file: torch.save({"x": torch.zeros(9000)}, file)):
+        with pytest.raises(LinprimError, match=r"mesh\.ply: no space left"), atomic_write(old) as temporary:
+            try:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (1024, hard))
+                with open(temporary, "wb") as file:
+                    write(file)
+            finally:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert_untouched(old)
+
+
+def test_the_data_is_on_disk_before_the_name_and_the_name_before_the_end(old, monkeypatch):
+    happened = []
+    fsync, replace = os.fsync, os.replace
+
+    def synced(handle):
+        happened.append("folder" if stat.S_ISDIR(os.fstat(handle).st_mode) else "file")
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "replace", lambda *names: (happened.append("rename"), replace(*names)))
+    write_json(old, {})
+    assert happened == ["file", "rename", "folder"]
+
+
+def test_what_a_kill_left_is_removed_and_nothing_else(tmp_path):
+    for name in (".mesh.abc.tmp.ply", ".mesh_visible.abc.tmp.ply", ".mesh.abc.tmp.obj", "mesh.ply", "mesh.tmp.ply"):
+        (tmp_path / name).touch()
+    remove_torn(tmp_path / "mesh.ply")
+    left = [".mesh.abc.tmp.obj", ".mesh_visible.abc.tmp.ply", "mesh.ply", "mesh.tmp.ply"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == left
 
 
 def test_a_folder_that_is_a_file_is_one_sentence(old):

@@ -28,6 +28,7 @@ from linprim_geo.options import SceneOptions, TrainOptions
 from linprim_geo.primitives import KINDS, Primitives, load_primitives
 from linprim_geo.run import Run
 from linprim_geo.scene import load_scene
+from linprim_geo.shots import load_shots
 from linprim_geo.synth import synthesize
 from linprim_geo.textured import TexturedMesh
 from linprim_geo.train import train
@@ -679,17 +680,40 @@ def test_a_full_disk_leaves_the_last_checkpoint(how, tiny_scene, tmp_path, monke
         patch.setattr(training, "_save", saving)
         if how != "write":
             patch.setattr(os, "fsync" if how == "flush" else "replace", failing)
-        # A file that may not grow (write) stands in for the disk; its error has another name.
-        with pytest.raises(Exception if how == "write" else LinprimError) as caught:
+        # A file that may not grow (write) stands in for the disk.
+        with pytest.raises(LinprimError, match="no space left") as caught:
             train(tiny_scene, run, options=options, quiet=True)
-    if how != "write":
-        assert "no space left" in str(caught.value) and str(run) in str(caught.value)
+    assert str(run) in str(caught.value) and "\n" not in str(caught.value)
     assert full and no_temporary_files(run)
     assert checkpoint(run)["step"] == 4
     assert Run.open(run).state["iteration"] == 4 and len(Run.open(run).primitives()) > 0
     train(tiny_scene, run, resume=True, quiet=True)
     train(tiny_scene, tmp_path / "whole", options=options, quiet=True)
     assert_same_run(tmp_path / "whole", run)
+
+
+def test_a_folder_that_becomes_read_only_keeps_what_was_saved(tiny_scene, run_copy, monkeypatch):
+    """Root may write anywhere, so the system's answer is put in its place."""
+    import builtins
+
+    def refuse(original, says_write):
+        def opened(file, *rest, **settings):
+            if str(run_copy) in str(file) and says_write(*rest):
+                raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(file))
+            return original(file, *rest, **settings)
+
+        return opened
+
+    before = {path: path.read_bytes() for path in run_copy.rglob("*") if path.is_file()}
+    monkeypatch.setattr(os, "open", refuse(os.open, lambda flags, *_: bool(flags & (os.O_WRONLY | os.O_RDWR))))
+    monkeypatch.setattr(builtins, "open", refuse(builtins.open, lambda mode="r", *_: not mode.startswith("r")))
+    with pytest.raises(LinprimError, match="cannot be written .Read-only file system") as caught:
+        train(tiny_scene, run_copy, resume=True, quiet=True)
+    assert str(run_copy) in str(caught.value)
+    run = Run.open(run_copy)
+    with pytest.raises(LinprimError, match="training_frame.npz: cannot be written"):
+        run.save(run.training_primitives(), run.state)
+    assert {path: path.read_bytes() for path in run_copy.rglob("*") if path.is_file()} == before
 
 
 @pytest.mark.parametrize("rate", [float("nan"), float("inf")])
@@ -725,7 +749,7 @@ def trainer(tiny_scene):
 
     scene = load_scene(tiny_scene)
     similarity = scene_normalization(scene)
-    shots = training_step.load_shots(scene.train, similarity)
+    shots = load_shots(scene.train, similarity)
     xyz = similarity.apply(scene.points.xyz[:40])
     parameters = training_step.initial_parameters(xyz, scene.points.rgb[:40], 1, 0, (1e-3, 1.0))
     options = TrainOptions(iterations=100, max_primitives=50, sh_degree=1, threads=1)

@@ -1,0 +1,102 @@
+"""Photographs as training uses them: bytes in memory as far as these take a part of it, else read from their files when they are due."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from .camera import Camera, Similarity
+from .errors import LinprimError
+from .fuse import available_memory
+from .scene import View
+
+# Photographs are kept in memory up to this share of what is available; of the others the last few that were read.
+MEMORY_SHARE, RECENT = 0.25, 2
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A view in memory: `rgb` (3, H, W) uint8, `alpha` (H, W) uint8 or None, and its camera in the training frame."""
+
+    name: str
+    camera: Camera
+    rgb: torch.Tensor
+    alpha: torch.Tensor | None
+
+    def over(self, background: torch.Tensor) -> torch.Tensor:
+        """(3, H, W) float32 in [0, 1], over `background` (3,) where alpha lets it through."""
+        rgb = self.rgb.to(torch.float32).mul_(1 / 255)
+        if self.alpha is None:
+            return rgb
+        alpha = self.alpha.to(torch.float32).mul_(1 / 255)
+        return rgb.mul_(alpha).add_(background[:, None, None] * (1 - alpha))
+
+
+class UnreadablePhoto(LinprimError):
+    """A photograph that could be read when training began no longer can."""
+
+
+class StoredShot(Shot):
+    """The same, read from its file whenever it is used."""
+
+    def __init__(self, view: View, camera: Camera, recent: dict[str, Shot]):
+        """`recent` holds what was read last, for all that share it."""
+        for name, value in (("name", view.name), ("camera", camera), ("_view", view), ("_recent", recent)):
+            object.__setattr__(self, name, value)
+
+    def _read(self) -> Shot:
+        shot = self._recent.pop(self.name, None)
+        if shot is None:
+            try:
+                shot = _decode(self._view, self.camera)
+            except LinprimError as error:
+                raise UnreadablePhoto(str(error)) from error
+            while len(self._recent) >= RECENT:
+                del self._recent[next(iter(self._recent))]
+        self._recent[self.name] = shot
+        return shot
+
+    @property
+    def rgb(self) -> torch.Tensor:
+        """(3, H, W) uint8."""
+        return self._read().rgb
+
+    @property
+    def alpha(self) -> torch.Tensor | None:
+        """(H, W) uint8, or None."""
+        return self._read().alpha if self._view.has_alpha else None
+
+
+def photo_bytes(views: tuple[View, ...]) -> int:
+    """What all of them take in memory."""
+    return sum(view.camera.width * view.camera.height * (4 if view.has_alpha else 3) for view in views)
+
+
+def load_shots(views: tuple[View, ...], similarity: Similarity, limit: int | None = None) -> list[Shot]:
+    """The views in their order. The first of them that take up to `limit` bytes are decoded into memory, the others when they are used:
+    the results of training are the same.
+
+    Args:
+        limit: bytes; without it MEMORY_SHARE of what is available.
+    """
+    left = int(MEMORY_SHARE * available_memory()) if limit is None else limit
+    recent: dict[str, Shot] = {}
+    shots: list[Shot | View] = []
+    for view in views:
+        left -= photo_bytes((view,))
+        shots.append(view if left >= 0 else StoredShot(view, view.camera.transformed(similarity), recent))
+    with ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
+        decoded = pool.map(
+            lambda shot: _decode(shot, shot.camera.transformed(similarity)) if isinstance(shot, View) else shot, shots
+        )
+        return list(decoded)
+
+
+def _decode(view: View, camera: Camera) -> Shot:
+    photo = view.load()
+    alpha = None if photo.alpha is None else torch.from_numpy(np.ascontiguousarray(photo.alpha))
+    return Shot(view.name, camera, torch.from_numpy(np.ascontiguousarray(photo.rgb.transpose(2, 0, 1))), alpha)

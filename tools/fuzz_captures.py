@@ -1,0 +1,209 @@
+"""Whole captures, files of protocols and runs, and what a correct result of reading one looks like."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+from fuzz_files import SIZE, check, check_primitives, finite, image, make_points
+
+# --- captures ---------------------------------------------------------------------------------------------
+
+
+def _poses(count: int) -> list[np.ndarray]:
+    poses = []
+    for angle in np.linspace(0, 5, count):
+        pose = np.eye(4)
+        pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        pose[:3, 3] = [3 * np.cos(angle), 3 * np.sin(angle), 1]
+        poses.append(pose)
+    return poses
+
+
+def make_transforms(folder: Path) -> None:
+    (folder / "images").mkdir()
+    frames = []
+    for number, pose in enumerate(_poses(3)):
+        image(folder / "images" / f"{number}.png", "RGBA")
+        image(folder / f"depth_{number}.png", "I;16")
+        image(folder / f"normal_{number}.png", "RGB")
+        frame = {"file_path": f"images/{number}.png", "transform_matrix": pose.tolist(), "depth_file_path": f"depth_{number}.png"}
+        frames.append(frame | {"normal_file_path": f"normal_{number}.png", "mask_path": f"normal_{number}.png"})
+    make_points(folder)
+    header = {"camera_angle_x": 0.8, "w": 12, "h": 9, "fl_x": 10.0, "fl_y": 11.0, "cx": 6.0, "cy": 4.5, "units": "m"}
+    header |= {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0, "camera_model": "OPENCV", "ply_file_path": "little.ply"}
+    header |= {"depth_unit_scale_factor": 0.001, "normal_frame": "world", "test_filenames": ["images/2.png"]}
+    header |= {"applied_transform": np.eye(4)[:3].tolist(), "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(header))
+    bare = [{"file_path": frame["file_path"][:-4], "transform_matrix": frame["transform_matrix"]} for frame in frames]
+    (folder / "bare.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": bare}))
+
+
+def read_scene_file(file: Path) -> None:
+    from linprim_geo.scene import load_scene
+
+    scene = load_scene(file if file.suffix == ".json" else file.parent)
+    for view in scene.views:
+        camera = view.camera
+        finite(np.array([camera.fx, camera.fy, camera.cx, camera.cy]), (4,), "camera")
+        finite(camera.world_to_camera, (4, 4), "pose")
+        finite(camera.center, (3,), "centre")
+        check(min(camera.width, camera.height) > 0 and min(camera.fx, camera.fy) > 0, "a camera without size")
+    if scene.points is not None:
+        finite(scene.points.xyz, (None, 3), "points")
+    view = scene.views[0]
+    photo = view.load()
+    finite(photo.rgb, (view.camera.height, view.camera.width, 3), "rgb")
+    for extra, shape in ((view.load_depth(), photo.rgb.shape[:2]), (view.load_normals(), photo.rgb.shape)):
+        if extra is not None:
+            finite(extra, shape, "depth or normals")
+
+
+def make_colmap(folder: Path, text: bool) -> None:
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(1, "OPENCV", 10.0, *SIZE)
+    model.add_camera_with_trivial_rig(camera)
+    model.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(2, "PINHOLE", 11.0, *SIZE))
+    for number, pose in enumerate(_poses(3), start=1):
+        rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:3, :3]), pose[:3, 3])
+        posed = pycolmap.Image(name=f"{number}.png", camera_id=1 + number % 2, image_id=number)
+        posed.points2D = pycolmap.Point2DList([pycolmap.Point2D(np.array([x, 2.5])) for x in (1.5, 3.5)])
+        model.add_image_with_trivial_frame(posed, rigid)
+    for row in range(2):
+        track = pycolmap.Track()
+        for number in (1, 2, 3):
+            track.add_element(number, row)
+        model.add_point3D(np.array([row, 1.0, 2.0]), track, np.array([1, 2, 3], np.uint8))
+    (model.write_text if text else model.write_binary)(str(folder))
+    # Models of old, without rigs and frames.
+    old = folder / "old"
+    old.mkdir()
+    for path in folder.glob("*.*"):
+        if path.stem not in ("rigs", "frames"):
+            shutil.copy(path, old)
+
+
+def read_colmap_file(file: Path) -> None:
+    from linprim_geo.read_colmap import read_model
+    from linprim_geo.scene import check_pose
+
+    model = read_model(file.parent)
+    for posed in model.images:
+        check(bool(np.isfinite(posed.lens.params).all()), "a camera is not finite")
+        finite(check_pose(posed.world_to_camera, f"{file.parent} image {posed.name}"), (4, 4), "pose")
+    if model.points is not None:
+        count = len(model.points.xyz)
+        finite(model.points.xyz, (None, 3), "points")
+        finite(model.points.rgb, (count, 3), "colours")
+        finite(model.points.error_px, (count,), "errors")
+
+
+def make_protocol(folder: Path) -> None:
+    from scipy.io import savemat
+
+    corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0.5], [0, 1, 0]]
+    crop = {"orthogonal_axis": "Z", "axis_min": -1, "axis_max": 2.5, "bounding_polygon": corners}
+    (folder / "crop.json").write_text(json.dumps(crop))
+    (folder / "matrix.txt").write_text("1 0 0 2\n0 1 0 3\n0 0 1 4.5\n0 0 0 1\n")
+    savemat(folder / "mask.mat", {"ObsMask": np.ones((3, 4, 5), np.uint8), "BB": np.array([[0, 0, 0], [3, 4, 5.0]]), "Res": 1.0})
+    savemat(folder / "plane.mat", {"P": np.array([0, 0, 1, -0.5])}, do_compression=True)
+
+
+def read_protocol_file(file: Path) -> None:
+    from linprim_geo.eval import protocol_files
+
+    points = np.random.default_rng(3).normal(size=(9, 3))
+    if file.name == "crop.json":
+        check(protocol_files.read_crop(file).holds(points).shape == (9,), "the crop volume does not answer")
+    elif file.name == "matrix.txt":
+        finite(np.linalg.inv(protocol_files.read_transform(file)), (4, 4), "matrix")
+    elif file.name == "mask.mat":
+        check(protocol_files.read_observed_volume(file, None).holds(points).shape == (9,), "the mask does not answer")
+    else:
+        finite(protocol_files.read_plane(file), (4,), "plane")
+
+
+# --- runs -------------------------------------------------------------------------------------------------
+
+
+def make_run(folder: Path) -> None:
+    from linprim_geo.camera import Similarity
+    from linprim_geo.options import SceneOptions, TrainOptions
+    from linprim_geo.run import Run
+    from linprim_geo.scene import load_scene
+
+    (folder / "scene").mkdir()
+    make_transforms(folder / "scene")
+    options = TrainOptions(max_primitives=20, iterations=10, threads=1, sh_degree=1)
+    where = folder / "run", load_scene(folder / "scene" / "bare.json"), folder / "scene"
+    run = Run.create(*where, SceneOptions(), options, Similarity(0.5, (1.0, 2.0, 3.0)), "x", [], {"seconds": 9.0, "finish_seconds": 1.0})
+    trainer = _trainer(options)
+    for _ in range(3):
+        trainer.advance()
+    run.save(trainer.primitives(), {"iteration": 3, "primitives": len(trainer), "background": [1, 1, 1], "seconds": 1.5})
+    lines = [json.dumps({"step": step, "loss": 0.5, "psnr": 20.0}) for step in (1, 2, 3)]
+    (folder / "run" / "metrics.jsonl").write_text("\n".join(lines) + "\n")
+    import torch
+
+    (folder / "run" / "checkpoints").mkdir()
+    torch.save(trainer.state(), folder / "run" / "checkpoints" / "step_000003.pt")
+    (folder / "run" / "checkpoints" / "latest").write_text("step_000003.pt\n")
+
+
+def _trainer(options):
+    import torch
+
+    from linprim_geo.camera import Camera
+    from linprim_geo.shots import Shot
+    from linprim_geo.trainer import Trainer, initial_parameters
+
+    rng = np.random.default_rng(7)
+    shots = []
+    for number, pose in enumerate(_poses(3)):
+        rgb = torch.from_numpy(rng.integers(0, 256, (3, 9, 12), np.uint8))
+        shots.append(Shot(str(number), Camera(*SIZE, 10.0, 11.0, 6.0, 4.5, np.linalg.inv(pose)), rgb, None))
+    parameters = initial_parameters(rng.normal(size=(7, 3)), rng.integers(0, 256, (7, 3)), 1, 0, (1e-3, 1.0))
+    return Trainer(shots, parameters, options, (1e-3, 1.0), torch.ones(3), False, True)
+
+
+def read_run_file(file: Path) -> None:
+    from linprim_geo.run import Run
+    from linprim_geo.train import _cut_metrics
+
+    folder = file.parent
+    if file.name == "metrics.jsonl":
+        _cut_metrics(file, 2)
+        for line in file.read_text().splitlines():
+            check(json.loads(line)["step"] <= 2, "a line of a later step was left")
+        return
+    run = Run.open(folder)
+    finite(run.background, (3,), "background")
+    check_primitives(run.primitives())
+    check(isinstance(run.notes, dict) and isinstance(run.unit, str) and isinstance(run.instruction_set, str), "notes are no table")
+    if "time_budget" in run.notes:
+        from linprim_geo.pacing import Pace
+
+        check(bool(np.isfinite(Pace.resumed(run, _trainer(run.train_options)).finish)), "the time is not finite")
+
+
+def read_checkpoint_file(file: Path) -> None:
+    import torch
+
+    from linprim_geo.checkpoint import read_checkpoint, restore
+    from linprim_geo.options import TrainOptions
+
+    run = file.parents[1]
+    state = read_checkpoint(run)
+    if state is None:
+        return
+    trainer = _trainer(TrainOptions(max_primitives=20, iterations=10, threads=1, sh_degree=1))
+    restore(trainer, state, file.parent)
+    for name, value in trainer.parameters.items():
+        check(bool(torch.isfinite(value).all()) and len(value) == len(trainer), f"{name} is not finite or too short")
+    if trainer.step < 10:
+        trainer.advance()
+    check_primitives(trainer.primitives())
