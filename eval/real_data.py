@@ -2,8 +2,8 @@
 
     python -m linprim_geo.eval.real_data --data DIR -o runs/real
 
-A capture is any sub-folder that `load_scene` reads. Its reference is a mesh `reference.ply` in it, or `DIR/meshes/NAME.*` whose NAME
-the folder's name begins with; depth is scored where the held-out views bring depth maps.
+A capture is any sub-folder that `load_scene` reads. Its reference is a mesh `reference.ply` or ScanNet++'s in it, or `DIR/meshes/NAME.*`
+whose NAME the folder's name begins with; depth is scored where the held-out views bring depth maps.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ def captures(data: Path, only: list[str]) -> list[Path]:
 
 def reference_of(capture: Path, data: Path) -> Path | None:
     """The mesh a capture is scored against, if there is one."""
-    own = capture / "reference.ply"
-    if own.exists():
-        return own
+    for name in ("reference.ply", "scans/mesh_aligned_0.05.ply"):  # the second is ScanNet++'s
+        if (capture / name).exists():
+            return capture / name
     fitting = [
         m
         for m in sorted((data / "meshes").glob("*"))

@@ -94,11 +94,13 @@ class Sweep:
     def __init__(self, scene, folder, run, reference, quick, rounds, threads, quiet):
         from linprim_geo.progress import Progress
         from linprim_geo.scene import load_scene
+        from linprim_geo.structure_from_motion import prepare
 
         self.scene_path, self.folder, self.given, self.quick, self.threads = scene.resolve(), folder, run, quick, threads
         self.rounds = rounds or (QUICK_ROUNDS if quick else ROUNDS)
         self.progress = Progress("tradeoff", 1, quiet=quiet)
         self.warm = self.warm_score = self.warm_train = False  # the first time of all loads libraries, and is not counted
+        prepare(scene, threads=threads, log=self.progress.note)
         self.scene = load_scene(scene)
         widest = max(view.camera.width for view in self.scene.train)
         self.scene_options = SceneOptions(downscale=-(-widest // (QUICK_WIDEST if quick else WIDEST)))

@@ -286,7 +286,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("train", _train, "train a scene: posed photographs to primitives")
     sub.add_argument(
-        "scene", nargs="?", metavar="SCENE", help="folder with a COLMAP model or transforms*.json"
+        "scene", nargs="?", metavar="SCENE", help="folder of a capture, of plain photographs, or a video"
     )
     sub.add_argument(
         "-s", "--source", "--source_path", dest="source", metavar="SCENE", help="the same, as in 3DGS"
@@ -315,7 +315,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_options(sub.add_argument_group("training"), TrainOptions)
 
     sub = command("inspect", _inspect, "say which effects a scene calls for, by which evidence, and what they cost")
-    sub.add_argument("scene", metavar="SCENE", help="folder with a COLMAP model or transforms*.json")
+    sub.add_argument("scene", metavar="SCENE", help="folder of a capture, of plain photographs, or a video")
     add_effects(sub.add_argument_group("effects"), "auto")
     add_options(sub.add_argument_group("scene"), SceneOptions)
     add_options(sub.add_argument_group("training"), TrainOptions)
@@ -398,7 +398,7 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
 
     sub = command("tradeoff", _tradeoff, "sweep every knob that trades time for accuracy: tables, plots, and a sentence for each")
-    sub.add_argument("scene", metavar="SCENE", help="folder with a COLMAP model or transforms*.json")
+    sub.add_argument("scene", metavar="SCENE", help="folder of a capture, of plain photographs, or a video")
     sub.add_argument("-o", "--output", metavar="DIR", help="folder to make, or to go on with (default runs/SCENE_tradeoff)")
     text = "knobs to sweep; a wrong name lists them (default all)"
     sub.add_argument("--knobs", nargs="+", default=[], metavar="NAME", help=text)
@@ -541,8 +541,12 @@ def _downscale_of(resolution: int, scene: str, parsed: argparse.Namespace) -> in
     if width < 1:
         raise LinprimError(f"-r is {resolution}, wanted 1, 2, 4, 8, a width in pixels, or -1")
     from .scene import load_scene
+    from .structure_from_motion import prepare
 
-    views = load_scene(scene, masks=getattr(parsed, "masks", None), sparse=getattr(parsed, "sparse", None)).train
+    given = {name: getattr(parsed, name) for name in ("masks", "images", "sparse", "frames") if hasattr(parsed, name)}
+    taken = {name: given[name] for name in ("sparse", "frames") if name in given}
+    prepare(Path(scene), **taken, threads=getattr(parsed, "threads", 0), log=lambda text: print(text, file=sys.stderr))
+    views = load_scene(scene, **given).train
     return -(-max(view.camera.width for view in views) // width)
 
 

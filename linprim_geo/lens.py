@@ -160,6 +160,13 @@ def straightened(lens: Lens, below: float) -> Lens:
     return Lens("PINHOLE", lens.width, lens.height, _pinhole_numbers(_camera(lens)))
 
 
+def resized(lens: Lens, width: int, height: int) -> Lens:
+    """The lens of the same photographs in another size; where there is one focal length, its scale is the mean of both."""
+    camera = _camera(lens)
+    camera.rescale(width, height)
+    return Lens(lens.model, width, height, tuple(float(value) for value in camera.params))
+
+
 @lru_cache(maxsize=64)
 def _undistorted(lens: Lens) -> Intrinsics:
     import pycolmap

@@ -126,6 +126,10 @@ class SceneOptions:
     masks: str = option(
         "", "folder of foreground masks, if they are not where data sets usually keep them; none: no masks and no alpha", metavar="DIR"
     )
+    images: str = option(
+        "", "folder of the photographs to use in place of those that the cameras name, in any size", metavar="DIR"
+    )
+    frames: int = option(150, "of a video, the sharpest of each of N equal parts", metavar="N")
     sparse: str = option(
         "", "COLMAP model to take points from, if it is not where data sets usually keep it", metavar="DIR"
     )

@@ -29,6 +29,13 @@ def cache_folder(cache: str | os.PathLike | None = None) -> Path:
     return Path(os.environ.get("LINPRIM_GEO_CACHE") or Path.home() / ".cache" / "linprim-geo")
 
 
+def files_in(folder: Path) -> list[Path]:
+    """The images that lie in a folder itself, sorted by name; none if there is no such folder."""
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith("."))
+
+
 @contextmanager
 def _opened(path: Path):
     """A PIL image, with everything that can go wrong while it is open turned into one sentence."""

@@ -59,6 +59,11 @@ def find_model(root: Path, sparse: Path | None = None) -> Path | None:
     return None
 
 
+def has_model(folder: Path) -> bool:
+    """Whether the folder has a model's table of cameras."""
+    return _has_table(folder, "cameras")
+
+
 def models_below(root: Path) -> list[Path]:
     """Every folder of a complete model up to three levels below `root`, the usual places first."""
     found = [root / name for name in _MODEL_FOLDERS]
@@ -69,8 +74,8 @@ def models_below(root: Path) -> list[Path]:
     return list(dict.fromkeys(folder.resolve() for folder in whole))
 
 
-def read_colmap(root: Path, model: Path) -> Listing:
-    """The listing of a capture whose cameras come from `model` and whose images lie in `root`.
+def read_colmap(root: Path, model: Path, images: Path | None = None) -> Listing:
+    """The listing of a capture whose cameras come from `model` and whose images lie in `images`, or in one of the usual folders of `root`.
 
     Raises:
         LinprimError: the model is damaged or empty, or registered images are not on disk.
@@ -79,9 +84,8 @@ def read_colmap(root: Path, model: Path) -> Listing:
     if not colmap.images:
         raise LinprimError(f"{model}: the reconstruction is empty (no registered image), wanted at least two")
     best, missing = None, None
-    for folder in dict.fromkeys(
-        [root / name for name in _IMAGE_FOLDERS] + [model.parent / "images", model.parent.parent / "images"]
-    ):
+    usual = [root / name for name in _IMAGE_FOLDERS] + [model.parent / "images", model.parent.parent / "images"]
+    for folder in dict.fromkeys(([images] if images else []) + usual):
         absent = [image.name for image in colmap.images if not is_file(folder / image.name)]
         if missing is None or len(absent) < len(missing):
             best, missing = folder, absent

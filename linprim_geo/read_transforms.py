@@ -76,7 +76,8 @@ def read_transforms(root: Path, json_file: Path | None = None, sparse: Path | No
         files = [(root / "transforms.json", None)]
     frames, headers = [], []
     for path, split in files:
-        header = _read_json(path)
+        # A file of held-out views that names none says that there are none.
+        header = _read_json(path, may_be_empty=split == "test")
         headers.append((path, header))
         frames.extend(_read_frames(path, header, split))
     points = _points(root, headers, frames, sparse)
@@ -92,7 +93,24 @@ def read_transforms(root: Path, json_file: Path | None = None, sparse: Path | No
     return Listing("transforms", tuple(frames), points, unit)
 
 
-def _read_json(path: Path) -> dict:
+def read_cameras(path: Path, images: Path) -> tuple[list[Frame], np.ndarray | None]:
+    """The frames of one file whose paths are names in the folder `images`, without side files, and its (3, 4) `applied_transform`.
+
+    Frames whose image is not on disk are there too.
+
+    Raises:
+        LinprimError: broken JSON, a missing key, an unknown camera model.
+    """
+    header = _read_json(path)
+    frames = []
+    for number, entry in enumerate(header["frames"] + (header.get("test_frames") or [])):
+        where = _checked(f"{path} frame {number}", entry)
+        bare = {key: value for key, value in entry.items() if not key.endswith(("mask_path", "depth_file_path", "normal_file_path"))}
+        frames.append(_frame(path.parent, header, bare, where, images / entry["file_path"], None))
+    return frames, _applied_transform([(path, header)])
+
+
+def _read_json(path: Path, may_be_empty: bool = False) -> dict:
     try:
         header = json.loads(path.read_text(encoding="utf-8-sig"))
     except json.JSONDecodeError as error:
@@ -104,7 +122,7 @@ def _read_json(path: Path) -> dict:
         raise LinprimError(f"{path}: cannot be read ({error}), wanted a JSON file") from error
     if not isinstance(header, dict) or not isinstance(header.get("frames"), list):
         raise LinprimError(f"{path}: no list 'frames', wanted one entry per image")
-    if not header["frames"]:
+    if not header["frames"] and not may_be_empty:
         raise LinprimError(f"{path}: the list 'frames' is empty, wanted one entry per image")
     return header
 
@@ -116,10 +134,7 @@ def _read_frames(path: Path, header: dict, split: str | None) -> list[Frame]:
     entries += header["test_frames"] if held_out else []
     located = []
     for number, entry in enumerate(entries):
-        where = f"{path} frame {number}"
-        if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
-            raise LinprimError(f"{where}: no 'file_path', wanted the path of its image")
-        where += f" ({entry['file_path']})"
+        where = _checked(f"{path} frame {number}", entry)
         located.append((where, entry, _find_image(path.parent, entry["file_path"])))
     missing = [(where, entry) for where, entry, image in located if image is None]
     if missing:
@@ -133,6 +148,13 @@ def _read_frames(path: Path, header: dict, split: str | None) -> list[Frame]:
         kind = "test" if id(entry) in held_out else name or split
         frames.append(_frame(path.parent, header, entry, where, image, kind))
     return frames
+
+
+def _checked(where: str, entry: object) -> str:
+    """Refuses an entry without a path; returns its place with the path, for messages."""
+    if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
+        raise LinprimError(f"{where}: no 'file_path', wanted the path of its image")
+    return f"{where} ({entry['file_path']})"
 
 
 def _frame(folder: Path, header: dict, entry: dict, where: str, image: Path, split: str | None) -> Frame:

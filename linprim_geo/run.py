@@ -5,7 +5,9 @@ transform.json    training frame <-> data-set frame, unit
 run.json          what the last save holds: iteration, primitives, background
 training_frame.npz   primitives in the training frame, bit for bit as trained
 scene.npz, scene.ply the same in the data set's frame, ours and in LinPrim's format (Gaussians: 3DGS's)
+sparse/0          the poses of photographs that came without
 metrics.jsonl     loss, PSNR, ... over time                        checkpoints/step_*.pt, latest
+found_poses/      COLMAP model of plain photographs, as their poses were found
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -26,7 +29,11 @@ from .errors import LinprimError
 from .files import is_remains, write_json
 from .options import SceneOptions, TrainOptions, check_train_options, from_saved, raster_options
 from .primitives import ARRAYS, KINDS, Primitives, load_primitives, save_primitives
-from .scene import Scene, View, load_scene
+from .scene import PHOTOGRAPHS, Scene, View, load_scene
+from .structure_from_motion import found_model
+
+# Folder of the COLMAP model of a run on photographs whose poses were found.
+FOUND_POSES = "found_poses"
 
 
 @dataclass(frozen=True)
@@ -75,6 +82,9 @@ class Run:
             config["effects"] = effects
         if time_budget is not None:
             config["time_budget"] = time_budget
+        # The cache may be emptied, and poses that are found anew would lie in another frame.
+        if scene.kind == PHOTOGRAPHS and (model := found_model(scene.root)) is not None:
+            shutil.copytree(model, path / FOUND_POSES, dirs_exist_ok=True)
         write_json(
             path / "transform.json",
             {
@@ -150,11 +160,14 @@ class Run:
     @cached_property
     def _scene(self) -> Scene:
         options = self.scene_options
+        found = self.path / FOUND_POSES
         return load_scene(
             self.scene_path,
             downscale=options.downscale,
             masks=options.masks or None,
-            sparse=options.sparse or None,
+            images=options.images or None,
+            sparse=options.sparse or (found if found.is_dir() else None),
+            frames=options.frames,
             pinhole_below=options.pinhole_below,
         ).with_training_views(options.views)
 
@@ -288,7 +301,7 @@ def is_unused(path: Path) -> bool:
     """Whether a run can be made at `path`: nothing is there, or no more than a run leaves that was killed before it began."""
     if not path.exists():
         return True
-    return path.is_dir() and all(is_remains(entry) or entry.name == "transform.json" for entry in path.iterdir())
+    return path.is_dir() and all(is_remains(entry) or entry.name in ("transform.json", FOUND_POSES) for entry in path.iterdir())
 
 
 def refuse_used(path: Path) -> None:

@@ -8,8 +8,9 @@ pixels; `View.load` decodes, undistorts and averages down.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,8 @@ from .lens import Intrinsics, Lens, check_lens, straightened, undistorted
 # Of the images sorted by name, those whose index is a multiple of this are held out if the data set does
 # not say.
 HOLD_OUT_EVERY = 8
+# `Scene.kind` of photographs whose poses were found by structure from motion.
+PHOTOGRAPHS = "photographs"
 # Largest entry of R^T R - 1 that is still taken for rounding of the file's digits; such poses are made
 # orthonormal.
 _RIGID_TOLERANCE = 5e-3
@@ -215,68 +218,116 @@ def load_scene(
     *,
     downscale: int = 1,
     masks: str | os.PathLike | None = None,
+    images: str | os.PathLike | None = None,
     sparse: str | os.PathLike | None = None,
+    frames: int = 150,
     cache: str | os.PathLike | None = None,
     pinhole_below: float = 0.0,
 ) -> Scene:
-    """Reads a posed capture: `transforms*.json` (NeRF-synthetic, nerfstudio, instant-ngp), else a COLMAP
-    model.
+    """Reads a posed capture: `transforms*.json` (NeRF-synthetic, nerfstudio, instant-ngp), ScanNet++, a COLMAP model, DTU's
+    `cameras_sphere.npz`, TUM's lists, or a trajectory (`.log`) with depth maps or of Tanks and Temples, in this order.
+
+    Photographs without poses, and videos, are read once `structure_from_motion.prepare` has found their poses.
 
     Held out are the frames that the data set names so (`transforms_test.json`, else `_val`;
-    `test_filenames`), else every 8th of the images sorted by name. Points come with the transforms
+    `test_filenames`; ScanNet++'s lists), else every 8th of the images sorted by name. Points come with the transforms
     (`ply_file_path`) or from a COLMAP model in the folder whose poses agree with them. Image headers are
     read, pixels are not (but for a few with alpha).
 
     Args:
-        path: the data set's folder, or a `.json` in it.
-        downscale: average this many pixels squared into one; cameras are scaled exactly.
+        path: the data set's folder, or a `.json` in it, or a video.
+        downscale: average this many pixels squared into one; cameras are scaled exactly. Where all photographs are there in a folder such
+            as `images_4` beside `images`, smaller by that factor but for rounding, these are taken.
         masks: folder of foreground masks named as the images; found by itself if it is `masks` or `mask`. With "none" neither masks
             nor alpha channels are used.
+        images: folder of photographs that take the place of those that the cameras name; cameras are scaled to their size.
         sparse: folder of the COLMAP model, if it is not `sparse/0`, `sparse`, `colmap/sparse/0` or the folder
             itself.
-        cache: where undistorted images are kept, see `photos.cache_folder`.
+        frames: how many were taken of a video.
+        cache: where undistorted images and poses that were found are kept, see `photos.cache_folder`.
         pinhole_below: a lens that shifts no ray by this many pixels (of the averaged image) from where the pinhole of its focal lengths and
             principal point has it is taken for that pinhole, and its photographs as they are.
 
     Raises:
         LinprimError: one sentence about the first thing that is missing, damaged or does not fit together.
     """
-    from . import read_colmap, read_transforms
+    from . import read_colmap, structure_from_motion
+    from .image_folders import with_images, with_masks, with_smaller_images
 
     if isinstance(downscale, bool) or int(downscale) != downscale or downscale < 1:
         raise LinprimError(f"downscale is {downscale}, wanted a whole number from 1")
-    root, json_file = _root(Path(path))
+    cache = Path(cache) if cache else None
+    path = structure_from_motion.frames_of(Path(path), frames, cache)
+    root, json_file = _root(path)
     sparse_folder = _option_folder(sparse, root, "--sparse")
     unmasked = masks == "none"
     masks_folder = None if unmasked else _option_folder(masks, root, "--masks")
-    if json_file is not None or read_transforms.is_there(root):
-        listing = read_transforms.read_transforms(root, json_file, sparse_folder)
-    elif (model := read_colmap.find_model(root, sparse_folder)) is not None:
-        listing = read_colmap.read_colmap(root, model)
+    images_folder = _option_folder(images, root, "--images")
+    read = _reader(root, json_file, sparse_folder, images_folder)
+    if read is not None:
+        listing = read()
+    elif (model := structure_from_motion.found_model(root, cache)) is not None:
+        listing = replace(read_colmap.read_colmap(root, model), kind=PHOTOGRAPHS)
     else:
         raise LinprimError(
-            f"{root}: no camera poses found ({_contents(root)}), wanted transforms.json,"
-            " transforms_train.json or a COLMAP model in sparse/0"
+            f"{root}: no camera poses found ({_contents(root)}), wanted transforms.json, transforms_train.json,"
+            " a COLMAP model in sparse/0 or the like; linprim-geo inspect and train find those of plain photographs"
         )
     if len(listing.frames) < 2:
         raise LinprimError(f"{root}: {len(listing.frames)} posed image found, wanted at least two")
-    frames = [replace(frame, mask_path=None) for frame in listing.frames]
+    posed = [replace(frame, mask_path=None) for frame in listing.frames] if unmasked else list(listing.frames)
+    if images_folder is not None:
+        posed = with_images(posed, images_folder)
     if not unmasked:
-        frames = _with_masks(listing.frames, root, masks_folder)
-    names = _names(frames)
-    alphas = _header_checks(frames)
-    has_alpha = any(frame.mask_path for frame in frames) or _alpha_says_something(frames, alphas)
+        posed = with_masks(posed, root, masks_folder)
+    smaller = with_smaller_images(posed, root, int(downscale)) if images_folder is None else None
+    if smaller is not None:
+        posed, downscale = smaller, 1
+    names = _names(posed)
+    alphas = _header_checks(posed)
+    has_alpha = any(frame.mask_path for frame in posed) or _alpha_says_something(posed, alphas)
     has_alpha = has_alpha and not unmasked
     folder = photos.cache_folder(cache)
     pinholes: dict[Lens, Intrinsics] = {}
     if pinhole_below > 0:
-        straight = {lens: straightened(lens, pinhole_below * downscale) for lens in {frame.lens for frame in frames}}
-        frames = [replace(frame, lens=straight[frame.lens]) for frame in frames]
+        straight = {lens: straightened(lens, pinhole_below * downscale) for lens in {frame.lens for frame in posed}}
+        posed = [replace(frame, lens=straight[frame.lens]) for frame in posed]
     views = []
-    for frame, name in zip(frames, names, strict=True):
+    for frame, name in zip(posed, names, strict=True):
         views.append(_view(frame, name, int(downscale), has_alpha, folder, pinholes))
-    train, test = _split(frames, views)
+    train, test = _split(posed, views)
     return Scene(root, listing.kind, train, test, listing.points, listing.unit or "unit of the data set")
+
+
+def has_poses(path: Path, sparse: str | os.PathLike | None = None) -> bool:
+    """Whether `load_scene` finds poses in a capture's folder, whatever they are worth; false for photographs alone.
+
+    Raises:
+        LinprimError: there is no such folder.
+    """
+    root, json_file = _root(path)
+    return _reader(root, json_file, _option_folder(sparse, root, "--sparse"), None) is not None
+
+
+def _reader(root: Path, json_file: Path | None, sparse: Path | None, images: Path | None) -> Callable[[], Listing] | None:
+    """What reads the first layout that the folder has; None if it has none."""
+    from . import read_colmap, read_dtu, read_rgbd, read_scannetpp, read_tnt, read_transforms
+
+    if json_file is not None or read_transforms.is_there(root):
+        return partial(read_transforms.read_transforms, root, json_file, sparse)
+    if sparse is None and (device := read_scannetpp.find_device(root)) is not None:
+        return partial(read_scannetpp.read_scannetpp, device)
+    if (model := read_colmap.find_model(root, sparse)) is not None:
+        return partial(read_colmap.read_colmap, root, model, images)
+    if (cameras := read_dtu.find_cameras(root)) is not None:
+        return partial(read_dtu.read_dtu, root, cameras)
+    if read_rgbd.find_tum(root):
+        return partial(read_rgbd.read_tum, root)
+    if (log := read_rgbd.find_log(root)) is not None:
+        return partial(read_rgbd.read_log, root, log)
+    if (log := read_tnt.find_log(root)) is not None:
+        return partial(read_tnt.read_tnt, root, log)
+    return None
 
 
 def check_pose(matrix: np.ndarray, where: str) -> np.ndarray:
@@ -333,45 +384,6 @@ def _contents(root: Path) -> str:
         return "the folder is empty"
     shown = ", ".join(entries[:6]) + (", ..." if len(entries) > 6 else "")
     return f"{images} images; it holds {shown}" if images else f"it holds {shown}"
-
-
-def _with_masks(frames: Sequence[Frame], root: Path, folder: Path | None) -> list[Frame]:
-    """Gives every frame its mask file; a folder found by itself that fits no frame at all is left alone."""
-    if folder is None and any(frame.mask_path for frame in frames):
-        return list(frames)
-    candidates = (
-        [folder]
-        if folder is not None
-        else [root / name for name in ("masks", "mask") if (root / name).is_dir()]
-    )
-    for candidate in candidates:
-        found = [_mask_of(frame, candidate) for frame in frames]
-        missing = [frame.relative for frame, mask in zip(frames, found, strict=True) if mask is None]
-        if not missing:
-            return [replace(frame, mask_path=mask) for frame, mask in zip(frames, found, strict=True)]
-        if folder is not None or len(missing) < len(frames):
-            raise LinprimError(
-                f"{candidate}: no mask for {len(missing)} of {len(frames)} images, the first is"
-                f" {missing[0]}, wanted {Path(missing[0]).stem}.png or {Path(missing[0]).name}.png"
-            )
-    return list(frames)
-
-
-def _mask_of(frame: Frame, folder: Path) -> Path | None:
-    relative = Path(frame.relative)
-    inner = Path(*relative.parts[1:]) if len(relative.parts) > 1 else relative
-    for base in dict.fromkeys((relative, inner, Path(relative.name))):
-        image_name = frame.image_path.name
-        for name in (
-            f"{base.name}.png",
-            f"{base.stem}.png",
-            f"{image_name}.png",
-            image_name,
-            f"{base.stem}.jpg",
-        ):
-            if is_file(folder / base.parent / name):
-                return folder / base.parent / name
-    return None
 
 
 def _names(frames: Sequence[Frame]) -> list[str]:
@@ -470,7 +482,7 @@ def _view(
 
 def _split(frames: Sequence[Frame], views: Sequence[View]) -> tuple[tuple[View, ...], tuple[View, ...]]:
     """By what the frames say, else every 8th by name; never fewer than two training views."""
-    if any(frame.split == "test" for frame in frames):
+    if any(frame.split is not None for frame in frames):
         train = tuple(view for frame, view in zip(frames, views, strict=True) if frame.split != "test")
         test = tuple(view for frame, view in zip(frames, views, strict=True) if frame.split == "test")
         if len(train) < 2:

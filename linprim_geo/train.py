@@ -41,6 +41,7 @@ from .progress import Progress, duration, memory_gib
 from .run import Run, is_unused, refuse_used
 from .scene import PointCloud, Scene, load_scene
 from .shots import Shot, UnreadablePhoto, load_shots
+from .structure_from_motion import prepare
 from .time_budget import Budget
 from .trainer import LARGEST_PART, SMALLEST_PX, Trainer, initial_parameters
 
@@ -100,13 +101,16 @@ def decided_scene(
             path,
             downscale=how.downscale,
             masks=how.masks or None,
+            images=how.images or None,
             sparse=how.sparse or None,
+            frames=how.frames,
             pinhole_below=how.pinhole_below,
         ).with_training_views(how.views)
         return with_points(loaded, options, log)
 
     if scene_options.views < 0:
         raise LinprimError(f"--views is {scene_options.views}, wanted a number of training views, or 0 for all")
+    prepare(path, scene_options.sparse or None, scene_options.frames, threads=options.threads, log=log)
     scene = read(scene_options)
     if choice.mode == "none" and not choice.asked:
         return [], scene, scene_options, options

@@ -9,6 +9,7 @@ import pytest
 from captures import picture, reconstruction, ring, write_colmap
 
 from linprim_geo.errors import LinprimError
+from linprim_geo.lens import model_parameter_counts
 from linprim_geo.read_colmap import find_model, read_model
 from linprim_geo.scene import load_scene
 
@@ -68,6 +69,23 @@ def test_a_distorted_camera_becomes_a_pinhole_of_its_own_size(tmp_path):
     half = load_scene(tmp_path, cache=tmp_path / "cache", downscale=2).train[0]
     assert half.load().rgb.shape == (view.camera.height // 2, view.camera.width // 2, 3)
     assert half.camera.cx * 2 == view.camera.cx
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_every_camera_model_is_read_with_its_parameters(tmp_path, text):
+    import pycolmap
+
+    for model in sorted(model_parameter_counts()):
+        params = list(pycolmap.Camera.create_from_model_name(1, model, 30.0, 32, 24).params)
+        write_colmap(tmp_path / model, 3, points=0, text=text, model=model, params=params)
+        if model == "EQUIRECTANGULAR":
+            assert "camera model EQUIRECTANGULAR is a panorama" in refusal(tmp_path / model)
+            continue
+        (lens,) = {image.lens for image in read_model(tmp_path / model / "sparse/0").images}
+        assert (lens.model, lens.width, lens.height) == (model, 32, 24)
+        np.testing.assert_allclose(lens.params, params, rtol=1e-12)
+        camera = load_scene(tmp_path / model).train[0].camera
+        assert abs(camera.cx - camera.width / 2) <= 1 and camera.width > 20
 
 
 def test_several_cameras_keep_their_own_intrinsics(tmp_path):

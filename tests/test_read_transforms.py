@@ -4,6 +4,7 @@ by name."""
 from __future__ import annotations
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -77,6 +78,25 @@ def test_distortion_keys(tmp_path, keys, model, params):
         assert lens is None
     else:
         assert lens.model == model and lens.params == (30, 30, 16, 12, *params)
+
+
+def test_what_instant_ngp_writes(tmp_path):
+    """Its script's keys: one lens for all, whole numbers as floats, sharpness per image, and a cube that nothing else asks for."""
+    cameras = ring(5)
+    content = transforms(cameras, [f"./images/{i:04d}.png" for i in range(5)])
+    angles = {"camera_angle_x": 2 * math.atan(16 / 30), "camera_angle_y": 2 * math.atan(12 / 30)}
+    distortion = {"k1": 0.02, "k2": -0.01, "k3": 0, "k4": 0, "p1": 0.001, "p2": -0.002, "is_fisheye": False}
+    content = {**angles, **content, **distortion, "w": 32.0, "h": 24.0, "aabb_scale": 16}
+    (tmp_path / "images").mkdir()
+    for i, frame in enumerate(content["frames"]):
+        picture(i).save(tmp_path / frame["file_path"])
+        frame["sharpness"] = 100.0 + i
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 5
+    for view in scene.views:
+        assert (view.lens.model, view.lens.params[4:]) == ("OPENCV", (0.02, -0.01, 0.001, -0.002))
+        np.testing.assert_allclose(view.camera.world_to_camera, cameras[int(view.name)].world_to_camera, atol=1e-12)
 
 
 def test_named_splits_of_nerfstudio(tmp_path):

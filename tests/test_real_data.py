@@ -33,6 +33,9 @@ def test_the_reference_is_the_captures_own_or_the_longest_name_that_fits(data, t
         (tmp_path / "meshes" / name).touch()
     assert real_data.reference_of(tmp_path / "part_b_small", tmp_path).name == "part_b.obj"
     assert real_data.reference_of(tmp_path / "room", tmp_path) is None
+    (tmp_path / "room" / "scans").mkdir(parents=True)
+    (tmp_path / "room" / "scans" / "mesh_aligned_0.05.ply").touch()
+    assert real_data.reference_of(tmp_path / "room", tmp_path).name == "mesh_aligned_0.05.ply"
 
 
 def test_photographs_are_never_deleted(data):

@@ -68,6 +68,16 @@ def test_test_file_wins_over_val_and_nerf_synthetic_side_images_are_no_views(tmp
     assert [view.name for view in load_scene(tmp_path).test] == ["val_r_0"]
 
 
+def test_a_test_file_without_frames_says_that_nothing_is_held_out(tmp_path):
+    write_transforms(tmp_path, 10, name="transforms_train.json")
+    assert len(load_scene(tmp_path).test) == 2
+    (tmp_path / "transforms_test.json").write_text('{"frames": []}')
+    scene = load_scene(tmp_path)
+    assert len(scene.train) == 10 and not scene.test
+    (tmp_path / "transforms_train.json").write_text('{"frames": []}')
+    assert "transforms_train.json: the list 'frames' is empty" in refusal(tmp_path)
+
+
 @pytest.mark.parametrize("factor", [1, 2, 3, 5])
 def test_downscaled_cameras_project_to_the_averaged_pixels(tmp_path, factor):
     cameras = write_transforms(tmp_path, 3)

@@ -9,6 +9,7 @@ from linprim_geo import campath, shapes, synth
 from linprim_geo.camera import Camera
 from linprim_geo.errors import LinprimError
 from linprim_geo.raycast import RayCaster
+from linprim_geo.scene import load_scene
 from linprim_geo.synth import synthesize
 from linprim_geo.synth_points import MAX_TRACK, sees
 from linprim_geo.textured import TexturedMesh, barycentric, load_textured, procedural_albedo, subdivide
@@ -362,8 +363,6 @@ def test_points_lie_on_the_surface_are_seen_and_carry_their_error(capture, built
 
 
 def test_the_reader_of_scenes_agrees_with_the_writer(capture):
-    from linprim_geo.scene import load_scene
-
     out, _ = capture
     scene = load_scene(out)
     assert len(scene.train) == 8 and len(scene.test) == 3
@@ -537,6 +536,8 @@ def test_an_existing_folder_is_kept_unless_it_is_ours_and_may_go(tmp_path, built
         synthesize(out, **settings)
     (out / "stale.txt").write_text("old")
     synthesize(out, overwrite=True, **settings)
+    scene = load_scene(out)
+    assert len(scene.train) == 2 and not scene.test
     assert not (out / "stale.txt").exists() and (out / "synth.json").is_file()
     assert [entry.name for entry in tmp_path.iterdir()] == ["out"]
 

@@ -1,0 +1,114 @@
+"""Photographs from a video: the sharpest frame of each of as many equal parts, through PyAV (the extra `video`)."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from . import photos
+from .errors import LinprimError
+
+SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+# Changed whenever other frames are chosen, so that old cache entries are not found any more.
+_CACHE_VERSION = 1
+_JPEG_QUALITY = 95
+_READ_BYTES = 1 << 22
+
+
+def is_video(path: Path) -> bool:
+    """Whether this is a file with the suffix of a video."""
+    return path.suffix.lower() in SUFFIXES and path.is_file()
+
+
+def frames_folder(video: Path, count: int, cache: Path | None = None) -> Path:
+    """Where `extract_frames` leaves the frames of a video: in the cache folder, under its content and their number."""
+    digest = hashlib.blake2b(repr((_CACHE_VERSION, count)).encode(), digest_size=16)
+    try:
+        with open(video, "rb") as file:
+            while block := file.read(_READ_BYTES):
+                digest.update(block)
+    except OSError as error:
+        raise LinprimError(f"{video}: cannot be read ({error.strerror}), wanted a video") from error
+    return photos.cache_folder(cache) / "video" / digest.hexdigest()
+
+
+def extract_frames(
+    video: Path, count: int, cache: Path | None = None, log: Callable[[str], None] | None = None
+) -> Path:
+    """Writes `count` frames, or all there are, as JPEG files unless that was done before; returns their folder.
+
+    Of each of `count` equal parts the frame is taken whose grey values have the largest variance of their Laplacian.
+
+    Raises:
+        LinprimError: PyAV is not installed, or the file holds no video that can be decoded.
+    """
+    from PIL import Image
+
+    folder = frames_folder(video, count, cache)
+    if folder.is_dir():
+        return folder
+    av = _pyav()
+    part = folder.with_name(folder.name + ".part")
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    try:
+        total = _count(av, video)
+        kept = 0
+        best: tuple[float, int, np.ndarray] | None = None
+        interval = 0
+        with av.open(str(video)) as container:
+            for index, frame in enumerate(container.decode(video=0)):
+                if index * count // total > interval and best is not None and total > count:
+                    kept, best = kept + _save(Image, part, best), None
+                interval = index * count // total
+                sharpness = _sharpness(frame.to_ndarray(format="gray"))
+                if total <= count:
+                    kept += _save(Image, part, (sharpness, index, frame.to_ndarray(format="rgb24")))
+                elif best is None or sharpness > best[0]:
+                    best = sharpness, index, frame.to_ndarray(format="rgb24")
+        if best is not None:
+            kept += _save(Image, part, best)
+    except (av.FFmpegError, IndexError, OSError, ValueError) as error:
+        reason = (str(error).splitlines() or ["damaged"])[0]
+        shutil.rmtree(part, ignore_errors=True)
+        raise LinprimError(f"{video}: cannot be decoded ({reason}), wanted a complete video") from error
+    if not kept:
+        shutil.rmtree(part, ignore_errors=True)
+        raise LinprimError(f"{video}: no frame could be decoded, wanted a complete video")
+    part.rename(folder)
+    if log:
+        log(f"{kept} frames of {video}, the sharpest of each part of its {total}, in {folder}")
+    return folder
+
+
+def _pyav():
+    try:
+        import av
+    except ModuleNotFoundError as error:
+        raise LinprimError(
+            "videos are decoded by PyAV, which is not installed: pip install 'linprim-geo[video]', or give a folder of photographs"
+        ) from error
+    return av
+
+
+def _count(av, video: Path) -> int:
+    """Frames in the first video stream: as the file says, else counted."""
+    with av.open(str(video)) as container:
+        stream = container.streams.video[0]
+        return stream.frames or max(1, sum(1 for packet in container.demux(stream) if packet.size))
+
+
+def _sharpness(grey: np.ndarray) -> float:
+    values = grey.astype(np.float32)
+    middle = values[1:-1, 1:-1]
+    laplacian = values[:-2, 1:-1] + values[2:, 1:-1] + values[1:-1, :-2] + values[1:-1, 2:] - 4 * middle
+    return float(laplacian.var()) if laplacian.size else 0.0
+
+
+def _save(image, folder: Path, frame: tuple[float, int, np.ndarray]) -> int:
+    image.fromarray(frame[2]).save(folder / f"{frame[1]:06d}.jpg", quality=_JPEG_QUALITY, subsampling=0)
+    return 1
