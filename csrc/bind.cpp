@@ -1,12 +1,14 @@
 // The compiled module linprim_geo._core: checks shapes, releases the interpreter lock, calls the core. No arithmetic here.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <optional>
 #include <stdexcept>
@@ -16,6 +18,7 @@
 
 #include "linprim.h"
 #include "parallel.h"
+#include "photo_sweep.h"
 #include "segment_depth.h"
 
 namespace nb = nanobind;
@@ -230,6 +233,23 @@ NB_MODULE(_core, m) {
     if (!(most > 0)) throw std::invalid_argument("most has to be positive");
     nb::gil_scoped_release release;
     self.optical_depth(from, to, start, count, most, sums);
+  });
+  m.def("add_photo", [](Pose pose, std::array<double, 4> lens, In<float> image, In<float> depth, In<float> jump, std::array<double, 2> rules,
+                        In<double> offset, In<double> point, In<double> normal, In<double> footprint, Out<int32_t> views, Out<float> weight,
+                        Out<float> value, Out<float> square) {
+    if (image.ndim() != 2 || image.size() == 0) throw std::invalid_argument("image has to have shape (H, W)");
+    const int64_t height = int64_t(image.shape(0)), width = int64_t(image.shape(1));
+    const int64_t count = int64_t(views.size()), offsets = int64_t(offset.size());
+    linprim::PhotoView view{{}, lens[0], lens[1], lens[2], lens[3], int(width), int(height), image.data(),
+                            checked(depth, {height, width}, "depth"), checked(jump, {height, width}, "jump")};
+    std::copy_n(pose.data(), 12, view.pose);
+    const linprim::PhotoSums sums{count, checked(point, {count, 3}, "point"), checked(normal, {count, 3}, "normal"),
+                                  checked(footprint, {count}, "footprint"), checked(views, {count}, "views"),
+                                  checked(weight, {count}, "weight"), checked(value, {count, offsets}, "value"),
+                                  checked(square, {count, offsets}, "square")};
+    const double* along = checked(offset, {offsets}, "offset");
+    nb::gil_scoped_release release;
+    linprim::add_photo(view, {rules[0], rules[1]}, along, int(offsets), sums);
   });
   m.def("photometric_loss", [](In<float> image, In<float> target, std::optional<In<float>> weight, float dssim, Out<float> gradient) {
     if (image.ndim() != 3) throw std::invalid_argument("image has to have shape (3, H, W)");

@@ -1,8 +1,8 @@
 """What each geometry-aware term of training buys, and costs: `python -m linprim_geo.eval.ablation_geometry -o runs/ablation`.
 
-A scene is trained once with photographs alone. Every variant then repeats the last part of that run from the same checkpoint with one
-or more terms switched on, so nothing differs before. Each is meshed and scored against the exact surface, or where a capture has only
-depth images, against these. `ablation.json` and `ablation.txt` hold per scene and variant
+A scene is trained once with photographs alone. Every variant, and `plain` too, then repeats the last part of that run from the same
+checkpoint with one or more terms switched on, so nothing differs before. Each is meshed and scored against the exact surface, or where
+a capture has only depth images, against these. `ablation.json` and `ablation.txt` hold per scene and variant
 
     PSNR of held-out views, depth AbsRel of held-out views, Chamfer distance in % of the reference's diagonal by extraction method,
     normal consistency, and the CPU seconds of the steps that were repeated
@@ -18,6 +18,7 @@ import json
 import math
 import shutil
 import sys
+import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -37,6 +38,8 @@ VARIANTS: dict[str, dict] = {
     "normal+patches": {"normal_consistency": 0.05, "patches": 0.1},
     "normal+binarisation": {"normal_consistency": 0.05, "binarisation": 0.02},
     "overlap+normal": {"order": "overlap", "order_from": 0.7, "normal_consistency": 0.05},
+    "overlap+points": {"order": "overlap", "order_from": 0.7, "point_depth": 1.0},
+    "overlap+patches": {"order": "overlap", "order_from": 0.7, "patches": 0.1},
     "overlap+normal+patches": {"order": "overlap", "order_from": 0.7, "normal_consistency": 0.05, "patches": 0.1},
     "sensor depth": {"sensor_depth": 1.0},
     "sensor depth+normals": {"sensor_depth": 1.0, "sensor_normals": 0.1},
@@ -50,7 +53,7 @@ COLUMNS = {
     "chamfer_tsdf": "Chamfer % tsdf",
     "chamfer_polyhedra": "polyhedra",
     "normal_consistency": "normal cons.",
-    "seconds": "seconds",
+    "seconds": "CPU seconds",
 }
 
 
@@ -65,7 +68,7 @@ def train_base(capture: Path, folder: Path, options: TrainOptions, scene_options
 
 
 def train_variant(base: Path, folder: Path, changed: dict) -> None:
-    """Repeats the last part of `base` with other options, unless the folder holds that run."""
+    """Repeats the last part of `base` with other options, unless the folder holds that run; leaves its CPU seconds in `seconds.json`."""
     from linprim_geo.run import Run
     from linprim_geo.train import train
 
@@ -83,7 +86,9 @@ def train_variant(base: Path, folder: Path, changed: dict) -> None:
     (temporary / "checkpoints" / "latest").write_text(f"step_{step:06d}.pt\n")
     config = json.loads((base / "config.json").read_text())
     write_json(temporary / "config.json", config | {"train_options": asdict(with_changes)})
+    began = time.process_time()
     train(run.scene_path, temporary, run.scene_options, with_changes, resume=True, quiet=True)
+    write_json(temporary / "seconds.json", {"cpu_seconds": time.process_time() - began})
     temporary.rename(folder)
 
 
@@ -103,9 +108,7 @@ def score(folder: Path, reference: Path | None, methods: tuple[str, ...]) -> dic
 
     run = Run.open(folder)
     cameras = [view.camera for view in run.scene().train]
-    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    begin = max((x["seconds"] for x in lines if x["step"] <= branch_step(run.train_options)), default=0.0)
-    row = {"psnr": eval_images_run(run)["psnr"], "seconds": run.state["seconds"] - begin}
+    row = {"psnr": eval_images_run(run)["psnr"], "seconds": json.loads((folder / "seconds.json").read_text())["cpu_seconds"]}
     if any(view.depth_path for view in run.scene().test):
         row["abs_rel"] = eval_depth_run(run)["abs_rel"]
     for method in methods:
@@ -199,13 +202,12 @@ def run(given: argparse.Namespace) -> None:
         jobs.append((capture.name, capture, reference, SceneOptions(downscale=given.downscale)))
     rows: dict[str, dict[str, dict]] = {}
     for name, capture, reference, scene_options in jobs:
-        base = given.output / name / "plain"
+        base = given.output / name / "base"
         train_base(capture, base, options, scene_options)
         rows[name] = {}
         for variant in ["plain", *(v for v in given.variants if v != "plain")]:
             folder = given.output / name / variant.replace(" ", "_")
-            if variant != "plain":
-                train_variant(base, folder, VARIANTS[variant])
+            train_variant(base, folder, VARIANTS[variant])
             saved = folder / "row.json"
             if not saved.exists():
                 write_json(saved, score(folder, reference, tuple(given.methods)))

@@ -11,16 +11,15 @@ from pathlib import Path
 from .auto_level import choose_level
 from .errors import LinprimError
 from .files import locked, remove_torn, write_json
-from .mesh import SUFFIXES, manifold_status, save_mesh, select_faces, topology, topology_line
-from .mesh_process import process_mesh
+from .finish import finish_surface, visible_file
+from .mesh import SUFFIXES, manifold_status, topology, topology_line
 from .options import ExtractOptions
 from .progress import Progress
 from .run import Run
 from .stages import Stages
 from .texture import LARGEST as LARGEST_TEXTURE
-from .texture import check_texture, make_texture, save_textured
+from .texture import check_texture
 from .time_budget import Budget, choose_voxel
-from .visibility import visible_faces
 
 # Each is a function (run, options, stages) -> (mesh, statistics of its own), found when it is wanted: their libraries are large.
 METHODS = {
@@ -35,6 +34,7 @@ RANGES = {
     "truncation": (1, 100),
     "memory_limit": (0, 1e9),
     "smallest_part": (0, 1),
+    "refine": (0, 100),
     "close_holes": (0, 10**9),
     "smooth": (0, 10_000),
     "remesh": (0, 1e30),
@@ -56,9 +56,9 @@ def extract_mesh(
 
     RUN/mesh/METHOD holds mesh.ply, mesh_visible.ply and stats.json; with `output` the two meshes go to OUTPUT and its sibling
     *_visible, in the format of the suffix (.ply, .obj, .glb, .stl). Vertices have normals, colours and, as `quality`,
-    the spread of the views' surfaces in the data set's unit; everything is in the data set's
-    frame and unit. Holes are closed, the surface smoothed, remeshed and simplified as the options ask (`mesh_process`); with
-    `texture` .obj and .glb have a texture out of the photographs in place of vertex colours.
+    the predicted error (`photo_sweep.predicted_error`); everything is in the data set's frame and unit. The photographs move the vertices
+    to where they agree best (`photo_sweep.refine_surface`), then holes are closed, the surface smoothed, remeshed and simplified as the
+    options ask (`mesh_process`); with `texture` .obj and .glb have a texture out of the photographs in place of vertex colours.
 
     With `time_budget`, in seconds, the voxel size is the smallest with which everything takes that time at most, by what coarse passes
     take (`time_budget.choose_voxel`); stats.json has `time_budget`: what was chosen and why, and the seconds that it took.
@@ -102,7 +102,7 @@ def _extract(
     opened: Run, method: str, folder: Path, target: Path, options: ExtractOptions, budget: Budget | None, progress: Progress
 ) -> dict:
     """What `extract_mesh` does when everything is in order and its folder is held."""
-    visible_target = target.with_name(f"{target.stem}_visible{target.suffix}")
+    visible_target = visible_file(target)
     written = [target, visible_target, folder / "stats.json"]
     if options.texture:
         written += [file.with_suffix(suffix) for file in (target, visible_target) for suffix in (".png", ".mtl")]
@@ -124,25 +124,8 @@ def _extract(
         options, frames, chosen = choose_voxel(opened, options, target, stages, budget)
         kept = (frames,)
     mesh, about = surface(opened, options, stages, *kept)
-    mesh, processing = process_mesh(mesh, options, stages.note)
-    if processing:
-        stages.lap("process")
-    views = opened.scene().train
-    cameras = [view.camera for view in views]
-    seen = visible_faces(mesh, cameras)
-    visible = select_faces(mesh, seen)
-    stages.lap("visibility")
-    texture = None
-    if options.texture:
-        texture = make_texture(mesh, options.texture, views, stages.note)
-        stages.lap("texture")
-        save_textured(target, mesh, texture)
-        save_textured(visible_target, visible, texture.select(seen))
-    else:
-        save_mesh(target, mesh)
-        save_mesh(visible_target, visible)
-    stages.lap("write")
-    shape = topology(mesh)
+    done = finish_surface(mesh, opened, options, target, stages)
+    shape = topology(done.mesh)
     stats = {
         "mesh": str(target),
         "mesh_visible": str(visible_target),
@@ -150,13 +133,14 @@ def _extract(
         **about,
         "level_differences": agreement,
         "unit": opened.unit,
-        "views": len(cameras),
+        "views": len(opened.scene().train),
         "primitives": opened.state.get("primitives"),
         **shape,
-        "manifold_status": manifold_status(mesh) if shape["watertight"] else None,
-        "processing": processing,
-        "texture": texture.about if texture else None,
-        "visible": topology(visible),
+        "manifold_status": manifold_status(done.mesh) if shape["watertight"] else None,
+        "refine": options.refine,
+        "processing": done.processing,
+        "texture": done.texture,
+        "visible": topology(done.visible),
         **stages.report(),
     }
     if budget:

@@ -11,7 +11,7 @@ import numpy as np
 
 from .errors import LinprimError
 from .mesh import Mesh, remove_small_components, select_faces, vertex_normals
-from .tsdf import BEHIND_VOXELS, DepthFrame, Grid, Rules, measure_spread
+from .tsdf import BEHIND_VOXELS, DepthFrame, Grid, Rules
 
 BYTES_PER_VOXEL = 44
 """12 for the votes; when they are done, 5 for the field, 8 for Open3D's copy of it, and marching cubes: 37
@@ -39,9 +39,9 @@ def fuse_tsdf(
     threads: int = 0,
     log: Callable[[str], None] | None = None,
 ) -> Mesh:
-    """Fuses depth maps into a triangle mesh with normals, colours and the spread of the views as `quality`.
+    """Fuses depth maps into a triangle mesh with normals and colours.
 
-    `frames` is iterated several times (blocks, field, quality, colours), so it must be re-iterable; a
+    `frames` is iterated several times (blocks, field, colours), so it must be re-iterable; a
     sequence that renders on demand keeps only one frame in memory. Blocks around every depth sample are
     allocated, then every frame votes in all blocks inside its frustum, so background and far depths carve
     what other views put there. The mesh is oriented with its front towards the cameras. The same input gives
@@ -64,8 +64,7 @@ def fuse_tsdf(
         log: called with lines such as the memory that will be taken.
 
     Returns:
-        The mesh in the frame of the cameras. `quality` is the root mean square distance of a vertex from the
-        surfels of the views that see it, in scene units.
+        The mesh in the frame of the cameras.
     Raises:
         LinprimError: no frame has a depth, the field would not fit in memory, or nothing comes out.
     Accuracy: Chamfer of 60 exact depth maps of 320x320 with a voxel of 1/200 of the diagonal, against what
@@ -101,7 +100,6 @@ def fuse_tsdf(
                 "try a larger voxel size"
             )
         mesh = replace(mesh, normals=vertex_normals(mesh))
-        mesh = replace(mesh, quality=measure_spread(mesh, frames, grid, pool))
     if colors and colored:
         from .visibility import color_vertices
 

@@ -231,6 +231,9 @@ class ExtractOptions:
         0.0, "memory the grid may take, in GiB; 0 allows 60 % of what is free", metavar="GIB"
     )
     smallest_part: float = option(0.01, "drop components with less than this share of the largest one's area")
+    refine: int = option(
+        2, "rounds in which vertices move to where the photographs agree best with each other; 0 leaves them", metavar="N"
+    )
     close_holes: int = option(0, "fill holes with at most N edges around them; 0 fills none")
     smooth: int = option(0, "iterations of smoothing that keeps the volume; 0 leaves the surface as it is")
     remesh: float = option(

@@ -5,9 +5,8 @@ transform.json    training frame <-> data-set frame, unit
 run.json          what the last save holds: iteration, primitives, background
 training_frame.npz   primitives in the training frame, bit for bit as trained
 scene.npz, scene.ply the same in the data set's frame, ours and in LinPrim's format (Gaussians: 3DGS's)
-sparse/0          the poses of photographs that came without
+found_poses/      COLMAP model of photographs that came without poses
 metrics.jsonl     loss, PSNR, ... over time                        checkpoints/step_*.pt, latest
-found_poses/      COLMAP model of plain photographs, as their poses were found
 """
 
 from __future__ import annotations

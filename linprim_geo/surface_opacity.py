@@ -82,12 +82,12 @@ VALUES_AT_ONCE = 1 << 22
 
 
 def opacity_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[Mesh, dict]:
-    """Returns the closed mesh, with `quality` and colours, and `level`, `spacing` and the numbers of points for the statistics.
+    """Returns the closed mesh, with colours, and `level`, `spacing` and the numbers of points for the statistics.
 
     The surface is where the transmittance towards the cameras falls to `options.level`; `options.voxel_size`, if any, is the distance
     between its sample points, and `options.smallest_part` the share of the largest component's area that others need. Components that no
-    camera sees are dropped. `quality` is the distance between the places where the light of the best and of the typical cameras falls to
-    the level; vertices are moved towards the latter.
+    camera sees are dropped. Vertices are moved from where the light of the best camera falls to the level towards where that of the typical
+    cameras does.
 
     Raises:
         LinprimError: Gaussians, which have no inside; nothing crosses the level, or the tetrahedra would not fit into memory.
@@ -134,7 +134,6 @@ def opacity_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[
         mesh,
         vertices=run.similarity.inverse().apply(mesh.vertices),
         normals=vertex_normals(mesh),
-        quality=gap / run.similarity.scale,
     )
     stages.lap("typical cameras")
     images = (view.load().rgb for view in views)

@@ -62,9 +62,8 @@ NO_PRIMITIVE = -1
 
 
 def polyhedra_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[Mesh, dict]:
-    """Returns the closed surface, with normals, colours and `quality`, and counts for the statistics.
+    """Returns the closed surface, with normals and colours, and counts for the statistics.
 
-    `quality` is the robust spread, around the planes that made the faces at a vertex, of the points where the views' light ends.
     See `traced_surface` for the steps and for the primitive of every face.
 
     Raises:
@@ -83,7 +82,7 @@ def polyhedra_surface(run: Run, options: ExtractOptions, stages: Stages) -> tupl
 
 
 def traced_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[Mesh, np.ndarray, dict]:
-    """The closed surface with `quality`, the row in `run.primitives()` of each face (F,), NO_PRIMITIVE for the core, and counts.
+    """The closed surface, the row in `run.primitives()` of each face (F,), NO_PRIMITIVE for the core, and counts.
 
     1. Primitives that dominate a pixel of a training view are candidates.
     2. Where the transmittance of the views' rays falls to 1 - CUT_DEPTH (1 - `options.level`), overlaps counted exactly, light ends:
@@ -139,7 +138,6 @@ def traced_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[M
     dropped = shells(mesh)[0]
     mesh, owner = select_faces(mesh, keep), owner[keep]
     dropped -= shells(mesh)[0]
-    mesh = replace(mesh, quality=_quality(mesh, owner, planes, len(chosen), points.noise))
     stages.lap("select")
 
     faces_primitive = np.where(owner == NO_PRIMITIVE, NO_PRIMITIVE, order[candidates[owner]])
@@ -233,14 +231,13 @@ def level_points(depths: list[np.ndarray], cameras: list[Camera], wanted: int) -
 
 @dataclass(frozen=True)
 class Planes:
-    """Fitted planes { x : normal x = offset }, the body on the negative side; `row` of the primitive that each belongs to, `spread`
-    of the points about it, and `cuts` (K, PLANES) bool: which planes of its primitive bound the body where this one does."""
+    """Fitted planes { x : normal x = offset }, the body on the negative side; `row` of the primitive that each belongs to,
+    and `cuts` (K, PLANES) bool: which planes of its primitive bound the body where this one does."""
 
     row: np.ndarray
     slot: np.ndarray
     normal: np.ndarray
     offset: np.ndarray
-    spread: np.ndarray
     cuts: np.ndarray
 
 
@@ -281,7 +278,7 @@ def fit_planes(primitives: Primitives, points: LevelPoints) -> tuple[Planes, np.
     # Points that scatter by more than a pixel make no plane.
     flat = np.append(spread <= points.footprint, False)
     cuts &= flat[table[row]]
-    return Planes(row, number, across, offset, spread, cuts), met
+    return Planes(row, number, across, offset, cuts), met
 
 
 def _points_within(primitives: Primitives, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -483,16 +480,3 @@ def _kept_faces(mesh: Mesh, cameras: list[Camera], smallest_part: float) -> np.n
     area = np.bincount(label, weights=face_areas(mesh), minlength=count)
     largest = area[seen].max() if seen.any() else 0.0
     return kept_shells(mesh, seen & (area >= smallest_part * largest))
-
-
-def _quality(mesh: Mesh, owner: np.ndarray, planes: Planes, count: int, least: float) -> np.ndarray:
-    """(V,) mean, over the faces at a vertex, of the spread of their primitive's planes, at least `least`; for primitives without
-    planes the median of all, for the core the largest."""
-    known = np.maximum(planes.spread, least)
-    uses = np.bincount(planes.row, minlength=count)
-    spread = np.bincount(planes.row, weights=known, minlength=count) / np.maximum(uses, 1)
-    spread[uses == 0] = np.median(known) if len(known) else least
-    of_face = np.where(owner == NO_PRIMITIVE, spread.max(), spread[owner])
-    corner = mesh.faces.ravel()
-    uses = np.bincount(corner, minlength=len(mesh.vertices))
-    return np.bincount(corner, weights=np.repeat(of_face, 3), minlength=len(mesh.vertices)) / uses

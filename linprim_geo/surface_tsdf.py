@@ -23,7 +23,7 @@ BYTES_PER_PIXEL, KEPT_BYTES = 8, 2**30
 def tsdf_surface(
     run: Run, options: ExtractOptions, stages: Stages, frames: DepthFrames | None = None
 ) -> tuple[Mesh, dict]:
-    """Returns the fused mesh, with `quality` and colours, and `level`, `voxel_size` and `truncation_voxels` for the statistics.
+    """Returns the fused mesh, with colours, and `level`, `voxel_size` and `truncation_voxels` for the statistics.
 
     `frames` of the same level, if there are any already, are taken in place of new ones.
 

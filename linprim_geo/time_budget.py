@@ -262,30 +262,16 @@ def _timed_pass(run, options, frames, target, stages) -> float:
     import tempfile
     from pathlib import Path
 
-    from .mesh import save_mesh, select_faces
-    from .mesh_process import process_mesh
+    from .finish import finish_surface
     from .progress import Progress
     from .stages import Stages
     from .surface_tsdf import tsdf_surface
-    from .texture import make_texture, save_textured
-    from .visibility import visible_faces
 
-    views = run.scene().train
     quiet = Stages(Progress("coarse pass", 1, quiet=True))
     with tempfile.TemporaryDirectory(prefix="linprim_geo_") as folder:
-        file = Path(folder) / target.name
         begin = time.monotonic()
         mesh, _ = tsdf_surface(run, options, quiet, frames)
-        mesh, _ = process_mesh(mesh, options, quiet.note)
-        seen = visible_faces(mesh, [view.camera for view in views])
-        visible = select_faces(mesh, seen)
-        if options.texture:
-            texture = make_texture(mesh, options.texture, views, quiet.note)
-            save_textured(file, mesh, texture)
-            save_textured(file, visible, texture.select(seen))
-        else:
-            save_mesh(file, mesh)
-            save_mesh(file, visible)
+        mesh = finish_surface(mesh, run, options, Path(folder) / target.name, quiet).mesh
         seconds = time.monotonic() - begin
     stages.note(f"coarse pass with voxels of {options.voxel_size:.3g}: {seconds:.2f} s, {len(mesh.faces)} triangles")
     return seconds

@@ -11,7 +11,6 @@ the blocks and runs marching cubes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -65,7 +64,6 @@ LEAST_SUPPORT = 1e-6
 """Voxels with less weight than this were seen by no view; far below the smallest weight a vote can have."""
 
 CHUNK_BLOCKS = 64
-CHUNK_POINTS = 16_384
 """Work per task: small enough for the cache, large enough to hide the cost of a task."""
 
 
@@ -331,38 +329,3 @@ def _canonical(mesh: Mesh) -> Mesh:
     first = np.argmin(faces, axis=1)
     faces = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
     return replace(mesh, faces=faces[np.lexsort(faces.T[::-1])])
-
-
-def measure_spread(
-    mesh: Mesh, frames: Iterable[DepthFrame], grid: Grid, pool: ThreadPoolExecutor
-) -> np.ndarray:
-    """(V,) float32: root mean square distance of vertices from the surfels of views that face them.
-
-    In scene units; a vertex that no view comes near gets the truncation, the least it can be.
-    """
-    points = np.ascontiguousarray((mesh.vertices - grid.origin).T)
-    normals = np.ascontiguousarray(mesh.normals.T, dtype=np.float64)
-    square, weight = np.zeros(points.shape[1]), np.zeros(points.shape[1])
-    parts = [slice(k, k + CHUNK_POINTS) for k in range(0, points.shape[1], CHUNK_POINTS)]
-    for frame in frames:
-        camera = frame.camera
-        table = surfels(frame, grid.voxel, grid.truncation, grid.origin)
-        project = camera.K @ camera.rotation
-        shift = camera.K @ (camera.rotation @ grid.origin + camera.world_to_camera[:3, 3])
-        eye = camera.center - grid.origin
-
-        def measure(part, camera=camera, table=table, project=project, shift=shift, eye=eye):
-            x, n = points[:, part], normals[:, part]
-            facing = np.flatnonzero(sum(n[k] * (eye[k] - x[k]) for k in range(3)) > 0)
-            x = x[:, facing]
-            image = np.einsum("ij,jn->in", project, x) + shift[:, None]
-            pixel, _, inside = _pixels(*image, camera)
-            rows = table[pixel]
-            value = rows[:, OFFSET] - sum(rows[:, k] * x[k] for k in range(3))
-            use = np.where(inside & (np.abs(value) <= rows[:, COSINE]), rows[:, WEIGHT], 0.0)
-            square[part.start + facing] += use * value**2
-            weight[part.start + facing] += use
-
-        list(pool.map(measure, parts))
-    spread = np.sqrt(np.divide(square, weight, out=np.ones_like(square), where=weight > 0))
-    return (spread * grid.truncation).astype(np.float32)

@@ -33,6 +33,9 @@ things in the way, misaligned views."""
 LEAST_FACING = 0.1
 """Views flatter than this (cosine, 84 degrees) onto a vertex are used only if there is no other."""
 
+BEHIND_SHARE = 1e-3
+"""Points this share of their depth, and of the diagonal, behind all that the pixels around them see may still be seen."""
+
 FAR = 1e3
 """Depth of a ray that hits nothing, in diagonals: finite, so that differences stay numbers."""
 
@@ -55,7 +58,8 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera]) -> np.ndarray:
     """Which faces any of the cameras sees, from either side.
 
     A face is seen if the ray through the centre of a pixel hits it first, or if one of four points on it lies
-    in the image of a camera with nothing in between.
+    in the image of a camera with nothing in between. A point farther than all that the centres of its own and the eight
+    pixels around it see is taken to be hidden, so a gap narrower than a pixel shows nothing.
 
     Returns:
         (F,) bool.
@@ -71,17 +75,30 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera]) -> np.ndarray:
         seen[face[face >= 0]] = True
     gap = SURFACE_GAP * caster.diagonal
     for camera in cameras:
+        farthest = _farthest_around(caster, camera)
         left = np.flatnonzero(~seen)
         corners = mesh.vertices[mesh.faces[left]]
         for sample in SAMPLES:
             points = np.einsum("k,fkd->fd", sample, corners)
-            rows = np.flatnonzero(_project(camera, points.T)[2] & ~seen[left])
+            pixels, z, inside = _project(camera, points.T)
+            rows = np.flatnonzero(inside & ~seen[left])
+            j, i = pixels[:, rows].astype(np.int64)
+            rows = rows[z[rows] <= farthest[i, j]]
             if len(rows) == 0:
                 continue
             ray = points[rows] - camera.center
             reach = 1.0 - gap / np.maximum(np.linalg.norm(ray, axis=1), 2.0 * gap)
             seen[left[rows[~caster.occluded(camera.center, ray, reach)]]] = True
     return seen
+
+
+def _farthest_around(caster: RayCaster, camera: Camera) -> np.ndarray:
+    """(H, W) the largest z-depth that the centres of 3x3 pixels see, and a little; inf where one of them misses."""
+    from scipy.ndimage import maximum_filter
+
+    depth = caster.cast_single(camera.center, camera.world_rays().reshape(-1, 3))[0].astype(np.float64)
+    farthest = maximum_filter(depth.reshape(camera.height, camera.width), size=3, mode="nearest")
+    return farthest * (1 + BEHIND_SHARE) + BEHIND_SHARE * caster.diagonal
 
 
 def _project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -192,26 +209,50 @@ def _samples(camera, image, depth, near, far, points, normals, slack):
     A fourth channel of `image` is alpha, and the others are premultiplied by it. `depth` (H, W) is that of the mesh, `near` and
     `far` the least and largest around each pixel.
     """
-    facing = _facing(points, normals, camera.center)
-    rows = np.flatnonzero(facing > 0)
-    pixels, z, inside = _project(camera, points[:, rows])
-    rows, pixels, z = rows[inside], pixels[:, inside], z[inside]
-    facing = facing[rows]
+    rows, pixels, z, facing = seen_points(camera, depth, points, normals, 0.0, slack)
     j, i = pixels.astype(np.int64)
-    # On a plane the depth changes by one pixel's footprint times the tangent from one pixel to the next.
-    step = z / min(camera.fx, camera.fy)
-    slope = np.maximum(slack, step) + step * np.sqrt(1.0 / np.maximum(facing, LEAST_FACING) ** 2 - 1.0)
-    visible = z <= depth[i, j] + slope
+    slope = depth_slope(camera, z, facing, slack)
     poor = (far[i, j] - near[i, j] > 4.0 * slope) | (z > near[i, j] + 2.0 * slope) | (facing < LEAST_FACING)
     color = bilinear(image, pixels)
     if image.shape[2] == 4:
         alpha = color[:, 3] / np.float32(255.0)
-        visible &= alpha >= 0.5
         poor |= alpha < OPAQUE
         color = color[:, :3] / np.maximum(alpha, np.float32(0.5))[:, None]
-    weight = np.maximum(facing, LEAST_FACING**2) / step**2
+    weight = np.maximum(facing, LEAST_FACING**2) / (z / min(camera.fx, camera.fy)) ** 2
     weight[poor] *= POOR_SHARE
-    return rows[visible], weight[visible].astype(np.float32), color[visible], ~poor[visible]
+    if image.shape[2] == 4:
+        opaque = alpha >= 0.5
+        rows, weight, color, poor = rows[opaque], weight[opaque], color[opaque], poor[opaque]
+    return rows, weight.astype(np.float32), color, ~poor
+
+
+def seen_points(
+    camera: Camera, depth: np.ndarray, points: np.ndarray, normals: np.ndarray, least_cosine: float, slack: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Which of surface points (3, P) with normals (3, P) face a camera, lie in its image and are not hidden.
+
+    Args:
+        depth: (H, W) z-depth of the surface at the pixel centres, inf where there is none.
+        least_cosine: of the angle between the normal and the direction to the camera.
+        slack: see `photographed`.
+    Returns:
+        rows (R,) of the points, and of these the pixel positions (2, R), z-depths (R,) and cosines (R,).
+    """
+    facing = _facing(points, normals, camera.center)
+    rows = np.flatnonzero(facing > least_cosine)
+    pixels, z, inside = _project(camera, points[:, rows])
+    rows, pixels, z = rows[inside], pixels[:, inside], z[inside]
+    facing = facing[rows]
+    j, i = pixels.astype(np.int64)
+    seen = z <= depth[i, j] + depth_slope(camera, z, facing, slack)
+    return rows[seen], pixels[:, seen], z[seen], facing[seen]
+
+
+def depth_slope(camera: Camera, z: np.ndarray, facing: np.ndarray, slack: float = 0.0) -> np.ndarray:
+    """How much the depth of a plane seen under the cosine `facing` changes by within a pixel, and the slack."""
+    # From one pixel to the next it is one pixel's footprint times the tangent.
+    step = z / min(camera.fx, camera.fy)
+    return np.maximum(slack, step) + step * np.sqrt(1.0 / np.maximum(facing, LEAST_FACING) ** 2 - 1.0)
 
 
 def _keep_best(best, shade, rows, weight, color):

@@ -44,7 +44,7 @@ def test_what_is_written(extracted, solid):
         folder / "mesh_visible.ply"
     )
     assert stats["views"] == 24 and stats["primitives"] == 1
-    assert stats["seconds"].keys() == {"level", "render", "fuse", "visibility", "write", "total"}
+    assert stats["seconds"].keys() == {"level", "render", "fuse", "refine", "quality", "visibility", "write", "total"}
     assert stats["peak_gib"].keys() == stats["seconds"].keys() and 0 < stats["peak_gib"]["fuse"] <= stats["peak_gib"]["total"]
     assert stats["visible"].keys() == topology(load_mesh(folder / "mesh.ply")).keys()
 

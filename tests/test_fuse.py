@@ -221,7 +221,7 @@ def test_occluded_votes_close_tunnels():
 def test_the_same_bytes_at_any_number_of_threads():
     frames = sphere_frames(around(8))
     one, again, many = (fuse_tsdf(frames, voxel_size=0.06, threads=n) for n in (1, 2, 3))
-    for name in ("vertices", "faces", "normals", "quality"):
+    for name in ("vertices", "faces", "normals"):
         assert getattr(one, name).tobytes() == getattr(many, name).tobytes()
         assert getattr(one, name).tobytes() == getattr(again, name).tobytes()
 
@@ -276,19 +276,6 @@ def test_auto_voxel_size_follows_the_pixels():
     assert 0.012 < coarse < 0.018
     fine = fuse.auto_voxel_size(sphere_frames(around(12, size=512)))
     assert fine == pytest.approx(2 * np.sqrt(3) / 400, rel=0.1)  # held back by the diagonal
-
-
-def test_quality_is_larger_where_the_views_disagree():
-    random = np.random.default_rng(1)
-    noisy = []
-    for frame in sphere_frames(around(24)):
-        points = frame.camera.world_rays() * frame.depth[..., None] + frame.camera.center
-        noise = 0.03 * random.standard_normal(frame.depth.shape) * (points[..., 2] > 0)
-        noisy.append(replace(frame, depth=np.where(frame.background, 0, frame.depth + noise)))
-    mesh = fuse_tsdf(noisy, voxel_size=0.05)
-    top, bottom = (mesh.quality[mesh.vertices[:, 2] * s > 0.2] for s in (1, -1))
-    assert np.median(top) > 5 * np.median(bottom)
-    assert 0.01 < np.median(top) < 0.04
 
 
 # --- what cameras see ------------------------------------------------------------------------------------

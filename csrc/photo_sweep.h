@@ -1,0 +1,39 @@
+// Brightness of photographs along the normals of surface points: what they say of where the surface is.
+#pragma once
+
+#include <cstdint>
+
+namespace linprim {
+
+// A pinhole photograph; pixel centres at +0.5. Arrays are (height, width).
+struct PhotoView {
+  double pose[12];                // world to camera, 3 rows of 4
+  double fx, fy, cx, cy;
+  int width, height;
+  const float* image;             // brightness
+  const float* depth;             // z of the surface
+  const float* jump;              // largest less least depth of 3x3 pixels
+};
+
+// A point is looked at where the cosine between its normal and the direction to the camera is above `least_cosine`, its depth is no more
+// than what its slope explains behind that of the surface, and the jump of its pixel is no more than `outline_slopes` times that.
+struct PhotoRules {
+  double least_cosine, outline_slopes;
+};
+
+// Sums over photographs per point, of `count` points. `footprint` is the unit of the offsets along the normal.
+struct PhotoSums {
+  int64_t count;
+  const double* point;            // (count, 3)
+  const double* normal;           // (count, 3) unit length
+  const double* footprint;        // (count)
+  int32_t* views;                 // (count) photographs that see it well
+  float* weight;                  // (count) sum of the cosines
+  float* value;                   // (count, offsets) sum of cosine times brightness
+  float* square;                  // (count, offsets) sum of cosine times brightness squared
+};
+
+// Adds one photograph. Brightness is interpolated bilinearly, beyond the outermost pixel centres it is theirs.
+void add_photo(const PhotoView& view, const PhotoRules& rules, const double* offset, int offsets, const PhotoSums& sums);
+
+}  // namespace linprim

@@ -1,0 +1,59 @@
+"""What follows the extraction of any surface: refinement, holes and simplification, quality, what cameras see, texture, files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from .mesh import Mesh, save_mesh, select_faces
+from .mesh_process import process_mesh
+from .options import ExtractOptions
+from .photo_sweep import best_agreement, predicted_error, refine_surface
+from .run import Run
+from .stages import Stages
+from .texture import make_texture, save_textured
+from .visibility import visible_faces
+
+
+@dataclass(frozen=True)
+class Finished:
+    """The mesh and the part that cameras see, as written; what was done step by step; what the texture says of itself, if there is one."""
+
+    mesh: Mesh
+    visible: Mesh
+    processing: list[dict]
+    texture: dict | None
+
+
+def visible_file(target: Path) -> Path:
+    """Where the part of a mesh goes that cameras see."""
+    return target.with_name(f"{target.stem}_visible{target.suffix}")
+
+
+def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, stages: Stages) -> Finished:
+    """Finishes a surface as the options ask, and writes it to `target` and `visible_file(target)`."""
+    views = run.scene().train
+    cameras = [view.camera for view in views]
+    if options.refine:
+        mesh = refine_surface(mesh, views, options.refine)
+        stages.lap("refine")
+    mesh, processing = process_mesh(mesh, options, stages.note)
+    if processing:
+        stages.lap("process")
+    agreement = best_agreement(mesh, cameras, (view.load() for view in views))
+    mesh = replace(mesh, quality=predicted_error(mesh, agreement))
+    stages.lap("quality")
+    seen = visible_faces(mesh, cameras)
+    visible = select_faces(mesh, seen)
+    stages.lap("visibility")
+    if not options.texture:
+        save_mesh(target, mesh)
+        save_mesh(visible_file(target), visible)
+        stages.lap("write")
+        return Finished(mesh, visible, processing, None)
+    texture = make_texture(mesh, options.texture, views, stages.note)
+    stages.lap("texture")
+    save_textured(target, mesh, texture)
+    save_textured(visible_file(target), visible, texture.select(seen))
+    stages.lap("write")
+    return Finished(mesh, visible, processing, texture.about)

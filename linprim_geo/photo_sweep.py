@@ -1,0 +1,173 @@
+"""Where along its normal each vertex of a mesh agrees best with the photographs: how far it is probably off, and a mesh that is nearer.
+
+A vertex is moved along its normal, and the photographs that see it are compared at each place. Where the surface really is they show
+the same colour; before or behind it each shows another place. No reference is looked at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from . import _core
+from .camera import Camera
+from .mesh import Mesh, vertex_normals
+from .scene import Photo, View
+from .visibility import FAR
+
+OFFSETS = np.arange(-3.0, 3.5, 0.5)
+"""Places along the normal at which photographs are compared, in footprints: what a pixel of the nearest view covers."""
+
+LEAST_COSINE = 0.15
+"""Views flatter than this (81 degrees) onto a vertex are not asked."""
+
+OUTLINE_SLOPES = 4.0
+"""Nor those in which it lies on an outline, whose colours are mixtures: where the depth jumps by more than this many times what the
+slope of the surface explains."""
+
+LARGEST_FOOTPRINT = 4.0
+"""Footprints above so many medians count as these."""
+
+SMOOTHING = 2
+"""Rings of neighbours over which moves are averaged, weighted by how clearly the photographs speak."""
+
+LEAST_SHARPNESS = 0.002
+"""Where the disagreement of the photographs rises by less than this, of white, beside its least, vertices hardly move."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What photographs say of the (V,) vertices of a mesh.
+
+    `offset` is the signed distance along the normal, in the unit of the mesh, to where they agree best; `sharpness` how much their
+    disagreement rises within a footprint on either side of it, as a share of white: 0 for a plain surface; `known` whether at least two
+    of them see a vertex well, `inside` whether the best place lies within the OFFSETS and not at their end.
+    """
+
+    offset: np.ndarray
+    sharpness: np.ndarray
+    known: np.ndarray
+    inside: np.ndarray
+
+
+def best_agreement(mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo]) -> Agreement:
+    """Compares photographs along the normal of every vertex.
+
+    The disagreement at a place is the standard deviation of brightness over the photographs, weighted by the cosine of the angle under
+    which they see the vertex; a parabola through the least and its two neighbours gives the best place. Memory: some 150 bytes per
+    vertex. The same to the last bit for any number of threads.
+
+    Args:
+        mesh: not empty; `normals` are used if it has them.
+        photos: one per camera, iterated once. Transparent pixels count as mid-grey.
+    """
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    from .raycast import RayCaster
+
+    caster = RayCaster(mesh.vertices, mesh.faces)
+    points = np.ascontiguousarray(mesh.vertices, np.float64)
+    normals = np.ascontiguousarray(vertex_normals(mesh) if mesh.normals is None else mesh.normals, np.float64)
+    footprint = _footprints(points, normals, cameras)
+    count = len(points)
+    views, weight = np.zeros(count, np.int32), np.zeros(count, np.float32)
+    value, square = np.zeros((2, count, len(OFFSETS)), np.float32)
+    for camera, photo in zip(cameras, photos, strict=True):
+        shape = (camera.height, camera.width)
+        depth = caster.cast_single(camera.center, camera.world_rays().reshape(-1, 3))[0].reshape(shape)
+        depth = np.minimum(depth, FAR * caster.diagonal).astype(np.float32)
+        jump = maximum_filter(depth, 3, mode="nearest") - minimum_filter(depth, 3, mode="nearest")
+        pose = np.ascontiguousarray(camera.world_to_camera[:3], np.float64)
+        lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+        rules = (LEAST_COSINE, OUTLINE_SLOPES)
+        _core.add_photo(
+            pose, lens, _brightness(photo), depth, jump, rules, OFFSETS, points, normals, footprint, views, weight, value, square
+        )
+    known = views >= 2
+    offset, sharpness, inside = np.zeros(count), np.zeros(count), np.zeros(count, bool)
+    total = weight[known, None]
+    mean = value[known] / total
+    disagreement = np.sqrt(np.maximum(square[known] / total - mean * mean, 0))
+    place, sharpness[known] = _least(disagreement)
+    offset[known] = place * footprint[known]
+    inside[known] = np.abs(place) < OFFSETS[-1] - 0.1
+    return Agreement(offset, sharpness, known, inside)
+
+
+def predicted_error(mesh: Mesh, agreement: Agreement) -> np.ndarray:
+    """(V,) float32 predicted distance of each vertex from the true surface: how far from it the photographs agree best, in the mesh's unit.
+
+    A vertex that is not known takes the value of the nearest that is; where none is, all are NaN.
+    Accuracy: `python -m linprim_geo.eval.surfaces` prints its rank correlation with the exact error, and the ratio of their means.
+    """
+    from scipy.spatial import cKDTree
+
+    known = agreement.known
+    error = np.full(len(known), np.nan, np.float32)
+    error[known] = np.abs(agreement.offset[known])
+    if known.any() and not known.all():
+        _, nearest = cKDTree(mesh.vertices[known]).query(mesh.vertices[~known], workers=-1)
+        error[~known] = error[known][nearest]
+    return error
+
+
+def refine_surface(mesh: Mesh, views: Sequence[View], rounds: int) -> Mesh:
+    """Moves vertices to where the photographs agree best, `rounds` times; faces stay as they are, normals are made anew.
+
+    Moves are averaged over neighbours and fade out where the photographs say nothing. Colours and quality are kept as they are.
+    """
+    from scipy.sparse import coo_matrix, diags, identity
+
+    cameras, count = [view.camera for view in views], len(mesh.vertices)
+    ends = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+    ends = np.unique(np.concatenate([ends, ends[:, ::-1]]), axis=0)
+    graph = coo_matrix((np.ones(len(ends)), ends.T), shape=(count, count)).tocsr() + identity(count, format="csr")
+    average = diags(1 / np.asarray(graph.sum(1)).ravel()) @ graph
+    for _ in range(rounds):
+        mesh = replace(mesh, normals=vertex_normals(mesh))
+        agreement = best_agreement(mesh, cameras, (view.load() for view in views))
+        weight = agreement.sharpness * agreement.inside
+        move = weight * agreement.offset
+        for _ in range(SMOOTHING):
+            move, weight = average @ move, average @ weight
+        move /= weight + LEAST_SHARPNESS
+        mesh = replace(mesh, vertices=mesh.vertices + move[:, None] * mesh.normals)
+    return replace(mesh, normals=vertex_normals(mesh))
+
+
+def _footprints(points: np.ndarray, normals: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """(V,) what a pixel of the nearest view that a vertex faces covers there, at most LARGEST_FOOTPRINT medians."""
+    least = np.full(len(points), np.inf)
+    for camera in cameras:
+        ray = points - camera.center
+        z = ray @ camera.rotation[2]
+        facing = -np.einsum("pd,pd->p", ray, normals) / np.maximum(np.linalg.norm(ray, axis=1), np.finfo(np.float64).tiny)
+        rows = np.flatnonzero((z > 0) & (facing > LEAST_COSINE))
+        pixel = ray[rows] @ (camera.K @ camera.rotation).T / z[rows, None]
+        rows = rows[(pixel[:, :2] >= 0).all(1) & (pixel[:, 0] < camera.width) & (pixel[:, 1] < camera.height)]
+        least[rows] = np.minimum(least[rows], z[rows] / (np.sqrt(camera.fx * camera.fy) * facing[rows]))
+    known = np.isfinite(least)
+    largest = LARGEST_FOOTPRINT * np.median(least[known]) if known.any() else 1.0
+    return np.minimum(least, largest)
+
+
+def _brightness(photo: Photo) -> np.ndarray:
+    """(H, W) float32 mean of the channels, 0 to 1, over mid-grey."""
+    value = photo.rgb.astype(np.float32) @ np.full(3, 1 / 765, np.float32)
+    if photo.alpha is None:
+        return value
+    alpha = photo.alpha / np.float32(255)
+    return value * alpha + np.float32(0.5) * (1 - alpha)
+
+
+def _least(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(P,) where the parabola through the least of (P, K) values and its neighbours has its vertex, within OFFSETS, and how much
+    higher the lower of the values two places before and two after it is."""
+    rows, step = np.arange(len(values)), OFFSETS[1] - OFFSETS[0]
+    k = np.clip(values.argmin(1), 1, len(OFFSETS) - 2)
+    before, least, after = values[rows, k - 1], values[rows, k], values[rows, k + 1]
+    bend = np.maximum(before - 2 * least + after, 1e-9)
+    sides = np.minimum(values[rows, np.maximum(k - 2, 0)], values[rows, np.minimum(k + 2, len(OFFSETS) - 1)])
+    return OFFSETS[k] + step * np.clip(0.5 * (before - after) / bend, -1, 1), np.maximum(sides - least, 0)

@@ -1,0 +1,185 @@
+"""Where photographs agree best along the normals of a mesh, against a textured plane whose photographs are known exactly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from linprim_geo import ops, photo_sweep
+from linprim_geo.camera import Camera
+from linprim_geo.campath import look_at
+from linprim_geo.mesh import Mesh, vertex_normals
+from linprim_geo.photo_sweep import best_agreement, predicted_error, refine_surface
+from linprim_geo.scene import Photo
+
+SIZE, FOCAL, DISTANCE = 96, 90.0, 3.0
+FOOTPRINT = DISTANCE / FOCAL
+
+
+def camera(eye):
+    return Camera(SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2, look_at(np.array(eye), np.zeros(3)))
+
+
+def ring(count=8, slant=0.8):
+    angles = 2 * np.pi * np.arange(count) / count
+    return [camera((slant * np.cos(a) * DISTANCE, slant * np.sin(a) * DISTANCE, DISTANCE)) for a in angles]
+
+
+def texture(x, y):
+    """Brightness of the plane z = 0, 0 to 1, with waves of four to eight footprints."""
+    waves = np.sin(40 * x + 9 * y) + np.sin(31 * y - 14 * x) + np.sin(22 * (x + y))
+    return 0.5 + 0.15 * waves
+
+
+def photograph(view, paint=texture):
+    rays = view.world_rays()
+    hit = view.center - rays * (view.center[2] / rays[..., 2])[..., None]
+    value = np.round(255 * np.clip(paint(hit[..., 0], hit[..., 1]), 0, 1)).astype(np.uint8)
+    return Photo(np.repeat(value[..., None], 3, axis=2))
+
+
+class Shown:
+    """A view of the plane."""
+
+    def __init__(self, view, paint=texture):
+        self.camera, self.photo = view, photograph(view, paint)
+
+    def load(self):
+        return self.photo
+
+
+def sheet(height, reach=0.5, steps=41):
+    """A grid of the height (x, y) -> z, its front upwards."""
+    line = np.linspace(-reach, reach, steps)
+    x, y = np.meshgrid(line, line, indexing="ij")
+    k = np.arange(steps * steps).reshape(steps, steps)
+    a, b, c, d = k[:-1, :-1].ravel(), k[1:, :-1].ravel(), k[1:, 1:].ravel(), k[:-1, 1:].ravel()
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    mesh = Mesh(np.stack([x.ravel(), y.ravel(), height(x, y).ravel()], 1), faces)
+    return replace(mesh, normals=vertex_normals(mesh))
+
+
+def inner(mesh, reach=0.4):
+    return (np.abs(mesh.vertices[:, :2]) < reach).all(1)
+
+
+@pytest.fixture(scope="module")
+def shown():
+    return [Shown(view) for view in ring()]
+
+
+def agreement(mesh, shown):
+    return best_agreement(mesh, [s.camera for s in shown], (s.load() for s in shown))
+
+
+@pytest.mark.parametrize("height", [-1.5, -0.6, 0.0, 0.4, 1.2])
+def test_the_best_place_is_the_plane(shown, height):
+    mesh = sheet(lambda x, y: np.full_like(x, height * FOOTPRINT))
+    found, middle = agreement(mesh, shown), inner(mesh)
+    assert found.known[middle].all() and found.inside[middle].mean() > 0.99
+    assert np.median(found.offset[middle]) == pytest.approx(-height * FOOTPRINT, abs=0.1 * FOOTPRINT)
+    assert (np.abs(found.offset[middle] + height * FOOTPRINT) < 0.5 * FOOTPRINT).mean() > 0.95
+
+
+def test_the_predicted_error_is_the_true_one(shown):
+    mesh = sheet(lambda x, y: 1.2 * FOOTPRINT * np.sin(6 * x))
+    predicted, middle = predicted_error(mesh, agreement(mesh, shown)), inner(mesh)
+    truth = np.abs(mesh.vertices[middle, 2])
+    # The waves repeat, so a few vertices agree best with the next one.
+    assert np.median(np.abs(predicted[middle] - truth)) < 0.1 * FOOTPRINT
+    assert predicted[middle].mean() == pytest.approx(truth.mean(), rel=0.15)
+
+
+def test_rounds_bring_the_surface_to_the_plane(shown):
+    mesh = sheet(lambda x, y: FOOTPRINT * np.sin(6 * x) * np.cos(5 * y))
+    middle = inner(mesh)
+    errors = [np.abs(refine_surface(mesh, shown, rounds).vertices[middle, 2]).mean() for rounds in (0, 1, 2)]
+    assert errors[1] < 0.3 * errors[0] and errors[2] < 0.15 * errors[0]
+    again = refine_surface(mesh, shown, 2)
+    assert (again.faces == mesh.faces).all() and np.allclose(again.normals, vertex_normals(again))
+
+
+def test_a_plain_surface_stays_where_it_is():
+    plain = [Shown(view, lambda x, y: np.full_like(x, 0.5)) for view in ring()]
+    mesh = sheet(lambda x, y: FOOTPRINT * np.sin(6 * x))
+    moved = refine_surface(mesh, plain, 2)
+    assert np.abs(moved.vertices - mesh.vertices).max() < 0.01 * FOOTPRINT
+
+
+def test_exposure_does_not_move_the_best_place(shown):
+    mesh = sheet(lambda x, y: np.full_like(x, 0.8 * FOOTPRINT))
+    gains = np.linspace(0.8, 1.2, len(shown))
+    drifted = [Shown(s.camera, lambda x, y, g=g: g * texture(x, y)) for s, g in zip(shown, gains, strict=True)]
+    found, middle = agreement(mesh, drifted), inner(mesh)
+    assert np.median(found.offset[middle]) == pytest.approx(-0.8 * FOOTPRINT, abs=0.2 * FOOTPRINT)
+
+
+def test_vertices_that_fewer_than_two_photographs_see_take_the_nearest_value(shown):
+    mesh = sheet(lambda x, y: np.full_like(x, 0.8 * FOOTPRINT))
+    above = mesh.vertices + [0, 0, 0.5]
+    below = Mesh(np.concatenate([mesh.vertices, above]), np.concatenate([mesh.faces, mesh.faces + len(above)]))
+    found = agreement(below, shown)
+    hidden = np.flatnonzero((np.abs(below.vertices[:, :2]) < 0.1).all(1) & (below.vertices[:, 2] < 0.25))
+    assert not found.known[hidden].any()
+    predicted = predicted_error(below, found)
+    assert np.isfinite(predicted).all()
+    known = np.flatnonzero(found.known)
+    for row in hidden[:3]:
+        nearest = known[np.argmin(np.linalg.norm(below.vertices[known] - below.vertices[row], axis=1))]
+        assert predicted[row] == predicted[nearest]
+    assert np.isnan(predicted_error(mesh, agreement(mesh, shown[:1]))).all()
+    assert (refine_surface(mesh, shown[:1], 1).vertices == mesh.vertices).all()
+
+
+def test_a_transparent_photograph_counts_as_grey(shown):
+    mesh = sheet(lambda x, y: np.full_like(x, 0.5 * FOOTPRINT))
+    clear = [replace(s.photo, alpha=np.zeros((SIZE, SIZE), np.uint8)) for s in shown]
+    found = best_agreement(mesh, [s.camera for s in shown], clear)
+    assert found.known[inner(mesh)].all() and found.sharpness.max() < 1e-3
+
+
+def test_the_core_adds_what_the_formulas_say(shown):
+    """Float64 numpy, from the definition."""
+    mesh = sheet(lambda x, y: 0.3 * FOOTPRINT * np.sin(9 * y), steps=9)
+    footprint = np.full(len(mesh.vertices), FOOTPRINT)
+    found = agreement(mesh, shown)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(photo_sweep, "_footprints", lambda points, normals, cameras: footprint)
+        same = agreement(mesh, shown)
+    sums = np.zeros((3, len(mesh.vertices), len(photo_sweep.OFFSETS)))
+    for s in shown:
+        c, image = s.camera, s.photo.rgb[..., 0] / 255.0
+        toward = c.center - mesh.vertices
+        cosine = np.einsum("vd,vd->v", mesh.normals, toward) / np.linalg.norm(toward, axis=1)
+        for k, offset in enumerate(photo_sweep.OFFSETS):
+            pixel, _ = c.project(mesh.vertices + offset * FOOTPRINT * mesh.normals)
+            x, y = pixel.T - 0.5
+            j, i = np.floor(x).astype(int), np.floor(y).astype(int)
+            a, b = x - j, y - i
+            value = (1 - b) * ((1 - a) * image[i, j] + a * image[i, j + 1]) + b * ((1 - a) * image[i + 1, j] + a * image[i + 1, j + 1])
+            sums[:, :, k] += [cosine, cosine * value, cosine * value**2]
+    mean = sums[1] / sums[0]
+    spread = np.sqrt(np.maximum(sums[2] / sums[0] - mean**2, 0))
+    middle = inner(mesh, 0.45)  # all views see these
+    best = photo_sweep.OFFSETS[spread.argmin(1)]
+    rows, k = np.arange(len(spread)), np.clip(spread.argmin(1), 2, len(photo_sweep.OFFSETS) - 3)
+    rise = np.minimum(spread[rows, k - 2], spread[rows, k + 2]) - spread[rows, k]
+    middle &= np.abs(best) < 2
+    assert same.sharpness[middle] == pytest.approx(rise[middle], abs=2e-3)
+    assert (np.abs(same.offset / FOOTPRINT - best)[middle] <= 0.5 + 1e-6).all()
+    assert np.abs(found.offset - same.offset)[middle].max() < FOOTPRINT
+
+
+def test_the_same_bytes_at_any_number_of_threads(shown):
+    mesh = sheet(lambda x, y: FOOTPRINT * np.sin(6 * x))
+    before, results = ops.threads(), []
+    try:
+        for threads in (1, 3):
+            ops.set_threads(threads)
+            results.append(agreement(mesh, shown))
+    finally:
+        ops.set_threads(before)
+    for name in ("offset", "sharpness", "known", "inside"):
+        assert getattr(results[0], name).tobytes() == getattr(results[1], name).tobytes()
