@@ -9,7 +9,8 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from .errors import LinprimError
@@ -28,6 +29,7 @@ _UMASK = _read_umask()
 # What a full disk says, a quota, or a file system that takes no file of this size.
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LOCK = ".lock"
+_SECONDS_BETWEEN_TRIES = 0.2
 
 
 @contextlib.contextmanager
@@ -93,11 +95,11 @@ def is_remains(entry: Path) -> bool:
 
 
 @contextlib.contextmanager
-def locked(folder: Path, what: str, file: str = "") -> Iterator[None]:
+def locked(folder: Path, what: str, file: str = "", wait: Callable[[], object] | None = None) -> Iterator[None]:
     """Holds a folder, which is made if need be, or only the name `file` in it, against other processes.
 
     The system lets go of it when this process ends, however it does; where the file system knows no locks there is none. `what` goes
-    into the sentence of those that are refused: "trained into".
+    into the sentence of those that are refused: "trained into". With `wait` nobody is refused: it is called once, and the lock waited for.
 
     Raises:
         LinprimError: another process holds it, or the folder cannot be written.
@@ -105,15 +107,24 @@ def locked(folder: Path, what: str, file: str = "") -> Iterator[None]:
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     path = folder / (f".{file}{_LOCK}" if file else _LOCK)
     with writing(path):
-        folder.mkdir(parents=True, exist_ok=True)
-        held = None
+        held, told = None, False
         while held is None:
-            handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+            folder.mkdir(parents=True, exist_ok=True)
+            try:
+                handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+            except FileNotFoundError:  # who held it before has just removed the folder, which was empty
+                continue
             if not _lock(handle):
                 os.close(handle)
-                raise LinprimError(f"{folder / file}: is being {what} by another process, wanted another place, or to wait for its end")
-            # Who held it before may have removed the file while this process opened it.
-            if _is_at(handle, path):
+                if wait is None:
+                    raise LinprimError(f"{folder / file}: is being {what} by another process, wanted another place, or to wait for its end")
+                if not told:
+                    wait()
+                    told = True
+                time.sleep(_SECONDS_BETWEEN_TRIES)
+                continue
+            # Who held it before may have removed the file while this process opened it; Windows lets nobody remove an open one.
+            if os.name == "nt" or _is_at(handle, path):
                 held = handle
             else:
                 os.close(handle)
@@ -187,6 +198,23 @@ def is_file(path: Path) -> bool:
         return path.is_file()
     except (OSError, ValueError):
         return False
+
+
+def read_json(path: Path, wanted: str) -> object:
+    """The value in a JSON file.
+
+    Raises:
+        LinprimError: it cannot be read, or is no JSON; `wanted` ends the sentence: "a camera's intrinsics".
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8-sig"))
+    except json.JSONDecodeError as error:
+        found = f"not valid JSON at line {error.lineno}, column {error.colno} ({error.msg})"
+    except OSError as error:
+        found = f"cannot be read ({error.strerror or error})"
+    except (ValueError, RecursionError) as error:  # not UTF-8, or lists in lists without end
+        found = f"cannot be read ({error})"
+    raise LinprimError(f"{path}: {found}, wanted {wanted}")
 
 
 def write_json(path: str | os.PathLike, value: object) -> None:

@@ -60,7 +60,7 @@ class Intrinsics:
 def model_parameter_counts() -> dict[str, tuple[int, int]]:
     """{name: (COLMAP's number of the model, number of parameters)} of every model the installed pycolmap
     knows."""
-    import pycolmap
+    from .load_pycolmap import pycolmap
 
     counts = {}
     for name, number in pycolmap.CameraModelId.__members__.items():
@@ -169,7 +169,7 @@ def resized(lens: Lens, width: int, height: int) -> Lens:
 
 @lru_cache(maxsize=64)
 def _undistorted(lens: Lens) -> Intrinsics:
-    import pycolmap
+    from .load_pycolmap import pycolmap
 
     pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), _camera(lens))
     return Intrinsics(pinhole.width, pinhole.height, *_pinhole_numbers(pinhole))
@@ -194,7 +194,7 @@ def _project_grid(lens: Lens, target: Intrinsics, x: np.ndarray, y: np.ndarray) 
 
 
 def _camera(lens: Lens):
-    import pycolmap
+    from .load_pycolmap import pycolmap
 
     return pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=list(lens.params))
 

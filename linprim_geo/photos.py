@@ -76,6 +76,16 @@ def image_header(path: Path) -> tuple[int, int, bool]:
         return image.width, image.height, _has_alpha(image)
 
 
+def image_format(path: Path) -> str:
+    """Pillow's name of the format that the file has, whatever its suffix says: PNG, JPEG, MPO, WEBP, TIFF, BMP or another.
+
+    Raises:
+        LinprimError: missing, empty, or not an image.
+    """
+    with _opened(path) as image:
+        return image.format
+
+
 def fits(path: Path, size: tuple[int, int]) -> bool:
     """Whether the file has `size` (width, height) as stored, or after the rotation that its EXIF data asks
     for."""

@@ -109,7 +109,7 @@ def read_model(folder: Path) -> ColmapModel:
     Raises:
         LinprimError: a file is missing or cut short, a camera model is unknown, a pose or camera holds NaN.
     """
-    import pycolmap
+    from .load_pycolmap import pycolmap
 
     suffix = _check_files(folder)
     try:

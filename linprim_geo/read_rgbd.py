@@ -3,23 +3,23 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 
 from . import photos, trajectories
 from .errors import LinprimError
-from .files import is_file
+from .files import is_file, read_json
 from .lens import Lens
 from .scene import Frame, Listing
 
 _COLOR_FOLDERS = ("image", "color", "rgb", "images")
 _LOGS = ("trajectory.log", "scene/trajectory.log")
 _INTRINSICS = ("camera_intrinsic.json", "intrinsic.json", "intrinsics.json", "camera_primesense.json")
-# Width, height, fx, fy, cx, cy of the PrimeSense that Redwood and TUM recorded with, where no file says otherwise.
-_PRIMESENSE = (640, 480, 525.0, 525.0, 319.5, 239.5)
-_METRES_PER_STEP = {"redwood": 1e-3, "tum": 1 / 5000}
+# The PrimeSense that Redwood and TUM recorded with, where no file says otherwise: 319.5, 239.5 with pixel centres at whole numbers.
+_PRIMESENSE = Lens("PINHOLE", 640, 480, (525.0, 525.0, 320.0, 240.0))
+# Metres per step of a depth map.
+_METRES_REDWOOD, _METRES_TUM = 1e-3, 1 / 5000
 # Seconds between a photograph and the depth map and pose that belong to it, at most.
 _MAX_SECONDS = 0.02
 
@@ -56,13 +56,15 @@ def read_tum(root: Path) -> Listing:
         raise LinprimError(
             f"{root / 'groundtruth.txt'}: no pose within {_MAX_SECONDS} s of any of the {len(names)} photographs of rgb.txt"
         )
-    frames, lenses = [], _Lenses(root)
+    frames, (lens, said) = [], _pinhole(root)
     for row, name in enumerate(names):
         if pose_of[row] >= 0:
             depth = root / depths[depth_of[row]] if depth_of[row] >= 0 else None
-            pose = poses[pose_of[row]]
+            where = f"{root / 'rgb.txt'} image {name}"
+            _check_size(root / name, where, lens, said)
+            pose = np.linalg.inv(poses[pose_of[row]])
             frames.append(
-                _frame(f"{root / 'rgb.txt'} row {row + 1}", root, root / name, depth, pose, lenses, "tum")
+                Frame(where, name, root / name, lens, pose, depth_path=depth, depth_scale=_METRES_TUM)
             )
     return Listing("tum", tuple(frames), None, "m")
 
@@ -86,74 +88,59 @@ def read_log(root: Path, log: Path) -> Listing:
                 f"{root / 'depth'}: {len(depths)} depth maps for {len(images)} images, wanted one for each"
             )
         depths = dict(zip((image.stem for image in images), depths.values(), strict=True))
-    frames, lenses = [], _Lenses(root)
+    frames, (lens, said) = [], _pinhole(root)
     for image, pose in trajectories.log_by_image(trajectories.read_log(log), images, log):
-        frames.append(
-            _frame(f"{log} pose of {image.name}", root, image, depths[image.stem], pose, lenses, "redwood")
-        )
+        where, name = f"{log} pose of {image.name}", image.relative_to(root).as_posix()
+        _check_size(image, where, lens, said)
+        depth, pose = depths[image.stem], np.linalg.inv(pose)
+        frames.append(Frame(where, name, image, lens, pose, depth_path=depth, depth_scale=_METRES_REDWOOD))
     return Listing("rgbd", tuple(frames), None, "m")
 
 
-def _frame(
-    where: str, root: Path, image: Path, depth: Path | None, pose: np.ndarray, lenses: _Lenses, kind: str
-) -> Frame:
+def _pinhole(root: Path) -> tuple[Lens, str]:
+    """The pinhole of a sequence, from a file or the PrimeSense's, and who says so."""
+    file = next((root / name for name in _INTRINSICS if (root / name).is_file()), None)
+    if file is not None:
+        return read_intrinsics(file), f"{file} says"
+    return _PRIMESENSE, "the PrimeSense had, and there is no camera_intrinsic.json that says otherwise"
+
+
+def _check_size(image: Path, where: str, lens: Lens, said: str) -> None:
     if not is_file(image):
         raise LinprimError(f"{where}: the image {image} is not on disk")
-    relative = image.relative_to(root).as_posix()
-    lens = lenses.of(image)
-    return Frame(
-        where,
-        relative,
-        image,
-        lens,
-        np.linalg.inv(pose),
-        depth_path=depth,
-        depth_scale=_METRES_PER_STEP[kind],
-    )
+    width, height, _ = photos.image_header(image)
+    if (width, height) != (lens.width, lens.height):
+        raise LinprimError(
+            f"{image}: the image is {width}x{height}, wanted {lens.width}x{lens.height} as {said}"
+        )
 
 
-class _Lenses:
-    """The pinhole of a sequence, from a file or the PrimeSense's; those numbers have pixel centres at whole numbers."""
-
-    def __init__(self, root: Path):
-        self.file = next((root / name for name in _INTRINSICS if (root / name).is_file()), None)
-        self.numbers = read_intrinsics(self.file) if self.file else _PRIMESENSE
-
-    def of(self, image: Path) -> Lens:
-        width, height, fx, fy, cx, cy = self.numbers
-        found = photos.image_header(image)[:2]
-        if found != (width, height):
-            said = (
-                f"{self.file} says"
-                if self.file
-                else "the PrimeSense had, and there is no camera_intrinsic.json that says otherwise"
-            )
-            raise LinprimError(
-                f"{image}: the image is {found[0]}x{found[1]}, wanted {width}x{height} as {said}"
-            )
-        return Lens("PINHOLE", width, height, (fx, fy, cx + 0.5, cy + 0.5))
-
-
-def read_intrinsics(path: Path) -> tuple[int, int, float, float, float, float]:
-    """(width, height, fx, fy, cx, cy) of Open3D's JSON: `width`, `height` and `intrinsic_matrix`, nine numbers column by column.
+def read_intrinsics(path: Path) -> Lens:
+    """The pinhole of Open3D's JSON: `width`, `height` and `intrinsic_matrix`, nine numbers column by column. Pixel centres are at whole
+    numbers there, so half a pixel is added to the principal point.
 
     Raises:
         LinprimError: unreadable, or not a pinhole.
     """
+    values = read_json(path, "a camera's intrinsics")
     try:
-        values = json.loads(path.read_text(encoding="utf-8-sig"))
         width, height = int(values["width"]), int(values["height"])
         matrix = np.array(values["intrinsic_matrix"], dtype=np.float64).reshape(3, 3).T
-    except OSError as error:
-        raise LinprimError(
-            f"{path}: cannot be read ({error.strerror}), wanted a camera's intrinsics"
-        ) from error
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
         raise LinprimError(
             f"{path}: not a camera's intrinsics, wanted width, height and intrinsic_matrix of nine numbers"
         ) from error
-    if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or width < 1 or height < 1:
+    pinhole = np.eye(3)
+    pinhole[0, 0], pinhole[1, 1], pinhole[:2, 2] = matrix[0, 0], matrix[1, 1], matrix[:2, 2]
+    if (
+        not np.isfinite(matrix).all()
+        or matrix[0, 0] <= 0
+        or matrix[1, 1] <= 0
+        or (matrix != pinhole).any()
+        or min(width, height) < 1
+    ):
         raise LinprimError(
             f"{path}: intrinsic_matrix is {matrix.T.ravel().tolist()}, wanted fx 0 0 0 fy 0 cx cy 1, columns first"
         )
-    return width, height, float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
+    fx, fy, (cx, cy) = matrix[0, 0], matrix[1, 1], matrix[:2, 2] + 0.5
+    return Lens("PINHOLE", width, height, (float(fx), float(fy), float(cx), float(cy)))

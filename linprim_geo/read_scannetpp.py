@@ -5,14 +5,13 @@ The masks of anonymised pixels say what was blurred, not what is empty, so they 
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 
 from . import read_colmap, read_transforms
 from .errors import LinprimError
-from .files import is_file
+from .files import is_file, read_json
 from .lens import Lens
 from .scene import Frame, Listing
 
@@ -99,12 +98,8 @@ def _held_out(device: Path) -> set[str]:
     path = device / _SPLIT
     if not path.is_file():
         return set()
-    try:
-        names = json.loads(path.read_text(encoding="utf-8-sig"))["test"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise LinprimError(
-            f"{path}: cannot be read, wanted JSON with a list 'test' of image names"
-        ) from error
+    lists = read_json(path, "lists of image names")
+    names = lists.get("test") if isinstance(lists, dict) else None
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise LinprimError(f"{path}: 'test' is not a list of names")
+        raise LinprimError(f"{path}: no list 'test', wanted the names of the images that are held out")
     return set(names)

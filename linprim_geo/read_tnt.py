@@ -8,7 +8,6 @@ import numpy as np
 
 from . import photos, trajectories
 from .errors import LinprimError
-from .lens import Lens
 from .read_rgbd import read_intrinsics
 from .scene import Frame, Listing
 
@@ -34,8 +33,7 @@ def read_tnt(root: Path, log: Path) -> Listing:
             f"{log}: a trajectory without intrinsics, wanted a COLMAP model in sparse/0, or {_INTRINSICS[0]} with width, height and"
             " intrinsic_matrix beside it"
         )
-    width, height, fx, fy, cx, cy = read_intrinsics(file)
-    lens = Lens("PINHOLE", width, height, (fx, fy, cx + 0.5, cy + 0.5))
+    lens = read_intrinsics(file)
     frames = [
         Frame(
             f"{log} pose of {image.name}",

@@ -1,12 +1,12 @@
 """Reading `transforms*.json`: NeRF-synthetic, nerfstudio and instant-ngp captures, and the points that belong
 to them.
 
-Their camera-to-world matrices have OpenGL axes (x right, y up, z backward); their pixel centres are at +0.5.
+Their camera-to-world matrices have OpenGL axes (x right, y up, z backward); their pixel centres are at +0.5. Poses and `ply_file_path` are
+taken to be in one frame, as they are written; points of a COLMAP model are brought into it by `applied_transform` and `applied_scale`.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 
 from . import photos, read_colmap
 from .errors import LinprimError
-from .files import is_file
+from .files import is_file, read_json
 from .lens import Lens
 from .ply_points import read_points_ply
 from .scene import Frame, Listing, PointCloud, check_pose
@@ -103,7 +103,7 @@ def read_cameras(path: Path, images: Path) -> tuple[list[Frame], np.ndarray | No
     """
     header = _read_json(path)
     frames = []
-    for number, entry in enumerate(header["frames"] + (header.get("test_frames") or [])):
+    for number, entry in enumerate(header["frames"] + header["test_frames"]):
         where = _checked(f"{path} frame {number}", entry)
         bare = {key: value for key, value in entry.items() if not key.endswith(("mask_path", "depth_file_path", "normal_file_path"))}
         frames.append(_frame(path.parent, header, bare, where, images / entry["file_path"], None))
@@ -111,27 +111,21 @@ def read_cameras(path: Path, images: Path) -> tuple[list[Frame], np.ndarray | No
 
 
 def _read_json(path: Path, may_be_empty: bool = False) -> dict:
-    try:
-        header = json.loads(path.read_text(encoding="utf-8-sig"))
-    except json.JSONDecodeError as error:
-        raise LinprimError(
-            f"{path}: not valid JSON at line {error.lineno}, column {error.colno} ({error.msg}),"
-            " wanted a complete file"
-        ) from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise LinprimError(f"{path}: cannot be read ({error}), wanted a JSON file") from error
+    header = read_json(path, "a complete file of cameras")
     if not isinstance(header, dict) or not isinstance(header.get("frames"), list):
         raise LinprimError(f"{path}: no list 'frames', wanted one entry per image")
     if not header["frames"] and not may_be_empty:
         raise LinprimError(f"{path}: the list 'frames' is empty, wanted one entry per image")
-    return header
+    held_out = header.get("test_frames") or []  # as ScanNet++ has them
+    if not isinstance(held_out, list):
+        raise LinprimError(f"{path}: 'test_frames' is {held_out!r:.40}, wanted a list of the images that are held out")
+    return header | {"test_frames": held_out}
 
 
 def _read_frames(path: Path, header: dict, split: str | None) -> list[Frame]:
     """The frames of one file, with images found on disk and cameras checked for numbers."""
-    entries = list(header["frames"])
-    held_out = set(map(id, header["test_frames"])) if isinstance(header.get("test_frames"), list) else set()
-    entries += header["test_frames"] if held_out else []
+    entries = header["frames"] + header["test_frames"]
+    held_out = set(map(id, header["test_frames"]))
     located = []
     for number, entry in enumerate(entries):
         where = _checked(f"{path} frame {number}", entry)
@@ -338,16 +332,21 @@ def _points(root: Path, headers: list, frames: list[Frame], sparse: Path | None)
 
 
 def _applied_transform(headers: list) -> np.ndarray | None:
-    """nerfstudio's (3, 4) matrix from COLMAP's world to that of the transforms, where it is given."""
+    """nerfstudio's (3, 4) matrix from COLMAP's world to that of the transforms, `applied_scale` times `applied_transform`; None where
+    neither is given."""
     for path, header in headers:
-        if header.get("applied_transform") is not None:
+        if header.get("applied_transform") is not None or header.get("applied_scale") is not None:
+            given = header.get("applied_transform")
             try:
-                matrix = np.array(header["applied_transform"], dtype=np.float64)[:3]
+                matrix = np.eye(4)[:3] if given is None else np.array(given, dtype=np.float64)[:3]
             except (TypeError, ValueError, IndexError, OverflowError):
                 matrix = np.empty(0)
             if matrix.shape != (3, 4) or not np.isfinite(matrix).all():
                 raise LinprimError(f"{path}: 'applied_transform' is not a table of 3x4 numbers")
-            return matrix
+            scale = _number(header, "applied_scale", str(path), 1.0)
+            if not scale > 0:
+                raise LinprimError(f"{path}: 'applied_scale' is {scale}, wanted a positive number")
+            return scale * matrix
     return None
 
 
@@ -370,23 +369,25 @@ def _model_points(
         linear, shift = applied[:, :3], applied[:, 3]
     options = [(np.eye(3), np.zeros(3))] if applied is None else [(linear, shift), (np.eye(3), np.zeros(3))]
     best = None
-    for rotation, offset in options:
-        difference = _pose_difference(pairs, rotation, offset)
+    for matrix, offset in options:
+        difference = _pose_difference(pairs, matrix, offset)
         if best is None or difference < best[0]:
-            best = (difference, rotation, offset)
-    difference, rotation, offset = best
+            best = (difference, matrix, offset)
+    difference, matrix, offset = best
     cloud = colmap.points
     if cloud is not None:
-        cloud = PointCloud(cloud.xyz @ rotation.T + offset, cloud.rgb, cloud.error_px)
+        cloud = PointCloud(cloud.xyz @ matrix.T + offset, cloud.rgb, cloud.error_px)
     return cloud, difference
 
 
-def _pose_difference(pairs: list, rotation: np.ndarray, offset: np.ndarray) -> float:
-    """Worst of the differences in position and angle, as multiples of what is allowed."""
-    theirs = np.array([-pose[:3, :3].T @ pose[:3, 3] for pose, _ in pairs]) @ rotation.T + offset
+def _pose_difference(pairs: list, matrix: np.ndarray, offset: np.ndarray) -> float:
+    """Worst of the differences in position and angle, as multiples of what is allowed, when `matrix`, a rotation that may scale, and
+    `offset` have moved the first of each pair."""
+    theirs = np.array([-pose[:3, :3].T @ pose[:3, 3] for pose, _ in pairs]) @ matrix.T + offset
     ours = np.array([-pose[:3, :3].T @ pose[:3, 3] for _, pose in pairs])
     spread = np.linalg.norm(ours - ours.mean(axis=0), axis=1).max()
     position = np.linalg.norm(theirs - ours, axis=1).max() / max(spread, np.finfo(float).tiny)
+    rotation = matrix / np.cbrt(np.abs(np.linalg.det(matrix)) or 1.0)
     worst = 0.0
     for their_pose, our_pose in pairs:
         turn = their_pose[:3, :3] @ rotation.T @ our_pose[:3, :3].T

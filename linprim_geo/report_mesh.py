@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from . import files
 from .camera import Camera
 from .display import Layer, is_inside, layers, light_mesh, up_direction
 from .errors import LinprimError
@@ -64,8 +64,8 @@ def find_meshes(run: Run, reference: str | os.PathLike | None, missing: list[str
         cameras = [view.camera for view in run.scene().train]
     except LinprimError:
         cameras = []
-    files = sorted((run.path / "eval" / "mesh").glob("**/results.json"))
-    stored = [(file, scores) for file in files if (scores := read_json(file, missing))]
+    results = sorted((run.path / "eval" / "mesh").glob("**/results.json"))
+    stored = [(file, scores) for file in results if (scores := read_json(file, missing))]
     for shown in found:
         if shown.path is None:
             shown.problem = (
@@ -213,12 +213,12 @@ def refers_to(name: object, path: Path) -> bool:
 
 def read_json(file: Path, missing: list[str]) -> dict | None:
     """The object in a JSON file; None if there is no file, and if it is damaged, which is said in `missing`."""
-    try:
-        value = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not file.exists():
         return None
-    except (OSError, ValueError) as error:
-        missing.append(f"{file}: cannot be read ({error})")
+    try:
+        value = files.read_json(file, "what an earlier command left")
+    except LinprimError as error:
+        missing.append(str(error))
         return None
     if not isinstance(value, dict):
         missing.append(f"{file}: holds no JSON object")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
 import time
 from collections.abc import Sequence
@@ -225,7 +226,9 @@ def _training(report: Report) -> str:
             entries = [
                 entry
                 for entry in report.metrics
-                if isinstance(entry.get(key), int | float) and (entry[key] > 0 or not log)
+                if isinstance(entry.get(key), int | float)
+                and math.isfinite(entry[key])
+                and (entry[key] > 0 or not log)
             ]
             if entries:
                 series.append((name, [entry["step"] for entry in entries], [entry[key] for entry in entries]))

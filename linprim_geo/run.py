@@ -12,6 +12,7 @@ metrics.jsonl     loss, PSNR, ... over time                        checkpoints/s
 from __future__ import annotations
 
 import json
+import math
 import os
 import platform
 import shutil
@@ -25,7 +26,7 @@ import numpy as np
 from . import __version__
 from .camera import Similarity
 from .errors import LinprimError
-from .files import is_remains, write_json
+from .files import is_remains, write_json, writing
 from .options import SceneOptions, TrainOptions, check_train_options, from_saved, raster_options
 from .primitives import ARRAYS, KINDS, Primitives, load_primitives, save_primitives
 from .scene import PHOTOGRAPHS, Scene, View, load_scene
@@ -83,7 +84,8 @@ class Run:
             config["time_budget"] = time_budget
         # The cache may be emptied, and poses that are found anew would lie in another frame.
         if scene.kind == PHOTOGRAPHS and (model := found_model(scene.root)) is not None:
-            shutil.copytree(model, path / FOUND_POSES, dirs_exist_ok=True)
+            with writing(path / FOUND_POSES):
+                shutil.copytree(model, path / FOUND_POSES, dirs_exist_ok=True)
         write_json(
             path / "transform.json",
             {
@@ -183,6 +185,10 @@ class Run:
             raise LinprimError(
                 f"{self.path / 'run.json'}: has no background colour of three numbers in [0, 1]"
             )
+        for name in ("iteration", "primitives", "seconds"):
+            value = state.get(name, 0)
+            if type(value) not in (int, float) or not 0 <= value < math.inf:
+                raise LinprimError(f"{self.path / 'run.json'}: {name} is {value!r:.40}, wanted a number from 0")
         return state
 
     @property

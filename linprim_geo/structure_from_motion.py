@@ -5,41 +5,32 @@ Keypoints and matches are kept while they are made, so that a run that was stopp
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
 import shutil
-import sqlite3
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, astuple, dataclass
+from functools import partial
 from pathlib import Path
 
 from . import photos, video_frames
 from .errors import LinprimError
-from .files import write_json
-from .image_pairs import pairs_to_match
+from .files import atomic_write, locked, write_json
+from .incremental_mapping import MIN_REGISTERED, SEED, largest_model, remove_work
+from .read_colmap import has_model
 from .scene import has_poses
 
 # Changed whenever the poses come out differently, so that old cache entries are not found any more.
 _CACHE_VERSION = 1
 # Where photographs lie in a capture's folder; in the first that has any. Those in the folder itself are not looked for any deeper.
 _PHOTO_FOLDERS = ("images", "image", "input", "rgb", ".")
-# Keypoints are looked for at this many pixels along the longer side; more takes long and finds few that can be matched.
-_WIDEST = 2000
-_MAX_FEATURES = 4096
-# Below COLMAP's 0.0067, as plain walls and renderings have few strong features; far below, weak ones crowd out the others.
-_PEAK_THRESHOLD = 0.004
-# Work between two lines of progress, and two moments at which it can be interrupted.
-_IMAGES_AT_ONCE = 4
-_PAIRS_AT_ONCE = 40
-_SECONDS_BETWEEN_LINES = 20.0
-_SEED = 0
-# Where COLMAP's demands on a photograph's match with the model (30 matches, a quarter of them right) leave some out, these are tried.
-_FEW_MATCHES, _FEW_RIGHT = 15, 0.1
+# Photographs in formats that pycolmap reads, in the folder of the result while they are needed.
+_COPIES = "copies"
+# Counts and pixels of a verdict are below this.
+_LARGEST = 1e12
 # What can be trained, and what is trained with a warning.
-_MIN_REGISTERED = 3
 _MIN_SHARE = 0.5
 _GOOD_SHARE = 0.9
 _GOOD_ERROR_PX = 1.0
@@ -66,7 +57,7 @@ class Verdict:
     @property
     def unusable(self) -> bool:
         """Whether too few photographs are left to train: fewer than three, or less than half."""
-        return self.registered < max(_MIN_REGISTERED, _MIN_SHARE * self.photographs)
+        return self.registered < max(MIN_REGISTERED, _MIN_SHARE * self.photographs)
 
     @property
     def doubts(self) -> str:
@@ -138,8 +129,8 @@ def frames_of(path: Path, frames: int, cache: Path | None = None) -> Path:
 
 
 def _checked_count(frames: int) -> int:
-    if frames < _MIN_REGISTERED:
-        raise LinprimError(f"--frames is {frames}, wanted at least {_MIN_REGISTERED}")
+    if frames < MIN_REGISTERED:
+        raise LinprimError(f"--frames is {frames}, wanted at least {MIN_REGISTERED}")
     return frames
 
 
@@ -179,13 +170,14 @@ def find_poses(
     """
     say = log or (lambda line: None)
     folder, names = photographs(root)
-    if len(names) < _MIN_REGISTERED:
+    if len(names) < MIN_REGISTERED:
         raise LinprimError(
-            f"{root}: {len(names)} photographs, wanted at least {_MIN_REGISTERED} to find their poses"
+            f"{root}: {len(names)} photographs, wanted at least {MIN_REGISTERED} to find their poses"
         )
     sizes = [photos.image_header(folder / name)[:2] for name in names]
     kept = _base(cache) / _key(folder, names)
-    with _alone(kept, say):
+    wait = partial(say, "another process is finding these poses; waiting for it ...")
+    with locked(kept, "worked on", wait=wait):
         verdict = _stored(kept)
         if verdict is None:
             start = time.monotonic()
@@ -204,7 +196,7 @@ def _refuse(root: Path, verdict: Verdict) -> None:
     if verdict.unusable:
         raise LinprimError(
             f"{root}: poses were found for {verdict.registered} of {verdict.photographs} photographs, wanted at least"
-            f" {_MIN_REGISTERED} and half of them (do they overlap by two thirds, is there texture, did nothing move?)"
+            f" {MIN_REGISTERED} and half of them (do they overlap by two thirds, is there texture, did nothing move?)"
         )
 
 
@@ -214,7 +206,7 @@ def _base(cache: Path | None) -> Path:
 
 def _key(folder: Path, names: Sequence[str]) -> str:
     """Of the names and contents of the photographs; neither where they lie nor the number of threads matter."""
-    digest = hashlib.blake2b(repr((_CACHE_VERSION, _SEED)).encode(), digest_size=16)
+    digest = hashlib.blake2b(repr((_CACHE_VERSION, SEED)).encode(), digest_size=16)
     for name in names:
         try:
             content = hashlib.blake2b((folder / name).read_bytes(), digest_size=16).digest()
@@ -227,35 +219,13 @@ def _key(folder: Path, names: Sequence[str]) -> str:
 
 
 def _stored(kept: Path) -> Verdict | None:
+    """What is said of the result in a folder; None if there is none, or one that is of no use and made again."""
     try:
-        return Verdict(**json.loads((kept / "verdict.json").read_text()))
-    except (OSError, ValueError, TypeError):
-        return None  # not there, or of no use: made again
-
-
-@contextlib.contextmanager
-def _alone(kept: Path, say: Callable[[str], None]) -> Iterator[None]:
-    """Waits until no other process works in the folder; a lock of SQLite's ends with the process that holds it."""
-    try:
-        kept.mkdir(parents=True, exist_ok=True)
-        lock = sqlite3.connect(kept / "lock", timeout=1.0, isolation_level=None)
-    except (OSError, sqlite3.Error) as error:
-        raise LinprimError(
-            f"{kept}: cannot be written ({error}), wanted a folder for poses; $LINPRIM_GEO_CACHE names another"
-        ) from error
-    with contextlib.closing(lock):
-        told = False
-        while True:
-            try:
-                lock.execute("BEGIN EXCLUSIVE")
-                break
-            except sqlite3.OperationalError as error:
-                if "locked" not in str(error):
-                    raise LinprimError(f"{kept}: cannot be locked ({error})") from error
-                if not told:
-                    say("another process is finding these poses; waiting for it ...")
-                told = True
-        yield
+        verdict = Verdict(**json.loads((kept / "verdict.json").read_text(encoding="utf-8")))
+        usable = all(type(value) in (int, float) and 0 <= value < _LARGEST for value in astuple(verdict))
+        return verdict if usable and (not verdict.registered or has_model(kept / "model")) else None
+    except (OSError, ValueError, TypeError, RecursionError):
+        return None
 
 
 def _reconstruct(
@@ -267,18 +237,8 @@ def _reconstruct(
     say: Callable[[str], None],
 ) -> Verdict:
     """Goes on with what is in `kept`, and leaves the largest model and the verdict there."""
-    import pycolmap
-
-    pycolmap.logging.minloglevel = max(
-        pycolmap.logging.minloglevel, 3
-    )  # progress of every image and pair otherwise
-    pycolmap.set_random_seed(_SEED)
-    database_path = kept / "database.db"
     try:
-        _register(database_path, folder, names, sizes)
-        _extract(database_path, folder, names, threads or -1, say)
-        _match(database_path, kept, names, threads or -1, say)
-        model = _map(database_path, folder, kept, threads or -1, len(names), say)
+        model = largest_model(_readable(folder, names, kept), names, sizes, kept, threads, say)
     except (ValueError, RuntimeError, MemoryError) as error:
         reason = (str(error).splitlines() or ["out of memory"])[0]
         raise LinprimError(
@@ -295,134 +255,25 @@ def _reconstruct(
         errors = model.compute_mean_reprojection_error(), model.compute_mean_track_length()
         verdict = Verdict(len(names), model.num_reg_images(), model.num_points3D(), *errors)
     write_json(kept / "verdict.json", asdict(verdict))
-    for leftover in kept.glob("database.db*"):
-        leftover.unlink()
+    remove_work(kept)
+    shutil.rmtree(kept / _COPIES, ignore_errors=True)
     return verdict
 
 
-def _register(database_path: Path, folder: Path, names: list[str], sizes: list[tuple[int, int]]) -> None:
-    """Numbers the photographs by name and gives those of one folder, size and focal length one camera, once.
+def _readable(folder: Path, names: Sequence[str], kept: Path) -> Path:
+    """The folder itself if pycolmap can read all its photographs, else one of copies by the same names; WebP, which it cannot, as PNG."""
+    from PIL import Image
 
-    Left to itself, pycolmap numbers them in the order in which its threads finish them.
-    """
-    import pycolmap
-
-    with pycolmap.Database.open(database_path) as database:
-        if database.num_frames() == len(names):  # written last
-            _rename(database, names)
-            return
-        database.clear_all_tables()
-        known = pycolmap.Reconstruction()
-        numbers: dict[tuple, int] = {}
-        for index, (name, size) in enumerate(zip(names, sizes, strict=True), start=1):
-            camera = pycolmap.infer_camera_from_image(folder / name)
-            alike = (Path(name).parent, size, round(camera.focal_length, 1))
-            if alike not in numbers:
-                numbers[alike] = camera.camera_id = index
-                known.add_camera_with_trivial_rig(camera)
-                database.write_camera(camera, use_camera_id=True)
-                database.write_rig(known.rig(index), use_rig_id=True)
-            image = pycolmap.Image(name=name, camera_id=numbers[alike], image_id=index)
-            known.add_image_with_trivial_frame(image)
-            database.write_image(image, use_image_id=True)
-            database.write_frame(known.frame(index), use_frame_id=True)
-
-
-def _extract(
-    database_path: Path, folder: Path, names: list[str], threads: int, say: Callable[[str], None]
-) -> None:
-    import pycolmap
-
-    options = pycolmap.FeatureExtractionOptions(num_threads=threads, max_image_size=_WIDEST)
-    options.sift.max_num_features = _MAX_FEATURES
-    options.sift.peak_threshold = _PEAK_THRESHOLD
-    with pycolmap.Database.open(database_path) as database:
-        left = [name for index, name in enumerate(names, start=1) if not database.exists_descriptors(index)]
-    for part in _in_parts(left, _IMAGES_AT_ONCE, "keypoints", "photographs", say):
-        pycolmap.extract_features(
-            database_path, folder, image_names=part, extraction_options=options, device=pycolmap.Device.cpu
-        )
-
-
-def _match(
-    database_path: Path, kept: Path, names: list[str], threads: int, say: Callable[[str], None]
-) -> None:
-    import pycolmap
-
-    matching = pycolmap.FeatureMatchingOptions(num_threads=threads)
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = _SEED
-    pairing = pycolmap.ImportedPairingOptions(match_list_path=str(kept / "pairs.txt"))
-    with pycolmap.Database.open(database_path) as database:
-        pairs = pairs_to_match(database, len(names))
-        left = [pair for pair in pairs if not database.exists_two_view_geometry(pair[0] + 1, pair[1] + 1)]
-        # The list of pairs is split at blanks, which file names may have.
-        _rename(database, [str(index) for index in range(len(names))])
-    for part in _in_parts(left, _PAIRS_AT_ONCE, "matches", "pairs", say):
-        (kept / "pairs.txt").write_text("".join(f"{i} {j}\n" for i, j in part))
-        pycolmap.match_image_pairs(
-            database_path,
-            matching_options=matching,
-            pairing_options=pairing,
-            verification_options=verification,
-            device=pycolmap.Device.cpu,
-        )
-    (kept / "pairs.txt").unlink(missing_ok=True)
-    with pycolmap.Database.open(database_path) as database:
-        _rename(database, names)
-
-
-def _rename(database, names: Sequence[str]) -> None:
-    for number, name in enumerate(names, start=1):
-        image = database.read_image(number)
-        if image.name != name:
-            image.name = name
-            database.update_image(image)
-
-
-def _map(database_path: Path, folder: Path, kept: Path, threads: int, count: int, say: Callable[[str], None]):
-    """The largest of the models that incremental mapping makes; None if there is none."""
-    import pycolmap
-
-    options = pycolmap.IncrementalPipelineOptions(
-        random_seed=_SEED, num_threads=threads, min_model_size=_MIN_REGISTERED
-    )
-    output = kept / "models"
-    done, last = 0, time.monotonic()
-
-    def placed() -> None:
-        nonlocal done, last
-        done += 1
-        if time.monotonic() - last > _SECONDS_BETWEEN_LINES:
-            last = time.monotonic()
-            say(f"poses: {done} photographs placed, of {count}")
-
-    models = []
-    for matches, right in ((None, None), (_FEW_MATCHES, _FEW_RIGHT)):
-        if matches is not None:
-            options.mapper.abs_pose_min_num_inliers, options.mapper.abs_pose_min_inlier_ratio = matches, right
-            done = 0
-        shutil.rmtree(output, ignore_errors=True)
-        output.mkdir()
-        models += pycolmap.incremental_mapping(
-            database_path, folder, output, options=options, next_image_callback=placed
-        ).values()
-        if any(model.num_reg_images() == count for model in models):
-            break
-    shutil.rmtree(output, ignore_errors=True)
-    return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
-
-
-def _in_parts(items: list, size: int, name: str, unit: str, say: Callable[[str], None]) -> Iterator[list]:
-    """Parts of `items`, with a line now and then that says how many were done."""
-    start = last = time.monotonic()
-    for first in range(0, len(items), size):
-        yield items[first : first + size]
-        done, now = min(first + size, len(items)), time.monotonic()
-        if now - last > _SECONDS_BETWEEN_LINES and done < len(items):
-            last = now
-            say(
-                f"{name}: {done} of {len(items)} {unit}, {(now - start) / done * (len(items) - done):.0f} s left"
-            )
-    if items:
-        say(f"{name}: {len(items)} {unit} in {time.monotonic() - start:.0f} s")
+    if not any(photos.image_format(folder / name) == "WEBP" for name in names):
+        return folder
+    for name in names:
+        source, copy = folder / name, kept / _COPIES / name
+        if not copy.exists():
+            with atomic_write(copy) as temporary:
+                if photos.image_format(source) == "WEBP":
+                    Image.fromarray(photos.read_photo(source)[0]).save(
+                        temporary, format="PNG", compress_level=1
+                    )
+                else:
+                    shutil.copyfile(source, temporary)
+    return kept / _COPIES

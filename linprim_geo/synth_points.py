@@ -147,7 +147,7 @@ def sees(
 
 def write_colmap(folder: Path, cameras: list[Camera], cloud: Cloud, distortion: float = 0.0) -> None:
     """A COLMAP model (binary) of the training views, with the points and their observations."""
-    import pycolmap
+    from .load_pycolmap import pycolmap
 
     folder.mkdir(parents=True)
     model = pycolmap.Reconstruction()

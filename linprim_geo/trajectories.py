@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
 
 from .errors import LinprimError
 from .scene import check_pose
+
+# A quaternion's length differs from 1 by rounding alone, which the files do to four digits.
+_UNIT_TOLERANCE = 0.01
 
 
 def is_log(path: Path) -> bool:
@@ -84,7 +88,7 @@ def read_tum_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """(F,) seconds, sorted, and (F, 4, 4) camera-to-world of lines `timestamp tx ty tz qx qy qz qw`.
 
     Raises:
-        LinprimError: unreadable, empty, not eight finite numbers in a line, or a quaternion of no length.
+        LinprimError: unreadable, empty, not eight finite numbers in a line, or a quaternion that is far from unit length.
     """
     from scipy.spatial.transform import Rotation
 
@@ -94,9 +98,13 @@ def read_tum_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:
             values = [float(word) for word in row]
         except ValueError:
             values = []
-        if len(values) != 8 or not np.isfinite(values).all() or not any(values[4:]):
+        if (
+            len(values) != 8
+            or not np.isfinite(values).all()
+            or abs(math.hypot(*values[4:]) - 1) > _UNIT_TOLERANCE
+        ):
             raise LinprimError(
-                f"{path} row {number}: {' '.join(row)!r} is no pose, wanted timestamp tx ty tz qx qy qz qw"
+                f"{path} row {number}: {' '.join(row)!r} is no pose, wanted timestamp tx ty tz and a unit quaternion qx qy qz qw"
             )
         table.append(values)
     values = np.array(sorted(table))

@@ -123,7 +123,7 @@ def matching_pairs(views: Sequence[View], partners: int = _PARTNERS) -> list[tup
 def _triangulate(views: Sequence[View], seed: int, threads: int):
     """(P, 3) positions, (P, 3) colours, (P,) mean errors in pixels, and per point the numbers of its
     views."""
-    import pycolmap
+    from .load_pycolmap import pycolmap
 
     pycolmap.logging.minloglevel = max(
         pycolmap.logging.minloglevel, 2
@@ -177,7 +177,7 @@ def _posed(views: Sequence[View], database_path: Path):
     Left to itself, pycolmap numbers images in the order in which its threads finish them, and points depend
     on that.
     """
-    import pycolmap
+    from .load_pycolmap import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
     with pycolmap.Database.open(database_path) as database:
@@ -207,7 +207,7 @@ def _verify(views: Sequence[View], database_path: Path, pairs: list) -> None:
 
     The distance is Sampson's, |x2' F x1| / sqrt(|(F x1)_xy|^2 + |(F' x2)_xy|^2), first order in pixels.
     """
-    import pycolmap
+    from .load_pycolmap import pycolmap
 
     with pycolmap.Database.open(database_path) as database:
         keypoints = [database.read_keypoints(index + 1)[:, :2] for index in range(len(views))]

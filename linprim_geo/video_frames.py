@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from . import photos
 from .errors import LinprimError
+from .files import locked, writing
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 # Changed whenever other frames are chosen, so that old cache entries are not found any more.
@@ -44,45 +46,57 @@ def extract_frames(
     Of each of `count` equal parts the frame is taken whose grey values have the largest variance of their Laplacian.
 
     Raises:
-        LinprimError: PyAV is not installed, or the file holds no video that can be decoded.
+        LinprimError: PyAV is not installed, the file holds no video that can be decoded, or the frames cannot be written.
     """
-    from PIL import Image
-
     folder = frames_folder(video, count, cache)
     if folder.is_dir():
         return folder
-    av = _pyav()
+    av, say = _pyav(), log or (lambda line: None)
+    wait = partial(say, "another process is taking these frames; waiting for it ...")
+    with locked(folder.parent, "worked on", folder.name, wait):
+        if not folder.is_dir():
+            _extract(av, video, count, folder, say)
+    return folder
+
+
+def _extract(av, video: Path, count: int, folder: Path, say: Callable[[str], None]) -> None:
+    """Makes the folder, complete at once."""
     part = folder.with_name(folder.name + ".part")
     shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
+    part.mkdir()
     try:
-        total = _count(av, video)
-        kept = 0
-        best: tuple[float, int, np.ndarray] | None = None
-        interval = 0
-        with av.open(str(video)) as container:
-            for index, frame in enumerate(container.decode(video=0)):
-                if index * count // total > interval and best is not None and total > count:
-                    kept, best = kept + _save(Image, part, best), None
-                interval = index * count // total
-                sharpness = _sharpness(frame.to_ndarray(format="gray"))
-                if total <= count:
-                    kept += _save(Image, part, (sharpness, index, frame.to_ndarray(format="rgb24")))
-                elif best is None or sharpness > best[0]:
-                    best = sharpness, index, frame.to_ndarray(format="rgb24")
-        if best is not None:
-            kept += _save(Image, part, best)
+        kept, total = _save_sharpest(av, video, count, part)
     except (av.FFmpegError, IndexError, OSError, ValueError) as error:
         reason = (str(error).splitlines() or ["damaged"])[0]
         shutil.rmtree(part, ignore_errors=True)
         raise LinprimError(f"{video}: cannot be decoded ({reason}), wanted a complete video") from error
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
     if not kept:
         shutil.rmtree(part, ignore_errors=True)
         raise LinprimError(f"{video}: no frame could be decoded, wanted a complete video")
     part.rename(folder)
-    if log:
-        log(f"{kept} frames of {video}, the sharpest of each part of its {total}, in {folder}")
-    return folder
+    say(f"{kept} frames of {video}, the sharpest of each part of its {total}, in {folder}")
+
+
+def _save_sharpest(av, video: Path, count: int, folder: Path) -> tuple[int, int]:
+    """Saves the frames; returns how many, and how many the video has."""
+    total, kept, interval = _count(av, video), 0, 0
+    best: tuple[float, int, np.ndarray] | None = None
+    with av.open(str(video)) as container:
+        for index, frame in enumerate(container.decode(video=0)):
+            if index * count // total > interval and best is not None and total > count:
+                kept, best = kept + _save(folder, best), None
+            interval = index * count // total
+            sharpness = _sharpness(frame.to_ndarray(format="gray"))
+            if total <= count:
+                kept += _save(folder, (sharpness, index, frame.to_ndarray(format="rgb24")))
+            elif best is None or sharpness > best[0]:
+                best = sharpness, index, frame.to_ndarray(format="rgb24")
+    if best is not None:
+        kept += _save(folder, best)
+    return kept, total
 
 
 def _pyav():
@@ -109,6 +123,10 @@ def _sharpness(grey: np.ndarray) -> float:
     return float(laplacian.var()) if laplacian.size else 0.0
 
 
-def _save(image, folder: Path, frame: tuple[float, int, np.ndarray]) -> int:
-    image.fromarray(frame[2]).save(folder / f"{frame[1]:06d}.jpg", quality=_JPEG_QUALITY, subsampling=0)
+def _save(folder: Path, frame: tuple[float, int, np.ndarray]) -> int:
+    from PIL import Image
+
+    path = folder / f"{frame[1]:06d}.jpg"
+    with writing(path):
+        Image.fromarray(frame[2]).save(path, quality=_JPEG_QUALITY, subsampling=0)
     return 1

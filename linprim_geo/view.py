@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -162,7 +163,7 @@ class Viewer:
         try:
             self._load()
         except LinprimError as error:
-            self._text.content = f"waiting: {error}"
+            self._text.content = as_text(f"waiting: {error}")
             return False
         return True
 
@@ -196,7 +197,7 @@ class Viewer:
 
     def _controls(self) -> None:
         gui = self.server.gui
-        self._text = gui.add_markdown(self.status)
+        self._text = gui.add_markdown(as_text(self.status))
         with gui.add_folder("Primitives"):
             self._primitives = gui.add_checkbox("show", True)
             hint = "share of light that one takes along its shortest diameter"
@@ -288,7 +289,7 @@ class Viewer:
                 self._put("/primitives", self._primitive_mesh())
                 mesh, inside = self._chosen_mesh()
                 self._put("/mesh", mesh, double_sided=not inside)
-            self._text.content = "  \n".join([self.status, *self.seen.notes])
+            self._text.content = "  \n".join(as_text(line) for line in (self.status, *self.seen.notes))
             self.server.flush()
 
     def _put(self, name: str, mesh: Mesh | None, *, double_sided: bool = False) -> None:
@@ -324,9 +325,8 @@ class Viewer:
             return None, False
         layer = next((each for each in chosen.layers if each.name == self._layer.value), chosen.layers[0])
         if layer.top is not None:
-            self._legend.content = (
-                f"{layer.name}: dark blue 0, light yellow {layer.top:.3g} {self.seen.run.unit} and more"
-            )
+            top = f"{layer.top:.3g} {self.seen.run.unit}"
+            self._legend.content = as_text(f"{layer.name}: dark blue 0, light yellow {top} and more")
         mesh = Mesh(chosen.mesh.vertices, chosen.mesh.faces, colors=layer.colors)
         keep = self._kept(mesh.vertices[mesh.faces].mean(1))
         return (mesh if keep.all() else select_faces(mesh, keep)), chosen.inside
@@ -339,6 +339,11 @@ class Viewer:
         axis = self.seen.up if self._axis.value == "up" else np.eye(3)["xyz".index(self._axis.value)]
         axis = -axis if self._flip.value else axis
         return points @ axis < np.quantile(self.seen.primitives.center @ axis, share)
+
+
+def as_text(line: str) -> str:
+    """Markdown that shows the line as it is. Names and units come out of files, and viser runs scripts that stand in Markdown."""
+    return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", " ".join(line.split()))
 
 
 def _glb(mesh: Mesh, double_sided: bool) -> bytes:

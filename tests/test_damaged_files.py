@@ -256,6 +256,14 @@ def test_json_nested_without_end_is_one_sentence(run_copy, tmp_path):
         assert name in refused(read, tmp_path / name)
 
 
+@pytest.mark.parametrize("name", ["iteration", "primitives", "seconds"])
+@pytest.mark.parametrize("value", ["9", None, -1, True, float("nan")], ids=str)
+def test_a_damaged_number_of_a_run_is_one_sentence(name, value, run_copy):
+    state = json.loads((run_copy / "run.json").read_text())
+    (run_copy / "run.json").write_text(json.dumps(state | {name: value}))
+    assert f"run.json: {name} is" in refused(lambda: Run.open(run_copy).state)
+
+
 BENT_BACK = {"seconds": 9, "correction": {"step": 5, "iterations": 2}}
 BAD_BUDGETS = ("x", [], {}, {"seconds": "x"}, {"seconds": 9, "finish_seconds": []}, BENT_BACK)
 

@@ -146,13 +146,25 @@ def test_missing_depth_maps_and_broken_intrinsics(tmp_path):
     (tmp_path / "depth" / "00002.png").unlink()
     assert "3 depth maps for 4 images" in refusal(tmp_path)
     depth_image(2, (32, 24), 1000).save(tmp_path / "depth" / "00002.png")
-    for content in ("{", "[]", '{"width": 32}', json.dumps({**JSON, "intrinsic_matrix": [1, 2]})):
+    infinite, nested = json.dumps({**JSON, "width": float("inf")}), "[" * 100_000
+    for content in (
+        "{",
+        nested,
+        "[]",
+        '{"width": 32}',
+        infinite,
+        json.dumps({**JSON, "intrinsic_matrix": [1, 2]}),
+    ):
         (tmp_path / "camera_intrinsic.json").write_text(content)
-        assert "camera_intrinsic.json: not a camera's intrinsics" in refusal(tmp_path)
-    (tmp_path / "camera_intrinsic.json").write_text(
-        json.dumps({**JSON, "intrinsic_matrix": [0, 0, 0, 0, 30, 0, 15, 11, 1]})
-    )
-    assert "wanted fx 0 0 0 fy 0 cx cy 1" in refusal(tmp_path)
+        assert "camera_intrinsic.json: " in (said := refusal(tmp_path)) and "wanted " in said
+    # Without a focal length; row by row, which puts the principal point where nothing may be; with skew.
+    for matrix in (
+        [0, 0, 0, 0, 30, 0, 15, 11, 1],
+        [30, 0, 15, 0, 30, 11, 0, 0, 1],
+        [30, 0, 0, 2, 30, 0, 15, 11, 1],
+    ):
+        (tmp_path / "camera_intrinsic.json").write_text(json.dumps({**JSON, "intrinsic_matrix": matrix}))
+        assert "wanted fx 0 0 0 fy 0 cx cy 1" in refusal(tmp_path)
 
 
 def test_tum_photographs_get_the_nearest_pose_and_depth(tmp_path):
@@ -184,6 +196,7 @@ def test_damaged_tum_lists_are_named(tmp_path):
         ("groundtruth.txt", "1305031102.1 0 0 0 0 0 0\n", "row 1: .* is no pose"),
         ("groundtruth.txt", "1305031102.1 0 0 nan 0 0 0 1\n", "row 1: .* is no pose"),
         ("groundtruth.txt", "1305031102.1 0 0 0 0 0 0 0\n", "row 1: .* is no pose"),
+        ("groundtruth.txt", "1305031102.1 0 0 0 0 0 0 1e300\n", "row 1: .* is no pose"),
         ("groundtruth.txt", "5.0 0 0 0 0 0 0 1\n", "no pose within 0.02 s of any of the 3 photographs"),
         ("rgb.txt", "now rgb/1.jpg\n", "row 1: .* wanted a timestamp and a file name"),
         ("rgb.txt", "1305031102.175304 rgb/none.jpg\n", "none.jpg is not on disk"),
@@ -195,6 +208,14 @@ def test_damaged_tum_lists_are_named(tmp_path):
             load_scene(tmp_path)
         (tmp_path / name).write_text(before)
     assert len(load_scene(tmp_path).views) == 3
+
+
+def test_tum_photographs_may_lie_anywhere(tmp_path):
+    write_tum(tmp_path / "lists")
+    text = (tmp_path / "lists" / "rgb.txt").read_text()
+    (tmp_path / "lists" / "rgb.txt").write_text(text.replace(" rgb/", f" {tmp_path}/photos/"))
+    (tmp_path / "lists" / "rgb").rename(tmp_path / "photos")
+    assert len(load_scene(tmp_path / "lists").views) == 6
 
 
 def test_the_nearest_of_sorted_moments():

@@ -209,17 +209,21 @@ def test_points_come_from_the_model_whose_cameras_agree(tmp_path):
     assert "its cameras are not those of" in refusal(tmp_path, sparse="sparse/0")
 
 
-def test_applied_transform_takes_colmap_points_along(tmp_path):
+@pytest.mark.parametrize("scale", [None, 2.5])
+def test_applied_transform_and_scale_take_colmap_points_along(tmp_path, scale):
     turn = np.array([[0.0, 1, 0, 0.3], [1, 0, 0, -0.2], [0, 0, -1, 0.1]])  # as nerfstudio exchanges axes
-    cameras = write_transforms(tmp_path, 5, applied_transform=turn.tolist())
+    header = {} if scale is None else {"applied_scale": scale}
+    cameras = write_transforms(tmp_path, 5, applied_transform=turn.tolist(), **header)
+    scale = scale or 1.0
     theirs = []
     for camera in cameras:
         pose = np.eye(4)
         pose[:3, :3] = camera.rotation @ turn[:, :3]
-        pose[:3, 3] = camera.rotation @ turn[:, 3] + camera.world_to_camera[:3, 3]
+        pose[:3, 3] = camera.rotation @ turn[:, 3] + camera.world_to_camera[:3, 3] / scale
         theirs.append(type(camera)(32, 24, camera.fx, camera.fy, camera.cx, camera.cy, pose))
     write_model(tmp_path / "colmap/sparse/0", theirs, [f"{i:02d}.png" for i in range(5)], XYZ)
-    np.testing.assert_allclose(load_scene(tmp_path).points.xyz, XYZ @ turn[:, :3].T + turn[:, 3], atol=1e-6)
+    wanted = scale * (XYZ @ turn[:, :3].T + turn[:, 3])
+    np.testing.assert_allclose(load_scene(tmp_path).points.xyz, wanted, atol=1e-6)
 
 
 def test_a_damaged_model_that_nobody_asked_for_stops_nobody(tmp_path):
@@ -252,6 +256,9 @@ def test_a_damaged_model_that_nobody_asked_for_stops_nobody(tmp_path):
         (lambda c: c["frames"][1].update(mask_path="m.png"), "'mask_path'"),
         (lambda c: c["frames"][1].update(depth_file_path="d.png"), "'depth_file_path'"),
         (lambda c: c.update(applied_transform=[1, 2]), "'applied_transform' is not"),
+        (lambda c: c.update(test_frames=1.5), "'test_frames' is 1.5, wanted a list"),
+        (lambda c: c.update(applied_scale=0), "'applied_scale' is 0.0, wanted a positive number"),
+        (lambda c: c.update(applied_scale="2"), "'applied_scale' is '2', wanted a finite number"),
         (lambda c: c.update(test_filenames="images/00.png"), "is not a list of paths"),
     ],
 )

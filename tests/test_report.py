@@ -210,6 +210,17 @@ def test_effects_that_were_decided_are_shown(run_copy):
     assert any(row[:4] == ["lens", "off", "the data say so", "spread: not measured"] for row in rows if row)
 
 
+def test_figures_that_are_not_finite_are_left_out_of_curves(run_copy):
+    def curves() -> list[str]:
+        report_run(run_copy)
+        return re.findall("<svg.*?</svg>", (run_copy / "report.html").read_text(), re.DOTALL)
+
+    before = curves()
+    with open(run_copy / "metrics.jsonl", "a") as table:
+        table.write('{"step": 999999, "loss": NaN, "psnr": Infinity, "train_psnr": 1e999}\n')
+    assert len(before) > 1 and curves() == before
+
+
 def test_scores_from_before_the_last_save_are_not_taken(run_copy):
     eval_images_run(run_copy)
     file = run_copy / "eval" / "images" / "results.json"

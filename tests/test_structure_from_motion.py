@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import shutil
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -12,9 +15,10 @@ from captures import look_at, picture, write_transforms
 from PIL import Image
 from textured_room import photograph
 
-from linprim_geo import image_pairs, structure_from_motion
+from linprim_geo import image_pairs, incremental_mapping, structure_from_motion
 from linprim_geo.cli import main
 from linprim_geo.errors import LinprimError
+from linprim_geo.files import locked
 from linprim_geo.image_pairs import pairs_to_match
 from linprim_geo.run import Run
 from linprim_geo.scene import PHOTOGRAPHS, load_scene
@@ -113,7 +117,7 @@ def test_a_run_that_was_stopped_goes_on(copied, tmp_path, monkeypatch, stage):
     import pycolmap
 
     with monkeypatch.context() as patch:
-        patch.setattr(structure_from_motion, stage, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(incremental_mapping, stage, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             find_poses(copied, tmp_path / "cache", threads=1)
     assert found_model(copied, tmp_path / "cache") is None
@@ -221,8 +225,8 @@ def test_photographs_that_are_alike_share_a_camera_and_exif_gives_its_focal_leng
         exif.get_ifd(0x8769)[0xA405] = 70 if name == "long.jpg" else 35  # focal length for 35 mm film
         image.save(tmp_path / name, exif=exif)
     sizes = [Image.open(tmp_path / name).size for name in names]
-    structure_from_motion._register(tmp_path / "d.db", tmp_path, names, sizes)
-    structure_from_motion._register(tmp_path / "d.db", tmp_path, names, sizes)  # once more changes nothing
+    incremental_mapping._register(tmp_path / "d.db", tmp_path, names, sizes)
+    incremental_mapping._register(tmp_path / "d.db", tmp_path, names, sizes)  # once more changes nothing
     with pycolmap.Database.open(tmp_path / "d.db") as database:
         images = [database.read_image(i + 1) for i in range(5)]
         assert [image.name for image in images] == names
@@ -272,7 +276,7 @@ def test_two_processes_do_not_find_the_same_poses_twice(copied, posed, tmp_path,
         waiting.set()
 
     monkeypatch.setattr(structure_from_motion, "_reconstruct", lambda *_: pytest.fail("made twice"))
-    with structure_from_motion._alone(kept, lambda line: None):
+    with locked(kept, "worked on"):
         other = threading.Thread(target=lambda: (find_poses(copied, tmp_path / "cache", log=say), done.set()))
         other.start()
         assert waiting.wait(10) and lines == ["another process is finding these poses; waiting for it ..."]
@@ -302,3 +306,84 @@ def test_a_run_keeps_the_poses_it_was_trained_with(copied, posed, tmp_path, monk
     shutil.rmtree(tmp_path / "cache")
     after = [view.camera.world_to_camera for view in Run.open(tmp_path / "run").scene().views]
     np.testing.assert_array_equal(before, after)
+
+
+def test_webp_photographs_are_read_as_well(copied, posed, tmp_path):
+    for number in range(COUNT):
+        with Image.open(copied / f"{number}.png") as image:
+            image.save(copied / f"{number}.webp", lossless=True)
+        if number:  # one of another kind stays among them
+            (copied / f"{number}.png").unlink()
+        else:
+            (copied / "0.webp").unlink()
+    cache = tmp_path / "cache"
+    prepare(copied, cache=cache, threads=1)
+    scene = load_scene(copied, cache=cache)
+    assert sorted(view.image_path.name for view in scene.views) == [
+        "0.png",
+        *(f"{i}.webp" for i in range(1, COUNT)),
+    ]
+    # Of lossless photographs the model is that of the same ones in the other format, colours included.
+    same = load_scene(copied, sparse=found_model(copied, cache)).points
+    assert len(same.xyz) > 100 and same.rgb.std() > 10
+    assert sorted(path.name for path in found_model(copied, cache).parent.iterdir()) == [
+        "model",
+        "verdict.json",
+    ]
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        b"",
+        b"[" * 100_000,
+        b"[9, 9]",
+        b'{"photographs": 9, "registered": "9"}',
+        b'{"photographs": 9, "registered": NaN}',
+        b'{"photographs": 1' + b"0" * 400 + b', "registered": 9}',
+        b'{"photographs": 9, "registered": 9, "points": null}',
+    ],
+)
+def test_a_result_that_is_damaged_is_not_taken(copied, posed, tmp_path, damaged):
+    kept = shutil.copytree(
+        found_model(copied, posed[0]).parent, tmp_path / "structure_from_motion" / "k"
+    ).parent
+    kept = (kept / "k").rename(kept / found_model(copied, posed[0]).parent.name)
+    assert found_model(copied, tmp_path) == kept / "model"
+    (kept / "verdict.json").write_bytes(damaged)
+    assert found_model(copied, tmp_path) is None
+
+
+def test_a_result_without_its_model_is_not_taken(copied, posed, tmp_path):
+    cache = Path(shutil.copytree(posed[0], tmp_path / "cache"))
+    shutil.rmtree(found_model(copied, cache))
+    assert found_model(copied, cache) is None
+
+
+def test_png_files_can_be_saved_after_pycolmap_was_loaded():
+    # zlib is hidden until pycolmap is there, as in a Python that has its own: else it is what loads the system's first.
+    program = """
+import io, sys
+sys.modules["zlib"] = None
+from linprim_geo.load_pycolmap import pycolmap
+del sys.modules["zlib"]
+import numpy
+from PIL import Image
+for seed in range(50):
+    noise = numpy.random.default_rng(seed).integers(0, 256, (150, 200, 3), numpy.uint8)
+    Image.fromarray(noise).save(io.BytesIO(), "PNG")
+print("saved")
+"""
+    # What is aborted in the middle of freeing memory may hang in the handler that is to report it.
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0 and done.stdout == "saved\n", done.stderr[-1000:]
+
+
+def test_pycolmap_is_imported_in_one_place():
+    package = Path(structure_from_motion.__file__).parent
+    found = [
+        path.name
+        for path in package.rglob("*.py")
+        if re.search(r"^\s*(import|from) pycolmap", path.read_text(), re.MULTILINE)
+    ]
+    assert found == ["load_pycolmap.py"]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import sys
+import threading
 
 import av
 import numpy as np
@@ -14,6 +16,7 @@ from textured_room import photograph
 
 from linprim_geo import video_frames
 from linprim_geo.errors import LinprimError
+from linprim_geo.files import locked
 from linprim_geo.scene import PHOTOGRAPHS, load_scene
 from linprim_geo.structure_from_motion import prepare
 from linprim_geo.video_frames import extract_frames, is_video
@@ -89,7 +92,7 @@ def test_videos_that_cannot_be_decoded_are_named(video, tmp_path, monkeypatch):
         with pytest.raises(LinprimError, match=f"{name}: .*wanted a complete video") as caught:
             extract_frames(tmp_path / name, 4, tmp_path / "cache")
         assert "\n" not in str(caught.value)
-    assert not list((tmp_path / "cache" / "video").iterdir())
+    assert not list((tmp_path / "cache").rglob("*"))
     with pytest.raises(LinprimError, match="--frames is 2, wanted at least 3"):
         prepare(video, frames=2)
     monkeypatch.setitem(sys.modules, "av", None)
@@ -113,3 +116,31 @@ def test_a_video_is_a_capture_once_its_poses_are_found(tmp_path):
     scene = load_scene(path, frames=8, cache=tmp_path / "cache")
     assert scene.kind == PHOTOGRAPHS and len(scene.views) >= 6
     assert abs(scene.train[0].camera.fx / 165 - 1) < 0.1
+
+
+def test_two_processes_do_not_take_the_same_frames_twice(tmp_path, video, monkeypatch):
+    folder = video_frames.frames_folder(video, 4, tmp_path)
+    lines, waiting = [], threading.Event()
+
+    def say(line: str) -> None:
+        lines.append(line)
+        waiting.set()
+
+    monkeypatch.setattr(video_frames, "_extract", lambda *_: pytest.fail("taken twice"))
+    with locked(folder.parent, "worked on", folder.name):
+        other = threading.Thread(target=extract_frames, args=(video, 4, tmp_path, say))
+        other.start()
+        assert waiting.wait(10) and lines == ["another process is taking these frames; waiting for it ..."]
+        folder.mkdir()
+    other.join(10)
+    assert not other.is_alive() and len(lines) == 1
+
+
+def test_a_disk_that_is_full_is_not_called_a_broken_video(tmp_path, video, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Image.Image, "save", full)
+    with pytest.raises(LinprimError, match="jpg: no space left on the device"):
+        extract_frames(video, 4, tmp_path)
+    assert not list(tmp_path.rglob("*.part"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import re
 import shutil
@@ -152,6 +153,22 @@ def test_cameras_stand_where_photographs_were_taken(viewer, meshed):
     start = viewer.server.initial_camera
     ahead = np.subtract(start.look_at, start.position)
     assert ahead @ first.rotation[2] / np.linalg.norm(ahead) > 0.9
+
+
+def test_what_stands_in_files_is_shown_and_not_run(meshed, tmp_path):
+    run = Path(shutil.copytree(meshed, tmp_path / "a_run_of *mine*"))
+    notes = json.loads((run / "transform.json").read_text())
+    evil = "<img src=x onerror=alert(1)> [m](http://x)"
+    (run / "transform.json").write_text(json.dumps(notes | {"unit": evil}))
+    made = Viewer(run, 0)
+    try:
+        change(made, mesh="tsdf", layer="predicted error")
+        for content in (made._legend.content, made._text.content):
+            # In CommonMark a backslash before any ASCII punctuation leaves that as it is, and no other punctuation is left.
+            assert not re.search(r"[!-/:-@\[-`{-~]", re.sub(r"\\[!-/:-@\[-`{-~]", "", content))
+        assert evil in re.sub(r"\\([!-/:-@\[-`{-~])", r"\1", made._legend.content)
+    finally:
+        made.close()
 
 
 def test_too_many_primitives_are_said_and_the_largest_shown(meshed, monkeypatch):

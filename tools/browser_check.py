@@ -58,18 +58,25 @@ class Browser:
         root = ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
         words = [program, *FLAGS, *root, f"--user-data-dir={folder}", "about:blank"]
         self.process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            self.socket = connect(self._address(folder), max_size=None, compression=None)
+            self.count, self.events = 0, []
+            for domain in ("Page", "Runtime", "Network", "Log"):
+                self.call(f"{domain}.enable")
+        except BaseException:
+            self.process.kill()
+            raise
+
+    def _address(self, folder: Path) -> str:
+        """Where the page can be talked to, as soon as the browser says it in its folder."""
         port_file, until = folder / "DevToolsActivePort", time.monotonic() + START_SECONDS
         while not port_file.exists() or not port_file.read_text().strip():
             if self.process.poll() is not None or time.monotonic() > until:
-                raise SystemExit(f"browser_check: {program} did not start")
+                raise SystemExit(f"browser_check: {self.process.args[0]} did not start")
             time.sleep(0.1)
         port = port_file.read_text().split()[0]
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as answer:
-            page = next(each for each in json.load(answer) if each["type"] == "page")
-        self.socket = connect(page["webSocketDebuggerUrl"], max_size=None, compression=None)
-        self.count, self.events = 0, []
-        for domain in ("Page", "Runtime", "Network", "Log"):
-            self.call(f"{domain}.enable")
+            return next(each for each in json.load(answer) if each["type"] == "page")["webSocketDebuggerUrl"]
 
     def call(self, method: str, **parameters) -> dict:
         """One call of the protocol; events that come meanwhile are kept."""

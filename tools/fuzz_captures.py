@@ -42,9 +42,13 @@ def make_transforms(folder: Path) -> None:
 
 
 def read_scene_file(file: Path) -> None:
+    check_scene(file if file.suffix == ".json" else file.parent)
+
+
+def check_scene(capture: Path, cache: Path | None = None) -> None:
     from linprim_geo.scene import load_scene
 
-    scene = load_scene(file if file.suffix == ".json" else file.parent)
+    scene = load_scene(capture, cache=cache)
     for view in scene.views:
         camera = view.camera
         finite(np.array([camera.fx, camera.fy, camera.cx, camera.cy]), (4,), "camera")
@@ -100,6 +104,115 @@ def read_colmap_file(file: Path) -> None:
         finite(model.points.xyz, (None, 3), "points")
         finite(model.points.rgb, (count, 3), "colours")
         finite(model.points.error_px, (count,), "errors")
+
+
+def make_dtu(folder: Path) -> None:
+    (folder / "image").mkdir()
+    (folder / "mask").mkdir()
+    arrays = {}
+    for number, pose in enumerate(_poses(3)):
+        image(folder / "image" / f"{number}.png", "RGB")
+        image(folder / "mask" / f"{number}.png", "RGB")
+        calibration = np.diag([10.0, 11.0, 1.0, 1.0])
+        calibration[:2, 2] = SIZE[0] / 2 - 0.5, SIZE[1] / 2 - 0.5
+        arrays[f"world_mat_{number}"] = calibration @ np.linalg.inv(pose)
+        arrays[f"scale_mat_{number}"] = np.diag([2.0, 2.0, 2.0, 1.0])
+    np.savez(folder / "cameras_sphere.npz", **arrays)
+
+
+def _log(folder: Path, name: str) -> None:
+    rows = []
+    for number, pose in enumerate(_poses(3)):
+        rows += [f"{number} {number} 0", *(" ".join(map(str, row)) for row in pose.tolist())]
+    (folder / name).write_text("\n".join(rows) + "\n")
+    matrix = [10.0, 0, 0, 0, 11.0, 0, SIZE[0] / 2, SIZE[1] / 2, 1]
+    (folder / "intrinsic.json").write_text(json.dumps({"width": SIZE[0], "height": SIZE[1], "intrinsic_matrix": matrix}))
+
+
+def make_redwood(folder: Path) -> None:
+    for name, mode in (("color", "RGB"), ("depth", "I;16")):
+        (folder / name).mkdir()
+        for number in range(3):
+            image(folder / name / f"{number}.png", mode)
+    _log(folder, "trajectory.log")
+
+
+def make_tanks(folder: Path) -> None:
+    (folder / "images").mkdir()
+    for number in range(3):
+        image(folder / "images" / f"{number}.png", "RGB")
+    _log(folder, "Barn_COLMAP_SfM.log")
+
+
+def read_trajectory_file(file: Path) -> None:
+    check_scene(file.parent)
+
+
+def make_tum(folder: Path) -> None:
+    from PIL import Image
+    from scipy.spatial.transform import Rotation
+
+    lists = {"rgb": ["# timestamp filename"], "depth": ["# timestamp filename"], "groundtruth": ["# timestamp tx ty tz qx qy qz qw"]}
+    for name, mode in (("rgb", "RGB"), ("depth", "I;16")):
+        (folder / name).mkdir()
+        for number in range(3):
+            # Without a file of intrinsics photographs have the PrimeSense's size.
+            Image.new(mode, (640, 480), 9).save(folder / name / f"{number}.png")
+            lists[name].append(f"{number / 30:.6f} {name}/{number}.png")
+    for number, pose in enumerate(_poses(3)):
+        numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
+        lists["groundtruth"].append(" ".join(f"{x:.4f}" for x in [number / 30, *numbers]))
+    for name, rows in lists.items():
+        (folder / f"{name}.txt").write_text("\n".join(rows) + "\n")
+
+
+def make_scannetpp(folder: Path) -> None:
+    device = folder / "dslr"
+    (device / "nerfstudio").mkdir(parents=True)
+    frames = [{"file_path": f"{number}.png", "transform_matrix": pose.tolist()} for number, pose in enumerate(_poses(3))]
+    for name in ("resized_images", "resized_undistorted_images"):
+        (device / name).mkdir()
+        for number in range(3):
+            image(device / name / f"{number}.png", "RGB")
+    header = {"w": SIZE[0], "h": SIZE[1], "fl_x": 10.0, "fl_y": 11.0, "cx": 6.0, "cy": 4.5, "camera_model": "OPENCV_FISHEYE"}
+    header |= {"k1": 0.0, "k2": 0.0, "k3": 0.0, "k4": 0.0, "applied_transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]}
+    for name, model in (("transforms", "OPENCV_FISHEYE"), ("transforms_undistorted", "PINHOLE")):
+        text = json.dumps(header | {"camera_model": model, "frames": frames[:2], "test_frames": frames[2:]})
+        (device / "nerfstudio" / f"{name}.json").write_text(text)
+    (device / "train_test_lists.json").write_text(json.dumps({"train": ["0.png", "1.png"], "test": ["2.png"]}))
+
+
+def read_scannetpp_file(file: Path) -> None:
+    device = next(folder for folder in file.parents if folder.name == "dslr")
+    photos = device / "resized_images"
+    if file.name == "transforms_undistorted.json" and photos.is_dir():
+        photos.rename(device / "hidden")
+        try:
+            check_scene(device.parent)
+        finally:
+            (device / "hidden").rename(photos)
+    else:
+        check_scene(device.parent)
+
+
+def make_found_poses(folder: Path) -> None:
+    from linprim_geo import structure_from_motion
+
+    (folder / "photos").mkdir()
+    for number in range(1, 4):
+        image(folder / "photos" / f"{number}.png", "RGB")
+    key = structure_from_motion._key(*structure_from_motion.photographs(folder / "photos"))
+    kept = folder / "structure_from_motion" / key
+    (kept / "model").mkdir(parents=True)
+    make_colmap(kept / "model", False)
+    shutil.rmtree(kept / "model" / "old")
+    verdict = {"photographs": 3, "registered": 3, "points": 2, "error_px": 0.5, "track_length": 3.0}
+    (kept / "verdict.json").write_text(json.dumps(verdict))
+
+
+def read_verdict_file(file: Path) -> None:
+    cache = file.parents[2]
+    check_scene(cache / "photos", cache)
 
 
 def make_protocol(folder: Path) -> None:

@@ -59,6 +59,29 @@ READERS = (
     ),
     Reader("normals", files.make_normals, (("*.png", "png"), ("*.npy", "npy")), files.read_normals_file),
     Reader("transforms json", captures.make_transforms, (("*.json", "json"),), captures.read_scene_file),
+    Reader("dtu", captures.make_dtu, (("*.npz", "zip"),), captures.read_scene_file),
+    Reader(
+        "redwood",
+        captures.make_redwood,
+        (("*.log", "text"), ("*.json", "json")),
+        captures.read_trajectory_file,
+    ),
+    Reader(
+        "tanks and temples",
+        captures.make_tanks,
+        (("*.log", "text"), ("*.json", "json")),
+        captures.read_trajectory_file,
+    ),
+    Reader("tum", captures.make_tum, (("*.txt", "text"),), captures.read_scene_file),
+    Reader(
+        "scannet++",
+        captures.make_scannetpp,
+        (("dslr/*.json", "json"), ("dslr/nerfstudio/*.json", "json")),
+        captures.read_scannetpp_file,
+    ),
+    Reader(
+        "found poses", captures.make_found_poses, (("**/verdict.json", "json"),), captures.read_verdict_file
+    ),
     Reader(
         "colmap bin",
         lambda folder: captures.make_colmap(folder, False),
