@@ -271,6 +271,9 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"linprim-geo {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
+    def add_quiet(sub: argparse.ArgumentParser) -> None:
+        sub.add_argument("--quiet", action="store_true", help="no progress")
+
     def command(
         name: str, handler: Callable[[argparse.Namespace], dict], text: str
     ) -> argparse.ArgumentParser:
@@ -301,7 +304,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="folder to make (default runs/SCENE)",
     )
     sub.add_argument("--resume", action="store_true", help="go on from the latest checkpoint in RUN")
-    sub.add_argument("--quiet", action="store_true", help="no progress")
+    add_quiet(sub)
     text = "say what would be trained, how long it takes and how much memory, by timing a few steps; nothing but the cache is written"
     sub.add_argument("--dry-run", action="store_true", help=text)
     text = "choose steps and primitives so that everything takes this long, by what a step costs here; one of the two may be given"
@@ -316,6 +319,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("inspect", _inspect, "say which effects a scene calls for, by which evidence, and what they cost")
     sub.add_argument("scene", metavar="SCENE", help="folder of a capture, of plain photographs, or a video")
+    add_quiet(sub)
     add_effects(sub.add_argument_group("effects"), "auto")
     add_options(sub.add_argument_group("scene"), SceneOptions)
     add_options(sub.add_argument_group("training"), TrainOptions)
@@ -324,6 +328,7 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("run", metavar="RUN", help="folder that train has made")
     sub.add_argument("--split", choices=SPLITS, default="test", help="which views (default test)")
     sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/renders)")
+    add_quiet(sub)
 
     sub = command("extract-mesh", _extract_mesh, "extract a triangle mesh from a run")
     sub.add_argument("run", metavar="RUN", help="folder that train has made")
@@ -335,6 +340,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     text = "choose the voxel size so that everything takes this long, by what coarse passes take"
     sub.add_argument("--time-budget", type=_seconds, metavar="TIME", help=text)
+    add_quiet(sub)
     add_options(sub.add_argument_group("extraction"), ExtractOptions)
 
     sub = command(
@@ -409,6 +415,7 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--quick", action="store_true", help="a tiny size, to see that all of it runs")
     sub.add_argument("--rounds", type=_positive, metavar="N", help="how often everything is timed, in turn (default 3, quick 2)")
     sub.add_argument("--threads", type=_whole, default=0, metavar="N", help="0 uses every core (default)")
+    add_quiet(sub)
 
     sub = command(
         "synth", _synth, "render posed images, depth, normals and points of a mesh or a built-in scene"
@@ -472,6 +479,10 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument(
         "--size", choices=("small", "normal"), default="normal", help="small: a quick check of it all"
     )
+    add_quiet(sub)
+
+    sub = command("completion", _completion, "print a script that completes this command line in a shell")
+    sub.add_argument("shell", choices=("bash", "zsh", "fish"))
     return parser
 
 
@@ -526,11 +537,13 @@ def _inspect(parsed: argparse.Namespace) -> dict:
     from .effects import inspect_scene
     from .options import SceneOptions, TrainOptions
 
-    def log(text: str) -> None:
-        print(text, file=sys.stderr)
-
     options = from_args(SceneOptions, parsed), from_args(TrainOptions, parsed)
-    return inspect_scene(parsed.scene, *options, _choice(parsed), log)
+    return inspect_scene(parsed.scene, *options, _choice(parsed), _log(parsed))
+
+
+def _log(parsed: argparse.Namespace) -> Callable[[str], None]:
+    """What prints a line of progress, or nothing with --quiet."""
+    return (lambda text: None) if parsed.quiet else (lambda text: print(text, file=sys.stderr))
 
 
 def _downscale_of(resolution: int, scene: str, parsed: argparse.Namespace) -> int:
@@ -545,7 +558,7 @@ def _downscale_of(resolution: int, scene: str, parsed: argparse.Namespace) -> in
 
     given = {name: getattr(parsed, name) for name in ("masks", "images", "sparse", "frames") if hasattr(parsed, name)}
     taken = {name: given[name] for name in ("sparse", "frames") if name in given}
-    prepare(Path(scene), **taken, threads=getattr(parsed, "threads", 0), log=lambda text: print(text, file=sys.stderr))
+    prepare(Path(scene), **taken, threads=getattr(parsed, "threads", 0), log=_log(parsed))
     views = load_scene(scene, **given).train
     return -(-max(view.camera.width for view in views) // width)
 
@@ -553,7 +566,7 @@ def _downscale_of(resolution: int, scene: str, parsed: argparse.Namespace) -> in
 def _render(parsed: argparse.Namespace) -> dict:
     from .render import render_run
 
-    return render_run(parsed.run, split=parsed.split, output=parsed.output)
+    return render_run(parsed.run, split=parsed.split, output=parsed.output, quiet=parsed.quiet)
 
 
 def _extract_mesh(parsed: argparse.Namespace) -> dict:
@@ -562,7 +575,8 @@ def _extract_mesh(parsed: argparse.Namespace) -> dict:
     from .options import ExtractOptions
 
     options = from_args(ExtractOptions, parsed)
-    return extract_mesh(parsed.run, method=parsed.method, output=parsed.output, options=options, **budget)
+    where = {"method": parsed.method, "output": parsed.output, "quiet": parsed.quiet}
+    return extract_mesh(parsed.run, options=options, **where, **budget)
 
 
 def _eval_depth(parsed: argparse.Namespace) -> dict:
@@ -611,6 +625,7 @@ def _tradeoff(parsed: argparse.Namespace) -> dict:
         quick=parsed.quick,
         rounds=parsed.rounds,
         threads=parsed.threads,
+        quiet=parsed.quiet,
     )
     files = [str(output / f"tradeoff.{suffix}") for suffix in ("html", "csv", "json")]
     return results | {"files": files, "_text": "\n".join([*results["sentences"].values(), "", results["rule"], "", *files])}
@@ -662,4 +677,11 @@ def _doctor(parsed: argparse.Namespace) -> dict:
 def _demo(parsed: argparse.Namespace) -> dict:
     from .demo import run_demo
 
-    return run_demo(parsed.output, parsed.size)
+    return run_demo(parsed.output, parsed.size, quiet=parsed.quiet)
+
+
+def _completion(parsed: argparse.Namespace) -> dict:
+    from .completion import completion
+
+    made = completion(build_parser(), parsed.shell)
+    return made | {"_text": made["script"]}

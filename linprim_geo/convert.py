@@ -17,6 +17,13 @@ if TYPE_CHECKING:
     from .mesh import Mesh
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb", ".stl")
+# What a format holds beside coordinates and faces.
+HELD = {
+    ".ply": ("normals", "colors", "quality"),
+    ".obj": ("normals", "colors"),
+    ".glb": ("normals", "colors"),
+    ".stl": (),
+}
 AS_CHOICES = ("auto", "primitives", "mesh", "gaussians")
 # A Gaussian in a mesh is the ellipsoid one standard deviation large, where its opacity is 61 % of that of its middle: beyond
 # it neighbours would hide each other.
@@ -32,11 +39,13 @@ def convert(source: str | os.PathLike, target: str | os.PathLike, write_as: str 
     another unless asked for: `write_as="gaussians"` writes octahedra as Gaussians for a 3DGS viewer (half-axes / 2.6).
     In a mesh every vertex has its primitive's colour without the view-dependent part, and in .ply and .glb its alpha:
     the share of light taken along the reference length, a Gaussian's opacity. Gaussians become ellipsoids one standard
-    deviation large. Meshes are read and written as .ply, .obj, .glb and .stl.
+    deviation large. Meshes are read and written as .ply, .obj, .glb and .stl; a texture goes from .obj or .glb to .obj or .glb,
+    elsewhere the vertices get its colours.
 
     Returns:
         What was read and written: `source`, `target`, `read`, `wrote`, `count`; for primitives also `dropped`
-        (rows without volume) and `clamped` (rows thicker than LinPrim's file can hold), where there are any.
+        (rows without volume) and `clamped` (rows thicker than LinPrim's file can hold), for meshes `left_out` (what OUT's
+        format cannot hold: normals, colors, quality, texture), where there are any.
 
     Raises:
         LinprimError: the input cannot be read, or the formats do not fit.
@@ -55,11 +64,7 @@ def convert(source: str | os.PathLike, target: str | os.PathLike, write_as: str 
     if not holds_primitives(source):
         if suffix == ".npz" or write_as in ("primitives", "gaussians"):
             raise LinprimError(f"{source}: is a mesh, which cannot be written as primitives to {target}")
-        from .mesh import load_mesh, save_mesh
-
-        mesh = load_mesh(source)
-        save_mesh(target, mesh)
-        return report | {"read": "mesh", "wrote": "mesh", "count": len(mesh.faces)}
+        return report | _convert_mesh(source, target)
 
     if suffix == ".npz" and write_as == "mesh":
         raise LinprimError(
@@ -84,6 +89,31 @@ def convert(source: str | os.PathLike, target: str | os.PathLike, write_as: str 
     return report | {"wrote": "mesh", "faces": save_primitive_mesh(target, primitives)}
 
 
+def _convert_mesh(source: Path, target: Path) -> dict:
+    """Writes the mesh `source` as `target`; what `convert` says of it."""
+    from .mesh import load_mesh, save_mesh
+    from .texture import TEXTURED_SUFFIXES, save_textured
+    from .texture_files import load_texture
+
+    suffix = target.suffix.lower()
+    textured = load_texture(source) if source.suffix.lower() in TEXTURED_SUFFIXES else None
+    if textured and suffix in TEXTURED_SUFFIXES:
+        mesh, texture = textured
+        save_textured(target, mesh, texture)
+        return {"read": "mesh", "wrote": "mesh with a texture", "count": len(mesh.faces)}
+    mesh = load_mesh(source)
+    save_mesh(target, mesh)
+    left_out = [
+        name
+        for name in ("normals", "colors", "quality")
+        if getattr(mesh, name) is not None and name not in HELD[suffix]
+    ]
+    left_out += ["texture"] if textured else []
+    return {"read": "mesh", "wrote": "mesh", "count": len(mesh.faces)} | (
+        {"left_out": left_out} if left_out else {}
+    )
+
+
 def describe(report: dict) -> str:
     """The report of `convert` as one sentence for a person."""
     unit = "faces" if report["read"] == "mesh" else "primitives"
@@ -92,6 +122,8 @@ def describe(report: dict) -> str:
         text += f"; {report['dropped']} rows without a volume were left out"
     if report.get("clamped"):
         text += f"; {report['clamped']} are thicker than LinPrim's file can hold and got its largest opacity"
+    if report.get("left_out"):
+        text += f"; left out, because the format has no place for it: {', '.join(report['left_out'])}"
     return text
 
 

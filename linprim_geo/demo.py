@@ -14,7 +14,7 @@ from .options import ExtractOptions, SceneOptions, TrainOptions
 SIZES = {"small": (40, 160, 1500, 2000), "normal": (60, 320, 7000, 5000)}
 
 
-def run_demo(output: str = "runs/demo", size: str = "normal") -> dict:
+def run_demo(output: str = "runs/demo", size: str = "normal", *, quiet: bool = False) -> dict:
     """Makes OUTPUT/scene (images, depth, reference mesh), OUTPUT/run (trained, meshed, scored) and OUTPUT/report.html, prints the scores.
 
     Replaces what an earlier demo left in `output`; any other folder there is refused.
@@ -39,26 +39,32 @@ def run_demo(output: str = "runs/demo", size: str = "normal") -> dict:
             )
         shutil.rmtree(root)
     write_json(marker, {"size": size})
-    print(f"1/6 photographing the built-in part: {views} views of {pixels}x{pixels}", file=sys.stderr)
+
+    def log(text: str) -> None:
+        if not quiet:
+            print(text, file=sys.stderr)
+
+    log(f"1/6 photographing the built-in part: {views} views of {pixels}x{pixels}")
     scene, run = root / "scene", root / "run"
     synthesize(scene, shape="cad", views=views, test_views=12, size=pixels, path="sphere")
-    print("2/6 training", file=sys.stderr)
+    log("2/6 training")
     trained = train(
         scene,
         run,
         SceneOptions(),
         TrainOptions(iterations=iterations, max_primitives=primitives, sh_degree=0, samples=2),
+        quiet=quiet,
     )
-    print("3/6 rendering held-out views", file=sys.stderr)
+    log("3/6 rendering held-out views")
     render_run(run, quiet=True)
-    print("4/6 extracting the surface", file=sys.stderr)
-    stats = extract_mesh(run, options=ExtractOptions())
-    print("5/6 scoring against the exact mesh", file=sys.stderr)
+    log("4/6 extracting the surface")
+    stats = extract_mesh(run, options=ExtractOptions(), quiet=quiet)
+    log("5/6 scoring against the exact mesh")
     reference = scene / "reference.ply"
     images = eval_images_run(run)
     depth = eval_depth_run(run, reference)
     mesh = eval_mesh_files(stats["mesh"], reference, run=run)
-    print("6/6 writing the report", file=sys.stderr)
+    log("6/6 writing the report")
     report = report_run(run, root / "report.html")
     result = {
         "psnr": images["psnr"],

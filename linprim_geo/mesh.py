@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -90,22 +91,30 @@ def load_mesh(path: str | Path) -> Mesh:
     Raises:
         LinprimError: missing or unreadable file, no faces in it, or indices out of range.
     """
+    return load_with_visual(path)[0]
+
+
+def load_with_visual(path: str | Path, seams: bool = False) -> tuple[Mesh, Any]:
+    """`load_mesh`, and what trimesh knows of its colours or texture (its `visual`; None of an STL file).
+
+    With `seams` the vertices of an OBJ file are split where its texture has seams, so that each has one place in the texture.
+    """
     path = Path(path)
     if not path.is_file():
         raise LinprimError(f"{path}: no such mesh file")
     try:
-        return _load_mesh(path)
+        return _load_mesh(path, seams)
     except LinprimError:
         raise
     except Exception as error:  # every reader of every format has its own errors
         raise LinprimError(f"{path}: cannot be read as a mesh ({error or type(error).__name__})") from error
 
 
-def _load_mesh(path: Path) -> Mesh:
-    """`load_mesh` with whatever errors trimesh and numpy raise for damaged files."""
+def _load_mesh(path: Path, seams: bool) -> tuple[Mesh, Any]:
+    """`load_with_visual` with whatever errors trimesh and numpy raise for damaged files."""
     import trimesh
 
-    loaded = trimesh.load(path, process=False, maintain_order=True)
+    loaded = trimesh.load(path, process=False, maintain_order=not seams)
     pose = np.eye(4)
     if isinstance(loaded, trimesh.Scene):
         nodes = loaded.graph.nodes_geometry
@@ -133,7 +142,9 @@ def _load_mesh(path: Path) -> Mesh:
     with np.errstate(invalid="ignore", over="ignore"):  # `clean_mesh` drops what is not finite
         vertices = vertices @ pose[:3, :3].T + pose[:3, 3]
     mesh = Mesh(vertices, faces, normals, _loaded_colors(loaded), quality)
-    return merge_vertices(replace(mesh, normals=None)) if path.suffix.lower() == ".stl" else mesh
+    if path.suffix.lower() == ".stl":
+        return merge_vertices(replace(mesh, normals=None)), None
+    return mesh, loaded.visual
 
 
 def _loaded_colors(loaded) -> np.ndarray | None:

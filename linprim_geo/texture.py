@@ -61,6 +61,10 @@ def check_texture(size: int, path: Path) -> None:
     """Raises LinprimError for a size or a file format that cannot be used."""
     if not SMALLEST <= size <= LARGEST:
         raise LinprimError(f"--texture is {size}, wanted {SMALLEST} to {LARGEST} texels, or 0 for none")
+    _check_suffix(path)
+
+
+def _check_suffix(path: Path) -> None:
     if path.suffix.lower() not in TEXTURED_SUFFIXES:
         raise LinprimError(
             f"{path}: {path.suffix} files hold no texture, wanted {' or '.join(TEXTURED_SUFFIXES)} with --texture"
@@ -468,7 +472,7 @@ def save_textured(path: str | Path, mesh: Mesh, texture: Texture) -> None:
         LinprimError: another suffix, an empty mesh, or a folder that cannot be written.
     """
     path = Path(path)
-    check_texture(len(texture.image), path)
+    _check_suffix(path)
     if len(mesh.faces) == 0:
         raise LinprimError(f"{path}: the mesh has no faces, nothing is written")
     from PIL import Image

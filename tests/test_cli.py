@@ -6,6 +6,7 @@ import dataclasses
 import errno
 import importlib
 import inspect
+import itertools
 import json
 import os
 import re
@@ -16,7 +17,7 @@ import types
 
 import pytest
 
-from linprim_geo import cli, doctor, system
+from linprim_geo import cli, doctor, progress, system
 from linprim_geo.errors import LinprimError
 from linprim_geo.options import ExtractOptions, SceneOptions, TrainOptions, option
 
@@ -35,7 +36,7 @@ HEAVY = {
     "viser",
 }
 COMMANDS = (
-    "train inspect render extract-mesh eval-depth eval-images eval-mesh report view tradeoff synth convert doctor demo".split()
+    "train inspect render extract-mesh eval-depth eval-images eval-mesh report view tradeoff synth convert doctor demo completion".split()
 )  # fmt: skip
 
 
@@ -390,6 +391,52 @@ def test_every_command_prints_one_object_and_does_what_it_says(result, tmp_path,
     assert result("convert p.ply p.glb")["faces"] == 8 * trained["primitives"]
     assert result("convert m.obj m.ply")["wrote"] == "mesh"
     assert {"problems", "cache", "instruction_set"} <= result("doctor").keys()
+    assert result("report r")["views"] == 2 and os.path.getsize("r/report.html") > 10_000
+    assert result("completion zsh")["script"].startswith("#compdef")
+
+
+# Every command that reports what it is doing, and a key of its result.
+REPORTING = {
+    "train SCENE -o r --iterations 20 --max-primitives 100 --sh-degree 0 --threads 1": "psnr",
+    "train SCENE -o r --dry-run --iterations 20 --max-primitives 100 --threads 1": "fits",
+    "inspect SCENE": "effects",
+    "render RUN -o renders": "files",
+    "extract-mesh RUN -o m.ply --voxel-size 0.1 --level 0.75": "faces",
+    "tradeoff SCENE -o t --run RUN --knobs rays --quick --rounds 1 --threads 1": "sentences",
+}
+
+
+@pytest.fixture
+def talkative(monkeypatch):
+    """Lines of progress are far apart in a log; here every one of them is due."""
+    monkeypatch.setattr(progress, "time", types.SimpleNamespace(monotonic=itertools.count(0, 30).__next__))
+
+
+@pytest.mark.parametrize(("line", "key"), REPORTING.items())
+def test_quiet_prints_one_object_and_nothing_else(line, key, tiny_scene, tiny_run, tmp_path, talkative, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    words = line.replace("SCENE", str(tiny_scene)).replace("RUN", str(tiny_run)).split()
+    capfd.readouterr()
+    assert cli.main([*words, "--quiet", "--json"]) == 0
+    shown = capfd.readouterr()
+    assert shown.err == "" and shown.out.count("\n") == 1 and key in json.loads(shown.out)
+
+
+def test_what_is_not_quiet_says_something(tiny_run, tmp_path, talkative, capfd):
+    assert cli.main(["render", str(tiny_run), "-o", str(tmp_path / "r")]) == 0
+    assert "render" in capfd.readouterr().err
+
+
+def test_quiet_is_an_option_where_something_is_reported():
+    takes = {"train", "inspect", "render", "extract-mesh", "tradeoff", "demo"}
+    assert {line.split()[0] for line in REPORTING} == takes - {"demo"}
+    for command in COMMANDS:
+        assert ("--quiet" in command_help(command)) == (command in takes), command
+
+
+def command_help(command: str) -> str:
+    (commands,) = (action.choices for action in cli.build_parser()._actions if isinstance(action, cli.argparse._SubParsersAction))
+    return commands[command].format_help()
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from linprim_geo import cli
-from linprim_geo.convert import convert, find_scene_file, save_primitive_mesh
+from linprim_geo.convert import HELD, convert, find_scene_file, save_primitive_mesh
 from linprim_geo.errors import LinprimError
+from linprim_geo.mesh import Mesh, load_mesh, save_mesh
 from linprim_geo.ply import read_ply_header, read_primitive_ply, write_primitive_ply
 from linprim_geo.primitives import (
     Primitives,
@@ -25,6 +26,8 @@ from linprim_geo.primitives import (
     save_primitives,
     unit_quaternions,
 )
+from linprim_geo.texture import Texture, save_textured, unwrap
+from linprim_geo.texture_files import load_texture
 
 FIELDS = ("center", "rotation", "extent", "density", "sh")
 
@@ -507,11 +510,135 @@ def test_primitives_become_meshes(tmp_path, suffix, capsys):
     )
 
 
-@pytest.mark.parametrize("suffix", [".obj", ".glb", ".stl", ".ply"])
-def test_meshes_become_meshes(tmp_path, suffix):
-    save_primitive_mesh(tmp_path / "x.ply", random_octahedra(5))
-    report = convert(tmp_path / "x.ply", tmp_path / f"y{suffix}")
-    assert (report["read"], report["wrote"], report["count"]) == ("mesh", "mesh", 40)
+MESH_FORMATS = (".ply", ".obj", ".glb", ".stl")
+
+
+def painted_ball() -> Mesh:
+    """A sphere with everything that a mesh can have."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(2)
+    rng = np.random.default_rng(0)
+    count = len(ball.vertices)
+    return Mesh(
+        ball.vertices * 0.3 + [3, -2, 1],
+        ball.faces,
+        normals=ball.vertices,
+        colors=rng.integers(0, 256, (count, 3)),
+        quality=rng.random(count),
+    )
+
+
+@pytest.mark.parametrize("first", MESH_FORMATS)
+@pytest.mark.parametrize("second", MESH_FORMATS)
+def test_meshes_keep_what_both_formats_hold(tmp_path, first, second):
+    mesh = painted_ball()
+    save_mesh(tmp_path / f"a{first}", mesh)
+    report = convert(tmp_path / f"a{first}", tmp_path / f"b{second}")
+    assert (report["read"], report["wrote"], report["count"]) == ("mesh", "mesh", len(mesh.faces))
+    after = load_mesh(tmp_path / f"b{second}")
+    # Corner by corner: an .stl has no shared vertices, and merges them in another order.
+    np.testing.assert_allclose(after.vertices[after.faces], mesh.vertices[mesh.faces], rtol=0, atol=5e-7)
+    held = set(HELD[first]) & set(HELD[second])
+    assert set(report.get("left_out", [])) == set(HELD[first]) - held
+    for name in ("normals", "colors", "quality"):
+        got = getattr(after, name)
+        if name not in held:
+            # An .stl of trimesh has a colour per face, but none was given to it.
+            assert got is None, name
+            continue
+        tolerance = {"normals": 2e-6, "colors": 0, "quality": 0}[name]
+        np.testing.assert_allclose(
+            got[after.faces], getattr(mesh, name)[mesh.faces], rtol=0, atol=tolerance, err_msg=name
+        )
+
+
+def textured_ball(size=32):
+    """A sphere of several charts and a texture of noise over it."""
+    ball = painted_ball()
+    uv, _ = unwrap(ball, size)
+    image = np.random.default_rng(1).integers(0, 256, (size, size, 3), dtype=np.uint8)
+    return ball, Texture(image, uv / size, {})
+
+
+@pytest.mark.parametrize("first", [".obj", ".glb"])
+@pytest.mark.parametrize("second", [".obj", ".glb"])
+def test_a_texture_goes_along(tmp_path, first, second):
+    ball, texture = textured_ball()
+    save_textured(tmp_path / f"a{first}", ball, texture)
+    report = convert(tmp_path / f"a{first}", tmp_path / f"b{second}")
+    assert report["wrote"] == "mesh with a texture" and "left_out" not in report
+    mesh, after = load_texture(tmp_path / f"b{second}")
+    np.testing.assert_array_equal(after.image, texture.image)
+    np.testing.assert_allclose(after.uv, texture.uv, atol=1e-6)
+    # Seams have split vertices on the way; they are whole again.
+    assert len(mesh.vertices) == len(ball.vertices)
+    np.testing.assert_allclose(mesh.vertices[mesh.faces], ball.vertices[ball.faces], rtol=0, atol=5e-7)
+    np.testing.assert_allclose(mesh.normals[mesh.faces], ball.normals[ball.faces], rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".stl"])
+def test_where_a_texture_has_no_place_that_is_said(tmp_path, suffix, capsys):
+    ball, texture = textured_ball()
+    texture.image[:] = (200, 100, 50)
+    save_textured(tmp_path / "a.obj", ball, texture)
+    assert cli.main(["convert", str(tmp_path / "a.obj"), str(tmp_path / f"b{suffix}")]) == 0
+    shown = capsys.readouterr().out
+    assert "left out" in shown and "texture" in shown
+    after = load_mesh(tmp_path / f"b{suffix}")
+    if suffix == ".ply":
+        assert (after.colors == (200, 100, 50)).all()
+    assert load_texture(tmp_path / "a.obj") is not None and load_texture(tmp_path / f"b{suffix}") is None
+
+
+def test_the_colour_of_a_material_is_in_the_texture(tmp_path):
+    import trimesh
+    from PIL import Image
+
+    white = Image.fromarray(np.full((4, 4, 3), 255, np.uint8))
+    box = trimesh.creation.box()
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=white, baseColorFactor=[255, 128, 0, 255])
+    box.visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=material)
+    box.export(tmp_path / "a.glb")
+    convert(tmp_path / "a.glb", tmp_path / "b.obj")
+    assert np.unique(np.asarray(Image.open(tmp_path / "b.png")).reshape(-1, 3), axis=0).tolist() == [
+        [255, 128, 0]
+    ]
+
+
+@pytest.mark.parametrize(
+    ("make", "thickness"), [(random_octahedra, 1.25), (random_tetrahedra, 1.25), (random_gaussians, None)]
+)
+def test_scenes_go_from_file_to_file_unchanged(make, thickness, tmp_path):
+    """npz -> ply -> npz -> ply -> ply: to float32, and what has been through a file once stays as it is."""
+    before = make(100, 16) if thickness is None else make(100, 16, thickness=thickness)
+    save_primitives(tmp_path / "a.npz", before)
+    for source, target in (("a.npz", "b.ply"), ("b.ply", "c.npz"), ("c.npz", "d.ply"), ("d.ply", "e.ply")):
+        report = convert(tmp_path / source, tmp_path / target)
+        assert report["count"] == 100 and not report.keys() & {"dropped", "clamped"}
+    after = load_primitives(tmp_path / "c.npz")
+    assert after.kind == before.kind
+    assert_same(before, after, ("center", "sh") if before.kind == "gaussian" else ("center", "sh", "extent"))
+    # Logarithms and logits are of a size up to 10 in float32.
+    np.testing.assert_allclose(after.extent, before.extent, rtol=2e-6)
+    np.testing.assert_allclose(after.density, before.density, rtol=1e-5)
+    np.testing.assert_allclose(after.rotation, before.rotation, atol=2e-7)
+    last, _ = read_primitive_ply(tmp_path / "e.ply")
+    assert_same(after, last, ("center", "sh") if before.kind == "gaussian" else ("center", "sh", "extent"))
+    np.testing.assert_allclose(last.density, after.density, rtol=1e-5)
+    np.testing.assert_allclose(last.extent, after.extent, rtol=2e-6)
+
+
+def test_linprims_file_becomes_3dgs_gaussians(tmp_path):
+    octahedra = random_octahedra(30, 16, thickness=1.0)
+    write_primitive_ply(tmp_path / "linprim.ply", octahedra)
+    convert(tmp_path / "linprim.ply", tmp_path / "gaussians.ply", "gaussians")
+    assert convert(tmp_path / "gaussians.ply", tmp_path / "x.npz")["wrote"] == "Gaussians"
+    after = load_primitives(tmp_path / "x.npz")
+    np.testing.assert_allclose(after.extent, octahedra.extent / 2.6, rtol=2e-6)
+    np.testing.assert_allclose(after.density, octahedra.alpha, rtol=1e-5)
+    np.testing.assert_allclose(after.rotation, octahedra.rotation, atol=4e-7)
+    assert_same(octahedra, after, ("center", "sh"))
 
 
 def test_a_run_and_a_model_folder_stand_for_their_primitives(tmp_path):

@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from linprim_geo import demo
+from linprim_geo import cli, demo
 from linprim_geo.errors import LinprimError
 
 SCORES = (
@@ -49,6 +49,15 @@ def test_the_demo_makes_a_scored_mesh_and_a_second_one_replaces_it(tiny_size, tm
         json.loads((root / "run" / "eval" / "images" / "results.json").read_text())["psnr"] == written["psnr"]
     )
 
+    # The command prints it as one object.
+    with monkeypatch.context() as patch:
+        patch.setattr(demo, "run_demo", lambda *_, **__: dict(first))
+        assert cli.main(["demo", "--json"]) == 0
+    shown = capsys.readouterr()
+    assert shown.out.count("\n") == 1 and json.loads(shown.out) == {
+        k: v for k, v in first.items() if k != "_text"
+    }
+
     # A second one, stopped early: nothing of the first is left to be taken for its result.
     def stop(*_, **__):
         raise LinprimError("stopped")
@@ -66,3 +75,24 @@ def test_a_folder_of_somebody_else_is_refused(tiny_size, tmp_path):
     with pytest.raises(LinprimError, match="not made by the demo.*-o"):
         demo.run_demo(str(tmp_path), "small")
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_quiet_reaches_every_stage(tmp_path, monkeypatch, capfd):
+    called = []
+
+    def stage(name, *, last=False):
+        def stand_in(*_, **settings):
+            called.append((name, settings.get("quiet")))
+            if last:
+                raise LinprimError("stopped")
+            return {}
+
+        return stand_in
+
+    monkeypatch.setattr("linprim_geo.synth.synthesize", stage("synth"))
+    monkeypatch.setattr("linprim_geo.train.train", stage("train"))
+    monkeypatch.setattr("linprim_geo.render.render_run", stage("render"))
+    monkeypatch.setattr("linprim_geo.extract.extract_mesh", stage("extract", last=True))
+    assert cli.main(["demo", "-o", str(tmp_path / "d"), "--quiet"]) == 1
+    assert called == [("synth", None), ("train", True), ("render", True), ("extract", True)]
+    assert capfd.readouterr().err == "linprim-geo: error: stopped\n"

@@ -1,0 +1,147 @@
+#!/usr/bin/env python3
+"""Builds the sdist and, from it, the wheel; installs the wheel into a fresh environment and runs it there: `python tools/check_wheel.py`.
+
+The wheel is looked through for what it has to hold, then commands from `doctor` to `report` run in a folder of their own, with a PATH that
+has no compiler on it. --python chooses the interpreter (from 3.12 on the wheel serves every later Python too), --output keeps the two
+files, otherwise nothing is left. Downloads the libraries of constraints.txt; takes several minutes.
+Exit status: 0, or 1 with one sentence about the first thing that failed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+# The checkout's folders that become packages, and where.
+PACKAGES = {"linprim_geo": "linprim_geo", "eval": "linprim_geo/eval"}
+NOT_PACKED = (".pyc", ".so")
+
+SMOKE = (
+    "doctor",
+    "synth scene --size 48 --views 8 --test-views 2 --points 300 --supersample 1 --threads 1",
+    "train scene -o run --iterations 60 --max-primitives 200 --sh-degree 0 --threads 1 --quiet",
+    "extract-mesh run -o mesh.ply",
+    "eval-mesh mesh.ply scene/reference.ply --samples 5000 -o scores",
+    "convert run primitives.glb --as mesh",
+    "report run",
+)
+
+
+class Failed(Exception):
+    """What failed, in one sentence."""
+
+
+def run(*words: str | Path, **settings) -> str:
+    """Runs a program and returns what it printed; Failed with the end of what it said if it fails."""
+    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, **settings)
+    if done.returncode:
+        said = (done.stderr.strip() or done.stdout.strip()).splitlines()[-12:]
+        raise Failed(
+            f"{' '.join(str(word) for word in words)} ended with {done.returncode}:\n" + "\n".join(said)
+        )
+    return done.stdout
+
+
+def make_environment(python: str, folder: Path) -> Path:
+    """A fresh virtual environment; returns its interpreter."""
+    run(python, "-m", "venv", folder)
+    return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+def build(python: Path, output: Path) -> tuple[Path, Path]:
+    """The sdist, and the wheel that is built from it."""
+    run(python, "-m", "pip", "install", "-qq", "build")
+    run(python, "-m", "build", "--outdir", output, ROOT)
+    (sdist,), (wheel,) = output.glob("*.tar.gz"), output.glob("*.whl")
+    return sdist, wheel
+
+
+def check_contents(wheel: Path) -> int:
+    """Every file of the packages is in the wheel, and the core, the entry point and the licence; returns the number of files."""
+    packed = set(zipfile.ZipFile(wheel).namelist())
+    for source, target in PACKAGES.items():
+        for file in (ROOT / source).rglob("*"):
+            if not file.is_file() or file.suffix in NOT_PACKED:
+                continue
+            name = f"{target}/{file.relative_to(ROOT / source).as_posix()}"
+            if name not in packed:
+                raise Failed(f"{wheel.name}: {name} is missing")
+    for part in ("linprim_geo/_core.", ".dist-info/entry_points.txt", "LICENSE"):
+        if not any(part in name for name in packed):
+            raise Failed(f"{wheel.name}: holds no {part}")
+    if strange := [name for name in packed if not name.startswith(("linprim_geo/", "linprim_geo-"))]:
+        raise Failed(f"{wheel.name}: puts {strange[0]} beside the package")
+    return len(packed)
+
+
+def check_tag(python: Path, wheel: Path) -> None:
+    """From Python 3.12 on the wheel is of the stable interface."""
+    minor = int(run(python, "-c", "import sys; print(sys.version_info.minor)"))
+    wanted = "-cp312-abi3-" if minor >= 12 else f"-cp3{minor}-cp3{minor}-"
+    if wanted not in wheel.name:
+        raise Failed(f"{wheel.name}: wanted a name with {wanted}")
+
+
+def smoke(python: Path, folder: Path) -> None:
+    """Runs the installed package in `folder`, away from the checkout and from every compiler."""
+    binary = python.parent
+    environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "CC", "CXX")}
+    environment |= {"PATH": str(binary), "LINPRIM_GEO_CACHE": str(folder / "cache")}
+    settings = {"cwd": folder, "env": environment}
+    where = run(python, "-c", "import linprim_geo; print(linprim_geo.__file__)", **settings).strip()
+    if not Path(where).is_relative_to(python.parent.parent):
+        raise Failed(f"linprim_geo comes from {where}, wanted the environment {python.parent.parent}")
+    for line in SMOKE:
+        shown = run(binary / "linprim-geo", *line.split(), "--json", **settings)
+        result = json.loads(shown)
+        print(f"  linprim-geo {line}: {len(result)} values")
+        if line == "doctor" and result["compiler"]:
+            raise Failed(f"doctor finds the compiler {result['compiler']}, wanted none on this PATH")
+    for name in ("mesh.ply", "primitives.glb", "run/report.html", "scores/results.json"):
+        if not (folder / name).stat().st_size:
+            raise Failed(f"{name} is empty")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description="Builds sdist and wheel, installs the wheel into a fresh environment and runs it."
+    )
+    parser.add_argument(
+        "--python", default=sys.executable, metavar="PROGRAM", help="interpreter (default: this one)"
+    )
+    parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="keep the two files here")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="linprim-geo-wheel-") as temporary:
+        folder = Path(temporary)
+        try:
+            builder = make_environment(options.python, folder / "builder")
+            sdist, wheel = build(builder, folder / "dist")
+            print(f"{sdist.name}: {sdist.stat().st_size / 2**20:.2f} MiB", flush=True)
+            count = check_contents(wheel)
+            check_tag(builder, wheel)
+            print(f"{wheel.name}: {wheel.stat().st_size / 2**20:.2f} MiB, {count} files", flush=True)
+            python = make_environment(options.python, folder / "fresh")
+            run(python, "-m", "pip", "install", "-qq", "-c", ROOT / "constraints.txt", wheel)
+            (folder / "elsewhere").mkdir()
+            smoke(python, folder / "elsewhere")
+        except Failed as error:
+            print(f"check_wheel: {error}", file=sys.stderr)
+            return 1
+        if options.output:
+            options.output.mkdir(parents=True, exist_ok=True)
+            for file in (sdist, wheel):
+                shutil.copy2(file, options.output)
+    print("the wheel works")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
