@@ -9,7 +9,7 @@ import numpy as np
 
 from linprim_geo.camera import Camera
 from linprim_geo.errors import LinprimError
-from linprim_geo.eval.surfaces import NAN, QUANTILES, mean
+from linprim_geo.eval.surface_samples import NAN, QUANTILES, mean
 from linprim_geo.mesh import Mesh
 from linprim_geo.raycast import RayCaster
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from linprim_geo.eval.surfaces import Comparison, PointDistance, SurfaceDistance, refine
+from linprim_geo.eval.surface_samples import Comparison, PointDistance, SurfaceDistance, refine
 from linprim_geo.files import atomic_write
 from linprim_geo.mesh import Mesh, save_mesh
 

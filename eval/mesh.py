@@ -20,7 +20,7 @@ import numpy as np
 from linprim_geo.camera import Camera
 from linprim_geo.errors import LinprimError
 from linprim_geo.eval import open_run, write_results
-from linprim_geo.eval.surfaces import (
+from linprim_geo.eval.surface_samples import (
     Comparison,
     SurfaceDistance,
     reduce_scores,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from linprim_geo.errors import LinprimError
-from linprim_geo.eval.surfaces import corner_and_edges, morton_order
+from linprim_geo.eval.surface_samples import corner_and_edges, morton_order
 from linprim_geo.mesh import Mesh
 
 MAX_POINTS = 60_000_000

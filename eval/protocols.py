@@ -19,7 +19,7 @@ from linprim_geo.errors import LinprimError
 from linprim_geo.eval.culling import count_views
 from linprim_geo.eval.point_sets import cell_means, check_count, lattice_points, thin
 from linprim_geo.eval.protocol_files import CropVolume, ObservedVolume
-from linprim_geo.eval.surfaces import (
+from linprim_geo.eval.surface_samples import (
     Comparison,
     PointDistance,
     longest_edges,

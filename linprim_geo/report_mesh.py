@@ -126,7 +126,7 @@ def _fill(
     light, rows, cell = light_mesh(mesh, most)
     error = None
     if truth is not None:
-        from .eval.surfaces import SurfaceDistance
+        from .eval.surface_samples import SurfaceDistance
         from .mesh import validate_mesh
 
         error, _ = SurfaceDistance(validate_mesh(load_mesh(truth), str(truth))).query(mesh.vertices[rows])

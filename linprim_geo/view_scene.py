@@ -141,7 +141,7 @@ def _read_meshes(seen: Seen, reference: str | os.PathLike | None) -> None:
             found[method] = file
     distance = None
     if reference is not None and found:
-        from .eval.surfaces import SurfaceDistance
+        from .eval.surface_samples import SurfaceDistance
 
         distance = SurfaceDistance(validate_mesh(load_mesh(reference), os.fspath(reference)))
     for method, file in found.items():

@@ -12,7 +12,7 @@ from surfaces import CONTEXT, SCORES, camera_above, grid, inradius, join, rotati
 from linprim_geo.errors import LinprimError
 from linprim_geo.eval.figures import error_colors
 from linprim_geo.eval.mesh import eval_mesh_files, score_mesh
-from linprim_geo.eval.surfaces import SurfaceDistance, morton_order, refine, sample_surface
+from linprim_geo.eval.surface_samples import SurfaceDistance, morton_order, refine, sample_surface
 from linprim_geo.mesh import Mesh, load_mesh, save_mesh
 
 LENGTHS = ("accuracy", "completeness", "chamfer", "hausdorff", "tau", "standard_error", "accuracy_q90")

@@ -7,7 +7,7 @@ import pytest
 from surfaces import grid, sphere
 
 from linprim_geo.eval.point_sets import cell_means, lattice_points, thin
-from linprim_geo.eval.surfaces import PointDistance, SurfaceDistance, sample_surface
+from linprim_geo.eval.surface_samples import PointDistance, SurfaceDistance, sample_surface
 from linprim_geo.mesh import Mesh
 
 

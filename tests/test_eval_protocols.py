@@ -18,7 +18,7 @@ from linprim_geo.eval.mesh import eval_mesh_files
 from linprim_geo.eval.point_sets import cell_means
 from linprim_geo.eval.protocol_files import CropVolume, ObservedVolume, read_observed_volume, read_plane
 from linprim_geo.eval.protocols import PROTOCOLS, TNT_TAU, Settings, score_by_protocol
-from linprim_geo.eval.surfaces import PointDistance, refine, sample_surface
+from linprim_geo.eval.surface_samples import PointDistance, refine, sample_surface
 from linprim_geo.mesh import Mesh, load_mesh, save_mesh
 from linprim_geo.raycast import RayCaster
 

@@ -10,7 +10,7 @@ from surfaces import grid, join, sphere
 
 from linprim_geo import mesh_process
 from linprim_geo.errors import LinprimError
-from linprim_geo.eval.surfaces import SurfaceDistance
+from linprim_geo.eval.surface_samples import SurfaceDistance
 from linprim_geo.extract import extract_mesh
 from linprim_geo.mesh import Mesh, load_mesh, manifold_status, select_faces, topology, vertex_normals
 from linprim_geo.mesh_process import close_holes, process_mesh, remesh, simplify, smooth

@@ -151,7 +151,7 @@ def test_the_mesh_of_the_page_is_the_mesh_of_the_file(made, meshed, tiny_scene):
     colors = {layer["name"]: array(layer["colors"], "u1", 3) for layer in shown["layers"]}
     assert np.array_equal(colors["photographs"], mesh.colors)
     from linprim_geo.eval.figures import error_colors
-    from linprim_geo.eval.surfaces import SurfaceDistance
+    from linprim_geo.eval.surface_samples import SurfaceDistance
 
     error = SurfaceDistance(load_mesh(tiny_scene / "reference.ply")).query(mesh.vertices)[0]
     assert np.array_equal(colors["true error"], error_colors(error / np.percentile(error, 95)))
