@@ -1,7 +1,7 @@
 // Gaussians to records, and the adjoint: gradient sums of a record back to centre, rotation, standard deviations and opacity.
 //
 // The covariance sum_k arm_k arm_k^T (arm_k the local axis k times its standard deviation) is projected by the Jacobian of the pixel position
-// at the centre, or, outside of 1.3 times the field of view, where it would run away, at that limit: with g_k = J arm_k,
+// at the centre, or, far outside of the image, where it would run away, at the nearest place in a margin around it: with g_k = J arm_k,
 // M = sum_k g_k g_k^T + filter I.  Source: Zwicker et al. 2002; Kerbl et al. 2023, equation 5.
 #pragma once
 
@@ -10,7 +10,6 @@
 
 namespace linprim::LINPRIM_ISA {
 
-constexpr double kViewLimit = 1.3;
 // A covariance whose determinant is below this part of its squared trace is a line, and not drawn.
 constexpr double kFlat = 1e-12;
 
@@ -18,7 +17,7 @@ struct GaussianFrame {
   Pose pose;
   D extent[3];
   D inverse_z, u, v;  // of the centre; z = 1 where it lies before the near plane
-  D limit_u, limit_v;  // u and v held within 1.3 times half the image
+  D limit_u, limit_v;  // u and v held in view
   B in_front;
   D gx[3], gy[3];     // projected arms, pixels
   D xx, xy, yy;       // covariance, pixels^2
@@ -31,8 +30,7 @@ struct GaussianFrame {
     in_front = (B)(pose.center[2] > view.near);
     inverse_z = 1.0 / (in_front ? pose.center[2] : splat(1.0));
     u = pose.center[0] * inverse_z, v = pose.center[1] * inverse_z;
-    const double most_u = kViewLimit * 0.5 * view.width / view.fx, most_v = kViewLimit * 0.5 * view.height / view.fy;
-    limit_u = clamp(u, -most_u, most_u), limit_v = clamp(v, -most_v, most_v);
+    limit_u = held_in_view(u, view.width, view.cx, view.fx), limit_v = held_in_view(v, view.height, view.cy, view.fy);
     xx = yy = splat(view.screen_filter), xy = splat(0.0);
     D smallest = splat(1e300);
     for (int k = 0; k < 3; ++k) {

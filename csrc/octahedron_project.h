@@ -5,7 +5,9 @@
 
 namespace linprim::LINPRIM_ISA {
 
-// The local forms n_k = axis_k / extent_k. Axes are mirrored so that m_k = n_k . c >= 0, which an octahedron does not notice; `flip` undoes it.
+// The local forms n_k = axis_k / extent_k. Axes are mirrored so that m_k = n_k . c >= 0 (affine: n_k . j), which an octahedron does not notice;
+// `flip` undoes it.
+template <RayModel kRays>
 struct OctahedronFrame {
   Pose pose;
   D extent[3], flip[3];
@@ -16,11 +18,15 @@ struct OctahedronFrame {
   template <class Real>
   OctahedronFrame(const View& view, const Primitives<Real>& p, const int64_t* rows) {
     set_pose(view, p, rows, pose);
+    D held[3];
+    B free[2];
+    const D* towards = pose.center;
+    if constexpr (kRays == RayModel::kAffine) RayFrame<kRays>::hold(view, pose.center, held, free), towards = held;
     for (int k = 0; k < 3; ++k) {
       const D raw = gather(p.extent + k, 3, rows);
       smallest = vmin(smallest, raw);
       extent[k] = clamp(raw, kSmallestExtent, kLargestExtent);
-      flip[k] = dot(pose.axis[k], pose.center) < 0.0 ? splat(-1.0) : splat(1.0);
+      flip[k] = dot(pose.axis[k], towards) < 0.0 ? splat(-1.0) : splat(1.0);
       const D inverse = flip[k] / extent[k];
       for (int i = 0; i < 3; ++i) {
         n[k][i] = pose.axis[k][i] * inverse;
@@ -70,7 +76,7 @@ void project_octahedra(const ProjectParams<Real>& P, int64_t begin, int64_t end)
     const int lanes = int(std::min<int64_t>(kLanes, end - first));
     int64_t rows[kLanes];
     for (int l = 0; l < kLanes; ++l) rows[l] = first + std::min(l, lanes - 1);
-    const OctahedronFrame f(view, P.primitives, rows);
+    const OctahedronFrame<kRays> f(view, P.primitives, rows);
     const D reach = f.reach_z(), *center = f.pose.center;
     const RayFrame<kRays> rays(view, center, reach);
 
@@ -87,7 +93,7 @@ void project_octahedra(const ProjectParams<Real>& P, int64_t begin, int64_t end)
     set_boxes(view, box.low_x, box.high_x, box.low_y, box.high_y, lanes, visible, print);
     D nearest = center[2] - reach;
     if constexpr (!kExact)
-      nearest = rays.length - vmax(vmax(vabs(dot(center, f.arm[0])), vabs(dot(center, f.arm[2]))), vabs(dot(center, f.arm[4]))) * rays.inverse_length;
+      nearest = rays.length - vmax(vmax(vabs(dot(rays.held, f.arm[0])), vabs(dot(rays.held, f.arm[2]))), vabs(dot(rays.held, f.arm[4]))) * rays.inverse_held;
     const D key = order_key(rays, nearest, longest);
     for (int l = 0; l < lanes; ++l) {
       P.key[first + l] = Real(key[l]);
@@ -197,7 +203,7 @@ void chain_octahedra(const ChainParams<Real>& P, int64_t begin, int64_t end) {
       return r;
     };
 
-    const OctahedronFrame f(view, P.primitives, rows);
+    const OctahedronFrame<kRays> f(view, P.primitives, rows);
     const RayFrame<kRays> rays(view, f.pose.center, f.reach_z());
     const bool filtered = view.screen_filter > 0;
     const Box box = filtered ? box_of(rays, f.arm, 6) : Box{};

@@ -4,8 +4,9 @@
 // A face is the plane n . (x - c) = 1 in camera space. Its w over the pixels (see OctahedronRecord) is (p - kappa) / h with p affine in
 // the pixel and both p and h linear in n:
 //   exact rays   p = n . (v - w0 c), kappa = w0, h = 1 + m, m = n . c           (w = inverse depth - w0)
-//   affine rays  p = n'_u (u - u_c) + n'_v (v - v_c), kappa = 1, h = m, m = n . c / |c|,   n' = J^-T n   (w = |c| - distance)
-// J is the Jacobian of (x/z, y/z, |x|) at the centre c, the ray space of EWA splatting (Zwicker et al. 2002, section 4).
+//   affine rays  p = n'_u (u - u_c) + n'_v (v - v_c), kappa = 1, h = m, m = n . j / |j|,   n' = J^-T n   (w = |c| - distance)
+// J is the Jacobian of (x/z, y/z, |x|) at j, the ray space of EWA splatting (Zwicker et al. 2002, section 4). j is the centre c, or at its depth
+// the nearest to it in a margin around the image, as for Gaussians: beyond, J grows without bound and small things cover the image.
 #pragma once
 
 #include "primitive_pose.h"
@@ -30,6 +31,8 @@ struct RayFrame {
   D w0, kappa;
   D base[3];            // exact: v_ref - w0 c; affine: (u_ref - u_c, v_ref - v_c, 0)
   D inverse_z, length, inverse_length;  // affine: 1/z, |c|, 1/|c|
+  D held[3], inverse_held;              // affine: j, 1/|j|
+  B free[2];                            // affine: j follows x, y of the centre
   B crosses_near;       // exact: w0 = 0 and the reference is the principal point
 
   // `reach` is how far the primitive extends from its centre along z, both ways.
@@ -49,19 +52,27 @@ struct RayFrame {
       length = vsqrt(length2 == 0.0 ? splat(1.0) : length2), inverse_length = 1.0 / length;
       w0 = length, kappa = splat(1.0);
       base[0] = u - c[0] * inverse_z, base[1] = v_ref - c[1] * inverse_z, base[2] = splat(0.0);
+      hold(view, c, held, free);
+      inverse_held = 1.0 / vsqrt(dot(held, held));
     }
   }
   static D nearest(D x) {
     return __builtin_convertvector(floor_of(clamp(x, -4e6, 4e6) + 0.5), D);
+  }
+  static void hold(const View& view, const D c[3], D held[3], B free[2]) {
+    const D z = c[2] > view.near ? c[2] : splat(1.0), inverse = 1.0 / z, u = c[0] * inverse, v = c[1] * inverse;
+    const D held_u = held_in_view(u, view.width, view.cx, view.fx), held_v = held_in_view(v, view.height, view.cy, view.fy);
+    free[0] = (B)(u == held_u), free[1] = (B)(v == held_v);
+    held[0] = free[0] ? c[0] : held_u * z, held[1] = free[1] ? c[1] : held_v * z, held[2] = z;
   }
   // p at the reference pixel, its steps per pixel, and m.
   void form(const D n[3], D& p, D& px, D& py, D& m) const {
     if constexpr (kExact) {
       p = dot(n, base), px = n[0] * (1.0 / view.fx), py = n[1] * (1.0 / view.fy), m = dot(n, c);
     } else {
-      const D along = dot(n, c), share = c[2] * inverse_length * inverse_length * along;
-      const D nu = c[2] * n[0] - c[0] * share, nv = c[2] * n[1] - c[1] * share;
-      p = nu * base[0] + nv * base[1], px = nu * (1.0 / view.fx), py = nv * (1.0 / view.fy), m = along * inverse_length;
+      const D along = dot(n, held), share = held[2] * inverse_held * inverse_held * along;
+      const D nu = held[2] * n[0] - held[0] * share, nv = held[2] * n[1] - held[1] * share;
+      p = nu * base[0] + nv * base[1], px = nu * (1.0 / view.fx), py = nv * (1.0 / view.fy), m = along * inverse_held;
     }
   }
   // Adds to the gradients of n and c.
@@ -70,18 +81,19 @@ struct RayFrame {
       for (int i = 0; i < 3; ++i) n_grad[i] += g * base[i] + gm * c[i], c_grad[i] += (gm - w0 * g) * n[i];
       n_grad[0] += gx * (1.0 / view.fx), n_grad[1] += gy * (1.0 / view.fy);
     } else {
-      const D along = dot(n, c), l2 = inverse_length * inverse_length, share = c[2] * l2 * along;
-      const D nu = c[2] * n[0] - c[0] * share, nv = c[2] * n[1] - c[1] * share;
+      const D along = dot(n, held), l2 = inverse_held * inverse_held, share = held[2] * l2 * along;
+      const D nu = held[2] * n[0] - held[0] * share, nv = held[2] * n[1] - held[1] * share;
       const D g_nu = g * base[0] + gx * (1.0 / view.fx), g_nv = g * base[1] + gy * (1.0 / view.fy);
       const D g_uc = -g * nu, g_vc = -g * nv;  // base = reference - (u_c, v_c)
-      const D g_share = -(c[0] * g_nu + c[1] * g_nv);
-      const D g_along = gm * inverse_length + g_share * c[2] * l2;
-      n_grad[0] += c[2] * g_nu, n_grad[1] += c[2] * g_nv;
-      c_grad[0] -= share * g_nu, c_grad[1] -= share * g_nv;
-      c_grad[2] += n[0] * g_nu + n[1] * g_nv + g_share * l2 * along;
-      // |c|: m has its inverse, share its inverse square.
-      const D radial = -(gm * along * l2 * inverse_length + 2.0 * g_share * share * l2);
-      for (int i = 0; i < 3; ++i) n_grad[i] += c[i] * g_along, c_grad[i] += n[i] * g_along + c[i] * radial;
+      const D g_share = -(held[0] * g_nu + held[1] * g_nv);
+      const D g_along = gm * inverse_held + g_share * held[2] * l2;
+      n_grad[0] += held[2] * g_nu, n_grad[1] += held[2] * g_nv;
+      D to[3] = {-share * g_nu, -share * g_nv, n[0] * g_nu + n[1] * g_nv + g_share * l2 * along};
+      // |j|: m has its inverse, share its inverse square.
+      const D radial = -(gm * along * l2 * inverse_held + 2.0 * g_share * share * l2);
+      for (int i = 0; i < 3; ++i) n_grad[i] += held[i] * g_along, to[i] += n[i] * g_along + held[i] * radial;
+      for (int i = 0; i < 2; ++i) c_grad[i] += free[i] ? to[i] : splat(0.0), c_grad[2] += free[i] ? splat(0.0) : to[i] * held[i] * inverse_z;
+      c_grad[2] += to[2];
       add_centre(g_uc, g_vc, c_grad);
     }
   }
@@ -96,8 +108,8 @@ struct RayFrame {
       const D inverse = 1.0 / (crosses_near ? splat(1.0) : c[2] + arm[2]);
       x = view.fx * (c[0] + arm[0]) * inverse + (view.cx - 0.5), y = view.fy * (c[1] + arm[1]) * inverse + (view.cy - 0.5);
     } else {
-      const D u = c[0] * inverse_z, v = c[1] * inverse_z;
-      x = view.fx * (u + (arm[0] - u * arm[2]) * inverse_z) + (view.cx - 0.5), y = view.fy * (v + (arm[1] - v * arm[2]) * inverse_z) + (view.cy - 0.5);
+      const D u = held[0] * inverse_z, v = held[1] * inverse_z;
+      x = view.fx * (c[0] + arm[0] - u * arm[2]) * inverse_z + (view.cx - 0.5), y = view.fy * (c[1] + arm[1] - v * arm[2]) * inverse_z + (view.cy - 0.5);
     }
   }
   void project_grad(const D arm[3], D gx, D gy, D arm_grad[3], D c_grad[3]) const {
@@ -107,10 +119,10 @@ struct RayFrame {
       const D to[3] = {gx * inverse, gy * inverse, -(gx * (c[0] + arm[0]) + gy * (c[1] + arm[1])) * inverse * inverse};
       for (int i = 0; i < 3; ++i) arm_grad[i] += to[i], c_grad[i] += to[i];
     } else {
-      const D u = c[0] * inverse_z, v = c[1] * inverse_z;
+      const D u = held[0] * inverse_z, v = held[1] * inverse_z;
       arm_grad[0] += gx * inverse_z, arm_grad[1] += gy * inverse_z, arm_grad[2] -= (gx * u + gy * v) * inverse_z;
-      const D left = 1.0 - arm[2] * inverse_z;
-      add_centre(gx * left, gy * left, c_grad);
+      const D part = arm[2] * inverse_z;
+      add_centre(free[0] ? gx * (1.0 - part) : gx, free[1] ? gy * (1.0 - part) : gy, c_grad);
       c_grad[2] -= (gx * (arm[0] - u * arm[2]) + gy * (arm[1] - v * arm[2])) * inverse_z * inverse_z;
     }
   }

@@ -18,6 +18,13 @@ constexpr double kPixelSlack = 1e-3;
 // Slack, relative, of the depth that a primitive is promised not to reach before.
 constexpr double kDepthSlack = 1e-5;
 
+// The affine approximation at a centre far outside of the image runs away with x/z and y/z: these are held within the image and this part of its
+// size around it, which is 1.3 times half the field of view to either side if the principal point is in the middle.
+constexpr double kViewMargin = 0.15;
+inline D held_in_view(D slope, int pixels, double principal, double focal) {
+  return clamp(slope, (-kViewMargin * pixels - principal) / focal, ((1 + kViewMargin) * pixels - principal) / focal);
+}
+
 // Centre and local axes in camera space.
 struct Pose {
   D q[4], q_length;  // unit quaternion and the length of the raw one (1 where that is 0)

@@ -96,8 +96,8 @@ void project_tetrahedra(const ProjectParams<Real>& P, int64_t begin, int64_t end
     D nearest = center[2] + f.low_z;
     if constexpr (!kExact) {
       D least = splat(0.0);
-      for (int j = 0; j < 4; ++j) least = vmin(least, dot(center, f.arm[j]));
-      nearest = rays.length + least * rays.inverse_length;
+      for (int j = 0; j < 4; ++j) least = vmin(least, dot(rays.held, f.arm[j]));
+      nearest = rays.length + least * rays.inverse_held;
     }
     const D key = order_key(rays, nearest, longest);
     for (int l = 0; l < lanes; ++l) {

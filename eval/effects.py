@@ -1,11 +1,11 @@
 """What switching an effect on is worth: pairs of built-in scenes, one that calls for it and one that does not.
 
-    python -m linprim_geo.eval.effects -o runs/effects [--size 96] [--iterations 600] [--only exposure lens ...]
+    python -m linprim_geo.eval.effects -o runs/effects --size 128 --iterations 1200 --seeds 2 [--only exposure lens ...] [--scenes ...]
 
-For every effect the detector decides about both scenes of its pair; then both are trained with the effect on and off, everything else off.
-`effects.txt` is the table: evidence on both, whether both decisions are right, what the effect gains where it is called for, and what it
-costs in time and quality where it is not. Then some scenes are trained as `--effects auto` and as `--effects all` would. Times are CPU
-seconds of the whole training on one thread.
+For every effect the detector decides about the scenes of its pair; then they are trained with the effect on and off, everything else off.
+Then some scenes are trained as `--effects auto`, `none` and `all` would. `effects.md` has both tables: evidence and whether the decision is
+right, what the effect gains, whether that is more than the scatter of trainings with other seeds, and what it costs. Times are CPU seconds
+of the whole training on one thread.
 """
 
 from __future__ import annotations
@@ -13,11 +13,13 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
+from statistics import median, variance
 
 from linprim_geo import train as train_module
-from linprim_geo.effects import EFFECTS, Choice, decide
+from linprim_geo.effects import EFFECTS, MODES, Choice, Decision, decide
 from linprim_geo.errors import LinprimError
 from linprim_geo.eval.depth import eval_depth_run
 from linprim_geo.files import write_json
@@ -39,22 +41,27 @@ SCENES = {
     "white": {"background": "white"},
     "black": {"background": "black"},
     "room": {"shape": "room", "shading": "albedo"},
+    "cad": {"shape": "cad", "shading": "shaded"},
+    "wires": {"shape": "wires", "shading": "shaded"},
 }
-# name: the scene that calls for it, the one that does not (None: there is none), and by what the gain is judged.
+# name: the scenes that call for it, those that do not, and by what the gain is judged.
 PAIRS = {
-    "view-dependence": ("highlights", "plain", "psnr"),
-    "exposure": ("exposure", "room", "psnr"),
-    "lens": ("lens", "slight lens", "abs_rel"),
-    "filter": ("zoom", "plain", "psnr"),
-    "background": ("white", "room", "psnr"),
-    "masks": ("plain", "black", "abs_rel"),
-    "depth": ("plain", None, "abs_rel"),
-    "normals": ("plain", None, "abs_rel"),
-    "overlap": (None, "plain", "psnr"),
-    "exact-rays": ("room", None, "psnr"),
-    "double": (None, "plain", "psnr"),
+    "view-dependence": (("highlights",), ("plain",), "psnr"),
+    "exposure": (("exposure",), ("room",), "psnr"),
+    "lens": (("lens",), ("slight lens",), "abs_rel"),
+    "filter": (("zoom",), ("plain", "room", "cad", "wires"), "psnr"),
+    "background": (("white",), ("room",), "psnr"),
+    "masks": (("plain",), ("black",), "abs_rel"),
+    "depth": (("plain",), (), "abs_rel"),
+    "normals": (("plain",), (), "abs_rel"),
+    "overlap": (("room",), ("plain",), "psnr"),
+    "exact-rays": (("room",), (), "psnr"),
+    "double": ((), ("plain",), "psnr"),
 }
-AUTO_OR_ALL = ("plain", "exposure", "highlights")
+AUTO_OR_ALL = ("plain", "cad", "room", "wires")
+QUIET = {"threads": 1, "evaluate_every": 0, "checkpoint_every": 10**9}
+# What trainings are judged by, and whether more or less of it is better.
+JUDGED = {"psnr": 1, "abs_rel": -1}
 
 
 @dataclass(frozen=True)
@@ -73,13 +80,13 @@ def all_off() -> dict:
 
 def base_options(size: Size) -> tuple[SceneOptions, TrainOptions]:
     """Options with every effect off but what costs nothing and is on as a rule: exact rays, masks and the lens."""
-    off = {k: v for k, v in all_off().items() if k in TrainOptions.__dataclass_fields__} | EFFECTS["exact-rays"].on
+    off = {k: v for k, v in all_off().items() if k in TrainOptions.__dataclass_fields__} | EFFECTS[
+        "exact-rays"
+    ].on
     options = TrainOptions(
         iterations=size.iterations,
         max_primitives=size.primitives,
-        threads=1,
-        evaluate_every=0,
-        checkpoint_every=10**9,
+        **QUIET,
         **off,
     )
     return SceneOptions(), options
@@ -91,114 +98,230 @@ def make_scene(folder: Path, name: str, size: Size) -> Path:
     if not (path / "synth.json").is_file():
         settings = {**PLAIN, **SCENES[name]}
         synthesize(
-            path, views=VIEWS, test_views=TEST_VIEWS, size=size.pixels, points=POINTS, supersample=2, threads=1, **settings
+            path,
+            views=VIEWS,
+            test_views=TEST_VIEWS,
+            size=size.pixels,
+            points=POINTS,
+            supersample=2,
+            threads=1,
+            **settings,
         )
     return path
 
 
-def trained(folder: Path, scene: str, label: str, choice: Choice, size: Size) -> dict:
-    """PSNR, depth error and CPU seconds of a training; taken from the folder if it is there."""
-    run = folder / "runs" / f"{scene.replace(' ', '_')}.{label}"
+def trained(
+    folder: Path, path: Path, label: str, choice: Choice, options: tuple[SceneOptions, TrainOptions]
+) -> dict:
+    """PSNR, depth error in percent (if there is truth) and CPU seconds of a training; taken from the folder if it is there."""
+    run = folder / "runs" / f"{path.name}.{label}.{options[1].seed}"
     result = run / "effects_result.json"
     if result.is_file():
         return json.loads(result.read_text())
-    path = make_scene(folder, scene, size)
     begin = time.process_time()
-    found = train(path, run, *base_options(size), quiet=True, effects=choice)
-    seconds = time.process_time() - begin
-    depth = eval_depth_run(run, path / "reference.ply")
-    row = {"psnr": found["psnr"], "psnr_gain": found.get("psnr_gain"), "abs_rel": depth["abs_rel"], "cpu_seconds": seconds}
+    found = train(path, run, *options, quiet=True, effects=choice)
+    row = {"psnr": found["psnr"], "cpu_seconds": time.process_time() - begin}
+    if (path / "reference.ply").is_file():
+        row["abs_rel"] = 100 * eval_depth_run(run, path / "reference.ply")["abs_rel"]
     write_json(result, row)
     return row
 
 
-def decision(folder: Path, scene: str, name: str, size: Size) -> tuple[float | None, bool]:
-    """The evidence for an effect in a scene and what it leads to."""
-    scene_options, options = base_options(size)
-    loaded = with_points(load_scene(make_scene(folder, scene, size)), options, lambda text: None)
-    found = next(d for d in decide(loaded, scene_options, options, Choice("auto")) if d.name == name)
-    return found.value, found.on
-
-
-def judge(folder: Path, name: str, size: Size) -> dict:
-    """One row of the table."""
-    row: dict = {"effect": name, "threshold": EFFECTS[name].threshold, "unit": EFFECTS[name].unit, "judged_by": PAIRS[name][2]}
-    called, not_called, by = PAIRS[name]
-    for part, scene, wanted in (("called", called, True), ("not_called", not_called, False)):
-        if scene is None:
-            continue
-        value, on = decision(folder, scene, name, size)
-        with_it, without = (
-            trained(folder, scene, f"{name}.{state}", Choice("none", {name: state == "on"}), size) for state in ("on", "off")
+def switched(folder: Path, path: Path, name: str, on: bool, size: Size, seeds: int) -> list[dict]:
+    """Trainings with an effect on or off and everything else off, one for each seed. What changes no option is the same training."""
+    rows = []
+    for seed in range(seeds):
+        base = tuple(
+            replace(options, **({"seed": seed} if hasattr(options, "seed") else {}))
+            for options in base_options(size)
         )
-        gain = with_it[by] - without[by] if by == "psnr" else 100 * (without[by] - with_it[by])
-        row[part] = {
+        setting = EFFECTS[name].on if on else EFFECTS[name].off
+        options = tuple(
+            replace(each, **{k: v for k, v in setting.items() if k in vars(each)}) for each in base
+        )
+        label = "base" if options == base else f"{name}.{'on' if on else 'off'}"
+        rows.append(trained(folder, path, label, Choice("none"), options))
+    return rows
+
+
+@cache
+def decisions(path: Path, size: Size) -> dict[str, Decision]:
+    """What the data of a scene say about every effect."""
+    scene_options, options = base_options(size)
+    loaded = with_points(load_scene(path), options, lambda text: None)
+    return {found.name: found for found in decide(loaded, scene_options, options, Choice("auto"))}
+
+
+def judge(folder: Path, name: str, size: Size, seeds: int) -> list[dict]:
+    """The rows of an effect, one for each of its scenes."""
+    called, not_called, by = PAIRS[name]
+    rows = []
+    for scene in (*called, *not_called):
+        path = make_scene(folder, scene, size)
+        found = decisions(path, size)[name]
+        row = {
+            "effect": name,
             "scene": scene,
-            "evidence": value,
-            "decided_on": on,
-            "right": on == wanted,
-            "on": with_it,
-            "off": without,
-            "gain": gain,
-            "cost": with_it["cpu_seconds"] / without["cpu_seconds"],
+            "called_for": scene in called,
+            "decided_on": found.on,
+            "reason": found.reason,
         }
-    return row
+        row |= {"evidence": found.value, "threshold": found.threshold, "unit": found.unit, "judged_by": by}
+        if found.reason != "impossible":
+            row |= {
+                "on": switched(folder, path, name, True, size, seeds),
+                "off": switched(folder, path, name, False, size, seeds),
+            }
+            row["gain"] = {
+                name: (mean(row["on"], name) - mean(row["off"], name)) * sign for name, sign in JUDGED.items()
+            }
+            row["cost"] = mean(row["on"], "cpu_seconds") / mean(row["off"], "cpu_seconds")
+        rows.append(row)
+    return rows
 
 
-def compare_all(folder: Path, scene: str, size: Size) -> dict:
-    """A training by what is decided from the data, and one with everything on."""
-    return {"scene": scene} | {mode: trained(folder, scene, mode, Choice(mode), size) for mode in ("auto", "all")}
+def mean(rows: list[dict], name: str) -> float:
+    """Of a figure over trainings."""
+    return sum(row[name] for row in rows) / len(rows)
 
 
-def table(rows: list[dict], comparisons: list[dict]) -> str:
-    """Both tables, for a README."""
-    lines = [
-        "| effect | evidence where called for / not (threshold) | decided | gain where called for | its cost | gain, cost where not |",
-        "|---|---|---|---|---|---|",
-    ]
+def scatter(trainings: list[list[dict]], name: str) -> float | None:
+    """Standard deviation of a figure over trainings that differ in their seed alone, from the median over what was trained; None of one.
+
+    The median of the variances, which are chi-squared over their k degrees of freedom, is their mean times (1 - 2 / 9k)^3.
+    """
+    variances = {}
+    for rows in trainings:
+        values = [row[name] for row in rows if name in row]
+        if len(values) > 1:
+            variances[tuple(values)] = variance(values)
+    freedom = max((len(values) - 1 for values in variances), default=0)
+    return (median(variances.values()) / (1 - 2 / (9 * freedom)) ** 3) ** 0.5 if freedom else None
+
+
+def compare_modes(folder: Path, path: Path, size: Size, seeds: int, downscale: int = 1) -> dict:
+    """Trainings by what is decided from the data, with nothing decided, and with everything on; all other options are the defaults."""
+    found: dict = {"scene": path.name}
+    for mode in MODES:
+        found[mode] = []
+        for seed in range(seeds):
+            options = TrainOptions(size.iterations, max_primitives=size.primitives, seed=seed, **QUIET)
+            found[mode].append(
+                trained(
+                    folder, path, f"mode.{mode}", Choice(mode), (SceneOptions(downscale=downscale), options)
+                )
+            )
+    return found
+
+
+def table(rows: list[dict], comparisons: list[dict], seeds: int) -> str:
+    """Both tables as Markdown, and below the first what trainings scatter by."""
+    lines = []
+    if rows:
+        lines = [
+            "| effect | scene | evidence (on from) | auto | PSNR gain | depth gain | time | verdict |",
+            "|---" * 8 + "|",
+        ]
+        sides = [side for row in rows if "on" in row for side in (row["on"], row["off"])]
+        spread = {name: scatter(sides, name) for name in JUDGED}
     for row in rows:
-        parts = [row.get("called"), row.get("not_called")]
-        evidence = " / ".join("–" if p is None or p["evidence"] is None else f"{p['evidence']:.3g}" for p in parts)
-        decided = " / ".join("–" if p is None else ("on" if p["decided_on"] else "off") + ("" if p["right"] else " (wrong)") for p in parts)
-        unit = "dB" if row["judged_by"] == "psnr" else "% depth error"
-        gain, cost = ("–", "–") if parts[0] is None else (f"{parts[0]['gain']:+.2f} {unit}", f"{parts[0]['cost']:.2f}")
-        other = "–" if parts[1] is None else f"{parts[1]['gain']:+.2f} {unit}, {parts[1]['cost']:.2f}"
-        threshold = f"{row['threshold']:g} {row['unit']}"
-        lines.append(f"| {row['effect']} | {evidence} ({threshold}) | {decided} | {gain} | {cost} | {other} |")
+        value = "–" if row["evidence"] is None else f"{row['evidence']:.3g}"
+        cells = [
+            row["effect"],
+            row["scene"],
+            f"{value} ({row['threshold']:g} {row['unit']})",
+            "on" if row["decided_on"] else "off",
+        ]
+        cells += (
+            [f"{row['gain'][name]:+.2f}" for name in JUDGED] + [f"{row['cost']:.2f}"]
+            if "gain" in row
+            else ["–"] * 3
+        )
+        lines.append(f"| {' | '.join([*cells, verdict(row, spread, seeds)])} |")
+    if rows and None not in spread.values():
+        lines += ["", "Gains in dB, and in % of depth (AbsRel); time with the effect by that without."]
+        lines[-1] += (
+            f" {seeds} seeds; one training scatters by {spread['psnr']:.2f} dB and {spread['abs_rel']:.3f} % (standard deviation)."
+        )
     if comparisons:
-        lines += ["", "| scene | auto: PSNR, depth error %, CPU s | all: PSNR, depth error %, CPU s |", "|---|---|---|"]
-    for c in comparisons:
-        cells = [f"{m['psnr']:.2f}, {100 * m['abs_rel']:.2f}, {m['cpu_seconds']:.1f}" for m in (c["auto"], c["all"])]
-        lines.append(f"| {c['scene']} | {cells[0]} | {cells[1]} |")
+        lines += ["", "| scene | effects | PSNR dB | depth AbsRel % | CPU s |", "|---" * 5 + "|"]
+    for found in comparisons:
+        for mode in MODES:
+            depth = f"{mean(found[mode], 'abs_rel'):.2f}" if "abs_rel" in found[mode][0] else "–"
+            cells = f"{mean(found[mode], 'psnr'):.2f} | {depth} | {mean(found[mode], 'cpu_seconds'):.1f}"
+            lines.append(f"| {found['scene']} | {mode} | {cells} |")
     return "\n".join(lines)
 
 
+def verdict(row: dict, spread: dict, seeds: int) -> str:
+    """Whether a decision is right by what the effect is judged by; a change counts that is more than twice its standard error."""
+    if row["reason"] == "impossible":
+        return "ruled out"
+    by = row["judged_by"]
+    if spread[by] is None:
+        return "–"
+    least = 2 * spread[by] * (2 / seeds) ** 0.5
+    change = "gains" if row["gain"][by] > least else "loses" if row["gain"][by] < -least else "no change"
+    if row["reason"] == "request":
+        return f"{change}, on request"
+    if row["reason"] == "free":
+        return f"{'wrong' if change == 'loses' else 'right'}: {change}, free"
+    if row["called_for"] and change == "no change":
+        return "gain not shown"
+    wrong = row["decided_on"] != row["called_for"] or change == ("loses" if row["decided_on"] else "gains")
+    return f"{'wrong' if wrong else 'right'}: {change}"
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("-o", "--output", default="runs/effects", metavar="DIR")
-    parser.add_argument("--size", type=int, default=96, metavar="PX")
-    parser.add_argument("--iterations", type=int, default=600, metavar="N")
+    parser.add_argument("--size", type=int, default=128, metavar="PX")
+    parser.add_argument("--iterations", type=int, default=1200, metavar="N")
     parser.add_argument("--primitives", type=int, default=2000, metavar="N")
-    parser.add_argument("--only", nargs="+", choices=tuple(PAIRS), default=tuple(PAIRS), metavar="EFFECT")
+    parser.add_argument(
+        "--seeds", type=int, default=2, metavar="N", help="trainings of everything that is compared"
+    )
+    parser.add_argument("--only", nargs="*", choices=tuple(PAIRS), default=tuple(PAIRS), metavar="EFFECT")
     text = "start from the scenes' points alone: looking for more takes longer than a small training"
     parser.add_argument("--own-points", action="store_true", help=text)
-    parser.add_argument("--scenes", nargs="*", choices=tuple(SCENES), default=AUTO_OR_ALL, help="for auto against all")
+    parser.add_argument(
+        "--scenes",
+        nargs="*",
+        choices=tuple(SCENES),
+        default=AUTO_OR_ALL,
+        help="for auto against none and all",
+    )
+    parser.add_argument(
+        "--captures", nargs="*", default=[], metavar="DIR[:K]", help="captures for the same, downscaled by K"
+    )
     parsed = parser.parse_args()
-    folder, size = Path(parsed.output), Size(parsed.size, parsed.iterations, parsed.primitives)
+    folder, size, seeds = (
+        Path(parsed.output),
+        Size(parsed.size, parsed.iterations, parsed.primitives),
+        parsed.seeds,
+    )
     if parsed.own_points:
         train_module.fill_points = lambda scene, *_: scene.points
     rows, comparisons = [], []
-    for name in parsed.only:
-        try:
-            rows.append(judge(folder, name, size))
-        except LinprimError as error:
-            raise SystemExit(f"{name}: {error}") from None
-        print(table(rows[-1:], []).splitlines()[-1], flush=True)
-    for scene in parsed.scenes:
-        comparisons.append(compare_all(folder, scene, size))
-    text = table(rows, comparisons)
-    write_json(folder / "effects.json", {"size": vars(size), "effects": rows, "auto_or_all": comparisons})
-    (folder / "effects.txt").write_text(text + "\n")
+    try:
+        for name in parsed.only:
+            rows += judge(folder, name, size, seeds)
+            print(table([row for row in rows if row["effect"] == name], [], seeds), flush=True)
+        for name in parsed.scenes:
+            comparisons.append(compare_modes(folder, make_scene(folder, name, size), size, seeds))
+            print(table([], comparisons[-1:], seeds), flush=True)
+        for word in parsed.captures:
+            path, _, downscale = word.partition(":")
+            comparisons.append(compare_modes(folder, Path(path), size, seeds, int(downscale or 1)))
+    except LinprimError as error:
+        raise SystemExit(str(error)) from None
+    text = table(rows, comparisons, seeds)
+    write_json(
+        folder / "effects.json", {"size": vars(size), "seeds": seeds, "effects": rows, "modes": comparisons}
+    )
+    (folder / "effects.md").write_text(text + "\n")
     print(text)
 
 

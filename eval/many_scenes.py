@@ -78,6 +78,12 @@ def rays_of(s: Scenes) -> Tensor:
     return torch.cat([xy, torch.ones_like(xy[..., :1])], -1)
 
 
+def view_limits(s: Scenes) -> tuple[Tensor, Tensor]:
+    """(B, 1, 2) least and largest x/z, y/z at which an affine approximation is taken: the image and 0.15 of its size around it."""
+    size = s.center.new_tensor([s.width, s.height])
+    return tuple(((share * size - s.middle) / s.focal)[:, None] for share in (-0.15, 1.15))
+
+
 def vertices(s: Scenes) -> tuple[Tensor, Tensor]:
     """Vertices relative to their centres (B, M, V, 3) and the centres (B, M, 3), camera space."""
     center, axes = camera_space(s)
@@ -116,7 +122,7 @@ def _lines(s: Scenes, center: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Ten
     """Each ray as origin + s direction relative to each centre, (B, R, M, 3) both, and the t or distance at its origin, (B, R, M).
 
     The origin is the point of an exact ray nearest to the centre; that of an affine one lies in the plane through the centre
-    square to the view.
+    square to the view, which is taken within `view_limits`.
     """
     c = center[:, None]
     if s.ray_model == "exact":
@@ -130,7 +136,10 @@ def _lines(s: Scenes, center: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Ten
         )
         * z
     )
-    along = c / length
+    low, high = view_limits(s)
+    held = torch.minimum(torch.maximum(c[..., :2] / z, low[:, None]), high[:, None])
+    along = torch.cat([held, torch.ones_like(z)], -1)
+    along = along / along.norm(dim=-1, keepdim=True)
     return (
         away - along * _dot(away, along)[..., None],
         along.expand_as(away),
@@ -245,11 +254,10 @@ def gaussian_ellipse(
     s: Scenes, center: Tensor, axes: Tensor
 ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, ...]]:
     """The rows of H (B, M, 3), px, with the covariance M = H H^T; and M's xx, xy, yy, its determinant by Cauchy and Binet, and the
-    projected centre x/z, y/z; (B, M). H is taken where the centre is, but within 1.3 times half the image."""
+    projected centre x/z, y/z; (B, M). H is taken where the centre is, but within `view_limits`."""
     z = center[..., 2:]
     place = center[..., :2] / z
-    limit = 1.3 * 0.5 * s.center.new_tensor([s.width, s.height]) / s.focal[:, None]
-    held = torch.minimum(torch.maximum(place, -limit), limit)
+    held = torch.minimum(torch.maximum(place, view_limits(s)[0]), view_limits(s)[1])
     half = (
         (axes[..., :2, :] - held[..., None] * axes[..., 2:, :])
         / z[..., None]

@@ -70,8 +70,8 @@ class Effect:
 
     `measure` returns a figure in `unit`, larger the more the effect is needed, or None where the data do not say; the effect is on from
     `threshold` upwards. `cost` is the time of a training step with the effect by that without: for exact-rays and overlap from README's
-    prices, for the others an estimate. `on` and `off` are the options that it stands for. `needs` returns why a scene or the options rule
-    it out, "" if they do not.
+    prices, for the others as eval/effects.py measures it. `on` and `off` are the options that it stands for. `needs` returns why a scene
+    or the options rule it out, "" if they do not. `on_request` says why evidence alone does not switch it on, "" if it does.
     """
 
     name: str
@@ -85,6 +85,7 @@ class Effect:
     off: dict[str, object]
     usually: bool = False
     needs: Callable[[Data], str] = field(default=lambda data: "")
+    on_request: str = ""
 
     @property
     def options(self) -> set[str]:
@@ -113,6 +114,7 @@ REASONS = {
     "data": "the data say so",
     "free": "it costs nothing",
     "unknown": "the data do not say; the usual setting",
+    "request": "only when asked for",
     "asked": "--effect asks for it",
     "all": "--effects all",
     "option": "the option was given",
@@ -185,6 +187,8 @@ def _decide(effect: Effect, data: Data, settings: dict, choice: Choice) -> Decis
         on, reason = choice.asked[effect.name], "asked"
     elif choice.mode == "all":
         on, reason = True, "all"
+    elif effect.on_request:
+        on, reason, note = False, "request", effect.on_request
     elif value is None:
         on, reason = effect.usually, "unknown"
     elif effect.usually and effect.cost < FREE and value < effect.threshold:
@@ -218,7 +222,13 @@ def settle(
     return replace(scene_options, **of_scene), replace(options, **of_training)
 
 
-def inspect_scene(path, scene_options: SceneOptions, options: TrainOptions, choice: Choice, log=None) -> dict:
+def inspect_scene(
+    path,
+    scene_options: SceneOptions = SceneOptions(),  # noqa: B008 (all three are frozen)
+    options: TrainOptions = TrainOptions(),  # noqa: B008
+    choice: Choice = Choice(),  # noqa: B008
+    log=None,
+) -> dict:
     """Reads a scene and decides: `effects`, a list of decisions as tables, `options` that follow from them, and a `_text` for people.
 
     Raises:
@@ -391,6 +401,8 @@ def _absent(name: str, what: str) -> Callable[[Data], str]:
     return lambda data: "" if _share(data, name) else f"the data set has no {what}"
 
 
+_TRUTH = "the data do not say whether it is there to train by or to score by"
+
 _REGISTRY = (
     Effect(
         "view-dependence", "colour that depends on the direction it is seen from",
@@ -406,11 +418,12 @@ _REGISTRY = (
         "overlap", "densities add up where primitives overlap, in place of blending by centres",
         "change of the image of the start", "% of white", 10.0, 3.3, _overlap_change,
         {"order": "overlap"}, {"order": "center"}, needs=_no_entry,
+        on_request="depth was better for it in every scene tried, so what decides is its price",
     ),
     Effect(
         "filter", "primitives are at least a part of a pixel of their nearest view",
-        "largest by smallest pixel over the views that see a point; a quarter of the points exceed it", "times", 2.5, 1.02, _scale_ratio,
-        {"filter": "3d"}, {"filter": "none"},
+        "largest by smallest pixel over the views that see a point; a quarter of the points exceed it", "times", 2.5, 1.0, _scale_ratio,
+        {"filter": "3d"}, {"filter": "none"}, usually=True,
     ),
     Effect(
         "lens", "photographs are undistorted",
@@ -419,7 +432,7 @@ _REGISTRY = (
     ),
     Effect(
         "exposure", "a gain per channel for every training photograph",
-        "spread of how bright the photographs show the same points", "%", 3.0, 1.03, _gain_spread,
+        "spread of how bright the photographs show the same points", "%", 3.0, 1.1, _gain_spread,
         {"exposure": "gain"}, {"exposure": "none"},
     ),
     Effect(
@@ -434,17 +447,17 @@ _REGISTRY = (
     ),
     Effect(
         "depth", "surfaces lie at the depths that the data set brings",
-        "training views with depth that agrees with the points", "%", 1.0, 1.3, _depth_share,
-        {"sensor_depth": 1.0}, {"sensor_depth": 0.0}, needs=_absent("depth_path", "depth"),
+        "training views with depth that agrees with the points", "%", 1.0, 1.1, _depth_share,
+        {"sensor_depth": 1.0}, {"sensor_depth": 0.0}, needs=_absent("depth_path", "depth"), on_request=_TRUTH,
     ),
     Effect(
         "normals", "faces point as the normals that the data set brings",
-        "training views with normals", "%", 1.0, 1.3, lambda data: _share(data, "normal_path"),
-        {"sensor_normals": 0.1}, {"sensor_normals": 0.0}, needs=_absent("normal_path", "normals whose axes are known"),
+        "training views with normals", "%", 1.0, 1.1, lambda data: _share(data, "normal_path"),
+        {"sensor_normals": 0.1}, {"sensor_normals": 0.0}, needs=_absent("normal_path", "normals whose axes are known"), on_request=_TRUTH,
     ),
     Effect(
         "double", "rendering in float64; parameters and the optimiser stay in float32",
-        "largest coordinate by the smallest primitive", "times", 5e5, 2.5, _extent_ratio,
+        "largest coordinate by the smallest primitive", "times", 5e5, 2.3, _extent_ratio,
         {"scalar": "float64"}, {"scalar": "float32"},
     ),
 )  # fmt: skip

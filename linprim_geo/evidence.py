@@ -32,6 +32,8 @@ _DARKEST, _BRIGHTEST = 0.06, 0.97
 _LEAST_VIEWS, _LEAST_POINTS = 5, 30
 # Residuals beyond this, of 1, are something else in front of the point.
 _SOMETHING_ELSE = 0.25
+# One in so many is left out at either end of what is averaged.
+_EXTREME = 20
 _GAIN_ROUNDS = 15
 # What holds the gain of photographs near 1 that share hardly anything with others, in points.
 _GAIN_PRIOR = 0.1
@@ -61,6 +63,8 @@ class Observations:
         for channel in range(3):
             color = self.color[..., channel]
             usable = self.plain & (color > _DARKEST) & (color < _BRIGHTEST)
+            # Of points that are dark as a rule, those colours alone would be left that something made bright.
+            usable &= (_median(np.where(self.plain, color, np.nan), 1) > 2 * _DARKEST)[:, None]
             usable &= (usable.sum(0) >= _LEAST_POINTS)[None]
             usable &= (usable.sum(1) >= 2)[:, None]
             known = usable.any(0)
@@ -92,7 +96,8 @@ class Observations:
         """By how much of 1 the points' colour changes with the direction that they are seen from, gains removed; None without enough views.
 
         A colour's deviation from the point's median is multiplied by that of a neighbouring point in the same view, some pixels away: noise
-        and texture finer than a pixel have no part that neighbours share, highlights and reflections have. The root of the mean.
+        and texture finer than a pixel have no part that neighbours share, highlights and reflections have. The root of the mean without
+        the largest and the smallest twentieth: few products are of something else in front of both points, but those are large.
         """
         from scipy.spatial import cKDTree
 
@@ -112,8 +117,9 @@ class Observations:
         both = usable & usable[other] & (far_enough.any(1) & (distance[rows, first] < 4 * apart))[:, None]
         if both.sum() < _LEAST_POINTS * _LEAST_VIEWS:
             return None
-        shared = (rest * rest[other]).mean(2)[both]
-        return float(np.sqrt(max(shared.mean(), 0.0)))
+        shared = np.sort((rest * rest[other]).mean(2)[both])
+        trimmed = shared[len(shared) // _EXTREME : len(shared) - len(shared) // _EXTREME]
+        return float(np.sqrt(max(trimmed.mean(), 0.0)))
 
     @property
     def scale_ratio(self) -> float | None:

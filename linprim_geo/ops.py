@@ -270,7 +270,8 @@ def rasterize(
         primitive: "octahedron", "tetrahedron", or "gaussian": 3D Gaussian splatting's, projected, alpha at most 0.99 and nothing below
             1/255, one depth each.
         ray_model: "exact" perspective, or "affine": inside one primitive rays are parallel in the ray space of its centre, nothing is cut
-            at the near plane, and a primitive whose centre is before it is not drawn. Gaussians are always affine.
+            at the near plane, and a primitive whose centre is before it is not drawn. The ray space of a centre farther than 0.15 of the
+            image's size outside of it is that of the nearest place within. Gaussians are always affine.
         order: "center": blended by the depth of their centres; "entry": by each ray's own entry depth; "overlap": absorbing where they are,
             overlaps included, which depends on no order: the integral itself. Gaussians go with "center" only.
         screen_filter: enlarges a polyhedron's box on the screen by half this many pixels on every side and thins it in proportion; to a

@@ -17,7 +17,7 @@ from .reference_blend import blend_in_order, blend_overlapping
 from .reference_blend import mean_depth_fraction as mean_depth_fraction
 from .reference_shapes import FACE_SIGNS as FACE_SIGNS
 from .reference_shapes import clip_to_octahedron as clip_to_octahedron
-from .reference_shapes import gaussian_chords, polyhedron_chords
+from .reference_shapes import gaussian_chords, polyhedron_chords, view_limits
 
 PRIMITIVES, RAY_MODELS = ("octahedron", "tetrahedron", "gaussian"), ("exact", "affine")
 ORDERS = ("center", "entry", "overlap")
@@ -224,9 +224,10 @@ def rasterize(
     rays = pixel_rays(width, height, fx, fy, cx, cy, center)
 
     shape = (center_camera, rotation_camera, extent, density, rays)
+    limits = view_limits((width, height), (fx, fy), (cx, cy))
     if primitive == "gaussian":
         chords = gaussian_chords(
-            *shape, screen_filter=screen_filter, focal=(fx, fy), size=(width, height), near=near
+            *shape, screen_filter=screen_filter, focal=(fx, fy), limits=limits, near=near
         )
     else:
         chords = polyhedron_chords(
@@ -235,6 +236,7 @@ def rasterize(
             ray_model=ray_model,
             screen_filter=screen_filter,
             focal=(fx, fy),
+            limits=limits,
             near=near,
         )
 

@@ -136,6 +136,22 @@ def ray_space_jacobian(center: Tensor) -> Tensor:
     return torch.stack([torch.stack(row) for row in rows])
 
 
+def view_limits(size: tuple[int, int], focal: tuple[float, float], principal: tuple[float, float]) -> Tensor:
+    """Returns (2, 2) the least and the largest x/z, y/z of the image, in px, and 0.15 of its size around it, float64."""
+    width, scale, middle = (torch.tensor(x, dtype=torch.float64) for x in (size, focal, principal))
+    return torch.stack([(-0.15 * width - middle) / scale, (1.15 * width - middle) / scale])
+
+
+def held_in_view(center: Tensor, limits: Tensor) -> Tensor:
+    """Returns where J is taken for `center` (3,): there, but x/z and y/z held within `limits` of `view_limits`.
+
+    Source: Kerbl et al., 3D Gaussian Splatting (2023), 1.3 times half the field of view: farther out J grows without bound.
+    """
+    low, high = limits.to(center)
+    held = torch.minimum(torch.maximum(center[:2] / center[2], low), high) * center[2]
+    return torch.cat([held, center[2:]])
+
+
 def _screen_scale(corners: Tensor, focal: Tensor, screen_filter: float) -> Tensor:
     """Returns (2,) h / (h + screen_filter / 2), h the half width and height in px of `corners` (V, 2), x/z and y/z."""
     half = focal * (corners.amax(0) - corners.amin(0)) / 2
@@ -171,13 +187,14 @@ def polyhedron_chords(
     ray_model: str,
     screen_filter: float,
     focal: tuple[float, float],
+    limits: Tensor,
     near: float,
 ) -> Chords:
     """Returns the chords of all rays in all octahedra or tetrahedra.
 
     exact: x = t v, t >= near, is met where it is. affine: ray-space points are (x/z, y/z, |c|) + J (p - c), so
-    the ray of a pixel is the line p(s) = c + J^-1 ((X, Y, s) - (x/z, y/z, |c|)) and t = s / |v|; there is no
-    near plane, but a primitive with z <= near is left out. screen_filter: the ray is first drawn towards the
+    the ray of a pixel is the line p(s) = c + J^-1 ((X, Y, s) - (x/z, y/z, |c|)) and t = s / |v|, J that of
+    `held_in_view`; there is no near plane, but a primitive with z <= near is left out. screen_filter: the ray is first drawn towards the
     centre, by s_x and s_y, and the density multiplied by s_x s_y; |v| stays.
 
     Args:
@@ -188,6 +205,7 @@ def polyhedron_chords(
         rays: (P, 3), v = (X, Y, 1).
         screen_filter: px, 0 for none. An exact primitive with a vertex at z <= near has none.
         focal: fx, fy in px.
+        limits: of `view_limits`.
 
     Gradient:
         Finite: a face that a ray is parallel to bounds nothing, so no division is by zero.
@@ -200,7 +218,7 @@ def polyhedron_chords(
         if affine and not center[i, 2] > near or not bool((extent[i] > 0).all()):
             continue
         solid = (_octahedron if primitive == "octahedron" else _tetrahedron)(rotation[i], extent[i])
-        jacobian = ray_space_jacobian(center[i]) if affine else None
+        jacobian = ray_space_jacobian(held_in_view(center[i], limits)) if affine else None
         inverse = torch.linalg.inv(jacobian) if affine else None
         sigma, scale = density[i], None
         corners = solid.vertices + center[i]
@@ -244,13 +262,13 @@ def gaussian_chords(
     *,
     screen_filter: float,
     focal: tuple[float, float],
-    size: tuple[int, int],
+    limits: Tensor,
     near: float,
 ) -> Chords:
     """Returns the splats of all rays in all Gaussians as chords of no length, at the depth of the centre.
 
     M = J2 S J2^T + screen_filter I, S = A A^T the covariance in camera axes, J2 the first two rows of
-    `ray_space_jacobian` in px, taken where the centre is but within 1.3 times half the image; alpha = min(0.99,
+    `ray_space_jacobian` in px, taken at `held_in_view`; alpha = min(0.99,
     opacity exp(-1/2 d^T M^-1 d)), d from the projected centre to the pixel, skipped below 1/255; tau = -ln(1 - alpha).
     The normal is the axis of the smallest extent (the first of equal ones), turned towards the camera. Left out:
     z <= near, and det M <= 1e-12 trace(M)^2.
@@ -266,14 +284,16 @@ def gaussian_chords(
     Source: Kerbl et al., 3D Gaussian Splatting (2023).
     """
     pixel_scale = rays.new_tensor(focal).double()
-    limit = 1.3 * 0.5 * rays.new_tensor(size).double() / pixel_scale
     parts = []
     for i in range(len(center)):
         c = center[i].double()
         if not c[2] > near:
             continue
-        held = torch.cat([torch.minimum(torch.maximum(c[:2] / c[2], -limit), limit) * c[2], c[2:]])
-        half = pixel_scale[:, None] * ray_space_jacobian(held)[:2] @ (rotation[i] * extent[i]).double()
+        half = (
+            pixel_scale[:, None]
+            * ray_space_jacobian(held_in_view(c, limits))[:2]
+            @ (rotation[i] * extent[i]).double()
+        )
         # det of half half^T by Cauchy-Binet: the squared area between its rows, without cancellation.
         area = torch.linalg.cross(half[0], half[1])
         xx, xy, yy = (half[0] ** 2).sum(), (half[0] * half[1]).sum(), (half[1] ** 2).sum()

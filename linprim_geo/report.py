@@ -299,7 +299,8 @@ def commands(run: Run, report: Report, reference: str | os.PathLike | None) -> l
     words = ["linprim-geo", "train", str(run.scene_path), "-o", str(run.path)]
     for options in (run.scene_options, run.train_options):
         words += _given(options)
-    lines = [shlex.join(words)]
+    # What the data called for is among the options: nothing is to be decided again.
+    lines = [shlex.join([*words, "--effects", "none"])]
     for shown in report.meshes:
         lines.append(shlex.join(_extraction(run, shown)))
         for scores in shown.scores:

@@ -12,6 +12,7 @@ import pytest
 from linprim_geo import cli
 from linprim_geo.effects import EFFECTS, Choice, Data, decide, inspect_scene, parse_asked, settle
 from linprim_geo.errors import LinprimError
+from linprim_geo.evidence import Observations
 from linprim_geo.lens import Lens, largest_displacement, straightened
 from linprim_geo.options import SceneOptions, TrainOptions
 from linprim_geo.run import Run
@@ -57,10 +58,13 @@ def decisions(scene, choice=None, options=OPTIONS, scene_options=None):
     return {decision.name: decision for decision in found}
 
 
-def test_a_plain_scene_calls_for_what_its_files_bring_alone(scenes):
+def test_a_plain_scene_calls_for_what_is_free_and_for_its_masks(scenes):
     found = decisions(scenes("plain"))
     assert list(found) == list(EFFECTS)
-    assert {name for name, d in found.items() if d.on} == {"exact-rays", "masks", "depth", "normals"}
+    assert {name for name, d in found.items() if d.on} == {"exact-rays", "filter", "masks"}
+    assert {name for name, d in found.items() if d.reason == "request"} == {"overlap", "depth", "normals"}
+    assert found["depth"].value == found["normals"].value == 100
+    assert found["filter"].reason == "free"
     assert found["background"].reason == "impossible" and found["background"].value is None
     assert found["view-dependence"].value < 0.2 and found["exposure"].value < 0.5
     assert 1 < found["filter"].value < 1.6 and found["lens"].value == 0
@@ -69,7 +73,7 @@ def test_a_plain_scene_calls_for_what_its_files_bring_alone(scenes):
 
 @pytest.mark.parametrize(
     ("scene", "name", "least"),
-    [("highlights", "view-dependence", 0.6), ("exposure", "exposure", 10), ("zoom", "filter", 3), ("lens", "lens", 0.4),
+    [("highlights", "view-dependence", 0.45), ("exposure", "exposure", 10), ("zoom", "filter", 3), ("lens", "lens", 0.4),
      ("white", "background", 90)],
 )  # fmt: skip
 def test_each_effect_is_seen_where_it_is(scene, name, least, scenes):
@@ -77,8 +81,40 @@ def test_each_effect_is_seen_where_it_is(scene, name, least, scenes):
     assert found[name].on and found[name].value > least and found[name].reason == "data"
     others = {"view-dependence", "exposure", "filter", "lens", "background", "overlap", "double"} - {name}
     # Where too few points are seen often enough, the usual setting stays: that says nothing about the detector.
-    assert not [other for other in others if found[other].on and found[other].reason != "unknown"]
+    assert not [other for other in others if found[other].on and found[other].reason not in ("unknown", "free")]
     assert {**found[name].options} == dict(EFFECTS[name].on)
+
+
+def looked_at(change) -> Observations:
+    """Points on a plane, 0.5 grey with noise, in 20 views in all of which `change` (P, V) is added."""
+    rng = np.random.default_rng(0)
+    side = np.arange(20.0)
+    xyz = np.stack([*map(np.ravel, np.meshgrid(side, side)), np.zeros(400)], 1)
+    color = 0.5 + 0.01 * rng.normal(size=(400, 20, 3)) + change(xyz)[..., None]
+    everywhere = np.ones((400, 20), bool)
+    return Observations(xyz, everywhere, everywhere, color, np.full((400, 20), 0.12))
+
+
+def test_what_is_in_front_of_few_points_is_no_view_dependence():
+    def post(xyz):
+        """In every view a bar hides a twentieth of the points, another one in each."""
+        return np.where(xyz[:, :1] == np.arange(20), -0.2, 0.0)
+
+    def highlight(xyz):
+        return 0.1 * np.exp(-(((xyz[:, :1] - np.arange(20)) / 3) ** 2))
+
+    assert looked_at(lambda xyz: np.zeros((400, 20))).view_dependence < 0.002
+    assert looked_at(post).view_dependence < 0.004 < looked_at(highlight).view_dependence
+
+
+def test_what_shines_on_dark_points_is_no_exposure():
+    found = looked_at(lambda xyz: np.zeros((400, 20)))
+    rng = np.random.default_rng(1)
+    shine = (rng.random((400, 20)) < 0.15) * (0.05 + 0.1 * rng.random((400, 20)) * np.linspace(0, 1, 20))
+    color = np.concatenate([found.color[..., :2], (0.03 + shine)[..., None]], 2)
+    assert replace(found, color=color).gain_spread < 0.01
+    gains = np.exp(np.linspace(-0.2, 0.2, 20))[:, None]
+    assert replace(found, color=color * gains).gain_spread == pytest.approx(np.log(gains).std(), rel=0.1)
 
 
 def test_exposure_is_as_large_as_it_was_made(scenes):
@@ -93,15 +129,17 @@ def test_points_that_say_nothing_leave_the_usual_setting(scenes):
 
     anywhere = replace(loaded, points=VolumePoints(loaded.points.xyz, loaded.points.rgb))
     found = decisions(anywhere)
-    for name, on in (("view-dependence", True), ("exposure", False), ("filter", False)):
+    for name, on in (("view-dependence", True), ("exposure", False), ("filter", True)):
         assert (found[name].on, found[name].reason, found[name].value) == (on, "unknown", None)
 
 
 def test_depth_in_another_unit_is_not_used(scenes):
     loaded = load_scene(scenes("plain"))
-    assert decisions(loaded)["depth"].value == 100
+    found = decisions(loaded)["depth"]
+    assert (found.value, found.on, found.reason) == (100, False, "request") and "to score by" in found.note
+    assert decisions(loaded, Choice("auto", {"depth": True}))["depth"].options == {"sensor_depth": 1.0}
     wrong = replace(loaded, train=tuple(replace(view, depth_scale=3 * view.depth_scale) for view in loaded.train))
-    assert not decisions(wrong)["depth"].on
+    assert decisions(wrong)["depth"].value == 0
     without = replace(loaded, train=tuple(replace(view, depth_path=None) for view in loaded.train))
     assert decisions(without)["depth"].reason == "impossible"
     half = tuple(replace(view, depth_path=None) if i % 2 else view for i, view in enumerate(loaded.train))
@@ -185,12 +223,12 @@ def test_the_lens_of_synth_is_opencvs(scenes):
 def test_training_decides_records_and_resumes_by_it(scenes, tmp_path, own_points):
     options = replace(OPTIONS, iterations=12, evaluate_every=0, checkpoint_every=6, max_primitives=100)
     given = frozenset({"iterations", "max_primitives"})
-    train(scenes("exposure"), tmp_path / "run", options=options, quiet=True, effects=Choice("auto", {"normals": False}, given))
+    train(scenes("exposure"), tmp_path / "run", options=options, quiet=True, effects=Choice("auto", {"depth": True}, given))
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     recorded = {entry["name"]: entry for entry in config["effects"]}
-    assert recorded["exposure"]["on"] and recorded["exposure"]["value"] > 10 and recorded["normals"]["reason"] == "asked"
+    assert recorded["exposure"]["on"] and recorded["exposure"]["value"] > 10 and recorded["depth"]["reason"] == "asked"
     chosen = Run.open(tmp_path / "run").train_options
-    assert (chosen.exposure, chosen.sh_degree, chosen.sensor_depth, chosen.sensor_normals) == ("gain", 0, 1.0, 0.0)
+    assert (chosen.exposure, chosen.sensor_depth, chosen.sensor_normals, chosen.filter) == ("gain", 1.0, 0.0, "3d")
     again = train(scenes("exposure"), tmp_path / "run", resume=True, quiet=True, effects=Choice("all"))
     assert again["iterations"] == 12 and Run.open(tmp_path / "run").train_options == chosen
     train(scenes("exposure"), tmp_path / "python", options=options, quiet=True)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from octahedra import IMAGES, KERNELS, fields, kernels, random_scene
+from octahedra import IMAGES, KERNELS, camera, fields, kernels, octahedra, random_scene
 
 from linprim_geo import ops, reference
 
@@ -110,3 +111,71 @@ def test_single_precision_is_near_the_twin(rung, isa):
         for seed in range(2):
             leaves, view, options = scene_of(200 + seed, rung, dtype=torch.float32)
             assert_alike(leaves, view, options, False, 1e-4, 2e-3)
+
+
+def beside_the_view(primitive: str, count: int, least: float, size: float):
+    """Primitives before the camera, `least` to 3 times `least` halves of the image from its middle, of `size` times their distance."""
+    rng = np.random.default_rng(1)
+    view = camera(21, 17, 12.0)
+    z = rng.uniform(0.05, 1.5, count)
+    half = np.array([view.width / 2 / view.fx, view.height / 2 / view.fy])
+    slope = rng.uniform(-1, 1, (count, 2)) * least
+    sides = np.arange(count)
+    slope[sides, sides % 2] = rng.uniform(least, 3 * least, count) * rng.choice([-1, 1], count)
+    center = np.concatenate([slope * half, np.ones((count, 1))], 1) * z[:, None]
+    extent = (
+        rng.uniform(0.3, 1.0, (count, 4 if primitive == "tetrahedron" else 3))
+        * size
+        * np.linalg.norm(center, axis=1)[:, None]
+    )
+    parameters = octahedra(
+        center.tolist(),
+        extent.tolist(),
+        (2 / extent.min(1)).tolist(),
+        rotation=rng.normal(size=(count, 4)).tolist(),
+    )
+    return [p.requires_grad_() for p in parameters], view
+
+
+@pytest.mark.parametrize("primitive", ["octahedron", "tetrahedron"])
+def test_affine_rays_keep_beside_the_view_what_is_there(primitive):
+    """The Jacobian of a centre far to the side would stretch its primitive over the whole image."""
+    leaves, view = beside_the_view(primitive, 80, 3.0, 0.3)
+    exact, affine = (
+        ops.rasterize(*[p.detach() for p in leaves], view, primitive=primitive, ray_model=model).opacity
+        for model in ("exact", "affine")
+    )
+    assert exact.mean() < 0.001
+    assert affine.mean() < 0.001
+
+
+@pytest.mark.parametrize("primitive", ["octahedron", "tetrahedron"])
+@pytest.mark.parametrize("order", ["center", "entry", "overlap"])
+@pytest.mark.parametrize("screen_filter", [0.0, 0.7], ids=["plain", "filtered"])
+def test_affine_rays_of_a_centre_outside_of_the_image_equal_the_twin(primitive, order, screen_filter):
+    leaves, view = beside_the_view(primitive, 40, 1.1, 0.8)
+    options = dict(
+        primitive=primitive, ray_model="affine", order=order, stop=0.0, screen_filter=screen_filter
+    )
+    assert ops.rasterize(*[p.detach() for p in leaves], view, **options).opacity.mean() > 0.2
+    assert_alike(leaves, view, options, True, 1e-9, 1e-7)
+
+
+@pytest.mark.parametrize("rung", [rung for rung in RUNGS if rung[1] == "affine"], ids="-".join)
+def test_an_image_cut_out_of_another_shows_the_same(rung):
+    """The part of an image far from the principal point: what is in view there is not drawn as if it were far outside."""
+    primitive, ray_model, order = rung
+    rng = np.random.default_rng(4)
+    whole = camera(61, 13, 40.0)
+    part = replace(whole, width=15, cx=whole.cx - 46)
+    pixels, z = rng.uniform([48, 2], [59, 11], (12, 2)), rng.uniform(1, 3, 12)
+    slope = (pixels - [whole.cx, whole.cy]) / [whole.fx, whole.fy]
+    center = np.concatenate([slope, np.ones((12, 1))], 1) * z[:, None]
+    extent = rng.uniform(0.05, 0.15, (12, 4 if primitive == "tetrahedron" else 3))
+    tensors = octahedra(
+        center.tolist(), extent.tolist(), [0.9] * 12, rotation=rng.normal(size=(12, 4)).tolist()
+    )
+    options = dict(primitive=primitive, ray_model=ray_model, order=order)
+    images = [ops.rasterize(*tensors, view, **options).rgb for view in (whole, part)]
+    assert float((images[1] - tensors[5][:, None, None]).abs().max()) > 0.05
+    assert torch.allclose(images[0][..., 46:], images[1], atol=1e-10)

@@ -89,7 +89,10 @@ def where(body, model, camera, pixels, k, near):
     principal = np.array([camera["cx"], camera["cy"]])
     length = np.linalg.norm(np.c_[(pixels - principal) / focal, np.ones(len(pixels))], axis=1)
     center = tensor(body.center)
-    jacobian = torch.autograd.functional.jacobian(ray_space, center).numpy()
+    size = np.array([camera["width"], camera["height"]])
+    limits = [(share * size - principal) / focal for share in (-0.15, 1.15)]
+    held = np.r_[np.clip(body.center[:2] / body.center[2], *limits), 1] * body.center[2]
+    jacobian = torch.autograd.functional.jacobian(ray_space, tensor(held)).numpy()
     middle, factor = focal * body.center[:2] / body.center[2] + principal, 1.0
     if k > 0 and (model == "affine" or (body.vertices[:, 2] > near).all()):
         corners = (body.vertices - body.center) @ jacobian[:2].T
@@ -349,7 +352,8 @@ def test_overlap_does_not_see_a_cut():
     camera, background = axis_camera(20, 20, 24.0), tensor([0.1, 0.2, 0.3])
     want = rasterize(*whole, background, **camera, primitive="tetrahedron", order="overlap", stop=0.0)
     rays = reference.pixel_rays(20, 20, 24.0, 24.0, 10.0, 10.0, background)
-    options = dict(ray_model="exact", screen_filter=0.0, focal=(24.0, 24.0), near=0.01)
+    limits = reference_shapes.view_limits((20, 20), (24.0, 24.0), (10.0, 10.0))
+    options = dict(ray_model="exact", screen_filter=0.0, focal=(24.0, 24.0), limits=limits, near=0.01)
     parts = [
         reference_shapes.polyhedron_chords(
             x[0], reference.rotation_matrix(x[1]), x[2], x[3], rays, primitive=kind, **options
@@ -676,10 +680,10 @@ def literal_gaussians(parameters, camera, blur=0.0, near=0.01, stop=1e-3, level=
             if z <= near or left < stop:
                 continue
             r = reference.rotation_matrix(tensor(quaternion[n])).numpy()
-            # Beyond 1.3 times half the image, the Jacobian is the one there.
+            # Farther than 0.15 of the image's size from it, the Jacobian is the one there.
             u, v = (
-                np.clip(x / z, *np.array([-0.65, 0.65]) * width / fx),
-                np.clip(y / z, *np.array([-0.65, 0.65]) * height / fy),
+                np.clip(x / z, *(np.array([-0.15, 1.15]) * width - cx) / fx),
+                np.clip(y / z, *(np.array([-0.15, 1.15]) * height - cy) / fy),
             )
             jacobian = np.array([[fx / z, 0, -fx * u / z], [0, fy / z, -fy * v / z]])
             cov = jacobian @ w @ r @ np.diag(extent[n] ** 2) @ r.T @ w.T @ jacobian.T + blur * np.eye(2)

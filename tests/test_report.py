@@ -167,6 +167,7 @@ def test_commands_repeat_the_run(made, meshed):
     run = Run.open(meshed)
     assert cli.from_args(TrainOptions, parsed["train"]) == run.train_options
     assert cli.from_args(SceneOptions, parsed["train"]) == run.scene_options
+    assert parsed["train"].effects == "none"
     assert parsed["train"].run == parsed["report"].run == str(meshed)
     options = cli.from_args(ExtractOptions, parsed["extract-mesh"])
     assert options.level == 0.7 and options.smooth == 2 and options.voxel_size > 0
