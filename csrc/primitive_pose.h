@@ -21,8 +21,11 @@ constexpr double kDepthSlack = 1e-5;
 // The affine approximation at a centre far outside of the image runs away with x/z and y/z: these are held within the image and this part of its
 // size around it, which is 1.3 times half the field of view to either side if the principal point is in the middle.
 constexpr double kViewMargin = 0.15;
+// An image that lies beyond, with its principal point far outside, is held at that.
+constexpr double kLargestSlope = 1e4;
 inline D held_in_view(D slope, int pixels, double principal, double focal) {
-  return clamp(slope, (-kViewMargin * pixels - principal) / focal, ((1 + kViewMargin) * pixels - principal) / focal);
+  const auto limit = [&](double pixel) { return std::clamp((pixel - principal) / focal, -kLargestSlope, kLargestSlope); };
+  return clamp(slope, limit(-kViewMargin * pixels), limit((1 + kViewMargin) * pixels));
 }
 
 // Centre and local axes in camera space.

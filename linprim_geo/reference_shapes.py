@@ -137,9 +137,9 @@ def ray_space_jacobian(center: Tensor) -> Tensor:
 
 
 def view_limits(size: tuple[int, int], focal: tuple[float, float], principal: tuple[float, float]) -> Tensor:
-    """Returns (2, 2) the least and the largest x/z, y/z of the image, in px, and 0.15 of its size around it, float64."""
+    """Returns (2, 2) the least and the largest x/z, y/z of the image, in px, and 0.15 of its size around it, float64, within 1e4."""
     width, scale, middle = (torch.tensor(x, dtype=torch.float64) for x in (size, focal, principal))
-    return torch.stack([(-0.15 * width - middle) / scale, (1.15 * width - middle) / scale])
+    return torch.stack([(-0.15 * width - middle) / scale, (1.15 * width - middle) / scale]).clamp(-1e4, 1e4)
 
 
 def held_in_view(center: Tensor, limits: Tensor) -> Tensor:

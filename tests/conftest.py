@@ -13,6 +13,8 @@ import pytest
 EXTENT, ROTATION, CENTER = (0.9, 0.6, 0.7), (0.8, 0.2, -0.4, 0.4), (3.0, -2.0, 1.0)
 # So dense that half of the light is gone 1e-5 behind the surface.
 DENSITY = 7e4
+# What other tests may have extracted into `tiny_run`, left out of copies.
+MESHES = shutil.ignore_patterns("mesh")
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -57,7 +59,7 @@ def tiny_run(tiny_scene, tiny_options, tmp_path_factory) -> Path:
 @pytest.fixture
 def run_copy(tiny_run, tmp_path) -> Path:
     """A copy of `tiny_run` that a test may damage."""
-    return Path(shutil.copytree(tiny_run, tmp_path / "run"))
+    return Path(shutil.copytree(tiny_run, tmp_path / "run", ignore=MESHES))
 
 
 def octahedron_run(folder: Path, density: float = DENSITY, views: int = 24, size: int = 64) -> Path:

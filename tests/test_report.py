@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from conftest import MESHES
 from PIL import Image
 
 from linprim_geo import cli, svg
@@ -35,7 +36,7 @@ XHTML_VOID = {"meta", "img", "input"}
 @pytest.fixture(scope="module")
 def meshed(tiny_run, tiny_scene, tmp_path_factory) -> Path:
     """A run with a name that HTML has to escape, meshed, and scored against the exact surface."""
-    run = Path(shutil.copytree(tiny_run, tmp_path_factory.mktemp("odd") / """a <b>&'"run"""))
+    run = Path(shutil.copytree(tiny_run, tmp_path_factory.mktemp("odd") / """a <b>&'"run""", ignore=MESHES))
     stats = extract_mesh(run, options=ExtractOptions(level=0.7, smooth=2), quiet=True)
     eval_mesh_files(stats["mesh"], tiny_scene / "reference.ply", run=run, samples=5000)
     return run

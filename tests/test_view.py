@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import MESHES
 
 from linprim_geo import cli, view, view_scene
 from linprim_geo.errors import LinprimError
@@ -31,7 +32,7 @@ from linprim_geo.view_scene import primitive_mesh, select
 
 @pytest.fixture(scope="module")
 def meshed(tiny_run, tmp_path_factory) -> Path:
-    run = Path(shutil.copytree(tiny_run, tmp_path_factory.mktemp("view") / "run"))
+    run = Path(shutil.copytree(tiny_run, tmp_path_factory.mktemp("view") / "run", ignore=MESHES))
     extract_mesh(run, options=ExtractOptions(level=0.7), quiet=True)
     return run
 
@@ -190,7 +191,7 @@ def test_it_follows_a_run(tiny_run, tmp_path):
     try:
         assert viewer.loads == 0 and "waiting for" in viewer._text.content and not viewer.look()
         assert page(viewer.address)
-        shutil.copytree(tiny_run, path)
+        shutil.copytree(tiny_run, path, ignore=MESHES)
         assert viewer.look() and not viewer.look()
         faces = len(shown(viewer, "/primitives").faces)
         run = Run.open(path)
