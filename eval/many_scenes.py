@@ -79,7 +79,7 @@ def rays_of(s: Scenes) -> Tensor:
 
 
 def view_limits(s: Scenes) -> tuple[Tensor, Tensor]:
-    """(B, 1, 2) least and largest x/z, y/z at which an affine approximation is taken: the image and 0.15 of its size around it, within 1e4."""
+    """(B, 1, 2) least and largest x/z, y/z at which an affine approximation is taken: the image and 0.15 of its size around it, in 1e4."""
     size = s.center.new_tensor([s.width, s.height])
     return tuple(((share * size - s.middle) / s.focal)[:, None].clamp(-1e4, 1e4) for share in (-0.15, 1.15))
 
