@@ -16,17 +16,14 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
-from . import __version__
+from . import __version__, commands
 from .errors import LinprimError
 
 EXIT_UNUSABLE, EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_PIPE = 1, 70, 130, 141
 
 SPLITS = ("train", "test", "all")
-# 3DGS's -r -1 leaves images up to this width as they are.
-WIDEST = 1600
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -161,25 +158,6 @@ def add_effects(parser: argparse._ActionsContainer, default: str) -> None:
     parser.add_argument("--effect", action="append", default=[], metavar="NAME=on|off", help=text)
 
 
-def _choice(parsed: argparse.Namespace):
-    """What the command line says about effects."""
-    from .effects import Choice, parse_asked
-    from .options import SceneOptions, TrainOptions
-
-    given = given_options(SceneOptions, parsed) + given_options(TrainOptions, parsed)
-    return Choice(parsed.effects, parse_asked(parsed.effect), frozenset(given))
-
-
-def from_args(options: type, parsed: argparse.Namespace):
-    """The dataclass `options` filled from the arguments that `add_options` has added."""
-    return options(**{name: getattr(parsed, name) for name in given_options(options, parsed)})
-
-
-def given_options(options: type, parsed: argparse.Namespace) -> list[str]:
-    """Names of the fields of `options` that the command line sets."""
-    return [field.name for field in dataclasses.fields(options) if hasattr(parsed, field.name)]
-
-
 def _number_or(word: str) -> Callable[[str], float | str]:
     def parse(text: str) -> float | str:
         return word if text == word else float(text)
@@ -269,7 +247,7 @@ def build_parser() -> argparse.ArgumentParser:
         allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"linprim-geo {__version__}")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
     def add_quiet(sub: argparse.ArgumentParser) -> None:
         sub.add_argument("--quiet", action="store_true", help="no progress")
@@ -277,7 +255,7 @@ def build_parser() -> argparse.ArgumentParser:
     def command(
         name: str, handler: Callable[[argparse.Namespace], dict], text: str
     ) -> argparse.ArgumentParser:
-        sub = commands.add_parser(
+        sub = subparsers.add_parser(
             name,
             parents=[common],
             help=text,
@@ -287,7 +265,7 @@ def build_parser() -> argparse.ArgumentParser:
         sub.set_defaults(handler=handler, command=name)
         return sub
 
-    sub = command("train", _train, "train a scene: posed photographs to primitives")
+    sub = command("train", commands.train, "train a scene: posed photographs to primitives")
     sub.add_argument(
         "scene", nargs="?", metavar="SCENE", help="folder of a capture, of plain photographs, or a video"
     )
@@ -317,20 +295,20 @@ def build_parser() -> argparse.ArgumentParser:
     add_options(sub.add_argument_group("scene"), SceneOptions)
     add_options(sub.add_argument_group("training"), TrainOptions)
 
-    sub = command("inspect", _inspect, "say which effects a scene calls for, by which evidence, and what they cost")
+    sub = command("inspect", commands.inspect, "say which effects a scene calls for, by which evidence, and what they cost")
     sub.add_argument("scene", metavar="SCENE", help="folder of a capture, of plain photographs, or a video")
     add_quiet(sub)
     add_effects(sub.add_argument_group("effects"), "auto")
     add_options(sub.add_argument_group("scene"), SceneOptions)
     add_options(sub.add_argument_group("training"), TrainOptions)
 
-    sub = command("render", _render, "render colour, depth, normals and opacity of a run's views")
+    sub = command("render", commands.render, "render colour, depth, normals and opacity of a run's views")
     sub.add_argument("run", metavar="RUN", help="folder that train has made")
     sub.add_argument("--split", choices=SPLITS, default="test", help="which views (default test)")
     sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/renders)")
     add_quiet(sub)
 
-    sub = command("extract-mesh", _extract_mesh, "extract a triangle mesh from a run")
+    sub = command("extract-mesh", commands.extract_mesh, "extract a triangle mesh from a run")
     sub.add_argument("run", metavar="RUN", help="folder that train has made")
     text = "tsdf: fuse depth maps (default); polyhedra: unite the primitives, cut back to the surface, closed and manifold;"
     text += " opacity-field: where light stops reaching the cameras, closed and without a grid"
@@ -344,7 +322,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_options(sub.add_argument_group("extraction"), ExtractOptions)
 
     sub = command(
-        "eval-depth", _eval_depth, "score a run's depth and normals against a mesh or the data set's depth"
+        "eval-depth", commands.eval_depth, "score a run's depth and normals against a mesh or the data set's depth"
     )
     sub.add_argument("run", metavar="RUN", help="folder that train has made")
     sub.add_argument(
@@ -355,13 +333,13 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--depth", choices=("overlap", "median", "expected", "first"), default="overlap", help=depth)
     sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/eval/depth)")
 
-    sub = command("eval-images", _eval_images, "score a run's colours: PSNR and SSIM on held-out views")
+    sub = command("eval-images", commands.eval_images, "score a run's colours: PSNR and SSIM on held-out views")
     sub.add_argument("run", metavar="RUN", help="folder that train has made")
     sub.add_argument("--split", choices=SPLITS, default="test", help="which views (default test)")
     sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/eval/images)")
 
     sub = command(
-        "eval-mesh", _eval_mesh, "score a mesh against a reference mesh: Chamfer distance and the rest"
+        "eval-mesh", commands.eval_mesh, "score a mesh against a reference mesh: Chamfer distance and the rest"
     )
     sub.add_argument("mesh", metavar="MESH", help="mesh to score")
     sub.add_argument(
@@ -389,13 +367,13 @@ def build_parser() -> argparse.ArgumentParser:
     tnt.add_argument("--crop", metavar="FILE", help="crop volume, .json")
     tnt.add_argument("--transform", metavar="FILE", help="4x4 matrix as text, takes MESH to REFERENCE")
 
-    sub = command("report", _report, "write one self-contained HTML page about a run")
+    sub = command("report", commands.report, "write one self-contained HTML page about a run")
     sub.add_argument("run", metavar="RUN", help="folder that train has made")
     sub.add_argument("-o", "--output", metavar="FILE", help="page to write (default RUN/report.html)")
     text = "mesh in the data set's frame to score depth and meshes against (default: what RUN/eval holds, and the data set's depth)"
     sub.add_argument("--reference", metavar="MESH", help=text)
 
-    sub = command("view", _view, "show a run in a browser: primitives, meshes, cameras")
+    sub = command("view", commands.view, "show a run in a browser: primitives, meshes, cameras")
     sub.add_argument("run", metavar="RUN", help="folder that train has made")
     sub.add_argument("--follow", action="store_true", help="wait for a run's first save, and show every save and mesh as it comes")
     sub.add_argument("--reference", metavar="MESH", help="mesh in the data set's frame, for the true error of meshes")
@@ -403,7 +381,7 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--port", type=_whole, default=8080, metavar="N", help=text)
     sub.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
 
-    sub = command("tradeoff", _tradeoff, "sweep every knob that trades time for accuracy: tables, plots, and a sentence for each")
+    sub = command("tradeoff", commands.tradeoff, "sweep every knob that trades time for accuracy: tables, plots, and a sentence for each")
     sub.add_argument("scene", metavar="SCENE", help="folder of a capture, of plain photographs, or a video")
     sub.add_argument("-o", "--output", metavar="DIR", help="folder to make, or to go on with (default runs/SCENE_tradeoff)")
     text = "knobs to sweep; a wrong name lists them (default all)"
@@ -418,7 +396,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_quiet(sub)
 
     sub = command(
-        "synth", _synth, "render posed images, depth, normals and points of a mesh or a built-in scene"
+        "synth", commands.synth, "render posed images, depth, normals and points of a mesh or a built-in scene"
     )
     sub.add_argument("output", metavar="OUT", help="folder to make")
     shape = sub.add_mutually_exclusive_group()
@@ -459,7 +437,7 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--overwrite", action="store_true", help="replace OUT if synth has made it")
 
     sub = command(
-        "convert", _convert, "convert primitives (npz, LinPrim's and 3DGS's ply) and meshes (ply, obj, glb, stl)"
+        "convert", commands.convert, "convert primitives (npz, LinPrim's and 3DGS's ply) and meshes (ply, obj, glb, stl)"
     )
     sub.add_argument("source", metavar="IN", help="run folder, .npz, .ply, .obj, .glb or .stl")
     sub.add_argument("target", metavar="OUT", help="file to write; its suffix says the format")
@@ -469,10 +447,10 @@ def build_parser() -> argparse.ArgumentParser:
     )  # fmt: skip
 
     sub = command(
-        "doctor", _doctor, "check versions, libraries, cores and memory; exit 1 if something is missing"
+        "doctor", commands.doctor, "check versions, libraries, cores and memory; exit 1 if something is missing"
     )
 
-    sub = command("demo", _demo, "synthesize, train, extract and score a built-in scene")
+    sub = command("demo", commands.demo, "synthesize, train, extract and score a built-in scene")
     sub.add_argument(
         "-o", "--output", default="runs/demo", metavar="RUN", help="folder to make (default runs/demo)"
     )
@@ -481,207 +459,6 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add_quiet(sub)
 
-    sub = command("completion", _completion, "print a script that completes this command line in a shell")
+    sub = command("completion", commands.completion, "print a script that completes this command line in a shell")
     sub.add_argument("shell", choices=("bash", "zsh", "fish"))
     return parser
-
-
-def _train(parsed: argparse.Namespace) -> dict:
-    budget = _budget(parsed)
-    from .options import SceneOptions, TrainOptions
-
-    scene = parsed.scene or parsed.source
-    if scene is None or (parsed.scene and parsed.source):
-        raise LinprimError("train wants one scene: its folder, or -s and its folder")
-    if parsed.resolution is not None:
-        if getattr(parsed, "downscale", 1) != 1:
-            raise LinprimError(f"-r {parsed.resolution} stands beside --downscale {parsed.downscale}, wanted one of them")
-        parsed.downscale = _downscale_of(parsed.resolution, scene, parsed)
-    run = parsed.run or Path("runs") / Path(scene).resolve().name
-    options = from_args(SceneOptions, parsed), from_args(TrainOptions, parsed)
-    if parsed.dry_run:
-        from .dry_run import dry_run
-
-        if parsed.resume:
-            raise LinprimError("--dry-run says what a new training would take: wanted without --resume")
-        return dry_run(scene, run, *options, quiet=parsed.quiet, effects=_choice(parsed), **budget)
-    from .train import train
-
-    shown = contextlib.nullcontext()
-    if parsed.view:
-        from .view import watched
-
-        shown = watched(run)
-    with shown:
-        return train(
-            scene,
-            run,
-            *options,
-            resume=parsed.resume,
-            quiet=parsed.quiet,
-            effects=_choice(parsed),
-            **budget,
-        )
-
-
-def _budget(parsed: argparse.Namespace) -> dict:
-    """`time_budget` from --time-budget as a keyword, counted from now, before large libraries are loaded; nothing without it."""
-    if parsed.time_budget is None:
-        return {}
-    from .time_budget import Budget
-
-    return {"time_budget": Budget(parsed.time_budget)}
-
-
-def _inspect(parsed: argparse.Namespace) -> dict:
-    from .effects import inspect_scene
-    from .options import SceneOptions, TrainOptions
-
-    options = from_args(SceneOptions, parsed), from_args(TrainOptions, parsed)
-    return inspect_scene(parsed.scene, *options, _choice(parsed), _log(parsed))
-
-
-def _log(parsed: argparse.Namespace) -> Callable[[str], None]:
-    """What prints a line of progress, or nothing with --quiet."""
-    return (lambda text: None) if parsed.quiet else (lambda text: print(text, file=sys.stderr))
-
-
-def _downscale_of(resolution: int, scene: str, parsed: argparse.Namespace) -> int:
-    """3DGS's -r as --downscale. Where it names a width, the least whole divisor that does not exceed it: pixels are averaged."""
-    if resolution in (1, 2, 4, 8):
-        return resolution
-    width = WIDEST if resolution == -1 else resolution
-    if width < 1:
-        raise LinprimError(f"-r is {resolution}, wanted 1, 2, 4, 8, a width in pixels, or -1")
-    from .scene import load_scene
-    from .structure_from_motion import prepare
-
-    given = {name: getattr(parsed, name) for name in ("masks", "images", "sparse", "frames") if hasattr(parsed, name)}
-    taken = {name: given[name] for name in ("sparse", "frames") if name in given}
-    prepare(Path(scene), **taken, threads=getattr(parsed, "threads", 0), log=_log(parsed))
-    views = load_scene(scene, **given).train
-    return -(-max(view.camera.width for view in views) // width)
-
-
-def _render(parsed: argparse.Namespace) -> dict:
-    from .render import render_run
-
-    return render_run(parsed.run, split=parsed.split, output=parsed.output, quiet=parsed.quiet)
-
-
-def _extract_mesh(parsed: argparse.Namespace) -> dict:
-    budget = _budget(parsed)
-    from .extract import extract_mesh
-    from .options import ExtractOptions
-
-    options = from_args(ExtractOptions, parsed)
-    where = {"method": parsed.method, "output": parsed.output, "quiet": parsed.quiet}
-    return extract_mesh(parsed.run, options=options, **where, **budget)
-
-
-def _eval_depth(parsed: argparse.Namespace) -> dict:
-    from .eval.depth import eval_depth_run
-
-    depth = f"depth_{parsed.depth}"
-    return eval_depth_run(parsed.run, parsed.reference, split=parsed.split, depth=depth, output=parsed.output)
-
-
-def _eval_images(parsed: argparse.Namespace) -> dict:
-    from .eval.images import eval_images_run
-
-    return eval_images_run(parsed.run, split=parsed.split, output=parsed.output)
-
-
-def _eval_mesh(parsed: argparse.Namespace) -> dict:
-    from .eval.mesh import eval_mesh_files
-
-    chosen = {k: v for k, v in vars(parsed).items() if k not in ("handler", "command", "json", "debug")}
-    return eval_mesh_files(chosen.pop("mesh"), chosen.pop("reference"), **chosen)
-
-
-def _report(parsed: argparse.Namespace) -> dict:
-    from .report import report_run
-
-    made = report_run(parsed.run, parsed.output, parsed.reference)
-    return made | {"_text": "\n".join([f"{made['report']}: {made['bytes'] / 2**20:.1f} MiB", *made["missing"]])}
-
-
-def _view(parsed: argparse.Namespace) -> dict:
-    from .view import view_run
-
-    return view_run(parsed.run, parsed.port, browser=parsed.browser, follow=parsed.follow, reference=parsed.reference)
-
-
-def _tradeoff(parsed: argparse.Namespace) -> dict:
-    from .eval.tradeoff import tradeoff
-
-    output = Path(parsed.output or Path("runs") / f"{Path(parsed.scene).resolve().name}_tradeoff")
-    results = tradeoff(
-        parsed.scene,
-        output,
-        knobs=parsed.knobs,
-        run=parsed.run,
-        reference=parsed.reference,
-        quick=parsed.quick,
-        rounds=parsed.rounds,
-        threads=parsed.threads,
-        quiet=parsed.quiet,
-    )
-    files = [str(output / f"tradeoff.{suffix}") for suffix in ("html", "csv", "json")]
-    return results | {"files": files, "_text": "\n".join([*results["sentences"].values(), "", results["rule"], "", *files])}
-
-
-def _synth(parsed: argparse.Namespace) -> dict:
-    from .synth import synthesize
-
-    # What is not said is left to `synthesize`, which knows what suits the scene.
-    chosen = {"shape": parsed.scene, "mesh": parsed.mesh, "path": parsed.path, "fov": parsed.fov}
-    chosen |= {"distance": parsed.distance, "background": parsed.background}
-    return synthesize(
-        parsed.output,
-        views=parsed.views,
-        test_views=parsed.test_views,
-        size=parsed.size,
-        shading=parsed.shading,
-        points=parsed.points,
-        point_noise=parsed.point_noise,
-        supersample=parsed.supersample,
-        depth_format=parsed.depth_format,
-        principal_point_offset=parsed.principal_point_offset,
-        detail=parsed.detail,
-        exposure_drift=parsed.exposure_drift,
-        distortion=parsed.distortion,
-        specular=parsed.specular,
-        zoom=parsed.zoom,
-        seed=parsed.seed,
-        threads=parsed.threads,
-        overwrite=parsed.overwrite,
-        **{name: value for name, value in chosen.items() if value is not None},
-    )
-
-
-def _convert(parsed: argparse.Namespace) -> dict:
-    from .convert import convert, describe
-
-    report = convert(parsed.source, parsed.target, parsed.write_as)
-    return report | {"_text": describe(report)}
-
-
-def _doctor(parsed: argparse.Namespace) -> dict:
-    from .doctor import describe, doctor
-
-    report = doctor()
-    return report | {"_text": describe(report), "_status": EXIT_UNUSABLE if report["problems"] else 0}
-
-
-def _demo(parsed: argparse.Namespace) -> dict:
-    from .demo import run_demo
-
-    return run_demo(parsed.output, parsed.size, quiet=parsed.quiet)
-
-
-def _completion(parsed: argparse.Namespace) -> dict:
-    from .completion import completion
-
-    made = completion(build_parser(), parsed.shell)
-    return made | {"_text": made["script"]}

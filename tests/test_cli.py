@@ -17,7 +17,7 @@ import types
 
 import pytest
 
-from linprim_geo import cli, doctor, progress, system
+from linprim_geo import cli, commands, doctor, progress, system
 from linprim_geo.errors import LinprimError
 from linprim_geo.options import ExtractOptions, SceneOptions, TrainOptions, option
 
@@ -117,9 +117,9 @@ def test_options_become_the_dataclass_they_come_from():
     parser = cli.argparse.ArgumentParser()
     cli.add_options(parser, Options)
     assert "100%" in parser.format_help() and "COUNT" in parser.format_help()
-    assert cli.from_args(Options, parser.parse_args([])) == Options()
+    assert commands.from_args(Options, parser.parse_args([])) == Options()
     given = parser.parse_args("--step-size 2 --kind b --count 9 --fast".split())
-    assert cli.from_args(Options, given) == Options(2.0, "b", 9, True)
+    assert commands.from_args(Options, given) == Options(2.0, "b", 9, True)
     for wrong in ("--kind c", "--count 1.5", "--step-size x"):
         with pytest.raises(SystemExit) as leaving:
             parser.parse_args(wrong.split())
