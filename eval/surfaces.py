@@ -97,6 +97,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--data", nargs="*", type=Path, default=[], metavar="CAPTURE", help="folders of further captures")
     parser.add_argument("--references", nargs="*", type=Path, default=[], metavar="MESH", help="their surfaces, in the same order")
     parser.add_argument("--primitives", nargs="+", choices=list(METHODS), default=list(METHODS), help="default: all")
+    parser.add_argument("--methods", nargs="+", choices=METHODS["octahedron"], default=METHODS["octahedron"], help="default: all")
     parser.add_argument("--refine", type=int, default=ExtractOptions.refine, help="rounds, see extract-mesh (default: %(default)s)")
     parser.add_argument("--size", type=int, default=320, help="pixels of the built-in scenes (default: %(default)s)")
     parser.add_argument("--iterations", type=int, default=7000, help="default: %(default)s")
@@ -140,7 +141,7 @@ def run(given: argparse.Namespace) -> None:
             )
             trained = given.output / f"{name}_{primitive}"
             train(capture, trained, scene_options, options, resume=trained.exists(), quiet=True)
-            for method in METHODS[primitive]:
+            for method in [m for m in METHODS[primitive] if m in given.methods]:
                 target = given.output / "meshes" / f"{name}_{primitive}_{method}_{given.refine}.ply"
                 saved = target.with_suffix(".json")
                 if not saved.exists():
