@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from . import ops
+from .adam import adam_rows
 
 # Adam's step in the logarithm of a gain at the start of a run, and the part of it at the end.
 RATE, RATE_END = 1e-2, 0.05
@@ -41,7 +41,7 @@ class Exposure:
         touched = torch.zeros(len(self.steps), dtype=torch.bool)
         touched[index] = True
         tables = ([self.log_gain], [gradients], [self.first], [self.second])
-        ops.adam_rows(*tables, [RATE * RATE_END**part], self.steps, touched)
+        adam_rows(*tables, [RATE * RATE_END**part], self.steps, touched)
         self.log_gain -= self.log_gain.mean(0)
 
     @property

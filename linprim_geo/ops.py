@@ -1,15 +1,13 @@
-"""The compiled core under torch: the only module that imports it.
+"""The rasterizer and the loss of the compiled core as torch operators.
 
 `rasterize` and `photometric_loss` are differentiable custom operators (`torch.ops.linprim_geo.*`) with fake
-implementations for tracing; `adam_step`, the thread pool and the choice of instruction set are plain functions.
+implementations for tracing; the thread pool and the choice of instruction set are plain functions.
 Arrays cross as `tensor.detach().numpy()`: no copy where a tensor is contiguous.
 """
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -41,11 +39,11 @@ _PLANES = (
 _CHANNELS = (3, 0, 0, 0, 0, 0, 3, 3, 4)
 
 
-def _array(tensor: Tensor):
+def as_array(tensor: Tensor):
     return tensor.detach().contiguous().resolve_neg().numpy()
 
 
-def _suffix(dtype: torch.dtype) -> str:
+def scalar_suffix(dtype: torch.dtype) -> str:
     if dtype == torch.float32:
         return "f32"
     if dtype == torch.float64:
@@ -58,16 +56,16 @@ def _planes(like: Tensor, width: int, height: int, geometry: bool) -> list[Tenso
     return [like.new_empty(shape if i < 2 or geometry else (0,)) for i, shape in enumerate(shapes)]
 
 
-def _check_dtypes(wanted: torch.dtype, **tensors: Tensor) -> None:
+def check_dtypes(wanted: torch.dtype, **tensors: Tensor) -> None:
     for name, tensor in tensors.items():
         if tensor.dtype != wanted:
             raise ValueError(f"{name} is {tensor.dtype}, wanted {wanted}")
 
 
-def _check_finite(suffix: str, **tensors: Tensor) -> None:
+def check_finite(suffix: str, **tensors: Tensor) -> None:
     check = getattr(_core, f"first_non_finite_{suffix}")
     for name, tensor in tensors.items():
-        at = check(_array(tensor))
+        at = check(as_array(tensor))
         if at >= 0:
             row = at // max(1, tensor[0].numel()) if tensor.dim() else 0
             raise LinprimError(
@@ -87,8 +85,8 @@ def _core_arguments(tensors: list[Tensor], pose: Tensor, numbers: list[float], c
     width, height, kind, rays, order, geometry = choices
     return [
         kind,
-        *[_array(t) for t in tensors],
-        _array(pose[:3].double()),
+        *[as_array(t) for t in tensors],
+        as_array(pose[:3].double()),
         (fx, fy, cx, cy),
         width,
         height,
@@ -113,10 +111,10 @@ def _rasterize(
     numbers: list[float],
     choices: list[int],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    suffix = _suffix(center.dtype)
+    suffix = scalar_suffix(center.dtype)
     given = dict(center=center, rotation=rotation, extent=extent, density=density, background=background)
-    _check_dtypes(center.dtype, sh=sh, **given)
-    _check_finite(suffix, **given)
+    check_dtypes(center.dtype, sh=sh, **given)
+    check_finite(suffix, **given)
     planes, color, max_weight, pixels = _outputs(center, choices)
     getattr(_core, f"rasterize_{suffix}")(
         *_core_arguments(
@@ -127,7 +125,7 @@ def _rasterize(
         max_weight.numpy(),
         pixels.numpy(),
     )
-    _check_finite(suffix, sh=color)
+    check_finite(suffix, sh=color)
     return (*planes, color, max_weight, pixels)
 
 
@@ -166,11 +164,11 @@ def _rasterize_grad(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     inputs = [center, rotation, extent, density, sh, background]
     out = _gradients(inputs)
-    getattr(_core, f"rasterize_grad_{_suffix(center.dtype)}")(
+    getattr(_core, f"rasterize_grad_{scalar_suffix(center.dtype)}")(
         *_core_arguments(inputs, world_to_camera, numbers, choices),
-        [_array(p) if p.numel() else None for p in planes],
-        _array(color),
-        [None if g is None or not g.numel() else _array(g) for g in grads],
+        [as_array(p) if p.numel() else None for p in planes],
+        as_array(color),
+        [None if g is None or not g.numel() else as_array(g) for g in grads],
         *[t.numpy() for t in out],
     )
     return tuple(out)
@@ -364,8 +362,8 @@ def has_kernels(primitive: str, ray_model: str, order: str) -> bool:
 def _average(image: Tensor, factor: int) -> Tensor:
     height, width = image.shape[-2] // factor, image.shape[-1] // factor
     coarse = image.new_empty((*image.shape[:-2], height, width))
-    getattr(_core, f"average_pixels_{_suffix(image.dtype)}")(
-        _array(image), height, width, factor, coarse.numpy()
+    getattr(_core, f"average_pixels_{scalar_suffix(image.dtype)}")(
+        as_array(image), height, width, factor, coarse.numpy()
     )
     return coarse
 
@@ -379,8 +377,8 @@ def _(image, factor):
 def _average_grad(grad: Tensor, factor: int) -> Tensor:
     height, width = grad.shape[-2:]
     fine = grad.new_empty((*grad.shape[:-2], height * factor, width * factor))
-    getattr(_core, f"average_pixels_grad_{_suffix(grad.dtype)}")(
-        _array(grad), height, width, factor, fine.numpy()
+    getattr(_core, f"average_pixels_grad_{scalar_suffix(grad.dtype)}")(
+        as_array(grad), height, width, factor, fine.numpy()
     )
     return fine
 
@@ -424,9 +422,9 @@ def level_depth(
 
     Accuracy: float64 to 1e-13, float32 to 1e-6, of the depth.
     """
-    suffix = _suffix(center.dtype)
-    _check_dtypes(center.dtype, rotation=rotation, extent=extent, density=density, sh=sh)
-    _check_finite(suffix, center=center, rotation=rotation, extent=extent, density=density)
+    suffix = scalar_suffix(center.dtype)
+    check_dtypes(center.dtype, rotation=rotation, extent=extent, density=density, sh=sh)
+    check_finite(suffix, center=center, rotation=rotation, extent=extent, density=density)
     if not 0 < level < 1:
         raise ValueError(f"level is {level}, wanted a transmittance between 0 and 1")
     depth = center.new_empty((camera.height, camera.width), requires_grad=False)
@@ -435,11 +433,11 @@ def level_depth(
         raise ValueError("a Gaussian has no entry and no exit, so no depth at a level")
     getattr(_core, f"level_depth_{suffix}")(
         KINDS.index(primitive),
-        _array(center),
-        _array(rotation),
-        _array(extent),
-        _array(density),
-        _array(sh),
+        as_array(center),
+        as_array(rotation),
+        as_array(extent),
+        as_array(density),
+        as_array(sh),
         camera.world_to_camera[:3].astype(float).copy(),
         (camera.fx, camera.fy, camera.cx, camera.cy),
         camera.width,
@@ -453,72 +451,12 @@ def level_depth(
     return depth, opacity
 
 
-class SolidTree:
-    """Polyhedra in a hierarchy of boxes, for the optical depth of many straight segments: closed form, overlaps included.
-
-    Args:
-        center, rotation, extent, density, primitive: as for `rasterize`, of octahedra or tetrahedra. Copied.
-
-    Raises:
-        LinprimError: a non-finite input, naming tensor and row, or a dtype other than float32, float64.
-        ValueError: shapes or dtypes that do not fit, or Gaussians, which have no inside.
-    """
-
-    def __init__(
-        self,
-        center: Tensor,
-        rotation: Tensor,
-        extent: Tensor,
-        density: Tensor,
-        *,
-        primitive: str = "octahedron",
-    ):
-        if primitive not in KINDS:
-            raise ValueError(f"primitive is {primitive!r}, wanted octahedron or tetrahedron")
-        given = dict(center=center, rotation=rotation, extent=extent, density=density)
-        suffix = _suffix(center.dtype)
-        _check_dtypes(center.dtype, **given)
-        _check_finite(suffix, **given)
-        self._tree = _core.SolidTree(KINDS.index(primitive), *[_array(tensor) for tensor in given.values()])
-
-    def __len__(self) -> int:
-        """Number of primitives that absorb at all."""
-        return len(self._tree)
-
-    def optical_depth(
-        self, origin: Tensor, ends: Tensor, *, begin: Tensor | None = None, most: float = math.inf
-    ) -> Tensor:
-        """(P,) float64 optical depths min(most, sum_i density_i length_i), length_i that of the part of a segment inside primitive i.
-
-        The transmittance of a segment is exp of minus that. No camera, no near plane, no order; no gradients.
-
-        Args:
-            origin: (3,) float64, the point that all segments start from.
-            ends: (P, 3) float64. Where neighbours lie near each other this is many times faster.
-            begin: (P,) float64 share of the way at which a segment begins, to leave out what is before a near plane; default 0.
-            most: optical depth above which none is needed: walks end there.
-
-        Raises:
-            LinprimError: a non-finite input.
-            ValueError: shapes or dtypes that do not fit, or `most` not positive.
-
-        Accuracy: each length to 1e-14 of the distance from the origin to the primitive, times 1 / sin of the angle between the segment and
-            the nearest to parallel of the faces it meets. Bitwise the same at any number of threads and for any other ends.
-        """
-        _check_dtypes(torch.float64, origin=origin, ends=ends, **({} if begin is None else {"begin": begin}))
-        _check_finite("f64", origin=origin, ends=ends, **({} if begin is None else {"begin": begin}))
-        depth = torch.empty(ends.shape[:1], dtype=torch.float64)
-        start = None if begin is None else _array(begin)
-        self._tree.optical_depth(_array(origin), _array(ends), start, float(most), depth.numpy())
-        return depth
-
-
 @torch.library.custom_op("linprim_geo::photometric_loss", mutates_args=())
 def _photometric(image: Tensor, target: Tensor, dssim: float, weight: Tensor | None) -> tuple[Tensor, Tensor]:
-    _check_dtypes(torch.float32, image=image, target=target, **({} if weight is None else {"weight": weight}))
+    check_dtypes(torch.float32, image=image, target=target, **({} if weight is None else {"weight": weight}))
     gradient = torch.empty_like(image, memory_format=torch.contiguous_format)
     parts = _core.photometric_loss(
-        _array(image), _array(target), None if weight is None else _array(weight), dssim, gradient.numpy()
+        as_array(image), as_array(target), None if weight is None else as_array(weight), dssim, gradient.numpy()
     )
     return torch.tensor(parts, dtype=torch.float64), gradient
 
@@ -558,98 +496,6 @@ def photometric_loss(
         variances as differences of float32 moments, so on bright images without any contrast 1e-5 and 5e-4.
     """
     return torch.ops.linprim_geo.photometric_loss(image, target, dssim, weight)[0]
-
-
-def adam_step(
-    value: Tensor,
-    gradient: Tensor,
-    first: Tensor,
-    second: Tensor,
-    rate: float,
-    step: int,
-    beta1: float = 0.9,
-    beta2: float = 0.999,
-    epsilon: float = 1e-15,
-) -> None:
-    """One Adam step with bias correction on float32 tensors, in place; `step` counts from 1.
-
-    Source: Kingma and Ba, ICLR 2015, algorithm 1.
-    """
-    _check_dtypes(torch.float32, value=value, gradient=gradient, first=first, second=second)
-    if not (value.is_contiguous() and first.is_contiguous() and second.is_contiguous()):
-        raise ValueError("value, first and second are changed in place and have to be contiguous")
-    _core.adam_step(
-        value.detach().numpy(),
-        _array(gradient),
-        first.numpy(),
-        second.numpy(),
-        rate,
-        beta1,
-        beta2,
-        epsilon,
-        step,
-    )
-
-
-def adam_rows(
-    values: Sequence[Tensor],
-    gradients: Sequence[Tensor],
-    firsts: Sequence[Tensor],
-    seconds: Sequence[Tensor],
-    rates: Sequence[float],
-    steps: Tensor,
-    touched: Tensor | None = None,
-    beta1: float = 0.9,
-    beta2: float = 0.999,
-    epsilon: float = 1e-15,
-) -> None:
-    """One sparse Adam step on the touched rows of several float32 tensors, in place and in one sweep.
-
-    A touched row's count of steps t goes up by one and its moments are corrected by 1 - beta^t: every row goes through exactly the
-    Adam of the steps that touched it, however rare they are. Of the other rows nothing changes, neither value, moments nor
-    count, where `adam_step` would let them glide on by their first moment and shrink both. With all rows touched in every step
-    the two are the same.
-
-    Args:
-        values, gradients, firsts, seconds: as many tensors each, with N rows of any shape; the gradients of untouched rows do not count.
-        rates: learning rate of each tensor.
-        steps: (N,) int32, 0 for a row without a history. To forget a row's history, set it and both moments to 0.
-        touched: (N,) bool; None: the rows where any of the tensors has a gradient that is not 0, which costs reading the gradients of the
-            others as well. After `rasterize`, `screen_grad[:, 2] > 0` is a row's being seen, as long as only the image gives gradients.
-
-    Raises:
-        ValueError: shapes, dtypes or layouts that do not fit.
-
-    Source: Kingma and Ba, ICLR 2015, algorithm 1, by row. (The sparse Adam of 3DGS's later code freezes unseen rows alike, but corrects by
-        the global step, which takes a row seen rarely for one that has had zero gradients, and its first steps are too small or large.)
-    """
-    for name, tensors in (("value", values), ("gradient", gradients), ("first", firsts), ("second", seconds)):
-        for tensor in tensors:
-            _check_dtypes(torch.float32, **{name: tensor})
-            if tensor.shape[:1] != steps.shape:
-                raise ValueError(
-                    f"{name} has {tuple(tensor.shape[:1])} rows, steps has shape {tuple(steps.shape)}"
-                )
-            if name != "gradient" and not tensor.is_contiguous():
-                raise ValueError(f"{name} is changed in place and has to be contiguous")
-    _check_dtypes(torch.int32, steps=steps)
-    if not steps.is_contiguous():
-        raise ValueError("steps is changed in place and has to be contiguous")
-    if touched is not None:
-        _check_dtypes(torch.bool, touched=touched)
-        touched = touched.contiguous().view(torch.uint8)
-    _core.adam_rows(
-        [t.detach().numpy() for t in values],
-        [_array(t) for t in gradients],
-        [t.numpy() for t in firsts],
-        [t.numpy() for t in seconds],
-        list(rates),
-        steps.numpy(),
-        None if touched is None else touched.numpy(),
-        beta1,
-        beta2,
-        epsilon,
-    )
 
 
 def set_threads(count: int) -> None:

@@ -157,10 +157,10 @@ class OpacityField:
     def __init__(self, primitives: Primitives, cameras: Sequence[Camera]):
         import torch
 
-        from . import ops
+        from .solid_tree import SolidTree
 
         arrays = (primitives.center, primitives.rotation, primitives.extent, primitives.density)
-        self._tree = ops.SolidTree(*map(torch.from_numpy, arrays), primitive=primitives.kind)
+        self._tree = SolidTree(*map(torch.from_numpy, arrays), primitive=primitives.kind)
         self._cameras = cameras
 
     def transmittance(self, points: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from . import ops
+from .adam import adam_rows, adam_step
 from .camera import Camera
 from .errors import LinprimError
 from .exposure import Exposure, exposed
@@ -316,7 +317,7 @@ class Trainer:
         if self.options.adam == "sparse":
             rows = [name for name in names if name != "background"]
             tables = (self.parameters, grads, self.first, self.second)
-            ops.adam_rows(
+            adam_rows(
                 *([table[name] for name in rows] for table in tables),
                 [rates[name] for name in rows],
                 self.steps,
@@ -324,7 +325,7 @@ class Trainer:
             )
             names = [name for name in names if name == "background"]
         for name in names:
-            ops.adam_step(
+            adam_step(
                 self.parameters[name],
                 grads[name],
                 self.first[name],

@@ -8,6 +8,7 @@ import torch
 from octahedra import KERNELS, assert_identical, kernels
 
 from linprim_geo import ops
+from linprim_geo.adam import adam_rows, adam_step
 from linprim_geo.errors import LinprimError
 
 EPS = torch.finfo(torch.float32).eps
@@ -37,7 +38,7 @@ class State:
         self.steps = torch.zeros(n, dtype=torch.int32)
 
     def advance(self, gradients, touched=None, **options):
-        ops.adam_rows(self.values, gradients, self.firsts, self.seconds, RATES, self.steps, touched, **options)
+        adam_rows(self.values, gradients, self.firsts, self.seconds, RATES, self.steps, touched, **options)
 
     def everything(self):
         return [*self.values, *self.firsts, *self.seconds, self.steps]
@@ -93,7 +94,7 @@ def test_with_every_row_touched_it_is_the_dense_step(isa):
             gradients = gradients_of(n, torch.ones(n, dtype=torch.bool), step)
             state.advance(gradients)
             for i, g in enumerate(gradients):
-                ops.adam_step(dense.values[i], g, dense.firsts[i], dense.seconds[i], RATES[i], step)
+                adam_step(dense.values[i], g, dense.firsts[i], dense.seconds[i], RATES[i], step)
     for mine, theirs in zip(state.values, dense.values, strict=True):
         torch.testing.assert_close(mine, theirs, rtol=0, atol=5 * (4 * EPS + 40 * EPS * RATES[-1]))
 
@@ -172,7 +173,7 @@ def test_it_does_not_depend_on_threads(isa):
 
 def test_no_rows_and_no_tensors_are_no_work():
     State(0).advance([torch.zeros(0, *shape) for shape in SHAPES])
-    ops.adam_rows([], [], [], [], [], torch.zeros(3, dtype=torch.int32))
+    adam_rows([], [], [], [], [], torch.zeros(3, dtype=torch.int32))
 
 
 def test_what_does_not_fit_is_refused():
@@ -194,6 +195,6 @@ def test_what_does_not_fit_is_refused():
     }
     for message, change in bad.items():
         with pytest.raises((ValueError, LinprimError), match=message):
-            ops.adam_rows(**(good | dict(steps=steps) | change))
+            adam_rows(**(good | dict(steps=steps) | change))
     assert not steps.any() and not good["values"][0].any()
 

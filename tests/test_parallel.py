@@ -12,6 +12,7 @@ import torch
 from octahedra import BUILDS, KERNELS, assert_identical, everything, kernels, leaves, random_scene
 
 from linprim_geo import ops
+from linprim_geo.adam import adam_step
 
 COUNTS = (1, 2, 3, 7)
 
@@ -79,7 +80,7 @@ def test_adam_does_not_depend_on_threads(isa):
         state = [value.clone(), torch.zeros(n), torch.zeros(n)]
         with kernels(isa, count):
             for step in (1, 2):
-                ops.adam_step(state[0], gradient, state[1], state[2], 0.01, step)
+                adam_step(state[0], gradient, state[1], state[2], 0.01, step)
         results.append(state)
     for other in results[1:]:
         assert_identical(results[0], other)
@@ -121,11 +122,12 @@ def test_both_precisions_at_once():
 FORK = """
 import os, sys, torch
 from linprim_geo import ops
+from linprim_geo.adam import adam_step
 torch.set_num_threads(1)  # torch itself cannot fork with more
 ops.set_threads(2)
 def step():
     value = torch.ones(100_000)
-    ops.adam_step(value, torch.ones(100_000), torch.zeros(100_000), torch.zeros(100_000), 0.5, 1)
+    adam_step(value, torch.ones(100_000), torch.zeros(100_000), torch.zeros(100_000), 0.5, 1)
     return value[0].item()
 first = step()
 child = os.fork()

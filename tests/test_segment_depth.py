@@ -11,6 +11,7 @@ from linprim_geo import ops
 from linprim_geo.camera import Camera
 from linprim_geo.errors import LinprimError
 from linprim_geo.primitives import KINDS, Primitives
+from linprim_geo.solid_tree import SolidTree
 
 ORIGIN = np.array([0.3, -0.2, -4.0])
 
@@ -27,9 +28,9 @@ def primitives(seed: int, count: int, kind: str = "octahedron", size: float = 0.
     )
 
 
-def tree_of(p: Primitives, dtype=torch.float64) -> ops.SolidTree:
+def tree_of(p: Primitives, dtype=torch.float64) -> SolidTree:
     arrays = (p.center, p.rotation, p.extent, p.density)
-    return ops.SolidTree(*[torch.from_numpy(x).to(dtype) for x in arrays], primitive=p.kind)
+    return SolidTree(*[torch.from_numpy(x).to(dtype) for x in arrays], primitive=p.kind)
 
 
 def depths(tree, origin, ends, begin=None, most=np.inf) -> np.ndarray:
@@ -125,7 +126,7 @@ def test_a_segment_without_length_and_no_primitives():
     assert (depths(tree, (0, 0, 0), [(0, 0, 0)]) == 0).all()
     assert depths(tree, (0, 0, 0), np.zeros((0, 3))).shape == (0,)
     for kind, extents in (("octahedron", 3), ("tetrahedron", 4)):
-        empty = ops.SolidTree(*[torch.zeros((0, k)) for k in (3, 4, extents)], torch.zeros(0), primitive=kind)
+        empty = SolidTree(*[torch.zeros((0, k)) for k in (3, 4, extents)], torch.zeros(0), primitive=kind)
         assert len(empty) == 0 and (depths(empty, (0, 0, 0), np.ones((5, 3))) == 0).all()
 
 
@@ -134,7 +135,7 @@ def test_what_does_not_absorb_is_left_out():
     tensors = [torch.from_numpy(x).double() for x in (p.center, p.rotation, p.extent, p.density)]
     tensors[2][1, 2], tensors[2][2, 0], tensors[3][3], tensors[3][4] = 0.0, -1.0, 0.0, -2.0
     tensors[1][5] = 0
-    tree = ops.SolidTree(*tensors)
+    tree = SolidTree(*tensors)
     assert len(tree) == 2
     plain = Primitives(p.center[[0, 5]], [p.rotation[0], [1, 0, 0, 0]], p.extent[[0, 5]], p.density[[0, 5]], p.sh[[0, 5]])
     ends = np.concatenate([p.center + 1e-3, p.center - 0.05])
@@ -192,14 +193,14 @@ def test_what_is_refused():
     p = primitives(11, 3)
     tensors = [torch.from_numpy(x) for x in (p.center, p.rotation, p.extent, p.density)]
     with pytest.raises(ValueError, match="octahedra and tetrahedra only"):
-        ops.SolidTree(*tensors, primitive="gaussian")
+        SolidTree(*tensors, primitive="gaussian")
     with pytest.raises(ValueError, match="primitive is 'cube'"):
-        ops.SolidTree(*tensors, primitive="cube")
+        SolidTree(*tensors, primitive="cube")
     with pytest.raises(ValueError, match="extent has shape"):
-        ops.SolidTree(*tensors, primitive="tetrahedron")
+        SolidTree(*tensors, primitive="tetrahedron")
     with pytest.raises(LinprimError, match="center: row 1"):
-        ops.SolidTree(torch.tensor([[0.0] * 3, [0, np.nan, 0], [0] * 3]), *tensors[1:])
-    tree = ops.SolidTree(*tensors)
+        SolidTree(torch.tensor([[0.0] * 3, [0, np.nan, 0], [0] * 3]), *tensors[1:])
+    tree = SolidTree(*tensors)
     origin, ends = torch.zeros(3, dtype=torch.float64), torch.ones((2, 3), dtype=torch.float64)
     with pytest.raises(ValueError, match="ends is torch.float32"):
         tree.optical_depth(origin, ends.float())

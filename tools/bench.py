@@ -113,6 +113,7 @@ def measure(
     import torch
 
     from linprim_geo import ops
+    from linprim_geo.adam import adam_step
     from linprim_geo.camera import Camera
 
     torch.set_num_threads(threads)
@@ -138,7 +139,7 @@ def measure(
         grads = torch.autograd.grad(loss, parameters)
         marks.append(time.perf_counter())
         for p, g, (first, second) in zip(parameters, grads, moments, strict=True):
-            ops.adam_step(p, g, first, second, 0.0, run + 1)
+            adam_step(p, g, first, second, 0.0, run + 1)
         marks.append(time.perf_counter())
         if run < 2:
             continue
