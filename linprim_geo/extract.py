@@ -33,6 +33,7 @@ RANGES = {
     "voxel_size": (0, 1e30),
     "truncation": (1, 100),
     "memory_limit": (0, 1e9),
+    "depth_limit": (0, 1e30),
     "smallest_part": (0, 1),
     "refine": (0, 100),
     "close_holes": (0, 10**9),

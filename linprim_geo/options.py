@@ -230,6 +230,11 @@ class ExtractOptions:
     memory_limit: float = option(
         0.0, "memory the grid may take, in GiB; 0 allows 60 % of what is free", metavar="GIB"
     )
+    depth_limit: float = option(
+        0.0,
+        "depths beyond this, in the data set's unit, only clear the space before them; 0: beyond what so many pixels can tell apart",
+        metavar="LENGTH",
+    )
     smallest_part: float = option(0.01, "drop components with less than this share of the largest one's area")
     refine: int = option(
         2, "rounds in which vertices move to where the photographs agree best with each other; 0 leaves them", metavar="N"

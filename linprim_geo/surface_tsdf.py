@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from .camera import Camera
 from .errors import LinprimError
 from .fuse import auto_voxel_size, fuse_tsdf
 from .mesh import Mesh
@@ -16,8 +18,17 @@ from .tsdf import DepthFrame
 
 # A ray with less opacity than this has seen through the scene: it votes for free space.
 SEEN_THROUGH = 0.5
-# Depth, colour and background of a pixel; frames of more than this in all are not kept.
-BYTES_PER_PIXEL, KEPT_BYTES = 8, 2**30
+# Depth, colour, background and whether it is clamped, of a pixel; frames of more than this in all are not kept.
+BYTES_PER_PIXEL, KEPT_BYTES = 9, 2**30
+
+SMALLEST_DISPARITY = 0.25
+"""Depths are trusted as far as this many pixels between the two cameras that are furthest apart move a point by a truncation."""
+
+SAMPLED = 2
+"""One of so many rows and columns of a depth map is looked at to choose the limit."""
+
+NEAREST_LIMIT = 4.0
+"""And at least this many median depths: cameras that are close together fuse what they see all the same."""
 
 
 def tsdf_surface(
@@ -30,12 +41,14 @@ def tsdf_surface(
     Raises:
         LinprimError: no ray crosses the level, or the grid would not fit into memory.
     """
-    frames = DepthFrames(run, options.level) if frames is None else frames
+    frames = DepthFrames(run, options.level, options.depth_limit) if frames is None else frames
     if not any((frame.depth > 0).any() for frame in frames):
         raise LinprimError(
             f"{run.path}: no ray of any training view crosses transmittance {options.level}, so there is no surface"
         )
     stages.lap("render")
+    if frames.beyond:
+        stages.note(f"{frames.beyond:.1%} of the depths lie beyond {frames.limit:.4g} and only clear the space before it")
     voxel = options.voxel_size if options.voxel_size > 0 else auto_voxel_size(frames)
     mesh = fuse_tsdf(
         frames,
@@ -46,33 +59,59 @@ def tsdf_surface(
         log=stages.note,
     )
     stages.lap("fuse")
-    return mesh, {"level": options.level, "voxel_size": voxel, "truncation_voxels": options.truncation}
+    return mesh, {"level": options.level, "voxel_size": voxel, "truncation_voxels": options.truncation, "depth_limit": frames.limit}
 
 
 class DepthFrames(Sequence):
     """`tsdf.DepthFrame`s of the training views: depth at transmittance `level`, the photographs' colours, free background.
 
-    Kept in memory if they are at most KEPT_BYTES in all, else rendered whenever they are asked for.
+    Depths beyond `limit` are clamped to it; 0 chooses one by `depth_limit`. `beyond` is their share. Frames are kept in memory if
+    they are at most KEPT_BYTES in all, else rendered whenever they are asked for.
     """
 
-    def __init__(self, run: Run, level: float):
-        self.run, self.level = run, level
+    def __init__(self, run: Run, level: float, limit: float = 0.0):
+        self.run, self.level, self.limit = run, level, np.inf
         self.views = run.scene().train
         size = sum(view.camera.width * view.camera.height * BYTES_PER_PIXEL for view in self.views)
-        self.kept = list(self._render(self.views)) if size <= KEPT_BYTES else None
+        self.kept, sample = [], []
+        for frame in self._render(self.views):
+            sample.append(frame.depth[::SAMPLED, ::SAMPLED].ravel())
+            if size <= KEPT_BYTES:
+                self.kept.append(frame)
+        depths = np.concatenate(sample)
+        depths = depths[depths > 0]
+        if len(depths):
+            self.limit = limit or depth_limit([view.camera for view in self.views], float(np.median(depths)))
+        self.beyond = float((depths > self.limit).mean()) if len(depths) else 0.0
+        self.kept = [self._clamp(frame) for frame in self.kept]
 
     def __len__(self) -> int:
         return len(self.views)
 
     def __getitem__(self, index):
-        return self.kept[index] if self.kept is not None else next(self._render([self.views[index]]))
+        return self.kept[index] if self.kept else self._clamp(next(self._render([self.views[index]])))
 
     def __iter__(self):
-        return iter(self.kept) if self.kept is not None else self._render(self.views)
+        return iter(self.kept) if self.kept else map(self._clamp, self._render(self.views))
 
     def _render(self, views):
         for view, depth, opacity in self.run.surface_depths(views, self.level):
             free = opacity < SEEN_THROUGH
-            yield DepthFrame(
-                view.camera, np.where(free, np.float32(0), depth), color=view.load().rgb, background=free
-            )
+            yield DepthFrame(view.camera, np.where(free, np.float32(0), depth), color=view.load().rgb, background=free)
+
+    def _clamp(self, frame: DepthFrame) -> DepthFrame:
+        beyond = frame.depth > self.limit
+        if not beyond.any():
+            return frame
+        return replace(frame, depth=np.where(beyond, np.float32(self.limit), frame.depth), clamped=beyond)
+
+
+def depth_limit(cameras: Sequence[Camera], median: float, truncation: float = 3.0) -> float:
+    """How far depths are worth fusing, from the median depth that the cameras see, in their unit.
+
+    A disparity of d pixels between cameras that are b apart moves a point at depth z by d z^2 / (b f) (a derivative of z = b f / d);
+    voxels are about as large as the median's pixel, median / f, so this exceeds the truncation beyond sqrt(truncation median b / d).
+    """
+    centers = np.array([camera.center for camera in cameras])
+    baseline = float(np.linalg.norm(np.ptp(centers, axis=0)))
+    return max(NEAREST_LIMIT * median, float(np.sqrt(truncation * median * baseline / SMALLEST_DISPARITY)))

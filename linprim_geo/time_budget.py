@@ -207,7 +207,7 @@ def choose_voxel(run, options, target, stages, budget: Budget):
     from .surface_tsdf import DepthFrames
 
     begin = time.monotonic()
-    frames = DepthFrames(run, options.level)
+    frames = DepthFrames(run, options.level, options.depth_limit)
     supported = auto_voxel_size(frames)
     stages.lap("render")
     rendering = time.monotonic() - begin

@@ -74,7 +74,8 @@ class DepthFrame:
     `depth` (H, W) float is z along the optical axis at the pixel centres, in scene units; 0, negative, NaN
     and inf mean that there is no surface. `background` (H, W) bool marks those of them through which the ray
     is known to be free; the others are unknown. `color` (H, W, 3) uint8, or float in [0, 1]. `confidence`
-    (H, W) multiplies the weight of each pixel.
+    (H, W) multiplies the weight of each pixel. `clamped` (H, W) bool marks depths that are only a least one: the
+    ray is free up to there, and where its surface is is not known.
     """
 
     camera: Camera
@@ -82,10 +83,11 @@ class DepthFrame:
     color: np.ndarray | None = None
     background: np.ndarray | None = None
     confidence: np.ndarray | None = None
+    clamped: np.ndarray | None = None
 
     def __post_init__(self):
         wanted = (self.camera.height, self.camera.width)
-        for name in ("depth", "color", "background", "confidence"):
+        for name in ("depth", "color", "background", "confidence", "clamped"):
             value = getattr(self, name)
             if value is not None and np.shape(value)[:2] != wanted:
                 raise LinprimError(
@@ -96,6 +98,8 @@ class DepthFrame:
         """(P, 3) float64 world points of the pixels that see a surface, and their (P,) depths."""
         depth = np.asarray(self.depth, dtype=np.float64)
         valid = np.isfinite(depth) & (depth > 0)
+        if self.clamped is not None:
+            valid &= ~self.clamped
         depth = depth[valid]
         return self.camera.world_rays()[valid] * depth[:, None] + self.camera.center, depth
 
@@ -159,7 +163,8 @@ def surfels(frame: DepthFrame, voxel: float, truncation: float, origin: np.ndarr
     table = np.zeros((*depth.shape, 8), dtype=np.float32)
     table[..., :3] = np.where(valid[..., None], plane, 0.0)
     table[..., OFFSET] = np.where(valid, offset, np.float32(1e9))  # background: far in front of anything
-    table[..., WEIGHT] = np.where(valid, cosine**COSINE_POWER, 0.0) * confidence
+    surface = valid if frame.clamped is None else valid & ~frame.clamped
+    table[..., WEIGHT] = np.where(surface, cosine**COSINE_POWER, 0.0) * confidence
     table[..., COSINE] = np.where(valid, cosine, 1.0)
     # A pixel beside the outline of something nearer says nothing about what is level with that: its free
     # votes hold only in front of all its neighbours.

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from conftest import CENTER, octahedron_run
 
+from linprim_geo.camera import Camera
 from linprim_geo.errors import LinprimError
 from linprim_geo.eval.mesh import score_mesh
 from linprim_geo.extract import extract_mesh
@@ -16,10 +17,10 @@ from linprim_geo.mesh import load_mesh, topology, validate_mesh
 from linprim_geo.options import ExtractOptions
 from linprim_geo.raycast import RayCaster
 from linprim_geo.run import Run
-from linprim_geo.surface_tsdf import DepthFrames
+from linprim_geo.surface_tsdf import DepthFrames, depth_limit
 
 STATS = {
-    "mesh", "mesh_visible", "method", "level", "voxel_size", "truncation_voxels", "unit", "views", "primitives",
+    "mesh", "mesh_visible", "method", "level", "voxel_size", "truncation_voxels", "depth_limit", "unit", "views", "primitives",
     "vertices", "faces", "components", "boundary_edges", "non_manifold_edges", "genus", "watertight", "area", "volume",
     "visible", "seconds", "peak_gib",
 }  # fmt: skip
@@ -179,6 +180,34 @@ def test_frames_are_in_the_frame_of_the_data_set(solid):
     assert hit[inner].all() and inner.sum() > 200
     assert np.abs(frames[0].depth[inner] - depth[inner]).max() < 2e-4
     assert not (frames[0].background & hit).any() and frames[0].background[~hit].all()
+
+
+def test_depths_that_no_disparity_can_tell_apart_are_clamped(solid):
+    run = Run.open(solid)
+    near = DepthFrames(run, 0.5)
+    assert near.beyond == 0 and all(frame.clamped is None for frame in near)
+    limit = float(np.median(np.concatenate([frame.depth[frame.depth > 0] for frame in near])))
+    cut = DepthFrames(run, 0.5, limit)
+    assert 0.4 < cut.beyond < 0.6 and cut.limit == limit
+    for frame, whole in zip(cut, near, strict=True):
+        assert frame.depth.max() <= np.float32(limit)
+        np.testing.assert_array_equal(frame.clamped, whole.depth > limit)
+        np.testing.assert_array_equal(frame.depth[~frame.clamped], whole.depth[~frame.clamped])
+
+
+def test_the_depth_limit_is_where_a_quarter_of_a_pixel_is_a_truncation():
+    cameras = [replace(Camera(64, 48, 500.0, 500.0, 32.0, 24.0, np.eye(4)), world_to_camera=_shifted(x)) for x in (0.0, 6.0)]
+    limit = depth_limit(cameras, 2.0)
+    # Disparity 500 * 6 / z: a quarter of a pixel less moves the point by three footprints of the median depth.
+    moved = 500 * 6 / (500 * 6 / limit - 0.25) - limit
+    assert moved == pytest.approx(3 * 2.0 / 500, rel=0.01)
+    assert depth_limit(cameras[:1], 2.0) == 8.0
+
+
+def _shifted(x: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[0, 3] = -x
+    return pose
 
 
 def test_frames_that_are_rendered_on_demand_give_the_same_mesh(tiny_run, tmp_path, monkeypatch):

@@ -183,6 +183,19 @@ def test_depth_far_behind_carves_too():
     assert pieces(mesh) == 1 and np.abs(radial_error(mesh)).max() < 0.25 * 0.05
 
 
+def test_clamped_depths_clear_the_space_before_them_and_nothing_else(ball):
+    frames = with_phantom(sphere_frames(around(10)), 3.0)
+    clear = [replace(f, depth=np.where(f.background, 4.5, f.depth), clamped=f.background) for f in frames]
+    mesh = fuse_tsdf(clear, voxel_size=0.05, min_component=0)
+    assert pieces(mesh) == 1 and np.abs(radial_error(mesh)).max() < 0.25 * 0.05
+    taken = fuse_tsdf([replace(f, clamped=None) for f in clear], voxel_size=0.05, min_component=0)
+    assert np.abs(radial_error(taken)).max() > 1  # shells behind the sphere
+    # Cameras whose every depth is clamped before the sphere do not contradict those that see it.
+    views, everywhere = sphere_frames(around(24)), np.ones((SIZE, SIZE), bool)
+    before = [replace(f, depth=np.ones((SIZE, SIZE)), clamped=everywhere, background=None) for f in views]
+    np.testing.assert_array_equal(fuse_tsdf([*views, *before], voxel_size=0.05).vertices, ball.vertices)
+
+
 def test_invalid_depths_of_every_kind_are_no_surface(ball):
     frames = sphere_frames(around(24))
     for k, value in enumerate((0.0, -1.0, np.nan, np.inf, -np.inf)):
