@@ -16,6 +16,7 @@
 #include <tuple>
 #include <vector>
 
+#include "fuse.h"
 #include "linprim.h"
 #include "parallel.h"
 #include "photo_sweep.h"
@@ -250,6 +251,32 @@ NB_MODULE(_core, m) {
     const double* along = checked(offset, {offsets}, "offset");
     nb::gil_scoped_release release;
     linprim::add_photo(view, {rules[0], rules[1]}, along, int(offsets), sums);
+  });
+  m.def("least_footprints", [](Pose pose, std::array<double, 4> lens, int width, int height, double least_cosine, In<double> point,
+                               In<double> normal, Out<double> least) {
+    const int64_t count = int64_t(least.size());
+    linprim::PhotoView view{{}, lens[0], lens[1], lens[2], lens[3], width, height, nullptr, nullptr, nullptr};
+    std::copy_n(pose.data(), 12, view.pose);
+    const double *at = checked(point, {count, 3}, "point"), *along = checked(normal, {count, 3}, "normal");
+    double* out = checked(least, {count}, "least");
+    nb::gil_scoped_release release;
+    linprim::least_footprints(view, least_cosine, at, along, count, out);
+  });
+  m.def("add_votes", [](Pose project, int width, int height, In<float> surfels, std::array<float, 8> rules, In<int64_t> rows,
+                        In<double> corner, double voxel, int resolution, Out<float> total, Out<float> weight, Out<float> free) {
+    const int64_t blocks = int64_t(corner.shape(0)), count = int64_t(rows.size()), voxels = int64_t(resolution) * resolution * resolution;
+    const float* table = checked(surfels, {int64_t(height) * width, linprim::kSurfelColumns}, "surfels");
+    linprim::SurfelView view{{}, width, height, reinterpret_cast<const linprim::Surfel*>(table)};
+    std::copy_n(project.data(), 12, view.project);
+    const auto [near, far_front, behind, behind_weight, grazed, grazed_reach, grazed_weight, occluded] = rules;
+    const linprim::VoteRules how{near, far_front, behind, behind_weight, grazed, grazed_reach, grazed_weight, occluded};
+    const linprim::VoxelSums sums{checked(corner, {blocks, 3}, "corner"), voxel, resolution, checked(total, {blocks, voxels}, "total"),
+                                  checked(weight, {blocks, voxels}, "weight"), checked(free, {blocks, voxels}, "free")};
+    const int64_t* chosen = checked(rows, {count}, "rows");
+    if (std::any_of(chosen, chosen + count, [&](int64_t row) { return row < 0 || row >= blocks; }))
+      throw std::invalid_argument("rows are outside of the blocks");
+    nb::gil_scoped_release release;
+    linprim::add_votes(view, how, chosen, count, sums);
   });
   m.def("photometric_loss", [](In<float> image, In<float> target, std::optional<In<float>> weight, float dssim, Out<float> gradient) {
     if (image.ndim() != 3) throw std::invalid_argument("image has to have shape (3, H, W)");

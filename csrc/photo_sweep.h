@@ -36,4 +36,8 @@ struct PhotoSums {
 // Adds one photograph. Brightness is interpolated bilinearly, beyond the outermost pixel centres it is theirs.
 void add_photo(const PhotoView& view, const PhotoRules& rules, const double* offset, int offsets, const PhotoSums& sums);
 
+// Lowers `least` of each of `count` points to what a pixel of this view covers at it, where the view looks onto it under more than
+// `least_cosine` and it lies in the image. Only the pose, the lens and the size of the view are used.
+void least_footprints(const PhotoView& view, double least_cosine, const double* point, const double* normal, int64_t count, double* least);
+
 }  // namespace linprim

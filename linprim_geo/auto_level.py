@@ -1,7 +1,7 @@
 """The transmittance level of a run's surface, chosen by the photographs' agreement with each other: no reference is looked at.
 
-At the right level a place of one photograph, sent to where the surface has it in another one, finds its own colour there; at a level
-too near to the cameras, or too far from them, it lands beside it, the more so the larger the angle between the views.
+At the right level a place of one photograph, sent to where the surface has it in another one, finds its own colour and its own depth
+there; at a level too near to the cameras, or too far from them, it lands beside it, the more so the larger the angle between the views.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ LEVELS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 USUAL_LEVEL = 0.75
 # Views that are looked at, each in so many others, and pixels of each pair; fewer pixels in all than the least decide nothing.
 VIEWS, SOURCES, PIXELS, LEAST_PIXELS = 10, 3, 20_000, 2000
-# Colours that differ by more than this, of 255, count as much as this: something else stands in between.
+# Colours that differ by more than this, of 255, count as much as this, and so do depths that contradict each other.
 LARGEST_DIFFERENCE = 40.0
-# A pixel whose depth in the other view differs from its own by more than this share is hidden there.
+# Two views contradict each other where the depth of the other differs from what it should be by more than this share.
 SAME_SURFACE = 0.03
 # The best level has to be better than the worst by this part, or the photographs are too plain to tell.
 LEAST_CONTRAST = 0.02
@@ -63,7 +63,10 @@ def choose_level(run: Run) -> tuple[float, dict[float, float]]:
 def color_differences(
     camera: Camera, photo: Photo, other: Camera, other_photo: Photo, depths: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> np.ndarray:
-    """(L, P) mean absolute colour difference, at most LARGEST_DIFFERENCE, of the pixels that both views see at all L levels.
+    """(L, P) mean absolute colour difference, at most LARGEST_DIFFERENCE, of the pixels that both views see at one of L levels at least.
+
+    Where their depths contradict each other it is LARGEST_DIFFERENCE. Pixels that contradict each other at every level are hidden in
+    the other view, and left out.
 
     Args:
         depths: per level the (H, W) z-depths of the two views, 0 where there is none.
@@ -75,19 +78,21 @@ def color_differences(
     step = -(-len(rows) // PIXELS) or 1
     rows, columns = rows[::step], columns[::step]
     rays, own = camera.world_rays()[rows, columns], photo.rgb[rows, columns].astype(np.float32)
-    seen = np.ones(len(rows), dtype=bool)
-    found = []
+    usable, seen, found = np.ones(len(rows), bool), np.zeros(len(rows), bool), []
     for depth, other_depth in depths:
         pixels, z = other.project(camera.center + rays * depth[rows, columns, None])
         with np.errstate(invalid="ignore"):
             inside = (z > 0) & (pixels >= 1).all(1) & (pixels < (other.width - 1, other.height - 1)).all(1)
         pixels = np.where(inside[:, None], pixels, 1.0)
         there = other_depth[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
-        seen &= inside & (there > 0) & (np.abs(there - z) < SAME_SURFACE * np.abs(z))
-        if other_photo.alpha is not None:
-            seen &= bilinear(other_photo.alpha[..., None], pixels.T)[:, 0] > 254.5  # opaque, all four pixels around
-        found.append(np.minimum(np.abs(bilinear(other_photo.rgb, pixels.T) - own).mean(1), LARGEST_DIFFERENCE))
-    return np.stack(found)[:, seen]
+        same = inside & (there > 0) & (np.abs(there - z) < SAME_SURFACE * np.abs(z))
+        usable &= inside
+        if other_photo.alpha is not None:  # colours are mixed with the background unless all four pixels around are opaque
+            usable &= ~same | (bilinear(other_photo.alpha[..., None], pixels.T)[:, 0] > 254.5)
+        seen |= same
+        difference = np.minimum(np.abs(bilinear(other_photo.rgb, pixels.T) - own).mean(1), LARGEST_DIFFERENCE)
+        found.append(np.where(same, difference, np.float32(LARGEST_DIFFERENCE)))
+    return np.stack(found)[:, usable & seen]
 
 
 def least_of(places: Sequence[float], values: np.ndarray) -> float:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 
 from .errors import LinprimError
 from .mesh import Mesh, remove_small_components, select_faces, vertex_normals
-from .tsdf import BEHIND_VOXELS, DepthFrame, Grid, Rules
+from .tsdf import BEHIND_VOXELS, DepthFrame, Grid, vote_rules
 
 BYTES_PER_VOXEL = 44
 """12 for the votes; when they are done, 5 for the field, 8 for Open3D's copy of it, and marching cubes: 37
@@ -36,7 +35,6 @@ def fuse_tsdf(
     min_component: float = 1e-3,
     behind_voxels: float = BEHIND_VOXELS,
     occluded_vote: float = 0.0,
-    threads: int = 0,
     log: Callable[[str], None] | None = None,
 ) -> Mesh:
     """Fuses depth maps into a triangle mesh with normals and colours.
@@ -60,7 +58,6 @@ def fuse_tsdf(
             price of swollen thin parts.
         occluded_vote: weight of a vote "inside" from every view in which a voxel lies further behind the
             surface than the truncation; 0.01 to 0.02 closes tunnels that too deep pixels dig into solids.
-        threads: 0 uses every core.
         log: called with lines such as the memory that will be taken.
 
     Returns:
@@ -76,7 +73,6 @@ def fuse_tsdf(
     _check_options(voxel_size, truncation_voxels, block_resolution, bounds)
     bounds = None if bounds is None else np.asarray(bounds, dtype=np.float64)
     limit = memory_limit or int(0.6 * available_memory())
-    workers = threads or os.cpu_count() or 1
     say = log or (lambda line: None)
 
     blocks, origin, largest, colored = _find_blocks(
@@ -88,18 +84,17 @@ def fuse_tsdf(
         f"{need / 2**20:.0f} MiB of {limit / 2**20:.0f} MiB"
     )
     grid = Grid(blocks, origin, voxel_size, truncation_voxels * voxel_size, block_resolution)
-    rules = Rules(truncation_voxels, behind_voxels, occluded_vote)
-    with ThreadPoolExecutor(workers) as pool:
-        for frame in frames:
-            grid.integrate(frame, rules, pool)
-        mesh = _trimmed(grid.extract(), bounds, min_component)
-        if len(mesh.faces) == 0:
-            raise LinprimError(
-                f"fusing {len(blocks)} blocks at voxel size {voxel_size:.4g} gave no surface: the views' "
-                "depths disagree by more than the truncation, or all of it lies outside the bounds; "
-                "try a larger voxel size"
-            )
-        mesh = replace(mesh, normals=vertex_normals(mesh))
+    rules = vote_rules(truncation_voxels, behind_voxels, occluded_vote)
+    for frame in frames:
+        grid.integrate(frame, rules)
+    mesh = _trimmed(grid.extract(), bounds, min_component)
+    if len(mesh.faces) == 0:
+        raise LinprimError(
+            f"fusing {len(blocks)} blocks at voxel size {voxel_size:.4g} gave no surface: the views' "
+            "depths disagree by more than the truncation, or all of it lies outside the bounds; "
+            "try a larger voxel size"
+        )
+    mesh = replace(mesh, normals=vertex_normals(mesh))
     if colors and colored:
         from .visibility import color_vertices
 

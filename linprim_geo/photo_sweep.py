@@ -79,8 +79,7 @@ def best_agreement(mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo
         depth = caster.cast_single(camera.center, camera.world_rays().reshape(-1, 3))[0].reshape(shape)
         depth = np.minimum(depth, FAR * caster.diagonal).astype(np.float32)
         jump = maximum_filter(depth, 3, mode="nearest") - minimum_filter(depth, 3, mode="nearest")
-        pose = np.ascontiguousarray(camera.world_to_camera[:3], np.float64)
-        lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+        pose, lens = _pinhole(camera)
         rules = (LEAST_COSINE, OUTLINE_SLOPES)
         _core.add_photo(
             pose, lens, _brightness(photo), depth, jump, rules, OFFSETS, points, normals, footprint, views, weight, value, square
@@ -121,9 +120,9 @@ def refine_surface(mesh: Mesh, views: Sequence[View], rounds: int) -> Mesh:
     from scipy.sparse import coo_matrix, diags, identity
 
     cameras, count = [view.camera for view in views], len(mesh.vertices)
-    ends = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
-    ends = np.unique(np.concatenate([ends, ends[:, ::-1]]), axis=0)
-    graph = coo_matrix((np.ones(len(ends)), ends.T), shape=(count, count)).tocsr() + identity(count, format="csr")
+    first, second = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
+    keys = np.unique(np.concatenate([first * count + second, second * count + first]))
+    graph = coo_matrix((np.ones(len(keys)), np.divmod(keys, count)), shape=(count, count)).tocsr() + identity(count, format="csr")
     average = diags(1 / np.asarray(graph.sum(1)).ravel()) @ graph
     for _ in range(rounds):
         mesh = replace(mesh, normals=vertex_normals(mesh))
@@ -141,16 +140,16 @@ def _footprints(points: np.ndarray, normals: np.ndarray, cameras: Sequence[Camer
     """(V,) what a pixel of the nearest view that a vertex faces covers there, at most LARGEST_FOOTPRINT medians."""
     least = np.full(len(points), np.inf)
     for camera in cameras:
-        ray = points - camera.center
-        z = ray @ camera.rotation[2]
-        facing = -np.einsum("pd,pd->p", ray, normals) / np.maximum(np.linalg.norm(ray, axis=1), np.finfo(np.float64).tiny)
-        rows = np.flatnonzero((z > 0) & (facing > LEAST_COSINE))
-        pixel = ray[rows] @ (camera.K @ camera.rotation).T / z[rows, None]
-        rows = rows[(pixel[:, :2] >= 0).all(1) & (pixel[:, 0] < camera.width) & (pixel[:, 1] < camera.height)]
-        least[rows] = np.minimum(least[rows], z[rows] / (np.sqrt(camera.fx * camera.fy) * facing[rows]))
+        pose, lens = _pinhole(camera)
+        _core.least_footprints(pose, lens, camera.width, camera.height, LEAST_COSINE, points, normals, least)
     known = np.isfinite(least)
     largest = LARGEST_FOOTPRINT * np.median(least[known]) if known.any() else 1.0
     return np.minimum(least, largest)
+
+
+def _pinhole(camera: Camera) -> tuple[np.ndarray, tuple[float, float, float, float]]:
+    """A camera as the core takes it: (3, 4) world to camera, and its focal lengths and principal point."""
+    return np.ascontiguousarray(camera.world_to_camera[:3], np.float64), (camera.fx, camera.fy, camera.cx, camera.cy)
 
 
 def _brightness(photo: Photo) -> np.ndarray:

@@ -350,6 +350,8 @@ def _extraction(run: Run, shown: ShownMesh) -> list[str]:
     for name, flag, usual in (
         ("voxel_size", "--voxel-size", 0.0),
         ("truncation_voxels", "--truncation", ExtractOptions.truncation),
+        ("depth_limit", "--depth-limit", ExtractOptions.depth_limit),
+        ("refine", "--refine", ExtractOptions.refine),
     ):
         if stats.get(name, usual) != usual:
             words += [flag, f"{stats[name]:.12g}"]

@@ -11,11 +11,11 @@ the blocks and runs marching cubes.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from . import _core
 from .camera import Camera
 from .errors import LinprimError
 from .mesh import Mesh, merge_vertices
@@ -62,10 +62,6 @@ several would coincide. Moves the surface by at most 0.006 voxel at a truncation
 
 LEAST_SUPPORT = 1e-6
 """Voxels with less weight than this were seen by no view; far below the smallest weight a vote can have."""
-
-CHUNK_BLOCKS = 64
-"""Work per task: small enough for the cache, large enough to hide the cost of a task."""
-
 
 @dataclass(frozen=True)
 class DepthFrame:
@@ -173,33 +169,18 @@ def surfels(frame: DepthFrame, voxel: float, truncation: float, origin: np.ndarr
     return table.reshape(-1, 8)
 
 
-@dataclass(frozen=True)
-class Rules:
-    """How much a vote weighs by its distance from the surfel, lengths in voxels."""
-
-    truncation: float
-    behind: float
-    occluded: float
-
-    def weigh(self, value, rows, inverse_depth):
-        """Values and weights of votes at signed distances `value` (truncations), and the free votes."""
-        along = value / rows[..., COSINE]  # along the ray
-        ahead = value * np.float32(self.truncation / NEAR_VOXELS)
-        front = np.maximum(1.0 / (1.0 + ahead * ahead), np.float32(FAR_FRONT_WEIGHT))
-        ramp = 2.0 + along * np.float32(self.truncation / self.behind)
-        weight = rows[..., WEIGHT] * np.where(value > 0, front, np.clip(ramp, BEHIND_WEIGHT, 1.0))
-        past = value > 1.0
-        free = np.where(past & (inverse_depth > rows[..., NEAREST]), rows[..., FREE], np.float32(0.0))
-        weight = np.where(past, np.float32(0.0), weight)
-        grazed = (value > -GRAZED_VOXELS / self.truncation) & (along > -GRAZED_REACH)
-        hidden = along < -1.0
-        if self.occluded:
-            value = np.where(hidden & ~grazed, np.float32(-1.0), value)
-        beyond = np.where(grazed, rows[..., WEIGHT] * np.float32(GRAZED_WEIGHT), np.float32(0.0))
-        beyond = np.maximum(beyond, rows[..., FREE] * np.float32(self.occluded))
-        weight = np.where(hidden, beyond, weight)
-        value = np.clip(value, -1.0, 1.0)
-        return value, weight, free
+def vote_rules(truncation: float, behind: float, occluded: float) -> tuple[float, ...]:
+    """The numbers of `VoteRules` in csrc/fuse.h; `truncation` and `behind` are in voxels."""
+    return (
+        NEAR_VOXELS / truncation,
+        FAR_FRONT_WEIGHT,
+        behind / truncation,
+        BEHIND_WEIGHT,
+        GRAZED_VOXELS / truncation,
+        GRAZED_REACH,
+        GRAZED_WEIGHT,
+        occluded,
+    )
 
 
 class Grid:
@@ -212,42 +193,20 @@ class Grid:
         self.total = np.zeros((len(blocks), size), dtype=np.float32)
         self.weight = np.zeros((len(blocks), size), dtype=np.float32)
         self.free = np.zeros((len(blocks), size), dtype=np.float32)
-        self.corner = blocks * (resolution * voxel)
-        # Open3D's order: x runs fastest.
-        z, y, x = np.meshgrid(*[np.arange(resolution) * voxel] * 3, indexing="ij")
-        self.local = np.stack([x.ravel(), y.ravel(), z.ravel()])
+        self.corner = np.ascontiguousarray(blocks * (resolution * voxel), np.float64)
 
-    def integrate(self, frame: DepthFrame, rules: Rules, pool: ThreadPoolExecutor) -> None:
-        """Adds the votes of one frame to every block in its frustum."""
+    def integrate(self, frame: DepthFrame, rules: tuple[float, ...]) -> None:
+        """Adds the votes of one frame to every block in its frustum; `rules` are `vote_rules`."""
         camera = frame.camera
-        ids = self._in_view(camera)
-        if len(ids) == 0:
+        rows = self._in_view(camera)
+        if len(rows) == 0:
             return
+        project = np.empty((3, 4))
+        project[:, :3] = camera.K @ camera.rotation
+        project[:, 3] = camera.K @ (camera.rotation @ self.origin + camera.world_to_camera[:3, 3])
         table = surfels(frame, self.voxel, self.truncation, self.origin)
-        project = camera.K @ camera.rotation
-        shift = camera.K @ (camera.rotation @ self.origin + camera.world_to_camera[:3, 3])
-        image = (self.corner @ project.T + shift).astype(np.float32)
-        corner = self.corner.astype(np.float32)
-        local = self.local.astype(np.float32)
-        spread = (project @ self.local).astype(np.float32)
-
-        def vote(rows):
-            x, y, z = (image[rows, k, None] + spread[k] for k in range(3))
-            pixel, inverse, inside = _pixels(x, y, z, camera)
-            values = table[pixel]
-            value = values[..., OFFSET].copy()
-            for k in range(3):
-                value -= values[..., k] * (corner[rows, k, None] + local[k])
-            value, weight, free = rules.weigh(value, values, inverse)
-            weight *= inside
-            free *= inside
-            self.free[rows] += free
-            self.weight[rows] += weight
-            weight *= value
-            self.total[rows] += weight
-
-        # Each task owns its blocks, so sums are taken in the order of the frames whoever does them.
-        list(pool.map(vote, (ids[k : k + CHUNK_BLOCKS] for k in range(0, len(ids), CHUNK_BLOCKS))))
+        sums = (self.total, self.weight, self.free)
+        _core.add_votes(project, camera.width, camera.height, table, rules, rows, self.corner, self.voxel, self.resolution, *sums)
 
     def _in_view(self, camera: Camera) -> np.ndarray:
         """Blocks whose bounding sphere meets the frustum."""
@@ -307,17 +266,6 @@ class Grid:
             return Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
         mesh = _canonical(Mesh(vertices, faces))
         return replace(mesh, vertices=mesh.vertices + self.origin)
-
-
-def _pixels(x, y, z, camera: Camera):
-    """Index of the pixel that each homogeneous image point falls on, 1/z, and whether there is one."""
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        inverse = np.float32(1.0) / z
-        column, row = x * inverse, y * inverse
-        inside = (z > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    column = np.where(inside, column, np.float32(0.0)).astype(np.int32)
-    row = np.where(inside, row, np.float32(0.0)).astype(np.int32)
-    return row * np.int32(camera.width) + column, inverse, inside
 
 
 def _canonical(mesh: Mesh) -> Mesh:

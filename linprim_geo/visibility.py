@@ -33,6 +33,9 @@ things in the way, misaligned views."""
 LEAST_FACING = 0.1
 """Views flatter than this (cosine, 84 degrees) onto a vertex are used only if there is no other."""
 
+AROUND = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], bool)
+"""The four neighbours of a pixel."""
+
 BEHIND_SHARE = 1e-3
 """Points this share of their depth, and of the diagonal, behind all that the pixels around them see may still be seen."""
 
@@ -66,16 +69,21 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera]) -> np.ndarray:
     Raises:
         LinprimError: the mesh is empty or not finite.
     """
+    from scipy.ndimage import maximum_filter
+
     from .raycast import RayCaster
 
     caster = RayCaster(mesh.vertices, mesh.faces)
     seen = np.zeros(len(mesh.faces), dtype=bool)
     for camera in cameras:
-        _, face, _ = caster.render_depth(camera)
-        seen[face[face >= 0]] = True
+        depth, face = _first_hits(caster, camera)
+        # A ray that slips through an edge sees further than all around it: what it hits has to pass the test below.
+        believed = (face >= 0) & (depth <= maximum_filter(depth, footprint=AROUND, mode="nearest") * (1 + BEHIND_SHARE))
+        seen[face[believed]] = True
     gap = SURFACE_GAP * caster.diagonal
     for camera in cameras:
-        farthest = _farthest_around(caster, camera)
+        farthest = maximum_filter(_first_hits(caster, camera)[0], size=3, mode="nearest")
+        farthest = farthest * (1 + BEHIND_SHARE) + BEHIND_SHARE * caster.diagonal
         left = np.flatnonzero(~seen)
         corners = mesh.vertices[mesh.faces[left]]
         for sample in SAMPLES:
@@ -92,13 +100,11 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera]) -> np.ndarray:
     return seen
 
 
-def _farthest_around(caster: RayCaster, camera: Camera) -> np.ndarray:
-    """(H, W) the largest z-depth that the centres of 3x3 pixels see, and a little; inf where one of them misses."""
-    from scipy.ndimage import maximum_filter
-
-    depth = caster.cast_single(camera.center, camera.world_rays().reshape(-1, 3))[0].astype(np.float64)
-    farthest = maximum_filter(depth.reshape(camera.height, camera.width), size=3, mode="nearest")
-    return farthest * (1 + BEHIND_SHARE) + BEHIND_SHARE * caster.diagonal
+def _first_hits(caster: RayCaster, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W) float32 z-depths at the pixel centres, inf where a ray misses, and (H, W) faces, there -1."""
+    depth, face, _ = caster.cast_single(camera.center, camera.world_rays().reshape(-1, 3))
+    shape = (camera.height, camera.width)
+    return depth.reshape(shape), face.astype(np.int64).reshape(shape)
 
 
 def _project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

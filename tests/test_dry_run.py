@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from conftest import with_budget
 
 from linprim_geo import cli, dry_run, shots
 from linprim_geo import train as training
@@ -147,8 +148,10 @@ def test_photographs_that_are_read_when_they_are_due_are_said(tiny_scene, tmp_pa
 
 
 def test_a_budget_is_planned_with(tiny_scene, tmp_path):
-    report = dry_run.dry_run(tiny_scene, tmp_path / "run", options=TrainOptions(threads=1), time_budget=30, quiet=True)
-    assert report["minutes"] == 0.5 and report["iterations"] >= 300 and not (tmp_path / "run").exists()
+    report, seconds = with_budget(
+        lambda budget: dry_run.dry_run(tiny_scene, tmp_path / "run", options=TrainOptions(threads=1), time_budget=budget, quiet=True), 30
+    )
+    assert report["minutes"] == seconds / 60 and report["iterations"] >= 300 and not (tmp_path / "run").exists()
 
 
 def test_what_training_refuses_it_refuses(tiny_scene, tiny_run, tmp_path):

@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from linprim_geo import fuse, visibility
+from linprim_geo import fuse, ops, tsdf, visibility
 from linprim_geo.camera import Camera
 from linprim_geo.errors import LinprimError
 from linprim_geo.fuse import DepthFrame, fuse_tsdf
 from linprim_geo.mesh import Mesh, face_components, manifold_status, topology
+from linprim_geo.tsdf import Grid, vote_rules
 
 SIZE = 128
 
@@ -228,12 +229,66 @@ def test_occluded_votes_close_tunnels():
     assert inside(fuse_tsdf(frames, voxel_size=0.05, min_component=0, occluded_vote=0.05)) == 0
 
 
+# --- votes -----------------------------------------------------------------------------------------------
+
+
+def votes_in_float64(table, rules, position, pixel, inverse):
+    """(value * weight, weight, free) of one surfel per voxel, written from the rules alone."""
+    near, far_front, behind, behind_weight, grazed, grazed_reach, grazed_weight, occluded = rules
+    rows = table[pixel].astype(np.float64)
+    value = rows[:, 3] - (rows[:, :3] * position).sum(1)
+    weight, cosine, nearest, free = rows[:, 4:].T
+    along = value / cosine
+    past, hidden = value > 1, along < -1
+    plane = (value > -grazed) & (along > -grazed_reach)
+    share = np.where(value > 0, np.maximum(1 / (1 + (value / near) ** 2), far_front), np.clip(2 + along / behind, behind_weight, 1))
+    late = np.maximum(np.where(plane, weight * grazed_weight, 0), free * occluded)
+    if occluded:
+        value = np.where(hidden & ~plane, -1, value)
+    said = np.where(past, 0, np.where(hidden, late, weight * share))
+    return said * np.clip(value, -1, 1), said, np.where(past & (inverse > nearest), free, 0)
+
+
+@pytest.mark.parametrize("occluded", [0.0, 0.02])
+def test_votes_are_those_of_the_rules(occluded):
+    rng, camera = np.random.default_rng(3), Camera(40, 30, 51.37, 46.71, 19.31, 15.83, np.eye(4))
+    table = rng.normal(size=(camera.width * camera.height, 8)).astype(np.float32)
+    table[:, 3] += table[:, 2] * 2  # planes near the blocks
+    table[:, 4:] = np.abs(table[:, 4:])
+    table[:, 5] = table[:, 5].clip(0.05, 1)
+    blocks = np.array([[-1, -1, 2], [0, 0, 2], [0, -2, 3], [5, 5, -1]])
+    rules = vote_rules(3.0, 0.75, occluded)
+    grid = Grid(blocks, np.array([0.0137, 0.0211, 0.0071]), 0.1, 0.3, 8)
+    project = np.concatenate([camera.K, (camera.K @ grid.origin)[:, None]], axis=1)
+    sums = (grid.total, grid.weight, grid.free)
+    rows = np.array([0, 1, 2, 3])
+    for _ in range(2):
+        tsdf._core.add_votes(project, camera.width, camera.height, table, rules, rows, grid.corner, grid.voxel, 8, *sums)
+    k, j, i = (axis.ravel() for axis in np.meshgrid(*[np.arange(8)] * 3, indexing="ij"))
+    for b in range(len(blocks)):
+        position = grid.corner[b] + 0.1 * np.stack([i, j, k], 1)
+        image = position @ project[:, :3].T + project[:, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = image[:, 0] / image[:, 2], image[:, 1] / image[:, 2]
+        inside = (image[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        pixel = np.where(inside, v.astype(int) * camera.width + u.astype(int), 0)
+        wanted = votes_in_float64(table, rules, position, pixel, 1 / np.where(inside, image[:, 2], 1))
+        for found, each in zip((grid.total[b], grid.weight[b], grid.free[b]), wanted, strict=True):
+            # A voxel on the border of two pixels, or of two rules, may fall on either side in float32.
+            assert np.isclose(found, 2 * each * inside, rtol=1e-4, atol=1e-5).mean() > 0.995
+    assert not grid.weight[3].any() and (grid.weight[:3] > 0).any(1).all()
+
+
 # --- contract --------------------------------------------------------------------------------------------
 
 
 def test_the_same_bytes_at_any_number_of_threads():
-    frames = sphere_frames(around(8))
-    one, again, many = (fuse_tsdf(frames, voxel_size=0.06, threads=n) for n in (1, 2, 3))
+    frames, meshes = sphere_frames(around(8)), []
+    for count in (1, 2, 3):
+        ops.set_threads(count)
+        meshes.append(fuse_tsdf(frames, voxel_size=0.06))
+    ops.set_threads(0)
+    one, again, many = meshes
     for name in ("vertices", "faces", "normals"):
         assert getattr(one, name).tobytes() == getattr(many, name).tobytes()
         assert getattr(one, name).tobytes() == getattr(again, name).tobytes()

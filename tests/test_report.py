@@ -18,7 +18,7 @@ import pytest
 from conftest import MESHES
 from PIL import Image
 
-from linprim_geo import cli, svg
+from linprim_geo import cli, commands, svg
 from linprim_geo.display import is_inside, layers, light_mesh, up_direction
 from linprim_geo.errors import LinprimError
 from linprim_geo.eval.images import composite, eval_images_run
@@ -160,18 +160,18 @@ def test_the_mesh_of_the_page_is_the_mesh_of_the_file(made, meshed, tiny_scene):
 
 
 def test_commands_repeat_the_run(made, meshed):
-    commands = "".join(
+    lines = "".join(
         next(each for each in made[2].iter("section") if each.get("id") == "repeat").find("pre").itertext()
     ).splitlines()
-    parsed = {line.split()[1]: cli.build_parser().parse_args(shlex.split(line)[1:]) for line in commands}
+    parsed = {line.split()[1]: cli.build_parser().parse_args(shlex.split(line)[1:]) for line in lines}
     assert list(parsed) == ["train", "extract-mesh", "eval-mesh", "eval-images", "eval-depth", "report"]
     run = Run.open(meshed)
-    assert cli.from_args(TrainOptions, parsed["train"]) == run.train_options
-    assert cli.from_args(SceneOptions, parsed["train"]) == run.scene_options
+    assert commands.from_args(TrainOptions, parsed["train"]) == run.train_options
+    assert commands.from_args(SceneOptions, parsed["train"]) == run.scene_options
     assert parsed["train"].effects == "none"
     assert parsed["train"].run == parsed["report"].run == str(meshed)
-    options = cli.from_args(ExtractOptions, parsed["extract-mesh"])
-    assert options.level == 0.7 and options.smooth == 2 and options.voxel_size > 0
+    options = commands.from_args(ExtractOptions, parsed["extract-mesh"])
+    assert options.level == 0.7 and options.smooth == 2 and options.voxel_size > 0 and options.depth_limit > 0
 
 
 def test_a_run_without_mesh_scores_and_capture_says_so(run_copy, tiny_scene, tmp_path):

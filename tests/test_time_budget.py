@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import with_budget
 
 from linprim_geo import cli, pacing, time_budget
 from linprim_geo import train as training
@@ -142,19 +143,23 @@ OPTIONS = TrainOptions(sh_degree=0, threads=1, evaluate_every=0, checkpoint_ever
 
 @pytest.fixture(scope="module")
 def budgeted(tiny_scene, tmp_path_factory):
-    """A run with a budget of 12 s, and the seconds it took."""
+    """A run with a budget, of 12 s unless the machine is too busy for that, that budget, and the seconds it took."""
     run = tmp_path_factory.mktemp("budget") / "run"
-    begin = time.monotonic()
-    result = train(tiny_scene, run, options=OPTIONS, time_budget=12.0, quiet=True)
-    return run, result, time.monotonic() - begin
+
+    def timed(budget):
+        begin = time.monotonic()
+        return train(tiny_scene, run, options=OPTIONS, time_budget=budget, quiet=True), time.monotonic() - begin
+
+    (result, seconds), budget = with_budget(timed, 12.0)
+    return run, result, budget, seconds
 
 
 def test_a_run_keeps_its_time(budgeted):
-    run, result, seconds = budgeted
+    run, result, budget, seconds = budgeted
     # A loaded machine changes its pace by a factor of two or three within such a time, after the one correction too.
-    assert 5 < seconds < 24
+    assert 5 / 12 * budget < seconds < 2 * budget
     noted = json.loads((run / "config.json").read_text())["time_budget"]
-    assert noted["seconds"] == 12.0 and noted["actual_seconds"] == pytest.approx(seconds, abs=1.0)
+    assert noted["seconds"] == budget and noted["actual_seconds"] == pytest.approx(seconds, abs=1.0)
     assert noted == json.loads(json.dumps(result["time_budget"]))
     assert noted["correction"]["step"] == round(0.6 * noted["iterations"])
     assert result["iterations"] == noted["correction"]["iterations"]
