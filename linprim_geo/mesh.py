@@ -29,12 +29,12 @@ FLOAT32_SHARE = 1e-6
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh in some frame; per-vertex attributes are optional.
+    """A triangle mesh in some frame; all but its vertices and faces is optional.
 
     `vertices` (V, 3) float64, `faces` (F, 3) int64, counter-clockwise seen from outside. `normals` (V, 3)
     float32 of unit length (zero where a vertex has none), `colors` (V, 3) uint8 sRGB as in the photographs,
-    `quality` (V,) float32: the uncertainty of the vertex, in scene units. Arrays of other types are
-    converted.
+    `quality` (V,) float32: the uncertainty of the vertex, in scene units, `primitive` (F,) int32: the row of the primitive that
+    a face is a part of, -1 for none. Arrays of other types are converted.
 
     Raises:
         LinprimError: an array has the wrong shape.
@@ -45,6 +45,7 @@ class Mesh:
     normals: np.ndarray | None = None
     colors: np.ndarray | None = None
     quality: np.ndarray | None = None
+    primitive: np.ndarray | None = None
 
     def __post_init__(self):
         count = len(self.vertices)
@@ -54,6 +55,7 @@ class Mesh:
             ("normals", np.float32, (count, 3)),
             ("colors", np.uint8, (count, 3)),
             ("quality", np.float32, (count,)),
+            ("primitive", np.int32, (len(self.faces),)),
         ):
             value = getattr(self, name)
             if value is None:
@@ -164,7 +166,7 @@ def _loaded_colors(loaded) -> np.ndarray | None:
 def save_mesh(path: str | Path, mesh: Mesh) -> None:
     """Writes a mesh as PLY, OBJ, GLB or STL, chosen by the suffix.
 
-    PLY is binary little-endian with normals, colours and `quality`; coordinates are float32, or double where
+    PLY is binary little-endian with normals, colours, `quality` and the faces' `primitive`; coordinates are float32, or double where
     float32 would round by more than a millionth of the diagonal (a mesh far from its origin). OBJ is text
     with nine digits (fifteen far from the origin) and colours as `v x y z r g b`. GLB stores float32 around
     the mesh's centre and moves it back by a node, so a far origin costs nothing; colours are stored as they
@@ -209,13 +211,17 @@ def _write_ply(path: Path, mesh: Mesh) -> None:
     rows = np.empty(len(mesh.vertices), dtype=fields)
     for (name, _), column in zip(fields, columns, strict=True):
         rows[name] = column
-    triangles = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("index", "<i4", (3,))])
+    traced = mesh.primitive is not None
+    triangles = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("index", "<i4", (3,)), *([("primitive", "<i4")] if traced else [])])
     triangles["count"] = 3
     triangles["index"] = mesh.faces
+    if traced:
+        triangles["primitive"] = mesh.primitive
     names = {"<f8": "double", "<f4": "float", "u1": "uchar"}
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     header += [f"property {names[kind]} {name}" for name, kind in fields]
-    header += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header", ""]
+    header += [f"element face {len(triangles)}", "property list uchar int vertex_indices"]
+    header += [*(["property int primitive"] if traced else []), "end_header", ""]
     with open(path, "wb") as file:
         file.write("\n".join(header).encode("ascii"))
         file.write(rows.tobytes())
@@ -357,7 +363,8 @@ def select_faces(mesh: Mesh, keep: np.ndarray) -> Mesh:
     faces = mesh.faces[keep]
     used = np.zeros(len(mesh.vertices), dtype=bool)
     used[faces] = True
-    return _select_vertices(replace(mesh, faces=(np.cumsum(used) - 1)[faces]), used)
+    primitive = None if mesh.primitive is None else mesh.primitive[keep]
+    return _select_vertices(replace(mesh, faces=(np.cumsum(used) - 1)[faces], primitive=primitive), used)
 
 
 def _select_vertices(mesh: Mesh, keep: np.ndarray) -> Mesh:
@@ -365,6 +372,7 @@ def _select_vertices(mesh: Mesh, keep: np.ndarray) -> Mesh:
         mesh.vertices[keep],
         mesh.faces,
         *(None if value is None else value[keep] for value in (mesh.normals, mesh.colors, mesh.quality)),
+        mesh.primitive,
     )
 
 

@@ -182,7 +182,7 @@ def _close_holes(mesh: Mesh, max_edges: int) -> tuple[Mesh, str | None]:
         sound = _sound_patches(faces, added)
         left = int((~sound).sum())
         faces = np.concatenate([faces, added[sound]])
-    result = replace(mesh, faces=faces)
+    result = replace(mesh, faces=faces, primitive=None)
     remark = "some holes could be closed only with edges of three faces, and stay" if left else None
     return replace(result, normals=None if mesh.normals is None else vertex_normals(result)), remark
 

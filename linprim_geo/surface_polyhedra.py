@@ -62,9 +62,9 @@ NO_PRIMITIVE = -1
 
 
 def polyhedra_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[Mesh, dict]:
-    """Returns the closed surface, with normals and colours, and counts for the statistics.
+    """Returns the closed surface, with normals, colours and the primitive of every face, and counts for the statistics.
 
-    See `traced_surface` for the steps and for the primitive of every face.
+    See `traced_surface` for the steps.
 
     Raises:
         LinprimError: the primitives are Gaussians, none is opaque enough, or no ray crosses the level.
@@ -73,7 +73,7 @@ def polyhedra_surface(run: Run, options: ExtractOptions, stages: Stages) -> tupl
     from .visibility import color_vertices
 
     views = run.scene().train
-    mesh = replace(mesh, normals=vertex_normals(mesh))
+    mesh = replace(mesh, normals=vertex_normals(mesh), primitive=owner)
     mesh = replace(
         mesh, colors=color_vertices(mesh, [view.camera for view in views], (view.load().rgb for view in views))
     )

@@ -191,6 +191,7 @@ def test_clamped_depths_clear_the_space_before_them_and_nothing_else(ball):
     assert pieces(mesh) == 1 and np.abs(radial_error(mesh)).max() < 0.25 * 0.05
     taken = fuse_tsdf([replace(f, clamped=None) for f in clear], voxel_size=0.05, min_component=0)
     assert np.abs(radial_error(taken)).max() > 1  # shells behind the sphere
+    assert fuse.auto_voxel_size(clear) == fuse.auto_voxel_size(frames) < fuse.auto_voxel_size([replace(f, clamped=None) for f in clear])
     # Cameras whose every depth is clamped before the sphere do not contradict those that see it.
     views, everywhere = sphere_frames(around(24)), np.ones((SIZE, SIZE), bool)
     before = [replace(f, depth=np.ones((SIZE, SIZE)), clamped=everywhere, background=None) for f in views]

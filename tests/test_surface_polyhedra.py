@@ -265,6 +265,27 @@ def test_a_trained_part_is_closed_and_traced(tiny_run):
     assert ahead.max() < 2 * about["tolerance"]
 
 
+def test_the_file_says_which_primitive_a_face_is_a_part_of(tiny_run, tmp_path):
+    import pymeshlab
+    import trimesh
+
+    target = tmp_path / "traced.ply"
+    extract_mesh(tiny_run, "polyhedra", target, ExtractOptions(level=0.75, refine=0), quiet=True)
+    mesh, owner, _ = traced(tiny_run)
+    for file in (target, target.with_name("traced_visible.ply")):
+        read = trimesh.load(file, process=False)
+        found = read.metadata["_ply_raw"]["face"]["data"]["primitive"].ravel()
+        # Faces in the file are those of the surface, or some of them: each by its corners.
+        wanted = dict(zip(map(tuple, mesh.vertices[mesh.faces].astype(np.float32).reshape(-1, 9).tolist()), owner, strict=True))
+        corners = np.asarray(read.vertices, np.float32)[read.faces].reshape(-1, 9)
+        assert [wanted[tuple(row)] for row in corners.tolist()] == found.tolist() and found.max() > 0
+        meshes = pymeshlab.MeshSet()
+        meshes.load_new_mesh(str(file))
+        assert meshes.current_mesh().face_number() == len(found)
+    extract_mesh(tiny_run, "polyhedra", target, ExtractOptions(level=0.75, refine=0, target_faces=200), quiet=True)
+    assert b"primitive" not in target.read_bytes()[:600]
+
+
 def test_the_order_of_the_primitives_does_not_matter(tiny_run, tmp_path):
     shuffle = np.random.default_rng(5).permutation(len(Run.open(tiny_run).primitives()))
     shuffled = with_primitives(
