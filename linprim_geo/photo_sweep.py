@@ -121,8 +121,9 @@ def refine_surface(mesh: Mesh, views: Sequence[View], rounds: int) -> Mesh:
 
     cameras, count = [view.camera for view in views], len(mesh.vertices)
     first, second = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
-    keys = np.unique(np.concatenate([first * count + second, second * count + first]))
-    graph = coo_matrix((np.ones(len(keys)), np.divmod(keys, count)), shape=(count, count)).tocsr() + identity(count, format="csr")
+    ends = (np.concatenate([first, second]), np.concatenate([second, first]))
+    graph = coo_matrix((np.ones(len(ends[0])), ends), shape=(count, count)).tocsr() + identity(count, format="csr")
+    graph.data[:] = 1  # an edge of two faces counts once
     average = diags(1 / np.asarray(graph.sum(1)).ravel()) @ graph
     for _ in range(rounds):
         mesh = replace(mesh, normals=vertex_normals(mesh))

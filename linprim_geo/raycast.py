@@ -64,7 +64,9 @@ class RayCaster:
         self.threads = threads or os.cpu_count() or 1
         self.recast = 0
 
-        used = vertices[np.unique(faces)]
+        corner = np.zeros(len(vertices), dtype=bool)
+        corner[faces] = True
+        used = vertices[corner]
         self.lower, self.upper = used.min(0), used.max(0)
         self._center = 0.5 * (self.lower + self.upper)
         half = 0.5 * float(np.linalg.norm(self.upper - self.lower))
