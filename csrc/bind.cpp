@@ -20,6 +20,7 @@
 #include "linprim.h"
 #include "parallel.h"
 #include "photo_sweep.h"
+#include "point_colors.h"
 #include "segment_depth.h"
 
 namespace nb = nanobind;
@@ -50,6 +51,13 @@ auto checked(const Array& array, std::initializer_list<int64_t> shape, const cha
     throw std::invalid_argument(std::string(name) + " has shape (" + found + "), wanted (" + wanted + ")");
   }
   return array.data();
+}
+
+linprim::PhotoView photo_view(const Pose& pose, const std::array<double, 4>& lens, int width, int height, const float* image, int channels,
+                              const float* depth) {
+  linprim::PhotoView view{{}, lens[0], lens[1], lens[2], lens[3], width, height, image, channels, depth};
+  std::copy_n(pose.data(), 12, view.pose);
+  return view;
 }
 
 linprim::View make_view(const Pose& pose, const std::tuple<double, double, double, double>& intrinsics, int width, int height, double near,
@@ -241,22 +249,36 @@ NB_MODULE(_core, m) {
     if (image.ndim() != 2 || image.size() == 0) throw std::invalid_argument("image has to have shape (H, W)");
     const int64_t height = int64_t(image.shape(0)), width = int64_t(image.shape(1));
     const int64_t count = int64_t(views.size()), offsets = int64_t(offset.size());
-    linprim::PhotoView view{{}, lens[0], lens[1], lens[2], lens[3], int(width), int(height), image.data(),
-                            checked(depth, {height, width}, "depth"), checked(jump, {height, width}, "jump")};
-    std::copy_n(pose.data(), 12, view.pose);
+    const linprim::PhotoView view = photo_view(pose, lens, int(width), int(height), image.data(), 1, checked(depth, {height, width}, "depth"));
+    const float* jumps = checked(jump, {height, width}, "jump");
     const linprim::PhotoSums sums{count, checked(point, {count, 3}, "point"), checked(normal, {count, 3}, "normal"),
                                   checked(footprint, {count}, "footprint"), checked(views, {count}, "views"),
                                   checked(weight, {count}, "weight"), checked(value, {count, offsets}, "value"),
                                   checked(square, {count, offsets}, "square")};
     const double* along = checked(offset, {offsets}, "offset");
     nb::gil_scoped_release release;
-    linprim::add_photo(view, {rules[0], rules[1]}, along, int(offsets), sums);
+    linprim::add_photo(view, jumps, {rules[0], rules[1]}, along, int(offsets), sums);
+  });
+  m.def("add_colors", [](Pose pose, std::array<double, 4> lens, In<float> image, In<float> depth, In<float> near, In<float> far,
+                         std::array<double, 4> rules, In<double> point, In<double> normal, Out<float> best, Out<float> shade,
+                         Out<uint8_t> good) {
+    if (image.ndim() != 3 || image.size() == 0 || (image.shape(2) != 3 && image.shape(2) != 4))
+      throw std::invalid_argument("image has to have shape (H, W, 3) or (H, W, 4)");
+    const int64_t height = int64_t(image.shape(0)), width = int64_t(image.shape(1)), count = int64_t(good.size());
+    const linprim::PhotoView view = photo_view(pose, lens, int(width), int(height), image.data(), int(image.shape(2)),
+                                               checked(depth, {height, width}, "depth"));
+    const float *nearest = checked(near, {height, width}, "near"), *farthest = checked(far, {height, width}, "far");
+    const int64_t kept = linprim::kKeptSamples;
+    const linprim::ColorSamples samples{count, checked(point, {count, 3}, "point"), checked(normal, {count, 3}, "normal"),
+                                        checked(best, {count, kept}, "best"), checked(shade, {count, kept, 3}, "shade"),
+                                        checked(good, {count}, "good")};
+    nb::gil_scoped_release release;
+    linprim::add_colors(view, nearest, farthest, {rules[0], rules[1], rules[2], rules[3]}, samples);
   });
   m.def("least_footprints", [](Pose pose, std::array<double, 4> lens, int width, int height, double least_cosine, In<double> point,
                                In<double> normal, Out<double> least) {
     const int64_t count = int64_t(least.size());
-    linprim::PhotoView view{{}, lens[0], lens[1], lens[2], lens[3], width, height, nullptr, nullptr, nullptr};
-    std::copy_n(pose.data(), 12, view.pose);
+    const linprim::PhotoView view = photo_view(pose, lens, width, height, nullptr, 0, nullptr);
     const double *at = checked(point, {count, 3}, "point"), *along = checked(normal, {count, 3}, "normal");
     double* out = checked(least, {count}, "least");
     nb::gil_scoped_release release;

@@ -3,17 +3,9 @@
 
 #include <cstdint>
 
-namespace linprim {
+#include "photo_view.h"
 
-// A pinhole photograph; pixel centres at +0.5. Arrays are (height, width).
-struct PhotoView {
-  double pose[12];                // world to camera, 3 rows of 4
-  double fx, fy, cx, cy;
-  int width, height;
-  const float* image;             // brightness
-  const float* depth;             // z of the surface
-  const float* jump;              // largest less least depth of 3x3 pixels
-};
+namespace linprim {
 
 // A point is looked at where the cosine between its normal and the direction to the camera is above `least_cosine`, its depth is no more
 // than what its slope explains behind that of the surface, and the jump of its pixel is no more than `outline_slopes` times that.
@@ -33,8 +25,8 @@ struct PhotoSums {
   float* square;                  // (count, offsets) sum of cosine times brightness squared
 };
 
-// Adds one photograph. Brightness is interpolated bilinearly, beyond the outermost pixel centres it is theirs.
-void add_photo(const PhotoView& view, const PhotoRules& rules, const double* offset, int offsets, const PhotoSums& sums);
+// Adds one photograph of one channel, brightness; `jump` (height, width) is the largest less least depth of 3x3 pixels.
+void add_photo(const PhotoView& view, const float* jump, const PhotoRules& rules, const double* offset, int offsets, const PhotoSums& sums);
 
 // Lowers `least` of each of `count` points to what a pixel of this view covers at it, where the view looks onto it under more than
 // `least_cosine` and it lies in the image. Only the pose, the lens and the size of the view are used.

@@ -73,6 +73,10 @@ class Camera:
         )
         return pixels, depth
 
+    def pinhole(self) -> tuple[np.ndarray, tuple[float, float, float, float]]:
+        """(3, 4) world to camera, and focal lengths and principal point, as the core takes them."""
+        return np.ascontiguousarray(self.world_to_camera[:3], np.float64), (self.fx, self.fy, self.cx, self.cy)
+
     def magnified(self, factor: int) -> Camera:
         """The same view with `factor` by `factor` pixels in place of each one."""
         return replace(

@@ -79,7 +79,7 @@ def best_agreement(mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo
         depth = caster.cast_single(camera.center, camera.world_rays().reshape(-1, 3))[0].reshape(shape)
         depth = np.minimum(depth, FAR * caster.diagonal).astype(np.float32)
         jump = maximum_filter(depth, 3, mode="nearest") - minimum_filter(depth, 3, mode="nearest")
-        pose, lens = _pinhole(camera)
+        pose, lens = camera.pinhole()
         rules = (LEAST_COSINE, OUTLINE_SLOPES)
         _core.add_photo(
             pose, lens, _brightness(photo), depth, jump, rules, OFFSETS, points, normals, footprint, views, weight, value, square
@@ -141,16 +141,11 @@ def _footprints(points: np.ndarray, normals: np.ndarray, cameras: Sequence[Camer
     """(V,) what a pixel of the nearest view that a vertex faces covers there, at most LARGEST_FOOTPRINT medians."""
     least = np.full(len(points), np.inf)
     for camera in cameras:
-        pose, lens = _pinhole(camera)
+        pose, lens = camera.pinhole()
         _core.least_footprints(pose, lens, camera.width, camera.height, LEAST_COSINE, points, normals, least)
     known = np.isfinite(least)
     largest = LARGEST_FOOTPRINT * np.median(least[known]) if known.any() else 1.0
     return np.minimum(least, largest)
-
-
-def _pinhole(camera: Camera) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """A camera as the core takes it: (3, 4) world to camera, and its focal lengths and principal point."""
-    return np.ascontiguousarray(camera.world_to_camera[:3], np.float64), (camera.fx, camera.fy, camera.cx, camera.cy)
 
 
 def _brightness(photo: Photo) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from . import _core
 from .camera import Camera
 from .errors import LinprimError
 from .mesh import Mesh, vertex_normals
@@ -50,7 +51,7 @@ OPAQUE = 0.98
 """Pixels with less alpha than this show some of what is behind."""
 
 POINTS_PER_TASK = 32_768
-"""Points whose samples of one view are taken at a time: their temporaries stay in cache. Results do not depend on it."""
+"""Points that are reduced to one colour at a time: their temporaries stay in cache. Results do not depend on it."""
 
 POOR_RINGS = 3
 """Vertices with poor samples only take the colour of well seen ones up to so many edges away: a pixel or two.
@@ -116,13 +117,6 @@ def _project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return pixels, z, inside
 
 
-def _facing(points: np.ndarray, normals: np.ndarray, eye: np.ndarray) -> np.ndarray:
-    """(P,) cosine between the normals (3, P) and the directions from the points (3, P) to `eye`."""
-    view = eye[:, None] - points
-    length = np.sqrt((view * view).sum(0))
-    return (view * normals).sum(0) / np.maximum(length, np.finfo(np.float64).tiny)
-
-
 def color_vertices(mesh: Mesh, cameras: Sequence[Camera], images: Iterable[np.ndarray]) -> np.ndarray:
     """Vertex colours from the photographs that see each vertex.
 
@@ -174,101 +168,30 @@ def photographed(
     """
     from scipy.ndimage import maximum_filter, minimum_filter
 
-    points, across = np.ascontiguousarray(points.T), np.ascontiguousarray(normals.T, dtype=np.float64)
-    count = points.shape[1]
+    points, normals = np.ascontiguousarray(points, np.float64), np.ascontiguousarray(normals, np.float64)
+    count = len(points)
     best = np.zeros((count, KEPT_SAMPLES), dtype=np.float32)
     shade = np.zeros((count, KEPT_SAMPLES, 3), dtype=np.float32)
-    good = np.zeros(count, dtype=bool)
-    parts = [slice(start, min(start + POINTS_PER_TASK, count)) for start in range(0, count, POINTS_PER_TASK)]
-    with ThreadPoolExecutor(min(caster.threads, max(len(parts), 1))) as pool:
-        for camera, image in zip(cameras, images, strict=True):
-            if image.shape[:2] != (camera.height, camera.width):
-                raise LinprimError(
-                    f"image is {image.shape[1]}x{image.shape[0]} pixels, "
-                    f"its camera {camera.width}x{camera.height}"
-                )
-            if image.shape[2] == 4:
-                # Premultiplied, so that transparent pixels have no colour in a sample beside them.
-                image = image / np.float32(255 if image.dtype == np.uint8 else 1)
-                image[..., :3] *= image[..., 3:]
-            rays = camera.world_rays().reshape(-1, 3)
-            # Single precision is plenty here: the comparison below has a slack.
-            depth = caster.cast_single(camera.center, rays)[0].astype(np.float64)
-            depth = np.minimum(depth, FAR * caster.diagonal).reshape(camera.height, camera.width)
-            near, far = (f(depth, size=3, mode="nearest") for f in (minimum_filter, maximum_filter))
-
-            def look(part, camera=camera, image=image, depth=depth, near=near, far=far):
-                rows, weight, color, well = _samples(
-                    camera, image, depth, near, far, points[:, part], across[:, part], slack
-                )
-                good[part][rows[well]] = True
-                _keep_best(best[part], shade[part], rows, weight, color)
-
-            list(pool.map(look, parts))
-        colors = np.concatenate([np.zeros((0, 3), np.float32), *pool.map(lambda k: _robust_mean(best[k], shade[k]), parts)])
-    return colors, good, best[:, 0] > 0
-
-
-def _samples(camera, image, depth, near, far, points, normals, slack):
-    """What one view says of points (3, P): rows of those that it sees, their weights, colours, and which are seen well.
-
-    A fourth channel of `image` is alpha, and the others are premultiplied by it. `depth` (H, W) is that of the mesh, `near` and
-    `far` the least and largest around each pixel.
-    """
-    rows, pixels, z, facing = seen_points(camera, depth, points, normals, 0.0, slack)
-    j, i = pixels.astype(np.int64)
-    slope = depth_slope(camera, z, facing, slack)
-    poor = (far[i, j] - near[i, j] > 4.0 * slope) | (z > near[i, j] + 2.0 * slope) | (facing < LEAST_FACING)
-    color = bilinear(image, pixels)
-    if image.shape[2] == 4:
-        alpha = color[:, 3] / np.float32(255.0)
-        poor |= alpha < OPAQUE
-        color = color[:, :3] / np.maximum(alpha, np.float32(0.5))[:, None]
-    weight = np.maximum(facing, LEAST_FACING**2) / (z / min(camera.fx, camera.fy)) ** 2
-    weight[poor] *= POOR_SHARE
-    if image.shape[2] == 4:
-        opaque = alpha >= 0.5
-        rows, weight, color, poor = rows[opaque], weight[opaque], color[opaque], poor[opaque]
-    return rows, weight.astype(np.float32), color, ~poor
-
-
-def seen_points(
-    camera: Camera, depth: np.ndarray, points: np.ndarray, normals: np.ndarray, least_cosine: float, slack: float = 0.0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Which of surface points (3, P) with normals (3, P) face a camera, lie in its image and are not hidden.
-
-    Args:
-        depth: (H, W) z-depth of the surface at the pixel centres, inf where there is none.
-        least_cosine: of the angle between the normal and the direction to the camera.
-        slack: see `photographed`.
-    Returns:
-        rows (R,) of the points, and of these the pixel positions (2, R), z-depths (R,) and cosines (R,).
-    """
-    facing = _facing(points, normals, camera.center)
-    rows = np.flatnonzero(facing > least_cosine)
-    pixels, z, inside = _project(camera, points[:, rows])
-    rows, pixels, z = rows[inside], pixels[:, inside], z[inside]
-    facing = facing[rows]
-    j, i = pixels.astype(np.int64)
-    seen = z <= depth[i, j] + depth_slope(camera, z, facing, slack)
-    return rows[seen], pixels[:, seen], z[seen], facing[seen]
-
-
-def depth_slope(camera: Camera, z: np.ndarray, facing: np.ndarray, slack: float = 0.0) -> np.ndarray:
-    """How much the depth of a plane seen under the cosine `facing` changes by within a pixel, and the slack."""
-    # From one pixel to the next it is one pixel's footprint times the tangent.
-    step = z / min(camera.fx, camera.fy)
-    return np.maximum(slack, step) + step * np.sqrt(1.0 / np.maximum(facing, LEAST_FACING) ** 2 - 1.0)
-
-
-def _keep_best(best, shade, rows, weight, color):
-    """Inserts samples into the descending lists of the best per vertex."""
-    slot = (best[rows] >= weight[:, None]).sum(1)
-    for k in range(KEPT_SAMPLES - 1, -1, -1):
-        move = rows[slot < k]
-        best[move, k], shade[move, k] = best[move, k - 1], shade[move, k - 1]
-        here = slot == k
-        best[rows[here], k], shade[rows[here], k] = weight[here], color[here]
+    good = np.zeros(count, dtype=np.uint8)
+    rules = (slack, LEAST_FACING, POOR_SHARE, OPAQUE)
+    for camera, image in zip(cameras, images, strict=True):
+        if image.shape[:2] != (camera.height, camera.width):
+            raise LinprimError(
+                f"image is {image.shape[1]}x{image.shape[0]} pixels, its camera {camera.width}x{camera.height}"
+            )
+        image = image.astype(np.float32) * np.float32(1 if image.dtype == np.uint8 else 255)
+        if image.shape[2] == 4:
+            # Premultiplied, so that transparent pixels have no colour in a sample beside them.
+            image[..., :3] *= image[..., 3:] / 255
+        # Single precision is plenty here: what is hidden is told with a slack.
+        depth = np.minimum(_first_hits(caster, camera)[0], np.float32(FAR * caster.diagonal))
+        near, far = (extreme(depth, size=3, mode="nearest") for extreme in (minimum_filter, maximum_filter))
+        _core.add_colors(*camera.pinhole(), image, depth, near, far, rules, points, normals, best, shade, good)
+    parts = range(0, count, POINTS_PER_TASK)
+    with ThreadPoolExecutor(caster.threads) as pool:
+        means = pool.map(lambda k: _robust_mean(best[k : k + POINTS_PER_TASK], shade[k : k + POINTS_PER_TASK]), parts)
+        colors = np.concatenate([np.zeros((0, 3), np.float32), *means])
+    return colors, good.astype(bool), best[:, 0] > 0
 
 
 def bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
