@@ -65,13 +65,13 @@ def color_differences(
 ) -> np.ndarray:
     """(L, P) mean absolute colour difference, at most LARGEST_DIFFERENCE, of the pixels that both views see at one of L levels at least.
 
-    Where their depths contradict each other it is LARGEST_DIFFERENCE. Pixels that contradict each other at every level are hidden in
-    the other view, and left out.
+    Where their depths contradict each other, or a ray does not reach the level, it is LARGEST_DIFFERENCE. Pixels that contradict each
+    other at every level are hidden in the other view, and left out.
 
     Args:
         depths: per level the (H, W) z-depths of the two views, 0 where there is none.
     """
-    usable = np.all([depth > 0 for depth, _ in depths], axis=0)
+    usable = np.any([depth > 0 for depth, _ in depths], axis=0)
     if photo.alpha is not None:
         usable &= photo.alpha == 255
     rows, columns = np.nonzero(usable)
@@ -80,13 +80,14 @@ def color_differences(
     rays, own = camera.world_rays()[rows, columns], photo.rgb[rows, columns].astype(np.float32)
     usable, seen, found = np.ones(len(rows), bool), np.zeros(len(rows), bool), []
     for depth, other_depth in depths:
+        reached = depth[rows, columns] > 0
         pixels, z = other.project(camera.center + rays * depth[rows, columns, None])
         with np.errstate(invalid="ignore"):
             inside = (z > 0) & (pixels >= 1).all(1) & (pixels < (other.width - 1, other.height - 1)).all(1)
         pixels = np.where(inside[:, None], pixels, 1.0)
         there = other_depth[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
-        same = inside & (there > 0) & (np.abs(there - z) < SAME_SURFACE * np.abs(z))
-        usable &= inside
+        same = reached & inside & (there > 0) & (np.abs(there - z) < SAME_SURFACE * np.abs(z))
+        usable &= inside | ~reached
         if other_photo.alpha is not None:  # colours are mixed with the background unless all four pixels around are opaque
             usable &= ~same | (bilinear(other_photo.alpha[..., None], pixels.T)[:, 0] > 254.5)
         seen |= same

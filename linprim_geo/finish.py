@@ -8,7 +8,7 @@ from pathlib import Path
 from .mesh import Mesh, save_mesh, select_faces
 from .mesh_process import process_mesh
 from .options import ExtractOptions
-from .photo_sweep import best_agreement, predicted_error, refine_surface
+from .photo_sweep import best_agreement, photo_gains, predicted_error, refine_surface
 from .run import Run
 from .stages import Stages
 from .texture import make_texture, save_textured
@@ -34,13 +34,14 @@ def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, 
     """Finishes a surface as the options ask, and writes it to `target` and `visible_file(target)`."""
     views = run.scene().train
     cameras = [view.camera for view in views]
+    gains = photo_gains(mesh, cameras, (view.load() for view in views))
     if options.refine:
-        mesh = refine_surface(mesh, views, options.refine)
+        mesh = refine_surface(mesh, views, options.refine, gains)
         stages.lap("refine")
     mesh, processing = process_mesh(mesh, options, stages.note)
     if processing:
         stages.lap("process")
-    agreement = best_agreement(mesh, cameras, (view.load() for view in views))
+    agreement = best_agreement(mesh, cameras, (view.load() for view in views), gains)
     mesh = replace(mesh, quality=predicted_error(mesh, agreement))
     stages.lap("quality")
     seen = visible_faces(mesh, cameras)

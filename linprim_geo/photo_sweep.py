@@ -6,7 +6,7 @@ the same colour; before or behind it each shows another place. No reference is l
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,6 +33,9 @@ LARGEST_FOOTPRINT = 4.0
 SMOOTHING = 2
 """Rings of neighbours over which moves are averaged, weighted by how clearly the photographs speak."""
 
+GAIN_POINTS, GAIN_ROUNDS, DARKEST = 20_000, 10, 0.03
+"""Vertices that exposures are told from, rounds of medians that do, and the brightness below which a vertex says nothing."""
+
 LEAST_SHARPNESS = 0.002
 """Where the disagreement of the photographs rises by less than this, of white, beside its least, vertices hardly move."""
 
@@ -52,7 +55,9 @@ class Agreement:
     inside: np.ndarray
 
 
-def best_agreement(mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo]) -> Agreement:
+def best_agreement(
+    mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo], gains: np.ndarray | None = None
+) -> Agreement:
     """Compares photographs along the normal of every vertex.
 
     The disagreement at a place is the standard deviation of brightness over the photographs, weighted by the cosine of the angle under
@@ -62,27 +67,18 @@ def best_agreement(mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo
     Args:
         mesh: not empty; `normals` are used if it has them.
         photos: one per camera, iterated once. Transparent pixels count as mid-grey.
+        gains: (K,) exposure of each photograph (`photo_gains`), default 1.
     """
-    from scipy.ndimage import maximum_filter, minimum_filter
-
-    from .raycast import RayCaster
-
-    caster = RayCaster(mesh.vertices, mesh.faces)
-    points = np.ascontiguousarray(mesh.vertices, np.float64)
-    normals = np.ascontiguousarray(vertex_normals(mesh) if mesh.normals is None else mesh.normals, np.float64)
-    footprint = _footprints(points, normals, cameras)
-    count = len(points)
+    points, normals = _points(mesh)
+    footprint, count = _footprints(points, normals, cameras), len(points)
     views, weight = np.zeros(count, np.int32), np.zeros(count, np.float32)
     value, square = np.zeros((2, count, len(OFFSETS)), np.float32)
-    for camera, photo in zip(cameras, photos, strict=True):
-        shape = (camera.height, camera.width)
-        depth = caster.cast_single(camera.center, camera.world_rays().reshape(-1, 3))[0].reshape(shape)
-        depth = np.minimum(depth, FAR * caster.diagonal).astype(np.float32)
-        jump = maximum_filter(depth, 3, mode="nearest") - minimum_filter(depth, 3, mode="nearest")
-        pose, lens = camera.pinhole()
+    gains = np.ones(len(cameras)) if gains is None else gains
+    for (camera, image, depth, jump), gain in zip(_photographed(mesh, cameras, photos), gains, strict=True):
+        image = image / np.float32(gain)
         rules = (LEAST_COSINE, OUTLINE_SLOPES)
         _core.add_photo(
-            pose, lens, _brightness(photo), depth, jump, rules, OFFSETS, points, normals, footprint, views, weight, value, square
+            *camera.pinhole(), image, depth, jump, rules, OFFSETS, points, normals, footprint, views, weight, value, square
         )
     known = views >= 2
     offset, sharpness, inside = np.zeros(count), np.zeros(count), np.zeros(count, bool)
@@ -93,6 +89,34 @@ def best_agreement(mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo
     offset[known] = place * footprint[known]
     inside[known] = np.abs(place) < OFFSETS[-1] - 0.1
     return Agreement(offset, sharpness, known, inside)
+
+
+def photo_gains(mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo]) -> np.ndarray:
+    """(K,) float64 brightness of each photograph relative to the others, of geometric mean 1, by what they show of the same vertices.
+
+    Medians over the vertices of a photograph and over the photographs of a vertex in turn, so highlights and places where the mesh
+    is wrong do not count. 1 for a photograph that shares no vertex with others. Of GAIN_POINTS vertices, evenly over their order.
+    """
+    points, normals = (array[:: -(-len(array) // GAIN_POINTS)] for array in _points(mesh))
+    points, normals = np.ascontiguousarray(points), np.ascontiguousarray(normals)
+    count, here = len(points), np.zeros(1)
+    seen = np.full((len(cameras), count), np.nan, np.float32)
+    for row, (camera, image, depth, jump) in zip(seen, _photographed(mesh, cameras, photos), strict=True):
+        views, weight = np.zeros(count, np.int32), np.zeros(count, np.float32)
+        value, square = np.zeros((2, count, 1), np.float32)
+        rules, footprint = (LEAST_COSINE, OUTLINE_SLOPES), np.ones(count)
+        _core.add_photo(*camera.pinhole(), image, depth, jump, rules, here, points, normals, footprint, views, weight, value, square)
+        bright = (views > 0) & (value[:, 0] > DARKEST * weight)
+        row[bright] = np.log(value[bright, 0] / weight[bright])
+    seen = seen[:, np.isfinite(seen).sum(0) >= 2]
+    logs = np.zeros(len(cameras))
+    there = np.isfinite(seen).any(1)
+    if there.any():
+        for _ in range(GAIN_ROUNDS):
+            middle = np.nanmedian(seen - logs[:, None], axis=0)
+            logs[there] = np.nanmedian(seen[there] - middle, axis=1)
+            logs[there] -= logs[there].mean()
+    return np.exp(logs)
 
 
 def predicted_error(mesh: Mesh, agreement: Agreement) -> np.ndarray:
@@ -112,7 +136,7 @@ def predicted_error(mesh: Mesh, agreement: Agreement) -> np.ndarray:
     return error
 
 
-def refine_surface(mesh: Mesh, views: Sequence[View], rounds: int) -> Mesh:
+def refine_surface(mesh: Mesh, views: Sequence[View], rounds: int, gains: np.ndarray | None = None) -> Mesh:
     """Moves vertices to where the photographs agree best, `rounds` times; faces stay as they are, normals are made anew.
 
     Moves are averaged over neighbours and fade out where the photographs say nothing. Colours and quality are kept as they are.
@@ -127,7 +151,7 @@ def refine_surface(mesh: Mesh, views: Sequence[View], rounds: int) -> Mesh:
     average = diags(1 / np.asarray(graph.sum(1)).ravel()) @ graph
     for _ in range(rounds):
         mesh = replace(mesh, normals=vertex_normals(mesh))
-        agreement = best_agreement(mesh, cameras, (view.load() for view in views))
+        agreement = best_agreement(mesh, cameras, (view.load() for view in views), gains)
         weight = agreement.sharpness * agreement.inside
         move = weight * agreement.offset
         for _ in range(SMOOTHING):
@@ -135,6 +159,26 @@ def refine_surface(mesh: Mesh, views: Sequence[View], rounds: int) -> Mesh:
         move /= weight + LEAST_SHARPNESS
         mesh = replace(mesh, vertices=mesh.vertices + move[:, None] * mesh.normals)
     return replace(mesh, normals=vertex_normals(mesh))
+
+
+def _points(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """(V, 3) float64 vertices and their normals."""
+    normals = vertex_normals(mesh) if mesh.normals is None else mesh.normals
+    return np.ascontiguousarray(mesh.vertices, np.float64), np.ascontiguousarray(normals, np.float64)
+
+
+def _photographed(mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo]) -> Iterator[tuple]:
+    """Of each view the camera, the (H, W) brightness of its photograph, depth of the mesh, and largest less least depth of 3x3 pixels."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    from .raycast import RayCaster
+
+    caster = RayCaster(mesh.vertices, mesh.faces)
+    for camera, photo in zip(cameras, photos, strict=True):
+        depth = caster.cast_single(camera.center, camera.world_rays().reshape(-1, 3))[0].reshape(camera.height, camera.width)
+        depth = np.minimum(depth, FAR * caster.diagonal).astype(np.float32)
+        jump = maximum_filter(depth, 3, mode="nearest") - minimum_filter(depth, 3, mode="nearest")
+        yield camera, _brightness(photo), depth, jump
 
 
 def _footprints(points: np.ndarray, normals: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:

@@ -11,7 +11,7 @@ from linprim_geo import ops, photo_sweep
 from linprim_geo.camera import Camera
 from linprim_geo.campath import look_at
 from linprim_geo.mesh import Mesh, vertex_normals
-from linprim_geo.photo_sweep import best_agreement, predicted_error, refine_surface
+from linprim_geo.photo_sweep import best_agreement, photo_gains, predicted_error, refine_surface
 from linprim_geo.scene import Photo
 
 SIZE, FOCAL, DISTANCE = 96, 90.0, 3.0
@@ -72,6 +72,22 @@ def shown():
 
 def agreement(mesh, shown):
     return best_agreement(mesh, [s.camera for s in shown], (s.load() for s in shown))
+
+
+def test_exposures_are_found_on_a_wrong_surface_and_taken_out():
+    true = np.exp(0.25 * np.cos(2.3 * np.arange(8)))
+    true /= np.exp(np.log(true).mean())
+    views = ring()
+    drifting = [Shown(view, lambda x, y, gain=gain: 0.6 * gain * texture(x, y)) for view, gain in zip(views, true, strict=True)]
+    mesh = sheet(lambda x, y: 0.7 * FOOTPRINT * np.cos(3 * x))
+    gains = photo_gains(mesh, views, (s.load() for s in drifting))
+    np.testing.assert_allclose(gains, true, rtol=0.02)
+    middle = inner(mesh)
+    moved = refine_surface(mesh, drifting, 2, gains)
+    left = np.abs(refine_surface(mesh, drifting, 2).vertices[middle, 2]).mean()
+    assert np.abs(moved.vertices[middle, 2]).mean() < 0.3 * np.abs(mesh.vertices[middle, 2]).mean() < left
+    apart = [camera((100.0 * k, 0.0, DISTANCE)) for k in range(2)]  # the second sees nothing of it
+    assert photo_gains(mesh, apart, (Shown(view).load() for view in apart)).tolist() == [1.0, 1.0]
 
 
 @pytest.mark.parametrize("height", [-1.5, -0.6, 0.0, 0.4, 1.2])
