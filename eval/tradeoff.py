@@ -96,7 +96,7 @@ class Sweep:
         from linprim_geo.scene import load_scene
         from linprim_geo.structure_from_motion import prepare
 
-        self.scene_path, self.folder, self.given, self.quick, self.threads = scene.resolve(), folder, run, quick, threads
+        self.scene_path, self.folder, self.given, self.quick, self.threads = Path(os.path.realpath(scene)), folder, run, quick, threads
         self.rounds = rounds or (QUICK_ROUNDS if quick else ROUNDS)
         self.progress = Progress("tradeoff", 1, quiet=quiet)
         self.warm = self.warm_score = self.warm_train = False  # the first time of all loads libraries, and is not counted

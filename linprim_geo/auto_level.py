@@ -25,6 +25,9 @@ VIEWS, SOURCES, PIXELS, LEAST_PIXELS = 10, 3, 20_000, 2000
 LARGEST_DIFFERENCE = 40.0
 # Two views contradict each other where the depth of the other differs from what it should be by more than this share.
 SAME_SURFACE = 0.03
+# Of levels whose difference is within this share of the least the one nearest to the cameras is taken: a surface too far from them has
+# lost its thin parts for good, one too near is still refined.
+EQUALLY_GOOD = 0.05
 # The best level has to be better than the worst by this part, or the photographs are too plain to tell.
 LEAST_CONTRAST = 0.02
 
@@ -32,8 +35,8 @@ LEAST_CONTRAST = 0.02
 def choose_level(run: Run) -> tuple[float, dict[float, float]]:
     """Returns the level, between the first and the last of LEVELS, and the mean colour difference (of 255) at each level.
 
-    The differences are those of the same pixels at every level, so that none is favoured by what it leaves out. The parabola through
-    the least and its neighbours gives the level; without enough to compare, USUAL_LEVEL and no differences.
+    The differences are those of the same pixels at every level, so that none is favoured by what it leaves out. The level is the one
+    nearest to the cameras that is as good as the best (EQUALLY_GOOD); without enough to compare, USUAL_LEVEL and no differences.
     """
     views = run.scene().train
     cameras = [view.camera for view in views]
@@ -57,7 +60,7 @@ def choose_level(run: Run) -> tuple[float, dict[float, float]]:
     found = dict(zip(LEVELS, map(float, errors), strict=True))
     if errors.min() > (1 - LEAST_CONTRAST) * errors.max():
         return USUAL_LEVEL, found
-    return round(least_of(LEVELS, errors), 3), found
+    return round(nearest_good(LEVELS, errors), 3), found
 
 
 def color_differences(
@@ -96,10 +99,10 @@ def color_differences(
     return np.stack(found)[:, usable & seen]
 
 
-def least_of(places: Sequence[float], values: np.ndarray) -> float:
-    """Where the parabola through the least value and its two neighbours has its vertex; an end of `places` if the least is there."""
-    k = int(np.argmin(values))
-    if k in (0, len(values) - 1):
+def nearest_good(places: Sequence[float], values: np.ndarray) -> float:
+    """The largest place whose value, linear between the given ones, is at most 1 + EQUALLY_GOOD times the least."""
+    limit = (1 + EQUALLY_GOOD) * values.min()
+    k = int(np.flatnonzero(values <= limit)[-1])
+    if k == len(places) - 1:
         return float(places[k])
-    a, b, _ = np.polyfit(places[k - 1 : k + 2], values[k - 1 : k + 2], 2)
-    return float(-b / (2 * a)) if a > 0 else float(places[k])
+    return float(np.interp(limit, values[k : k + 2], places[k : k + 2]))

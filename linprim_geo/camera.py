@@ -110,5 +110,5 @@ class Similarity:
 
     def inverse(self) -> Similarity:
         """The similarity that undoes this one."""
-        offset = -self.scale * np.asarray(self.offset)
-        return Similarity(1.0 / self.scale, tuple(float(x) for x in offset))
+        x, y, z = (float(-self.scale * value) for value in self.offset)
+        return Similarity(1.0 / self.scale, (x, y, z))

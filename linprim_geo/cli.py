@@ -88,11 +88,13 @@ def _stdout_for_result(as_json: bool) -> Iterator[Callable[[Any], None]]:
     results: list[Any] = []
     stdout = sys.stdout
     stdout.flush()
+    descriptor: int | None = None
+    saved = -1
     try:
+        saved = os.dup(stdout.fileno())
         descriptor = stdout.fileno()
-        saved = os.dup(descriptor)
     except (OSError, ValueError):
-        descriptor = saved = None
+        pass
     try:
         if descriptor is not None:
             os.dup2(sys.stderr.fileno(), descriptor)

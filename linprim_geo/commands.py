@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -28,7 +29,7 @@ def train(parsed: argparse.Namespace) -> dict:
         if getattr(parsed, "downscale", 1) != 1:
             raise LinprimError(f"-r {parsed.resolution} stands beside --downscale {parsed.downscale}, wanted one of them")
         parsed.downscale = _downscale_of(parsed.resolution, scene, parsed)
-    run = parsed.run or Path("runs") / Path(scene).resolve().name
+    run = parsed.run or Path("runs") / Path(os.path.abspath(scene)).name
     options = from_args(SceneOptions, parsed), from_args(TrainOptions, parsed)
     if parsed.dry_run:
         from .dry_run import dry_run
@@ -38,7 +39,7 @@ def train(parsed: argparse.Namespace) -> dict:
         return dry_run(scene, run, *options, quiet=parsed.quiet, effects=_choice(parsed), **budget)
     from .train import train
 
-    shown = contextlib.nullcontext()
+    shown: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
     if parsed.view:
         from .view import watched
 
@@ -146,7 +147,7 @@ def view(parsed: argparse.Namespace) -> dict:
 def tradeoff(parsed: argparse.Namespace) -> dict:
     from .eval.tradeoff import tradeoff
 
-    output = Path(parsed.output or Path("runs") / f"{Path(parsed.scene).resolve().name}_tradeoff")
+    output = Path(parsed.output or Path("runs") / f"{Path(os.path.abspath(parsed.scene)).name}_tradeoff")
     results = tradeoff(
         parsed.scene,
         output,

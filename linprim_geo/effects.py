@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -54,6 +55,7 @@ class Data:
         """(N, 3) points in the training frame, as many as primitives at the start, and their mean distance to the three nearest."""
         from scipy.spatial import cKDTree
 
+        assert self.scene.points is not None
         xyz = self.scene.points.xyz
         count = initial_count(self.options, 0.8)
         if len(xyz) > count:
@@ -214,7 +216,7 @@ def settle(
     scene_options: SceneOptions, options: TrainOptions, decisions: Iterable[Decision]
 ) -> tuple[SceneOptions, TrainOptions]:
     """The options with what was decided put in."""
-    chosen: dict[str, object] = {}
+    chosen: dict[str, Any] = {}
     for decision in decisions:
         chosen |= decision.options
     of_scene = {name: value for name, value in chosen.items() if name in vars(scene_options)}
@@ -304,12 +306,12 @@ def _overlap_change(data: Data) -> float | None:
     from . import ops
     from .trainer import activate
 
-    xyz = data.start[0]
-    if len(xyz) < 4:
+    xyz, cloud = data.start[0], data.scene.points
+    if len(xyz) < 4 or cloud is None:
         return None
     rng = np.random.default_rng([data.options.seed, 12])
     rows = np.sort(rng.choice(len(xyz), min(START_POINTS, len(xyz)), replace=False))
-    rgb = data.scene.points.rgb
+    rgb = cloud.rgb
     rgb = rgb[np.linspace(0, len(rgb) - 1, len(rows)).astype(int)] if len(rgb) != len(xyz) else rgb[rows]
     bounds = (1e-4, CAMERA_DISTANCE)
     kind = data.options.primitive
@@ -378,6 +380,7 @@ def _depth_share(data: Data) -> float:
     ratios = []
     for view in [v for v in data.scene.train if v.depth_path is not None][:4]:
         depth = view.load_depth()
+        assert depth is not None
         pixels, along = view.camera.project(points.xyz)
         with np.errstate(invalid="ignore"):
             inside = (along > 0) & (pixels >= 0).all(1) & (pixels < [view.camera.width, view.camera.height]).all(1)

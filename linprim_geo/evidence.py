@@ -163,8 +163,8 @@ def observe(scene: Scene, seed: int = 0, views: int = VIEWS) -> Observations | N
         footprint[:, index] = np.where(depth > 0, depth, 1.0) / max(camera.fx, camera.fy)
     difference = np.abs(color - cloud.rgb[rows][:, None] / 255.0).mean(2)
     unlike = []
-    for side in (1, -1):
-        front = plain & (side * cosine > _LEAST_COSINE)
+    for sign in (1, -1):
+        front = plain & (sign * cosine > _LEAST_COSINE)
         typical = _median(np.where(front, difference, np.nan), 1)
         unlike.append(np.where(front.any(1), typical, np.inf))
     side = np.where(unlike[0] <= unlike[1], 1, -1)

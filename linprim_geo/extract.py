@@ -120,7 +120,8 @@ def _extract(
         stages.lap("level")
     module, function = METHODS[method].split(".")
     surface = getattr(import_module(f".{module}", __package__), function)
-    kept, chosen = (), None
+    kept: tuple = ()
+    chosen: dict = {}
     if budget:
         options, frames, chosen = choose_voxel(opened, options, target, stages, budget)
         kept = (frames,)

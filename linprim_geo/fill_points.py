@@ -65,13 +65,15 @@ def fill_points(scene: Scene, seed: int, backdrop: np.ndarray | None = None) -> 
 
     Returns: the cloud, without errors in pixels; the scene's own if nothing was found.
     """
-    views = [_Gaps(look, scene.points.xyz) for look in _looks(scene.train, _MOST_VIEWS)]
+    cloud = scene.points
+    assert cloud is not None, "of a scene without points there is nothing to fill"
+    views = [_Gaps(look, cloud.xyz) for look in _looks(scene.train, _MOST_VIEWS)]
     rng = np.random.default_rng([seed, 8])
     found = [np.empty((0, 3))]
     colors = [np.empty((0, 3), np.uint8)]
     for source in (_between_points, _same_colors, _nearest_points):
         if source is not _between_points:  # by now there are more points, and more space is known to be free
-            views = [_Gaps(view.look, np.concatenate([scene.points.xyz, *found])) for view in views]
+            views = [_Gaps(view.look, np.concatenate([cloud.xyz, *found])) for view in views]
         cell = CELL if source is _between_points else PATCH_CELL
         for index in np.argsort([-len(view.pixels) for view in views], kind="stable"):
             view = views[index]
@@ -86,10 +88,10 @@ def fill_points(scene: Scene, seed: int, backdrop: np.ndarray | None = None) -> 
             found.append(points[free])
             colors.append(view.look.rgb[row, column])
     if sum(map(len, found)) == 0:
-        return scene.points
+        return cloud
     return PointCloud(
-        np.concatenate([scene.points.xyz, *found]),
-        np.concatenate([scene.points.rgb, *colors]).astype(np.uint8),
+        np.concatenate([cloud.xyz, *found]),
+        np.concatenate([cloud.rgb, *colors]).astype(np.uint8),
     )
 
 
@@ -292,7 +294,7 @@ def _sampled(image: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndar
     """((..., 3) bilinear samples at (..., 2) positions, (...) whether they lie within the outermost pixel centres)."""
     height, width = image.shape[:2]
     at = places - 0.5
-    inside = ((at >= 0) & (at <= [width - 1, height - 1])).all(-1)
+    inside = np.asarray(((at >= 0) & (at <= [width - 1, height - 1])).all(-1))
     at = np.where(inside[..., None], at, 0.0)
     low = np.minimum(at.astype(np.int64), [max(width - 2, 0), max(height - 2, 0)])
     x, y = np.moveaxis((at - low).astype(np.float32)[..., None], -2, 0)

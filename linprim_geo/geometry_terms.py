@@ -66,16 +66,18 @@ class GeometryTerms:
         if o.normal_consistency > 0:
             total = total + o.normal_consistency * normal_consistency(out, shot.camera)
         if o.distortion > 0:
+            assert out.distortion is not None
             total = total + o.distortion * out.distortion.mean()
         if o.sensor_depth > 0 and evidence.depth is not None:
-            total = total + o.sensor_depth * depth_error(out.depth_median, evidence.depth)
+            total = total + o.sensor_depth * depth_error(_geometry(out)[0], evidence.depth)
         if o.sensor_normals > 0 and evidence.normal is not None:
-            total = total + o.sensor_normals * normal_error(out.normal, evidence.normal, out.opacity)
+            total = total + o.sensor_normals * normal_error(_geometry(out)[1], evidence.normal, out.opacity)
         if o.point_depth > 0 and evidence.pixels is not None:
             column, row = evidence.pixels.T
-            found = out.depth_median[row, column]
+            found = _geometry(out)[0][row, column]
+            assert evidence.point_depth is not None and evidence.point_weight is not None
             total = total + o.point_depth * depth_error(found, evidence.point_depth, evidence.point_weight)
-        if o.patches > 0 and self.sources[index]:
+        if self.sources is not None and self.sources[index]:
             rng = np.random.default_rng([o.seed, 9, step])
             other = self.shots[self.sources[index][rng.integers(len(self.sources[index]))]]
             opaque = out.opacity.detach() > 0.5
@@ -89,12 +91,12 @@ class GeometryTerms:
 
 def gather_evidence(scene: Scene, options: TrainOptions, similarity: Similarity, log: Callable[[str], None]) -> list[Evidence]:
     """What the terms in use need of each training view. A term that finds nothing of its kind is named by `log`."""
-    points = certainty = None
-    if options.point_depth > 0 and not isinstance(scene.points, VolumePoints):
-        points = similarity.apply(scene.points.xyz)
+    points, cloud = None, scene.points
+    if options.point_depth > 0 and cloud is not None and not isinstance(cloud, VolumePoints):
+        points = similarity.apply(cloud.xyz)
         certainty = np.ones(len(points))
-        if scene.points.error_px is not None:
-            certainty = 1 / (1 + (scene.points.error_px / max(float(np.median(scene.points.error_px)), 1e-6)) ** 2)
+        if cloud.error_px is not None:
+            certainty = 1 / (1 + (cloud.error_px / max(float(np.median(cloud.error_px)), 1e-6)) ** 2)
     gathered = []
     for view in scene.train:
         depth = view.load_depth() if options.sensor_depth > 0 else None
@@ -148,10 +150,17 @@ def depth_normals(depth: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     return torch.nn.functional.pad(normal, pad), torch.nn.functional.pad(valid, pad)
 
 
+def _geometry(out: Rendering) -> tuple[Tensor, Tensor]:
+    """(H, W) median depth and (3, H, W) normals of a rendering that has them."""
+    assert out.depth_median is not None and out.normal is not None, "rendered without geometry"
+    return out.depth_median, out.normal
+
+
 def normal_consistency(out: Rendering, camera: Camera) -> Tensor:
     """Mean of 1 - n . N: n the blended normals of the entry faces, N the normal of the depth map; 2DGS (Huang et al. 2024)."""
-    surface, valid = depth_normals(out.depth_median, camera)
-    cosine = (out.normal * surface).sum(0)
+    depth, normal = _geometry(out)
+    surface, valid = depth_normals(depth, camera)
+    cosine = (normal * surface).sum(0)
     return ((out.opacity.detach() - cosine) * valid).sum() / valid.sum().clamp_min(1)
 
 
@@ -220,7 +229,8 @@ def patch_consistency(
     """
     half = PATCH // 2
     column, row = pixels.T
-    depth, normal = out.depth_median[row, column], out.normal[:, row, column]
+    depths, normals = _geometry(out)
+    depth, normal = depths[row, column], normals[:, row, column]
     focal, middle = _pair(camera.fx, camera.fy), _pair(camera.cx, camera.cy)
     ray = _with_one((pixels + 0.5 - middle) / focal)
     steps = torch.arange(-half, half + 1)

@@ -160,7 +160,7 @@ def _map(database_path: Path, folder: Path, work: Path, threads: int, count: int
             last = time.monotonic()
             say(f"poses: {done} photographs placed, of {count}")
 
-    models = []
+    models: list = []
     for matches, right in ((None, None), (_FEW_MATCHES, _FEW_RIGHT)):
         if matches is not None:
             options.mapper.abs_pose_min_num_inliers, options.mapper.abs_pose_min_inlier_ratio = matches, right

@@ -8,6 +8,7 @@ Embree.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -82,7 +83,7 @@ class Mesh:
 # --- files -----------------------------------------------------------------------------------------------
 
 
-def load_mesh(path: str | Path) -> Mesh:
+def load_mesh(path: str | os.PathLike) -> Mesh:
     """Reads a PLY, OBJ, GLB or STL file (or any other that trimesh reads) as one triangle mesh.
 
     Several objects and their transforms are flattened into one; polygons are triangulated; a texture becomes
@@ -96,7 +97,7 @@ def load_mesh(path: str | Path) -> Mesh:
     return load_with_visual(path)[0]
 
 
-def load_with_visual(path: str | Path, seams: bool = False) -> tuple[Mesh, Any]:
+def load_with_visual(path: str | os.PathLike, seams: bool = False) -> tuple[Mesh, Any]:
     """`load_mesh`, and what trimesh knows of its colours or texture (its `visual`; None of an STL file).
 
     With `seams` the vertices of an OBJ file are split where its texture has seams, so that each has one place in the texture.

@@ -283,7 +283,7 @@ class UndistortedCache:
                     content = source.read_bytes()
                 except OSError as error:
                     raise LinprimError(
-                        f"{source}: cannot be read ({os.strerror(error.errno)}), wanted an image"
+                        f"{source}: cannot be read ({error.strerror}), wanted an image"
                     ) from error
                 digest.update(len(content).to_bytes(8, "little"))
                 digest.update(content)

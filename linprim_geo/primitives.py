@@ -15,6 +15,8 @@ from .errors import LinprimError
 from .files import atomic_write
 
 if TYPE_CHECKING:
+    import torch
+
     from .mesh import Mesh
 
 # The constant spherical harmonic: 1 / (2 sqrt(pi)).
@@ -188,6 +190,13 @@ class Primitives:
                     f"{what.plural}: {name} of row {row} is {getattr(self, name)[row].tolist()}"
                     f" ({int(bad.sum())} of {count} rows), wanted {wanted}"
                 )
+
+    def tensors(self, dtype: torch.dtype | None = None) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """The arrays as `ops.rasterize` takes them, sharing their memory unless `dtype` is another than theirs."""
+        import torch
+
+        center, rotation, extent, density, sh = (torch.from_numpy(getattr(self, name)).to(dtype or torch.float32) for name in ARRAYS)
+        return center, rotation, extent, density, sh
 
     def __len__(self) -> int:
         return len(self.center)

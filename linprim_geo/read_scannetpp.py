@@ -39,7 +39,8 @@ def read_scannetpp(device: Path) -> Listing:
     """Reads the images as they were taken (fisheye) if they are there, else the undistorted ones.
 
     Poses and points are those of `colmap`; without it poses are those of `nerfstudio`, turned back. Held out is what
-    `train_test_lists.json` calls test; of those, images that are not on disk are left out, as the benchmark keeps some.
+    `train_test_lists.json` calls test; of those, images that are not on disk are left out, as the benchmark keeps some. Images that
+    `nerfstudio` marks `is_bad` (blurred, most of them) are left out of both.
 
     Raises:
         LinprimError: a file that is missing or damaged, or training images that are not on disk.
@@ -58,9 +59,11 @@ def read_scannetpp(device: Path) -> Listing:
         lenses, theirs = _of_transforms(transforms, images)
         poses = {name: poses.get(name, theirs[name]) for name in theirs}
         where = transforms
-    held_out = _held_out(device)
+    held_out, bad = _held_out(device), _bad(transforms)
     frames, missing = [], []
     for name in sorted(poses):
+        if name in bad or Path(name).name in bad:
+            continue
         image = next((path for path in (images / name, images / Path(name).name) if is_file(path)), None)
         test = name in held_out or Path(name).name in held_out
         if image is not None:
@@ -73,6 +76,8 @@ def read_scannetpp(device: Path) -> Listing:
         raise LinprimError(
             f"{images}: {len(missing)} of the {len(poses)} images of {where} are not on disk, the first is {missing[0]}"
         )
+    if bad and not frames:
+        raise LinprimError(f"{transforms}: all images are marked 'is_bad', wanted some that are not")
     return Listing("scannetpp", tuple(frames), points, "m")
 
 
@@ -92,6 +97,13 @@ def _of_transforms(path: Path, images: Path) -> tuple[dict[str, Lens], dict[str,
         back[:3] = applied
     lenses = {frame.relative: frame.lens for frame in frames}
     return lenses, {frame.relative: frame.world_to_camera @ back for frame in frames}
+
+
+def _bad(transforms: Path) -> set[str]:
+    """Names of the images that are of no use, where there is a file that says so."""
+    if not transforms.is_file():
+        return set()
+    return {Path(name.replace("\\", "/")).name for name in read_transforms.bad_frames(transforms)}
 
 
 def _held_out(device: Path) -> set[str]:

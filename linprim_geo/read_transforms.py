@@ -96,7 +96,7 @@ def read_transforms(root: Path, json_file: Path | None = None, sparse: Path | No
 def read_cameras(path: Path, images: Path) -> tuple[list[Frame], np.ndarray | None]:
     """The frames of one file whose paths are names in the folder `images`, without side files, and its (3, 4) `applied_transform`.
 
-    Frames whose image is not on disk are there too.
+    Frames whose image is not on disk are there too, those that are marked `is_bad` are not.
 
     Raises:
         LinprimError: broken JSON, a missing key, an unknown camera model.
@@ -105,6 +105,8 @@ def read_cameras(path: Path, images: Path) -> tuple[list[Frame], np.ndarray | No
     frames = []
     for number, entry in enumerate(header["frames"] + header["test_frames"]):
         where = _checked(f"{path} frame {number}", entry)
+        if _is_bad(entry, where):
+            continue
         bare = {key: value for key, value in entry.items() if not key.endswith(("mask_path", "depth_file_path", "normal_file_path"))}
         frames.append(_frame(path.parent, header, bare, where, images / entry["file_path"], None))
     return frames, _applied_transform([(path, header)])
@@ -129,14 +131,18 @@ def _read_frames(path: Path, header: dict, split: str | None) -> list[Frame]:
     located = []
     for number, entry in enumerate(entries):
         where = _checked(f"{path} frame {number}", entry)
+        if _is_bad(entry, where):
+            continue
         located.append((where, entry, _find_image(path.parent, entry["file_path"])))
+    if not located and split != "test":
+        raise LinprimError(f"{path}: all {len(entries)} frames are marked 'is_bad', wanted some that are not")
     missing = [(where, entry) for where, entry, image in located if image is None]
     if missing:
         raise LinprimError(
-            f"{path}: {len(missing)} of {len(entries)} images are not on disk, the first is"
+            f"{path}: {len(missing)} of {len(located)} images are not on disk, the first is"
             f" {path.parent / missing[0][1]['file_path']}"
         )
-    named = _named_splits(path, header, [entry["file_path"] for entry in entries])
+    named = _named_splits(path, header, [entry["file_path"] for _, entry, _ in located])
     frames = []
     for (where, entry, image), name in zip(located, named, strict=True):
         kind = "test" if id(entry) in held_out else name or split
@@ -149,6 +155,26 @@ def _checked(where: str, entry: object) -> str:
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
         raise LinprimError(f"{where}: no 'file_path', wanted the path of its image")
     return f"{where} ({entry['file_path']})"
+
+
+def _is_bad(entry: dict, where: str) -> bool:
+    """Whether the data set advises against the frame (nerfstudio's and ScanNet++'s mark of blurred ones)."""
+    bad = entry.get("is_bad", False)
+    if not isinstance(bad, bool):
+        raise LinprimError(f"{where}: 'is_bad' is {bad!r:.40}, wanted true or false")
+    return bad
+
+
+def bad_frames(path: Path) -> set[str]:
+    """The `file_path`s that one file marks `is_bad`.
+
+    Raises:
+        LinprimError: broken JSON, or entries without a path.
+    """
+    header = _read_json(path, may_be_empty=True)
+    entries = header["frames"] + header["test_frames"]
+    checked = [(entry, _checked(f"{path} frame {number}", entry)) for number, entry in enumerate(entries)]
+    return {entry["file_path"] for entry, where in checked if _is_bad(entry, where)}
 
 
 def _frame(folder: Path, header: dict, entry: dict, where: str, image: Path, split: str | None) -> Frame:

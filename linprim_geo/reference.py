@@ -8,6 +8,7 @@ come from autograd. Speed is no aim: time grows with primitives x pixels, memory
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -240,7 +241,7 @@ def rasterize(
             near=near,
         )
 
-    options = dict(stop=stop, level=level, geometry=geometry)
+    options: dict[str, Any] = dict(stop=stop, level=level, geometry=geometry)
     if order == "overlap":
         flat = blend_overlapping(chords, color, background, len(rays), **options)
     else:

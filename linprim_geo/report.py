@@ -183,8 +183,9 @@ def _score_views(report: Report, reference: str | os.PathLike | None) -> None:
     from .eval.depth import eval_depth_run
     from .eval.images import eval_images_run
 
-    run, missing = report.run, report.missing
-    has_depth = any(view.depth_path is not None for view in report.scene.test)
+    run, missing, scene = report.run, report.missing, report.scene
+    assert scene is not None
+    has_depth = any(view.depth_path is not None for view in scene.test)
     with tempfile.TemporaryDirectory() as scratch:
         try:
             folder = run.path / "eval" / "images"
@@ -206,7 +207,7 @@ def _score_views(report: Report, reference: str | os.PathLike | None) -> None:
                 missing.append(
                     "The data set has no depth, and no --reference mesh was given, so depth is not scored"
                 )
-            report.views = _pictures(report, _chosen(report.scene.test, ranking))
+            report.views = _pictures(report, _chosen(scene.test, ranking))
         except LinprimError as error:
             missing.append(f"Held-out views could not be shown: {error}")
 
@@ -271,7 +272,7 @@ def _pictures(report: Report, views: list[View]) -> list[ShownView]:
                     colors,
                 )
             )
-        if mesh is not None:
+        if mesh is not None and mesh.light is not None:
             grey = np.full(mesh.light.vertices.shape, 205, np.uint8)
             pictures.append(
                 (f"mesh of {mesh.method} from there", render_preview(mesh.light, view.camera, colors=grey))

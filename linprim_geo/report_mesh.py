@@ -94,15 +94,17 @@ def _fill(
     most: int,
     missing: list[str],
 ) -> None:
-    mesh = load_mesh(shown.path)
+    path = shown.path
+    assert path is not None
+    mesh = load_mesh(path)
     for file, scores in stored:
-        if refers_to(scores.get("prediction"), shown.path):
-            if file.stat().st_mtime < shown.path.stat().st_mtime:
-                missing.append(f"{file}: is older than {shown.path}, so its scores are left out")
+        if refers_to(scores.get("prediction"), path):
+            if file.stat().st_mtime < path.stat().st_mtime:
+                missing.append(f"{file}: is older than {path}, so its scores are left out")
             else:
                 shown.scores.append(scores)
     if reference is not None:
-        truth = Path(reference)
+        truth: Path | None = Path(reference)
         shown.scores = [scores for scores in shown.scores if refers_to(scores.get("reference"), truth)]
         if not any(scores.get("protocol") == HEADLINE for scores in shown.scores):
             from .eval.mesh import score_mesh
@@ -120,9 +122,10 @@ def _fill(
                 f"{shown.scores[0].get('reference')}: is not there any more, so the true error of {shown.method} is not shown"
             )
     inside = bool(cameras) and is_inside(mesh, cameras)
-    visible = shown.path.with_name(f"{shown.path.stem}_visible{shown.path.suffix}")
+    visible = path.with_name(f"{path.stem}_visible{path.suffix}")
     if inside and visible.exists():  # what lies behind walls would hide the room
-        shown.path, mesh = visible, load_mesh(visible)
+        path, mesh = visible, load_mesh(visible)
+        shown.path = path
     light, rows, cell = light_mesh(mesh, most)
     error = None
     if truth is not None:
@@ -131,7 +134,7 @@ def _fill(
 
         error, _ = SurfaceDistance(validate_mesh(load_mesh(truth), str(truth))).query(mesh.vertices[rows])
     colors = layers(mesh, rows, error)
-    said = f"{shown.path.name} of {shown.method}: {len(mesh.faces)} faces"
+    said = f"{path.name} of {shown.method}: {len(mesh.faces)} faces"
     if cell:
         said += f", shown with {len(light.faces)}: vertices are clustered in cells of {cell:.3g} {run.unit}, which makes small folds"
     if inside:

@@ -28,7 +28,7 @@ from .camera import Similarity
 from .errors import LinprimError
 from .files import is_remains, write_json, writing
 from .options import SceneOptions, TrainOptions, check_train_options, from_saved, raster_options
-from .primitives import ARRAYS, KINDS, Primitives, load_primitives, save_primitives
+from .primitives import KINDS, Primitives, load_primitives, save_primitives
 from .scene import PHOTOGRAPHS, Scene, View, load_scene
 from .structure_from_motion import found_model
 
@@ -285,7 +285,7 @@ class Run:
 
         primitives = self.training_primitives()
         dtype = getattr(torch, self.train_options.scalar)
-        tensors = [torch.from_numpy(getattr(primitives, name)).to(dtype) for name in ARRAYS]
+        tensors = primitives.tensors(dtype)
         how = raster_options(self.train_options) | {"primitive": primitives.kind}
         return tensors, torch.tensor(self.background, dtype=torch.float32).to(dtype), how
 
@@ -312,7 +312,8 @@ def is_unused(path: Path) -> bool:
 def refuse_used(path: Path) -> None:
     """Raises LinprimError where something is in the way of a new run."""
     if not is_unused(path):
-        raise LinprimError(f"{path}: exists already; give another folder with -o, or go on with --resume")
+        how = ", or go on with --resume" if (path / "config.json").is_file() else ""
+        raise LinprimError(f"{path}: exists already; give another folder with -o{how}")
 
 
 def _read_json(file: Path, run: Path) -> dict:
@@ -323,7 +324,7 @@ def _read_json(file: Path, run: Path) -> dict:
             f"{run}: {file.name} is missing, so this is not the folder of a run that has saved something"
         ) from None
     except (OSError, ValueError, RecursionError) as error:
-        raise LinprimError(f"{file}: cannot be read ({error})") from None
+        raise LinprimError(f"{file}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
     if not isinstance(value, dict):
         raise LinprimError(f"{file}: holds no JSON object")
     return value

@@ -26,8 +26,8 @@ from .scene import has_poses
 _CACHE_VERSION = 1
 # Where photographs lie in a capture's folder; in the first that has any. Those in the folder itself are not looked for any deeper.
 _PHOTO_FOLDERS = ("images", "image", "input", "rgb", ".")
-# Photographs in formats that pycolmap reads, in the folder of the result while they are needed.
-_COPIES = "copies"
+# Pillow's names of the formats that pycolmap reads; photographs in others are copied, in the folder of the result while they are needed.
+_FORMATS, _COPIES = ("JPEG", "MPO", "PNG", "TIFF", "BMP"), "copies"
 # Counts and pixels of a verdict are below this.
 _LARGEST = 1e12
 # What can be trained, and what is trained with a warning.
@@ -172,7 +172,7 @@ def find_poses(
     folder, names = photographs(root)
     if len(names) < MIN_REGISTERED:
         raise LinprimError(
-            f"{root}: {len(names)} photographs, wanted at least {MIN_REGISTERED} to find their poses"
+            f"{root}: {len(names)} photograph{'' if len(names) == 1 else 's'}, wanted at least {MIN_REGISTERED} to find their poses"
         )
     sizes = [photos.image_header(folder / name)[:2] for name in names]
     kept = _base(cache) / _key(folder, names)
@@ -261,16 +261,16 @@ def _reconstruct(
 
 
 def _readable(folder: Path, names: Sequence[str], kept: Path) -> Path:
-    """The folder itself if pycolmap can read all its photographs, else one of copies by the same names; WebP, which it cannot, as PNG."""
+    """The folder itself if pycolmap can read all its photographs, else one of copies by the same names; those which it cannot, as PNG."""
     from PIL import Image
 
-    if not any(photos.image_format(folder / name) == "WEBP" for name in names):
+    if all(photos.image_format(folder / name) in _FORMATS for name in names):
         return folder
     for name in names:
         source, copy = folder / name, kept / _COPIES / name
         if not copy.exists():
             with atomic_write(copy) as temporary:
-                if photos.image_format(source) == "WEBP":
+                if photos.image_format(source) not in _FORMATS:
                     Image.fromarray(photos.read_photo(source)[0]).save(
                         temporary, format="PNG", compress_level=1
                     )

@@ -107,7 +107,8 @@ def opacity_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[
     if len(points) == 0:
         raise LinprimError(nothing)
     stages.note(_memory_line(len(points), limit, run))
-    rough = _level_set(field, points, light, options.level, ROUGH)
+    level = float(options.level)
+    rough = _level_set(field, points, light, level, ROUGH)
     if len(rough.faces) == 0:
         raise LinprimError(nothing)
     stages.lap("first round")
@@ -115,11 +116,11 @@ def opacity_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[
     rough = remove_small_components(rough, options.smallest_part)
     spacing = options.voxel_size * run.similarity.scale or auto_spacing(rough, cameras)
     around = _around(rough, spacing)
-    first, inner = len(points), light < options.level
+    first, inner = len(points), light < level
     points = np.concatenate([points[inner], around])
     stages.note(_memory_line(len(points), limit, run))
     points = points[_near_each_other(points)]
-    mesh = _level_set(field, points, field.transmittance(points), options.level, RESOLUTION)
+    mesh = _level_set(field, points, field.transmittance(points), level, RESOLUTION)
     if len(mesh.faces) == 0:
         raise LinprimError(nothing)
     stages.lap("second round")
@@ -127,7 +128,7 @@ def opacity_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[
     mesh = remove_small_components(mesh, options.smallest_part)
     mesh = _seen_components(mesh, cameras)
     mesh = replace(mesh, normals=vertex_normals(mesh))
-    gap = field.spread(mesh, options.level, spacing)
+    gap = field.spread(mesh, level, spacing)
     move = np.minimum(gap, LARGEST_MOVE * spacing)
     mesh = replace(mesh, vertices=mesh.vertices + move[:, None] * mesh.normals)
     mesh = replace(
@@ -213,11 +214,12 @@ class OpacityField:
         ladder = reach * np.array(LADDER)
         out = np.full(len(mesh.vertices), reach)
         order = _near_each_other(mesh.vertices)
+        assert mesh.normals is not None
         for part in self.parts(len(order)):
             rows = order[part]
             points, normals = mesh.vertices[rows], mesh.normals[rows].astype(np.float64)
             place, found = np.full(len(rows), reach), np.zeros(len(rows), dtype=bool)
-            before = None
+            before = np.empty(0)
             for step, height in enumerate(ladder):
                 left = np.flatnonzero(~found)
                 light = robust_largest(*self.per_camera(points[left] + height * normals[left]), TYPICAL_SHARE)

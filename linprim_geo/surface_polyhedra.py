@@ -104,7 +104,7 @@ def traced_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[M
     order = canonical_order(rendered)
     primitives, rendered = _take(primitives, order), _take(rendered, order)
     cameras = [view.camera for view in run.scene().train]
-    level = 1 - CUT_DEPTH * (1 - options.level)
+    level = 1 - CUT_DEPTH * (1 - float(options.level))
     weight, depths = _render(run, rendered, cameras, level)
     candidates = np.flatnonzero(weight > LEAST_WEIGHT)
     if not len(candidates):
@@ -172,7 +172,7 @@ def _render(run: Run, primitives: Primitives, cameras: list[Camera], level: floa
 
     from . import ops
 
-    tensors = [torch.from_numpy(getattr(primitives, name)) for name in ARRAYS]
+    tensors = primitives.tensors()
     _, background, how = run._tensors()
     kind = {"primitive": how["primitive"], "ray_model": how["ray_model"]}
     weight, depths = np.zeros(len(primitives), dtype=np.float32), []
@@ -181,9 +181,10 @@ def _render(run: Run, primitives: Primitives, cameras: list[Camera], level: floa
         with torch.no_grad():
             out = ops.rasterize(*tensors, background, seen, stop=run.train_options.stop, geometry=True, **how)
             depth, opacity = ops.level_depth(*tensors, seen, level=level, **kind)
+        assert out.max_weight is not None
         np.maximum(weight, out.max_weight.numpy(), out=weight)
-        depth = np.where(opacity.numpy() < SEEN_THROUGH, np.float32(0), depth.numpy() / run.similarity.scale)
-        depths.append(depth.astype(np.float32))
+        seen_depth = np.where(opacity.numpy() < SEEN_THROUGH, np.float32(0), depth.numpy() / run.similarity.scale)
+        depths.append(seen_depth.astype(np.float32))
     return weight, depths
 
 

@@ -117,7 +117,7 @@ def curves(
     y_axis = Axis([y for _, _, ys in series for y in ys], HEIGHT - BOTTOM, TOP, log=log, room=0.06)
     named = [f"{name}: {_said(ys[-1])}" for name, _, ys in series]
     out = frame(x_axis, y_axis, x_label, y_label, f"{y_label} over {x_label}; at the end {', '.join(named)}")
-    left = LEFT
+    left: float = LEFT
     for index, ((_, xs, ys), label) in enumerate(zip(series, named, strict=True)):
         places = [f"{x_axis.at(x):.1f} {y_axis.at(y):.1f}" for x, y in zip(xs, ys, strict=True)]
         kind = "curve" if len(places) > 1 else "curve point"

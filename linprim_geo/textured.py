@@ -268,7 +268,8 @@ def refine(
         points, triangles, origin = result if result is not None else subdivide(*own, max_edge)
         pieces.append((points, triangles.astype(np.int64) + start, rows[origin.astype(np.int64)]))
         start += len(points)
-    return tuple(np.concatenate([piece[i] for piece in pieces]) for i in range(3))
+    points, triangles, rows = (np.concatenate([piece[i] for piece in pieces]) for i in range(3))
+    return points, triangles, rows
 
 
 # Meshes from files

@@ -12,6 +12,7 @@ from dataclasses import fields
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from . import ops
 from .adam import adam_rows, adam_step
@@ -24,6 +25,9 @@ from .population import Control, GradientControl
 from .population_papers import ClassicControl, McmcControl
 from .primitives import KINDS, SH_Y0, Primitives, reference_length
 from .shots import Shot
+
+# Center, rotation, extent, density, sh: what the rasterizer takes of primitives.
+Tensors = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 CONTROLS: dict[str, type[Control]] = {
     "gradient": GradientControl,
@@ -97,7 +101,7 @@ def activate(
     degree: int,
     kind: str = "octahedron",
     filter_3d: torch.Tensor | None = None,
-) -> tuple[torch.Tensor, ...]:
+) -> Tensors:
     """Raw parameters to what the rasterizer takes: center, rotation, extent, density, sh.
 
     extent = exp(log_extent), and with `filter_3d` f (N,), a constant, extent + f / 2, or sqrt(extent^2 + f^2) for Gaussians.
@@ -253,9 +257,9 @@ class Trainer:
             )
         target = shot.over(background.detach())
         leaves = {k: v.requires_grad_() for k, v in self.parameters.items()}
-        active = self._cast(activate(leaves, self.degree, self.kind, self.filter_3d))
+        active = self._cast(*activate(leaves, self.degree, self.kind, self.filter_3d))
         screen = torch.zeros(len(self), 3, dtype=active[0].dtype, requires_grad=True)
-        (behind,) = self._cast((background,))
+        behind = background.to(active[0].dtype)
         terms = self.terms if self.has_reached(self.options.geometry_from) else None
         # Geometry has no average over the rays of a pixel: with several of them it is rendered by itself.
         needed = terms is not None and terms.needs_geometry
@@ -275,11 +279,14 @@ class Trainer:
         objective = parts[0] if penalty is None else parts[0] + penalty
         if terms is not None:
 
-            def surface(camera: Camera, tensors: tuple[torch.Tensor, ...]) -> ops.Rendering:
+            def surface(camera: Camera, tensors: Tensors) -> ops.Rendering:
                 return _single(ops.rasterize(*tensors, behind, camera, geometry=True, **how))
 
             def depth_of(camera: Camera) -> torch.Tensor:
-                return surface(camera, tuple(tensor.detach() for tensor in active)).depth_median
+                center, rotation, extent, density, sh = (tensor.detach() for tensor in active)
+                depth = surface(camera, (center, rotation, extent, density, sh)).depth_median
+                assert depth is not None
+                return depth
 
             geometry = surface(shot.camera, active) if needed and not shared else out
             objective = objective + terms.loss(geometry, index, self.step, leaves["raw_opacity"], depth_of)
@@ -287,7 +294,7 @@ class Trainer:
         grads = torch.autograd.grad(objective, wanted, allow_unused=True)
         screen_grad = grads[len(leaves)].float()
         with torch.no_grad():
-            if log_gain is not None:
+            if self.exposure is not None:
                 self.exposure.update(index, grads[-1], self.part())
             grads = grads[: len(leaves)]
             # A penalty or a term on opacities reaches every primitive, whether the view touched it or not.
@@ -311,14 +318,17 @@ class Trainer:
     def _update(self, grads: dict[str, torch.Tensor | None], touched: torch.Tensor | None) -> None:
         part = self.part()
         rates = {name: rate * final**part for name, (rate, final) in RATES.items()}
-        names = [name for name in self.parameters if grads[name] is not None]
+        wanted = {name: grad for name in self.parameters if (grad := grads[name]) is not None}
+        names = list(wanted)
         for value in self.parameters.values():
             value.requires_grad_(False)
         if self.options.adam == "sparse":
             rows = [name for name in names if name != "background"]
-            tables = (self.parameters, grads, self.first, self.second)
             adam_rows(
-                *([table[name] for name in rows] for table in tables),
+                [self.parameters[name] for name in rows],
+                [wanted[name] for name in rows],
+                [self.first[name] for name in rows],
+                [self.second[name] for name in rows],
                 [rates[name] for name in rows],
                 self.steps,
                 touched,
@@ -327,7 +337,7 @@ class Trainer:
         for name in names:
             adam_step(
                 self.parameters[name],
-                grads[name],
+                wanted[name],
                 self.first[name],
                 self.second[name],
                 rates[name],
@@ -350,12 +360,13 @@ class Trainer:
             if name in event.values:
                 rows, values = event.values[name]
                 self.parameters[name][torch.from_numpy(rows)] = torch.from_numpy(values.astype(np.float32))
+            moments: list[tuple[dict[str, Tensor], np.ndarray | slice | None]]
             moments = [(self.first, event.calm), (self.first, event.fresh), (self.second, event.fresh)]
             if name == "raw_opacity" and event.calm_opacity:
                 moments += [(self.first, slice(None)), (self.second, slice(None))]
-            for table, rows in moments:
-                if rows is not None:
-                    table[name][rows] = 0
+            for table, calmed in moments:
+                if calmed is not None:
+                    table[name][calmed] = 0
         self.steps = self.steps[source]
         if event.fresh is not None:
             self.steps[event.fresh] = 0
@@ -373,16 +384,19 @@ class Trainer:
         """(3, H, W) colour of a camera in the training frame, at the photographs' mean exposure."""
         active = activate(self.parameters, self.degree, self.kind, self.filter_3d)
         return ops.rasterize(
-            *self._cast((*active, background)),
+            *self._cast(*active),
+            background.double() if self.options.scalar == "float64" else background,
             camera,
             stop=self.options.stop,
             samples=self.options.samples,
             **self.how,
         ).rgb.float()
 
-    def _cast(self, tensors: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, ...]:
+    def _cast(self, center: Tensor, rotation: Tensor, extent: Tensor, density: Tensor, sh: Tensor) -> Tensors:
         """What the kernels take: with `--scalar float64` the same numbers in double."""
-        return tuple(tensor.double() for tensor in tensors) if self.options.scalar == "float64" else tensors
+        if self.options.scalar == "float64":
+            return center.double(), rotation.double(), extent.double(), density.double(), sh.double()
+        return center, rotation, extent, density, sh
 
     def shown_background(self) -> torch.Tensor:
         """(3,) the background that renders and scores use."""
@@ -392,7 +406,8 @@ class Trainer:
         """The primitives as the rasterizer takes them, the 3D filter included, in the training frame."""
         with torch.no_grad():
             active = activate(self.parameters, self.options.sh_degree, self.kind, self.filter_3d)
-            return Primitives(*(tensor.numpy().copy() for tensor in active), kind=self.kind)
+            center, rotation, extent, density, sh = (tensor.numpy().copy() for tensor in active)
+            return Primitives(center, rotation, extent, density, sh, self.kind)
 
     def state(self) -> dict:
         """Everything a resumed run needs, as tensors and numbers."""

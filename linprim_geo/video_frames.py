@@ -16,7 +16,7 @@ from .files import locked, writing
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 # Changed whenever other frames are chosen, so that old cache entries are not found any more.
-_CACHE_VERSION = 1
+_CACHE_VERSION = 2
 _JPEG_QUALITY = 95
 _READ_BYTES = 1 << 22
 
@@ -43,7 +43,8 @@ def extract_frames(
 ) -> Path:
     """Writes `count` frames, or all there are, as JPEG files unless that was done before; returns their folder.
 
-    Of each of `count` equal parts the frame is taken whose grey values have the largest variance of their Laplacian.
+    Of each of `count` equal parts the frame is taken whose grey values have the largest variance of their Laplacian. Frames of a phone
+    that was held upright are turned as the video says.
 
     Raises:
         LinprimError: PyAV is not installed, the file holds no video that can be decoded, or the frames cannot be written.
@@ -91,9 +92,9 @@ def _save_sharpest(av, video: Path, count: int, folder: Path) -> tuple[int, int]
             interval = index * count // total
             sharpness = _sharpness(frame.to_ndarray(format="gray"))
             if total <= count:
-                kept += _save(folder, (sharpness, index, frame.to_ndarray(format="rgb24")))
+                kept += _save(folder, (sharpness, index, _upright(frame)))
             elif best is None or sharpness > best[0]:
-                best = sharpness, index, frame.to_ndarray(format="rgb24")
+                best = sharpness, index, _upright(frame)
     if best is not None:
         kept += _save(folder, best)
     return kept, total
@@ -114,6 +115,19 @@ def _count(av, video: Path) -> int:
     with av.open(str(video)) as container:
         stream = container.streams.video[0]
         return stream.frames or max(1, sum(1 for packet in container.demux(stream) if packet.size))
+
+
+def _upright(frame) -> np.ndarray:
+    """(H, W, 3) uint8 colours of a frame as a player shows it: turned by quarters and mirrored as its display matrix says."""
+    image = frame.to_ndarray(format="rgb24")
+    side_data = frame.side_data.get("DISPLAYMATRIX")
+    if side_data is None:
+        return image
+    # (x, y) is shown at (a x + c y, b x + d y), in numbers of 16.16 bits.
+    (a, b), (c, d) = np.frombuffer(bytes(side_data), "=i4").reshape(3, 3)[:2, :2].astype(float)
+    if abs(b) + abs(c) > abs(a) + abs(d):
+        image, a, d = image.transpose(1, 0, 2), c, b
+    return np.ascontiguousarray(image[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])
 
 
 def _sharpness(grey: np.ndarray) -> float:

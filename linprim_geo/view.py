@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -119,10 +120,11 @@ class Viewer:
         import viser
 
         self.path, self.reference = path, reference
-        self.seen, self.loads, self._stamps = Seen(), 0, {}
+        self.seen, self.loads = Seen(), 0
+        self._stamps: dict[str, int] = {}
         # Controls are served by threads; a scene is built by one at a time.
         self._lock = threading.RLock()
-        self._shown: dict[str, object] = {}
+        self._shown: dict[str, Any] = {}
         if not follow:
             Run.open(path)
         _check_port(port)
@@ -238,7 +240,7 @@ class Viewer:
         side = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
         scene.add_light_directional("/light_above", intensity=FROM_ABOVE, position=tuple(2.0 * up + side))
         scene.add_light_directional("/light_below", intensity=FROM_BELOW, position=tuple(-up - 2.0 * side))
-        if self.seen.cameras:
+        if self.seen.cameras and self.seen.primitives is not None:
             camera = self.seen.cameras[0][1]
             start = self.server.initial_camera
             start.position, start.up = (
@@ -305,7 +307,7 @@ class Viewer:
         from .eval.figures import error_colors
 
         seen = self.seen
-        if not self._primitives.value:
+        if not self._primitives.value or seen.primitives is None or seen.opacity is None:
             return None
         keep = (seen.opacity >= self._opacity.value) & self._kept(seen.primitives.center)
         if not keep.any():
@@ -324,7 +326,7 @@ class Viewer:
         if chosen is None:
             return None, False
         layer = next((each for each in chosen.layers if each.name == self._layer.value), chosen.layers[0])
-        if layer.top is not None:
+        if layer.top is not None and self.seen.run is not None:
             top = f"{layer.top:.3g} {self.seen.run.unit}"
             self._legend.content = as_text(f"{layer.name}: dark blue 0, light yellow {top} and more")
         mesh = Mesh(chosen.mesh.vertices, chosen.mesh.faces, colors=layer.colors)
@@ -334,7 +336,7 @@ class Viewer:
     def _kept(self, points: np.ndarray) -> np.ndarray:
         """(P,) bool: on the side of the clipping plane that is kept, which has so many per cent of the primitives' centres."""
         share = self._plane.value / 100.0
-        if share >= 1.0:
+        if share >= 1.0 or self.seen.primitives is None:
             return np.ones(len(points), dtype=bool)
         axis = self.seen.up if self._axis.value == "up" else np.eye(3)["xyz".index(self._axis.value)]
         axis = -axis if self._flip.value else axis
@@ -351,6 +353,7 @@ def _glb(mesh: Mesh, double_sided: bool) -> bytes:
     import trimesh
     from trimesh.visual.material import PBRMaterial
 
+    assert mesh.colors is not None
     shares = mesh.colors / 255.0
     linear = np.where(shares <= 0.04045, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)

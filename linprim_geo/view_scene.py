@@ -77,11 +77,11 @@ def load_seen(
         primitives, seen.opacity = select(primitives, keep), seen.opacity[keep]
         seen.notes.append(f"the {most:,} largest and densest of {seen.count:,} {kind.plural} are shown")
     seen.primitives = primitives
-    if before is not None and before.cameras and _capture(before.run) == _capture(run):
+    if before is not None and before.run is not None and before.cameras and _capture(before.run) == _capture(run):
         seen.cameras, seen.up = before.cameras, before.up
     else:
-        _read_cameras(seen)
-    _read_meshes(seen, reference)
+        _read_cameras(seen, run)
+    _read_meshes(seen, run, reference)
     return seen
 
 
@@ -116,14 +116,14 @@ def photo(view: View) -> np.ndarray:
     return np.asarray(image)
 
 
-def _read_cameras(seen: Seen) -> None:
+def _read_cameras(seen: Seen, run: Run) -> None:
     try:
-        scene = seen.run.scene()
+        scene = run.scene()
     except LinprimError as error:
         seen.notes.append(f"no cameras are shown: {error}")
         return
-    places = [(view, view.camera.transformed(seen.run.similarity), False) for view in scene.train]
-    places += [(view, view.camera.transformed(seen.run.similarity), True) for view in scene.test]
+    places = [(view, view.camera.transformed(run.similarity), False) for view in scene.train]
+    places += [(view, view.camera.transformed(run.similarity), True) for view in scene.test]
     seen.up = up_direction([camera for _, camera, _ in places])
     if len(places) > MOST_CAMERAS:
         rows = np.unique(np.linspace(0, len(places) - 1, MOST_CAMERAS).round().astype(int))
@@ -132,8 +132,8 @@ def _read_cameras(seen: Seen) -> None:
     seen.cameras = places
 
 
-def _read_meshes(seen: Seen, reference: str | os.PathLike | None) -> None:
-    run, ignored = seen.run, []
+def _read_meshes(seen: Seen, run: Run, reference: str | os.PathLike | None) -> None:
+    ignored: list[str] = []
     found = {}
     for method in METHODS:
         stats = read_json(run.path / "mesh" / method / "stats.json", ignored)
@@ -147,8 +147,8 @@ def _read_meshes(seen: Seen, reference: str | os.PathLike | None) -> None:
     for method, file in found.items():
         try:
             mesh = load_mesh(file)
-        except LinprimError as error:
-            seen.notes.append(str(error))
+        except LinprimError as refused:
+            seen.notes.append(str(refused))
             continue
         light, rows, cell = light_mesh(mesh, MOST_MESH_FACES // len(found))
         if cell:

@@ -1,13 +1,14 @@
 """A process that has loaded the libraries and copies itself for every job, so that fifty of them can be started and killed in a minute.
 
-Run as a program it reads one JSON object per line, {"call", "arguments", "delay"}, and answers with one. A copy of itself does the
-call; after `delay` seconds it is killed with SIGKILL, or with null waited for.
+Run as a program it reads one JSON object per line, {"call", "arguments", "delay", "at"}, and answers with one. A copy of itself does the
+call; after `delay` seconds, or in the middle of a write, it is killed, or with neither waited for.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -30,11 +31,41 @@ class Jobs:
         self.process.stdin.close()
         self.process.wait()
 
-    def run(self, call: str, *arguments, delay: float | None = None) -> dict:
-        """`killed` (whether it was still at it), `seconds` that it ran, and `error`, what it raised."""
-        self.process.stdin.write(json.dumps({"call": call, "arguments": [str(x) for x in arguments], "delay": delay}) + "\n")
+    def run(self, call: str, *arguments, delay: float | None = None, at: tuple[int, int | None] | None = None) -> dict:
+        """`killed` (whether it was still at it), `seconds` that it ran, `error`, what it raised, and the `writes` of one that came to its
+        end: names of files beside or below its arguments that were opened for writing or renamed, in order.
+
+        With `at` = (number, None) it kills itself with SIGKILL just before that one of its writes; with (number, bytes) the system lets it
+        write so many bytes into any file from then on, and ends it in the middle of the next write beyond them.
+        """
+        job = {"call": call, "arguments": [str(x) for x in arguments], "delay": delay, "at": at}
+        self.process.stdin.write(json.dumps(job) + "\n")
         self.process.stdin.flush()
         return json.loads(self.process.stdout.readline())
+
+
+class Writes:
+    """Counts what a process writes, in Python's own words, and ends it at one of them."""
+
+    def __init__(self, folders: list[str], at: tuple[int, int | None] | None):
+        self.folders, self.at, self.names = tuple(folder + os.sep for folder in folders), at, []
+        sys.addaudithook(self._heard)
+
+    def _heard(self, event: str, arguments: tuple) -> None:
+        if event == "open":
+            path, _, flags = arguments
+            writes = isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR)
+        elif event == "os.rename":
+            path, writes = arguments[1], True
+        else:
+            return
+        if not writes or isinstance(path, int) or not os.fsdecode(path).startswith(self.folders):
+            return
+        if self.at is not None and len(self.names) == self.at[0]:
+            if self.at[1] is None:
+                os.kill(os.getpid(), signal.SIGKILL)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (self.at[1], self.at[1]))
+        self.names.append(os.path.basename(os.fsdecode(path)))
 
 
 def train(scene: str, run: str, options: str, resume: str) -> None:
@@ -78,21 +109,28 @@ def _serve() -> None:
         begin = time.monotonic()
         child = os.fork()
         if child == 0:
+            said, silence = "", os.open(os.devnull, os.O_WRONLY)
+            os.dup2(silence, 1)
+            os.dup2(silence, 2)  # a file perhaps, which is not to count as one that is written
+            signal.signal(signal.SIGXFSZ, signal.SIG_DFL)  # ends it, without a core file
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            writes = Writes([os.path.dirname(path) for path in job["arguments"] if os.path.isabs(path)], job["at"])
             try:
                 globals()[job["call"]](*job["arguments"])
             except BaseException as error:  # noqa: BLE001 - it is told
-                os.write(writer, f"{type(error).__name__}: {error}".encode())
+                said = f"{type(error).__name__}: {error}"
+            os.write(writer, json.dumps([said, writes.names]).encode())
             os._exit(0)
         os.close(writer)
         if job["delay"] is not None:
             while time.monotonic() < begin + job["delay"] and not os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT):
                 time.sleep(0.001)
             os.kill(child, signal.SIGKILL)
-        status = os.waitpid(child, 0)[1]
         with open(reader, "rb") as file:
-            error = file.read().decode()
-        killed = os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
-        answer = {"killed": killed, "seconds": time.monotonic() - begin, "error": error}
+            error, names = json.loads(file.read() or '["", []]')
+        status = os.waitpid(child, 0)[1]
+        killed = os.WIFSIGNALED(status) and os.WTERMSIG(status) in (signal.SIGKILL, signal.SIGXFSZ)
+        answer = {"killed": killed, "seconds": time.monotonic() - begin, "error": error, "writes": names}
         os.write(answers, (json.dumps(answer) + "\n").encode())
 
 

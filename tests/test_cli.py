@@ -499,3 +499,14 @@ def test_missing_system_libraries_come_with_the_line_that_installs_them(monkeypa
 def test_a_compiler_that_cannot_do_cxx20_is_named(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     assert "no-such-compiler does not compile C++20" in system.compiler_problem()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="makes a symbolic link")
+@pytest.mark.parametrize("command", ["train", "inspect", "tradeoff", "render"])
+def test_a_link_to_itself_is_refused_in_one_sentence(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    assert cli.main([command, "loop"]) == cli.EXIT_UNUSABLE
+    said = capsys.readouterr().err
+    assert said.startswith("linprim-geo: error: loop") and said.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["loop"]

@@ -140,6 +140,29 @@ def test_images_of_the_benchmark_that_are_not_given_out_are_no_error_but_others_
         load_scene(tmp_path)
 
 
+@pytest.mark.parametrize("distorted", [True, False])
+@pytest.mark.parametrize("colmap", [True, False])
+def test_images_that_are_marked_bad_are_left_out(tmp_path, distorted, colmap):
+    write_dslr(tmp_path, distorted=distorted, undistorted=not distorted, colmap=colmap)
+    path = tmp_path / "dslr/nerfstudio" / ("transforms.json" if distorted else "transforms_undistorted.json")
+    header = json.loads(path.read_text())
+    for entry in header["frames"] + header["test_frames"]:
+        entry["is_bad"] = entry["file_path"] in ("DSC00002.JPG", "DSC00008.JPG")
+    path.write_text(json.dumps(header))
+    scene = load_scene(tmp_path)
+    assert [view.name for view in scene.train] == [f"DSC{i:05d}" for i in (0, 1, 3, 4, 5, 6)]
+    assert [view.name for view in scene.test] == ["DSC00007"]
+    for entry in header["frames"] + header["test_frames"]:
+        entry["is_bad"] = True
+    path.write_text(json.dumps(header))
+    with pytest.raises(LinprimError, match="all images are marked 'is_bad', wanted some that are not"):
+        load_scene(tmp_path)
+    header["frames"][0]["is_bad"] = "no"
+    path.write_text(json.dumps(header))
+    with pytest.raises(LinprimError, match="frame 0 .*: 'is_bad' is 'no', wanted true or false"):
+        load_scene(tmp_path)
+
+
 @pytest.mark.parametrize(
     "file, content, words",
     [

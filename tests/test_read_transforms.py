@@ -99,6 +99,18 @@ def test_what_instant_ngp_writes(tmp_path):
         np.testing.assert_allclose(view.camera.world_to_camera, cameras[int(view.name)].world_to_camera, atol=1e-12)
 
 
+def test_frames_that_are_marked_bad_are_left_out(tmp_path):
+    write_transforms(tmp_path, 6)
+    path = tmp_path / "transforms.json"
+    edit(path, lambda c: [frame.update(is_bad=i in (1, 4)) for i, frame in enumerate(c["frames"])])
+    (tmp_path / "images" / "04.png").unlink()
+    assert sorted(view.name for view in load_scene(tmp_path).views) == ["00", "02", "03", "05"]
+    edit(path, lambda c: c["frames"][0].update(is_bad=1))
+    assert "frame 0 (images/00.png): 'is_bad' is 1, wanted true or false" in refusal(tmp_path)
+    edit(path, lambda c: [frame.update(is_bad=True) for frame in c["frames"]])
+    assert "all 6 frames are marked 'is_bad'" in refusal(tmp_path)
+
+
 def test_named_splits_of_nerfstudio(tmp_path):
     write_transforms(
         tmp_path, 6, train_filenames=["images/00.png"], test_filenames=["images/02.png", "./images/05.png"]

@@ -332,6 +332,17 @@ def test_webp_photographs_are_read_as_well(copied, posed, tmp_path):
     ]
 
 
+def test_a_photograph_whose_suffix_is_wrong_is_copied_as_png(tmp_path):
+    names = ["0.png", "1.png"]
+    for index, (name, kind) in enumerate(zip(names, ("PNG", "GIF"), strict=True)):
+        picture(index).convert("L").save(tmp_path / name, format=kind)
+    folder = structure_from_motion._readable(tmp_path, names, tmp_path / "kept")
+    for index, name in enumerate(names):
+        with Image.open(folder / name) as image:
+            assert image.format == "PNG"
+            np.testing.assert_array_equal(np.asarray(image.convert("L")), np.asarray(picture(index).convert("L")))
+
+
 @pytest.mark.parametrize(
     "damaged",
     [

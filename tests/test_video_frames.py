@@ -22,12 +22,14 @@ from linprim_geo.structure_from_motion import prepare
 from linprim_geo.video_frames import extract_frames, is_video
 
 
-def write_video(path, images, rate=10):
-    """An MPEG-4 video of PIL images."""
+def write_video(path, images, rate=10, matrix=None):
+    """An MPEG-4 video of PIL images, shown as the display matrix says."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("mpeg4", rate=rate)
         stream.width, stream.height = images[0].size
         stream.pix_fmt, stream.bit_rate = "yuv420p", 8_000_000
+        if matrix:
+            stream.set_display_matrix(matrix)
         for image in images:
             for packet in stream.encode(av.VideoFrame.from_image(image.convert("RGB"))):
                 container.mux(packet)
@@ -68,6 +70,32 @@ def test_the_sharpest_frame_of_each_part_is_taken(video, tmp_path):
 def test_a_short_video_gives_all_its_frames(video, tmp_path):
     assert len(list(extract_frames(video, 24, tmp_path).iterdir())) == 24
     assert len(list(extract_frames(video, 150, tmp_path).iterdir())) == 24
+
+
+ONE = 1 << 16
+
+
+@pytest.mark.parametrize(
+    "a, b, c, d, shown",
+    [
+        (0, ONE, -ONE, 0, Image.Transpose.ROTATE_270),  # a phone held upright
+        (0, -ONE, ONE, 0, Image.Transpose.ROTATE_90),
+        (-ONE, 0, 0, -ONE, Image.Transpose.ROTATE_180),
+        (-ONE, 0, 0, ONE, Image.Transpose.FLIP_LEFT_RIGHT),
+        (ONE, 0, 0, -ONE, Image.Transpose.FLIP_TOP_BOTTOM),
+        (0, ONE, ONE, 0, Image.Transpose.TRANSPOSE),
+        (0, -ONE, -ONE, 0, Image.Transpose.TRANSVERSE),
+    ],
+)
+def test_frames_are_turned_as_the_video_says(a, b, c, d, shown, tmp_path):
+    image = Image.new("RGB", (96, 64), (20, 20, 20))
+    image.paste((230, 30, 30), (0, 0, 48, 16))
+    image.paste((30, 230, 30), (80, 32, 96, 64))
+    write_video(tmp_path / "phone.mp4", [image] * 3, matrix=(a, b, 0, c, d, 0, 0, 0, 1 << 30))
+    folder = extract_frames(tmp_path / "phone.mp4", 3, tmp_path)
+    wanted, found = image.transpose(shown), Image.open(folder / "000001.jpg")
+    assert found.size == wanted.size
+    assert np.abs(np.asarray(found, np.float32) - np.asarray(wanted, np.float32)).mean() < 6
 
 
 def test_frames_are_kept_by_content_and_number(video, tmp_path, monkeypatch):
