@@ -108,7 +108,8 @@ def score(folder: Path, reference: Path | None, methods: tuple[str, ...]) -> dic
 
     run = Run.open(folder)
     cameras = [view.camera for view in run.scene().train]
-    row = {"psnr": eval_images_run(run)["psnr"], "seconds": json.loads((folder / "seconds.json").read_text())["cpu_seconds"]}
+    row = {"psnr": eval_images_run(run, lpips_weights="none")["psnr"]}
+    row["seconds"] = json.loads((folder / "seconds.json").read_text())["cpu_seconds"]
     if any(view.depth_path for view in run.scene().test):
         row["abs_rel"] = eval_depth_run(run)["abs_rel"]
     for method in methods:

@@ -1,4 +1,4 @@
-"""Image scores: PSNR and SSIM of renders against held-out photographs.
+"""Image scores: PSNR, SSIM and, where its weights are at hand, LPIPS of renders against held-out photographs.
 
 Renders are clamped to [0, 1] and rounded to 8 bits before they are compared, exactly as a saved PNG would be,
 and a photograph with alpha is first composited over the background that the run renders with, and rounded to
@@ -104,26 +104,38 @@ def composite(photo, background: np.ndarray) -> np.ndarray:
     return to_8bit(photo.rgb / 255.0 * alpha + np.asarray(background, np.float64) * (1.0 - alpha))
 
 
-def eval_images_run(run, *, split: str = "test", output: str | os.PathLike | None = None) -> dict:
+def eval_images_run(
+    run,
+    *,
+    split: str = "test",
+    output: str | os.PathLike | None = None,
+    lpips_weights: str | os.PathLike | None = None,
+) -> dict:
     """Renders the held-out views of a run and scores them against the photographs.
 
-    Writes `results.json` and `per_view.csv` (name, psnr, ssim) to `output`, by default the run's
+    Writes `results.json` and `per_view.csv` (name, psnr, ssim, LPIPS) to `output`, by default the run's
     `eval/images`.
 
     Args:
         run: a run folder, or an open run.
         split: "test", "train" or "all".
+        lpips_weights: file or folder, see `lpips.find_lpips`; None takes what is installed or was downloaded before, "none" leaves
+            LPIPS out.
 
     Returns:
         `psnr` in dB and `ssim`, means over the views, with `psnr_standard_error` and `ssim_standard_error`
         as for independent views (NaN of one); `views`, `split`, `protocol`, `background` and `seconds`.
+        Where weights are at hand likewise `lpips_alex`, `lpips_vgg` and `lpips_vgg_3dgs` (as the tables of 3DGS and LinPrim have it),
+        and `lpips_files`; where they are not, `lpips_missing` says so.
 
     Raises:
-        LinprimError: the split is empty, or a render is not finite or of another size than its photograph.
+        LinprimError: the split is empty, a render is not finite or of another size than its photograph, or the weights that are given
+            cannot be used.
     """
     start = time.perf_counter()
     run = open_run(run)
     views = views_of(run.scene(), split)
+    distances, missing = _distances(views, lpips_weights)
     background = np.asarray(run.background, np.float64)
     rows = []
     for view, rendered in run.render_views(views, geometry=False):
@@ -137,12 +149,21 @@ def eval_images_run(run, *, split: str = "test", output: str | os.PathLike | Non
         if not np.isfinite(render).all():
             raise LinprimError(f"view {view.name}: the render holds NaN or infinity, expected finite colours")
         render = to_8bit(render)
-        rows.append({"name": view.name, "psnr": psnr(render, truth), "ssim": ssim(render, truth)})
-    results = {
-        "psnr": float(np.mean([row["psnr"] for row in rows])),
-        "ssim": float(np.mean([row["ssim"] for row in rows])),
-        "psnr_standard_error": _standard_error([row["psnr"] for row in rows]),
-        "ssim_standard_error": _standard_error([row["ssim"] for row in rows]),
+        row = {"name": view.name, "psnr": psnr(render, truth), "ssim": ssim(render, truth)}
+        for lpips in distances:
+            name = f"lpips_{lpips.network.name}"
+            row[name] = lpips.distance(render, truth)
+            if lpips.network.name == "vgg":
+                row[f"{name}_3dgs"] = lpips.distance(render, truth, as_3dgs=True)
+        rows.append(row)
+    names = [name for name in rows[0] if name != "name"]
+    results = {name: float(np.mean([row[name] for row in rows])) for name in names}
+    results |= {f"{name}_standard_error": _standard_error([row[name] for row in rows]) for name in names}
+    if distances:
+        results["lpips_files"] = {lpips.network.name: lpips.files for lpips in distances}
+    elif missing:
+        results["lpips_missing"] = missing
+    results |= {
         "views": len(rows),
         "split": split,
         "protocol": "8-bit renders and photographs, mean over views",
@@ -151,6 +172,28 @@ def eval_images_run(run, *, split: str = "test", output: str | os.PathLike | Non
     }
     write_results(Path(run.path) / "eval" / "images" if output is None else output, results, rows)
     return results
+
+
+def _distances(views, weights: str | os.PathLike | None) -> tuple[list, str]:
+    """What computes LPIPS of these views, and why nothing does.
+
+    Raises:
+        LinprimError: weights are given, and cannot be used or are for larger images.
+    """
+    if weights is not None and os.fspath(weights) == "none":
+        return [], ""
+    from linprim_geo.eval.lpips import find_lpips
+
+    found, missing = find_lpips(weights)
+    small = min(views, key=lambda view: min(view.camera.width, view.camera.height))
+    least = min(small.camera.width, small.camera.height)
+    fitting = [lpips for lpips in found if lpips.network.smallest <= least]
+    if found and not fitting:
+        wanted = min(lpips.network.smallest for lpips in found)
+        missing = f"view {small.name} is {small.camera.width}x{small.camera.height}, LPIPS wants at least {wanted}x{wanted}"
+        if weights is not None:
+            raise LinprimError(missing)
+    return fitting, missing
 
 
 def _standard_error(values: list[float]) -> float:

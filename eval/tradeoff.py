@@ -60,6 +60,8 @@ def tradeoff(
     reference: str | os.PathLike | None = None,
     quick: bool = False,
     rounds: int | None = None,
+    iterations: int | None = None,
+    max_primitives: int | None = None,
     threads: int = 0,
     quiet: bool = False,
 ) -> dict:
@@ -72,6 +74,7 @@ def tradeoff(
         reference: mesh in the data set's frame for Chamfer distances and depth; default: `reference.ply` in the scene, if there.
         quick: the size `QUICK`, to see that all of it runs.
         rounds: how often everything is timed (default 3, quick 2).
+        iterations, max_primitives: in place of those of `MODEST` or `QUICK`.
 
     Returns: what tradeoff.json holds: `rows` (one per rung of each knob), `sentences`, `rule`, `about`.
 
@@ -83,7 +86,12 @@ def tradeoff(
         raise LinprimError(f"--knobs {unknown[0]} is unknown, wanted some of {', '.join(KNOBS)}")
     if rounds is not None and rounds < 1:
         raise LinprimError(f"--rounds is {rounds}, wanted at least 1")
-    sweep = Sweep(Path(scene), Path(output), run, reference, quick, rounds, threads, quiet)
+    size = {"iterations": iterations, "max_primitives": max_primitives}
+    for name, value in size.items():
+        if value is not None and value < 1:
+            raise LinprimError(f"--{name.replace('_', '-')} is {value}, wanted at least 1")
+    size = (QUICK if quick else MODEST) | {name: value for name, value in size.items() if value is not None}
+    sweep = Sweep(Path(scene), Path(output), run, reference, quick, rounds, size, threads, quiet)
     chosen = [KNOBS[name] for name in KNOBS if not knobs or name in knobs]
     return sweep.measure(chosen)
 
@@ -91,7 +99,7 @@ def tradeoff(
 class Sweep:
     """One folder of measurements. `store[key]` of a setting holds `times`, `peak_gib`, and what was found of it once."""
 
-    def __init__(self, scene, folder, run, reference, quick, rounds, threads, quiet):
+    def __init__(self, scene, folder, run, reference, quick, rounds, size, threads, quiet):
         from linprim_geo.progress import Progress
         from linprim_geo.scene import load_scene
         from linprim_geo.structure_from_motion import prepare
@@ -105,7 +113,7 @@ class Sweep:
         widest = max(view.camera.width for view in self.scene.train)
         self.scene_options = SceneOptions(downscale=-(-widest // (QUICK_WIDEST if quick else WIDEST)))
         self.options = TrainOptions(
-            **(QUICK if quick else MODEST), threads=threads, evaluate_every=0, checkpoint_every=10**9
+            **size, threads=threads, evaluate_every=0, checkpoint_every=10**9
         )
         found = Path(reference) if reference else self.scene_path / "reference.ply"
         if reference and not found.exists():
@@ -382,7 +390,7 @@ class Sweep:
         run = replace(run, scene_options=replace(run.scene_options, downscale=self.scene_options.downscale))
         found = {}
         if run.scene().test:
-            found["psnr"] = eval_images_run(run)["psnr"]
+            found["psnr"] = eval_images_run(run, lpips_weights="none")["psnr"]
             found["photo_percent"] = 100 * 10 ** (-found["psnr"] / 20)
             if self.reference or any(view.depth_path for view in run.scene().test):
                 found["depth_percent"] = 100 * eval_depth_run(run, self.reference)["abs_rel"]

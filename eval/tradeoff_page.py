@@ -88,19 +88,19 @@ def plot(rows: Sequence[dict], error: str) -> str:
     if on:
         # What one can have: the error of the best that takes no longer, so the line goes in steps.
         path = f"M{on[0][0]:.1f} {TOP}V{on[0][1]:.1f}" + "".join(f"H{x:.1f}V{y:.1f}" for x, y in on[1:]) + f"H{WIDTH - RIGHT}"
-        out.append(f'<path d="{path}" fill="none" stroke="#1f63b2" stroke-width="1.5" stroke-opacity="0.6"/>')
+        out.append(f'<path d="{path}" class="on" fill="none" stroke-width="1.5" stroke-opacity="0.6"/>')
     boxes = [(x - 6, y - 6, x + 6, y + 6) for x, y in places]
     boxes += [(x_axis.at(row["low"]), y - 3, x_axis.at(row["high"]), y + 3) for row, (_, y) in zip(rows, places, strict=True)]
     for (x0, y0), (x1, y1) in zip(on, [*on[1:], (WIDTH - RIGHT, on[-1][1])] if on else [], strict=True):
         boxes += [(x0, y0 - 3, x1, y0 + 3), (x1 - 3, min(y0, y1), x1 + 3, max(y0, y1))]
     for row, (x, y) in zip(rows, places, strict=True):
-        color = "#1f63b2" if row["frontier"] else "#8a939e"
+        kind = "on" if row["frontier"] else "off"
         low, high = x_axis.at(row["low"]), x_axis.at(row["high"])
-        bar = f'x1="{low:.1f}" x2="{high:.1f}" y1="{y:.1f}" y2="{y:.1f}" stroke="{color}"'
+        bar = f'x1="{low:.1f}" x2="{high:.1f}" y1="{y:.1f}" y2="{y:.1f}" class="{kind}"'
         out.append(f'<line {bar} stroke-width="2" stroke-opacity="0.5"/>')
         if row["default"]:
-            out.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="7.5" fill="none" stroke="{color}"/>')
-        out.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{color}"/>')
+            out.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="7.5" class="{kind}" fill="none"/>')
+        out.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" class="{kind} dot"/>')
     for row, (x, y) in zip(rows, places, strict=True):
         left, top = _free_place(x, y, len(row["rung"]) * LETTER, boxes)
         boxes.append((left, top, left + len(row["rung"]) * LETTER, top + LINE))

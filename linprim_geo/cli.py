@@ -335,10 +335,12 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--depth", choices=("overlap", "median", "expected", "first"), default="overlap", help=depth)
     sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/eval/depth)")
 
-    sub = command("eval-images", commands.eval_images, "score a run's colours: PSNR and SSIM on held-out views")
+    sub = command("eval-images", commands.eval_images, "score a run's colours: PSNR, SSIM and LPIPS on held-out views")
     sub.add_argument("run", metavar="RUN", help="folder that train has made")
     sub.add_argument("--split", choices=SPLITS, default="test", help="which views (default test)")
     sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/eval/images)")
+    text = "weights of LPIPS, file or folder (default: torch's cache, and packages lpips or torchmetrics; none: leaves it out)"
+    sub.add_argument("--lpips-weights", metavar="PATH", help=text)
 
     sub = command(
         "eval-mesh", commands.eval_mesh, "score a mesh against a reference mesh: Chamfer distance and the rest"
@@ -394,6 +396,8 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--reference", metavar="MESH", help=text)
     sub.add_argument("--quick", action="store_true", help="a tiny size, to see that all of it runs")
     sub.add_argument("--rounds", type=_positive, metavar="N", help="how often everything is timed, in turn (default 3, quick 2)")
+    for name in ("iterations", "max-primitives"):
+        sub.add_argument(f"--{name}", type=_positive, metavar="N", help="of the training that is swept around (default 2000, quick 200)")
     sub.add_argument("--threads", type=_whole, default=0, metavar="N", help="0 uses every core (default)")
     add_quiet(sub)
 

@@ -121,7 +121,7 @@ def eval_depth(parsed: argparse.Namespace) -> dict:
 def eval_images(parsed: argparse.Namespace) -> dict:
     from .eval.images import eval_images_run
 
-    return eval_images_run(parsed.run, split=parsed.split, output=parsed.output)
+    return eval_images_run(parsed.run, split=parsed.split, output=parsed.output, lpips_weights=parsed.lpips_weights)
 
 
 def eval_mesh(parsed: argparse.Namespace) -> dict:
@@ -156,6 +156,8 @@ def tradeoff(parsed: argparse.Namespace) -> dict:
         reference=parsed.reference,
         quick=parsed.quick,
         rounds=parsed.rounds,
+        iterations=parsed.iterations,
+        max_primitives=parsed.max_primitives,
         threads=parsed.threads,
         quiet=parsed.quiet,
     )

@@ -42,6 +42,14 @@ MESH_SCORES = (
     ("f1", "F1", ""),
     ("normal_consistency", "normals", "|cos|"),
 )
+# Of the held-out views, with the digits to show; the first two are always there.
+IMAGE_SCORES = (
+    ("psnr", "PSNR, dB", 2),
+    ("ssim", "SSIM", 4),
+    ("lpips_alex", "LPIPS, AlexNet", 4),
+    ("lpips_vgg", "LPIPS, VGG16", 4),
+    ("lpips_vgg_3dgs", "LPIPS as 3DGS has it", 4),
+)
 DEPTH_SCORES = (
     ("abs_rel", "AbsRel", ""),
     ("rmse", "RMSE", "{unit}"),
@@ -267,17 +275,16 @@ def _scores(report: Report) -> str:
     parts = []
     if report.images:
         images = report.images
+        shown = [*IMAGE_SCORES[:2], *(score for score in IMAGE_SCORES[2:] if score[0] in images)]
         rows = [
             [
                 f"{_number(images.get(name), digits)} ± {_number(images.get(f'{name}_standard_error'), digits)}"
-                for name, digits in (("psnr", 2), ("ssim", 4))
+                for name, _, digits in shown
             ]
             + [str(images.get("views"))]
         ]
-        parts.append(
-            "<h3>Colours</h3>"
-            + _table(rows, ("PSNR, dB", "SSIM", "views"), f"Protocol: {images.get('protocol')}.")
-        )
+        head = (*(title for _, title, _ in shown), "views")
+        parts.append("<h3>Colours</h3>" + _table(rows, head, f"Protocol: {images.get('protocol')}."))
     if report.depth:
         depth = report.depth
         head = [title + (f", {unit}" if unit else "") for _, title, unit in DEPTH_SCORES]

@@ -1,6 +1,6 @@
 """Plots as inline SVG: an axis with round ticks, a frame with a grid, and curves over one axis; well-formed XML, no script.
 
-Colours are the classes `frame`, `grid` and `series0`, `series1`, ... of `STYLE`, so that a page can be light or dark.
+Colours are the classes `frame`, `grid`, `series0`, `series1`, `on`, `off` of `STYLE`, so that a page can be light or dark.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ STYLE = """
 svg text { font: 11px system-ui, sans-serif; fill: var(--ink, #1b1f24); }
 svg .frame { fill: var(--plot, #fafbfc); stroke: var(--edge, #c8ced6); } svg .grid { stroke: var(--line, #e3e7ec); }
 svg .series0 { stroke: var(--blue, #1f63b2); } svg .series1 { stroke: var(--orange, #c25e0c); }
+svg .on { stroke: var(--blue, #1f63b2); } svg .off { stroke: var(--dim, #8a939e); }
+svg .on.dot { fill: var(--blue, #1f63b2); } svg .off.dot { fill: var(--dim, #8a939e); } svg .dot { stroke: none; }
 svg .curve { fill: none; stroke-width: 1.6; stroke-linejoin: round; } svg .point { stroke-width: 5; stroke-linecap: round; }
 """
 # A linear axis has round steps, about so many.

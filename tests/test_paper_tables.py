@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import csv
 import json
 import math
@@ -12,15 +13,17 @@ import torch
 
 from linprim_geo import train as train_module
 from linprim_geo.camera import Camera
-from linprim_geo.eval import paper_tables
-from linprim_geo.eval.paper_tables import Model, Variant
+from linprim_geo.eval import equal_points, paper_kinds, paper_models, paper_tables
+from linprim_geo.eval.paper_models import Model, Variant
 from linprim_geo.primitives import KINDS, Primitives
 from linprim_geo.reference import rotation_matrix
 from linprim_geo.trainer import Trainer
 
 NEAR = 0.01  # of ops.rasterize
 SMALLEST_ALPHA = 1 / 255  # of a Gaussian that counts as hit
-DOUBTFUL = 1e-4  # share of its own size by which float32 may take a pixel on the edge for inside or outside: 1e3 eps
+DOUBTFUL = (
+    1e-4  # share of its own size by which float32 may take a pixel on the edge for inside or outside: 1e3 eps
+)
 
 
 # --- interpolation -----------------------------------------------------------------------------------------
@@ -28,31 +31,42 @@ DOUBTFUL = 1e-4  # share of its own size by which float32 may take a pixel on th
 
 def power_law(counts, offset=0.0, factor=1.0):
     """(count, psnr, frame ms, core ms) with psnr = 20 + offset + 5 log10(count / 1000), ms = factor count^0.8 / 100, core half of it."""
-    return [(n, 20 + offset + 5 * math.log10(n / 1000), factor * n**0.8 / 100, factor * n**0.8 / 200) for n in counts]
+    return [
+        (n, 20 + offset + 5 * math.log10(n / 1000), factor * n**0.8 / 100, factor * n**0.8 / 200)
+        for n in counts
+    ]
 
 
 def test_what_costs_more_without_scoring_more_is_no_part_of_a_curve():
-    assert paper_tables.rising([(4, 22.0), (1, 20.0), (3, 21.0), (2, 21.0), (5, 21.9)]) == [(1, 20.0), (2, 21.0), (4, 22.0)]
+    assert equal_points.rising([(4, 22.0), (1, 20.0), (3, 21.0), (2, 21.0), (5, 21.9)]) == [
+        (1, 20.0),
+        (2, 21.0),
+        (4, 22.0),
+    ]
 
 
 def test_a_power_law_is_interpolated_exactly_between_any_points():
     curve = power_law([1000, 3000, 20_000])
     for count in (1000, 1001, 2500, 3000, 19_000, 20_000):
         ((_, level, *wanted),) = power_law([count])
-        assert paper_tables.at_psnr(curve, level) == pytest.approx((count, *wanted), rel=1e-12)
+        assert equal_points.at_psnr(curve, level) == pytest.approx((count, *wanted), rel=1e-12)
     # A larger model that scores less does not bend it.
-    assert paper_tables.at_psnr([*curve, (25_000, 21.0, 99.0, 99.0)], 22.0)[0] == pytest.approx(1000 * 10**0.4)
+    assert equal_points.at_psnr([*curve, (25_000, 21.0, 99.0, 99.0)], 22.0)[0] == pytest.approx(
+        1000 * 10**0.4
+    )
 
 
 def test_nothing_is_extrapolated():
     curve = power_law([1000, 2000])
-    assert paper_tables.at_psnr(curve, 19.99) is None and paper_tables.at_psnr(curve, 22.0) is None
-    assert paper_tables.equal_psnr(curve, power_law([1000, 2000], offset=2.0)) == []
+    assert equal_points.at_psnr(curve, 19.99) is None and equal_points.at_psnr(curve, 22.0) is None
+    assert equal_points.equal_psnr(curve, power_law([1000, 2000], offset=2.0)) == []
 
 
 def test_frame_times_are_compared_where_the_psnr_is_the_same():
     # B needs 10^(1 / 5) times fewer primitives for the same PSNR and three times longer for each of them.
-    found = paper_tables.equal_psnr(power_law([1000, 4000, 9000]), power_law([900, 8000], offset=1.0, factor=3.0))
+    found = equal_points.equal_psnr(
+        power_law([1000, 4000, 9000]), power_law([900, 8000], offset=1.0, factor=3.0)
+    )
     both = 21 + 5 * math.log10(0.9), 20 + 5 * math.log10(9)
     assert [p["psnr"] for p in found] == pytest.approx([both[0], sum(both) / 2, both[1]])
     for point in found:
@@ -64,10 +78,10 @@ def test_frame_times_are_compared_where_the_psnr_is_the_same():
 def test_psnr_after_a_time_is_linear_in_its_logarithm_and_stays_after_the_end():
     curve = [(t, 20 + 3 * math.log(t)) for t in (1.0, 4.0, 30.0)]
     for seconds in (1.0, 2.0, 4.0, 29.0):
-        assert paper_tables.at_time(curve, seconds) == pytest.approx(20 + 3 * math.log(seconds))
-    assert paper_tables.at_time(curve, 0.99) is None
-    assert paper_tables.at_time(curve, 100.0) == pytest.approx(curve[-1][1])
-    assert paper_tables.at_time([*curve, (40.0, 3.0)], 40.0) == pytest.approx(curve[-1][1])
+        assert equal_points.at_time(curve, seconds) == pytest.approx(20 + 3 * math.log(seconds))
+    assert equal_points.at_time(curve, 0.99) is None
+    assert equal_points.at_time(curve, 100.0) == pytest.approx(curve[-1][1])
+    assert equal_points.at_time([*curve, (40.0, 3.0)], 40.0) == pytest.approx(curve[-1][1])
 
 
 def test_a_comparison_of_made_up_models():
@@ -76,11 +90,18 @@ def test_a_comparison_of_made_up_models():
         for n, psnr, ms, core in power_law([1000, 2000, 4000], offset, slow):
             row = {"model": kind, "kind": kind, "cap": n, "count": n, "psnr": psnr, "frame_cpu_ms": ms}
             row |= {"preprocess_ms": core / 4, "sort_tile_ms": core / 4, "render_ms": core / 2}
-            rows.append(row | {"train_cpu_seconds": slow * n / 100, "curve": [[n / 1000, 15.0], [slow * n / 100, psnr]]})
-    found = paper_tables.compare(rows)
+            rows.append(
+                row
+                | {"train_cpu_seconds": slow * n / 100, "curve": [[n / 1000, 15.0], [slow * n / 100, psnr]]}
+            )
+    found = paper_kinds.compare(rows)
     (pair,) = found["equal_psnr"]
     assert pair["pair"] == ["octahedron", "gaussian"]
-    assert [p["ms_ratio"] for p in pair["points"]] == pytest.approx([10**0.16 / 2] * 3) == [p["core_ratio"] for p in pair["points"]]
+    assert (
+        [p["ms_ratio"] for p in pair["points"]]
+        == pytest.approx([10**0.16 / 2] * 3)
+        == [p["core_ratio"] for p in pair["points"]]
+    )
     # Finished: 20 to 40 s are shared, and a Gaussian of the same time has half as many primitives.
     assert [e["seconds"] for e in found["equal_time"]] == pytest.approx([20, 20 * 2**0.5, 40])
     for entry in found["equal_time"]:
@@ -93,10 +114,10 @@ def test_a_comparison_of_made_up_models():
 
 
 def test_thinness_is_that_of_the_shape():
-    assert paper_tables.thinness(np.array([[1.0, 2.0, 4.0]]), "octahedron") == pytest.approx(0.25)
-    assert paper_tables.thinness(np.array([[1.0, 2.0, 4.0]]), "gaussian") == pytest.approx(0.25)
-    assert paper_tables.thinness(np.full((3, 4), 0.7), "tetrahedron") == pytest.approx(1.0)
-    assert paper_tables.thinness(np.array([[0.01, 1.0, 1.0, 1.0]]), "tetrahedron") < 0.5
+    assert paper_models.thinness(np.array([[1.0, 2.0, 4.0]]), "octahedron") == pytest.approx(0.25)
+    assert paper_models.thinness(np.array([[1.0, 2.0, 4.0]]), "gaussian") == pytest.approx(0.25)
+    assert paper_models.thinness(np.full((3, 4), 0.7), "tetrahedron") == pytest.approx(1.0)
+    assert paper_models.thinness(np.array([[0.01, 1.0, 1.0, 1.0]]), "tetrahedron") < 0.5
 
 
 # --- counts ------------------------------------------------------------------------------------------------
@@ -109,7 +130,14 @@ def some_primitives(kind: str, rng) -> Primitives:
     center[27:, 0] += 40
     extent = rng.uniform(0.25, 0.6, (30, KINDS[kind].extents)) * KINDS[kind].size
     rotation, sh = rng.normal(size=(30, 4)), rng.uniform(0, 1, (30, 1, 3))
-    return Primitives(center, rotation / np.linalg.norm(rotation, axis=1, keepdims=True), extent, rng.uniform(0.2, 0.9, 30), sh, kind)
+    return Primitives(
+        center,
+        rotation / np.linalg.norm(rotation, axis=1, keepdims=True),
+        extent,
+        rng.uniform(0.2, 0.9, 30),
+        sh,
+        kind,
+    )
 
 
 CAMERA = Camera(40, 32, 33.0, 35.0, 20.3, 15.8, np.eye(4))
@@ -135,7 +163,9 @@ def brute_force(p: Primitives, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
             doubtful.append(abs(chord) < DOUBTFUL * extent[i].min())
         else:
             u, v, w = center[i]
-            jacobian = np.array([[camera.fx / w, 0, -camera.fx * u / w**2], [0, camera.fy / w, -camera.fy * v / w**2]])
+            jacobian = np.array(
+                [[camera.fx / w, 0, -camera.fx * u / w**2], [0, camera.fy / w, -camera.fy * v / w**2]]
+            )
             arms = jacobian @ (axes[i] * extent[i])
             off = np.stack([x - camera.fx * u / w - camera.cx, y - camera.fy * v / w - camera.cy], -1)
             exponent = np.einsum("hwi,ij,hwj->hw", off, np.linalg.inv(arms @ arms.T), off) / 2
@@ -165,7 +195,7 @@ def test_counts_are_those_of_brute_force(kind):
     p = some_primitives(kind, np.random.default_rng(3))
     hit, doubtful = brute_force(p, CAMERA)
     model = Model(p, np.zeros(3), [CAMERA], {"primitive": kind, "stop": 0.0, "samples": 1})
-    (found,) = paper_tables.measure([model], repeats=1)
+    (found,) = paper_models.measure([model], repeats=1)
     assert found["in_frustum"] == hit.any((1, 2)).sum() == 24
     assert abs(found["intersected"] - hit.sum()) <= doubtful.sum() < 5
     # Blocks of 4x4 pixels of lists of 16x16 tiles: at least those with a hit, at most those of the box round the hits.
@@ -177,32 +207,64 @@ def test_counts_are_those_of_brute_force(kind):
 
 
 def test_counts_of_something_that_fills_the_image_are_all_its_pixels():
-    one = Primitives(np.array([[0, 0, 3.0]]), np.array([[1.0, 0, 0, 0]]), np.full((1, 3), 20.0), np.array([0.01]), np.zeros((1, 1, 3)))
+    one = Primitives(
+        np.array([[0, 0, 3.0]]),
+        np.array([[1.0, 0, 0, 0]]),
+        np.full((1, 3), 20.0),
+        np.array([0.01]),
+        np.zeros((1, 1, 3)),
+    )
     how = {"primitive": "octahedron", "stop": 0.0, "samples": 1}
-    (found,) = paper_tables.measure([Model(one, np.zeros(3), [CAMERA] * 2, how)], repeats=2)
-    assert (found["in_frustum"], found["tile_entries"], found["iterated"], found["intersected"]) == (1, 6, 1280, 1280)
-    stages = sum(found[name] for name in paper_tables.STAGES)
+    (found,) = paper_models.measure([Model(one, np.zeros(3), [CAMERA] * 2, how)], repeats=2)
+    assert (found["in_frustum"], found["tile_entries"], found["iterated"], found["intersected"]) == (
+        1,
+        6,
+        1280,
+        1280,
+    )
+    stages = sum(found[name] for name in paper_models.STAGES)
     assert 0 < stages <= found["frame_ms"] and found["frame_cpu_ms"] > 0
 
 
 # --- the whole ---------------------------------------------------------------------------------------------
 
 
-def test_a_quick_run_writes_all_tables_and_a_second_one_trains_nothing(tmp_path, capsys):
+def test_a_quick_run_writes_all_tables_and_a_second_one_trains_nothing(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(
+        train_module, "fill_points", lambda scene, *_: scene.points
+    )  # seconds for every model
     command = ["--quick", "-o", str(tmp_path), "--iterations", "50"]
     paper_tables.main(command)
     assert train_module.Trainer is Trainer
     text = (tmp_path / "paper_tables.txt").read_text()
     assert text.strip() in capsys.readouterr().out
-    for heading in ("== cad: 3 held-out", "Counts and cost", "Work", "Stages", "Equal PSNR", "Equal time", "Start:", "Notes"):
+    headings = [
+        "== cad: 3 held-out",
+        "Counts and cost",
+        "Work",
+        "Stages",
+        "Equal PSNR",
+        "Equal time",
+        "Start:",
+        "Notes",
+    ]
+    for heading in [*headings, "Published, table 6"]:
         assert heading in text
     first = json.loads((tmp_path / "paper_tables.json").read_text())
     assert [(r["model"], r["cap"]) for r in first["rows"]] == [
         (name, cap) for name in ("octahedron", "tetrahedron", "gaussian") for cap in (100, 200)
     ]
     for row in first["rows"]:
-        assert row["psnr"] > 12 and row["count"] <= row["cap"] and row["intersected"] <= row["iterated"] and row["file_mb"] > 0
-        assert row["curve"][-1] == [pytest.approx(row["train_cpu_seconds"], abs=1e-3), pytest.approx(row["psnr"], abs=1e-3)]
+        assert (
+            row["psnr"] > 12
+            and row["count"] <= row["cap"]
+            and row["intersected"] <= row["iterated"]
+            and row["file_mb"] > 0
+        )
+        assert row["curve"][-1] == [
+            pytest.approx(row["train_cpu_seconds"], abs=1e-3),
+            pytest.approx(row["psnr"], abs=1e-3),
+        ]
         assert len(row["curve"]) == 10 and row["options"]["threads"] == 1
     with open(tmp_path / "paper_tables.csv", newline="") as file:
         assert [row["model"] for row in csv.DictReader(file)] == [row["model"] for row in first["rows"]]
@@ -212,9 +274,11 @@ def test_a_quick_run_writes_all_tables_and_a_second_one_trains_nothing(tmp_path,
     (models / "octahedron_100" / "model.json").unlink()  # stopped before it was done
     paper_tables.main(command)
     second = json.loads((tmp_path / "paper_tables.json").read_text())
-    assert [name for name, old in before.items() if (models / name / "model.json").stat().st_mtime_ns != old] == ["octahedron_100"]
+    assert [
+        name for name, old in before.items() if (models / name / "model.json").stat().st_mtime_ns != old
+    ] == ["octahedron_100"]
     for a, b in zip(first["rows"], second["rows"], strict=True):
-        for name in ("psnr", "ssim", "count", "start_thinness", *paper_tables.COUNTS):
+        for name in ("psnr", "ssim", "count", "start_thinness", *paper_models.COUNTS):
             assert a[name] == b[name]
 
     with pytest.raises(SystemExit, match="other options"):
@@ -224,6 +288,9 @@ def test_a_quick_run_writes_all_tables_and_a_second_one_trains_nothing(tmp_path,
 
 
 def test_a_variant_is_a_kind_and_a_rule_of_growth():
-    assert Variant.parse("gaussian").name == "gaussian" and Variant.parse("gaussian:3dgs").name == "gaussian:3dgs"
-    with pytest.raises(paper_tables.argparse.ArgumentTypeError, match="none of octahedron"):
+    assert (
+        Variant.parse("gaussian").name == "gaussian"
+        and Variant.parse("gaussian:3dgs").name == "gaussian:3dgs"
+    )
+    with pytest.raises(argparse.ArgumentTypeError, match="none of octahedron"):
         Variant.parse("cube")

@@ -228,7 +228,11 @@ def test_scores_from_before_the_last_save_are_not_taken(run_copy):
     file = run_copy / "eval" / "images" / "results.json"
     wrong = json.loads(file.read_text()) | {"psnr": 99.0}
     file.write_text(json.dumps(wrong))
-    assert "99.00 dB" in Path(report_run(run_copy)["report"]).read_text()
+    text = Path(report_run(run_copy)["report"]).read_text()
+    assert "99.00 dB" in text and "LPIPS" not in text
+    file.write_text(json.dumps(wrong | {"lpips_vgg": 0.12362, "lpips_vgg_standard_error": 0.01}))
+    text = Path(report_run(run_copy)["report"]).read_text()
+    assert "LPIPS, VGG16" in text and "0.1236" in text and "AlexNet" not in text
     saved = (run_copy / "training_frame.npz").stat().st_mtime
     os.utime(file, (saved - 10, saved - 10))
     assert "99.00 dB" not in Path(report_run(run_copy)["report"]).read_text()

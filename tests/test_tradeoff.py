@@ -231,7 +231,6 @@ def test_what_was_measured_is_taken_from_the_folder(swept, tiny_scene, tiny_run,
 
 def test_training_knobs_run_on_every_rung(tiny_scene, tmp_path, monkeypatch):
     """A few steps each; how runs are scored is tested by the ones that score."""
-    monkeypatch.setattr(sweeping, "QUICK", {"iterations": 8, "max_primitives": 60})
     monkeypatch.setattr("linprim_geo.train.fill_points", lambda scene, *_: scene.points)  # seconds for every rung
     scored = []
 
@@ -244,7 +243,9 @@ def test_training_knobs_run_on_every_rung(tiny_scene, tmp_path, monkeypatch):
 
     monkeypatch.setattr(sweeping.Sweep, "_train_errors", score)
     chosen = [name for name, each in KNOBS.items() if each.group == "train"]
-    results = tradeoff(tiny_scene, tmp_path / "sweep", knobs=chosen, quick=True, rounds=1, threads=1, quiet=True)
+    size = {"iterations": 8, "max_primitives": 60}
+    results = tradeoff(tiny_scene, tmp_path / "sweep", knobs=chosen, quick=True, rounds=1, **size, threads=1, quiet=True)
+    assert results["about"]["options"].items() >= size.items()
     assert len(results["rows"]) == sum(len(KNOBS[name].rungs) for name in chosen)
     assert {run.train_options.primitive for run in scored} == {"octahedron", "tetrahedron", "gaussian"}
     assert {run.train_options.sh_degree for run in scored} == {0, 1, 2, 3}
@@ -258,7 +259,7 @@ def test_training_knobs_run_on_every_rung(tiny_scene, tmp_path, monkeypatch):
 
 
 def test_a_trained_run_is_scored_by_image_depth_and_surface(swept, tiny_scene, tiny_run, tmp_path):
-    sweep = sweeping.Sweep(tiny_scene, tmp_path / "x", tiny_run, None, True, None, 1, True)
+    sweep = sweeping.Sweep(tiny_scene, tmp_path / "x", tiny_run, None, True, None, sweeping.QUICK, 1, True)
     found = sweep._train_errors(swept[0] / "runs" / "given")
     assert 22 < found["psnr"] < 40 and found["photo_percent"] == pytest.approx(100 * 10 ** (-found["psnr"] / 20))
     assert 0 < found["depth_percent"] < 10 and 0 < found["chamfer_percent"] < 5
@@ -295,6 +296,8 @@ def test_what_cannot_be_swept_is_one_sentence(swept, tiny_scene, tiny_run, tmp_p
         tradeoff(tiny_scene, out, quick=True, threads=1, quiet=True)
     with pytest.raises(LinprimError, match="--rounds is 0"):
         tradeoff(tiny_scene, tmp_path / "x", rounds=0, quiet=True)
+    with pytest.raises(LinprimError, match="--max-primitives is 0, wanted at least 1"):
+        tradeoff(tiny_scene, tmp_path / "x", max_primitives=0, quiet=True)
     with pytest.raises(LinprimError, match="no such file, wanted a reference mesh"):
         tradeoff(tiny_scene, tmp_path / "x", reference=tmp_path / "none.ply", quiet=True)
     with pytest.raises(LinprimError, match="not the folder of a run"):

@@ -1,0 +1,73 @@
+"""Two curves of quality over cost compared where one of the two is the same."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+LEVELS = 3  # at which two curves are compared: both ends of what they share, and the middle
+
+
+def rising(points: Sequence[Sequence[float]]) -> list[tuple[float, ...]]:
+    """The (x, psnr, ...) in the order of x, without those that no larger PSNR rewards for their larger x."""
+    kept: list[tuple[float, ...]] = []
+    for point in sorted(map(tuple, points)):
+        if not kept or point[1] > kept[-1][1]:
+            kept.append(point)
+    return kept
+
+
+def at_psnr(points: Sequence[Sequence[float]], level: float) -> tuple[float, ...] | None:
+    """All but the PSNR of (count, psnr, cost, ...), all > 0, where the curve through `rising(points)` has PSNR `level`.
+
+    Between neighbours the logarithms are linear in the PSNR: log x = (1 - f) log x0 + f log x1, f = (level - p0) / (p1 - p0).
+    None outside of the curve; of a single point only its own PSNR is inside.
+    """
+    curve = rising(points)
+    for point in curve:
+        if point[1] == level:
+            return (point[0], *point[2:])
+    for low, high in itertools.pairwise(curve):
+        if low[1] < level < high[1]:
+            part = (level - low[1]) / (high[1] - low[1])
+            values = zip((low[0], *low[2:]), (high[0], *high[2:]), strict=True)
+            return tuple(math.exp((1 - part) * math.log(a) + part * math.log(b)) for a, b in values)
+    return None
+
+
+def at_time(points: Sequence[Sequence[float]], seconds: float) -> float | None:
+    """PSNR after `seconds` on the curve through the (seconds, psnr), linear in the logarithm of time; None before its first point.
+
+    Points without a larger PSNR than an earlier one do not count, and after the last one the PSNR stays: the best so far.
+    """
+    curve = [point for point in rising(points) if point[0] > 0]
+    if not curve or seconds < curve[0][0]:
+        return None
+    return float(np.interp(math.log(seconds), [math.log(p[0]) for p in curve], [p[1] for p in curve]))
+
+
+def shared_range(curves: Sequence[Sequence[float]]) -> tuple[float, float] | None:
+    """The (low, high) that lies within the range of every list of numbers; None if nothing does."""
+    low, high = max(min(c) for c in curves), min(max(c) for c in curves)
+    return (low, high) if low <= high else None
+
+
+def equal_psnr(a: Sequence[Sequence[float]], b: Sequence[Sequence[float]]) -> list[dict]:
+    """Counts and frame times of two curves of (count, psnr, frame ms, core ms) at `LEVELS` PSNRs that both reach; [] if there are none."""
+    both = shared_range([[p[1] for p in rising(curve)] for curve in (a, b)])
+    if both is None:
+        return []
+    found = []
+    for level in sorted(set(np.linspace(*both, LEVELS).tolist())):
+        (count_a, ms_a, core_a), (count_b, ms_b, core_b) = at_psnr(a, level), at_psnr(b, level)
+        times = {
+            "ms": [ms_a, ms_b],
+            "ms_ratio": ms_a / ms_b,
+            "core_ms": [core_a, core_b],
+            "core_ratio": core_a / core_b,
+        }
+        found.append({"psnr": level, "count": [count_a, count_b], **times})
+    return found

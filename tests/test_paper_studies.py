@@ -1,0 +1,365 @@
+"""The paper's tables of single changes: what each study changes, known figures by class, and a quick run of all tables."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from linprim_geo import train as train_module
+from linprim_geo import trainer as trainer_module
+from linprim_geo.errors import LinprimError
+from linprim_geo.eval import paper_tables
+from linprim_geo.eval.images import composite, psnr, to_8bit
+from linprim_geo.eval.paper_classes import class_errors, read_labels, stand_in_labels
+from linprim_geo.eval.paper_starts import (
+    STARTS,
+    by_density,
+    camera_spread,
+    halved,
+    log_density,
+    noisy,
+    raw_opacity,
+    started,
+)
+from linprim_geo.eval.published import PUBLISHED, published
+from linprim_geo.eval.text_tables import number
+from linprim_geo.options import SceneOptions, TrainOptions
+from linprim_geo.primitives import reference_length
+from linprim_geo.run import Run
+from linprim_geo.scene import PointCloud, load_scene
+
+USUAL = (
+    train_module.Trainer,
+    train_module.initial_cloud,
+    train_module.initial_parameters,
+    trainer_module.activate,
+)
+
+
+def usual():
+    return (
+        train_module.Trainer,
+        train_module.initial_cloud,
+        train_module.initial_parameters,
+        trainer_module.activate,
+    )
+
+
+@pytest.fixture(autouse=True)
+def points_as_they_are(monkeypatch):
+    """Looking for more points takes seconds for every training."""
+    monkeypatch.setattr(train_module, "fill_points", lambda scene, *_: scene.points)
+
+
+# --- starts ----------------------------------------------------------------------------------------------
+
+
+def test_the_spread_of_cameras_is_their_largest_distance_from_their_mean(tiny_scene):
+    centers = np.stack([view.camera.center for view in load_scene(tiny_scene).train])
+    spread = camera_spread(tiny_scene, SceneOptions())
+    assert spread == max(float(np.linalg.norm(c - centers.mean(0))) for c in centers) > 0
+
+
+def test_points_are_moved_by_noise_and_halved():
+    rng = np.random.default_rng(0)
+    cloud = PointCloud(rng.normal(size=(20_001, 3)), rng.integers(0, 255, (20_001, 3), dtype=np.uint8))
+    moved = noisy(cloud, 0.3, seed=5)
+    off = moved.xyz - cloud.xyz
+    assert np.std(off, axis=0) == pytest.approx([0.3] * 3, rel=0.02) and np.abs(off.mean(0)).max() < 0.01
+    assert np.array_equal(moved.rgb, cloud.rgb) and np.array_equal(noisy(cloud, 0.3, seed=5).xyz, moved.xyz)
+    half = halved(cloud, seed=5)
+    assert len(half.xyz) == 10_000
+    found = {tuple(p) for p in cloud.xyz}
+    assert all(tuple(p) in found for p in half.xyz) and len({tuple(p) for p in half.xyz}) == 10_000
+    assert len(halved(PointCloud(np.zeros((1, 3)), np.zeros((1, 3), np.uint8)), 0).xyz) == 1
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_a_training_starts_from_what_was_asked_for(start, tiny_scene, tmp_path):
+    """One step is taken, and what it begins with is compared with what it usually does."""
+    begun = {}
+
+    def begin(name, context):
+        class Looking(train_module.Trainer):
+            def __init__(self, *args, **named):
+                super().__init__(*args, **named)
+                begun[name] = {key: value.detach().numpy().copy() for key, value in self.parameters.items()}
+                begun[name]["bounds"] = self.bounds
+
+        options = TrainOptions(
+            iterations=1, max_primitives=200, initial_primitives=150, sh_degree=0, threads=1
+        )
+        with context, pytest.MonkeyPatch.context() as patch:
+            patch.setattr(train_module, "Trainer", Looking)
+            train_module.train(tiny_scene, tmp_path / name, SceneOptions(), options, quiet=True)
+
+    begin("before", started("as given", 0.2))
+    begin("after", started(start, 0.2))
+    assert usual() == USUAL
+    before, after = begun["before"], begun["after"]
+    center = before["center"]
+    if start == "as given":
+        assert all(np.array_equal(before[name], after[name]) for name in before)
+    elif start == "noisy points":
+        scale = Run.open(tmp_path / "after").similarity.scale
+        assert np.std(after["center"] - center) == pytest.approx(0.2 * scale, rel=0.15)
+    elif start == "half the points":
+        assert len(after["center"]) == len(center) // 2 == 75
+        assert {tuple(p) for p in after["center"].tolist()} <= {tuple(p) for p in center.tolist()}
+    else:
+        assert np.array_equal(after["center"], center)
+        free = before["log_extent"][:, :2] > math.log(
+            2.1 * before["bounds"][0]
+        )  # those are laid flat across the third
+        assert free.sum() > 100
+        assert (before["log_extent"] - after["log_extent"])[:, :2][free] == pytest.approx(
+            math.log(2), abs=1e-5
+        )
+
+
+# --- density against opacity -----------------------------------------------------------------------------
+
+
+def test_the_logarithm_of_the_density_and_the_opacity_are_each_others_inverse():
+    raw, length = np.linspace(-15, 40, 200), np.geomspace(1e-4, 3, 200)
+    logarithm = log_density(raw, length)
+    assert np.exp(logarithm) * length == pytest.approx(np.log1p(np.exp(raw)), rel=1e-9)
+    assert raw_opacity(logarithm, length) == pytest.approx(raw, rel=1e-9, abs=1e-9)
+
+
+def test_by_density_the_extent_leaves_the_density_alone(tiny_scene, tmp_path):
+    """The same start, no step that differs before the first; then the gradient by the extent is that at constant density."""
+    import torch
+
+    seen = {}
+
+    class Looking(train_module.Trainer):
+        def advance(self):
+            active = trainer_module.activate(self.parameters, 0, self.kind, self.filter_3d)
+            seen.setdefault("first", [t.detach().numpy().copy() for t in active])
+            if self.step == 0:
+                leaf = self.parameters["log_extent"].clone().requires_grad_()
+                density = trainer_module.activate(self.parameters | {"log_extent": leaf}, 0, self.kind, None)[
+                    3
+                ]
+                seen["gradient"] = (
+                    torch.autograd.grad(density.sum() + 0 * leaf.sum(), leaf)[0].abs().sum().item()
+                )
+            super().advance()
+
+        def _grow(self):
+            seen["counts"] = [*seen.get("counts", []), len(self)]
+            super()._grow()
+
+    options = TrainOptions(iterations=150, max_primitives=220, initial_primitives=150, sh_degree=0, threads=1)
+    found = {}
+    for name in ("opacity", "density"):
+        seen.clear()
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(train_module, "Trainer", Looking)
+            if name == "opacity":
+                trained = train_module.train(tiny_scene, tmp_path / name, SceneOptions(), options, quiet=True)
+            else:
+                with by_density():
+                    trained = train_module.train(
+                        tiny_scene, tmp_path / name, SceneOptions(), options, quiet=True
+                    )
+        found[name] = {**seen, "trained": trained, "saved": Run.open(tmp_path / name).training_primitives()}
+    assert usual() == USUAL
+    for a, b in zip(found["opacity"]["first"], found["density"]["first"], strict=True):
+        assert b == pytest.approx(a, rel=1e-5, abs=1e-6)
+    assert found["density"]["gradient"] == 0 < found["opacity"]["gradient"]
+    saved, counts = found["density"]["saved"], found["density"]["counts"]
+    assert len(saved.center) > 150 and len(counts) > 1 and found["density"]["trained"]["psnr"] > 14
+    opacity = 1 - np.exp(-saved.density * reference_length(saved.extent, "octahedron"))
+    assert np.isfinite(opacity).all() and 0.3 < np.median(opacity) < 1
+    assert found["density"]["trained"]["psnr"] != found["opacity"]["trained"]["psnr"]
+
+
+# --- classes ---------------------------------------------------------------------------------------------
+
+
+def test_the_classes_add_up_to_the_image(tiny_run, tmp_path):
+    run = Run.open(tiny_run)
+    views = run.scene().test
+    rng = np.random.default_rng(1)
+    labels = {view.name: rng.integers(0, 4, (48, 48)).astype(np.uint8) for view in views}
+    for view in views:
+        labels[view.name][0] = 255  # no class
+        target = tmp_path / Path(view.name).with_suffix(".png")
+        target.parent.mkdir(exist_ok=True)
+        Image.fromarray(labels[view.name]).save(target)
+    found = class_errors(tiny_run, tmp_path)
+    assert set(found) == {0, 1, 2, 3}
+    errors = {}
+    for view, images in run.render_views(views, geometry=False):
+        render, truth = to_8bit(np.moveaxis(images["rgb"], 0, -1)), composite(view.load(), run.background)
+        for label in range(4):
+            of = labels[view.name] == label
+            assert psnr(render[of], truth[of]) > 0
+            errors.setdefault(label, []).append(((render[of] / 255 - truth[of] / 255) ** 2).mean(1))
+    for label, (total, pixels) in found.items():
+        of_class = np.concatenate(errors[label])
+        assert pixels == len(of_class) and total == pytest.approx(of_class.sum())
+
+
+def test_labels_that_do_not_fit_are_refused_in_a_sentence(tiny_scene, tmp_path):
+    view = load_scene(tiny_scene).test[0]
+    target = tmp_path / f"{Path(view.name).stem}.png"
+    with pytest.raises(
+        LinprimError,
+        match=f"has no labels of view {view.name}, wanted {Path(view.name).with_suffix('.png')} there",
+    ):
+        read_labels(tmp_path, view)
+    for image, said in (
+        (np.zeros((48, 47), np.uint8), "is 47x48 of uint8, wanted one whole number for each of 48x48 pixels"),
+        (np.zeros((49, 49), np.uint8), "is 49x49 of uint8"),
+        (np.zeros((48, 48, 3), np.uint8), "is 48x48 of uint8"),
+    ):
+        Image.fromarray(image).save(target)
+        with pytest.raises(LinprimError, match=said):
+            read_labels(tmp_path, view)
+    target.write_bytes(b"no image")
+    with pytest.raises(LinprimError, match="cannot be read"):
+        read_labels(tmp_path, view)
+    wide = np.arange(48 * 48, dtype=np.uint16).reshape(48, 48)
+    Image.fromarray(wide).save(target)
+    assert np.array_equal(read_labels(tmp_path, view), wide)
+    half = load_scene(tiny_scene, downscale=2).test[0]
+    assert np.array_equal(read_labels(tmp_path, half), wide[::2, ::2])
+
+
+def test_the_labels_of_a_built_in_scene_are_its_parts(tiny_scene, tmp_path):
+    from linprim_geo.shapes import SHAPES
+
+    views = load_scene(tiny_scene).test
+    folder = stand_in_labels(tmp_path / "labels", "cad", views)
+    parts = SHAPES["cad"]().part
+    names = json.loads((folder / "names.json").read_text())
+    assert set(names) == {str(part) for part in set(parts.tolist())}
+    for view in views:
+        labels = read_labels(folder, view)
+        # Where the data set's depth says that there is something, a part is seen, and nowhere else.
+        assert np.mean((labels == 255) == (view.load_depth() == 0)) == 1
+        assert len(np.unique(labels)) > 4
+
+
+# --- published figures -----------------------------------------------------------------------------------
+
+
+def test_published_figures_are_those_of_the_authors_and_marked_as_such():
+    assert all(row["source"] == "published" for row in PUBLISHED)
+    assert {row["table"] for row in PUBLISHED} == {"1", "2", "3", "4", "5", "6", "7", "8", "9", "10", "12"}
+    for row in published("3"):  # three of their numbers say one thing
+        if "gaussians" in row:
+            assert row["octahedra"] - row["gaussians"] == pytest.approx(row["change"])
+    for row in published("4"):
+        assert sum(row[f"scale_{k}"] for k in (1, 2, 4, 8)) / 4 == pytest.approx(row["mean"], abs=0.0101)
+    (octahedra,) = [r for r in published("12") if (r["scene"], r["method"]) == ("room", "octahedra")]
+    assert (octahedra["ssim"], octahedra["psnr"], octahedra["lpips"]) == (0.913, 29.88, 0.216)
+    assert published("rays") == published("density") == []
+
+
+def test_numbers_of_a_table():
+    assert [number(1.234, 2), number(1.234, 1, True), number(-0.5, 2, True), number(None, 2), number(math.nan, 2)] == [
+        "1.23", "+1.2", "-0.50", "", "-",
+    ]  # fmt: skip
+
+
+# --- the whole -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory):
+    """Every table at the quick size with 25 steps, and what was printed."""
+    out = tmp_path_factory.mktemp("paper")
+    paper_tables.main(
+        ["--quick", "-o", str(out), "--iterations", "25", "--caps", "60", "--tables", *paper_tables.TABLES]
+    )
+    return out
+
+
+# The columns of each table that our rows have, and how many rows there are.
+MADE = {
+    "2": (("psnr_3", "change_2", "change_1", "change_0"), 2),
+    "3": (("share", "gaussians", "octahedra", "change"), 8),
+    "4": (("scale_1", "scale_2", "scale_4", "scale_8", "mean"), 2),
+    "5": (("ssim", "psnr", "count"), 8),
+    "7": (("ssim", "psnr", "count"), 4),
+    "9": (("l1", "l1_std", "l2", "l2_std", "coverage"), 2),
+    "10": (("voxel", "chamfer", "standard_error"), 2),
+    "12": (("ssim", "psnr", "count"), 2),
+    "rays": (("psnr", "train_cpu_seconds", "frame_cpu_ms"), 2),
+    "density": (("psnr", "train_cpu_seconds", "frame_cpu_ms"), 2),
+}
+
+
+@pytest.mark.parametrize("name", paper_tables.TABLES)
+def test_a_quick_run_makes_the_table(name, quick):
+    table = json.loads((quick / f"table_{name}.json").read_text())
+    text = (quick / f"table_{name}.txt").read_text()
+    ours = [row for row in table["rows"] if row["source"] == "here"]
+    columns, count = MADE[name]
+    assert len(ours) == count and len({row["method"] for row in ours}) == count and table["left_out"] == []
+    for row in ours:
+        assert row["scene"] == "cad" and all(math.isfinite(row[column]) for column in columns)
+        assert row["method"] in text
+    assert ("published" in text) == (name not in ("rays", "density")) and paper_tables.TABLES[
+        name
+    ].title in text
+    assert len([row for row in table["rows"] if row["source"] == "published"]) == len(published(name))
+    # What a study changes makes a difference.
+    assert len({tuple(row[column] for column in columns[:2]) for row in ours}) > 1
+
+
+def test_tables_share_models_and_a_second_run_trains_nothing(quick, capsys):
+    models = quick / "models" / "cad"
+    names = {folder.name for folder in models.iterdir()}
+    assert {
+        "octahedron_60",
+        "gaussian_60",
+        "octahedron_60_noisy-points",
+        "octahedron_60_by-density",
+        "octahedron_mcmc_60",
+    } <= names
+    assert len(names) == 22
+    before = {name: (models / name / "model.json").stat().st_mtime_ns for name in names}
+    command = ["--quick", "-o", str(quick), "--iterations", "25", "--caps", "60"]
+    paper_tables.main([*command, "--tables", "11"])  # the same as 7
+    assert "Tables 7 and 11" in capsys.readouterr().out
+    assert {name: (models / name / "model.json").stat().st_mtime_ns for name in names} == before
+    with pytest.raises(SystemExit, match="was trained with other options"):
+        paper_tables.main([*command, "--tables", "12", "--seed", "1"])
+    with pytest.raises(SystemExit, match="--labels names 1 for 0 captures of --data, wanted one for each"):
+        paper_tables.main([*command, "--tables", "3", "--labels", "x"])
+
+
+def test_a_capture_without_truth_is_left_out_and_named(quick, tmp_path, capsys):
+    from linprim_geo.synth import synthesize
+
+    synthesize(tmp_path / "bare", shape="cad", views=6, test_views=2, size=32, points=200, supersample=1)
+    (tmp_path / "bare" / "reference.ply").unlink()
+    command = [
+        "--quick",
+        "-o",
+        str(quick),
+        "--iterations",
+        "25",
+        "--caps",
+        "60",
+        "--data",
+        str(tmp_path / "bare"),
+    ]
+    for name, option in (("3", "--labels"), ("10", "--references")):
+        paper_tables.main([*command, "--tables", name])
+        assert f"bare is left out: wanted {option}" in capsys.readouterr().out
+        assert json.loads((quick / f"table_{name}.json").read_text())["left_out"] == [
+            f"bare is left out: wanted {option}"
+        ]
+        with pytest.raises(SystemExit, match=f"table {name}: bare is left out: wanted {option}"):
+            paper_tables.main([*command, "--tables", name, "--scenes"])

@@ -1,0 +1,142 @@
+"""The README's plots out of a sweep: what they show of known rows, that they are well-formed and light or dark, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ElementTree
+
+import pytest
+
+from linprim_geo.eval import tradeoff_figures
+from linprim_geo.eval.knobs import KNOBS
+from linprim_geo.eval.tradeoff_figures import figures, rungs
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def sweep(folder, leave_out=(), chamfer=True):
+    """A tradeoff.json whose every rung takes longer and errs less than the one before it."""
+    rows = []
+    for knob in KNOBS.values():
+        if knob.name in leave_out:
+            continue
+        for k, rung in enumerate(knob.rungs):
+            seconds = 1e-3 * 2**k
+            row = {
+                "knob": knob.name,
+                "rung": rung.name,
+                "default": rung.name == knob.default,
+                "seconds": seconds,
+                "frontier": True,
+            }
+            row |= {
+                "low": 0.9 * seconds,
+                "high": 1.1 * seconds,
+                "image_percent": 1 / (k + 1),
+                "depth_percent": 0.5 / (k + 1),
+            }
+            rows.append(row | ({"chamfer_percent": 0.3 / (k + 1)} if chamfer else {"chamfer_percent": None}))
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "tradeoff.json").write_text(json.dumps({"rows": rows}))
+    return folder
+
+
+def test_both_files_show_every_rung_in_both_panels(tmp_path, capsys):
+    tradeoff_figures.main([str(sweep(tmp_path / "sweep")), "-o", str(tmp_path / "out")])
+    names = ("tradeoff_ladder.svg", "tradeoff_surface.svg")
+    assert capsys.readouterr().out.split() == [str(tmp_path / "out" / name) for name in names]
+    ladder, surface = (ElementTree.fromstring((tmp_path / "out" / name).read_text()) for name in names)
+    labels = [[text.text for text in root.iter(f"{SVG}text")] for root in (ladder, surface)]
+    for name in ("default", "affine rays", "entry order", "overlap order", "float64"):
+        assert labels[0].count(name) == 2  # image and depth
+    for name in (
+        "twice the primitives",
+        "1/4 of the steps",
+        "1/2 of the views",
+        "default",
+        "polyhedra",
+        "tsdf x4",
+    ):
+        assert labels[1].count(name) == 1
+    assert "Chamfer distance, % of the diagonal" in labels[1] and "seconds" in labels[0]
+    style = ladder.find(f"{SVG}style").text
+    assert "prefers-color-scheme: dark" in style
+    for colors in (tradeoff_figures.LIGHT, tradeoff_figures.DARK):
+        assert all(f"--{name}: {color};" in style for name, color in colors.items())
+    # Every colour is a class, and the ground is the file's own: nothing depends on the page round it.
+    assert not [e for e in ladder.iter() if "#" in (e.get("stroke") or "") + (e.get("fill") or "")]
+    ground = ladder.find(f"{SVG}rect")
+    assert (ground.get("class"), ground.get("width")) == ("ground", ladder.get("width"))
+    # All that is drawn lies inside.
+    width, height = float(ladder.get("width")), float(ladder.get("height"))
+    for panel in ladder.iter(f"{SVG}g"):
+        left, top = map(float, panel.get("transform").removeprefix("translate(").removesuffix(")").split())
+        for circle in panel.iter(f"{SVG}circle"):
+            assert 0 < left + float(circle.get("cx")) < width and 0 < top + float(circle.get("cy")) < height
+
+
+def test_the_shared_default_is_one_point_and_the_frontier_is_that_of_all_of_them():
+    def row(knob, rung, seconds, error, default=False):
+        return {
+            "knob": knob,
+            "rung": rung,
+            "seconds": seconds,
+            "default": default,
+            "depth_percent": error,
+            "frontier": True,
+        }
+
+    rows = [
+        row("rays", "affine", 2.0, 3.0),
+        row("rays", "exact", 1.0, 2.0, True),
+        row("order", "center", 1.0, 2.0, True),
+    ]
+    rows += [row("order", "overlap", 4.0, 1.0), row("order", "entry", 4.5, 1.5), row("stop", "0", 0.5, 0.1)]
+    rows += [row("scalar", "float64", 0.0, 0.1), row("scalar", "float32", 3.0, None)]
+    found = rungs(rows, ("rays", "order", "scalar"), "depth_percent")
+    assert {r["rung"]: r["frontier"] for r in found} == {
+        "affine rays": False, "default": True, "overlap order": True, "entry order": False,
+    }  # fmt: skip
+    rows = [row("extraction", "tsdf x1", 1.0, 2.0, True), row("extraction", "polyhedra", 2.0, 3.0)]
+    alone = rungs(rows, ("extraction",), "depth_percent")
+    assert [r["rung"] for r in alone] == ["tsdf x1", "polyhedra"]
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (lambda folder: folder, "tradeoff.json: cannot be read"),
+        (
+            lambda folder: folder.mkdir() or (folder / "tradeoff.json").write_text("[]"),
+            "has no rows of knobs",
+        ),
+        (
+            lambda folder: sweep(folder, leave_out=("rays", "order", "scalar")),
+            "has no image_percent of rays, order, scalar",
+        ),
+        (
+            lambda folder: sweep(folder, chamfer=False),
+            "has no chamfer_percent of iterations, primitives, scale, views",
+        ),
+    ],
+)
+def test_what_is_no_whole_sweep_is_refused_and_nothing_is_written(made, said, tmp_path):
+    made(tmp_path / "sweep")
+    with pytest.raises(SystemExit, match=said) as leaving:
+        tradeoff_figures.main([str(tmp_path / "sweep"), "-o", str(tmp_path / "out")])
+    assert "\n" not in str(leaving.value) and not (tmp_path / "out").exists()
+
+
+def test_a_page_of_a_sweep_still_has_colours(tmp_path):
+    """The page's plots take the same classes, with the colours that its style falls back to."""
+    from linprim_geo import svg
+    from linprim_geo.eval.tradeoff_page import plot
+
+    rows = json.loads((sweep(tmp_path) / "tradeoff.json").read_text())["rows"]
+    drawn = ElementTree.fromstring(plot([row for row in rows if row["knob"] == "rays"], "depth_percent"))
+    assert {circle.get("class").split()[0] for circle in drawn.iter("circle")} == {"on"}
+    assert (
+        "svg .on { stroke: var(--blue, #1f63b2); }" in svg.STYLE
+        and "svg .off.dot { fill: var(--dim, #8a939e); }" in svg.STYLE
+    )
+    assert len(figures(sweep(tmp_path), tmp_path)) == 2
