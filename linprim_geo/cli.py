@@ -28,6 +28,8 @@ SPLITS = ("train", "test", "all")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command line and returns its exit status; argparse itself leaves with 0 (--help) or 2."""
+    # NumPy's matrices are small here, and OpenBLAS's threads wait for each other in a loop: on a busy machine many times the work.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # The two flags are known before and after the subcommand, so neither parser may set a default for them.
     parsed = build_parser().parse_args(arguments)
     parsed.json, parsed.debug = getattr(parsed, "json", False), getattr(parsed, "debug", False)

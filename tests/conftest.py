@@ -3,9 +3,13 @@ surface is known exactly."""
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from pathlib import Path
+
+# The matrices here are small, and OpenBLAS's threads wait for each other in a loop: on a busy machine a hundredfold of the work.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import pytest
