@@ -162,6 +162,20 @@ def add_effects(parser: argparse._ActionsContainer, default: str) -> None:
     parser.add_argument("--effect", action="append", default=[], metavar="NAME=on|off", help=text)
 
 
+def add_workers(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
+    """Adds --cluster and --workers, which say where the parts of a job are done."""
+    group = parser.add_argument_group("workers")
+    text = "local: Ray on this machine; an address such as 10.0.0.1:6379: the Ray cluster there, whose machines all see the folders"
+    text += " (default: processes of this machine); needs pip install 'linprim-geo[cluster]'"
+    group.add_argument("--cluster", metavar="local|ADDRESS", help=text)
+    group.add_argument("--workers", type=_whole, default=0, metavar="N", help="at once at most (default 0: one per core)")
+    return group
+
+
+def _blocks(text: str) -> int | str:
+    return text if text == "auto" else _positive(text)
+
+
 def _number_or(word: str) -> Callable[[str], float | str]:
     def parse(text: str) -> float | str:
         return word if text == word else float(text)
@@ -225,6 +239,7 @@ def _size(text: str) -> tuple[int, int]:
 # argparse names the type in its message: "invalid count value", not "invalid _positive value".
 _positive.__name__ = _whole.__name__ = "count"
 _not_negative.__name__ = _length.__name__ = "number"
+_blocks.__name__ = "count, or auto:"
 _size.__name__, _pair.__name__, _seconds.__name__ = "size", "pair X,Y", "time such as 90s, 5m or 1h"
 
 
@@ -296,6 +311,9 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("-r", "--resolution", type=int, metavar="K", help=resolution)
     sub.add_argument("--eval", action="store_true", help="accepted as in 3DGS: views are always held out")
     add_effects(sub.add_argument_group("effects"), "none")
+    text = "train in so many blocks of space, each by a worker of its own; auto: as few as a worker's memory allows (default 1)"
+    several = add_workers(sub)
+    several.add_argument("--blocks", type=_blocks, default=1, metavar="auto|K", help=text)
     add_options(sub.add_argument_group("scene"), SceneOptions)
     add_options(sub.add_argument_group("training"), TrainOptions)
 
@@ -323,6 +341,8 @@ def build_parser() -> argparse.ArgumentParser:
     text = "choose the voxel size so that everything takes this long, by what coarse passes take"
     sub.add_argument("--time-budget", type=_seconds, metavar="TIME", help=text)
     add_quiet(sub)
+    text = "fuse in so many parts of one grid, each by a worker of its own, with the same result (default 1)"
+    add_workers(sub).add_argument("--blocks", type=_positive, default=1, metavar="K", help=text)
     add_options(sub.add_argument_group("extraction"), ExtractOptions)
 
     sub = command(

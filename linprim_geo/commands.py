@@ -36,6 +36,8 @@ def train(parsed: argparse.Namespace) -> dict:
 
         if parsed.resume:
             raise LinprimError("--dry-run says what a new training would take: wanted without --resume")
+        if parsed.blocks != 1:
+            raise LinprimError("--dry-run times the training of the whole scene: wanted without --blocks")
         return dry_run(scene, run, *options, quiet=parsed.quiet, effects=_choice(parsed), **budget)
     from .train import train
 
@@ -52,8 +54,16 @@ def train(parsed: argparse.Namespace) -> dict:
             resume=parsed.resume,
             quiet=parsed.quiet,
             effects=_choice(parsed),
+            **_several(parsed),
             **budget,
         )
+
+
+def _several(parsed: argparse.Namespace) -> dict:
+    """--blocks, --cluster and --workers as keywords."""
+    if parsed.blocks == 1 and parsed.cluster is not None and not getattr(parsed, "resume", False):
+        raise LinprimError(f"--cluster is {parsed.cluster}, but there is one block, which is done here: wanted --blocks as well")
+    return {"blocks": parsed.blocks, "cluster": parsed.cluster, "workers": parsed.workers}
 
 
 def _budget(parsed: argparse.Namespace) -> dict:
@@ -108,7 +118,7 @@ def extract_mesh(parsed: argparse.Namespace) -> dict:
 
     options = from_args(ExtractOptions, parsed)
     where = {"method": parsed.method, "output": parsed.output, "quiet": parsed.quiet}
-    return extract_mesh(parsed.run, options=options, **where, **budget)
+    return extract_mesh(parsed.run, options=options, **where, **_several(parsed), **budget)
 
 
 def eval_depth(parsed: argparse.Namespace) -> dict:

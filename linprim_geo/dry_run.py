@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -15,6 +16,7 @@ from .options import SceneOptions, TrainOptions, check_train_options
 from .pacing import calibrate, plan_run
 from .primitives import KINDS
 from .progress import Progress, duration, memory_gib
+from .scene import View
 from .shots import MEMORY_SHARE, StoredShot, load_shots, photo_bytes
 from .time_budget import SAVE_SECONDS, Budget, mean_population
 from .train import QUICK_VIEWS, SFM_START, _begin, _start, _terms, evaluate
@@ -25,6 +27,8 @@ TIMING = 125.0
 # Bytes that a primitive takes while a step is made: so many in any case, and so many for each of its numbers, with Adam's moments and
 # gradients. Fitted to 300,000 octahedra of degree 1 and 3 (1560 and 2340 bytes measured); Gaussians of degree 3 take 17 % less.
 PRIMITIVE_BYTES, NUMBER_BYTES = 1060, 21.6
+# What a process takes in any case, libraries above all, and each pixel of the image that is at work.
+PROCESS_GIB, PIXEL_BYTES = 0.45, 300
 
 
 def dry_run(
@@ -128,6 +132,18 @@ def bytes_per_primitive(options: TrainOptions) -> float:
     """What one more primitive takes in memory."""
     numbers = 3 + 4 + KINDS[options.primitive].extents + 1 + 3 * (options.sh_degree + 1) ** 2
     return PRIMITIVE_BYTES + NUMBER_BYTES * numbers
+
+
+def memory_estimate(views: Sequence[View], options: TrainOptions, photos: int | None = None, largest: int | None = None) -> float:
+    """GiB that a process takes at its peak which trains these views, without trying; photographs count in full.
+
+    Args:
+        photos: bytes of the photographs, and `largest`, pixels of the largest one, if they are not those of the views.
+    """
+    photos = photo_bytes(tuple(views)) if photos is None else photos
+    largest = max((view.camera.width * view.camera.height for view in views), default=0) if largest is None else largest
+    primitives = bytes_per_primitive(options) * options.max_primitives
+    return PROCESS_GIB + (photos + PIXEL_BYTES * options.samples**2 * largest + primitives) / 2**30
 
 
 def _advice(used: float, available: float, per_primitive: float, options: TrainOptions) -> str:

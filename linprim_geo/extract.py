@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shutil
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from importlib import import_module
@@ -10,6 +12,7 @@ from pathlib import Path
 
 from .auto_level import choose_level
 from .errors import LinprimError
+from .executor import Executor, open_executor
 from .files import locked, remove_torn, write_json
 from .finish import finish_surface, visible_file
 from .mesh import SUFFIXES, manifold_status, topology, topology_line
@@ -27,6 +30,9 @@ METHODS = {
     "polyhedra": "surface_polyhedra.polyhedra_surface",
     "opacity-field": "surface_opacity.opacity_surface",
 }
+
+# Folder of what workers have done, in that of the method.
+PARTS = "parts"
 
 RANGES = {
     "level": (1e-6, 1 - 1e-6),
@@ -52,6 +58,9 @@ def extract_mesh(
     *,
     time_budget: Budget | float | None = None,
     quiet: bool = False,
+    blocks: int = 1,
+    cluster: str | None = None,
+    workers: int = 0,
 ) -> dict:
     """Extracts the surface of a run and writes it, the part that cameras see, and statistics.
 
@@ -63,6 +72,9 @@ def extract_mesh(
 
     With `time_budget`, in seconds, the voxel size is the smallest with which everything takes that time at most, by what coarse passes
     take (`time_budget.choose_voxel`); stats.json has `time_budget`: what was chosen and why, and the seconds that it took.
+
+    With `blocks` other than 1 the depth maps are fused in so many parts of one lattice by several workers, with the same result to the last
+    bit; `cluster` and `workers` say where, see `executor.open_executor`.
 
     Returns: what stats.json holds: topology of both meshes, options, `processing` step by step, `texture`, what manifold3d says of
     a watertight mesh (`manifold_status`), seconds and peak memory per stage, and the paths.
@@ -85,6 +97,10 @@ def extract_mesh(
         raise LinprimError(f"--time-budget chooses a voxel size, which --method {method} has none of: wanted --method tsdf")
     if budget and options.voxel_size > 0:
         raise LinprimError("--time-budget chooses the voxel size: wanted one of it and --voxel-size")
+    if blocks < 1:
+        raise LinprimError(f"--blocks is {blocks}, wanted a number from 1")
+    if blocks > 1 and method != "tsdf":
+        raise LinprimError(f"--blocks fuses depth maps in parts, which --method {method} has none of: wanted --method tsdf")
     opened = Run.open(run)
     folder = opened.path / "mesh" / method
     target = Path(output) if output else folder / "mesh.ply"
@@ -96,11 +112,23 @@ def extract_mesh(
         held.enter_context(locked(folder, "extracted into"))
         if output:
             held.enter_context(locked(target.parent, "written", target.name))
-        return _extract(opened, method, folder, target, options, budget, Progress("extract", 1, quiet=quiet))
+        several = None
+        if blocks > 1:
+            several = lambda: held.enter_context(open_executor(cluster, folder / PARTS, workers))  # noqa: E731
+        progress = Progress("extract", 1, quiet=quiet)
+        return _extract(opened, method, folder, target, options, budget, progress, blocks, several)
 
 
 def _extract(
-    opened: Run, method: str, folder: Path, target: Path, options: ExtractOptions, budget: Budget | None, progress: Progress
+    opened: Run,
+    method: str,
+    folder: Path,
+    target: Path,
+    options: ExtractOptions,
+    budget: Budget | None,
+    progress: Progress,
+    blocks: int = 1,
+    executor: Callable[[], Executor] | None = None,
 ) -> dict:
     """What `extract_mesh` does when everything is in order and its folder is held."""
     visible_target = visible_file(target)
@@ -125,7 +153,15 @@ def _extract(
     if budget:
         options, frames, chosen = choose_voxel(opened, options, target, stages, budget)
         kept = (frames,)
-    mesh, about = surface(opened, options, stages, *kept)
+    if executor is not None:
+        from .block_extraction import PartFusion
+
+        fuse = PartFusion(opened, options.level, blocks, executor(), folder / PARTS, progress.quiet)
+        mesh, about = surface(opened, options, stages, *kept, fuse=fuse)
+        shutil.rmtree(folder / PARTS)
+        about = about | {"blocks": blocks}
+    else:
+        mesh, about = surface(opened, options, stages, *kept)
     done = finish_surface(mesh, opened, options, target, stages)
     shape = topology(done.mesh)
     stats = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,6 +36,7 @@ def fuse_tsdf(
     behind_voxels: float = BEHIND_VOXELS,
     occluded_vote: float = 0.0,
     log: Callable[[str], None] | None = None,
+    fuse: Callable[[Lattice, Iterable[DepthFrame]], Mesh] | None = None,
 ) -> Mesh:
     """Fuses depth maps into a triangle mesh with normals and colours.
 
@@ -59,6 +60,7 @@ def fuse_tsdf(
         occluded_vote: weight of a vote "inside" from every view in which a voxel lies further behind the
             surface than the truncation; 0.01 to 0.02 closes tunnels that too deep pixels dig into solids.
         log: called with lines such as the memory that will be taken.
+        fuse: makes the surface of a lattice in place of `fuse_lattice`; then `memory_limit` is its own affair.
 
     Returns:
         The mesh in the frame of the cameras.
@@ -76,18 +78,16 @@ def fuse_tsdf(
     say = log or (lambda line: None)
 
     blocks, origin, largest, colored = _find_blocks(
-        frames, voxel_size, truncation_voxels, bounds, block_resolution, limit
+        frames, voxel_size, truncation_voxels, bounds, block_resolution, limit if fuse is None else np.inf
     )
     need = estimate_memory(len(blocks), block_resolution, largest)
     say(
         f"fusing: {len(blocks)} blocks of {block_resolution}^3 voxels of {voxel_size:.4g}, "
         f"{need / 2**20:.0f} MiB of {limit / 2**20:.0f} MiB"
     )
-    grid = Grid(blocks, origin, voxel_size, truncation_voxels * voxel_size, block_resolution)
     rules = vote_rules(truncation_voxels, behind_voxels, occluded_vote)
-    for frame in frames:
-        grid.integrate(frame, rules)
-    mesh = _trimmed(grid.extract(), bounds, min_component)
+    lattice = Lattice(blocks, origin, voxel_size, block_resolution, truncation_voxels, rules)
+    mesh = _trimmed((fuse or fuse_lattice)(lattice, frames), bounds, min_component)
     if len(mesh.faces) == 0:
         raise LinprimError(
             f"fusing {len(blocks)} blocks at voxel size {voxel_size:.4g} gave no surface: the views' "
@@ -101,6 +101,31 @@ def fuse_tsdf(
         images = (frame.color for frame in frames if frame.color is not None)
         mesh = replace(mesh, colors=color_vertices(mesh, colored, images))
     return mesh
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Where a field is kept: `blocks` (B, 3) of `resolution`^3 voxels of edge `voxel`; block (0, 0, 0) starts at `origin` (3,).
+    `truncation` is in voxels, `rules` are `tsdf.vote_rules`."""
+
+    blocks: np.ndarray
+    origin: np.ndarray
+    voxel: float
+    resolution: int
+    truncation: float
+    rules: tuple[float, ...]
+
+    def grid(self) -> Grid:
+        """An empty field on it."""
+        return Grid(self.blocks, self.origin, self.voxel, self.truncation * self.voxel, self.resolution)
+
+
+def fuse_lattice(lattice: Lattice, frames: Iterable[DepthFrame]) -> Mesh:
+    """The surface of all frames on a lattice."""
+    grid = lattice.grid()
+    for frame in frames:
+        grid.integrate(frame, lattice.rules)
+    return grid.extract()
 
 
 def estimate_memory(blocks: int, block_resolution: int = 8, frame_pixels: int = 0) -> int:

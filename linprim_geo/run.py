@@ -58,9 +58,11 @@ class Run:
         instruction_set: str = "",
         effects: list[dict] | None = None,
         time_budget: dict | None = None,
+        blocks: int | None = None,
     ) -> Run:
         """Makes the folder and writes its configuration. `instruction_set` is noted because results depend on it in their last bits,
-        `effects`, what was decided about the scene (`effects.Decision`), to be read, and `time_budget`, a plan (`pacing.Pace`).
+        `effects`, what was decided about the scene (`effects.Decision`), to be read, `time_budget`, a plan (`pacing.Pace`), and `blocks`,
+        their number where it is trained in several (`block_training`).
 
         config.json comes last: without it nothing has begun, see `is_unused`.
 
@@ -82,6 +84,8 @@ class Run:
             config["effects"] = effects
         if time_budget is not None:
             config["time_budget"] = time_budget
+        if blocks is not None:
+            config["blocks"] = blocks
         # The cache may be emptied, and poses that are found anew would lie in another frame.
         if scene.kind == PHOTOGRAPHS and (model := found_model(scene.root)) is not None:
             with writing(path / FOUND_POSES):

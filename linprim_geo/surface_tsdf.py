@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -32,11 +32,11 @@ NEAREST_LIMIT = 4.0
 
 
 def tsdf_surface(
-    run: Run, options: ExtractOptions, stages: Stages, frames: DepthFrames | None = None
+    run: Run, options: ExtractOptions, stages: Stages, frames: DepthFrames | None = None, fuse: Callable | None = None
 ) -> tuple[Mesh, dict]:
     """Returns the fused mesh, with colours, and `level`, `voxel_size` and `truncation_voxels` for the statistics.
 
-    `frames` of the same level, if there are any already, are taken in place of new ones.
+    `frames` of the same level, if there are any already, are taken in place of new ones. `fuse`: see `fuse_tsdf`.
 
     Raises:
         LinprimError: no ray crosses the level, or the grid would not fit into memory.
@@ -57,6 +57,7 @@ def tsdf_surface(
         memory_limit=int(options.memory_limit * 2**30) if options.memory_limit > 0 else None,
         min_component=options.smallest_part,
         log=stages.note,
+        fuse=fuse,
     )
     stages.lap("fuse")
     return mesh, {"level": options.level, "voxel_size": voxel, "truncation_voxels": options.truncation, "depth_limit": frames.limit}
@@ -66,23 +67,23 @@ class DepthFrames(Sequence):
     """`tsdf.DepthFrame`s of the training views: depth at transmittance `level`, the photographs' colours, free background.
 
     Depths beyond `limit` are clamped to it; 0 chooses one by `depth_limit`. `beyond` is their share. Frames are kept in memory if
-    they are at most KEPT_BYTES in all, else rendered whenever they are asked for.
+    they are at most KEPT_BYTES in all, else, and without `keep`, rendered whenever they are asked for.
     """
 
-    def __init__(self, run: Run, level: float, limit: float = 0.0):
-        self.run, self.level, self.limit = run, level, np.inf
+    def __init__(self, run: Run, level: float, limit: float = 0.0, keep: bool = True):
+        self.run, self.level, self.limit, self.beyond = run, level, limit or np.inf, 0.0
         self.views = run.scene().train
-        size = sum(view.camera.width * view.camera.height * BYTES_PER_PIXEL for view in self.views)
-        self.kept, sample = [], []
-        for frame in self._render(self.views):
+        keep = keep and sum(view.camera.width * view.camera.height * BYTES_PER_PIXEL for view in self.views) <= KEPT_BYTES
+        self.kept, sample = [], [np.zeros(0, np.float32)]
+        for frame in self._render(self.views) if keep or not limit else ():
             sample.append(frame.depth[::SAMPLED, ::SAMPLED].ravel())
-            if size <= KEPT_BYTES:
+            if keep:
                 self.kept.append(frame)
         depths = np.concatenate(sample)
         depths = depths[depths > 0]
         if len(depths):
             self.limit = limit or depth_limit([view.camera for view in self.views], float(np.median(depths)))
-        self.beyond = float((depths > self.limit).mean()) if len(depths) else 0.0
+            self.beyond = float((depths > self.limit).mean())
         self.kept = [self._clamp(frame) for frame in self.kept]
 
     def __len__(self) -> int:

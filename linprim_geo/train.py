@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from . import ops
+from .camera import Similarity
 from .checkpoint import read_checkpoint, restore, write_checkpoint
 from .effects import Choice, Decision, decide, settle, summary
 from .errors import LinprimError
@@ -135,6 +136,9 @@ def train(
     resume: bool = False,
     quiet: bool = False,
     effects: Choice | None = None,
+    blocks: int | str = 1,
+    cluster: str | None = None,
+    workers: int = 0,
 ) -> dict:
     """Trains a scene into a run folder.
 
@@ -149,6 +153,8 @@ def train(
     With `effects` the options that the scene calls for take the place of those that were not given (effects.py); without, all are taken as
     they are. What was decided is in config.json, and a resumed run keeps it.
 
+    With `blocks` other than 1 the scene is trained in blocks of space by several workers, see `block_training.train_blocks`.
+
     Returns: `run`, `iterations`, `seconds` (of training steps alone), `primitives`, `psnr` (mean over held-out views), `views`; with
     `--exposure gain` also `psnr_gain`, each render times the gain per channel that brings it nearest to its photograph.
 
@@ -156,6 +162,13 @@ def train(
         LinprimError: the scene or an option cannot be used, or the folder exists already.
     """
     run_path = Path(run)
+    if blocks != 1 or (resume and "blocks" in _notes(run_path)):
+        from .block_training import train_blocks
+
+        if time_budget:
+            raise LinprimError("--time-budget plans one training: wanted without --blocks")
+        several = {"blocks": blocks, "cluster": cluster, "workers": workers}
+        return train_blocks(scene, run, scene_options, options, **several, resume=resume, quiet=quiet, effects=effects)
     check_train_options(options := options or TrainOptions())
     scene_options = scene_options or SceneOptions()
     progress = Progress("train", options.iterations, quiet=quiet)
@@ -186,6 +199,14 @@ def train(
             return _train(opened, loaded, None, progress, decisions, budget)
     finally:
         torch.set_num_threads(before)
+
+
+def _notes(path: Path) -> dict:
+    """What a run's config.json holds; nothing where there is none that can be read, which is told later."""
+    try:
+        return Run(path, path, SceneOptions(), TrainOptions(), Similarity()).notes
+    except LinprimError:
+        return {}
 
 
 def _has_remains(path: Path) -> bool:
@@ -373,8 +394,15 @@ def _mean_color(shots: list[Shot]) -> np.ndarray:
     return np.mean([s.rgb.numpy().mean((1, 2)) for s in shots], 0).astype(np.float32) / np.float32(255)
 
 
-def _start(scene: Scene, run: Run, shots: list[Shot], options: TrainOptions, state: dict | None) -> Trainer:
-    """A trainer at step 0, or at the step of a checkpoint's `state`."""
+def _start(
+    scene: Scene,
+    run: Run,
+    shots: list[Shot],
+    options: TrainOptions,
+    state: dict | None,
+    region: Callable[[PointCloud], PointCloud] | None = None,
+) -> Trainer:
+    """A trainer at step 0, or at the step of a checkpoint's `state`. `region` leaves of the points to start from what is to be trained."""
     focal = float(np.median([max(s.camera.fx, s.camera.fy) for s in shots]))
     centers = np.stack([s.camera.center for s in shots])
     background, fitted, random_background = _background(options.background, shots)
@@ -384,7 +412,7 @@ def _start(scene: Scene, run: Run, shots: list[Shot], options: TrainOptions, sta
     else:
         backdrop = background.numpy() if fitted else None
         cloud = fill_points(scene, options.seed, backdrop) if surface else scene.points
-        cloud = initial_cloud(cloud, options)
+        cloud = initial_cloud(cloud if region is None else region(cloud), options)
         xyz, rgb = run.similarity.apply(cloud.xyz), cloud.rgb
         middle = np.median(xyz, 0)
         reach = np.linalg.norm(xyz - middle, axis=1)

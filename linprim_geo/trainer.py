@@ -199,6 +199,8 @@ class Trainer:
             options, len(self), [shot.camera for shot in shots], bounds
         )
         self.filter_3d: torch.Tensor | None = None
+        # Primitives that stay as they are, as the rasterizer takes them: they stand for what others train.
+        self.frozen: Tensors | None = None
         self._refilter()
 
     def __len__(self) -> int:
@@ -257,8 +259,8 @@ class Trainer:
             )
         target = shot.over(background.detach())
         leaves = {k: v.requires_grad_() for k, v in self.parameters.items()}
-        active = self._cast(*activate(leaves, self.degree, self.kind, self.filter_3d))
-        screen = torch.zeros(len(self), 3, dtype=active[0].dtype, requires_grad=True)
+        active = self._cast(*self._with_frozen(activate(leaves, self.degree, self.kind, self.filter_3d)))
+        screen = torch.zeros(len(active[0]), 3, dtype=active[0].dtype, requires_grad=True)
         behind = background.to(active[0].dtype)
         terms = self.terms if self.has_reached(self.options.geometry_from) else None
         # Geometry has no average over the rays of a pixel: with several of them it is rendered by itself.
@@ -292,7 +294,7 @@ class Trainer:
             objective = objective + terms.loss(geometry, index, self.step, leaves["raw_opacity"], depth_of)
         wanted = [*leaves.values(), screen] + ([] if log_gain is None else [log_gain])
         grads = torch.autograd.grad(objective, wanted, allow_unused=True)
-        screen_grad = grads[len(leaves)].float()
+        screen_grad = grads[len(leaves)].float()[: len(self)]
         with torch.no_grad():
             if self.exposure is not None:
                 self.exposure.update(index, grads[-1], self.part())
@@ -382,7 +384,7 @@ class Trainer:
     @torch.no_grad()
     def render(self, camera: Camera, background: torch.Tensor) -> torch.Tensor:
         """(3, H, W) colour of a camera in the training frame, at the photographs' mean exposure."""
-        active = activate(self.parameters, self.degree, self.kind, self.filter_3d)
+        active = self._with_frozen(activate(self.parameters, self.degree, self.kind, self.filter_3d))
         return ops.rasterize(
             *self._cast(*active),
             background.double() if self.options.scalar == "float64" else background,
@@ -391,6 +393,16 @@ class Trainer:
             samples=self.options.samples,
             **self.how,
         ).rgb.float()
+
+    def _with_frozen(self, active: Tensors) -> Tensors:
+        """The active tensors, and after them the frozen ones with as many harmonics."""
+        if self.frozen is None:
+            return active
+        *rest, sh = self.frozen
+        wanted = active[-1].shape[1]
+        sh = torch.nn.functional.pad(sh, (0, 0, 0, max(0, wanted - sh.shape[1])))[:, :wanted]
+        center, rotation, extent, density, colors = (torch.cat(pair) for pair in zip(active, (*rest, sh), strict=True))
+        return center, rotation, extent, density, colors
 
     def _cast(self, center: Tensor, rotation: Tensor, extent: Tensor, density: Tensor, sh: Tensor) -> Tensors:
         """What the kernels take: with `--scalar float64` the same numbers in double."""

@@ -225,7 +225,11 @@ class Grid:
         return np.flatnonzero(seen)
 
     def extract(self) -> Mesh:
-        """Marching cubes between voxels that any view has voted on; empty if the field never changes sign.
+        """The surface in the order of its coordinates; empty if the field never changes sign. Uses the field up."""
+        return placed(self.surface(), self.origin)
+
+    def surface(self) -> Mesh:
+        """Marching cubes between voxels that any view has voted on, relative to `origin`, in any order.
 
         Uses the field up, to have its memory for the mesh.
         """
@@ -264,8 +268,15 @@ class Grid:
             faces = raw.triangle.indices.numpy().astype(np.int64)
         except RuntimeError:  # what Open3D raises where there is no surface
             return Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
-        mesh = _canonical(Mesh(vertices, faces))
-        return replace(mesh, vertices=mesh.vertices + self.origin)
+        return Mesh(vertices, faces)
+
+
+def placed(surface: Mesh, origin: np.ndarray) -> Mesh:
+    """A surface that `Grid.surface` gave, or several together, in the order of its coordinates and the frame of the cameras."""
+    if len(surface.faces) == 0:
+        return surface
+    mesh = _canonical(surface)
+    return replace(mesh, vertices=mesh.vertices + origin)
 
 
 def _canonical(mesh: Mesh) -> Mesh:

@@ -135,8 +135,17 @@ def test_train_gets_what_was_said(recorded_train, capsys):
     assert train_options == TrainOptions(iterations=12)
     choice = settings.pop("effects")
     assert (choice.mode, choice.asked, choice.given) == ("none", {}, {"iterations", "downscale"})
-    assert settings == {"resume": True, "quiet": True}
+    assert settings == {"resume": True, "quiet": True, "blocks": 1, "cluster": None, "workers": 0}
     assert "primitives: 7" in capsys.readouterr().out
+
+
+def test_blocks_and_where_they_are_trained_are_passed_on(recorded_train):
+    assert cli.main("train data/lego --blocks auto".split()) == 0
+    assert cli.main("train data/lego --blocks 4 --cluster local --workers 3".split()) == 0
+    said = [tuple(call[4][name] for name in ("blocks", "cluster", "workers")) for call in recorded_train]
+    assert said == [("auto", None, 0), (4, "local", 3)]
+    with pytest.raises(SystemExit):
+        cli.main("train data/lego --blocks some".split())
 
 
 def test_options_of_3dgs_are_understood(recorded_train, tiny_scene):

@@ -1,0 +1,80 @@
+"""The photographs of a block: the parts of views that show it, and in place of the rest what the coarse scene shows there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from . import ops
+from .blocks import Block, cropped, shown, smaller, window
+from .camera import Camera, Similarity
+from .options import TrainOptions, raster_options
+from .primitives import ARRAYS
+from .run import Run
+from .scene import View
+from .shots import Shot
+
+# Transmittance at which the coarse surface is taken.
+LEVEL = 0.5
+
+
+def small_depths(coarse: Run, views: Sequence[View], factor: int) -> Iterator[tuple[Camera, np.ndarray]]:
+    """For every view its camera, `factor` times as small, and the (h, w) z-depths of the coarse surface, 0 for none, in the training
+    frame."""
+    small = [replace(view, camera=smaller(view.camera, factor)) for view in views]
+    for view, depth, _ in coarse.surface_depths(small, LEVEL):
+        yield view.camera.transformed(coarse.similarity), depth * np.float32(coarse.similarity.scale)
+
+
+def block_shots(
+    coarse: Run, views: Sequence[View], block: Block, margin: float, factor: int, similarity: Similarity, options: TrainOptions
+) -> tuple[list[Shot], tuple[torch.Tensor, ...]]:
+    """What a block is trained on.
+
+    A photograph is cut to the window that shows the block. Its pixels whose surface lies elsewhere are replaced by what the frozen
+    primitives alone show there, with their opacity for alpha: a block is neither to explain the rest of the scene nor to hide it.
+
+    Returns: the shots, and the frozen primitives as the rasterizer takes them: the coarse ones outside of the block and its margin, but for
+        those that reach into the block.
+    """
+    primitives = coarse.training_primitives()
+    reach = primitives.extent.max(1)[:, None]
+    center = primitives.center
+    low, high = np.asarray(block.low), np.asarray(block.high)
+    outside = ~block.holds(center, margin) & ((center + reach < low) | (center - reach > high)).any(1)
+    frozen = tuple(torch.from_numpy(getattr(primitives, name)[outside]) for name in ARRAYS)
+    how = raster_options(options) | {"stop": options.stop}
+    shots = []
+    for view, (camera, depth) in zip(views, small_depths(coarse, views, factor), strict=True):
+        found = window(shown(block, margin, camera, depth), view.camera, factor)
+        if found is None:
+            continue
+        mask, (left, top, width, height) = found
+        small = cropped(view.camera.transformed(similarity), left, top, width, height)
+        photo = view.load()
+        part = np.s_[top : top + height, left : left + width]
+        rgb = photo.rgb[part]
+        alpha = np.full(mask.shape, 255, np.uint8) if photo.alpha is None else photo.alpha[part]
+        instead, opacity = _rendered(frozen, small, how)
+        rgb, alpha = np.where(mask[..., None], rgb, instead), np.where(mask, alpha, opacity)
+        planes = torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1))), torch.from_numpy(np.ascontiguousarray(alpha))
+        shots.append(Shot(view.name, small, *planes))
+    return shots, frozen
+
+
+def _rendered(frozen: tuple[torch.Tensor, ...], camera: Camera, how: dict) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W, 3) straight colours and (H, W) opacities of the frozen primitives, uint8."""
+    if len(frozen[0]) == 0:
+        return np.zeros((camera.height, camera.width, 3), np.uint8), np.zeros((camera.height, camera.width), np.uint8)
+    with torch.no_grad():
+        out = ops.rasterize(*frozen, torch.zeros(3), camera, **how)
+    opacity = out.opacity.float().numpy()
+    rgb = out.rgb.float().numpy().transpose(1, 2, 0) / np.maximum(opacity, 1e-3)[..., None]
+    return (_bytes(rgb), _bytes(opacity))
+
+
+def _bytes(values: np.ndarray) -> np.ndarray:
+    return np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)

@@ -1,0 +1,296 @@
+"""A scene trained in blocks is a run like any other; killed anywhere it ends in the same bits; one block is today's path."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_executor import is_alive
+
+from linprim_geo import block_training, worker
+from linprim_geo.block_shots import block_shots
+from linprim_geo.block_training import block_of, blocks_that_fit, train_blocks
+from linprim_geo.blocks import Block
+from linprim_geo.cli import main
+from linprim_geo.errors import LinprimError
+from linprim_geo.eval.images import eval_images_run
+from linprim_geo.executor import Processes
+from linprim_geo.extract import extract_mesh
+from linprim_geo.options import ExtractOptions, TrainOptions
+from linprim_geo.primitives import load_primitives
+from linprim_geo.run import Run
+from linprim_geo.scene import load_scene
+from linprim_geo.train import train
+from linprim_geo.trainer import Trainer, initial_parameters
+
+OPTIONS = TrainOptions(iterations=160, max_primitives=300, sh_degree=1, threads=1, checkpoint_every=20, evaluate_every=0)
+ARGUMENTS = "--iterations 160 --max-primitives 300 --sh-degree 1 --threads 1 --checkpoint-every 20 --evaluate-every 0 --quiet".split()
+SAVED = ("training_frame.npz", "scene.npz", "scene.ply")
+COUNT = 2
+
+
+@pytest.fixture(scope="module")
+def whole(tiny_scene, tmp_path_factory) -> tuple[Path, dict]:
+    """An undisturbed run in two blocks, and what training said."""
+    run = tmp_path_factory.mktemp("blocks") / "run"
+    return run, train_blocks(tiny_scene, run, options=OPTIONS, blocks=COUNT, workers=2, quiet=True)
+
+
+def assert_same(run: Path, reference: Path) -> None:
+    for name in SAVED:
+        assert (run / name).read_bytes() == (reference / name).read_bytes(), name
+
+
+def test_the_run_renders_extracts_and_scores_as_any_other(whole, tmp_path):
+    run, done = whole
+    opened = Run.open(run)
+    assert done["blocks"] == COUNT and done["views"] == 3 and done["psnr"] > 18
+    assert opened.train_options == OPTIONS and opened.state["primitives"] == done["primitives"] == len(opened.primitives())
+    assert eval_images_run(run)["psnr"] == pytest.approx(done["psnr"], abs=0.01)
+    stats = extract_mesh(run, output=tmp_path / "mesh.ply", options=ExtractOptions(level=0.5, refine=0), quiet=True)
+    assert stats["faces"] > 300
+    assert 0.1 < done["block_peak_gib"] < 4
+
+
+def test_every_block_keeps_what_it_owns(whole):
+    run, done = whole
+    plan = worker.result_of_folder(run / "blocks" / "plan")
+    kept = []
+    for k in range(COUNT):
+        primitives = load_primitives(run / "blocks" / f"{k:03d}" / "run" / "training_frame.npz")
+        own = block_of(plan, k).holds(primitives.center)
+        assert 0 < own.sum() < len(primitives)  # the margin is trained and dropped
+        kept.append(primitives.center[own])
+    assert np.array_equal(Run.open(run).training_primitives().center, np.concatenate(kept))
+    assert sum(part["work"] for part in plan["blocks"]) == pytest.approx(1)
+    assert all(0.4 < part["work"] < 0.6 for part in plan["blocks"])
+
+
+def test_a_finished_run_is_not_done_again(whole, tiny_scene):
+    run, done = whole
+    before = {path: path.stat().st_mtime_ns for path in run.glob(f"blocks/*/{worker.DONE}")}
+    again = train(tiny_scene, run, options=OPTIONS, resume=True, quiet=True)
+    assert before == {path: path.stat().st_mtime_ns for path in run.glob(f"blocks/*/{worker.DONE}")} and len(before) == COUNT + 2
+    assert again["psnr"] == done["psnr"] and again["primitives"] == done["primitives"]
+    with pytest.raises(LinprimError, match="exists already; give another folder"):
+        train_blocks(tiny_scene, run, options=OPTIONS, blocks=COUNT, quiet=True)
+
+
+@pytest.mark.parametrize("blocks", ["1", "auto"])
+def test_what_fits_one_block_is_trained_as_it_always_was(blocks, tiny_scene, tmp_path):
+    short = replace(OPTIONS, iterations=30)
+    train(tiny_scene, tmp_path / "always", options=short, quiet=True)
+    arguments = ["--iterations", "30", *ARGUMENTS[2:]]
+    assert main(["train", str(tiny_scene), "-o", str(tmp_path / "run"), "--blocks", blocks, *arguments]) == 0
+    assert_same(tmp_path / "run", tmp_path / "always")
+    assert not (tmp_path / "run" / "blocks").exists() and "blocks" not in Run.open(tmp_path / "run").notes
+
+
+def test_auto_takes_as_many_blocks_as_memory_asks_for(tiny_scene, tmp_path):
+    views = load_scene(tiny_scene).train
+    large = replace(OPTIONS, max_primitives=4_000_000)
+    with Processes(tmp_path, 1) as executor:
+        executor.memory_gib = 64.0
+        assert blocks_that_fit(views, large, executor) == 1
+        executor.memory_gib = 4.0
+        few = blocks_that_fit(views, large, executor)
+        executor.memory_gib = 2.0
+        assert 1 < few < blocks_that_fit(views, large, executor)
+        executor.memory_gib = 0.1
+        with pytest.raises(LinprimError, match="a worker has 0.1 GiB and one photograph takes"):
+            blocks_that_fit(views, large, executor)
+
+
+def test_a_run_of_one_block_is_not_resumed_in_several(tiny_run, tiny_scene):
+    before = {path: path.stat().st_mtime_ns for path in tiny_run.rglob("*")}
+    with pytest.raises(LinprimError, match="was not begun in blocks, wanted --resume without --blocks"):
+        train(tiny_scene, tiny_run, blocks=2, resume=True, quiet=True)
+    assert before.keys() == {path for path in tiny_run.rglob("*")}
+
+
+@pytest.mark.parametrize(
+    ("options", "blocks", "sentence"),
+    [
+        ({"exposure": "gain"}, 2, "--exposure gain is fitted over all photographs at once"),
+        ({"patches": 0.1}, 2, "--patches looks at whole views"),
+        ({}, 0, "--blocks is 0, wanted auto, or a number from 1"),
+    ],
+)
+def test_what_blocks_cannot_do_is_one_sentence(options, blocks, sentence, tiny_scene, tmp_path):
+    with pytest.raises(LinprimError, match=sentence):
+        train(tiny_scene, tmp_path / "run", options=replace(OPTIONS, **options), blocks=blocks, quiet=True)
+    assert not (tmp_path / "run").exists()
+
+
+def test_blocks_that_no_camera_sees_are_one_sentence(whole, monkeypatch):
+    run, _ = whole
+    monkeypatch.setattr(block_training, "window", lambda *_: None)
+    with pytest.raises(LinprimError, match="block 0 of 2 is seen by 0 cameras, wanted two at least: fewer blocks"):
+        block_training.plan_task(run / "blocks" / "plan", str(run), 2)
+
+
+def test_a_time_budget_and_a_lone_cluster_are_refused(tiny_scene, tmp_path, capsys):
+    for arguments, sentence in (
+        (["--blocks", "2", "--time-budget", "5m"], "--time-budget plans one training"),
+        (["--cluster", "local"], "there is one block, which is done here: wanted --blocks as well"),
+        (["--blocks", "2", "--dry-run"], "wanted without --blocks"),
+    ):
+        assert main(["train", str(tiny_scene), "-o", str(tmp_path / "run"), *arguments]) == 1
+        assert sentence in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+# --- what a block is trained on ---------------------------------------------------------------------------
+
+
+def test_a_block_sees_its_own_pixels_and_the_frozen_scene_elsewhere(whole):
+    run = Run.open(whole[0])
+    scene, coarse = run.scene(), Run.open(whole[0] / "blocks" / "coarse" / "run")
+    everything = Block((-np.inf,) * 3, (np.inf,) * 3)
+    factor = coarse.scene_options.downscale
+    shots, frozen = block_shots(coarse, scene.train[:2], everything, 0.1, factor, run.similarity, OPTIONS)
+    assert len(frozen[0]) == 0
+    photo = scene.train[0].load()
+    camera = shots[0].camera
+    left, top = (round(a - b) for a, b in ((scene.train[0].camera.cx, camera.cx), (scene.train[0].camera.cy, camera.cy)))
+    part = photo.rgb[top : top + camera.height, left : left + camera.width]
+    alpha = shots[0].alpha.numpy() > 0
+    assert np.array_equal(shots[0].rgb.numpy().transpose(1, 2, 0)[alpha], part[alpha])
+    own = block_of(worker.result_of_folder(run.path / "blocks" / "plan"), 0)
+    shots, frozen = block_shots(coarse, scene.train, own, 0.05, factor, run.similarity, OPTIONS)
+    assert len(frozen[0]) > 0 and not own.holds(frozen[0].numpy(), 0.05).any()
+    assert all(shot.camera.width <= 48 and shot.rgb.shape[1:] == (shot.camera.height, shot.camera.width) for shot in shots)
+    assert sum(shot.camera.width * shot.camera.height for shot in shots) < 0.9 * len(scene.train) * 48 * 48
+
+
+def test_frozen_primitives_are_drawn_and_stay(whole):
+    run = Run.open(whole[0])
+    scene, coarse = run.scene(), Run.open(whole[0] / "blocks" / "coarse" / "run")
+    own = block_of(worker.result_of_folder(run.path / "blocks" / "plan"), 0)
+    shots, frozen = block_shots(coarse, scene.train, own, 0.05, coarse.scene_options.downscale, run.similarity, OPTIONS)
+    rng = np.random.default_rng(0)
+    start = initial_parameters(rng.normal(size=(40, 3)), rng.integers(0, 255, (40, 3)), 1, 0, (0.01, 1.0))
+    trainer = Trainer(shots, start, replace(OPTIONS, iterations=20), (0.01, 1.0), torch.ones(3), False, True)
+    alone = trainer.render(shots[0].camera, torch.ones(3))
+    trainer.frozen = frozen
+    before = [tensor.clone() for tensor in frozen]
+    assert not torch.equal(alone, trainer.render(shots[0].camera, torch.ones(3)))
+    for _ in range(20):
+        trainer.advance()
+    assert all(torch.equal(a, b) for a, b in zip(before, frozen, strict=True))
+    assert len(trainer) == len(trainer.primitives()) == len(trainer.state()["parameters"]["center"]) < 40 + len(frozen[0])
+    empty = tuple(tensor[:0] for tensor in frozen)
+    twins = [Trainer(shots, {k: v.clone() for k, v in start.items()}, OPTIONS, (0.01, 1.0), torch.ones(3), False, True) for _ in range(2)]
+    twins[1].frozen = empty
+    for twin in twins:
+        twin.advance()
+    assert all(torch.equal(twins[0].parameters[name], twins[1].parameters[name]) for name in start)
+
+
+# --- kills ------------------------------------------------------------------------------------------------
+
+
+def workers_of(driver: int) -> list[int]:
+    """Processes below a driver that do tasks, of either engine."""
+    parents, found = {}, []
+    for entry in Path("/proc").iterdir():
+        try:
+            if entry.name.isdigit():
+                parents[int(entry.name)] = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
+                line = (entry / "cmdline").read_bytes()
+                if b"linprim_geo.worker" in line or line.startswith((b"ray::coarse", b"ray::plan", b"ray::block", b"ray::_work")):
+                    found.append(int(entry.name))
+        except OSError:
+            continue
+
+    def is_below(pid: int) -> bool:
+        while pid > 1 and pid != driver:
+            pid = parents.get(pid, 0)
+        return pid == driver
+
+    return [pid for pid in found if is_below(pid)]
+
+
+def train_killed_at_random(scene: Path, run: Path, kills: int, rng: random.Random, longest: float, *arguments: str) -> int:
+    """Trains in two blocks, killing a worker or the driver `kills` times; returns how many drivers it took."""
+    command = [sys.executable, "-m", "linprim_geo", "train", str(scene), "-o", str(run), "--blocks", str(COUNT), "--workers", "2"]
+    drivers = done = in_a_row = 0
+    while True:
+        driver = subprocess.Popen([*command, *ARGUMENTS, *arguments, *(["--resume"] if run.exists() else [])])
+        drivers += 1
+        in_a_row = 0
+        try:
+            while driver.poll() is None:
+                time.sleep(rng.uniform(0.1, longest))
+                at_it = workers_of(driver.pid)
+                if done < kills and at_it and driver.poll() is None:
+                    done += 1
+                    in_a_row += 1
+                    if rng.random() < 0.3 or in_a_row == 3:
+                        driver.kill()
+                        break
+                    victim = rng.choice(at_it)
+                    os.kill(victim, signal.SIGKILL)
+        finally:
+            if driver.poll() is None:
+                driver.kill()
+            driver.wait()
+        if driver.returncode != -signal.SIGKILL:
+            assert driver.returncode == 0 and drivers < 4 * kills + 4
+            assert done == kills
+            return drivers
+
+
+def test_killed_at_random_moments_it_ends_in_the_same_bits(whole, tiny_scene, tmp_path):
+    run = tmp_path / "run"
+    train_killed_at_random(tiny_scene, run, 3, random.Random(5), 3.0)
+    assert_same(run, whole[0])
+    assert not [path for path in run.rglob(".*") if ".tmp" in path.name]
+
+
+def test_a_driver_that_is_asked_to_end_lets_its_workers_save(tiny_scene, tmp_path):
+    run = tmp_path / "run"
+    # What starts the tests may ignore Ctrl-C, which a process inherits.
+    program = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    program += "; from linprim_geo.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", program, "train", str(tiny_scene), "-o", str(run), "--blocks", str(COUNT)]
+    driver = subprocess.Popen([*command, *ARGUMENTS, "--iterations", "100000"], stderr=subprocess.PIPE, text=True)
+    try:
+        latest = run / "blocks" / "coarse" / "run" / "checkpoints" / "latest"
+        end = time.monotonic() + 120
+        while not latest.exists() and time.monotonic() < end:
+            time.sleep(0.05)
+        pids = workers_of(driver.pid)
+        driver.send_signal(signal.SIGINT)
+        _, error = driver.communicate(timeout=60)
+    finally:
+        driver.kill()
+        driver.wait()
+    assert driver.returncode == 130 and "interrupted" in error
+    assert pids and not any(map(is_alive, pids))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arguments", [[], ["--cluster", "local"]], ids=["processes", "ray"])
+def test_twenty_kills_end_in_the_same_bits(arguments, whole, tiny_scene, tmp_path):
+    rng, kills = random.Random(11), 0
+    while kills < 20:
+        run = tmp_path / f"run_{kills}"
+        train_killed_at_random(tiny_scene, run, 5, rng, 4.0, *arguments)
+        kills += 5
+        assert_same(run, whole[0])
+
+
+def test_the_result_has_the_line_of_a_table(whole):
+    (line,) = [json.loads(text) for text in (whole[0] / "metrics.jsonl").read_text().splitlines()]
+    assert line["step"] == OPTIONS.iterations and line["psnr"] == pytest.approx(whole[1]["psnr"], abs=1e-3) and line["memory_gib"] > 0

@@ -1,0 +1,93 @@
+"""The fits and predictions of cost, the street, and the tables of both scripts, on sizes that take seconds."""
+
+from __future__ import annotations
+
+import json
+from argparse import Namespace
+
+import numpy as np
+import pytest
+
+from linprim_geo.blocks import Block
+from linprim_geo.eval import block_quality, scaling
+from linprim_geo.eval.street import HEIGHT, HOUSE, WIDTH, street
+from linprim_geo.raycast import RayCaster
+
+TRUE = scaling.Fit((1.0, 0.05, 2e-7), (0.002, 4e-7, 3e-6), (0.4, 4e-9, 2e-7, 1.5e-6))
+
+
+def rows_of(true: scaling.Fit, noise: float = 0.0) -> list[dict]:
+    rng, rows = np.random.default_rng(0), []
+    for photos, downscale, primitives in scaling.SIZES:
+        pixels = (160 // downscale) ** 2
+        values = (true.seconds_of_setup(photos, pixels), true.seconds_of_step(pixels, primitives), true.gib(photos, pixels, primitives))
+        size = {"photos": photos, "pixels": pixels, "primitives": primitives}
+        factors = np.exp(noise * rng.normal(size=3))
+        rows.append(size | dict(zip(("setup_seconds", "step_seconds", "gib"), np.multiply(values, factors), strict=True)))
+    return rows
+
+
+def test_a_fit_finds_the_numbers_that_made_its_rows():
+    found = scaling.fit(rows_of(TRUE)[:-1])
+    for name in ("setup", "step", "memory"):
+        assert np.allclose(getattr(found, name), getattr(TRUE, name), rtol=1e-6), name
+
+
+def test_the_check_is_of_a_size_that_was_not_fitted():
+    rows = rows_of(TRUE, 0.02)
+    checked = scaling.check(scaling.fit(rows[:-1]), rows[-1])
+    assert all(0.9 < value["ratio"] < 1.1 for value in checked.values())
+    rows[-1]["gib"] *= 2
+    assert scaling.check(scaling.fit(rows[:-1]), rows[-1])["gib"]["ratio"] == pytest.approx(checked["gib"]["ratio"] / 2)
+
+
+def test_predictions_grow_with_the_photographs_and_a_worker_does_not():
+    some, many = (scaling.predict(TRUE, photos, scaling.Capture()) for photos in (1e4, 1e6))
+    assert some["blocks"] == 125 and many["blocks"] == 12500
+    for name in ("core_hours", "storage_gib", "network_gib"):
+        assert 90 < many[name] / some[name] <= 101, name
+    assert many["gib_per_worker"] == pytest.approx(some["gib_per_worker"], rel=1e-6)
+    # By hand: a block is its setup and 60 x 200 steps over 60 % of 2 million pixels.
+    step = 0.002 + 4e-7 * 1.2e6 + 3e-6 * (24_000 + 20_000)
+    block = (1.0 + 0.05 * 200 + 2e-7 * 200 * 1.2e6 + 12_000 * step) / 3600
+    assert 125 * block < some["core_hours"] < 1.1 * 125 * block
+
+
+def test_a_street_is_a_closed_surface_seen_from_inside():
+    mesh = street(2)
+    assert np.allclose(mesh.vertices.max(0)[[0, 2]], (2 * HOUSE, HEIGHT)) and np.ptp(mesh.vertices[:, 1]) >= WIDTH
+    caster = RayCaster(mesh.vertices, mesh.faces, threads=1)
+    directions = np.random.default_rng(0).normal(size=(500, 3))
+    assert (caster.cast_single(np.array([HOUSE, WIDTH / 2, 1.5]), directions.astype(np.float32))[1] >= 0).all()
+    again = street(2)
+    assert np.array_equal(mesh.vertices, again.vertices) and not np.array_equal(street(2, seed=1).vertices.shape, mesh.vertices.shape)
+
+
+def test_distances_are_to_borders_between_blocks_only():
+    blocks = [Block((-np.inf,) * 3, (1.0, np.inf, np.inf)), Block((1.0, -np.inf, -np.inf), (np.inf, 0.0, np.inf))]
+    points = np.array([[0.0, 5, 5], [0.9, -5, 5], [1.5, -0.2, 0], [9.0, -7, 0], [2.0, 3.0, 0.0]])
+    assert np.allclose(block_quality.border_distance(blocks, points), [1.0, 0.1, 0.2, 7.0, np.inf])
+
+
+def test_scaling_measures_fits_and_writes_its_table(tmp_path, monkeypatch):
+    sizes = ((6, 1, 100), (6, 2, 200), (10, 1, 200), (10, 2, 100), (10, 1, 300))
+    given = Namespace(output=tmp_path, sizes=sizes, views=10, side=48, steps=2, cluster=None, workers=1, run=None)
+    result = scaling.run(given)
+    assert [row["primitives"] for row in result["rows"]] == [100, 200, 200, 100, 300]
+    assert [row["pixels"] for row in result["rows"]] == [2304, 576, 2304, 576, 2304]
+    assert all(row["step_seconds"] > 0 and 0.1 < row["gib"] < 4 for row in result["rows"])
+    text = (tmp_path / "scaling.md").read_text()
+    assert "| 10000 |" in text and "| 1000000 |" in text and "Checked on a size" in text
+    monkeypatch.setattr(scaling, "measure_task", None)
+    assert scaling.run(given)["rows"] == result["rows"]  # what is measured is not measured again
+
+
+def test_block_quality_writes_its_table(tmp_path):
+    given = ["--houses", "3", "--views", "24", "--size", "48", "--points", "6000", "--blocks", "1", "2"]
+    assert block_quality.main(["-o", str(tmp_path), *given, "--iterations", "120", "--max-primitives", "400", "--workers", "2"]) == 0
+    rows = json.loads((tmp_path / "block_quality.json").read_text())["rows"]
+    assert [row["blocks"] for row in rows] == [1, 2]
+    for row in rows:
+        assert row["psnr"] > 12 and 0 < row["chamfer"] < 5 and 0 < row["near"] < 1 and row["seam"] > 0 and row["gib"] > 0.1
+    assert "| 2 |" in (tmp_path / "block_quality.md").read_text()
+    assert block_quality.main(["-o", str(tmp_path / "x"), "--blocks", "1"]) == 1
