@@ -82,6 +82,7 @@ def test_scaling_measures_fits_and_writes_its_table(tmp_path, monkeypatch):
     assert scaling.run(given)["rows"] == result["rows"]  # what is measured is not measured again
 
 
+@pytest.mark.slow
 def test_block_quality_writes_its_table(tmp_path):
     given = ["--houses", "3", "--views", "24", "--size", "48", "--points", "6000", "--blocks", "1", "2"]
     assert block_quality.main(["-o", str(tmp_path), *given, "--iterations", "120", "--max-primitives", "400", "--workers", "2"]) == 0
