@@ -2,7 +2,7 @@
 # make test   environment, then the tests                                    (make test PYTEST="-k mesh")
 # make env    the environment alone, in .venv                                (make env PYTHON=/path/to/python3.12)
 # make lint   the linter
-# make types  the type checker
+# make types  the type checker, which still finds errors
 # make wheel  sdist and wheel in dist, checked in a fresh environment without a compiler
 # make browser-check   a report and a view in a headless Chromium (make browser-check PAGE=runs/demo/report.html)
 # Nothing is done again unless what it depends on has changed.

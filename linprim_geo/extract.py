@@ -10,7 +10,7 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
-from .auto_level import choose_level
+from .auto_level import USUAL_LEVEL, choose_level
 from .errors import LinprimError
 from .executor import Executor, open_executor
 from .files import locked, remove_torn, write_json
@@ -143,7 +143,7 @@ def _extract(
     if options.level == "auto":
         level, agreement = choose_level(opened)
         options = replace(options, level=level)
-        said = "the photographs agree best there" if agreement else "too little of the photographs overlaps to choose it"
+        said = "the photographs do not tell" if level == USUAL_LEVEL else "the nearest at which the photographs agree"
         stages.note(f"level {level:g}: {said}")
         stages.lap("level")
     module, function = METHODS[method].split(".")

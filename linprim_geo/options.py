@@ -219,7 +219,7 @@ class ExtractOptions:
     level: float | str = option(
         "auto",
         "transmittance at which the surface is taken, between 0 and 1, nearer to 1 is nearer to the cameras;"
-        " auto: where the photographs agree best with each other",
+        " auto: the nearest of those at which the photographs agree about as well as at the best",
         metavar="T",
         number_or="auto",
     )
