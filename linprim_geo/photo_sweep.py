@@ -96,6 +96,7 @@ def photo_gains(mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo]) 
 
     Medians over the vertices of a photograph and over the photographs of a vertex in turn, so highlights and places where the mesh
     is wrong do not count. 1 for a photograph that shares no vertex with others. Of GAIN_POINTS vertices, evenly over their order.
+    Memory: 12 bytes per photograph and such vertex.
     """
     points, normals = (array[:: -(-len(array) // GAIN_POINTS)] for array in _points(mesh))
     points, normals = np.ascontiguousarray(points), np.ascontiguousarray(normals)
