@@ -16,6 +16,7 @@
 #include <tuple>
 #include <vector>
 
+#include "face_samples.h"
 #include "fuse.h"
 #include "linprim.h"
 #include "parallel.h"
@@ -283,6 +284,21 @@ NB_MODULE(_core, m) {
     double* out = checked(least, {count}, "least");
     nb::gil_scoped_release release;
     linprim::least_footprints(view, least_cosine, at, along, count, out);
+  });
+  m.def("face_samples", [](Pose pose, std::array<double, 4> lens, In<float> depth, In<double> vertex, In<int64_t> corner,
+                           In<double> bary, double behind, double slack, In<uint8_t> skip, Out<uint8_t> found) {
+    if (depth.ndim() != 2) throw std::invalid_argument("depth has to have shape (H, W)");
+    const int64_t samples = int64_t(bary.shape(0)), count = int64_t(found.size()), vertices = int64_t(vertex.shape(0));
+    if (samples > linprim::kMostFaceSamples) throw std::invalid_argument("too many samples");
+    const linprim::PhotoView view = photo_view(pose, lens, int(depth.shape(1)), int(depth.shape(0)), nullptr, 0, depth.data());
+    const linprim::Faces faces{count, checked(vertex, {vertices, 3}, "vertex"), checked(corner, {count, 3}, "corner"),
+                               checked(skip, {count}, "skip")};
+    if (std::any_of(faces.corner, faces.corner + 3 * count, [&](int64_t row) { return row < 0 || row >= vertices; }))
+      throw std::invalid_argument("corners are outside of the vertices");
+    const double* weights = checked(bary, {samples, 3}, "bary");
+    uint8_t* out = checked(found, {count}, "found");
+    nb::gil_scoped_release release;
+    linprim::face_samples(view, faces, weights, int(samples), behind, slack, out);
   });
   m.def("add_votes", [](Pose project, int width, int height, In<float> surfels, std::array<float, 8> rules, In<int64_t> rows,
                         In<double> corner, double voxel, int resolution, Out<float> total, Out<float> weight, Out<float> free) {

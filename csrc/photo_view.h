@@ -19,6 +19,14 @@ struct PhotoView {
   const float* depth;             // z of the surface
 };
 
+// Camera coordinates of a point.
+inline void to_camera(const PhotoView& view, const double* point, double* at) {
+  for (int r = 0; r < 3; ++r) {
+    const double* row = view.pose + 4 * r;
+    at[r] = row[0] * point[0] + row[1] * point[1] + row[2] * point[2] + row[3];
+  }
+}
+
 // A point and its normal in camera coordinates, the cosine between the normal and the direction to the camera, and its pixel.
 struct SeenPoint {
   double at[3], normal[3], facing, u, v;
@@ -28,9 +36,9 @@ struct SeenPoint {
 
 // False where the point is behind the camera, flatter than `least_cosine`, or outside of the image.
 inline bool look(const PhotoView& view, double least_cosine, const double* point, const double* normal, SeenPoint& out) {
+  to_camera(view, point, out.at);
   for (int r = 0; r < 3; ++r) {
     const double* row = view.pose + 4 * r;
-    out.at[r] = row[0] * point[0] + row[1] * point[1] + row[2] * point[2] + row[3];
     out.normal[r] = row[0] * normal[0] + row[1] * normal[1] + row[2] * normal[2];
   }
   const double *at = out.at, z = at[2];

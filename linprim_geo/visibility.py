@@ -62,8 +62,8 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera]) -> np.ndarray:
     """Which faces any of the cameras sees, from either side.
 
     A face is seen if the ray through the centre of a pixel hits it first, or if one of four points on it lies
-    in the image of a camera with nothing in between. A point farther than all that the centres of its own and the eight
-    pixels around it see is taken to be hidden, so a gap narrower than a pixel shows nothing.
+    in the image of a camera with nothing in between. A point farther than what the four pixel centres around it see is taken
+    to be hidden, so a gap narrower than a pixel shows nothing.
 
     Returns:
         (F,) bool.
@@ -81,23 +81,22 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera]) -> np.ndarray:
         # A ray that slips through an edge sees further than all around it: what it hits has to pass the test below.
         believed = (face >= 0) & (depth <= maximum_filter(depth, footprint=AROUND, mode="nearest") * (1 + BEHIND_SHARE))
         seen[face[believed]] = True
-    gap = SURFACE_GAP * caster.diagonal
+    gap, before = SURFACE_GAP * caster.diagonal, np.zeros(len(seen), np.uint8)
     for camera in cameras:
-        farthest = maximum_filter(_first_hits(caster, camera)[0], size=3, mode="nearest")
-        farthest = farthest * (1 + BEHIND_SHARE) + BEHIND_SHARE * caster.diagonal
-        left = np.flatnonzero(~seen)
-        corners = mesh.vertices[mesh.faces[left]]
-        for sample in SAMPLES:
-            points = np.einsum("k,fkd->fd", sample, corners)
-            pixels, z, inside = _project(camera, points.T)
-            rows = np.flatnonzero(inside & ~seen[left])
-            j, i = pixels[:, rows].astype(np.int64)
-            rows = rows[z[rows] <= farthest[i, j]]
+        depth = _first_hits(caster, camera)[0]
+        behind = (BEHIND_SHARE, BEHIND_SHARE * caster.diagonal)
+        _core.face_samples(
+            *camera.pinhole(), depth, caster.vertices, caster.faces, SAMPLES, *behind, seen.view(np.uint8), before
+        )
+        for number, sample in enumerate(SAMPLES):
+            rows = np.flatnonzero(before >> number & 1 & ~seen)
             if len(rows) == 0:
                 continue
-            ray = points[rows] - camera.center
+            ray = np.einsum("k,fkd->fd", sample, caster.vertices[caster.faces[rows]]) - camera.center
             reach = 1.0 - gap / np.maximum(np.linalg.norm(ray, axis=1), 2.0 * gap)
-            seen[left[rows[~caster.occluded(camera.center, ray, reach)]]] = True
+            # Single precision tells most of them apart; what it lets through is asked again.
+            left = np.flatnonzero(~caster.occluded_single(camera.center, ray, reach))
+            seen[rows[left[~caster.occluded(camera.center, ray[left], reach[left])]]] = True
     return seen
 
 
@@ -106,15 +105,6 @@ def _first_hits(caster: RayCaster, camera: Camera) -> tuple[np.ndarray, np.ndarr
     depth, face, _ = caster.cast_single(camera.center, camera.world_rays().reshape(-1, 3))
     shape = (camera.height, camera.width)
     return depth.reshape(shape), face.astype(np.int64).reshape(shape)
-
-
-def _project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(2, P) pixel positions of (3, P) world points, their (P,) depths, and which lie in the image."""
-    x, y, z = np.einsum("ij,jp->ip", camera.rotation, points) + camera.world_to_camera[:3, 3, None]
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        pixels = np.stack([x / z * camera.fx + camera.cx, y / z * camera.fy + camera.cy])
-        inside = (z > 0) & (pixels >= 0).all(0) & (pixels[0] < camera.width) & (pixels[1] < camera.height)
-    return pixels, z, inside
 
 
 def color_vertices(mesh: Mesh, cameras: Sequence[Camera], images: Iterable[np.ndarray]) -> np.ndarray:
