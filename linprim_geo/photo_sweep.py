@@ -39,6 +39,9 @@ GAIN_POINTS, GAIN_ROUNDS, DARKEST = 20_000, 10, 0.03
 LEAST_SHARPNESS = 0.002
 """Where the disagreement of the photographs rises by less than this, of white, beside its least, vertices hardly move."""
 
+ROUNDING = 1 / (255 * np.sqrt(12))
+"""Standard deviation of brightness, of white, that is due to its 255 steps alone."""
+
 
 @dataclass(frozen=True)
 class Agreement:
@@ -46,13 +49,15 @@ class Agreement:
 
     `offset` is the signed distance along the normal, in the unit of the mesh, to where they agree best; `sharpness` how much their
     disagreement rises within a footprint on either side of it, as a share of white: 0 for a plain surface; `known` whether at least two
-    of them see a vertex well, `inside` whether the best place lies within the OFFSETS and not at their end.
+    of them see a vertex well, `inside` whether the best place lies within the OFFSETS and not at their end; `rounding` is what the
+    rounding of the photographs alone may shift `offset` by: more the plainer the surface, less the more photographs.
     """
 
     offset: np.ndarray
     sharpness: np.ndarray
     known: np.ndarray
     inside: np.ndarray
+    rounding: np.ndarray
 
 
 def best_agreement(
@@ -88,7 +93,8 @@ def best_agreement(
     place, sharpness[known] = _least(disagreement)
     offset[known] = place * footprint[known]
     inside[known] = np.abs(place) < OFFSETS[-1] - 0.1
-    return Agreement(offset, sharpness, known, inside)
+    rounding = footprint * ROUNDING / np.sqrt(np.maximum(views, 1)) / (sharpness + LEAST_SHARPNESS)
+    return Agreement(offset, sharpness, known, inside, rounding)
 
 
 def photo_gains(mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo]) -> np.ndarray:
@@ -121,16 +127,16 @@ def photo_gains(mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo]) 
 
 
 def predicted_error(mesh: Mesh, agreement: Agreement) -> np.ndarray:
-    """(V,) float32 predicted distance of each vertex from the true surface: how far from it the photographs agree best, in the mesh's unit.
+    """(V,) float32 predicted distance of each vertex from the true surface, in the mesh's unit.
 
-    A vertex that is not known takes the value of the nearest that is; where none is, all are NaN.
+    It is how far from it the photographs agree best, plus what the rounding of the photographs may shift that place by. A vertex that is not known takes the value of the nearest that is; where none is, all are NaN.
     Accuracy: `python -m linprim_geo.eval.surfaces` prints its rank correlation with the exact error, and the ratio of their means.
     """
     from scipy.spatial import cKDTree
 
     known = agreement.known
     error = np.full(len(known), np.nan, np.float32)
-    error[known] = np.abs(agreement.offset[known])
+    error[known] = (np.abs(agreement.offset) + agreement.rounding)[known]
     if known.any() and not known.all():
         _, nearest = cKDTree(mesh.vertices[known]).query(mesh.vertices[~known], workers=-1)
         error[~known] = error[known][nearest]

@@ -472,12 +472,11 @@ def _kept_faces(mesh: Mesh, cameras: list[Camera], smallest_part: float) -> np.n
     """(F,) bool: shells that the ray of some pixel meets first and that have the share `smallest_part` of the largest one's area, and
     what they need."""
     from .raycast import RayCaster
+    from .visibility import faces_of_pixels
 
     count, label = shells(mesh)
-    caster, seen = RayCaster(mesh.vertices, mesh.faces), np.zeros(count, dtype=bool)
-    for camera in cameras:
-        face = caster.render_depth(camera)[1]
-        seen[label[face[face >= 0]]] = True
+    seen = np.zeros(count, dtype=bool)
+    seen[label[faces_of_pixels(RayCaster(mesh.vertices, mesh.faces), cameras)]] = True
     area = np.bincount(label, weights=face_areas(mesh), minlength=count)
     largest = area[seen].max() if seen.any() else 0.0
     return kept_shells(mesh, seen & (area >= smallest_part * largest))

@@ -70,17 +70,10 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera]) -> np.ndarray:
     Raises:
         LinprimError: the mesh is empty or not finite.
     """
-    from scipy.ndimage import maximum_filter
-
     from .raycast import RayCaster
 
     caster = RayCaster(mesh.vertices, mesh.faces)
-    seen = np.zeros(len(mesh.faces), dtype=bool)
-    for camera in cameras:
-        depth, face = _first_hits(caster, camera)
-        # A ray that slips through an edge sees further than all around it: what it hits has to pass the test below.
-        believed = (face >= 0) & (depth <= maximum_filter(depth, footprint=AROUND, mode="nearest") * (1 + BEHIND_SHARE))
-        seen[face[believed]] = True
+    seen = faces_of_pixels(caster, cameras)
     gap, before = SURFACE_GAP * caster.diagonal, np.zeros(len(seen), np.uint8)
     for camera in cameras:
         depth = _first_hits(caster, camera)[0]
@@ -97,6 +90,22 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera]) -> np.ndarray:
             # Single precision tells most of them apart; what it lets through is asked again.
             left = np.flatnonzero(~caster.occluded_single(camera.center, ray, reach))
             seen[rows[left[~caster.occluded(camera.center, ray[left], reach[left])]]] = True
+    return seen
+
+
+def faces_of_pixels(caster: RayCaster, cameras: Sequence[Camera]) -> np.ndarray:
+    """(F,) bool: faces of the mesh that the ray through the centre of a pixel hits first.
+
+    A ray that sees further than those of all four pixels around it has slipped through an edge, or looks through a gap narrower than
+    a pixel, and is not believed.
+    """
+    from scipy.ndimage import maximum_filter
+
+    seen = np.zeros(len(caster.faces), dtype=bool)
+    for camera in cameras:
+        depth, face = _first_hits(caster, camera)
+        believed = (face >= 0) & (depth <= maximum_filter(depth, footprint=AROUND, mode="nearest") * (1 + BEHIND_SHARE))
+        seen[face[believed]] = True
     return seen
 
 

@@ -108,6 +108,16 @@ def test_the_predicted_error_is_the_true_one(shown):
     assert predicted[middle].mean() == pytest.approx(truth.mean(), rel=0.15)
 
 
+@pytest.mark.parametrize("contrast", [1, 0.3, 0.1, 0.03, 0.01])
+def test_plain_surfaces_are_less_certain(contrast):
+    faint = [Shown(view, lambda x, y: 0.5 + contrast * (texture(x, y) - 0.5)) for view in ring()]
+    mesh = sheet(lambda x, y: np.zeros_like(x))
+    found, middle = agreement(mesh, faint), inner(mesh)
+    # Of a strong texture what the parabola leaves is the larger error, of a faint one what the rounding does.
+    actual, told = np.median(np.abs(found.offset[middle])), np.median(found.rounding[middle])
+    assert 0.2 * actual < told < 3 * actual
+
+
 def test_rounds_bring_the_surface_to_the_plane(shown):
     mesh = sheet(lambda x, y: FOOTPRINT * np.sin(6 * x) * np.cos(5 * y))
     middle = inner(mesh)
