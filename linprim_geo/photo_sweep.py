@@ -129,7 +129,8 @@ def photo_gains(mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo]) 
 def predicted_error(mesh: Mesh, agreement: Agreement) -> np.ndarray:
     """(V,) float32 predicted distance of each vertex from the true surface, in the mesh's unit.
 
-    It is how far from it the photographs agree best, plus what the rounding of the photographs may shift that place by. A vertex that is not known takes the value of the nearest that is; where none is, all are NaN.
+    It is how far from it the photographs agree best, plus what the rounding of the photographs may shift that place by. A vertex that
+    is not known takes the value of the nearest that is; where none is, all are NaN.
     Accuracy: `python -m linprim_geo.eval.surfaces` prints its rank correlation with the exact error, and the ratio of their means.
     """
     from scipy.spatial import cKDTree
