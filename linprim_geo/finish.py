@@ -9,6 +9,7 @@ from .mesh import Mesh, save_mesh, select_faces
 from .mesh_process import process_mesh
 from .options import ExtractOptions
 from .photo_sweep import best_agreement, photo_gains, predicted_error, refine_surface
+from .raycast import RayCaster
 from .run import Run
 from .stages import Stages
 from .texture import make_texture, save_textured
@@ -34,17 +35,19 @@ def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, 
     """Finishes a surface as the options ask, and writes it to `target` and `visible_file(target)`."""
     views = run.scene().train
     cameras = [view.camera for view in views]
-    gains = photo_gains(mesh, cameras, (view.load() for view in views))
+    caster = RayCaster(mesh.vertices, mesh.faces)
+    gains = photo_gains(mesh, cameras, (view.load() for view in views), caster)
     if options.refine:
-        mesh = refine_surface(mesh, views, options.refine, gains)
+        mesh = refine_surface(mesh, views, options.refine, gains, caster)
         stages.lap("refine")
     mesh, processing = process_mesh(mesh, options, stages.note)
     if processing:
         stages.lap("process")
-    agreement = best_agreement(mesh, cameras, (view.load() for view in views), gains)
+    caster = RayCaster(mesh.vertices, mesh.faces)
+    agreement = best_agreement(mesh, cameras, (view.load() for view in views), gains, caster)
     mesh = replace(mesh, quality=predicted_error(mesh, agreement))
     stages.lap("quality")
-    seen = visible_faces(mesh, cameras)
+    seen = visible_faces(mesh, cameras, caster)
     visible = select_faces(mesh, seen)
     stages.lap("visibility")
     if not options.texture:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from .camera import Camera
 from .mesh import Mesh, vertex_normals
 from .scene import Photo, View
 from .visibility import FAR
+
+if TYPE_CHECKING:
+    from .raycast import RayCaster
 
 OFFSETS = np.arange(-3.0, 3.5, 0.5)
 """Places along the normal at which photographs are compared, in footprints: what a pixel of the nearest view covers."""
@@ -61,7 +65,11 @@ class Agreement:
 
 
 def best_agreement(
-    mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo], gains: np.ndarray | None = None
+    mesh: Mesh,
+    cameras: Sequence[Camera],
+    photos: Iterable[Photo],
+    gains: np.ndarray | None = None,
+    caster: RayCaster | None = None,
 ) -> Agreement:
     """Compares photographs along the normal of every vertex.
 
@@ -73,13 +81,14 @@ def best_agreement(
         mesh: not empty; `normals` are used if it has them.
         photos: one per camera, iterated once. Transparent pixels count as mid-grey.
         gains: (K,) exposure of each photograph (`photo_gains`), default 1.
+        caster: of the mesh, if there is one already.
     """
     points, normals = _points(mesh)
     footprint, count = _footprints(points, normals, cameras), len(points)
     views, weight = np.zeros(count, np.int32), np.zeros(count, np.float32)
     value, square = np.zeros((2, count, len(OFFSETS)), np.float32)
     gains = np.ones(len(cameras)) if gains is None else gains
-    for (camera, image, depth, jump), gain in zip(_photographed(mesh, cameras, photos), gains, strict=True):
+    for (camera, image, depth, jump), gain in zip(_photographed(mesh, cameras, photos, caster), gains, strict=True):
         image = image / np.float32(gain)
         rules = (LEAST_COSINE, OUTLINE_SLOPES)
         _core.add_photo(
@@ -97,18 +106,20 @@ def best_agreement(
     return Agreement(offset, sharpness, known, inside, rounding)
 
 
-def photo_gains(mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo]) -> np.ndarray:
+def photo_gains(
+    mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo], caster: RayCaster | None = None
+) -> np.ndarray:
     """(K,) float64 brightness of each photograph relative to the others, of geometric mean 1, by what they show of the same vertices.
 
     Medians over the vertices of a photograph and over the photographs of a vertex in turn, so highlights and places where the mesh
     is wrong do not count. 1 for a photograph that shares no vertex with others. Of GAIN_POINTS vertices, evenly over their order.
-    Memory: 12 bytes per photograph and such vertex.
+    Memory: 12 bytes per photograph and such vertex. `caster`: of the mesh, if there is one already.
     """
     points, normals = (array[:: -(-len(array) // GAIN_POINTS)] for array in _points(mesh))
     points, normals = np.ascontiguousarray(points), np.ascontiguousarray(normals)
     count, here = len(points), np.zeros(1)
     seen = np.full((len(cameras), count), np.nan, np.float32)
-    for row, (camera, image, depth, jump) in zip(seen, _photographed(mesh, cameras, photos), strict=True):
+    for row, (camera, image, depth, jump) in zip(seen, _photographed(mesh, cameras, photos, caster), strict=True):
         views, weight = np.zeros(count, np.int32), np.zeros(count, np.float32)
         value, square = np.zeros((2, count, 1), np.float32)
         rules, footprint = (LEAST_COSINE, OUTLINE_SLOPES), np.ones(count)
@@ -144,10 +155,13 @@ def predicted_error(mesh: Mesh, agreement: Agreement) -> np.ndarray:
     return error
 
 
-def refine_surface(mesh: Mesh, views: Sequence[View], rounds: int, gains: np.ndarray | None = None) -> Mesh:
+def refine_surface(
+    mesh: Mesh, views: Sequence[View], rounds: int, gains: np.ndarray | None = None, caster: RayCaster | None = None
+) -> Mesh:
     """Moves vertices to where the photographs agree best, `rounds` times; faces stay as they are, normals are made anew.
 
     Moves are averaged over neighbours and fade out where the photographs say nothing. Colours and quality are kept as they are.
+    `caster`: of the mesh as it is given, if there is one already.
     """
     from scipy.sparse import coo_matrix, diags, identity
 
@@ -159,7 +173,8 @@ def refine_surface(mesh: Mesh, views: Sequence[View], rounds: int, gains: np.nda
     average = diags(1 / np.asarray(graph.sum(1)).ravel()) @ graph
     for _ in range(rounds):
         mesh = replace(mesh, normals=vertex_normals(mesh))
-        agreement = best_agreement(mesh, cameras, (view.load() for view in views), gains)
+        agreement = best_agreement(mesh, cameras, (view.load() for view in views), gains, caster)
+        caster = None
         weight = agreement.sharpness * agreement.inside
         move = weight * agreement.offset
         for _ in range(SMOOTHING):
@@ -175,13 +190,15 @@ def _points(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     return np.ascontiguousarray(mesh.vertices, np.float64), np.ascontiguousarray(normals, np.float64)
 
 
-def _photographed(mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo]) -> Iterator[tuple]:
+def _photographed(
+    mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo], caster: RayCaster | None
+) -> Iterator[tuple]:
     """Of each view the camera, the (H, W) brightness of its photograph, depth of the mesh, and largest less least depth of 3x3 pixels."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     from .raycast import RayCaster
 
-    caster = RayCaster(mesh.vertices, mesh.faces)
+    caster = caster or RayCaster(mesh.vertices, mesh.faces)
     for camera, photo in zip(cameras, photos, strict=True):
         depth = caster.cast_single(camera.center, camera.world_rays().reshape(-1, 3))[0].reshape(camera.height, camera.width)
         depth = np.minimum(depth, FAR * caster.diagonal).astype(np.float32)

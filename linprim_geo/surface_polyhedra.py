@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -28,6 +29,9 @@ POINTS_PER_PRIMITIVE, LEAST_POINTS_IN_ALL = 40, 20_000
 
 NEIGHBOURHOOD = 1.5
 """Planes are fitted to the points within a primitive enlarged by this, so that those of neighbours agree."""
+
+SEARCHED_AT_A_TIME, SAME_REACH = 256, 1.2
+"""Primitives whose points are looked for at a time, which bounds the memory of it, and the largest ratio of their reaches."""
 
 PLANES = 8
 """Most planes that cut one primitive: so many faces has an octahedron that is seen from all around."""
@@ -292,19 +296,27 @@ def _points_within(primitives: Primitives, points: np.ndarray) -> tuple[np.ndarr
     center = primitives.center.astype(np.float64)
     reach = NEIGHBOURHOOD * primitives.extent.astype(np.float64).max(1)
     rows, found = [], []
-    for start in range(0, len(primitives), 256):
-        near = tree.query_ball_point(center[start : start + 256], reach[start : start + 256], return_sorted=True)
-        point = np.concatenate([np.asarray(part, dtype=np.int64) for part in near])
-        row = start + np.repeat(np.arange(len(near)), [len(part) for part in near])
+    # Of about the same reach at a time: one search knows but one.
+    order = np.argsort(reach, kind="stable")
+    size = np.floor(np.log(reach[order]) / np.log(SAME_REACH))
+    start = np.flatnonzero(np.diff(size, prepend=-np.inf))
+    some_of_each = (np.split(part, range(SEARCHED_AT_A_TIME, len(part), SEARCHED_AT_A_TIME)) for part in np.split(order, start[1:]))
+    for some in chain.from_iterable(some_of_each):
+        near = cKDTree(center[some]).sparse_distance_matrix(tree, reach[some].max(), output_type="ndarray")
+        row, point = some[near["i"]], near["j"]
         level = np.full(len(row), -np.inf)
         for face in range(normals.shape[1]):
             ahead = np.einsum("ij,ij->i", normals[row, face], points[point] - center[row])
-            np.maximum(level, ahead / offsets[row, face], out=level)
-        inside = np.bincount(row[level <= 1], minlength=start + len(near))
-        taken = (level <= NEIGHBOURHOOD) & (inside[row] >= LEAST_POINTS)
+            level = np.maximum(level, ahead / offsets[row, face])
+            near = level <= NEIGHBOURHOOD
+            row, point, level = row[near], point[near], level[near]
+        inside = np.bincount(row[level <= 1], minlength=len(primitives))
+        taken = inside[row] >= LEAST_POINTS
         rows.append(row[taken])
         found.append(point[taken])
-    return np.concatenate(rows), np.concatenate(found)
+    row, point = np.concatenate(rows), np.concatenate(found)
+    order = np.lexsort((point, row))
+    return row[order], point[order]
 
 
 def _face_planes(primitives: Primitives) -> tuple[np.ndarray, np.ndarray]:
@@ -325,7 +337,11 @@ def _sums(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
 
 def _medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
     """(count,) lower medians by group; every group has a value."""
-    order = np.lexsort((values, group))
+    from scipy.sparse import coo_matrix
+
+    # By value, then by group: the conversion to rows keeps the order within each, and is faster than sorting again.
+    order = np.argsort(values)
+    order = coo_matrix((order, (group[order], np.arange(len(order)))), shape=(count, len(order))).tocsr().data
     size = np.bincount(group, minlength=count)
     return values[order[np.cumsum(size) - size + (size - 1) // 2]]
 

@@ -58,12 +58,12 @@ POOR_RINGS = 3
 Wires, which are nothing but outline, keep their own."""
 
 
-def visible_faces(mesh: Mesh, cameras: Sequence[Camera]) -> np.ndarray:
+def visible_faces(mesh: Mesh, cameras: Sequence[Camera], caster: RayCaster | None = None) -> np.ndarray:
     """Which faces any of the cameras sees, from either side.
 
     A face is seen if the ray through the centre of a pixel hits it first, or if one of four points on it lies
     in the image of a camera with nothing in between. A point farther than what the four pixel centres around it see is taken
-    to be hidden, so a gap narrower than a pixel shows nothing.
+    to be hidden, so a gap narrower than a pixel shows nothing. `caster`: of the mesh, if there is one already.
 
     Returns:
         (F,) bool.
@@ -72,7 +72,7 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera]) -> np.ndarray:
     """
     from .raycast import RayCaster
 
-    caster = RayCaster(mesh.vertices, mesh.faces)
+    caster = caster or RayCaster(mesh.vertices, mesh.faces)
     seen = faces_of_pixels(caster, cameras)
     gap, before = SURFACE_GAP * caster.diagonal, np.zeros(len(seen), np.uint8)
     for camera in cameras:
