@@ -128,19 +128,21 @@ def _read_frames(path: Path, header: dict, split: str | None) -> list[Frame]:
     """The frames of one file, with images found on disk and cameras checked for numbers."""
     entries = header["frames"] + header["test_frames"]
     held_out = set(map(id, header["test_frames"]))
-    located = []
+    located, missing = [], []
     for number, entry in enumerate(entries):
         where = _checked(f"{path} frame {number}", entry)
         if _is_bad(entry, where):
             continue
-        located.append((where, entry, _find_image(path.parent, entry["file_path"])))
-    if not located and split != "test":
+        image = _find_image(path.parent, entry["file_path"])
+        if image is None:
+            missing.append(path.parent / entry["file_path"])
+        else:
+            located.append((where, entry, image))
+    if not located and not missing and split != "test":
         raise LinprimError(f"{path}: all {len(entries)} frames are marked 'is_bad', wanted some that are not")
-    missing = [(where, entry) for where, entry, image in located if image is None]
     if missing:
         raise LinprimError(
-            f"{path}: {len(missing)} of {len(located)} images are not on disk, the first is"
-            f" {path.parent / missing[0][1]['file_path']}"
+            f"{path}: {len(missing)} of {len(missing) + len(located)} images are not on disk, the first is {missing[0]}"
         )
     named = _named_splits(path, header, [entry["file_path"] for _, entry, _ in located])
     frames = []
@@ -277,7 +279,7 @@ def _lens(values: dict, where: str, image: Path) -> Lens:
         raise LinprimError(
             f"{where}: neither 'fl_x' nor 'camera_angle_x' is there, wanted a focal length or a view angle"
         )
-    fx, fy = fx or fy, fy or fx
+    fx, fy = fx or fy or 0.0, fy or fx or 0.0
     cx, cy = _number(values, "cx", where, width / 2), _number(values, "cy", where, height / 2)
     k1, k2, k3, k4, p1, p2 = (
         _number(values, key, where, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -332,6 +334,7 @@ def _points(root: Path, headers: list, frames: list[Frame], sparse: Path | None)
     applied = _applied_transform(headers)
     if sparse is not None:
         model = read_colmap.find_model(root, sparse)
+        assert model is not None
         cloud, difference = _model_points(model, frames, applied)
         if difference > 1:
             raise LinprimError(
@@ -346,7 +349,7 @@ def _points(root: Path, headers: list, frames: list[Frame], sparse: Path | None)
             if not is_file(file):
                 raise LinprimError(f"{path}: 'ply_file_path' {file} is not on disk")
             return read_points_ply(file)
-    found = []
+    found: list[tuple[float, int, PointCloud]] = []
     for model in read_colmap.models_below(root):
         try:
             cloud, difference = _model_points(model, frames, applied)
@@ -394,12 +397,9 @@ def _model_points(
     if applied is not None:
         linear, shift = applied[:, :3], applied[:, 3]
     options = [(np.eye(3), np.zeros(3))] if applied is None else [(linear, shift), (np.eye(3), np.zeros(3))]
-    best = None
-    for matrix, offset in options:
-        difference = _pose_difference(pairs, matrix, offset)
-        if best is None or difference < best[0]:
-            best = (difference, matrix, offset)
-    difference, matrix, offset = best
+    differences = [_pose_difference(pairs, matrix, offset) for matrix, offset in options]
+    difference = min(differences)
+    matrix, offset = options[differences.index(difference)]
     cloud = colmap.points
     if cloud is not None:
         cloud = PointCloud(cloud.xyz @ matrix.T + offset, cloud.rgb, cloud.error_px)
