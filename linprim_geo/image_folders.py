@@ -20,8 +20,13 @@ def with_images(frames: Sequence[Frame], folder: Path) -> list[Frame]:
     Raises:
         LinprimError: one is missing, is that of two cameras, or is of another shape than its camera's.
     """
-    found = [_beside(frame.relative, folder) for frame in frames]
-    missing = [frame.relative for frame, image in zip(frames, found, strict=True) if image is None]
+    found, missing = [], []
+    for frame in frames:
+        image = _beside(frame.relative, folder)
+        if image is None:
+            missing.append(frame.relative)
+        else:
+            found.append(image)
     if missing:
         raise LinprimError(
             f"{folder}: no image for {len(missing)} of {len(frames)} cameras, the first is {missing[0]}"

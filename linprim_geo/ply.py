@@ -103,7 +103,7 @@ def read_ply_header(path: str | os.PathLike) -> PlyHeader:
     if newline < 0:
         raise LinprimError(f"{path}: the PLY header has no end within {len(start)} bytes")
 
-    layout = None
+    layout: str | None = None
     elements: list[tuple[str, int, list]] = []
     for number, line in enumerate(start[:end].decode("latin-1").splitlines()[1:], start=2):
         words = line.split()
@@ -150,7 +150,7 @@ def read_primitive_ply(path: str | os.PathLike) -> tuple[Primitives, dict]:
     if header.format != "binary_little_endian":
         raise LinprimError(f"{path}: the PLY format is {header.format}, wanted binary_little_endian")
     table = _vertex_table(path, header)
-    present = set(table.dtype.names)
+    present = set(table.dtype.names or ())
     rest = sum(name.startswith("f_rest_") for name in present)
     if rest % 3 or rest // 3 + 1 not in SH_COEFFICIENTS:
         raise LinprimError(f"{path}: has {rest} properties f_rest_*, wanted 0, 9, 24 or 45")
@@ -283,12 +283,12 @@ def _vertex_table(path: Path, header: PlyHeader) -> np.ndarray:
     if not header.elements or header.elements[0].name != "vertex":
         raise LinprimError(f"{path}: the first PLY element is not vertex")
     vertex = header.elements[0]
-    names = [name for name, _ in vertex.properties]
-    if None in (kind for _, kind in vertex.properties) or len(set(names)) != len(names) or not names:
+    kinds = {name: kind for name, kind in vertex.properties if kind is not None}
+    if len(kinds) < len(vertex.properties) or not kinds:
         raise LinprimError(
             f"{path}: the vertices have lists, repeated properties or none, wanted plain numbers"
         )
-    dtype = np.dtype([(name, "<" + kind) for name, kind in vertex.properties])
+    dtype = np.dtype([(name, "<" + kind) for name, kind in kinds.items()])
     size = path.stat().st_size
     wanted = header.data_start + vertex.count * dtype.itemsize
     if size < wanted:

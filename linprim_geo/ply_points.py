@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from .errors import LinprimError
-from .ply import PlyElement, read_ply_header
+from .ply import read_ply_header
 from .scene import PointCloud
 
 _COLORS = ("red", "green", "blue")
@@ -27,17 +27,18 @@ def read_points_ply(path: Path) -> PointCloud | None:
     vertex = header.element("vertex")
     if vertex is None or header.elements[0] is not vertex:
         raise LinprimError(f"{path}: the PLY file does not begin with vertices, wanted a file of points")
-    kinds = dict(vertex.properties)
-    if not {"x", "y", "z"} <= set(kinds) or None in kinds.values() or len(kinds) < len(vertex.properties):
+    kinds = {name: kind for name, kind in vertex.properties if kind is not None}
+    if not {"x", "y", "z"} <= set(kinds) or len(kinds) < len(vertex.properties):
         found = ", ".join(name for name, _ in vertex.properties) or "no properties"
         raise LinprimError(f"{path}: vertices have {found}, wanted x, y, z, no lists and nothing twice")
     with open(path, "rb") as file:
         file.seek(header.data_start)
         data = file.read()
     if header.format == "ascii":
-        table = _ascii(path, data, vertex)
+        table = _ascii(path, data, list(kinds), vertex.count)
     else:
-        table = _binary(path, data, vertex, "<" if header.format == "binary_little_endian" else ">")
+        order = "<" if header.format == "binary_little_endian" else ">"
+        table = _binary(path, data, np.dtype([(name, order + kind) for name, kind in kinds.items()]), vertex.count)
     xyz = np.stack([np.asarray(table[axis], dtype=np.float64) for axis in "xyz"], axis=1)
     rgb = np.full((vertex.count, 3), _GREY, dtype=np.uint8)
     if set(_COLORS) <= set(kinds):
@@ -48,24 +49,22 @@ def read_points_ply(path: Path) -> PointCloud | None:
     return PointCloud(xyz[finite], rgb[finite]) if finite.any() else None
 
 
-def _binary(path: Path, data: bytes, vertex: PlyElement, order: str) -> np.ndarray:
-    layout = np.dtype([(name, order + kind) for name, kind in vertex.properties])
-    if len(data) < vertex.count * layout.itemsize:
-        raise _cut_short(path, len(data) // layout.itemsize, vertex.count)
-    return np.frombuffer(data, dtype=layout, count=vertex.count)
+def _binary(path: Path, data: bytes, layout: np.dtype, count: int) -> np.ndarray:
+    if len(data) < count * layout.itemsize:
+        raise _cut_short(path, len(data) // layout.itemsize, count)
+    return np.frombuffer(data, dtype=layout, count=count)
 
 
-def _ascii(path: Path, data: bytes, vertex: PlyElement) -> dict[str, np.ndarray]:
-    names = [name for name, _ in vertex.properties]
-    lines = [line for line in data.split(b"\n") if line.strip()][: vertex.count]
+def _ascii(path: Path, data: bytes, names: list[str], count: int) -> dict[str, np.ndarray]:
+    lines = [line for line in data.split(b"\n") if line.strip()][:count]
     try:
         rows = [[float(word) for word in line.split()[: len(names)]] for line in lines]
     except ValueError as error:
         raise LinprimError(f"{path}: a point holds something that is not a number ({error})") from error
     whole = sum(len(row) == len(names) for row in rows)
-    if whole < vertex.count:
-        raise _cut_short(path, whole, vertex.count)
-    values = np.array(rows, dtype=np.float64).reshape(vertex.count, len(names))
+    if whole < count:
+        raise _cut_short(path, whole, count)
+    values = np.array(rows, dtype=np.float64).reshape(count, len(names))
     return {name: values[:, i] for i, name in enumerate(names)}
 
 

@@ -83,9 +83,10 @@ def read_colmap(root: Path, model: Path, images: Path | None = None) -> Listing:
     colmap = read_model(model)
     if not colmap.images:
         raise LinprimError(f"{model}: the reconstruction is empty (no registered image), wanted at least two")
-    best, missing = None, None
     usual = [root / name for name in _IMAGE_FOLDERS] + [model.parent / "images", model.parent.parent / "images"]
-    for folder in dict.fromkeys(([images] if images else []) + usual):
+    folders = [*([images] if images else []), *usual]
+    best, missing = folders[0], None
+    for folder in dict.fromkeys(folders):
         absent = [image.name for image in colmap.images if not is_file(folder / image.name)]
         if missing is None or len(absent) < len(missing):
             best, missing = folder, absent

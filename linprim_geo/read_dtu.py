@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,7 @@ def read_dtu(root: Path, cameras: Path) -> Listing:
         raise LinprimError(
             f"{cameras}: {len(matrices)} cameras for {len(images)} images in {folder}, wanted one for each"
         )
-    masks: list[Path | None] = [None] * len(images)
+    masks: Sequence[Path | None] = [None] * len(images)
     place = next((root / name for name in _MASK_FOLDERS if photos.files_in(root / name)), None)
     if place is not None:
         masks = photos.files_in(place)
@@ -100,11 +101,13 @@ def _projections(path: Path) -> list[np.ndarray]:
         raise LinprimError(f"{path}: no world_mat_0, wanted world_mat_i and scale_mat_i of every image")
     matrices = []
     for index in range(count):
-        pair = [held.get(f"{name}_mat_{index}") for name in ("world", "scale")]
-        for name, matrix in zip(("world", "scale"), pair, strict=True):
+        pair = []
+        for name in ("world", "scale"):
+            matrix = held.get(f"{name}_mat_{index}")
             if matrix is None or matrix.shape not in ((3, 4), (4, 4)):
                 found = "missing" if matrix is None else f"of shape {matrix.shape}"
                 raise LinprimError(f"{path}: {name}_mat_{index} is {found}, wanted a 4x4 matrix")
+            pair.append(matrix)
         matrices.append((pair[0][:3] @ np.vstack([pair[1][:3], [0, 0, 0, 1]]))[:3])
     return matrices
 

@@ -48,7 +48,8 @@ def read_tum(root: Path) -> Listing:
     seconds, names = trajectories.read_tum_list(root / "rgb.txt")
     times, poses = trajectories.read_tum_poses(root / "groundtruth.txt")
     pose_of = trajectories.nearest(times, seconds, _MAX_SECONDS)
-    depth_of, depths = np.full(len(names), -1), []
+    depths: list[str] = []
+    depth_of = np.full(len(names), -1)
     if (root / "depth.txt").is_file():
         depth_times, depths = trajectories.read_tum_list(root / "depth.txt")
         depth_of = trajectories.nearest(depth_times, seconds, _MAX_SECONDS)
@@ -124,6 +125,8 @@ def read_intrinsics(path: Path) -> Lens:
     """
     values = read_json(path, "a camera's intrinsics")
     try:
+        if not isinstance(values, dict):
+            raise TypeError
         width, height = int(values["width"]), int(values["height"])
         matrix = np.array(values["intrinsic_matrix"], dtype=np.float64).reshape(3, 3).T
     except (ValueError, TypeError, KeyError, OverflowError) as error:

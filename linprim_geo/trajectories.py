@@ -75,13 +75,14 @@ def log_by_image(
         if len(poses) < len(frames) or min(poses) < 0 or max(poses) >= len(images):
             raise LinprimError(f"{path}: {len(frames)} poses for {len(images)} images, {wanted}")
         return [(images[number], pose) for number, pose in frames]
-    numbers = [int(image.stem) if image.stem.isdecimal() else None for image in images]
-    strange = [image.name for image, number in zip(images, numbers, strict=True) if number not in poses]
+    pose_of = {image: poses.get(int(image.stem)) if image.stem.isdecimal() else None for image in images}
+    found = [(image, pose) for image, pose in pose_of.items() if pose is not None]
+    strange = [image.name for image, pose in pose_of.items() if pose is None]
     if strange or len(poses) < len(frames):
         raise LinprimError(
             f"{path}: {len(frames)} poses for {len(images)} images, such as {(strange or [images[0].name])[0]}, {wanted}"
         )
-    return [(image, poses[number]) for image, number in zip(images, numbers, strict=True)]
+    return found
 
 
 def read_tum_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:
