@@ -88,7 +88,7 @@ def train_blocks(
             ops.set_threads(options.threads)
             if resume:
                 opened, loaded = _reopen(where, run_path, scene_options, options, progress)
-                count = opened.notes.get("blocks")
+                count: int | None = opened.notes.get("blocks")
                 if type(count) is not int or count < 2:
                     raise LinprimError(f"{run_path}: was not begun in blocks, wanted --resume without --blocks")
                 loaded = with_points(loaded, opened.train_options, progress.note)
@@ -96,14 +96,15 @@ def train_blocks(
                 opened, loaded, decisions = _begin(where, run_path, scene_options, options, effects or Choice("none"), progress)
                 check_options(opened.train_options, blocks)
                 loaded = with_points(loaded, opened.train_options, progress.note)
-                count = blocks
-            if count == "auto":
+                count = None if blocks == "auto" else int(blocks)
+            if count is None:
                 with TemporaryDirectory(prefix="linprim_geo_") as folder, open_executor(cluster, Path(folder), workers) as executor:
                     count = blocks_that_fit(loaded.train, opened.train_options, executor)
             if count > 1:
                 if not resume:
                     notes = opened.scene_path, opened.scene_options, opened.train_options, opened.similarity, ops.instruction_set()
                     Run.create(run_path, loaded, *notes, [asdict(decision) for decision in decisions], blocks=count)
+                assert loaded.points is not None
                 save_points(run_path / FOLDER / "points.npz", loaded.points)
                 with open_executor(cluster, run_path / FOLDER, workers) as executor:
                     return _all(replace(opened, path=run_path), loaded, count, executor, progress)
@@ -128,7 +129,7 @@ def check_options(options: TrainOptions, blocks: int | str) -> None:
 
 def blocks_that_fit(views: Sequence[View], options: TrainOptions, executor: Executor) -> int:
     """The least number of blocks, 1 or more, each of which a worker should have the memory for when all workers are at it."""
-    _, memory = executor.capacity(None)
+    _, memory = executor.capacity()
     whole = memory_estimate(views, options)
     if whole <= memory:
         return 1
@@ -299,6 +300,7 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
     _prepared(opened.train_options)
     coarse = Run.open(opened.path / FOLDER / "coarse" / "run")
     factor = coarse.scene_options.downscale // opened.scene_options.downscale
+    assert scene.points is not None
     points = opened.similarity.apply(scene.points.xyz)
     depths = list(small_depths(coarse, scene.train, factor))
     seen = [(camera, depth, view.camera.width * view.camera.height) for view, (camera, depth) in zip(scene.train, depths, strict=True)]

@@ -65,7 +65,7 @@ class RayCluster(Executor):
                 if address != "local" or attempt + 1 == STARTS or "timed out" not in str(error):
                     raise
 
-    def capacity(self, task):
+    def capacity(self):
         # How many fit at once, and where, is Ray's to say; a single task has to fit a machine.
         return self.workers, self.memory_gib
 

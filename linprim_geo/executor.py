@@ -84,9 +84,9 @@ class Executor:
                 written is kept, and the next run goes on from it.
         """
         specs = [self._spec(task) for task in tasks]
-        results = [result_of(spec) for spec in specs]
+        results = {k: result for k, spec in enumerate(specs) if (result := result_of(spec)) is not None}
         deaths = [0] * len(tasks)
-        waiting = [k for k, result in enumerate(results) if result is None]
+        waiting = [k for k in range(len(tasks)) if k not in results]
         running: dict[object, int] = {}
         progress.total, progress.start = len(tasks), len(tasks) - len(waiting)
         if waiting and len(waiting) < len(tasks):
@@ -115,11 +115,10 @@ class Executor:
                         )
                     progress.note(f"  {task.name} died of {outcome.died}, begun again")
                     waiting.insert(0, k)
-            done = sum(result is not None for result in results)
             far = "  ".join(f"{tasks[k].name} {state(tasks[k])}" for k in sorted(running.values())) if state else ""
-            progress.update(done, far)
+            progress.update(len(results), far)
         progress.clear()
-        return results
+        return [results[k] for k in range(len(tasks))]
 
     def _spec(self, task: Task) -> dict:
         plain = asdict(task)
@@ -127,7 +126,7 @@ class Executor:
         return self.about | kept | {"folder": str(Path(task.folder).resolve())}
 
     def _has_room(self, task: Task, beside: Sequence[Task]) -> bool:
-        cores, memory = self.capacity(task)
+        cores, memory = self.capacity()
         if task.memory_gib > memory:
             need = f"{task.memory_gib:.1f} GiB of the {memory:.1f} GiB of a worker"
             raise LinprimError(f"{task.name} would take {need}: wanted {task.remedy}")
@@ -135,7 +134,7 @@ class Executor:
             return True
         return task.cores + sum(t.cores for t in beside) <= cores and task.memory_gib + sum(t.memory_gib for t in beside) <= memory
 
-    def capacity(self, task: Task) -> tuple[float, float]:
+    def capacity(self) -> tuple[float, float]:
         """(cores, GiB) that may be taken by all running tasks together."""
         raise NotImplementedError
 
@@ -164,7 +163,7 @@ class Processes(Executor):
         self.memory_gib = available_memory() / 2**30
         self.processes: dict[subprocess.Popen, int] = {}
 
-    def capacity(self, task):
+    def capacity(self):
         return self.workers, self.memory_gib
 
     def start(self, spec, task):
@@ -188,6 +187,7 @@ class Processes(Executor):
         return [(process, self._outcome(process)) for process in ready]
 
     def _outcome(self, process: subprocess.Popen) -> Outcome:
+        assert process.stdout is not None
         line = process.stdout.readline()
         status = process.wait()
         kills = self._forget(process)
@@ -200,6 +200,7 @@ class Processes(Executor):
 
     def _forget(self, process: subprocess.Popen) -> int:
         for stream in (process.stdin, process.stdout):
+            assert stream is not None
             with suppress(OSError):
                 stream.close()
         return self.processes.pop(process)

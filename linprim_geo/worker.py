@@ -117,7 +117,7 @@ def _run_task(task: dict) -> dict:
 
         result |= {"task_seconds": time.monotonic() - begin, "task_peak_gib": peak_memory_gib()}
         write_json(folder / DONE, {"task": key_of(task), "name": task["name"], "result": result})
-        return result_of(task)
+        return result_of_folder(folder)
 
 
 def _check_worker(task: dict) -> None:

@@ -135,7 +135,7 @@ class Recorded(Executor):
         super().__init__(shared)
         self.limits, self.together = (cores, memory), []
 
-    def capacity(self, task):
+    def capacity(self):
         return self.limits
 
     def start(self, spec, task):
