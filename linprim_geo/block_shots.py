@@ -11,6 +11,7 @@ import torch
 from . import ops
 from .blocks import Block, cropped, shown, smaller, window
 from .camera import Camera, Similarity
+from .ops import Tensors
 from .options import TrainOptions, raster_options
 from .primitives import ARRAYS
 from .run import Run
@@ -31,7 +32,7 @@ def small_depths(coarse: Run, views: Sequence[View], factor: int) -> Iterator[tu
 
 def block_shots(
     coarse: Run, views: Sequence[View], block: Block, margin: float, factor: int, similarity: Similarity, options: TrainOptions
-) -> tuple[list[Shot], tuple[torch.Tensor, ...]]:
+) -> tuple[list[Shot], Tensors]:
     """What a block is trained on.
 
     A photograph is cut to the window that shows the block. Its pixels whose surface lies elsewhere are replaced by what the frozen
@@ -45,7 +46,8 @@ def block_shots(
     center = primitives.center
     low, high = np.asarray(block.low), np.asarray(block.high)
     outside = ~block.holds(center, margin) & ((center + reach < low) | (center - reach > high)).any(1)
-    frozen = tuple(torch.from_numpy(getattr(primitives, name)[outside]) for name in ARRAYS)
+    means, rotation, extent, density, sh = (torch.from_numpy(getattr(primitives, name)[outside]) for name in ARRAYS)
+    frozen = means, rotation, extent, density, sh
     how = raster_options(options) | {"stop": options.stop}
     shots = []
     for view, (camera, depth) in zip(views, small_depths(coarse, views, factor), strict=True):
@@ -65,7 +67,7 @@ def block_shots(
     return shots, frozen
 
 
-def _rendered(frozen: tuple[torch.Tensor, ...], camera: Camera, how: dict) -> tuple[np.ndarray, np.ndarray]:
+def _rendered(frozen: Tensors, camera: Camera, how: dict) -> tuple[np.ndarray, np.ndarray]:
     """(H, W, 3) straight colours and (H, W) opacities of the frozen primitives, uint8."""
     if len(frozen[0]) == 0:
         return np.zeros((camera.height, camera.width, 3), np.uint8), np.zeros((camera.height, camera.width), np.uint8)

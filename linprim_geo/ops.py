@@ -24,6 +24,9 @@ if os.environ.get("LINPRIM_GEO_ISA", "auto") not in ("auto", _core.instruction_s
         f" unset, {_core.instruction_set()} is used"
     )
 
+# Center, rotation, extent, density, sh: what the rasterizer takes of primitives.
+Tensors = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+
 # Planes in the order the core wants them; the last one is private state for the backward pass.
 _PLANES = (
     "rgb",
@@ -126,7 +129,8 @@ def _rasterize(
         pixels.numpy(),
     )
     check_finite(suffix, sh=color)
-    return (*planes, color, max_weight, pixels)
+    # torch reads the number of outputs from the annotation; the planes are a list of nine.
+    return (*planes, color, max_weight, pixels)  # type: ignore[return-value]
 
 
 def _outputs(center: Tensor, choices: list[int]) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
@@ -171,7 +175,7 @@ def _rasterize_grad(
         [None if g is None or not g.numel() else as_array(g) for g in grads],
         *[t.numpy() for t in out],
     )
-    return tuple(out)
+    return tuple(out)  # type: ignore[return-value]  # a list of seven, see above
 
 
 def _gradients(inputs: list[Tensor]) -> list[Tensor]:
@@ -350,7 +354,7 @@ def rasterize(
     )
     if not geometry:
         return Rendering(out[0], out[1])
-    return Rendering(*out[:8], max_weight=out[10], pixels=out[11])
+    return Rendering(*out[:8], *out[10:])  # without what is for the backward pass
 
 
 def has_kernels(primitive: str, ray_model: str, order: str) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -223,7 +224,7 @@ def polyhedron_chords(
         sigma, scale = density[i], None
         corners = solid.vertices + center[i]
         if screen_filter > 0 and (affine or bool((corners[:, 2] > near).all())):
-            corners = solid.vertices @ jacobian[:2].T if affine else corners[:, :2] / corners[:, 2:]
+            corners = solid.vertices @ jacobian[:2].T if jacobian is not None else corners[:, :2] / corners[:, 2:]
             scale = _screen_scale(corners, pixel_scale, screen_filter)
             sigma = sigma * scale[0] * scale[1]
 
@@ -318,7 +319,7 @@ def gaussian_chords(
     return _joined(parts, center)
 
 
-def _joined(parts: list[tuple[Tensor, ...]], like: Tensor) -> Chords:
+def _joined(parts: Sequence[tuple[Tensor, ...]], like: Tensor) -> Chords:
     if not parts:
         none = like.new_zeros(0)
         index = none.long()

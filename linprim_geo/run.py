@@ -20,6 +20,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,6 +32,11 @@ from .options import SceneOptions, TrainOptions, check_train_options, from_saved
 from .primitives import KINDS, Primitives, load_primitives, save_primitives
 from .scene import PHOTOGRAPHS, Scene, View, load_scene
 from .structure_from_motion import found_model
+
+if TYPE_CHECKING:
+    import torch
+
+    from .ops import Tensors
 
 # Folder of the COLMAP model of a run on photographs whose poses were found.
 FOUND_POSES = "found_poses"
@@ -71,7 +77,7 @@ class Run:
         """
         refuse_used(path)
         run = Run(path, scene_path.resolve(), scene_options, options, similarity, scene.unit)
-        config = {
+        config: dict[str, object] = {
             "linprim_geo": __version__,
             "scene": str(run.scene_path),
             "scene_options": asdict(scene_options),
@@ -112,7 +118,7 @@ class Run:
         path = Path(path)
         config, transform = _read_json(path / "config.json", path), _read_json(path / "transform.json", path)
         try:
-            similarity = Similarity(float(transform["scale"]), tuple(float(x) for x in transform["offset"]))
+            scale, offset = float(transform["scale"]), [float(x) for x in transform["offset"]]
             scene, unit = Path(config["scene"]), str(transform["unit"])
             scene.exists()  # raises for what no path can be
             saved = config["scene_options"], config["train_options"]
@@ -120,11 +126,11 @@ class Run:
             raise LinprimError(
                 f"{path}: config.json or transform.json lacks what a run needs ({error})"
             ) from None
-        numbers = (similarity.scale, *similarity.offset)
-        if len(numbers) != 4 or not np.isfinite(numbers).all() or similarity.scale <= 0:
+        if len(offset) != 3 or not np.isfinite([scale, *offset]).all() or scale <= 0:
             raise LinprimError(
                 f"{path / 'transform.json'}: holds no positive scale with an offset of three numbers"
             )
+        similarity = Similarity(scale, (offset[0], offset[1], offset[2]))
         where = str(path / "config.json")
         options = from_saved(TrainOptions, saved[1], where)
         check_train_options(options)
@@ -249,6 +255,8 @@ class Run:
             if geometry:
                 unit = 1.0 / self.similarity.scale
                 opacity = np.maximum(images["opacity"], 1e-6)
+                assert out.depth_median is not None and out.depth_first is not None
+                assert out.depth_expected is not None and out.normal_median is not None
                 images["depth_median"] = (out.depth_median.numpy() * unit).astype(np.float32)
                 images["depth_first"] = (out.depth_first.numpy() * unit).astype(np.float32)
                 images["depth_expected"] = (out.depth_expected.numpy() * unit / opacity).astype(np.float32)
@@ -280,10 +288,11 @@ class Run:
                     depth, opacity = ops.level_depth(*tensors, camera, level=level, **kind)
                 else:
                     out = ops.rasterize(*tensors, background, camera, level=level, geometry=True, **kind)
+                    assert out.depth_median is not None
                     depth, opacity = out.depth_median, out.opacity
             yield view, (depth.numpy() / self.similarity.scale).astype(np.float32), opacity.float().numpy()
 
-    def _tensors(self):
+    def _tensors(self) -> tuple[Tensors, torch.Tensor, dict]:
         """What `ops.rasterize` takes: tensors, background, keywords."""
         import torch
 

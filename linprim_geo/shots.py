@@ -43,6 +43,9 @@ class UnreadablePhoto(LinprimError):
 class StoredShot(Shot):
     """The same, read from its file whenever it is used."""
 
+    _view: View
+    _recent: dict[str, Shot]
+
     def __init__(self, view: View, camera: Camera, recent: dict[str, Shot]):
         """`recent` holds what was read last, for all that share it."""
         for name, value in (("name", view.name), ("camera", camera), ("_view", view), ("_recent", recent)):

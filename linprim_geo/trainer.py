@@ -20,14 +20,12 @@ from .camera import Camera
 from .errors import LinprimError
 from .exposure import Exposure, exposed
 from .geometry_terms import GeometryTerms
+from .ops import Tensors
 from .options import TrainOptions, raster_options
 from .population import Control, GradientControl
 from .population_papers import ClassicControl, McmcControl
 from .primitives import KINDS, SH_Y0, Primitives, reference_length
 from .shots import Shot
-
-# Center, rotation, extent, density, sh: what the rasterizer takes of primitives.
-Tensors = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 CONTROLS: dict[str, type[Control]] = {
     "gradient": GradientControl,

@@ -235,7 +235,7 @@ class Grid:
         """
         import open3d
 
-        core = open3d.core
+        core, cpu = open3d.core, open3d.core.Device("CPU:0")
         field, weight, free = self.total, self.weight, self.free
         self.total = self.weight = self.free = None
         known = weight + free > LEAST_SUPPORT
@@ -251,10 +251,10 @@ class Grid:
         np.copyto(field, gap, where=np.abs(field) < ZERO_GAP)
         del weight, free, gap, voted
         grid = open3d.t.geometry.VoxelBlockGrid(
-            ("tsdf", "weight"), (core.float32, core.float32), ((1,), (1,)),
-            self.voxel, self.resolution, len(self.blocks), core.Device("CPU:0"),
+            ("tsdf", "weight"), (core.float32, core.float32), (core.SizeVector([1]), core.SizeVector([1])),
+            self.voxel, self.resolution, len(self.blocks), cpu,
         )  # fmt: skip
-        keys = core.Tensor(np.ascontiguousarray(self.blocks.astype(np.int32)))
+        keys = core.Tensor(np.ascontiguousarray(self.blocks.astype(np.int32)), core.int32, cpu)
         grid.hashmap().activate(keys)
         slots, _ = grid.hashmap().find(keys)
         slots = slots.numpy().astype(np.int64)
