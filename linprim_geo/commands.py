@@ -30,7 +30,7 @@ def train(parsed: argparse.Namespace) -> dict:
             raise LinprimError(f"-r {parsed.resolution} stands beside --downscale {parsed.downscale}, wanted one of them")
         parsed.downscale = _downscale_of(parsed.resolution, scene, parsed)
     run = parsed.run or Path("runs") / Path(os.path.abspath(scene)).name
-    options = from_args(SceneOptions, parsed), from_args(TrainOptions, parsed)
+    scene_options, options = from_args(SceneOptions, parsed), from_args(TrainOptions, parsed)
     if parsed.dry_run:
         from .dry_run import dry_run
 
@@ -38,7 +38,7 @@ def train(parsed: argparse.Namespace) -> dict:
             raise LinprimError("--dry-run says what a new training would take: wanted without --resume")
         if parsed.blocks != 1:
             raise LinprimError("--dry-run times the training of the whole scene: wanted without --blocks")
-        return dry_run(scene, run, *options, quiet=parsed.quiet, effects=_choice(parsed), **budget)
+        return dry_run(scene, run, scene_options, options, quiet=parsed.quiet, effects=_choice(parsed), **budget)
     from .train import train
 
     shown: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
@@ -50,7 +50,8 @@ def train(parsed: argparse.Namespace) -> dict:
         return train(
             scene,
             run,
-            *options,
+            scene_options,
+            options,
             resume=parsed.resume,
             quiet=parsed.quiet,
             effects=_choice(parsed),

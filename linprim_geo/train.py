@@ -23,7 +23,7 @@ from .checkpoint import read_checkpoint, restore, write_checkpoint
 from .effects import Choice, Decision, decide, settle, summary
 from .errors import LinprimError
 from .evidence import observe
-from .exposure import with_best_gain
+from .exposure import Exposure, with_best_gain
 from .files import atomic_write, is_remains, locked, writing
 from .fill_points import fill_points
 from .geometry_terms import GeometryTerms, gather_evidence
@@ -167,8 +167,10 @@ def train(
 
         if time_budget:
             raise LinprimError("--time-budget plans one training: wanted without --blocks")
-        several = {"blocks": blocks, "cluster": cluster, "workers": workers}
-        return train_blocks(scene, run, scene_options, options, **several, resume=resume, quiet=quiet, effects=effects)
+        return train_blocks(
+            scene, run, scene_options, options,
+            blocks=blocks, cluster=cluster, workers=workers, resume=resume, quiet=quiet, effects=effects,
+        )  # fmt: skip
     check_train_options(options := options or TrainOptions())
     scene_options = scene_options or SceneOptions()
     progress = Progress("train", options.iterations, quiet=quiet)
@@ -273,9 +275,10 @@ def _train(
     shots = load_shots(scene.train, run.similarity)
     if all(shot.alpha is not None and int(shot.alpha.max()) == 0 for shot in shots):
         raise LinprimError(f"{scene.root}: the masks leave no pixel of any training image")
-    held_out = load_shots(scene.test, run.similarity) if budget else None
+    held_out: list[Shot] | None = None
     pace = None
     if budget:
+        held_out = load_shots(scene.test, run.similarity)
         volume = isinstance(scene.points, VolumePoints)
         run, pace = plan_run(
             run,
@@ -343,6 +346,7 @@ def _terms(run: Run, scene: Scene, shots: list[Shot], progress: Progress) -> Geo
     options = run.train_options
     if not any(getattr(options, name) > 0 for name in GEOMETRY_WEIGHTS):
         return None
+    assert scene.points is not None
     evidence = gather_evidence(scene, options, run.similarity, progress.note)
     terms = GeometryTerms(options, shots, evidence, run.similarity.apply(scene.points.xyz))
     if terms.sources is not None and not any(terms.sources):
@@ -410,6 +414,7 @@ def _start(
     if state is not None:
         xyz, rgb, radius = np.zeros((4, 3)), np.zeros((4, 3)), 1.0  # replaced below
     else:
+        assert scene.points is not None
         backdrop = background.numpy() if fitted else None
         cloud = fill_points(scene, options.seed, backdrop) if surface else scene.points
         cloud = initial_cloud(cloud if region is None else region(cloud), options)
@@ -586,10 +591,10 @@ def _save(trainer: Trainer, run: Run) -> None:
             "background": [float(x) for x in trainer.shown_background()],
             "seconds": trainer.seconds,
         }
-        | ({} if trainer.exposure is None else {"gains": _gains(trainer)}),
+        | ({} if trainer.exposure is None else {"gains": _gains(trainer.shots, trainer.exposure)}),
     )
 
 
-def _gains(trainer: Trainer) -> dict[str, list[float]]:
+def _gains(shots: Sequence[Shot], exposure: Exposure) -> dict[str, list[float]]:
     """{name of a training view: its gain per channel}."""
-    return {shot.name: gain.tolist() for shot, gain in zip(trainer.shots, trainer.exposure.gains, strict=True)}
+    return {shot.name: gain.tolist() for shot, gain in zip(shots, exposure.gains, strict=True)}
