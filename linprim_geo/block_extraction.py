@@ -115,9 +115,11 @@ def together(parts: Iterable[Mesh]) -> Mesh:
 
 def save_lattice(path: Path, lattice: Lattice, owner: np.ndarray) -> None:
     """Writes a lattice and who owns its blocks."""
-    size = {"voxel": lattice.voxel, "resolution": lattice.resolution, "truncation": lattice.truncation, "rules": lattice.rules}
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, blocks=lattice.blocks, owner=owner, origin=lattice.origin, **size)
+        np.savez(
+            file, blocks=lattice.blocks, owner=owner, origin=lattice.origin, voxel=lattice.voxel, resolution=lattice.resolution,
+            truncation=lattice.truncation, rules=lattice.rules,
+        )  # fmt: skip
 
 
 def load_lattice(path: Path) -> tuple[Lattice, np.ndarray]:

@@ -27,12 +27,12 @@ _BULK = (0.01, 0.99)
 class Block:
     """The points x with low <= x < high per axis, both (3,); infinite where no other block lies beyond."""
 
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
 
     def holds(self, xyz: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """(...,) bool for (..., 3) points; with `margin` those in the block grown by it on all sides."""
-        return ((xyz >= np.asarray(self.low) - margin) & (xyz < np.asarray(self.high) + margin)).all(-1)
+        return np.all((xyz >= np.asarray(self.low) - margin) & (xyz < np.asarray(self.high) + margin), axis=-1)
 
 
 def split_space(xyz: np.ndarray, work: np.ndarray, count: int) -> list[Block]:
@@ -79,8 +79,8 @@ def margin_of(blocks: Sequence[Block], xyz: np.ndarray) -> float:
 def smaller(camera: Camera, factor: int) -> Camera:
     """The same view with `factor` by `factor` pixels averaged into one, as `scene.load_scene` does."""
     k = factor
-    size = {"width": camera.width // k, "height": camera.height // k}
-    return replace(camera, **size, fx=camera.fx / k, fy=camera.fy / k, cx=camera.cx / k, cy=camera.cy / k)
+    width, height = camera.width // k, camera.height // k
+    return replace(camera, width=width, height=height, fx=camera.fx / k, fy=camera.fy / k, cx=camera.cx / k, cy=camera.cy / k)
 
 
 def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:

@@ -217,6 +217,7 @@ def _save_glb(path: Path, mesh: Mesh, alpha: np.ndarray) -> None:
     import trimesh
     from trimesh.visual.material import PBRMaterial
 
+    assert mesh.colors is not None
     colors = np.column_stack([mesh.colors, alpha])
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     # A material says that the alpha of the vertices is meant; the exporter takes it from a texture's visuals.

@@ -62,7 +62,7 @@ def doctor() -> dict:
             problems.append(problem)
     instruction_set, problem = _instruction_set()
     if problem:
-        problems += [problem, *([compiler_problem()] if compiler_problem() else [])]
+        problems += [each for each in (problem, compiler_problem()) if each]
     memory, available = memory_bytes()
     disk = shutil.disk_usage(Path.cwd()).free
     if available is not None and available < LITTLE_MEMORY:

@@ -156,7 +156,7 @@ def _extract(
     if executor is not None:
         from .block_extraction import PartFusion
 
-        fuse = PartFusion(opened, options.level, blocks, executor(), folder / PARTS, progress.quiet)
+        fuse = PartFusion(opened, float(options.level), blocks, executor(), folder / PARTS, progress.quiet)
         mesh, about = surface(opened, options, stages, *kept, fuse=fuse)
         shutil.rmtree(folder / PARTS)
         about = about | {"blocks": blocks}

@@ -161,9 +161,9 @@ def _map(database_path: Path, folder: Path, work: Path, threads: int, count: int
             say(f"poses: {done} photographs placed, of {count}")
 
     models: list = []
-    for matches, right in ((None, None), (_FEW_MATCHES, _FEW_RIGHT)):
-        if matches is not None:
-            options.mapper.abs_pose_min_num_inliers, options.mapper.abs_pose_min_inlier_ratio = matches, right
+    for lenient in (False, True):
+        if lenient:
+            options.mapper.abs_pose_min_num_inliers, options.mapper.abs_pose_min_inlier_ratio = _FEW_MATCHES, _FEW_RIGHT
             done = 0
         shutil.rmtree(output, ignore_errors=True)
         output.mkdir()

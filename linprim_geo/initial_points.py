@@ -102,7 +102,8 @@ def scene_normalization(scene: Scene) -> Similarity:
         raise LinprimError(
             f"{scene.root}: all cameras are in one place and there are no points, wanted one or the other"
         )
-    return Similarity(CAMERA_DISTANCE / distance, tuple(float(value) for value in target))
+    x, y, z = (float(value) for value in target)
+    return Similarity(CAMERA_DISTANCE / distance, (x, y, z))
 
 
 def looked_at(scene: Scene) -> tuple[np.ndarray, float]:
@@ -272,6 +273,7 @@ def _inside_hull(points: np.ndarray, looks: Sequence[_Look], grow: int | Sequenc
     against, seen = np.zeros(len(points), dtype=np.int64), np.zeros(len(points), dtype=np.int64)
     grow = [grow] * len(looks) if isinstance(grow, int) else grow
     for look, radius in zip(looks, grow, strict=True):
+        assert look.foreground is not None, "a visual hull is made of masks"
         mask = _grown(look.foreground, radius)
         inside, row, column = _in_image(look.camera, points[alive])
         background = np.zeros(len(alive), dtype=bool) if look.open else ~inside

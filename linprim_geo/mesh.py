@@ -271,6 +271,7 @@ def _write_trimesh(path: Path, mesh: Mesh, kind: str) -> None:
         scene = trimesh.Scene()
         scene.add_geometry(body, node_name="mesh", transform=move)
         data = scene.export(file_type="glb", include_normals=mesh.normals is not None)
+    assert isinstance(data, bytes)
     path.write_bytes(data)
 
 
@@ -369,12 +370,10 @@ def select_faces(mesh: Mesh, keep: np.ndarray) -> Mesh:
 
 
 def _select_vertices(mesh: Mesh, keep: np.ndarray) -> Mesh:
-    return Mesh(
-        mesh.vertices[keep],
-        mesh.faces,
-        *(None if value is None else value[keep] for value in (mesh.normals, mesh.colors, mesh.quality)),
-        mesh.primitive,
+    normals, colors, quality = (
+        None if value is None else value[keep] for value in (mesh.normals, mesh.colors, mesh.quality)
     )
+    return Mesh(mesh.vertices[keep], mesh.faces, normals, colors, quality, mesh.primitive)
 
 
 def merge_vertices(mesh: Mesh) -> Mesh:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -37,18 +38,19 @@ def process_mesh(mesh: Mesh, options, note: Callable[[str], None] | None = None)
     Raises:
         LinprimError: an empty mesh, coordinates that are not finite, or a parameter that no mesh can be made with.
     """
-    steps, entries = [], []
+    steps: list[tuple[str, str, float, Callable[[Mesh], tuple[Mesh, str | None]]]] = []
+    entries = []
     if options.close_holes:
-        steps.append(("close_holes", "max_edges", options.close_holes, _close_holes))
+        steps.append(("close_holes", "max_edges", options.close_holes, partial(_close_holes, max_edges=options.close_holes)))
     if options.smooth:
-        steps.append(("smooth", "iterations", options.smooth, _smooth))
+        steps.append(("smooth", "iterations", options.smooth, partial(_smooth, iterations=options.smooth)))
     if options.remesh:
-        steps.append(("remesh", "edge_length", options.remesh, _remesh))
+        steps.append(("remesh", "edge_length", options.remesh, partial(_remesh, length=options.remesh)))
     if options.target_faces:
-        steps.append(("simplify", "target_faces", options.target_faces, _simplify))
+        steps.append(("simplify", "target_faces", options.target_faces, partial(_simplify, target=options.target_faces)))
     for name, parameter, value, function in steps:
         before = _shape(mesh)
-        mesh, remark = function(mesh, value)
+        mesh, remark = function(mesh)
         after = _shape(mesh)
         entry = {
             "step": name,
@@ -226,7 +228,7 @@ def _sound_patches(faces: np.ndarray, added: np.ndarray) -> np.ndarray:
     count = int(max(faces.max(), added.max(initial=0))) + 1
     ends = np.sort(np.concatenate([faces, added])[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     _, edge, uses = np.unique(ends[:, 0] * np.int64(count) + ends[:, 1], return_inverse=True, return_counts=True)
-    bad = (uses[edge] > 2).reshape(-1, 3).any(1)[len(faces) :]
+    bad = np.any((uses[edge] > 2).reshape(-1, 3), axis=1)[len(faces) :]
     _, patch = face_components(Mesh(np.zeros((count, 3)), added))
     return ~np.isin(patch, patch[bad])
 

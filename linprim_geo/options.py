@@ -29,7 +29,8 @@ def from_saved(cls: type, values: object, where: str):
     for entry in fields(cls):
         if entry.name not in values:
             continue
-        value, wanted = values[entry.name], type(entry.default)
+        value = values[entry.name]
+        wanted: type = type(entry.default)
         if isinstance(value, bool) != (wanted is bool) or not isinstance(
             value, (int, float) if wanted is float else wanted
         ):

@@ -65,7 +65,8 @@ def unite(pieces: Sequence, owners: Sequence[int], simplify: float = 0.0) -> tup
         bodies = united
     body = bodies[0].simplify(simplify) if simplify > 0 else bodies[0]
     out = body.to_mesh64()
-    runs = np.diff(np.asarray(out.run_index).astype(np.int64)) // 3
+    starts: np.ndarray = np.asarray(out.run_index).astype(np.int64)
+    runs = np.diff(starts) // 3
     face_owner = np.repeat([owner_of[int(i)] for i in out.run_original_id], runs).astype(np.int64)
     return Mesh(np.array(out.vert_properties[:, :3]), np.array(out.tri_verts, dtype=np.int64)), face_owner
 

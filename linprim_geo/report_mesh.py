@@ -103,9 +103,10 @@ def _fill(
                 missing.append(f"{file}: is older than {path}, so its scores are left out")
             else:
                 shown.scores.append(scores)
+    truth: Path | None
     if reference is not None:
-        truth: Path | None = Path(reference)
-        shown.scores = [scores for scores in shown.scores if refers_to(scores.get("reference"), truth)]
+        truth = given = Path(reference)
+        shown.scores = [scores for scores in shown.scores if refers_to(scores.get("reference"), given)]
         if not any(scores.get("protocol") == HEADLINE for scores in shown.scores):
             from .eval.mesh import score_mesh
 

@@ -204,11 +204,11 @@ def _decisions(report: Report) -> str:
         path = escape(str(report.run.scene_path))
         said = f"Effects were not decided by the data (--effects none); linprim-geo inspect {path} says what they call for."
         return text + f"<p>{said}</p>"
-    rows = []
+    decided = []
     for each in effects:
         value = "not measured" if each.get("value") is None else f"{each['value']:.3g} {each.get('unit', '')}"
         reason = REASONS.get(str(each.get("reason")), str(each.get("reason")))
-        rows.append(
+        decided.append(
             (
                 str(each.get("name")), "on" if each.get("on") else "off", reason, f"{each.get('evidence')}: {value}",
                 f"{each.get('threshold'):g} {each.get('unit', '')}", str(each.get("what")),
@@ -217,7 +217,7 @@ def _decisions(report: Report) -> str:
     return (
         text
         + "<h3>Effects</h3>"
-        + _words(rows, ("effect", "decision", "why", "evidence", "on from", "what it is"))
+        + _words(decided, ("effect", "decision", "why", "evidence", "on from", "what it is"))
     )
 
 
@@ -294,24 +294,25 @@ def _scores(report: Report) -> str:
             "<h3>Depth and normals</h3>"
             + _table([[_short(depth.get(key)) for key, _, _ in DEPTH_SCORES]], head, said)
         )
-    rows, said = [], []
+    scored: list[tuple[str, ...]] = []
+    sources: list[str] = []
     for shown in report.meshes:
         for scores in shown.scores:
             for part, values in (("whole", scores), ("seen by cameras", scores.get("visible"))):
                 if values:
                     cells = [_short(values.get(key)) for key, _, _ in MESH_SCORES]
-                    rows.append((shown.method, str(scores.get("protocol")), part, *cells))
+                    scored.append((shown.method, str(scores.get("protocol")), part, *cells))
             text = f"{scores.get('protocol')} of {shown.method} against {scores.get('reference')}: {scores.get('sampling', '')}; "
             text += f"rates within {_short(scores.get('tau'))} {scores.get('unit', '')}; "
-            said.append(f"{text}culling: {scores.get('culling', 'none')}.")
-    if rows:
+            sources.append(f"{text}culling: {scores.get('culling', 'none')}.")
+    if scored:
         head = [
             "mesh",
             "protocol",
             "part",
             *(title + (f", {unit}" if unit else "") for _, title, unit in MESH_SCORES),
         ]
-        parts.append("<h3>Meshes</h3>" + _table(rows, head, "") + f'<div class="small">{_list(said)}</div>')
+        parts.append("<h3>Meshes</h3>" + _table(scored, head, "") + f'<div class="small">{_list(sources)}</div>')
     return "".join(parts) or "<p>Nothing was scored; see the end of the page.</p>"
 
 

@@ -282,7 +282,7 @@ SHAPES: dict[str, Callable[..., TexturedMesh]] = {
 class _Tags:
     """Remembers which piece every solid is, through any number of booleans, by manifold's original ids."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.part_of_id: dict[int, int] = {}
 
     def tag(self, solid, part: int):

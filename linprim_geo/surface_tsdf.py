@@ -41,7 +41,7 @@ def tsdf_surface(
     Raises:
         LinprimError: no ray crosses the level, or the grid would not fit into memory.
     """
-    frames = DepthFrames(run, options.level, options.depth_limit) if frames is None else frames
+    frames = DepthFrames(run, float(options.level), options.depth_limit) if frames is None else frames
     if not any((frame.depth > 0).any() for frame in frames):
         raise LinprimError(
             f"{run.path}: no ray of any training view crosses transmittance {options.level}, so there is no surface"

@@ -170,7 +170,7 @@ def _facing_axes(normals: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """(F,) axis of each face: 0 to 2 for +x, +y, +z and 3 to 5 for the opposite ones, mostly the same among neighbours."""
     cosine = np.concatenate([normals, -normals], axis=1)
     # The best of six is at least 1 / sqrt(3), so a face with a normal always has a choice.
-    allowed = (cosine >= LEAST_COSINE) | ~normals.any(1)[:, None]
+    allowed = (cosine >= LEAST_COSINE) | ~np.any(normals, axis=1)[:, None]
     label = np.argmax(cosine, axis=1)
     ends = np.concatenate([pairs, pairs[:, ::-1]])
     for _ in range(ROUNDS):

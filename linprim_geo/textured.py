@@ -180,7 +180,7 @@ def procedural_albedo(
         base=base,
         tint=tint,
         waves=np.ascontiguousarray(wave, dtype=np.float32),
-        phase=rng.uniform(0.0, 2.0 * np.pi, wave.shape[1]).astype(np.float32),
+        phase=rng.uniform(0.0, 2.0 * np.pi, wave.shape[1:]).astype(np.float32),
         mix=np.concatenate(mixes).astype(np.float32),
         band=band.astype(np.float32),
     )

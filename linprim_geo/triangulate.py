@@ -331,6 +331,7 @@ def _stored(path: Path) -> PointCloud | None:
 
 
 def _store(path: Path, cloud: PointCloud) -> None:
+    assert cloud.error_px is not None
     try:
         with atomic_write(path) as temporary:
             np.savez(temporary, xyz=cloud.xyz, rgb=cloud.rgb, error_px=cloud.error_px)

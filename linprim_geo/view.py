@@ -13,11 +13,13 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from .camera import Camera
 from .errors import LinprimError
 from .mesh import Mesh, select_faces
 from .run import Run
@@ -188,7 +190,7 @@ class Viewer:
             ):
                 value = choice.value if choice.value in options else options[0]
                 choice.options = options
-                choice.value = value
+                choice.value = value  # type: ignore[misc]  # it has a setter, which viser writes apart from its getter
             self._draw()
 
     def _layers(self) -> tuple[str, ...]:
@@ -272,7 +274,7 @@ class Viewer:
                 position=camera.center,
                 visible=False,
             )
-            frustum.on_click(lambda event, camera=camera: _stand_at(event.client, camera))
+            frustum.on_click(partial(_stand_at, camera))
             self._shown[frustum.name] = frustum
 
     def _show_cameras(self) -> None:
@@ -364,9 +366,9 @@ def _glb(mesh: Mesh, double_sided: bool) -> bytes:
     return trimesh.Scene(body).export(file_type="glb", include_normals=False)
 
 
-def _stand_at(client, camera) -> None:
-    with client.atomic():
-        client.camera.wxyz, client.camera.position = _quaternion(camera.rotation.T), camera.center
+def _stand_at(camera: Camera, event) -> None:
+    with event.client.atomic():
+        event.client.camera.wxyz, event.client.camera.position = _quaternion(camera.rotation.T), camera.center
 
 
 def _quaternion(rotation: np.ndarray) -> np.ndarray:
