@@ -1,8 +1,7 @@
 # make demo   environment, then the demo: a mesh with a score in runs/demo   (make demo DEMO="--size small")
 # make test   environment, then the tests                                    (make test PYTEST="-k mesh")
 # make env    the environment alone, in .venv                                (make env PYTHON=/path/to/python3.12)
-# make lint   the linter
-# make types  the type checker, which still finds errors
+# make lint   the linter, then the type checker
 # make wheel  sdist and wheel in dist, checked in a fresh environment without a compiler
 # make browser-check   a report and a view in a headless Chromium (make browser-check PAGE=runs/demo/report.html)
 # Nothing is done again unless what it depends on has changed.
@@ -18,7 +17,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3
 CORE := CMakeLists.txt csrc $(wildcard csrc/*)
 
-.PHONY: env demo test lint types wheel browser-check clean
+.PHONY: env demo test lint wheel browser-check clean
 
 demo: env
 	$(BIN)/python -m linprim_geo demo $(DEMO)
@@ -28,8 +27,6 @@ test: env
 
 lint: env
 	$(BIN)/ruff check .
-
-types: env
 	$(BIN)/mypy
 
 wheel: env
