@@ -18,7 +18,7 @@ from functools import cache
 from pathlib import Path
 from statistics import median, variance
 
-from linprim_geo import train as train_module
+from linprim_geo import training_start
 from linprim_geo.effects import EFFECTS, MODES, Choice, Decision, decide
 from linprim_geo.errors import LinprimError
 from linprim_geo.eval.depth import eval_depth_run
@@ -26,7 +26,7 @@ from linprim_geo.files import write_json
 from linprim_geo.options import SceneOptions, TrainOptions
 from linprim_geo.scene import load_scene
 from linprim_geo.synth import synthesize
-from linprim_geo.train import train, with_points
+from linprim_geo.train import train
 
 VIEWS, TEST_VIEWS, POINTS = 32, 8, 3000
 PLAIN = {"shape": "smooth", "shading": "shaded"}
@@ -148,7 +148,7 @@ def switched(folder: Path, path: Path, name: str, on: bool, size: Size, seeds: i
 def decisions(path: Path, size: Size) -> dict[str, Decision]:
     """What the data of a scene say about every effect."""
     scene_options, options = base_options(size)
-    loaded = with_points(load_scene(path), options, lambda text: None)
+    loaded = training_start.with_points(load_scene(path), options, lambda text: None)
     return {found.name: found for found in decide(loaded, scene_options, options, Choice("auto"))}
 
 
@@ -303,7 +303,7 @@ def main() -> None:
         parsed.seeds,
     )
     if parsed.own_points:
-        train_module.fill_points = lambda scene, *_: scene.points
+        training_start.fill_points = lambda scene, *_: scene.points
     rows, comparisons = [], []
     try:
         for name in parsed.only:

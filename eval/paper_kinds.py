@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from linprim_geo import train as train_module
 from linprim_geo.eval.equal_points import LEVELS, at_time, equal_psnr, rising, shared_range
 from linprim_geo.eval.paper_models import COUNTS, STAGES
 from linprim_geo.eval.text_tables import plain, short
+from linprim_geo.training_loop import QUICK_VIEWS
 
 COMPARED = (("octahedron", "gaussian"), ("tetrahedron", "octahedron"), ("tetrahedron", "gaussian"))
 
@@ -151,9 +151,9 @@ def footnotes(rows: Sequence[dict]) -> str:
         "did not start alike: the trainer lays some kinds flat on the surface and others not.",
         "One seed: differences below 0.2 dB say nothing.",
     ]
-    if any(r["held_out_views"] >= 2 * train_module.QUICK_VIEWS for r in rows):
+    if any(r["held_out_views"] >= 2 * QUICK_VIEWS for r in rows):
         lines.append(
-            f"During training some {train_module.QUICK_VIEWS} of the held-out views are scored, all of them at the end."
+            f"During training some {QUICK_VIEWS} of the held-out views are scored, all of them at the end."
         )
     if any(r["options"]["samples"] == 1 for r in rows):
         lines.append(

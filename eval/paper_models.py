@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from linprim_geo import __version__, ops
-from linprim_geo import train as train_module
+from linprim_geo import __version__, ops, training_start
 from linprim_geo.camera import Camera
 from linprim_geo.errors import LinprimError
 from linprim_geo.files import write_json
 from linprim_geo.options import SceneOptions, TrainOptions, from_saved, raster_options
 from linprim_geo.primitives import ARRAYS, KINDS, Primitives
+from linprim_geo.train import train
 
 STAGES = {
     "preprocess_ms": ("project_ms",),
@@ -68,7 +68,7 @@ def _watched(record: dict):
     `record` gets `start_count`, `start_thinness` (`thinness` before the first step) and `train_wall_seconds` of all steps.
     """
 
-    class Watched(train_module.Trainer):
+    class Watched(training_start.Trainer):
         def __init__(self, *args, **named):
             super().__init__(*args, **named)
             record.update(start_count=len(self), train_wall_seconds=0.0)
@@ -82,12 +82,12 @@ def _watched(record: dict):
             self.seconds = before + time.process_time() - cpu
             record["train_wall_seconds"] += time.perf_counter() - wall
 
-    usual = train_module.Trainer
-    train_module.Trainer = Watched
+    usual = training_start.Trainer
+    training_start.Trainer = Watched
     try:
         yield
     finally:
-        train_module.Trainer = usual
+        training_start.Trainer = usual
 
 
 @functools.cache
@@ -95,7 +95,7 @@ def _warm_up(capture: Path, scene_options: SceneOptions) -> None:
     """Two steps for nothing: the first ones of a process load code, which the first kind to be trained would pay for."""
     with tempfile.TemporaryDirectory() as folder:
         options = TrainOptions(iterations=2, max_primitives=50, threads=1)
-        train_module.train(capture, Path(folder) / "run", scene_options, options, quiet=True)
+        train(capture, Path(folder) / "run", scene_options, options, quiet=True)
 
 
 def thinness(extent: np.ndarray, kind: str) -> float:
@@ -140,7 +140,7 @@ def train_model(
         shutil.rmtree(folder)  # stopped before it was done
     _warm_up(capture, scene_options)
     with changed(), _watched(record := {}):
-        trained = train_module.train(capture, folder, scene_options, options, quiet=True)
+        trained = train(capture, folder, scene_options, options, quiet=True)
     scores = eval_images_run(folder, lpips_weights="none")
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     row = {

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from linprim_geo import train as train_module
 from linprim_geo import trainer as trainer_module
+from linprim_geo import training_start
 from linprim_geo.options import SceneOptions
 from linprim_geo.primitives import reference_length
 from linprim_geo.scene import PointCloud, load_scene
@@ -45,7 +45,7 @@ def halved(cloud: PointCloud, seed: int) -> PointCloud:
 @contextmanager
 def started(start: str, deviation: float) -> Iterator[None]:
     """While entered, `train` starts from what one of `STARTS` makes of its points; `deviation` is that of noise, in the data set's unit."""
-    cloud_of, parameters_of = train_module.initial_cloud, train_module.initial_parameters
+    cloud_of, parameters_of = training_start.initial_cloud, training_start.initial_parameters
 
     def initial_cloud(cloud, options):
         cloud = cloud_of(cloud, options)
@@ -59,7 +59,7 @@ def started(start: str, deviation: float) -> Iterator[None]:
             parameters["log_extent"] = (parameters["log_extent"] - math.log(2)).clamp_min(math.log(bounds[0]))
         return parameters
 
-    with _in_place_of(train_module, initial_cloud=initial_cloud, initial_parameters=initial_parameters):
+    with _in_place_of(training_start, initial_cloud=initial_cloud, initial_parameters=initial_parameters):
         yield
 
 
@@ -76,7 +76,7 @@ def by_density() -> Iterator[None]:
         center, rotation, extent, _, sh = usual(parameters, degree, kind, filter_3d)
         return center, rotation, extent, torch.exp(parameters["raw_opacity"]), sh
 
-    class ByDensity(train_module.Trainer):
+    class ByDensity(training_start.Trainer):
         """`raw_opacity` holds the logarithm of the density, but while the population grows."""
 
         def __init__(self, *args, **named):
@@ -96,7 +96,7 @@ def by_density() -> Iterator[None]:
             changed = change(raw, reference_length(extent, self.kind))
             self.parameters["raw_opacity"] = torch.from_numpy(changed.astype(np.float32))
 
-    with _in_place_of(trainer_module, activate=activate), _in_place_of(train_module, Trainer=ByDensity):
+    with _in_place_of(trainer_module, activate=activate), _in_place_of(training_start, Trainer=ByDensity):
         yield
 
 

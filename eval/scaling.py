@@ -152,7 +152,7 @@ def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitiv
     from linprim_geo.run import Run
     from linprim_geo.scene import load_scene
     from linprim_geo.shots import load_shots
-    from linprim_geo.train import _start
+    from linprim_geo.training_start import start_trainer
 
     torch.set_num_threads(1)
     ops.set_threads(1)
@@ -162,7 +162,7 @@ def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitiv
     similarity = scene_normalization(loaded)
     shots = load_shots(loaded.train, similarity)
     run = Run(folder / "run", Path(scene), SceneOptions(), how, similarity)
-    trainer = _start(loaded, run, shots, how, None)
+    trainer = start_trainer(loaded, run, shots, how, None)
     setup = time.process_time() - begin
     for _ in range(WARM_UP):
         trainer.advance()

@@ -34,8 +34,10 @@ from .progress import Progress, duration
 from .run import Run, is_unused
 from .scene import PointCloud, Scene, View
 from .shots import load_shots, photo_bytes
-from .train import _background, _begin, _loop, _reopen, _start, _train, with_points
+from .train import train, train_run
 from .trainer import Trainer
+from .training_loop import run_steps
+from .training_start import begin_run, chosen_background, reopen_run, start_trainer, with_points
 
 FOLDER = "blocks"
 # The coarse scene: pixels averaged, parts of the steps and of the primitives of the whole, and the most of these and of the views.
@@ -87,13 +89,13 @@ def train_blocks(
         with locked(run_path, "trained into"):
             ops.set_threads(options.threads)
             if resume:
-                opened, loaded = _reopen(where, run_path, scene_options, options, progress)
+                opened, loaded = reopen_run(where, run_path, scene_options, options, progress)
                 count: int | None = opened.notes.get("blocks")
                 if type(count) is not int or count < 2:
                     raise LinprimError(f"{run_path}: was not begun in blocks, wanted --resume without --blocks")
                 loaded = with_points(loaded, opened.train_options, progress.note)
             else:
-                opened, loaded, decisions = _begin(where, run_path, scene_options, options, effects or Choice("none"), progress)
+                opened, loaded, decisions = begin_run(where, run_path, scene_options, options, effects or Choice("none"), progress)
                 check_options(opened.train_options, blocks)
                 loaded = with_points(loaded, opened.train_options, progress.note)
                 count = None if blocks == "auto" else int(blocks)
@@ -110,8 +112,6 @@ def train_blocks(
                     return _all(replace(opened, path=run_path), loaded, count, executor, progress)
     finally:
         torch.set_num_threads(before)
-    from .train import train
-
     progress.note("one block holds it all")
     return train(scene, run, scene_options, options, quiet=quiet, effects=effects)
 
@@ -287,9 +287,9 @@ def coarse_task(folder: Path, run: str) -> dict:
     coarse = coarse_of(opened, scene)
     small = replace(coarse.scene(), points=scene.points)
     with locked(coarse.path, "trained into"):
-        background, fitted, random = _background(coarse.train_options.background, load_shots(small.train, coarse.similarity))
+        background, fitted, random = chosen_background(coarse.train_options.background, load_shots(small.train, coarse.similarity))
         state = read_checkpoint(coarse.path) if (coarse.path / "config.json").exists() else None
-        done = _train(coarse, small, state, Progress("coarse scene", 1, quiet=True))
+        done = train_run(coarse, small, state, Progress("coarse scene", 1, quiet=True))
     shown_color = [float(x) for x in (Run.open(coarse.path).background if fitted else background)]
     return {"background": "random" if random else ",".join(map(repr, shown_color)), "shown": shown_color, "seconds": done["seconds"]}
 
@@ -392,13 +392,13 @@ def block_task(folder: Path, run: str, block: int) -> dict:
     with locked(path, "trained into"):
         begun = (path / "config.json").exists()
         state = read_checkpoint(path) if begun else None
-        trainer: Trainer = _start(seen, here, shots, options, state, region)
+        trainer: Trainer = start_trainer(seen, here, shots, options, state, region)
         trainer.frozen = frozen
         if not begun:
             about = opened.scene_path, opened.scene_options, options, opened.similarity, ops.instruction_set()
             Run.create(path, seen, *about)
         for torn in [*path.glob(".*.tmp*"), *path.glob("checkpoints/.*.tmp*")]:
             torn.unlink()
-        seconds, _, _ = _loop(trainer, here, [], Progress(f"block {block}", options.iterations, quiet=True))
+        seconds, _, _ = run_steps(trainer, here, [], Progress(f"block {block}", options.iterations, quiet=True))
     kept = int(own.holds(trainer.primitives().center).sum())
     return {"seconds": seconds, "primitives": len(trainer), "kept": kept, "loss": trainer.loss, "train_psnr": trainer.psnr}

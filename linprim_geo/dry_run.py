@@ -19,8 +19,9 @@ from .progress import Progress, duration, memory_gib
 from .scene import View
 from .shots import MEMORY_SHARE, StoredShot, load_shots, photo_bytes
 from .time_budget import SAVE_SECONDS, Budget, mean_population
-from .train import QUICK_VIEWS, SFM_START, _begin, _start, _terms, evaluate
 from .trainer import Trainer
+from .training_loop import QUICK_VIEWS, evaluate
+from .training_start import SFM_START, begin_run, late_terms, start_trainer
 
 # Timing takes at most CALIBRATION_SHARE of so many seconds.
 TIMING = 125.0
@@ -59,16 +60,17 @@ def dry_run(
     try:
         torch.set_num_threads(1)
         ops.set_threads(options.threads)
-        planned, loaded, _ = _begin(Path(scene), Path(run), scene_options or SceneOptions(), options, effects or Choice("none"), progress)
+        effects, scene_options = effects or Choice("none"), scene_options or SceneOptions()
+        planned, loaded, _ = begin_run(Path(scene), Path(run), scene_options, options, effects, progress)
         # What is there now is what would be there for all of it.
         limit = MEMORY_SHARE * available_memory()
         shots, held_out = (load_shots(views, planned.similarity) for views in (loaded.train, loaded.test))
-        terms = _terms(planned, loaded, shots, progress)
+        terms = late_terms(planned, loaded, shots, progress)
 
         counts = []
 
         def start(options: TrainOptions) -> Trainer:
-            trainer = _start(loaded, planned, shots, options, None)
+            trainer = start_trainer(loaded, planned, shots, options, None)
             counts.append(len(trainer))
             return trainer
 

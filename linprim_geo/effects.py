@@ -37,7 +37,7 @@ class Data:
     """A scene as the detectors see it: what they share is measured once."""
 
     def __init__(self, scene: Scene, options: TrainOptions):
-        """`scene` with points to start from, as `train.with_points` gives."""
+        """`scene` with points to start from, as `training_start.with_points` gives."""
         self.scene, self.options = scene, options
 
     @cached_property
@@ -236,7 +236,7 @@ def inspect_scene(
     Raises:
         LinprimError: the scene or an option cannot be used.
     """
-    from .train import decided_scene
+    from .training_start import decided_scene
 
     decisions, scene, scene_options, options = decided_scene(path, scene_options, options, choice, log or (lambda text: None))
     chosen = {name: value for decision in decisions for name, value in decision.options.items()}
@@ -357,7 +357,7 @@ def _gain_spread(data: Data) -> float | None:
 
 
 def _plain_border(data: Data) -> float:
-    from .train import plain_border
+    from .training_start import plain_border
 
     views = data.scene.train[:: max(1, len(data.scene.train) // 60)]
     return 100 * plain_border(load_shots(views, data.similarity))

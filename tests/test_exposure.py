@@ -33,7 +33,7 @@ def drifting(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def own_points(monkeypatch):
     """Trainings start from the scene's points alone: looking for more is slow, and no matter of exposure."""
-    monkeypatch.setattr("linprim_geo.train.fill_points", lambda scene, *_: scene.points)
+    monkeypatch.setattr("linprim_geo.training_start.fill_points", lambda scene, *_: scene.points)
 
 
 def true_gains(scene):
@@ -69,21 +69,21 @@ def test_training_finds_the_gains_and_keeps_their_mean(drifting, tmp_path):
 
 
 def test_a_resumed_run_repeats_the_gains_bit_for_bit(drifting, tmp_path, monkeypatch):
-    from linprim_geo import train as training
+    from linprim_geo.trainer import Trainer
 
     options = replace(QUICK, checkpoint_every=25)
     train(drifting, tmp_path / "whole", options=options, quiet=True)
-    advance = training.Trainer.advance
+    advance = Trainer.advance
 
     def killed(self):
         if self.step == 40:
             raise RuntimeError("killed")
         return advance(self)
 
-    monkeypatch.setattr(training.Trainer, "advance", killed)
+    monkeypatch.setattr(Trainer, "advance", killed)
     with pytest.raises(RuntimeError):
         train(drifting, tmp_path / "torn", options=options, quiet=True)
-    monkeypatch.setattr(training.Trainer, "advance", advance)
+    monkeypatch.setattr(Trainer, "advance", advance)
     train(drifting, tmp_path / "torn", resume=True, quiet=True)
     one, other = (torch.load(tmp_path / name / "checkpoints" / "step_000060.pt") for name in ("whole", "torn"))
     assert one["exposure"]["log_gain"].abs().max() > 0.05

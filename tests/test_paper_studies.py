@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from linprim_geo import train as train_module
 from linprim_geo import trainer as trainer_module
+from linprim_geo import training_start
 from linprim_geo.errors import LinprimError
 from linprim_geo.eval import paper_tables
 from linprim_geo.eval.images import composite, psnr, to_8bit
@@ -32,20 +32,21 @@ from linprim_geo.options import SceneOptions, TrainOptions
 from linprim_geo.primitives import reference_length
 from linprim_geo.run import Run
 from linprim_geo.scene import PointCloud, load_scene
+from linprim_geo.train import train
 
 USUAL = (
-    train_module.Trainer,
-    train_module.initial_cloud,
-    train_module.initial_parameters,
+    training_start.Trainer,
+    training_start.initial_cloud,
+    training_start.initial_parameters,
     trainer_module.activate,
 )
 
 
 def usual():
     return (
-        train_module.Trainer,
-        train_module.initial_cloud,
-        train_module.initial_parameters,
+        training_start.Trainer,
+        training_start.initial_cloud,
+        training_start.initial_parameters,
         trainer_module.activate,
     )
 
@@ -53,7 +54,7 @@ def usual():
 @pytest.fixture(autouse=True)
 def points_as_they_are(monkeypatch):
     """Looking for more points takes seconds for every training."""
-    monkeypatch.setattr(train_module, "fill_points", lambda scene, *_: scene.points)
+    monkeypatch.setattr(training_start, "fill_points", lambda scene, *_: scene.points)
 
 
 # --- starts ----------------------------------------------------------------------------------------------
@@ -85,7 +86,7 @@ def test_a_training_starts_from_what_was_asked_for(start, tiny_scene, tmp_path):
     begun = {}
 
     def begin(name, context):
-        class Looking(train_module.Trainer):
+        class Looking(training_start.Trainer):
             def __init__(self, *args, **named):
                 super().__init__(*args, **named)
                 begun[name] = {key: value.detach().numpy().copy() for key, value in self.parameters.items()}
@@ -95,8 +96,8 @@ def test_a_training_starts_from_what_was_asked_for(start, tiny_scene, tmp_path):
             iterations=1, max_primitives=200, initial_primitives=150, sh_degree=0, threads=1
         )
         with context, pytest.MonkeyPatch.context() as patch:
-            patch.setattr(train_module, "Trainer", Looking)
-            train_module.train(tiny_scene, tmp_path / name, SceneOptions(), options, quiet=True)
+            patch.setattr(training_start, "Trainer", Looking)
+            train(tiny_scene, tmp_path / name, SceneOptions(), options, quiet=True)
 
     begin("before", started("as given", 0.2))
     begin("after", started(start, 0.2))
@@ -138,7 +139,7 @@ def test_by_density_the_extent_leaves_the_density_alone(tiny_scene, tmp_path):
 
     seen = {}
 
-    class Looking(train_module.Trainer):
+    class Looking(training_start.Trainer):
         def advance(self):
             active = trainer_module.activate(self.parameters, 0, self.kind, self.filter_3d)
             seen.setdefault("first", [t.detach().numpy().copy() for t in active])
@@ -161,12 +162,12 @@ def test_by_density_the_extent_leaves_the_density_alone(tiny_scene, tmp_path):
     for name in ("opacity", "density"):
         seen.clear()
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(train_module, "Trainer", Looking)
+            patch.setattr(training_start, "Trainer", Looking)
             if name == "opacity":
-                trained = train_module.train(tiny_scene, tmp_path / name, SceneOptions(), options, quiet=True)
+                trained = train(tiny_scene, tmp_path / name, SceneOptions(), options, quiet=True)
             else:
                 with by_density():
-                    trained = train_module.train(
+                    trained = train(
                         tiny_scene, tmp_path / name, SceneOptions(), options, quiet=True
                     )
         found[name] = {**seen, "trained": trained, "saved": Run.open(tmp_path / name).training_primitives()}

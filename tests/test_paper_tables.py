@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from linprim_geo import train as train_module
+from linprim_geo import training_start
 from linprim_geo.camera import Camera
 from linprim_geo.eval import equal_points, paper_kinds, paper_models, paper_tables
 from linprim_geo.eval.paper_models import Model, Variant
@@ -231,11 +231,11 @@ def test_counts_of_something_that_fills_the_image_are_all_its_pixels():
 
 def test_a_quick_run_writes_all_tables_and_a_second_one_trains_nothing(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(
-        train_module, "fill_points", lambda scene, *_: scene.points
+        training_start, "fill_points", lambda scene, *_: scene.points
     )  # seconds for every model
     command = ["--quick", "-o", str(tmp_path), "--iterations", "50"]
     paper_tables.main(command)
-    assert train_module.Trainer is Trainer
+    assert training_start.Trainer is Trainer
     text = (tmp_path / "paper_tables.txt").read_text()
     assert text.strip() in capsys.readouterr().out
     headings = [

@@ -12,11 +12,11 @@ import pytest
 from conftest import with_budget
 
 from linprim_geo import cli, pacing, time_budget
-from linprim_geo import train as training
 from linprim_geo.errors import LinprimError
 from linprim_geo.extract import extract_mesh
 from linprim_geo.options import ExtractOptions, TrainOptions
 from linprim_geo.run import Run
+from linprim_geo.shots import load_shots
 from linprim_geo.time_budget import (
     LARGEST_CORRECTION,
     LEAST_PRIMITIVES,
@@ -32,6 +32,7 @@ from linprim_geo.time_budget import (
 )
 from linprim_geo.train import train
 from linprim_geo.trainer import Trainer
+from linprim_geo.training_start import start_trainer
 
 MANY = 10**9
 
@@ -114,8 +115,8 @@ def test_the_voxel_fills_the_time():
 @pytest.fixture
 def trainer(tiny_scene, tiny_run):
     run = Run.open(tiny_run)
-    shots = training.load_shots(run.scene().train, run.similarity)
-    return training._start(run.scene(), run, shots, run.train_options, None)
+    shots = load_shots(run.scene().train, run.similarity)
+    return start_trainer(run.scene(), run, shots, run.train_options, None)
 
 
 def test_a_correction_stretches_what_is_left_of_the_schedule(trainer):

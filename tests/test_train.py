@@ -18,8 +18,7 @@ import pytest
 import torch
 from PIL import Image
 
-from linprim_geo import ops
-from linprim_geo import train as training
+from linprim_geo import ops, training_loop
 from linprim_geo import trainer as training_step
 from linprim_geo.errors import LinprimError
 from linprim_geo.eval.depth import eval_depth_run
@@ -41,12 +40,12 @@ UNSTEADY = ("seconds", "memory_gib")
 # Trains slowly enough to be hit at any moment: arguments are scene, run, milliseconds per step, options of the CLI.
 SLOW_TRAINING = """
 import sys, time
-from linprim_geo import cli, train
-advance = train.Trainer.advance
+from linprim_geo import cli, trainer
+advance = trainer.Trainer.advance
 def slow(self):
     time.sleep(float(sys.argv[3]) / 1000)
     return advance(self)
-train.Trainer.advance = slow
+trainer.Trainer.advance = slow
 sys.exit(cli.main(["train", sys.argv[1], "-o", sys.argv[2], *sys.argv[4:]]))
 """
 
@@ -656,7 +655,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(how, tiny_scene, tmp_path, monke
     import resource
 
     run, options = tmp_path / "run", replace(QUICK, checkpoint_every=4)
-    original, save = getattr(os, {"flush": "fsync", "rename": "replace"}.get(how, "fsync")), training._save
+    original, save = getattr(os, {"flush": "fsync", "rename": "replace"}.get(how, "fsync")), training_loop.save_training
     full = []
 
     def failing(*arguments, **settings):
@@ -677,7 +676,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(how, tiny_scene, tmp_path, monke
         return save(trainer, *rest)
 
     with monkeypatch.context() as patch:
-        patch.setattr(training, "_save", saving)
+        patch.setattr(training_loop, "save_training", saving)
         if how != "write":
             patch.setattr(os, "fsync" if how == "flush" else "replace", failing)
         # A file that may not grow (write) stands in for the disk.
@@ -898,6 +897,6 @@ def test_the_newest_checkpoint_is_kept_when_its_number_gets_a_digit_more(tiny_ru
         parameters, step, iterations, state, options, seconds, exposure = {}, 1_000_000, 1_000_000, dict, QUICK, 0.0, None
         primitives, shown_background, __len__ = lambda _: octahedra, lambda _: torch.zeros(3), lambda _: 1
 
-    training._save(Late(), Run.open(run_copy))
+    training_loop.save_training(Late(), Run.open(run_copy))
     assert sorted(p.name for p in folder.glob("step_*")) == ["step_1000000.pt", "step_999000.pt"]
     assert (folder / "latest").read_text() == "step_1000000.pt\n"

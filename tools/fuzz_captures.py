@@ -285,11 +285,11 @@ def _trainer(options):
 
 def read_run_file(file: Path) -> None:
     from linprim_geo.run import Run
-    from linprim_geo.train import _cut_metrics
+    from linprim_geo.training_loop import cut_metrics
 
     folder = file.parent
     if file.name == "metrics.jsonl":
-        _cut_metrics(file, 2)
+        cut_metrics(file, 2)
         for line in file.read_text().splitlines():
             check(json.loads(line)["step"] <= 2, "a line of a later step was left")
         return
