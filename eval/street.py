@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from linprim_geo.shapes import SEGMENTS, _op, _Tags
+from linprim_geo.shapes import SEGMENTS, Tags, operation
 from linprim_geo.textured import TexturedMesh, procedural_albedo
 
 # Width and height of the street, in metres, and the length of one house.
@@ -19,7 +19,7 @@ def street(houses: int, seed: int = 11) -> TexturedMesh:
     """The air of a street of so many houses on either side: one closed surface whose faces look into it. In metres, x along it, z up."""
     from manifold3d import Manifold
 
-    tags, rng = _Tags(), np.random.default_rng(seed)
+    tags, rng = Tags(), np.random.default_rng(seed)
     length = houses * HOUSE
     air = Manifold.cube((length, WIDTH, HEIGHT))
     air = tags.tag(air, 0)
@@ -57,8 +57,8 @@ def street(houses: int, seed: int = 11) -> TexturedMesh:
                 for level in range(int(rng.integers(1, 4))):
                     half = 0.35 - 0.06 * level
                     things.append(tags.tag(box((x - half, y - half, 0.5 * level - 0.1), (x + half, y + half, 0.5 * level + 0.5)), part))
-    air = Manifold.batch_boolean([air, *recesses], _op("Add"))
-    air = Manifold.batch_boolean([air, *things], _op("Subtract"))
+    air = Manifold.batch_boolean([air, *recesses], operation("Add"))
+    air = Manifold.batch_boolean([air, *things], operation("Subtract"))
     vertices, faces, part = tags.triangles(air)
     faces = faces[:, ::-1]
     corner = vertices[faces]

@@ -20,7 +20,7 @@ from .dry_run import PROCESS_GIB
 from .errors import LinprimError
 from .executor import Executor, Task
 from .files import atomic_write
-from .fuse import Lattice, _pack, estimate_memory
+from .fuse import Lattice, block_keys, estimate_memory
 from .mesh import Mesh, select_faces
 from .progress import Progress
 from .run import Run
@@ -73,8 +73,8 @@ def owners(blocks: np.ndarray, count: int) -> np.ndarray:
 def halo(blocks: np.ndarray, own: np.ndarray) -> np.ndarray:
     """(B,) bool: the blocks of (B, 3) that are `own` (B,) or touch one that is."""
     steps = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
-    near = np.unique(np.concatenate([_pack(blocks[own] + step) for step in steps]))
-    return np.isin(_pack(blocks), near)
+    near = np.unique(np.concatenate([block_keys(blocks[own] + step) for step in steps]))
+    return np.isin(block_keys(blocks), near)
 
 
 def part_task(folder: Path, run: str, level: float, limit: float, part: int) -> dict:
@@ -90,14 +90,14 @@ def part_task(folder: Path, run: str, level: float, limit: float, part: int) -> 
     frames = DepthFrames(Run.open(run), level, limit, keep=False)
     used = 0
     for number, view in enumerate(frames.views):
-        if len(grid._in_view(view.camera)):
+        if len(grid.in_view(view.camera)):
             grid.integrate(frames[number], lattice.rules)
             used += 1
     surface = grid.surface()
     if len(surface.faces):
         middle = surface.vertices[surface.faces].mean(1)
         block = np.floor(middle / (lattice.voxel * lattice.resolution)).astype(np.int64)
-        surface = select_faces(surface, np.isin(_pack(block), _pack(lattice.blocks[own])))
+        surface = select_faces(surface, np.isin(block_keys(block), block_keys(lattice.blocks[own])))
     with atomic_write(folder / "part.npz") as temporary, open(temporary, "wb") as file:
         np.savez(file, vertices=surface.vertices, faces=surface.faces)
     return {"faces": len(surface.faces), "views": used, "blocks": int(own.sum())}

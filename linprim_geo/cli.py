@@ -106,10 +106,10 @@ def _stdout_for_result(as_json: bool) -> Iterator[Callable[[Any], None]]:
         if descriptor is not None:
             os.dup2(saved, descriptor)
             os.close(saved)
-    from .files import _finite
+    from .files import json_ready
 
     shown = {key: value for key, value in (results[0] or {}).items() if not key.startswith("_")}
-    stdout.write(json.dumps(_finite(shown), allow_nan=False) + "\n")
+    stdout.write(json.dumps(json_ready(shown), allow_nan=False) + "\n")
     stdout.flush()
 
 

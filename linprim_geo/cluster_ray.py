@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from .errors import LinprimError
-from .executor import Executor, Outcome, _answered
+from .executor import Executor, Outcome, outcome_of
 from .worker import ONE_THREAD
 
 # Seconds in which a running cluster has to answer, and how often a start of one is tried that does not come up in time.
@@ -84,7 +84,7 @@ class RayCluster(Executor):
     def _outcome(self, handle) -> Outcome:
         errors = self.ray.exceptions
         try:
-            return _answered(self.ray.get(handle))
+            return outcome_of(self.ray.get(handle))
         except errors.OutOfMemoryError:
             return Outcome(memory="Ray killed it, for the machine had hardly any left")
         except (errors.WorkerCrashedError, errors.NodeDiedError, errors.ObjectLostError, errors.RaySystemError) as error:

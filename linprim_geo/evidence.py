@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from .camera import Camera
-from .initial_points import VolumePoints, _in_image, _Look, _looks, local_planes
+from .initial_points import Look, VolumePoints, in_image, local_planes, spread_looks
 from .lens import sample_bilinear
 from .scene import Scene
 
@@ -141,7 +141,7 @@ def observe(scene: Scene, seed: int = 0, views: int = VIEWS) -> Observations | N
     cloud = scene.points
     if cloud is None or isinstance(cloud, VolumePoints) or len(cloud.xyz) < _LEAST_POINTS:
         return None
-    looks = _looks(scene.train, views)
+    looks = spread_looks(scene.train, views)
     rng = np.random.default_rng([seed, 11])
     normal, flat = _normals(cloud.xyz, seed)
     good = np.flatnonzero(flat < _FLAT)
@@ -172,20 +172,20 @@ def observe(scene: Scene, seed: int = 0, views: int = VIEWS) -> Observations | N
     return Observations(xyz, seen, plain & seen, color, footprint)
 
 
-def _same_views(scene: Scene, looks: Sequence[_Look]) -> list[Camera]:
+def _same_views(scene: Scene, looks: Sequence[Look]) -> list[Camera]:
     chosen = np.unique(np.linspace(0, len(scene.train) - 1, len(looks)).round().astype(int))
     return [scene.train[i].camera for i in chosen]
 
 
 def _colors_in(
-    look: _Look, xyz: np.ndarray, rows: np.ndarray, facing: np.ndarray
+    look: Look, xyz: np.ndarray, rows: np.ndarray, facing: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Of the points `rows` of (N, 3) `xyz` in a view, whose planes have the normals (P, 3) `facing` it: (P,) whether it sees them,
     (P,) whether also in plain surroundings, (P, 3) colours in [0, 1], (P,) z-depths."""
     from scipy.ndimage import minimum_filter, uniform_filter
     from scipy.spatial import cKDTree
 
-    inside = np.flatnonzero(_in_image(look.camera, xyz)[0])
+    inside = np.flatnonzero(in_image(look.camera, xyz)[0])
     pixels, depth = look.camera.project(xyz)
     seen = np.isin(rows, inside)
     if len(inside) > _NEIGHBOURS and seen.any():

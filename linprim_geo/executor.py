@@ -196,7 +196,7 @@ class Processes(Executor):
             if status == -getattr(signal, "SIGKILL", 9) and _oom_kills() > kills:
                 return Outcome(memory="the system killed it")
             return Outcome(died=name)
-        return _answered(json.loads(line))
+        return outcome_of(json.loads(line))
 
     def _forget(self, process: subprocess.Popen) -> int:
         for stream in (process.stdin, process.stdout):
@@ -218,7 +218,8 @@ class Processes(Executor):
             self._forget(process)
 
 
-def _answered(answer: dict) -> Outcome:
+def outcome_of(answer: dict) -> Outcome:
+    """What `worker.run_task` answered."""
     if "result" in answer:
         return Outcome(result=answer["result"])
     if "stopped" in answer:

@@ -221,7 +221,7 @@ def read_json(path: Path, wanted: str) -> object:
 def write_json(path: str | os.PathLike, value: object) -> None:
     """Writes `value` as indented JSON, atomically. NaN and infinity become null, which JSON can hold."""
     with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(_finite(value), indent=2) + "\n")
+        temporary.write_text(json.dumps(json_ready(value), indent=2) + "\n")
 
 
 def _disk_is_full(folder: Path) -> bool:
@@ -232,13 +232,14 @@ def _disk_is_full(folder: Path) -> bool:
         return False
 
 
-def _finite(value):
+def json_ready(value: object):
+    """`value` as JSON can hold it: arrays and tuples become lists, paths and keys text, NaN and infinity null."""
     if isinstance(value, dict):
-        return {str(key): _finite(item) for key, item in value.items()}
+        return {str(key): json_ready(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_finite(item) for item in value]
+        return [json_ready(item) for item in value]
     if hasattr(value, "tolist"):
-        return _finite(value.tolist())
+        return json_ready(value.tolist())
     if isinstance(value, float) and (value != value or value in (float("inf"), float("-inf"))):
         return None
     if isinstance(value, os.PathLike):

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from .camera import Camera
-from .initial_points import _in_image, _Look, _looks
+from .initial_points import Look, in_image, spread_looks
 from .scene import PointCloud, Scene
 
 # A cell of the image, as a share of its longer side, is to hold a point: about 1,400 cells of 4:3, fewer than the primitives that
@@ -67,7 +67,7 @@ def fill_points(scene: Scene, seed: int, backdrop: np.ndarray | None = None) -> 
     """
     cloud = scene.points
     assert cloud is not None, "of a scene without points there is nothing to fill"
-    views = [_Gaps(look, cloud.xyz) for look in _looks(scene.train, _MOST_VIEWS)]
+    views = [_Gaps(look, cloud.xyz) for look in spread_looks(scene.train, _MOST_VIEWS)]
     rng = np.random.default_rng([seed, 8])
     found = [np.empty((0, 3))]
     colors = [np.empty((0, 3), np.uint8)]
@@ -98,9 +98,9 @@ def fill_points(scene: Scene, seed: int, backdrop: np.ndarray | None = None) -> 
 class _Gaps:
     """A view, the points it sees, and the triangles between them: `pixels` (P, 2) and `inverse` (P,) depths."""
 
-    def __init__(self, look: _Look, xyz: np.ndarray):
+    def __init__(self, look: Look, xyz: np.ndarray):
         self.look, self.camera = look, look.camera
-        inside = _in_image(self.camera, xyz)[0]
+        inside = in_image(self.camera, xyz)[0]
         self.pixels, depth = self.camera.project(xyz[inside])
         self.inverse = 1.0 / depth
         for choose in (self._nearest_of_each_place, self._not_hidden):
@@ -162,7 +162,7 @@ class _Gaps:
         size = np.array([self.camera.width, self.camera.height])
         count = np.maximum(1, np.round(size / (cell * self.longer_side))).astype(np.int64)
         taken = np.zeros((count[1], count[0]), dtype=bool)
-        inside = _in_image(self.camera, xyz)[0]
+        inside = in_image(self.camera, xyz)[0]
         for pixels in (self.pixels, self.camera.project(xyz[inside])[0]):
             column, row = np.minimum((pixels * (count / size)).astype(np.int64), count - 1).T
             taken[row, column] = True
@@ -312,7 +312,7 @@ def _not_in_free_space(points: np.ndarray, views: Sequence[_Gaps], own: int) -> 
     for index, view in enumerate(views):
         if index == own or not view.usable:
             continue
-        inside = np.flatnonzero(_in_image(view.camera, points)[0])
+        inside = np.flatnonzero(in_image(view.camera, points)[0])
         if not len(inside):
             continue
         pixels, depth = view.camera.project(points[inside])

@@ -211,7 +211,8 @@ def _check_options(voxel_size, truncation_voxels, block_resolution, bounds):
             raise LinprimError(f"bounds are {box.tolist()}, wanted [low, high] corners of a box")
 
 
-def _pack(index: np.ndarray) -> np.ndarray:
+def block_keys(index: np.ndarray) -> np.ndarray:
+    """(B,) int64 keys of blocks (B, 3) of a lattice, in the order of x, then y, then z."""
     half = 1 << (KEY_BITS - 1)
     x, y, z = (index + half).T
     return (x << (2 * KEY_BITS)) | (y << KEY_BITS) | z
@@ -272,11 +273,11 @@ def _blocks_of(points, voxel, truncation, footprint, resolution):
             "give bounds, or a larger voxel size"
         )
     # Pairs of voxels first: far fewer than samples.
-    pairs = np.unique(_pack(np.floor(index).astype(np.int64) >> 1))
+    pairs = np.unique(block_keys(np.floor(index).astype(np.int64) >> 1))
     low = 2 * _unpack(pairs) - reach
     width = 2 * reach + 1
     steps = np.append(np.arange(0, width, resolution), width)
-    found = [np.unique(_pack((low + [x, y, z]) // resolution)) for x in steps for y in steps for z in steps]
+    found = [np.unique(block_keys((low + [x, y, z]) // resolution)) for x in steps for y in steps for z in steps]
     return np.unique(np.concatenate(found))
 
 

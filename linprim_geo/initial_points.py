@@ -165,7 +165,7 @@ def visual_hull_points(scene: Scene, count: int, seed: int) -> VolumePoints:
             f"{scene.root}: the images have no alpha channel and no masks, wanted one for a visual hull"
         )
     rng = np.random.default_rng(seed)
-    looks = _looks(scene.train, _MAX_LOOKS)
+    looks = spread_looks(scene.train, _MAX_LOOKS)
     box = _hull_box(scene, looks, rng)
     kept, total, batches = [], 0, 0
     while total < count and batches < _HULL_MAX_BATCHES:
@@ -207,18 +207,21 @@ def frusta_points(scene: Scene, count: int, seed: int) -> VolumePoints:
         points = _along_pixels(cameras, 2 * count, low, high, rng)
         seen = np.zeros(len(points), dtype=np.int64)
         for camera in cameras:
-            seen += _in_image(camera, points)[0]
+            seen += in_image(camera, points)[0]
         for number in range(_FRUSTA_SEEN):
             exact = seen == number + 1 if number + 1 < _FRUSTA_SEEN else seen >= _FRUSTA_SEEN
             found[number].append(points[exact])
         if sum(len(points) for points in found[-1]) >= count:
             break
     xyz = np.concatenate([np.concatenate(points) for points in reversed(found)])[:count]
-    return VolumePoints(xyz, _colors(xyz, _looks(scene.train, _COLOR_VIEWS)))
+    return VolumePoints(xyz, _colors(xyz, spread_looks(scene.train, _COLOR_VIEWS)))
 
 
-class _Look:
-    """A training view's camera and photograph, averaged down to what choosing points needs."""
+class Look:
+    """A training view's camera and photograph, averaged down to what choosing points needs.
+
+    `rgb` (h, w, 3) uint8; `foreground` (h, w) bool, None without alpha; `open` says whether the object goes on outside of the image.
+    """
 
     def __init__(self, view: View):
         photo = view.load()
@@ -230,19 +233,23 @@ class _Look:
             width, height, c.fx / factor, c.fy / factor, c.cx / factor, c.cy / factor, c.world_to_camera
         )
         self.foreground = None if alpha is None else alpha >= _FOREGROUND
-        self.open = False  # whether the object goes on outside of the image
+        self.open = False
         if self.foreground is not None:
             edges = self.foreground[[0, -1]].any() or self.foreground[:, [0, -1]].any()
             self.open = bool(edges)
 
 
-def _looks(views: Sequence[View], limit: int) -> list[_Look]:
-    """At most `limit` of the views, evenly spread over their order."""
+def spread_looks(views: Sequence[View], limit: int) -> list[Look]:
+    """Looks at no more than `limit` of the views, evenly spread over their order.
+
+    Raises:
+        LinprimError: a photograph cannot be read.
+    """
     chosen = np.unique(np.linspace(0, len(views) - 1, min(limit, len(views))).round().astype(int))
-    return [_Look(views[i]) for i in chosen]
+    return [Look(views[i]) for i in chosen]
 
 
-def _hull_box(scene: Scene, looks: Sequence[_Look], rng: np.random.Generator) -> np.ndarray:
+def _hull_box(scene: Scene, looks: Sequence[Look], rng: np.random.Generator) -> np.ndarray:
     """(2, 3) corners of a box round the visual hull, from coarse to fine."""
     cameras = [look.camera for look in looks]
     center, distance = looked_at(scene)
@@ -265,7 +272,7 @@ def _hull_box(scene: Scene, looks: Sequence[_Look], rng: np.random.Generator) ->
     return box
 
 
-def _inside_hull(points: np.ndarray, looks: Sequence[_Look], grow: int | Sequence[int]) -> np.ndarray:
+def _inside_hull(points: np.ndarray, looks: Sequence[Look], grow: int | Sequence[int]) -> np.ndarray:
     """(P,) whether enough views see the points and hardly any sees background there."""
     allowed = int(_MASK_ERRORS * len(looks))
     needed = max(2, int(np.ceil(_HULL_MIN_SEEN * len(looks))))
@@ -275,7 +282,7 @@ def _inside_hull(points: np.ndarray, looks: Sequence[_Look], grow: int | Sequenc
     for look, radius in zip(looks, grow, strict=True):
         assert look.foreground is not None, "a visual hull is made of masks"
         mask = _grown(look.foreground, radius)
-        inside, row, column = _in_image(look.camera, points[alive])
+        inside, row, column = in_image(look.camera, points[alive])
         background = np.zeros(len(alive), dtype=bool) if look.open else ~inside
         background[inside] = ~mask[row[inside], column[inside]]
         against[alive] += background
@@ -297,7 +304,7 @@ def _grown(mask: np.ndarray, radius: int) -> np.ndarray:
     return maximum_filter(mask, size=2 * radius + 1, mode="nearest")
 
 
-def _in_image(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def in_image(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """((P,) whether in front and in the image, (P,) row, (P,) column; rows and columns mean nothing
     elsewhere)."""
     pixels, depth = camera.project(points)
@@ -323,13 +330,13 @@ def _along_pixels(cameras: Sequence[Camera], count: int, low: float, high: float
     return points
 
 
-def _colors(points: np.ndarray, looks: Sequence[_Look]) -> np.ndarray:
+def _colors(points: np.ndarray, looks: Sequence[Look]) -> np.ndarray:
     """(P, 3) uint8 mean of the foreground pixels that the points fall on; the images' mean where there is
     none."""
     total, weight = np.zeros((len(points), 3)), np.zeros(len(points))
     step = max(1, len(looks) // _COLOR_VIEWS)
     for look in looks[::step]:
-        inside, row, column = _in_image(look.camera, points)
+        inside, row, column = in_image(look.camera, points)
         if look.foreground is not None:
             inside[inside] = look.foreground[row[inside], column[inside]]
         total[inside] += look.rgb[row[inside], column[inside]]
@@ -346,7 +353,7 @@ def _looked_at_points(cameras: Sequence[Camera], xyz: np.ndarray) -> tuple[np.nd
     """From the points in each image, their median position and depth, the median of both over the cameras."""
     targets, depths = [], []
     for camera in cameras:
-        inside = _in_image(camera, xyz)[0]
+        inside = in_image(camera, xyz)[0]
         if inside.sum() < _MIN_POINTS_SEEN:
             continue
         seen = xyz[inside]

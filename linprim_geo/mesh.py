@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -192,12 +192,13 @@ def save_mesh(path: str | Path, mesh: Mesh) -> None:
             _write_trimesh(temporary, mesh, suffix[1:])
 
 
-def _needs_double(mesh: Mesh) -> bool:
+def needs_double(mesh: Mesh) -> bool:
+    """Whether float32 would move vertices by more than FLOAT32_SHARE of the mesh's diagonal."""
     return np.abs(mesh.vertices).max() * np.finfo(np.float32).eps / 2 > FLOAT32_SHARE * mesh.diagonal
 
 
 def _write_ply(path: Path, mesh: Mesh) -> None:
-    real = "<f8" if _needs_double(mesh) else "<f4"
+    real = "<f8" if needs_double(mesh) else "<f4"
     fields = [(name, real) for name in "xyz"]
     columns = [*mesh.vertices.T]
     if mesh.normals is not None:
@@ -230,7 +231,7 @@ def _write_ply(path: Path, mesh: Mesh) -> None:
 
 
 def _write_obj(path: Path, mesh: Mesh) -> None:
-    digits = "%.15g" if _needs_double(mesh) else "%.9g"
+    digits = "%.15g" if needs_double(mesh) else "%.9g"
     line, columns = "v" + f" {digits}" * 3, [mesh.vertices]
     if mesh.colors is not None:
         # Readers make a byte by round(255 x) or, as MeshLab, by cutting 255 x off: both get the same one.
@@ -241,13 +242,14 @@ def _write_obj(path: Path, mesh: Mesh) -> None:
     if mesh.normals is not None:
         corner, faces = "%d//%d", np.repeat(faces, 2, axis=1)
     with open(path, "w", encoding="ascii") as file:
-        _write_rows(file, line, np.concatenate(columns, axis=1))
+        write_rows(file, line, np.concatenate(columns, axis=1))
         if mesh.normals is not None:
-            _write_rows(file, "vn %.6g %.6g %.6g", mesh.normals)
-        _write_rows(file, f"f {corner} {corner} {corner}", faces)
+            write_rows(file, "vn %.6g %.6g %.6g", mesh.normals)
+        write_rows(file, f"f {corner} {corner} {corner}", faces)
 
 
-def _write_rows(file, line: str, rows: np.ndarray, chunk: int = 65536) -> None:
+def write_rows(file: TextIO, line: str, rows: np.ndarray, chunk: int = 65536) -> None:
+    """Writes each of the rows (N, K) as `line`, a format of K values, `chunk` of them at a time."""
     for start in range(0, len(rows), chunk):
         part = rows[start : start + chunk]
         file.write(((line + "\n") * len(part)) % tuple(part.ravel().tolist()))
@@ -256,7 +258,7 @@ def _write_rows(file, line: str, rows: np.ndarray, chunk: int = 65536) -> None:
 def _write_trimesh(path: Path, mesh: Mesh, kind: str) -> None:
     import trimesh
 
-    center = mesh.bounds.mean(0) if kind == "glb" and _needs_double(mesh) else np.zeros(3)
+    center = mesh.bounds.mean(0) if kind == "glb" and needs_double(mesh) else np.zeros(3)
     body = trimesh.Trimesh(
         vertices=mesh.vertices - center,
         faces=mesh.faces,

@@ -237,7 +237,7 @@ class Run:
 
         from . import ops
 
-        tensors, background, how = self._tensors()
+        tensors, background, how = self.raster_arguments()
         for view in views:
             camera, options = view.camera.transformed(self.similarity), self.train_options
             with torch.no_grad():
@@ -279,7 +279,7 @@ class Run:
 
         from . import ops
 
-        tensors, background, how = self._tensors()
+        tensors, background, how = self.raster_arguments()
         kind = {"primitive": how["primitive"], "ray_model": how["ray_model"]}
         for view in views:
             camera = view.camera.transformed(self.similarity)
@@ -292,7 +292,7 @@ class Run:
                     depth, opacity = out.depth_median, out.opacity
             yield view, (depth.numpy() / self.similarity.scale).astype(np.float32), opacity.float().numpy()
 
-    def _tensors(self) -> tuple[Tensors, torch.Tensor, dict]:
+    def raster_arguments(self) -> tuple[Tensors, torch.Tensor, dict]:
         """What `ops.rasterize` takes: tensors, background, keywords."""
         import torch
 

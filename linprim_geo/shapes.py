@@ -20,7 +20,7 @@ def cad_part(detail: float = 1.0) -> TexturedMesh:
     2."""
     from manifold3d import CrossSection, Manifold
 
-    tags = _Tags()
+    tags = Tags()
 
     def box(low, high):
         return Manifold.cube(np.subtract(high, low)).translate(low)
@@ -50,7 +50,7 @@ def cad_part(detail: float = 1.0) -> TexturedMesh:
     for x in (-0.42, -0.14, 0.14, 0.42):
         fence -= box((x - 0.07, 0.4, 0.18), (x + 0.07, 0.5, 0.34))
     stud = drum(0.09, 0.3, (-0.42, -0.36, 0.1)) + drum(0.09, 0.04, (-0.42, -0.36, 0.4), top=0.06)
-    solid = Manifold.batch_boolean([plate, block, *ribs, tags.tag(fence, 3), tags.tag(stud, 4)], _op("Add"))
+    solid = Manifold.batch_boolean([plate, block, *ribs, tags.tag(fence, 3), tags.tag(stud, 4)], operation("Add"))
 
     bore = across(0.19, -0.3, 0.3, 0.15, 0.55) + across(0.215, -0.05, 0.05, 0.15, 0.55)
     bore += across(0.25, -0.2501, -0.1501, 0.15, 0.55, end=0.15)
@@ -63,7 +63,7 @@ def cad_part(detail: float = 1.0) -> TexturedMesh:
     cuts += [tags.tag(slot, 6), tags.tag(socket, 6)]
     for x in (-0.3, 0.3):
         cuts.append(tags.tag(box((x - 0.22, -0.3, -0.1), (x + 0.22, 0.3, 0.05)), 7))
-    solid = Manifold.batch_boolean([solid, *cuts], _op("Subtract"))
+    solid = Manifold.batch_boolean([solid, *cuts], operation("Subtract"))
     return _finish("cad_part", *tags.triangles(solid), detail=detail, seed=1)
 
 
@@ -133,7 +133,7 @@ def furnished_room(detail: float = 1.0, seed: int = 5) -> TexturedMesh:
     """
     from manifold3d import CrossSection, Manifold
 
-    tags, rng = _Tags(), np.random.default_rng(seed)
+    tags, rng = Tags(), np.random.default_rng(seed)
     things = []
 
     def box(low, high):
@@ -211,8 +211,8 @@ def furnished_room(detail: float = 1.0, seed: int = 5) -> TexturedMesh:
     air = tags.tag(box((0, 0, 0), (6, 5, 2.7)), 0)
     recesses = [box((1.4, 4.9, 0.9), (3.2, 5.22, 2.1)), box((-0.14, 3.3, 0.0), (0.1, 4.2, 2.05))]
     mullion = box((2.27, 5.12, 0.8), (2.33, 5.3, 2.2))
-    air = Manifold.batch_boolean([air, *(tags.tag(item, 16) for item in recesses)], _op("Add"))
-    air = Manifold.batch_boolean([air, tags.tag(mullion, 7), *things], _op("Subtract"))
+    air = Manifold.batch_boolean([air, *(tags.tag(item, 16) for item in recesses)], operation("Add"))
+    air = Manifold.batch_boolean([air, tags.tag(mullion, 7), *things], operation("Subtract"))
     vertices, faces, part = tags.triangles(air)
     faces = faces[:, ::-1]
     corner = vertices[faces]
@@ -237,7 +237,7 @@ def wire_and_sheet(detail: float = 1.0) -> TexturedMesh:
     Diagonal 2."""
     from manifold3d import Manifold
 
-    tags = _Tags()
+    tags = Tags()
     rods = []
     x, y, z = 0.72, 0.5, 0.46
     corners = [(sx * x, sy * y) for sx, sy in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
@@ -256,7 +256,7 @@ def wire_and_sheet(detail: float = 1.0) -> TexturedMesh:
     rods.append(tags.tag(_tube(knot, 0.014, closed=True), 2))
     rods.append(tags.tag(_tube([(-x, -y, z), (x, y, -z)], 0.008), 3))
     rods.append(tags.tag(_tube([(-x, y, 0.1), (x, y, -0.15)], 0.012), 3))
-    vertices, faces, part = tags.triangles(Manifold.batch_boolean(rods, _op("Add")))
+    vertices, faces, part = tags.triangles(Manifold.batch_boolean(rods, operation("Add")))
 
     n = 96
     u, v = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n), indexing="ij")
@@ -279,13 +279,14 @@ SHAPES: dict[str, Callable[..., TexturedMesh]] = {
 """The built-in scenes by name; each takes `detail`, the contrast of its fine texture."""
 
 
-class _Tags:
+class Tags:
     """Remembers which piece every solid is, through any number of booleans, by manifold's original ids."""
 
     def __init__(self) -> None:
         self.part_of_id: dict[int, int] = {}
 
     def tag(self, solid, part: int):
+        """The solid with an id of its own, which is remembered as piece `part`."""
         solid = solid.as_original()
         self.part_of_id[solid.original_id()] = part
         return solid
@@ -304,7 +305,8 @@ class _Tags:
         return np.array(mesh.vert_properties[:, :3], dtype=np.float64), faces, part
 
 
-def _op(name: str):
+def operation(name: str):
+    """manifold3d's boolean operation "Add", "Subtract" or "Intersect"."""
     from manifold3d import OpType
 
     return getattr(OpType, name)

@@ -177,7 +177,7 @@ def _render(run: Run, primitives: Primitives, cameras: list[Camera], level: floa
     from . import ops
 
     tensors = primitives.tensors()
-    _, background, how = run._tensors()
+    _, background, how = run.raster_arguments()
     kind = {"primitive": how["primitive"], "ray_model": how["ray_model"]}
     weight, depths = np.zeros(len(primitives), dtype=np.float32), []
     for camera in cameras:

@@ -15,7 +15,7 @@ import numpy as np
 
 from .errors import LinprimError
 from .files import atomic_write
-from .mesh import Mesh, _needs_double, _write_rows, face_areas, face_normals, validate_mesh
+from .mesh import Mesh, face_areas, face_normals, needs_double, validate_mesh, write_rows
 from .mesh_process import paired_edges
 from .visibility import POOR_RINGS, color_vertices, photographed
 
@@ -502,26 +502,26 @@ def _seams(mesh: Mesh, texture: Texture) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def _write_obj(path: Path, mesh: Mesh, texture: Texture, material: str) -> None:
-    digits = "%.15g" if _needs_double(mesh) else "%.9g"
+    digits = "%.15g" if needs_double(mesh) else "%.9g"
     _, uv, corner = _seams(mesh, texture)
     faces, line = np.stack([mesh.faces, corner], axis=2) + 1, "f %d/%d %d/%d %d/%d"
     if mesh.normals is not None:
         faces, line = faces[..., [0, 1, 0]], "f %d/%d/%d %d/%d/%d %d/%d/%d"
     with open(path, "w", encoding="utf-8") as file:
         file.write(f"mtllib {material}\n")
-        _write_rows(file, "v" + f" {digits}" * 3, mesh.vertices)
-        _write_rows(file, "vt %.8f %.8f", uv)
+        write_rows(file, "v" + f" {digits}" * 3, mesh.vertices)
+        write_rows(file, "vt %.8f %.8f", uv)
         if mesh.normals is not None:
-            _write_rows(file, "vn %.6g %.6g %.6g", mesh.normals)
+            write_rows(file, "vn %.6g %.6g %.6g", mesh.normals)
         file.write("usemtl surface\n")
-        _write_rows(file, line, faces.reshape(len(faces), -1))
+        write_rows(file, line, faces.reshape(len(faces), -1))
 
 
 def _glb(mesh: Mesh, texture: Texture, picture) -> bytes:
     import trimesh
 
     vertex, uv, faces = _seams(mesh, texture)
-    center = mesh.bounds.mean(0) if _needs_double(mesh) else np.zeros(3)
+    center = mesh.bounds.mean(0) if needs_double(mesh) else np.zeros(3)
     material = trimesh.visual.material.PBRMaterial(
         baseColorTexture=picture, baseColorFactor=[255, 255, 255, 255], metallicFactor=0.0, roughnessFactor=1.0
     )

@@ -198,7 +198,7 @@ class Grid:
     def integrate(self, frame: DepthFrame, rules: tuple[float, ...]) -> None:
         """Adds the votes of one frame to every block in its frustum; `rules` are `vote_rules`."""
         camera = frame.camera
-        rows = self._in_view(camera)
+        rows = self.in_view(camera)
         if len(rows) == 0:
             return
         project = np.empty((3, 4))
@@ -208,7 +208,7 @@ class Grid:
         sums = (self.total, self.weight, self.free)
         _core.add_votes(project, camera.width, camera.height, table, rules, rows, self.corner, self.voxel, self.resolution, *sums)
 
-    def _in_view(self, camera: Camera) -> np.ndarray:
+    def in_view(self, camera: Camera) -> np.ndarray:
         """Blocks whose bounding sphere meets the frustum."""
         middle = 0.5 * (self.resolution - 1) * self.voxel
         centers = (self.corner + middle + self.origin) @ camera.rotation.T + camera.world_to_camera[:3, 3]

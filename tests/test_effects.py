@@ -249,7 +249,7 @@ def test_double_precision_renders_nearly_the_same(scenes, tmp_path, own_points):
     for scalar in ("float32", "float64"):
         train(scenes("plain"), tmp_path / scalar, options=replace(options, scalar=scalar), quiet=True)
     one, other = (Run.open(tmp_path / scalar) for scalar in ("float32", "float64"))
-    tensors, background, _ = other._tensors()
+    tensors, background, _ = other.raster_arguments()
     assert str(tensors[0].dtype) == str(background.dtype) == "torch.float64"
     view = one.scene().test[0]
     images = [next(run.render_views([view]))[1] for run in (one, other)]

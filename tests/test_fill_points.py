@@ -11,7 +11,7 @@ from PIL import Image
 
 from linprim_geo import fill_points as filling
 from linprim_geo.fill_points import _differences, _Gaps, _not_in_free_space, _sources, fill_points
-from linprim_geo.initial_points import _looks, local_planes
+from linprim_geo.initial_points import local_planes, spread_looks
 from linprim_geo.scene import PointCloud, Scene, load_scene
 
 # A room of 4 x 4 x 3: the far wall at y = 2, the floor at z = -1.5, a box in front of the wall.
@@ -166,7 +166,7 @@ def test_a_plain_backdrop_gets_no_points(room):
 
 def test_points_that_other_views_see_through_are_dropped(room):
     full = full_cloud(room)
-    views = [_Gaps(look, full.points.xyz) for look in _looks(room.train, 100)]
+    views = [_Gaps(look, full.points.xyz) for look in spread_looks(room.train, 100)]
     wall = np.array([[0.2, 2.0, 0.4], [-0.7, 2.0, 0.2], [0.9, 2.0, 0.3]])
     floating = wall - [0, 0.5, 0]
     np.testing.assert_array_equal(_not_in_free_space(wall, views, 0), True)
@@ -174,7 +174,7 @@ def test_points_that_other_views_see_through_are_dropped(room):
 
 
 def test_patches_agree_at_the_true_depth(room):
-    views = [_Gaps(look, room.points.xyz) for look in _looks(room.train, 100)]
+    views = [_Gaps(look, room.points.xyz) for look in spread_looks(room.train, 100)]
     index = 4
     view, depth = views[index], cast(cameras()[index])[0]
     face = np.array([[64.0, 60.0], [58.0, 64.0], [70.0, 58.0]])  # the box's front

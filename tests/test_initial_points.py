@@ -14,10 +14,10 @@ from linprim_geo.errors import LinprimError
 from linprim_geo.initial_points import (
     CAMERA_DISTANCE,
     _colors,
-    _looks,
     focus_point,
     frusta_points,
     scene_normalization,
+    spread_looks,
     visual_hull_points,
 )
 from linprim_geo.scene import PointCloud, Scene, View, load_scene
@@ -141,7 +141,7 @@ def test_colors_come_from_the_foreground_alone(tmp_path):
     # The pixels beside the ball hide blue: a point there has no colour of its own and gets the ball's.
     scene = silhouettes(tmp_path, sphere_ring(8))
     beside = PLACE + np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0], [0.1, 0.1, 0.1]])
-    colors = _colors(beside, _looks(scene.train, 8))
+    colors = _colors(beside, spread_looks(scene.train, 8))
     np.testing.assert_allclose(colors, np.broadcast_to([200, 60, 20], (4, 3)), atol=1)
 
 
