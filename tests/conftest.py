@@ -45,6 +45,29 @@ def cache_folder(tmp_path_factory):
         yield
 
 
+@pytest.fixture
+def one_thread():
+    """torch with one thread."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def few_threads(one_thread):
+    """The core with one thread as well; what a test does to its threads and instruction set is undone."""
+    from linprim_geo import ops
+
+    before = ops.threads(), ops.instruction_set()
+    ops.set_threads(1)
+    yield
+    ops.set_threads(before[0])
+    ops.set_instruction_set(before[1])
+
+
 @pytest.fixture(scope="session")
 def tiny_scene(tmp_path_factory) -> Path:
     """The built-in part with transparent background: 12 + 3 views of 48x48, 400 points, depth, reference.ply."""

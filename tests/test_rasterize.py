@@ -1,4 +1,4 @@
-"""The compiled rasterizer against its float64 twin, invariants and differences, on ordinary and on hard scenes."""
+"""The compiled rasterizer against its float64 twin and invariants, on ordinary and on hard scenes."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ import pytest
 import torch
 from octahedra import (
     BUILDS,
-    C0,
-    COLOR,
     IMAGES,
     KERNELS,
     NAMES,
@@ -20,7 +18,6 @@ from octahedra import (
     everything,
     fields,
     gradients,
-    hard_scene,
     kernels,
     leaves,
     octahedra,
@@ -29,20 +26,10 @@ from octahedra import (
     twin,
 )
 
-from linprim_geo import ops, reference
+from linprim_geo import ops
 from linprim_geo.camera import Camera
-from linprim_geo.errors import LinprimError
 
-
-@pytest.fixture(autouse=True)
-def few_threads():
-    before = torch.get_num_threads(), ops.threads(), ops.instruction_set()
-    torch.set_num_threads(1)
-    ops.set_threads(1)
-    yield
-    torch.set_num_threads(before[0])
-    ops.set_threads(before[1])
-    ops.set_instruction_set(before[2])
+pytestmark = pytest.mark.usefixtures("few_threads")
 
 
 # --- the twin ---
@@ -337,173 +324,6 @@ def test_median_depth_follows_its_level():
     assert ops.rasterize(*scene, view, geometry=True, level=0.05).depth_median.item() == 0  # e^-2.8 is 0.06
 
 
-# --- gradients ---
-
-
-@pytest.mark.parametrize("geometry", [False, True])
-@pytest.mark.parametrize("seed,coefficients,depth", [(51, 4, 3.0), (52, 1, 0.5), (53, 16, 2.5)])
-def test_gradients_by_finite_differences(seed, coefficients, depth, geometry):
-    # Six pixels and three primitives; seeds whose rays keep clear of edges by more than the step.
-    scene, view = random_scene(seed, 3, coefficients, 3, 2, depth, spread=0.3)
-    inputs = leaves(scene)
-
-    def run(*tensors):
-        return tuple(fields(ops.rasterize(*tensors, view, geometry=geometry), IMAGES if geometry else COLOR).values())
-
-    assert run(*inputs)[1].max() > 0.1
-    assert torch.autograd.gradcheck(run, inputs, eps=1e-6, atol=1e-6, rtol=1e-5, fast_mode=coefficients == 16)
-
-
-def operator_arguments(dtype=torch.float32, geometry=False, screen=True, requires_grad=True):
-    scene, view = random_scene(61, 4, 4, 7, 5)
-    inputs = leaves(scene, dtype) if requires_grad else [p.to(dtype) for p in scene]
-    zeros = torch.zeros(4, 3, dtype=dtype, requires_grad=requires_grad) if screen else None
-    pose = torch.from_numpy(view.world_to_camera)
-    numbers = [view.fx, view.fy, view.cx, view.cy, 0.01, 1e-3, 0.5, 0.0]
-    return (*inputs, zeros, pose, numbers, [view.width, view.height, 0, 0, 0, int(geometry)])
-
-
-@pytest.mark.parametrize("geometry", [False, True])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_operator_is_registered_correctly(geometry, dtype):
-    torch.library.opcheck(torch.ops.linprim_geo.rasterize.default, operator_arguments(dtype, geometry))
-
-
-def test_the_operator_without_gradients_is_registered_correctly():
-    torch.library.opcheck(torch.ops.linprim_geo.rasterize.default, operator_arguments(screen=False, requires_grad=False))
-
-
-@pytest.mark.parametrize("geometry", [False, True])
-def test_the_adjoint_operator_is_registered_correctly(geometry):
-    args = operator_arguments(torch.float64, geometry, requires_grad=False)
-    *planes, color, _, _ = torch.ops.linprim_geo.rasterize(*args)
-    grads = [torch.ones_like(p) for p in planes[:8]]
-    grads[1] = None
-    torch.library.opcheck(torch.ops.linprim_geo.rasterize_grad.default, (*args[:6], *args[7:], color, planes, grads))
-
-
-def test_gradient_of_each_input_alone_equals_that_of_all():
-    scene, view = random_scene(62, 5, 4)
-    inputs = leaves(scene)
-    together = torch.autograd.grad(ops.rasterize(*inputs, view).rgb.square().sum(), inputs)
-    for i, wanted in enumerate(together):
-        alone = [p.detach() for p in scene]
-        alone[i] = inputs[i]
-        (grad,) = torch.autograd.grad(ops.rasterize(*alone, view).rgb.square().sum(), inputs[i])
-        assert torch.equal(grad, wanted)
-
-
-@pytest.mark.parametrize("dtype,isa", BUILDS)
-def test_weights_of_the_adjoint_are_those_of_the_forward_pass_bit_by_bit(dtype, isa):
-    # One pixel at a time, no sum is rounded: the gradient to a primitive's coefficient of degree 0 is C0 times its weight, and
-    # `max_weight` is that weight. It is 0 exactly where the forward pass did not hit.
-    met = 0
-    with kernels(isa):
-        for seed in range(80):
-            scene, view = random_scene(700 + seed, 8, 1, 1, 1, 2.0, spread=0.4)
-            inputs = leaves(scene, getattr(torch, dtype))
-            inputs[4] = torch.full_like(inputs[4], 0.1).requires_grad_()  # no colour is clamped
-            out = ops.rasterize(*inputs, view, geometry=True, stop=0.2)
-            (grad,) = torch.autograd.grad(out.rgb.sum(), inputs[4])
-            met += int((out.max_weight > 0).sum())
-            wanted = out.max_weight * torch.tensor(C0, dtype=grad.dtype)
-            assert torch.equal(grad, wanted[:, None, None].expand_as(grad))
-    assert met > 100
-
-
-@pytest.mark.parametrize("dtype,isa", BUILDS)
-def test_colour_does_not_depend_on_whether_geometry_is_asked_for(dtype, isa):
-    scene, view = random_scene(63, 20, 9, 33, 20)
-    scene = [p.to(getattr(torch, dtype)) for p in scene]
-    with kernels(isa):
-        images = [fields(ops.rasterize(*scene, view, geometry=g), COLOR) for g in (False, True)]
-    # The two kernels may be contracted differently: each rounding counts once.
-    for name in COLOR:
-        torch.testing.assert_close(images[0][name], images[1][name], rtol=0, atol=200 * torch.finfo(images[0][name].dtype).eps)
-
-
-def test_gradient_to_the_background_is_the_transmittance():
-    scene, view = random_scene(64, 10, 4)
-    inputs = leaves(scene)
-    out = ops.rasterize(*inputs, view)
-    weight = torch.rand(3, view.height, view.width, dtype=torch.float64)
-    (grad,) = torch.autograd.grad((out.rgb * weight).sum(), inputs[5])
-    torch.testing.assert_close(grad, ((1 - out.opacity.detach()) * weight).sum((1, 2)), rtol=1e-13, atol=1e-13)
-
-
-@pytest.mark.parametrize("samples", [1, 3])
-def test_screen_gradient_is_that_of_moving_a_centre_by_a_pixel(samples):
-    # Degree 0: the colour does not turn with the centre. The loss's own third derivative bounds the difference quotient.
-    scene, view = random_scene(65, 4, 1, 25, 21, depth=4.0, spread=0.3)
-    screen = torch.zeros(4, 3, dtype=torch.float64, requires_grad=True)
-    weight = torch.rand(3, view.height, view.width, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-
-    def loss(center):
-        return (ops.rasterize(center, *scene[1:], view, samples=samples, screen=screen).rgb * weight).sum()
-
-    (grad,) = torch.autograd.grad(loss(scene[0]), screen)
-    assert (grad[:, :2].abs() > 1e-3).sum() >= 4
-    # The third column adds lengths tile by tile, so it is at least the length of the sum.
-    assert (grad[:, 2] >= grad[:, :2].norm(dim=1) * (1 - 1e-12)).all()
-    depth = scene[0].numpy() @ view.rotation[2] + view.world_to_camera[2, 3]
-    assert (depth > 1.0).all()
-    step = 1e-5
-    for i in range(4):
-        for axis, focal in ((0, view.fx), (1, view.fy)):
-            move = torch.zeros_like(scene[0])
-            move[i] = torch.from_numpy(view.rotation[axis] * depth[i] / focal) * step
-            quotient = (loss(scene[0] + move) - loss(scene[0] - move)) / (2 * step)
-            assert grad[i, axis].item() == pytest.approx(quotient.item(), rel=1e-3, abs=1e-4)
-
-
-def test_two_graphs_may_be_differentiated_in_any_order_and_twice():
-    first, second = (random_scene(seed, 30, 4, 40, 30) for seed in (66, 67))
-    alone = [everything(*first), everything(*second)]
-    inputs = [leaves(first[0]), leaves(second[0])]
-    out = [fields(ops.rasterize(*x, view, geometry=True)) for x, view in zip(inputs, (first[1], second[1]), strict=True)]
-    for k in (0, 1, 1, 0):
-        grads = gradients(out[k], inputs[k], cotangents(out[k]))
-        assert_identical(grads, alone[k][10:16])
-
-
-@pytest.mark.parametrize("geometry", [False, True])
-@pytest.mark.parametrize("dtype,isa", BUILDS)
-def test_gradients_do_not_depend_on_what_was_rendered_in_between(dtype, isa, geometry):
-    scene, view = random_scene(68, 60, 4, 45, 37)
-    scene = [p.to(getattr(torch, dtype)) for p in scene]
-    with kernels(isa):
-        wanted = everything(scene, view, geometry, stop=0.2)
-        inputs = leaves(scene)
-        images = fields(ops.rasterize(*inputs, view, geometry=geometry, stop=0.2), IMAGES if geometry else COLOR)
-        for seed in range(4):  # more views than the core remembers, larger and smaller
-            other, elsewhere = random_scene(seed, 10 + 90 * (seed % 2), 1, 30 * (1 + seed % 2), 20)
-            ops.rasterize(*[p.to(scene[0].dtype) for p in other], elsewhere)
-        grads = gradients(images, inputs, cotangents(images))
-        start = 10 if geometry else 2
-        assert_identical(grads, wanted[start : start + 6])
-        # The same view of the same scene with another stop is another list.
-        ops.rasterize(*scene, view, geometry=geometry, stop=0.9)
-        assert_identical(gradients(images, inputs, cotangents(images)), grads)
-
-
-def test_a_list_is_taken_again_only_for_the_very_same_content():
-    # Every pair of scenes differs in one value of one tensor, or in one number of the view.
-    scene, view = random_scene(69, 12, 4, 20, 14)
-    values = {k: getattr(view, k) for k in ("width", "height", "fx", "fy", "cx", "cy", "world_to_camera")}
-    pose = view.world_to_camera.copy()
-    pose[0, 3] += 0.1
-    others = [({name: 1.3}, {}, {}) for name in NAMES]
-    others += [({}, {"fx": view.fx * 1.1}, {}), ({}, {"cy": view.cy + 2}, {}), ({}, {"world_to_camera": pose}, {}), ({}, {}, {"near": 2.9})]
-    wanted = everything(scene, view)[10:16]
-    for factors, numbers, options in others:
-        inputs = leaves(scene)
-        images = fields(ops.rasterize(*inputs, view, geometry=True))
-        changed = [p * factors.get(name, 1.0) for name, p in zip(NAMES, scene, strict=True)]
-        ops.rasterize(*changed, Camera(**values | numbers), geometry=True, **options)
-        ops.rasterize(*changed, Camera(**values | numbers), geometry=False, **options)
-        assert_identical(gradients(images, inputs, cotangents(images)), wanted)
-
-
 # --- statistics, samples ---
 
 
@@ -527,85 +347,6 @@ def test_samples_average_a_magnified_image():
         ops.rasterize(*scene, view, samples=2, geometry=True)
     with pytest.raises(ValueError, match="samples"):
         ops.rasterize(*scene, view, samples=0)
-
-
-# --- the depth of a level, overlaps included ---
-
-
-def overlap_depth(scene, view, near, level):
-    """Where the summed thickness of a ray reaches ln(1 / level): the twin's intervals, cut at all their ends; 0 where never."""
-    center, rotation, extent, density = (p.double() for p in scene[:4])
-    pose = torch.from_numpy(view.world_to_camera)
-    local = center @ pose[:3, :3].T + pose[:3, 3]
-    turn = pose[:3, :3] @ reference.rotation_matrix(rotation)
-    rays = reference.pixel_rays(view.width, view.height, view.fx, view.fy, view.cx, view.cy, center)
-    spans = []
-    for i in range(len(center)):
-        start, end, *_ = reference.clip_to_octahedron(rays @ turn[i] / extent[i], -(local[i] @ turn[i]) / extent[i], near)
-        spans.append(torch.where(end > start, torch.stack([start, end]), torch.zeros(())))
-    spans = torch.stack(spans)  # (N, 2, pixels)
-    out = torch.zeros(len(rays), dtype=torch.float64)
-    for p, length in enumerate(rays.norm(dim=1)):
-        starts, ends = spans[:, 0, p], spans[:, 1, p]
-        cuts = spans[:, :, p].reshape(-1).sort().values
-        thickness = (density * length * (torch.minimum(cuts[:, None], ends) - starts).clamp(min=0)).sum(1)
-        k = int((thickness < -np.log(level)).sum())
-        if 0 < k < len(cuts):
-            share = (-np.log(level) - thickness[k - 1]) / (thickness[k] - thickness[k - 1])
-            out[p] = cuts[k - 1] + share * (cuts[k] - cuts[k - 1])
-    return out.reshape(view.height, view.width)
-
-
-@pytest.mark.parametrize("seed,depth,near,level", [(91, 3.0, 0.01, 0.5), (92, 0.5, 0.2, 0.8), (93, 2.0, 0.01, 0.05)])
-def test_level_depth_equals_the_sum_of_the_twins_intervals(seed, depth, near, level):
-    scene, view = random_scene(seed, 25, 1, 21, 18, depth)
-    for dtype, isa in BUILDS:
-        inputs = [p.to(getattr(torch, dtype)) for p in scene]
-        wanted = overlap_depth(inputs, view, near, level)
-        assert (wanted > 0).sum() > 30
-        with kernels(isa):
-            got = ops.level_depth(*inputs[:5], view, level=level, near=near)[0].double()
-            again = ops.level_depth(*[p.flip(0) for p in inputs[:5]], view, level=level, near=near)[0].double()
-        # Thickness is good to 400 eps (above); the depth to that over density |v|, at least 0.1 in sum where little is behind.
-        eps = torch.finfo(getattr(torch, dtype)).eps
-        for image in (got, again):
-            both = (image > 0) & (wanted > 0)
-            assert int((~both & ((image > 0) | (wanted > 0))).sum()) <= 1  # a ray whose whole thickness is the level
-            torch.testing.assert_close(image[both], wanted[both], rtol=0, atol=1000 * eps * 5)
-
-
-@pytest.mark.parametrize("level", [0.0, 1.0, -0.5, float("nan")])
-def test_impossible_levels_are_refused(level):
-    scene, view = random_scene(94, 3, 1)
-    with pytest.raises(ValueError, match="level"):
-        ops.level_depth(*scene[:5], view, level=level)
-
-
-@pytest.mark.parametrize("isa", KERNELS)
-def test_level_depth_keeps_its_digits_before_a_far_background(isa):
-    near = ([0.0, 0.0, 3.0], 2.0, 1.0)
-    results = []
-    for far in (None, 1e5):
-        rows = [near] if far is None else [near, ([0.0, 0.0, far], far / 4, 10.0 / far)]
-        center, extent, density = (torch.tensor(x) for x in zip(*rows, strict=True))
-        turn = torch.tensor([[1.0, 0, 0, 0]] * len(rows))
-        with kernels(isa):
-            results.append(
-                ops.level_depth(
-                    center, turn, extent[:, None].repeat(1, 3), density, torch.zeros(len(rows), 1, 3), camera(8, 8), level=0.6
-                )
-            )
-    (alone, alone_opacity), (before, opacity) = results
-    hit = alone > 0
-    assert hit.sum() > 8
-    # The bracket reaches 40,000 times as far, and the depth keeps float32's digits: 4 roundings.
-    torch.testing.assert_close(before[hit], alone[hit], rtol=4 * 1.2e-7, atol=0)
-    assert (opacity >= alone_opacity).all() and (opacity > alone_opacity).any()
-
-
-def test_no_primitives_have_no_level_depth():
-    scene = hard("nothing", torch.float64)[0]
-    assert not any(image.any() for image in ops.level_depth(*scene[:5], camera(5, 3), level=0.5))
 
 
 # --- invariants ---
@@ -645,154 +386,3 @@ def test_a_part_of_an_image_is_the_image_of_that_part():
         for name in IMAGES:
             crop = getattr(whole, name)[..., top : top + height, left : left + width]
             torch.testing.assert_close(getattr(out, name), crop, rtol=1e-10, atol=1e-10)
-
-
-# --- nothing but finite numbers ---
-
-
-def assert_finite_everywhere(scene, view, options):
-    """All outputs and gradients are finite and the opacity is a share; returns whether anything was hit."""
-    inputs = leaves(scene)
-    screen = torch.zeros(len(inputs[0]), 3, dtype=inputs[0].dtype, requires_grad=True)
-    out = ops.rasterize(*inputs, view, geometry=True, screen=screen, **options)
-    images = fields(out)
-    total = sum((image * torch.linspace(-1, 1, image.numel(), dtype=image.dtype).view_as(image)).sum() for image in images.values())
-    grads = torch.autograd.grad(total, [*inputs, screen])
-    assert all(bool(x.isfinite().all()) for x in (*images.values(), out.max_weight, *grads))
-    # 1 - T with 0 <= T <= 1, and weights T alpha with alpha <= 1 to a rounding.
-    assert 0 <= out.opacity.min() and out.opacity.max() <= 1 and out.max_weight.max() <= 1 + 4 * torch.finfo(inputs[0].dtype).eps
-    return bool((out.pixels > 0).any())
-
-
-def test_hard_scenes_give_finite_numbers_only():
-    hit = 0
-    others = [name for name in KERNELS if name != KERNELS[-1]]
-    for seed in range(1800):
-        scene, view, options = hard_scene(seed)
-        hit += assert_finite_everywhere(scene, view, options)
-        single = [p.float() for p in scene]
-        for isa in (KERNELS[-1], *([others[seed // 4 % len(others)]] if seed % 4 == 0 and others else [])):
-            ops.set_instruction_set(isa)
-            assert_finite_everywhere(single, view, options)
-    assert hit > 900
-
-
-@pytest.mark.parametrize("isa", KERNELS)
-def test_a_thickness_beyond_float_gives_finite_numbers(isa):
-    scene = [p.float() for p in octahedra([[0.01, 0.02, 3.0]], [[1.0, 1.0, 1.0]], [3e38])]
-    with kernels(isa):
-        out = ops.rasterize(*scene, camera(), geometry=True)
-    assert all(bool(image.isfinite().all()) for image in fields(out).values())
-
-
-@pytest.mark.parametrize("isa", KERNELS)
-def test_a_denormal_axis_gives_finite_gradients(isa):
-    scene = [p.float() for p in octahedra([[0.0, 0.0, 0.0]], [[0.0255, 0.281, 2.55e-41]], [1.0], [(-0.186, -1.351, 2.53, -0.4255)])]
-    inputs = leaves(scene)
-    with kernels(isa):
-        out = ops.rasterize(*inputs, Camera(50, 1, 3014.0, 3652.0, 25.0, 0.5, np.eye(4)), near=0.0185)
-        for extent in (1.0, 2.0):
-            ops.rasterize(*[p.float() for p in octahedra([[0, 0, 3.0]], [[extent] * 3], [1.0])], camera())
-        grads = torch.autograd.grad(out.rgb.sum(), inputs)
-    assert all(bool(g.isfinite().all()) for g in grads)
-
-
-# --- the interface ---
-
-
-@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
-@pytest.mark.parametrize("name", NAMES)
-def test_an_input_that_is_not_finite_is_named_with_its_row(name, bad):
-    scene, view = random_scene(81, 5, 4)
-    tensor = scene[NAMES.index(name)]
-    row = 2
-    tensor.view(len(tensor), -1)[row, 0] = bad
-    with pytest.raises(LinprimError, match=f"{name}: row {row} "):
-        ops.rasterize(*scene, view)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_wrong_shape_is_named(name):
-    scene, view = random_scene(82, 5, 4)
-    i = NAMES.index(name)
-    scene[i] = scene[i][..., :-1]
-    with pytest.raises(ValueError, match=name):
-        ops.rasterize(*scene, view)
-
-
-def test_two_coefficients_are_refused():
-    scene, view = random_scene(83, 5, 4)
-    scene[4] = scene[4][:, :2]
-    with pytest.raises(ValueError, match=r"sh has to have shape \(N, 1 \| 4 \| 9 \| 16, 3\)"):
-        ops.rasterize(*scene, view)
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.int64])
-def test_other_dtypes_are_refused(dtype):
-    scene, view = random_scene(84, 5, 4)
-    with pytest.raises(LinprimError, match="float32 or float64"):
-        ops.rasterize(*[p.to(dtype) for p in scene], view)
-
-
-@pytest.mark.parametrize("odd", range(1, 6))
-def test_tensors_of_two_dtypes_are_refused(odd):
-    scene, view = random_scene(85, 5, 4)
-    mixed = [p.double() if i == odd else p.float() for i, p in enumerate(scene)]
-    with pytest.raises((LinprimError, ValueError, TypeError), match=NAMES[odd]):
-        ops.rasterize(*mixed, view)
-
-
-@pytest.mark.parametrize("change", [{"width": 0}, {"height": -1}, {"fx": 0.0}, {"fy": -3.0}, {"fx": float("nan")}])
-def test_impossible_cameras_are_refused(change):
-    scene, view = random_scene(86, 5, 4)
-    values = {k: getattr(view, k) for k in ("width", "height", "fx", "fy", "cx", "cy", "world_to_camera")}
-    with pytest.raises((ValueError, RuntimeError)):
-        ops.rasterize(*scene, Camera(**values | change))
-    for options, name in (({"near": 0.0}, "near"), ({"near": -1.0}, "near"), ({"stop": -1.0}, "stop"), ({"stop": 1.0}, "stop")):
-        with pytest.raises(ValueError, match=name):
-            ops.rasterize(*scene, view, **options)
-
-
-@pytest.mark.parametrize("change", [{"cx": float("nan")}, {"world_to_camera": np.full((4, 4), np.nan)}, {"fx": float("inf")}])
-def test_cameras_that_are_not_finite_are_refused(change):
-    scene, view = random_scene(86, 5, 4)
-    values = {k: getattr(view, k) for k in ("width", "height", "fx", "fy", "cx", "cy", "world_to_camera")}
-    with pytest.raises((LinprimError, ValueError)):
-        ops.rasterize(*scene, Camera(**values | change))
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_inputs_of_any_layout_give_the_same_and_stay_as_they_are(dtype):
-    scene, view = random_scene(87, 7, 9, 20, 14)
-    scene = [p.to(dtype) for p in scene]
-    wanted = everything(scene, view)
-    strided = [torch.stack([p, torch.full_like(p, 7.0)], -1)[..., 0] for p in scene]
-    transposed = [p.transpose(0, -1).contiguous().transpose(0, -1) for p in scene]
-    assert not any(p.is_contiguous() for p in strided) and not transposed[0].is_contiguous()
-    for layout in (strided, transposed):
-        before = [p.clone() for p in layout]
-        inputs = [p.detach().requires_grad_() for p in layout]
-        screen = torch.zeros(7, 3, dtype=dtype, requires_grad=True)
-        out = ops.rasterize(*inputs, view, geometry=True, screen=screen)
-        images = fields(out)
-        grads = gradients(images, [*inputs, screen], cotangents(images))
-        assert_identical([*images.values(), out.max_weight, out.pixels, *grads], wanted)
-        assert_identical(layout, before)
-
-
-def test_gradients_that_are_not_contiguous_are_read_right():
-    scene, view = random_scene(88, 7, 1, 20, 14)
-    inputs = leaves(scene)
-    out = ops.rasterize(*inputs, view)
-    weight = torch.rand(20, 14, 3, dtype=torch.float64).permute(2, 1, 0)
-    a = torch.autograd.grad(out.rgb, inputs, weight, retain_graph=True)
-    b = torch.autograd.grad(out.rgb, inputs, weight.contiguous())
-    assert_identical(a, b)
-
-
-def test_an_unknown_instruction_set_is_refused_and_the_old_one_kept():
-    before = ops.instruction_set()
-    with pytest.raises(LinprimError, match="v9"):
-        ops.set_instruction_set("v9")
-    assert ops.instruction_set() == before and "scalar" in KERNELS
-

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import with_budget
+from training_runs import assert_same_run
 
 from linprim_geo import cli, pacing, time_budget
 from linprim_geo.errors import LinprimError
@@ -172,8 +173,6 @@ def test_a_run_keeps_its_time(budgeted):
 
 def test_a_run_with_a_correction_repeats_itself_after_a_kill(tiny_scene, tmp_path, monkeypatch):
     """Killed before and after the correction: what is recorded is repeated, to the last bit."""
-    from test_train import assert_same_run
-
     options = replace(OPTIONS, iterations=200, max_primitives=100, checkpoint_every=50)
     cost = StepCost(0.001, 0.0)
     monkeypatch.setattr(pacing, "calibrate", lambda *_: (cost, 1.0, 0.0, 0.0))

@@ -22,6 +22,9 @@ ROOT = Path(__file__).resolve().parent.parent
 
 TESTS = (
     "test_rasterize.py",
+    "test_rasterize_gradients.py",
+    "test_rasterize_interface.py",
+    "test_level_depth.py",
     "test_parallel.py",
     "test_ladder.py",
     "test_stability.py",

@@ -1,0 +1,163 @@
+"""The trainer itself: the order of views, bounds, growth, the start, and the 3D filter."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from linprim_geo import trainer as training_step
+from linprim_geo.options import TrainOptions
+from linprim_geo.primitives import KINDS, Primitives
+from linprim_geo.scene import load_scene
+from linprim_geo.shots import load_shots
+from linprim_geo.trainer import Trainer
+
+
+def test_activation_gives_the_opacity_of_the_raw_value():
+    raw = torch.tensor([-30.0, -2.0, 0.0, 3.0, 40.0])
+    parameters = {
+        "center": torch.zeros(5, 3), "rotation": torch.tensor([[1.0, 0, 0, 0]]).repeat(5, 1), "raw_opacity": raw,
+        "log_extent": torch.log(torch.tensor([0.2, 0.05, 3.0])).repeat(5, 1), "sh_dc": torch.zeros(5, 1, 3),
+        "sh_rest": torch.zeros(5, 8, 3),
+    }  # fmt: skip
+    _, _, extent, density, sh = training_step.activate(parameters, 1)
+    # Along the shortest diagonal, 2 * 0.05 long, the light that is left is exp(-density * 0.1).
+    expected = torch.sigmoid(raw.double())
+    assert torch.allclose(-torch.expm1(-0.1 * density.double()), expected, rtol=1e-5, atol=0)
+    assert torch.allclose(extent.amin(1), torch.full((5,), 0.05)) and sh.shape == (5, 4, 3)
+
+
+@pytest.fixture
+def trainer(tiny_scene):
+    from linprim_geo.initial_points import scene_normalization
+
+    scene = load_scene(tiny_scene)
+    similarity = scene_normalization(scene)
+    shots = load_shots(scene.train, similarity)
+    xyz = similarity.apply(scene.points.xyz[:40])
+    parameters = training_step.initial_parameters(xyz, scene.points.rgb[:40], 1, 0, (1e-3, 1.0))
+    options = TrainOptions(iterations=100, max_primitives=50, sh_degree=1, threads=1)
+    return Trainer(shots, parameters, options, (1e-3, 1.0), torch.ones(3), False, True)
+
+
+def test_every_view_is_seen_once_per_round(trainer):
+    count = len(trainer.shots)
+    rounds = [[trainer.view_of(step) for step in range(r * count, (r + 1) * count)] for r in range(4)]
+    assert all(sorted(order) == list(range(count)) for order in rounds)
+    assert len({tuple(order) for order in rounds}) > 1
+
+
+def test_half_axes_stay_within_their_bounds_and_rotations_are_of_length_one(trainer):
+    trainer.bounds = (0.04, 0.05)
+    for _ in range(5):
+        trainer.advance()
+    extent = torch.exp(trainer.parameters["log_extent"])
+    assert extent.min() >= 0.04 * (1 - 1e-6) and extent.max() <= 0.05 * (1 + 1e-6)
+    assert torch.allclose(
+        torch.linalg.vector_norm(trainer.parameters["rotation"], dim=1), torch.ones(len(trainer))
+    )
+
+
+def test_degrees_of_the_colour_join_one_after_the_other(trainer):
+    assert trainer.degree == 0
+    before = trainer.parameters["sh_rest"].clone()
+    trainer.advance()
+    assert torch.equal(trainer.parameters["sh_rest"], before)
+    trainer.step = 90
+    assert trainer.degree == 1
+    trainer.advance()
+    assert not torch.equal(trainer.parameters["sh_rest"], before)
+
+
+def test_a_child_has_its_parents_state_but_no_momentum(trainer):
+    for _ in range(3):
+        trainer.advance()
+    for name in ("first", "second"):
+        assert all(value.abs().max() > 0 for key, value in getattr(trainer, name).items() if key != "sh_rest")
+    dc, second = trainer.parameters["sh_dc"].clone(), trainer.second["center"].clone()
+    trainer._grow()
+    assert 40 < len(trainer) <= 50
+    assert torch.equal(trainer.parameters["sh_dc"][:40], dc) and torch.equal(
+        trainer.second["center"][:40], second
+    )
+    for row in range(40, len(trainer)):
+        assert (dc == trainer.parameters["sh_dc"][row]).all((1, 2)).any()
+        assert (trainer.first["center"][row] == 0).all()
+    pull = trainer.control.gathered["pull"]
+    assert len(pull) == len(trainer) and pull.max() == 0
+    for table in (trainer.parameters, trainer.first, trainer.second):
+        assert all(len(value) == len(trainer) for value in table.values())
+
+
+def test_the_start_follows_the_points():
+    xyz = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 1.5]])
+    rgb = np.array([[255, 0, 128]] * 5, dtype=np.uint8)
+    start = training_step.initial_parameters(xyz, rgb, 2, 0, (1e-3, 0.9))
+    assert torch.equal(start["center"], torch.from_numpy(xyz.astype(np.float32)))
+    # The mean distance to the three nearest: 1 for the first, which the largest half-axis cuts to 0.9.
+    nearest = (0.5 + np.sqrt(2) * 2) / 3
+    assert torch.allclose(torch.exp(start["log_extent"][0]), torch.tensor(0.9))
+    assert nearest > 0.9 and start["log_extent"].max() <= np.log(0.9) + 1e-6
+    small = training_step.initial_parameters(xyz * 0.1, rgb, 2, 0, (1e-3, 0.9))
+    assert torch.allclose(torch.exp(small["log_extent"][0]), torch.tensor(0.1))
+    _, _, _, _, sh = training_step.activate(start, 2)
+    assert torch.allclose(
+        0.5 + training_step.SH_Y0 * sh[:, 0], torch.tensor([1.0, 0.0, 128 / 255]).repeat(5, 1), atol=1e-6
+    )
+    assert sh.shape == (5, 9, 3) and sh[:, 1:].abs().max() == 0
+    one = training_step.initial_parameters(xyz[:1], rgb[:1], 0, 0, (1e-3, 0.9))
+    assert torch.allclose(torch.exp(one["log_extent"]), torch.tensor(0.9)) and one["sh_rest"].shape == (
+        1,
+        0,
+        3,
+    )
+    twins = training_step.initial_parameters(np.zeros((5, 3)), rgb, 0, 0, (1e-3, 0.9))
+    assert torch.allclose(torch.exp(twins["log_extent"]), torch.tensor(1e-3))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_start_of_every_kind(kind):
+    xyz = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 1.5]])
+    start = training_step.initial_parameters(xyz, np.zeros((5, 3), np.uint8), 0, 0, (1e-3, 9.0), kind)
+    extent = np.exp(start["log_extent"].numpy())
+    assert extent.shape == (5, KINDS[kind].extents) and np.ptp(extent, axis=1).max() == 0
+    # The mean distance to the three nearest is 1.
+    assert extent[0, 0] == pytest.approx(0.5 if kind == "gaussian" else KINDS[kind].size)
+    assert start["raw_opacity"].abs().max() == 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_3d_filter_widens_what_is_rendered(kind):
+    columns, raw = KINDS[kind].extents, torch.tensor([-2.0, 0.0, 3.0])
+    parameters = {
+        "center": torch.zeros(3, 3), "rotation": torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1), "raw_opacity": raw,
+        "log_extent": torch.log(torch.full((3, columns), 0.2)), "sh_dc": torch.zeros(3, 1, 3), "sh_rest": torch.zeros(3, 0, 3),
+    }  # fmt: skip
+    length = torch.tensor([0.0, 0.1, 0.3])
+    _, _, extent, density, _ = training_step.activate(parameters, 0, kind, length)
+    wider = torch.sqrt(0.04 + length**2) if kind == "gaussian" else 0.2 + length / 2
+    assert torch.allclose(extent, wider[:, None].repeat(1, columns))
+    # Opacity refers to what is rendered.
+    saved = Primitives(*(x.numpy() for x in training_step.activate(parameters, 0, kind, length)), kind)
+    assert np.allclose(saved.alpha, torch.sigmoid(raw), rtol=1e-5)
+
+
+def test_the_length_of_the_3d_filter_is_that_of_the_nearest_view_that_sees(trainer):
+    cameras = [shot.camera for shot in trainer.shots]
+    rng = np.random.default_rng(0)
+    center = rng.normal(size=(300, 3)) * 4
+    found = training_step.filter_lengths(torch.from_numpy(center.astype(np.float32)), cameras).numpy()
+    focal = max(max(c.fx, c.fy) for c in cameras)
+    seen = 0
+    for point, length in zip(center, found, strict=True):
+        depths = []
+        for c in cameras:
+            x, y, z = c.rotation @ point + c.world_to_camera[:3, 3]
+            u, v = c.fx * x / z + c.cx, c.fy * y / z + c.cy
+            if z > 0.2 and -0.15 * c.width < u < 1.15 * c.width and -0.15 * c.height < v < 1.15 * c.height:
+                depths.append(z)
+        seen += bool(depths)
+        depth = min(depths or [np.linalg.norm(point - c.center) for c in cameras])
+        assert length == pytest.approx(np.sqrt(0.2) * depth / focal, rel=1e-5)
+    assert 50 < seen < 300
