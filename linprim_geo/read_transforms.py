@@ -275,11 +275,11 @@ def _lens(values: dict, where: str, image: Path) -> Lens:
     width, height = int(width), int(height)
     fx = _focal(values, "fl_x", "camera_angle_x", width, where)
     fy = _focal(values, "fl_y", "camera_angle_y", height, where)
-    if fx is None and fy is None:
+    fx, fy = fy if fx is None else fx, fx if fy is None else fy
+    if fx is None or fy is None:
         raise LinprimError(
             f"{where}: neither 'fl_x' nor 'camera_angle_x' is there, wanted a focal length or a view angle"
         )
-    fx, fy = fx or fy or 0.0, fy or fx or 0.0
     cx, cy = _number(values, "cx", where, width / 2), _number(values, "cy", where, height / 2)
     k1, k2, k3, k4, p1, p2 = (
         _number(values, key, where, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")

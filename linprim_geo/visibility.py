@@ -81,15 +81,17 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera], caster: RayCaster | Non
         _core.face_samples(
             *camera.pinhole(), depth, caster.vertices, caster.faces, SAMPLES, *behind, seen.view(np.uint8), before
         )
-        for number, sample in enumerate(SAMPLES):
-            rows = np.flatnonzero(before >> number & 1 & ~seen)
-            if len(rows) == 0:
-                continue
-            ray = np.einsum("k,fkd->fd", sample, caster.vertices[caster.faces[rows]]) - camera.center
+        face = np.flatnonzero(before)
+        row, sample = np.nonzero(before[face, None] >> np.arange(len(SAMPLES), dtype=np.uint8) & 1)
+        face = face[row]
+        # Single precision tells most of them apart; what it lets through is asked again.
+        for dtype, occluded in ((np.float32, caster.occluded_single), (np.float64, caster.occluded)):
+            corners = (caster.vertices - camera.center).astype(dtype)
+            ray = np.einsum("rk,rkd->rd", SAMPLES.astype(dtype)[sample], corners[caster.faces[face]])
             reach = 1.0 - gap / np.maximum(np.linalg.norm(ray, axis=1), 2.0 * gap)
-            # Single precision tells most of them apart; what it lets through is asked again.
-            left = np.flatnonzero(~caster.occluded_single(camera.center, ray, reach))
-            seen[rows[left[~caster.occluded(camera.center, ray[left], reach[left])]]] = True
+            left = ~occluded(camera.center, ray, reach)
+            face, sample = face[left], sample[left]
+        seen[face] = True
     return seen
 
 

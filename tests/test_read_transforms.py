@@ -259,6 +259,7 @@ def test_a_damaged_model_that_nobody_asked_for_stops_nobody(tmp_path):
         (lambda c: c.update(fl_x="wide"), "'fl_x' is 'wide', wanted a finite number"),
         (lambda c: c.update(fl_x=-3), "focal length that is not positive"),
         (lambda c: (c.update(fl_x=0), c.pop("fl_y")), "focal length that is not positive"),
+        (lambda c: c.update(fl_x=0), "focal length that is not positive"),
         (lambda c: (c.pop("fl_x"), c.pop("fl_y")), "neither 'fl_x' nor 'camera_angle_x'"),
         (lambda c: c.update(fl_x=None, fl_y=None, camera_angle_x=3.5), "between 0 and pi"),
         (lambda c: c.update(w=31), "the image is 32x24, wanted 31x24"),
