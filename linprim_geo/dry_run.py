@@ -17,7 +17,7 @@ from .pacing import calibrate, plan_run
 from .primitives import KINDS
 from .progress import Progress, duration, memory_gib
 from .scene import View
-from .shots import MEMORY_SHARE, StoredShot, load_shots, photo_bytes
+from .shots import StoredShot, load_shots, photo_bytes, photo_limit
 from .time_budget import SAVE_SECONDS, Budget, mean_population
 from .trainer import Trainer
 from .training_loop import QUICK_VIEWS, evaluate
@@ -63,7 +63,7 @@ def dry_run(
         effects, scene_options = effects or Choice("none"), scene_options or SceneOptions()
         planned, loaded, _ = begin_run(Path(scene), Path(run), scene_options, options, effects, progress)
         # What is there now is what would be there for all of it.
-        limit = MEMORY_SHARE * available_memory()
+        limit = photo_limit()
         shots, held_out = (load_shots(views, planned.similarity) for views in (loaded.train, loaded.test))
         terms = late_terms(planned, loaded, shots, progress)
 

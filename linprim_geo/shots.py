@@ -14,8 +14,9 @@ from .errors import LinprimError
 from .fuse import available_memory
 from .scene import View
 
-# Photographs are kept in memory up to this share of what is available; of the others the last few that were read.
-MEMORY_SHARE, RECENT = 0.25, 2
+# Photographs are kept in memory up to this share of what is available, and so many bytes: a step on large ones takes tens of times as
+# long as reading one. Of the others the last few that were read are kept.
+MEMORY_SHARE, MOST_KEPT, RECENT = 0.25, 3 * 2**29, 2
 
 
 @dataclass(frozen=True)
@@ -79,14 +80,19 @@ def photo_bytes(views: tuple[View, ...]) -> int:
     return sum(view.camera.width * view.camera.height * (4 if view.has_alpha else 3) for view in views)
 
 
+def photo_limit() -> int:
+    """Bytes of photographs that are kept in memory now."""
+    return min(int(MEMORY_SHARE * available_memory()), MOST_KEPT)
+
+
 def load_shots(views: tuple[View, ...], similarity: Similarity, limit: int | None = None) -> list[Shot]:
     """The views in their order. The first of them that take up to `limit` bytes are decoded into memory, the others when they are used:
     the results of training are the same.
 
     Args:
-        limit: bytes; without it MEMORY_SHARE of what is available.
+        limit: bytes; default `photo_limit()`.
     """
-    left = int(MEMORY_SHARE * available_memory()) if limit is None else limit
+    left = photo_limit() if limit is None else limit
     recent: dict[str, Shot] = {}
     shots: list[Shot | View] = []
     for view in views:

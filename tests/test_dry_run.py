@@ -66,6 +66,13 @@ def test_a_photograph_on_disk_is_the_one_in_memory_and_few_are_kept(tiny_scene):
         assert len(other._recent) <= shots.RECENT
 
 
+def test_photographs_take_a_share_of_the_memory_but_not_all_of_a_large_one(monkeypatch):
+    monkeypatch.setattr(shots, "available_memory", lambda: 2**30)
+    assert shots.photo_limit() == 2**28
+    monkeypatch.setattr(shots, "available_memory", lambda: 2**40)
+    assert shots.photo_limit() == shots.MOST_KEPT
+
+
 def test_a_step_reads_its_photograph_once(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(shots, "available_memory", lambda: 0)
     reads, before = [], []
