@@ -21,9 +21,12 @@ GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 CLEARANCE = 0.03
 NEAR = 0.08
 OPEN = 0.12
-"""Inside a room, in bounding-box diagonals: cameras keep CLEARANCE from every surface, at most a fifth of a
+"""Inside a room, in its sizes (`room_size`): cameras keep CLEARANCE from every surface, at most a fifth of a
 view is nearer than NEAR, and half of all directions see at least OPEN (or the camera would sit in a
 cupboard)."""
+
+LONGEST = 1.6
+"""A room whose diagonal is longer than this many times that across it, a street, has the size of a shorter one."""
 
 ROUNDS = 12
 """Batches of random positions that are tried: enough for rooms of which a tenth is free."""
@@ -141,7 +144,7 @@ def inside_out(
             pose = look_at(position, position + direction)
             x, y, z = pose[:3, :3] @ probe.T
             framed = (z > 0) & (np.abs(x) < tan_x * z) & (np.abs(y) < tan_y * z)
-            if framed.any() and np.mean(reach[number][framed] < NEAR * caster.diagonal) > 0.2:
+            if framed.any() and np.mean(reach[number][framed] < NEAR * room_size(caster)) > 0.2:
                 continue
             x, y, z = pose[:3, :3] @ offset.T
             candidates.append(pose)
@@ -189,19 +192,24 @@ def surface_samples(
     return np.einsum("nc,ncd->nd", weight, corners[face]), normals, face, bary
 
 
+def room_size(caster: RayCaster) -> float:
+    """The bounding box's diagonal, but at most LONGEST times that of its two smaller sides."""
+    return min(caster.diagonal, LONGEST * float(np.linalg.norm(np.sort(caster.upper - caster.lower)[:2])))
+
+
 def _free_positions(caster: RayCaster, wanted: int, rng: np.random.Generator):
     """Camera positions (P, 3), the distances (P, D) seen from them, and the probing directions (D, 3)."""
     probe = fibonacci_directions(192)
     extent = caster.upper - caster.lower
     low = caster.lower + extent * np.array([0.04, 0.04, 0.3])
     high = caster.upper - extent * np.array([0.04, 0.04, 0.2])
-    kept, reach = [], []
+    kept, reach, size = [], [], room_size(caster)
     for _ in range(ROUNDS):
         positions = rng.uniform(low, high, (wanted, 3))
         rays = np.tile(probe, (wanted, 1))
         distance = caster.cast(np.repeat(positions, len(probe), axis=0), rays)[0].reshape(wanted, -1)
-        good = distance.min(1) > CLEARANCE * caster.diagonal
-        good &= np.median(distance, axis=1) > OPEN * caster.diagonal
+        good = distance.min(1) > CLEARANCE * size
+        good &= np.median(distance, axis=1) > OPEN * size
         good &= np.isfinite(distance).mean(axis=1) > 0.9
         kept.append(positions[good])
         reach.append(distance[good])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from linprim_geo.blocks import Block
+from linprim_geo.campath import inside_out
 from linprim_geo.eval import block_quality, scaling
 from linprim_geo.eval.street import HEIGHT, HOUSE, WIDTH, street
 from linprim_geo.raycast import RayCaster
@@ -51,6 +52,14 @@ def test_predictions_grow_with_the_photographs_and_a_worker_does_not():
     step = 0.002 + 4e-7 * 1.2e6 + 3e-6 * (24_000 + 20_000)
     block = (1.0 + 0.05 * 200 + 2e-7 * 200 * 1.2e6 + 12_000 * step) / 3600
     assert 125 * block < some["core_hours"] < 1.1 * 125 * block
+
+
+def test_a_long_street_has_as_much_room_for_cameras_as_a_short_one():
+    mesh = street(8)
+    views, held_out = inside_out(RayCaster(mesh.vertices, mesh.faces), 12, 2, (0.5, 0.5), 0)
+    eyes = np.array([-pose[:3, :3].T @ pose[:3, 3] for pose in views])
+    assert len(held_out) == 2 and np.ptp(eyes[:, 0]) > 4 * HOUSE
+    assert ((eyes[:, 1] > 0) & (eyes[:, 1] < WIDTH) & (eyes[:, 2] > 0) & (eyes[:, 2] < HEIGHT)).all()
 
 
 def test_a_street_is_a_closed_surface_seen_from_inside():
