@@ -85,7 +85,7 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera], caster: RayCaster | Non
         row, sample = np.nonzero(before[face, None] >> np.arange(len(SAMPLES), dtype=np.uint8) & 1)
         face = face[row]
         # Single precision tells most of them apart; what it lets through is asked again.
-        for dtype, occluded in ((np.float32, caster.occluded_single), (np.float64, caster.occluded)):
+        for dtype, occluded in (("float32", caster.occluded_single), ("float64", caster.occluded)):
             corners = (caster.vertices - camera.center).astype(dtype)
             ray = np.einsum("rk,rkd->rd", SAMPLES.astype(dtype)[sample], corners[caster.faces[face]])
             reach = 1.0 - gap / np.maximum(np.linalg.norm(ray, axis=1), 2.0 * gap)
