@@ -27,11 +27,6 @@ def memory_gib(entry: str = "VmRSS") -> float:
                     return int(line.split()[1]) / 2**20
     except OSError:
         pass
-    return peak_memory_gib()
-
-
-def peak_memory_gib() -> float:
-    """Largest resident memory this process has had, in GiB; 0 where the system does not tell."""
     try:
         import resource
 

@@ -18,7 +18,7 @@ from linprim_geo import executor as executors
 from linprim_geo import worker
 from linprim_geo.errors import LinprimError
 from linprim_geo.executor import ATTEMPTS, Executor, Outcome, Processes, Task, open_executor
-from linprim_geo.progress import Progress
+from linprim_geo.progress import Progress, memory_gib
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="workers are killed by SIGKILL")
 
@@ -69,6 +69,15 @@ def run(tasks, shared, executor=None):
 
 def task(shared: Path, function: str, name: str = "t", **arguments) -> Task:
     return Task(name, f"executor_tasks:{function}", arguments, shared / name, remedy="fewer of everything")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a child's peak begins with its parent's")
+def test_the_peak_of_a_worker_is_its_own(tmp_path):
+    large = bytearray(b"1") * 2**30
+    assert memory_gib("VmHWM") > 1
+    [done] = run([task(tmp_path, "chain", start="a", steps=1)], tmp_path)
+    del large
+    assert 0 < done["task_peak_gib"] < 0.9
 
 
 def test_tasks_are_done_once_with_one_thread_each(executor, tmp_path):
