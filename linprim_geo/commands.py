@@ -139,7 +139,13 @@ def eval_mesh(parsed: argparse.Namespace) -> dict:
     from .eval.mesh import eval_mesh_files
 
     chosen = {k: v for k, v in vars(parsed).items() if k not in ("handler", "command", "json", "debug")}
-    return eval_mesh_files(chosen.pop("mesh"), chosen.pop("reference"), **chosen)
+    files = {"prediction": chosen.pop("mesh"), "reference": chosen.pop("reference")}
+    results = eval_mesh_files(*files.values(), **chosen)
+    for which, file in files.items():
+        broken = results["dropped"][which].get("not_finite", 0)
+        if broken:
+            print(f"linprim-geo: {file}: faces left out because a coordinate is not finite: {broken}", file=sys.stderr)
+    return results
 
 
 def report(parsed: argparse.Namespace) -> dict:

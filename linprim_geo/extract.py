@@ -10,6 +10,8 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
+
 from .auto_level import USUAL_LEVEL, choose_level
 from .errors import LinprimError
 from .executor import Executor, open_executor
@@ -77,7 +79,8 @@ def extract_mesh(
     bit; `cluster` and `workers` say where, see `executor.open_executor`.
 
     Returns: what stats.json holds: topology of both meshes, options, `processing` step by step, `texture`, what manifold3d says of
-    a watertight mesh (`manifold_status`), seconds and peak memory per stage, and the paths.
+    a watertight mesh (`manifold_status`), `predicted_error` (median and 90 % quantile) of the vertices that cameras see, seconds and peak
+    memory per stage, and the paths.
 
     Raises:
         LinprimError: nothing was trained, no ray crosses the level, the grid would not fit into memory, or the time is too little for
@@ -179,6 +182,7 @@ def _extract(
         "processing": done.processing,
         "texture": done.texture,
         "visible": topology(done.visible),
+        "predicted_error": error_summary(done.visible.quality),
         **stages.report(),
     }
     if budget:
@@ -186,5 +190,15 @@ def _extract(
         stages.note(f"{budget.elapsed():.1f} s of the {budget.seconds:.3g} s")
     write_json(folder / "stats.json", stats)
     progress.note(f"{target}: {topology_line(stats)}")
+    if predicted := stats["predicted_error"]:
+        stages.note(f"predicted error, seen part: median {predicted['median']:.3g}, 90 % below {predicted['q90']:.3g} ({opened.unit})")
     stages.note(stages.line())
     return stats
+
+
+def error_summary(quality: np.ndarray | None) -> dict[str, float] | None:
+    """Median and 90 % quantile of the (V,) predicted errors of vertices, None where none is known."""
+    known = np.zeros(0) if quality is None else quality[np.isfinite(quality)]
+    if not len(known):
+        return None
+    return {"median": float(np.median(known)), "q90": float(np.quantile(known, 0.9))}

@@ -519,3 +519,15 @@ def test_a_link_to_itself_is_refused_in_one_sentence(command, tmp_path, monkeypa
     said = capsys.readouterr().err
     assert said.startswith("linprim-geo: error: loop") and said.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["loop"]
+
+
+def test_faces_that_are_not_finite_are_named_and_the_rest_is_scored(tmp_path, capsys):
+    square = "\n0 0 0\n1 0 0\n1 1 0\n{} 1 0\n3 0 1 2\n3 0 2 3\n"
+    head = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "element face 2\nproperty list uchar int vertex_indices\nend_header"
+    (tmp_path / "whole.ply").write_text(head + square.format(0))
+    (tmp_path / "broken.ply").write_text(head + square.format("nan"))
+    assert cli.main(["eval-mesh", str(tmp_path / "broken.ply"), str(tmp_path / "whole.ply"), "--samples", "100", "--json"]) == 0
+    shown = capsys.readouterr()
+    assert json.loads(shown.out)["dropped"]["prediction"]["not_finite"] == 1
+    assert shown.err == f"linprim-geo: {tmp_path / 'broken.ply'}: faces left out because a coordinate is not finite: 1\n"
