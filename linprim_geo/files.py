@@ -105,9 +105,12 @@ def locked(folder: Path, what: str, file: str = "", wait: Callable[[], object] |
     Raises:
         LinprimError: another process holds it, or the folder cannot be written.
     """
+    for above in (folder, *folder.parents):
+        if above.exists() and not above.is_dir():
+            raise LinprimError(f"{above}: is a file, wanted a folder")
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     path = folder / (f".{file}{_LOCK}" if file else _LOCK)
-    with writing(path):
+    with writing(folder / file):
         held, told = None, False
         while held is None:
             folder.mkdir(parents=True, exist_ok=True)

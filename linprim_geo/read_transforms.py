@@ -47,7 +47,14 @@ _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def is_there(root: Path) -> bool:
-    """Whether the folder has transforms that `read_transforms` looks for."""
+    """Whether the folder has transforms that `read_transforms` looks for.
+
+    Raises:
+        LinprimError: one of them is a link to nothing, which is not what a folder of plain photographs has.
+    """
+    for name in ("transforms_train.json", "transforms.json"):
+        if (root / name).is_symlink() and not (root / name).exists():
+            raise LinprimError(f"{root / name}: is a link to a file that is not there")
     return (root / "transforms_train.json").is_file() or (root / "transforms.json").is_file()
 
 

@@ -333,6 +333,8 @@ def _read_json(file: Path, run: Path) -> dict:
     try:
         value = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
+        if not run.exists():
+            raise LinprimError(f"{run}: no such folder, wanted that of a run") from None
         raise LinprimError(
             f"{run}: {file.name} is missing, so this is not the folder of a run that has saved something"
         ) from None

@@ -12,7 +12,7 @@ import sys
 import pytest
 
 from linprim_geo.errors import LinprimError
-from linprim_geo.files import atomic_write, remove_torn, write_json
+from linprim_geo.files import atomic_write, locked, remove_torn, write_json
 
 
 @pytest.fixture
@@ -140,6 +140,13 @@ def test_what_a_kill_left_is_removed_and_nothing_else(tmp_path):
 def test_a_folder_that_is_a_file_is_one_sentence(old):
     with pytest.raises(LinprimError, match="mesh.ply"), atomic_write(old / "inside.json") as temporary:
         temporary.write_text("new")
+    assert_untouched(old)
+
+
+def test_what_is_written_below_a_file_names_the_file(old):
+    for name in ("", "mesh.ply"):
+        with pytest.raises(LinprimError, match=r"mesh\.ply: is a file, wanted a folder"), locked(old / "runs" / "one", "written", name):
+            pass
     assert_untouched(old)
 
 

@@ -13,7 +13,7 @@ from PIL import Image
 
 from linprim_geo.errors import LinprimError
 from linprim_geo.ply_points import read_points_ply
-from linprim_geo.scene import load_scene
+from linprim_geo.scene import has_poses, load_scene
 
 
 def refusal(path, **options) -> str:
@@ -304,3 +304,10 @@ def test_training_frames_must_be_left(tmp_path):
             json.dumps(transforms([cameras[i] for i in indices], paths))
         )
     assert "1 of 3 images are for training" in refusal(tmp_path)
+
+
+def test_a_link_to_nothing_is_no_folder_of_plain_photographs(tmp_path):
+    (tmp_path / "transforms.json").symlink_to(tmp_path / "gone.json")
+    for read in (load_scene, has_poses):
+        with pytest.raises(LinprimError, match="transforms.json: is a link to a file that is not there"):
+            read(tmp_path)

@@ -157,6 +157,6 @@ def test_a_scene_that_was_moved_away_is_named(run_copy, tmp_path):
 
 
 def test_a_folder_that_is_no_run_is_one_sentence(tmp_path):
-    for path in (tmp_path, tmp_path / "missing"):
-        with pytest.raises(LinprimError, match="config.json is missing"):
+    for path, sentence in ((tmp_path, "config.json is missing"), (tmp_path / "missing", "missing: no such folder")):
+        with pytest.raises(LinprimError, match=sentence):
             Run.open(path)
