@@ -300,7 +300,7 @@ def test_what_cannot_be_swept_is_one_sentence(swept, tiny_scene, tiny_run, tmp_p
         tradeoff(tiny_scene, tmp_path / "x", max_primitives=0, quiet=True)
     with pytest.raises(LinprimError, match="no such file, wanted a reference mesh"):
         tradeoff(tiny_scene, tmp_path / "x", reference=tmp_path / "none.ply", quiet=True)
-    with pytest.raises(LinprimError, match="not the folder of a run"):
+    with pytest.raises(LinprimError, match="none: no such folder, wanted that of a run"):
         tradeoff(tiny_scene, tmp_path / "y", knobs=("rays",), run=tmp_path / "none", quick=True, quiet=True)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").write_text("mine")
