@@ -22,6 +22,7 @@
 #include "parallel.h"
 #include "photo_sweep.h"
 #include "point_colors.h"
+#include "points_within.h"
 #include "segment_depth.h"
 
 namespace nb = nanobind;
@@ -52,6 +53,12 @@ auto checked(const Array& array, std::initializer_list<int64_t> shape, const cha
     throw std::invalid_argument(std::string(name) + " has shape (" + found + "), wanted (" + wanted + ")");
   }
   return array.data();
+}
+
+// A numpy array that has the values.
+nb::ndarray<nb::numpy, int64_t, nb::ndim<1>> owned(std::vector<int64_t>&& values) {
+  auto* kept = new std::vector<int64_t>(std::move(values));
+  return {kept->data(), {kept->size()}, nb::capsule(kept, [](void* p) noexcept { delete static_cast<std::vector<int64_t>*>(p); })};
 }
 
 linprim::PhotoView photo_view(const Pose& pose, const std::array<double, 4>& lens, int width, int height, const float* image, int channels,
@@ -299,6 +306,25 @@ NB_MODULE(_core, m) {
     uint8_t* out = checked(found, {count}, "found");
     nb::gil_scoped_release release;
     linprim::face_samples(view, faces, weights, int(samples), behind, slack, out);
+  });
+  // (N,) how many points each body has, and the rows of them all, body by body.
+  m.def("points_within", [](In<double> center, In<double> normal, In<double> offset, In<double> point, double enlarged, int64_t least) {
+    if (normal.ndim() != 3) throw std::invalid_argument("normal has to have shape (N, F, 3)");
+    const int64_t count = int64_t(normal.shape(0)), faces = int64_t(normal.shape(1)), points = int64_t(point.shape(0));
+    const linprim::ConvexBodies bodies{count, int(faces), checked(center, {count, 3}, "center"), checked(normal, {count, faces, 3}, "normal"),
+                                       checked(offset, {count, faces}, "offset")};
+    const double* at = checked(point, {points, 3}, "point");
+    std::vector<std::vector<int64_t>> found;
+    {
+      nb::gil_scoped_release release;
+      found = linprim::points_within(bodies, at, points, enlarged, least);
+    }
+    size_t total = 0;
+    for (const auto& rows : found) total += rows.size();
+    std::vector<int64_t> sizes, all;
+    sizes.reserve(found.size()), all.reserve(total);
+    for (const auto& rows : found) sizes.push_back(int64_t(rows.size())), all.insert(all.end(), rows.begin(), rows.end());
+    return std::tuple(owned(std::move(sizes)), owned(std::move(all)));
   });
   m.def("add_votes", [](Pose project, int width, int height, In<float> surfels, std::array<float, 8> rules, In<int64_t> rows,
                         In<double> corner, double voxel, int resolution, Out<float> total, Out<float> weight, Out<float> free) {

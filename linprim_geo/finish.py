@@ -1,4 +1,4 @@
-"""What follows the extraction of any surface: refinement, holes and simplification, quality, what cameras see, texture, files."""
+"""What follows the extraction of any surface: refinement, holes and simplification, quality, colours, what cameras see, texture, files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .raycast import RayCaster
 from .run import Run
 from .stages import Stages
 from .texture import make_texture, save_textured
-from .visibility import visible_faces
+from .visibility import color_vertices, visible_faces
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,13 @@ def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, 
     mesh, processing = process_mesh(mesh, options, stages.note)
     if processing:
         stages.lap("process")
-    caster = RayCaster(mesh.vertices, mesh.faces)
+    if options.refine or processing:
+        caster = RayCaster(mesh.vertices, mesh.faces)
     agreement = best_agreement(mesh, cameras, (view.load() for view in views), gains, caster)
     mesh = replace(mesh, quality=predicted_error(mesh, agreement))
     stages.lap("quality")
+    mesh = replace(mesh, colors=color_vertices(mesh, cameras, (view.load().rgb for view in views), caster))
+    stages.lap("colours")
     seen = visible_faces(mesh, cameras, caster)
     visible = select_faces(mesh, seen)
     stages.lap("visibility")

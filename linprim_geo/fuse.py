@@ -30,7 +30,6 @@ def fuse_tsdf(
     truncation_voxels: float = 3.0,
     bounds: np.ndarray | None = None,
     memory_limit: int | None = None,
-    colors: bool = True,
     block_resolution: int = 8,
     min_component: float = 1e-3,
     behind_voxels: float = BEHIND_VOXELS,
@@ -38,9 +37,9 @@ def fuse_tsdf(
     log: Callable[[str], None] | None = None,
     fuse: Callable[[Lattice, Iterable[DepthFrame]], Mesh] | None = None,
 ) -> Mesh:
-    """Fuses depth maps into a triangle mesh with normals and colours.
+    """Fuses depth maps into a triangle mesh with normals.
 
-    `frames` is iterated several times (blocks, field, colours), so it must be re-iterable; a
+    `frames` is iterated several times (blocks, field), so it must be re-iterable; a
     sequence that renders on demand keeps only one frame in memory. Blocks around every depth sample are
     allocated, then every frame votes in all blocks inside its frustum, so background and far depths carve
     what other views put there. The mesh is oriented with its front towards the cameras. The same input gives
@@ -52,7 +51,6 @@ def fuse_tsdf(
             above 4 thin parts swell.
         bounds: (2, 3) box; samples and faces outside are dropped.
         memory_limit: bytes the field may take; default 60 % of what is available.
-        colors: colour the vertices from the frames that have `color`.
         block_resolution: voxels along the edge of a block.
         min_component: pieces with less than this share of the largest piece's area are dropped; 0 keeps all.
         behind_voxels: see `tsdf.BEHIND_VOXELS`; 1.5 makes a sheet without thickness a closed shell, at the
@@ -77,7 +75,7 @@ def fuse_tsdf(
     limit = memory_limit or int(0.6 * available_memory())
     say = log or (lambda line: None)
 
-    blocks, origin, largest, colored = _find_blocks(
+    blocks, origin, largest = _find_blocks(
         frames, voxel_size, truncation_voxels, bounds, block_resolution, limit if fuse is None else np.inf
     )
     need = estimate_memory(len(blocks), block_resolution, largest)
@@ -94,13 +92,7 @@ def fuse_tsdf(
             "depths disagree by more than the truncation, or all of it lies outside the bounds; "
             "try a larger voxel size"
         )
-    mesh = replace(mesh, normals=vertex_normals(mesh))
-    if colors and colored:
-        from .visibility import color_vertices
-
-        images = (frame.color for frame in frames if frame.color is not None)
-        mesh = replace(mesh, colors=color_vertices(mesh, colored, images))
-    return mesh
+    return replace(mesh, normals=vertex_normals(mesh))
 
 
 @dataclass(frozen=True)
@@ -226,14 +218,11 @@ def _unpack(key: np.ndarray) -> np.ndarray:
 def _find_blocks(frames, voxel, truncation, bounds, resolution, limit):
     """Blocks within a truncation of any depth sample; refuses what does not fit in memory.
 
-    Returns sorted (B, 3) indices, the world point that block (0, 0, 0) starts at, the pixels of the largest
-    frame, and the cameras of the frames that have colour.
+    Returns sorted (B, 3) indices, the world point that block (0, 0, 0) starts at, and the pixels of the largest frame.
     """
-    keys, origin, largest, done, colored = np.zeros(0, dtype=np.int64), None, 0, 0, []
+    keys, origin, largest, done = np.zeros(0, dtype=np.int64), None, 0, 0
     for frame in frames:
         done += 1
-        if frame.color is not None:
-            colored.append(frame.camera)
         points, depth = frame.surface()
         if bounds is not None:
             inside = ((points >= bounds[0]) & (points <= bounds[1])).all(1)
@@ -255,7 +244,7 @@ def _find_blocks(frames, voxel, truncation, bounds, resolution, limit):
     blocks = _unpack(keys)
     # Coordinates are float32 from here on, so they are counted from the middle.
     middle = (blocks.min(0) + blocks.max(0)) // 2
-    return blocks - middle, origin + middle * (resolution * voxel), largest, colored
+    return blocks - middle, origin + middle * (resolution * voxel), largest
 
 
 def _blocks_of(points, voxel, truncation, footprint, resolution):

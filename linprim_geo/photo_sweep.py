@@ -200,8 +200,7 @@ def _photographed(
 
     caster = caster or RayCaster(mesh.vertices, mesh.faces)
     for camera, photo in zip(cameras, photos, strict=True):
-        depth = caster.cast_single(camera.center, camera.world_rays().reshape(-1, 3))[0].reshape(camera.height, camera.width)
-        depth = np.minimum(depth, FAR * caster.diagonal).astype(np.float32)
+        depth = np.minimum(caster.first_hits(camera)[0], FAR * caster.diagonal).astype(np.float32)
         jump = maximum_filter(depth, 3, mode="nearest") - minimum_filter(depth, 3, mode="nearest")
         yield camera, _brightness(photo), depth, jump
 

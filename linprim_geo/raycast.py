@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,8 +30,22 @@ NEARER = 2e-5
 """A surface counts as nearer only by more than this (half-diagonals): ten jitters, so that meeting the same
 surface with a shifted ray at up to 84 degrees is not taken for another surface."""
 
+KEPT_BYTES = 1 << 29
+"""First hits of cameras are kept up to this, so that what asks for them one after the other has them once."""
+
 SPHERE = 1.0 + 1e-5
 """Radius of the sphere that surely holds the scaled mesh (half-diagonal 1, rounded to float32)."""
+
+
+class Triangles(NamedTuple):
+    """Faces in the scaled frame: (F, 3) first corners, edges from there, and their cross products; -1 if they enclose a negative volume,
+    else 1."""
+
+    origin: np.ndarray
+    edge1: np.ndarray
+    edge2: np.ndarray
+    cross: np.ndarray
+    outward: float
 
 
 class RayCaster:
@@ -74,27 +90,30 @@ class RayCaster:
             raise LinprimError(f"mesh: all {len(faces)} faces lie in one point, a surface is wanted")
         self._scale = 1.0 / half
 
-        corners = (vertices[faces] - self._center) * self._scale
-        self._origin = np.ascontiguousarray(corners[:, 0])
-        self._edge1 = corners[:, 1] - corners[:, 0]
-        self._edge2 = corners[:, 2] - corners[:, 0]
-        self._cross = np.cross(self._edge1, self._edge2)
-        volume = np.einsum("ij,ij->", corners[:, 0], self._cross)
-        self._outward = -1.0 if volume < 0 else 1.0
-
         self._scene = EmbreeScene()
         scaled = ((vertices - self._center) * self._scale).astype(np.float32)
         TriangleMesh(self._scene, scaled, faces.astype(np.int32))
+        self._kept: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
 
     @property
     def diagonal(self) -> float:
         """Length of the diagonal of the bounding box of the faces."""
         return 2.0 / self._scale
 
+    @cached_property
+    def _triangles(self) -> Triangles:
+        """Made when something exact is asked for first: single precision has Embree's own."""
+        corners = (self.vertices[self.faces] - self._center) * self._scale
+        edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        cross = np.cross(edge1, edge2)
+        volume = np.einsum("ij,ij->", corners[:, 0], cross)
+        return Triangles(np.ascontiguousarray(corners[:, 0]), edge1, edge2, cross, -1.0 if volume < 0 else 1.0)
+
     def face_normals(self) -> np.ndarray:
         """(F, 3) unit geometric normals by the order of the vertices; zero for degenerate faces."""
-        length = np.linalg.norm(self._cross, axis=1, keepdims=True)
-        return self._cross / np.where(length > 0, length, 1.0)
+        cross = self._triangles.cross
+        length = np.linalg.norm(cross, axis=1, keepdims=True)
+        return cross / np.where(length > 0, length, 1.0)
 
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """First hit of each ray.
@@ -113,6 +132,7 @@ class RayCaster:
         distance = np.full(len(directions), np.inf)
         face = np.full(len(directions), -1, dtype=np.int64)
         bary = np.zeros((len(directions), 2))
+        self._triangles  # noqa: B018 (before several threads make them)
 
         def work(part: slice) -> int:
             distance[part], face[part], bary[part], slipped = self._cast(origins[part], directions[part])
@@ -157,7 +177,7 @@ class RayCaster:
         depth, face, _ = self.cast(camera.center, rays)
         normal = np.zeros((len(rays), 3))
         hit = face >= 0
-        cross = self._cross[face[hit]]
+        cross = self._triangles.cross[face[hit]]
         cross /= np.linalg.norm(cross, axis=1, keepdims=True)
         towards = np.where(np.einsum("ij,ij->i", cross, rays[hit]) > 0, -1.0, 1.0)
         normal[hit] = cross * towards[:, None]
@@ -185,6 +205,24 @@ class RayCaster:
 
         self._run(work, count)
         return distance, face, bary
+
+    def first_hits(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """What a camera sees at its pixel centres, by `cast_single`: to tell what is hidden, not for measuring.
+
+        Returns read-only depth (H, W) float32 along the optical axis, inf where nothing is hit, and face (H, W) int32, there -1.
+        Memory: 8 bytes per pixel are kept, at most KEPT_BYTES over all cameras.
+        """
+        lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        key = (*lens, camera.world_to_camera.tobytes())
+        if key in self._kept:
+            return self._kept[key]
+        depth, face, _ = self.cast_single(camera.center, camera.world_rays().reshape(-1, 3))
+        hits = (depth.reshape(camera.height, camera.width), face.reshape(camera.height, camera.width))
+        for array in hits:
+            array.flags.writeable = False
+        if sum(array.nbytes for kept in (*self._kept.values(), hits) for array in kept) <= KEPT_BYTES:
+            self._kept[key] = hits
+        return hits
 
     def occluded_single(self, origins: np.ndarray, directions: np.ndarray, tmax: np.ndarray) -> np.ndarray:
         """`occluded` in single precision, as `cast_single`: quick to tell most of what is hidden; the rest wants `occluded`."""
@@ -244,7 +282,7 @@ class RayCaster:
         face_hit, near = self._first(start + advance[:, None] * unit, unit)
         t, uv, facing = self._solve(start, unit, face_hit, near + advance)
 
-        behind = np.where(inside[rows], 1.0, self._outward) * facing > 0.0
+        behind = np.where(inside[rows], 1.0, self._triangles.outward) * facing > 0.0
         suspicious = np.flatnonzero((face_hit < 0) | behind)
         slipped = 0
         if len(suspicious):
@@ -278,13 +316,14 @@ class RayCaster:
         """
         miss = face < 0
         index = np.where(miss, 0, face)
-        normal = self._cross[index]
-        to_origin = self._origin[index] - start
+        triangles = self._triangles
+        normal = triangles.cross[index]
+        to_origin = triangles.origin[index] - start
         facing = np.einsum("ij,ij->i", normal, unit)
         with np.errstate(invalid="ignore", divide="ignore"):
             across = np.cross(to_origin, unit)
-            u = np.einsum("ij,ij->i", self._edge2[index], across) / facing
-            v = -np.einsum("ij,ij->i", self._edge1[index], across) / facing
+            u = np.einsum("ij,ij->i", triangles.edge2[index], across) / facing
+            v = -np.einsum("ij,ij->i", triangles.edge1[index], across) / facing
             t = np.einsum("ij,ij->i", normal, to_origin) / facing
         outside = ~((u >= 0.0) & (v >= 0.0) & (u + v <= 1.0)) & ~miss
         if outside.any():
@@ -294,8 +333,8 @@ class RayCaster:
             u[rows], v[rows] = u_in / total, v_in / total
             nearest = (
                 to_origin[rows]
-                + u[rows, None] * self._edge1[index[rows]]
-                + v[rows, None] * self._edge2[index[rows]]
+                + u[rows, None] * triangles.edge1[index[rows]]
+                + v[rows, None] * triangles.edge2[index[rows]]
             )
             t[rows] = np.einsum("ij,ij->i", nearest, unit[rows])
         np.maximum(t, 0.0, out=t)

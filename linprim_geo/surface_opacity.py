@@ -21,7 +21,7 @@ from .options import ExtractOptions
 from .primitives import KINDS, Primitives
 from .run import Run
 from .stages import Stages
-from .visibility import color_vertices, visible_faces
+from .visibility import visible_faces
 
 NEAR = 0.01
 """Depth at which light begins to be absorbed, training frame: where the renderer's rays begin."""
@@ -82,7 +82,7 @@ VALUES_AT_ONCE = 1 << 22
 
 
 def opacity_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[Mesh, dict]:
-    """Returns the closed mesh, with colours, and `level`, `spacing` and the numbers of points for the statistics.
+    """Returns the closed mesh and `level`, `spacing` and the numbers of points for the statistics.
 
     The surface is where the transmittance towards the cameras falls to `options.level`; `options.voxel_size`, if any, is the distance
     between its sample points, and `options.smallest_part` the share of the largest component's area that others need. Components that no
@@ -137,9 +137,6 @@ def opacity_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[
         normals=vertex_normals(mesh),
     )
     stages.lap("typical cameras")
-    images = (view.load().rgb for view in views)
-    mesh = replace(mesh, colors=color_vertices(mesh, [view.camera for view in views], images))
-    stages.lap("colour")
     about = {
         "level": options.level,
         "spacing": spacing / run.similarity.scale,

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from itertools import chain
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from .camera import Camera
 from .errors import LinprimError
 from .mesh import Mesh, face_areas, select_faces, vertex_normals
 from .options import ExtractOptions
+from .plane_fit import Planes, fit_planes, level_points
 from .polyhedra_union import convex_piece, kept_shells, own_identity, shells, unite
 from .primitives import ARRAYS, KINDS, Primitives
 from .run import Run
@@ -27,34 +27,6 @@ outermost of all overlapping pieces, but what is cut too deep of a thin part is 
 POINTS_PER_PRIMITIVE, LEAST_POINTS_IN_ALL = 40, 20_000
 """About so many points where light ends are wanted per primitive; pixels are left out in a regular pattern to get there."""
 
-NEIGHBOURHOOD = 1.5
-"""Planes are fitted to the points within a primitive enlarged by this, so that those of neighbours agree."""
-
-SEARCHED_AT_A_TIME, SAME_REACH = 256, 1.2
-"""Primitives whose points are looked for at a time, which bounds the memory of it, and the largest ratio of their reaches."""
-
-PLANES = 8
-"""Most planes that cut one primitive: so many faces has an octahedron that is seen from all around."""
-
-SAME_PLANE = np.cos(np.radians(35.0))
-"""Points whose normals are closer than this to a direction belong to one plane: less than half of a right angle, which parts sides
-of a body, and more than the unevenness of a side."""
-
-DIRECTION_CELLS = 3
-"""Cells per unit of a coordinate of a normal, 19 degrees wide, the fullest of which a direction is looked for in."""
-
-SAME_DIRECTION = np.cos(np.radians(20.0))
-"""Window of the mean shift that finds a direction: less than half of what parts two planes."""
-
-LEAST_POINTS, LEAST_SHARE = 6, 0.06
-"""A plane needs so many points, and this share of those around its primitive."""
-
-ROUNDS = 4
-"""Reweighted rounds of a fit; the normal moves by less than its own uncertainty after three."""
-
-LEAST_SHARE_OF_PIXEL = 0.1
-"""Share of a pixel's footprint that the surface may move by to lose slivers: what the robust mean of many pixels still resolves."""
-
 CORE_CELLS = 200
 """Most cells along the longest side of the grid that tells what is inside; they have to be smaller than primitives are thick."""
 
@@ -66,27 +38,8 @@ NO_PRIMITIVE = -1
 
 
 def polyhedra_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[Mesh, dict]:
-    """Returns the closed surface, with normals, colours and the primitive of every face, and counts for the statistics.
-
-    See `traced_surface` for the steps.
-
-    Raises:
-        LinprimError: the primitives are Gaussians, none is opaque enough, or no ray crosses the level.
-    """
-    mesh, owner, about = traced_surface(run, options, stages)
-    from .visibility import color_vertices
-
-    views = run.scene().train
-    mesh = replace(mesh, normals=vertex_normals(mesh), primitive=owner)
-    mesh = replace(
-        mesh, colors=color_vertices(mesh, [view.camera for view in views], (view.load().rgb for view in views))
-    )
-    stages.lap("colours")
-    return mesh, about
-
-
-def traced_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[Mesh, np.ndarray, dict]:
-    """The closed surface, the row in `run.primitives()` of each face (F,), NO_PRIMITIVE for the core, and counts.
+    """The closed surface, with normals and, as `primitive`, the row in `run.primitives()` of each face (NO_PRIMITIVE for the core), and
+    counts for the statistics.
 
     1. Primitives that dominate a pixel of a training view are candidates.
     2. Where the transmittance of the views' rays falls to 1 - CUT_DEPTH (1 - `options.level`), overlaps counted exactly, light ends:
@@ -97,7 +50,8 @@ def traced_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[M
 
     Neither the order of the primitives nor the number of threads matters, to the last bit.
 
-    Raises: as `polyhedra_surface`.
+    Raises:
+        LinprimError: the primitives are Gaussians, none is opaque enough, or no ray crosses the level.
     """
     primitives = run.primitives()
     if not KINDS[primitives.kind].solid:
@@ -144,7 +98,8 @@ def traced_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[M
     dropped -= shells(mesh)[0]
     stages.lap("select")
 
-    faces_primitive = np.where(owner == NO_PRIMITIVE, NO_PRIMITIVE, order[candidates[owner]])
+    primitive = np.where(owner == NO_PRIMITIVE, NO_PRIMITIVE, order[candidates[owner]])
+    mesh = replace(mesh, normals=vertex_normals(mesh), primitive=primitive)
     about = {
         "level": options.level,
         "cut_level": level,
@@ -156,7 +111,7 @@ def traced_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[M
         "core_area_share": float(face_areas(mesh)[owner == NO_PRIMITIVE].sum() / face_areas(mesh).sum()),
         "shells_dropped": dropped,
     }
-    return mesh, faces_primitive, about
+    return mesh, about
 
 
 def canonical_order(primitives: Primitives) -> np.ndarray:
@@ -190,210 +145,6 @@ def _render(run: Run, primitives: Primitives, cameras: list[Camera], level: floa
         seen_depth = np.where(opacity.numpy() < SEEN_THROUGH, np.float32(0), depth.numpy() / run.similarity.scale)
         depths.append(seen_depth.astype(np.float32))
     return weight, depths
-
-
-@dataclass(frozen=True)
-class LevelPoints:
-    """(P, 3) points where light ends, their (P, 3) unit normals towards the cameras, and the median footprint of a pixel there."""
-
-    position: np.ndarray
-    normal: np.ndarray
-    footprint: float
-
-    @property
-    def noise(self) -> float:
-        """Length below which the views tell nothing."""
-        return LEAST_SHARE_OF_PIXEL * self.footprint
-
-
-def level_points(depths: list[np.ndarray], cameras: list[Camera], wanted: int) -> LevelPoints:
-    """Points of about `wanted` pixels of all depth maps, in a regular pattern that moves from view to view.
-
-    Normals are those of the surface through a pixel's four neighbours; pixels at the border, and beside one without depth, have none.
-    """
-    stride = max(1, round(np.sqrt(sum(int((depth > 0).sum()) for depth in depths) / max(wanted, 1))))
-    positions, normals, footprints = [], [], []
-    for number, (depth, camera) in enumerate(zip(depths, cameras, strict=True)):
-        there = depth > 0
-        if min(depth.shape) < 3 or not there.any():
-            continue
-        footprints.append(np.median(depth[there]) / np.sqrt(camera.fx * camera.fy))
-        local = camera.ray_grid() * depth[..., None].astype(np.float64)
-        across = np.cross(local[1:-1, 2:] - local[1:-1, :-2], local[2:, 1:-1] - local[:-2, 1:-1])
-        inner = there[1:-1, 1:-1] & there[1:-1, 2:] & there[1:-1, :-2] & there[2:, 1:-1] & there[:-2, 1:-1]
-        pattern = np.zeros_like(inner)
-        pattern[number % stride :: stride, number // stride % stride :: stride] = True
-        point, normal = local[1:-1, 1:-1][inner & pattern], across[inner & pattern]
-        length = np.linalg.norm(normal, axis=1)
-        point, normal = point[length > 0], normal[length > 0] / length[length > 0, None]
-        normal *= np.where(np.einsum("ij,ij->i", normal, point) > 0, -1.0, 1.0)[:, None]
-        positions.append((point - camera.world_to_camera[:3, 3]) @ camera.rotation)
-        normals.append(normal @ camera.rotation)
-    if not positions:
-        return LevelPoints(np.zeros((0, 3)), np.zeros((0, 3)), 0.0)
-    return LevelPoints(np.concatenate(positions), np.concatenate(normals), float(np.median(footprints)))
-
-
-@dataclass(frozen=True)
-class Planes:
-    """Fitted planes { x : normal x = offset }, the body on the negative side; `row` of the primitive that each belongs to,
-    and `cuts` (K, PLANES) bool: which planes of its primitive bound the body where this one does."""
-
-    row: np.ndarray
-    slot: np.ndarray
-    normal: np.ndarray
-    offset: np.ndarray
-    cuts: np.ndarray
-
-
-def fit_planes(primitives: Primitives, points: LevelPoints) -> tuple[Planes, np.ndarray]:
-    """Planes through the points around each primitive, at most PLANES each, and (N,) bool: whether it holds LEAST_POINTS of them;
-    one that does not gets no plane.
-
-    Points are parted by their normals: the strongest direction first, by mean shift, then the next among what is left. Each part gets a
-    plane by least squares, reweighted by a Cauchy weight of its own spread. Two planes of a primitive bound the body together if
-    the points of the one lie behind the other (a convex edge), else each for itself (a concave one).
-    """
-    owner, point = _points_within(primitives, points.position)
-    met = np.bincount(owner, minlength=len(primitives)) > 0
-    count, position, normal = len(primitives), points.position[point], points.normal[point]
-    slot = np.full(len(owner), -1)
-    total = np.bincount(owner, minlength=count)
-    for k in range(PLANES):
-        left = np.flatnonzero(slot < 0)
-        direction = _strongest_direction(owner[left], normal[left], count)
-        near = left[np.einsum("ij,ij->i", normal[left], direction[owner[left]]) > SAME_PLANE]
-        size = np.bincount(owner[near], minlength=count)
-        enough = (size >= LEAST_POINTS) & (size >= LEAST_SHARE * total)
-        slot[near[enough[owner[near]]]] = k
-    used = np.flatnonzero(slot >= 0)
-    key = owner[used] * PLANES + slot[used]
-    order = used[np.argsort(key, kind="stable")]
-    keys, group = np.unique(owner[order] * PLANES + slot[order], return_inverse=True)
-    across, offset, spread = _robust_planes(position[order], normal[order], group, len(keys))
-    row, number = keys // PLANES, keys % PLANES
-    table = np.full((count, PLANES), -1)
-    table[row, number] = np.arange(len(keys))
-    cuts = np.zeros((len(keys), PLANES), dtype=bool)
-    for k in range(PLANES):
-        other = table[row, k]
-        signed = np.einsum("ij,ij->i", position[order], across[other[group]]) - offset[other[group]]
-        cuts[:, k] = (other >= 0) & (_medians(signed, group, len(keys)) < 0)
-    cuts[np.arange(len(keys)), number] = True
-    # Points that scatter by more than a pixel make no plane.
-    flat = np.append(spread <= points.footprint, False)
-    cuts &= flat[table[row]]
-    return Planes(row, number, across, offset, cuts), met
-
-
-def _points_within(primitives: Primitives, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (row, point) of the points within primitives that are enlarged about their centres by NEIGHBOURHOOD, of those
-    primitives that have LEAST_POINTS within themselves."""
-    from scipy.spatial import cKDTree
-
-    tree = cKDTree(points)
-    normals, offsets = _face_planes(primitives)
-    center = primitives.center.astype(np.float64)
-    reach = NEIGHBOURHOOD * primitives.extent.astype(np.float64).max(1)
-    rows, found = [], []
-    # Of about the same reach at a time: one search knows but one.
-    order = np.argsort(reach, kind="stable")
-    size = np.floor(np.log(reach[order]) / np.log(SAME_REACH))
-    start = np.flatnonzero(np.diff(size, prepend=-np.inf))
-    some_of_each = (np.split(part, range(SEARCHED_AT_A_TIME, len(part), SEARCHED_AT_A_TIME)) for part in np.split(order, start[1:]))
-    for some in chain.from_iterable(some_of_each):
-        near = cKDTree(center[some]).sparse_distance_matrix(tree, reach[some].max(), output_type="ndarray")
-        row, point = some[near["i"]], near["j"]
-        level = np.full(len(row), -np.inf)
-        for face in range(normals.shape[1]):
-            ahead = np.einsum("ij,ij->i", normals[row, face], points[point] - center[row])
-            level = np.maximum(level, ahead / offsets[row, face])
-            near = level <= NEIGHBOURHOOD
-            row, point, level = row[near], point[near], level[near]
-        inside = np.bincount(row[level <= 1], minlength=len(primitives))
-        taken = inside[row] >= LEAST_POINTS
-        rows.append(row[taken])
-        found.append(point[taken])
-    row, point = np.concatenate(rows), np.concatenate(found)
-    order = np.lexsort((point, row))
-    return row[order], point[order]
-
-
-def _face_planes(primitives: Primitives) -> tuple[np.ndarray, np.ndarray]:
-    """(N, F, 3) outward unit normals of the faces and (N, F) their distances from the centre."""
-    local = primitives.vertices - primitives.center.astype(np.float64)[:, None]
-    a, b, c = (local[:, KINDS[primitives.kind].faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    normal /= np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), np.finfo(np.float64).tiny)
-    return normal, np.maximum(np.einsum("nfi,nfi->nf", normal, a), np.finfo(np.float64).tiny)
-
-
-def _sums(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
-    """(count, ...) sums of (M, ...) values by group."""
-    flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
-    out = [np.bincount(group, weights=column, minlength=count).astype(np.float64) for column in flat.T]
-    return np.stack(out, axis=-1).reshape((count,) + values.shape[1:])
-
-
-def _medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
-    """(count,) lower medians by group; every group has a value."""
-    from scipy.sparse import coo_matrix
-
-    # By value, then by group: the conversion to rows keeps the order within each, and is faster than sorting again.
-    order = np.argsort(values)
-    order = coo_matrix((order, (group[order], np.arange(len(order)))), shape=(count, len(order))).tocsr().data
-    size = np.bincount(group, minlength=count)
-    return values[order[np.cumsum(size) - size + (size - 1) // 2]]
-
-
-def _strongest_direction(group: np.ndarray, normal: np.ndarray, count: int) -> np.ndarray:
-    """(count, 3) direction where most normals of each group are: the fullest of the cells of 1 / DIRECTION_CELLS, then mean shift.
-    Zero for a group without normals."""
-    side = 2 * DIRECTION_CELLS + 1
-    x, y, z = np.rint(normal * DIRECTION_CELLS).astype(np.int64).T + DIRECTION_CELLS
-    cells, cell, size = np.unique(((group * side + x) * side + y) * side + z, return_inverse=True, return_counts=True)
-    of_cell = cells // side**3
-    order = np.lexsort((-cells, size, of_cell))
-    fullest = np.full(count, -1)
-    fullest[of_cell[order]] = order
-    chosen = cell == fullest[group]
-    direction = np.zeros((count, 3))
-    for _ in range(ROUNDS):
-        mean = _sums(normal[chosen], group[chosen], count)
-        length = np.linalg.norm(mean, axis=1, keepdims=True)
-        direction = np.where(length > 0, mean / np.maximum(length, np.finfo(np.float64).tiny), direction)
-        chosen = np.einsum("ij,ij->i", normal, direction[group]) > SAME_DIRECTION
-    return direction
-
-
-def _robust_planes(position: np.ndarray, normal: np.ndarray, group: np.ndarray, count: int):
-    """(count, 3) normals, (count,) offsets and (count,) spreads (1.4826 median |residual|) of planes by group.
-
-    The normal is that of the points where they tell one (their flattest direction holds less than a tenth of the variance of the next),
-    else the mean of theirs.
-    """
-    tiny = np.finfo(np.float64).tiny
-    across = _sums(normal, group, count)
-    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), tiny)
-    origin = _sums(position, group, count) / np.bincount(group, minlength=count)[:, None]
-    weight = np.ones(len(group))
-    for step in range(ROUNDS + 1):
-        away = np.einsum("ij,ij->i", position - origin[group], across[group])
-        middle = _medians(away, group, count)
-        spread = 1.4826 * _medians(np.abs(away - middle[group]), group, count)
-        if step == ROUNDS:
-            break
-        scaled = (away - middle[group]) / np.maximum(2 * spread[group], tiny)
-        weight = 1 / (1 + np.minimum(np.abs(scaled), 1e6) ** 2)
-        mass = _sums(weight, group, count)
-        origin = _sums(weight[:, None] * position, group, count) / mass[:, None]
-        centered = position - origin[group]
-        moment = _sums((weight[:, None] * centered)[:, :, None] * centered[:, None, :], group, count)
-        variance, axes = np.linalg.eigh(moment)
-        flattest = axes[:, :, 0] * np.where(np.einsum("ij,ij->i", axes[:, :, 0], across) < 0, -1.0, 1.0)[:, None]
-        told = variance[:, 0] < 0.1 * variance[:, 1]
-        across = np.where(told[:, None], flattest, across)
-    return across, np.einsum("ij,ij->i", origin, across) + middle, spread
 
 
 def cut(primitives: Primitives, planes: Planes, met: np.ndarray, least: float) -> tuple[list, np.ndarray]:

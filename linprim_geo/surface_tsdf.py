@@ -18,8 +18,8 @@ from .tsdf import DepthFrame
 
 # A ray with less opacity than this has seen through the scene: it votes for free space.
 SEEN_THROUGH = 0.5
-# Depth, colour, background and whether it is clamped, of a pixel; frames of more than this in all are not kept.
-BYTES_PER_PIXEL, KEPT_BYTES = 9, 2**30
+# Depth, background and whether it is clamped, of a pixel; frames of more than this in all are not kept.
+BYTES_PER_PIXEL, KEPT_BYTES = 6, 2**30
 
 SMALLEST_DISPARITY = 0.25
 """Depths are trusted as far as this many pixels between the two cameras that are furthest apart move a point by a truncation."""
@@ -34,7 +34,7 @@ NEAREST_LIMIT = 4.0
 def tsdf_surface(
     run: Run, options: ExtractOptions, stages: Stages, frames: DepthFrames | None = None, fuse: Callable | None = None
 ) -> tuple[Mesh, dict]:
-    """Returns the fused mesh, with colours, and `level`, `voxel_size` and `truncation_voxels` for the statistics.
+    """Returns the fused mesh and `level`, `voxel_size` and `truncation_voxels` for the statistics.
 
     `frames` of the same level, if there are any already, are taken in place of new ones. `fuse`: see `fuse_tsdf`.
 
@@ -64,7 +64,7 @@ def tsdf_surface(
 
 
 class DepthFrames(Sequence):
-    """`tsdf.DepthFrame`s of the training views: depth at transmittance `level`, the photographs' colours, free background.
+    """`tsdf.DepthFrame`s of the training views: depth at transmittance `level`, free background.
 
     Depths beyond `limit` are clamped to it; 0 chooses one by `depth_limit`. `beyond` is their share. Frames are kept in memory if
     they are at most KEPT_BYTES in all, else, and without `keep`, rendered whenever they are asked for.
@@ -98,7 +98,7 @@ class DepthFrames(Sequence):
     def _render(self, views):
         for view, depth, opacity in self.run.surface_depths(views, self.level):
             free = opacity < SEEN_THROUGH
-            yield DepthFrame(view.camera, np.where(free, np.float32(0), depth), color=view.load().rgb, background=free)
+            yield DepthFrame(view.camera, np.where(free, np.float32(0), depth), background=free)
 
     def _clamp(self, frame: DepthFrame) -> DepthFrame:
         beyond = frame.depth > self.limit

@@ -69,21 +69,20 @@ class DepthFrame:
 
     `depth` (H, W) float is z along the optical axis at the pixel centres, in scene units; 0, negative, NaN
     and inf mean that there is no surface. `background` (H, W) bool marks those of them through which the ray
-    is known to be free; the others are unknown. `color` (H, W, 3) uint8, or float in [0, 1]. `confidence`
-    (H, W) multiplies the weight of each pixel. `clamped` (H, W) bool marks depths that are only a least one: the
-    ray is free up to there, and where its surface is is not known.
+    is known to be free; the others are unknown. `confidence` (H, W) multiplies the
+    weight of each pixel. `clamped` (H, W) bool marks depths that are only a least one: the ray is free up to there, and where its
+    surface is is not known.
     """
 
     camera: Camera
     depth: np.ndarray
-    color: np.ndarray | None = None
     background: np.ndarray | None = None
     confidence: np.ndarray | None = None
     clamped: np.ndarray | None = None
 
     def __post_init__(self):
         wanted = (self.camera.height, self.camera.width)
-        for name in ("depth", "color", "background", "confidence", "clamped"):
+        for name in ("depth", "background", "confidence", "clamped"):
             value = getattr(self, name)
             if value is not None and np.shape(value)[:2] != wanted:
                 raise LinprimError(

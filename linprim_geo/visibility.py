@@ -76,7 +76,7 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera], caster: RayCaster | Non
     seen = faces_of_pixels(caster, cameras)
     gap, before = SURFACE_GAP * caster.diagonal, np.zeros(len(seen), np.uint8)
     for camera in cameras:
-        depth = _first_hits(caster, camera)[0]
+        depth = caster.first_hits(camera)[0]
         behind = (BEHIND_SHARE, BEHIND_SHARE * caster.diagonal)
         _core.face_samples(
             *camera.pinhole(), depth, caster.vertices, caster.faces, SAMPLES, *behind, seen.view(np.uint8), before
@@ -84,13 +84,12 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera], caster: RayCaster | Non
         face = np.flatnonzero(before)
         row, sample = np.nonzero(before[face, None] >> np.arange(len(SAMPLES), dtype=np.uint8) & 1)
         face = face[row]
+        ray = np.einsum("rk,rkd->rd", SAMPLES[sample], caster.vertices[caster.faces[face]]) - camera.center
+        reach = 1.0 - gap / np.maximum(np.linalg.norm(ray, axis=1), 2.0 * gap)
         # Single precision tells most of them apart; what it lets through is asked again.
-        for dtype, occluded in (("float32", caster.occluded_single), ("float64", caster.occluded)):
-            corners = (caster.vertices - camera.center).astype(dtype)
-            ray = np.einsum("rk,rkd->rd", SAMPLES.astype(dtype)[sample], corners[caster.faces[face]])
-            reach = 1.0 - gap / np.maximum(np.linalg.norm(ray, axis=1), 2.0 * gap)
+        for occluded in (caster.occluded_single, caster.occluded):
             left = ~occluded(camera.center, ray, reach)
-            face, sample = face[left], sample[left]
+            face, ray, reach = face[left], ray[left], reach[left]
         seen[face] = True
     return seen
 
@@ -105,20 +104,15 @@ def faces_of_pixels(caster: RayCaster, cameras: Sequence[Camera]) -> np.ndarray:
 
     seen = np.zeros(len(caster.faces), dtype=bool)
     for camera in cameras:
-        depth, face = _first_hits(caster, camera)
+        depth, face = caster.first_hits(camera)
         believed = (face >= 0) & (depth <= maximum_filter(depth, footprint=AROUND, mode="nearest") * (1 + BEHIND_SHARE))
         seen[face[believed]] = True
     return seen
 
 
-def _first_hits(caster: RayCaster, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) float32 z-depths at the pixel centres, inf where a ray misses, and (H, W) faces, there -1."""
-    depth, face, _ = caster.cast_single(camera.center, camera.world_rays().reshape(-1, 3))
-    shape = (camera.height, camera.width)
-    return depth.reshape(shape), face.astype(np.int64).reshape(shape)
-
-
-def color_vertices(mesh: Mesh, cameras: Sequence[Camera], images: Iterable[np.ndarray]) -> np.ndarray:
+def color_vertices(
+    mesh: Mesh, cameras: Sequence[Camera], images: Iterable[np.ndarray], caster: RayCaster | None = None
+) -> np.ndarray:
     """Vertex colours from the photographs that see each vertex.
 
     Each view that looks onto a vertex with nothing in front gives its bilinear colour there, weighted by the
@@ -129,6 +123,7 @@ def color_vertices(mesh: Mesh, cameras: Sequence[Camera], images: Iterable[np.nd
     Args:
         images: one (H, W, 3), or with alpha (H, W, 4), uint8, or float in [0, 1], per camera; iterated once, one in memory at a
             time.
+        caster: of the mesh, if there is one already.
     Returns:
         (V, 3) uint8.
     Raises:
@@ -136,7 +131,7 @@ def color_vertices(mesh: Mesh, cameras: Sequence[Camera], images: Iterable[np.nd
     """
     from .raycast import RayCaster
 
-    caster = RayCaster(mesh.vertices, mesh.faces)
+    caster = caster or RayCaster(mesh.vertices, mesh.faces)
     normals = vertex_normals(mesh) if mesh.normals is None else mesh.normals
     edge = mesh.vertices[mesh.faces[:, 1]] - mesh.vertices[mesh.faces[:, 0]]
     slack = float(np.median(np.linalg.norm(edge, axis=1)))
@@ -185,7 +180,7 @@ def photographed(
             # Premultiplied, so that transparent pixels have no colour in a sample beside them.
             image[..., :3] *= image[..., 3:] / 255
         # Single precision is plenty here: what is hidden is told with a slack.
-        depth = np.minimum(_first_hits(caster, camera)[0], np.float32(FAR * caster.diagonal))
+        depth = np.minimum(caster.first_hits(camera)[0], np.float32(FAR * caster.diagonal))
         near, far = (extreme(depth, size=3, mode="nearest") for extreme in (minimum_filter, maximum_filter))
         _core.add_colors(*camera.pinhole(), image, depth, near, far, rules, points, normals, best, shade, good)
     parts = range(0, count, POINTS_PER_TASK)

@@ -34,7 +34,7 @@ LEVEL = 0.5
 def lattice(tiny_run):
     frames = DepthFrames(Run.open(tiny_run), LEVEL)
     voxel, rules = 0.02, vote_rules(3.0, 0.75, 0.0)
-    blocks, origin, _, _ = _find_blocks(frames, voxel, 3.0, None, 8, np.inf)
+    blocks, origin, _ = _find_blocks(frames, voxel, 3.0, None, 8, np.inf)
     made = Lattice(blocks, origin, voxel, 8, 3.0, rules)
     return made, fuse_lattice(made, frames)
 

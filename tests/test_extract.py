@@ -45,7 +45,7 @@ def test_what_is_written(extracted, solid):
         folder / "mesh_visible.ply"
     )
     assert stats["views"] == 24 and stats["primitives"] == 1
-    assert stats["seconds"].keys() == {"level", "render", "fuse", "refine", "quality", "visibility", "write", "total"}
+    assert stats["seconds"].keys() == {"level", "render", "fuse", "refine", "quality", "colours", "visibility", "write", "total"}
     assert stats["peak_gib"].keys() == stats["seconds"].keys() and 0 < stats["peak_gib"]["fuse"] <= stats["peak_gib"]["total"]
     predicted = load_mesh(folder / "mesh_visible.ply").quality
     assert stats["predicted_error"] == pytest.approx({"median": np.median(predicted), "q90": np.quantile(predicted, 0.9)})

@@ -11,25 +11,19 @@ import numpy as np
 import pytest
 from conftest import CENTER, octahedron_run
 
+from linprim_geo import plane_fit
 from linprim_geo.camera import Camera
 from linprim_geo.errors import LinprimError
 from linprim_geo.extract import extract_mesh
 from linprim_geo.mesh import face_normals, load_mesh, manifold_status, topology
 from linprim_geo.options import ExtractOptions
+from linprim_geo.plane_fit import LevelPoints, face_planes, fit_planes
 from linprim_geo.polyhedra_union import GROUP, convex_piece, kept_shells, shells, unite
 from linprim_geo.primitives import ARRAYS, Primitives, load_primitives, save_primitives
 from linprim_geo.progress import Progress
 from linprim_geo.run import Run
 from linprim_geo.stages import Stages
-from linprim_geo.surface_polyhedra import (
-    NO_PRIMITIVE,
-    LevelPoints,
-    _face_planes,
-    core_boxes,
-    cut,
-    fit_planes,
-    traced_surface,
-)
+from linprim_geo.surface_polyhedra import NO_PRIMITIVE, core_boxes, cut, polyhedra_surface
 
 CUBE = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
@@ -52,7 +46,9 @@ def octahedra(count, seed=0, size=0.12):
 
 
 def traced(run, level=0.75):
-    return traced_surface(Run.open(run), ExtractOptions(level=level), Stages(Progress("extract", 1, quiet=True)))
+    """The surface, the primitive of each face, and counts."""
+    mesh, about = polyhedra_surface(Run.open(run), ExtractOptions(level=level), Stages(Progress("extract", 1, quiet=True)))
+    return mesh, mesh.primitive, about
 
 
 def with_primitives(run: Path, out: Path, change) -> Path:
@@ -259,7 +255,7 @@ def test_a_trained_part_is_closed_and_traced(tiny_run):
     assert about["primitives_on_surface"] == len(np.unique(primitive[owned])) > 50
     primitives = Run.open(tiny_run).primitives()
     middle, rows = mesh.vertices[mesh.faces[owned]].mean(1), primitive[owned]
-    normals, offsets = _face_planes(primitives)
+    normals, offsets = face_planes(primitives)
     ahead = np.einsum("fki,fi->fk", normals[rows], middle - primitives.center[rows].astype(float)) - offsets[rows]
     # On the primitive, or inside it where it was cut; a sliver that went let the surface move by the tolerance.
     assert ahead.max() < 2 * about["tolerance"]
@@ -332,3 +328,23 @@ def test_a_speck_of_one_pixel_is_one_sentence(solid, tmp_path):
     )
     with pytest.raises(LinprimError, match="no pixel.*four neighbours"):
         traced(speck)
+
+
+@pytest.mark.parametrize("shift", [0.0, 1e6])
+def test_points_within_bodies_are_those_that_all_planes_say(shift):
+    random = np.random.default_rng(3)
+    bodies = octahedra(60, size=0.3)
+    normal, offset = face_planes(bodies)
+    center = bodies.center.astype(np.float64) + shift
+    points = np.concatenate([random.random((3000, 3)), np.full((40, 3), 0.5), np.array([[9.0, 9, 9]])]) + shift
+    size, rows = plane_fit._core.points_within(center, normal, offset, points, 1.5, 60)
+    ahead = sum(normal[:, :, None, k] * (points[None, None, :, k] - center[:, None, None, k]) for k in range(3))
+    level = (ahead / offset[:, :, None]).max(1)
+    wanted = [np.flatnonzero(of <= 1.5) if (of <= 1).sum() >= 60 else np.zeros(0, int) for of in level]
+    assert 0 < np.count_nonzero(size) < len(size)
+    assert size.tolist() == [len(each) for each in wanted]
+    assert rows.tolist() == np.concatenate(wanted).tolist()
+    none = plane_fit._core.points_within(center, normal, offset, np.zeros((0, 3)), 1.5, 0)
+    assert none[0].tolist() == [0] * 60 and len(none[1]) == 0
+    with pytest.raises(ValueError, match="offset has shape"):
+        plane_fit._core.points_within(center, normal, offset[:, :3].copy(), points, 1.5, 60)
