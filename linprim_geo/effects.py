@@ -22,13 +22,13 @@ from .options import SceneOptions, TrainOptions, initial_count
 from .primitives import KINDS
 from .scene import Scene
 from .shots import load_shots
-from .trainer import SMALLEST_PX, initial_parameters
+from .trainer import SMALLEST_PX
 
 MODES = ("auto", "none", "all")
 # An effect that makes a step of training dearer by less than this costs nothing worth saving.
 FREE = 1.05
-# Points, and views, that are enough for what is measured on the primitives of the start.
-START_POINTS, START_VIEWS, START_PX = 4000, 3, 96
+# Views that are enough for what is measured on the primitives of the start.
+START_VIEWS = 12
 # Depth maps may differ from the points' depths by this factor; beyond, their unit is another one.
 DEPTH_AGREES = 1.1
 
@@ -65,15 +65,33 @@ class Data:
         near = cKDTree(xyz).query(xyz, k=min(4, len(xyz)))[0].reshape(len(xyz), -1)[:, 1:]
         return xyz, near.mean(1) if near.shape[1] else np.full(len(xyz), CAMERA_DISTANCE)
 
+    @cached_property
+    def start_in_views(self) -> np.ndarray:
+        """(4, P) of the primitives of the start in each of some views: depth, distance from the optical axis on the image plane at depth
+        1, focal length in pixels, and mean distance to the three nearest."""
+        xyz, spacing = self.start
+        found = [np.zeros((4, 0))]
+        for view in self.scene.train[:: max(1, len(self.scene.train) // START_VIEWS)]:
+            camera = view.camera.transformed(self.similarity)
+            local = xyz @ camera.rotation.T + camera.world_to_camera[:3, 3]
+            x, y, z = local.T
+            with np.errstate(divide="ignore", invalid="ignore"):
+                column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+                inside = (z > spacing) & (column > 0) & (column < camera.width) & (row > 0) & (row < camera.height)
+            z = z[inside]
+            found.append(np.stack([z, np.hypot(x[inside], y[inside]) / z, np.full(len(z), camera.fx), spacing[inside]]))
+        return np.concatenate(found, axis=1)
+
 
 @dataclass(frozen=True)
 class Effect:
     """One entry of the registry.
 
     `measure` returns a figure in `unit`, larger the more the effect is needed, or None where the data do not say; the effect is on from
-    `threshold` upwards. `cost` is the time of a training step with the effect by that without: for exact-rays and overlap from README's
-    prices, for the others as eval/effects.py measures it. `on` and `off` are the options that it stands for. `needs` returns why a scene
-    or the options rule it out, "" if they do not. `on_request` says why evidence alone does not switch it on, "" if it does.
+    `threshold` upwards. `cost` is the time of a training with the effect by that without: for exact-rays from README's prices, for the
+    others as eval/effects.py measures it. `on` and `off` are the settings that it stands for; who gives an option of `off` decides by
+    that. `needs` returns why a scene or the options rule it out, "" if they do not. `on_request` says why evidence alone does not switch
+    it on, "" if it does.
     """
 
     name: str
@@ -91,8 +109,8 @@ class Effect:
 
     @property
     def options(self) -> set[str]:
-        """Names of the options that it stands for."""
-        return set(self.on) | set(self.off)
+        """Names of the options that switch it."""
+        return set(self.off)
 
 
 @dataclass(frozen=True)
@@ -207,7 +225,7 @@ def _decide(effect: Effect, data: Data, settings: dict, choice: Choice) -> Decis
         on=bool(on),
         reason=reason,
         cost=effect.cost,
-        options={} if reason == "option" else dict(effect.on if on else effect.off),
+        options={k: v for k, v in (effect.on if on else effect.off).items() if not given and k not in choice.given},
         note=note,
     )
 
@@ -255,7 +273,7 @@ def describe(decisions: Iterable[Decision]) -> str:
     """A block per effect: on or off and why, what it costs, and the evidence."""
     lines = []
     for d in decisions:
-        cost = "no time" if d.cost < FREE else f"about {d.cost:.2f} times the time of a step"
+        cost = "no time" if d.cost < FREE else f"about {d.cost:.2f} times the time"
         why = f"{REASONS[d.reason]}{': ' + d.note if d.note else ''}"
         lines.append(f"{d.name:<15} {'on ' if d.on else 'off'}  {why}. Costs {cost}: {d.what}")
         value = "not measured" if d.value is None else f"{d.value:.3g} {d.unit}"
@@ -284,58 +302,15 @@ def _affine_error(data: Data) -> float | None:
     With z and u the depth and the image-plane position (x / z) of a centre, a point at distance e from it is drawn by the affine
     approximation off by at most F (e / z)^2 (|u| + sqrt(1 + u^2)) / 2, to second order in e / z.
     """
-    xyz, spacing = data.start
-    errors = []
-    for view in data.scene.train[:: max(1, len(data.scene.train) // 12)]:
-        camera = view.camera.transformed(data.similarity)
-        local = xyz @ camera.rotation.T + camera.world_to_camera[:3, 3]
-        x, y, z = local.T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-            inside = (z > spacing) & (column > 0) & (column < camera.width) & (row > 0) & (row < camera.height)
-        if inside.any():
-            z, u = z[inside], np.hypot(x[inside], y[inside]) / z[inside]
-            errors.append(camera.fx * (spacing[inside] / z) ** 2 * (u + np.sqrt(1 + u * u)) / 2)
-    return float(np.percentile(np.concatenate(errors), 90)) if errors else None
+    z, u, focal, spacing = data.start_in_views
+    errors = focal * (spacing / z) ** 2 * (u + np.sqrt(1 + u * u)) / 2
+    return float(np.percentile(errors, 90)) if len(errors) else None
 
 
-def _overlap_change(data: Data) -> float | None:
-    """Root mean square difference of a few small renderings of the start, blended by centres and by exact overlap."""
-    import torch
-
-    from . import ops
-    from .trainer import activate
-
-    xyz, cloud = data.start[0], data.scene.points
-    if len(xyz) < 4 or cloud is None:
-        return None
-    rng = np.random.default_rng([data.options.seed, 12])
-    rows = np.sort(rng.choice(len(xyz), min(START_POINTS, len(xyz)), replace=False))
-    rgb = cloud.rgb
-    rgb = rgb[np.linspace(0, len(rgb) - 1, len(rows)).astype(int)] if len(rgb) != len(xyz) else rgb[rows]
-    bounds = (1e-4, CAMERA_DISTANCE)
-    kind = data.options.primitive
-    tensors = activate(initial_parameters(xyz[rows], rgb, 0, data.options.seed, bounds, kind), 0, kind)
-    total = []
-    for view in data.scene.train[:: max(1, len(data.scene.train) // START_VIEWS)][:START_VIEWS]:
-        camera = view.camera.transformed(data.similarity)
-        scale = START_PX / max(camera.width, camera.height)
-        small = replace(
-            camera,
-            width=max(1, round(camera.width * scale)),
-            height=max(1, round(camera.height * scale)),
-            fx=camera.fx * scale,
-            fy=camera.fy * scale,
-            cx=camera.cx * scale,
-            cy=camera.cy * scale,
-        )
-        with torch.no_grad():
-            images = [
-                ops.rasterize(*tensors, torch.zeros(3), small, primitive=kind, order=order).rgb
-                for order in ("center", "overlap")
-            ]
-        total.append(float(((images[0] - images[1]) ** 2).mean()))
-    return 100 * math.sqrt(np.mean(total))
+def _apparent_size(data: Data) -> float | None:
+    """Size by depth of the primitives of the start, in %: the 90th percentile over them and the views that they are in."""
+    z, _, _, spacing = data.start_in_views
+    return 100 * float(np.percentile(spacing / z, 90)) if len(z) else None
 
 
 def _no_entry(data: Data) -> str:
@@ -418,10 +393,9 @@ _REGISTRY = (
         {"ray_model": "exact"}, {"ray_model": "affine"}, usually=True,
     ),
     Effect(
-        "overlap", "densities add up where primitives overlap, in place of blending by centres",
-        "change of the image of the start", "% of white", 10.0, 3.3, _overlap_change,
-        {"order": "overlap"}, {"order": "center"}, needs=_no_entry,
-        on_request="depth was better for it in every scene tried, so what decides is its price",
+        "overlap", "densities add up where primitives overlap, in place of blending by centres, in the last part of the run",
+        "size by depth of the primitives of the start, the largest tenth", "%", 5.0, 1.3, _apparent_size,
+        {"order": "overlap", "order_from": 0.7}, {"order": "center"}, needs=_no_entry,
     ),
     Effect(
         "filter", "primitives are at least a part of a pixel of their nearest view",

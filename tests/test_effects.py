@@ -29,6 +29,7 @@ SCENES = {
     "lens": {"distortion": -0.1},
     "slight": {"distortion": -1e-4},
     "white": {"background": "white"},
+    "room": {"shape": "room", "shading": "albedo"},
 }
 OPTIONS = TrainOptions(max_primitives=500, threads=1)
 
@@ -40,7 +41,7 @@ def scenes(tmp_path_factory):
 
     def get(name):
         if not (folder / name).exists():
-            synthesize(folder / name, **SMALL, **SCENES[name])
+            synthesize(folder / name, **{**SMALL, **SCENES[name]})
         return folder / name
 
     return get
@@ -62,19 +63,20 @@ def test_a_plain_scene_calls_for_what_is_free_and_for_its_masks(scenes):
     found = decisions(scenes("plain"))
     assert list(found) == list(EFFECTS)
     assert {name for name, d in found.items() if d.on} == {"exact-rays", "filter", "masks"}
-    assert {name for name, d in found.items() if d.reason == "request"} == {"overlap", "depth", "normals"}
+    assert {name for name, d in found.items() if d.reason == "request"} == {"depth", "normals"}
     assert found["depth"].value == found["normals"].value == 100
     assert found["filter"].reason == "free"
     assert found["background"].reason == "impossible" and found["background"].value is None
     assert found["view-dependence"].value < 0.2 and found["exposure"].value < 0.5
     assert 1 < found["filter"].value < 1.6 and found["lens"].value == 0
     assert 10 < found["double"].value < 1e5
+    assert 1 < found["overlap"].value < 4.5 and not found["overlap"].on
 
 
 @pytest.mark.parametrize(
     ("scene", "name", "least"),
     [("highlights", "view-dependence", 0.45), ("exposure", "exposure", 10), ("zoom", "filter", 3), ("lens", "lens", 0.4),
-     ("white", "background", 90)],
+     ("white", "background", 90), ("room", "overlap", 6)],
 )  # fmt: skip
 def test_each_effect_is_seen_where_it_is(scene, name, least, scenes):
     found = decisions(scenes(scene))
@@ -154,7 +156,9 @@ def test_what_is_asked_comes_before_the_data_and_what_is_given_before_all(scenes
     degree = found["view-dependence"]
     assert (degree.on, degree.reason, degree.options) == (True, "option", {})
     assert degree.note == "--sh-degree 3 overrules --effect view-dependence=off"
-    assert found["overlap"].on and found["overlap"].note == "--order overlap"
+    assert found["overlap"].on and found["overlap"].note == "--order overlap" and found["overlap"].options == {}
+    late = decisions(scenes("plain"), Choice("all", given=frozenset({"order_from"})), replace(OPTIONS, order_from=0.5))
+    assert late["overlap"].options == {"order": "overlap"}
     _, settled = settle(SceneOptions(), options, found.values())
     assert (settled.sh_degree, settled.order, settled.filter, settled.exposure) == (3, "overlap", "3d", "none")
     everything = decisions(scenes("plain"), Choice("all"))
