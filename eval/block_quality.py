@@ -44,7 +44,7 @@ def border_distance(blocks, xyz: np.ndarray) -> np.ndarray:
 
 def borders(run: Path) -> tuple[list, float]:
     """The blocks of a run and their margin, in the training frame."""
-    from linprim_geo.block_training import FOLDER, block_of
+    from linprim_geo.block_tasks import FOLDER, block_of
     from linprim_geo.worker import result_of_folder
 
     plan = result_of_folder(run / FOLDER / "plan")

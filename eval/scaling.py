@@ -103,7 +103,7 @@ def check(found: Fit, row: dict) -> dict:
 
 def predict(found: Fit, photos: float, capture: Capture) -> dict:
     """Core-hours, memory of a worker, storage and network of a capture of so many photographs."""
-    from linprim_geo.block_training import MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS
+    from linprim_geo.block_tasks import MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS
 
     window = capture.window * capture.pixels
     blocks = max(1, math.ceil(photos * capture.uses / capture.photos_per_block))
@@ -133,7 +133,7 @@ def predict(found: Fit, photos: float, capture: Capture) -> dict:
 
 def shown_in_blocks(run: Path) -> tuple[float, float]:
     """(blocks that a photograph is used in, part of its pixels that is used in one) of a run in blocks."""
-    from linprim_geo.block_training import FOLDER
+    from linprim_geo.block_tasks import FOLDER
     from linprim_geo.run import Run
     from linprim_geo.worker import result_of_folder
 

@@ -13,7 +13,6 @@ from .blocks import Block, cropped, shown, smaller, window
 from .camera import Camera, Similarity
 from .ops import Tensors
 from .options import TrainOptions, raster_options
-from .primitives import ARRAYS
 from .run import Run
 from .scene import View
 from .shots import Shot
@@ -31,23 +30,21 @@ def small_depths(coarse: Run, views: Sequence[View], factor: int) -> Iterator[tu
 
 
 def block_shots(
-    coarse: Run, views: Sequence[View], block: Block, margin: float, factor: int, similarity: Similarity, options: TrainOptions
-) -> tuple[list[Shot], Tensors]:
+    coarse: Run,
+    views: Sequence[View],
+    block: Block,
+    margin: float,
+    factor: int,
+    similarity: Similarity,
+    options: TrainOptions,
+    frozen: Tensors,
+) -> list[Shot]:
     """What a block is trained on.
 
-    A photograph is cut to the window that shows the block. Its pixels whose surface lies elsewhere are replaced by what the frozen
-    primitives alone show there, with their opacity for alpha: a block is neither to explain the rest of the scene nor to hide it.
-
-    Returns: the shots, and the frozen primitives as the rasterizer takes them: the coarse ones outside of the block and its margin, but for
-        those that reach into the block.
+    A photograph is cut to the window that shows the block, and counts by that window's share of its pixels. Its pixels whose surface lies
+    elsewhere are replaced by what the frozen primitives alone show there, with their opacity for alpha: a block is neither to explain the
+    rest of the scene nor to hide it.
     """
-    primitives = coarse.training_primitives()
-    reach = primitives.extent.max(1)[:, None]
-    center = primitives.center
-    low, high = np.asarray(block.low), np.asarray(block.high)
-    outside = ~block.holds(center, margin) & ((center + reach < low) | (center - reach > high)).any(1)
-    means, rotation, extent, density, sh = (torch.from_numpy(getattr(primitives, name)[outside]) for name in ARRAYS)
-    frozen = means, rotation, extent, density, sh
     how = raster_options(options) | {"stop": options.stop}
     shots = []
     for view, (camera, depth) in zip(views, small_depths(coarse, views, factor), strict=True):
@@ -63,8 +60,9 @@ def block_shots(
         instead, opacity = _rendered(frozen, small, how)
         rgb, alpha = np.where(mask[..., None], rgb, instead), np.where(mask, alpha, opacity)
         planes = torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1))), torch.from_numpy(np.ascontiguousarray(alpha))
-        shots.append(Shot(view.name, small, *planes))
-    return shots, frozen
+        share = width * height / (view.camera.width * view.camera.height)
+        shots.append(Shot(view.name, small, *planes, share))
+    return shots
 
 
 def _rendered(frozen: Tensors, camera: Camera, how: dict) -> tuple[np.ndarray, np.ndarray]:

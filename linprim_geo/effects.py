@@ -65,23 +65,6 @@ class Data:
         near = cKDTree(xyz).query(xyz, k=min(4, len(xyz)))[0].reshape(len(xyz), -1)[:, 1:]
         return xyz, near.mean(1) if near.shape[1] else np.full(len(xyz), CAMERA_DISTANCE)
 
-    @cached_property
-    def start_in_views(self) -> np.ndarray:
-        """(4, P) of the primitives of the start in each of some views: depth, distance from the optical axis on the image plane at depth
-        1, focal length in pixels, and mean distance to the three nearest."""
-        xyz, spacing = self.start
-        found = [np.zeros((4, 0))]
-        for view in self.scene.train[:: max(1, len(self.scene.train) // START_VIEWS)]:
-            camera = view.camera.transformed(self.similarity)
-            local = xyz @ camera.rotation.T + camera.world_to_camera[:3, 3]
-            x, y, z = local.T
-            with np.errstate(divide="ignore", invalid="ignore"):
-                column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-                inside = (z > spacing) & (column > 0) & (column < camera.width) & (row > 0) & (row < camera.height)
-            z = z[inside]
-            found.append(np.stack([z, np.hypot(x[inside], y[inside]) / z, np.full(len(z), camera.fx), spacing[inside]]))
-        return np.concatenate(found, axis=1)
-
 
 @dataclass(frozen=True)
 class Effect:
@@ -302,15 +285,29 @@ def _affine_error(data: Data) -> float | None:
     With z and u the depth and the image-plane position (x / z) of a centre, a point at distance e from it is drawn by the affine
     approximation off by at most F (e / z)^2 (|u| + sqrt(1 + u^2)) / 2, to second order in e / z.
     """
-    z, u, focal, spacing = data.start_in_views
-    errors = focal * (spacing / z) ** 2 * (u + np.sqrt(1 + u * u)) / 2
-    return float(np.percentile(errors, 90)) if len(errors) else None
+    xyz, spacing = data.start
+    errors = []
+    for view in data.scene.train[:: max(1, len(data.scene.train) // START_VIEWS)]:
+        camera = view.camera.transformed(data.similarity)
+        local = xyz @ camera.rotation.T + camera.world_to_camera[:3, 3]
+        x, y, z = local.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+            inside = (z > spacing) & (column > 0) & (column < camera.width) & (row > 0) & (row < camera.height)
+        if inside.any():
+            z, u = z[inside], np.hypot(x[inside], y[inside]) / z[inside]
+            errors.append(camera.fx * (spacing[inside] / z) ** 2 * (u + np.sqrt(1 + u * u)) / 2)
+    return float(np.percentile(np.concatenate(errors), 90)) if errors else None
 
 
-def _apparent_size(data: Data) -> float | None:
-    """Size by depth of the primitives of the start, in %: the 90th percentile over them and the views that they are in."""
-    z, _, _, spacing = data.start_in_views
-    return 100 * float(np.percentile(spacing / z, 90)) if len(z) else None
+def _surrounded(data: Data) -> float:
+    """Solid angles of the primitives of the start together, in % of the sphere, median over cameras. Hidden ones count, too."""
+    xyz, spacing = data.start
+    shares = []
+    for view in data.scene.train[:: max(1, len(data.scene.train) // START_VIEWS)]:
+        away = xyz - view.camera.transformed(data.similarity).center
+        shares.append(float((spacing**2 / np.maximum((away**2).sum(1), spacing**2)).sum()) / (4 * math.pi))
+    return 100 * float(np.median(shares))
 
 
 def _no_entry(data: Data) -> str:
@@ -394,7 +391,7 @@ _REGISTRY = (
     ),
     Effect(
         "overlap", "densities add up where primitives overlap, in place of blending by centres, in the last part of the run",
-        "size by depth of the primitives of the start, the largest tenth", "%", 5.0, 1.3, _apparent_size,
+        "how much of the sphere around a camera surfaces fill", "%", 30.0, 1.3, _surrounded,
         {"order": "overlap", "order_from": 0.7}, {"order": "center"}, needs=_no_entry,
     ),
     Effect(

@@ -21,12 +21,13 @@ MEMORY_SHARE, MOST_KEPT, RECENT = 0.25, 3 * 2**29, 2
 
 @dataclass(frozen=True)
 class Shot:
-    """A view in memory: `rgb` (3, H, W) uint8, `alpha` (H, W) uint8 or None, and its camera in the training frame."""
+    """A view in memory: `rgb` (3, H, W) uint8, `alpha` (H, W) uint8 or None, its camera in the training frame, the weight of its loss."""
 
     name: str
     camera: Camera
     rgb: torch.Tensor
     alpha: torch.Tensor | None
+    weight: float = 1.0
 
     def over(self, background: torch.Tensor) -> torch.Tensor:
         """(3, H, W) float32 in [0, 1], over `background` (3,) where alpha lets it through."""

@@ -276,7 +276,8 @@ class Trainer:
             shown = exposed(out.rgb, log_gain, target, rest)
         parts = ops.photometric_loss(shown, target, self.options.dssim)
         penalty = self.control.penalty(leaves)
-        objective = parts[0] if penalty is None else parts[0] + penalty
+        photometric = parts[0] if shot.weight == 1 else shot.weight * parts[0]
+        objective = photometric if penalty is None else photometric + penalty
         if terms is not None:
 
             def surface(camera: Camera, tensors: Tensors) -> ops.Rendering:

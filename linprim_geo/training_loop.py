@@ -27,9 +27,9 @@ QUICK_VIEWS = 16
 
 
 def run_steps(
-    trainer: Trainer, run: Run, held_out: list[Shot], progress: Progress, pace: Pace | None = None
+    trainer: Trainer, run: Run, held_out: list[Shot], progress: Progress, pace: Pace | None = None, until: int | None = None
 ) -> tuple[float, float | None, float | None]:
-    """Steps until the end, with lines in metrics.jsonl, checkpoints, and scores on `held_out` now and then.
+    """Steps until the end, or to step `until` of all, with lines in metrics.jsonl, checkpoints, and scores on `held_out` now and then.
 
     Returns: seconds spent in steps, and the final mean held-out PSNR in dB, as rendered and, where exposures are fitted, with gains; None
         without views.
@@ -44,7 +44,7 @@ def run_steps(
     score = score_gain = None
     saved = -1
     with writing(table), open(table, "a") as log, _interrupt_flag() as interrupted:
-        while trainer.step < trainer.iterations and not interrupted:
+        while trainer.step < (until or trainer.iterations) and not interrupted:
             if pace:
                 pace.watch(trainer, run, progress, save=lambda: save_training(trainer, run))
             try:
@@ -55,7 +55,7 @@ def run_steps(
                 raise LinprimError(
                     f"{run.path}: training diverged at step {trainer.step} ({error}); what was saved before is intact"
                 ) from None
-            last = trainer.step == trainer.iterations
+            last = trainer.step == (until or trainer.iterations)
             score = None
             if last or (options.evaluate_every and trainer.step % options.evaluate_every == 0):
                 views = held_out if last else held_out[:: max(1, len(held_out) // QUICK_VIEWS)]

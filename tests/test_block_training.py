@@ -17,9 +17,10 @@ import pytest
 import torch
 from test_executor import is_alive
 
-from linprim_geo import block_training, worker
+from linprim_geo import block_tasks, worker
 from linprim_geo.block_shots import block_shots
-from linprim_geo.block_training import block_of, blocks_that_fit, train_blocks
+from linprim_geo.block_tasks import beyond, block_of, tensors
+from linprim_geo.block_training import blocks_that_fit, train_blocks
 from linprim_geo.blocks import Block
 from linprim_geo.cli import main
 from linprim_geo.errors import LinprimError
@@ -67,10 +68,11 @@ def test_every_block_keeps_what_it_owns(whole):
     plan = worker.result_of_folder(run / "blocks" / "plan")
     kept = []
     for k in range(COUNT):
-        primitives = load_primitives(run / "blocks" / f"{k:03d}" / "run" / "training_frame.npz")
-        own = block_of(plan, k).holds(primitives.center)
-        assert 0 < own.sum() < len(primitives)  # the margin is trained and dropped
-        kept.append(primitives.center[own])
+        begun, ended = (load_primitives(run / "blocks" / name / "run" / "training_frame.npz") for name in (f"{k:03d}", f"{k:03d}joined"))
+        own = block_of(plan, k).holds(begun.center)
+        assert 0 < own.sum() < len(begun)  # the margin is trained and dropped
+        assert len(ended) == own.sum() and not np.array_equal(ended.center, begun.center[own])
+        kept.append(ended.center[block_of(plan, k).holds(ended.center)])
     assert np.array_equal(Run.open(run).training_primitives().center, np.concatenate(kept))
     assert sum(part["work"] for part in plan["blocks"]) == pytest.approx(1)
     assert all(0.4 < part["work"] < 0.6 for part in plan["blocks"])
@@ -80,7 +82,7 @@ def test_a_finished_run_is_not_done_again(whole, tiny_scene):
     run, done = whole
     before = {path: path.stat().st_mtime_ns for path in run.glob(f"blocks/*/{worker.DONE}")}
     again = train(tiny_scene, run, options=OPTIONS, resume=True, quiet=True)
-    assert before == {path: path.stat().st_mtime_ns for path in run.glob(f"blocks/*/{worker.DONE}")} and len(before) == COUNT + 2
+    assert before == {path: path.stat().st_mtime_ns for path in run.glob(f"blocks/*/{worker.DONE}")} and len(before) == 2 * COUNT + 2
     assert again["psnr"] == done["psnr"] and again["primitives"] == done["primitives"]
     with pytest.raises(LinprimError, match="exists already; give another folder"):
         train_blocks(tiny_scene, run, options=OPTIONS, blocks=COUNT, quiet=True)
@@ -134,9 +136,9 @@ def test_what_blocks_cannot_do_is_one_sentence(options, blocks, sentence, tiny_s
 
 def test_blocks_that_no_camera_sees_are_one_sentence(whole, monkeypatch):
     run, _ = whole
-    monkeypatch.setattr(block_training, "window", lambda *_: None)
+    monkeypatch.setattr(block_tasks, "window", lambda *_: None)
     with pytest.raises(LinprimError, match="block 0 of 2 is seen by 0 cameras, wanted two at least: fewer blocks"):
-        block_training.plan_task(run / "blocks" / "plan", str(run), 2)
+        block_tasks.plan_task(run / "blocks" / "plan", str(run), 2)
 
 
 def test_a_time_budget_and_a_lone_cluster_are_refused(tiny_scene, tmp_path, capsys):
@@ -158,8 +160,9 @@ def test_a_block_sees_its_own_pixels_and_the_frozen_scene_elsewhere(whole):
     scene, coarse = run.scene(), Run.open(whole[0] / "blocks" / "coarse" / "run")
     everything = Block((-np.inf,) * 3, (np.inf,) * 3)
     factor = coarse.scene_options.downscale
-    shots, frozen = block_shots(coarse, scene.train[:2], everything, 0.1, factor, run.similarity, OPTIONS)
-    assert len(frozen[0]) == 0
+    frozen = beyond(coarse.training_primitives(), everything, 0.1)
+    assert len(frozen["center"]) == 0
+    shots = block_shots(coarse, scene.train[:2], everything, 0.1, factor, run.similarity, OPTIONS, tensors(frozen))
     photo = scene.train[0].load()
     camera = shots[0].camera
     left, top = (round(a - b) for a, b in ((scene.train[0].camera.cx, camera.cx), (scene.train[0].camera.cy, camera.cy)))
@@ -167,8 +170,10 @@ def test_a_block_sees_its_own_pixels_and_the_frozen_scene_elsewhere(whole):
     alpha = shots[0].alpha.numpy() > 0
     assert np.array_equal(shots[0].rgb.numpy().transpose(1, 2, 0)[alpha], part[alpha])
     own = block_of(worker.result_of_folder(run.path / "blocks" / "plan"), 0)
-    shots, frozen = block_shots(coarse, scene.train, own, 0.05, factor, run.similarity, OPTIONS)
-    assert len(frozen[0]) > 0 and not own.holds(frozen[0].numpy(), 0.05).any()
+    frozen = beyond(coarse.training_primitives(), own, 0.05)
+    assert len(frozen["center"]) > 0 and not own.holds(frozen["center"], 0.05).any()
+    shots = block_shots(coarse, scene.train, own, 0.05, factor, run.similarity, OPTIONS, tensors(frozen))
+    assert all(shot.weight == shot.camera.width * shot.camera.height / 48**2 for shot in shots)
     assert all(shot.camera.width <= 48 and shot.rgb.shape[1:] == (shot.camera.height, shot.camera.width) for shot in shots)
     assert sum(shot.camera.width * shot.camera.height for shot in shots) < 0.9 * len(scene.train) * 48 * 48
 
@@ -177,7 +182,8 @@ def test_frozen_primitives_are_drawn_and_stay(whole):
     run = Run.open(whole[0])
     scene, coarse = run.scene(), Run.open(whole[0] / "blocks" / "coarse" / "run")
     own = block_of(worker.result_of_folder(run.path / "blocks" / "plan"), 0)
-    shots, frozen = block_shots(coarse, scene.train, own, 0.05, coarse.scene_options.downscale, run.similarity, OPTIONS)
+    frozen = tensors(beyond(coarse.training_primitives(), own, 0.05))
+    shots = block_shots(coarse, scene.train, own, 0.05, coarse.scene_options.downscale, run.similarity, OPTIONS, frozen)
     rng = np.random.default_rng(0)
     start = initial_parameters(rng.normal(size=(40, 3)), rng.integers(0, 255, (40, 3)), 1, 0, (0.01, 1.0))
     trainer = Trainer(shots, start, replace(OPTIONS, iterations=20), (0.01, 1.0), torch.ones(3), False, True)

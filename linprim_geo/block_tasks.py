@@ -1,0 +1,277 @@
+"""What workers do when a scene is trained in blocks: the coarse scene, the plan, a block by itself, and its end beside its neighbours.
+
+Every task reads what those before it left in RUN/blocks, and goes on from its own last checkpoint.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from . import ops, worker
+from .block_shots import block_shots, small_depths
+from .blocks import Block, margin_of, point_work, shown, split_space, window
+from .checkpoint import read_checkpoint
+from .errors import LinprimError
+from .files import atomic_write, locked
+from .initial_points import VolumePoints
+from .ops import Tensors
+from .options import TrainOptions
+from .primitives import ARRAYS, Primitives
+from .progress import Progress
+from .run import Run
+from .scene import PointCloud, Scene
+from .shots import load_shots
+from .train import train_run
+from .training_loop import run_steps
+from .training_start import chosen_background, start_trainer
+
+# Arrays of primitives by name, of any number: the frozen ones may be none.
+Arrays = dict[str, np.ndarray]
+
+FOLDER = "blocks"
+# The coarse scene: pixels averaged, parts of the steps and of the primitives of the whole, and the most of these and of the views.
+COARSE_DOWNSCALE, COARSE_STEPS, COARSE_PRIMITIVES = 2, 0.25, 0.25
+MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS, LEAST_SIDE = 20_000, 1000, 32
+# Steps of a block at least, as far as the whole has so many.
+LEAST_STEPS = 300
+# A block takes the last steps, this part of all, beside what its neighbours have become; they stand in full within so many margins of it.
+END, NEAR = 0.15, 2.0
+# Where it does.
+JOINED = "joined"
+
+def save_points(path: Path, cloud: PointCloud) -> None:
+    """Writes the points that a scene starts from."""
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, xyz=cloud.xyz, rgb=cloud.rgb, volume=isinstance(cloud, VolumePoints))
+
+
+def load_points(path: Path) -> PointCloud:
+    """Reads what `save_points` wrote."""
+    with np.load(path, allow_pickle=False) as file:
+        return (VolumePoints if file["volume"] else PointCloud)(file["xyz"], file["rgb"])
+
+
+def coarse_of(run: Run, scene: Scene) -> Run:
+    """The run of the whole scene with fewer pixels, views, steps and primitives that stands for what a block does not hold."""
+    options, scene_options = run.train_options, run.scene_options
+    side = min(min(view.camera.width, view.camera.height) for view in scene.train)
+    factor = COARSE_DOWNSCALE if side >= COARSE_DOWNSCALE * LEAST_SIDE else 1
+    most = max(1, min(MOST_COARSE_PRIMITIVES, round(COARSE_PRIMITIVES * options.max_primitives)))
+    coarse = replace(
+        options,
+        iterations=max(min(LEAST_STEPS, options.iterations), round(COARSE_STEPS * options.iterations)),
+        max_primitives=most, initial_primitives=0, sh_degree=0, samples=1, evaluate_every=0,
+    )  # fmt: skip
+    views = min(scene_options.views or len(scene.train), MOST_COARSE_VIEWS)
+    seen = replace(scene_options, downscale=factor * scene_options.downscale, views=views)
+    return replace(run, path=run.path / FOLDER / "coarse" / "run", scene_options=seen, train_options=coarse)
+
+
+def _opened(run: str) -> tuple[Run, Scene]:
+    """The run and its scene with the points to start from."""
+    opened = Run.open(run)
+    return opened, replace(opened.scene(), points=load_points(opened.path / FOLDER / "points.npz"))
+
+
+def _prepared(options: TrainOptions) -> None:
+    torch.set_num_threads(1)
+    ops.set_threads(worker.cores)
+
+
+def coarse_task(folder: Path, run: str) -> dict:
+    """Trains the coarse scene. Returns the background that it shows, `fitted`, and whether training draws a random one."""
+    opened, scene = _opened(run)
+    _prepared(opened.train_options)
+    coarse = coarse_of(opened, scene)
+    small = replace(coarse.scene(), points=scene.points)
+    with locked(coarse.path, "trained into"):
+        background, fitted, random = chosen_background(coarse.train_options.background, load_shots(small.train, coarse.similarity))
+        state = read_checkpoint(coarse.path) if (coarse.path / "config.json").exists() else None
+        done = train_run(coarse, small, state, Progress("coarse scene", 1, quiet=True))
+    shown_color = [float(x) for x in (Run.open(coarse.path).background if fitted else background)]
+    return {"background": "random" if random else ",".join(map(repr, shown_color)), "shown": shown_color, "seconds": done["seconds"]}
+
+
+def plan_task(folder: Path, run: str, count: int) -> dict:
+    """Splits space, and finds the views that show each block. Returns the plan that `block_task` reads."""
+    opened, scene = _opened(run)
+    _prepared(opened.train_options)
+    coarse = Run.open(opened.path / FOLDER / "coarse" / "run")
+    factor = coarse.scene_options.downscale // opened.scene_options.downscale
+    assert scene.points is not None
+    points = opened.similarity.apply(scene.points.xyz)
+    depths = list(small_depths(coarse, scene.train, factor))
+    seen = [(camera, depth, view.camera.width * view.camera.height) for view, (camera, depth) in zip(scene.train, depths, strict=True)]
+    work = point_work(points, seen)
+    used = work > 0
+    if not used.any():
+        raise LinprimError(f"{scene.root}: no camera sees a point of the scene, so no block can be made")
+    blocks = split_space(points[used], work[used], count)
+    margin = margin_of(blocks, points[used])
+    options = opened.train_options
+    parts = []
+    for k, block in enumerate(blocks):
+        views, pixels = [], 0
+        for number, (view, (camera, depth)) in enumerate(zip(scene.train, depths, strict=True)):
+            found = window(shown(block, margin, camera, depth), view.camera, factor)
+            if found is not None:
+                views.append(number)
+                pixels += found[1][2] * found[1][3]
+        if len(views) < 2:
+            raise LinprimError(f"block {k} of {count} is seen by {len(views)} cameras, wanted two at least: fewer blocks")
+        share = float(work[block.holds(points, margin)].sum() / work.sum())
+        most = max(1, math.ceil(share * options.max_primitives))
+        steps = math.ceil(options.iterations * len(views) / len(scene.train))
+        parts.append(
+            {
+                "low": [_plain(x) for x in block.low],
+                "high": [_plain(x) for x in block.high],
+                "views": views,
+                "pixels": pixels,
+                "work": float(work[block.holds(points)].sum() / work.sum()),
+                "iterations": max(min(LEAST_STEPS, options.iterations), steps),
+                "max_primitives": most,
+                "initial_primitives": min(most, math.ceil(share * options.initial_primitives)),
+            }
+        )
+    background = worker.result_of_folder(opened.path / FOLDER / "coarse")
+    largest = max(view.camera.width * view.camera.height for view in scene.train)
+    return {
+        "margin": margin,
+        "factor": factor,
+        "background": background["background"],
+        "shown": background["shown"],
+        "frozen": len(coarse.training_primitives()),
+        "largest": largest,
+        "all_pixels": sum(view.camera.width * view.camera.height for view in scene.train),
+        "blocks": parts,
+    }
+
+
+def _plain(x: float) -> float | None:
+    return float(x) if math.isfinite(x) else None
+
+
+def block_of(plan: dict, k: int) -> Block:
+    """A block of the plan."""
+    part = plan["blocks"][k]
+    low, high = ([x if x is not None else end for x in part[name]] for name, end in (("low", -np.inf), ("high", np.inf)))
+    return Block(tuple(low), tuple(high))
+
+
+def block_task(folder: Path, run: str, block: int) -> dict:
+    """Trains a block of the plan before the coarse scene, but for the last steps. What it does not own is dropped after that."""
+    opened, scene = _opened(run)
+    plan = worker.result_of_folder(opened.path / FOLDER / "plan")
+    own, margin = block_of(plan, block), plan["margin"]
+    coarse = Run.open(opened.path / FOLDER / "coarse" / "run").training_primitives()
+
+    def region(cloud: PointCloud) -> PointCloud:
+        inside = own.holds(opened.similarity.apply(cloud.xyz), margin)
+        if not inside.any():
+            raise LinprimError(f"block {block} holds no point to start from: wanted fewer blocks")
+        return PointCloud(cloud.xyz[inside], cloud.rgb[inside])
+
+    return _trained(folder, opened, scene, plan, block, beyond(coarse, own, margin), 1 - END, None, region)
+
+
+def join_task(folder: Path, run: str, block: int) -> dict:
+    """Trains what a block owns to the end before what its neighbours own, and before the coarse scene where that is far."""
+    opened, scene = _opened(run)
+    plan = worker.result_of_folder(opened.path / FOLDER / "plan")
+    own, near = block_of(plan, block), NEAR * plan["margin"]
+    frozen = [beyond(Run.open(opened.path / FOLDER / "coarse" / "run").training_primitives(), own, near)]
+    for other in range(len(plan["blocks"])):
+        if other != block:
+            primitives = trained_block(opened.path, other)
+            inside = own.holds(primitives.center, near) & block_of(plan, other).holds(primitives.center)
+            frozen.append(select(primitives, inside))
+    state = read_checkpoint(block_folder(opened.path, block) / "run")
+    assert state is not None
+    rows = torch.from_numpy(own.holds(state["parameters"]["center"].numpy()))
+    if rows.any():
+        state |= {name: {key: value[rows] for key, value in state[name].items()} for name in ("parameters", "first", "second", "gathered")}
+        state |= {name: state[name][rows] for name in ("steps", "filter_3d") if state[name] is not None}
+    return _trained(folder, opened, scene, plan, block, joined(frozen), 1.0, state, None)
+
+
+def _trained(
+    folder: Path,
+    opened: Run,
+    scene: Scene,
+    plan: dict,
+    block: int,
+    frozen: Arrays,
+    until: float,
+    begin: dict | None,
+    region: Callable[[PointCloud], PointCloud] | None,
+) -> dict:
+    """Trains a block in folder/run up to a part of its steps, from its last checkpoint there, else from the state `begin`, else from the
+    points that `region` leaves."""
+    _prepared(opened.train_options)
+    part, own = plan["blocks"][block], block_of(plan, block)
+    names = ("iterations", "max_primitives", "initial_primitives")
+    options = replace(
+        opened.train_options, **{name: part[name] for name in names}, background=plan["background"], evaluate_every=0, threads=worker.cores
+    )
+    path = folder / "run"
+    seen = replace(scene, train=tuple(scene.train[k] for k in part["views"]), test=())
+    coarse = Run.open(opened.path / FOLDER / "coarse" / "run")
+    shots = block_shots(coarse, seen.train, own, plan["margin"], plan["factor"], opened.similarity, options, tensors(frozen))
+    here = replace(opened, path=path, train_options=options)
+    with locked(path, "trained into"):
+        begun = (path / "config.json").exists()
+        state = read_checkpoint(path) if begun else None
+        trainer = start_trainer(seen, here, shots, options, state or begin, region)
+        trainer.frozen = tensors(frozen)
+        if not begun:
+            about = opened.scene_path, opened.scene_options, options, opened.similarity, ops.instruction_set()
+            Run.create(path, seen, *about)
+        for torn in [*path.glob(".*.tmp*"), *path.glob("checkpoints/.*.tmp*")]:
+            torn.unlink()
+        steps = math.ceil(until * options.iterations)
+        seconds, _, _ = run_steps(trainer, here, [], Progress(f"block {block}", steps, quiet=True), until=steps)
+    kept = int(own.holds(trainer.primitives().center).sum())
+    return {"seconds": seconds, "primitives": len(trainer), "kept": kept, "loss": trainer.loss, "train_psnr": trainer.psnr}
+
+
+def block_folder(run: Path, block: int, end: str = "") -> Path:
+    """Where the task of a block works; with JOINED for its last steps."""
+    return run / FOLDER / f"{block:03d}{end}"
+
+
+def trained_block(run: Path, block: int, end: str = "") -> Primitives:
+    """What a block has become, its margin included."""
+    return Run.open(block_folder(run, block, end) / "run").training_primitives()
+
+
+def beyond(primitives: Primitives, block: Block, margin: float) -> Arrays:
+    """Those outside of a block and its margin, but for those that reach into the block."""
+    reach = primitives.extent.max(1)[:, None]
+    low, high = np.asarray(block.low), np.asarray(block.high)
+    apart = ((primitives.center + reach < low) | (primitives.center - reach > high)).any(1)
+    return select(primitives, apart & ~block.holds(primitives.center, margin))
+
+
+def select(primitives: Primitives, rows: np.ndarray) -> Arrays:
+    """The arrays of some of the primitives."""
+    return {name: getattr(primitives, name)[rows] for name in ARRAYS}
+
+
+def joined(parts: Sequence[Arrays]) -> Arrays:
+    """All of them in one, with the harmonics of the one that has most."""
+    count = max(part["sh"].shape[1] for part in parts)
+    padded = [part | {"sh": np.pad(part["sh"], ((0, 0), (0, count - part["sh"].shape[1]), (0, 0)))} for part in parts]
+    return {name: np.concatenate([part[name] for part in padded]) for name in ARRAYS}
+
+
+def tensors(arrays: Arrays) -> Tensors:
+    """As the rasterizer takes them."""
+    center, rotation, extent, density, sh = (torch.from_numpy(arrays[name]) for name in ARRAYS)
+    return center, rotation, extent, density, sh
