@@ -21,9 +21,12 @@ from __future__ import annotations
 import argparse
 import csv
 import itertools
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from linprim_geo.errors import LinprimError
 from linprim_geo.eval import paper_studies
@@ -34,9 +37,11 @@ from linprim_geo.eval.paper_studies import Case
 from linprim_geo.eval.paper_surfaces import chamfers, depths
 from linprim_geo.eval.published import published
 from linprim_geo.eval.text_tables import number, plain
+from linprim_geo.executor import Task, open_executor
 from linprim_geo.files import atomic_write, write_json
 from linprim_geo.options import SceneOptions, TrainOptions
 from linprim_geo.primitives import KINDS
+from linprim_geo.progress import Progress
 from linprim_geo.scene import load_scene
 from linprim_geo.shapes import SHAPES
 
@@ -213,6 +218,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--repeats", type=int, default=9, help="measured frames per view")
     parser.add_argument("--lpips-weights", metavar="PATH", help="as of linprim-geo eval-images")
+    text = "train the models of so many scenes at once, a worker each; 0: one per core; frames are measured alone after that (default: 1)"
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help=text)
+    parser.add_argument("--cluster", metavar="local|ADDRESS", help="train on Ray, as of linprim-geo train")
     parser.add_argument(
         "--quick", action="store_true", help="tiny and meaningless: 48 pixels, 120 steps, 200 primitives"
     )
@@ -276,25 +284,28 @@ def _options(args: argparse.Namespace, cap: int) -> TrainOptions:
     )  # fmt: skip
 
 
+def _models_of_kinds(args: argparse.Namespace, scene: str, capture: Capture) -> list[dict]:
+    """The models of tables 1, 6 and 8, by kind. They are trained by size, so that an early stop leaves complete comparisons."""
+    rows = []
+    for cap, variant in itertools.product(args.caps, args.kinds):
+        folder = args.output / "models" / scene / f"{variant.name.replace(':', '_')}_{cap}"
+        options = _options(args, cap)
+        options = TrainOptions(
+            **vars(options) | {"primitive": variant.kind, "population": variant.population}
+        )
+        row = train_model(scene, capture.folder, capture.options, variant, options, folder)
+        rows.append(row | {"folder": str(folder)})
+        cost = f"{row['train_cpu_seconds']:.0f} s CPU"
+        print(
+            f"{scene}, {variant.name}, cap {cap}: {row['count']} primitives, {row['psnr']:.2f} dB, {cost}",
+            flush=True,
+        )
+    return sorted(rows, key=lambda row: [v.name for v in args.kinds].index(row["model"]))
+
+
 def _of_kinds(args: argparse.Namespace, captures: dict[str, Capture]) -> None:
-    """Tables 1, 6 and 8: trained by size, so that an early stop leaves complete comparisons."""
-    rows: dict[str, list[dict]] = {}
-    for scene, capture in captures.items():
-        rows[scene] = []
-        for cap, variant in itertools.product(args.caps, args.kinds):
-            folder = args.output / "models" / scene / f"{variant.name.replace(':', '_')}_{cap}"
-            options = _options(args, cap)
-            options = TrainOptions(
-                **vars(options) | {"primitive": variant.kind, "population": variant.population}
-            )
-            row = train_model(scene, capture.folder, capture.options, variant, options, folder)
-            rows[scene].append(row | {"folder": str(folder)})
-            cost = f"{row['train_cpu_seconds']:.0f} s CPU"
-            print(
-                f"{scene}, {variant.name}, cap {cap}: {row['count']} primitives, {row['psnr']:.2f} dB, {cost}",
-                flush=True,
-            )
-        rows[scene].sort(key=lambda row: [v.name for v in args.kinds].index(row["model"]))
+    """Tables 1, 6 and 8."""
+    rows = {scene: _models_of_kinds(args, scene, capture) for scene, capture in captures.items()}
     for of_scene in rows.values():
         measured = measure([Model.open(Path(row["folder"])) for row in of_scene], args.repeats)
         for row, figures in zip(of_scene, measured, strict=True):
@@ -329,28 +340,36 @@ def _of_kinds(args: argparse.Namespace, captures: dict[str, Capture]) -> None:
     _finish(args.output / "paper_tables.txt", text)
 
 
+def _rows(name: str, args: argparse.Namespace, scene: str, capture: Capture) -> list[dict] | str:
+    """Those of one of `TABLES` on a scene, or the option that is missing for it."""
+    kinds = {kind: next((v for v in args.kinds if v.kind == kind), Variant.parse(kind)) for kind in KINDS}
+    loaded, labels = load_scene(capture.folder, downscale=capture.options.downscale), capture.labels
+    if name == "3" and capture.shape:
+        labels = stand_in_labels(capture.folder / "labels", capture.shape, loaded.test)
+    has_depth = capture.reference is not None or any(view.depth_path for view in loaded.views)
+    wanted = {
+        "3": (labels, "--labels"),
+        "9": (has_depth or None, "--references"),
+        "10": (capture.reference, "--references"),
+    }
+    if name in wanted and wanted[name][0] is None:
+        return wanted[name][1]
+    case = Case(
+        scene, capture.folder, capture.options, _options(args, max(args.caps)), args.caps, kinds, args.output / "models" / scene,
+        args.lpips_weights, args.repeats, capture.reference, labels,
+    )  # fmt: skip
+    return TABLES[name].rows(case)
+
+
 def _study(name: str, args: argparse.Namespace, captures: dict[str, Capture]) -> None:
     """One of `TABLES` on all scenes that have what it needs."""
     rows, left_out = [], []
-    kinds = {kind: next((v for v in args.kinds if v.kind == kind), Variant.parse(kind)) for kind in KINDS}
     for scene, capture in captures.items():
-        loaded, labels = load_scene(capture.folder, downscale=capture.options.downscale), capture.labels
-        if name == "3" and capture.shape:
-            labels = stand_in_labels(capture.folder / "labels", capture.shape, loaded.test)
-        has_depth = capture.reference is not None or any(view.depth_path for view in loaded.views)
-        wanted = {
-            "3": (labels, "--labels"),
-            "9": (has_depth or None, "--references"),
-            "10": (capture.reference, "--references"),
-        }
-        if name in wanted and wanted[name][0] is None:
-            left_out.append(f"{scene} is left out: wanted {wanted[name][1]}")
-            continue
-        case = Case(
-            scene, capture.folder, capture.options, _options(args, max(args.caps)), args.caps, kinds, args.output / "models" / scene,
-            args.lpips_weights, args.repeats, capture.reference, labels,
-        )  # fmt: skip
-        rows += TABLES[name].rows(case)
+        found = _rows(name, args, scene, capture)
+        if isinstance(found, str):
+            left_out.append(f"{scene} is left out: wanted {found}")
+        else:
+            rows += found
     if not rows:
         raise LinprimError(f"table {name}: {'; '.join(left_out)}")
     rows += published(name)
@@ -367,16 +386,45 @@ def _finish(file: Path, text: str) -> None:
     print("\n" + text, flush=True)
 
 
-def main(arguments: list[str] | None = None) -> None:
+def _parsed(arguments: Sequence[str] | None) -> tuple[argparse.Namespace, list[str]]:
+    """What was asked for, and the tables."""
     parser = _parser()
     if parser.parse_args(arguments).quick:
         parser.set_defaults(**QUICK)
     args = parser.parse_args(arguments)
     args.caps = sorted(set(args.caps))
     args.kinds = list(dict.fromkeys(args.kinds))
-    wanted = [*OF_KINDS, *TABLES] if "all" in args.tables else [SAME.get(name, name) for name in args.tables]
+    return args, [*OF_KINDS, *TABLES] if "all" in args.tables else [SAME.get(name, name) for name in args.tables]
+
+
+def scene_task(folder: Path, arguments: list[str], scene: str) -> dict:
+    """Trains the models of a scene that the tables of `arguments` want; who makes the tables finds them there."""
+    args, wanted = _parsed(arguments)
+    with redirect_stdout(sys.stderr):  # a worker answers on stdout
+        capture = _captures(args)[scene]
+        if set(wanted) & set(OF_KINDS):
+            _models_of_kinds(args, scene, capture)
+        for name in (name for name in TABLES if name in wanted):
+            _rows(name, args, scene, capture)
+    return {}
+
+
+def _trained_by_workers(args: argparse.Namespace, arguments: list[str], captures: dict[str, Capture]) -> None:
+    """Has every scene's models trained by a worker of its own."""
+    # What is trained stays in `models`, so nothing is lost with the tasks' own folders.
+    with TemporaryDirectory(prefix="tasks_", dir=args.output) as folder:
+        function = "linprim_geo.eval.paper_tables:scene_task"
+        tasks = [Task(scene, function, {"arguments": arguments, "scene": scene}, Path(folder) / scene) for scene in captures]
+        with open_executor(args.cluster, Path(folder), args.workers) as executor:
+            executor.run(tasks, Progress("scenes", 1))
+
+
+def main(arguments: list[str] | None = None) -> None:
+    args, wanted = _parsed(arguments)
     try:
         captures = _captures(args)
+        if args.workers != 1 or args.cluster:
+            _trained_by_workers(args, list(sys.argv[1:] if arguments is None else arguments), captures)
         if set(wanted) & set(OF_KINDS):
             _of_kinds(args, captures)
         for name in (name for name in TABLES if name in wanted):

@@ -11,11 +11,17 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+import sys
+from contextlib import redirect_stdout
+from dataclasses import asdict
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from linprim_geo.errors import LinprimError
+from linprim_geo.executor import Task, open_executor
 from linprim_geo.files import atomic_write, write_json
 from linprim_geo.options import ExtractOptions, SceneOptions, TrainOptions
+from linprim_geo.progress import Progress
 
 
 def captures(data: Path, only: list[str]) -> list[Path]:
@@ -101,6 +107,33 @@ def run_capture(
     return row
 
 
+def tried(capture: Path, data: Path, output: Path, options: TrainOptions, scene_options: SceneOptions) -> dict:
+    """The row of a capture, or what is wrong with it as `error`: the others are done all the same."""
+    try:
+        return run_capture(capture, data, output, options, scene_options)
+    except LinprimError as error:
+        return {"error": str(error)}
+
+
+def capture_task(folder: Path, capture: str, data: str, output: str, options: dict, scene_options: dict) -> dict:
+    """The same by a worker, on one core."""
+    how = TrainOptions(**options | {"threads": 1})
+    with redirect_stdout(sys.stderr):  # a worker answers on stdout
+        return tried(Path(capture), Path(data), Path(output), how, SceneOptions(**scene_options))
+
+
+def by_workers(found: list[Path], args: argparse.Namespace, options: TrainOptions, scene_options: SceneOptions) -> list[dict]:
+    """The rows of all captures, several at a time."""
+    args.output.mkdir(parents=True, exist_ok=True)
+    given = {"data": str(args.data.resolve()), "output": str(args.output.resolve()), "options": asdict(options)}
+    given |= {"scene_options": asdict(scene_options)}
+    with TemporaryDirectory(prefix="tasks_", dir=args.output) as folder:
+        function = "linprim_geo.eval.real_data:capture_task"
+        tasks = [Task(path.name, function, given | {"capture": str(path.resolve())}, Path(folder) / path.name) for path in found]
+        with open_executor(args.cluster, Path(folder), args.workers) as executor:
+            return executor.run(tasks, Progress("captures", 1))
+
+
 def table(rows: list[dict]) -> str:
     """The rows as a Markdown table; figures without a truth to compare with are dashes."""
     columns = [
@@ -145,6 +178,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--samples", type=int, default=TrainOptions.samples)
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--evaluate-every", type=int, default=TrainOptions.evaluate_every)
+    text = "do so many captures at once, each by a worker on one core; 0: one per core (default: 1, on all cores)"
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help=text)
+    parser.add_argument("--cluster", metavar="local|ADDRESS", help="on Ray, as of linprim-geo train")
     args = parser.parse_args(arguments)
     options = TrainOptions(
         iterations=args.iterations,
@@ -153,21 +189,24 @@ def main(arguments: list[str] | None = None) -> None:
         samples=args.samples,
         evaluate_every=args.evaluate_every,
     )
+    scene_options = SceneOptions(downscale=args.downscale)
     rows, failed = [], []
     try:
         found = captures(args.data, args.only)
+        if args.workers != 1 or args.cluster:
+            results = by_workers(found, args, options, scene_options)
+        else:
+            results = (tried(capture, args.data, args.output, options, scene_options) for capture in found)
+        for capture, result in zip(found, results, strict=True):
+            if "error" in result:
+                failed.append(f"{capture.name}: {result['error']}")
+            else:
+                rows.append(result)
+            write_json(args.output / "real_data.json", rows)
+            with atomic_write(args.output / "real_data.md") as temporary:
+                temporary.write_text(table(rows) + "\n\n" + curves(rows) + "\n")
     except LinprimError as error:
         raise SystemExit(f"real_data: error: {error}") from None
-    for capture in found:
-        try:
-            rows.append(
-                run_capture(capture, args.data, args.output, options, SceneOptions(downscale=args.downscale))
-            )
-        except LinprimError as error:
-            failed.append(f"{capture.name}: {error}")
-        write_json(args.output / "real_data.json", rows)
-        with atomic_write(args.output / "real_data.md") as temporary:
-            temporary.write_text(table(rows) + "\n\n" + curves(rows) + "\n")
     print(table(rows) + "\n\n" + curves(rows))
     if failed:
         raise SystemExit("real_data: error: " + "; ".join(failed))

@@ -13,7 +13,7 @@ import torch
 
 from linprim_geo import training_start
 from linprim_geo.camera import Camera
-from linprim_geo.eval import equal_points, paper_kinds, paper_models, paper_tables
+from linprim_geo.eval import equal_points, paper_kinds, paper_models, paper_studies, paper_tables
 from linprim_geo.eval.paper_models import Model, Variant
 from linprim_geo.primitives import KINDS, Primitives
 from linprim_geo.reference import rotation_matrix
@@ -294,3 +294,20 @@ def test_a_variant_is_a_kind_and_a_rule_of_growth():
     )
     with pytest.raises(argparse.ArgumentTypeError, match="none of octahedron"):
         Variant.parse("cube")
+
+
+def test_workers_train_what_a_table_wants(tmp_path, capsys, monkeypatch):
+    command = ["--quick", "-o", str(tmp_path), "--iterations", "30", "--tables", "12", "--workers", "2"]
+    trained = []
+    train_model = paper_studies.train_model
+
+    def watched(*args, **named):
+        folder = args[5]
+        trained.append((folder / "model.json").exists())
+        return train_model(*args, **named)
+
+    monkeypatch.setattr(paper_studies, "train_model", watched)
+    paper_tables.main(command)
+    assert trained == [True, True]  # nothing was left to do here
+    rows = [row for row in json.loads((tmp_path / "table_12.json").read_text())["rows"] if row["source"] == "here"]
+    assert [row["method"] for row in rows] == ["octahedron", "tetrahedron"] and all(row["psnr"] > 10 for row in rows)

@@ -55,3 +55,13 @@ def test_a_table_is_written(data, tmp_path, capsys):
     assert [len(point) for point in row["curve"]] == [2, 2]
     text = (tmp_path / "real_data.md").read_text()
     assert text.strip() in capsys.readouterr().out and "| part_small | 10+2 | 40x40 |" in text and "* part_small: " in text
+
+
+def test_workers_give_the_same_scores(data, tmp_path, capsys):
+    options = ["--iterations", "40", "--max-primitives", "150", "--sh-degree", "0", "--evaluate-every", "20"]
+    for name, workers in (("here", "1"), ("workers", "2")):
+        real_data.main(["--data", str(data), "-o", str(tmp_path / name), "--workers", workers, *options])
+    here, workers = (json.loads((tmp_path / name / "real_data.json").read_text())[0] for name in ("here", "workers"))
+    for key in ("psnr", "ssim", "abs_rel", "primitives", "faces", "chamfer_percent_diagonal"):
+        assert here[key] == workers[key], key
+    assert not list((tmp_path / "workers").glob("tasks_*"))
