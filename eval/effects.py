@@ -3,9 +3,9 @@
     python -m linprim_geo.eval.effects -o runs/effects --size 128 --iterations 1200 --seeds 2 [--only exposure lens ...] [--scenes ...]
 
 For every effect the detector decides about the scenes of its pair; then they are trained with the effect on and off, everything else off.
-Then some scenes are trained as `--effects auto`, `none` and `all` would. `effects.md` has both tables: evidence and whether the decision is
-right, what the effect gains, whether that is more than the scatter of trainings with other seeds, and what it costs. Times are CPU seconds
-of the whole training on one thread.
+Then some scenes are trained as `--effects auto`, `none` and `all` would, and with all that photographs alone tell. `effects.md` has both
+tables: evidence and whether the decision is right, what the effect gains, whether that is more than the scatter of trainings with other
+seeds, and what it costs. Times are CPU seconds of the whole training on one thread.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 from statistics import median, variance
 
 from linprim_geo import training_start
-from linprim_geo.effects import EFFECTS, MODES, Choice, Decision, decide
+from linprim_geo.effects import EFFECTS, Choice, Decision, decide
 from linprim_geo.errors import LinprimError
 from linprim_geo.eval.depth import eval_depth_run
 from linprim_geo.files import write_json
@@ -57,6 +57,13 @@ PAIRS = {
     "overlap": (("room",), ("plain",), "psnr"),
     "exact-rays": (("room",), (), "psnr"),
     "double": ((), ("plain",), "psnr"),
+}
+# What is compared with what everything costs; measured depth and normals are truth in built-in scenes, so all there is without them, too.
+WAYS = {
+    "auto": Choice("auto"),
+    "none": Choice("none"),
+    "all from photographs": Choice("all", {"depth": False, "normals": False}),
+    "all": Choice("all"),
 }
 AUTO_OR_ALL = ("plain", "cad", "room", "wires")
 QUIET = {"threads": 1, "evaluate_every": 0, "checkpoint_every": 10**9}
@@ -200,17 +207,14 @@ def scatter(trainings: list[list[dict]], name: str) -> float | None:
 
 
 def compare_modes(folder: Path, path: Path, size: Size, seeds: int, downscale: int = 1) -> dict:
-    """Trainings by what is decided from the data, with nothing decided, and with everything on; all other options are the defaults."""
+    """Trainings in each of WAYS; all other options are the defaults."""
     found: dict = {"scene": path.name}
-    for mode in MODES:
-        found[mode] = []
+    for way, choice in WAYS.items():
+        found[way] = []
         for seed in range(seeds):
             options = TrainOptions(size.iterations, max_primitives=size.primitives, seed=seed, **QUIET)
-            found[mode].append(
-                trained(
-                    folder, path, f"mode.{mode}", Choice(mode), (SceneOptions(downscale=downscale), options)
-                )
-            )
+            label = f"mode.{way.replace(' ', '_')}"
+            found[way].append(trained(folder, path, label, choice, (SceneOptions(downscale=downscale), options)))
     return found
 
 
@@ -246,10 +250,10 @@ def table(rows: list[dict], comparisons: list[dict], seeds: int) -> str:
     if comparisons:
         lines += ["", "| scene | effects | PSNR dB | depth AbsRel % | CPU s |", "|---" * 5 + "|"]
     for found in comparisons:
-        for mode in MODES:
-            depth = f"{mean(found[mode], 'abs_rel'):.2f}" if "abs_rel" in found[mode][0] else "–"
-            cells = f"{mean(found[mode], 'psnr'):.2f} | {depth} | {mean(found[mode], 'cpu_seconds'):.1f}"
-            lines.append(f"| {found['scene']} | {mode} | {cells} |")
+        for way in WAYS:
+            depth = f"{mean(found[way], 'abs_rel'):.2f}" if "abs_rel" in found[way][0] else "–"
+            cells = f"{mean(found[way], 'psnr'):.2f} | {depth} | {mean(found[way], 'cpu_seconds'):.1f}"
+            lines.append(f"| {found['scene']} | {way} | {cells} |")
     return "\n".join(lines)
 
 

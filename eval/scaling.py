@@ -26,13 +26,13 @@ from linprim_geo.errors import LinprimError
 from linprim_geo.files import atomic_write, write_json
 from linprim_geo.options import SceneOptions, TrainOptions
 
-# (photographs, downscale, primitives) of a capture of 160x160; the last is what the fit is checked on.
+# (photographs, downscale, primitives) of a capture of 1024x1024; the last is what the fit is checked on.
 SIZES = (
-    (20, 1, 500), (20, 1, 4000), (20, 2, 500), (20, 2, 4000), (60, 1, 1000), (60, 2, 2000), (120, 2, 1000), (120, 1, 2000),
-    (40, 4, 1000), (160, 1, 6000),
+    (20, 1, 4000), (20, 1, 40_000), (20, 2, 4000), (20, 2, 40_000), (60, 1, 10_000), (60, 2, 20_000), (120, 2, 10_000), (120, 1, 20_000),
+    (40, 4, 10_000), (160, 1, 30_000),
 )  # fmt: skip
 STEPS, WARM_UP = 30, 5
-SIDE, VIEWS = 160, 160
+SIDE, VIEWS = 1024, 160
 BYTES_OF_PHOTO = 0.5
 """Bytes per pixel of a photograph as a JPEG of good quality: an assumption, not measured here."""
 
@@ -103,14 +103,17 @@ def check(found: Fit, row: dict) -> dict:
 
 def predict(found: Fit, photos: float, capture: Capture) -> dict:
     """Core-hours, memory of a worker, storage and network of a capture of so many photographs."""
-    from linprim_geo.block_tasks import MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS
+    from linprim_geo.block_tasks import END, MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS
 
     window = capture.window * capture.pixels
     blocks = max(1, math.ceil(photos * capture.uses / capture.photos_per_block))
     primitives = photos * capture.primitives_per_photo
+    # In its last steps a block stands before about as many primitives of its neighbours as it has; it is set up anew for these.
     held = primitives / blocks + MOST_COARSE_PRIMITIVES
+    joined = held + primitives / blocks
     steps = capture.steps_per_photo * capture.photos_per_block
-    block = found.seconds_of_setup(capture.photos_per_block, window) + steps * found.seconds_of_step(window, held)
+    step = (1 - END) * found.seconds_of_step(window, held) + END * found.seconds_of_step(window, joined)
+    block = 2 * found.seconds_of_setup(capture.photos_per_block, window) + steps * step
     coarse_views, small = min(photos, MOST_COARSE_VIEWS), capture.pixels / 4
     coarse = found.seconds_of_setup(coarse_views, small)
     coarse += 0.25 * capture.steps_per_photo * coarse_views * found.seconds_of_step(small, MOST_COARSE_PRIMITIVES)
@@ -125,9 +128,9 @@ def predict(found: Fit, photos: float, capture: Capture) -> dict:
         "primitives": int(primitives),
         "core_hours": (blocks * block + coarse + planning) / 3600,
         "longest_task_hours": max(block, coarse, planning) / 3600,
-        "gib_per_worker": found.gib(capture.photos_per_block, window, held),
+        "gib_per_worker": found.gib(capture.photos_per_block, window, joined),
         "storage_gib": (photos * photo + primitives * state * (2 * 3 + 3)) / 2**30,
-        "network_gib": (photos * photo * (1 + capture.uses) + blocks * MOST_COARSE_PRIMITIVES * state) / 2**30,
+        "network_gib": (photos * photo * (1 + 2 * capture.uses) + 2 * (blocks * MOST_COARSE_PRIMITIVES + primitives) * state) / 2**30,
     }
 
 

@@ -115,6 +115,8 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
     blocks = split_space(points[used], work[used], count)
     margin = margin_of(blocks, points[used])
     options = opened.train_options
+    # Where the coarse scene has grown primitives the whole would, too.
+    grown = coarse.training_primitives().center
     parts = []
     for k, block in enumerate(blocks):
         views, pixels = [], 0
@@ -125,7 +127,7 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
                 pixels += found[1][2] * found[1][3]
         if len(views) < 2:
             raise LinprimError(f"block {k} of {count} is seen by {len(views)} cameras, wanted two at least: fewer blocks")
-        share = float(work[block.holds(points, margin)].sum() / work.sum())
+        share = float(block.holds(grown, margin).mean())
         most = max(1, math.ceil(share * options.max_primitives))
         steps = math.ceil(options.iterations * len(views) / len(scene.train))
         parts.append(
@@ -147,7 +149,7 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
         "factor": factor,
         "background": background["background"],
         "shown": background["shown"],
-        "frozen": len(coarse.training_primitives()),
+        "frozen": len(grown),
         "largest": largest,
         "all_pixels": sum(view.camera.width * view.camera.height for view in scene.train),
         "blocks": parts,
