@@ -214,7 +214,8 @@ def workers_of(driver: int) -> list[int]:
             if entry.name.isdigit():
                 parents[int(entry.name)] = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
                 line = (entry / "cmdline").read_bytes()
-                if b"linprim_geo.worker" in line or line.startswith((b"ray::coarse", b"ray::plan", b"ray::block", b"ray::_work")):
+                of_ray = tuple(b"ray::" + name for name in (b"coarse", b"plan", b"block", b"end", b"_work"))
+                if b"linprim_geo.worker" in line or line.startswith(of_ray):
                     found.append(int(entry.name))
         except OSError:
             continue
