@@ -45,6 +45,7 @@ END, NEAR = 0.15, 2.0
 # Where it does.
 JOINED = "joined"
 
+
 def save_points(path: Path, cloud: PointCloud) -> None:
     """Writes the points that a scene starts from."""
     with atomic_write(path) as temporary, open(temporary, "wb") as file:

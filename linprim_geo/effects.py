@@ -406,7 +406,7 @@ _REGISTRY = (
     ),
     Effect(
         "exposure", "a gain per channel for every training photograph",
-        "spread of how bright the photographs show the same points", "%", 3.0, 1.1, _gain_spread,
+        "spread of how bright the photographs show the same points", "%", 3.0, 1.3, _gain_spread,
         {"exposure": "gain"}, {"exposure": "none"},
     ),
     Effect(
@@ -421,12 +421,12 @@ _REGISTRY = (
     ),
     Effect(
         "depth", "surfaces lie at the depths that the data set brings",
-        "training views with depth that agrees with the points", "%", 1.0, 1.1, _depth_share,
+        "training views with depth that agrees with the points", "%", 1.0, 1.2, _depth_share,
         {"sensor_depth": 1.0}, {"sensor_depth": 0.0}, needs=_absent("depth_path", "depth"), on_request=_TRUTH,
     ),
     Effect(
         "normals", "faces point as the normals that the data set brings",
-        "training views with normals", "%", 1.0, 1.1, lambda data: _share(data, "normal_path"),
+        "training views with normals", "%", 1.0, 1.2, lambda data: _share(data, "normal_path"),
         {"sensor_normals": 0.1}, {"sensor_normals": 0.0}, needs=_absent("normal_path", "normals whose axes are known"), on_request=_TRUTH,
     ),
     Effect(
