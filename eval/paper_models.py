@@ -22,6 +22,7 @@ from linprim_geo.errors import LinprimError
 from linprim_geo.files import write_json
 from linprim_geo.options import SceneOptions, TrainOptions, from_saved, raster_options
 from linprim_geo.primitives import ARRAYS, KINDS, Primitives
+from linprim_geo.run import is_unused
 from linprim_geo.train import train
 
 STAGES = {
@@ -134,7 +135,7 @@ def train_model(
         if any(from_saved(cls, row[name], str(marker)) != wanted for cls, name, wanted in of):
             raise LinprimError(f"{folder}: was trained with other options; give another folder with -o")
         return row
-    if folder.exists():
+    if folder.exists() and not is_unused(folder):
         if not (folder / "config.json").is_file():
             raise LinprimError(f"{folder}: exists and is not an earlier run; give another folder with -o")
         shutil.rmtree(folder)  # stopped before it was done

@@ -201,7 +201,7 @@ def join_task(folder: Path, run: str, block: int) -> dict:
     if rows.any():
         state |= {name: {key: value[rows] for key, value in state[name].items()} for name in ("parameters", "first", "second", "gathered")}
         state |= {name: state[name][rows] for name in ("steps", "filter_3d") if state[name] is not None}
-    return _trained(folder, opened, scene, plan, block, joined(frozen), 1.0, state, None)
+    return _trained(folder, opened, scene, plan, block, concatenated(frozen), 1.0, state, None)
 
 
 def _trained(
@@ -267,7 +267,7 @@ def select(primitives: Primitives, rows: np.ndarray) -> Arrays:
     return {name: getattr(primitives, name)[rows] for name in ARRAYS}
 
 
-def joined(parts: Sequence[Arrays]) -> Arrays:
+def concatenated(parts: Sequence[Arrays]) -> Arrays:
     """All of them in one, with the harmonics of the one that has most."""
     count = max(part["sh"].shape[1] for part in parts)
     padded = [part | {"sh": np.pad(part["sh"], ((0, 0), (0, count - part["sh"].shape[1]), (0, 0)))} for part in parts]

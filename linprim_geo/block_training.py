@@ -26,7 +26,7 @@ from .block_tasks import (
     block_folder,
     block_of,
     coarse_of,
-    joined,
+    concatenated,
     save_points,
     select,
     trained_block,
@@ -191,7 +191,7 @@ def _merged(
     from .eval.images import psnr, to_8bit
 
     blocks = [trained_block(run.path, k, JOINED) for k in range(len(ended))]
-    together = joined([select(each, block_of(plan, k).holds(each.center)) for k, each in enumerate(blocks)])
+    together = concatenated([select(each, block_of(plan, k).holds(each.center)) for k, each in enumerate(blocks)])
     if len(together["center"]) == 0:
         raise LinprimError(f"{run.path}: no block has kept a primitive, so there is no scene")
     merged = Primitives(**together, kind=run.train_options.primitive)

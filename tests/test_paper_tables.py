@@ -298,6 +298,9 @@ def test_a_variant_is_a_kind_and_a_rule_of_growth():
 
 def test_workers_train_what_a_table_wants(tmp_path, capsys, monkeypatch):
     command = ["--quick", "-o", str(tmp_path), "--iterations", "30", "--tables", "12", "--workers", "2"]
+    begun = tmp_path / "models" / "cad" / "octahedron_200"  # a training that ended before it wrote anything leaves its lock
+    begun.mkdir(parents=True)
+    (begun / ".lock").touch()
     trained = []
     train_model = paper_studies.train_model
 
