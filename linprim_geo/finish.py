@@ -8,7 +8,7 @@ from pathlib import Path
 from .mesh import Mesh, save_mesh, select_faces
 from .mesh_process import process_mesh
 from .options import ExtractOptions
-from .photo_sweep import best_agreement, photo_gains, predicted_error, refine_surface
+from .photo_sweep import photo_gains, predicted_error, refine_surface
 from .raycast import RayCaster
 from .run import Run
 from .stages import Stages
@@ -45,8 +45,7 @@ def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, 
         stages.lap("process")
     if options.refine or processing:
         caster = RayCaster(mesh.vertices, mesh.faces)
-    agreement = best_agreement(mesh, cameras, (view.load() for view in views), gains, caster)
-    mesh = replace(mesh, quality=predicted_error(mesh, agreement))
+    mesh = replace(mesh, quality=predicted_error(mesh, cameras, (view.load() for view in views), gains, caster))
     stages.lap("quality")
     mesh = replace(mesh, colors=color_vertices(mesh, cameras, (view.load().rgb for view in views), caster))
     stages.lap("colours")

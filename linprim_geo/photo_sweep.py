@@ -19,6 +19,8 @@ from .scene import Photo, View
 from .visibility import FAR
 
 if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
     from .raycast import RayCaster
 
 OFFSETS = np.arange(-3.0, 3.5, 0.5)
@@ -43,8 +45,23 @@ GAIN_POINTS, GAIN_ROUNDS, DARKEST = 20_000, 10, 0.03
 LEAST_SHARPNESS = 0.002
 """Where the disagreement of the photographs rises by less than this, of white, beside its least, vertices hardly move."""
 
-ROUNDING = 1 / (255 * np.sqrt(12))
-"""Standard deviation of brightness, of white, that is due to its 255 steps alone."""
+DENSE_OFFSETS, FINEST_OFFSET = np.arange(-3.0, 3.25, 0.25), 1 / 16
+"""Of the predicted error: places at which photographs are compared, and the spacing to which these are interpolated, in footprints."""
+
+LEAST_DEVIATION = 0.5 / (255 * np.sqrt(12))
+"""Disagreement that is always there, of white: half of what rounding brightness to 255 steps causes."""
+
+INDEPENDENT_PHOTOS = 8
+"""Photographs of a vertex count as so many independent ones: there are more, but the errors of neighbouring views are much the same."""
+
+PRIOR_SCALE, PRIOR_ROUNDS = 1.0, 2
+"""Mean distance of vertices from the surface before photographs are asked, in footprints, and how often it is replaced by what they say."""
+
+NEIGHBOURS = 64
+"""Vertices that photographs do not tell of take the mean of so many nearest ones that they do."""
+
+ROWS_AT_ONCE = 2**14
+"""Vertices whose distances are weighed at once, to limit memory."""
 
 
 @dataclass(frozen=True)
@@ -53,15 +70,13 @@ class Agreement:
 
     `offset` is the signed distance along the normal, in the unit of the mesh, to where they agree best; `sharpness` how much their
     disagreement rises within a footprint on either side of it, as a share of white: 0 for a plain surface; `known` whether at least two
-    of them see a vertex well, `inside` whether the best place lies within the OFFSETS and not at their end; `rounding` is what the
-    rounding of the photographs alone may shift `offset` by: more the plainer the surface, less the more photographs.
+    of them see a vertex well, `inside` whether the best place lies within the OFFSETS and not at their end.
     """
 
     offset: np.ndarray
     sharpness: np.ndarray
     known: np.ndarray
     inside: np.ndarray
-    rounding: np.ndarray
 
 
 def best_agreement(
@@ -78,32 +93,17 @@ def best_agreement(
     vertex. The same to the last bit for any number of threads.
 
     Args:
-        mesh: not empty; `normals` are used if it has them.
+        mesh: not empty.
         photos: one per camera, iterated once. Transparent pixels count as mid-grey.
         gains: (K,) exposure of each photograph (`photo_gains`), default 1.
         caster: of the mesh, if there is one already.
     """
-    points, normals = _points(mesh)
-    footprint, count = _footprints(points, normals, cameras), len(points)
-    views, weight = np.zeros(count, np.int32), np.zeros(count, np.float32)
-    value, square = np.zeros((2, count, len(OFFSETS)), np.float32)
-    gains = np.ones(len(cameras)) if gains is None else gains
-    for (camera, image, depth, jump), gain in zip(_photographed(mesh, cameras, photos, caster), gains, strict=True):
-        image = image / np.float32(gain)
-        rules = (LEAST_COSINE, OUTLINE_SLOPES)
-        _core.add_photo(
-            *camera.pinhole(), image, depth, jump, rules, OFFSETS, points, normals, footprint, views, weight, value, square
-        )
-    known = views >= 2
-    offset, sharpness, inside = np.zeros(count), np.zeros(count), np.zeros(count, bool)
-    total = weight[known, None]
-    mean = value[known] / total
-    disagreement = np.sqrt(np.maximum(square[known] / total - mean * mean, 0))
-    place, sharpness[known] = _least(disagreement)
+    known, footprint, variance = _compared(mesh, cameras, photos, gains, caster, OFFSETS)
+    offset, sharpness, inside = np.zeros(len(known)), np.zeros(len(known)), np.zeros(len(known), bool)
+    place, sharpness[known] = _least(np.sqrt(variance))
     offset[known] = place * footprint[known]
     inside[known] = np.abs(place) < OFFSETS[-1] - 0.1
-    rounding = footprint * ROUNDING / np.sqrt(np.maximum(views, 1)) / (sharpness + LEAST_SHARPNESS)
-    return Agreement(offset, sharpness, known, inside, rounding)
+    return Agreement(offset, sharpness, known, inside)
 
 
 def photo_gains(
@@ -137,22 +137,39 @@ def photo_gains(
     return np.exp(logs)
 
 
-def predicted_error(mesh: Mesh, agreement: Agreement) -> np.ndarray:
-    """(V,) float32 predicted distance of each vertex from the true surface, in the mesh's unit.
+def predicted_error(
+    mesh: Mesh,
+    cameras: Sequence[Camera],
+    photos: Iterable[Photo],
+    gains: np.ndarray | None = None,
+    caster: RayCaster | None = None,
+) -> np.ndarray:
+    """(V,) float32 predicted distance of each vertex from the true surface, in the mesh's unit; arguments as of `best_agreement`.
 
-    It is how far from it the photographs agree best, plus what the rounding of the photographs may shift that place by. A vertex that
-    is not known takes the value of the nearest that is; where none is, all are NaN.
+    It is the expected distance along the normal to where the surface is, given the photographs. At a wrong place their brightness
+    has the variance v that is measured, at the right one the least; m photographs of unknown brightness and variance make a place
+    as likely as v^(-m/2) (Jeffreys' prior), here with m = INDEPENDENT_PHOTOS. Distances are expected to fall off exponentially, at
+    first with PRIOR_SCALE, then with the mean that comes out. So a vertex is uncertain where photographs agree elsewhere, where
+    they agree in many places, and where nothing agrees. One that is not known takes the mean of the nearest NEIGHBOURS that are;
+    where none is, all are NaN. Memory: some 250 bytes per vertex. The same to the last bit for any number of threads.
     Accuracy: `python -m linprim_geo.eval.surfaces` prints its rank correlation with the exact error, and the ratio of their means.
     """
     from scipy.spatial import cKDTree
 
-    known = agreement.known
-    error = np.full(len(known), np.nan, np.float32)
-    error[known] = (np.abs(agreement.offset) + agreement.rounding)[known]
-    if known.any() and not known.all():
-        _, nearest = cKDTree(mesh.vertices[known]).query(mesh.vertices[~known], workers=-1)
-        error[~known] = error[known][nearest]
-    return error
+    known, footprint, variance = _compared(mesh, cameras, photos, gains, caster, DENSE_OFFSETS)
+    error = np.full(len(known), np.nan)
+    if not known.any():
+        return error.astype(np.float32)
+    scale = PRIOR_SCALE
+    for _ in range(PRIOR_ROUNDS):
+        distance = _expected_distance(variance, scale)
+        scale = max(float(distance.mean()), FINEST_OFFSET)
+    error[known] = distance * footprint[known]
+    if not known.all():
+        count = min(NEIGHBOURS, int(known.sum()))
+        _, nearest = cKDTree(mesh.vertices[known]).query(mesh.vertices[~known], np.arange(1, count + 1), workers=-1)
+        error[~known] = error[known][nearest].mean(1)
+    return error.astype(np.float32)
 
 
 def refine_surface(
@@ -163,16 +180,11 @@ def refine_surface(
     Moves are averaged over neighbours and fade out where the photographs say nothing. Colours and quality are kept as they are.
     `caster`: of the mesh as it is given, if there is one already.
     """
-    from scipy.sparse import coo_matrix, diags, identity
+    from scipy.sparse import diags
 
-    cameras, count = [view.camera for view in views], len(mesh.vertices)
-    first, second = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
-    ends = (np.concatenate([first, second]), np.concatenate([second, first]))
-    graph = coo_matrix((np.ones(len(ends[0])), ends), shape=(count, count)).tocsr() + identity(count, format="csr")
-    graph.data[:] = 1  # an edge of two faces counts once
+    cameras, graph = [view.camera for view in views], _neighbours(mesh)
     average = diags(1 / np.asarray(graph.sum(1)).ravel()) @ graph
     for _ in range(rounds):
-        mesh = replace(mesh, normals=vertex_normals(mesh))
         agreement = best_agreement(mesh, cameras, (view.load() for view in views), gains, caster)
         caster = None
         weight = agreement.sharpness * agreement.inside
@@ -180,14 +192,70 @@ def refine_surface(
         for _ in range(SMOOTHING):
             move, weight = average @ move, average @ weight
         move /= weight + LEAST_SHARPNESS
-        mesh = replace(mesh, vertices=mesh.vertices + move[:, None] * mesh.normals)
+        mesh = replace(mesh, vertices=mesh.vertices + move[:, None] * _points(mesh)[1])
     return replace(mesh, normals=vertex_normals(mesh))
 
 
+def _compared(
+    mesh: Mesh,
+    cameras: Sequence[Camera],
+    photos: Iterable[Photo],
+    gains: np.ndarray | None,
+    caster: RayCaster | None,
+    places: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(V,) whether at least two photographs see a vertex well, (V,) footprints, and of the P vertices that they do see the (P, K)
+    variance of brightness over them at each of K places along the normal, weighted by cosines. Arguments as of `best_agreement`."""
+    points, normals = _points(mesh)
+    footprint, count = _footprints(points, normals, cameras), len(points)
+    views, weight = np.zeros(count, np.int32), np.zeros(count, np.float32)
+    value, square = np.zeros((2, count, len(places)), np.float32)
+    gains = np.ones(len(cameras)) if gains is None else gains
+    for (camera, image, depth, jump), gain in zip(_photographed(mesh, cameras, photos, caster), gains, strict=True):
+        image = image / np.float32(gain)
+        rules = (LEAST_COSINE, OUTLINE_SLOPES)
+        _core.add_photo(*camera.pinhole(), image, depth, jump, rules, places, points, normals, footprint, views, weight, value, square)
+    known = views >= 2
+    total = weight[known, None]
+    mean = value[known] / total
+    return known, footprint, np.maximum(square[known] / total - mean * mean, 0)
+
+
+def _expected_distance(variance: np.ndarray, scale: float) -> np.ndarray:
+    """(P,) expected distance from the surface, in footprints, given (P, K) variances at DENSE_OFFSETS and that of all vertices, `scale`."""
+    from scipy.interpolate import CubicSpline
+
+    places = np.arange(DENSE_OFFSETS[0], DENSE_OFFSETS[-1] + FINEST_OFFSET / 2, FINEST_OFFSET)
+    expected = np.zeros(len(variance))
+    for start in range(0, len(variance), ROWS_AT_ONCE):
+        rows = slice(start, start + ROWS_AT_ONCE)
+        logs = CubicSpline(DENSE_OFFSETS, np.log(variance[rows] + LEAST_DEVIATION**2), axis=1)(places)
+        likelihood = -0.5 * INDEPENDENT_PHOTOS * logs - np.abs(places) / scale
+        chance = np.exp(likelihood - likelihood.max(1, keepdims=True))
+        expected[rows] = (chance * np.abs(places)).sum(1) / chance.sum(1)
+    return expected
+
+
+def _neighbours(mesh: Mesh) -> csr_matrix:
+    """(V, V) 1 where two vertices share an edge, and on the diagonal."""
+    from scipy.sparse import coo_matrix, identity
+
+    first, second = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
+    ends, count = (np.concatenate([first, second]), np.concatenate([second, first])), len(mesh.vertices)
+    graph = coo_matrix((np.ones(len(ends[0])), ends), shape=(count, count)).tocsr() + identity(count, format="csr")
+    graph.data[:] = 1  # an edge of two faces counts once
+    return graph
+
+
 def _points(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """(V, 3) float64 vertices and their normals."""
-    normals = vertex_normals(mesh) if mesh.normals is None else mesh.normals
-    return np.ascontiguousarray(mesh.vertices, np.float64), np.ascontiguousarray(normals, np.float64)
+    """(V, 3) float64 vertices, and the unit normals along which they are swept: the mean by area over the faces of a vertex and of its
+    neighbours. Those of a vertex alone are noise where faces are slivers, as on a union of polyhedra."""
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    own = np.stack([np.bincount(mesh.faces.ravel(), np.repeat(area[:, k], 3), len(mesh.vertices)) for k in range(3)], axis=1)
+    normals = _neighbours(mesh) @ own
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.ascontiguousarray(mesh.vertices, np.float64), normals / np.where(length > 0, length, 1)
 
 
 def _photographed(
