@@ -5,7 +5,8 @@
 For every effect the detector decides about the scenes of its pair; then they are trained with the effect on and off, everything else off.
 Then some scenes are trained as `--effects auto`, `none` and `all` would, and with all that photographs alone tell. `effects.md` has both
 tables: evidence and whether the decision is right, what the effect gains, whether that is more than the scatter of trainings with other
-seeds, and what it costs. Times are CPU seconds of the whole training on one thread.
+seeds, and what it costs. Times are CPU seconds of the whole training on one thread. Depth errors are relative to the truth, means over
+the pixels that show something; one where the render has no surface counts as 100 %, so holes are no gain.
 """
 
 from __future__ import annotations
@@ -48,12 +49,12 @@ SCENES = {
 PAIRS = {
     "view-dependence": (("highlights",), ("plain",), "psnr"),
     "exposure": (("exposure",), ("room",), "psnr"),
-    "lens": (("lens",), ("slight lens",), "abs_rel"),
+    "lens": (("lens",), ("slight lens",), "depth"),
     "filter": (("zoom",), ("plain", "room", "cad", "wires"), "psnr"),
     "background": (("white",), ("room",), "psnr"),
-    "masks": (("plain",), ("black",), "abs_rel"),
-    "depth": (("plain",), (), "abs_rel"),
-    "normals": (("plain",), (), "abs_rel"),
+    "masks": (("plain",), ("black",), "depth"),
+    "depth": (("plain",), (), "depth"),
+    "normals": (("plain",), (), "depth"),
     "overlap": (("room",), ("plain",), "psnr"),
     "exact-rays": (("room",), (), "psnr"),
     "double": ((), ("plain",), "psnr"),
@@ -68,7 +69,7 @@ WAYS = {
 AUTO_OR_ALL = ("plain", "cad", "room", "wires")
 QUIET = {"threads": 1, "evaluate_every": 0, "checkpoint_every": 10**9}
 # What trainings are judged by, and whether more or less of it is better.
-JUDGED = {"psnr": 1, "abs_rel": -1}
+JUDGED = {"psnr": 1, "depth": -1}
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,8 @@ def make_scene(folder: Path, name: str, size: Size) -> Path:
 def trained(
     folder: Path, path: Path, label: str, choice: Choice, options: tuple[SceneOptions, TrainOptions]
 ) -> dict:
-    """PSNR, depth error in percent (if there is truth) and CPU seconds of a training; taken from the folder if it is there."""
+    """PSNR, depth error in percent (if there is truth, a mesh or depth images) and CPU seconds of a training; taken from the folder if it
+    is there."""
     run = folder / "runs" / f"{path.name}.{label}.{options[1].seed}"
     result = run / "effects_result.json"
     if result.is_file():
@@ -128,8 +130,10 @@ def trained(
     begin = time.process_time()
     found = train(path, run, *options, quiet=True, effects=choice)
     row = {"psnr": found["psnr"], "cpu_seconds": time.process_time() - begin}
-    if (path / "reference.ply").is_file():
-        row["abs_rel"] = 100 * eval_depth_run(run, path / "reference.ply")["abs_rel"]
+    reference = path / "reference.ply"
+    if reference.is_file() or any(view.depth_path for view in load_scene(path).test):
+        scores = eval_depth_run(run, reference if reference.is_file() else None)
+        row["depth"] = 100 * (scores["coverage"] * scores["abs_rel"] + 1 - scores["coverage"])
     write_json(result, row)
     return row
 
@@ -243,36 +247,41 @@ def table(rows: list[dict], comparisons: list[dict], seeds: int) -> str:
         )
         lines.append(f"| {' | '.join([*cells, verdict(row, spread, seeds)])} |")
     if rows and None not in spread.values():
-        lines += ["", "Gains in dB, and in % of depth (AbsRel); time with the effect by that without."]
+        lines += ["", "Gains in dB, and in % of depth, 100 where there is no surface; time with the effect by that without."]
         lines[-1] += (
-            f" {seeds} seeds; one training scatters by {spread['psnr']:.2f} dB and {spread['abs_rel']:.3f} % (standard deviation)."
+            f" {seeds} seeds; one training scatters by {spread['psnr']:.2f} dB and {spread['depth']:.3f} % (standard deviation)."
         )
     if comparisons:
-        lines += ["", "| scene | effects | PSNR dB | depth AbsRel % | CPU s |", "|---" * 5 + "|"]
+        lines += ["", "| scene | effects | PSNR dB | depth error % | CPU s |", "|---" * 5 + "|"]
     for found in comparisons:
         for way in WAYS:
-            depth = f"{mean(found[way], 'abs_rel'):.2f}" if "abs_rel" in found[way][0] else "–"
+            depth = f"{mean(found[way], 'depth'):.2f}" if "depth" in found[way][0] else "–"
             cells = f"{mean(found[way], 'psnr'):.2f} | {depth} | {mean(found[way], 'cpu_seconds'):.1f}"
             lines.append(f"| {found['scene']} | {way} | {cells} |")
     return "\n".join(lines)
 
 
 def verdict(row: dict, spread: dict, seeds: int) -> str:
-    """Whether a decision is right by what the effect is judged by; a change counts that is more than twice its standard error."""
+    """Whether a decision is right by what the effect is judged by; a change counts that is more than twice its standard error.
+
+    Where nothing calls for the effect, what it gains by that does not count if it loses as much, in standard errors, by the other.
+    """
     if row["reason"] == "impossible":
         return "ruled out"
     by = row["judged_by"]
-    if spread[by] is None:
+    if None in spread.values():
         return "–"
-    least = 2 * spread[by] * (2 / seeds) ** 0.5
-    change = "gains" if row["gain"][by] > least else "loses" if row["gain"][by] < -least else "no change"
+    clear = {name: row["gain"][name] / (2 * spread[name] * (2 / seeds) ** 0.5) for name in JUDGED}
+    change = "gains" if clear[by] > 1 else "loses" if clear[by] < -1 else "no change"
     if row["reason"] == "request":
         return f"{change}, on request"
     if row["reason"] == "free":
         return f"{'wrong' if change == 'loses' else 'right'}: {change}, free"
     if row["called_for"] and change == "no change":
         return "gain not shown"
-    wrong = row["decided_on"] != row["called_for"] or change == ("loses" if row["decided_on"] else "gains")
+    if not row["called_for"] and change == "gains" and min(clear.values()) <= -clear[by]:
+        change = "loses more than it gains"
+    wrong = row["decided_on"] != row["called_for"] or change.startswith("loses" if row["decided_on"] else "gains")
     return f"{'wrong' if wrong else 'right'}: {change}"
 
 

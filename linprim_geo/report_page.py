@@ -343,8 +343,8 @@ def _viewer(shown: Sequence[ShownMesh]) -> str:
         '<p id="view-message" class="small"></p><noscript><p>The mesh needs JavaScript to be turned.</p></noscript>'
         '<p class="small">Drag to turn; Shift and drag, or two fingers, to move; pinch, + and -, or the wheel once the mesh was clicked, '
         "to zoom; double-click for the first look. The backs of faces are bluish. Predicted error is how far from a vertex "
-        "the photographs agree best; both errors have one scale of colours, up to what 5 % of the vertices exceed, and grey where there "
-        "is none.</p>"
+        "the surface is expected, given the photographs; both errors have one scale of colours, up to what 5 % of the vertices exceed, and "
+        "grey where there is none.</p>"
     )
 
 
