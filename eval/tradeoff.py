@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from linprim_geo.dry_run import memory_estimate
 from linprim_geo.errors import LinprimError
 from linprim_geo.eval.frontier import RULE, frontier, verdict
 from linprim_geo.eval.knobs import (
@@ -33,8 +34,11 @@ from linprim_geo.eval.knobs import (
     settings,
     training_options,
 )
+from linprim_geo.executor import Executor, Task, open_executor
 from linprim_geo.files import atomic_write, write_json
 from linprim_geo.options import SceneOptions, TrainOptions
+from linprim_geo.progress import Progress
+from linprim_geo.shots import photo_bytes
 
 # The training that knobs are swept around: a modest size of the defaults, images averaged down to at most so many pixels across.
 MODEST = {"iterations": 2000, "max_primitives": 2000}
@@ -63,6 +67,8 @@ def tradeoff(
     iterations: int | None = None,
     max_primitives: int | None = None,
     threads: int = 0,
+    cluster: str | None = None,
+    workers: int = 1,
     quiet: bool = False,
 ) -> dict:
     """Sweeps the knobs on a scene and writes the tables and the page into the folder `output`.
@@ -75,6 +81,8 @@ def tradeoff(
         quick: the size `QUICK`, to see that all of it runs.
         rounds: how often everything is timed (default 3, quick 2).
         iterations, max_primitives: in place of those of `MODEST` or `QUICK`.
+        cluster, workers: where and how many trainings at once, see `executor.open_executor`; their times are those of machines with as
+            many trainings on them. One worker and no cluster: here, one after another. Everything else is measured here.
 
     Returns: what tradeoff.json holds: `rows` (one per rung of each knob), `sentences`, `rule`, `about`.
 
@@ -93,14 +101,22 @@ def tradeoff(
     size = (QUICK if quick else MODEST) | {name: value for name, value in size.items() if value is not None}
     sweep = Sweep(Path(scene), Path(output), run, reference, quick, rounds, size, threads, quiet)
     chosen = [KNOBS[name] for name in KNOBS if not knobs or name in knobs]
-    return sweep.measure(chosen)
+    if cluster is None and workers == 1:
+        return sweep.measure(chosen)
+    with open_executor(cluster, sweep.folder / "runs", workers) as executor:
+        cores = os.cpu_count() or 1
+        sweep.executor, sweep.cores = executor, threads or max(1, cores // (workers or cores) if cluster is None else cores)
+        return sweep.measure(chosen)
 
 
 class Sweep:
-    """One folder of measurements. `store[key]` of a setting holds `times`, `peak_gib`, and what was found of it once."""
+    """One folder of measurements. `store[key]` of a setting holds `times`, `peak_gib`, and what was found of it once. With an `executor`
+    trainings are its tasks, on so many `cores` each."""
+
+    executor: Executor | None = None
+    cores = 0
 
     def __init__(self, scene, folder, run, reference, quick, rounds, size, threads, quiet):
-        from linprim_geo.progress import Progress
         from linprim_geo.scene import load_scene
         from linprim_geo.structure_from_motion import prepare
 
@@ -191,6 +207,8 @@ class Sweep:
                 setting = self._setting(knob, rung)
                 wanted.setdefault(_key(group, setting), (setting, set()))[1].update(knob.errors)
         for turn in range(self.rounds):
+            if group == "train" and self.executor:
+                self._train_at_once([setting for setting, _ in wanted.values()], turn)
             for key, (setting, errors) in wanted.items():
                 entry = self.store.setdefault(key, {"setting": setting, "times": [], "peak_gib": 0.0, "errors": {}})
                 if "failed" in entry or (len(entry["times"]) > turn and errors <= entry["errors"].keys() | {"photo_percent"}):
@@ -338,17 +356,57 @@ class Sweep:
 
     # --- train ------------------------------------------------------------------------------------------
 
-    def _train(self, key: str, setting: dict, errors: set, turn: int) -> None:
-        from linprim_geo.stages import Stages
-        from linprim_geo.train import train
-
+    def _options(self, key: str, setting: dict) -> tuple[TrainOptions, SceneOptions]:
+        """Those of a training, chosen once."""
         entry = self.store[key]
         if "options" not in entry:
             options, scene_options = training_options(self.options, self.scene_options, len(self.scene.train), setting)
             if setting.get("equal_time"):
                 options = replace(options, iterations=self._equal_time(setting, options.iterations))
             entry["options"] = asdict(options), asdict(scene_options)
-        options, scene_options = TrainOptions(**entry["options"][0]), SceneOptions(**entry["options"][1])
+        return TrainOptions(**entry["options"][0]), SceneOptions(**entry["options"][1])
+
+    def _train_at_once(self, settings: Sequence[dict], turn: int) -> None:
+        """The trainings of a round that are not measured yet, by the executor; those of equal time are left, as they wait for others."""
+        assert self.executor is not None
+        tasks = {}
+        for setting in settings:
+            key = _key("train", setting)
+            entry = self.store.setdefault(key, {"setting": setting, "times": [], "peak_gib": 0.0, "errors": {}})
+            if setting.get("equal_time") or "failed" in entry or len(entry["times"]) > turn:
+                continue
+            options, scene_options = self._options(key, setting)
+            square = scene_options.downscale**2
+            largest = max(view.camera.width * view.camera.height for view in self.scene.train)
+            tasks[key] = Task(
+                _shown(setting),
+                "linprim_geo.eval.tradeoff:train_task",
+                {
+                    "scene": str(self.scene_path),
+                    "scene_options": asdict(scene_options),
+                    "options": asdict(replace(options, threads=self.cores)),
+                },
+                self.folder / "runs" / f"round_{turn}" / _name(setting),
+                memory_estimate((), options, photo_bytes(self.scene.train) // square, largest // square),
+                self.cores,
+                "fewer --workers, or more memory",
+            )
+        progress = Progress(f"train, round {turn + 1} of {self.rounds}", 1, quiet=self.progress.quiet)
+        for key, found in zip(tasks, self.executor.run(list(tasks.values()), progress), strict=True):
+            kept = self.folder / "runs" / _name(self.store[key]["setting"])
+            if not self.store[key]["errors"]:
+                shutil.rmtree(kept, ignore_errors=True)
+                (tasks[key].folder / "run").rename(kept)
+            self._note(key, found["seconds"], found["task_peak_gib"], primitives=found["primitives"])
+        self._save()
+        shutil.rmtree(self.folder / "runs" / f"round_{turn}", ignore_errors=True)
+
+    def _train(self, key: str, setting: dict, errors: set, turn: int) -> None:
+        from linprim_geo.stages import Stages
+        from linprim_geo.train import train
+
+        entry = self.store[key]
+        options, scene_options = self._options(key, setting)
         if len(entry["times"]) <= turn:
             folder = self.folder / "runs" / (_name(setting) if not entry["errors"] else "again")
             shutil.rmtree(folder, ignore_errors=True)
@@ -509,6 +567,18 @@ class Sweep:
         with atomic_write(self.folder / "tradeoff.html") as temporary:
             temporary.write_text(page(results, {knob.name: knob for knob in knobs}), encoding="utf-8")
         return results
+
+
+def train_task(folder: Path, scene: str, scene_options: dict, options: dict) -> dict:
+    """A training into folder/run, after a few steps that load the libraries. Returns its seconds and primitives."""
+    from linprim_geo.train import train
+
+    chosen = SceneOptions(**scene_options), TrainOptions(**options)
+    for name, iterations in (("warm_up", min(20, chosen[1].iterations)), ("run", chosen[1].iterations)):
+        shutil.rmtree(folder / name, ignore_errors=True)
+        trained = train(scene, folder / name, chosen[0], replace(chosen[1], iterations=iterations), quiet=True)
+    shutil.rmtree(folder / "warm_up")
+    return {"seconds": trained["seconds"], "primitives": trained["primitives"]}
 
 
 COLUMNS = (

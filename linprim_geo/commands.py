@@ -176,6 +176,8 @@ def tradeoff(parsed: argparse.Namespace) -> dict:
         iterations=parsed.iterations,
         max_primitives=parsed.max_primitives,
         threads=parsed.threads,
+        cluster=parsed.cluster,
+        workers=parsed.workers,
         quiet=parsed.quiet,
     )
     files = [str(output / f"tradeoff.{suffix}") for suffix in ("html", "csv", "json")]

@@ -258,6 +258,20 @@ def test_training_knobs_run_on_every_rung(tiny_scene, tmp_path, monkeypatch):
     assert equal == max(1, round(8 * base / other))
 
 
+def test_trainings_by_workers_are_those_of_this_process(monkeypatch, tiny_scene, tmp_path):
+    monkeypatch.setattr(sweeping, "POINTS", 3000)
+    how = {"knobs": ["iterations", "primitive"], "quick": True, "iterations": 12, "max_primitives": 60, "threads": 1, "quiet": True}
+    here = tradeoff(tiny_scene, tmp_path / "here", rounds=1, **how)
+    there = tradeoff(tiny_scene, tmp_path / "there", rounds=2, workers=2, **how)
+    assert len(there["rows"]) == len(here["rows"]) > 4
+    for one, other in zip(there["rows"], here["rows"], strict=True):
+        assert one["rounds"] == 2 and one["seconds"] > 0 and 0.1 < one["peak_gib"] < 4
+        if "equal" not in one["rung"]:
+            assert (one["rung"], one["psnr"], one["primitives"]) == (other["rung"], other["psnr"], other["primitives"])
+    names = {path.name for path in (tmp_path / "there" / "runs").iterdir()}
+    assert "base" in names and not [name for name in names if name.startswith("round_") or name == "again"]
+
+
 def test_a_trained_run_is_scored_by_image_depth_and_surface(swept, tiny_scene, tiny_run, tmp_path):
     sweep = sweeping.Sweep(tiny_scene, tmp_path / "x", tiny_run, None, True, None, sweeping.QUICK, 1, True)
     found = sweep._train_errors(swept[0] / "runs" / "given")
