@@ -103,7 +103,7 @@ def check(found: Fit, row: dict) -> dict:
 
 def predict(found: Fit, photos: float, capture: Capture) -> dict:
     """Core-hours, memory of a worker, storage and network of a capture of so many photographs."""
-    from linprim_geo.block_tasks import END, MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS
+    from linprim_geo.block_tasks import EXCHANGES, MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS
 
     window = capture.window * capture.pixels
     blocks = max(1, math.ceil(photos * capture.uses / capture.photos_per_block))
@@ -112,8 +112,8 @@ def predict(found: Fit, photos: float, capture: Capture) -> dict:
     held = primitives / blocks + MOST_COARSE_PRIMITIVES
     joined = held + primitives / blocks
     steps = capture.steps_per_photo * capture.photos_per_block
-    step = (1 - END) * found.seconds_of_step(window, held) + END * found.seconds_of_step(window, joined)
-    block = 2 * found.seconds_of_setup(capture.photos_per_block, window) + steps * step
+    step = EXCHANGES[0] * found.seconds_of_step(window, held) + (1 - EXCHANGES[0]) * found.seconds_of_step(window, joined)
+    block = (1 + len(EXCHANGES)) * found.seconds_of_setup(capture.photos_per_block, window) + steps * step
     coarse_views, small = min(photos, MOST_COARSE_VIEWS), capture.pixels / 4
     coarse = found.seconds_of_setup(coarse_views, small)
     coarse += 0.25 * capture.steps_per_photo * coarse_views * found.seconds_of_step(small, MOST_COARSE_PRIMITIVES)

@@ -1,4 +1,4 @@
-"""What workers do when a scene is trained in blocks: the coarse scene, the plan, a block by itself, and its end beside its neighbours.
+"""What workers do when a scene is trained in blocks: the coarse scene, the plan, a block by itself, and its ends beside its neighbours.
 
 Every task reads what those before it left in RUN/blocks, and goes on from its own last checkpoint.
 """
@@ -40,10 +40,8 @@ COARSE_DOWNSCALE, COARSE_STEPS, COARSE_PRIMITIVES = 2, 0.25, 0.25
 MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS, LEAST_SIDE = 20_000, 1000, 32
 # Steps of a block at least, as far as the whole has so many.
 LEAST_STEPS = 300
-# A block takes the last steps, this part of all, beside what its neighbours have become; they stand in full within so many margins of it.
-END, NEAR = 0.15, 2.0
-# Where it does.
-JOINED = "joined"
+# Parts of its steps after which a block takes up what its neighbours have become; they stand in full within so many margins of it.
+EXCHANGES, NEAR = (0.85, 0.925), 2.0
 
 
 def save_points(path: Path, cloud: PointCloud) -> None:
@@ -181,27 +179,28 @@ def block_task(folder: Path, run: str, block: int) -> dict:
             raise LinprimError(f"block {block} holds no point to start from: wanted fewer blocks")
         return PointCloud(cloud.xyz[inside], cloud.rgb[inside])
 
-    return _trained(folder, opened, scene, plan, block, beyond(coarse, own, margin), 1 - END, None, region)
+    return _trained(folder, opened, scene, plan, block, beyond(coarse, own, margin), EXCHANGES[0], None, region)
 
 
-def join_task(folder: Path, run: str, block: int) -> dict:
-    """Trains what a block owns to the end before what its neighbours own, and before the coarse scene where that is far."""
+def join_task(folder: Path, run: str, block: int, exchange: int) -> dict:
+    """Trains what a block owns from the `exchange`th of EXCHANGES, counted from 1, to the next or to the end, before what its neighbours
+    own there, and before the coarse scene where that is far."""
     opened, scene = _opened(run)
     plan = worker.result_of_folder(opened.path / FOLDER / "plan")
     own, near = block_of(plan, block), NEAR * plan["margin"]
     frozen = [beyond(Run.open(opened.path / FOLDER / "coarse" / "run").training_primitives(), own, near)]
     for other in range(len(plan["blocks"])):
         if other != block:
-            primitives = trained_block(opened.path, other)
-            inside = own.holds(primitives.center, near) & block_of(plan, other).holds(primitives.center)
-            frozen.append(select(primitives, inside))
-    state = read_checkpoint(block_folder(opened.path, block) / "run")
+            theirs = owned(opened.path, plan, other, exchange - 1)
+            inside = own.holds(theirs["center"], near)
+            frozen.append({name: array[inside] for name, array in theirs.items()})
+    state = read_checkpoint(block_folder(opened.path, block, exchange - 1) / "run")
     assert state is not None
     rows = torch.from_numpy(own.holds(state["parameters"]["center"].numpy()))
-    if rows.any():
+    if exchange == 1 and rows.any():
         state |= {name: {key: value[rows] for key, value in state[name].items()} for name in ("parameters", "first", "second", "gathered")}
         state |= {name: state[name][rows] for name in ("steps", "filter_3d") if state[name] is not None}
-    return _trained(folder, opened, scene, plan, block, concatenated(frozen), 1.0, state, None)
+    return _trained(folder, opened, scene, plan, block, concatenated(frozen), (*EXCHANGES, 1.0)[exchange], state, None)
 
 
 def _trained(
@@ -240,18 +239,22 @@ def _trained(
             torn.unlink()
         steps = math.ceil(until * options.iterations)
         seconds, _, _ = run_steps(trainer, here, [], Progress(f"block {block}", steps, quiet=True), until=steps)
-    kept = int(own.holds(trainer.primitives().center).sum())
-    return {"seconds": seconds, "primitives": len(trainer), "kept": kept, "loss": trainer.loss, "train_psnr": trainer.psnr}
+    return {"seconds": seconds, "primitives": len(trainer), "loss": trainer.loss, "train_psnr": trainer.psnr}
 
 
-def block_folder(run: Path, block: int, end: str = "") -> Path:
-    """Where the task of a block works; with JOINED for its last steps."""
-    return run / FOLDER / f"{block:03d}{end}"
+def block_folder(run: Path, block: int, exchange: int = 0) -> Path:
+    """Where the task of a block works before the first exchange, or after the `exchange`th."""
+    return run / FOLDER / (f"{block:03d}joined{exchange}" if exchange else f"{block:03d}")
 
 
-def trained_block(run: Path, block: int, end: str = "") -> Primitives:
-    """What a block has become, its margin included."""
-    return Run.open(block_folder(run, block, end) / "run").training_primitives()
+def owned(run: Path, plan: dict, block: int, exchange: int) -> Arrays:
+    """What a block owns after an exchange. Whose a primitive is, is decided at the first; later it may leave the block."""
+    before = Run.open(block_folder(run, block) / "run").training_primitives()
+    inside = block_of(plan, block).holds(before.center)
+    if exchange == 0 or not inside.any():
+        return select(before, inside)
+    after = Run.open(block_folder(run, block, exchange) / "run").training_primitives()
+    return select(after, np.ones(len(after), bool))
 
 
 def beyond(primitives: Primitives, block: Block, margin: float) -> Arrays:

@@ -1,8 +1,8 @@
 """Training a scene in blocks: the whole of it coarsely, a plan, every block before what the coarse scene shows of the rest, its last steps
-beside what its neighbours have become, and one run of all.
+beside what its neighbours have become, in rounds, and one run of all.
 
-RUN/blocks holds `points.npz` (what the scene starts from), `coarse`, `plan`, and `000`, `000joined`, `001`, ... with a run in each, and the
-markers of what is done. The result, in RUN itself, is like that of any training, but has no checkpoint.
+RUN/blocks holds `points.npz` (what the scene starts from), `coarse`, `plan`, and `000`, `000joined1`, `000joined2`, `001`, ... with a run
+in each, and the markers of what is done. The result, in RUN itself, is like that of any training, but has no checkpoint.
 """
 
 from __future__ import annotations
@@ -20,16 +20,14 @@ import torch
 
 from . import ops
 from .block_tasks import (
+    EXCHANGES,
     FOLDER,
-    JOINED,
     MOST_COARSE_VIEWS,
     block_folder,
-    block_of,
     coarse_of,
     concatenated,
+    owned,
     save_points,
-    select,
-    trained_block,
 )
 from .dry_run import memory_estimate
 from .effects import Choice
@@ -160,18 +158,26 @@ def _all(run: Run, scene: Scene, count: int, executor: Executor, progress: Progr
     (coarse,) = executor.run([Task("coarse scene", f"{module}:coarse_task", where, folder / "coarse", need, cores, REMEDY)], stage, _step)
     planning = Task("plan", f"{module}:plan_task", where | {"count": count}, folder / "plan", need, cores, REMEDY)
     (plan,) = executor.run([planning], Progress("plan", 1, quiet=progress.quiet))
-    tasks, ends = [], []
+    tasks, memory = [], []
     for k, part in enumerate(plan["blocks"]):
         need, arguments = block_memory(part, plan, options), where | {"block": k}
         tasks.append(Task(f"block {k}", f"{module}:block_task", arguments, block_folder(run.path, k), need, 1, REMEDY))
-        ends.append(Task(f"end of block {k}", f"{module}:join_task", arguments, block_folder(run.path, k, JOINED), need, 1, REMEDY))
+        memory.append(need)
         progress.note(
             f"  block {k}: {len(part['views'])} views, {part['pixels'] / max(1, plan['all_pixels']):.0%} of the pixels, "
             f"{part['iterations']} steps, {part['max_primitives']} primitives, {need:.1f} GiB"
         )
-    results = executor.run(tasks, Progress("blocks", 1, quiet=progress.quiet), _step)
-    ended = executor.run(ends, Progress("ends of blocks", 1, quiet=progress.quiet), _step)
-    return _merged(run, scene, coarse, plan, results, ended, progress)
+    rounds = [executor.run(tasks, Progress("blocks", 1, quiet=progress.quiet), _step)]
+    for exchange in range(1, len(EXCHANGES) + 1):
+        tasks = [
+            Task(
+                f"block {k}, exchange {exchange}", f"{module}:join_task", where | {"block": k, "exchange": exchange},
+                block_folder(run.path, k, exchange), need, 1, REMEDY,
+            )
+            for k, need in enumerate(memory)
+        ]  # fmt: skip
+        rounds.append(executor.run(tasks, Progress(f"exchange {exchange} of {len(EXCHANGES)}", 1, quiet=progress.quiet), _step))
+    return _merged(run, scene, coarse, plan, rounds, progress)
 
 
 def _step(task: Task) -> str:
@@ -184,14 +190,12 @@ def _step(task: Task) -> str:
         return "begun"
 
 
-def _merged(
-    run: Run, scene: Scene, coarse: dict, plan: dict, begun: Sequence[dict], ended: Sequence[dict], progress: Progress
-) -> dict:
-    """Writes the primitives that the blocks own as those of the run, and scores them; `begun` and `ended` are what the tasks said."""
+def _merged(run: Run, scene: Scene, coarse: dict, plan: dict, rounds: Sequence[list[dict]], progress: Progress) -> dict:
+    """Writes the primitives that the blocks own as those of the run, and scores them; `rounds` are what the tasks said."""
     from .eval.images import psnr, to_8bit
 
-    blocks = [trained_block(run.path, k, JOINED) for k in range(len(ended))]
-    together = concatenated([select(each, block_of(plan, k).holds(each.center)) for k, each in enumerate(blocks)])
+    ended, results = rounds[-1], [result for each in rounds for result in each]
+    together = concatenated([owned(run.path, plan, k, len(EXCHANGES)) for k in range(len(ended))])
     if len(together["center"]) == 0:
         raise LinprimError(f"{run.path}: no block has kept a primitive, so there is no scene")
     merged = Primitives(**together, kind=run.train_options.primitive)
@@ -208,7 +212,7 @@ def _merged(
             rgb = rgb * alpha + np.asarray(plan["shown"], np.float32)[:, None, None] * (1 - alpha)
         scores.append(psnr(to_8bit(images["rgb"]), to_8bit(rgb)))
     score = float(np.mean(scores)) if scores else None
-    peak = max(result["task_peak_gib"] for result in (*begun, *ended))
+    peak = max(result["task_peak_gib"] for result in results)
     line = {"step": steps, "seconds": round(seconds, 3), "primitives": len(merged), "memory_gib": round(peak, 3)}
     for name in ("loss", "train_psnr"):
         line[name] = round(float(np.average([result[name] for result in ended], weights=[part["pixels"] for part in plan["blocks"]])), 6)
@@ -230,7 +234,7 @@ def _merged(
         "blocks": len(ended),
         "block_peak_gib": peak,
         "coarse_seconds": coarse["task_seconds"],
-        "worker_seconds": coarse["task_seconds"] + sum(result["task_seconds"] for result in (*begun, *ended)),
+        "worker_seconds": coarse["task_seconds"] + sum(result["task_seconds"] for result in results),
     }
 
 

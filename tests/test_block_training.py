@@ -19,7 +19,7 @@ from test_executor import is_alive
 
 from linprim_geo import block_tasks, worker
 from linprim_geo.block_shots import block_shots
-from linprim_geo.block_tasks import beyond, block_of, tensors
+from linprim_geo.block_tasks import EXCHANGES, beyond, block_folder, block_of, owned, tensors
 from linprim_geo.block_training import blocks_that_fit, train_blocks
 from linprim_geo.blocks import Block
 from linprim_geo.cli import main
@@ -68,21 +68,30 @@ def test_every_block_keeps_what_it_owns(whole):
     plan = worker.result_of_folder(run / "blocks" / "plan")
     kept = []
     for k in range(COUNT):
-        begun, ended = (load_primitives(run / "blocks" / name / "run" / "training_frame.npz") for name in (f"{k:03d}", f"{k:03d}joined"))
+        begun, ended = (load_primitives(block_folder(run, k, at) / "run" / "training_frame.npz") for at in (0, len(EXCHANGES)))
         own = block_of(plan, k).holds(begun.center)
         assert 0 < own.sum() < len(begun)  # the margin is trained and dropped
         assert len(ended) == own.sum() and not np.array_equal(ended.center, begun.center[own])
-        kept.append(ended.center[block_of(plan, k).holds(ended.center)])
+        kept.append(ended.center)
     assert np.array_equal(Run.open(run).training_primitives().center, np.concatenate(kept))
     assert sum(part["work"] for part in plan["blocks"]) == pytest.approx(1)
     assert all(0.4 < part["work"] < 0.6 for part in plan["blocks"])
+
+
+def test_a_block_that_has_lost_all_it_owned_adds_nothing(whole):
+    run, _ = whole
+    plan = worker.result_of_folder(run / "blocks" / "plan")
+    far = plan | {"blocks": [part | {"low": [1e6] * 3, "high": [2e6] * 3} for part in plan["blocks"]]}
+    for exchange in range(len(EXCHANGES) + 1):
+        assert len(owned(run, plan, 0, exchange)["center"]) > 0
+        assert len(owned(run, far, 0, exchange)["center"]) == 0
 
 
 def test_a_finished_run_is_not_done_again(whole, tiny_scene):
     run, done = whole
     before = {path: path.stat().st_mtime_ns for path in run.glob(f"blocks/*/{worker.DONE}")}
     again = train(tiny_scene, run, options=OPTIONS, resume=True, quiet=True)
-    assert before == {path: path.stat().st_mtime_ns for path in run.glob(f"blocks/*/{worker.DONE}")} and len(before) == 2 * COUNT + 2
+    assert before == {path: path.stat().st_mtime_ns for path in run.glob(f"blocks/*/{worker.DONE}")} and len(before) == (1 + len(EXCHANGES)) * COUNT + 2
     assert again["psnr"] == done["psnr"] and again["primitives"] == done["primitives"]
     with pytest.raises(LinprimError, match="exists already; give another folder"):
         train_blocks(tiny_scene, run, options=OPTIONS, blocks=COUNT, quiet=True)
