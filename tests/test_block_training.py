@@ -91,7 +91,8 @@ def test_a_finished_run_is_not_done_again(whole, tiny_scene):
     run, done = whole
     before = {path: path.stat().st_mtime_ns for path in run.glob(f"blocks/*/{worker.DONE}")}
     again = train(tiny_scene, run, options=OPTIONS, resume=True, quiet=True)
-    assert before == {path: path.stat().st_mtime_ns for path in run.glob(f"blocks/*/{worker.DONE}")} and len(before) == (1 + len(EXCHANGES)) * COUNT + 2
+    assert before == {path: path.stat().st_mtime_ns for path in run.glob(f"blocks/*/{worker.DONE}")}
+    assert len(before) == (1 + len(EXCHANGES)) * COUNT + 2
     assert again["psnr"] == done["psnr"] and again["primitives"] == done["primitives"]
     with pytest.raises(LinprimError, match="exists already; give another folder"):
         train_blocks(tiny_scene, run, options=OPTIONS, blocks=COUNT, quiet=True)
