@@ -42,6 +42,7 @@ SCENES = {
     "white": {"background": "white"},
     "black": {"background": "black"},
     "room": {"shape": "room", "shading": "albedo"},
+    "telephoto": {"fov": 4.0},
     "cad": {"shape": "cad", "shading": "shaded"},
     "wires": {"shape": "wires", "shading": "shaded"},
 }
@@ -56,7 +57,7 @@ PAIRS = {
     "depth": (("plain",), (), "depth"),
     "normals": (("plain",), (), "depth"),
     "overlap": (("room",), ("plain",), "psnr"),
-    "exact-rays": (("room",), (), "psnr"),
+    "exact-rays": (("room",), ("telephoto",), "psnr"),
     "double": ((), ("plain",), "psnr"),
 }
 # What is compared with what everything costs; measured depth and normals are truth in built-in scenes, so all there is without them, too.
