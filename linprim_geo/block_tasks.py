@@ -41,7 +41,7 @@ MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS, LEAST_SIDE = 20_000, 1000, 32
 # Steps of a block at least, as far as the whole has so many.
 LEAST_STEPS = 300
 # Parts of its steps after which a block takes up what its neighbours have become; they stand in full within so many margins of it.
-EXCHANGES, NEAR = (0.85, 0.925), 2.0
+EXCHANGES, NEAR = (0.85, 0.925), 1.0
 
 
 def save_points(path: Path, cloud: PointCloud) -> None:

@@ -11,7 +11,7 @@ from .camera import Camera
 from .errors import LinprimError
 
 # A margin is this part of the longest side of what a block holds, median over the blocks.
-MARGIN = 0.1
+MARGIN = 0.2
 # A point that lies behind the depth of its pixel by more than this share is hidden there.
 HIDDEN = 0.1
 # A camera sees a block if this share of its pixels shows it.

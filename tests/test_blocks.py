@@ -54,9 +54,9 @@ def test_a_margin_grows_a_block_on_all_sides():
     assert block.holds(points, 0.1).tolist() == [True, True, True, False, False]
 
 
-def test_a_margin_is_a_tenth_of_the_longest_side():
+def test_a_margin_is_a_fifth_of_the_longest_side():
     xyz = RNG.uniform(0, 1, (20000, 3)) * [8, 1, 1]
-    assert margin_of(split_space(xyz, np.ones(20000), 4), xyz) == pytest.approx(0.1 * 0.98 * 2.0, rel=0.02)
+    assert margin_of(split_space(xyz, np.ones(20000), 4), xyz) == pytest.approx(0.2 * 0.98 * 2.0, rel=0.02)
 
 
 def test_more_blocks_than_places_are_refused():
