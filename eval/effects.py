@@ -5,8 +5,8 @@
 For every effect the detector decides about the scenes of its pair; then they are trained with the effect on and off, everything else off.
 Then some scenes are trained as `--effects auto`, `none` and `all` would, and with all that photographs alone tell. `effects.md` has both
 tables: evidence and whether the decision is right, what the effect gains, whether that is more than the scatter of trainings with other
-seeds, and what it costs. Times are CPU seconds of the whole training on one thread. Depth errors are relative to the truth, means over
-the pixels that show something; one where the render has no surface counts as 100 %, so holes are no gain.
+seeds, and what it costs. Times are CPU seconds of the whole training on one thread. Depth errors are relative to the truth; the
+share of the pixels where the render has no surface counts as 100 %, so holes are no gain.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def trained(
     """PSNR, depth error in percent (if there is truth, a mesh or depth images) and CPU seconds of a training; taken from the folder if it
     is there."""
     run = folder / "runs" / f"{path.name}.{label}.{options[1].seed}"
-    result = run / "effects_result.json"
+    result = run / "effects_scores.json"
     if result.is_file():
         return json.loads(result.read_text())
     begin = time.process_time()
@@ -134,7 +134,8 @@ def trained(
     reference = path / "reference.ply"
     if reference.is_file() or any(view.depth_path for view in load_scene(path).test):
         scores = eval_depth_run(run, reference if reference.is_file() else None)
-        row["depth"] = 100 * (scores["coverage"] * scores["abs_rel"] + 1 - scores["coverage"])
+        covered = scores["coverage"]
+        row["depth"] = 100 * (1 - covered + (covered * scores["abs_rel"] if covered else 0))
     write_json(result, row)
     return row
 

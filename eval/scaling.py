@@ -113,15 +113,18 @@ def predict(found: Fit, photos: float, capture: Capture) -> dict:
     joined = held + primitives / blocks
     steps = capture.steps_per_photo * capture.photos_per_block
     step = EXCHANGES[0] * found.seconds_of_step(window, held) + (1 - EXCHANGES[0]) * found.seconds_of_step(window, joined)
-    block = (1 + len(EXCHANGES)) * found.seconds_of_setup(capture.photos_per_block, window) + steps * step
+    tasks = 1 + len(EXCHANGES)  # of a block
+    block = tasks * found.seconds_of_setup(capture.photos_per_block, window) + steps * step
     coarse_views, small = min(photos, MOST_COARSE_VIEWS), capture.pixels / 4
     coarse = found.seconds_of_setup(coarse_views, small)
     coarse += 0.25 * capture.steps_per_photo * coarse_views * found.seconds_of_step(small, MOST_COARSE_PRIMITIVES)
     # A view's depth is a third of a step: forward only.
     planning = photos * found.seconds_of_step(small, MOST_COARSE_PRIMITIVES) / 3
     photo = BYTES_OF_PHOTO * capture.pixels
-    # Parameters and both of Adam's moments, twice; then the scene in three files. 27 colour numbers and 11 others, 4 bytes each.
+    # Parameters and both of Adam's moments, in two checkpoints per task; then the scene in three files. 27 numbers of colour and 11
+    # others, 4 bytes each.
     state = 4 * (11 + 27)
+    moved = tasks * (blocks * MOST_COARSE_PRIMITIVES + primitives) * state
     return {
         "photos": int(photos),
         "blocks": blocks,
@@ -129,8 +132,8 @@ def predict(found: Fit, photos: float, capture: Capture) -> dict:
         "core_hours": (blocks * block + coarse + planning) / 3600,
         "longest_task_hours": max(block, coarse, planning) / 3600,
         "gib_per_worker": found.gib(capture.photos_per_block, window, joined),
-        "storage_gib": (photos * photo + primitives * state * (2 * 3 + 3)) / 2**30,
-        "network_gib": (photos * photo * (1 + 2 * capture.uses) + 2 * (blocks * MOST_COARSE_PRIMITIVES + primitives) * state) / 2**30,
+        "storage_gib": (photos * photo + primitives * state * (2 * 3 * tasks + 3)) / 2**30,
+        "network_gib": (photos * photo * (1 + tasks * capture.uses) + moved) / 2**30,
     }
 
 

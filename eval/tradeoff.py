@@ -68,7 +68,7 @@ def tradeoff(
     max_primitives: int | None = None,
     threads: int = 0,
     cluster: str | None = None,
-    workers: int = 1,
+    workers: int | None = None,
     quiet: bool = False,
 ) -> dict:
     """Sweeps the knobs on a scene and writes the tables and the page into the folder `output`.
@@ -81,8 +81,8 @@ def tradeoff(
         quick: the size `QUICK`, to see that all of it runs.
         rounds: how often everything is timed (default 3, quick 2).
         iterations, max_primitives: in place of those of `MODEST` or `QUICK`.
-        cluster, workers: where and how many trainings at once, see `executor.open_executor`; their times are those of machines with as
-            many trainings on them. One worker and no cluster: here, one after another. Everything else is measured here.
+        cluster, workers: where and how many trainings at once, see `executor.open_executor`; they share the cores of a machine, and are
+            timed so. Neither: here, one after another. Everything else is measured here in any case.
 
     Returns: what tradeoff.json holds: `rows` (one per rung of each knob), `sentences`, `rule`, `about`.
 
@@ -101,20 +101,21 @@ def tradeoff(
     size = (QUICK if quick else MODEST) | {name: value for name, value in size.items() if value is not None}
     sweep = Sweep(Path(scene), Path(output), run, reference, quick, rounds, size, threads, quiet)
     chosen = [KNOBS[name] for name in KNOBS if not knobs or name in knobs]
-    if cluster is None and workers == 1:
+    if cluster is None and workers is None:
         return sweep.measure(chosen)
-    with open_executor(cluster, sweep.folder / "runs", workers) as executor:
-        cores = os.cpu_count() or 1
-        sweep.executor, sweep.cores = executor, threads or max(1, cores // (workers or cores) if cluster is None else cores)
+    cores, own_machines = os.cpu_count() or 1, cluster not in (None, "local")
+    with open_executor(cluster, sweep.folder / "runs", workers or 0) as executor:
+        sweep.executor, sweep.cores = executor, threads or (cores if own_machines else max(1, cores // (workers or cores)))
+        sweep.slot = sweep.cores if own_machines else 1
         return sweep.measure(chosen)
 
 
 class Sweep:
     """One folder of measurements. `store[key]` of a setting holds `times`, `peak_gib`, and what was found of it once. With an `executor`
-    trainings are its tasks, on so many `cores` each."""
+    trainings are its tasks, on so many `cores` each, and count as `slot` of its own."""
 
     executor: Executor | None = None
-    cores = 0
+    cores = slot = 1
 
     def __init__(self, scene, folder, run, reference, quick, rounds, size, threads, quiet):
         from linprim_geo.scene import load_scene
@@ -208,7 +209,9 @@ class Sweep:
                 wanted.setdefault(_key(group, setting), (setting, set()))[1].update(knob.errors)
         for turn in range(self.rounds):
             if group == "train" and self.executor:
-                self._train_at_once([setting for setting, _ in wanted.values()], turn)
+                each = [setting for setting, _ in wanted.values()]
+                self._train_at_once([setting for setting in each if "equal_time" not in setting], turn)
+                self._train_at_once([setting for setting in each if "equal_time" in setting], turn)
             for key, (setting, errors) in wanted.items():
                 entry = self.store.setdefault(key, {"setting": setting, "times": [], "peak_gib": 0.0, "errors": {}})
                 if "failed" in entry or (len(entry["times"]) > turn and errors <= entry["errors"].keys() | {"photo_percent"}):
@@ -241,6 +244,8 @@ class Sweep:
                 self.store.setdefault(key, {"setting": {}, "times": [], "peak_gib": 0.0, "errors": {}})
                 self.progress.note("training with the defaults")
                 self._train(key, {}, set(KNOBS["primitive"].errors), 0)
+                if self.executor:
+                    self.store[key]["times"].clear()  # it was alone; the others share the cores
                 self._save()
             return self.folder / "runs" / _name({})
         from linprim_geo.run import Run
@@ -367,39 +372,42 @@ class Sweep:
         return TrainOptions(**entry["options"][0]), SceneOptions(**entry["options"][1])
 
     def _train_at_once(self, settings: Sequence[dict], turn: int) -> None:
-        """The trainings of a round that are not measured yet, by the executor; those of equal time are left, as they wait for others."""
+        """The trainings of a round that are not measured yet, by the executor. Raises LinprimError for what ends them all."""
         assert self.executor is not None
         tasks = {}
+        folder = self.folder / "runs" / f"round_{turn}_{self.cores}"
+        largest = max(view.camera.width * view.camera.height for view in self.scene.train)
         for setting in settings:
             key = _key("train", setting)
             entry = self.store.setdefault(key, {"setting": setting, "times": [], "peak_gib": 0.0, "errors": {}})
-            if setting.get("equal_time") or "failed" in entry or len(entry["times"]) > turn:
+            if "failed" in entry or len(entry["times"]) > turn:
                 continue
             options, scene_options = self._options(key, setting)
             square = scene_options.downscale**2
-            largest = max(view.camera.width * view.camera.height for view in self.scene.train)
+            arguments = {"scene": str(self.scene_path), "scene_options": asdict(scene_options)}
             tasks[key] = Task(
                 _shown(setting),
                 "linprim_geo.eval.tradeoff:train_task",
-                {
-                    "scene": str(self.scene_path),
-                    "scene_options": asdict(scene_options),
-                    "options": asdict(replace(options, threads=self.cores)),
-                },
-                self.folder / "runs" / f"round_{turn}" / _name(setting),
+                arguments | {"options": asdict(replace(options, threads=self.cores))},
+                folder / _name(setting),
                 memory_estimate((), options, photo_bytes(self.scene.train) // square, largest // square),
-                self.cores,
+                self.slot,
                 "fewer --workers, or more memory",
             )
+        self._save()
         progress = Progress(f"train, round {turn + 1} of {self.rounds}", 1, quiet=self.progress.quiet)
         for key, found in zip(tasks, self.executor.run(list(tasks.values()), progress), strict=True):
-            kept = self.folder / "runs" / _name(self.store[key]["setting"])
-            if not self.store[key]["errors"]:
+            if "failed" in found:
+                self.store[key]["failed"] = found["failed"]
+                self.progress.note(f"  {found['failed']}")
+                continue
+            trained, kept = tasks[key].folder / "run", self.folder / "runs" / _name(self.store[key]["setting"])
+            if not self.store[key]["errors"] and trained.exists():
                 shutil.rmtree(kept, ignore_errors=True)
-                (tasks[key].folder / "run").rename(kept)
+                trained.rename(kept)
             self._note(key, found["seconds"], found["task_peak_gib"], primitives=found["primitives"])
-        self._save()
-        shutil.rmtree(self.folder / "runs" / f"round_{turn}", ignore_errors=True)
+            self._save()
+        shutil.rmtree(folder, ignore_errors=True)
 
     def _train(self, key: str, setting: dict, errors: set, turn: int) -> None:
         from linprim_geo.stages import Stages
@@ -570,13 +578,16 @@ class Sweep:
 
 
 def train_task(folder: Path, scene: str, scene_options: dict, options: dict) -> dict:
-    """A training into folder/run, after a few steps that load the libraries. Returns its seconds and primitives."""
+    """A training into folder/run, after a few steps that load the libraries. Returns its seconds and primitives, or why it `failed`."""
     from linprim_geo.train import train
 
     chosen = SceneOptions(**scene_options), TrainOptions(**options)
-    for name, iterations in (("warm_up", min(20, chosen[1].iterations)), ("run", chosen[1].iterations)):
-        shutil.rmtree(folder / name, ignore_errors=True)
-        trained = train(scene, folder / name, chosen[0], replace(chosen[1], iterations=iterations), quiet=True)
+    try:
+        for name, iterations in (("warm_up", min(20, chosen[1].iterations)), ("run", chosen[1].iterations)):
+            shutil.rmtree(folder / name, ignore_errors=True)
+            trained = train(scene, folder / name, chosen[0], replace(chosen[1], iterations=iterations), quiet=True)
+    except LinprimError as error:
+        return {"failed": str(error)}
     shutil.rmtree(folder / "warm_up")
     return {"seconds": trained["seconds"], "primitives": trained["primitives"]}
 

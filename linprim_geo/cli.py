@@ -162,13 +162,13 @@ def add_effects(parser: argparse._ActionsContainer, default: str) -> None:
     parser.add_argument("--effect", action="append", default=[], metavar="NAME=on|off", help=text)
 
 
-def add_workers(parser: argparse.ArgumentParser, workers: int = 0) -> argparse._ArgumentGroup:
+def add_workers(parser: argparse.ArgumentParser, workers: int | None = 0) -> argparse._ArgumentGroup:
     """Adds --cluster and --workers, of default `workers`, which say where the parts of a job are done."""
     group = parser.add_argument_group("workers")
     text = "local: Ray on this machine; an address such as 10.0.0.1:6379: the Ray cluster there, whose machines all see the folders"
     text += " (default: processes of this machine); needs pip install 'linprim-geo[cluster]'"
     group.add_argument("--cluster", metavar="local|ADDRESS", help=text)
-    text = "at once at most; 0: one per core (default %(default)s)"
+    text = "at once at most; 0: one per core" + (" (default 0)" if workers == 0 else "")
     group.add_argument("--workers", type=_whole, default=workers, metavar="N", help=text)
     return group
 
@@ -422,7 +422,7 @@ def build_parser() -> argparse.ArgumentParser:
     for name in ("iterations", "max-primitives"):
         sub.add_argument(f"--{name}", type=_positive, metavar="N", help="of the training that is swept around (default 2000, quick 200)")
     sub.add_argument("--threads", type=_whole, default=0, metavar="N", help="0 uses every core (default)")
-    add_workers(sub, 1)
+    add_workers(sub, None).description = "trainings at once; without either, here, one after another"
     add_quiet(sub)
 
     sub = command(

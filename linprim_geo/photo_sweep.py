@@ -52,10 +52,11 @@ LEAST_DEVIATION = 0.5 / (255 * np.sqrt(12))
 """Disagreement that is always there, of white: half of what rounding brightness to 255 steps causes."""
 
 INDEPENDENT_PHOTOS = 8
-"""Photographs of a vertex count as so many independent ones: there are more, but the errors of neighbouring views are much the same."""
+"""Photographs of a vertex count as so many independent ones: as a rule there are more, but the errors of neighbouring views are alike."""
 
 PRIOR_SCALE, PRIOR_ROUNDS = 1.0, 2
-"""Mean distance of vertices from the surface before photographs are asked, in footprints, and how often it is replaced by what they say."""
+"""Mean distance of vertices from the surface before photographs are asked, in footprints, and how often they are: from the second time on
+the mean is that of the time before."""
 
 NEIGHBOURS = 64
 """Vertices that photographs do not tell of take the mean of so many nearest ones that they do."""
@@ -68,11 +69,12 @@ ROWS_AT_ONCE = 2**14
 class Agreement:
     """What photographs say of the (V,) vertices of a mesh.
 
-    `offset` is the signed distance along the normal, in the unit of the mesh, to where they agree best; `sharpness` how much their
-    disagreement rises within a footprint on either side of it, as a share of white: 0 for a plain surface; `known` whether at least two
-    of them see a vertex well, `inside` whether the best place lies within the OFFSETS and not at their end.
+    `offset` is the signed distance along the (V, 3) `normals`, in the unit of the mesh, to where they agree best; `sharpness` how much
+    their disagreement rises within a footprint on either side of it, as a share of white: 0 for a plain surface; `known` whether at
+    least two of them see a vertex well, `inside` whether the best place lies within the OFFSETS and not at their end.
     """
 
+    normals: np.ndarray
     offset: np.ndarray
     sharpness: np.ndarray
     known: np.ndarray
@@ -98,12 +100,12 @@ def best_agreement(
         gains: (K,) exposure of each photograph (`photo_gains`), default 1.
         caster: of the mesh, if there is one already.
     """
-    known, footprint, variance = _compared(mesh, cameras, photos, gains, caster, OFFSETS)
+    normals, known, footprint, variance = _compared(mesh, cameras, photos, gains, caster, OFFSETS)
     offset, sharpness, inside = np.zeros(len(known)), np.zeros(len(known)), np.zeros(len(known), bool)
     place, sharpness[known] = _least(np.sqrt(variance))
     offset[known] = place * footprint[known]
     inside[known] = np.abs(place) < OFFSETS[-1] - 0.1
-    return Agreement(offset, sharpness, known, inside)
+    return Agreement(normals, offset, sharpness, known, inside)
 
 
 def photo_gains(
@@ -151,12 +153,12 @@ def predicted_error(
     as likely as v^(-m/2) (Jeffreys' prior), here with m = INDEPENDENT_PHOTOS. Distances are expected to fall off exponentially, at
     first with PRIOR_SCALE, then with the mean that comes out. So a vertex is uncertain where photographs agree elsewhere, where
     they agree in many places, and where nothing agrees. One that is not known takes the mean of the nearest NEIGHBOURS that are;
-    where none is, all are NaN. Memory: some 250 bytes per vertex. The same to the last bit for any number of threads.
+    where none is, all are NaN. Memory: some 600 bytes per vertex. The same to the last bit for any number of threads.
     Accuracy: `python -m linprim_geo.eval.surfaces` prints its rank correlation with the exact error, and the ratio of their means.
     """
     from scipy.spatial import cKDTree
 
-    known, footprint, variance = _compared(mesh, cameras, photos, gains, caster, DENSE_OFFSETS)
+    _, known, footprint, variance = _compared(mesh, cameras, photos, gains, caster, DENSE_OFFSETS)
     error = np.full(len(known), np.nan)
     if not known.any():
         return error.astype(np.float32)
@@ -166,9 +168,11 @@ def predicted_error(
         scale = max(float(distance.mean()), FINEST_OFFSET)
     error[known] = distance * footprint[known]
     if not known.all():
-        count = min(NEIGHBOURS, int(known.sum()))
-        _, nearest = cKDTree(mesh.vertices[known]).query(mesh.vertices[~known], np.arange(1, count + 1), workers=-1)
-        error[~known] = error[known][nearest].mean(1)
+        tree, told, unknown = cKDTree(mesh.vertices[known]), error[known], np.flatnonzero(~known)
+        ranks = np.arange(1, min(NEIGHBOURS, len(told)) + 1)
+        for start in range(0, len(unknown), ROWS_AT_ONCE):
+            rows = unknown[start : start + ROWS_AT_ONCE]
+            error[rows] = told[tree.query(mesh.vertices[rows], ranks, workers=-1)[1]].mean(1)
     return error.astype(np.float32)
 
 
@@ -192,7 +196,7 @@ def refine_surface(
         for _ in range(SMOOTHING):
             move, weight = average @ move, average @ weight
         move /= weight + LEAST_SHARPNESS
-        mesh = replace(mesh, vertices=mesh.vertices + move[:, None] * _points(mesh)[1])
+        mesh = replace(mesh, vertices=mesh.vertices + move[:, None] * agreement.normals)
     return replace(mesh, normals=vertex_normals(mesh))
 
 
@@ -203,9 +207,10 @@ def _compared(
     gains: np.ndarray | None,
     caster: RayCaster | None,
     places: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(V,) whether at least two photographs see a vertex well, (V,) footprints, and of the P vertices that they do see the (P, K)
-    variance of brightness over them at each of K places along the normal, weighted by cosines. Arguments as of `best_agreement`."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(V, 3) normals, (V,) whether at least two photographs see a vertex well, (V,) footprints, and of the P vertices that they do see
+    the (P, K) variance of brightness over them at each of K places along the normal, weighted by cosines. Arguments as of
+    `best_agreement`."""
     points, normals = _points(mesh)
     footprint, count = _footprints(points, normals, cameras), len(points)
     views, weight = np.zeros(count, np.int32), np.zeros(count, np.float32)
@@ -218,7 +223,7 @@ def _compared(
     known = views >= 2
     total = weight[known, None]
     mean = value[known] / total
-    return known, footprint, np.maximum(square[known] / total - mean * mean, 0)
+    return normals, known, footprint, np.maximum(square[known] / total - mean * mean, 0)
 
 
 def _expected_distance(variance: np.ndarray, scale: float) -> np.ndarray:

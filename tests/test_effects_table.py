@@ -31,7 +31,7 @@ def row(psnr, depth, called_for, decided_on, reason="data"):
         (0.05, 0.0, False, False, "right: no change"),
         (-0.5, 0.0, False, False, "right: loses"),
         (0.5, 0.0, False, False, "wrong: gains"),
-        (0.5, -0.2, False, False, "wrong: gains"),  # 5 and 4 standard errors
+        (0.5, -0.2, False, False, "wrong: gains"),  # 10 and 8 standard errors
         (0.5, -7.0, False, False, "right: loses more than it gains"),
         (0.5, -7.0, False, True, "wrong: loses more than it gains"),
         (0.5, -7.0, True, True, "right: gains"),

@@ -272,6 +272,38 @@ def test_trainings_by_workers_are_those_of_this_process(monkeypatch, tiny_scene,
     assert "base" in names and not [name for name in names if name.startswith("round_") or name == "again"]
 
 
+def test_a_sweep_by_workers_goes_on_and_tells_what_fails(monkeypatch, tiny_scene, tmp_path):
+    monkeypatch.setattr(sweeping, "POINTS", 3000)
+    how = {"knobs": ["iterations"], "quick": True, "iterations": 12, "max_primitives": 60, "rounds": 1, "quiet": True, "workers": 2}
+    save = sweeping.Sweep._note
+    noted = []
+
+    def stopped(self, key, *rest, **more):
+        if len(noted) == 2:
+            raise KeyboardInterrupt
+        noted.append(key)
+        save(self, key, *rest, **more)
+
+    monkeypatch.setattr(sweeping.Sweep, "_note", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        tradeoff(tiny_scene, tmp_path / "sweep", **how)
+    monkeypatch.setattr(sweeping.Sweep, "_note", save)
+    tasks = []
+    run = sweeping.Executor.run
+
+    def counted(self, given, *rest):
+        tasks.extend(task for task in given if not (task.folder / "done.json").exists())
+        return run(self, given, *rest)
+
+    monkeypatch.setattr(sweeping.Executor, "run", counted)
+    results = tradeoff(tiny_scene, tmp_path / "sweep", **how)
+    assert tasks == [] and len(results["rows"]) == len(KNOBS["iterations"].rungs)
+    (tmp_path / "x").mkdir()
+    options = {"threads": 1, "iterations": 5, "max_primitives": 10, "background": "no colour"}
+    told = sweeping.train_task(tmp_path / "x", str(tiny_scene), {}, options)
+    assert "--background is 'no colour'" in told["failed"]
+
+
 def test_a_trained_run_is_scored_by_image_depth_and_surface(swept, tiny_scene, tiny_run, tmp_path):
     sweep = sweeping.Sweep(tiny_scene, tmp_path / "x", tiny_run, None, True, None, sweeping.QUICK, 1, True)
     found = sweep._train_errors(swept[0] / "runs" / "given")
