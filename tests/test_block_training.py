@@ -87,6 +87,11 @@ def test_a_block_that_has_lost_all_it_owned_adds_nothing(whole):
         assert len(owned(run, far, 0, exchange)["center"]) == 0
 
 
+def test_so_few_steps_that_none_are_left_after_an_exchange(tiny_scene, tmp_path):
+    done = train_blocks(tiny_scene, tmp_path / "run", options=replace(OPTIONS, iterations=5), blocks=COUNT, quiet=True)
+    assert done["iterations"] == 5 and done["primitives"] > 20 and done["psnr"] > 5
+
+
 def test_a_finished_run_is_not_done_again(whole, tiny_scene):
     run, done = whole
     before = {path: path.stat().st_mtime_ns for path in run.glob(f"blocks/*/{worker.DONE}")}
