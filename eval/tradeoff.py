@@ -8,7 +8,6 @@ the folder, and taken from there.
 from __future__ import annotations
 
 import contextlib
-import csv
 import json
 import math
 import os
@@ -23,9 +22,7 @@ import numpy as np
 
 from linprim_geo.dry_run import memory_estimate
 from linprim_geo.errors import LinprimError
-from linprim_geo.eval.frontier import RULE, frontier, verdict
 from linprim_geo.eval.knobs import (
-    ERRORS,
     KNOBS,
     RENDER_DEFAULTS,
     RENDER_REFERENCE,
@@ -34,8 +31,9 @@ from linprim_geo.eval.knobs import (
     settings,
     training_options,
 )
+from linprim_geo.eval.tradeoff_results import write_report
 from linprim_geo.executor import Executor, Task, open_executor
-from linprim_geo.files import atomic_write, write_json
+from linprim_geo.files import write_json
 from linprim_geo.options import SceneOptions, TrainOptions
 from linprim_geo.progress import Progress
 from linprim_geo.shots import photo_bytes
@@ -400,6 +398,7 @@ class Sweep:
             if "failed" in found:
                 self.store[key]["failed"] = found["failed"]
                 self.progress.note(f"  {found['failed']}")
+                self._save()
                 continue
             trained, kept = tasks[key].folder / "run", self.folder / "runs" / _name(self.store[key]["setting"])
             if not self.store[key]["errors"] and trained.exists():
@@ -545,36 +544,12 @@ class Sweep:
     # --- results ----------------------------------------------------------------------------------------
 
     def _report(self, knobs: Sequence[Knob]) -> dict:
-        from linprim_geo.eval.tradeoff_page import page
-
-        rows, verdicts = [], {}
+        measured: dict[str, list[tuple[Rung, dict]]] = {}
         for knob in knobs:
-            mine = []
-            for rung in knob.rungs:
-                entry = self.store.get(_key(knob.group, self._setting(knob, rung)))
-                if entry and entry["times"]:
-                    mine.append(_row(knob, rung, entry))
-            verdicts[knob.name] = verdict(knob, mine)
-            error = verdicts[knob.name]["error"]
-            on = {mine[k]["rung"] for k in frontier([(row["seconds"], row[error]) for row in mine])} if error else set()
-            rows += [row | {"frontier": row["rung"] in on} for row in mine]
-        results = {
-            "about": self.about | {"rounds": self.rounds, "load": os.getloadavg()[0], "cores": os.cpu_count()},
-            "rule": RULE,
-            "sentences": {name: found["sentence"] for name, found in verdicts.items()},
-            "verdicts": verdicts,
-            "rows": rows,
-        }
-        results = json.loads(json.dumps(_without_nan(results)))
-        write_json(self.folder / "tradeoff.json", results)
-        with atomic_write(self.folder / "tradeoff.csv") as temporary:
-            with open(temporary, "w", newline="", encoding="utf-8") as file:
-                writer = csv.DictWriter(file, fieldnames=list(COLUMNS), restval="", extrasaction="ignore")
-                writer.writeheader()
-                writer.writerows({name: "" if value is None else value for name, value in row.items()} for row in results["rows"])
-        with atomic_write(self.folder / "tradeoff.html") as temporary:
-            temporary.write_text(page(results, {knob.name: knob for knob in knobs}), encoding="utf-8")
-        return results
+            entries = [(rung, self.store.get(_key(knob.group, self._setting(knob, rung)))) for rung in knob.rungs]
+            measured[knob.name] = [(rung, entry) for rung, entry in entries if entry and entry["times"]]
+        about = self.about | {"rounds": self.rounds, "load": os.getloadavg()[0], "cores": os.cpu_count()}
+        return write_report(self.folder, about, knobs, measured)
 
 
 def train_task(folder: Path, scene: str, scene_options: dict, options: dict) -> dict:
@@ -592,12 +567,6 @@ def train_task(folder: Path, scene: str, scene_options: dict, options: dict) -> 
     return {"seconds": trained["seconds"], "primitives": trained["primitives"]}
 
 
-COLUMNS = (
-    "knob", "rung", "default", "frontier", "seconds", "low", "high", "rounds", "gradient_seconds", "peak_gib", *ERRORS, "psnr",
-    "primitives", "faces",
-)  # fmt: skip
-
-
 def rotated(camera):
     """The camera turned about its own upright axis by POP_PX pixels at the middle of its image."""
     angle = POP_PX / camera.fx
@@ -605,24 +574,6 @@ def rotated(camera):
     turn[0, 0] = turn[2, 2] = math.cos(angle)
     turn[0, 2], turn[2, 0] = math.sin(angle), -math.sin(angle)
     return replace(camera, world_to_camera=turn @ camera.world_to_camera)
-
-
-def _row(knob: Knob, rung: Rung, entry: dict) -> dict:
-    low, middle, high = np.percentile(entry["times"], [25, 50, 75])
-    row = {
-        "knob": knob.name,
-        "rung": rung.name,
-        "default": rung.name == knob.default,
-        "seconds": float(middle),
-        "low": float(low),
-        "high": float(high),
-        "rounds": len(entry["times"]),
-        "peak_gib": entry["peak_gib"],
-    }
-    if entry.get("gradient_times"):
-        row["gradient_seconds"] = float(np.median(entry["gradient_times"]))
-    found = {name: entry["errors"][name] for name in (*knob.errors, "psnr") if entry["errors"].get(name) is not None}
-    return row | {name: math.nan for name in knob.errors} | found | {n: entry[n] for n in ("primitives", "faces") if n in entry}
 
 
 def _key(group: str, setting: dict) -> str:
@@ -635,11 +586,3 @@ def _shown(setting: dict) -> str:
 
 def _name(setting: dict) -> str:
     return "_".join(f"{name}-{value}" for name, value in setting.items()) or "base"
-
-
-def _without_nan(value):
-    if isinstance(value, dict):
-        return {name: _without_nan(item) for name, item in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -254,7 +254,7 @@ def owned(run: Path, plan: dict, block: int, exchange: int) -> Arrays:
     if exchange == 0 or not inside.any():
         return select(before, inside)
     after = Run.open(block_folder(run, block, exchange) / "run").training_primitives()
-    return select(after, np.ones(len(after), bool))
+    return {name: getattr(after, name) for name in ARRAYS}
 
 
 def beyond(primitives: Primitives, block: Block, margin: float) -> Arrays:

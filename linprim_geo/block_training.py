@@ -64,7 +64,8 @@ def train_blocks(
     """Trains a scene in blocks of space into a run folder; with a single block this is `train`.
 
     The steps and primitives of `options` are those of the whole: a block's cameras are those that show it, each as often as in a training
-    of the whole, and it has its part of the primitives.
+    of the whole, and it has its part of the primitives. Margins are trained twice and dropped, so the sum may miss the most by a percent
+    or two, on either side.
 
     Args:
         blocks: how many; "auto": as few as a worker's memory allows.
