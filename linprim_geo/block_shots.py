@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import IO
 
 import numpy as np
 import torch
@@ -11,11 +16,13 @@ import torch
 from . import ops
 from .blocks import Block, cropped, shown, smaller, window
 from .camera import Camera, Similarity
+from .errors import LinprimError
+from .files import writing
 from .ops import Tensors
 from .options import TrainOptions, raster_options
 from .run import Run
 from .scene import View
-from .shots import Shot
+from .shots import Shot, StoredShot
 
 # Transmittance at which the coarse surface is taken.
 LEVEL = 0.5
@@ -30,6 +37,7 @@ def small_depths(coarse: Run, views: Sequence[View], factor: int) -> Iterator[tu
 
 
 def block_shots(
+    folder: Path,
     coarse: Run,
     views: Sequence[View],
     block: Block,
@@ -44,9 +52,18 @@ def block_shots(
     A photograph is cut to the window that shows the block, and counts by that window's share of its pixels. Its pixels whose surface lies
     elsewhere are replaced by what the frozen primitives alone show there, with their opacity for alpha: a block is neither to explain the
     rest of the scene nor to hide it.
+
+    The windows lie in a file in `folder` that has no name, so that it is gone with the last of them, however this process ends: reading
+    one takes a hundredth of the time of a step, and a worker's memory does not grow with the photographs.
+
+    Raises:
+        LinprimError: a photograph cannot be read, or the disk is full.
     """
     how = raster_options(options) | {"stop": options.stop}
-    shots = []
+    shots: list[Shot] = []
+    recent: dict[str, Shot] = {}
+    with writing(folder / "windows"):
+        file = tempfile.TemporaryFile(dir=folder)
     for view, (camera, depth) in zip(views, small_depths(coarse, views, factor), strict=True):
         found = window(shown(block, margin, camera, depth), view.camera, factor)
         if found is None:
@@ -59,10 +76,24 @@ def block_shots(
         alpha = np.full(mask.shape, 255, np.uint8) if photo.alpha is None else photo.alpha[part]
         instead, opacity = _rendered(frozen, small, how)
         rgb, alpha = np.where(mask[..., None], rgb, instead), np.where(mask, alpha, opacity)
-        planes = torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1))), torch.from_numpy(np.ascontiguousarray(alpha))
+        with writing(folder / "windows"):
+            file.seek(0, os.SEEK_END)
+            read = partial(_read_window, file, file.tell(), view.name, small)
+            file.write(rgb.transpose(2, 0, 1).tobytes() + alpha.tobytes())
         share = width * height / (view.camera.width * view.camera.height)
-        shots.append(Shot(view.name, small, *planes, share))
+        side = max(width, height) / max(view.camera.width, view.camera.height)
+        shots.append(StoredShot(view.name, small, read, True, recent, share, side))
     return shots
+
+
+def _read_window(file: IO[bytes], begin: int, name: str, camera: Camera) -> Shot:
+    """The planes of a window, red, green, blue and alpha, which begin at this byte."""
+    planes = bytearray(4 * camera.height * camera.width)
+    file.seek(begin)
+    if file.readinto(planes) != len(planes):  # type: ignore[attr-defined]
+        raise LinprimError(f"{name}: what was kept of this photograph cannot be read again")
+    rgba = torch.frombuffer(planes, dtype=torch.uint8).reshape(4, camera.height, camera.width)
+    return Shot(name, camera, rgba[:3], rgba[3])
 
 
 def _rendered(frozen: Tensors, camera: Camera, how: dict) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,7 @@ Every task reads what those before it left in RUN/blocks, and goes on from its o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from .blocks import Block, margin_of, point_work, shown, split_space, window
 from .checkpoint import read_checkpoint
 from .errors import LinprimError
 from .files import atomic_write, locked
+from .fill_points import fill_points
 from .initial_points import VolumePoints
 from .ops import Tensors
 from .options import TrainOptions
@@ -114,8 +115,10 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
     blocks = split_space(points[used], work[used], count)
     margin = margin_of(blocks, points[used])
     options = opened.train_options
-    # Where the coarse scene has grown primitives the whole would, too.
+    # Where the coarse scene has grown primitives the whole would, too, and none larger.
     grown = coarse.training_primitives().center
+    state = read_checkpoint(coarse.path)
+    assert state is not None
     parts = []
     for k, block in enumerate(blocks):
         views, pixels = [], 0
@@ -149,6 +152,7 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
         "background": background["background"],
         "shown": background["shown"],
         "frozen": len(grown),
+        "extent": float(state["bounds"][1]),
         "largest": largest,
         "all_pixels": sum(view.camera.width * view.camera.height for view in scene.train),
         "blocks": parts,
@@ -172,14 +176,7 @@ def block_task(folder: Path, run: str, block: int) -> dict:
     plan = worker.result_of_folder(opened.path / FOLDER / "plan")
     own, margin = block_of(plan, block), plan["margin"]
     coarse = Run.open(opened.path / FOLDER / "coarse" / "run").training_primitives()
-
-    def region(cloud: PointCloud) -> PointCloud:
-        inside = own.holds(opened.similarity.apply(cloud.xyz), margin)
-        if not inside.any():
-            raise LinprimError(f"block {block} holds no point to start from: wanted fewer blocks")
-        return PointCloud(cloud.xyz[inside], cloud.rgb[inside])
-
-    return _trained(folder, opened, scene, plan, block, beyond(coarse, own, margin), EXCHANGES[0], None, region)
+    return _trained(folder, opened, scene, plan, block, beyond(coarse, own, margin), EXCHANGES[0], None)
 
 
 def join_task(folder: Path, run: str, block: int, exchange: int) -> dict:
@@ -200,22 +197,14 @@ def join_task(folder: Path, run: str, block: int, exchange: int) -> dict:
     if exchange == 1 and rows.any():
         state |= {name: {key: value[rows] for key, value in state[name].items()} for name in ("parameters", "first", "second", "gathered")}
         state |= {name: state[name][rows] for name in ("steps", "filter_3d") if state[name] is not None}
-    return _trained(folder, opened, scene, plan, block, concatenated(frozen), (*EXCHANGES, 1.0)[exchange], state, None)
+    return _trained(folder, opened, scene, plan, block, concatenated(frozen), (*EXCHANGES, 1.0)[exchange], state)
 
 
 def _trained(
-    folder: Path,
-    opened: Run,
-    scene: Scene,
-    plan: dict,
-    block: int,
-    frozen: Arrays,
-    until: float,
-    begin: dict | None,
-    region: Callable[[PointCloud], PointCloud] | None,
+    folder: Path, opened: Run, scene: Scene, plan: dict, block: int, frozen: Arrays, until: float, begin: dict | None
 ) -> dict:
     """Trains a block in folder/run up to a part of its steps, from its last checkpoint there, else from the state `begin`, else from the
-    points that `region` leaves."""
+    points in it and its margin."""
     _prepared(opened.train_options)
     part, own = plan["blocks"][block], block_of(plan, block)
     names = ("iterations", "max_primitives", "initial_primitives")
@@ -224,13 +213,14 @@ def _trained(
     )
     path = folder / "run"
     seen = replace(scene, train=tuple(scene.train[k] for k in part["views"]), test=())
-    coarse = Run.open(opened.path / FOLDER / "coarse" / "run")
-    shots = block_shots(coarse, seen.train, own, plan["margin"], plan["factor"], opened.similarity, options, tensors(frozen))
-    here = replace(opened, path=path, train_options=options)
     with locked(path, "trained into"):
         begun = (path / "config.json").exists()
-        state = read_checkpoint(path) if begun else None
-        trainer = start_trainer(seen, here, shots, options, state or begin, region)
+        state = (read_checkpoint(path) if begun else None) or begin
+        cloud = _points_of(seen, opened, own, plan["margin"], block) if state is None else None
+        coarse = Run.open(opened.path / FOLDER / "coarse" / "run")
+        shots = block_shots(folder, coarse, seen.train, own, plan["margin"], plan["factor"], opened.similarity, options, tensors(frozen))
+        here = replace(opened, path=path, train_options=options)
+        trainer = start_trainer(seen, here, shots, options, state, cloud, plan["extent"])
         trainer.frozen = tensors(frozen)
         if not begun:
             about = opened.scene_path, opened.scene_options, options, opened.similarity, ops.instruction_set()
@@ -240,6 +230,16 @@ def _trained(
         steps = math.ceil(until * options.iterations)
         seconds, _, _ = run_steps(trainer, here, [], Progress(f"block {block}", steps, quiet=True), until=steps)
     return {"seconds": seconds, "primitives": len(trainer), "loss": trainer.loss, "train_psnr": trainer.psnr}
+
+
+def _points_of(scene: Scene, run: Run, block: Block, margin: float, number: int) -> PointCloud:
+    """The scene's points in a block and its margin, filled up."""
+    assert scene.points is not None
+    cloud = scene.points if isinstance(scene.points, VolumePoints) else fill_points(scene, run.train_options.seed)
+    inside = block.holds(run.similarity.apply(cloud.xyz), margin)
+    if not inside.any():
+        raise LinprimError(f"block {number} holds no point to start from: wanted fewer blocks")
+    return PointCloud(cloud.xyz[inside], cloud.rgb[inside])
 
 
 def block_folder(run: Path, block: int, exchange: int = 0) -> Path:

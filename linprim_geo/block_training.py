@@ -22,6 +22,7 @@ from . import ops
 from .block_tasks import (
     EXCHANGES,
     FOLDER,
+    MOST_COARSE_PRIMITIVES,
     MOST_COARSE_VIEWS,
     block_folder,
     coarse_of,
@@ -29,7 +30,8 @@ from .block_tasks import (
     owned,
     save_points,
 )
-from .dry_run import memory_estimate
+from .blocks import MARGIN
+from .dry_run import bytes_per_primitive, memory_estimate
 from .effects import Choice
 from .errors import LinprimError
 from .executor import Executor, Task, open_executor
@@ -39,12 +41,12 @@ from .primitives import Primitives
 from .progress import Progress, duration
 from .run import Run, is_unused
 from .scene import Scene, View
-from .shots import photo_bytes
+from .shots import MOST_KEPT, RECENT, photo_bytes
 from .train import train
 from .training_start import begin_run, reopen_run, with_points
 
-# What margins, and pixels that show several blocks, add to a block's part of the whole, for the choice of their number.
-OVERLAP = 1.5
+# What margins add to a block's part of the primitives, where it has others on all sides of its ground plan.
+OVERLAP = (1 + 2 * MARGIN) ** 2
 REMEDY = "more blocks (--blocks), fewer --max-primitives, a larger --downscale, fewer --workers, or more memory"
 
 
@@ -127,16 +129,18 @@ def check_options(options: TrainOptions, blocks: int | str) -> None:
 
 
 def blocks_that_fit(views: Sequence[View], options: TrainOptions, executor: Executor) -> int:
-    """The least number of blocks, 1 or more, each of which a worker should have the memory for when all workers are at it."""
+    """The least number of blocks, 1 or more, each of which a worker has the memory for. Only primitives are shared out: of the photographs
+    of a block a worker holds few."""
     _, memory = executor.capacity()
-    whole = memory_estimate(views, options)
-    if whole <= memory:
+    if memory_estimate(views, options, min(photo_bytes(tuple(views)), MOST_KEPT)) <= memory:
         return 1
-    fixed = memory_estimate(views[:1], replace(options, max_primitives=1, initial_primitives=0))
+    coarse = min(MOST_COARSE_PRIMITIVES, options.max_primitives)
+    fixed = memory_estimate(views[:1], replace(options, max_primitives=coarse, initial_primitives=0))
     if fixed >= memory:
         wanted = "wanted a larger --downscale, or more memory"
         raise LinprimError(f"a worker has {memory:.1f} GiB and one photograph takes {fixed:.1f} GiB: {wanted}")
-    return max(2, math.ceil(OVERLAP * (whole - fixed) / (memory - fixed)))
+    primitives = bytes_per_primitive(options) * options.max_primitives / 2**30
+    return max(2, math.ceil(OVERLAP * primitives / (memory - fixed)))
 
 
 # --- the driver -------------------------------------------------------------------------------------------
@@ -240,6 +244,7 @@ def _merged(run: Run, scene: Scene, coarse: dict, plan: dict, rounds: Sequence[l
 
 
 def block_memory(part: dict, plan: dict, options: TrainOptions) -> float:
-    """GiB that training a block of the plan takes."""
+    """GiB that training a block of the plan takes. Of its photographs it holds those that were used last."""
     count = part["max_primitives"] + plan["frozen"]
-    return memory_estimate((), replace(options, max_primitives=count, initial_primitives=0), 4 * part["pixels"], plan["largest"])
+    photos = 4 * RECENT * plan["largest"]
+    return memory_estimate((), replace(options, max_primitives=count, initial_primitives=0), photos, plan["largest"])

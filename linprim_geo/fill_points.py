@@ -45,6 +45,8 @@ _SAME_COLOR = 6.0
 # Depths tried, evenly spread in inverse depth over what the view's points span, widened by the factors.
 _DEPTHS = 64
 _NEARER, _FARTHER = 2.0, 1.2
+# Patches compared at once, at all their depths; more take memory and no less time.
+_AT_ONCE = 64
 # Colours this near to a backdrop's, per channel of 255, belong to it.
 _BACKDROP = 25.5
 
@@ -142,10 +144,10 @@ class _Gaps:
 
     @cached_property
     def image(self) -> np.ndarray:
-        """(H, W, 3) float32, averaged over 3x3 pixels so that bilinear samples of it do not alias."""
+        """(H, W, 3) uint16, the sum over 3x3 pixels, so that bilinear samples of it do not alias. All views have theirs in memory."""
         from scipy.ndimage import uniform_filter
 
-        return uniform_filter(self.look.rgb.astype(np.float32), (3, 3, 1), mode="nearest")
+        return np.rint(9 * uniform_filter(self.look.rgb.astype(np.float32), (3, 3, 1), mode="nearest")).astype(np.uint16)
 
     def interpolate(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """((Q,) triangle or -1, (Q,) inverse depth inside it) at (Q, 2) positions."""
@@ -265,6 +267,9 @@ def _differences(
 
     Patches are parallel to the image, at (Q, 2) positions and (Q, D) inverse depths. Infinite where fewer than two sources see one.
     """
+    if len(pixels) > _AT_ONCE:
+        parts = [slice(begin, begin + _AT_ONCE) for begin in range(0, len(pixels), _AT_ONCE)]
+        return np.concatenate([_differences(view, sources, pixels[part], inverse[part]) for part in parts])
     offset = (np.arange(_PATCH) - _PATCH // 2) * float(_PATCH_STEP)
     patch = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)
     size = np.array([view.camera.width, view.camera.height])
@@ -281,7 +286,7 @@ def _differences(
             y = local[..., 1] / local[..., 2] * source.camera.fy + source.camera.cy
         x, y = (np.where(local[..., 2] > 0, value, -1.0) for value in (x, y))
         theirs, inside = _sampled(source.image, np.stack([x, y], axis=-1))
-        difference = np.abs(theirs - mine[:, None]).mean((2, 3))
+        difference = np.abs(theirs - mine[:, None]).mean((2, 3)) / 9
         result[number] = np.where(inside.all(2), difference, np.inf)
     result.sort(axis=0)
     seen = np.isfinite(result).sum(0)

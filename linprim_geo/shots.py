@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -21,13 +23,18 @@ MEMORY_SHARE, MOST_KEPT, RECENT = 0.25, 3 * 2**29, 2
 
 @dataclass(frozen=True)
 class Shot:
-    """A view in memory: `rgb` (3, H, W) uint8, `alpha` (H, W) uint8 or None, its camera in the training frame, the weight of its loss."""
+    """A view in memory: `rgb` (3, H, W) uint8, `alpha` (H, W) uint8 or None, its camera in the training frame.
+
+    Of a photograph that it is cut out of it has the share `weight` of the pixels, which its loss counts by, and the share `side` of the
+    longer side.
+    """
 
     name: str
     camera: Camera
     rgb: torch.Tensor
     alpha: torch.Tensor | None
     weight: float = 1.0
+    side: float = 1.0
 
     def over(self, background: torch.Tensor) -> torch.Tensor:
         """(3, H, W) float32 in [0, 1], over `background` (3,) where alpha lets it through."""
@@ -43,21 +50,27 @@ class UnreadablePhoto(LinprimError):
 
 
 class StoredShot(Shot):
-    """The same, read from its file whenever it is used."""
+    """The same, read whenever it is used.
 
-    _view: View
+    `read` gives it, and `recent` holds what was read last, for all that share it.
+    """
+
+    _read_it: Callable[[], Shot]
     _recent: dict[str, Shot]
+    _has_alpha: bool
 
-    def __init__(self, view: View, camera: Camera, recent: dict[str, Shot]):
-        """`recent` holds what was read last, for all that share it."""
-        for name, value in (("name", view.name), ("camera", camera), ("_view", view), ("_recent", recent)):
-            object.__setattr__(self, name, value)
+    def __init__(
+        self, name: str, camera: Camera, read: Callable[[], Shot], has_alpha: bool, recent: dict[str, Shot], weight=1.0, side=1.0
+    ):
+        given = {"name": name, "camera": camera, "weight": weight, "side": side}
+        for key, value in (given | {"_read_it": read, "_recent": recent, "_has_alpha": has_alpha}).items():
+            object.__setattr__(self, key, value)
 
     def _read(self) -> Shot:
         shot = self._recent.pop(self.name, None)
         if shot is None:
             try:
-                shot = _decode(self._view, self.camera)
+                shot = self._read_it()
             except LinprimError as error:
                 raise UnreadablePhoto(str(error)) from error
             while len(self._recent) >= RECENT:
@@ -73,7 +86,7 @@ class StoredShot(Shot):
     @property
     def alpha(self) -> torch.Tensor | None:
         """(H, W) uint8, or None."""
-        return self._read().alpha if self._view.has_alpha else None
+        return self._read().alpha if self._has_alpha else None
 
 
 def photo_bytes(views: tuple[View, ...]) -> int:
@@ -95,15 +108,14 @@ def load_shots(views: tuple[View, ...], similarity: Similarity, limit: int | Non
     """
     left = photo_limit() if limit is None else limit
     recent: dict[str, Shot] = {}
-    shots: list[Shot | View] = []
+    shots: list[Callable[[], Shot]] = []
     for view in views:
         left -= photo_bytes((view,))
-        shots.append(view if left >= 0 else StoredShot(view, view.camera.transformed(similarity), recent))
+        camera = view.camera.transformed(similarity)
+        read = partial(_decode, view, camera)
+        shots.append(read if left >= 0 else partial(StoredShot, view.name, camera, read, view.has_alpha, recent))
     with ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
-        decoded = pool.map(
-            lambda shot: _decode(shot, shot.camera.transformed(similarity)) if isinstance(shot, View) else shot, shots
-        )
-        return list(decoded)
+        return list(pool.map(lambda make: make(), shots))
 
 
 def _decode(view: View, camera: Camera) -> Shot:

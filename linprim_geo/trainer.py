@@ -302,7 +302,8 @@ class Trainer:
             touched = screen_grad[:, 2] > 0 if penalty is None and terms is None else None
             self._update(dict(zip(leaves, grads, strict=True)), touched)
             self.control.disturb(self.parameters, self.step + 1)
-            self.control.gather(self.parameters, shot.camera, screen_grad)
+            # As the whole photograph would pull, where this is a part of one.
+            self.control.gather(self.parameters, shot.camera, screen_grad if shot.side == 1 else screen_grad / shot.side)
         self.step += 1
         if self.control.is_due(self.step):
             self._grow()

@@ -228,14 +228,16 @@ def start_trainer(
     shots: list[Shot],
     options: TrainOptions,
     state: dict | None,
-    region: Callable[[PointCloud], PointCloud] | None = None,
+    cloud: PointCloud | None = None,
+    largest: float | None = None,
 ) -> Trainer:
     """A trainer at step 0, or at the step of a checkpoint's `state`.
 
     Args:
         scene: with points to start from; those of a checkpoint need none.
         shots: its training views in the training frame.
-        region: leaves of the points, in the data set's frame, what is to be trained.
+        cloud: the points to start from if they are not those of the scene, which are filled up first.
+        largest: extent that a primitive may have, in the training frame; default: by what the points reach.
 
     Raises:
         LinprimError: the background is none, or the checkpoint does not fit the options.
@@ -249,8 +251,9 @@ def start_trainer(
     else:
         assert scene.points is not None
         backdrop = background.numpy() if fitted else None
-        cloud = fill_points(scene, options.seed, backdrop) if surface else scene.points
-        cloud = initial_cloud(cloud if region is None else region(cloud), options)
+        if cloud is None:
+            cloud = fill_points(scene, options.seed, backdrop) if surface else scene.points
+        cloud = initial_cloud(cloud, options)
         xyz, rgb = run.similarity.apply(cloud.xyz), cloud.rgb
         middle = np.median(xyz, 0)
         reach = np.linalg.norm(xyz - middle, axis=1)
@@ -259,7 +262,7 @@ def start_trainer(
         )
     smallest = SMALLEST_PX * CAMERA_DISTANCE / focal
     like = KINDS[options.primitive].size
-    bounds = (like * smallest, like * max(LARGEST_PART * radius, 4 * smallest))
+    bounds = (like * smallest, like * max(LARGEST_PART * radius, 4 * smallest) if largest is None else largest)
     parameters = initial_parameters(xyz, rgb, options.sh_degree, options.seed, bounds, options.primitive)
     if surface and parameters["log_extent"].shape[1] == 3:
         _lay_down(parameters, xyz, options.seed, bounds[0])

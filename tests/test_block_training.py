@@ -21,7 +21,8 @@ from linprim_geo import block_tasks, worker
 from linprim_geo.block_shots import block_shots
 from linprim_geo.block_tasks import EXCHANGES, beyond, block_folder, block_of, owned, tensors
 from linprim_geo.block_training import blocks_that_fit, train_blocks
-from linprim_geo.blocks import Block
+from linprim_geo.blocks import Block, cropped
+from linprim_geo.camera import Camera
 from linprim_geo.cli import main
 from linprim_geo.errors import LinprimError
 from linprim_geo.eval.images import eval_images_run
@@ -31,6 +32,7 @@ from linprim_geo.options import ExtractOptions, TrainOptions
 from linprim_geo.primitives import load_primitives
 from linprim_geo.run import Run
 from linprim_geo.scene import load_scene
+from linprim_geo.shots import RECENT, Shot, StoredShot
 from linprim_geo.train import train
 from linprim_geo.trainer import Trainer, initial_parameters
 
@@ -170,14 +172,14 @@ def test_a_time_budget_and_a_lone_cluster_are_refused(tiny_scene, tmp_path, caps
 # --- what a block is trained on ---------------------------------------------------------------------------
 
 
-def test_a_block_sees_its_own_pixels_and_the_frozen_scene_elsewhere(whole):
-    run = Run.open(whole[0])
+def test_a_block_sees_its_own_pixels_and_the_frozen_scene_elsewhere(whole, tmp_path):
+    run, folder = Run.open(whole[0]), tmp_path
     scene, coarse = run.scene(), Run.open(whole[0] / "blocks" / "coarse" / "run")
     everything = Block((-np.inf,) * 3, (np.inf,) * 3)
     factor = coarse.scene_options.downscale
     frozen = beyond(coarse.training_primitives(), everything, 0.1)
     assert len(frozen["center"]) == 0
-    shots = block_shots(coarse, scene.train[:2], everything, 0.1, factor, run.similarity, OPTIONS, tensors(frozen))
+    shots = block_shots(folder, coarse, scene.train[:2], everything, 0.1, factor, run.similarity, OPTIONS, tensors(frozen))
     photo = scene.train[0].load()
     camera = shots[0].camera
     left, top = (round(a - b) for a, b in ((scene.train[0].camera.cx, camera.cx), (scene.train[0].camera.cy, camera.cy)))
@@ -187,18 +189,51 @@ def test_a_block_sees_its_own_pixels_and_the_frozen_scene_elsewhere(whole):
     own = block_of(worker.result_of_folder(run.path / "blocks" / "plan"), 0)
     frozen = beyond(coarse.training_primitives(), own, 0.05)
     assert len(frozen["center"]) > 0 and not own.holds(frozen["center"], 0.05).any()
-    shots = block_shots(coarse, scene.train, own, 0.05, factor, run.similarity, OPTIONS, tensors(frozen))
+    shots = block_shots(folder, coarse, scene.train, own, 0.05, factor, run.similarity, OPTIONS, tensors(frozen))
     assert all(shot.weight == shot.camera.width * shot.camera.height / 48**2 for shot in shots)
     assert all(shot.camera.width <= 48 and shot.rgb.shape[1:] == (shot.camera.height, shot.camera.width) for shot in shots)
     assert sum(shot.camera.width * shot.camera.height for shot in shots) < 0.9 * len(scene.train) * 48 * 48
+    assert all(shot.side == max(shot.camera.width, shot.camera.height) / 48 for shot in shots)
 
 
-def test_frozen_primitives_are_drawn_and_stay(whole):
+def test_windows_are_in_no_memory_and_leave_no_file(whole, tmp_path):
     run = Run.open(whole[0])
+    scene, coarse = run.scene(), Run.open(whole[0] / "blocks" / "coarse" / "run")
+    everything, factor = Block((-np.inf,) * 3, (np.inf,) * 3), coarse.scene_options.downscale
+    nothing = tensors(beyond(coarse.training_primitives(), everything, 0.1))
+    shots = block_shots(tmp_path, coarse, scene.train, everything, 0.1, factor, run.similarity, OPTIONS, nothing)
+    assert not list(tmp_path.iterdir())
+    assert all(type(shot) is StoredShot for shot in shots) and len(shots) > RECENT
+    first = [(shot.rgb.clone(), shot.alpha.clone()) for shot in shots]
+    assert all(torch.equal(shot.rgb, rgb) and torch.equal(shot.alpha, alpha) for shot, (rgb, alpha) in zip(shots, first, strict=True))
+    assert len({rgb.numpy().tobytes() for rgb, _ in first}) == len(shots)
+
+
+def test_a_window_pulls_as_its_photograph_does():
+    rng = np.random.default_rng(0)
+    start = initial_parameters(rng.uniform(-0.3, 0.3, (40, 3)), rng.integers(0, 255, (40, 3)), 0, 0, (0.01, 0.1))
+    pose = np.eye(4)
+    pose[2, 3] = 3.0
+    camera = Camera(64, 64, 60.0, 60.0, 32.0, 32.0, pose)
+    rgb = torch.zeros(3, 64, 64, dtype=torch.uint8)
+    rgb[:, 16:48, 16:48] = torch.from_numpy(rng.integers(0, 255, (3, 32, 32), dtype=np.uint8))
+    whole_photo = Shot("whole", camera, rgb, None)
+    window = Shot("window", cropped(camera, 16, 16, 32, 32), rgb[:, 16:48, 16:48].contiguous(), None, 0.25, 0.5)
+    pulls = []
+    for shot in (whole_photo, window):
+        options, copy = replace(OPTIONS, dssim=0.0), {k: v.clone() for k, v in start.items()}
+        trainer = Trainer([shot], copy, options, (0.01, 0.1), torch.zeros(3), False, False)
+        trainer.advance()
+        pulls.append(trainer.control.gathered["pull"])
+    assert pulls[0].max() > 0 and torch.allclose(pulls[0], pulls[1], rtol=1e-4, atol=1e-7 * float(pulls[0].max()))
+
+
+def test_frozen_primitives_are_drawn_and_stay(whole, tmp_path):
+    run, folder = Run.open(whole[0]), tmp_path
     scene, coarse = run.scene(), Run.open(whole[0] / "blocks" / "coarse" / "run")
     own = block_of(worker.result_of_folder(run.path / "blocks" / "plan"), 0)
     frozen = tensors(beyond(coarse.training_primitives(), own, 0.05))
-    shots = block_shots(coarse, scene.train, own, 0.05, coarse.scene_options.downscale, run.similarity, OPTIONS, frozen)
+    shots = block_shots(folder, coarse, scene.train, own, 0.05, coarse.scene_options.downscale, run.similarity, OPTIONS, frozen)
     rng = np.random.default_rng(0)
     start = initial_parameters(rng.normal(size=(40, 3)), rng.integers(0, 255, (40, 3)), 1, 0, (0.01, 1.0))
     trainer = Trainer(shots, start, replace(OPTIONS, iterations=20), (0.01, 1.0), torch.ones(3), False, True)
