@@ -150,14 +150,15 @@ def shown_in_blocks(run: Path) -> tuple[float, float]:
 
 
 def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitives: int, steps: int) -> dict:
-    """Processor seconds of the setup and of a step of a training."""
+    """Processor seconds of the setup and of a step of a training that has its photographs where a block has them."""
     import torch
 
     from linprim_geo import ops
+    from linprim_geo.block_shots import Windows
+    from linprim_geo.fill_points import fill_points
     from linprim_geo.initial_points import scene_normalization
     from linprim_geo.run import Run
     from linprim_geo.scene import load_scene
-    from linprim_geo.shots import load_shots
     from linprim_geo.training_start import start_trainer
 
     torch.set_num_threads(1)
@@ -166,9 +167,12 @@ def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitiv
     loaded = load_scene(scene, downscale=downscale).with_training_views(photos)
     how = TrainOptions(max_primitives=primitives, initial_primitives=primitives, threads=1)
     similarity = scene_normalization(loaded)
-    shots = load_shots(loaded.train, similarity)
+    cloud, windows, shots = fill_points(loaded, how.seed), Windows(folder), []
+    for view in loaded.train:
+        rgb = view.load().rgb
+        shots.append(windows.shot(view.name, view.camera.transformed(similarity), rgb, np.full(rgb.shape[:2], 255, np.uint8)))
     run = Run(folder / "run", Path(scene), SceneOptions(), how, similarity)
-    trainer = start_trainer(loaded, run, shots, how, None)
+    trainer = start_trainer(loaded, run, shots, how, None, cloud)
     setup = time.process_time() - begin
     for _ in range(WARM_UP):
         trainer.advance()

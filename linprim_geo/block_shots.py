@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 import torch
@@ -16,7 +15,6 @@ import torch
 from . import ops
 from .blocks import Block, cropped, shown, smaller, window
 from .camera import Camera, Similarity
-from .errors import LinprimError
 from .files import writing
 from .ops import Tensors
 from .options import TrainOptions, raster_options
@@ -36,6 +34,38 @@ def small_depths(coarse: Run, views: Sequence[View], factor: int) -> Iterator[tu
         yield view.camera.transformed(coarse.similarity), depth * np.float32(coarse.similarity.scale)
 
 
+class Windows:
+    """Parts of photographs in a file in `folder`, so that a worker's memory does not grow with them.
+
+    Reading one takes a hundredth of the time of a step. The file has no name: it is gone with the last of them, however this process ends.
+    """
+
+    def __init__(self, folder: Path):
+        """Raises LinprimError where the folder cannot be written."""
+        self._what = folder / "windows"
+        with writing(self._what):
+            self._file = tempfile.TemporaryFile(dir=folder)
+        self._recent: dict[str, Shot] = {}
+
+    def shot(self, name: str, camera: Camera, rgb: np.ndarray, alpha: np.ndarray, weight: float = 1.0, side: float = 1.0) -> StoredShot:
+        """Takes up (H, W, 3) and (H, W) uint8; for the other arguments see `Shot`.
+
+        Raises:
+            LinprimError: the disk is full.
+        """
+        with writing(self._what):
+            begin = self._file.seek(0, os.SEEK_END)
+            self._file.write(rgb.transpose(2, 0, 1).tobytes() + alpha.tobytes())
+        return StoredShot(name, camera, partial(self._read, begin, name, camera), True, self._recent, weight, side)
+
+    def _read(self, begin: int, name: str, camera: Camera) -> Shot:
+        with writing(self._what):
+            self._file.seek(begin)
+            planes = bytearray(self._file.read(4 * camera.height * camera.width))
+        rgba = torch.frombuffer(planes, dtype=torch.uint8).reshape(4, camera.height, camera.width)
+        return Shot(name, camera, rgba[:3], rgba[3])
+
+
 def block_shots(
     folder: Path,
     coarse: Run,
@@ -53,17 +83,12 @@ def block_shots(
     elsewhere are replaced by what the frozen primitives alone show there, with their opacity for alpha: a block is neither to explain the
     rest of the scene nor to hide it.
 
-    The windows lie in a file in `folder` that has no name, so that it is gone with the last of them, however this process ends: reading
-    one takes a hundredth of the time of a step, and a worker's memory does not grow with the photographs.
-
     Raises:
         LinprimError: a photograph cannot be read, or the disk is full.
     """
     how = raster_options(options) | {"stop": options.stop}
     shots: list[Shot] = []
-    recent: dict[str, Shot] = {}
-    with writing(folder / "windows"):
-        file = tempfile.TemporaryFile(dir=folder)
+    windows = Windows(folder)
     for view, (camera, depth) in zip(views, small_depths(coarse, views, factor), strict=True):
         found = window(shown(block, margin, camera, depth), view.camera, factor)
         if found is None:
@@ -76,24 +101,10 @@ def block_shots(
         alpha = np.full(mask.shape, 255, np.uint8) if photo.alpha is None else photo.alpha[part]
         instead, opacity = _rendered(frozen, small, how)
         rgb, alpha = np.where(mask[..., None], rgb, instead), np.where(mask, alpha, opacity)
-        with writing(folder / "windows"):
-            file.seek(0, os.SEEK_END)
-            read = partial(_read_window, file, file.tell(), view.name, small)
-            file.write(rgb.transpose(2, 0, 1).tobytes() + alpha.tobytes())
         share = width * height / (view.camera.width * view.camera.height)
         side = max(width, height) / max(view.camera.width, view.camera.height)
-        shots.append(StoredShot(view.name, small, read, True, recent, share, side))
+        shots.append(windows.shot(view.name, small, rgb, alpha, share, side))
     return shots
-
-
-def _read_window(file: IO[bytes], begin: int, name: str, camera: Camera) -> Shot:
-    """The planes of a window, red, green, blue and alpha, which begin at this byte."""
-    planes = bytearray(4 * camera.height * camera.width)
-    file.seek(begin)
-    if file.readinto(planes) != len(planes):  # type: ignore[attr-defined]
-        raise LinprimError(f"{name}: what was kept of this photograph cannot be read again")
-    rgba = torch.frombuffer(planes, dtype=torch.uint8).reshape(4, camera.height, camera.width)
-    return Shot(name, camera, rgba[:3], rgba[3])
 
 
 def _rendered(frozen: Tensors, camera: Camera, how: dict) -> tuple[np.ndarray, np.ndarray]:

@@ -42,7 +42,7 @@ MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS, LEAST_SIDE = 20_000, 1000, 32
 # Steps of a block at least, as far as the whole has so many.
 LEAST_STEPS = 300
 # Parts of its steps after which a block takes up what its neighbours have become; they stand in full within so many margins of it.
-EXCHANGES, NEAR = (0.85, 0.925), 1.0
+EXCHANGES, NEAR = (0.85, 0.925), 1.5
 
 
 def save_points(path: Path, cloud: PointCloud) -> None:
@@ -180,24 +180,58 @@ def block_task(folder: Path, run: str, block: int) -> dict:
 
 
 def join_task(folder: Path, run: str, block: int, exchange: int) -> dict:
-    """Trains what a block owns from the `exchange`th of EXCHANGES, counted from 1, to the next or to the end, before what its neighbours
-    own there, and before the coarse scene where that is far."""
+    """Trains a block from the `exchange`th of EXCHANGES, counted from 1, to the next or to the end, beside what its neighbours have become.
+
+    What they own in its margin is trained with it, so that both sides of a border fit each other, and then dropped: the restricted additive
+    Schwarz method (Cai and Sarkis, SIAM J. Sci. Comput. 21, 1999). Beyond the margin their primitives stand still, and farther off the
+    coarse scene does. Returns as `_trained`, and `owned`: so many, the first ones, are the block's.
+    """
     opened, scene = _opened(run)
     plan = worker.result_of_folder(opened.path / FOLDER / "plan")
-    own, near = block_of(plan, block), NEAR * plan["margin"]
-    frozen = [beyond(Run.open(opened.path / FOLDER / "coarse" / "run").training_primitives(), own, near)]
+    own, margin = block_of(plan, block), plan["margin"]
+    state = _state_of(opened.path, block, exchange - 1)
+    begin = [_rows(state, is_owned(opened.path, plan, block, exchange - 1, state))]
+    frozen = [beyond(Run.open(opened.path / FOLDER / "coarse" / "run").training_primitives(), own, NEAR * margin)]
     for other in range(len(plan["blocks"])):
-        if other != block:
-            theirs = owned(opened.path, plan, other, exchange - 1)
-            inside = own.holds(theirs["center"], near)
-            frozen.append({name: array[inside] for name, array in theirs.items()})
-    state = read_checkpoint(block_folder(opened.path, block, exchange - 1) / "run")
+        if other != block and not own.is_apart(block_of(plan, other), NEAR * margin):
+            theirs = _state_of(opened.path, other, exchange - 1)
+            center, rows = _centers(theirs), is_owned(opened.path, plan, other, exchange - 1, theirs)
+            inside = own.holds(center, margin)
+            begin.append(_rows(theirs, rows & inside))
+            shown_there = Run.open(block_folder(opened.path, other, exchange - 1) / "run").training_primitives()
+            frozen.append(select(shown_there, rows & ~inside & own.holds(center, NEAR * margin)))
+    count = len(_centers(begin[0]))
+    if sum(len(_centers(each)) for each in begin):
+        state |= _together(begin)
+    trained = _trained(folder, opened, scene, plan, block, concatenated(frozen), (*EXCHANGES, 1.0)[exchange], state)
+    return trained | {"owned": count}
+
+
+def _state_of(run: Path, block: int, exchange: int) -> dict:
+    state = read_checkpoint(block_folder(run, block, exchange) / "run")
     assert state is not None
-    rows = torch.from_numpy(own.holds(state["parameters"]["center"].numpy()))
-    if exchange == 1 and rows.any():
-        state |= {name: {key: value[rows] for key, value in state[name].items()} for name in ("parameters", "first", "second", "gathered")}
-        state |= {name: state[name][rows] for name in ("steps", "filter_3d") if state[name] is not None}
-    return _trained(folder, opened, scene, plan, block, concatenated(frozen), (*EXCHANGES, 1.0)[exchange], state)
+    return state
+
+
+def _centers(state: dict) -> np.ndarray:
+    return state["parameters"]["center"].numpy()
+
+
+# What a checkpoint holds for every primitive, in tables by name and as tensors.
+_TABLES, _TENSORS = ("parameters", "first", "second", "gathered"), ("steps", "filter_3d")
+
+
+def _rows(state: dict, keep: np.ndarray) -> dict:
+    """That of some of the primitives."""
+    rows = torch.from_numpy(keep)
+    tables = {name: {key: value[rows] for key, value in state[name].items()} for name in _TABLES}
+    return tables | {name: None if state[name] is None else state[name][rows] for name in _TENSORS}
+
+
+def _together(parts: Sequence[dict]) -> dict:
+    """That of all of them."""
+    tables = {name: {key: torch.cat([part[name][key] for part in parts]) for key in parts[0][name]} for name in _TABLES}
+    return tables | {name: None if parts[0][name] is None else torch.cat([part[name] for part in parts]) for name in _TENSORS}
 
 
 def _trained(
@@ -247,14 +281,11 @@ def block_folder(run: Path, block: int, exchange: int = 0) -> Path:
     return run / FOLDER / (f"{block:03d}joined{exchange}" if exchange else f"{block:03d}")
 
 
-def owned(run: Path, plan: dict, block: int, exchange: int) -> Arrays:
-    """What a block owns after an exchange. Whose a primitive is, is decided at the first; later it may leave the block."""
-    before = Run.open(block_folder(run, block) / "run").training_primitives()
-    inside = block_of(plan, block).holds(before.center)
-    if exchange == 0 or not inside.any():
-        return select(before, inside)
-    after = Run.open(block_folder(run, block, exchange) / "run").training_primitives()
-    return {name: getattr(after, name) for name in ARRAYS}
+def is_owned(run: Path, plan: dict, block: int, exchange: int, state: dict) -> np.ndarray:
+    """(N,) which primitives of a block's state after an exchange are its own. That is decided at the first; later they may leave it."""
+    if exchange == 0:
+        return block_of(plan, block).holds(_centers(state))
+    return np.arange(len(_centers(state))) < worker.result_of_folder(block_folder(run, block, exchange))["owned"]
 
 
 def beyond(primitives: Primitives, block: Block, margin: float) -> Arrays:

@@ -27,8 +27,8 @@ from .block_tasks import (
     block_folder,
     coarse_of,
     concatenated,
-    owned,
     save_points,
+    select,
 )
 from .blocks import MARGIN
 from .dry_run import bytes_per_primitive, memory_estimate
@@ -200,7 +200,11 @@ def _merged(run: Run, scene: Scene, coarse: dict, plan: dict, rounds: Sequence[l
     from .eval.images import psnr, to_8bit
 
     ended, results = rounds[-1], [result for each in rounds for result in each]
-    together = concatenated([owned(run.path, plan, k, len(EXCHANGES)) for k in range(len(ended))])
+    kept = []
+    for k, result in enumerate(ended):
+        primitives = Run.open(block_folder(run.path, k, len(EXCHANGES)) / "run").training_primitives()
+        kept.append(select(primitives, np.arange(len(primitives)) < result["owned"]))
+    together = concatenated(kept)
     if len(together["center"]) == 0:
         raise LinprimError(f"{run.path}: no block has kept a primitive, so there is no scene")
     merged = Primitives(**together, kind=run.train_options.primitive)

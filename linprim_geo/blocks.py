@@ -34,6 +34,11 @@ class Block:
         """(...,) bool for (..., 3) points; with `margin` those in the block grown by it on all sides."""
         return np.all((xyz >= np.asarray(self.low) - margin) & (xyz < np.asarray(self.high) + margin), axis=-1)
 
+    def is_apart(self, other: Block, margin: float) -> bool:
+        """Whether the other lies farther than `margin` from this one along an axis."""
+        ends = zip(self.low, self.high, other.low, other.high, strict=True)
+        return any(low - margin > far or near > high + margin for low, high, near, far in ends)
+
 
 def split_space(xyz: np.ndarray, work: np.ndarray, count: int) -> list[Block]:
     """`count` boxes that fill space, each with about the same part of the `work` (P,) of the points `xyz` (P, 3).

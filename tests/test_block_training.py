@@ -19,7 +19,7 @@ from test_executor import is_alive
 
 from linprim_geo import block_tasks, worker
 from linprim_geo.block_shots import block_shots
-from linprim_geo.block_tasks import EXCHANGES, beyond, block_folder, block_of, owned, tensors
+from linprim_geo.block_tasks import EXCHANGES, beyond, block_folder, block_of, join_task, tensors
 from linprim_geo.block_training import blocks_that_fit, train_blocks
 from linprim_geo.blocks import Block, cropped
 from linprim_geo.camera import Camera
@@ -73,20 +73,23 @@ def test_every_block_keeps_what_it_owns(whole):
         begun, ended = (load_primitives(block_folder(run, k, at) / "run" / "training_frame.npz") for at in (0, len(EXCHANGES)))
         own = block_of(plan, k).holds(begun.center)
         assert 0 < own.sum() < len(begun)  # the margin is trained and dropped
-        assert len(ended) == own.sum() and not np.array_equal(ended.center, begun.center[own])
-        kept.append(ended.center)
+        neighbour = load_primitives(block_folder(run, 1 - k) / "run" / "training_frame.npz").center
+        beside = block_of(plan, 1 - k).holds(neighbour) & block_of(plan, k).holds(neighbour, plan["margin"])
+        after = load_primitives(block_folder(run, k, 1) / "run" / "training_frame.npz").center
+        assert len(after) == own.sum() + beside.sum()
+        assert 0 < np.abs(after - np.concatenate([begun.center[own], neighbour[beside]])).max() < 0.2
+        kept.append(ended.center[: own.sum()])
     assert np.array_equal(Run.open(run).training_primitives().center, np.concatenate(kept))
     assert sum(part["work"] for part in plan["blocks"]) == pytest.approx(1)
     assert all(0.4 < part["work"] < 0.6 for part in plan["blocks"])
 
 
-def test_a_block_that_has_lost_all_it_owned_adds_nothing(whole):
-    run, _ = whole
-    plan = worker.result_of_folder(run / "blocks" / "plan")
-    far = plan | {"blocks": [part | {"low": [1e6] * 3, "high": [2e6] * 3} for part in plan["blocks"]]}
-    for exchange in range(len(EXCHANGES) + 1):
-        assert len(owned(run, plan, 0, exchange)["center"]) > 0
-        assert len(owned(run, far, 0, exchange)["center"]) == 0
+@pytest.mark.parametrize("lost", [(0,), (0, 1)])
+def test_a_block_that_has_lost_all_it_owned_adds_nothing(lost, whole, tmp_path, monkeypatch):
+    run, is_owned = whole[0], block_tasks.is_owned
+    monkeypatch.setattr(block_tasks, "is_owned", lambda run, plan, k, at, state: is_owned(run, plan, k, at, state) & (k not in lost))
+    result = join_task(tmp_path, str(run), 0, 1)
+    assert result["owned"] == 0 < result["primitives"]
 
 
 def test_so_few_steps_that_none_are_left_after_an_exchange(tiny_scene, tmp_path):
