@@ -103,16 +103,20 @@ def check(found: Fit, row: dict) -> dict:
 
 def predict(found: Fit, photos: float, capture: Capture) -> dict:
     """Core-hours, memory of a worker, storage and network of a capture of so many photographs."""
-    from linprim_geo.block_tasks import EXCHANGES, MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS
+    from linprim_geo.block_tasks import EXCHANGES, MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS, NEAR, until
+    from linprim_geo.block_training import OVERLAP
+    from linprim_geo.blocks import MARGIN
 
     window = capture.window * capture.pixels
     blocks = max(1, math.ceil(photos * capture.uses / capture.photos_per_block))
     primitives = photos * capture.primitives_per_photo
-    # In its last steps a block stands before about as many primitives of its neighbours as it has; it is set up anew for these.
-    held = primitives / blocks + MOST_COARSE_PRIMITIVES
-    joined = held + primitives / blocks
+    # A block and its margin stand before the coarse scene, and after an exchange before what the blocks round it hold, too.
+    own, around = OVERLAP * primitives / blocks, (1 + 2 * NEAR * MARGIN) ** 2 * primitives / blocks
+    held = own + MOST_COARSE_PRIMITIVES
+    joined = around + MOST_COARSE_PRIMITIVES
     steps = capture.steps_per_photo * capture.photos_per_block
-    step = EXCHANGES[0] * found.seconds_of_step(window, held) + (1 - EXCHANGES[0]) * found.seconds_of_step(window, joined)
+    alone = until(TrainOptions(), 0)
+    step = alone * found.seconds_of_step(window, held) + (1 - alone) * found.seconds_of_step(window, joined)
     tasks = 1 + len(EXCHANGES)  # of a block
     block = tasks * found.seconds_of_setup(capture.photos_per_block, window) + steps * step
     coarse_views, small = min(photos, MOST_COARSE_VIEWS), capture.pixels / 4
@@ -121,10 +125,10 @@ def predict(found: Fit, photos: float, capture: Capture) -> dict:
     # A view's depth is a third of a step: forward only.
     planning = photos * found.seconds_of_step(small, MOST_COARSE_PRIMITIVES) / 3
     photo = BYTES_OF_PHOTO * capture.pixels
-    # Parameters and both of Adam's moments, in two checkpoints per task; then the scene in three files. 27 numbers of colour and 11
-    # others, 4 bytes each.
+    # Parameters and both of Adam's moments, in two checkpoints per task, which are also what the blocks round it read; then the scene in
+    # three files. 27 numbers of colour and 11 others, 4 bytes each.
     state = 4 * (11 + 27)
-    moved = tasks * (blocks * MOST_COARSE_PRIMITIVES + primitives) * state
+    moved = tasks * blocks * MOST_COARSE_PRIMITIVES * state + 3 * (tasks - 1) * blocks * OVERLAP * around * state
     return {
         "photos": int(photos),
         "blocks": blocks,
@@ -167,7 +171,7 @@ def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitiv
     loaded = load_scene(scene, downscale=downscale).with_training_views(photos)
     how = TrainOptions(max_primitives=primitives, initial_primitives=primitives, threads=1)
     similarity = scene_normalization(loaded)
-    cloud, windows, shots = fill_points(loaded, how.seed), Windows(folder), []
+    cloud, windows, shots = fill_points(loaded, how.seed), Windows(), []
     for view in loaded.train:
         rgb = view.load().rgb
         shots.append(windows.shot(view.name, view.camera.transformed(similarity), rgb, np.full(rgb.shape[:2], 255, np.uint8)))

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from . import ops
-from .blocks import Block, cropped, shown, smaller, window
+from .blocks import Block, cropped, enlarged, shown, smaller, window
 from .camera import Camera, Similarity
 from .files import writing
 from .ops import Tensors
@@ -35,16 +35,16 @@ def small_depths(coarse: Run, views: Sequence[View], factor: int) -> Iterator[tu
 
 
 class Windows:
-    """Parts of photographs in a file in `folder`, so that a worker's memory does not grow with them.
+    """Parts of photographs in a file in the system's folder for temporary ones (TMPDIR), so that a worker's memory does not grow with them.
 
     Reading one takes a hundredth of the time of a step. The file has no name: it is gone with the last of them, however this process ends.
     """
 
-    def __init__(self, folder: Path):
-        """Raises LinprimError where the folder cannot be written."""
-        self._what = folder / "windows"
+    def __init__(self) -> None:
+        """Raises LinprimError where that folder cannot be written."""
+        self._what = Path(tempfile.gettempdir()) / "windows of photographs"
         with writing(self._what):
-            self._file = tempfile.TemporaryFile(dir=folder)
+            self._file = tempfile.TemporaryFile()
         self._recent: dict[str, Shot] = {}
 
     def shot(self, name: str, camera: Camera, rgb: np.ndarray, alpha: np.ndarray, weight: float = 1.0, side: float = 1.0) -> StoredShot:
@@ -67,11 +67,11 @@ class Windows:
 
 
 def block_shots(
-    folder: Path,
     coarse: Run,
     views: Sequence[View],
     block: Block,
     margin: float,
+    known: float,
     factor: int,
     similarity: Similarity,
     options: TrainOptions,
@@ -79,25 +79,25 @@ def block_shots(
 ) -> list[Shot]:
     """What a block is trained on.
 
-    A photograph is cut to the window that shows the block, and counts by that window's share of its pixels. Its pixels whose surface lies
-    elsewhere are replaced by what the frozen primitives alone show there, with their opacity for alpha: a block is neither to explain the
-    rest of the scene nor to hide it.
+    A photograph is cut to the window that shows the block and its margin, and counts by that window's share of its pixels. Pixels whose
+    surface lies farther than `known` from the block, where the frozen primitives are coarse, are replaced by what these alone show there,
+    with their opacity for alpha: a block is neither to explain the rest of the scene nor to hide it.
 
     Raises:
         LinprimError: a photograph cannot be read, or the disk is full.
     """
     how = raster_options(options) | {"stop": options.stop}
     shots: list[Shot] = []
-    windows = Windows(folder)
+    windows = Windows()
     for view, (camera, depth) in zip(views, small_depths(coarse, views, factor), strict=True):
         found = window(shown(block, margin, camera, depth), view.camera, factor)
         if found is None:
             continue
-        mask, (left, top, width, height) = found
+        left, top, width, height = found
         small = cropped(view.camera.transformed(similarity), left, top, width, height)
         photo = view.load()
         part = np.s_[top : top + height, left : left + width]
-        rgb = photo.rgb[part]
+        rgb, mask = photo.rgb[part], enlarged(shown(block, known, camera, depth), view.camera, factor)[part]
         alpha = np.full(mask.shape, 255, np.uint8) if photo.alpha is None else photo.alpha[part]
         instead, opacity = _rendered(frozen, small, how)
         rgb, alpha = np.where(mask[..., None], rgb, instead), np.where(mask, alpha, opacity)

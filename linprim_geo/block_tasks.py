@@ -29,6 +29,7 @@ from .run import Run
 from .scene import PointCloud, Scene
 from .shots import load_shots
 from .train import train_run
+from .trainer import CONTROLS
 from .training_loop import run_steps
 from .training_start import chosen_background, start_trainer
 
@@ -41,8 +42,9 @@ COARSE_DOWNSCALE, COARSE_STEPS, COARSE_PRIMITIVES = 2, 0.25, 0.25
 MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS, LEAST_SIDE = 20_000, 1000, 32
 # Steps of a block at least, as far as the whole has so many.
 LEAST_STEPS = 300
-# Parts of its steps after which a block takes up what its neighbours have become; they stand in full within so many margins of it.
-EXCHANGES, NEAR = (0.85, 0.925), 1.5
+# Parts of the steps that a block has left when its population has stopped growing, after which it takes up what its neighbours have
+# become: three times. These stand in full within so many margins of it, which is the longest side of a block.
+EXCHANGES, NEAR = (0.125, 0.5, 0.8125), 5.0
 
 
 def save_points(path: Path, cloud: PointCloud) -> None:
@@ -126,7 +128,7 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
             found = window(shown(block, margin, camera, depth), view.camera, factor)
             if found is not None:
                 views.append(number)
-                pixels += found[1][2] * found[1][3]
+                pixels += found[2] * found[3]
         if len(views) < 2:
             raise LinprimError(f"block {k} of {count} is seen by {len(views)} cameras, wanted two at least: fewer blocks")
         share = float(block.holds(grown, margin).mean())
@@ -171,12 +173,12 @@ def block_of(plan: dict, k: int) -> Block:
 
 
 def block_task(folder: Path, run: str, block: int) -> dict:
-    """Trains a block of the plan before the coarse scene, but for the last steps. What it does not own is dropped after that."""
+    """Trains a block of the plan and its margin before the coarse scene, up to the first exchange."""
     opened, scene = _opened(run)
     plan = worker.result_of_folder(opened.path / FOLDER / "plan")
     own, margin = block_of(plan, block), plan["margin"]
     coarse = Run.open(opened.path / FOLDER / "coarse" / "run").training_primitives()
-    return _trained(folder, opened, scene, plan, block, beyond(coarse, own, margin), EXCHANGES[0], None)
+    return _trained(folder, opened, scene, plan, block, beyond(coarse, own, margin), margin, until(opened.train_options, 0), None)
 
 
 def join_task(folder: Path, run: str, block: int, exchange: int) -> dict:
@@ -198,12 +200,13 @@ def join_task(folder: Path, run: str, block: int, exchange: int) -> dict:
             center, rows = _centers(theirs), is_owned(opened.path, plan, other, exchange - 1, theirs)
             inside = own.holds(center, margin)
             begin.append(_rows(theirs, rows & inside))
-            shown_there = Run.open(block_folder(opened.path, other, exchange - 1) / "run").training_primitives()
-            frozen.append(select(shown_there, rows & ~inside & own.holds(center, NEAR * margin)))
+            still = Run.open(block_folder(opened.path, other, exchange - 1) / "run").training_primitives()
+            frozen.append(select(still, rows & ~inside & own.holds(center, NEAR * margin)))
     count = len(_centers(begin[0]))
     if sum(len(_centers(each)) for each in begin):
         state |= _together(begin)
-    trained = _trained(folder, opened, scene, plan, block, concatenated(frozen), (*EXCHANGES, 1.0)[exchange], state)
+    end = until(opened.train_options, exchange)
+    trained = _trained(folder, opened, scene, plan, block, concatenated(frozen), NEAR * margin, end, state)
     return trained | {"owned": count}
 
 
@@ -234,11 +237,17 @@ def _together(parts: Sequence[dict]) -> dict:
     return tables | {name: None if parts[0][name] is None else torch.cat([part[name] for part in parts]) for name in _TENSORS}
 
 
+def until(options: TrainOptions, exchange: int) -> float:
+    """The part of its steps that a block has behind it when the task that begins with an exchange, 0 for the first task, ends."""
+    grows = CONTROLS[options.population].GROWS_UNTIL
+    return grows + (1 - grows) * (*EXCHANGES, 1.0)[exchange]
+
+
 def _trained(
-    folder: Path, opened: Run, scene: Scene, plan: dict, block: int, frozen: Arrays, until: float, begin: dict | None
+    folder: Path, opened: Run, scene: Scene, plan: dict, block: int, frozen: Arrays, known: float, end: float, begin: dict | None
 ) -> dict:
     """Trains a block in folder/run up to a part of its steps, from its last checkpoint there, else from the state `begin`, else from the
-    points in it and its margin."""
+    points in it and its margin. Up to `known` from the block the frozen primitives are those that the scene will have."""
     _prepared(opened.train_options)
     part, own = plan["blocks"][block], block_of(plan, block)
     names = ("iterations", "max_primitives", "initial_primitives")
@@ -252,16 +261,17 @@ def _trained(
         state = (read_checkpoint(path) if begun else None) or begin
         cloud = _points_of(seen, opened, own, plan["margin"], block) if state is None else None
         coarse = Run.open(opened.path / FOLDER / "coarse" / "run")
-        shots = block_shots(folder, coarse, seen.train, own, plan["margin"], plan["factor"], opened.similarity, options, tensors(frozen))
+        margin, factor, still = plan["margin"], plan["factor"], tensors(frozen)
+        shots = block_shots(coarse, seen.train, own, margin, known, factor, opened.similarity, options, still)
         here = replace(opened, path=path, train_options=options)
         trainer = start_trainer(seen, here, shots, options, state, cloud, plan["extent"])
-        trainer.frozen = tensors(frozen)
+        trainer.frozen = still
         if not begun:
             about = opened.scene_path, opened.scene_options, options, opened.similarity, ops.instruction_set()
             Run.create(path, seen, *about)
         for torn in [*path.glob(".*.tmp*"), *path.glob("checkpoints/.*.tmp*")]:
             torn.unlink()
-        steps = math.ceil(until * options.iterations)
+        steps = math.ceil(end * options.iterations)
         seconds, _, _ = run_steps(trainer, here, [], Progress(f"block {block}", steps, quiet=True), until=steps)
     return {"seconds": seconds, "primitives": len(trainer), "loss": trainer.loss, "train_psnr": trainer.psnr}
 

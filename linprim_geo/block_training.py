@@ -24,7 +24,9 @@ from .block_tasks import (
     FOLDER,
     MOST_COARSE_PRIMITIVES,
     MOST_COARSE_VIEWS,
+    NEAR,
     block_folder,
+    block_of,
     coarse_of,
     concatenated,
     save_points,
@@ -163,11 +165,10 @@ def _all(run: Run, scene: Scene, count: int, executor: Executor, progress: Progr
     (coarse,) = executor.run([Task("coarse scene", f"{module}:coarse_task", where, folder / "coarse", need, cores, REMEDY)], stage, _step)
     planning = Task("plan", f"{module}:plan_task", where | {"count": count}, folder / "plan", need, cores, REMEDY)
     (plan,) = executor.run([planning], Progress("plan", 1, quiet=progress.quiet))
-    tasks, memory = [], []
+    tasks = []
     for k, part in enumerate(plan["blocks"]):
-        need, arguments = block_memory(part, plan, options), where | {"block": k}
+        need, arguments = block_memory(k, plan, options), where | {"block": k}
         tasks.append(Task(f"block {k}", f"{module}:block_task", arguments, block_folder(run.path, k), need, 1, REMEDY))
-        memory.append(need)
         progress.note(
             f"  block {k}: {len(part['views'])} views, {part['pixels'] / max(1, plan['all_pixels']):.0%} of the pixels, "
             f"{part['iterations']} steps, {part['max_primitives']} primitives, {need:.1f} GiB"
@@ -177,9 +178,9 @@ def _all(run: Run, scene: Scene, count: int, executor: Executor, progress: Progr
         tasks = [
             Task(
                 f"block {k}, exchange {exchange}", f"{module}:join_task", where | {"block": k, "exchange": exchange},
-                block_folder(run.path, k, exchange), need, 1, REMEDY,
+                block_folder(run.path, k, exchange), block_memory(k, plan, options, joined=True), 1, REMEDY,
             )
-            for k, need in enumerate(memory)
+            for k in range(count)
         ]  # fmt: skip
         rounds.append(executor.run(tasks, Progress(f"exchange {exchange} of {len(EXCHANGES)}", 1, quiet=progress.quiet), _step))
     return _merged(run, scene, coarse, plan, rounds, progress)
@@ -247,8 +248,10 @@ def _merged(run: Run, scene: Scene, coarse: dict, plan: dict, rounds: Sequence[l
     }
 
 
-def block_memory(part: dict, plan: dict, options: TrainOptions) -> float:
-    """GiB that training a block of the plan takes. Of its photographs it holds those that were used last."""
-    count = part["max_primitives"] + plan["frozen"]
+def block_memory(block: int, plan: dict, options: TrainOptions, joined: bool = False) -> float:
+    """GiB that training a block of the plan takes, `joined` beside its neighbours. Of its photographs it holds the last that were used."""
+    own, near = block_of(plan, block), NEAR * plan["margin"]
+    beside = [k for k in range(len(plan["blocks"])) if k == block or (joined and not own.is_apart(block_of(plan, k), near))]
+    count = plan["frozen"] + sum(plan["blocks"][k]["max_primitives"] for k in beside)
     photos = 4 * RECENT * plan["largest"]
     return memory_estimate((), replace(options, max_primitives=count, initial_primitives=0), photos, plan["largest"])

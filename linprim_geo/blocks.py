@@ -118,21 +118,24 @@ def shown(block: Block, margin: float, camera: Camera, depth: np.ndarray) -> np.
     return block.holds(points, margin) & (depth > 0)
 
 
-def window(mask: np.ndarray, camera: Camera, factor: int) -> tuple[np.ndarray, tuple[int, int, int, int]] | None:
-    """What of a photograph shows a block, from a mask (h, w) of a view `factor` times as small.
-
-    Returns: ((H, W) bool of the window's pixels that belong to the block, (left, top, width, height) of the window in the photograph), None
-        where less than LEAST_SHARE of the pixels show it.
-    """
+def enlarged(mask: np.ndarray, camera: Camera, factor: int) -> np.ndarray:
+    """(H, W) bool of the photograph's pixels, from a mask (h, w) of a view `factor` times as small, and those round it."""
     from scipy.ndimage import binary_dilation
 
-    if mask.sum() < max(4, LEAST_SHARE * mask.size):
-        return None
     mask = binary_dilation(mask, iterations=DILATION)
     full = np.zeros((camera.height, camera.width), dtype=bool)
     large = np.repeat(np.repeat(mask, factor, 0), factor, 1)[: camera.height, : camera.width]
     full[: large.shape[0], : large.shape[1]] = large
+    return full
+
+
+def window(mask: np.ndarray, camera: Camera, factor: int) -> tuple[int, int, int, int] | None:
+    """(left, top, width, height) of the part of a photograph that shows a block, from a mask (h, w) of a view `factor` times as small; None
+    where less than LEAST_SHARE of the pixels show it."""
+    if mask.sum() < max(4, LEAST_SHARE * mask.size):
+        return None
+    full = enlarged(mask, camera, factor)
     rows, columns = np.flatnonzero(full.any(1)), np.flatnonzero(full.any(0))
     top, left = max(0, rows[0] - BORDER), max(0, columns[0] - BORDER)
     bottom, right = min(camera.height, rows[-1] + 1 + BORDER), min(camera.width, columns[-1] + 1 + BORDER)
-    return full[top:bottom, left:right], (int(left), int(top), int(right - left), int(bottom - top))
+    return int(left), int(top), int(right - left), int(bottom - top)

@@ -19,6 +19,8 @@ from .primitives import KINDS
 
 Parameters = dict[str, torch.Tensor]
 
+# The part of a run's steps after which the population stays.
+GROWS_UNTIL = 0.6
 # A primitive whose opacity along its reference length is below this is moved to where it is needed.
 DEAD_OPACITY = 0.005
 # Two halves of a split octahedron: centres at +-0.4 of the half-axis that is cut, which becomes 0.6 of itself, the others 0.8.
@@ -44,12 +46,12 @@ class Growth:
 
     @staticmethod
     def plan(iterations: int, start: int, cap: int) -> Growth:
-        """Events every 100 steps (60 in all of a shorter run) from 3 % to 60 % of the run.
+        """Events every 100 steps (60 in all of a shorter run) from 3 % of the run to GROWS_UNTIL.
 
         The rate brings `start` to `cap` a little before the last event.
         """
         every = max(10, min(100, iterations // 60))
-        first, last = max(every, round(0.03 * iterations)), round(0.6 * iterations)
+        first, last = max(every, round(0.03 * iterations)), round(GROWS_UNTIL * iterations)
         events = max(1, (last - first) // every)
         rate = max(0.02, (max(cap, start) / max(1, start)) ** (1 / (0.9 * events)) - 1)
         return Growth(first, last, every, min(rate, 0.25), cap)
@@ -82,6 +84,8 @@ class Control:
     """
 
     NAMES: tuple[str, ...] = ()
+    # The part of a run's steps after which there are no more events.
+    GROWS_UNTIL: float
 
     def __init__(self, options: TrainOptions, count: int, cameras: list[Camera], bounds: tuple[float, float]):
         """`count` primitives at the start, the training `cameras`, and the `bounds` that extents stay within."""
@@ -127,6 +131,7 @@ class GradientControl(Control):
     """This file's rule: `grow` at the steps of a plan."""
 
     NAMES = ("pull",)
+    GROWS_UNTIL = GROWS_UNTIL
 
     def __init__(self, options, count, cameras, bounds):
         super().__init__(options, count, cameras, bounds)

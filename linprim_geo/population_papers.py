@@ -50,7 +50,7 @@ class ClassicConstants:
 # LinPrim spreads halves by whole extents, which puts 93 % of their centres outside of the parent; by extents / 2.6 it is 39 %.
 POLYHEDRA = ClassicConstants(250, 1.5e-4, 0.01, 0.4, 0.025, 1.2, 1 / DIST_TO_SCALE)
 GAUSSIANS = ClassicConstants(100, 2e-4, 0.01, 0.1, 0.005, 1.6, 1.0)
-RESET_EVERY, LAST_PART = 3000, 0.5
+RESET_EVERY = 3000
 
 
 class ClassicControl(Control):
@@ -65,6 +65,7 @@ class ClassicControl(Control):
     """
 
     NAMES = ("gradient", "seen")
+    GROWS_UNTIL = 0.5
 
     def __init__(self, options, count, cameras, bounds):
         super().__init__(options, count, cameras, bounds)
@@ -72,7 +73,7 @@ class ClassicControl(Control):
         self.radius = scene_radius(cameras)
         total = options.iterations
         self.every, self.reset_every = _steps(self.constants.every, total), _steps(RESET_EVERY, total)
-        self.first, self.last = _steps(FIRST, total), round(LAST_PART * total)
+        self.first, self.last = _steps(FIRST, total), round(self.GROWS_UNTIL * total)
 
     def gather(self, parameters, camera, screen_grad):
         half = torch.tensor([camera.width / 2, camera.height / 2])
@@ -139,7 +140,7 @@ class ClassicControl(Control):
         return Event(source, values, fresh=fresh, calm_opacity=reset)
 
 
-MCMC_EVERY, MCMC_LAST_PART, MCMC_RATE = 100, 5 / 6, 0.05
+MCMC_EVERY, MCMC_RATE = 100, 0.05
 DEAD, MOST_COPIES = 0.005, 50
 NOISE_RATE, NOISE_CENTER = 5e5, (1.6e-4, 1.6e-6)
 SIZE_PENALTY = OPACITY_PENALTY = 0.01
@@ -154,6 +155,8 @@ class McmcControl(Control):
     extents are kept without the filter and end at their lower bound.
     """
 
+    GROWS_UNTIL = 5 / 6
+
     def __init__(self, options, count, cameras, bounds):
         super().__init__(options, count, cameras, bounds)
         self.radius = scene_radius(cameras)
@@ -161,7 +164,7 @@ class McmcControl(Control):
             _steps(MCMC_EVERY, options.iterations),
             _steps(FIRST, options.iterations),
         )
-        self.last = round(MCMC_LAST_PART * options.iterations)
+        self.last = round(self.GROWS_UNTIL * options.iterations)
         # Standard deviations per extent.
         self.scale = 1.0 if self.kind == "gaussian" else 1 / (DIST_TO_SCALE * KINDS[self.kind].size)
 

@@ -8,6 +8,7 @@ import random
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,7 @@ import torch
 from test_executor import is_alive
 
 from linprim_geo import block_tasks, worker
-from linprim_geo.block_shots import block_shots
+from linprim_geo.block_shots import Windows, block_shots
 from linprim_geo.block_tasks import EXCHANGES, beyond, block_folder, block_of, join_task, tensors
 from linprim_geo.block_training import blocks_that_fit, train_blocks
 from linprim_geo.blocks import Block, cropped
@@ -175,14 +176,14 @@ def test_a_time_budget_and_a_lone_cluster_are_refused(tiny_scene, tmp_path, caps
 # --- what a block is trained on ---------------------------------------------------------------------------
 
 
-def test_a_block_sees_its_own_pixels_and_the_frozen_scene_elsewhere(whole, tmp_path):
-    run, folder = Run.open(whole[0]), tmp_path
+def test_a_block_sees_its_own_pixels_and_the_frozen_scene_elsewhere(whole):
+    run = Run.open(whole[0])
     scene, coarse = run.scene(), Run.open(whole[0] / "blocks" / "coarse" / "run")
     everything = Block((-np.inf,) * 3, (np.inf,) * 3)
     factor = coarse.scene_options.downscale
     frozen = beyond(coarse.training_primitives(), everything, 0.1)
     assert len(frozen["center"]) == 0
-    shots = block_shots(folder, coarse, scene.train[:2], everything, 0.1, factor, run.similarity, OPTIONS, tensors(frozen))
+    shots = block_shots(coarse, scene.train[:2], everything, 0.1, 0.1, factor, run.similarity, OPTIONS, tensors(frozen))
     photo = scene.train[0].load()
     camera = shots[0].camera
     left, top = (round(a - b) for a, b in ((scene.train[0].camera.cx, camera.cx), (scene.train[0].camera.cy, camera.cy)))
@@ -192,24 +193,32 @@ def test_a_block_sees_its_own_pixels_and_the_frozen_scene_elsewhere(whole, tmp_p
     own = block_of(worker.result_of_folder(run.path / "blocks" / "plan"), 0)
     frozen = beyond(coarse.training_primitives(), own, 0.05)
     assert len(frozen["center"]) > 0 and not own.holds(frozen["center"], 0.05).any()
-    shots = block_shots(folder, coarse, scene.train, own, 0.05, factor, run.similarity, OPTIONS, tensors(frozen))
+    shots = block_shots(coarse, scene.train, own, 0.05, 0.05, factor, run.similarity, OPTIONS, tensors(frozen))
     assert all(shot.weight == shot.camera.width * shot.camera.height / 48**2 for shot in shots)
     assert all(shot.camera.width <= 48 and shot.rgb.shape[1:] == (shot.camera.height, shot.camera.width) for shot in shots)
     assert sum(shot.camera.width * shot.camera.height for shot in shots) < 0.9 * len(scene.train) * 48 * 48
     assert all(shot.side == max(shot.camera.width, shot.camera.height) / 48 for shot in shots)
 
 
-def test_windows_are_in_no_memory_and_leave_no_file(whole, tmp_path):
+def test_windows_are_in_no_memory_and_leave_no_file(whole, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     run = Run.open(whole[0])
     scene, coarse = run.scene(), Run.open(whole[0] / "blocks" / "coarse" / "run")
     everything, factor = Block((-np.inf,) * 3, (np.inf,) * 3), coarse.scene_options.downscale
     nothing = tensors(beyond(coarse.training_primitives(), everything, 0.1))
-    shots = block_shots(tmp_path, coarse, scene.train, everything, 0.1, factor, run.similarity, OPTIONS, nothing)
+    shots = block_shots(coarse, scene.train, everything, 0.1, 0.1, factor, run.similarity, OPTIONS, nothing)
     assert not list(tmp_path.iterdir())
     assert all(type(shot) is StoredShot for shot in shots) and len(shots) > RECENT
     first = [(shot.rgb.clone(), shot.alpha.clone()) for shot in shots]
     assert all(torch.equal(shot.rgb, rgb) and torch.equal(shot.alpha, alpha) for shot, (rgb, alpha) in zip(shots, first, strict=True))
     assert len({rgb.numpy().tobytes() for rgb, _ in first}) == len(shots)
+    monkeypatch.setattr(tempfile, "tempdir", "/dev/null/nowhere")
+    with pytest.raises(LinprimError, match="/dev/null/nowhere"):
+        Windows()
+    with pytest.raises(LinprimError, match="the disk is full"):
+        windows = Windows.__new__(Windows)
+        windows._what, windows._file, windows._recent = tmp_path / "windows", open("/dev/full", "wb"), {}
+        windows.shot("a", shots[0].camera, np.zeros((999, 999, 3), np.uint8), np.zeros((999, 999), np.uint8))
 
 
 def test_a_window_pulls_as_its_photograph_does():
@@ -231,12 +240,12 @@ def test_a_window_pulls_as_its_photograph_does():
     assert pulls[0].max() > 0 and torch.allclose(pulls[0], pulls[1], rtol=1e-4, atol=1e-7 * float(pulls[0].max()))
 
 
-def test_frozen_primitives_are_drawn_and_stay(whole, tmp_path):
-    run, folder = Run.open(whole[0]), tmp_path
+def test_frozen_primitives_are_drawn_and_stay(whole):
+    run = Run.open(whole[0])
     scene, coarse = run.scene(), Run.open(whole[0] / "blocks" / "coarse" / "run")
     own = block_of(worker.result_of_folder(run.path / "blocks" / "plan"), 0)
     frozen = tensors(beyond(coarse.training_primitives(), own, 0.05))
-    shots = block_shots(folder, coarse, scene.train, own, 0.05, coarse.scene_options.downscale, run.similarity, OPTIONS, frozen)
+    shots = block_shots(coarse, scene.train, own, 0.05, 0.05, coarse.scene_options.downscale, run.similarity, OPTIONS, frozen)
     rng = np.random.default_rng(0)
     start = initial_parameters(rng.normal(size=(40, 3)), rng.integers(0, 255, (40, 3)), 1, 0, (0.01, 1.0))
     trainer = Trainer(shots, start, replace(OPTIONS, iterations=20), (0.01, 1.0), torch.ones(3), False, True)

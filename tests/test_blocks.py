@@ -10,6 +10,7 @@ from linprim_geo.blocks import (
     DILATION,
     Block,
     cropped,
+    enlarged,
     margin_of,
     point_work,
     shown,
@@ -87,14 +88,22 @@ def test_a_window_is_the_part_of_a_photograph_that_shows_a_block():
     view, mask = camera(80, 60), np.zeros((30, 40), dtype=bool)
     assert window(mask, view, 2) is None
     mask[14, 10:16] = True
-    found, (left, top, width, height) = window(mask, view, 2)
-    assert found.shape == (height, width)
+    left, top, width, height = window(mask, view, 2)
+    found = enlarged(mask, view, 2)
+    assert found.shape == (60, 80)
+    found = found[top : top + height, left : left + width]
     assert (left, top) == (2 * (10 - DILATION) - BORDER, 2 * (14 - DILATION) - BORDER)
     assert (width, height) == (2 * (6 + 2 * DILATION) + 2 * BORDER, 2 * (1 + 2 * DILATION) + 2 * BORDER)
     assert found[height // 2, width // 2] and not found[0].any() and not found[:, 0].any()
     mask[:] = True
-    found, where = window(mask, view, 2)
-    assert where == (0, 0, 80, 60) and found.all()
+    assert window(mask, view, 2) == (0, 0, 80, 60) and enlarged(mask, view, 2).all()
+
+
+def test_blocks_are_apart_by_what_lies_between_them():
+    near, far = Block((-np.inf, 0.0, 0.0), (1.0, 1.0, 1.0)), Block((1.5, -1.0, -np.inf), (2.0, 5.0, np.inf))
+    assert near.is_apart(far, 0.4) and far.is_apart(near, 0.4)
+    assert not near.is_apart(far, 0.6) and not far.is_apart(near, 0.6)
+    assert not near.is_apart(near, 0.0)
 
 
 def test_the_cut_camera_sees_the_same_through_its_pixels():
