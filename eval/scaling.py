@@ -103,17 +103,21 @@ def check(found: Fit, row: dict) -> dict:
 
 def predict(found: Fit, photos: float, capture: Capture) -> dict:
     """Core-hours, memory of a worker, storage and network of a capture of so many photographs."""
-    from linprim_geo.block_tasks import EXCHANGES, MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS, NEAR, until
+    from linprim_geo.block_tasks import (
+        EXCHANGES,
+        MOST_BESIDE,
+        MOST_COARSE_PRIMITIVES,
+        MOST_COARSE_VIEWS,
+        until,
+    )
     from linprim_geo.block_training import OVERLAP
-    from linprim_geo.blocks import MARGIN
 
     window = capture.window * capture.pixels
     blocks = max(1, math.ceil(photos * capture.uses / capture.photos_per_block))
     primitives = photos * capture.primitives_per_photo
-    # A block and its margin stand before the coarse scene, and after an exchange before what the blocks round it hold, too.
-    own, around = OVERLAP * primitives / blocks, (1 + 2 * NEAR * MARGIN) ** 2 * primitives / blocks
-    held = own + MOST_COARSE_PRIMITIVES
-    joined = around + MOST_COARSE_PRIMITIVES
+    # A block and its margin stand before the coarse scene, and after an exchange before what others hold, too.
+    held = OVERLAP * primitives / blocks + MOST_COARSE_PRIMITIVES
+    joined = held + min(MOST_BESIDE, primitives)
     steps = capture.steps_per_photo * capture.photos_per_block
     alone = until(TrainOptions(), 0)
     step = alone * found.seconds_of_step(window, held) + (1 - alone) * found.seconds_of_step(window, joined)
@@ -125,10 +129,10 @@ def predict(found: Fit, photos: float, capture: Capture) -> dict:
     # A view's depth is a third of a step: forward only.
     planning = photos * found.seconds_of_step(small, MOST_COARSE_PRIMITIVES) / 3
     photo = BYTES_OF_PHOTO * capture.pixels
-    # Parameters and both of Adam's moments, in two checkpoints per task, which are also what the blocks round it read; then the scene in
-    # three files. 27 numbers of colour and 11 others, 4 bytes each.
+    # Parameters and both of Adam's moments, in two checkpoints per task, which are also what a block takes up of others, whole ones of
+    # about twice what it needs; then the scene in three files. 27 numbers of colour and 11 others, 4 bytes each.
     state = 4 * (11 + 27)
-    moved = tasks * blocks * MOST_COARSE_PRIMITIVES * state + 3 * (tasks - 1) * blocks * OVERLAP * around * state
+    moved = blocks * state * (tasks * MOST_COARSE_PRIMITIVES + 3 * (tasks - 1) * 2 * joined)
     return {
         "photos": int(photos),
         "blocks": blocks,

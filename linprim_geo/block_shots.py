@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -97,7 +98,8 @@ def block_shots(
         small = cropped(view.camera.transformed(similarity), left, top, width, height)
         photo = view.load()
         part = np.s_[top : top + height, left : left + width]
-        rgb, mask = photo.rgb[part], enlarged(shown(block, known, camera, depth), view.camera, factor)[part]
+        near = shown(block, known, camera, depth) | math.isinf(known)
+        rgb, mask = photo.rgb[part], enlarged(near, view.camera, factor)[part]
         alpha = np.full(mask.shape, 255, np.uint8) if photo.alpha is None else photo.alpha[part]
         instead, opacity = _rendered(frozen, small, how)
         rgb, alpha = np.where(mask[..., None], rgb, instead), np.where(mask, alpha, opacity)

@@ -42,9 +42,9 @@ COARSE_DOWNSCALE, COARSE_STEPS, COARSE_PRIMITIVES = 2, 0.25, 0.25
 MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS, LEAST_SIDE = 20_000, 1000, 32
 # Steps of a block at least, as far as the whole has so many.
 LEAST_STEPS = 300
-# Parts of the steps that a block has left when its population has stopped growing, after which it takes up what its neighbours have
-# become: three times. These stand in full within so many margins of it, which is the longest side of a block.
-EXCHANGES, NEAR = (0.125, 0.5, 0.8125), 5.0
+# Parts of the steps that a block has left when its population has stopped growing, after which it takes up what others have become: three
+# times. Others stand in full, the nearest first, up to about so many primitives; beyond these the coarse scene does.
+EXCHANGES, MOST_BESIDE = (0.125, 0.5, 0.8125), 100_000
 
 
 def save_points(path: Path, cloud: PointCloud) -> None:
@@ -144,6 +144,7 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
                 "iterations": max(min(LEAST_STEPS, options.iterations), steps),
                 "max_primitives": most,
                 "initial_primitives": min(most, math.ceil(share * options.initial_primitives)),
+                "known": _plain(known_of(block.distance(grown), margin, options.max_primitives)),
             }
         )
     background = worker.result_of_folder(opened.path / FOLDER / "coarse")
@@ -159,6 +160,17 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
         "all_pixels": sum(view.camera.width * view.camera.height for view in scene.train),
         "blocks": parts,
     }
+
+
+def known_of(distances: np.ndarray, margin: float, primitives: int) -> float:
+    """How far from a block, beyond its margin, MOST_BESIDE primitives reach, infinite if there are fewer in all.
+
+    Args:
+        distances: (P,) of the primitives of the coarse scene from the block, 0 in it; each stands for its part of so many `primitives`.
+    """
+    outside = np.sort(distances[distances > 0])
+    most = int(MOST_BESIDE * len(distances) / primitives)
+    return max(margin, float(outside[most])) if most < len(outside) else math.inf
 
 
 def _plain(x: float) -> float | None:
@@ -191,22 +203,23 @@ def join_task(folder: Path, run: str, block: int, exchange: int) -> dict:
     opened, scene = _opened(run)
     plan = worker.result_of_folder(opened.path / FOLDER / "plan")
     own, margin = block_of(plan, block), plan["margin"]
+    known = math.inf if plan["blocks"][block]["known"] is None else plan["blocks"][block]["known"]
     state = _state_of(opened.path, block, exchange - 1)
     begin = [_rows(state, is_owned(opened.path, plan, block, exchange - 1, state))]
-    frozen = [beyond(Run.open(opened.path / FOLDER / "coarse" / "run").training_primitives(), own, NEAR * margin)]
+    frozen = [beyond(Run.open(opened.path / FOLDER / "coarse" / "run").training_primitives(), own, known)]
     for other in range(len(plan["blocks"])):
-        if other != block and not own.is_apart(block_of(plan, other), NEAR * margin):
+        if other != block and not own.is_apart(block_of(plan, other), known):
             theirs = _state_of(opened.path, other, exchange - 1)
             center, rows = _centers(theirs), is_owned(opened.path, plan, other, exchange - 1, theirs)
             inside = own.holds(center, margin)
             begin.append(_rows(theirs, rows & inside))
             still = Run.open(block_folder(opened.path, other, exchange - 1) / "run").training_primitives()
-            frozen.append(select(still, rows & ~inside & own.holds(center, NEAR * margin)))
+            frozen.append(select(still, rows & ~inside & own.holds(center, known)))
     count = len(_centers(begin[0]))
     if sum(len(_centers(each)) for each in begin):
         state |= _together(begin)
     end = until(opened.train_options, exchange)
-    trained = _trained(folder, opened, scene, plan, block, concatenated(frozen), NEAR * margin, end, state)
+    trained = _trained(folder, opened, scene, plan, block, concatenated(frozen), known, end, state)
     return trained | {"owned": count}
 
 

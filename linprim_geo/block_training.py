@@ -22,11 +22,10 @@ from . import ops
 from .block_tasks import (
     EXCHANGES,
     FOLDER,
+    MOST_BESIDE,
     MOST_COARSE_PRIMITIVES,
     MOST_COARSE_VIEWS,
-    NEAR,
     block_folder,
-    block_of,
     coarse_of,
     concatenated,
     save_points,
@@ -136,8 +135,8 @@ def blocks_that_fit(views: Sequence[View], options: TrainOptions, executor: Exec
     _, memory = executor.capacity()
     if memory_estimate(views, options, min(photo_bytes(tuple(views)), MOST_KEPT)) <= memory:
         return 1
-    coarse = min(MOST_COARSE_PRIMITIVES, options.max_primitives)
-    fixed = memory_estimate(views[:1], replace(options, max_primitives=coarse, initial_primitives=0))
+    still = min(MOST_COARSE_PRIMITIVES + MOST_BESIDE, options.max_primitives)
+    fixed = memory_estimate(views[:1], replace(options, max_primitives=still, initial_primitives=0))
     if fixed >= memory:
         wanted = "wanted a larger --downscale, or more memory"
         raise LinprimError(f"a worker has {memory:.1f} GiB and one photograph takes {fixed:.1f} GiB: {wanted}")
@@ -167,20 +166,21 @@ def _all(run: Run, scene: Scene, count: int, executor: Executor, progress: Progr
     (plan,) = executor.run([planning], Progress("plan", 1, quiet=progress.quiet))
     tasks = []
     for k, part in enumerate(plan["blocks"]):
-        need, arguments = block_memory(k, plan, options), where | {"block": k}
+        need, arguments = block_memory(part, plan, options), where | {"block": k}
         tasks.append(Task(f"block {k}", f"{module}:block_task", arguments, block_folder(run.path, k), need, 1, REMEDY))
         progress.note(
             f"  block {k}: {len(part['views'])} views, {part['pixels'] / max(1, plan['all_pixels']):.0%} of the pixels, "
             f"{part['iterations']} steps, {part['max_primitives']} primitives, {need:.1f} GiB"
         )
     rounds = [executor.run(tasks, Progress("blocks", 1, quiet=progress.quiet), _step)]
+    beside = min(MOST_BESIDE, options.max_primitives)
     for exchange in range(1, len(EXCHANGES) + 1):
         tasks = [
             Task(
                 f"block {k}, exchange {exchange}", f"{module}:join_task", where | {"block": k, "exchange": exchange},
-                block_folder(run.path, k, exchange), block_memory(k, plan, options, joined=True), 1, REMEDY,
+                block_folder(run.path, k, exchange), block_memory(part, plan, options, beside), 1, REMEDY,
             )
-            for k in range(count)
+            for k, part in enumerate(plan["blocks"])
         ]  # fmt: skip
         rounds.append(executor.run(tasks, Progress(f"exchange {exchange} of {len(EXCHANGES)}", 1, quiet=progress.quiet), _step))
     return _merged(run, scene, coarse, plan, rounds, progress)
@@ -248,10 +248,9 @@ def _merged(run: Run, scene: Scene, coarse: dict, plan: dict, rounds: Sequence[l
     }
 
 
-def block_memory(block: int, plan: dict, options: TrainOptions, joined: bool = False) -> float:
-    """GiB that training a block of the plan takes, `joined` beside its neighbours. Of its photographs it holds the last that were used."""
-    own, near = block_of(plan, block), NEAR * plan["margin"]
-    beside = [k for k in range(len(plan["blocks"])) if k == block or (joined and not own.is_apart(block_of(plan, k), near))]
-    count = plan["frozen"] + sum(plan["blocks"][k]["max_primitives"] for k in beside)
+def block_memory(part: dict, plan: dict, options: TrainOptions, beside: int = 0) -> float:
+    """GiB that training a block of the plan takes, `beside` so many primitives of others. Of its photographs it holds the last that were
+    used."""
+    count = part["max_primitives"] + plan["frozen"] + beside
     photos = 4 * RECENT * plan["largest"]
     return memory_estimate((), replace(options, max_primitives=count, initial_primitives=0), photos, plan["largest"])

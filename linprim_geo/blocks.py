@@ -34,6 +34,10 @@ class Block:
         """(...,) bool for (..., 3) points; with `margin` those in the block grown by it on all sides."""
         return np.all((xyz >= np.asarray(self.low) - margin) & (xyz < np.asarray(self.high) + margin), axis=-1)
 
+    def distance(self, xyz: np.ndarray) -> np.ndarray:
+        """(...,) by how much the block is to grow on all sides to reach (..., 3) points."""
+        return np.maximum(np.maximum(np.asarray(self.low) - xyz, xyz - np.asarray(self.high)), 0.0).max(-1)
+
     def is_apart(self, other: Block, margin: float) -> bool:
         """Whether the other lies farther than `margin` from this one along an axis."""
         ends = zip(self.low, self.high, other.low, other.high, strict=True)

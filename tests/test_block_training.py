@@ -20,7 +20,7 @@ from test_executor import is_alive
 
 from linprim_geo import block_tasks, worker
 from linprim_geo.block_shots import Windows, block_shots
-from linprim_geo.block_tasks import EXCHANGES, beyond, block_folder, block_of, join_task, tensors
+from linprim_geo.block_tasks import EXCHANGES, beyond, block_folder, block_of, join_task, known_of, tensors
 from linprim_geo.block_training import blocks_that_fit, train_blocks
 from linprim_geo.blocks import Block, cropped
 from linprim_geo.camera import Camera
@@ -91,6 +91,14 @@ def test_a_block_that_has_lost_all_it_owned_adds_nothing(lost, whole, tmp_path, 
     monkeypatch.setattr(block_tasks, "is_owned", lambda run, plan, k, at, state: is_owned(run, plan, k, at, state) & (k not in lost))
     result = join_task(tmp_path, str(run), 0, 1)
     assert result["owned"] == 0 < result["primitives"]
+
+
+def test_the_nearest_that_memory_allows_stand_in_full(monkeypatch):
+    distances = np.concatenate([np.zeros(100), np.linspace(0.01, 9.0, 900)])
+    assert known_of(distances, 0.5, 100_000) == np.inf  # 90,000 lie outside
+    monkeypatch.setattr(block_tasks, "MOST_BESIDE", 10_000)
+    assert known_of(distances, 0.5, 100_000) == pytest.approx(1.01)
+    assert known_of(distances, 2.0, 100_000) == 2.0
 
 
 def test_so_few_steps_that_none_are_left_after_an_exchange(tiny_scene, tmp_path):

@@ -104,6 +104,9 @@ def test_blocks_are_apart_by_what_lies_between_them():
     assert near.is_apart(far, 0.4) and far.is_apart(near, 0.4)
     assert not near.is_apart(far, 0.6) and not far.is_apart(near, 0.6)
     assert not near.is_apart(near, 0.0)
+    points = np.array([[0.5, 0.5, 0.5], [-9.0, 0.5, 0.5], [1.25, 0.5, 3.0], [0.0, -0.5, 1.25]])
+    assert np.array_equal(near.distance(points), [0.0, 0.0, 2.0, 0.5])
+    assert np.array_equal(near.holds(points, 0.75), near.distance(points) < 0.75)
 
 
 def test_the_cut_camera_sees_the_same_through_its_pixels():

@@ -49,8 +49,8 @@ def test_predictions_grow_with_the_photographs_and_a_worker_does_not():
         assert 90 < many[name] / some[name] <= 101, name
     assert many["gib_per_worker"] == pytest.approx(some["gib_per_worker"], rel=1e-6)
     # By hand: a block of 24,000 is four setups and 60 x 200 steps over 60 % of 2 million pixels, the first 65 % of them with a margin of
-    # a fifth of its side all round and before 20,000 coarse ones, the others before all that is within a side of it.
-    alone, joined = 1.4**2 * 24_000 + 20_000, 9 * 24_000 + 20_000
+    # a fifth of its side all round and before 20,000 coarse ones, the others before 100,000 of the nearest blocks, too.
+    alone, joined = 1.4**2 * 24_000 + 20_000, 1.4**2 * 24_000 + 120_000
     step = 0.002 + 4e-7 * 1.2e6 + 3e-6 * (0.65 * alone + 0.35 * joined)
     block = (4 * (1.0 + 0.05 * 200 + 2e-7 * 200 * 1.2e6) + 12_000 * step) / 3600
     assert 125 * block < some["core_hours"] < 1.05 * 125 * block
