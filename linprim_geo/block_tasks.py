@@ -31,7 +31,7 @@ from .shots import load_shots
 from .train import train_run
 from .trainer import CONTROLS
 from .training_loop import run_steps
-from .training_start import chosen_background, start_trainer
+from .training_start import chosen_background, initial_cloud, start_trainer
 
 # Arrays of primitives by name, of any number: the frozen ones may be none.
 Arrays = dict[str, np.ndarray]
@@ -121,6 +121,7 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
     grown = coarse.training_primitives().center
     state = read_checkpoint(coarse.path)
     assert state is not None
+    own = apportioned([int(block.holds(grown).sum()) for block in blocks], options.max_primitives)
     parts = []
     for k, block in enumerate(blocks):
         views, pixels = [], 0
@@ -143,6 +144,7 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
                 "work": float(work[block.holds(points)].sum() / work.sum()),
                 "iterations": max(min(LEAST_STEPS, options.iterations), steps),
                 "max_primitives": most,
+                "own_primitives": own[k],
                 "initial_primitives": min(most, math.ceil(share * options.initial_primitives)),
                 "known": _plain(known_of(block.distance(grown), margin, options.max_primitives)),
             }
@@ -160,6 +162,14 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
         "all_pixels": sum(view.camera.width * view.camera.height for view in scene.train),
         "blocks": parts,
     }
+
+
+def apportioned(counts: Sequence[int], total: int) -> list[int]:
+    """A total in whole parts, in the ratio of the counts: the largest remainders are rounded up."""
+    exact = total * np.asarray(counts) / sum(counts)
+    parts = np.floor(exact).astype(int)
+    parts[np.argsort(parts - exact, kind="stable")[: total - parts.sum()]] += 1
+    return parts.tolist()
 
 
 def known_of(distances: np.ndarray, margin: float, primitives: int) -> float:
@@ -272,13 +282,16 @@ def _trained(
     with locked(path, "trained into"):
         begun = (path / "config.json").exists()
         state = (read_checkpoint(path) if begun else None) or begin
-        cloud = _points_of(seen, opened, own, plan["margin"], block) if state is None else None
+        cloud = None
+        if state is None:
+            cloud = _points_of(seen, opened, own, plan["margin"], block, part["own_primitives"], options)
         coarse = Run.open(opened.path / FOLDER / "coarse" / "run")
         margin, factor, still = plan["margin"], plan["factor"], tensors(frozen)
         shots = block_shots(coarse, seen.train, own, margin, known, factor, opened.similarity, options, still)
         here = replace(opened, path=path, train_options=options)
         trainer = start_trainer(seen, here, shots, options, state, cloud, plan["extent"])
         trainer.frozen = still
+        trainer.control.limit_only(own.holds, part["own_primitives"], trainer.parameters, trainer.step)
         if not begun:
             about = opened.scene_path, opened.scene_options, options, opened.similarity, ops.instruction_set()
             Run.create(path, seen, *about)
@@ -289,14 +302,21 @@ def _trained(
     return {"seconds": seconds, "primitives": len(trainer), "loss": trainer.loss, "train_psnr": trainer.psnr}
 
 
-def _points_of(scene: Scene, run: Run, block: Block, margin: float, number: int) -> PointCloud:
-    """The scene's points in a block and its margin, filled up."""
+def _points_of(scene: Scene, run: Run, block: Block, margin: float, number: int, own: int, options: TrainOptions) -> PointCloud:
+    """The scene's points in a block and its margin, filled up: at most as many in either as a training begins with that has `own`
+    primitives in the block and the others of `options` in the margin."""
     assert scene.points is not None
-    cloud = scene.points if isinstance(scene.points, VolumePoints) else fill_points(scene, run.train_options.seed)
-    inside = block.holds(run.similarity.apply(cloud.xyz), margin)
-    if not inside.any():
+    cloud = scene.points if isinstance(scene.points, VolumePoints) else fill_points(scene, options.seed)
+    where = run.similarity.apply(cloud.xyz)
+    inside, beside = block.holds(where), block.holds(where, margin)
+    if not beside.any():
         raise LinprimError(f"block {number} holds no point to start from: wanted fewer blocks")
-    return PointCloud(cloud.xyz[inside], cloud.rgb[inside])
+    chosen = []
+    for rows, most in ((inside, own), (beside & ~inside, options.max_primitives - own)):
+        begin = math.ceil(options.initial_primitives * most / options.max_primitives)
+        part = replace(options, max_primitives=max(0, most), initial_primitives=max(0, begin))
+        chosen.append(initial_cloud(PointCloud(cloud.xyz[rows], cloud.rgb[rows]), part))
+    return PointCloud(np.concatenate([part.xyz for part in chosen]), np.concatenate([part.rgb for part in chosen]))
 
 
 def block_folder(run: Path, block: int, exchange: int = 0) -> Path:

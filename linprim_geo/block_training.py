@@ -67,8 +67,8 @@ def train_blocks(
     """Trains a scene in blocks of space into a run folder; with a single block this is `train`.
 
     The steps and primitives of `options` are those of the whole: a block's cameras are those that show it, each as often as in a training
-    of the whole, and it has its part of the primitives. Margins are trained twice and dropped, so the sum may miss the most by a percent
-    or two, on either side.
+    of the whole, and it has its part of the primitives, without those of its margin, which is trained twice and dropped. The sum may miss
+    the most by a few that have crossed a border; `--population 3dgs|mcmc` limits those of the margin, too, and may miss it by percents.
 
     Args:
         blocks: how many; "auto": as few as a worker's memory allows.

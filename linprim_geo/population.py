@@ -8,6 +8,7 @@ that this is compared with are in population_papers.py; what they all have in co
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -119,6 +120,12 @@ class Control:
         """The change after this step."""
         raise NotImplementedError
 
+    def limit_only(self, counts: Callable[[np.ndarray], np.ndarray], most: int, parameters: Parameters, step: int) -> None:
+        """Limits to `most` those alone whose centres (N, 3) `counts` says (N,) True of, where a rule can; the others limit all.
+
+        To be called with the parameters and the step that a training, or its resumption, begins with.
+        """
+
     def state(self) -> list[float]:
         """Numbers that follow from the run's start and not from its options."""
         return []
@@ -136,6 +143,12 @@ class GradientControl(Control):
     def __init__(self, options, count, cameras, bounds):
         super().__init__(options, count, cameras, bounds)
         self.growth = Growth.plan(options.iterations, count, options.max_primitives)
+        self.counts: Callable[[np.ndarray], np.ndarray] | None = None
+
+    def limit_only(self, counts, most, parameters, step):
+        self.counts = counts
+        if step == 0:
+            self.growth = Growth.plan(self.options.iterations, int(counts(parameters["center"].detach().numpy()).sum()), most)
 
     def gather(self, parameters, camera, screen_grad):
         # In units of the image's size, so that views of different resolution pull alike.
@@ -152,6 +165,7 @@ class GradientControl(Control):
             math.log(self.bounds[0]),
             self.rng(5, step),
             self.kind,
+            None if self.counts is None else int(self.counts(parameters["center"].detach().numpy()).sum()),
         )
         count = len(self.gathered["pull"])
         source = np.arange(max(count, int(children.max(initial=-1)) + 1))
@@ -176,6 +190,7 @@ def grow(
     smallest_log_extent: float,
     rng: np.random.Generator,
     kind: str = "octahedron",
+    counted: int | None = None,
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Draws the parents of one event and computes their halves.
 
@@ -183,6 +198,7 @@ def grow(
         parameters: raw trainable tensors, `center` (N, 3), `rotation` (N, 4), `log_extent` (N, 3 or 4), `raw_opacity` (N,), ...
         pull: (N,) screen-space gradient gathered since the last event, >= 0.
         smallest_log_extent: a primitive with an extent at this floor counts as dead.
+        counted: primitives that count towards the cap; default: all.
 
     Returns: rows (P,) of the parents, overwritten by their first halves; rows (P,) that receive the second halves, from N on where
         they are new; and what the halves have of their own, {"center": (2, P, 3), "log_extent": (2, P, 3 or 4), for
@@ -195,7 +211,7 @@ def grow(
     dead = (opacity < DEAD_OPACITY) | (log_extent.min(1) <= smallest_log_extent + 1e-6)
     weight[dead] = 0
     candidates = int((weight > 0).sum())
-    extra = min(growth.cap - count, int(np.ceil(growth.rate * count)))
+    extra = min(growth.cap - (count if counted is None else counted), int(np.ceil(growth.rate * count)))
     wanted = min(candidates, max(0, extra) + int(dead.sum()))
     if wanted == 0:
         empty = np.zeros(0, dtype=np.int64)

@@ -20,7 +20,16 @@ from test_executor import is_alive
 
 from linprim_geo import block_tasks, worker
 from linprim_geo.block_shots import Windows, block_shots
-from linprim_geo.block_tasks import EXCHANGES, beyond, block_folder, block_of, join_task, known_of, tensors
+from linprim_geo.block_tasks import (
+    EXCHANGES,
+    apportioned,
+    beyond,
+    block_folder,
+    block_of,
+    join_task,
+    known_of,
+    tensors,
+)
 from linprim_geo.block_training import blocks_that_fit, train_blocks
 from linprim_geo.blocks import Block, cropped
 from linprim_geo.camera import Camera
@@ -99,6 +108,15 @@ def test_the_nearest_that_memory_allows_stand_in_full(monkeypatch):
     monkeypatch.setattr(block_tasks, "MOST_BESIDE", 10_000)
     assert known_of(distances, 0.5, 100_000) == pytest.approx(1.01)
     assert known_of(distances, 2.0, 100_000) == 2.0
+
+
+def test_own_primitives_are_limited_to_what_is_asked_for(whole):
+    run, done = whole
+    plan = worker.result_of_folder(run / "blocks" / "plan")
+    assert sum(part["own_primitives"] for part in plan["blocks"]) == OPTIONS.max_primitives
+    assert 0.97 * OPTIONS.max_primitives <= done["primitives"] <= 1.01 * OPTIONS.max_primitives
+    assert sum(part["max_primitives"] for part in plan["blocks"]) > 1.05 * OPTIONS.max_primitives
+    assert apportioned([1, 1, 1], 10) == [4, 3, 3] and apportioned([0, 5, 2], 70) == [0, 50, 20]
 
 
 def test_so_few_steps_that_none_are_left_after_an_exchange(tiny_scene, tmp_path):
