@@ -4,7 +4,7 @@ for 10^4 and 10^6 photographs. `python -m linprim_geo.eval.scaling -o runs/scali
 Measured are trainings in workers of their own, on a street. The fit is
 
     setup seconds   = s0 + s1 photos + s2 photos pixels          GiB = m0 + m1 photos pixels + m2 pixels + m3 primitives
-    seconds a step  = t0 + t1 pixels + t2 primitives
+    seconds a step  = t0 + t1 pixels + t2 primitives             filling up points, seconds = f0 + f1 photos
 
 with no negative number, by relative errors; it is checked on the largest size, which it has not seen. Processor time, not the clock's, is
 measured, so a machine that does other work beside is no matter. A prediction also takes what a run in blocks shows (--run): in how many
@@ -51,14 +51,19 @@ class Capture:
 
 @dataclass(frozen=True)
 class Fit:
-    """The numbers of the three lines of this module's formula."""
+    """The numbers of this module's formula."""
 
     setup: tuple[float, float, float]
     step: tuple[float, float, float]
     memory: tuple[float, float, float, float]
+    filling: tuple[float, float]
+
+    def seconds_of_filling(self, photos: float) -> float:
+        """Processor seconds of filling up the points before the first task of a block; of no more than so many views."""
+        return float(np.dot(self.filling, _filling_terms(photos)))
 
     def seconds_of_setup(self, photos: float, pixels: float) -> float:
-        """Processor seconds before the first step."""
+        """Processor seconds before the first step, without filling up points."""
         return float(np.dot(self.setup, _setup_terms(photos, pixels)))
 
     def seconds_of_step(self, pixels: float, primitives: float) -> float:
@@ -74,8 +79,14 @@ def _setup_terms(photos: float, pixels: float) -> tuple[float, float, float]:
     return 1.0, float(photos), float(photos) * pixels
 
 
+def _filling_terms(photos: float) -> tuple[float, float]:
+    from linprim_geo.fill_points import MOST_VIEWS
+
+    return 1.0, min(float(photos), MOST_VIEWS)
+
+
 def fit(rows: list[dict]) -> Fit:
-    """The fit through rows of `photos`, `pixels`, `primitives`, `setup_seconds`, `step_seconds`, `gib`."""
+    """The fit through rows of `photos`, `pixels`, `primitives`, `setup_seconds`, `step_seconds`, `gib`, `filling_seconds`."""
     from scipy.optimize import nnls
 
     def solve(terms: list[tuple], wanted: list[float]) -> tuple[float, ...]:
@@ -88,6 +99,7 @@ def fit(rows: list[dict]) -> Fit:
         solve([_setup_terms(row["photos"], row["pixels"]) for row in rows], [row["setup_seconds"] for row in rows]),
         solve([(1.0, row["pixels"], row["primitives"]) for row in rows], [row["step_seconds"] for row in rows]),
         solve([(1.0, row["photos"] * row["pixels"], row["pixels"], row["primitives"]) for row in rows], [row["gib"] for row in rows]),
+        solve([_filling_terms(row["photos"]) for row in rows], [row["filling_seconds"] for row in rows]),
     )
 
 
@@ -97,6 +109,7 @@ def check(found: Fit, row: dict) -> dict:
         "setup_seconds": found.seconds_of_setup(row["photos"], row["pixels"]),
         "step_seconds": found.seconds_of_step(row["pixels"], row["primitives"]),
         "gib": found.gib(row["photos"], row["pixels"], row["primitives"]),
+        "filling_seconds": found.seconds_of_filling(row["photos"]),
     }
     return {name: {"predicted": value, "measured": row[name], "ratio": value / row[name]} for name, value in said.items()}
 
@@ -104,6 +117,8 @@ def check(found: Fit, row: dict) -> dict:
 def predict(found: Fit, photos: float, capture: Capture) -> dict:
     """Core-hours, memory of a worker, storage and network of a capture of so many photographs."""
     from linprim_geo.block_tasks import (
+        COARSE_DOWNSCALE,
+        COARSE_STEPS,
         EXCHANGES,
         MOST_BESIDE,
         MOST_COARSE_PRIMITIVES,
@@ -112,36 +127,42 @@ def predict(found: Fit, photos: float, capture: Capture) -> dict:
     )
     from linprim_geo.block_training import OVERLAP
 
-    window = capture.window * capture.pixels
+    window, small = capture.window * capture.pixels, capture.pixels / COARSE_DOWNSCALE**2
     blocks = max(1, math.ceil(photos * capture.uses / capture.photos_per_block))
     primitives = photos * capture.primitives_per_photo
     # A block and its margin stand before the coarse scene, and after an exchange before what others hold, too.
-    held = OVERLAP * primitives / blocks + MOST_COARSE_PRIMITIVES
+    trained = OVERLAP * primitives / blocks
+    held = trained + MOST_COARSE_PRIMITIVES
     joined = held + min(MOST_BESIDE, primitives)
     steps = capture.steps_per_photo * capture.photos_per_block
-    alone = until(TrainOptions(), 0)
-    step = alone * found.seconds_of_step(window, held) + (1 - alone) * found.seconds_of_step(window, joined)
-    tasks = 1 + len(EXCHANGES)  # of a block
-    block = tasks * found.seconds_of_setup(capture.photos_per_block, window) + steps * step
-    coarse_views, small = min(photos, MOST_COARSE_VIEWS), capture.pixels / 4
-    coarse = found.seconds_of_setup(coarse_views, small)
-    coarse += 0.25 * capture.steps_per_photo * coarse_views * found.seconds_of_step(small, MOST_COARSE_PRIMITIVES)
-    # A view's depth is a third of a step: forward only.
-    planning = photos * found.seconds_of_step(small, MOST_COARSE_PRIMITIVES) / 3
+    alone, tasks = until(TrainOptions(), 0), 1 + len(EXCHANGES)
+    # Forward only is a third of a step: every task renders the coarse depth of its views, and what stands beyond where that is coarse.
+    setup = found.seconds_of_setup(capture.photos_per_block, window) + capture.photos_per_block / 3 * (
+        found.seconds_of_step(small, MOST_COARSE_PRIMITIVES) + found.seconds_of_step(window, joined)
+    )
+    first = setup + found.seconds_of_filling(capture.photos_per_block) + alone * steps * found.seconds_of_step(window, held)
+    block = first + len(EXCHANGES) * setup + (1 - alone) * steps * found.seconds_of_step(window, joined)
+    views = min(photos, MOST_COARSE_VIEWS)
+    coarse = found.seconds_of_setup(views, small) + found.seconds_of_filling(views)
+    coarse += COARSE_STEPS * capture.steps_per_photo * views * found.seconds_of_step(small, MOST_COARSE_PRIMITIVES)
+    # It looks at every view twice.
+    planning = 2 * photos * found.seconds_of_step(small, MOST_COARSE_PRIMITIVES) / 3
     photo = BYTES_OF_PHOTO * capture.pixels
-    # Parameters and both of Adam's moments, in two checkpoints per task, which are also what a block takes up of others, whole ones of
-    # about twice what it needs; then the scene in three files. 27 numbers of colour and 11 others, 4 bytes each.
+    # 27 numbers of colour and 11 others, 4 bytes each: a task leaves two checkpoints, with both of Adam's moments, and what it trained in
+    # three files. It reads those checkpoints of others that hold what it takes up, about twice as much.
     state = 4 * (11 + 27)
-    moved = blocks * state * (tasks * MOST_COARSE_PRIMITIVES + 3 * (tasks - 1) * 2 * joined)
+    saved = trained * (3 + 3) * state
+    saves = steps / TrainOptions().checkpoint_every + tasks
+    moved = blocks * (saves * saved + tasks * MOST_COARSE_PRIMITIVES * state + len(EXCHANGES) * 2 * joined * 3 * state)
     return {
         "photos": int(photos),
         "blocks": blocks,
         "primitives": int(primitives),
         "core_hours": (blocks * block + coarse + planning) / 3600,
-        "longest_task_hours": max(block, coarse, planning) / 3600,
+        "longest_task_hours": max(first, coarse, planning) / 3600,
         "gib_per_worker": found.gib(capture.photos_per_block, window, joined),
-        "storage_gib": (photos * photo + primitives * state * (2 * 3 * tasks + 3)) / 2**30,
-        "network_gib": (photos * photo * (1 + tasks * capture.uses) + moved) / 2**30,
+        "storage_gib": (photos * photo + blocks * tasks * trained * (2 * 3 + 3) * state + 3 * primitives * state) / 2**30,
+        "network_gib": (photos * photo * (3 + tasks * capture.uses) + moved) / 2**30,
     }
 
 
@@ -175,13 +196,16 @@ def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitiv
     loaded = load_scene(scene, downscale=downscale).with_training_views(photos)
     how = TrainOptions(max_primitives=primitives, initial_primitives=primitives, threads=1)
     similarity = scene_normalization(loaded)
-    cloud, windows, shots = fill_points(loaded, how.seed), Windows(), []
+    before = time.process_time()
+    cloud = fill_points(loaded, how.seed)
+    filling = time.process_time() - before
+    windows, shots = Windows(), []
     for view in loaded.train:
         rgb = view.load().rgb
         shots.append(windows.shot(view.name, view.camera.transformed(similarity), rgb, np.full(rgb.shape[:2], 255, np.uint8)))
     run = Run(folder / "run", Path(scene), SceneOptions(), how, similarity)
     trainer = start_trainer(loaded, run, shots, how, None, cloud)
-    setup = time.process_time() - begin
+    setup = time.process_time() - begin - filling
     for _ in range(WARM_UP):
         trainer.advance()
     trainer.step = TrainOptions.iterations // 2  # all degrees of the colour
@@ -195,6 +219,7 @@ def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitiv
         "pixels": camera.width * camera.height,
         "primitives": len(trainer),
         "setup_seconds": setup,
+        "filling_seconds": filling,
         "step_seconds": step,
     }
 

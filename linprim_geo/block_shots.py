@@ -14,8 +14,9 @@ import numpy as np
 import torch
 
 from . import ops
-from .blocks import Block, cropped, enlarged, shown, smaller, window
+from .blocks import Block, cropped, enlarged, smaller, surface_points, window
 from .camera import Camera, Similarity
+from .errors import LinprimError
 from .files import writing
 from .ops import Tensors
 from .options import TrainOptions, raster_options
@@ -36,20 +37,25 @@ def small_depths(coarse: Run, views: Sequence[View], factor: int) -> Iterator[tu
 
 
 class Windows:
-    """Parts of photographs in a file in the system's folder for temporary ones (TMPDIR), so that a worker's memory does not grow with them.
+    """Parts of photographs in a file in the system's folder for temporary ones, so that a worker's memory does not grow with them; where
+    that folder is itself memory, TMPDIR is to name another.
 
     Reading one takes a hundredth of the time of a step. The file has no name: it is gone with the last of them, however this process ends.
     """
 
     def __init__(self) -> None:
-        """Raises LinprimError where that folder cannot be written."""
-        self._what = Path(tempfile.gettempdir()) / "windows of photographs"
+        """Raises LinprimError where no such folder can be written."""
+        try:
+            folder = Path(tempfile.gettempdir())
+        except FileNotFoundError as error:
+            raise LinprimError(f"no folder for temporary files can be written ({error}): wanted TMPDIR to name one") from None
+        self._what = folder / "windows of photographs (TMPDIR)"
         with writing(self._what):
             self._file = tempfile.TemporaryFile()
         self._recent: dict[str, Shot] = {}
 
-    def shot(self, name: str, camera: Camera, rgb: np.ndarray, alpha: np.ndarray, weight: float = 1.0, side: float = 1.0) -> StoredShot:
-        """Takes up (H, W, 3) and (H, W) uint8; for the other arguments see `Shot`.
+    def shot(self, name: str, camera: Camera, rgb: np.ndarray, alpha: np.ndarray, photo: tuple[int, int] | None = None) -> StoredShot:
+        """Takes up (H, W, 3) and (H, W) uint8; `photo` as of a `Shot`.
 
         Raises:
             LinprimError: the disk is full.
@@ -57,12 +63,14 @@ class Windows:
         with writing(self._what):
             begin = self._file.seek(0, os.SEEK_END)
             self._file.write(rgb.transpose(2, 0, 1).tobytes() + alpha.tobytes())
-        return StoredShot(name, camera, partial(self._read, begin, name, camera), True, self._recent, weight, side)
+        return StoredShot(name, camera, partial(self._read, begin, name, camera), True, self._recent, photo)
 
     def _read(self, begin: int, name: str, camera: Camera) -> Shot:
         with writing(self._what):
             self._file.seek(begin)
             planes = bytearray(self._file.read(4 * camera.height * camera.width))
+        if len(planes) != 4 * camera.height * camera.width:
+            raise LinprimError(f"{self._what}: what was written of {name} cannot be read again")
         rgba = torch.frombuffer(planes, dtype=torch.uint8).reshape(4, camera.height, camera.width)
         return Shot(name, camera, rgba[:3], rgba[3])
 
@@ -91,21 +99,20 @@ def block_shots(
     shots: list[Shot] = []
     windows = Windows()
     for view, (camera, depth) in zip(views, small_depths(coarse, views, factor), strict=True):
-        found = window(shown(block, margin, camera, depth), view.camera, factor)
+        surface = surface_points(camera, depth)
+        found = window(block.holds(surface, margin), view.camera, factor)
         if found is None:
             continue
         left, top, width, height = found
         small = cropped(view.camera.transformed(similarity), left, top, width, height)
         photo = view.load()
         part = np.s_[top : top + height, left : left + width]
-        near = shown(block, known, camera, depth) | math.isinf(known)
-        rgb, mask = photo.rgb[part], enlarged(near, view.camera, factor)[part]
+        rgb, mask = photo.rgb[part], enlarged(block.holds(surface, known) | math.isinf(known), view.camera, factor)[part]
         alpha = np.full(mask.shape, 255, np.uint8) if photo.alpha is None else photo.alpha[part]
-        instead, opacity = _rendered(frozen, small, how)
-        rgb, alpha = np.where(mask[..., None], rgb, instead), np.where(mask, alpha, opacity)
-        share = width * height / (view.camera.width * view.camera.height)
-        side = max(width, height) / max(view.camera.width, view.camera.height)
-        shots.append(windows.shot(view.name, small, rgb, alpha, share, side))
+        if not mask.all():
+            instead, opacity = _rendered(frozen, small, how)
+            rgb, alpha = np.where(mask[..., None], rgb, instead), np.where(mask, alpha, opacity)
+        shots.append(windows.shot(view.name, small, rgb, alpha, (view.camera.width, view.camera.height)))
     return shots
 
 

@@ -1,4 +1,4 @@
-"""What workers do when a scene is trained in blocks: the coarse scene, the plan, a block by itself, and its ends beside its neighbours.
+"""What workers do when a scene is trained in blocks: the coarse scene, the plan, a block by itself, and it beside what others have become.
 
 Every task reads what those before it left in RUN/blocks, and goes on from its own last checkpoint.
 """
@@ -6,7 +6,7 @@ Every task reads what those before it left in RUN/blocks, and goes on from its o
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +15,8 @@ import torch
 
 from . import ops, worker
 from .block_shots import block_shots, small_depths
-from .blocks import Block, margin_of, point_work, shown, split_space, window
+from .blocks import Block, margin_of, point_work, split_space, surface_points, window
+from .camera import Camera
 from .checkpoint import read_checkpoint
 from .errors import LinprimError
 from .files import atomic_write, locked
@@ -26,7 +27,7 @@ from .options import TrainOptions
 from .primitives import ARRAYS, Primitives
 from .progress import Progress
 from .run import Run
-from .scene import PointCloud, Scene
+from .scene import PointCloud, Scene, View
 from .shots import load_shots
 from .train import train_run
 from .trainer import CONTROLS
@@ -37,13 +38,15 @@ from .training_start import chosen_background, initial_cloud, start_trainer
 Arrays = dict[str, np.ndarray]
 
 FOLDER = "blocks"
+# Goes up whenever tasks need what those of before have not left.
+FORMAT = 2
 # The coarse scene: pixels averaged, parts of the steps and of the primitives of the whole, and the most of these and of the views.
 COARSE_DOWNSCALE, COARSE_STEPS, COARSE_PRIMITIVES = 2, 0.25, 0.25
 MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS, LEAST_SIDE = 20_000, 1000, 32
 # Steps of a block at least, as far as the whole has so many.
 LEAST_STEPS = 300
-# Parts of the steps that a block has left when its population has stopped growing, after which it takes up what others have become: three
-# times. Others stand in full, the nearest first, up to about so many primitives; beyond these the coarse scene does.
+# Blocks take up what others have become at these parts of the steps that are left once growth has ended. Then others stand in full, the
+# nearest first, up to about so many primitives with those that are trained in the margin; beyond these the coarse scene does.
 EXCHANGES, MOST_BESIDE = (0.125, 0.5, 0.8125), 100_000
 
 
@@ -65,12 +68,12 @@ def coarse_of(run: Run, scene: Scene) -> Run:
     side = min(min(view.camera.width, view.camera.height) for view in scene.train)
     factor = COARSE_DOWNSCALE if side >= COARSE_DOWNSCALE * LEAST_SIDE else 1
     most = max(1, min(MOST_COARSE_PRIMITIVES, round(COARSE_PRIMITIVES * options.max_primitives)))
+    views = min(scene_options.views or len(scene.train), MOST_COARSE_VIEWS)
     coarse = replace(
         options,
-        iterations=max(min(LEAST_STEPS, options.iterations), round(COARSE_STEPS * options.iterations)),
+        iterations=max(min(LEAST_STEPS, options.iterations), round(COARSE_STEPS * options.iterations * views / len(scene.train))),
         max_primitives=most, initial_primitives=0, sh_degree=0, samples=1, evaluate_every=0,
     )  # fmt: skip
-    views = min(scene_options.views or len(scene.train), MOST_COARSE_VIEWS)
     seen = replace(scene_options, downscale=factor * scene_options.downscale, views=views)
     return replace(run, path=run.path / FOLDER / "coarse" / "run", scene_options=seen, train_options=coarse)
 
@@ -87,7 +90,7 @@ def _prepared(options: TrainOptions) -> None:
 
 
 def coarse_task(folder: Path, run: str) -> dict:
-    """Trains the coarse scene. Returns the background that it shows, `fitted`, and whether training draws a random one."""
+    """Trains the coarse scene. Returns the background to train with, as the option says it, its colour, and whether that is fitted."""
     opened, scene = _opened(run)
     _prepared(opened.train_options)
     coarse = coarse_of(opened, scene)
@@ -97,7 +100,8 @@ def coarse_task(folder: Path, run: str) -> dict:
         state = read_checkpoint(coarse.path) if (coarse.path / "config.json").exists() else None
         done = train_run(coarse, small, state, Progress("coarse scene", 1, quiet=True))
     shown_color = [float(x) for x in (Run.open(coarse.path).background if fitted else background)]
-    return {"background": "random" if random else ",".join(map(repr, shown_color)), "shown": shown_color, "seconds": done["seconds"]}
+    background_option = "random" if random else ",".join(map(repr, shown_color))
+    return {"background": background_option, "shown": shown_color, "fitted": fitted, "seconds": done["seconds"]}
 
 
 def plan_task(folder: Path, run: str, count: int) -> dict:
@@ -108,14 +112,30 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
     factor = coarse.scene_options.downscale // opened.scene_options.downscale
     assert scene.points is not None
     points = opened.similarity.apply(scene.points.xyz)
-    depths = list(small_depths(coarse, scene.train, factor))
-    seen = [(camera, depth, view.camera.width * view.camera.height) for view, (camera, depth) in zip(scene.train, depths, strict=True)]
-    work = point_work(points, seen)
+
+    def looks() -> Iterator[tuple[View, Camera, np.ndarray]]:
+        """Rendered twice: depths of all views take more memory than there may be."""
+        for view, (camera, depth) in zip(scene.train, small_depths(coarse, scene.train, factor), strict=True):
+            yield view, camera, depth
+
+    work = point_work(points, ((camera, depth, view.camera.width * view.camera.height) for view, camera, depth in looks()))
     used = work > 0
     if not used.any():
         raise LinprimError(f"{scene.root}: no camera sees a point of the scene, so no block can be made")
     blocks = split_space(points[used], work[used], count)
     margin = margin_of(blocks, points[used])
+    seen_by: list[list[int]] = [[] for _ in blocks]
+    pixels = [0] * count
+    for number, (view, camera, depth) in enumerate(looks()):
+        if not (depth > 0).any():
+            continue
+        surface = surface_points(camera, depth)
+        reach = Block(tuple(np.nanmin(surface, (0, 1))), tuple(np.nanmax(surface, (0, 1))))
+        for k, block in enumerate(blocks):
+            found = None if reach.is_apart(block, margin) else window(block.holds(surface, margin), view.camera, factor)
+            if found is not None:
+                seen_by[k].append(number)
+                pixels[k] += found[2] * found[3]
     options = opened.train_options
     # Where the coarse scene has grown primitives the whole would, too, and none larger.
     grown = coarse.training_primitives().center
@@ -124,23 +144,17 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
     own = apportioned([int(block.holds(grown).sum()) for block in blocks], options.max_primitives)
     parts = []
     for k, block in enumerate(blocks):
-        views, pixels = [], 0
-        for number, (view, (camera, depth)) in enumerate(zip(scene.train, depths, strict=True)):
-            found = window(shown(block, margin, camera, depth), view.camera, factor)
-            if found is not None:
-                views.append(number)
-                pixels += found[2] * found[3]
-        if len(views) < 2:
-            raise LinprimError(f"block {k} of {count} is seen by {len(views)} cameras, wanted two at least: fewer blocks")
+        if len(seen_by[k]) < 2:
+            raise LinprimError(f"block {k} of {count} is seen by {len(seen_by[k])} cameras, wanted two at least: fewer blocks")
         share = float(block.holds(grown, margin).mean())
         most = max(1, math.ceil(share * options.max_primitives))
-        steps = math.ceil(options.iterations * len(views) / len(scene.train))
+        steps = math.ceil(options.iterations * len(seen_by[k]) / len(scene.train))
         parts.append(
             {
                 "low": [_plain(x) for x in block.low],
                 "high": [_plain(x) for x in block.high],
-                "views": views,
-                "pixels": pixels,
+                "views": seen_by[k],
+                "pixels": pixels[k],
                 "work": float(work[block.holds(points)].sum() / work.sum()),
                 "iterations": max(min(LEAST_STEPS, options.iterations), steps),
                 "max_primitives": most,
@@ -150,15 +164,16 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
             }
         )
     background = worker.result_of_folder(opened.path / FOLDER / "coarse")
-    largest = max(view.camera.width * view.camera.height for view in scene.train)
     return {
+        "format": FORMAT,
         "margin": margin,
         "factor": factor,
         "background": background["background"],
         "shown": background["shown"],
+        "fitted": background["fitted"],
         "frozen": len(grown),
         "extent": float(state["bounds"][1]),
-        "largest": largest,
+        "largest": max(view.camera.width * view.camera.height for view in scene.train),
         "all_pixels": sum(view.camera.width * view.camera.height for view in scene.train),
         "blocks": parts,
     }
@@ -173,7 +188,7 @@ def apportioned(counts: Sequence[int], total: int) -> list[int]:
 
 
 def known_of(distances: np.ndarray, margin: float, primitives: int) -> float:
-    """How far from a block, beyond its margin, MOST_BESIDE primitives reach, infinite if there are fewer in all.
+    """How far from a block the nearest MOST_BESIDE primitives outside of it reach, its margin at least; infinite if there are fewer.
 
     Args:
         distances: (P,) of the primitives of the coarse scene from the block, 0 in it; each stands for its part of so many `primitives`.
@@ -282,9 +297,7 @@ def _trained(
     with locked(path, "trained into"):
         begun = (path / "config.json").exists()
         state = (read_checkpoint(path) if begun else None) or begin
-        cloud = None
-        if state is None:
-            cloud = _points_of(seen, opened, own, plan["margin"], block, part["own_primitives"], options)
+        cloud = _points_of(seen, opened, plan, block, options) if state is None else None
         coarse = Run.open(opened.path / FOLDER / "coarse" / "run")
         margin, factor, still = plan["margin"], plan["factor"], tensors(frozen)
         shots = block_shots(coarse, seen.train, own, margin, known, factor, opened.similarity, options, still)
@@ -302,13 +315,14 @@ def _trained(
     return {"seconds": seconds, "primitives": len(trainer), "loss": trainer.loss, "train_psnr": trainer.psnr}
 
 
-def _points_of(scene: Scene, run: Run, block: Block, margin: float, number: int, own: int, options: TrainOptions) -> PointCloud:
-    """The scene's points in a block and its margin, filled up: at most as many in either as a training begins with that has `own`
-    primitives in the block and the others of `options` in the margin."""
+def _points_of(scene: Scene, run: Run, plan: dict, number: int, options: TrainOptions) -> PointCloud:
+    """The scene's points in a block and its margin, filled up: at most as many in either as a training begins with that has the block's
+    own primitives in the one and the others of its `options` in the other."""
     assert scene.points is not None
-    cloud = scene.points if isinstance(scene.points, VolumePoints) else fill_points(scene, options.seed)
-    where = run.similarity.apply(cloud.xyz)
-    inside, beside = block.holds(where), block.holds(where, margin)
+    backdrop = np.asarray(plan["shown"]) if plan["fitted"] else None
+    cloud = scene.points if isinstance(scene.points, VolumePoints) else fill_points(scene, options.seed, backdrop)
+    where, block, own = run.similarity.apply(cloud.xyz), block_of(plan, number), max(1, plan["blocks"][number]["own_primitives"])
+    inside, beside = block.holds(where), block.holds(where, plan["margin"])
     if not beside.any():
         raise LinprimError(f"block {number} holds no point to start from: wanted fewer blocks")
     chosen = []

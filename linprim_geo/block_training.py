@@ -1,8 +1,8 @@
-"""Training a scene in blocks: the whole of it coarsely, a plan, every block before what the coarse scene shows of the rest, its last steps
-beside what its neighbours have become, in rounds, and one run of all.
+"""Training a scene in blocks: the whole of it coarsely, a plan, every block before what the coarse scene shows of the rest, its later steps
+beside what other blocks have become, in rounds, and one run of all.
 
-RUN/blocks holds `points.npz` (what the scene starts from), `coarse`, `plan`, and `000`, `000joined1`, `000joined2`, `001`, ... with a run
-in each, and the markers of what is done. The result, in RUN itself, is like that of any training, but has no checkpoint.
+RUN/blocks holds `points.npz` (what the scene starts from), `coarse`, `plan`, and `000`, `000joined1`, ..., `000joined3`, `001`, ... with a
+run in each, and the markers of what is done. The result, in RUN itself, is like that of any training, but has no checkpoint.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from . import ops
 from .block_tasks import (
     EXCHANGES,
     FOLDER,
+    FORMAT,
     MOST_BESIDE,
     MOST_COARSE_PRIMITIVES,
     MOST_COARSE_VIEWS,
@@ -46,7 +47,7 @@ from .shots import MOST_KEPT, RECENT, photo_bytes
 from .train import train
 from .training_start import begin_run, reopen_run, with_points
 
-# What margins add to a block's part of the primitives, where it has others on all sides of its ground plan.
+# What margins make of a block's part of the primitives, where it has others on all sides of a square ground plan; fewer elsewhere.
 OVERLAP = (1 + 2 * MARGIN) ** 2
 REMEDY = "more blocks (--blocks), fewer --max-primitives, a larger --downscale, fewer --workers, or more memory"
 
@@ -130,18 +131,30 @@ def check_options(options: TrainOptions, blocks: int | str) -> None:
 
 
 def blocks_that_fit(views: Sequence[View], options: TrainOptions, executor: Executor) -> int:
-    """The least number of blocks, 1 or more, each of which a worker has the memory for. Only primitives are shared out: of the photographs
-    of a block a worker holds few."""
+    """The least number of blocks, 1 or more, each of which a worker should have the memory for. Only primitives are shared out: of the
+    photographs of a block a worker holds few."""
     _, memory = executor.capacity()
     if memory_estimate(views, options, min(photo_bytes(tuple(views)), MOST_KEPT)) <= memory:
         return 1
-    still = min(MOST_COARSE_PRIMITIVES + MOST_BESIDE, options.max_primitives)
-    fixed = memory_estimate(views[:1], replace(options, max_primitives=still, initial_primitives=0))
+    largest = max(view.camera.width * view.camera.height for view in views)
+    fixed = block_memory(0, min(MOST_COARSE_PRIMITIVES, options.max_primitives), largest, options)
     if fixed >= memory:
         wanted = "wanted a larger --downscale, or more memory"
-        raise LinprimError(f"a worker has {memory:.1f} GiB and one photograph takes {fixed:.1f} GiB: {wanted}")
+        raise LinprimError(f"a worker has {memory:.1f} GiB and a block of the fewest primitives takes {fixed:.1f} GiB: {wanted}")
     primitives = bytes_per_primitive(options) * options.max_primitives / 2**30
     return max(2, math.ceil(OVERLAP * primitives / (memory - fixed)))
+
+
+def block_memory(primitives: int, coarse: int, largest: int, options: TrainOptions) -> float:
+    """GiB that a worker takes which trains so many primitives of a block and its margin, before those of the coarse scene and, after an
+    exchange, of other blocks.
+
+    Args:
+        largest: pixels of the largest photograph. Of all photographs a worker holds the last that were used.
+        options: of the whole.
+    """
+    count = primitives + coarse + min(MOST_BESIDE, options.max_primitives)
+    return memory_estimate((), replace(options, max_primitives=count, initial_primitives=0), 4 * RECENT * largest, largest)
 
 
 # --- the driver -------------------------------------------------------------------------------------------
@@ -164,25 +177,24 @@ def _all(run: Run, scene: Scene, count: int, executor: Executor, progress: Progr
     (coarse,) = executor.run([Task("coarse scene", f"{module}:coarse_task", where, folder / "coarse", need, cores, REMEDY)], stage, _step)
     planning = Task("plan", f"{module}:plan_task", where | {"count": count}, folder / "plan", need, cores, REMEDY)
     (plan,) = executor.run([planning], Progress("plan", 1, quiet=progress.quiet))
-    tasks = []
+    if plan.get("format") != FORMAT:
+        raise LinprimError(f"{run.path}: was begun in blocks by another version of linprim-geo, wanted a new folder")
+    rounds, memory = [], []
     for k, part in enumerate(plan["blocks"]):
-        need, arguments = block_memory(part, plan, options), where | {"block": k}
-        tasks.append(Task(f"block {k}", f"{module}:block_task", arguments, block_folder(run.path, k), need, 1, REMEDY))
+        memory.append(block_memory(part["max_primitives"], plan["frozen"], plan["largest"], options))
         progress.note(
             f"  block {k}: {len(part['views'])} views, {part['pixels'] / max(1, plan['all_pixels']):.0%} of the pixels, "
-            f"{part['iterations']} steps, {part['max_primitives']} primitives, {need:.1f} GiB"
+            f"{part['iterations']} steps, {part['max_primitives']} primitives, {memory[k]:.1f} GiB"
         )
-    rounds = [executor.run(tasks, Progress("blocks", 1, quiet=progress.quiet), _step)]
-    beside = min(MOST_BESIDE, options.max_primitives)
-    for exchange in range(1, len(EXCHANGES) + 1):
-        tasks = [
-            Task(
-                f"block {k}, exchange {exchange}", f"{module}:join_task", where | {"block": k, "exchange": exchange},
-                block_folder(run.path, k, exchange), block_memory(part, plan, options, beside), 1, REMEDY,
-            )
-            for k, part in enumerate(plan["blocks"])
-        ]  # fmt: skip
-        rounds.append(executor.run(tasks, Progress(f"exchange {exchange} of {len(EXCHANGES)}", 1, quiet=progress.quiet), _step))
+    for exchange in range(len(EXCHANGES) + 1):
+        title = f"exchange {exchange} of {len(EXCHANGES)}" if exchange else "blocks"
+        tasks = []
+        for k, need in enumerate(memory):
+            name, function, arguments = f"block {k}", f"{module}:block_task", where | {"block": k}
+            if exchange:
+                name, function, arguments = f"{name}, exchange {exchange}", f"{module}:join_task", arguments | {"exchange": exchange}
+            tasks.append(Task(name, function, arguments, block_folder(run.path, k, exchange), need, 1, REMEDY))
+        rounds.append(executor.run(tasks, Progress(title, 1, quiet=progress.quiet), _step))
     return _merged(run, scene, coarse, plan, rounds, progress)
 
 
@@ -246,11 +258,3 @@ def _merged(run: Run, scene: Scene, coarse: dict, plan: dict, rounds: Sequence[l
         "coarse_seconds": coarse["task_seconds"],
         "worker_seconds": coarse["task_seconds"] + sum(result["task_seconds"] for result in results),
     }
-
-
-def block_memory(part: dict, plan: dict, options: TrainOptions, beside: int = 0) -> float:
-    """GiB that training a block of the plan takes, `beside` so many primitives of others. Of its photographs it holds the last that were
-    used."""
-    count = part["max_primitives"] + plan["frozen"] + beside
-    photos = 4 * RECENT * plan["largest"]
-    return memory_estimate((), replace(options, max_primitives=count, initial_primitives=0), photos, plan["largest"])

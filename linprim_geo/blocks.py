@@ -116,10 +116,9 @@ def point_work(xyz: np.ndarray, views: Iterable[tuple[Camera, np.ndarray, int]])
     return work
 
 
-def shown(block: Block, margin: float, camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels whose surface, at z-depths `depth` (H, W), lies in the block or its margin."""
-    points = camera.center + camera.world_rays() * depth[..., None]
-    return block.holds(points, margin) & (depth > 0)
+def surface_points(camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """(H, W, 3) points of a view at z-depths (H, W), NaN where that is 0."""
+    return camera.center + camera.world_rays() * np.where(depth > 0, depth, np.nan)[..., None]
 
 
 def enlarged(mask: np.ndarray, camera: Camera, factor: int) -> np.ndarray:

@@ -21,7 +21,7 @@ from .scene import PointCloud, Scene
 # a view ends up with, so that what is found by features is hardly ever doubled. Depths from colours are coarser: they match patches.
 CELL, PATCH_CELL = 12 / 512, 18 / 512
 # Views that take part; more say little that is new.
-_MOST_VIEWS = 100
+MOST_VIEWS = 100
 # A triangle of three neighbouring points spans a surface if their depths differ by at most this factor ...
 _MAX_DEPTH_RATIO = 1.15
 # ... and speaks for the space in front of it if its sides are no longer than this many cells.
@@ -69,7 +69,7 @@ def fill_points(scene: Scene, seed: int, backdrop: np.ndarray | None = None) -> 
     """
     cloud = scene.points
     assert cloud is not None, "of a scene without points there is nothing to fill"
-    views = [_Gaps(look, cloud.xyz) for look in spread_looks(scene.train, _MOST_VIEWS)]
+    views = [_Gaps(look, cloud.xyz) for look in spread_looks(scene.train, MOST_VIEWS)]
     rng = np.random.default_rng([seed, 8])
     found = [np.empty((0, 3))]
     colors = [np.empty((0, 3), np.uint8)]

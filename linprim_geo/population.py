@@ -106,8 +106,9 @@ class Control:
         """What is added to the loss, differentiable in the raw parameters."""
         return None
 
-    def gather(self, parameters: Parameters, camera: Camera, screen_grad: torch.Tensor) -> None:
-        """Notes one view's gradient to the projected centres (N, 3); see `ops.rasterize`'s `screen`."""
+    def gather(self, parameters: Parameters, camera: Camera, size: tuple[int, int], screen_grad: torch.Tensor) -> None:
+        """Notes one view's gradient to the projected centres (N, 3), see `ops.rasterize`'s `screen`; `size`, (width, height), is that of
+        the photograph, of which the camera may see a part."""
 
     def disturb(self, parameters: Parameters, step: int) -> None:
         """Changes parameters in place after the optimiser's step, `step` counted from 1."""
@@ -150,9 +151,9 @@ class GradientControl(Control):
         if step == 0:
             self.growth = Growth.plan(self.options.iterations, int(counts(parameters["center"].detach().numpy()).sum()), most)
 
-    def gather(self, parameters, camera, screen_grad):
+    def gather(self, parameters, camera, size, screen_grad):
         # In units of the image's size, so that views of different resolution pull alike.
-        self.gathered["pull"] += screen_grad[:, 2] * max(camera.width, camera.height)
+        self.gathered["pull"] += screen_grad[:, 2] * max(size)
 
     def is_due(self, step):
         return self.growth.is_due(step)

@@ -75,8 +75,8 @@ class ClassicControl(Control):
         self.every, self.reset_every = _steps(self.constants.every, total), _steps(RESET_EVERY, total)
         self.first, self.last = _steps(FIRST, total), round(self.GROWS_UNTIL * total)
 
-    def gather(self, parameters, camera, screen_grad):
-        half = torch.tensor([camera.width / 2, camera.height / 2])
+    def gather(self, parameters, camera, size, screen_grad):
+        half = torch.tensor([size[0] / 2, size[1] / 2])
         seen = in_view(parameters, camera, self.kind)
         pull = torch.linalg.vector_norm(screen_grad[:, :2] * half, dim=1)
         self.gathered["gradient"] += torch.where(seen, pull, 0.0)

@@ -25,16 +25,24 @@ MEMORY_SHARE, MOST_KEPT, RECENT = 0.25, 3 * 2**29, 2
 class Shot:
     """A view in memory: `rgb` (3, H, W) uint8, `alpha` (H, W) uint8 or None, its camera in the training frame.
 
-    Of a photograph that it is cut out of it has the share `weight` of the pixels, which its loss counts by, and the share `side` of the
-    longer side.
+    `photo` is (width, height) of the photograph that it is cut out of, None where it is the whole.
     """
 
     name: str
     camera: Camera
     rgb: torch.Tensor
     alpha: torch.Tensor | None
-    weight: float = 1.0
-    side: float = 1.0
+    photo: tuple[int, int] | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the whole photograph."""
+        return self.photo or (self.camera.width, self.camera.height)
+
+    @property
+    def weight(self) -> float:
+        """Its share of the pixels of the whole photograph, which its loss counts by."""
+        return self.camera.width * self.camera.height / (self.size[0] * self.size[1])
 
     def over(self, background: torch.Tensor) -> torch.Tensor:
         """(3, H, W) float32 in [0, 1], over `background` (3,) where alpha lets it through."""
@@ -60,10 +68,16 @@ class StoredShot(Shot):
     _has_alpha: bool
 
     def __init__(
-        self, name: str, camera: Camera, read: Callable[[], Shot], has_alpha: bool, recent: dict[str, Shot], weight=1.0, side=1.0
+        self,
+        name: str,
+        camera: Camera,
+        read: Callable[[], Shot],
+        has_alpha: bool,
+        recent: dict[str, Shot],
+        photo: tuple[int, int] | None = None,
     ):
-        given = {"name": name, "camera": camera, "weight": weight, "side": side}
-        for key, value in (given | {"_read_it": read, "_recent": recent, "_has_alpha": has_alpha}).items():
+        given = {"name": name, "camera": camera, "photo": photo, "_read_it": read, "_recent": recent, "_has_alpha": has_alpha}
+        for key, value in given.items():
             object.__setattr__(self, key, value)
 
     def _read(self) -> Shot:

@@ -302,8 +302,7 @@ class Trainer:
             touched = screen_grad[:, 2] > 0 if penalty is None and terms is None else None
             self._update(dict(zip(leaves, grads, strict=True)), touched)
             self.control.disturb(self.parameters, self.step + 1)
-            # As the whole photograph would pull, where this is a part of one.
-            self.control.gather(self.parameters, shot.camera, screen_grad if shot.side == 1 else screen_grad / shot.side)
+            self.control.gather(self.parameters, shot.camera, shot.size, screen_grad)
         self.step += 1
         if self.control.is_due(self.step):
             self._grow()

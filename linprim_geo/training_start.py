@@ -262,7 +262,8 @@ def start_trainer(
         )
     smallest = SMALLEST_PX * CAMERA_DISTANCE / focal
     like = KINDS[options.primitive].size
-    bounds = (like * smallest, like * max(LARGEST_PART * radius, 4 * smallest) if largest is None else largest)
+    largest = like * LARGEST_PART * radius if largest is None else largest
+    bounds = (like * smallest, max(largest, like * 4 * smallest))
     parameters = initial_parameters(xyz, rgb, options.sh_degree, options.seed, bounds, options.primitive)
     if surface and parameters["log_extent"].shape[1] == 3:
         _lay_down(parameters, xyz, options.seed, bounds[0])

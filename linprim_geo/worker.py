@@ -68,7 +68,7 @@ def result_of(task: dict) -> dict | None:
         return None
     done = read_json(file, "the marker of a task that is done")
     if not isinstance(done, dict) or done.get("task") != key_of(task) or not isinstance(done.get("result"), dict):
-        raise LinprimError(f"{file}: is the result of other options than those of {task['name']}, wanted another folder")
+        raise LinprimError(f"{file}: is the result of other options than those of {task['name']}, or was moved: wanted another folder")
     return done["result"]
 
 

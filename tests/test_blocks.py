@@ -13,9 +13,9 @@ from linprim_geo.blocks import (
     enlarged,
     margin_of,
     point_work,
-    shown,
     smaller,
     split_space,
+    surface_points,
     window,
 )
 from linprim_geo.camera import Camera
@@ -77,11 +77,12 @@ def test_the_work_of_a_point_is_the_pixels_of_the_views_that_see_it():
 def test_pixels_show_a_block_where_their_surface_lies_in_it():
     depth = np.full((30, 40), 4.0)
     depth[:10] = 0
-    mask = shown(Block((-np.inf,) * 3, (0.0, np.inf, np.inf)), 0.0, camera(), depth)
+    surface = surface_points(camera(), depth)
+    mask = Block((-np.inf,) * 3, (0.0, np.inf, np.inf)).holds(surface)
     assert mask[10:, :20].all() and not mask[10:, 20:].any() and not mask[:10].any()
     # A margin of 4/30 is a pixel at depth 4.
-    assert shown(Block((-np.inf,) * 3, (0.0, np.inf, np.inf)), 4 / 30, camera(), depth)[10:, :21].all()
-    assert not shown(Block((-np.inf, -np.inf, 5.0), (np.inf,) * 3), 0.0, camera(), depth).any()
+    assert Block((-np.inf,) * 3, (0.0, np.inf, np.inf)).holds(surface, 4 / 30)[10:, :21].all()
+    assert not Block((-np.inf, -np.inf, 5.0), (np.inf,) * 3).holds(surface).any()
 
 
 def test_a_window_is_the_part_of_a_photograph_that_shows_a_block():

@@ -99,7 +99,7 @@ def test_a_gradient_is_averaged_over_the_views_that_see():
     screen = torch.tensor([[3e-6, 4e-6, 9.0], [0, 0, 0], [1, 1, 1]])
     assert list(in_view(parameters, CAMERAS[0], "octahedron")) == [True, True, False]
     for _ in range(2):
-        control.gather(parameters, CAMERAS[0], screen)
+        control.gather(parameters, CAMERAS[0], (CAMERAS[0].width, CAMERAS[0].height), screen)
     # From -1 to 1 over 100 pixels: 50 times as much per unit, 5e-6 * 50 = 2.5e-4 per view.
     assert torch.allclose(control.gathered["gradient"], torch.tensor([5e-4, 0, 0]), rtol=1e-5)
     assert list(control.gathered["seen"]) == [2, 2, 0]

@@ -14,7 +14,7 @@ from linprim_geo.eval import block_quality, scaling
 from linprim_geo.eval.street import HEIGHT, HOUSE, WIDTH, street
 from linprim_geo.raycast import RayCaster
 
-TRUE = scaling.Fit((1.0, 0.05, 2e-7), (0.002, 4e-7, 3e-6), (0.4, 4e-9, 2e-7, 1.5e-6))
+TRUE = scaling.Fit((1.0, 0.05, 2e-7), (0.002, 4e-7, 3e-6), (0.4, 4e-9, 2e-7, 1.5e-6), (2.0, 0.1))
 
 
 def rows_of(true: scaling.Fit, noise: float = 0.0) -> list[dict]:
@@ -23,14 +23,16 @@ def rows_of(true: scaling.Fit, noise: float = 0.0) -> list[dict]:
         pixels = (160 // downscale) ** 2
         values = (true.seconds_of_setup(photos, pixels), true.seconds_of_step(pixels, primitives), true.gib(photos, pixels, primitives))
         size = {"photos": photos, "pixels": pixels, "primitives": primitives}
-        factors = np.exp(noise * rng.normal(size=3))
-        rows.append(size | dict(zip(("setup_seconds", "step_seconds", "gib"), np.multiply(values, factors), strict=True)))
+        values = (*values, true.seconds_of_filling(photos))
+        factors = np.exp(noise * rng.normal(size=4))
+        names = ("setup_seconds", "step_seconds", "gib", "filling_seconds")
+        rows.append(size | dict(zip(names, np.multiply(values, factors), strict=True)))
     return rows
 
 
 def test_a_fit_finds_the_numbers_that_made_its_rows():
     found = scaling.fit(rows_of(TRUE)[:-1])
-    for name in ("setup", "step", "memory"):
+    for name in ("setup", "step", "memory", "filling"):
         assert np.allclose(getattr(found, name), getattr(TRUE, name), rtol=1e-6), name
 
 
@@ -48,12 +50,19 @@ def test_predictions_grow_with_the_photographs_and_a_worker_does_not():
     for name in ("core_hours", "storage_gib", "network_gib"):
         assert 90 < many[name] / some[name] <= 101, name
     assert many["gib_per_worker"] == pytest.approx(some["gib_per_worker"], rel=1e-6)
-    # By hand: a block of 24,000 is four setups and 60 x 200 steps over 60 % of 2 million pixels, the first 65 % of them with a margin of
-    # a fifth of its side all round and before 20,000 coarse ones, the others before 100,000 of the nearest blocks, too.
+    # By hand: a block of 24,000 is 60 x 200 steps over 60 % of 2 million pixels, the first 65 % of them with a margin of a fifth of its
+    # side all round and before 20,000 coarse ones, the others before 100,000 of the nearest blocks, too; four setups, each with two renders
+    # of 200 photographs at a third of a step; and points filled up once.
     alone, joined = 1.4**2 * 24_000 + 20_000, 1.4**2 * 24_000 + 120_000
-    step = 0.002 + 4e-7 * 1.2e6 + 3e-6 * (0.65 * alone + 0.35 * joined)
-    block = (4 * (1.0 + 0.05 * 200 + 2e-7 * 200 * 1.2e6) + 12_000 * step) / 3600
-    assert 125 * block < some["core_hours"] < 1.05 * 125 * block
+    first_step, step = (0.002 + 4e-7 * 1.2e6 + 3e-6 * held for held in (alone, joined))
+    coarse_step = 0.002 + 4e-7 * 5e5 + 3e-6 * 20_000
+    setup = 1.0 + 0.05 * 200 + 2e-7 * 200 * 1.2e6 + 200 / 3 * (coarse_step + step)
+    first = (setup + 2.0 + 0.1 * 100 + 7_800 * first_step) / 3600
+    block = first + (3 * setup + 4_200 * step) / 3600
+    coarse = (1.0 + 0.05 * 1000 + 2e-7 * 1000 * 5e5 + 2.0 + 0.1 * 100 + 15_000 * coarse_step) / 3600
+    planning = 2 * 1e4 / 3 * coarse_step / 3600
+    assert some["core_hours"] == pytest.approx(125 * block + coarse + planning)
+    assert some["longest_task_hours"] == pytest.approx(max(first, coarse, planning))
 
 
 def test_a_long_street_has_as_much_room_for_cameras_as_a_short_one():
