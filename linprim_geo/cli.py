@@ -312,7 +312,10 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("-r", "--resolution", type=int, metavar="K", help=resolution)
     sub.add_argument("--eval", action="store_true", help="accepted as in 3DGS: views are always held out")
     add_effects(sub.add_argument_group("effects"), "none")
-    text = "train in so many blocks of space, each by a worker of its own; auto: as few as a worker's memory allows (default 1)"
+    text = (
+        "train in so many blocks of space, each by a worker of its own; auto: as few as a worker's memory allows (default 1); "
+        "a block's photographs lie in a temporary file, see TMPDIR"
+    )
     several = add_workers(sub)
     several.add_argument("--blocks", type=_blocks, default=1, metavar="auto|K", help=text)
     add_options(sub.add_argument_group("scene"), SceneOptions)
