@@ -43,6 +43,9 @@ FORMAT = 2
 # The coarse scene: pixels averaged, parts of the steps and of the primitives of the whole, and the most of these and of the views.
 COARSE_DOWNSCALE, COARSE_STEPS, COARSE_PRIMITIVES = 2, 0.25, 0.25
 MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS, LEAST_SIDE = 20_000, 1000, 32
+# Primitives are shared out as the coarse scene has grown them, but for this part, which goes by the pixels that show a block: the whole has
+# four times as long to grow them where pixels ask for more.
+BY_PIXELS = 0.25
 # Steps of a block at least, as far as the whole has so many.
 LEAST_STEPS = 300
 # Blocks take up what others have become at these parts of the steps that are left once growth has ended. Then others stand in full, the
@@ -125,14 +128,19 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
     blocks = split_space(points[used], work[used], count)
     margin = margin_of(blocks, points[used])
     seen_by: list[list[int]] = [[] for _ in blocks]
-    pixels = [0] * count
+    # Of windows, and of the coarse scene: in a block, and in it and its margin.
+    pixels, within = [0] * count, np.zeros((2, count))
     for number, (view, camera, depth) in enumerate(looks()):
         if not (depth > 0).any():
             continue
         surface = surface_points(camera, depth)
         reach = Block(tuple(np.nanmin(surface, (0, 1))), tuple(np.nanmax(surface, (0, 1))))
         for k, block in enumerate(blocks):
-            found = None if reach.is_apart(block, margin) else window(block.holds(surface, margin), view.camera, factor)
+            if reach.is_apart(block, margin):
+                continue
+            mask = block.holds(surface, margin)
+            within[:, k] += block.holds(surface).sum(), mask.sum()
+            found = window(mask, view.camera, factor)
             if found is not None:
                 seen_by[k].append(number)
                 pixels[k] += found[2] * found[3]
@@ -141,12 +149,14 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
     grown = coarse.training_primitives().center
     state = read_checkpoint(coarse.path)
     assert state is not None
-    own = apportioned([int(block.holds(grown).sum()) for block in blocks], options.max_primitives)
+    held = np.array([[block.holds(grown, more).mean() for block in blocks] for more in (0.0, margin)])
+    shares = (1 - BY_PIXELS) * held + BY_PIXELS * within / within[0].sum()
+    own = apportioned(shares[0], options.max_primitives)
     parts = []
     for k, block in enumerate(blocks):
         if len(seen_by[k]) < 2:
             raise LinprimError(f"block {k} of {count} is seen by {len(seen_by[k])} cameras, wanted two at least: fewer blocks")
-        share = float(block.holds(grown, margin).mean())
+        share = float(shares[1, k])
         most = max(1, math.ceil(share * options.max_primitives))
         steps = math.ceil(options.iterations * len(seen_by[k]) / len(scene.train))
         parts.append(
@@ -179,9 +189,9 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
     }
 
 
-def apportioned(counts: Sequence[int], total: int) -> list[int]:
-    """A total in whole parts, in the ratio of the counts: the largest remainders are rounded up."""
-    exact = total * np.asarray(counts) / sum(counts)
+def apportioned(shares: Sequence[float] | np.ndarray, total: int) -> list[int]:
+    """A total in whole parts, in the ratio of the shares: the largest remainders are rounded up."""
+    exact = total * np.asarray(shares) / np.sum(shares)
     parts = np.floor(exact).astype(int)
     parts[np.argsort(parts - exact, kind="stable")[: total - parts.sum()]] += 1
     return parts.tolist()
