@@ -144,6 +144,9 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
             if found is not None:
                 seen_by[k].append(number)
                 pixels[k] += found[2] * found[3]
+    for k, views in enumerate(seen_by):
+        if len(views) < 2:
+            raise LinprimError(f"block {k} of {count} is seen by {len(views)} cameras, wanted two at least: fewer blocks")
     options = opened.train_options
     # Where the coarse scene has grown primitives the whole would, too, and none larger.
     grown = coarse.training_primitives().center
@@ -154,8 +157,6 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
     own = apportioned(shares[0], options.max_primitives)
     parts = []
     for k, block in enumerate(blocks):
-        if len(seen_by[k]) < 2:
-            raise LinprimError(f"block {k} of {count} is seen by {len(seen_by[k])} cameras, wanted two at least: fewer blocks")
         share = float(shares[1, k])
         most = max(1, math.ceil(share * options.max_primitives))
         steps = math.ceil(options.iterations * len(seen_by[k]) / len(scene.train))
