@@ -20,7 +20,6 @@ from .camera import Camera
 from .checkpoint import read_checkpoint
 from .errors import LinprimError
 from .files import atomic_write, locked
-from .fill_points import fill_points
 from .initial_points import VolumePoints
 from .ops import Tensors
 from .options import TrainOptions
@@ -32,7 +31,7 @@ from .shots import load_shots
 from .train import train_run
 from .trainer import CONTROLS
 from .training_loop import run_steps
-from .training_start import chosen_background, initial_cloud, start_trainer
+from .training_start import chosen_background, filled_points, initial_cloud, start_trainer
 
 # Arrays of primitives by name, of any number: the frozen ones may be none.
 Arrays = dict[str, np.ndarray]
@@ -329,9 +328,7 @@ def _trained(
 def _points_of(scene: Scene, run: Run, plan: dict, number: int, options: TrainOptions) -> PointCloud:
     """The scene's points in a block and its margin, filled up: at most as many in either as a training begins with that has the block's
     own primitives in the one and the others of its `options` in the other."""
-    assert scene.points is not None
-    backdrop = np.asarray(plan["shown"]) if plan["fitted"] else None
-    cloud = scene.points if isinstance(scene.points, VolumePoints) else fill_points(scene, options.seed, backdrop)
+    cloud = filled_points(scene, options.seed, np.asarray(plan["shown"]) if plan["fitted"] else None)
     where, block, own = run.similarity.apply(cloud.xyz), block_of(plan, number), max(1, plan["blocks"][number]["own_primitives"])
     inside, beside = block.holds(where), block.holds(where, plan["margin"])
     if not beside.any():

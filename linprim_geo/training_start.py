@@ -222,6 +222,12 @@ def _mean_color(shots: list[Shot]) -> np.ndarray:
     return np.mean([s.rgb.numpy().mean((1, 2)) for s in shots], 0).astype(np.float32) / np.float32(255)
 
 
+def filled_points(scene: Scene, seed: int, backdrop: np.ndarray | None) -> PointCloud:
+    """The scene's points, filled up (`fill_points`) unless they are random ones, which lie on no surface."""
+    assert scene.points is not None
+    return scene.points if isinstance(scene.points, VolumePoints) else fill_points(scene, seed, backdrop)
+
+
 def start_trainer(
     scene: Scene,
     run: Run,
@@ -236,7 +242,7 @@ def start_trainer(
     Args:
         scene: with points to start from; those of a checkpoint need none.
         shots: its training views in the training frame.
-        cloud: the points to start from if they are not those of the scene, which are filled up first.
+        cloud: the points to start from; default: `filled_points` of the scene.
         largest: extent that a primitive may have, in the training frame; default: by what the points reach.
 
     Raises:
@@ -249,10 +255,8 @@ def start_trainer(
     if state is not None:
         xyz, rgb, radius = np.zeros((4, 3)), np.zeros((4, 3)), 1.0  # replaced below
     else:
-        assert scene.points is not None
-        backdrop = background.numpy() if fitted else None
         if cloud is None:
-            cloud = fill_points(scene, options.seed, backdrop) if surface else scene.points
+            cloud = filled_points(scene, options.seed, background.numpy() if fitted else None)
         cloud = initial_cloud(cloud, options)
         xyz, rgb = run.similarity.apply(cloud.xyz), cloud.rgb
         middle = np.median(xyz, 0)
