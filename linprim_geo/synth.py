@@ -8,7 +8,6 @@ import shutil
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,8 @@ from .errors import LinprimError
 from .files import write_json
 from .raycast import RayCaster
 from .shapes import SHAPES
+from .synth_cameras import place_cameras
+from .synth_options import Options, background_color, checked_options, choice, number
 from .synth_points import camera_rays, sample_points, write_colmap, write_points
 from .textured import TexturedMesh, load_textured
 
@@ -119,30 +120,21 @@ def synthesize(
     """
     start = time.perf_counter()
     out = Path(out)
-    options = _Options(
-        views=_integer("views", views, 2),
-        test_views=_integer("test_views", test_views, 0),
-        size=_size(size),
-        supersample=_integer("supersample", supersample, 1, 16),
-        points=_integer("points", points, 0),
-        point_noise=_number("point_noise", point_noise, 0.0),
-        shading=_choice("shading", shading, ("albedo", "shaded")),
-        depth_format=_choice("depth_format", depth_format, ("png", "npy")),
-        seed=_integer("seed", seed, 0),
-        exposure_drift=_number("exposure_drift", exposure_drift, 0.0, 2.0),
-        distortion=_number("distortion", distortion, -0.5, 0.5),
-        specular=_number("specular", specular, 0.0, 10.0),
-        zoom=_number("zoom", zoom, 0.1, 10.0),
-    )
+    options = checked_options(
+        views=views, test_views=test_views, size=size, supersample=supersample, points=points, point_noise=point_noise,
+        shading=shading, depth_format=depth_format, seed=seed, exposure_drift=exposure_drift, distortion=distortion,
+        specular=specular, zoom=zoom,
+    )  # fmt: skip
     surface = _surface(shape, mesh, detail)
-    path = _choice("path", path or surface.path, campath.PATHS)
+    path = choice("path", path or surface.path, campath.PATHS)
     inside = path == "inside-out"
-    color = _background(background if background is not None else ("black" if inside else "transparent"))
+    color = background_color(background if background is not None else ("black" if inside else "transparent"))
     workers = threads or os.cpu_count() or 1
     caster = RayCaster(surface.vertices, surface.faces, threads=workers)
-    field = _number("fov", fov if fov is not None else (75.0 if inside else 45.0), 1.0, 170.0)
-    train, test, distance = _cameras(surface, caster, options, path, field, distance, principal_point_offset)
-    train, test = (_zoomed(cameras, options.zoom) for cameras in (train, test))
+    field = number("fov", fov if fov is not None else (75.0 if inside else 45.0), 1.0, 170.0)
+    train, test, distance = place_cameras(
+        surface, caster, options, path, field, distance, principal_point_offset
+    )
     gains = _gains(options)
 
     temporary = _prepare(out, overwrite)
@@ -220,84 +212,21 @@ def synthesize(
     return {**report, "seconds": round(time.perf_counter() - start, 3)}
 
 
-@dataclass(frozen=True)
-class _Options:
-    views: int
-    test_views: int
-    size: tuple[int, int]
-    supersample: int
-    points: int
-    point_noise: float
-    shading: str
-    depth_format: str
-    seed: int
-    exposure_drift: float
-    distortion: float
-    specular: float
-    zoom: float
-
-
 # What was asked for
 
 
-def _integer(name: str, value, low: int, high: int | None = None) -> int:
-    if not isinstance(value, (int, np.integer)) or value < low or (high is not None and value > high):
-        wanted = f"at least {low}" if high is None else f"{low} to {high}"
-        raise LinprimError(f"{name} is {value!r}, a whole number of {wanted} is wanted")
-    return int(value)
-
-
-def _number(name: str, value, low: float, high: float = np.inf) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = np.nan
-    if not low <= number <= high or not np.isfinite(number):
-        raise LinprimError(f"{name} is {value!r}, a number from {low:g} to {high:g} is wanted")
-    return number
-
-
-def _choice(name: str, value, choices: tuple[str, ...]) -> str:
-    if value not in choices:
-        raise LinprimError(f"{name} is {value!r}, one of {', '.join(choices)} is wanted")
-    return value
-
-
-def _size(size) -> tuple[int, int]:
-    width, height = size if isinstance(size, (tuple, list)) else (size, size)
-    return _integer("width", width, 8, 16384), _integer("height", height, 8, 16384)
-
-
-def _background(value) -> tuple[float, float, float] | None:
-    named = {"transparent": None, "black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-    if isinstance(value, str) and value in named:
-        return named[value]
-    try:
-        color = tuple(float(x) for x in (value.split(",") if isinstance(value, str) else value))
-    except (TypeError, ValueError):
-        color = ()
-    if len(color) != 3 or not all(0.0 <= x <= 1.0 for x in color):
-        raise LinprimError(f"background is {value!r}, transparent, black, white or r,g,b in [0, 1] is wanted")
-    return color
-
-
 def _surface(shape, mesh, detail) -> TexturedMesh:
-    detail = _number("detail", detail, 0.0, 10.0)
+    detail = number("detail", detail, 0.0, 10.0)
     if shape is not None and mesh is not None:
         raise LinprimError(f"shape {shape!r} and mesh {str(mesh)!r} are both given, one of them is wanted")
     if isinstance(mesh, TexturedMesh):
         return mesh
     if mesh is not None:
         return load_textured(mesh, detail=detail)
-    return SHAPES[_choice("shape", shape or "cad", tuple(SHAPES))](detail=detail)
+    return SHAPES[choice("shape", shape or "cad", tuple(SHAPES))](detail=detail)
 
 
-def _zoomed(cameras: list[Camera], zoom: float) -> list[Camera]:
-    """The cameras, every third one with `zoom` times the focal length."""
-    return [replace(c, fx=c.fx * zoom, fy=c.fy * zoom) if i % 3 == 1 else c for i, c in enumerate(cameras)]
-
-
-def _gains(options: _Options) -> np.ndarray:
+def _gains(options: Options) -> np.ndarray:
     """(views, 3) gains of the training photographs, of geometric mean 1 per channel."""
     rng = np.random.default_rng([options.seed, 5])
     log = rng.uniform(-1.0, 1.0, (options.views, 1)) + 0.25 * rng.uniform(-1.0, 1.0, (options.views, 3))
@@ -310,34 +239,6 @@ def _without_threads(caster: RayCaster) -> RayCaster:
     single.__dict__.update(caster.__dict__)
     single.threads, single.recast = 1, 0
     return single
-
-
-def _cameras(surface, caster, options, path, fov, distance, offset):
-    width, height = options.size
-    focal = 0.5 * width / np.tan(0.5 * np.deg2rad(fov))
-    half = (0.5 * np.deg2rad(fov), float(np.arctan(0.5 * height / focal)))
-    dx, dy = (_number("principal_point_offset", value, -float(max(width, height))) for value in offset)
-    base = Camera(width, height, focal, focal, 0.5 * width + dx, 0.5 * height + dy, np.eye(4))
-    if path == "inside-out":
-        poses, held_out = campath.inside_out(caster, options.views, options.test_views, half, options.seed)
-        distance = None
-    else:
-        center = 0.5 * (caster.lower + caster.upper)
-        radius = float(np.linalg.norm(surface.vertices - center, axis=1).max())
-        if distance is None:
-            distance = campath.fitting_distance(path, surface.vertices, center, options.views, base)
-        distance = _number("distance", distance, 0.0)
-        if distance <= radius:
-            raise LinprimError(
-                f"distance is {distance:g}, but the object reaches {radius:g} from its middle; more is wanted"
-            )
-        poses = campath.around(path, options.views, center, distance)
-        held_out = campath.around(path, options.test_views, center, distance, held_out=True)
-    return (
-        [replace(base, world_to_camera=pose) for pose in poses],
-        [replace(base, world_to_camera=pose) for pose in held_out],
-        distance,
-    )
 
 
 # Pictures
@@ -473,7 +374,7 @@ def _depth_unit(surface: TexturedMesh, cameras: list[Camera]) -> float:
 # Files
 
 
-def _shared_keys(camera: Camera, unit: float, options: _Options, name_of_unit: str) -> dict:
+def _shared_keys(camera: Camera, unit: float, options: Options, name_of_unit: str) -> dict:
     lens = {"camera_model": "OPENCV", "k1": options.distortion} if options.distortion else {"camera_model": "PINHOLE"}
     return {
         **lens,
@@ -491,7 +392,7 @@ def _shared_keys(camera: Camera, unit: float, options: _Options, name_of_unit: s
     }
 
 
-def _frame(split: str, number: int, camera: Camera, options: _Options) -> dict:
+def _frame(split: str, number: int, camera: Camera, options: Options) -> dict:
     name = f"{split}/{number:03d}"
     opengl = camera.camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])
     zoomed = {"fl_x": camera.fx, "fl_y": camera.fy, "camera_angle_x": 2.0 * float(np.arctan(0.5 * camera.width / camera.fx))}

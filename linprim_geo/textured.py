@@ -46,6 +46,11 @@ class TexturedMesh:
         """Length of the diagonal of the bounding box."""
         return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
 
+    @property
+    def used_vertices(self) -> np.ndarray:
+        """(U, 3) the vertices of faces; a file may hold others."""
+        return self.vertices[np.unique(self.faces)]
+
     def colors(self, points: np.ndarray, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
         """(N, 3) float32 albedo at surface points (N, 3) of the mesh's own frame."""
         return self.albedo((points - self.center).astype(np.float32), face, bary)

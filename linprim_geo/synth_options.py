@@ -1,0 +1,101 @@
+"""The options of a synthetic capture, checked: each that has no meaning is refused with one sentence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .errors import LinprimError
+
+Color = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Options:
+    """The options of `synth.synthesize` that do not depend on the surface, as `checked_options` gives them."""
+
+    views: int
+    test_views: int
+    size: tuple[int, int]
+    supersample: int
+    points: int
+    point_noise: float
+    shading: str
+    depth_format: str
+    seed: int
+    exposure_drift: float
+    distortion: float
+    specular: float
+    zoom: float
+
+
+def checked_options(
+    *, views, test_views, size, supersample, points, point_noise, shading, depth_format, seed, exposure_drift,
+    distortion, specular, zoom,
+) -> Options:  # fmt: skip
+    """The options, each within its range.
+
+    Raises:
+        LinprimError: an option has no meaning.
+    """
+    return Options(
+        views=integer("views", views, 2),
+        test_views=integer("test_views", test_views, 0),
+        size=_size(size),
+        supersample=integer("supersample", supersample, 1, 16),
+        points=integer("points", points, 0),
+        point_noise=number("point_noise", point_noise, 0.0),
+        shading=choice("shading", shading, ("albedo", "shaded")),
+        depth_format=choice("depth_format", depth_format, ("png", "npy")),
+        seed=integer("seed", seed, 0),
+        exposure_drift=number("exposure_drift", exposure_drift, 0.0, 2.0),
+        distortion=number("distortion", distortion, -0.5, 0.5),
+        specular=number("specular", specular, 0.0, 10.0),
+        zoom=number("zoom", zoom, 0.1, 10.0),
+    )
+
+
+def integer(name: str, value, low: int, high: int | None = None) -> int:
+    """The whole number `value` of at least `low` and at most `high`."""
+    if not isinstance(value, (int, np.integer)) or value < low or (high is not None and value > high):
+        wanted = f"at least {low}" if high is None else f"{low} to {high}"
+        raise LinprimError(f"{name} is {value!r}, a whole number of {wanted} is wanted")
+    return int(value)
+
+
+def number(name: str, value, low: float, high: float = np.inf) -> float:
+    """The finite number `value` from `low` to `high`."""
+    try:
+        converted = float(value)
+    except (TypeError, ValueError):
+        converted = np.nan
+    if not low <= converted <= high or not np.isfinite(converted):
+        raise LinprimError(f"{name} is {value!r}, a number from {low:g} to {high:g} is wanted")
+    return converted
+
+
+def choice(name: str, value, choices: tuple[str, ...]) -> str:
+    """`value`, which is one of `choices`."""
+    if value not in choices:
+        raise LinprimError(f"{name} is {value!r}, one of {', '.join(choices)} is wanted")
+    return value
+
+
+def background_color(value: str | Color) -> Color | None:
+    """The colour of an opaque background, None for a transparent one."""
+    named = {"transparent": None, "black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+    if isinstance(value, str) and value in named:
+        return named[value]
+    try:
+        color = tuple(float(x) for x in (value.split(",") if isinstance(value, str) else value))
+    except (TypeError, ValueError):
+        color = ()
+    if len(color) != 3 or not all(0.0 <= x <= 1.0 for x in color):
+        raise LinprimError(f"background is {value!r}, transparent, black, white or r,g,b in [0, 1] is wanted")
+    return color
+
+
+def _size(size) -> tuple[int, int]:
+    width, height = size if isinstance(size, (tuple, list)) else (size, size)
+    return integer("width", width, 8, 16384), integer("height", height, 8, 16384)
