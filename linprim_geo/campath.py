@@ -1,4 +1,4 @@
-"""Camera poses for synthetic captures: rings and spheres around an object, and stations inside a room."""
+"""Camera poses for synthetic captures: rings, spheres and hand-held arcs around an object, and stations inside a room."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from .camera import Camera
 from .errors import LinprimError
 from .raycast import RayCaster
 
-PATHS = ("orbit", "hemisphere", "sphere", "inside-out")
+PATHS = ("orbit", "hemisphere", "sphere", "arc", "inside-out")
 
 RING_ELEVATIONS_DEG = (-38.0, 6.0, 42.0)
 """The rings of `orbit`: below, level and above, so that every side of an object is seen."""
@@ -17,6 +17,19 @@ FIT_MARGIN = 0.04
 """Share of the image's width and height that stays free on each side of an object."""
 
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+
+ARC_DEG = 300.0
+"""Azimuth that the path `arc` covers unless another is said."""
+
+ARC_ELEVATIONS_DEG = (12.0, 45.0)
+ARC_DISTANCE = 0.1
+ARC_AIM = 0.06
+ARC_ROLL_DEG = 2.0
+"""A hand-held arc: lowest and highest elevation; largest deviations of the distance from its mean, of the aim
+from the object's middle (both in units of the mean distance), and of the horizon."""
+
+ARC_JITTER = 0.15
+"""Share of those deviations that differs from view to view; the larger part changes slowly along the arc."""
 
 CLEARANCE = 0.03
 NEAR = 0.08
@@ -87,6 +100,45 @@ def around(
             f"path {path!r} does not go around an object, orbit, hemisphere or sphere is wanted"
         )
     return [look_at(center + distance * direction, center) for direction in directions]
+
+
+def arc(
+    views: int, test_views: int, center: np.ndarray, distance: float, degrees: float, seed: int
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Training and held-out (4, 4) world-to-camera poses of somebody who walks round `center`, camera in hand.
+
+    The azimuths of the training views are equally spaced over `degrees`; elevation, distance, aim and roll
+    wander slowly along the way within the limits above, and jitter from view to view. Every held-out view lies
+    between two training views, at least a quarter of their spacing from both, and jitters independently.
+    """
+    rng = np.random.default_rng([seed, 7])
+    # Elevation, distance, aim along x, y and z, roll: one to two and two to four waves along the way.
+    frequency = rng.uniform((1.0, 2.0), (2.0, 4.0), (6, 2))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (6, 2))
+    step = (np.arange(test_views) + 0.5) / max(test_views, 1) * (views - 1)
+    between = np.floor(step) + 0.25 + 0.5 * (step - np.floor(step))
+    poses = []
+    for place in (np.arange(views, dtype=float), between):
+        way = (place + 0.5) / views
+        waves = np.sin(2.0 * np.pi * way[:, None, None] * frequency + phase) @ (0.65, 0.35)
+        wander = (1.0 - ARC_JITTER) * waves + ARC_JITTER * rng.uniform(-1.0, 1.0, waves.shape)
+        azimuth = np.deg2rad(degrees * (way - 0.5))
+        poses.append([_held(center, distance, *item) for item in zip(azimuth, wander, strict=True)])
+    return poses[0], poses[1]
+
+
+def _held(center: np.ndarray, distance: float, azimuth: float, wander: np.ndarray) -> np.ndarray:
+    """(4, 4) world-to-camera of one view of `arc`; `wander` (6,) in [-1, 1] for elevation, distance, aim and roll."""
+    low, high = np.deg2rad(ARC_ELEVATIONS_DEG)
+    elevation = 0.5 * (low + high) + 0.5 * (high - low) * wander[0]
+    direction = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    # The three axes together deviate by no more than ARC_AIM.
+    target = center + ARC_AIM * distance / np.sqrt(3.0) * wander[2:5]
+    pose = look_at(center + distance * (1.0 + ARC_DISTANCE * wander[1]) * direction, target)
+    roll = np.deg2rad(ARC_ROLL_DEG) * wander[5]
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]]
+    return turn @ pose
 
 
 def fitting_distance(

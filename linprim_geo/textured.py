@@ -12,8 +12,8 @@ import numpy as np
 from .errors import LinprimError
 
 Albedo = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""(points (N, 3) relative to the mesh's `center`, face (N,), bary (N, 2)) -> (N, 3) float32 colours in [0,
-1]."""
+"""(points (N, 3) relative to the mesh's `albedo_origin`, face (N,), bary (N, 2)) -> (N, 3) float32 colours in
+[0, 1]."""
 
 POINTS_AT_ONCE = 1024
 """Small enough that the matrix products stay below the size at which OpenBLAS starts threads of its own,
@@ -25,7 +25,8 @@ class TexturedMesh:
     """A triangle mesh and its colour as a function of the surface point.
 
     `vertices` (V, 3) float64, `faces` (F, 3) int64, `part` (F,) int32 says which piece a face belongs to,
-    `albedo` gives colours (see `Albedo`), `path` is the camera path that suits it, `unit` the unit of length.
+    `albedo` gives colours (see `Albedo`), `path` is the camera path that suits it, `unit` the unit of length,
+    `origin` (3,) the point from which the albedo counts its points, by default the middle of the bounding box.
     """
 
     name: str
@@ -35,6 +36,12 @@ class TexturedMesh:
     albedo: Albedo
     path: str = "orbit"
     unit: str = "unit"
+    origin: np.ndarray | None = None
+
+    @property
+    def albedo_origin(self) -> np.ndarray:
+        """(3,) the point that the albedo's points are relative to."""
+        return self.center if self.origin is None else self.origin
 
     @property
     def center(self) -> np.ndarray:
@@ -53,7 +60,7 @@ class TexturedMesh:
 
     def colors(self, points: np.ndarray, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
         """(N, 3) float32 albedo at surface points (N, 3) of the mesh's own frame."""
-        return self.albedo((points - self.center).astype(np.float32), face, bary)
+        return self.albedo((points - self.albedo_origin).astype(np.float32), face, bary)
 
     def refined(self, max_edge: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Vertices, faces and (V, 3) uint8 vertex colours of the same surface with edges up to about
