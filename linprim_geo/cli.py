@@ -438,7 +438,7 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--views", type=_positive, default=60, metavar="N", help="training views (default 60)")
     sub.add_argument("--test-views", type=_whole, default=12, metavar="N", help="held-out views (default 12)")
     sub.add_argument("--size", type=_size, default=(320, 320), metavar="WxH", help="pixels (default 320x320)")
-    paths = ("orbit", "hemisphere", "sphere", "inside-out")
+    paths = ("orbit", "hemisphere", "sphere", "arc", "inside-out")
     sub.add_argument("--path", choices=paths, help="of the cameras (default: what suits the scene)")
     sub.add_argument("--fov", type=_length, metavar="DEGREES", help="horizontal (default 45, inside 75)")
     sub.add_argument("--distance", type=_length, metavar="LENGTH", help="from the middle, in the mesh's unit")
@@ -463,6 +463,16 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--specular", type=_not_negative, default=0.0, metavar="X", help=text)
     text = "every third camera has X times the focal length (default 1)"
     sub.add_argument("--zoom", type=_length, default=1.0, metavar="X", help=text)
+    text = "stand it on a table X times as wide as it is (default 0, none)"
+    sub.add_argument("--table", type=_not_negative, default=0.0, metavar="X", help=text)
+    text = "a room at infinity, drawn by seed N, in place of a background"
+    sub.add_argument("--environment", type=_whole, metavar="N", help=text)
+    text = "of azimuth that the path arc covers (default 300)"
+    sub.add_argument("--arc", type=_length, metavar="DEGREES", help=text)
+    text = "standard deviation of sensor noise at middle grey, in units of 1/255 (default 0)"
+    sub.add_argument("--noise", type=_not_negative, default=0.0, metavar="X", help=text)
+    text = "photographs as .jpg of this quality (default 0, .png)"
+    sub.add_argument("--jpeg", type=_whole, default=0, metavar="QUALITY", help=text)
     sub.add_argument(
         "--seed", type=_whole, default=0, metavar="N", help="seed of everything random (default 0)"
     )

@@ -190,6 +190,7 @@ def synth(parsed: argparse.Namespace) -> dict:
     # What is not said is left to `synthesize`, which knows what suits the scene.
     chosen = {"shape": parsed.scene, "mesh": parsed.mesh, "path": parsed.path, "fov": parsed.fov}
     chosen |= {"distance": parsed.distance, "background": parsed.background}
+    chosen |= {"environment": parsed.environment, "arc": parsed.arc}
     return synthesize(
         parsed.output,
         views=parsed.views,
@@ -206,6 +207,9 @@ def synth(parsed: argparse.Namespace) -> dict:
         distortion=parsed.distortion,
         specular=parsed.specular,
         zoom=parsed.zoom,
+        table=parsed.table,
+        noise=parsed.noise,
+        jpeg=parsed.jpeg,
         seed=parsed.seed,
         threads=parsed.threads,
         overwrite=parsed.overwrite,

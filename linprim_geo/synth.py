@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +19,19 @@ from .files import write_json
 from .raycast import RayCaster
 from .shapes import SHAPES
 from .synth_cameras import place_cameras
-from .synth_options import Options, background_color, checked_options, choice, number
+from .synth_files import frame_entry, prepare_folder, publish_folder, shared_keys
+from .synth_options import Color, Options, background_color, check_together, checked_options, choice, number
+from .synth_photos import photo_name, save_photo, save_png, sensor_noise, to_bytes
 from .synth_points import camera_rays, sample_points, write_colmap, write_points
+from .synthetic_environment import SyntheticEnvironment, synthetic_environment
+from .tabletop import on_table
 from .textured import TexturedMesh, load_textured
+
+Backdrop = Color | SyntheticEnvironment | None
+"""What stands behind the surface; None is a transparent background."""
+
+NOISE_SEED = 6
+"""Tells the random numbers of the sensor noise from those of the gains (5) and of the path `arc` (7)."""
 
 RAYS_AT_ONCE = 16_384
 """Sub-pixel rays per step: the temporaries of one step (some 3 kB per ray at most) stay in cache."""
@@ -60,6 +70,11 @@ def synthesize(
     distortion: float = 0.0,
     specular: float = 0.0,
     zoom: float = 1.0,
+    table: float = 0.0,
+    environment: int | None = None,
+    arc: float | None = None,
+    noise: float = 0.0,
+    jpeg: int = 0,
     seed: int = 0,
     threads: int = 0,
     overwrite: bool = False,
@@ -76,8 +91,8 @@ def synthesize(
     optical axis, exactly at the pixel centre, rounded to `depth_unit_scale_factor` (at most 1/30000 of the
     largest depth) as uint16, 0 for nothing; or float32 as `.npy`. Normals are geometric, in the world's axes,
     towards the camera, (n + 1) / 2 in 8 bits, black for nothing. Masks are the coverage in 8 bits, the
-    images' alpha; with an opaque background the images hold the background already, and the coverage is in
-    `truth_masks/` so that nobody applies it a second time.
+    images' alpha; with an opaque background or an environment the images hold it already, and the coverage is
+    in `truth_masks/` so that nobody applies it a second time.
 
     Args:
         out: folder to make; it must not exist or be empty. Everything is written to a temporary folder beside
@@ -86,17 +101,18 @@ def synthesize(
         mesh: a mesh file with texture or vertex colours, or a `TexturedMesh`.
         views, test_views: how many; the test views lie between the others.
         size: pixels, one number or (width, height).
-        path: `orbit` (three rings), `hemisphere`, `sphere` or `inside-out`; default: what suits the shape.
+        path: `orbit` (three rings), `hemisphere`, `sphere`, `arc` (walked, camera in hand) or `inside-out`; default: what suits the
+            shape, and `arc` with a table.
         fov: horizontal field of view in degrees; default 45 around an object, 75 inside.
         distance: of the camera from the middle of the bounding box, in the mesh's unit; default: the object
-        fills the frame.
+            fills the frame. On an arc it is the mean distance.
         principal_point_offset: of (cx, cy) from the middle of the image, in pixels.
         shading: `albedo`, or `shaded` by two distant lamps without shadows (Lambert, no view dependence).
         supersample: rays per pixel along each axis.
         background: `transparent` (straight alpha), `black`, `white`, `r,g,b` in [0, 1]; default transparent
             around an object, black inside.
-        points: SfM-like points on the surface, uniform by area, each observed by at least three training
-            views (two if there are no more).
+        points: SfM-like points on the surface, uniform by area (with a table: as dense as the pixels that show it),
+            each observed by at least three training views (two if there are no more).
         point_noise: standard deviation per axis in the mesh's unit; the observations stay exact, and the
             points' error is their mean reprojection error in pixels.
         depth_format: `png` or `npy`.
@@ -107,7 +123,13 @@ def synthesize(
         distortion: k1 of OpenCV's radial distortion; images, depth, normals and masks are those of that lens.
         specular: strength of highlights of the two lamps (Phong's, exponent 12), added to either shading.
         zoom: every third camera has a focal length so many times as long.
-        seed: of the points, the noise, the gains and the inside-out path.
+        table: the object stands on a square table of wood whose side is so many times its largest horizontal extent; 0 is none.
+            Everything that is written contains the table. Cameras look at the object, and stay above the table.
+        environment: seed of a room at infinity that stands behind everything, in place of `background`; None is none.
+        arc: degrees of azimuth that the path `arc` covers; default 300.
+        noise: standard deviation of the sensor noise at middle grey, in units of 1/255; half of its variance grows with the signal.
+        jpeg: quality (1 to 100) of the photographs as .jpg; 0 writes .png. Not with a transparent background.
+        seed: of the points, the noise, the gains, the wood, and the paths inside-out and arc.
         threads: 0 uses every core; the files do not depend on it.
         overwrite: replace `out` if it was made by `synth` before.
 
@@ -123,34 +145,28 @@ def synthesize(
     options = checked_options(
         views=views, test_views=test_views, size=size, supersample=supersample, points=points, point_noise=point_noise,
         shading=shading, depth_format=depth_format, seed=seed, exposure_drift=exposure_drift, distortion=distortion,
-        specular=specular, zoom=zoom,
+        specular=specular, zoom=zoom, table=table, environment=environment, arc=arc, noise=noise, jpeg=jpeg,
     )  # fmt: skip
-    surface = _surface(shape, mesh, detail)
-    path = choice("path", path or surface.path, campath.PATHS)
+    subject = _surface(shape, mesh, detail)
+    path = choice("path", path or ("arc" if options.table else subject.path), campath.PATHS)
     inside = path == "inside-out"
-    color = background_color(background if background is not None else ("black" if inside else "transparent"))
+    backdrop = _backdrop(options, background, inside)
+    check_together(options, path, background, transparent=backdrop is None)
+    surface = on_table(subject, options.table, options.seed) if options.table else subject
     workers = threads or os.cpu_count() or 1
     caster = RayCaster(surface.vertices, surface.faces, threads=workers)
     field = number("fov", fov if fov is not None else (75.0 if inside else 45.0), 1.0, 170.0)
     train, test, distance = place_cameras(
-        surface, caster, options, path, field, distance, principal_point_offset
+        subject, caster, options, path, field, distance, principal_point_offset
     )
     gains = _gains(options)
 
-    temporary = _prepare(out, overwrite)
+    temporary = prepare_folder(out, overwrite)
     try:
         unit = _depth_unit(surface, train + test) if options.depth_format == "png" else 1.0
-        masks = "masks" if color is None else "truth_masks"
-        jobs = [("train", i, camera) for i, camera in enumerate(train)]
-        jobs += [("test", i, camera) for i, camera in enumerate(test)]
-        for folder in {
-            f"{kind}{split}" for split, _, _ in jobs for kind in ("", "depth/", "normal/", f"{masks}/")
-        }:
-            (temporary / folder).mkdir(parents=True, exist_ok=True)
         single = _without_threads(caster)
-        renderer = _Renderer(surface, single, options, color, unit, masks, temporary, gains)
-        with ThreadPoolExecutor(workers) as pool:
-            covered = list(pool.map(lambda job: renderer.write(*job), jobs))
+        renderer = _Renderer(surface, single, options, backdrop, unit, temporary, gains)
+        covered = _render_views(renderer, train, test, workers)
         cloud = sample_points(
             surface,
             caster,
@@ -160,48 +176,35 @@ def synthesize(
             noise=options.point_noise,
             seed=options.seed,
             distortion=options.distortion,
+            by_pixels=options.table > 0.0,
         )
-        write_colmap(temporary / "sparse" / "0", train, cloud, options.distortion)
+        write_colmap(temporary / "sparse" / "0", train, cloud, options.distortion, options.jpeg)
         write_points(temporary / "points3D.ply", cloud)
         _write_reference(temporary / "reference.ply", surface)
-        shared = _shared_keys(train[0], unit, options, surface.unit)
+        shared = shared_keys(train[0], unit, options, surface.unit)
         for split, cameras in (("train", train), ("test", test)):
-            frames = [_frame(split, i, camera, options) for i, camera in enumerate(cameras)]
+            frames = [frame_entry(split, i, camera, options) for i, camera in enumerate(cameras)]
             write_json(temporary / f"transforms_{split}.json", {**shared, "frames": frames})
         report = {
             "output": str(out),
             "shape": surface.name,
             "unit": surface.unit,
             "path": path,
-            "views": len(train),
-            "test_views": len(test),
-            "width": options.size[0],
-            "height": options.size[1],
             "fov_degrees": field,
             "distance": distance,
             "principal_point_offset": list(principal_point_offset),
-            "shading": options.shading,
-            "supersample": options.supersample,
-            "background": "transparent" if color is None else list(color),
-            "points": len(cloud.xyz),
-            "point_noise": options.point_noise,
-            "mean_track_length": float(np.mean(cloud.track_length)) if len(cloud.xyz) else 0.0,
-            "depth_format": options.depth_format,
-            "depth_unit_scale_factor": unit,
             "detail": detail,
-            "exposure_drift": options.exposure_drift,
-            "gains": gains.tolist() if options.exposure_drift else [],
-            "distortion": options.distortion,
-            "specular": options.specular,
-            "zoom": options.zoom,
-            "seed": options.seed,
+            **_described(options, path, backdrop, gains),
+            "points": len(cloud.xyz),
+            "mean_track_length": float(np.mean(cloud.track_length)) if len(cloud.xyz) else 0.0,
+            "depth_unit_scale_factor": unit,
             "faces": len(surface.faces),
             "diagonal": surface.diagonal,
             "coverage": float(np.mean(covered)),
             "recast_rays": caster.recast + single.recast,
         }
         write_json(temporary / "synth.json", report)
-        _publish(temporary, out)
+        publish_folder(temporary, out)
     except BaseException as error:
         shutil.rmtree(temporary, ignore_errors=True)
         if isinstance(error, OSError):
@@ -226,6 +229,31 @@ def _surface(shape, mesh, detail) -> TexturedMesh:
     return SHAPES[choice("shape", shape or "cad", tuple(SHAPES))](detail=detail)
 
 
+def _backdrop(options: Options, background: str | Color | None, inside: bool) -> Backdrop:
+    """What stands behind the surface: an environment, a colour, or nothing (None, transparent)."""
+    if options.environment is not None:
+        return synthetic_environment(options.environment)
+    if background is None:
+        background = "black" if inside else "transparent"
+    return background_color(background)
+
+
+def _described(options: Options, path: str, backdrop: Backdrop, gains: np.ndarray) -> dict:
+    """The options as `synth.json` records them, with what was chosen where nothing was said."""
+    settings = asdict(options)
+    width, height = settings.pop("size")
+    color = list(backdrop) if isinstance(backdrop, tuple) else ("transparent" if backdrop is None else "environment")
+    arc = campath.ARC_DEG if options.arc is None else options.arc
+    return {
+        **settings,
+        "width": width,
+        "height": height,
+        "background": color,
+        "arc": arc if path == "arc" else None,
+        "gains": gains.tolist() if options.exposure_drift else [],
+    }
+
+
 def _gains(options: Options) -> np.ndarray:
     """(views, 3) gains of the training photographs, of geometric mean 1 per channel."""
     rng = np.random.default_rng([options.seed, 5])
@@ -244,45 +272,63 @@ def _without_threads(caster: RayCaster) -> RayCaster:
 # Pictures
 
 
+def _render_views(renderer: _Renderer, train: list[Camera], test: list[Camera], workers: int) -> list[float]:
+    """Renders all views into their files; returns the share of pixels of each that show the surface."""
+    jobs = [("train", i, camera) for i, camera in enumerate(train)]
+    jobs += [("test", i, camera) for i, camera in enumerate(test)]
+    for split in {split for split, _, _ in jobs}:
+        for kind in ("", "depth", "normal", renderer.masks):
+            (renderer.folder / kind / split).mkdir(parents=True, exist_ok=True)
+    with ThreadPoolExecutor(workers) as pool:
+        return list(pool.map(lambda job: renderer.write(*job), jobs))
+
+
 class _Renderer:
     """Renders views and writes their files; `write` may run in several threads at once."""
 
-    def __init__(self, surface, caster, options, background, unit, masks, folder, gains):
+    def __init__(self, surface, caster, options, backdrop: Backdrop, unit, folder, gains):
         self.surface, self.caster, self.options, self.gains = surface, caster, options, gains
-        self.background, self.unit, self.masks, self.folder = background, unit, masks, folder
+        self.backdrop, self.unit, self.folder = backdrop, unit, folder
+        self.masks = "masks" if backdrop is None else "truth_masks"
         self.normals = caster.face_normals().astype(np.float32)
-        self.center = surface.center
+        self.origin = surface.albedo_origin
 
     def write(self, split: str, number: int, camera: Camera) -> float:
         """Renders one view into its files and returns the share of pixels that show the surface."""
         depth, face, normal = self.render_depth(camera)
         color, alpha = self.render(camera)
-        gain = self.gains[number].astype(np.float32) if split == "train" else np.ones(3, np.float32)
         name = f"{split}/{number:03d}"
-        coverage = _bytes(alpha)
-        if self.background is None:
-            straight = gain * color / np.maximum(alpha, 1e-6)[..., None]
-            pixels = np.concatenate([_bytes(straight), coverage[..., None]], axis=2)
-        else:
-            shown = color + (1.0 - alpha)[..., None] * np.array(self.background, dtype=np.float32)
-            pixels = _bytes(gain * shown)
-        _save_png(self.folder / f"{name}.png", pixels)
-        _save_png(self.folder / self.masks / f"{name}.png", coverage)
+        photo = self.folder / photo_name(split, number, self.options.jpeg)
+        save_photo(photo, self.photograph(split, number, color, alpha), self.options.jpeg)
+        save_png(self.folder / self.masks / f"{name}.png", to_bytes(alpha))
         hit = face >= 0
-        _save_png(
-            self.folder / "normal" / f"{name}.png",
-            _bytes(np.where(hit[..., None], 0.5 * (normal + 1.0), 0.0)),
-        )
+        shown_normal = np.where(hit[..., None], 0.5 * (normal + 1.0), 0.0)
+        save_png(self.folder / "normal" / f"{name}.png", to_bytes(shown_normal))
         if self.options.depth_format == "png":
             steps = np.where(hit, np.rint(np.where(hit, depth, 0.0) / self.unit), 0.0).astype(np.uint16)
-            _save_png(self.folder / "depth" / f"{name}.png", steps)
+            save_png(self.folder / "depth" / f"{name}.png", steps)
         else:
             np.save(self.folder / "depth" / f"{name}.npy", np.where(hit, depth, 0.0).astype(np.float32))
         return float(hit.mean())
 
+    def photograph(self, split: str, number: int, color: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+        """(H, W, 3 or 4) uint8 of what `render` gives: behind it the background, gain and noise of the camera."""
+        gain = self.gains[number].astype(np.float32) if split == "train" else np.ones(3, np.float32)
+        seed = (self.options.seed, NOISE_SEED, int(split == "test"), number)
+        if self.backdrop is None:
+            straight = gain * color / np.maximum(alpha, 1e-6)[..., None]
+            pixels = to_bytes(sensor_noise(straight, self.options.noise, seed))
+            return np.concatenate([pixels, to_bytes(alpha)[..., None]], axis=2)
+        if isinstance(self.backdrop, tuple):
+            color = color + (1.0 - alpha)[..., None] * np.array(self.backdrop, dtype=np.float32)
+        return to_bytes(sensor_noise(gain * color, self.options.noise, seed))
+
     def render(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Premultiplied colour (H, W, 3) float32 and coverage (H, W) float32, the mean of supersample^2
-        rays."""
+        """Premultiplied colour (H, W, 3) float32 and coverage (H, W) float32, the mean of supersample^2 rays.
+
+        The colour is that of the surface; an environment is in it where rays miss the surface, a plain background
+        is not.
+        """
         height, width, n = camera.height, camera.width, self.options.supersample
         color = np.zeros((height * width, 3), dtype=np.float32)
         alpha = np.zeros(height * width, dtype=np.float32)
@@ -296,9 +342,13 @@ class _Renderer:
             for step in steps:
                 for column in columns:
                     rays = camera_rays(camera, column, rows + step, self.options.distortion).astype(np.float32)
-                    seen, shades = self.shade(camera.center, rays.reshape(-1, 3) @ rotation)
+                    rays = rays.reshape(-1, 3) @ rotation
+                    seen, shades = self.shade(camera.center, rays)
                     color[part][seen] += shades
                     alpha[part][seen] += 1.0
+                    if isinstance(self.backdrop, SyntheticEnvironment):
+                        missed = np.delete(np.arange(len(rays)), seen)
+                        color[part][missed] += self.backdrop(rays[missed])
         count = np.float32(1.0 / (n * n))
         return (color * count).reshape(height, width, 3), (alpha * count).reshape(height, width)
 
@@ -320,7 +370,7 @@ class _Renderer:
         distance, face, bary = self.caster.cast_single(origin, rays)
         seen = np.flatnonzero(face >= 0)
         face, direction = face[seen], rays[seen]
-        points = (origin - self.center).astype(np.float32) + distance[seen, None] * direction
+        points = (origin - self.origin).astype(np.float32) + distance[seen, None] * direction
         color = self.surface.albedo(points, face, bary[seen])
         return seen, self.light(color, face, direction)
 
@@ -347,17 +397,6 @@ class _Renderer:
         return np.minimum(color * strength[:, None] + highlight[:, None], 1.0).astype(np.float32)
 
 
-def _bytes(values: np.ndarray) -> np.ndarray:
-    return (np.clip(values, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
-
-
-def _save_png(path: Path, pixels: np.ndarray) -> None:
-    from PIL import Image
-
-    # Level 3 is a third of the time of Pillow's 6 for files a few per cent larger.
-    Image.fromarray(np.ascontiguousarray(pixels)).save(path, compress_level=3)
-
-
 def _depth_unit(surface: TexturedMesh, cameras: list[Camera]) -> float:
     """The smallest of 1, 2, 5 times a power of ten with which every depth of the scene fits 16 bits."""
     corners = (
@@ -374,37 +413,6 @@ def _depth_unit(surface: TexturedMesh, cameras: list[Camera]) -> float:
 # Files
 
 
-def _shared_keys(camera: Camera, unit: float, options: Options, name_of_unit: str) -> dict:
-    lens = {"camera_model": "OPENCV", "k1": options.distortion} if options.distortion else {"camera_model": "PINHOLE"}
-    return {
-        **lens,
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "camera_angle_x": 2.0 * float(np.arctan(0.5 * camera.width / camera.fx)),
-        "depth_unit_scale_factor": unit,
-        "ply_file_path": "points3D.ply",
-        "unit": name_of_unit,
-        "normal_frame": "world",
-    }
-
-
-def _frame(split: str, number: int, camera: Camera, options: Options) -> dict:
-    name = f"{split}/{number:03d}"
-    opengl = camera.camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])
-    zoomed = {"fl_x": camera.fx, "fl_y": camera.fy, "camera_angle_x": 2.0 * float(np.arctan(0.5 * camera.width / camera.fx))}
-    return {
-        **(zoomed if options.zoom != 1 else {}),
-        "file_path": f"{name}.png",
-        "depth_file_path": f"depth/{name}.{options.depth_format}",
-        "normal_file_path": f"normal/{name}.png",
-        "transform_matrix": opengl.tolist(),
-    }
-
-
 def _write_reference(path: Path, surface: TexturedMesh) -> None:
     from .mesh import Mesh, save_mesh
 
@@ -412,31 +420,3 @@ def _write_reference(path: Path, surface: TexturedMesh) -> None:
     save_mesh(path, Mesh(vertices, faces, colors=colors))
 
 
-def _prepare(out: Path, overwrite: bool) -> Path:
-    """A temporary folder beside `out`, after making sure that `out` may be made."""
-    if out.exists() and not out.is_dir():
-        raise LinprimError(f"{out}: is a file, a folder to make is wanted")
-    if out.is_dir() and any(out.iterdir()):
-        if not overwrite:
-            raise LinprimError(f"{out}: is a folder with files in it, a new or empty one is wanted")
-        if not (out / "synth.json").is_file():
-            raise LinprimError(
-                f"{out}: was not made by synth (it has no synth.json), so it is not overwritten"
-            )
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        return Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".tmp", dir=out.parent))
-    except OSError as error:
-        raise LinprimError(f"{out}: cannot be made ({error.strerror})") from error
-
-
-def _publish(temporary: Path, out: Path) -> None:
-    """Puts the finished folder in its place; what was there is removed only after that."""
-    os.chmod(temporary, 0o755)
-    old = None
-    if out.exists():
-        old = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".old", dir=out.parent))
-        os.replace(out, old / "old")
-    os.replace(temporary, out)
-    if old is not None:
-        shutil.rmtree(old, ignore_errors=True)

@@ -26,9 +26,10 @@ def place_cameras(
     """Training cameras, held-out cameras, and their distance from the middle of the surface (None inside it).
 
     Args:
-        caster: that of `surface`.
+        surface: what the cameras look at, without a table.
+        caster: that of `surface`; only cameras inside it need it.
         fov: horizontal field of view in degrees.
-        distance: None for the smallest one at which the surface is within all pictures.
+        distance: None for the smallest one at which the surface is within all pictures (of an arc: of a hemisphere).
         principal_point_offset: of (cx, cy) from the middle of the image, pixels.
 
     Raises:
@@ -53,13 +54,21 @@ def _poses_around(surface: TexturedMesh, options: Options, path: str, base: Came
     vertices = surface.used_vertices
     center = 0.5 * (vertices.min(0) + vertices.max(0))
     radius = float(np.linalg.norm(vertices - center, axis=1).max())
+    on_arc = path == "arc"
     if distance is None:
-        distance = campath.fitting_distance(path, vertices, center, options.views, base)
+        fitted = "hemisphere" if on_arc else path
+        distance = campath.fitting_distance(fitted, vertices, center, options.views, base)
     distance = number("distance", distance, 0.0)
-    if distance <= radius:
+    nearest = distance * (1.0 - campath.ARC_DISTANCE) if on_arc else distance
+    if nearest <= radius:
         raise LinprimError(
-            f"distance is {distance:g}, but the object reaches {radius:g} from its middle; more is wanted"
+            f"distance is {distance:g}, but the object reaches {radius:g} from its middle"
+            f"{f' and the nearest view is at {nearest:g}' if on_arc else ''}; more is wanted"
         )
+    if on_arc:
+        degrees = campath.ARC_DEG if options.arc is None else options.arc
+        poses, held_out = campath.arc(options.views, options.test_views, center, distance, degrees, options.seed)
+        return poses, held_out, distance
     poses = campath.around(path, options.views, center, distance)
     return poses, campath.around(path, options.test_views, center, distance, held_out=True), distance
 

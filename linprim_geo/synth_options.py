@@ -28,11 +28,16 @@ class Options:
     distortion: float
     specular: float
     zoom: float
+    table: float
+    environment: int | None
+    arc: float | None
+    noise: float
+    jpeg: int
 
 
 def checked_options(
     *, views, test_views, size, supersample, points, point_noise, shading, depth_format, seed, exposure_drift,
-    distortion, specular, zoom,
+    distortion, specular, zoom, table, environment, arc, noise, jpeg,
 ) -> Options:  # fmt: skip
     """The options, each within its range.
 
@@ -53,7 +58,33 @@ def checked_options(
         distortion=number("distortion", distortion, -0.5, 0.5),
         specular=number("specular", specular, 0.0, 10.0),
         zoom=number("zoom", zoom, 0.1, 10.0),
+        table=_table(table),
+        environment=None if environment is None else integer("environment", environment, 0),
+        arc=None if arc is None else number("arc", arc, 1.0, 360.0),
+        noise=number("noise", noise, 0.0, 100.0),
+        jpeg=integer("jpeg", jpeg, 0, 100),
     )
+
+
+def check_together(options: Options, path: str, background: str | Color | None, transparent: bool) -> None:
+    """Refuses options that exclude each other; `background` is None if it was not given.
+
+    Raises:
+        LinprimError: a table seen from below, an arc that is not walked, two backgrounds, JPEG with alpha.
+    """
+    if options.table and path not in ("arc", "hemisphere"):
+        raise LinprimError(f"path is {path}, but of a table only what is above it is seen; arc or hemisphere is wanted")
+    if options.arc is not None and path != "arc":
+        raise LinprimError(f"arc is {options.arc:g}, but path is {path}; only the path arc has an arc")
+    if options.environment is not None and background is not None:
+        raise LinprimError(
+            f"environment {options.environment} and background {background!r} are both given, one of them is wanted"
+        )
+    if options.jpeg and transparent:
+        raise LinprimError(
+            f"jpeg is {options.jpeg}, but the background is transparent, which JPEG cannot hold;"
+            " an environment or an opaque background is wanted"
+        )
 
 
 def integer(name: str, value, low: int, high: int | None = None) -> int:
@@ -94,6 +125,13 @@ def background_color(value: str | Color) -> Color | None:
     if len(color) != 3 or not all(0.0 <= x <= 1.0 for x in color):
         raise LinprimError(f"background is {value!r}, transparent, black, white or r,g,b in [0, 1] is wanted")
     return color
+
+
+def _table(value) -> float:
+    table = number("table", value, 0.0, 100.0)
+    if 0.0 < table < 1.0:
+        raise LinprimError(f"table is {value!r}, 0 or a number from 1 to 100 is wanted")
+    return table
 
 
 def _size(size) -> tuple[int, int]:

@@ -14,6 +14,7 @@ from .camera import Camera
 from .campath import surface_samples
 from .errors import LinprimError
 from .raycast import RayCaster
+from .synth_photos import photo_name
 from .textured import TexturedMesh
 
 MAX_TRACK = 8
@@ -50,10 +51,12 @@ def sample_points(
     noise: float,
     seed: int,
     distortion: float = 0.0,
+    by_pixels: bool = False,
 ) -> Cloud:
-    """Area-uniform surface points, each seen by at least three of the cameras (two if there are no more).
+    """Surface points, each seen by at least three of the cameras (two if there are no more).
 
-    `light(color, face, direction)` turns albedo into the colour seen along `direction`. Fewer than `count`
+    They are uniform by area or, `by_pixels`, as dense as the pixels that show the surface, as are the keypoints
+    of photographs. `light(color, face, direction)` turns albedo into the colour seen along `direction`. Fewer than `count`
     points come back only if the cameras see almost nothing of the surface.
     """
     rng = np.random.default_rng(seed + 1)
@@ -65,7 +68,10 @@ def sample_points(
         if found >= wanted:
             break
         batch = int(1.3 * (wanted - found)) + 64
-        xyz, normal, face, bary = surface_samples(caster, batch, rng)
+        if by_pixels:
+            xyz, normal, face, bary = pixel_samples(caster, cameras, batch, rng)
+        else:
+            xyz, normal, face, bary = surface_samples(caster, batch, rng)
         seen = np.stack([sees(caster, camera, xyz, normal, distortion) for camera in cameras], axis=1)
         keep = seen.sum(axis=1) >= needed
         batches.append((xyz[keep], normal[keep], face[keep], bary[keep], seen[keep]))
@@ -94,6 +100,26 @@ def sample_points(
     total = np.bincount(point, weights=error, minlength=len(xyz))
     mean = (total / np.bincount(point, minlength=len(xyz))).astype(np.float32)
     return Cloud(given, (np.clip(color, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8), mean, point, image, pixel)
+
+
+def pixel_samples(
+    caster: RayCaster, cameras: list[Camera], count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What rays through random positions in random pictures meet, as `campath.surface_samples`; no more than `count`."""
+    chosen = rng.integers(len(cameras), size=count)
+    place = rng.uniform(size=(count, 2))
+    origins, rays = np.empty((count, 3)), np.empty((count, 3))
+    for number, camera in enumerate(cameras):
+        rows = np.flatnonzero(chosen == number)
+        pixel = place[rows] * (camera.width, camera.height)
+        plane = (pixel - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        rays[rows] = np.column_stack([plane, np.ones(len(rows))]) @ camera.rotation
+        origins[rows] = camera.center
+    _, face, bary = caster.cast(origins, rays)
+    face, bary = face[face >= 0], bary[face >= 0]
+    weight = np.concatenate([1.0 - bary.sum(1, keepdims=True), bary], axis=1)
+    xyz = np.einsum("nc,ncd->nd", weight, caster.vertices[caster.faces[face]])
+    return xyz, caster.face_normals()[face], face, bary
 
 
 def project(camera: Camera, xyz: np.ndarray, distortion: float) -> tuple[np.ndarray, np.ndarray]:
@@ -145,7 +171,9 @@ def sees(
     return seen
 
 
-def write_colmap(folder: Path, cameras: list[Camera], cloud: Cloud, distortion: float = 0.0) -> None:
+def write_colmap(
+    folder: Path, cameras: list[Camera], cloud: Cloud, distortion: float = 0.0, jpeg: int = 0
+) -> None:
     """A COLMAP model (binary) of the training views, with the points and their observations."""
     from .load_pycolmap import pycolmap
 
@@ -171,7 +199,7 @@ def write_colmap(folder: Path, cameras: list[Camera], cloud: Cloud, distortion: 
         rows = np.flatnonzero(cloud.image == number)
         slot[rows] = np.arange(len(rows))
         image = pycolmap.Image(
-            name=f"train/{number:03d}.png",
+            name=photo_name("train", number, jpeg),
             keypoints=cloud.pixel[rows],
             camera_id=lens_of[(camera.fx, camera.fy, camera.cx, camera.cy)],
             image_id=number + 1,

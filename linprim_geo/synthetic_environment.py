@@ -178,7 +178,7 @@ def _shelf(rng: np.random.Generator, wall: int) -> list[Rectangle | BookRow]:
     items: list[Rectangle | BookRow] = [Rectangle(wall, left - 0.03, right + 0.03, FLOOR, top, wood)]
     step = (top - FLOOR - 0.1) / rows
     for row in range(rows):
-        widths = rng.uniform(np.deg2rad(1.6), np.deg2rad(3.6), 60)
+        widths = rng.uniform(np.deg2rad(1.3), np.deg2rad(2.8), 80)
         edges = left + np.concatenate([[0.0], np.cumsum(widths)])
         edges = np.append(edges[edges < right - 2.0 * BLUR], right).astype(np.float32)
         colors = np.array([_colored(rng, rng.uniform(0.15, 0.6), rng.uniform(0.35, 0.85)) for _ in edges[1:]])
