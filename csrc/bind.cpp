@@ -14,8 +14,10 @@
 #include <stdexcept>
 #include <string>
 #include <tuple>
+#include <utility>
 #include <vector>
 
+#include "environment.h"
 #include "face_samples.h"
 #include "fuse.h"
 #include "linprim.h"
@@ -104,6 +106,22 @@ linprim::Primitives<Real> make_primitives(int kind, const In<Real>& center, cons
           checked(density, {n}, "density"),
           checked(sh, {n, count, 3}, "sh"),
           int(count)};
+}
+
+// A view's directions, whose size is that of `opacity` (H, W), and the cube map that it looks at.
+template <class Real>
+std::pair<linprim::DirectionView, linprim::CubeMap<Real>> seen_directions(const std::array<double, 9>& rotation, const std::array<double, 4>& lens,
+                                                                         const In<Real>& map, const In<Real>& opacity) {
+  if (opacity.ndim() != 2 || opacity.size() == 0) throw std::invalid_argument("opacity has to have shape (H, W)");
+  if (map.ndim() != 4 || map.size() == 0) throw std::invalid_argument("the map has to have shape (6, S, S, 3)");
+  linprim::DirectionView view{{}, lens[0], lens[1], lens[2], lens[3], int(opacity.shape(1)), int(opacity.shape(0))};
+  std::copy_n(rotation.data(), 9, view.rotation);
+  bool finite = view.fx > 0 && view.fy > 0;
+  for (double x : rotation) finite = finite && std::isfinite(x);
+  for (double x : lens) finite = finite && std::isfinite(x);
+  if (!finite) throw std::invalid_argument("the camera's rotation or intrinsics are not finite");
+  const int64_t size = int64_t(map.shape(1));
+  return {view, {checked(map, {6, size, size, 3}, "the map"), int(size)}};
 }
 
 // Planes in the order rgb, opacity, depth_expected, depth_median, depth_first, distortion, normal, normal_median, state.
@@ -203,6 +221,23 @@ void bind_real(nb::module_& m, const char* suffix) {
       function(in, int(planes), width, height, factor, out);
     });
   };
+  m.def((std::string("add_environment_") + suffix).c_str(),
+        [](std::array<double, 9> rotation, std::array<double, 4> lens, Array map, double least, Array opacity, Out<Real> rgb) {
+          const auto [view, cube] = seen_directions<Real>(rotation, lens, map, opacity);
+          Real* image = checked(rgb, {3, view.height, view.width}, "rgb");
+          nb::gil_scoped_release release;
+          linprim::add_environment<Real>(view, cube, least, opacity.data(), image);
+        });
+  m.def((std::string("add_environment_grad_") + suffix).c_str(),
+        [](std::array<double, 9> rotation, std::array<double, 4> lens, Array map, double least, Array opacity, Array rgb_grad,
+           Out<Real> opacity_grad, Out<Real> map_grad) {
+          const auto [view, cube] = seen_directions<Real>(rotation, lens, map, opacity);
+          const Real* grad = checked(rgb_grad, {3, view.height, view.width}, "rgb_grad");
+          Real* to_opacity = checked(opacity_grad, {view.height, view.width}, "opacity_grad");
+          Real* to_map = checked(map_grad, {6, cube.size, cube.size, 3}, "map_grad");
+          nb::gil_scoped_release release;
+          linprim::add_environment_grad<Real>(view, cube, least, opacity.data(), grad, to_opacity, to_map);
+        });
   bind_average("average_pixels_", &linprim::average_pixels<Real>);
   bind_average("average_pixels_grad_", &linprim::average_pixels_grad<Real>);
   m.def((std::string("has_kernels_") + suffix).c_str(), [](int kind, int rays, int order) {

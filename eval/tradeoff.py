@@ -295,7 +295,7 @@ class Sweep:
         how |= {"ray_model": setting["ray_model"], "order": setting["order"], "stop": setting["stop"]}
         if not ops.has_kernels(primitives.kind, how["ray_model"], how["order"]):
             raise LinprimError(f"a {primitives.kind} is not drawn in the order {how['order']} with {how['ray_model']} rays")
-        background = torch.from_numpy(self.run.background).to(dtype)
+        background = self.run.raster_arguments()[1].to(dtype)
         begin = time.perf_counter()
         out = ops.rasterize(*tensors, background, camera, geometry=geometry, **how)
         if gradients:

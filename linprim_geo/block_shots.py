@@ -90,7 +90,8 @@ def block_shots(
 
     A photograph is cut to the window that shows the block and its margin, and counts by that window's share of its pixels. Pixels whose
     surface lies farther than `known` from the block, where the frozen primitives are coarse, are replaced by what these alone show there,
-    with their opacity for alpha: a block is neither to explain the rest of the scene nor to hide it.
+    with their opacity for alpha: a block is neither to explain the rest of the scene nor to hide it. So are those that show the coarse
+    scene's environment.
 
     Raises:
         LinprimError: a photograph cannot be read, or the disk is full.
@@ -107,7 +108,10 @@ def block_shots(
         small = cropped(view.camera.transformed(similarity), left, top, width, height)
         photo = view.load()
         part = np.s_[top : top + height, left : left + width]
-        rgb, mask = photo.rgb[part], enlarged(block.holds(surface, known) | math.isinf(known), view.camera, factor)[part]
+        explained = block.holds(surface, known) | math.isinf(known)
+        if coarse.environment is not None:
+            explained &= depth > 0
+        rgb, mask = photo.rgb[part], enlarged(explained, view.camera, factor)[part]
         alpha = np.full(mask.shape, 255, np.uint8) if photo.alpha is None else photo.alpha[part]
         if not mask.all():
             instead, opacity = _rendered(frozen, small, how)

@@ -31,14 +31,14 @@ from .shots import load_shots
 from .train import train_run
 from .trainer import CONTROLS
 from .training_loop import run_steps
-from .training_start import chosen_background, filled_points, initial_cloud, start_trainer
+from .training_start import chosen_background, far_colors, filled_points, initial_cloud, start_trainer
 
 # Arrays of primitives by name, of any number: the frozen ones may be none.
 Arrays = dict[str, np.ndarray]
 
 FOLDER = "blocks"
 # Goes up whenever tasks need what those of before have not left.
-FORMAT = 2
+FORMAT = 3
 # The coarse scene: pixels averaged, parts of the steps and of the primitives of the whole, and the most of these and of the views.
 COARSE_DOWNSCALE, COARSE_STEPS, COARSE_PRIMITIVES = 2, 0.25, 0.25
 MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS, LEAST_SIDE = 20_000, 1000, 32
@@ -98,12 +98,14 @@ def coarse_task(folder: Path, run: str) -> dict:
     coarse = coarse_of(opened, scene)
     small = replace(coarse.scene(), points=scene.points)
     with locked(coarse.path, "trained into"):
-        background, fitted, random = chosen_background(coarse.train_options.background, load_shots(small.train, coarse.similarity))
+        behind = chosen_background(coarse.train_options.background, small, load_shots(small.train, coarse.similarity))
         state = read_checkpoint(coarse.path) if (coarse.path / "config.json").exists() else None
         done = train_run(coarse, small, state, Progress("coarse scene", 1, quiet=True))
-    shown_color = [float(x) for x in (Run.open(coarse.path).background if fitted else background)]
-    background_option = "random" if random else ",".join(map(repr, shown_color))
-    return {"background": background_option, "shown": shown_color, "fitted": fitted, "seconds": done["seconds"]}
+    shown_color = [float(x) for x in (Run.open(coarse.path).background if behind.fitted else behind.color)]
+    # What the coarse environment shows is transparent in the windows of blocks.
+    background_option = "random" if behind.random or behind.environment else ",".join(map(repr, shown_color))
+    about = {"fitted": behind.fitted, "environment": behind.environment, "seconds": done["seconds"]}
+    return {"background": background_option, "shown": shown_color} | about
 
 
 def plan_task(folder: Path, run: str, count: int) -> dict:
@@ -181,6 +183,7 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
         "background": background["background"],
         "shown": background["shown"],
         "fitted": background["fitted"],
+        "environment": background["environment"],
         "frozen": len(grown),
         "extent": float(state["bounds"][1]),
         "largest": max(view.camera.width * view.camera.height for view in scene.train),
@@ -328,7 +331,8 @@ def _trained(
 def _points_of(scene: Scene, run: Run, plan: dict, number: int, options: TrainOptions) -> PointCloud:
     """The scene's points in a block and its margin, filled up: at most as many in either as a training begins with that has the block's
     own primitives in the one and the others of its `options` in the other."""
-    cloud = filled_points(scene, options.seed, np.asarray(plan["shown"]) if plan["fitted"] else None)
+    far = far_colors(scene) if plan["environment"] else None
+    cloud = filled_points(scene, options.seed, np.asarray(plan["shown"]) if plan["fitted"] else None, far)
     where, block, own = run.similarity.apply(cloud.xyz), block_of(plan, number), max(1, plan["blocks"][number]["own_primitives"])
     inside, beside = block.holds(where), block.holds(where, plan["margin"])
     if not beside.any():

@@ -224,7 +224,7 @@ def _merged(run: Run, scene: Scene, coarse: dict, plan: dict, rounds: Sequence[l
     seconds = sum(result["seconds"] for result in ended)
     steps = run.train_options.iterations
     state = {"iteration": steps, "iterations": steps, "primitives": len(merged), "background": plan["shown"], "seconds": seconds}
-    run.save(merged, state)
+    run.save(merged, state, Run.open(run.path / FOLDER / "coarse" / "run").environment)
     scores = []
     for view, images in run.render_views(scene.test, geometry=False):
         photo = view.load()

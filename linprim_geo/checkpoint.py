@@ -10,7 +10,7 @@ import torch
 
 from .errors import LinprimError
 from .files import atomic_write
-from .trainer import Trainer
+from .trainer import SHARED, Trainer
 
 KEPT = 2
 
@@ -89,7 +89,7 @@ def _check_state(trainer: Trainer, state: dict) -> None:
         raise ValueError("there are no primitives")
     for table in ("parameters", "first", "second"):
         for name, like in getattr(trainer, table).items():
-            shape = like.shape if name == "background" else (count, *like.shape[1:])
+            shape = like.shape if name in SHARED else (count, *like.shape[1:])
             _check_tensor(f"{table} {name}", state[table][name], like.dtype, shape)
     if any(bool((value < 0).any()) for value in state["second"].values()):
         raise ValueError("a second moment is negative")

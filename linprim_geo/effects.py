@@ -179,7 +179,7 @@ def _decide(effect: Effect, data: Data, settings: dict, choice: Choice) -> Decis
     given = sorted(effect.options & choice.given)
     note = ""
     if given:
-        on = any(settings[name] != effect.off.get(name, settings[name]) for name in given)
+        on = any(_is_on(effect, name, settings[name]) for name in given)
         reason = "option"
         note = ", ".join(f"--{name.replace('_', '-')} {settings[name]}" for name in given)
         if effect.name in choice.asked and choice.asked[effect.name] != on:
@@ -213,16 +213,26 @@ def _decide(effect: Effect, data: Data, settings: dict, choice: Choice) -> Decis
     )
 
 
+def _is_on(effect: Effect, name: str, value: object) -> bool:
+    """Whether an option's value that was given stands for the effect: not that which switches it off, nor that of another effect."""
+    others = [other.on.get(name) for other in EFFECTS.values() if other is not effect]
+    return value != effect.off.get(name, value) and value not in others
+
+
 def settle(
     scene_options: SceneOptions, options: TrainOptions, decisions: Iterable[Decision]
 ) -> tuple[SceneOptions, TrainOptions]:
     """The options with what was decided put in."""
-    chosen: dict[str, Any] = {}
-    for decision in decisions:
-        chosen |= decision.options
+    chosen = chosen_options(decisions)
     of_scene = {name: value for name, value in chosen.items() if name in vars(scene_options)}
     of_training = {name: value for name, value in chosen.items() if name in vars(options)}
     return replace(scene_options, **of_scene), replace(options, **of_training)
+
+
+def chosen_options(decisions: Iterable[Decision]) -> dict[str, Any]:
+    """{name: value} of the options that follow. Of two effects with the same option the one that is on counts."""
+    ordered = sorted(decisions, key=lambda decision: decision.on)
+    return {name: value for decision in ordered for name, value in decision.options.items()}
 
 
 def inspect_scene(
@@ -240,7 +250,7 @@ def inspect_scene(
     from .training_start import decided_scene
 
     decisions, scene, scene_options, options = decided_scene(path, scene_options, options, choice, log or (lambda text: None))
-    chosen = {name: value for decision in decisions for name, value in decision.options.items()}
+    chosen = chosen_options(decisions)
     result = {
         "scene": str(path),
         "views": len(scene.train),
@@ -335,6 +345,12 @@ def _plain_border(data: Data) -> float:
     return 100 * plain_border(load_shots(views, data.similarity))
 
 
+def _far(data: Data) -> float:
+    from .training_start import far_colors, far_share
+
+    return 100 * far_share(far_colors(data.scene), data.scene)
+
+
 def _masked(data: Data) -> str:
     return "masks or alpha say what is background" if data.scene.has_alpha else ""
 
@@ -413,6 +429,11 @@ _REGISTRY = (
         "background", "one colour behind everything is fitted; without it a random one makes everything opaque",
         "border pixels of one colour", "%", 80.0, 1.0, _plain_border,
         {"background": "fitted"}, {"background": "random"}, needs=_masked,
+    ),
+    Effect(
+        "environment", "what is far away stands at infinity behind everything, and in no mesh",
+        "textured parts of the photographs that colours at infinity explain", "%", 10.0, 1.1, _far,
+        {"background": "environment"}, {"background": "random"}, needs=_masked,
     ),
     Effect(
         "masks", "background that masks or alpha channels mark is kept out",

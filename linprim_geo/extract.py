@@ -21,6 +21,7 @@ from .mesh import SUFFIXES, manifold_status, topology, topology_line
 from .options import ExtractOptions
 from .progress import Progress
 from .run import Run
+from .single_view import without_single_views
 from .stages import Stages
 from .texture import LARGEST as LARGEST_TEXTURE
 from .texture import check_texture
@@ -165,6 +166,13 @@ def _extract(
         about = about | {"blocks": blocks}
     else:
         mesh, about = surface(opened, options, stages, *kept)
+    if opened.environment is not None:
+        views = opened.surface_depths(opened.scene().train, float(options.level))
+        mesh, left_out = without_single_views(mesh, ((view.camera, depth) for view, depth, _ in views), options.smallest_part)
+        about = about | {"seen_by_one_view": left_out}
+        if left_out["pieces"]:
+            stages.note(f"left out: {left_out['pieces']} parts that one camera alone sees before the open background")
+        stages.lap("support")
     done = finish_surface(mesh, opened, options, target, stages)
     shape = topology(done.mesh)
     stats = {

@@ -8,12 +8,13 @@ other views show the same colours.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import numpy as np
 
 from .camera import Camera
+from .environment import FarColors
 from .initial_points import Look, in_image, spread_looks
 from .scene import PointCloud, Scene
 
@@ -42,6 +43,9 @@ _SOURCES = 6
 _PATCH, _PATCH_STEP = 5, 3
 # Patches are the same if their colours differ by less on average, of 255: noise and the interpolation of what is finer than a pixel.
 _SAME_COLOR = 6.0
+# One depth explains photographs better than another by this, of 255: three standard deviations of a patch's mean difference where
+# pixels have noise of 3.
+_BETTER = 1.5
 # Depths tried, evenly spread in inverse depth over what the view's points span, widened by the factors.
 _DEPTHS = 64
 _NEARER, _FARTHER = 2.0, 1.2
@@ -51,7 +55,9 @@ _AT_ONCE = 64
 _BACKDROP = 25.5
 
 
-def fill_points(scene: Scene, seed: int, backdrop: np.ndarray | None = None) -> PointCloud:
+def fill_points(
+    scene: Scene, seed: int, backdrop: np.ndarray | None = None, far: FarColors | None = None
+) -> PointCloud:
     """The scene's points and, after them, new ones in the image cells of training views that hold none.
 
     View by view, those with most points first, every cell that neither a given nor a new point falls into gets a candidate, at a
@@ -64,16 +70,19 @@ def fill_points(scene: Scene, seed: int, backdrop: np.ndarray | None = None) -> 
         scene: with points; held-out views are not used.
         seed: of the places in the cells.
         backdrop: (3,) colour in [0, 1] of a plain backdrop, or None.
+        far: of an open scene, what its photographs show at infinity. Then only candidates between points are made, and kept where
+            infinity does not explain the photographs better: a patch compared over all depths finds one for the background, too.
 
     Returns: the cloud, without errors in pixels; the scene's own if nothing was found.
     """
     cloud = scene.points
     assert cloud is not None, "of a scene without points there is nothing to fill"
     views = [_Gaps(look, cloud.xyz) for look in spread_looks(scene.train, MOST_VIEWS)]
+    at_infinity = [None if far is None else far.difference(view.look) for view in views]
     rng = np.random.default_rng([seed, 8])
     found = [np.empty((0, 3))]
     colors = [np.empty((0, 3), np.uint8)]
-    for source in (_between_points, _same_colors, _nearest_points):
+    for source in (_between_points, _same_colors, _nearest_points) if far is None else (_between_points,):
         if source is not _between_points:  # by now there are more points, and more space is known to be free
             views = [_Gaps(view.look, np.concatenate([cloud.xyz, *found])) for view in views]
         cell = CELL if source is _between_points else PATCH_CELL
@@ -83,7 +92,10 @@ def fill_points(scene: Scene, seed: int, backdrop: np.ndarray | None = None) -> 
                 continue
             pixels = view.empty_cells(np.concatenate(found), cell, rng)
             pixels = pixels[view.shows_something(pixels, backdrop)]
-            pixels, inverse = source(view, _sources(views, index), pixels)
+            sources = _sources(views, index)
+            pixels, inverse = source(view, sources, pixels)
+            finite = _not_farther(view, sources, pixels, inverse, at_infinity[index])
+            pixels, inverse = pixels[finite], inverse[finite]
             points = view.points_at(pixels, inverse)
             free = _not_in_free_space(points, views, index)
             column, row = pixels[free].astype(np.int64).T
@@ -209,6 +221,16 @@ class _Gaps:
         close = distance[:, 1:] <= _TRUSTED_CELLS * CELL * self.longer_side
         nearer = self.inverse[near[:, 1:]] > _HIDDEN_RATIO * self.inverse[:, None]
         return (close & nearer).sum(1) < _HIDDEN_BY
+
+
+def _not_farther(
+    view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray, inverse: np.ndarray, at_infinity: Callable | None
+) -> np.ndarray:
+    """(Q,) whether photographs at (Q, 2) positions agree at these inverse depths about as well as at infinity, as far as that is known."""
+    if at_infinity is None:
+        return np.ones(len(pixels), dtype=bool)
+    near = _differences(view, sources, pixels, inverse[:, None])[:, 0]
+    return ~(near > at_infinity(pixels) + _BETTER)
 
 
 def _between_points(

@@ -402,6 +402,86 @@ _average.register_autograd(
 )
 
 
+@torch.library.custom_op("linprim_geo::add_environment", mutates_args=())
+def _environment(
+    rgb: Tensor, opacity: Tensor, texels: Tensor, rotation: list[float], lens: list[float], least: float
+) -> Tensor:
+    check_dtypes(rgb.dtype, opacity=opacity, texels=texels)
+    shown = rgb.detach().contiguous().clone()
+    getattr(_core, f"add_environment_{scalar_suffix(rgb.dtype)}")(
+        rotation, lens, as_array(texels), least, as_array(opacity), shown.numpy()
+    )
+    return shown
+
+
+@_environment.register_fake
+def _(rgb, opacity, texels, rotation, lens, least):
+    return torch.empty_like(rgb, memory_format=torch.contiguous_format)
+
+
+@torch.library.custom_op("linprim_geo::add_environment_grad", mutates_args=())
+def _environment_grad(
+    grad: Tensor, opacity: Tensor, texels: Tensor, rotation: list[float], lens: list[float], least: float
+) -> tuple[Tensor, Tensor]:
+    out = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in (opacity, texels)]
+    getattr(_core, f"add_environment_grad_{scalar_suffix(grad.dtype)}")(
+        rotation, lens, as_array(texels), least, as_array(opacity), as_array(grad), *[t.numpy() for t in out]
+    )
+    return out[0], out[1]
+
+
+@_environment_grad.register_fake
+def _(grad, opacity, texels, rotation, lens, least):
+    return torch.empty_like(opacity), torch.empty_like(texels)
+
+
+def _environment_setup(ctx, inputs, output):
+    _, opacity, texels, *ctx.how = inputs
+    ctx.save_for_backward(opacity, texels)
+
+
+def _environment_backward(ctx, grad):
+    opacity, texels = ctx.saved_tensors
+    return (grad, *torch.ops.linprim_geo.add_environment_grad(grad, opacity, texels, *ctx.how), None, None, None)
+
+
+_environment.register_autograd(_environment_backward, setup_context=_environment_setup)
+
+
+def add_environment(rgb: Tensor, opacity: Tensor, texels: Tensor, camera: Camera, least: float = 0.0) -> Tensor:
+    """(3, H, W) image `rgb`, rendered over black, with what a cube map shows at infinity behind it: rgb + (1 - opacity) * colour.
+
+    The colour depends on the direction of the pixel's ray alone. Face 2a of the map is that of directions d whose largest coordinate is
+    d_a > 0, face 2a + 1 that of d_a < 0; columns go with d_b / |d_a| and rows with d_c / |d_a| from -1 to 1, (a, b, c) cyclic.
+    Colours between texel centres are bilinear; beyond a face's border its neighbour's nearest texel counts, so that seams stay within
+    the difference of two neighbouring texels.
+
+    Args:
+        rgb, opacity: (3, H, W) and (H, W) as `rasterize` gives them over black; float32 or float64, all tensors alike.
+        texels: (6, S, S, 3) colours.
+        camera: of the rendering; its place does not matter.
+        least: where 1 - opacity is below this nothing is added: the ray has ended.
+
+    Raises:
+        ValueError: shapes or dtypes that do not fit.
+
+    Gradient: to rgb, opacity and texels; once.
+
+    Accuracy: the interpolation is in double; float64 agrees with `reference.add_environment` to 1e-12.
+    """
+    rotation = camera.rotation.reshape(-1).tolist()
+    lens = [camera.fx, camera.fy, camera.cx, camera.cy]
+    return torch.ops.linprim_geo.add_environment(rgb, opacity, texels, rotation, lens, least)
+
+
+def environment_weights(values: Tensor, opacity: Tensor, texels: Tensor, camera: Camera) -> Tensor:
+    """(6, S, S, 3) sums over pixels of 1 - opacity times (3, H, W) `values` times the weight of each texel in the pixel: the adjoint of
+    `add_environment` in a map of the size of `texels`."""
+    rotation = camera.rotation.reshape(-1).tolist()
+    lens = [camera.fx, camera.fy, camera.cx, camera.cy]
+    return torch.ops.linprim_geo.add_environment_grad(values, opacity, texels, rotation, lens, 0.0)[1]
+
+
 def level_depth(
     center: Tensor,
     rotation: Tensor,

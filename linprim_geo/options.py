@@ -174,7 +174,8 @@ class TrainOptions:
     threads: int = option(0, "worker threads; 0 uses every core; the result does not depend on it")
     background: str = option(
         "auto",
-        "auto, fitted, random, black, white, or r,g,b in [0,1]; auto: fitted before a plain backdrop, else random",
+        "auto, environment, fitted, random, black, white, or r,g,b in [0,1]; auto: an environment at infinity if the scene is open,"
+        " fitted before a plain backdrop, else random",
     )
     exposure: str = option(
         "none",

@@ -27,7 +27,7 @@ from .time_budget import (
     least_training,
     plan_training,
 )
-from .trainer import Trainer
+from .trainer import SHARED, Trainer
 
 # A calibration: steps of each of two populations, the smaller one this part of the larger, in turn after the
 # warm-up, and the share of the budget after which no further ones are timed.
@@ -191,11 +191,12 @@ def calibrate(
     begun = len(large) / options.max_primitives
     part = max(1, round(CALIBRATION_PART * len(large)))
     keep = torch.from_numpy(np.sort(np.random.default_rng([options.seed, 1]).choice(len(large), part, replace=False)))
-    fewer = {name: value[keep].clone() for name, value in large.parameters.items() if name != "background"}
+    fewer = {name: value[keep].clone() for name, value in large.parameters.items() if name not in SHARED}
     fewer["log_extent"] += float(np.log(len(large) / part)) / 2  # as many over a place of the surface
     fewer["log_extent"].clamp_(*(float(np.log(bound)) for bound in large.bounds))
+    environment = None if large.environment is None else large.environment.clone()
     small = Trainer(
-        shots, fewer, options, large.bounds, large.background.clone(), large.fitted, large.random_background, terms
+        shots, fewer, options, large.bounds, large.background.clone(), large.fitted, large.random_background, terms, environment=environment
     )
     large.terms = terms
     late_from = min(options.geometry_from if terms else 1.0, options.order_from if options.order_from > GROWTH_END else 1.0)

@@ -254,6 +254,47 @@ def rasterize(
 
 
 @torch.no_grad()
+def add_environment(rgb: Tensor, opacity: Tensor, texels: Tensor, camera: Any, least: float = 0.0) -> Tensor:
+    """What `ops.add_environment` computes, differentiable by autograd: (3, H, W) rgb + (1 - opacity) * colour of the pixel's direction."""
+    size = texels.shape[1]
+    rotation = torch.as_tensor(camera.rotation, dtype=rgb.dtype)
+    rays = pixel_rays(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, rgb).reshape(-1, 3) @ rotation
+    face, along, across = _cube_face(rays)
+    column, row = (size * (coordinate + 1) / 2 - 0.5 for coordinate in (along, across))
+    color = torch.zeros_like(rays)
+    for right in (0, 1):
+        for down in (0, 1):
+            x, y = column.floor() + right, row.floor() + down
+            weight = (1 - (column - x).abs()) * (1 - (row - y).abs())
+            color = color + weight[:, None] * texels[_texel_at(face, x, y, size)]
+    color = color.T.reshape(rgb.shape)
+    left = 1 - opacity
+    return torch.where(left >= least, rgb + left * color, rgb)
+
+
+def _cube_face(direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of (R, 3) directions the face of the cube, 2a for +a and 2a + 1 for -a, and their coordinates on it, -1 to 1."""
+    axis = direction.abs().argmax(1)
+    rows = torch.arange(len(direction))
+    largest = direction[rows, axis]
+    first, second = (direction[rows, (axis + step) % 3] / largest.abs() for step in (1, 2))
+    return 2 * axis + (largest < 0).long(), first, second
+
+
+def _texel_at(face: Tensor, x: Tensor, y: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Index (face, row, column) of texels, those beyond the border of a face being the nearest of its neighbour."""
+    axis, rows = face // 2, torch.arange(len(face))
+    direction = torch.zeros(len(face), 3, dtype=x.dtype)
+    direction[rows, axis] = 1.0 - 2.0 * (face % 2).to(x.dtype)
+    for step, coordinate in ((1, x), (2, y)):
+        direction[rows, (axis + step) % 3] = 2 * (coordinate + 0.5) / size - 1
+    inside = (x >= 0) & (x < size) & (y >= 0) & (y < size)
+    there, first, second = _cube_face(direction)
+    column, row = ((size * (c + 1) / 2).floor().clamp(0, size - 1) for c in (first, second))
+    chosen = (torch.where(inside, one, other).long() for one, other in ((face, there), (y, row), (x, column)))
+    return tuple(chosen)  # type: ignore[return-value]  # three of them
+
+
 def quadrature_transmittance(
     center: Tensor,
     rotation: Tensor,

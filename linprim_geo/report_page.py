@@ -138,7 +138,8 @@ def _summary(report: Report) -> str:
         cards.append((duration(float(state.get("seconds") or 0)), "of training"))
     shown = "".join(f'<div class="card"><b>{escape(value)}</b>{escape(text)}</div>' for value, text in cards)
     where = f"Run {report.run.path.resolve()}, trained on {report.run.scene_path}; page of {time.strftime('%Y-%m-%d %H:%M')}."
-    return f'<p class="small">{escape(where)}</p><div class="cards">{shown}</div>'
+    advice = f"<p><b>{escape(str(report.notes['advice']))}</b></p>" if report.notes.get("advice") else ""
+    return f'<p class="small">{escape(where)}</p><div class="cards">{shown}</div>{advice}'
 
 
 def _input(report: Report) -> str:

@@ -5,6 +5,7 @@ transform.json    training frame <-> data-set frame, unit
 run.json          what the last save holds: iteration, primitives, background
 training_frame.npz   primitives in the training frame, bit for bit as trained
 scene.npz, scene.ply the same in the data set's frame, ours and in LinPrim's format (Gaussians: 3DGS's)
+environment.npy, .png  cube map of what stands behind everything, if it was trained, and a picture of it (`environment`)
 found_poses/      COLMAP model of photographs that came without poses
 metrics.jsonl     loss, PSNR, ... over time                        checkpoints/step_*.pt, latest
 """
@@ -206,15 +207,27 @@ class Run:
         """(3,) float64 colour in [0, 1] behind everything."""
         return np.asarray(self.state["background"], dtype=np.float64)
 
-    def save(self, primitives: Primitives, state: dict) -> None:
-        """Replaces the saved primitives (training frame) and run.json, each atomically."""
+    def save(self, primitives: Primitives, state: dict, environment: torch.Tensor | None = None) -> None:
+        """Replaces the saved primitives (training frame), the environment if there is one, and run.json, each atomically."""
+        from .environment import save_environment
         from .ply import write_primitive_ply
+
+        if environment is not None:
+            save_environment(self.path, environment)
 
         save_primitives(self.path / "training_frame.npz", primitives)
         exported = to_data_set(primitives, self.similarity)
         save_primitives(self.path / "scene.npz", exported)
         write_primitive_ply(self.path / "scene.ply", exported)
         write_json(self.path / "run.json", state)
+
+    @cached_property
+    def environment(self) -> torch.Tensor | None:
+        """(6, S, S, 3) cube map of what stands at infinity behind everything, see `ops.add_environment`; None without one. Its axes are
+        those of the data set."""
+        from .environment import load_environment
+
+        return load_environment(self.path)
 
     def training_primitives(self) -> Primitives:
         """The saved primitives in the training frame, bit for bit as trained."""
@@ -238,6 +251,7 @@ class Run:
         from . import ops
 
         tensors, background, how = self.raster_arguments()
+        environment = self.environment
         for view in views:
             camera, options = view.camera.transformed(self.similarity), self.train_options
             with torch.no_grad():
@@ -251,7 +265,10 @@ class Run:
                     if geometry
                     else color
                 )
-            images = {"rgb": color.rgb.float().numpy(), "opacity": out.opacity.float().numpy()}
+                rgb, opacity = color.rgb.float(), color.opacity.float()
+                if environment is not None:
+                    rgb = ops.add_environment(rgb, opacity, environment, camera, options.stop)
+            images = {"rgb": rgb.numpy(), "opacity": out.opacity.float().numpy()}
             if geometry:
                 unit = 1.0 / self.similarity.scale
                 opacity = np.maximum(images["opacity"], 1e-6)
@@ -293,14 +310,15 @@ class Run:
             yield view, (depth.numpy() / self.similarity.scale).astype(np.float32), opacity.float().numpy()
 
     def raster_arguments(self) -> tuple[Tensors, torch.Tensor, dict]:
-        """What `ops.rasterize` takes: tensors, background, keywords."""
+        """What `ops.rasterize` takes: tensors, background, keywords. Before an environment the background is black."""
         import torch
 
         primitives = self.training_primitives()
         dtype = getattr(torch, self.train_options.scalar)
         tensors = primitives.tensors(dtype)
         how = raster_options(self.train_options) | {"primitive": primitives.kind}
-        return tensors, torch.tensor(self.background, dtype=torch.float32).to(dtype), how
+        background = self.background if self.environment is None else np.zeros(3)
+        return tensors, torch.tensor(background, dtype=torch.float32).to(dtype), how
 
 
 def to_data_set(primitives: Primitives, similarity: Similarity) -> Primitives:

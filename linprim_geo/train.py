@@ -19,6 +19,7 @@ from .checkpoint import read_checkpoint
 from .effects import Choice, Decision
 from .errors import LinprimError
 from .files import is_remains, locked
+from .held_out_gap import gap_advice
 from .initial_points import VolumePoints
 from .options import GEOMETRY_WEIGHTS, SceneOptions, TrainOptions, check_train_options
 from .pacing import Pace, plan_run
@@ -61,7 +62,9 @@ def train(
     With `blocks` other than 1 the scene is trained in blocks of space by several workers, see `block_training.train_blocks`.
 
     Returns: `run`, `iterations`, `seconds` (of training steps alone), `primitives`, `psnr` (mean over held-out views), `views`; with
-    `--exposure gain` also `psnr_gain`, each render times the gain per channel that brings it nearest to its photograph.
+    held-out views also `train_psnr`, the mean over at most 31 training views, and `advice` where these are far ahead
+    (`held_out_gap.gap_advice`), which is in config.json, too; with `--exposure gain` also `psnr_gain`, each render times the gain per
+    channel that brings it nearest to its photograph.
 
     Raises:
         LinprimError: the scene or an option cannot be used, or the folder exists already.
@@ -205,6 +208,15 @@ def train_run(
         + (f", held-out PSNR {score:.2f} dB over {len(held_out)} views" if held_out else "")
         + (f", {score_gain:.2f} dB with the best gain of each" if held_out and score_gain is not None else "")
     )
+    if score is not None:
+        train_score = evaluate(trainer, shots[:: max(1, len(shots) // QUICK_VIEWS)])
+        assert train_score is not None
+        result["train_psnr"] = train_score
+        effects = run.notes.get("effects")
+        if advice := gap_advice(train_score, score, len(shots), options, effects if isinstance(effects, list) else []):
+            progress.note(advice)
+            result["advice"] = advice
+            run.note("advice", advice)
     if pace:
         result["time_budget"] = pace.close(run, progress)
     return result

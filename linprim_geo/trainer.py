@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import fields
+from collections.abc import Iterator
+from dataclasses import fields, replace
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor
 from . import ops
 from .adam import adam_rows, adam_step
 from .camera import Camera
+from .environment import SAME_COLOR, SURVEY_VIEWS, filled, seen_through
 from .errors import LinprimError
 from .exposure import Exposure, exposed
 from .geometry_terms import GeometryTerms
@@ -26,6 +28,7 @@ from .population import Control, GradientControl
 from .population_papers import ClassicControl, McmcControl
 from .primitives import KINDS, SH_Y0, Primitives, reference_length
 from .shots import Shot
+from .support import Support
 
 CONTROLS: dict[str, type[Control]] = {
     "gradient": GradientControl,
@@ -43,7 +46,20 @@ RATES = {
     "sh_dc": (5e-3, 0.1),
     "sh_rest": (5e-4, 0.1),
     "background": (5e-3, 0.1),
+    "environment": (5e-3, 0.1),
 }
+# Parameters of the whole scene; the others have a row per primitive.
+SHARED = frozenset({"background", "environment"})
+# Parts of the run after which all views are looked at together, before an environment.
+LOOKS_AROUND = (0.1, 0.2, 0.35, 0.5, 0.7)
+# Light that passes primitives to this part tells little of the environment: Adam would move its texels as fast as those in full view.
+FAINT = 0.5
+# Adam's epsilon elsewhere.
+ADAM_EPSILON = 1e-15
+# Weight of `contradiction` in the loss.
+CONTRADICTION = 1.0
+# Raw opacity of a primitive that is to be moved: an opacity of 0.0003.
+TRANSPARENT = -8.0
 # An octahedron's half-axes, and as large extents of the other kinds (Kind.size), stay within these: a part of a pixel at the
 # distance of the subject, and of the scene's radius.
 SMALLEST_PX, LARGEST_PART = 0.35, 0.5
@@ -151,6 +167,20 @@ def filter_lengths(center: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
     return torch.from_numpy((math.sqrt(FILTER_VARIANCE) / focal * least).astype(np.float32))
 
 
+def contradiction(photo: Tensor, passed: Tensor, left: Tensor) -> Tensor:
+    """Mean over the pixels of the transmittance `left` (H, W) times how much the environment differs from the photograph (3, H, W), beyond
+    SAME_COLOR; `passed` (3, H, W) is the transmittance times the environment.
+
+    Where the two differ there is a surface, and no light of the environment: without this term a translucent surface of another colour
+    explains the photograph as well.
+
+    Gradient: to `left`.
+    """
+    weight = left.detach()
+    difference = (weight * photo - passed).abs().mean(0) / weight.clamp_min(1e-6)
+    return (left * (difference - SAME_COLOR / 255).clamp_min(0)).mean()
+
+
 def _single(out: ops.Rendering) -> ops.Rendering:
     """The rendering in float32, in which the loss and the optimiser work."""
     if out.rgb.dtype == torch.float32:
@@ -175,14 +205,22 @@ class Trainer:
         random_background: bool,
         terms: GeometryTerms | None = None,
         log_gain: np.ndarray | None = None,
+        environment: torch.Tensor | None = None,
     ):
-        """`log_gain` (V, 3): where the gains of the photographs begin, with `--exposure gain`."""
+        """`log_gain` (V, 3): where the gains of the photographs begin, with `--exposure gain`. `environment` (6, S, S, 3): texels of
+        what stands behind everything, in place of a background, to begin with."""
         self.shots, self.options, self.bounds, self.terms = shots, options, bounds, terms
         self.parameters = dict(parameters)
         self.fitted, self.random_background = fitted, random_background
         self.background = background
         if fitted:
             self.parameters["background"] = background
+        self.looks_around = {round(share * options.iterations) for share in LOOKS_AROUND}
+        # Gradient of the loss to a texel through which a pixel's light passes to this part: below it Adam's steps get small.
+        camera = shots[0].camera
+        self.faint = FAINT / (3 * camera.width * camera.height)
+        if environment is not None:
+            self.parameters["environment"] = environment
         self.first = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
         self.second = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
         self.exposure = Exposure(len(shots), log_gain) if options.exposure == "gain" else None
@@ -200,6 +238,11 @@ class Trainer:
         # Primitives that stay as they are, as the rasterizer takes them: they stand for what others train.
         self.frozen: Tensors | None = None
         self._refilter()
+
+    @property
+    def environment(self) -> torch.Tensor | None:
+        """(6, S, S, 3) texels of what stands behind everything, if there is an environment."""
+        return self.parameters.get("environment")
 
     def __len__(self) -> int:
         return len(self.parameters["center"])
@@ -259,7 +302,7 @@ class Trainer:
         leaves = {k: v.requires_grad_() for k, v in self.parameters.items()}
         active = self._cast(*self._with_frozen(activate(leaves, self.degree, self.kind, self.filter_3d)))
         screen = torch.zeros(len(active[0]), 3, dtype=active[0].dtype, requires_grad=True)
-        behind = background.to(active[0].dtype)
+        behind = self._flat(background).to(active[0].dtype)
         terms = self.terms if self.has_reached(self.options.geometry_from) else None
         # Geometry has no average over the rays of a pixel: with several of them it is rendered by itself.
         needed = terms is not None and terms.needs_geometry
@@ -267,6 +310,10 @@ class Trainer:
         how = {"stop": self.options.stop, **self.how_now()}
         samples = self.options.samples
         out = _single(ops.rasterize(*active, behind, shot.camera, samples=samples, geometry=shared, screen=screen, **how))
+        contradicted = None
+        if self.environment is not None:
+            bare, out = out.rgb, self._before(leaves["environment"], out, shot.camera)
+            contradicted = contradiction(target, (out.rgb - bare).detach(), 1 - out.opacity)
         shown, log_gain = out.rgb, None
         if self.exposure is not None:
             log_gain = self.exposure.row(index)
@@ -278,6 +325,8 @@ class Trainer:
         penalty = self.control.penalty(leaves)
         photometric = parts[0] if shot.weight == 1 else shot.weight * parts[0]
         objective = photometric if penalty is None else photometric + penalty
+        if contradicted is not None:
+            objective = objective + CONTRADICTION * contradicted
         if terms is not None:
 
             def surface(camera: Camera, tensors: Tensors) -> ops.Rendering:
@@ -304,6 +353,8 @@ class Trainer:
             self.control.disturb(self.parameters, self.step + 1)
             self.control.gather(self.parameters, shot.camera, shot.size, screen_grad)
         self.step += 1
+        if self.step in self.looks_around:
+            self._look_around()
         if self.control.is_due(self.step):
             self._grow()
         elif self.step % FILTER_EVERY == 0:
@@ -324,7 +375,7 @@ class Trainer:
         for value in self.parameters.values():
             value.requires_grad_(False)
         if self.options.adam == "sparse":
-            rows = [name for name in names if name != "background"]
+            rows = [name for name in names if name not in SHARED]
             adam_rows(
                 [self.parameters[name] for name in rows],
                 [wanted[name] for name in rows],
@@ -334,7 +385,7 @@ class Trainer:
                 self.steps,
                 touched,
             )
-            names = [name for name in names if name == "background"]
+            names = [name for name in names if name in SHARED]
         for name in names:
             adam_step(
                 self.parameters[name],
@@ -343,18 +394,19 @@ class Trainer:
                 self.second[name],
                 rates[name],
                 self.step + 1,
+                epsilon=self.faint if name == "environment" else ADAM_EPSILON,
             )
         rotation = self.parameters["rotation"]
         rotation /= torch.linalg.vector_norm(rotation, dim=1, keepdim=True).clamp_min(1e-12)
         self.parameters["log_extent"].clamp_(math.log(self.bounds[0]), math.log(self.bounds[1]))
-        if self.fitted:
-            self.parameters["background"].clamp_(0, 1)
+        for name in SHARED & self.parameters.keys():
+            self.parameters[name].clamp_(0, 1)
 
     def _grow(self) -> None:
         event = self.control.change(self.parameters, self.step)
         source = torch.from_numpy(event.source)
         for name in self.parameters:
-            if name == "background":
+            if name in SHARED:
                 continue
             for table in (self.parameters, self.first, self.second):
                 table[name] = table[name][source]
@@ -374,6 +426,27 @@ class Trainer:
         self.control.reset(len(self))
         self._refilter()
 
+    @torch.no_grad()
+    def _look_around(self) -> None:
+        """Before an environment: makes primitives transparent that one view alone sees, so that growth moves them to where they are needed,
+        and gives texels that no view sees past the primitives the colours round them."""
+        if self.environment is None:
+            return
+        support = Support(self.parameters["center"])
+        active = self._cast(*self._with_frozen(activate(self.parameters, self.degree, self.kind, self.filter_3d)))
+        black = torch.zeros(3, dtype=active[0].dtype)
+
+        def opacities() -> Iterator[tuple[Camera, Tensor]]:
+            for shot in self.shots[:: max(1, len(self.shots) // SURVEY_VIEWS)]:
+                out = _single(ops.rasterize(*active, black, shot.camera, stop=self.options.stop, geometry=True, **self.how_now()))
+                assert out.max_weight is not None
+                support.add(shot.camera, out.max_weight[: len(self)])
+                yield shot.camera, out.opacity
+
+        seen = seen_through(len(self.environment[0]), opacities())
+        self.parameters["environment"] = filled(self.environment, seen)
+        self.parameters["raw_opacity"][support.alone()] = TRANSPARENT
+
     def _refilter(self) -> None:
         """Makes the 3D filter for where the primitives are now."""
         if self.options.filter != "none":
@@ -383,15 +456,26 @@ class Trainer:
     @torch.no_grad()
     def render(self, camera: Camera, background: torch.Tensor) -> torch.Tensor:
         """(3, H, W) colour of a camera in the training frame, at the photographs' mean exposure."""
-        active = self._with_frozen(activate(self.parameters, self.degree, self.kind, self.filter_3d))
-        return ops.rasterize(
-            *self._cast(*active),
-            background.double() if self.options.scalar == "float64" else background,
-            camera,
-            stop=self.options.stop,
-            samples=self.options.samples,
-            **self.how,
-        ).rgb.float()
+        active = self._cast(*self._with_frozen(activate(self.parameters, self.degree, self.kind, self.filter_3d)))
+        out = _single(
+            ops.rasterize(
+                *active,
+                self._flat(background).to(active[0].dtype),
+                camera,
+                stop=self.options.stop,
+                samples=self.options.samples,
+                **self.how,
+            )
+        )
+        return out.rgb if self.environment is None else self._before(self.environment, out, camera).rgb
+
+    def _flat(self, background: torch.Tensor) -> torch.Tensor:
+        """The background that primitives are rendered over: black where an environment follows."""
+        return background if self.environment is None else torch.zeros(3)
+
+    def _before(self, texels: Tensor, out: ops.Rendering, camera: Camera) -> ops.Rendering:
+        """The rendering before an environment."""
+        return replace(out, rgb=ops.add_environment(out.rgb, out.opacity, texels, camera, self.options.stop))
 
     def _with_frozen(self, active: Tensors) -> Tensors:
         """The active tensors, and after them the frozen ones with as many harmonics."""

@@ -178,6 +178,7 @@ def save_training(trainer: Trainer, run: Run) -> None:
             "seconds": trainer.seconds,
         }
         | ({} if trainer.exposure is None else {"gains": _gains(trainer.shots, trainer.exposure)}),
+        trainer.environment,
     )
 
 

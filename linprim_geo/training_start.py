@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ import torch
 from . import ops
 from .checkpoint import restore
 from .effects import Choice, Decision, decide, settle, summary
+from .environment import SURVEY_VIEWS, FarColors, texels_for
 from .errors import LinprimError
 from .evidence import observe
 from .fill_points import fill_points
@@ -22,6 +23,7 @@ from .initial_points import (
     frusta_points,
     local_planes,
     scene_normalization,
+    spread_looks,
     visual_hull_points,
 )
 from .options import GEOMETRY_WEIGHTS, SceneOptions, TrainOptions, check_train_options, initial_count
@@ -37,6 +39,9 @@ from .trainer import LARGEST_PART, SMALLEST_PX, Trainer, initial_parameters
 SFM_START, RANDOM_START = 0.8, 0.25
 # Triangulated points fewer than this leave too much of a scene empty.
 FEW_POINTS = 500
+# A scene is open where colours at infinity explain this share of the textured parts of its photographs; of closed rooms, of scenes on black
+# and of facades it is up to 0.04, as where cameras happen to look alike.
+OPEN_SHARE = 0.1
 # A backdrop is plain where this share of all border pixels lies this near to their median colour, per channel.
 BACKDROP_SHARE, BACKDROP_TOLERANCE = 0.8, 0.1
 
@@ -175,33 +180,68 @@ def late_terms(run: Run, scene: Scene, shots: list[Shot], progress: Progress) ->
     return terms
 
 
-def chosen_background(text: str, shots: list[Shot]) -> tuple[torch.Tensor, bool, bool]:
-    """((3,) float32 colour in [0, 1] that renders show, whether it is fitted, whether training draws a random one) of the option's text.
+@dataclass(frozen=True)
+class Background:
+    """What training puts behind everything: a `color` (3,) float32 in [0, 1], which is `fitted`, or replaced by a `random` one in each
+    step or by an `environment`, which begins with the photographs' colours at infinity, `far`."""
+
+    color: torch.Tensor
+    fitted: bool = False
+    random: bool = False
+    environment: bool = False
+    far: FarColors | None = None
+
+
+def chosen_background(text: str, scene: Scene, shots: list[Shot], begun: bool | None = None) -> Background:
+    """What the option's text stands for. Of a training that goes on, `begun` says whether it has an environment: that has its colours.
 
     Without alpha a random background makes everything opaque: a fitted one would let a wall of its colour become transparent. It is
-    fitted only where photographs have a plain backdrop.
+    fitted only where photographs have a plain backdrop, and an environment is trained only where they say that a scene is open.
 
     Raises:
         LinprimError: the text is no name and not three numbers in [0, 1].
     """
     named = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
     has_alpha = shots[0].alpha is not None
+    far = None
     if text == "auto":
-        text = "fitted" if not has_alpha and plain_border(shots) > BACKDROP_SHARE else "random"
+        text = "random"
+        if begun:
+            text = "environment"
+        elif not has_alpha and plain_border(shots) > BACKDROP_SHARE:
+            text = "fitted"
+        elif not has_alpha and begun is None:
+            far = far_colors(scene)
+            text = "environment" if far_share(far, scene) >= OPEN_SHARE else "random"
     if text == "random":
-        shown = torch.ones(3) if has_alpha else torch.from_numpy(_mean_color(shots))
-        return shown, False, True
+        return Background(torch.ones(3) if has_alpha else torch.from_numpy(_mean_color(shots)), random=True)
+    if text == "environment":
+        if has_alpha:
+            raise LinprimError("--background environment: masks or alpha say already what is background")
+        far = far_colors(scene) if far is None and begun is None else far
+        return Background(torch.from_numpy(_mean_color(shots)), environment=True, far=far)
     if text == "fitted":
-        return torch.from_numpy(np.median(_border_colors(shots), 0).astype(np.float32)), True, False
+        return Background(torch.from_numpy(np.median(_border_colors(shots), 0).astype(np.float32)), fitted=True)
     try:
         color = named[text] if text in named else tuple(float(x) for x in text.split(","))
     except ValueError:
         color = ()
     if len(color) != 3 or not all(0 <= x <= 1 for x in color):
         raise LinprimError(
-            f"--background is {text!r}, wanted auto, fitted, random, black, white, or three numbers in [0,1] such as 0.5,0.5,1"
+            f"--background is {text!r}, wanted auto, fitted, environment, random, black, white, or three numbers in [0,1] such as 0.5,0.5,1"
         )
-    return torch.tensor(color, dtype=torch.float32), False, False
+    return Background(torch.tensor(color, dtype=torch.float32))
+
+
+def far_colors(scene: Scene) -> FarColors:
+    """What the photographs of a scene show at infinity."""
+    return FarColors(spread_looks(scene.train, SURVEY_VIEWS))
+
+
+def far_share(far: FarColors, scene: Scene) -> float:
+    """`FarColors.explained` by the scene's points; 0 where the photographs do not tell."""
+    points = scene.points
+    return far.explained(np.zeros((0, 3)) if points is None or isinstance(points, VolumePoints) else points.xyz) or 0.0
 
 
 def _border_colors(shots: list[Shot]) -> np.ndarray:
@@ -222,10 +262,10 @@ def _mean_color(shots: list[Shot]) -> np.ndarray:
     return np.mean([s.rgb.numpy().mean((1, 2)) for s in shots], 0).astype(np.float32) / np.float32(255)
 
 
-def filled_points(scene: Scene, seed: int, backdrop: np.ndarray | None) -> PointCloud:
+def filled_points(scene: Scene, seed: int, backdrop: np.ndarray | None, far: FarColors | None = None) -> PointCloud:
     """The scene's points, filled up (`fill_points`) unless they are random ones, which lie on no surface."""
     assert scene.points is not None
-    return scene.points if isinstance(scene.points, VolumePoints) else fill_points(scene, seed, backdrop)
+    return scene.points if isinstance(scene.points, VolumePoints) else fill_points(scene, seed, backdrop, far)
 
 
 def start_trainer(
@@ -250,13 +290,14 @@ def start_trainer(
     """
     focal = float(np.median([max(s.camera.fx, s.camera.fy) for s in shots]))
     centers = np.stack([s.camera.center for s in shots])
-    background, fitted, random_background = chosen_background(options.background, shots)
+    begun = None if state is None else "environment" in state.get("parameters", {})
+    behind = chosen_background(options.background, scene, shots, begun)
     surface = state is None and not isinstance(scene.points, VolumePoints)
     if state is not None:
         xyz, rgb, radius = np.zeros((4, 3)), np.zeros((4, 3)), 1.0  # replaced below
     else:
         if cloud is None:
-            cloud = filled_points(scene, options.seed, background.numpy() if fitted else None)
+            cloud = filled_points(scene, options.seed, behind.color.numpy() if behind.fitted else None, behind.far)
         cloud = initial_cloud(cloud, options)
         xyz, rgb = run.similarity.apply(cloud.xyz), cloud.rgb
         middle = np.median(xyz, 0)
@@ -275,7 +316,13 @@ def start_trainer(
     if options.exposure == "gain" and state is None:
         seen = observe(scene, options.seed, views=len(shots))
         log_gain = None if seen is None else seen.log_gains[0]
-    trainer = Trainer(shots, parameters, options, bounds, background, fitted, random_background, log_gain=log_gain)
+    environment = None
+    if behind.environment:
+        size = texels_for([shot.camera for shot in shots])
+        environment = torch.zeros(6, size, size, 3) if behind.far is None else behind.far.start(size)  # zeros: replaced below
+    trainer = Trainer(
+        shots, parameters, options, bounds, behind.color, behind.fitted, behind.random, log_gain=log_gain, environment=environment
+    )
     if state is not None:
         restore(trainer, state, run.path / "checkpoints")
     return trainer

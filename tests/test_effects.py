@@ -162,7 +162,7 @@ def test_what_is_asked_comes_before_the_data_and_what_is_given_before_all(scenes
     _, settled = settle(SceneOptions(), options, found.values())
     assert (settled.sh_degree, settled.order, settled.filter, settled.exposure) == (3, "overlap", "3d", "none")
     everything = decisions(scenes("plain"), Choice("all"))
-    assert {name for name, d in everything.items() if not d.on} == {"background"}
+    assert {name for name, d in everything.items() if not d.on} == {"background", "environment"}
     assert set(decisions(scenes("plain"), Choice("none", {"double": True}))) == {"double"}
 
 
