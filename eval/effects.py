@@ -45,6 +45,7 @@ SCENES = {
     "telephoto": {"fov": 4.0},
     "cad": {"shape": "cad", "shading": "shaded"},
     "wires": {"shape": "wires", "shading": "shaded"},
+    "tabletop": {"table": 2.5, "environment": 4, "noise": 2.0},
 }
 # name: the scenes that call for it, those that do not, and by what the gain is judged.
 PAIRS = {
@@ -53,6 +54,7 @@ PAIRS = {
     "lens": (("lens",), ("slight lens",), "depth"),
     "filter": (("zoom",), ("plain", "room", "cad", "wires"), "psnr"),
     "background": (("white",), ("room",), "psnr"),
+    "environment": (("tabletop",), ("room",), "psnr"),
     "masks": (("plain",), ("black",), "depth"),
     "depth": (("plain",), (), "depth"),
     "normals": (("plain",), (), "depth"),

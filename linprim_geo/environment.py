@@ -31,7 +31,7 @@ SURVEY_TEXELS, SURVEY_VIEWS = 128, 60
 # A patch is explained by the environment if its mean difference, of 255, is below this, or below this part of its variation: noise of 12
 # averages to this over 4 by 4 pixels, and what is finer than a texel is filtered.
 SAME_COLOR, EXPLAINED = 3.0, 1 / 3
-# Views that say the same before a direction counts as known.
+# Photographs that show a direction, at least, for its colour to be known.
 LEAST_VIEWS = 3
 # Of more photographs of a direction than this, so many are compared with each other.
 COMPARED = 24
@@ -73,8 +73,8 @@ def nearest_texel(directions: np.ndarray, size: int) -> np.ndarray:
 class FarColors:
     """The colours that photographs show in each direction, as if everything were at infinity.
 
-    `texels` (T, 3) float32, 0 to 255, the median over the photographs of a direction, NaN without one, of T = 6 size^2; `views` (T,) how
-    many show it. Where most see past the scene, that is the environment.
+    `texels` (T, 3) float32, 0 to 255, of T = 6 size^2, the colour that most photographs of a direction agree on, NaN without one; `views`
+    (T,) how many show it. Where some see past the scene that is the environment, for what stands before it differs from view to view.
     """
 
     def __init__(self, looks: Sequence[Look]):

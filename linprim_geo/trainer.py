@@ -57,7 +57,7 @@ FAINT = 0.5
 # Adam's epsilon elsewhere.
 ADAM_EPSILON = 1e-15
 # Weight of `contradiction` in the loss.
-CONTRADICTION = 1.0
+CONTRADICTION = 0.5
 # Raw opacity of a primitive that is to be moved: an opacity of 0.0003.
 TRANSPARENT = -8.0
 # An octahedron's half-axes, and as large extents of the other kinds (Kind.size), stay within these: a part of a pixel at the
@@ -310,10 +310,9 @@ class Trainer:
         how = {"stop": self.options.stop, **self.how_now()}
         samples = self.options.samples
         out = _single(ops.rasterize(*active, behind, shot.camera, samples=samples, geometry=shared, screen=screen, **how))
-        contradicted = None
+        bare = out.rgb
         if self.environment is not None:
-            bare, out = out.rgb, self._before(leaves["environment"], out, shot.camera)
-            contradicted = contradiction(target, (out.rgb - bare).detach(), 1 - out.opacity)
+            out = self._before(leaves["environment"], out, shot.camera)
         shown, log_gain = out.rgb, None
         if self.exposure is not None:
             log_gain = self.exposure.row(index)
@@ -325,8 +324,9 @@ class Trainer:
         penalty = self.control.penalty(leaves)
         photometric = parts[0] if shot.weight == 1 else shot.weight * parts[0]
         objective = photometric if penalty is None else photometric + penalty
-        if contradicted is not None:
-            objective = objective + CONTRADICTION * contradicted
+        if self.environment is not None:
+            photo = target if log_gain is None else target * torch.exp(-log_gain.detach())[:, None, None]
+            objective = objective + CONTRADICTION * contradiction(photo, (out.rgb - bare).detach(), 1 - out.opacity)
         if terms is not None:
 
             def surface(camera: Camera, tensors: Tensors) -> ops.Rendering:
