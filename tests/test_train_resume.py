@@ -212,7 +212,8 @@ def test_the_newest_checkpoint_is_kept_when_its_number_gets_a_digit_more(tiny_ru
     octahedra = Run.open(tiny_run).training_primitives()
 
     class Late:
-        parameters, step, iterations, state, options, seconds, exposure = {}, 1_000_000, 1_000_000, dict, QUICK, 0.0, None
+        parameters, step, iterations, state, options, seconds = {}, 1_000_000, 1_000_000, dict, QUICK, 0.0
+        exposure = environment = None
         primitives, shown_background, __len__ = lambda _: octahedra, lambda _: torch.zeros(3), lambda _: 1
 
     training_loop.save_training(Late(), Run.open(run_copy))
