@@ -2,11 +2,15 @@
 
 #include <algorithm>
 #include <cmath>
+#include <vector>
 
 #include "parallel.h"
 
 namespace linprim {
 namespace {
+
+// Samples that are kept at once, of 64 bytes.
+constexpr int64_t kSamplesAtOnce = 65536;
 
 // The four texels round a direction and their weights.
 struct Sample {
@@ -51,10 +55,15 @@ Sample sample(const DirectionView& view, int size, int row, int column) {
   double u, v;
   on_face(face, d, u, v);
   u = (u + 1) / 2 * size - 0.5, v = (v + 1) / 2 * size - 0.5;
-  const int left = int(std::floor(u)), top = int(std::floor(v));
+  const int left = int(u + 1) - 1, top = int(v + 1) - 1;  // rounded down, for both are above -1
   const double a = u - left, b = v - top;
   Sample result{{}, {(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b}};
-  for (int k = 0; k < 4; ++k) result.texel[k] = texel_at(size, face, top + k / 2, left + k % 2);
+  if (left >= 0 && top >= 0 && left + 1 < size && top + 1 < size) {
+    const int64_t first = texel_index(size, face, top, left), below = first + int64_t(3) * size;
+    result.texel[0] = first, result.texel[1] = first + 3, result.texel[2] = below, result.texel[3] = below + 3;
+  } else {
+    for (int k = 0; k < 4; ++k) result.texel[k] = texel_at(size, face, top + k / 2, left + k % 2);
+  }
   return result;
 }
 
@@ -78,28 +87,36 @@ void add_environment(const DirectionView& view, const CubeMap<Real>& map, double
   });
 }
 
-// On one thread: pixels share texels, and the sum over them is to have one order.
 template <class Real>
 void add_environment_grad(const DirectionView& view, const CubeMap<Real>& map, double least, const Real* opacity, const Real* rgb_grad,
                           Real* opacity_grad, Real* map_grad) {
   const int64_t pixels = int64_t(view.width) * view.height;
   std::fill_n(map_grad, int64_t(6) * map.size * map.size * 3, Real(0));
-  for (int64_t pixel = 0; pixel < pixels; ++pixel) {
-    opacity_grad[pixel] = 0;
-    const double left = 1 - double(opacity[pixel]);
-    if (!(left >= least)) continue;
-    const Sample s = sample(view, map.size, int(pixel / view.width), int(pixel % view.width));
-    double lost = 0;
-    for (int c = 0; c < 3; ++c) {
-      const double grad = rgb_grad[c * pixels + pixel];
-      double color = 0;
-      for (int k = 0; k < 4; ++k) {
-        color += s.weight[k] * map.texels[s.texel[k] + c];
-        map_grad[s.texel[k] + c] += Real(left * s.weight[k] * grad);
+  // Some rows at a time: their samples in parallel, then the sums over texels, which pixels share, in one order.
+  const int rows = std::clamp(int(kSamplesAtOnce / view.width), 1, view.height);
+  std::vector<Sample> samples(size_t(rows) * view.width);
+  for (int top = 0; top < view.height; top += rows) {
+    const int count = std::min(rows, view.height - top);
+    parallel_for(count, [&](int64_t row, int) {
+      for (int column = 0; column < view.width; ++column) {
+        const int64_t pixel = (top + row) * view.width + column;
+        opacity_grad[pixel] = 0;
+        if (!(1 - double(opacity[pixel]) >= least)) continue;
+        const Sample s = samples[row * view.width + column] = sample(view, map.size, int(top + row), column);
+        double lost = 0;
+        for (int c = 0; c < 3; ++c)
+          for (int k = 0; k < 4; ++k) lost += s.weight[k] * map.texels[s.texel[k] + c] * rgb_grad[c * pixels + pixel];
+        opacity_grad[pixel] = Real(-lost);
       }
-      lost += color * grad;
+    });
+    for (int64_t at = 0, pixel = int64_t(top) * view.width; at < int64_t(count) * view.width; ++at, ++pixel) {
+      const double left = 1 - double(opacity[pixel]);
+      if (!(left >= least)) continue;
+      const Sample& s = samples[at];
+      const Real grad[3] = {Real(left * rgb_grad[pixel]), Real(left * rgb_grad[pixels + pixel]), Real(left * rgb_grad[2 * pixels + pixel])};
+      for (int k = 0; k < 4; ++k)
+        for (int c = 0; c < 3; ++c) map_grad[s.texel[k] + c] += Real(s.weight[k]) * grad[c];
     }
-    opacity_grad[pixel] = Real(-lost);
   }
 }
 

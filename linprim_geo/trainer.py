@@ -177,8 +177,8 @@ def contradiction(photo: Tensor, passed: Tensor, left: Tensor) -> Tensor:
     Gradient: to `left`.
     """
     weight = left.detach()
-    difference = (weight * photo - passed).abs().mean(0) / weight.clamp_min(1e-6)
-    return (left * (difference - SAME_COLOR / 255).clamp_min(0)).mean()
+    difference = (weight * photo).sub_(passed).abs_().mean(0) / weight.clamp_min(1e-6)
+    return (left * difference.sub_(SAME_COLOR / 255).clamp_min_(0)).mean()
 
 
 def _single(out: ops.Rendering) -> ops.Rendering:
