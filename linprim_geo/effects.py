@@ -432,7 +432,7 @@ _REGISTRY = (
     ),
     Effect(
         "environment", "what is far away stands at infinity behind everything, and in no mesh",
-        "textured parts of the photographs that colours at infinity explain", "%", 10.0, 1.1, _far,
+        "textured parts of the photographs that colours at infinity explain", "%", 10.0, 1.3, _far,
         {"background": "environment"}, {"background": "random"}, needs=_masked,
     ),
     Effect(
