@@ -18,6 +18,7 @@ from .block_shots import block_shots, small_depths
 from .blocks import Block, margin_of, point_work, split_space, surface_points, window
 from .camera import Camera
 from .checkpoint import read_checkpoint
+from .environment import far_colors
 from .errors import LinprimError
 from .files import atomic_write, locked
 from .initial_points import VolumePoints
@@ -31,7 +32,7 @@ from .shots import load_shots
 from .train import train_run
 from .trainer import CONTROLS
 from .training_loop import run_steps
-from .training_start import chosen_background, far_colors, filled_points, initial_cloud, start_trainer
+from .training_start import chosen_background, filled_points, initial_cloud, start_trainer
 
 # Arrays of primitives by name, of any number: the frozen ones may be none.
 Arrays = dict[str, np.ndarray]

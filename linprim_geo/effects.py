@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from .environment import OPEN_SHARE, far_colors, far_share
 from .errors import LinprimError
 from .evidence import Observations, observe
 from .initial_points import CAMERA_DISTANCE, VolumePoints, scene_normalization
@@ -346,8 +347,6 @@ def _plain_border(data: Data) -> float:
 
 
 def _far(data: Data) -> float:
-    from .training_start import far_colors, far_share
-
     return 100 * far_share(far_colors(data.scene), data.scene)
 
 
@@ -432,7 +431,7 @@ _REGISTRY = (
     ),
     Effect(
         "environment", "what is far away stands at infinity behind everything, and in no mesh",
-        "textured parts of the photographs that colours at infinity explain", "%", 10.0, 1.3, _far,
+        "textured parts of the photographs that colours at infinity explain", "%", 100 * OPEN_SHARE, 1.3, _far,
         {"background": "environment"}, {"background": "random"}, needs=_masked,
     ),
     Effect(

@@ -20,7 +20,8 @@ from . import ops
 from .camera import Camera
 from .errors import LinprimError
 from .files import atomic_write
-from .initial_points import Look, in_image
+from .initial_points import Look, VolumePoints, in_image, spread_looks
+from .scene import Scene
 
 # Its files in the folder of a run.
 FILE, PICTURE = "environment.npy", "environment.png"
@@ -28,6 +29,9 @@ FILE, PICTURE = "environment.npy", "environment.png"
 TEXEL_PX, MOST_TEXELS = 4.0, 512
 # The photographs' own colours at infinity are gathered with fewer, from views spread over the capture.
 SURVEY_TEXELS, SURVEY_VIEWS = 128, 60
+# A scene is open where colours at infinity explain this share of the textured parts of its photographs: 0.31 to 0.39 of four objects before
+# far rooms, 0.06 at most of six captures of rooms, facades, and objects on black or near a wall.
+OPEN_SHARE = 0.1
 # A patch is explained by the environment if its mean difference, of 255, is below this, or below this part of its variation: noise of 12
 # averages to this over 4 by 4 pixels, and what is finer than a texel is filtered.
 SAME_COLOR, EXPLAINED = 3.0, 1 / 3
@@ -170,6 +174,17 @@ class FarColors:
         return fine.movedim(1, -1).contiguous()
 
 
+def far_colors(scene: Scene) -> FarColors:
+    """What the photographs of a scene show at infinity."""
+    return FarColors(spread_looks(scene.train, SURVEY_VIEWS))
+
+
+def far_share(far: FarColors, scene: Scene) -> float:
+    """`FarColors.explained` by the scene's points; 0 where the photographs do not tell."""
+    points = scene.points
+    return far.explained(np.zeros((0, 3)) if points is None or isinstance(points, VolumePoints) else points.xyz) or 0.0
+
+
 def filled(texels: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
     """(6, S, S, C) texels, of which those without weight (6, S, S, 1) have the mean of those round them, from as near as there are any.
 
@@ -192,6 +207,20 @@ def filled(texels: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
         coarse = torch.nn.functional.interpolate(result, size=value.shape[-2:], mode="bilinear", align_corners=False)
         result = torch.where(weight > 0, value, coarse)
     return result.movedim(1, -1).contiguous()
+
+
+def contradiction(photo: torch.Tensor, passed: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
+    """Mean over the pixels of the transmittance `left` (H, W) times how much the environment differs from the photograph (3, H, W), beyond
+    SAME_COLOR; `passed` (3, H, W) is the transmittance times the environment.
+
+    Where the two differ there is a surface, and no light of the environment: without this term a translucent surface of another colour
+    explains the photograph as well.
+
+    Gradient: to `left`.
+    """
+    weight = left.detach()
+    difference = (weight * photo).sub_(passed).abs_().mean(0) / weight.clamp_min(1e-6)
+    return (left * difference.sub_(SAME_COLOR / 255).clamp_min_(0)).mean()
 
 
 def seen_through(size: int, views: Iterable[tuple[Camera, torch.Tensor]]) -> torch.Tensor:

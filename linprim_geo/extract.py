@@ -79,7 +79,8 @@ def extract_mesh(
     With `blocks` other than 1 the depth maps are fused in so many parts of one lattice by several workers, with the same result to the last
     bit; `cluster` and `workers` say where, see `executor.open_executor`.
 
-    Returns: what stats.json holds: topology of both meshes, options, `processing` step by step, `texture`, what manifold3d says of
+    Returns: what stats.json holds: topology of both meshes, options, before an environment
+        `seen_by_one_view` (`single_view.without_single_views`), `processing` step by step, `texture`, what manifold3d says of
     a watertight mesh (`manifold_status`), `predicted_error` (median and 90 % quantile) of the vertices that cameras see, seconds and peak
     memory per stage, and the paths.
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from . import ops
 from .adam import adam_rows, adam_step
 from .camera import Camera
-from .environment import SAME_COLOR, SURVEY_VIEWS, filled, seen_through
+from .environment import SURVEY_VIEWS, contradiction, filled, seen_through
 from .errors import LinprimError
 from .exposure import Exposure, exposed
 from .geometry_terms import GeometryTerms
@@ -165,20 +165,6 @@ def filter_lengths(center: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
         least[unseen] = np.minimum(least[unseen], np.linalg.norm(xyz[unseen] - position, axis=1))
     focal = max(max(camera.fx, camera.fy) for camera in cameras)
     return torch.from_numpy((math.sqrt(FILTER_VARIANCE) / focal * least).astype(np.float32))
-
-
-def contradiction(photo: Tensor, passed: Tensor, left: Tensor) -> Tensor:
-    """Mean over the pixels of the transmittance `left` (H, W) times how much the environment differs from the photograph (3, H, W), beyond
-    SAME_COLOR; `passed` (3, H, W) is the transmittance times the environment.
-
-    Where the two differ there is a surface, and no light of the environment: without this term a translucent surface of another colour
-    explains the photograph as well.
-
-    Gradient: to `left`.
-    """
-    weight = left.detach()
-    difference = (weight * photo).sub_(passed).abs_().mean(0) / weight.clamp_min(1e-6)
-    return (left * difference.sub_(SAME_COLOR / 255).clamp_min_(0)).mean()
 
 
 def _single(out: ops.Rendering) -> ops.Rendering:

@@ -12,7 +12,7 @@ import torch
 from . import ops
 from .checkpoint import restore
 from .effects import Choice, Decision, decide, settle, summary
-from .environment import SURVEY_VIEWS, FarColors, texels_for
+from .environment import OPEN_SHARE, FarColors, far_colors, far_share, texels_for
 from .errors import LinprimError
 from .evidence import observe
 from .fill_points import fill_points
@@ -23,7 +23,6 @@ from .initial_points import (
     frusta_points,
     local_planes,
     scene_normalization,
-    spread_looks,
     visual_hull_points,
 )
 from .options import GEOMETRY_WEIGHTS, SceneOptions, TrainOptions, check_train_options, initial_count
@@ -39,9 +38,6 @@ from .trainer import LARGEST_PART, SMALLEST_PX, Trainer, initial_parameters
 SFM_START, RANDOM_START = 0.8, 0.25
 # Triangulated points fewer than this leave too much of a scene empty.
 FEW_POINTS = 500
-# A scene is open where colours at infinity explain this share of the textured parts of its photographs: 0.31 to 0.39 of four objects before
-# far rooms, 0.06 at most of seven captures of rooms, facades, and objects on black or near a wall.
-OPEN_SHARE = 0.1
 # A backdrop is plain where this share of all border pixels lies this near to their median colour, per channel.
 BACKDROP_SHARE, BACKDROP_TOLERANCE = 0.8, 0.1
 
@@ -231,17 +227,6 @@ def chosen_background(text: str, scene: Scene, shots: list[Shot], begun: bool | 
             f"--background is {text!r}, wanted auto, fitted, environment, random, black, white, or three numbers in [0,1] such as 0.5,0.5,1"
         )
     return Background(torch.tensor(color, dtype=torch.float32))
-
-
-def far_colors(scene: Scene) -> FarColors:
-    """What the photographs of a scene show at infinity."""
-    return FarColors(spread_looks(scene.train, SURVEY_VIEWS))
-
-
-def far_share(far: FarColors, scene: Scene) -> float:
-    """`FarColors.explained` by the scene's points; 0 where the photographs do not tell."""
-    points = scene.points
-    return far.explained(np.zeros((0, 3)) if points is None or isinstance(points, VolumePoints) else points.xyz) or 0.0
 
 
 def _border_colors(shots: list[Shot]) -> np.ndarray:
