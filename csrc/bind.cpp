@@ -109,9 +109,9 @@ linprim::Primitives<Real> make_primitives(int kind, const In<Real>& center, cons
 }
 
 // A view's directions, whose size is that of `opacity` (H, W), and the cube map that it looks at.
-template <class Real>
+template <class Real, class Map>
 std::pair<linprim::DirectionView, linprim::CubeMap<Real>> seen_directions(const std::array<double, 9>& rotation, const std::array<double, 4>& lens,
-                                                                         const In<Real>& map, const In<Real>& opacity) {
+                                                                         const Map& map, const In<Real>& opacity) {
   if (opacity.ndim() != 2 || opacity.size() == 0) throw std::invalid_argument("opacity has to have shape (H, W)");
   if (map.ndim() != 4 || map.size() == 0) throw std::invalid_argument("the map has to have shape (6, S, S, 3)");
   linprim::DirectionView view{{}, lens[0], lens[1], lens[2], lens[3], int(opacity.shape(1)), int(opacity.shape(0))};
@@ -121,6 +121,7 @@ std::pair<linprim::DirectionView, linprim::CubeMap<Real>> seen_directions(const 
   for (double x : lens) finite = finite && std::isfinite(x);
   if (!finite) throw std::invalid_argument("the camera's rotation or intrinsics are not finite");
   const int64_t size = int64_t(map.shape(1));
+  if (size > 8192) throw std::invalid_argument("a side of the map has more than 8192 texels");
   return {view, {checked(map, {6, size, size, 3}, "the map"), int(size)}};
 }
 
@@ -221,22 +222,19 @@ void bind_real(nb::module_& m, const char* suffix) {
       function(in, int(planes), width, height, factor, out);
     });
   };
-  m.def((std::string("add_environment_") + suffix).c_str(),
-        [](std::array<double, 9> rotation, std::array<double, 4> lens, Array map, double least, Array opacity, Out<Real> rgb) {
+  m.def((std::string("environment_light_") + suffix).c_str(),
+        [](std::array<double, 9> rotation, std::array<double, 4> lens, Array map, double least, Array opacity, Out<Real> light) {
           const auto [view, cube] = seen_directions<Real>(rotation, lens, map, opacity);
-          Real* image = checked(rgb, {3, view.height, view.width}, "rgb");
+          Real* image = checked(light, {3, view.height, view.width}, "light");
           nb::gil_scoped_release release;
-          linprim::add_environment<Real>(view, cube, least, opacity.data(), image);
+          linprim::environment_light<Real>(view, cube, least, opacity.data(), image);
         });
-  m.def((std::string("add_environment_grad_") + suffix).c_str(),
-        [](std::array<double, 9> rotation, std::array<double, 4> lens, Array map, double least, Array opacity, Array rgb_grad,
-           Out<Real> opacity_grad, Out<Real> map_grad) {
-          const auto [view, cube] = seen_directions<Real>(rotation, lens, map, opacity);
-          const Real* grad = checked(rgb_grad, {3, view.height, view.width}, "rgb_grad");
-          Real* to_opacity = checked(opacity_grad, {view.height, view.width}, "opacity_grad");
-          Real* to_map = checked(map_grad, {6, cube.size, cube.size, 3}, "map_grad");
+  m.def((std::string("environment_light_grad_") + suffix).c_str(),
+        [](std::array<double, 9> rotation, std::array<double, 4> lens, double least, Array opacity, Array light_grad, Out<Real> map_grad) {
+          const auto [view, cube] = seen_directions<Real>(rotation, lens, map_grad, opacity);
+          const Real* grad = checked(light_grad, {3, view.height, view.width}, "light_grad");
           nb::gil_scoped_release release;
-          linprim::add_environment_grad<Real>(view, cube, least, opacity.data(), grad, to_opacity, to_map);
+          linprim::environment_light_grad<Real>(view, cube.size, least, opacity.data(), grad, map_grad.data());
         });
   bind_average("average_pixels_", &linprim::average_pixels<Real>);
   bind_average("average_pixels_grad_", &linprim::average_pixels_grad<Real>);

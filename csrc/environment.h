@@ -21,13 +21,13 @@ struct CubeMap {
   int size;
 };
 
-// rgb (3,H,W) += (1 - opacity) * colour of the pixel's direction. Where 1 - opacity is below `least`, the ray has ended: nothing is added.
+// light (3,H,W) = (1 - opacity) * colour of the pixel's direction: what reaches a camera past primitives of that opacity. Where 1 - opacity
+// is below `least`, the ray has ended: 0.
 template <class Real>
-void add_environment(const DirectionView& view, const CubeMap<Real>& map, double least, const Real* opacity, Real* rgb);
+void environment_light(const DirectionView& view, const CubeMap<Real>& map, double least, const Real* opacity, Real* light);
 
-// Adjoint of add_environment for the same arguments and the gradient to its result: writes those to the opacity (H,W) and to the map.
+// Adjoint of environment_light for a map of (6, size, size, 3) texels: writes the gradient to them.
 template <class Real>
-void add_environment_grad(const DirectionView& view, const CubeMap<Real>& map, double least, const Real* opacity, const Real* rgb_grad,
-                          Real* opacity_grad, Real* map_grad);
+void environment_light_grad(const DirectionView& view, int size, double least, const Real* opacity, const Real* light_grad, Real* map_grad);
 
 }  // namespace linprim

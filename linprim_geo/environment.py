@@ -2,7 +2,7 @@
 
 `FarColors` is what photographs say of it before anything is trained: the colour that most of them show in a direction, and how well
 that explains them. From it follow whether a scene is open, which points lie in front, and where the training of the map begins.
-`ops.add_environment` says how the six faces lie.
+`ops.environment_light` says how the six faces lie.
 """
 
 from __future__ import annotations
@@ -121,8 +121,7 @@ class FarColors:
         part = image[lattice]
         texel = nearest_texel(look.camera.world_rays()[lattice], self.size)
         texels = torch.from_numpy(np.nan_to_num(self.texels)).reshape(6, self.size, self.size, 3)
-        empty = torch.zeros(3, *image.shape[:2])
-        environment = ops.add_environment(empty, empty[0], texels, look.camera).numpy().transpose(1, 2, 0)
+        environment = ops.environment_light(torch.zeros(image.shape[:2]), texels, look.camera).numpy().transpose(1, 2, 0)
         difference = np.abs(part - environment[lattice]).mean(-1)
         mean = uniform_filter(part, (PATCH, PATCH, 1), mode="nearest")
         variance = uniform_filter(part * part, (PATCH, PATCH, 1), mode="nearest") - mean * mean
@@ -226,10 +225,9 @@ def contradiction(photo: torch.Tensor, passed: torch.Tensor, left: torch.Tensor)
 def seen_through(size: int, views: Iterable[tuple[Camera, torch.Tensor]]) -> torch.Tensor:
     """(6, size, size, 1) bool, the texels that cameras see past primitives of (H, W) opacity, where these let most of the light through."""
     weight = torch.zeros(6, size, size, 3)
-    like = torch.zeros_like(weight)
     for camera, opacity in views:
         passing = torch.where(opacity < 0.5, opacity, 1.0)
-        weight += ops.environment_weights(torch.ones(3, *opacity.shape), passing, like, camera)
+        weight += ops.environment_weights(torch.ones(3, *opacity.shape), passing, size, camera)
     return weight[..., :1] > LEAST_WEIGHT
 
 

@@ -402,84 +402,87 @@ _average.register_autograd(
 )
 
 
-@torch.library.custom_op("linprim_geo::add_environment", mutates_args=())
-def _environment(
-    rgb: Tensor, opacity: Tensor, texels: Tensor, rotation: list[float], lens: list[float], least: float
-) -> Tensor:
-    check_dtypes(rgb.dtype, opacity=opacity, texels=texels)
-    shown = rgb.detach().contiguous().clone()
-    getattr(_core, f"add_environment_{scalar_suffix(rgb.dtype)}")(
-        rotation, lens, as_array(texels), least, as_array(opacity), shown.numpy()
+@torch.library.custom_op("linprim_geo::environment_light", mutates_args=())
+def _environment(opacity: Tensor, texels: Tensor, rotation: list[float], lens: list[float], least: float) -> Tensor:
+    check_dtypes(texels.dtype, opacity=opacity)
+    light = opacity.new_empty(3, *opacity.shape)
+    getattr(_core, f"environment_light_{scalar_suffix(texels.dtype)}")(
+        rotation, lens, as_array(texels), least, as_array(opacity), light.numpy()
     )
-    return shown
+    return light
 
 
 @_environment.register_fake
-def _(rgb, opacity, texels, rotation, lens, least):
-    return torch.empty_like(rgb, memory_format=torch.contiguous_format)
+def _(opacity, texels, rotation, lens, least):
+    return opacity.new_empty(3, *opacity.shape)
 
 
-@torch.library.custom_op("linprim_geo::add_environment_grad", mutates_args=())
+@torch.library.custom_op("linprim_geo::environment_light_grad", mutates_args=())
 def _environment_grad(
-    grad: Tensor, opacity: Tensor, texels: Tensor, rotation: list[float], lens: list[float], least: float
-) -> tuple[Tensor, Tensor]:
-    out = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in (opacity, texels)]
-    getattr(_core, f"add_environment_grad_{scalar_suffix(grad.dtype)}")(
-        rotation, lens, as_array(texels), least, as_array(opacity), as_array(grad), *[t.numpy() for t in out]
+    grad: Tensor, opacity: Tensor, size: int, rotation: list[float], lens: list[float], least: float
+) -> Tensor:
+    out = grad.new_empty(6, size, size, 3)
+    getattr(_core, f"environment_light_grad_{scalar_suffix(grad.dtype)}")(
+        rotation, lens, least, as_array(opacity), as_array(grad), out.numpy()
     )
-    return out[0], out[1]
+    return out
 
 
 @_environment_grad.register_fake
-def _(grad, opacity, texels, rotation, lens, least):
-    return torch.empty_like(opacity), torch.empty_like(texels)
+def _(grad, opacity, size, rotation, lens, least):
+    return grad.new_empty(6, size, size, 3)
 
 
 def _environment_setup(ctx, inputs, output):
-    _, opacity, texels, *ctx.how = inputs
-    ctx.save_for_backward(opacity, texels)
+    opacity, texels, *ctx.how = inputs
+    ctx.size = texels.shape[1]
+    ctx.save_for_backward(opacity, output)
 
 
 def _environment_backward(ctx, grad):
-    opacity, texels = ctx.saved_tensors
-    return (grad, *torch.ops.linprim_geo.add_environment_grad(grad, opacity, texels, *ctx.how), None, None, None)
+    opacity, light = ctx.saved_tensors
+    # light = (1 - opacity) colour
+    left = (1 - opacity).clamp_min(torch.finfo(opacity.dtype).tiny)
+    to_opacity = (grad * light).sum(0).div_(left).neg_()
+    return to_opacity, torch.ops.linprim_geo.environment_light_grad(grad, opacity, ctx.size, *ctx.how), None, None, None
 
 
 _environment.register_autograd(_environment_backward, setup_context=_environment_setup)
 
 
-def add_environment(rgb: Tensor, opacity: Tensor, texels: Tensor, camera: Camera, least: float = 0.0) -> Tensor:
-    """(3, H, W) image `rgb`, rendered over black, with what a cube map shows at infinity behind it: rgb + (1 - opacity) * colour.
+def environment_light(opacity: Tensor, texels: Tensor, camera: Camera, least: float = 0.0) -> Tensor:
+    """(3, H, W) light of a cube map at infinity that passes primitives of (H, W) `opacity`: (1 - opacity) * colour of a pixel's direction.
+    Added to an image that was rendered over black, it is the image before that environment.
 
-    The colour depends on the direction of the pixel's ray alone. Face 2a of the map is that of directions d whose largest coordinate is
-    d_a > 0, face 2a + 1 that of d_a < 0; columns go with d_b / |d_a| and rows with d_c / |d_a| from -1 to 1, (a, b, c) cyclic.
-    Colours between texel centres are bilinear; beyond a face's border its neighbour's nearest texel counts, so that seams stay within
-    the difference of two neighbouring texels.
+    Face 2a of the map is that of directions d whose largest coordinate is d_a > 0, face 2a + 1 that of d_a < 0; columns go with
+    d_b / |d_a| and rows with d_c / |d_a| from -1 to 1, (a, b, c) cyclic. Colours between texel centres are bilinear; beyond a face's border
+    its neighbour's nearest texel counts, so that seams stay within the difference of two neighbouring texels.
 
     Args:
-        rgb, opacity: (3, H, W) and (H, W) as `rasterize` gives them over black; float32 or float64, all tensors alike.
+        opacity: (H, W) as `rasterize` gives it; float32 or float64, both tensors alike.
         texels: (6, S, S, 3) colours.
         camera: of the rendering; its place does not matter.
-        least: where 1 - opacity is below this nothing is added: the ray has ended.
+        least: where 1 - opacity is below this the light is 0: the ray has ended.
 
     Raises:
         ValueError: shapes or dtypes that do not fit.
 
-    Gradient: to rgb, opacity and texels; once.
+    Gradient: to opacity (0 where it is 1) and texels; once.
 
-    Accuracy: the interpolation is in double; float64 agrees with `reference.add_environment` to 1e-12.
+    Accuracy: places are computed in double, colours in the tensors' type; float64 agrees with `reference.environment_light` to 1e-12.
     """
-    rotation = camera.rotation.reshape(-1).tolist()
-    lens = [camera.fx, camera.fy, camera.cx, camera.cy]
-    return torch.ops.linprim_geo.add_environment(rgb, opacity, texels, rotation, lens, least)
+    return torch.ops.linprim_geo.environment_light(opacity, texels, *_directions(camera), least)
 
 
-def environment_weights(values: Tensor, opacity: Tensor, texels: Tensor, camera: Camera) -> Tensor:
-    """(6, S, S, 3) sums over pixels of 1 - opacity times (3, H, W) `values` times the weight of each texel in the pixel: the adjoint of
-    `add_environment` in a map of the size of `texels`."""
-    rotation = camera.rotation.reshape(-1).tolist()
-    lens = [camera.fx, camera.fy, camera.cx, camera.cy]
-    return torch.ops.linprim_geo.add_environment_grad(values, opacity, texels, rotation, lens, 0.0)[1]
+def environment_weights(values: Tensor, opacity: Tensor, size: int, camera: Camera) -> Tensor:
+    """(6, size, size, 3) sums over pixels of 1 - opacity times (3, H, W) `values` times the weight of each texel in the pixel: the adjoint
+    of `environment_light`."""
+    return torch.ops.linprim_geo.environment_light_grad(values, opacity, size, *_directions(camera), 0.0)
+
+
+def _directions(camera: Camera) -> tuple[list[float], list[float]]:
+    """The rotation and the lens of a camera, all that matters at infinity."""
+    return camera.rotation.reshape(-1).tolist(), [camera.fx, camera.fy, camera.cx, camera.cy]
 
 
 def level_depth(

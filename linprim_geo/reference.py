@@ -254,11 +254,11 @@ def rasterize(
 
 
 @torch.no_grad()
-def add_environment(rgb: Tensor, opacity: Tensor, texels: Tensor, camera: Any, least: float = 0.0) -> Tensor:
-    """What `ops.add_environment` computes, differentiable by autograd: (3, H, W) rgb + (1 - opacity) * colour of the pixel's direction."""
+def environment_light(opacity: Tensor, texels: Tensor, camera: Any, least: float = 0.0) -> Tensor:
+    """What `ops.environment_light` computes, differentiable by autograd: (3, H, W) (1 - opacity) * colour of the pixel's direction."""
     size = texels.shape[1]
-    rotation = torch.as_tensor(camera.rotation, dtype=rgb.dtype)
-    rays = pixel_rays(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, rgb).reshape(-1, 3) @ rotation
+    rotation = torch.as_tensor(camera.rotation, dtype=opacity.dtype)
+    rays = pixel_rays(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, opacity).reshape(-1, 3) @ rotation
     face, along, across = _cube_face(rays)
     column, row = (size * (coordinate + 1) / 2 - 0.5 for coordinate in (along, across))
     color = torch.zeros_like(rays)
@@ -267,9 +267,8 @@ def add_environment(rgb: Tensor, opacity: Tensor, texels: Tensor, camera: Any, l
             x, y = column.floor() + right, row.floor() + down
             weight = (1 - (column - x).abs()) * (1 - (row - y).abs())
             color = color + weight[:, None] * texels[_texel_at(face, x, y, size)]
-    color = color.T.reshape(rgb.shape)
-    left = 1 - opacity
-    return torch.where(left >= least, rgb + left * color, rgb)
+    light = (1 - opacity) * color.T.reshape(3, *opacity.shape)
+    return torch.where(1 - opacity >= least, light, torch.zeros_like(light))
 
 
 def _cube_face(direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -223,7 +223,7 @@ class Run:
 
     @cached_property
     def environment(self) -> torch.Tensor | None:
-        """(6, S, S, 3) cube map of what stands at infinity behind everything, see `ops.add_environment`; None without one. Its axes are
+        """(6, S, S, 3) cube map of what stands at infinity behind everything, see `ops.environment_light`; None without one. Its axes are
         those of the data set."""
         from .environment import load_environment
 
@@ -267,7 +267,7 @@ class Run:
                 )
                 rgb, opacity = color.rgb.float(), color.opacity.float()
                 if environment is not None:
-                    rgb = ops.add_environment(rgb, opacity, environment, camera, options.stop)
+                    rgb = rgb + ops.environment_light(opacity, environment, camera, options.stop)
             images = {"rgb": rgb.numpy(), "opacity": out.opacity.float().numpy()}
             if geometry:
                 unit = 1.0 / self.similarity.scale

@@ -296,9 +296,10 @@ class Trainer:
         how = {"stop": self.options.stop, **self.how_now()}
         samples = self.options.samples
         out = _single(ops.rasterize(*active, behind, shot.camera, samples=samples, geometry=shared, screen=screen, **how))
-        bare = out.rgb
+        passed = None
         if self.environment is not None:
-            out = self._before(leaves["environment"], out, shot.camera)
+            passed = ops.environment_light(out.opacity, leaves["environment"], shot.camera, self.options.stop)
+            out = replace(out, rgb=out.rgb + passed)
         shown, log_gain = out.rgb, None
         if self.exposure is not None:
             log_gain = self.exposure.row(index)
@@ -310,9 +311,9 @@ class Trainer:
         penalty = self.control.penalty(leaves)
         photometric = parts[0] if shot.weight == 1 else shot.weight * parts[0]
         objective = photometric if penalty is None else photometric + penalty
-        if self.environment is not None:
+        if passed is not None:
             photo = target if log_gain is None else target * torch.exp(-log_gain.detach())[:, None, None]
-            objective = objective + CONTRADICTION * contradiction(photo, (out.rgb - bare).detach(), 1 - out.opacity)
+            objective = objective + CONTRADICTION * contradiction(photo, passed.detach(), 1 - out.opacity)
         if terms is not None:
 
             def surface(camera: Camera, tensors: Tensors) -> ops.Rendering:
@@ -453,15 +454,13 @@ class Trainer:
                 **self.how,
             )
         )
-        return out.rgb if self.environment is None else self._before(self.environment, out, camera).rgb
+        if self.environment is None:
+            return out.rgb
+        return out.rgb + ops.environment_light(out.opacity, self.environment, camera, self.options.stop)
 
     def _flat(self, background: torch.Tensor) -> torch.Tensor:
         """The background that primitives are rendered over: black where an environment follows."""
         return background if self.environment is None else torch.zeros(3)
-
-    def _before(self, texels: Tensor, out: ops.Rendering, camera: Camera) -> ops.Rendering:
-        """The rendering before an environment."""
-        return replace(out, rgb=ops.add_environment(out.rgb, out.opacity, texels, camera, self.options.stop))
 
     def _with_frozen(self, active: Tensors) -> Tensors:
         """The active tensors, and after them the frozen ones with as many harmonics."""
