@@ -1,7 +1,8 @@
 # make demo   environment, then the demo: a mesh with a score in runs/demo   (make demo DEMO="--size small")
 # make test   environment, then the tests                                    (make test PYTEST="-k mesh")
 # make env    the environment alone, in .venv                                (make env PYTHON=/path/to/python3.12)
-# make lint   the linter, then the type checker
+# make lint   the linters, the formats, the type checker
+# make format every file in the form that make lint wants
 # make wheel  sdist and wheel in dist, checked in a fresh environment without a compiler
 # make browser-check   a report and a view in a headless Chromium (make browser-check PAGE=runs/demo/report.html)
 # Nothing is done again unless what it depends on has changed.
@@ -17,7 +18,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3
 CORE := CMakeLists.txt csrc $(wildcard csrc/*)
 
-.PHONY: env demo test lint wheel browser-check clean
+.PHONY: env demo test lint format wheel browser-check clean
 
 demo: env
 	$(BIN)/python -m linprim_geo demo $(DEMO)
@@ -27,7 +28,14 @@ test: env
 
 lint: env
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check -q .
+	$(BIN)/clang-format --dry-run --Werror csrc/*.h csrc/*.cpp
 	$(BIN)/mypy
+
+format: env
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+	$(BIN)/clang-format -i csrc/*.h csrc/*.cpp
 
 wheel: env
 	$(BIN)/python tools/check_wheel.py -o dist

@@ -41,7 +41,8 @@ int64_t bin(const BinParams& P, int64_t begin, int64_t end, LoosePair* out, int6
       }
       uint32_t tile = uint32_t(ty * tiles_x + tx0);
       for (int c0 = bx0 - tx0 * kSide, c1 = bx1 - tx0 * kSide; c1 >= 0; c0 -= kSide, c1 -= kSide, ++tile) {
-        const unsigned columns = ((0xfu << std::max(c0, 0)) & (0xfu >> (kSide - 1 - std::min(c1, kSide - 1)))) * 0x1111u;
+        const unsigned columns =
+            ((0xfu << std::max(c0, 0)) & (0xfu >> (kSide - 1 - std::min(c1, kSide - 1)))) * 0x1111u;
         unsigned blocks = 0;
         for (int p = 0; p < kParts; ++p) {
           auto holds = [&](int e) { return zero < fma(V::set(f.b[e]), x[p], line[e][p]); };

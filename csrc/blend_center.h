@@ -1,8 +1,8 @@
 // Blending primitives one after another in the order of their tile's list, and the adjoint of that.
 //
-// Forward, a tile goes block by block, so that a block's pixels stay in registers; backward, primitive by primitive, so that a primitive's
-// gradient sums do. Both first intersect a few entries and then blend them: the two halves of an entry are long chains of dependent
-// instructions, and apart from each other the processor can overlap several of each.
+// Forward, a tile goes block by block, so that a block's pixels stay in registers; backward, primitive by primitive, so
+// that a primitive's gradient sums do. Both first intersect a few entries and then blend them: the two halves of an
+// entry are long chains of dependent instructions, and apart from each other the processor can overlap several of each.
 #pragma once
 
 #include "tile.h"
@@ -13,16 +13,31 @@ constexpr int kChunk = 32;  // pairs of a list that are looked at together, one 
 constexpr int kGroup = 8;   // entries that are intersected before they are blended
 
 // The per-pixel state of the geometric outputs while a tile is blended forward.
-enum GeometryState { kFirst, kReference, kMoment1, kMoment2, kMedian, kSlowness, kNormal, kMedianNormal = kNormal + 3, kSeen = kMedianNormal + 3, kGeometryStates };
+enum GeometryState {
+  kFirst,
+  kReference,
+  kMoment1,
+  kMoment2,
+  kMedian,
+  kSlowness,
+  kNormal,
+  kMedianNormal = kNormal + 3,
+  kSeen = kMedianNormal + 3,
+  kGeometryStates
+};
 
 // Adds one primitive to the geometric outputs of a part of a block.
 template <class Solid>
-inline void blend_geometry(const typename Solid::Record& record, const typename Solid::Real (*normals)[3], Vec<typename Solid::Real, Solid::kWidth> v_length,
-                           Mask<typename Solid::Real, Solid::kWidth> hit, Index<typename Solid::Real, Solid::kWidth> in_face,
+inline void blend_geometry(const typename Solid::Record& record, const typename Solid::Real (*normals)[3],
+                           Vec<typename Solid::Real, Solid::kWidth> v_length,
+                           Mask<typename Solid::Real, Solid::kWidth> hit,
+                           Index<typename Solid::Real, Solid::kWidth> in_face,
                            Vec<typename Solid::Real, Solid::kWidth> t, Vec<typename Solid::Real, Solid::kWidth> after,
                            Vec<typename Solid::Real, Solid::kWidth> tau, Vec<typename Solid::Real, Solid::kWidth> alpha,
-                           Vec<typename Solid::Real, Solid::kWidth> e_tau, Vec<typename Solid::Real, Solid::kWidth> weight,
-                           Vec<typename Solid::Real, Solid::kWidth> t_in, Vec<typename Solid::Real, Solid::kWidth> t_out, typename Solid::Real level,
+                           Vec<typename Solid::Real, Solid::kWidth> e_tau,
+                           Vec<typename Solid::Real, Solid::kWidth> weight,
+                           Vec<typename Solid::Real, Solid::kWidth> t_in,
+                           Vec<typename Solid::Real, Solid::kWidth> t_out, typename Solid::Real level,
                            typename Solid::Real (*geo)[kTilePixels], int at) {
   using Real = typename Solid::Real;
   using V = Vec<Real, Solid::kWidth>;
@@ -59,14 +74,16 @@ inline void blend_geometry(const typename Solid::Record& record, const typename 
       select(crossing, slowness, state(kSlowness)).store(geo[kSlowness] + at);
     }
     select(crossing, median, state(kMedian)).store(geo[kMedian] + at);
-    for (int k = 0; k < 3; ++k) select(crossing, normal[k], state(kMedianNormal + k)).store(geo[kMedianNormal + k] + at);
+    for (int k = 0; k < 3; ++k)
+      select(crossing, normal[k], state(kMedianNormal + k)).store(geo[kMedianNormal + k] + at);
   }
 }
 
-// Writes a tile's finished pixels to the image planes. Colours come without the background, `through` is what is left of the light.
+// Writes a tile's finished pixels to the image planes. Colours come without the background, `through` is what is left
+// of the light.
 template <class Real, int W, bool kGeometry>
-inline void store_pixels(const RasterParams<Real>& P, int tile_x, int tile_y, Real* red, Real* green, Real* blue, Real* through,
-                         Real (*geo)[kTilePixels]) {
+inline void store_pixels(const RasterParams<Real>& P, int tile_x, int tile_y, Real* red, Real* green, Real* blue,
+                         Real* through, Real (*geo)[kTilePixels]) {
   using T = Tile<Real, W>;
   const View& view = P.view;
   const int64_t plane = int64_t(view.width) * view.height;
@@ -76,18 +93,21 @@ inline void store_pixels(const RasterParams<Real>& P, int tile_x, int tile_y, Re
     red[i] += through[i] * background[0], green[i] += through[i] * background[1], blue[i] += through[i] * background[2];
     through[i] = 1 - through[i];
   }
-  store(red, P.out.rgb), store(green, P.out.rgb + plane), store(blue, P.out.rgb + 2 * plane), store(through, P.out.opacity);
+  store(red, P.out.rgb), store(green, P.out.rgb + plane), store(blue, P.out.rgb + 2 * plane),
+      store(through, P.out.opacity);
   if constexpr (kGeometry) {
     alignas(64) Real expected[kTilePixels], distortion[kTilePixels];
     for (int i = 0; i < kTilePixels; ++i) {
       expected[i] = geo[kMoment1][i] + geo[kReference][i] * through[i];
       distortion[i] = through[i] * geo[kMoment2][i] - geo[kMoment1][i] * geo[kMoment1][i];
     }
-    store(geo[kFirst], P.out.depth_first), store(expected, P.out.depth_expected), store(geo[kMedian], P.out.depth_median);
+    store(geo[kFirst], P.out.depth_first), store(expected, P.out.depth_expected),
+        store(geo[kMedian], P.out.depth_median);
     store(distortion, P.out.distortion);
     for (int k = 0; k < 3; ++k)
       store(geo[kNormal + k], P.out.normal + k * plane), store(geo[kMedianNormal + k], P.out.normal_median + k * plane);
-    store(geo[kReference], P.out.state), store(geo[kMoment1], P.out.state + plane), store(geo[kMoment2], P.out.state + 2 * plane);
+    store(geo[kReference], P.out.state), store(geo[kMoment1], P.out.state + plane),
+        store(geo[kMoment2], P.out.state + 2 * plane);
     store(geo[kSlowness], P.out.state + 3 * plane);
   }
 }
@@ -127,7 +147,8 @@ Counts forward_center(const RasterParams<typename Solid::Real>& P, int tile, voi
         __builtin_prefetch(record[i]), __builtin_prefetch(reinterpret_cast<const char*>(record[i]) + 64);
       }
     if constexpr (kGeometry)
-      for (int i = 0; i < count; ++i) P.pair_weight[P.lists.slot[begin + i]] = 0, P.pair_pixels[P.lists.slot[begin + i]] = 0;
+      for (int i = 0; i < count; ++i)
+        P.pair_weight[P.lists.slot[begin + i]] = 0, P.pair_pixels[P.lists.slot[begin + i]] = 0;
 
     for (unsigned left = alive; left; left &= left - 1) {
       const int block = std::countr_zero(left);
@@ -149,7 +170,8 @@ Counts forward_center(const RasterParams<typename Solid::Real>& P, int tile, voi
             const int i = std::countr_zero(todo);
             const auto& R = *record[i];
             typename Solid::Meeting m;
-            const M hit = Solid::template meet<kGeometry>(R, view, x - V::set(R.ref_x), y - V::set(R.ref_y), v_length, m);
+            const M hit =
+                Solid::template meet<kGeometry>(R, view, x - V::set(R.ref_x), y - V::set(R.ref_y), v_length, m);
             taus[kept] = Solid::thickness(R, v_length, hit, m);
             if constexpr (kGeometry) Solid::depths(R, v_length, m, t_in[kept], t_out[kept]), in_face[kept] = m.in_face;
             hits[kept] = hit, entry[kept] = i;
@@ -162,15 +184,17 @@ Counts forward_center(const RasterParams<typename Solid::Real>& P, int tile, voi
             V alpha, e_tau;
             Solid::attenuate(R, taus[k], alpha, e_tau);
             const V weight = select(hit, t * alpha, zero), after = t * e_tau;
-            r = fma(weight, V::set(R.rgb[0]), r), g = fma(weight, V::set(R.rgb[1]), g), b = fma(weight, V::set(R.rgb[2]), b);
+            r = fma(weight, V::set(R.rgb[0]), r), g = fma(weight, V::set(R.rgb[1]), g),
+            b = fma(weight, V::set(R.rgb[2]), b);
             const unsigned bits = hit.bits();
             hit_lanes += unsigned(std::popcount(bits));
             touched[entry[k]] |= unsigned(bits != 0) << block;
             if constexpr (kGeometry) {
               const uint32_t slot = P.lists.slot[begin + entry[k]];
-              P.pair_weight[slot] = std::max(P.pair_weight[slot], max_lane(weight)), P.pair_pixels[slot] += unsigned(std::popcount(bits));
-              blend_geometry<Solid>(R, P.normals[P.lists.primitive[begin + entry[k]]], v_length, hit, in_face[k], t, after, taus[k], alpha, e_tau,
-                                    weight, t_in[k], t_out[k], Real(view.level), geo, at);
+              P.pair_weight[slot] = std::max(P.pair_weight[slot], max_lane(weight)),
+              P.pair_pixels[slot] += unsigned(std::popcount(bits));
+              blend_geometry<Solid>(R, P.normals[P.lists.primitive[begin + entry[k]]], v_length, hit, in_face[k], t,
+                                    after, taus[k], alpha, e_tau, weight, t_in[k], t_out[k], Real(view.level), geo, at);
             }
             t = select(hit, after, t);
           }
@@ -191,10 +215,22 @@ Counts forward_center(const RasterParams<typename Solid::Real>& P, int tile, voi
 template <class Real, int W, bool kGeometry>
 struct Incoming {
   // remaining = sum over what is still in front of us (background included) of its weight times (its value . gradient).
-  alignas(64) Real length[kTilePixels], through[kTilePixels], remaining[kTilePixels], red[kTilePixels], green[kTilePixels], blue[kTilePixels],
-      one[kTilePixels];
-  // Gradients to moment 1, moment 2, first depth, median depth, normal, median normal; then reference depth, 1/(density |v|), seen.
-  enum { kMoment1, kMoment2, kFirst, kMedian, kNormal, kMedianNormal = kNormal + 3, kReference = kMedianNormal + 3, kSlowness, kSeen, kStates };
+  alignas(64) Real length[kTilePixels], through[kTilePixels], remaining[kTilePixels], red[kTilePixels],
+      green[kTilePixels], blue[kTilePixels], one[kTilePixels];
+  // Gradients to moment 1, moment 2, first depth, median depth, normal, median normal; then reference depth, 1/(density
+  // |v|), seen.
+  enum {
+    kMoment1,
+    kMoment2,
+    kFirst,
+    kMedian,
+    kNormal,
+    kMedianNormal = kNormal + 3,
+    kReference = kMedianNormal + 3,
+    kSlowness,
+    kSeen,
+    kStates
+  };
   alignas(64) Real geo[kGeometry ? kStates : 1][kTilePixels];
 
   // Reads the planes of one tile; writes the tile's share of the background's gradient.
@@ -205,7 +241,9 @@ struct Incoming {
     const int64_t plane = int64_t(view.width) * view.height;
     T::ray_lengths(view, tile_x, tile_y, length);
     T::start(view, tile_x, tile_y, through);
-    auto get = [&](const Real* from, int channel, Real* state) { T::load(view, tile_x, tile_y, from ? from + channel * plane : nullptr, state); };
+    auto get = [&](const Real* from, int channel, Real* state) {
+      T::load(view, tile_x, tile_y, from ? from + channel * plane : nullptr, state);
+    };
     alignas(64) Real opacity[kTilePixels], value[3][kTilePixels];
     get(P.out.opacity, 0, opacity);
     for (int k = 0; k < 3; ++k) get(P.out.rgb, k, value[k]);
@@ -215,23 +253,26 @@ struct Incoming {
       const V r = V::load(red + i), g = V::load(green + i), b = V::load(blue + i);
       fma(r, V::load(value[0] + i), fma(g, V::load(value[1] + i), b * V::load(value[2] + i))).store(remaining + i);
       const V t = V::set(1) - V::load(opacity + i);  // outside the image this is 1, but the gradients there are 0
-      background[0] = fma(t, r, background[0]), background[1] = fma(t, g, background[1]), background[2] = fma(t, b, background[2]);
+      background[0] = fma(t, r, background[0]), background[1] = fma(t, g, background[1]),
+      background[2] = fma(t, b, background[2]);
     }
     for (int k = 0; k < 3; ++k) P.background_sums[3 * tile + k] = sum(background[k]);
     if constexpr (kGeometry) {
       alignas(64) Real m1[kTilePixels], m2[kTilePixels], distortion[kTilePixels], normal[3][kTilePixels];
-      get(P.out.state, 0, geo[kReference]), get(P.out.state, 1, m1), get(P.out.state, 2, m2), get(P.out.state, 3, geo[kSlowness]);
+      get(P.out.state, 0, geo[kReference]), get(P.out.state, 1, m1), get(P.out.state, 2, m2),
+          get(P.out.state, 3, geo[kSlowness]);
       get(P.grad.depth_expected, 0, geo[kMoment1]), get(P.grad.distortion, 0, distortion);
       get(P.grad.depth_first, 0, geo[kFirst]), get(P.grad.depth_median, 0, geo[kMedian]);
       for (int k = 0; k < 3; ++k)
-        get(P.grad.normal, k, geo[kNormal + k]), get(P.grad.normal_median, k, geo[kMedianNormal + k]), get(P.out.normal, k, normal[k]);
+        get(P.grad.normal, k, geo[kNormal + k]), get(P.grad.normal_median, k, geo[kMedianNormal + k]),
+            get(P.out.normal, k, normal[k]);
       std::fill(geo[kSeen], geo[kSeen] + kTilePixels, Real(0));
       for (int i = 0; i < kTilePixels; ++i) {
         one[i] += geo[kMoment1][i] * geo[kReference][i] + distortion[i] * m2[i];
         geo[kMoment1][i] -= 2 * m1[i] * distortion[i];
         geo[kMoment2][i] = distortion[i] * opacity[i];
-        remaining[i] += geo[kMoment1][i] * m1[i] + geo[kMoment2][i] * m2[i] + geo[kNormal][i] * normal[0][i] + geo[kNormal + 1][i] * normal[1][i] +
-                        geo[kNormal + 2][i] * normal[2][i];
+        remaining[i] += geo[kMoment1][i] * m1[i] + geo[kMoment2][i] * m2[i] + geo[kNormal][i] * normal[0][i] +
+                        geo[kNormal + 1][i] * normal[1][i] + geo[kNormal + 2][i] * normal[2][i];
       }
     }
     for (int i = 0; i < kTilePixels; ++i) remaining[i] += one[i] * opacity[i];
@@ -240,9 +281,10 @@ struct Incoming {
 
 // The adjoint of blending one primitive into a part of a block: adds to its sums, and takes it from what is in front.
 template <class Solid, bool kGeometry>
-inline void blend_backward(const typename Solid::Record& record, const typename Solid::Real (*normals)[3], const View& view,
-                           Incoming<typename Solid::Real, Solid::kWidth, kGeometry>& state, const typename Solid::Meeting& m,
-                           Mask<typename Solid::Real, Solid::kWidth> met, Vec<typename Solid::Real, Solid::kWidth> tau, int at,
+inline void blend_backward(const typename Solid::Record& record, const typename Solid::Real (*normals)[3],
+                           const View& view, Incoming<typename Solid::Real, Solid::kWidth, kGeometry>& state,
+                           const typename Solid::Meeting& m, Mask<typename Solid::Real, Solid::kWidth> met,
+                           Vec<typename Solid::Real, Solid::kWidth> tau, int at,
                            Vec<typename Solid::Real, Solid::kWidth> px, Vec<typename Solid::Real, Solid::kWidth> py,
                            Vec<typename Solid::Real, Solid::kWidth>* sums) {
   using Real = typename Solid::Real;
@@ -255,7 +297,8 @@ inline void blend_backward(const typename Solid::Record& record, const typename 
   Solid::attenuate(record, tau, alpha, e_tau);
   const V after = t * e_tau, weight = select(hit, t * alpha, zero);
   const V gr = V::load(state.red + at), gg = V::load(state.green + at), gb = V::load(state.blue + at);
-  V value = fma(V::set(record.rgb[0]), gr, fma(V::set(record.rgb[1]), gg, fma(V::set(record.rgb[2]), gb, V::load(state.one + at))));
+  V value = fma(V::set(record.rgb[0]), gr,
+                fma(V::set(record.rgb[1]), gg, fma(V::set(record.rgb[2]), gb, V::load(state.one + at))));
   V d_in = zero, d_out = zero, d_tau_direct = zero, d_density_direct = zero;  // gradients to t_in, t_out, tau, density
   const V v_length = V::load(state.length + at);
   if constexpr (kGeometry) {
@@ -305,19 +348,21 @@ inline void blend_backward(const typename Solid::Record& record, const typename 
   sums[Sum::rgb] = fma(weight, gr, sums[Sum::rgb]);
   sums[Sum::rgb + 1] = fma(weight, gg, sums[Sum::rgb + 1]);
   sums[Sum::rgb + 2] = fma(weight, gb, sums[Sum::rgb + 2]);
-  Solid::template add_gradient<Solid, kGeometry>(record, m, hit, v_length, e_tau, d_tau, d_in, d_out, d_density_direct, px, py, sums);
+  Solid::template add_gradient<Solid, kGeometry>(record, m, hit, v_length, e_tau, d_tau, d_in, d_out, d_density_direct,
+                                                 px, py, sums);
   rest.store(state.remaining + at);
   select(hit, after, t).store(state.through + at);
 }
 
-// Where, in a tile, the positions in a pair's sums count from: the reference pixel, or the tile's pixel nearest to it. Sums of what lies near
-// the reference then cancel nowhere.
+// Where, in a tile, the positions in a pair's sums count from: the reference pixel, or the tile's pixel nearest to it.
+// Sums of what lies near the reference then cancel nowhere.
 template <class Real>
 inline Real origin_in_tile(Real reference, int tile) {
   return std::clamp(reference - Real(tile), Real(0), Real(kTile - 1));
 }
 
-// The same object, but the compiler does not know: keeps it from copying a record's fields to the stack before a loop over few entries.
+// The same object, but the compiler does not know: keeps it from copying a record's fields to the stack before a loop
+// over few entries.
 template <class T>
 inline const T& opaque(const T& object) {
   const T* p = &object;
@@ -355,8 +400,10 @@ void backward_center(const RasterParams<typename Solid::Real>& P, int tile, void
       for (size_t line = 0; line < sizeof(typename Solid::Record); line += 64) __builtin_prefetch(next + line);
     }
     const auto& record_of_pair = records[P.lists.primitive[e]];
-    const Real origin_x = origin_in_tile(record_of_pair.ref_x, tile_x), origin_y = origin_in_tile(record_of_pair.ref_y, tile_y);
-    const V from_x = V::set(Real(tile_x) + origin_x - record_of_pair.ref_x), from_y = V::set(Real(tile_y) + origin_y - record_of_pair.ref_y);
+    const Real origin_x = origin_in_tile(record_of_pair.ref_x, tile_x),
+               origin_y = origin_in_tile(record_of_pair.ref_y, tile_y);
+    const V from_x = V::set(Real(tile_x) + origin_x - record_of_pair.ref_x),
+            from_y = V::set(Real(tile_y) + origin_y - record_of_pair.ref_y);
     V sums[kSums];
     for (V& s : sums) s = V::set(0);
     int part = 0;
@@ -383,8 +430,8 @@ void backward_center(const RasterParams<typename Solid::Real>& P, int tile, void
         const int at = places[k], block = at / 16, place = at % 16 / W;
         const V px = lanes.x + V::set(Real(4 * (block & 3) + T::part_x(place)) - origin_x);
         const V py = lanes.y + V::set(Real(4 * (block >> 2) + T::part_y(place)) - origin_y);
-        blend_backward<Solid, kGeometry>(record, kGeometry ? P.normals[P.lists.primitive[e]] : nullptr, view, state, ready[k], met[k], taus[k], at, px,
-                                         py, sums);
+        blend_backward<Solid, kGeometry>(record, kGeometry ? P.normals[P.lists.primitive[e]] : nullptr, view, state,
+                                         ready[k], met[k], taus[k], at, px, py, sums);
       }
     }
     reduce(sums, kSums, slot);

@@ -1,8 +1,10 @@
-// Blending by what each ray meets: primitives one after another by their entry depth, or all at once where they overlap; and the adjoints.
+// Blending by what each ray meets: primitives one after another by their entry depth, or all at once where they
+// overlap; and the adjoints.
 //
-// A tile list comes in the order of a depth that no ray meets the primitive before (ProjectParams::key). For the W rays of a part of a block,
-// a window holds the primitives that are being met; the next primitive is taken in as soon as a ray could meet it before its next event. Every
-// ray goes from event to event by itself, but the loops run over the window, the same for all: nothing is gathered or scattered.
+// A tile list comes in the order of a depth that no ray meets the primitive before (ProjectParams::key). For the W rays
+// of a part of a block, a window holds the primitives that are being met; the next primitive is taken in as soon as a
+// ray could meet it before its next event. Every ray goes from event to event by itself, but the loops run over the
+// window, the same for all: nothing is gathered or scattered.
 #pragma once
 
 #include <limits>
@@ -16,10 +18,16 @@ template <class Solid, class Candidate>
 class Window {
  public:
   using Real = typename Solid::Real;
-  static int64_t bytes(int64_t longest_list) { return (longest_list + 1) * int64_t(sizeof(Candidate) + 2 * sizeof(int32_t)); }
+  static int64_t bytes(int64_t longest_list) {
+    return (longest_list + 1) * int64_t(sizeof(Candidate) + 2 * sizeof(int32_t));
+  }
   Window(const RasterParams<Real>& P, int tile, void* scratch, int64_t capacity)
-      : P_(P), end_(P.lists.tile_begin[tile + 1]), candidates_(static_cast<Candidate*>(scratch)),
-        members_(reinterpret_cast<int32_t*>(candidates_ + capacity + 1)), free_(members_ + capacity + 1), begin_(P.lists.tile_begin[tile]) {}
+      : P_(P),
+        end_(P.lists.tile_begin[tile + 1]),
+        candidates_(static_cast<Candidate*>(scratch)),
+        members_(reinterpret_cast<int32_t*>(candidates_ + capacity + 1)),
+        free_(members_ + capacity + 1),
+        begin_(P.lists.tile_begin[tile]) {}
   // Starts a part of a block.
   void start(int block) {
     block_ = block, at_ = begin_, count_ = free_count_ = used_ = 0;
@@ -74,18 +82,20 @@ constexpr Real kNever = Real(1e30);  // later than every event
 template <class Real, int W>
 struct Part {
   using V = Vec<Real, W>;
-  int at;       // into the state arrays
-  V px, py;     // position in the tile
-  V x, y;       // in the image
+  int at;    // into the state arrays
+  V px, py;  // position in the tile
+  V x, y;    // in the image
   Part(const Lanes<Real, W>& lanes, int tile_x, int tile_y, int block, int part) {
     using T = Tile<Real, W>;
     at = block * 16 + part * W;
-    px = lanes.x + V::set(Real(4 * (block & 3) + T::part_x(part))), py = lanes.y + V::set(Real(4 * (block >> 2) + T::part_y(part)));
+    px = lanes.x + V::set(Real(4 * (block & 3) + T::part_x(part))),
+    py = lanes.y + V::set(Real(4 * (block >> 2) + T::part_y(part)));
     x = px + V::set(Real(tile_x)), y = py + V::set(Real(tile_y));
   }
 };
 
-// ---- By entry depth -----------------------------------------------------------------------------------------------------
+// ---- By entry depth
+// -----------------------------------------------------------------------------------------------------
 
 template <class Solid, bool kBackward, bool kGeometry>
 struct EntryCandidate {
@@ -99,11 +109,13 @@ struct EntryCandidate {
   V sums[kBackward ? (kGeometry ? Solid::kGeometrySums : Solid::kColorSums) : 1];
 };
 
-// Calls blend(candidate, mask) for the rays of a part, each in the order of its entries, while go_on() says that a ray is open; finish(candidate)
-// when a candidate leaves.
+// Calls blend(candidate, mask) for the rays of a part, each in the order of its entries, while go_on() says that a ray
+// is open; finish(candidate) when a candidate leaves.
 template <class Solid, bool kTrack, class Candidate, class Begin, class Open, class Blend, class Finish>
-inline void sweep_entries(Window<Solid, Candidate>& window, const View& view, const Part<typename Solid::Real, Solid::kWidth>& part,
-                          Vec<typename Solid::Real, Solid::kWidth> v_length, Begin begin, Open open, Blend blend, Finish finish) {
+inline void sweep_entries(Window<Solid, Candidate>& window, const View& view,
+                          const Part<typename Solid::Real, Solid::kWidth>& part,
+                          Vec<typename Solid::Real, Solid::kWidth> v_length, Begin begin, Open open, Blend blend,
+                          Finish finish) {
   using Real = typename Solid::Real;
   using V = Vec<Real, Solid::kWidth>;
   using M = Mask<Real, Solid::kWidth>;
@@ -116,7 +128,8 @@ inline void sweep_entries(Window<Solid, Candidate>& window, const View& view, co
     auto latest = [&] { return max_lane(select(going & (next < never), next, V::set(-kNever<Real>))); };
     while (window.more() && (window.bound() <= latest() || !(going & (next < never)).bits())) {
       Candidate& c = window.take();
-      c.waiting = Solid::template meet<kTrack>(*c.record, view, part.x - V::set(c.record->ref_x), part.y - V::set(c.record->ref_y), v_length, c.meeting);
+      c.waiting = Solid::template meet<kTrack>(*c.record, view, part.x - V::set(c.record->ref_x),
+                                               part.y - V::set(c.record->ref_y), v_length, c.meeting);
       if (!(c.waiting & going).bits()) {
         window.drop_last();
         continue;
@@ -185,14 +198,15 @@ Counts forward_entry(const RasterParams<typename Solid::Real>& P, int tile, void
             V alpha, e_tau;
             Solid::attenuate(R, c.tau, alpha, e_tau);
             const V weight = select(hit, t * alpha, zero), after = t * e_tau;
-            r = fma(weight, V::set(R.rgb[0]), r), g = fma(weight, V::set(R.rgb[1]), g), b = fma(weight, V::set(R.rgb[2]), b);
+            r = fma(weight, V::set(R.rgb[0]), r), g = fma(weight, V::set(R.rgb[1]), g),
+            b = fma(weight, V::set(R.rgb[2]), b);
             const unsigned count = unsigned(std::popcount(hit.bits()));
             hit_lanes += count;
             if constexpr (kGeometry) {
               const uint32_t slot = P.lists.slot[c.entry];
               P.pair_weight[slot] = std::max(P.pair_weight[slot], max_lane(weight)), P.pair_pixels[slot] += count;
-              blend_geometry<Solid>(R, P.normals[P.lists.primitive[c.entry]], v_length, hit, c.meeting.in_face, t, after, c.tau, alpha, e_tau, weight,
-                                    c.t_in, c.t_out, Real(view.level), geo, at);
+              blend_geometry<Solid>(R, P.normals[P.lists.primitive[c.entry]], v_length, hit, c.meeting.in_face, t,
+                                    after, c.tau, alpha, e_tau, weight, c.t_in, c.t_out, Real(view.level), geo, at);
             }
             t = select(hit, after, t);
           },
@@ -205,12 +219,13 @@ Counts forward_entry(const RasterParams<typename Solid::Real>& P, int tile, void
 
 // Adds a finished candidate's sums to its slot.
 template <class Solid, int kSums>
-inline void add_to_slot(const typename Solid::Record& record, const Vec<typename Solid::Real, Solid::kWidth>* sums, int tile_x, int tile_y,
-                        typename Solid::Real* slot) {
+inline void add_to_slot(const typename Solid::Record& record, const Vec<typename Solid::Real, Solid::kWidth>* sums,
+                        int tile_x, int tile_y, typename Solid::Real* slot) {
   alignas(64) typename Solid::Real own[kSums];
   reduce(sums, kSums, own);
   using Real = typename Solid::Real;
-  Solid::recenter(record, Real(tile_x) + origin_in_tile(record.ref_x, tile_x), Real(tile_y) + origin_in_tile(record.ref_y, tile_y), own);
+  Solid::recenter(record, Real(tile_x) + origin_in_tile(record.ref_x, tile_x),
+                  Real(tile_y) + origin_in_tile(record.ref_y, tile_y), own);
   for (int i = 0; i < kSums; ++i) slot[i] += own[i];
 }
 
@@ -238,11 +253,13 @@ void backward_entry(const RasterParams<typename Solid::Real>& P, int tile, void*
       const Part<Real, W> part(lanes, tile_x, tile_y, block, p);
       window.start(block);
       sweep_entries<Solid, true>(
-          window, view, part, V::load(state.length + part.at), [](Candidate& c) { std::fill(c.sums, c.sums + kSums, V::set(0)); },
+          window, view, part, V::load(state.length + part.at),
+          [](Candidate& c) { std::fill(c.sums, c.sums + kSums, V::set(0)); },
           [&] { return V::load(state.through + part.at) >= V::set(Real(view.stop)); },
           [&](Candidate& c, M now) {
-            blend_backward<Solid, kGeometry>(*c.record, kGeometry ? P.normals[P.lists.primitive[c.entry]] : nullptr, view, state, c.meeting, now, c.tau,
-                                             part.at, part.px - V::set(origin_in_tile(c.record->ref_x, tile_x)),
+            blend_backward<Solid, kGeometry>(*c.record, kGeometry ? P.normals[P.lists.primitive[c.entry]] : nullptr,
+                                             view, state, c.meeting, now, c.tau, part.at,
+                                             part.px - V::set(origin_in_tile(c.record->ref_x, tile_x)),
                                              part.py - V::set(origin_in_tile(c.record->ref_y, tile_y)), c.sums);
           },
           [&](Candidate& c) { add_to_slot<Solid, kSums>(*c.record, c.sums, tile_x, tile_y, slot_of(c.entry)); });

@@ -12,13 +12,15 @@ namespace {
 // Samples that are kept at once, of at most 32 bytes.
 constexpr int64_t kSamplesAtOnce = 65536;
 
-// The place of a direction on the cube: a face, and coordinates in texels along its columns and rows, 0 at the first centre.
+// The place of a direction on the cube: a face, and coordinates in texels along its columns and rows, 0 at the first
+// centre.
 struct Place {
   int face;
   double column, row;
 };
 
-// The texels round a place, by the index of their first channel, left to right and top to bottom, and how far it lies from the first one.
+// The texels round a place, by the index of their first channel, left to right and top to bottom, and how far it lies
+// from the first one.
 template <class Real>
 struct Sample {
   int32_t texel[4];
@@ -33,12 +35,17 @@ inline Place place_of(double dx, double dy, double dz, int size) {
   const double along = first ? dx : second ? dy : dz;
   const double across = first ? dy : second ? dz : dx, down = first ? dz : second ? dx : dy;
   const double half = 0.5 * size, scale = half / std::abs(along);
-  return {(first ? 0 : second ? 2 : 4) + (along < 0 ? 1 : 0), across * scale + (half - 0.5), down * scale + (half - 0.5)};
+  return {(first    ? 0
+           : second ? 2
+                    : 4) +
+              (along < 0 ? 1 : 0),
+          across * scale + (half - 0.5), down * scale + (half - 0.5)};
 }
 
 int32_t texel_index(int size, int face, int row, int column) { return ((face * size + row) * size + column) * 3; }
 
-// The texel of a face's lattice, which goes on by one beyond its border: there it is the nearest one of the neighbouring face.
+// The texel of a face's lattice, which goes on by one beyond its border: there it is the nearest one of the
+// neighbouring face.
 int32_t texel_at(int size, int face, int row, int column) {
   if (row >= 0 && row < size && column >= 0 && column < size) return texel_index(size, face, row, column);
   const int axis = face / 2;
@@ -65,7 +72,8 @@ Sample<Real> sample(const Place& place, int size) {
 
 // Calls visit(column, sample) for the pixels of a row whose ray has not ended.
 template <class Real, class Visit>
-void for_each_sample(const DirectionView& view, int size, double least, int row, const Real* opacity, const Visit& visit) {
+void for_each_sample(const DirectionView& view, int size, double least, int row, const Real* opacity,
+                     const Visit& visit) {
   constexpr int kAtOnce = 64;
   double columns[kAtOnce], rows[kAtOnce];
   int faces[kAtOnce];
@@ -80,7 +88,8 @@ void for_each_sample(const DirectionView& view, int size, double least, int row,
       faces[k] = place.face, columns[k] = place.column, rows[k] = place.row;
     }
     for (int k = 0; k < count; ++k)
-      if (1 - double(opacity[first + k]) >= least) visit(first + k, sample<Real>({faces[k], columns[k], rows[k]}, size));
+      if (1 - double(opacity[first + k]) >= least)
+        visit(first + k, sample<Real>({faces[k], columns[k], rows[k]}, size));
   }
 }
 
@@ -114,7 +123,8 @@ class Gathered {
 }  // namespace
 
 template <class Real>
-void environment_light(const DirectionView& view, const CubeMap<Real>& map, double least, const Real* opacity, Real* light) {
+void environment_light(const DirectionView& view, const CubeMap<Real>& map, double least, const Real* opacity,
+                       Real* light) {
   const int64_t pixels = int64_t(view.width) * view.height;
   std::fill_n(light, 3 * pixels, Real(0));
   parallel_for(view.height, [&](int64_t row, int) {
@@ -132,7 +142,8 @@ void environment_light(const DirectionView& view, const CubeMap<Real>& map, doub
 }
 
 template <class Real>
-void environment_light_grad(const DirectionView& view, int size, double least, const Real* opacity, const Real* light_grad, Real* map_grad) {
+void environment_light_grad(const DirectionView& view, int size, double least, const Real* opacity,
+                            const Real* light_grad, Real* map_grad) {
   const int64_t pixels = int64_t(view.width) * view.height;
   std::fill_n(map_grad, int64_t(6) * size * size * 3, Real(0));
   // Some rows at a time: their samples in parallel, then the sums over texels, which pixels share, in one order.
@@ -148,7 +159,8 @@ void environment_light_grad(const DirectionView& view, int size, double least, c
     for (int64_t at = 0, pixel = int64_t(top) * view.width; at < int64_t(count) * view.width; ++at, ++pixel) {
       if (!(1 - double(opacity[pixel]) >= least)) continue;
       const Real left = 1 - opacity[pixel];
-      gathered.add(samples[at], {left * light_grad[pixel], left * light_grad[pixels + pixel], left * light_grad[2 * pixels + pixel]});
+      gathered.add(samples[at], {left * light_grad[pixel], left * light_grad[pixels + pixel],
+                                 left * light_grad[2 * pixels + pixel]});
     }
     gathered.flush();
   }

@@ -20,12 +20,14 @@ bool maybe_seen(const PhotoView& view, const double* point, double behind, doubl
 
 }  // namespace
 
-void face_samples(const PhotoView& view, const Faces& faces, const double* bary, int samples, double behind, double slack, uint8_t* found) {
+void face_samples(const PhotoView& view, const Faces& faces, const double* bary, int samples, double behind,
+                  double slack, uint8_t* found) {
   for_points(faces.count, [&](int64_t f) {
     found[f] = 0;
     if (faces.skip[f]) return;
     const int64_t* corner = faces.corner + 3 * f;
-    const double *a = faces.vertex + 3 * corner[0], *b = faces.vertex + 3 * corner[1], *c = faces.vertex + 3 * corner[2];
+    const double *a = faces.vertex + 3 * corner[0], *b = faces.vertex + 3 * corner[1],
+                 *c = faces.vertex + 3 * corner[2];
     for (int s = 0; s < samples; ++s) {
       const double* w = bary + 3 * s;
       double point[3];

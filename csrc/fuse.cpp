@@ -50,8 +50,8 @@ void add_block(const SurfelView& view, const VoteRules& rules, const VoxelSums& 
         const float v = (image[1] + i * step[0][1] + j * step[1][1] + k * step[2][1]) * inverse;
         if (!(u >= 0 && v >= 0 && u < view.width && v < view.height)) continue;
         const Surfel& surfel = view.surfels[int64_t(v) * view.width + int64_t(u)];
-        const float value = surfel.offset - surfel.plane[0] * (origin[0] + i * voxel) - surfel.plane[1] * (origin[1] + j * voxel) -
-                            surfel.plane[2] * (origin[2] + k * voxel);
+        const float value = surfel.offset - surfel.plane[0] * (origin[0] + i * voxel) -
+                            surfel.plane[1] * (origin[1] + j * voxel) - surfel.plane[2] * (origin[2] + k * voxel);
         const Vote said = vote(surfel, rules, value, inverse);
         *total += said.weight * said.value, *weight += said.weight, *free += said.free;
       }
@@ -59,7 +59,8 @@ void add_block(const SurfelView& view, const VoteRules& rules, const VoxelSums& 
 
 }  // namespace
 
-void add_votes(const SurfelView& view, const VoteRules& rules, const int64_t* rows, int64_t count, const VoxelSums& sums) {
+void add_votes(const SurfelView& view, const VoteRules& rules, const int64_t* rows, int64_t count,
+               const VoxelSums& sums) {
   parallel_for((count + kBlocksPerTask - 1) / kBlocksPerTask, [&](int64_t task, int) {
     const int64_t end = std::min((task + 1) * kBlocksPerTask, count);
     for (int64_t b = task * kBlocksPerTask; b < end; ++b) add_block(view, rules, sums, rows[b]);

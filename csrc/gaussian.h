@@ -1,8 +1,9 @@
 // How a tile kernel meets a Gaussian: 3D Gaussian splatting's projected ellipse, and the adjoint of that.
 //
-// Not a solid: it has an alpha per pixel and one depth, that of its centre. alpha = min(0.99, opacity exp(-d^T Q d / 2)), nothing
-// below 1/255, d the pixel's offset from the projected centre and Q the inverse of the projected covariance.
-// Source: Kerbl et al. 2023 (arXiv 2308.04079), sections 4 and 6; the two limits are those of its appendix C.
+// Not a solid: it has an alpha per pixel and one depth, that of its centre. alpha = min(0.99, opacity exp(-d^T Q d /
+// 2)), nothing below 1/255, d the pixel's offset from the projected centre and Q the inverse of the projected
+// covariance. Source: Kerbl et al. 2023 (arXiv 2308.04079), sections 4 and 6; the two limits are those of its appendix
+// C.
 #pragma once
 
 #include "kernels.h"
@@ -32,20 +33,27 @@ struct Gaussian {
   static M meet(const Record& r, const View&, V x, V y, V, Meeting& m) {
     m.dx = x - V::set(r.mean_x), m.dy = y - V::set(r.mean_y);
     const V half = V::set(Real(0.5));
-    const V distance = fma(fma(V::set(r.xx) * half, m.dx, V::set(r.xy) * m.dy), m.dx, V::set(r.yy) * half * m.dy * m.dy);
+    const V distance =
+        fma(fma(V::set(r.xx) * half, m.dx, V::set(r.xy) * m.dy), m.dx, V::set(r.yy) * half * m.dy * m.dy);
     V unused;
     exp_neg(max(distance, V::set(0)), unused, m.falloff);
     m.alpha = V::set(r.density) * m.falloff;
     m.in_face = I::set(0);
     return m.alpha >= V::set(Real(kSmallestAlpha));
   }
-  static V thickness(const Record&, V, M hit, Meeting& m) { return select(hit, min(m.alpha, V::set(Real(kLargestAlpha))), V::set(0)); }
-  static void attenuate(const Record&, V absorbed, V& alpha, V& through) { alpha = absorbed, through = V::set(1) - absorbed; }
+  static V thickness(const Record&, V, M hit, Meeting& m) {
+    return select(hit, min(m.alpha, V::set(Real(kLargestAlpha))), V::set(0));
+  }
+  static void attenuate(const Record&, V absorbed, V& alpha, V& through) {
+    alpha = absorbed, through = V::set(1) - absorbed;
+  }
   static void depths(const Record& r, V, const Meeting&, V& t_in, V& t_out) { t_in = t_out = V::set(r.w0); }
 
-  // With g the gradient to the exponent: the sums of g dx dx, g dx dy, g dy dy, g dx, g dy at 0-4; d_tau is the gradient to -ln(1 - alpha).
+  // With g the gradient to the exponent: the sums of g dx dx, g dx dy, g dy dy, g dx, g dy at 0-4; d_tau is the
+  // gradient to -ln(1 - alpha).
   template <class Solid, bool kDistance>
-  static void add_gradient(const Record&, const Meeting& m, M hit, V, V through, V d_tau, V d_in, V d_out, V, V, V, V* sums) {
+  static void add_gradient(const Record&, const Meeting& m, M hit, V, V through, V d_tau, V d_in, V d_out, V, V, V,
+                           V* sums) {
     const M free = hit & (m.alpha < V::set(Real(kLargestAlpha)));
     const V d_alpha = select(free, d_tau * rcp(through), V::set(0)), g = d_alpha * m.alpha;
     const V gx = g * m.dx, gy = g * m.dy;

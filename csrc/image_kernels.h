@@ -1,7 +1,7 @@
 // L1 + D-SSIM with its gradient, and Adam.
 //
-// SSIM as in 3DGS: 11x11 Gaussian window of sigma 1.5, zeros beyond the border, C1 = 0.01^2, C2 = 0.03^2, mean over pixels.
-// Included by kernels.cpp only.
+// SSIM as in 3DGS: 11x11 Gaussian window of sigma 1.5, zeros beyond the border, C1 = 0.01^2, C2 = 0.03^2, mean over
+// pixels. Included by kernels.cpp only.
 #pragma once
 
 #include <algorithm>
@@ -26,12 +26,14 @@ template <int kMaps>
 struct RowGroups {
   float* memory;
   int64_t pitch;
-  float* row(int map, int row) const { return memory + (int64_t(map) * 3 * kSsimRows + (row + 3 * kSsimRows) % (3 * kSsimRows)) * pitch; }
+  float* row(int map, int row) const {
+    return memory + (int64_t(map) * 3 * kSsimRows + (row + 3 * kSsimRows) % (3 * kSsimRows)) * pitch;
+  }
   static int64_t size(int64_t pitch) { return kMaps * 3 * kSsimRows * pitch; }
 };
 
-// Columns [begin, end) of kSsimRows consecutive rows of one map, blurred along y; `rows` are those from kSsimRadius above the first to
-// kSsimRadius below the last. A row is loaded once for all the rows it goes into.
+// Columns [begin, end) of kSsimRows consecutive rows of one map, blurred along y; `rows` are those from kSsimRadius
+// above the first to kSsimRadius below the last. A row is loaded once for all the rows it goes into.
 template <int W>
 inline void blur_rows(const float* const* rows, float* __restrict out, int64_t pitch, int begin, int end) {
   using V = Vec<float, W>;
@@ -68,8 +70,8 @@ inline Vec<float, W> blur_along(const float* center) {
   return even + odd;
 }
 
-// The four maps that SSIM takes the mean of, of image a and target b; with d = a - b instead of b and a b, what is small where the
-// images agree is not a difference of large numbers.
+// The four maps that SSIM takes the mean of, of image a and target b; with d = a - b instead of b and a b, what is
+// small where the images agree is not a difference of large numbers.
 struct Moment {
   static constexpr int kImage = 0, kDifference = 1, kSquares = 2 /* a^2 + b^2 */, kDifferenceSquare = 3, kCount = 4;
 };
@@ -78,8 +80,8 @@ constexpr int kDerivatives = 3;
 
 // A row of the four maps, from pixel `left` of the image on, in columns [0, pitch); 0 outside the image.
 template <int W>
-inline void moment_row(const float* image, const float* target, int width, int left, int64_t pitch, const RowGroups<Moment::kCount>& out,
-                       int row) {
+inline void moment_row(const float* image, const float* target, int width, int left, int64_t pitch,
+                       const RowGroups<Moment::kCount>& out, int row) {
   float *a = out.row(Moment::kImage, row), *d = out.row(Moment::kDifference, row);
   float *squares = out.row(Moment::kSquares, row), *square = out.row(Moment::kDifferenceSquare, row);
   const int begin = std::max(0, -left), end = int(std::min<int64_t>(pitch, width - left));
@@ -96,20 +98,21 @@ inline void moment_row(const float* image, const float* target, int width, int l
   columns(Vec<float, 1>{}, columns(Vec<float, W>{}, begin, end), end);
 }
 
-// Columns [begin, end) of a row: takes the row's maps blurred along y, blurs them along x, and writes the derivatives of
-// weight (1 - SSIM), to be blurred in turn; adds the columns' sums of weight times |a - b|, (a - b)^2 and 1 - SSIM.
+// Columns [begin, end) of a row: takes the row's maps blurred along y, blurs them along x, and writes the derivatives
+// of weight (1 - SSIM), to be blurred in turn; adds the columns' sums of weight times |a - b|, (a - b)^2 and 1 - SSIM.
 //
-// With the means A, B, their difference D = A - B, M = A^2 + B^2 and V the sum of both variances: 1 - SSIM = 1 - a1 a2 / (b1 b2),
-// b1 = M + C1, a1 = b1 - D^2, b2 = V + C2, a2 = b2 - (variance of a - b).
+// With the means A, B, their difference D = A - B, M = A^2 + B^2 and V the sum of both variances: 1 - SSIM = 1 - a1 a2
+// / (b1 b2), b1 = M + C1, a1 = b1 - D^2, b2 = V + C2, a2 = b2 - (variance of a - b).
 template <int W>
-inline void ssim_row(const float* const* blurred, const float* difference, const float* weight, float* const* derivative,
-                     int begin, int end, double sums[3]) {
+inline void ssim_row(const float* const* blurred, const float* difference, const float* weight,
+                     float* const* derivative, int begin, int end, double sums[3]) {
   using V = Vec<float, W>;
   const V two = V::set(2), c1 = V::set(kC1), c2 = V::set(kC2), zero = V::set(0);
   V l1 = zero, square = zero, off = zero;
   for (int x = begin; x < end; x += W) {
     const V a = blur_along<W>(blurred[Moment::kImage] + x), d = blur_along<W>(blurred[Moment::kDifference] + x);
-    const V squares = blur_along<W>(blurred[Moment::kSquares] + x), difference_square = blur_along<W>(blurred[Moment::kDifferenceSquare] + x);
+    const V squares = blur_along<W>(blurred[Moment::kSquares] + x),
+            difference_square = blur_along<W>(blurred[Moment::kDifferenceSquare] + x);
     const V w = V::load(weight + x), b = a - d, dd = d * d, m = fma(a, a, b * b);
     const V b1 = m + c1, b2 = (squares - m) + c2, variance = difference_square - dd;
     const V a1 = b1 - dd, a2 = b2 - variance;
@@ -130,30 +133,34 @@ inline void ssim_row(const float* const* blurred, const float* difference, const
 
 // Columns [begin, end) of the gradient, from the derivatives blurred along y.
 template <int W>
-inline void gradient_row(const float* const* blurred, const float* image, const float* difference, const float* weight, float l1_scale,
-                         float ssim_scale, float* out, int begin, int end) {
+inline void gradient_row(const float* const* blurred, const float* image, const float* difference, const float* weight,
+                         float l1_scale, float ssim_scale, float* out, int begin, int end) {
   using V = Vec<float, W>;
   const V zero = V::set(0), one = V::set(l1_scale), scale = V::set(ssim_scale);
   for (int x = begin; x < end; x += W) {
     const V e = V::load(difference + x), a = V::load(image + x);
-    const V mean = blur_along<W>(blurred[0] + x), square = blur_along<W>(blurred[1] + x), cross = blur_along<W>(blurred[2] + x);
+    const V mean = blur_along<W>(blurred[0] + x), square = blur_along<W>(blurred[1] + x),
+            cross = blur_along<W>(blurred[2] + x);
     const V sign = select(zero < e, one, select(e < zero, zero - one, zero));
     fma(scale, fma(e, cross, fma(a, square, mean)), sign * V::load(weight + x)).store(out + (x - begin));
   }
 }
 
-// Loss sums and gradient of rows [begin, end) and one tile of columns of a channel in one sweep: blur, SSIM and its derivatives, and
-// their blur again (the window is symmetric and zeros lie beyond the border, so the blur is its own adjoint). Rows and columns around
-// the part are computed as well; every row's results are the same wherever the part begins.
+// Loss sums and gradient of rows [begin, end) and one tile of columns of a channel in one sweep: blur, SSIM and its
+// derivatives, and their blur again (the window is symmetric and zeros lie beyond the border, so the blur is its own
+// adjoint). Rows and columns around the part are computed as well; every row's results are the same wherever the part
+// begins.
 template <int W>
-inline void photometric(const PhotometricParams& P, int channel, int tile, int begin, int end, float* buffer, double* row_sums) {
+inline void photometric(const PhotometricParams& P, int channel, int tile, int begin, int end, float* buffer,
+                        double* row_sums) {
   constexpr int kPad = 2 * kSsimAlign;
   const int width = P.width, height = P.height, columns = photometric_columns(width);
   const int left = tile * columns, right = std::min(width, left + columns);
   const int64_t pitch = photometric_pitch(width), plane = int64_t(width) * height;
   const float *image = P.image + channel * plane, *target = P.target + channel * plane;
   const float l1_scale = float((1.0 - P.dssim) / P.weight_sum), ssim_scale = float(P.dssim / P.weight_sum);
-  // Local columns, kPad more than those from `left`: of the part, of its derivatives, which are 0 beyond the image, and of what they need.
+  // Local columns, kPad more than those from `left`: of the part, of its derivatives, which are 0 beyond the image, and
+  // of what they need.
   const int first = kPad, last = kPad + (right - left + kSsimAlign - 1) / kSsimAlign * kSsimAlign;
   const int outer_first = left > 0 ? first - kSsimAlign : first, outer_last = right < width ? last + kSsimAlign : last;
   buffer += (kSsimAlign - reinterpret_cast<uintptr_t>(buffer) / sizeof(float) % kSsimAlign) % kSsimAlign;
@@ -167,7 +174,9 @@ inline void photometric(const PhotometricParams& P, int channel, int tile, int b
   std::fill(weights, weights + pitch, 0.0f);
   std::fill(weights + inside_first, weights + inside_last, 1.0f);
   auto load_weights = [&](int row) {
-    if (P.weight) std::copy_n(P.weight + int64_t(row) * width + left - kPad + inside_first, inside_last - inside_first, weights + inside_first);
+    if (P.weight)
+      std::copy_n(P.weight + int64_t(row) * width + left - kPad + inside_first, inside_last - inside_first,
+                  weights + inside_first);
   };
   // Columns [from, to) of all rows of a group, blurred along y.
   auto blur_group = [&](const auto& groups, int maps, int group, int from, int to) {
@@ -183,14 +192,17 @@ inline void photometric(const PhotometricParams& P, int channel, int tile, int b
   const int group_first = begin / kSsimRows, group_last = (end + kSsimRows - 1) / kSsimRows;
   for (int group = group_first - 2; group < group_last + 2; ++group) {
     auto rows_of = [&](int of, int around) {
-      return std::pair(std::max({0, begin - around, of * kSsimRows}), std::min({height, end + around, (of + 1) * kSsimRows}));
+      return std::pair(std::max({0, begin - around, of * kSsimRows}),
+                       std::min({height, end + around, (of + 1) * kSsimRows}));
     };
     const auto [load_first, load_last] = rows_of(group, 2 * kSsimRadius);
     for (int row = load_first; row < load_last; ++row)
-      moment_row<W>(image + int64_t(row) * width, target + int64_t(row) * width, width, left - kPad, pitch, moments, row);
+      moment_row<W>(image + int64_t(row) * width, target + int64_t(row) * width, width, left - kPad, pitch, moments,
+                    row);
 
     const auto [middle_first, middle_last] = rows_of(group - 1, kSsimRadius);
-    if (middle_first < middle_last) blur_group(moments, Moment::kCount, group - 1, outer_first - kSsimAlign, outer_last + kSsimAlign);
+    if (middle_first < middle_last)
+      blur_group(moments, Moment::kCount, group - 1, outer_first - kSsimAlign, outer_last + kSsimAlign);
     for (int row = middle_first; row < middle_last; ++row) {
       const float *in[Moment::kCount], *difference = moments.row(Moment::kDifference, row);
       float* out[kDerivatives];
@@ -223,7 +235,7 @@ inline void photometric(const PhotometricParams& P, int channel, int tile, int b
 
 // Adam with bias correction (Kingma and Ba 2015, algorithm 1) on elements [begin, end).
 inline void adam(const AdamParams& P, int64_t begin, int64_t end) {
-  float *__restrict value = P.value, *__restrict first = P.first, *__restrict second = P.second;
+  float* __restrict value = P.value, * __restrict first = P.first, * __restrict second = P.second;
   const float* __restrict gradient = P.gradient;
   const float step = P.rate / P.correction1, root = 1.0f / std::sqrt(P.correction2);
   for (int64_t i = begin; i < end; ++i) {
@@ -234,28 +246,34 @@ inline void adam(const AdamParams& P, int64_t begin, int64_t end) {
   }
 }
 
-// N of a row's elements in W lanes. No byte beyond them is touched, not even under a mask: a load of the next row would then have to wait
-// for this row's store.
+// N of a row's elements in W lanes. No byte beyond them is touched, not even under a mask: a load of the next row would
+// then have to wait for this row's store.
 template <int W, int N = W>
 inline void adam_part(const AdamRowsParams& P, const RowTensor& t, int64_t at, float step, float root) {
   using V = Vec<float, W>;
   static_assert(N == W || (W == 4 && N < 4));
   auto load = [&](const float* from) {
     from += at;
-    if constexpr (N == W) return V::load(from);
-    else return V{typename V::native{from[0], N > 1 ? from[1] : 0.0f, N > 2 ? from[2] : 0.0f, 0.0f}};
+    if constexpr (N == W)
+      return V::load(from);
+    else
+      return V{typename V::native{from[0], N > 1 ? from[1] : 0.0f, N > 2 ? from[2] : 0.0f, 0.0f}};
   };
   auto store = [&](V v, float* to) {
     to += at;
-    if constexpr (N == W) v.store(to);
-    else to[0] = v.v[0], to[N > 1 ? 1 : 0] = v.v[N > 1 ? 1 : 0], to[N - 1] = v.v[N - 1];
+    if constexpr (N == W)
+      v.store(to);
+    else
+      to[0] = v.v[0], to[N > 1 ? 1 : 0] = v.v[N > 1 ? 1 : 0], to[N - 1] = v.v[N - 1];
   };
   const V g = load(t.gradient), first = fma(V::set(P.beta1), load(t.first), V::set(1 - P.beta1) * g);
   const V second = fma(V::set(P.beta2), load(t.second), V::set(1 - P.beta2) * g * g);
 #if defined(LINPRIM_ISA_V2) || defined(LINPRIM_ISA_V3) || defined(LINPRIM_ISA_V4)
   V deviation;
-  if constexpr (W == 4) deviation = {(F4::native)_mm_sqrt_ps((__m128)second.v)};
-  else deviation = sqrt(second);
+  if constexpr (W == 4)
+    deviation = {(F4::native)_mm_sqrt_ps((__m128)second.v)};
+  else
+    deviation = sqrt(second);
 #else
   const V deviation = sqrt(second);
 #endif
@@ -272,8 +290,8 @@ inline bool any_nonzero(const float* values, int64_t n) {
   return bits != 0;
 }
 
-// Adam on the touched ones of rows [begin, end), each by its own count of steps; at most kAdamRows rows. Tensor after tensor, as the
-// processor can only follow a few streams of memory.
+// Adam on the touched ones of rows [begin, end), each by its own count of steps; at most kAdamRows rows. Tensor after
+// tensor, as the processor can only follow a few streams of memory.
 template <int W>
 inline void adam_rows(const AdamRowsParams& P, int64_t begin, int64_t end) {
   constexpr int kLine = 16, kAhead = 6;
@@ -303,16 +321,19 @@ inline void adam_rows(const AdamRowsParams& P, int64_t begin, int64_t end) {
     for (int k = 0; k < count; ++k) {
       const int64_t last = (rows[k] + 1) * t.columns, next = rows[k + kAhead] * t.columns;
       for (int64_t c = 0; c < t.columns; c += kLine)
-        __builtin_prefetch(t.gradient + next + c), __builtin_prefetch(t.value + next + c, 1), __builtin_prefetch(t.first + next + c, 1),
-            __builtin_prefetch(t.second + next + c, 1);
+        __builtin_prefetch(t.gradient + next + c), __builtin_prefetch(t.value + next + c, 1),
+            __builtin_prefetch(t.first + next + c, 1), __builtin_prefetch(t.second + next + c, 1);
       const float step = t.rate * inverse[k];
       int64_t at = rows[k] * t.columns;
       for (; at + W <= last; at += W) adam_part<W>(P, t, at, step, root[k]);
       if constexpr (W >= 4) {
         for (; at + 4 <= last; at += 4) adam_part<4>(P, t, at, step, root[k]);
-        if (last - at == 3) adam_part<4, 3>(P, t, at, step, root[k]);
-        else if (last - at == 2) adam_part<4, 2>(P, t, at, step, root[k]);
-        else if (last - at == 1) adam_part<1>(P, t, at, step, root[k]);
+        if (last - at == 3)
+          adam_part<4, 3>(P, t, at, step, root[k]);
+        else if (last - at == 2)
+          adam_part<4, 2>(P, t, at, step, root[k]);
+        else if (last - at == 1)
+          adam_part<1>(P, t, at, step, root[k]);
       }
     }
   }

@@ -26,10 +26,11 @@ int available(Choice (&out)[kChoices]) {
       __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("fma") &&
       __builtin_cpu_supports("bmi") && __builtin_cpu_supports("bmi2") && __builtin_cpu_supports("popcnt"))
     out[count++] = {&kernels_v4(), &image_kernels_v4()};
-  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi") && __builtin_cpu_supports("bmi2") &&
-      __builtin_cpu_supports("popcnt"))
+  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi") &&
+      __builtin_cpu_supports("bmi2") && __builtin_cpu_supports("popcnt"))
     out[count++] = {&kernels_v3(), &image_kernels_v3()};
-  if (__builtin_cpu_supports("sse4.2") && __builtin_cpu_supports("popcnt")) out[count++] = {&kernels_v2(), &image_kernels_v2()};
+  if (__builtin_cpu_supports("sse4.2") && __builtin_cpu_supports("popcnt"))
+    out[count++] = {&kernels_v2(), &image_kernels_v2()};
 #else
   out[count++] = {&kernels_neon(), &image_kernels_neon()};
 #endif
@@ -65,9 +66,13 @@ bool set_instruction_set(const char* name) {
 const char* instruction_set() { return current().load()->kernels->name; }
 
 template <>
-const Kernels<float>& kernels<float>() { return *current().load()->kernels; }
+const Kernels<float>& kernels<float>() {
+  return *current().load()->kernels;
+}
 template <>
-const Kernels<double>& kernels<double>() { return kernels_scalar<double>(); }
+const Kernels<double>& kernels<double>() {
+  return kernels_scalar<double>();
+}
 const ImageKernels& image_kernels() { return *current().load()->image; }
 Limits measure_limits() { return image_kernels().limits(); }
 

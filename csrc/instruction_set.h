@@ -1,4 +1,5 @@
-// The kernels in force: the choice made by set_instruction_set, the environment's LINPRIM_GEO_ISA, or the best available.
+// The kernels in force: the choice made by set_instruction_set, the environment's LINPRIM_GEO_ISA, or the best
+// available.
 #pragma once
 
 #include "kernels.h"

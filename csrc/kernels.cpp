@@ -1,6 +1,8 @@
-// The hot loops, compiled once per instruction set: LINPRIM_ISA is scalar, v2, v3, v4 (x86-64) or neon, and LINPRIM_ISA_<NAME> is 1.
+// The hot loops, compiled once per instruction set: LINPRIM_ISA is scalar, v2, v3, v4 (x86-64) or neon, and
+// LINPRIM_ISA_<NAME> is 1.
 //
-// Everything included here lives in namespace linprim::LINPRIM_ISA. Only the two table functions at the end are seen outside.
+// Everything included here lives in namespace linprim::LINPRIM_ISA. Only the two table functions at the end are seen
+// outside.
 #ifndef LINPRIM_ISA
 #error "compile this file with -DLINPRIM_ISA=<name> -DLINPRIM_ISA_<NAME>=1"
 #endif
@@ -35,15 +37,19 @@ constexpr int kWidth = 4;
 template <class Solid>
 int64_t scratch_bytes(Order order, bool geometry, int64_t longest_list) {
   if (order == Order::kEntry)
-    return geometry ? Window<Solid, EntryCandidate<Solid, true, true>>::bytes(longest_list) : Window<Solid, EntryCandidate<Solid, true, false>>::bytes(longest_list);
+    return geometry ? Window<Solid, EntryCandidate<Solid, true, true>>::bytes(longest_list)
+                    : Window<Solid, EntryCandidate<Solid, true, false>>::bytes(longest_list);
   if (order == Order::kOverlap)
-    return geometry ? Window<Solid, OverlapCandidate<Solid, true, true>>::bytes(longest_list) : Window<Solid, OverlapCandidate<Solid, true, false>>::bytes(longest_list);
+    return geometry ? Window<Solid, OverlapCandidate<Solid, true, true>>::bytes(longest_list)
+                    : Window<Solid, OverlapCandidate<Solid, true, false>>::bytes(longest_list);
   return 0;
 }
 
 template <class Solid>
-constexpr SolidKernels<typename Solid::Real> solid_kernels(void (*project)(const ProjectParams<typename Solid::Real>&, int64_t, int64_t),
-                                                           void (*chain)(const ChainParams<typename Solid::Real>&, int64_t, int64_t)) {
+constexpr SolidKernels<typename Solid::Real> solid_kernels(void (*project)(const ProjectParams<typename Solid::Real>&,
+                                                                           int64_t, int64_t),
+                                                           void (*chain)(const ChainParams<typename Solid::Real>&,
+                                                                         int64_t, int64_t)) {
   SolidKernels<typename Solid::Real> k{};
   k.record_bytes = sizeof(typename Solid::Record);
   k.project = project, k.chain = chain;
@@ -67,11 +73,16 @@ constexpr Kernels<Real> all_kernels(const char* name) {
   constexpr RayModel kExact = RayModel::kExact, kAffine = RayModel::kAffine;
   Kernels<Real> k{};
   k.name = name, k.width = kWidth, k.bin = bin<kWidth>;
-  k.solids[0][0] = solid_kernels<Octahedron<Real, kWidth, kExact>>(project_octahedra<Real, kExact>, chain_octahedra<Real, kExact>);
-  k.solids[0][1] = solid_kernels<Octahedron<Real, kWidth, kAffine>>(project_octahedra<Real, kAffine>, chain_octahedra<Real, kAffine>);
-  k.solids[1][0] = solid_kernels<Tetrahedron<Real, kWidth, kExact>>(project_tetrahedra<Real, kExact>, chain_tetrahedra<Real, kExact>);
-  k.solids[1][1] = solid_kernels<Tetrahedron<Real, kWidth, kAffine>>(project_tetrahedra<Real, kAffine>, chain_tetrahedra<Real, kAffine>);
-  k.solids[2][0] = k.solids[2][1] = solid_kernels<Gaussian<Real, kWidth, kAffine>>(project_gaussians<Real>, chain_gaussians<Real>);
+  k.solids[0][0] =
+      solid_kernels<Octahedron<Real, kWidth, kExact>>(project_octahedra<Real, kExact>, chain_octahedra<Real, kExact>);
+  k.solids[0][1] = solid_kernels<Octahedron<Real, kWidth, kAffine>>(project_octahedra<Real, kAffine>,
+                                                                    chain_octahedra<Real, kAffine>);
+  k.solids[1][0] = solid_kernels<Tetrahedron<Real, kWidth, kExact>>(project_tetrahedra<Real, kExact>,
+                                                                    chain_tetrahedra<Real, kExact>);
+  k.solids[1][1] = solid_kernels<Tetrahedron<Real, kWidth, kAffine>>(project_tetrahedra<Real, kAffine>,
+                                                                     chain_tetrahedra<Real, kAffine>);
+  k.solids[2][0] = k.solids[2][1] =
+      solid_kernels<Gaussian<Real, kWidth, kAffine>>(project_gaussians<Real>, chain_gaussians<Real>);
   return k;
 }
 
@@ -89,9 +100,13 @@ const ImageKernels image_table = {photometric<kWidth>, adam, adam_rows<kWidth>, 
 
 #if defined(LINPRIM_ISA_SCALAR)
 template <>
-const Kernels<float>& kernels_scalar<float>() { return LINPRIM_ISA::table<float>; }
+const Kernels<float>& kernels_scalar<float>() {
+  return LINPRIM_ISA::table<float>;
+}
 template <>
-const Kernels<double>& kernels_scalar<double>() { return LINPRIM_ISA::table<double>; }
+const Kernels<double>& kernels_scalar<double>() {
+  return LINPRIM_ISA::table<double>;
+}
 #else
 const Kernels<float>& LINPRIM_JOIN(kernels_, LINPRIM_ISA)() { return LINPRIM_ISA::table<float>; }
 #endif

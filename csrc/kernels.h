@@ -1,4 +1,5 @@
-// What the instruction-set builds of kernels.cpp offer to the rest of the core: plain parameter structs and tables of functions.
+// What the instruction-set builds of kernels.cpp offer to the rest of the core: plain parameter structs and tables of
+// functions.
 #pragma once
 
 #include <cstddef>
@@ -6,22 +7,23 @@
 
 namespace linprim {
 
-constexpr int kTile = 16;                       // pixels along a tile's side
-constexpr int kBlock = 4;                       // pixels along a block's side; a tile has 4x4 blocks
-constexpr int kBlocks = 16;                     // blocks per tile, one bit each in a pair's mask
-constexpr int kTilePixels = kTile * kTile;      // stored block after block, row by row inside a block
-constexpr int kMaxShCoefficients = 16;          // degree 3
-constexpr int kColorSums = 16;                  // gradient sums per (tile, primitive) pair, see Sum
-constexpr int kGeometrySums = 32;               // the same with the entry normals' sums (28 used)
+constexpr int kTile = 16;                   // pixels along a tile's side
+constexpr int kBlock = 4;                   // pixels along a block's side; a tile has 4x4 blocks
+constexpr int kBlocks = 16;                 // blocks per tile, one bit each in a pair's mask
+constexpr int kTilePixels = kTile * kTile;  // stored block after block, row by row inside a block
+constexpr int kMaxShCoefficients = 16;      // degree 3
+constexpr int kColorSums = 16;              // gradient sums per (tile, primitive) pair, see Sum
+constexpr int kGeometrySums = 32;           // the same with the entry normals' sums (28 used)
 
 // What the tile kernels are compiled for, beside the scalar and the set of outputs. Numbers cross into Python.
 enum class PrimitiveKind : int { kOctahedron, kTetrahedron, kGaussian };
 constexpr int kKinds = 3;
-// Exact perspective, or the rays of one primitive parallel in the ray space of its centre (EWA). A Gaussian knows only the latter.
+// Exact perspective, or the rays of one primitive parallel in the ray space of its centre (EWA). A Gaussian knows only
+// the latter.
 enum class RayModel : int { kExact, kAffine };
 constexpr int kRayModels = 2;
-// Primitives blended one after another by the depth of their centres, or by each ray's entry; or absorbing where they are, overlaps
-// included.
+// Primitives blended one after another by the depth of their centres, or by each ray's entry; or absorbing where they
+// are, overlaps included.
 enum class Order : int { kCenter, kEntry, kOverlap };
 constexpr int kOrders = 3;
 
@@ -38,8 +40,9 @@ struct View {
   Order order;
 };
 
-// Arrays of n primitives, row major: center (n,3), rotation (n,4) as w,x,y,z of any length, extent (n, extents()): half-axes, vertex
-// distances or standard deviations; density (n) per world unit, or a Gaussian's peak opacity; sh (n, sh_count, 3) with sh_count 1, 4, 9 or 16.
+// Arrays of n primitives, row major: center (n,3), rotation (n,4) as w,x,y,z of any length, extent (n, extents()):
+// half-axes, vertex distances or standard deviations; density (n) per world unit, or a Gaussian's peak opacity; sh (n,
+// sh_count, 3) with sh_count 1, 4, 9 or 16.
 template <class Real>
 struct Primitives {
   PrimitiveKind kind;
@@ -49,8 +52,9 @@ struct Primitives {
   int extents() const { return kind == PrimitiveKind::kTetrahedron ? 4 : 3; }
 };
 
-// Gradients with the layout of Primitives. screen (n,3): the gradient to the centre's position in pixels, and the sum over tiles of the
-// lengths of each tile's part of it, which does not cancel where a texture pulls a large primitive both ways.
+// Gradients with the layout of Primitives. screen (n,3): the gradient to the centre's position in pixels, and the sum
+// over tiles of the lengths of each tile's part of it, which does not cancel where a texture pulls a large primitive
+// both ways.
 template <class Real>
 struct PrimitiveGradients {
   Real *center, *rotation, *extent, *density, *sh, *screen;
@@ -58,19 +62,21 @@ struct PrimitiveGradients {
 
 // Projected primitives, as the tile kernels read them, one type per kind.
 //
-// The faces of a polyhedron are planes w_f(x, y) = a_f + b_f (x - ref_x) + c_f (y - ref_y), x and y counted in pixels, with w the
-// inverse depth less w0, the inverse depth of the reference (exact rays), or the centre's distance w0 less the distance
-// (affine rays): either way a ray is inside for w from the largest of the back faces to the smallest of the front faces.
+// The faces of a polyhedron are planes w_f(x, y) = a_f + b_f (x - ref_x) + c_f (y - ref_y), x and y counted in pixels,
+// with w the inverse depth less w0, the inverse depth of the reference (exact rays), or the centre's distance w0 less
+// the distance (affine rays): either way a ray is inside for w from the largest of the back faces to the smallest of
+// the front faces.
 //
-// An octahedron's slots 0-3 hold, of each pair of opposite faces, the one turned to the camera; slots 4-7 their opposites,
-// always back faces.
+// An octahedron's slots 0-3 hold, of each pair of opposite faces, the one turned to the camera; slots 4-7 their
+// opposites, always back faces.
 template <class Real>
 struct alignas(64) OctahedronRecord {
   Real a[8], b[8], c[8];
   Real w0, density, rgb[3];
   Real ref_x, ref_y;  // integers
-  uint32_t flags;     // bits 0-3: slot 0-3 is a front face; bit 4: take the general path (not all are, or the near plane is crossed)
-  Real face[3][8];    // s_k / h_s: derivative of the face's w with respect to the local form p_k
+  uint32_t flags;   // bits 0-3: slot 0-3 is a front face; bit 4: take the general path (not all are, or the near plane
+                    // is crossed)
+  Real face[3][8];  // s_k / h_s: derivative of the face's w with respect to the local form p_k
 };
 constexpr uint32_t kGeneral = 16;
 template <class Real>
@@ -82,14 +88,15 @@ struct alignas(16) TetrahedronRecord {
 };
 template <class Real>
 struct alignas(16) GaussianRecord {
-  Real xx, xy, yy;  // inverse covariance, 1 / pixel^2
-  Real mean_x, mean_y;  // projected centre, relative to the reference
+  Real xx, xy, yy;           // inverse covariance, 1 / pixel^2
+  Real mean_x, mean_y;       // projected centre, relative to the reference
   Real w0, density, rgb[3];  // depth of the centre, peak opacity, colour
   Real ref_x, ref_y;
 };
 
-// Order of the gradient sums of a pair. The first twelve are the kind's own (see its add_gradient); then density and colour; with
-// geometry also the gradient to the unit normals of slots 0-3 and to the distance of the centre that depths count from.
+// Order of the gradient sums of a pair. The first twelve are the kind's own (see its add_gradient); then density and
+// colour; with geometry also the gradient to the unit normals of slots 0-3 and to the distance of the centre that
+// depths count from.
 struct Sum {
   static constexpr int g = 0, density = 12, rgb = 13, normal = 16, distance = 28;
 };
@@ -102,8 +109,9 @@ struct Footprint {
   float a[6], b[6], c[6];
 };
 
-// The primitives of all tiles, tile after tile, each tile's in order: which blocks of the tile a primitive may touch (after a centre-ordered
-// forward pass: does touch) and the slot of its gradient sums. tile_begin has tiles + 1 entries.
+// The primitives of all tiles, tile after tile, each tile's in order: which blocks of the tile a primitive may touch
+// (after a centre-ordered forward pass: does touch) and the slot of its gradient sums. tile_begin has tiles + 1
+// entries.
 struct TileLists {
   const uint32_t *tile_begin, *primitive, *slot;
   uint32_t* blocks;
@@ -117,11 +125,12 @@ template <class Real>
 struct ProjectParams {
   View view;
   Primitives<Real> primitives;
-  void* records;            // n of the kind's records
-  Footprint* footprints;    // n
-  Real* key;                // n: depth of the centre; for the other orders a lower bound of all the primitive's depths
-  Real* color;              // (n, 3), 0 where not visible
-  Real (*normals)[4][3];    // n: outward unit normals of slots 0-3 in camera space (a Gaussian has one); null without geometry
+  void* records;          // n of the kind's records
+  Footprint* footprints;  // n
+  Real* key;              // n: depth of the centre; for the other orders a lower bound of all the primitive's depths
+  Real* color;            // (n, 3), 0 where not visible
+  Real (*normals)[4][3];  // n: outward unit normals of slots 0-3 in camera space (a Gaussian has one); null without
+                          // geometry
 };
 
 template <class Real>
@@ -129,10 +138,10 @@ struct ChainParams {
   View view;
   Primitives<Real> primitives;
   const Footprint* footprints;
-  const Real* color;             // (n, 3) as projected
-  const uint32_t* first_slot;    // n: first gradient slot of a primitive
-  const uint32_t* slot_count;    // n
-  const Real* sums;              // slots x sums_per_slot
+  const Real* color;           // (n, 3) as projected
+  const uint32_t* first_slot;  // n: first gradient slot of a primitive
+  const uint32_t* slot_count;  // n
+  const Real* sums;            // slots x sums_per_slot
   int sums_per_slot;
   PrimitiveGradients<Real> out;  // every row is written
 };
@@ -140,27 +149,28 @@ struct ChainParams {
 // Image planes of H x W. Null pointers are allowed only where said.
 template <class Real>
 struct Planes {
-  Real *rgb, *opacity;                       // (3,H,W), (H,W)
+  Real *rgb, *opacity;                                                                      // (3,H,W), (H,W)
   Real *depth_expected, *depth_median, *depth_first, *distortion, *normal, *normal_median;  // geometry only
-  Real* state;                               // (4,H,W), geometry only: reference depth, first and second moment about it, 1/(density |v|) at the median
+  Real* state;  // (4,H,W), geometry only: reference depth, first and second moment about it, 1/(density |v|) at the
+                // median
 };
 
 template <class Real>
 struct RasterParams {
   View view;
   int tiles_x, tiles_y;
-  const void* records;         // of the kind
-  const Real* key;             // per primitive, see ProjectParams
+  const void* records;  // of the kind
+  const Real* key;      // per primitive, see ProjectParams
   const Real (*normals)[4][3];
   TileLists lists;
-  const Real* background;      // 3
+  const Real* background;  // 3
   Planes<Real> out;
-  Real* pair_weight;           // geometry only, per slot: largest weight
-  uint32_t* pair_pixels;       // geometry only, per slot: pixels hit
+  Real* pair_weight;      // geometry only, per slot: largest weight
+  uint32_t* pair_pixels;  // geometry only, per slot: pixels hit
   // Backward only: `out` then holds what the forward pass wrote, and `grad` the incoming gradients (null where zero).
   Planes<Real> grad;
-  Real* sums;                  // per slot
-  Real* background_sums;       // per tile, 3
+  Real* sums;             // per slot
+  Real* background_sums;  // per tile, 3
 };
 
 // Counts of one tile's forward pass.
@@ -172,17 +182,17 @@ struct BinParams {
   const Footprint* footprints;
   const uint32_t* visible;  // rows
   int tiles_x;
-  uint32_t* slot_count;     // per row, written for the visible ones: number of pairs
-  uint32_t* tile_count;     // per tile, added to: number of pairs
+  uint32_t* slot_count;  // per row, written for the visible ones: number of pairs
+  uint32_t* tile_count;  // per tile, added to: number of pairs
 };
 
 struct PhotometricParams {
   const float *image, *target;  // (3,H,W)
   const float* weight;          // (H,W) or null for all ones
   int width, height;
-  float dssim;                  // weight of D-SSIM; L1 has the rest
-  double weight_sum;            // sum of weight over pixels, times 3
-  float* gradient;              // (3,H,W), written
+  float dssim;        // weight of D-SSIM; L1 has the rest
+  double weight_sum;  // sum of weight over pixels, times 3
+  float* gradient;    // (3,H,W), written
 };
 
 struct AdamParams {
@@ -218,22 +228,22 @@ struct SolidKernels {
   int64_t record_bytes;
   void (*project)(const ProjectParams<Real>&, int64_t begin, int64_t end);
   void (*chain)(const ChainParams<Real>&, int64_t begin, int64_t end);
-  // Per order and set of outputs (colour; colour and geometry); null where a kind has no such order. `scratch` is the calling
-  // thread's own, scratch_bytes(longest tile list) bytes, 64-byte aligned.
+  // Per order and set of outputs (colour; colour and geometry); null where a kind has no such order. `scratch` is the
+  // calling thread's own, scratch_bytes(longest tile list) bytes, 64-byte aligned.
   Counts (*forward[kOrders][2])(const RasterParams<Real>&, int tile, void* scratch);
   void (*backward[kOrders][2])(const RasterParams<Real>&, int tile, void* scratch);
   int64_t (*scratch_bytes)(Order, bool geometry, int64_t longest_list);
   int sums_per_slot[kOrders][2];
-  // Depth at the view's transmittance level by exact overlap, into out.depth_median and out.opacity; scratch: 3 * kBlocks values per
-  // pair of the tile. Null for Gaussians.
+  // Depth at the view's transmittance level by exact overlap, into out.depth_median and out.opacity; scratch: 3 *
+  // kBlocks values per pair of the tile. Null for Gaussians.
   void (*level_depth)(const RasterParams<Real>&, int tile, Real* scratch);
 };
 
 // What one core can do at this moment, see machine_limits.h.
 struct Limits {
-  double fma_gflops;                           // multiply-adds count as two
-  double exp_ns;                               // per value: alpha and transmittance
-  double pair_forward_ns, pair_backward_ns;    // per (pixel, primitive) of octahedra, exact rays
+  double fma_gflops;                         // multiply-adds count as two
+  double exp_ns;                             // per value: alpha and transmittance
+  double pair_forward_ns, pair_backward_ns;  // per (pixel, primitive) of octahedra, exact rays
 };
 
 template <class Real>
@@ -241,16 +251,18 @@ struct Kernels {
   const char* name;
   int width;
   SolidKernels<Real> solids[kKinds][kRayModels];
-  // Appends the pairs of visible[begin..end), each primitive's tile rows downwards, to `out`, which has room for `capacity`; returns the
-  // index of the first primitive that no longer fitted (or `end`), and the number of pairs in `written`.
+  // Appends the pairs of visible[begin..end), each primitive's tile rows downwards, to `out`, which has room for
+  // `capacity`; returns the index of the first primitive that no longer fitted (or `end`), and the number of pairs in
+  // `written`.
   int64_t (*bin)(const BinParams&, int64_t begin, int64_t end, LoosePair* out, int64_t capacity, int64_t* written);
 };
 
 struct ImageKernels {
-  // Gradient of rows [begin, end) of a channel in one of its photometric_tiles(width) tiles of columns; adds each row's sums of weight
-  // times |d|, d^2 and 1 - SSIM to row_sums (H,3). No row's results depend on which rows a call takes. `buffer` is the calling thread's
-  // own, photometric_buffer_size(width) floats.
-  void (*photometric)(const PhotometricParams&, int channel, int tile, int begin, int end, float* buffer, double* row_sums);
+  // Gradient of rows [begin, end) of a channel in one of its photometric_tiles(width) tiles of columns; adds each row's
+  // sums of weight times |d|, d^2 and 1 - SSIM to row_sums (H,3). No row's results depend on which rows a call takes.
+  // `buffer` is the calling thread's own, photometric_buffer_size(width) floats.
+  void (*photometric)(const PhotometricParams&, int channel, int tile, int begin, int end, float* buffer,
+                      double* row_sums);
   void (*adam)(const AdamParams&, int64_t begin, int64_t end);
   void (*adam_rows)(const AdamRowsParams&, int64_t begin, int64_t end);
   Limits (*limits)();
@@ -264,10 +276,15 @@ inline int photometric_columns(int width) {
   const int tiles = (width + kSsimMaxColumns - 1) / kSsimMaxColumns;
   return ((width + tiles - 1) / tiles + kSsimAlign - 1) / kSsimAlign * kSsimAlign;
 }
-inline int photometric_tiles(int width) { return (width + photometric_columns(width) - 1) / photometric_columns(width); }
-// Floats of a row of a tile: two cache lines more on either side, and an odd number of lines, which spreads the rows over the cache.
+inline int photometric_tiles(int width) {
+  return (width + photometric_columns(width) - 1) / photometric_columns(width);
+}
+// Floats of a row of a tile: two cache lines more on either side, and an odd number of lines, which spreads the rows
+// over the cache.
 inline int64_t photometric_pitch(int width) { return ((photometric_columns(width) / kSsimAlign + 4) | 1) * kSsimAlign; }
-inline int64_t photometric_buffer_size(int width) { return ((4 + 3) * 3 * kSsimRows + 4 * kSsimRows + 2) * photometric_pitch(width) + kSsimAlign; }
+inline int64_t photometric_buffer_size(int width) {
+  return ((4 + 3) * 3 * kSsimRows + 4 * kSsimRows + 2) * photometric_pitch(width) + kSsimAlign;
+}
 
 template <class Real>
 const Kernels<Real>& kernels_scalar();

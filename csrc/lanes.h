@@ -1,4 +1,5 @@
-// Several primitives at a time in double precision: the lane types of the per-primitive stages, and moving their results to rows.
+// Several primitives at a time in double precision: the lane types of the per-primitive stages, and moving their
+// results to rows.
 #pragma once
 
 #include <cmath>
@@ -70,12 +71,14 @@ inline void to_rows(Real* first, int64_t stride, const D* values, int count, int
     for (; done + 8 <= count; done += 8) {
       __m256 r[8], s[8];
       for (int i = 0; i < 8; ++i) r[i] = _mm512_cvtpd_ps((__m512d)values[done + i]);
-      for (int i = 0; i < 8; i += 2) s[i] = _mm256_unpacklo_ps(r[i], r[i + 1]), s[i + 1] = _mm256_unpackhi_ps(r[i], r[i + 1]);
+      for (int i = 0; i < 8; i += 2)
+        s[i] = _mm256_unpacklo_ps(r[i], r[i + 1]), s[i + 1] = _mm256_unpackhi_ps(r[i], r[i + 1]);
       for (int i = 0; i < 8; i += 4) {
         r[i] = _mm256_shuffle_ps(s[i], s[i + 2], 0x44), r[i + 1] = _mm256_shuffle_ps(s[i], s[i + 2], 0xee);
         r[i + 2] = _mm256_shuffle_ps(s[i + 1], s[i + 3], 0x44), r[i + 3] = _mm256_shuffle_ps(s[i + 1], s[i + 3], 0xee);
       }
-      for (int i = 0; i < 4; ++i) s[i] = _mm256_permute2f128_ps(r[i], r[4 + i], 0x20), s[4 + i] = _mm256_permute2f128_ps(r[i], r[4 + i], 0x31);
+      for (int i = 0; i < 4; ++i)
+        s[i] = _mm256_permute2f128_ps(r[i], r[4 + i], 0x20), s[4 + i] = _mm256_permute2f128_ps(r[i], r[4 + i], 0x31);
       for (int l = 0; l < lanes; ++l) _mm256_storeu_ps(first + l * stride + done, s[l]);
     }
 #elif defined(LINPRIM_ISA_V3)

@@ -7,10 +7,10 @@
 
 namespace linprim::LINPRIM_ISA {
 
-// Where the transmittance of one tile's rays falls to `level`, all primitives absorbing where they are, overlaps included:
-// sum_i density_i |v| clamp(t - t_in_i, 0, t_out_i - t_in_i) = ln(1 / level). The sum does not depend on any order and grows with t,
-// so it is bisected. `scratch` holds 3 * 16 values per pair of the longest tile list. Writes out.depth_median, 0 where never, and
-// out.opacity, which does not depend on the order either.
+// Where the transmittance of one tile's rays falls to `level`, all primitives absorbing where they are, overlaps
+// included: sum_i density_i |v| clamp(t - t_in_i, 0, t_out_i - t_in_i) = ln(1 / level). The sum does not depend on any
+// order and grows with t, so it is bisected. `scratch` holds 3 * 16 values per pair of the longest tile list. Writes
+// out.depth_median, 0 where never, and out.opacity, which does not depend on the order either.
 template <class Solid>
 void level_depth_tile(const RasterParams<typename Solid::Real>& P, int tile, typename Solid::Real* scratch) {
   using Real = typename Solid::Real;
@@ -39,7 +39,8 @@ void level_depth_tile(const RasterParams<typename Solid::Real>& P, int tile, typ
         const auto& record = static_cast<const typename Solid::Record*>(P.records)[P.lists.primitive[e]];
         typename Solid::Meeting meeting;
         const V v_length = V::load(length + at);
-        const M hit = Solid::template meet<false>(record, view, x - V::set(record.ref_x), y - V::set(record.ref_y), v_length, meeting);
+        const M hit = Solid::template meet<false>(record, view, x - V::set(record.ref_x), y - V::set(record.ref_y),
+                                                  v_length, meeting);
         if (!hit.bits()) continue;
         Solid::thickness(record, v_length, hit, meeting);
         V t_in, t_out;

@@ -1,5 +1,6 @@
-// What one core can do at this moment: peak multiply-adds, the vector exponential, and the bare work of one (primitive, tile) pair with
-// all data at hand and every pixel hit. The rasterizer's speed is stated as a ratio to these (tools/bench.py).
+// What one core can do at this moment: peak multiply-adds, the vector exponential, and the bare work of one (primitive,
+// tile) pair with all data at hand and every pixel hit. The rasterizer's speed is stated as a ratio to these
+// (tools/bench.py).
 #pragma once
 
 #include <chrono>
@@ -61,9 +62,11 @@ Limits measure_limits() {
   // Octahedra in front of a camera of 600 pixels focal length, all of a tile inside each, thin enough that no ray ends.
   constexpr int kPairs = 32;
   View view{};
-  view.fx = view.fy = 600, view.cx = view.cy = 8, view.width = view.height = kTile, view.near = 0.01, view.stop = 1e-3, view.level = 0.5;
+  view.fx = view.fy = 600, view.cx = view.cy = 8, view.width = view.height = kTile, view.near = 0.01, view.stop = 1e-3,
+  view.level = 0.5;
   for (int i = 0; i < 3; ++i) view.world_to_camera[5 * i] = 1;
-  float center[kPairs][3], rotation[kPairs][4], extent[kPairs][3], density[kPairs], sh[kPairs][3], color[kPairs][3], key[kPairs];
+  float center[kPairs][3], rotation[kPairs][4], extent[kPairs][3], density[kPairs], sh[kPairs][3], color[kPairs][3],
+      key[kPairs];
   Footprint footprints[kPairs];
   OctahedronRecord<float> records[kPairs];
   for (int i = 0; i < kPairs; ++i) {
@@ -73,8 +76,10 @@ Limits measure_limits() {
     for (int k = 0; k < 3; ++k) extent[i][k] = 0.4f + 0.1f * float(k), sh[i][k] = 0.5f;
     density[i] = 0.02f;
   }
-  const Primitives<float> primitives{PrimitiveKind::kOctahedron, kPairs, center[0], rotation[0], extent[0], density, sh[0], 1};
-  project_octahedra<float, RayModel::kExact>({view, primitives, records, footprints, key, color[0], nullptr}, 0, kPairs);
+  const Primitives<float> primitives{
+      PrimitiveKind::kOctahedron, kPairs, center[0], rotation[0], extent[0], density, sh[0], 1};
+  project_octahedra<float, RayModel::kExact>({view, primitives, records, footprints, key, color[0], nullptr}, 0,
+                                             kPairs);
 
   const Lanes<float, W> lanes;
   alignas(64) float length[kTilePixels], through[kTilePixels], red[kTilePixels], green[kTilePixels], blue[kTilePixels];
@@ -82,7 +87,8 @@ Limits measure_limits() {
   auto each_part = [&](auto body) {
     for (int block = 0; block < kBlocks; ++block)
       for (int part = 0; part < T::kParts; ++part)
-        body(block * 16 + part * W, lanes.x + V::set(float(4 * (block & 3) + T::part_x(part))), lanes.y + V::set(float(4 * (block >> 2) + T::part_y(part))));
+        body(block * 16 + part * W, lanes.x + V::set(float(4 * (block & 3) + T::part_x(part))),
+             lanes.y + V::set(float(4 * (block >> 2) + T::part_y(part))));
   };
   const double forward = shortest_ns(kRepeats, [&] {
     each_part([&](int at, V x, V y) {
@@ -101,7 +107,8 @@ Limits measure_limits() {
           V alpha, e_tau;
           Solid::attenuate(R, taus[i], alpha, e_tau);
           const V weight = t * alpha;
-          r = fma(weight, V::set(R.rgb[0]), r), g = fma(weight, V::set(R.rgb[1]), g), b = fma(weight, V::set(R.rgb[2]), b);
+          r = fma(weight, V::set(R.rgb[0]), r), g = fma(weight, V::set(R.rgb[1]), g),
+          b = fma(weight, V::set(R.rgb[2]), b);
           t = t * e_tau;
         }
       }

@@ -15,7 +15,8 @@ struct Octahedron : Polyhedron<RealType, W, kRays> {
   using I = typename Base::I;
   using Meeting = typename Base::Meeting;
 
-  // Planes where the rays enter and leave; x and y are counted in pixels from the record's reference. kTrack: also which faces.
+  // Planes where the rays enter and leave; x and y are counted in pixels from the record's reference. kTrack: also
+  // which faces.
   template <bool kTrack>
   static M meet(const Record& r, const View& view, V x, V y, V, Meeting& m) {
     auto value = [&](int f) { return fma(V::set(r.b[f]), x, fma(V::set(r.c[f]), y, V::set(r.a[f]))); };
@@ -51,8 +52,9 @@ struct Octahedron : Polyhedron<RealType, W, kRays> {
     return m.out < m.in;
   }
 
-  // Adds gradients to the planes of entry and exit (0 in lanes without a hit) to the sums of the three local forms p_k: with g the gradient
-  // to p_k, the sums of g, g x, g y and g w at 0, 3, 6 and 9; px and py are positions from the pair's origin.
+  // Adds gradients to the planes of entry and exit (0 in lanes without a hit) to the sums of the three local forms p_k:
+  // with g the gradient to p_k, the sums of g, g x, g y and g w at 0, 3, 6 and 9; px and py are positions from the
+  // pair's origin.
   static void add_planes(const Record& r, const Meeting& m, M hit, V g_in, V g_out, V px, V py, V* sums) {
     // A lane that does not hit may hold an infinity, and 0 times that is no number.
     const V zero = V::set(0), g_in_w = g_in * select(hit, m.in, zero), g_out_w = g_out * select(hit, m.out, zero);

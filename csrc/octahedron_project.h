@@ -5,8 +5,8 @@
 
 namespace linprim::LINPRIM_ISA {
 
-// The local forms n_k = axis_k / extent_k. Axes are mirrored so that m_k = n_k . c >= 0 (affine: n_k . j), which an octahedron does not notice;
-// `flip` undoes it.
+// The local forms n_k = axis_k / extent_k. Axes are mirrored so that m_k = n_k . c >= 0 (affine: n_k . j), which an
+// octahedron does not notice; `flip` undoes it.
 template <RayModel kRays>
 struct OctahedronFrame {
   Pose pose;
@@ -48,7 +48,8 @@ inline void pair_sums(const D v[3], D out[4]) {
 }
 
 // Silhouette half-planes of one lane for the general path: every edge between a front and a back face.
-inline void silhouette_lines(const D* a, const D* b, const D* c, int l, const bool front[8], const double signs[8][3], D* line_a, D* line_b, D* line_c) {
+inline void silhouette_lines(const D* a, const D* b, const D* c, int l, const bool front[8], const double signs[8][3],
+                             D* line_a, D* line_b, D* line_c) {
   int count = 0;
   for (int i = 0; i < 8; ++i)
     for (int j = 0; j < 8; ++j) {
@@ -93,7 +94,9 @@ void project_octahedra(const ProjectParams<Real>& P, int64_t begin, int64_t end)
     set_boxes(view, box.low_x, box.high_x, box.low_y, box.high_y, lanes, visible, print);
     D nearest = center[2] - reach;
     if constexpr (!kExact)
-      nearest = rays.length - vmax(vmax(vabs(dot(rays.held, f.arm[0])), vabs(dot(rays.held, f.arm[2]))), vabs(dot(rays.held, f.arm[4]))) * rays.inverse_held;
+      nearest = rays.length - vmax(vmax(vabs(dot(rays.held, f.arm[0])), vabs(dot(rays.held, f.arm[2]))),
+                                   vabs(dot(rays.held, f.arm[4]))) *
+                                  rays.inverse_held;
     const D key = order_key(rays, nearest, longest);
     for (int l = 0; l < lanes; ++l) {
       P.key[first + l] = Real(key[l]);
@@ -127,12 +130,14 @@ void project_octahedra(const ProjectParams<Real>& P, int64_t begin, int64_t end)
       a[j] = (side[j] * q[j] - rays.kappa) * near_side, a[4 + j] = (-side[j] * q[j] - rays.kappa) * far_side;
       b[j] = side[j] * qx[j] * near_side, b[4 + j] = -side[j] * qx[j] * far_side;
       c[j] = side[j] * qy[j] * near_side, c[4 + j] = -side[j] * qy[j] * far_side;
-      for (int k = 0; k < 3; ++k) face[8 * k + j] = kSign[j][k] * side[j] * near_side, face[8 * k + 4 + j] = -kSign[j][k] * side[j] * far_side;
+      for (int k = 0; k < 3; ++k)
+        face[8 * k + j] = kSign[j][k] * side[j] * near_side, face[8 * k + 4 + j] = -kSign[j][k] * side[j] * far_side;
     }
     const B general = ~(front[0] & front[1] & front[2] & front[3]) | rays.crosses_near;
 
-    // Silhouette: with m >= 0 at most one of sigma[1..3] is negative. If none is, the silhouette is a hexagon and its edges lie
-    // between the face pairs {1,2}, {1,3}, {2,3}; if sigma[k] is, it is a quadrilateral between {0,k} and the other two.
+    // Silhouette: with m >= 0 at most one of sigma[1..3] is negative. If none is, the silhouette is a hexagon and its
+    // edges lie between the face pairs {1,2}, {1,3}, {2,3}; if sigma[k] is, it is a quadrilateral between {0,k} and the
+    // other two.
     D line_a[6], line_b[6], line_c[6];
     const B n1 = (B)(sigma[1] <= 0.0), n2 = (B)(sigma[2] <= 0.0), n3 = (B)(sigma[3] <= 0.0);
     auto edges = [&](int slot, int i, int j, B to0i, B to0j) {
@@ -170,14 +175,15 @@ void project_octahedra(const ProjectParams<Real>& P, int64_t begin, int64_t end)
       record[l].w0 = Real(rays.w0[l]), record[l].density = Real(density[l]);
       record[l].ref_x = Real(rays.ref_x[l]), record[l].ref_y = Real(rays.ref_y[l]);
       print[l].ref_x = int(rays.ref_x[l]), print[l].ref_y = int(rays.ref_y[l]);
-      record[l].flags = (front[0][l] ? 1u : 0u) | (front[1][l] ? 2u : 0u) | (front[2][l] ? 4u : 0u) | (front[3][l] ? 8u : 0u) |
-                        (general[l] ? kGeneral : 0u);
+      record[l].flags = (front[0][l] ? 1u : 0u) | (front[1][l] ? 2u : 0u) | (front[2][l] ? 4u : 0u) |
+                        (front[3][l] ? 8u : 0u) | (general[l] ? kGeneral : 0u);
     }
     evaluate_color(eye, f.pose, P.primitives, first, lanes, visible, P.color, &record[0].rgb[0], kRow);
     if (P.normals)
       for (int j = 0; j < 4; ++j) {
         D normal[3];
-        for (int i = 0; i < 3; ++i) normal[i] = side[j] * (kSign[j][0] * f.n[0][i] + kSign[j][1] * f.n[1][i] + kSign[j][2] * f.n[2][i]);
+        for (int i = 0; i < 3; ++i)
+          normal[i] = side[j] * (kSign[j][0] * f.n[0][i] + kSign[j][1] * f.n[1][i] + kSign[j][2] * f.n[2][i]);
         const D inverse = 1.0 / vsqrt(dot(normal, normal));
         for (int i = 0; i < 3; ++i)
           for (int l = 0; l < lanes; ++l) P.normals[first + l][j][i] = Real(normal[i][l] * inverse[l]);

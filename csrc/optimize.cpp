@@ -11,8 +11,8 @@
 
 namespace linprim {
 
-Photometric photometric_loss(const float* image, const float* target, const float* weight, int width, int height, float dssim,
-                             float* gradient) {
+Photometric photometric_loss(const float* image, const float* target, const float* weight, int width, int height,
+                             float dssim, float* gradient) {
   constexpr double kNoWeight = 1e-12;
   constexpr int kMinRows = 64;  // of a part: a part also computes most of what belongs to the 20 rows around it
   static std::mutex mutex;
@@ -47,13 +47,23 @@ Photometric photometric_loss(const float* image, const float* target, const floa
   return result;
 }
 
-void adam_step(float* value, const float* gradient, float* first, float* second, int64_t n, float rate, float beta1, float beta2,
-               float epsilon, int64_t step) {
+void adam_step(float* value, const float* gradient, float* first, float* second, int64_t n, float rate, float beta1,
+               float beta2, float epsilon, int64_t step) {
   constexpr int64_t kPerTask = 1 << 15;
-  const AdamParams params{value, first, second, gradient, n, rate, beta1, beta2, epsilon,
-                          float(1.0 - std::pow(double(beta1), double(step))), float(1.0 - std::pow(double(beta2), double(step)))};
-  parallel_for((n + kPerTask - 1) / kPerTask,
-               [&](int64_t task, int) { image_kernels().adam(params, task * kPerTask, std::min(n, (task + 1) * kPerTask)); });
+  const AdamParams params{value,
+                          first,
+                          second,
+                          gradient,
+                          n,
+                          rate,
+                          beta1,
+                          beta2,
+                          epsilon,
+                          float(1.0 - std::pow(double(beta1), double(step))),
+                          float(1.0 - std::pow(double(beta2), double(step)))};
+  parallel_for((n + kPerTask - 1) / kPerTask, [&](int64_t task, int) {
+    image_kernels().adam(params, task * kPerTask, std::min(n, (task + 1) * kPerTask));
+  });
 }
 
 namespace {
@@ -80,17 +90,27 @@ struct Corrections {
 
 }  // namespace
 
-void adam_rows(const RowTensor* tensors, int count, int64_t n, const uint8_t* touched, int32_t* steps, float beta1, float beta2,
-               float epsilon) {
+void adam_rows(const RowTensor* tensors, int count, int64_t n, const uint8_t* touched, int32_t* steps, float beta1,
+               float beta2, float epsilon) {
   constexpr int64_t kPerTask = kAdamRows;
   static std::mutex mutex;
   static auto* corrections = new Corrections;
   std::lock_guard lock(mutex);
   corrections->make(beta1, beta2);
-  const AdamRowsParams params{tensors, count, touched, steps, beta1, beta2, epsilon, corrections->inverse.data(), corrections->root.data(),
-                              int64_t(corrections->inverse.size()), corrections->complete};
-  parallel_for((n + kPerTask - 1) / kPerTask,
-               [&](int64_t task, int) { image_kernels().adam_rows(params, task * kPerTask, std::min(n, (task + 1) * kPerTask)); });
+  const AdamRowsParams params{tensors,
+                              count,
+                              touched,
+                              steps,
+                              beta1,
+                              beta2,
+                              epsilon,
+                              corrections->inverse.data(),
+                              corrections->root.data(),
+                              int64_t(corrections->inverse.size()),
+                              corrections->complete};
+  parallel_for((n + kPerTask - 1) / kPerTask, [&](int64_t task, int) {
+    image_kernels().adam_rows(params, task * kPerTask, std::min(n, (task + 1) * kPerTask));
+  });
 }
 
 namespace {

@@ -99,7 +99,8 @@ Shared*& shared_pointer() {
 }
 Shared& shared() {
 #if !defined(_WIN32)
-  // A forked child has the pool's memory but none of its threads, and perhaps a lock that nobody will release: it gets new ones.
+  // A forked child has the pool's memory but none of its threads, and perhaps a lock that nobody will release: it gets
+  // new ones.
   static pid_t owner = getpid();
   if (owner != getpid()) {
     owner = getpid();

@@ -12,8 +12,8 @@ namespace linprim {
 void set_threads(int count);
 int threads();
 
-// Calls body(item, thread) once for each item in [0, items), on up to threads() threads; returns when all are done. If a body throws
-// (out of memory is all that can), the remaining items are skipped and the exception is thrown here.
+// Calls body(item, thread) once for each item in [0, items), on up to threads() threads; returns when all are done. If
+// a body throws (out of memory is all that can), the remaining items are skipped and the exception is thrown here.
 // `thread` is below threads(). Items are handed out in order. Calls from several threads take turns.
 void parallel_for(int64_t items, const std::function<void(int64_t item, int thread)>& body);
 

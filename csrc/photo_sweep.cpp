@@ -5,8 +5,8 @@ namespace {
 
 constexpr double kLeastFacing = 0.1;
 
-void add_point(const PhotoView& view, const float* jump, const PhotoRules& rules, const double* offset, int offsets, const PhotoSums& sums,
-               int64_t p) {
+void add_point(const PhotoView& view, const float* jump, const PhotoRules& rules, const double* offset, int offsets,
+               const PhotoSums& sums, int64_t p) {
   SeenPoint seen;
   if (!look(view, rules.least_cosine, sums.point + 3 * p, sums.normal + 3 * p, seen)) return;
   const double *at = seen.at, *normal = seen.normal, z = at[2];
@@ -21,7 +21,8 @@ void add_point(const PhotoView& view, const float* jump, const PhotoRules& rules
   for (int k = 0; k < offsets; ++k) {
     const double along = offset[k] * sums.footprint[p], depth = z + along * normal[2];
     float found;
-    bilinear(view, (at[0] + along * normal[0]) / depth * view.fx + view.cx, (at[1] + along * normal[1]) / depth * view.fy + view.cy, &found);
+    bilinear(view, (at[0] + along * normal[0]) / depth * view.fx + view.cx,
+             (at[1] + along * normal[1]) / depth * view.fy + view.cy, &found);
     value[k] += weight * found, square[k] += weight * found * found;
   }
   sums.weight[p] += weight;
@@ -30,15 +31,18 @@ void add_point(const PhotoView& view, const float* jump, const PhotoRules& rules
 
 }  // namespace
 
-void add_photo(const PhotoView& view, const float* jump, const PhotoRules& rules, const double* offset, int offsets, const PhotoSums& sums) {
+void add_photo(const PhotoView& view, const float* jump, const PhotoRules& rules, const double* offset, int offsets,
+               const PhotoSums& sums) {
   for_points(sums.count, [&](int64_t p) { add_point(view, jump, rules, offset, offsets, sums, p); });
 }
 
-void least_footprints(const PhotoView& view, double least_cosine, const double* point, const double* normal, int64_t count, double* least) {
+void least_footprints(const PhotoView& view, double least_cosine, const double* point, const double* normal,
+                      int64_t count, double* least) {
   const double focal = std::sqrt(view.fx * view.fy);
   for_points(count, [&](int64_t p) {
     SeenPoint seen;
-    if (look(view, least_cosine, point + 3 * p, normal + 3 * p, seen)) least[p] = std::min(least[p], seen.at[2] / (focal * seen.facing));
+    if (look(view, least_cosine, point + 3 * p, normal + 3 * p, seen))
+      least[p] = std::min(least[p], seen.at[2] / (focal * seen.facing));
   });
 }
 

@@ -11,12 +11,12 @@ namespace linprim {
 
 // Pixel centres at +0.5. Arrays are (height, width).
 struct PhotoView {
-  double pose[12];                // world to camera, 3 rows of 4
+  double pose[12];  // world to camera, 3 rows of 4
   double fx, fy, cx, cy;
   int width, height;
-  const float* image;             // (height, width, channels)
+  const float* image;  // (height, width, channels)
   int channels;
-  const float* depth;             // z of the surface
+  const float* depth;  // z of the surface
 };
 
 // Camera coordinates of a point.
@@ -27,7 +27,8 @@ inline void to_camera(const PhotoView& view, const double* point, double* at) {
   }
 }
 
-// A point and its normal in camera coordinates, the cosine between the normal and the direction to the camera, and its pixel.
+// A point and its normal in camera coordinates, the cosine between the normal and the direction to the camera, and its
+// pixel.
 struct SeenPoint {
   double at[3], normal[3], facing, u, v;
 
@@ -35,7 +36,8 @@ struct SeenPoint {
 };
 
 // False where the point is behind the camera, flatter than `least_cosine`, or outside of the image.
-inline bool look(const PhotoView& view, double least_cosine, const double* point, const double* normal, SeenPoint& out) {
+inline bool look(const PhotoView& view, double least_cosine, const double* point, const double* normal,
+                 SeenPoint& out) {
   to_camera(view, point, out.at);
   for (int r = 0; r < 3; ++r) {
     const double* row = view.pose + 4 * r;
@@ -50,8 +52,8 @@ inline bool look(const PhotoView& view, double least_cosine, const double* point
   return out.u >= 0 && out.u < view.width && out.v >= 0 && out.v < view.height;
 }
 
-// How much the depth of a plane changes from one pixel to the next: a pixel's footprint times the tangent. Flatter ones than
-// `least_facing` slope no more than that.
+// How much the depth of a plane changes from one pixel to the next: a pixel's footprint times the tangent. Flatter ones
+// than `least_facing` slope no more than that.
 inline double slope_across(double footprint, double facing, double least_facing) {
   const double cosine = std::max(facing, least_facing);
   return footprint * std::sqrt(1 / (cosine * cosine) - 1);
@@ -59,7 +61,8 @@ inline double slope_across(double footprint, double facing, double least_facing)
 
 // Writes the channels at (u, v), interpolated bilinearly; beyond the outermost pixel centres they are theirs.
 inline void bilinear(const PhotoView& view, double u, double v, float* out) {
-  const double x = std::clamp(u - 0.5, 0.0, double(view.width - 1)), y = std::clamp(v - 0.5, 0.0, double(view.height - 1));
+  const double x = std::clamp(u - 0.5, 0.0, double(view.width - 1)),
+               y = std::clamp(v - 0.5, 0.0, double(view.height - 1));
   const int j = std::min(int(x), std::max(view.width - 2, 0)), i = std::min(int(y), std::max(view.height - 2, 0));
   const int right = std::min(j + 1, view.width - 1), below = std::min(i + 1, view.height - 1), n = view.channels;
   const float a = float(x - j), b = float(y - i);

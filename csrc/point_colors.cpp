@@ -6,7 +6,8 @@ namespace {
 // Slopes that the depth on an outline jumps by, and that a point on it lies behind what is nearest.
 constexpr double kOutlineSlopes = 4, kBehindSlopes = 2;
 
-void add_color(const PhotoView& view, const float* near, const float* far, const ColorRules& rules, const ColorSamples& samples, int64_t p) {
+void add_color(const PhotoView& view, const float* near, const float* far, const ColorRules& rules,
+               const ColorSamples& samples, int64_t p) {
   SeenPoint seen;
   if (!look(view, 0, samples.point + 3 * p, samples.normal + 3 * p, seen)) return;
   const int64_t pixel = seen.pixel(view.width);
@@ -23,8 +24,8 @@ void add_color(const PhotoView& view, const float* near, const float* far, const
     poor |= alpha < rules.opaque;
     for (int c = 0; c < 3; ++c) color[c] /= alpha;
   }
-  const float weight =
-      float(std::max(seen.facing, rules.least_facing * rules.least_facing) / (step * step) * (poor ? rules.poor_share : 1));
+  const float weight = float(std::max(seen.facing, rules.least_facing * rules.least_facing) / (step * step) *
+                             (poor ? rules.poor_share : 1));
   if (!poor) samples.good[p] = 1;
   float *best = samples.best + p * kKeptSamples, *shade = samples.shade + p * kKeptSamples * 3;
   int slot = kKeptSamples;
@@ -38,7 +39,8 @@ void add_color(const PhotoView& view, const float* near, const float* far, const
 
 }  // namespace
 
-void add_colors(const PhotoView& view, const float* near, const float* far, const ColorRules& rules, const ColorSamples& samples) {
+void add_colors(const PhotoView& view, const float* near, const float* far, const ColorRules& rules,
+                const ColorSamples& samples) {
   for_points(samples.count, [&](int64_t p) { add_color(view, near, far, rules, samples, p); });
 }
 

@@ -9,10 +9,11 @@
 namespace linprim {
 namespace {
 
-constexpr int64_t kLeaf = 16;           // points in a leaf at most
+constexpr int64_t kLeaf = 16;  // points in a leaf at most
 constexpr int64_t kBodiesPerTask = 64;
 
-// Points begin .. end - 1 of the order. Its first child is the next node, unless that is `after`, the next one that is not below it: a leaf.
+// Points begin .. end - 1 of the order. Its first child is the next node, unless that is `after`, the next one that is
+// not below it: a leaf.
 struct PointNode {
   double low[3], high[3];
   int64_t begin, end;
@@ -55,7 +56,8 @@ double ahead(const double* normal, const double* center, const double* x) {
 }
 
 // The points within a body, in order; none if fewer than `least` are within it before it is enlarged.
-std::vector<int64_t> find(const PointTree& tree, const ConvexBodies& bodies, int64_t body, double enlarged, int64_t least) {
+std::vector<int64_t> find(const PointTree& tree, const ConvexBodies& bodies, int64_t body, double enlarged,
+                          int64_t least) {
   const double* center = bodies.center + 3 * body;
   const double* normal = bodies.normal + 3 * bodies.faces * body;
   const double* offset = bodies.offset + bodies.faces * body;
@@ -88,14 +90,16 @@ std::vector<int64_t> find(const PointTree& tree, const ConvexBodies& bodies, int
 
 }  // namespace
 
-std::vector<std::vector<int64_t>> points_within(const ConvexBodies& bodies, const double* point, int64_t count, double enlarged, int64_t least) {
+std::vector<std::vector<int64_t>> points_within(const ConvexBodies& bodies, const double* point, int64_t count,
+                                                double enlarged, int64_t least) {
   PointTree tree{point, std::vector<int64_t>(count), {}};
   std::iota(tree.order.begin(), tree.order.end(), int64_t(0));
   if (count > 0) tree.build(0, count);
   std::vector<std::vector<int64_t>> found(bodies.count);
   parallel_for((bodies.count + kBodiesPerTask - 1) / kBodiesPerTask, [&](int64_t task, int) {
     const int64_t end = std::min((task + 1) * kBodiesPerTask, bodies.count);
-    for (int64_t body = task * kBodiesPerTask; body < end; ++body) found[body] = find(tree, bodies, body, enlarged, least);
+    for (int64_t body = task * kBodiesPerTask; body < end; ++body)
+      found[body] = find(tree, bodies, body, enlarged, least);
   });
   return found;
 }

@@ -14,8 +14,9 @@ struct ConvexBodies {
   const double* offset;  // (count, faces) of the faces from the centre, not negative
 };
 
-// For each body the rows, in order, of the points within it when it is `enlarged` times as large about its centre; none if fewer than
-// `least` lie within the body as it is. Points are finite.
-std::vector<std::vector<int64_t>> points_within(const ConvexBodies& bodies, const double* point, int64_t count, double enlarged, int64_t least);
+// For each body the rows, in order, of the points within it when it is `enlarged` times as large about its centre; none
+// if fewer than `least` lie within the body as it is. Points are finite.
+std::vector<std::vector<int64_t>> points_within(const ConvexBodies& bodies, const double* point, int64_t count,
+                                                double enlarged, int64_t least);
 
 }  // namespace linprim

@@ -1,4 +1,5 @@
-// What the polyhedra have in common in a tile kernel: from the planes of entry and exit to depths and optical thickness, and back.
+// What the polyhedra have in common in a tile kernel: from the planes of entry and exit to depths and optical
+// thickness, and back.
 //
 // A tile kernel asks of a primitive kind ("Solid"):
 //   Record, Meeting, kVolume (absorbs along an interval), kColorSums and kGeometrySums per gradient slot
@@ -33,10 +34,10 @@ struct Polyhedron {
   static constexpr int kColorSums = 16, kGeometrySums = 32;
 
   struct Meeting {
-    V in, out;            // planes of entry and exit, in < out is a miss
-    I in_face, out_face;  // where tracked
+    V in, out;               // planes of entry and exit, in < out is a miss
+    I in_face, out_face;     // where tracked
     V w_in, w_out, inverse;  // exact rays: inverse depths and 1 / (w_in w_out)
-    V chord;              // metric length inside
+    V chord;                 // metric length inside
   };
 
   template <class Record>
@@ -63,12 +64,12 @@ struct Polyhedron {
       t_in = (V::set(r.w0) - m.in) * inverse, t_out = (V::set(r.w0) - m.out) * inverse;
     }
   }
-  // From the gradients to optical thickness, z-depth of entry and of exit (0 in lanes without a hit), and what the density has beside its
-  // share of the thickness, to the sums of Solid's record. The unnamed argument is the transmittance; kDistance: there is a sum for the
-  // centre's distance.
+  // From the gradients to optical thickness, z-depth of entry and of exit (0 in lanes without a hit), and what the
+  // density has beside its share of the thickness, to the sums of Solid's record. The unnamed argument is the
+  // transmittance; kDistance: there is a sum for the centre's distance.
   template <class Solid, bool kDistance>
-  static void add_gradient(const typename Solid::Record& r, const Meeting& m, M hit, V length, V, V d_tau, V d_in, V d_out, V d_density, V px, V py,
-                           V* sums) {
+  static void add_gradient(const typename Solid::Record& r, const Meeting& m, M hit, V length, V, V d_tau, V d_in,
+                           V d_out, V d_density, V px, V py, V* sums) {
     const V zero = V::set(0), d_chord = d_tau * V::set(r.density);
     sums[Sum::density] = fma(d_tau, m.chord, sums[Sum::density] + d_density);
     const M faced = hit & is_face(m.in_face);  // a ray that entered through the near plane moves with no face

@@ -1,12 +1,14 @@
-// What the polyhedra share when they are projected: face planes over the pixels for both ray models, screen boxes, the screen filter;
-// each with its adjoint beside it.
+// What the polyhedra share when they are projected: face planes over the pixels for both ray models, screen boxes, the
+// screen filter; each with its adjoint beside it.
 //
-// A face is the plane n . (x - c) = 1 in camera space. Its w over the pixels (see OctahedronRecord) is (p - kappa) / h with p affine in
-// the pixel and both p and h linear in n:
+// A face is the plane n . (x - c) = 1 in camera space. Its w over the pixels (see OctahedronRecord) is (p - kappa) / h
+// with p affine in the pixel and both p and h linear in n:
 //   exact rays   p = n . (v - w0 c), kappa = w0, h = 1 + m, m = n . c           (w = inverse depth - w0)
-//   affine rays  p = n'_u (u - u_c) + n'_v (v - v_c), kappa = 1, h = m, m = n . j / |j|,   n' = J^-T n   (w = |c| - distance)
-// J is the Jacobian of (x/z, y/z, |x|) at j, the ray space of EWA splatting (Zwicker et al. 2002, section 4). j is the centre c, or at its depth
-// the nearest to it in a margin around the image, as for Gaussians: beyond, J grows without bound and small things cover the image.
+//   affine rays  p = n'_u (u - u_c) + n'_v (v - v_c), kappa = 1, h = m, m = n . j / |j|,   n' = J^-T n   (w = |c| -
+//   distance)
+// J is the Jacobian of (x/z, y/z, |x|) at j, the ray space of EWA splatting (Zwicker et al. 2002, section 4). j is the
+// centre c, or at its depth the nearest to it in a margin around the image, as for Gaussians: beyond, J grows without
+// bound and small things cover the image.
 #pragma once
 
 #include "primitive_pose.h"
@@ -26,14 +28,14 @@ template <RayModel kRays>
 struct RayFrame {
   static constexpr bool kExact = kRays == RayModel::kExact;
   const View& view;
-  const D* c;           // centre, camera space
-  D ref_x, ref_y;       // reference pixel: the one nearest to the projected centre
+  const D* c;      // centre, camera space
+  D ref_x, ref_y;  // reference pixel: the one nearest to the projected centre
   D w0, kappa;
-  D base[3];            // exact: v_ref - w0 c; affine: (u_ref - u_c, v_ref - v_c, 0)
+  D base[3];                            // exact: v_ref - w0 c; affine: (u_ref - u_c, v_ref - v_c, 0)
   D inverse_z, length, inverse_length;  // affine: 1/z, |c|, 1/|c|
   D held[3], inverse_held;              // affine: j, 1/|j|
   B free[2];                            // affine: j follows x, y of the centre
-  B crosses_near;       // exact: w0 = 0 and the reference is the principal point
+  B crosses_near;                       // exact: w0 = 0 and the reference is the principal point
 
   // `reach` is how far the primitive extends from its centre along z, both ways.
   RayFrame(const View& v, const D center[3], D reach) : view(v), c(center) {
@@ -42,7 +44,8 @@ struct RayFrame {
     inverse_z = 1.0 / safe_z;
     const D x = view.fx * c[0] * inverse_z + (view.cx - 0.5), y = view.fy * c[1] * inverse_z + (view.cy - 0.5);
     // A reference far outside the image only loses precision where nothing is drawn.
-    ref_x = nearest(crosses_near ? splat(std::floor(view.cx)) : x), ref_y = nearest(crosses_near ? splat(std::floor(view.cy)) : y);
+    ref_x = nearest(crosses_near ? splat(std::floor(view.cx)) : x),
+    ref_y = nearest(crosses_near ? splat(std::floor(view.cy)) : y);
     const D u = (ref_x + (0.5 - view.cx)) * (1.0 / view.fx), v_ref = (ref_y + (0.5 - view.cy)) * (1.0 / view.fy);
     if constexpr (kExact) {
       w0 = kappa = crosses_near ? splat(0.0) : inverse_z;
@@ -56,12 +59,11 @@ struct RayFrame {
       inverse_held = 1.0 / vsqrt(dot(held, held));
     }
   }
-  static D nearest(D x) {
-    return __builtin_convertvector(floor_of(clamp(x, -4e6, 4e6) + 0.5), D);
-  }
+  static D nearest(D x) { return __builtin_convertvector(floor_of(clamp(x, -4e6, 4e6) + 0.5), D); }
   static void hold(const View& view, const D c[3], D held[3], B free[2]) {
     const D z = c[2] > view.near ? c[2] : splat(1.0), inverse = 1.0 / z, u = c[0] * inverse, v = c[1] * inverse;
-    const D held_u = held_in_view(u, view.width, view.cx, view.fx), held_v = held_in_view(v, view.height, view.cy, view.fy);
+    const D held_u = held_in_view(u, view.width, view.cx, view.fx),
+            held_v = held_in_view(v, view.height, view.cy, view.fy);
     free[0] = (B)(u == held_u), free[1] = (B)(v == held_v);
     held[0] = free[0] ? c[0] : held_u * z, held[1] = free[1] ? c[1] : held_v * z, held[2] = z;
   }
@@ -92,7 +94,8 @@ struct RayFrame {
       // |j|: m has its inverse, share its inverse square.
       const D radial = -(gm * along * l2 * inverse_held + 2.0 * g_share * share * l2);
       for (int i = 0; i < 3; ++i) n_grad[i] += held[i] * g_along, to[i] += n[i] * g_along + held[i] * radial;
-      for (int i = 0; i < 2; ++i) c_grad[i] += free[i] ? to[i] : splat(0.0), c_grad[2] += free[i] ? splat(0.0) : to[i] * held[i] * inverse_z;
+      for (int i = 0; i < 2; ++i)
+        c_grad[i] += free[i] ? to[i] : splat(0.0), c_grad[2] += free[i] ? splat(0.0) : to[i] * held[i] * inverse_z;
       c_grad[2] += to[2];
       add_centre(g_uc, g_vc, c_grad);
     }
@@ -106,10 +109,12 @@ struct RayFrame {
   void project(const D arm[3], D& x, D& y) const {
     if constexpr (kExact) {
       const D inverse = 1.0 / (crosses_near ? splat(1.0) : c[2] + arm[2]);
-      x = view.fx * (c[0] + arm[0]) * inverse + (view.cx - 0.5), y = view.fy * (c[1] + arm[1]) * inverse + (view.cy - 0.5);
+      x = view.fx * (c[0] + arm[0]) * inverse + (view.cx - 0.5),
+      y = view.fy * (c[1] + arm[1]) * inverse + (view.cy - 0.5);
     } else {
       const D u = held[0] * inverse_z, v = held[1] * inverse_z;
-      x = view.fx * (c[0] + arm[0] - u * arm[2]) * inverse_z + (view.cx - 0.5), y = view.fy * (c[1] + arm[1] - v * arm[2]) * inverse_z + (view.cy - 0.5);
+      x = view.fx * (c[0] + arm[0] - u * arm[2]) * inverse_z + (view.cx - 0.5),
+      y = view.fy * (c[1] + arm[1] - v * arm[2]) * inverse_z + (view.cy - 0.5);
     }
   }
   void project_grad(const D arm[3], D gx, D gy, D arm_grad[3], D c_grad[3]) const {
@@ -138,21 +143,24 @@ inline Box box_of(const RayFrame<kRays>& rays, const D (*arm)[3], int vertices) 
   for (int i = 0; i < vertices; ++i) {
     D x, y;
     rays.project(arm[i], x, y);
-    box.low_x = vmin(box.low_x, x), box.high_x = vmax(box.high_x, x), box.low_y = vmin(box.low_y, y), box.high_y = vmax(box.high_y, y);
+    box.low_x = vmin(box.low_x, x), box.high_x = vmax(box.high_x, x), box.low_y = vmin(box.low_y, y),
+    box.high_y = vmax(box.high_y, y);
   }
   return box;
 }
 
-// For lanes that cross the near plane: the box of what lies beyond it, from the vertices there and where edges pass through. Every two vertices
-// are joined by an edge but, with kOpposite, 2 k and 2 k + 1.
+// For lanes that cross the near plane: the box of what lies beyond it, from the vertices there and where edges pass
+// through. Every two vertices are joined by an edge but, with kOpposite, 2 k and 2 k + 1.
 template <bool kOpposite>
-inline void clip_boxes(const View& view, const D center[3], const D (*arm)[3], int vertices, B crosses, int lanes, Box& box) {
+inline void clip_boxes(const View& view, const D center[3], const D (*arm)[3], int vertices, B crosses, int lanes,
+                       Box& box) {
   for (int l = 0; l < lanes; ++l) {
     if (!crosses[l]) continue;
     double low_x = 1e30, high_x = -1e30, low_y = 1e30, high_y = -1e30;
     auto add = [&](double x, double y, double z) {
       const double px = view.fx * x / z + (view.cx - 0.5), py = view.fy * y / z + (view.cy - 0.5);
-      low_x = std::min(low_x, px), high_x = std::max(high_x, px), low_y = std::min(low_y, py), high_y = std::max(high_y, py);
+      low_x = std::min(low_x, px), high_x = std::max(high_x, px), low_y = std::min(low_y, py),
+      high_y = std::max(high_y, py);
     };
     double at[6][3];
     for (int i = 0; i < vertices; ++i)
@@ -170,8 +178,9 @@ inline void clip_boxes(const View& view, const D center[3], const D (*arm)[3], i
   }
 }
 
-// Screen filter: a pixel's ray meets the primitive where the ray of (pixel - projected centre) * scale would, so its box grows by half the
-// filter on every side; density is multiplied by scale_x scale_y, which keeps the optical thickness summed over the screen.
+// Screen filter: a pixel's ray meets the primitive where the ray of (pixel - projected centre) * scale would, so its
+// box grows by half the filter on every side; density is multiplied by scale_x scale_y, which keeps the optical
+// thickness summed over the screen.
 template <RayModel kRays>
 struct ScreenFilter {
   D scale_x, scale_y, half_x, half_y;
@@ -179,7 +188,8 @@ struct ScreenFilter {
   double half;
   ScreenFilter(const RayFrame<kRays>& rays, const Box& box) : half(rays.view.screen_filter / 2) {
     half_x = 0.5 * (box.high_x - box.low_x), half_y = 0.5 * (box.high_y - box.low_y);
-    scale_x = rays.crosses_near ? splat(1.0) : half_x / (half_x + half), scale_y = rays.crosses_near ? splat(1.0) : half_y / (half_y + half);
+    scale_x = rays.crosses_near ? splat(1.0) : half_x / (half_x + half),
+    scale_y = rays.crosses_near ? splat(1.0) : half_y / (half_y + half);
     const View& view = rays.view;
     center_x = rays.crosses_near ? splat(0.0) : view.fx * rays.c[0] * rays.inverse_z + (view.cx - 0.5) - rays.ref_x;
     center_y = rays.crosses_near ? splat(0.0) : view.fy * rays.c[1] * rays.inverse_z + (view.cy - 0.5) - rays.ref_y;
@@ -193,7 +203,8 @@ struct ScreenFilter {
     box.low_x = x + (box.low_x - x) / scale_x, box.high_x = x + (box.high_x - x) / scale_x;
     box.low_y = y + (box.low_y - y) / scale_y, box.high_y = y + (box.high_y - y) / scale_y;
   }
-  // Turns the gradients of a filtered form into those of the form; gathers its part of the gradients to scales and centre.
+  // Turns the gradients of a filtered form into those of the form; gathers its part of the gradients to scales and
+  // centre.
   D g_scale_x{}, g_scale_y{}, g_center_x{}, g_center_y{};
   void apply_grad(D px, D py, D g, D& gx, D& gy) {
     g_scale_x += px * (gx - g * center_x), g_scale_y += py * (gy - g * center_y);
@@ -201,7 +212,8 @@ struct ScreenFilter {
     gx = g * (1.0 - scale_x) * center_x + gx * scale_x, gy = g * (1.0 - scale_y) * center_y + gy * scale_y;
   }
   // Adds what was gathered, and the density's part, to the gradients of vertices and centre.
-  void finish(const RayFrame<kRays>& rays, const Box& box, const D (*arm)[3], int vertices, D density, D density_grad, D (*arm_grad)[3], D c_grad[3]) {
+  void finish(const RayFrame<kRays>& rays, const Box& box, const D (*arm)[3], int vertices, D density, D density_grad,
+              D (*arm_grad)[3], D c_grad[3]) {
     g_scale_x += density_grad * density * scale_y, g_scale_y += density_grad * density * scale_x;
     // scale = h / (h + half)
     const D g_half_x = rays.crosses_near ? splat(0.0) : g_scale_x * half / ((half_x + half) * (half_x + half));
@@ -215,10 +227,12 @@ struct ScreenFilter {
         found |= here;
         return here ? splat(0.5) : splat(0.0);
       };
-      const D at_x = pick(x, box.high_x, high_x) - pick(x, box.low_x, low_x), at_y = pick(y, box.high_y, high_y) - pick(y, box.low_y, low_y);
+      const D at_x = pick(x, box.high_x, high_x) - pick(x, box.low_x, low_x),
+              at_y = pick(y, box.high_y, high_y) - pick(y, box.low_y, low_y);
       rays.project_grad(arm[i], g_half_x * at_x, g_half_y * at_y, arm_grad[i], c_grad);
     }
-    rays.add_centre(rays.crosses_near ? splat(0.0) : g_center_x * rays.view.fx, rays.crosses_near ? splat(0.0) : g_center_y * rays.view.fy, c_grad);
+    rays.add_centre(rays.crosses_near ? splat(0.0) : g_center_x * rays.view.fx,
+                    rays.crosses_near ? splat(0.0) : g_center_y * rays.view.fy, c_grad);
   }
 };
 
@@ -229,8 +243,8 @@ inline double longest_ray(const View& view) {
   return std::sqrt(1 + u * u + v * v);
 }
 
-// The order's key: depth of the centre, or a depth that no ray meets the primitive before; `nearest` is the smallest z (exact rays) or
-// distance (affine) of its vertices.
+// The order's key: depth of the centre, or a depth that no ray meets the primitive before; `nearest` is the smallest z
+// (exact rays) or distance (affine) of its vertices.
 template <RayModel kRays>
 inline D order_key(const RayFrame<kRays>& rays, D nearest, double longest) {
   if (rays.view.order == Order::kCenter) return rays.c[2];

@@ -1,4 +1,5 @@
-// The rasterizer's pipeline: project, sort by depth, bin into tiles, blend; and back: tiles, reduction per primitive, chain.
+// The rasterizer's pipeline: project, sort by depth, bin into tiles, blend; and back: tiles, reduction per primitive,
+// chain.
 #include <algorithm>
 #include <array>
 #include <bit>
@@ -56,9 +57,22 @@ uint64_t hash_bytes(uint64_t seed, const void* data, size_t bytes) {
 
 template <class Real>
 uint64_t content_hash(const View& view, const Primitives<Real>& p, bool geometry, const Real* color) {
-  const double numbers[] = {view.fx, view.fy, view.cx, view.cy, double(view.width), double(view.height), view.near, view.stop,
-                            view.level, double(p.n), double(geometry), double(sizeof(Real)), view.screen_filter, double(view.rays),
-                            double(view.order), double(p.kind)};
+  const double numbers[] = {view.fx,
+                            view.fy,
+                            view.cx,
+                            view.cy,
+                            double(view.width),
+                            double(view.height),
+                            view.near,
+                            view.stop,
+                            view.level,
+                            double(p.n),
+                            double(geometry),
+                            double(sizeof(Real)),
+                            view.screen_filter,
+                            double(view.rays),
+                            double(view.order),
+                            double(p.kind)};
   constexpr int64_t kPerTask = 4096;
   std::vector<uint64_t> parts(size_t((p.n + kPerTask - 1) / kPerTask) + 2);
   parts[0] = hash_bytes(1, view.world_to_camera, sizeof view.world_to_camera);
@@ -66,7 +80,9 @@ uint64_t content_hash(const View& view, const Primitives<Real>& p, bool geometry
   parallel_for(int64_t(parts.size()) - 2, [&](int64_t task, int) {  // memory sets its time
     const int64_t begin = task * kPerTask, rows = std::min(p.n - begin, kPerTask);
     uint64_t h = 3;
-    auto add = [&](const Real* values, int columns) { h = hash_bytes(h, values + begin * columns, size_t(rows) * columns * sizeof(Real)); };
+    auto add = [&](const Real* values, int columns) {
+      h = hash_bytes(h, values + begin * columns, size_t(rows) * columns * sizeof(Real));
+    };
     add(p.center, 3), add(p.rotation, 4), add(p.extent, p.extents()), add(p.density, 1), add(color, 3);
     parts[size_t(task) + 2] = h;
   });
@@ -78,7 +94,8 @@ struct alignas(64) Line {
   char bytes[64];
 };
 
-// Everything between the primitives and the pixels of one view. Buffers only grow, so a view after the first allocates nothing.
+// Everything between the primitives and the pixels of one view. Buffers only grow, so a view after the first allocates
+// nothing.
 template <class Real>
 struct Frame {
   uint64_t hash = 0, used = 0;
@@ -116,7 +133,12 @@ struct Frame {
     grow(records, (p.n * solid->record_bytes + 63) / 64);
     grow(footprints, p.n), grow(key, p.n), grow(first_slot, p.n), grow(slot_count, p.n);
     if (geometry) grow(normals, p.n);
-    const ProjectParams<Real> project{view, p, records.data(), footprints.data(), key.data(), color,
+    const ProjectParams<Real> project{view,
+                                      p,
+                                      records.data(),
+                                      footprints.data(),
+                                      key.data(),
+                                      color,
                                       geometry ? reinterpret_cast<Real(*)[4][3]>(normals.data()) : nullptr};
     rows = p.n;
     grow(order, p.n), grow(order_swap, p.n), grow(keys, p.n), grow(keys_swap, p.n);
@@ -143,8 +165,9 @@ struct Frame {
     return bits ^ ((bits >> 31) ? 0xffffffffu : 0x80000000u);
   }
 
-  // The part of sorting and binning that belongs to the rows of one projection task, while their footprints are in the cache: the visible
-  // ones with their keys, at the beginning of the task's rows of `order` and `keys`, and their pairs.
+  // The part of sorting and binning that belongs to the rows of one projection task, while their footprints are in the
+  // cache: the visible ones with their keys, at the beginning of the task's rows of `order` and `keys`, and their
+  // pairs.
   void collect(int64_t index, int64_t begin, int64_t end, int thread) {
     Task& task = tasks[index];
     int64_t count = begin;
@@ -156,10 +179,12 @@ struct Frame {
     }
     std::vector<LoosePair>& list = loose[thread];
     task.visible = uint32_t(count - begin), task.thread = thread, task.pairs_begin = loose_count[thread];
-    const BinParams params{footprints.data(), order.data(), tiles_x, slot_count.data(), &tile_count[int64_t(thread) * tiles()]};
+    const BinParams params{footprints.data(), order.data(), tiles_x, slot_count.data(),
+                           &tile_count[int64_t(thread) * tiles()]};
     for (int64_t at = begin;;) {
       int64_t written = 0;
-      at = kernels<Real>().bin(params, at, count, list.data() + loose_count[thread], int64_t(list.size()) - loose_count[thread], &written);
+      at = kernels<Real>().bin(params, at, count, list.data() + loose_count[thread],
+                               int64_t(list.size()) - loose_count[thread], &written);
       loose_count[thread] += written;
       if (at == count) break;
       list.resize(list.size() * 2 + 2 * size_t(tiles()));
@@ -210,12 +235,14 @@ struct Frame {
   void bin() {
     int64_t pairs_in_all = 0;
     for (const Task& task : tasks) pairs_in_all += task.pairs;
-    if (pairs_in_all >= int64_t(1) << 32) throw std::bad_alloc();  // slots are counted in 32 bits; this is above 200 GiB of them
+    if (pairs_in_all >= int64_t(1) << 32)
+      throw std::bad_alloc();  // slots are counted in 32 bits; this is above 200 GiB of them
     pair_count = pairs_in_all;
     uint32_t slot = 0;
     for (int64_t t = 0, i = 0; t < int64_t(tasks.size()); ++t) {
       tasks[t].first_slot = slot;
-      for (const int64_t end = std::min(i + kPrimitivesPerTask, int64_t(rows)); i < end; ++i) first_slot[i] = slot, slot += slot_count[i];
+      for (const int64_t end = std::min(i + kPrimitivesPerTask, int64_t(rows)); i < end; ++i)
+        first_slot[i] = slot, slot += slot_count[i];
     }
     // Chunks of the order are put in place at the same time: each begins in a tile's list where those before it end.
     const int chunks = threads() == 1 ? 1 : 4 * threads();
@@ -225,10 +252,13 @@ struct Frame {
       return loose[task.thread].data() + task.pairs_begin + (first_slot[primitive] - task.first_slot);
     };
     auto each_pair = [&](int64_t chunk, auto body) {
-      constexpr int64_t kFar = 24, kNear = 12;  // how far ahead of its use, in primitives, memory is fetched: order is not order of input
+      constexpr int64_t
+          kFar = 24,
+          kNear = 12;  // how far ahead of its use, in primitives, memory is fetched: order is not order of input
       const int64_t end = begin_of(chunk + 1);
       for (int64_t i = begin_of(chunk); i < end; ++i) {
-        if (i + kFar < end) __builtin_prefetch(&first_slot[order[i + kFar]]), __builtin_prefetch(&slot_count[order[i + kFar]]);
+        if (i + kFar < end)
+          __builtin_prefetch(&first_slot[order[i + kFar]]), __builtin_prefetch(&slot_count[order[i + kFar]]);
         if (i + kNear < end) __builtin_prefetch(pairs_of(order[i + kNear]));
         const uint32_t primitive = order[i], first = first_slot[primitive], count = slot_count[primitive];
         const LoosePair* pairs = pairs_of(primitive);
@@ -247,7 +277,8 @@ struct Frame {
     uint32_t total = 0;
     for (int tile = 0; tile < tiles(); ++tile) {
       tile_begin[tile] = total;
-      for (int chunk = 0; chunk < chunks; ++chunk) total += std::exchange(chunk_tile[int64_t(chunk) * tiles() + tile], total);
+      for (int chunk = 0; chunk < chunks; ++chunk)
+        total += std::exchange(chunk_tile[int64_t(chunk) * tiles() + tile], total);
     }
     tile_begin[tiles()] = total;
     grow(pair_primitive, pair_count), grow(pair_slot, pair_count), grow(pair_blocks, pair_count);
@@ -274,8 +305,20 @@ struct Frame {
   }
 
   RasterParams<Real> raster(const View& view, const Real* background, const Planes<Real>& out) {
-    return {view, tiles_x, tiles_y, records.data(), key.data(), reinterpret_cast<const Real(*)[4][3]>(normals.data()),
-            {tile_begin.data(), pair_primitive.data(), pair_slot.data(), pair_blocks.data()}, background, out, pair_weight.data(), pair_pixels.data(), {}, sums.data(), background_sums.data()};
+    return {view,
+            tiles_x,
+            tiles_y,
+            records.data(),
+            key.data(),
+            reinterpret_cast<const Real(*)[4][3]>(normals.data()),
+            {tile_begin.data(), pair_primitive.data(), pair_slot.data(), pair_blocks.data()},
+            background,
+            out,
+            pair_weight.data(),
+            pair_pixels.data(),
+            {},
+            sums.data(),
+            background_sums.data()};
   }
 
   template <class T>
@@ -284,9 +327,10 @@ struct Frame {
   }
   int64_t bytes() const {
     auto of = [](const auto& v) { return int64_t(v.capacity() * sizeof(v[0])); };
-    int64_t total = of(records) + of(normals) + of(footprints) + of(key) + of(order) + of(order_swap) + of(keys) + of(keys_swap) +
-                    of(tasks) + of(tile_count) + of(chunk_tile) + of(tile_begin) + of(first_slot) + of(slot_count) + of(pair_primitive) + of(pair_slot) + of(pair_blocks) + of(scratch) + of(pair_weight) + of(sums) +
-                    of(background_sums) + of(pair_pixels);
+    int64_t total = of(records) + of(normals) + of(footprints) + of(key) + of(order) + of(order_swap) + of(keys) +
+                    of(keys_swap) + of(tasks) + of(tile_count) + of(chunk_tile) + of(tile_begin) + of(first_slot) +
+                    of(slot_count) + of(pair_primitive) + of(pair_slot) + of(pair_blocks) + of(scratch) +
+                    of(pair_weight) + of(sums) + of(background_sums) + of(pair_pixels);
     for (const auto& list : loose) total += of(list);
     return total;
   }
@@ -325,8 +369,8 @@ Cache<Real>& cache() {
 Statistics statistics() { return last_statistics; }
 
 template <class Real>
-void rasterize(const View& view, const Primitives<Real>& primitives, const Real* background, bool geometry, const Planes<Real>& out,
-               Real* color, Real* max_weight, int32_t* pixels) {
+void rasterize(const View& view, const Primitives<Real>& primitives, const Real* background, bool geometry,
+               const Planes<Real>& out, Real* color, Real* max_weight, int32_t* pixels) {
   std::lock_guard lock(cache<Real>().mutex);
   Statistics stats{};
   Frame<Real>& frame = cache<Real>().oldest();
@@ -335,11 +379,13 @@ void rasterize(const View& view, const Primitives<Real>& primitives, const Real*
   if (geometry) frame.grow(frame.pair_weight, frame.pair_count), frame.grow(frame.pair_pixels, frame.pair_count);
   const RasterParams<Real> params = frame.raster(view, background, out);
   std::vector<Counts> counts(threads(), Counts{});
-  frame.each_tile(frame.solid->scratch_bytes(view.order, geometry, frame.longest_list()), [&](int tile, int thread, void* scratch) {
-    const Counts c = frame.solid->forward[int(view.order)][geometry](params, tile, scratch);
-    counts[thread].visited_lanes += c.visited_lanes, counts[thread].hit_lanes += c.hit_lanes;
-  });
-  for (const Counts& c : counts) stats.visited_lanes += int64_t(c.visited_lanes), stats.hit_lanes += int64_t(c.hit_lanes);
+  frame.each_tile(frame.solid->scratch_bytes(view.order, geometry, frame.longest_list()),
+                  [&](int tile, int thread, void* scratch) {
+                    const Counts c = frame.solid->forward[int(view.order)][geometry](params, tile, scratch);
+                    counts[thread].visited_lanes += c.visited_lanes, counts[thread].hit_lanes += c.hit_lanes;
+                  });
+  for (const Counts& c : counts)
+    stats.visited_lanes += int64_t(c.visited_lanes), stats.hit_lanes += int64_t(c.hit_lanes);
   if (geometry) {
     for (int64_t i = 0; i < primitives.n; ++i) {
       Real largest = 0;
@@ -358,8 +404,8 @@ void rasterize(const View& view, const Primitives<Real>& primitives, const Real*
 
 template <class Real>
 void rasterize_grad(const View& view, const Primitives<Real>& primitives, const Real* background, bool geometry,
-                    const Planes<Real>& out, const Real* color, const Planes<Real>& grad, const PrimitiveGradients<Real>& gradients,
-                    Real* background_grad) {
+                    const Planes<Real>& out, const Real* color, const Planes<Real>& grad,
+                    const PrimitiveGradients<Real>& gradients, Real* background_grad) {
   std::lock_guard lock(cache<Real>().mutex);
   Statistics stats = last_statistics;
   const uint64_t hash = content_hash(view, primitives, geometry, color);
@@ -372,18 +418,27 @@ void rasterize_grad(const View& view, const Primitives<Real>& primitives, const 
   }
   Stopwatch watch;
   const int per_slot = frame->solid->sums_per_slot[int(view.order)][geometry];
-  frame->grow(frame->sums, frame->pair_count * per_slot), frame->grow(frame->background_sums, int64_t(frame->tiles()) * 3);
+  frame->grow(frame->sums, frame->pair_count * per_slot),
+      frame->grow(frame->background_sums, int64_t(frame->tiles()) * 3);
   RasterParams<Real> params = frame->raster(view, background, out);
   params.grad = grad;
-  frame->each_tile(frame->solid->scratch_bytes(view.order, geometry, frame->longest_list()),
-                   [&](int tile, int, void* scratch) { frame->solid->backward[int(view.order)][geometry](params, tile, scratch); });
+  frame->each_tile(
+      frame->solid->scratch_bytes(view.order, geometry, frame->longest_list()),
+      [&](int tile, int, void* scratch) { frame->solid->backward[int(view.order)][geometry](params, tile, scratch); });
   double total[3] = {0, 0, 0};
   for (int tile = 0; tile < frame->tiles(); ++tile)
     for (int k = 0; k < 3; ++k) total[k] += double(frame->background_sums[3 * tile + k]);
   for (int k = 0; k < 3; ++k) background_grad[k] = Real(total[k]);
   stats.backward_ms = watch.lap();
-  const ChainParams<Real> chain{view,     primitives, frame->footprints.data(), color, frame->first_slot.data(), frame->slot_count.data(),
-                                frame->sums.data(), per_slot, gradients};
+  const ChainParams<Real> chain{view,
+                                primitives,
+                                frame->footprints.data(),
+                                color,
+                                frame->first_slot.data(),
+                                frame->slot_count.data(),
+                                frame->sums.data(),
+                                per_slot,
+                                gradients};
   parallel_for((primitives.n + kPrimitivesPerTask - 1) / kPrimitivesPerTask, [&](int64_t task, int) {
     const int64_t begin = task * kPrimitivesPerTask;
     frame->solid->chain(chain, begin, std::min(primitives.n, begin + kPrimitivesPerTask));
@@ -402,8 +457,9 @@ void level_depth(const View& view, const Primitives<Real>& primitives, Real* dep
   Planes<Real> out{};
   out.depth_median = depth, out.opacity = opacity;
   const RasterParams<Real> params = frame.raster(view, nullptr, out);
-  frame.each_tile(frame.longest_list() * 3 * kBlocks * int64_t(sizeof(Real)),
-                  [&](int tile, int, void* scratch) { frame.solid->level_depth(params, tile, static_cast<Real*>(scratch)); });
+  frame.each_tile(frame.longest_list() * 3 * kBlocks * int64_t(sizeof(Real)), [&](int tile, int, void* scratch) {
+    frame.solid->level_depth(params, tile, static_cast<Real*>(scratch));
+  });
 }
 
 template <class Real>
@@ -411,12 +467,13 @@ bool has_kernels(PrimitiveKind kind, RayModel rays, Order order) {
   return kernels<Real>().solids[int(kind)][int(rays)].forward[int(order)][0] != nullptr;
 }
 
-#define LINPRIM_INSTANTIATE(Real)                                                                                                    \
-  template void rasterize<Real>(const View&, const Primitives<Real>&, const Real*, bool, const Planes<Real>&, Real*, Real*, int32_t*); \
-  template bool has_kernels<Real>(PrimitiveKind, RayModel, Order);                                                                     \
-  template void level_depth<Real>(const View&, const Primitives<Real>&, Real*, Real*);                                                \
-  template void rasterize_grad<Real>(const View&, const Primitives<Real>&, const Real*, bool, const Planes<Real>&, const Real*,       \
-                                     const Planes<Real>&, const PrimitiveGradients<Real>&, Real*);
+#define LINPRIM_INSTANTIATE(Real)                                                                                    \
+  template void rasterize<Real>(const View&, const Primitives<Real>&, const Real*, bool, const Planes<Real>&, Real*, \
+                                Real*, int32_t*);                                                                    \
+  template bool has_kernels<Real>(PrimitiveKind, RayModel, Order);                                                   \
+  template void level_depth<Real>(const View&, const Primitives<Real>&, Real*, Real*);                               \
+  template void rasterize_grad<Real>(const View&, const Primitives<Real>&, const Real*, bool, const Planes<Real>&,   \
+                                     const Real*, const Planes<Real>&, const PrimitiveGradients<Real>&, Real*);
 LINPRIM_INSTANTIATE(float)
 LINPRIM_INSTANTIATE(double)
 

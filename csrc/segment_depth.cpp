@@ -1,4 +1,5 @@
-// The hierarchy of boxes behind segment optical depths: built by halves, walked by the kernels of the instruction set in use.
+// The hierarchy of boxes behind segment optical depths: built by halves, walked by the kernels of the instruction set
+// in use.
 #include "segment_depth.h"
 
 #include <algorithm>
@@ -14,7 +15,7 @@
 namespace linprim {
 namespace {
 
-constexpr int64_t kLeaf = 4;            // solids in a leaf at most
+constexpr int64_t kLeaf = 4;  // solids in a leaf at most
 constexpr int64_t kSegmentsPerTask = 512;
 // As in primitive_pose.h.
 constexpr double kLargestDensity = 1e20, kSmallestExtent = 1e-15, kLargestExtent = 1e12;
@@ -55,9 +56,9 @@ void set_octahedron(const double r[3][3], const double* extent, SlabSolid& solid
   for (double& s : solid.shift) s = 0;
 }
 
-// Barycentric coordinates l_j of p = sum_j l_j e_j b_j, where b_i . b_j = -1/3 and sum b_j = 0: with m_j = l_j e_j and M their sum,
-// p . b_j = (4 m_j - M) / 3, so m_j = (3 p . b_j + M) / 4, and sum l_j = 1 gives M = (4 - 3 p . sum_i b_i / e_i) / sum_i 1 / e_i.
-// The slabs are |2 l_j - 1| <= 1.
+// Barycentric coordinates l_j of p = sum_j l_j e_j b_j, where b_i . b_j = -1/3 and sum b_j = 0: with m_j = l_j e_j and
+// M their sum, p . b_j = (4 m_j - M) / 3, so m_j = (3 p . b_j + M) / 4, and sum l_j = 1 gives M = (4 - 3 p . sum_i b_i
+// / e_i) / sum_i 1 / e_i. The slabs are |2 l_j - 1| <= 1.
 void set_tetrahedron(const double r[3][3], const double* extent, SlabSolid& solid, Box& box) {
   const double u = 1 / std::sqrt(3.0), b[4][3] = {{u, u, u}, {u, -u, -u}, {-u, u, -u}, {-u, -u, u}};
   double inverses = 0, w[3] = {0, 0, 0};
@@ -75,7 +76,8 @@ void set_tetrahedron(const double r[3][3], const double* extent, SlabSolid& soli
     box.low[i] = std::numeric_limits<double>::infinity(), box.high[i] = -box.low[i];
     for (int j = 0; j < 4; ++j) {
       const double arm = extent[j] * (r[i][0] * b[j][0] + r[i][1] * b[j][1] + r[i][2] * b[j][2]);
-      box.low[i] = std::min(box.low[i], solid.center[i] + arm), box.high[i] = std::max(box.high[i], solid.center[i] + arm);
+      box.low[i] = std::min(box.low[i], solid.center[i] + arm),
+      box.high[i] = std::max(box.high[i], solid.center[i] + arm);
     }
   }
 }
@@ -139,7 +141,8 @@ SegmentKernel kernel_in_use() {
 }  // namespace
 
 template <class Real>
-SolidTree::SolidTree(PrimitiveKind kind, int64_t n, const Real* center, const Real* rotation, const Real* extent, const Real* density) {
+SolidTree::SolidTree(PrimitiveKind kind, int64_t n, const Real* center, const Real* rotation, const Real* extent,
+                     const Real* density) {
   const int extents = kind == PrimitiveKind::kTetrahedron ? 4 : 3;
   std::vector<SlabSolid> from;
   std::vector<Box> boxes;
@@ -187,8 +190,9 @@ void SolidTree::optical_depth(const double* origin, const double* ends, const do
   }
   const SegmentParams params{seen.data(), nodes_.data(), origin, ends, begin, most, depth};
   const SegmentKernel kernel = kernel_in_use();
-  parallel_for((count + kSegmentsPerTask - 1) / kSegmentsPerTask,
-               [&](int64_t task, int) { kernel(params, task * kSegmentsPerTask, std::min(count, (task + 1) * kSegmentsPerTask)); });
+  parallel_for((count + kSegmentsPerTask - 1) / kSegmentsPerTask, [&](int64_t task, int) {
+    kernel(params, task * kSegmentsPerTask, std::min(count, (task + 1) * kSegmentsPerTask));
+  });
 }
 
 }  // namespace linprim

@@ -11,7 +11,8 @@ namespace LINPRIM_ISA {
 
 // Boxes on the way to a leaf: each halves the number of solids, of which there are less than 2^31.
 constexpr int kMostLevels = 64;
-// A rate smaller than this is taken as this, so that its inverse is finite: such a segment stays on its side of the plane.
+// A rate smaller than this is taken as this, so that its inverse is finite: such a segment stays on its side of the
+// plane.
 constexpr double kSmallestRate = 1e-280;
 
 inline D inverse_of(D rate) { return 1.0 / (vabs(rate) < kSmallestRate ? splat(kSmallestRate) : rate); }
@@ -41,7 +42,8 @@ inline void add_solid(Packet& p, const SeenSolid& solid) {
   p.sum += solid.density * p.length * vmax(out - in, D{});
 }
 
-// Near child first, as seen from the origin: the order of the sum is the same for every segment, and opaque ones end early.
+// Near child first, as seen from the origin: the order of the sum is the same for every segment, and opaque ones end
+// early.
 inline void segment_depths(const SegmentParams& P, int64_t begin, int64_t end) {
   for (int64_t first = begin; first < end; first += kLanes) {
     const int lanes = int(end - first < kLanes ? end - first : kLanes);

@@ -1,7 +1,7 @@
 // Vectors of W floats (or doubles) at the machine's native width, for code that is compiled once per instruction set.
 //
-// Included only by files that are built per instruction set: everything lives in namespace linprim::LINPRIM_ISA, so that no
-// inline function built for one instruction set can be linked into the path of another.
+// Included only by files that are built per instruction set: everything lives in namespace linprim::LINPRIM_ISA, so
+// that no inline function built for one instruction set can be linked into the path of another.
 //
 //   Vec<T, W>   W lanes of T        + - * fma min max rcp exp_neg
 //   Mask<T, W>  W booleans          & | bits all
@@ -48,23 +48,41 @@ struct Vec<T, 1> {
   friend Mask<T, 1> operator>=(Vec a, Vec b) { return {a.v >= b.v}; }
 };
 template <class T>
-inline Vec<T, 1> fma(Vec<T, 1> a, Vec<T, 1> b, Vec<T, 1> c) { return {a.v * b.v + c.v}; }
+inline Vec<T, 1> fma(Vec<T, 1> a, Vec<T, 1> b, Vec<T, 1> c) {
+  return {a.v * b.v + c.v};
+}
 template <class T>
-inline Vec<T, 1> min(Vec<T, 1> a, Vec<T, 1> b) { return {a.v < b.v ? a.v : b.v}; }
+inline Vec<T, 1> min(Vec<T, 1> a, Vec<T, 1> b) {
+  return {a.v < b.v ? a.v : b.v};
+}
 template <class T>
-inline Vec<T, 1> max(Vec<T, 1> a, Vec<T, 1> b) { return {a.v > b.v ? a.v : b.v}; }
+inline Vec<T, 1> max(Vec<T, 1> a, Vec<T, 1> b) {
+  return {a.v > b.v ? a.v : b.v};
+}
 template <class T>
-inline Vec<T, 1> select(Mask<T, 1> m, Vec<T, 1> a, Vec<T, 1> b) { return m.m ? a : b; }
+inline Vec<T, 1> select(Mask<T, 1> m, Vec<T, 1> a, Vec<T, 1> b) {
+  return m.m ? a : b;
+}
 template <class T>
-inline Vec<T, 1> rcp(Vec<T, 1> a) { return {T(1) / a.v}; }
+inline Vec<T, 1> rcp(Vec<T, 1> a) {
+  return {T(1) / a.v};
+}
 template <class T>
-inline Vec<T, 1> sqrt(Vec<T, 1> a) { return {std::sqrt(a.v)}; }
+inline Vec<T, 1> sqrt(Vec<T, 1> a) {
+  return {std::sqrt(a.v)};
+}
 template <class T>
-inline Vec<T, 1> log(Vec<T, 1> a) { return {std::log(a.v)}; }
+inline Vec<T, 1> log(Vec<T, 1> a) {
+  return {std::log(a.v)};
+}
 template <class T>
-inline T sum(Vec<T, 1> a) { return a.v; }
+inline T sum(Vec<T, 1> a) {
+  return a.v;
+}
 template <class T>
-inline T max_lane(Vec<T, 1> a) { return a.v; }
+inline T max_lane(Vec<T, 1> a) {
+  return a.v;
+}
 // alpha = 1 - exp(-x) to full relative accuracy and transmittance = exp(-x), for x >= 0.
 template <class T>
 inline void exp_neg(Vec<T, 1> x, Vec<T, 1>& alpha, Vec<T, 1>& transmittance) {
@@ -80,17 +98,26 @@ struct Index<T, 1> {
   static Index set(int x) { return {x}; }
 };
 template <class T>
-inline Index<T, 1> select(Mask<T, 1> m, Index<T, 1> a, Index<T, 1> b) { return m.m ? a : b; }
+inline Index<T, 1> select(Mask<T, 1> m, Index<T, 1> a, Index<T, 1> b) {
+  return m.m ? a : b;
+}
 // table[index] per lane; the table has 8 entries.
 template <class T>
-inline Vec<T, 1> lookup8(const T* table, Index<T, 1> i) { return {table[i.v & 7]}; }
+inline Vec<T, 1> lookup8(const T* table, Index<T, 1> i) {
+  return {table[i.v & 7]};
+}
 template <class T>
-inline Mask<T, 1> equal(Index<T, 1> i, int x) { return {i.v == x}; }
+inline Mask<T, 1> equal(Index<T, 1> i, int x) {
+  return {i.v == x};
+}
 // index < 8: a face, not the near plane.
 template <class T>
-inline Mask<T, 1> is_face(Index<T, 1> i) { return {i.v < 8}; }
+inline Mask<T, 1> is_face(Index<T, 1> i) {
+  return {i.v < 8};
+}
 
-// ---- W = 4 (SSE4, NEON) through the compiler's vector extensions -------------------------------------------------------
+// ---- W = 4 (SSE4, NEON) through the compiler's vector extensions
+// -------------------------------------------------------
 
 template <>
 struct Mask<float, 4> {
@@ -150,7 +177,9 @@ struct Index<float, 4> {
   static Index set(int x) { return {M4::native{x, x, x, x}}; }
 };
 inline Index<float, 4> select(M4 m, Index<float, 4> a, Index<float, 4> b) { return {m.m ? a.v : b.v}; }
-inline F4 lookup8(const float* t, Index<float, 4> i) { return {F4::native{t[i.v[0] & 7], t[i.v[1] & 7], t[i.v[2] & 7], t[i.v[3] & 7]}}; }
+inline F4 lookup8(const float* t, Index<float, 4> i) {
+  return {F4::native{t[i.v[0] & 7], t[i.v[1] & 7], t[i.v[2] & 7], t[i.v[3] & 7]}};
+}
 inline M4 is_face(Index<float, 4> i) { return {i.v < 8}; }
 inline M4 equal(Index<float, 4> i, int x) { return {i.v == x}; }
 inline F4 round_to_int(F4 a) {
@@ -165,7 +194,8 @@ inline F4 exp2_int(F4 n) {
   return r;
 }
 
-// ---- W = 8 (AVX2, FMA) --------------------------------------------------------------------------------------------------
+// ---- W = 8 (AVX2, FMA)
+// --------------------------------------------------------------------------------------------------
 
 #if defined(LINPRIM_ISA_V3)
 template <>
@@ -225,7 +255,9 @@ inline Index<float, 8> select(M8 m, Index<float, 8> a, Index<float, 8> b) {
   return {_mm256_blendv_epi8(b.v, a.v, _mm256_castps_si256(m.m))};
 }
 inline F8 lookup8(const float* t, Index<float, 8> i) { return {_mm256_permutevar8x32_ps(_mm256_loadu_ps(t), i.v)}; }
-inline M8 equal(Index<float, 8> i, int x) { return {_mm256_castsi256_ps(_mm256_cmpeq_epi32(i.v, _mm256_set1_epi32(x)))}; }
+inline M8 equal(Index<float, 8> i, int x) {
+  return {_mm256_castsi256_ps(_mm256_cmpeq_epi32(i.v, _mm256_set1_epi32(x)))};
+}
 inline M8 is_face(Index<float, 8> i) { return {_mm256_castsi256_ps(_mm256_cmpgt_epi32(_mm256_set1_epi32(8), i.v))}; }
 inline F8 round_to_int(F8 a) { return {_mm256_round_ps(a.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC)}; }
 inline F8 exp2_int(F8 n) {
@@ -234,7 +266,8 @@ inline F8 exp2_int(F8 n) {
 }
 #endif
 
-// ---- W = 16 (AVX-512) ---------------------------------------------------------------------------------------------------
+// ---- W = 16 (AVX-512)
+// ---------------------------------------------------------------------------------------------------
 
 #if defined(LINPRIM_ISA_V4)
 template <>
@@ -296,8 +329,8 @@ inline F16 exp2_int(F16 n) { return {_mm512_scalef_ps(_mm512_set1_ps(1.0f), n.v)
 
 // alpha = 1 - exp(-x) and transmittance = exp(-x) for x >= 0, both to about 3e-7 relative (alpha also for tiny x).
 //
-// exp(-x) = 2^n (1 + f(r)) with n = round(-x / ln 2), |r| <= ln(2)/2 and f(r) = exp(r) - 1, a Taylor polynomial of degree 7
-// whose remainder there is below 6e-9. With s = 2^n: 1 - exp(-x) = (1 - s) - s f, exact where s = 1.
+// exp(-x) = 2^n (1 + f(r)) with n = round(-x / ln 2), |r| <= ln(2)/2 and f(r) = exp(r) - 1, a Taylor polynomial of
+// degree 7 whose remainder there is below 6e-9. With s = 2^n: 1 - exp(-x) = (1 - s) - s f, exact where s = 1.
 template <class V>
 inline void exp_neg(V x, V& alpha, V& transmittance) {
   const V limited = min(x, V::set(87.0f));  // exp(-87) = 1.6e-38 is the smallest normal float

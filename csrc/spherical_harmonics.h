@@ -6,10 +6,12 @@
 
 namespace linprim::LINPRIM_ISA {
 
-constexpr double kSh0 = 0.28209479177387814;                                     // 1/2 sqrt(1/pi)
-constexpr double kSh1 = 0.48860251190291992;                                     // 1/2 sqrt(3/pi)
-constexpr double kSh2[3] = {1.0925484305920792, 0.31539156525252005, 0.54627421529603959};  // 1/2 sqrt(15/pi), 1/4 sqrt(5/pi), 1/4 sqrt(15/pi)
-constexpr double kSh3[5] = {0.59004358992664352, 2.8906114426405538, 0.45704579946446572, 0.3731763325901154, 1.4453057213202769};
+constexpr double kSh0 = 0.28209479177387814;  // 1/2 sqrt(1/pi)
+constexpr double kSh1 = 0.48860251190291992;  // 1/2 sqrt(3/pi)
+constexpr double kSh2[3] = {1.0925484305920792, 0.31539156525252005,
+                            0.54627421529603959};  // 1/2 sqrt(15/pi), 1/4 sqrt(5/pi), 1/4 sqrt(15/pi)
+constexpr double kSh3[5] = {0.59004358992664352, 2.8906114426405538, 0.45704579946446572, 0.3731763325901154,
+                            1.4453057213202769};
 // 1/4 sqrt(35/(2 pi)), 1/2 sqrt(105/pi), 1/4 sqrt(21/(2 pi)), 1/4 sqrt(7/pi), 1/4 sqrt(105/pi)
 
 // out[0..count) = basis functions at the unit vector (x, y, z); count is 1, 4, 9 or 16.
@@ -47,9 +49,12 @@ inline void sh_basis_grad(int count, T x, T y, T z, T out[][3]) {
   if (count < 16) return;
   out[9][0] = -6.0 * kSh3[0] * x * y, out[9][1] = -3.0 * kSh3[0] * (xx - yy), out[9][2] = zero;
   out[10][0] = kSh3[1] * y * z, out[10][1] = kSh3[1] * x * z, out[10][2] = kSh3[1] * x * y;
-  out[11][0] = 2.0 * kSh3[2] * x * y, out[11][1] = -kSh3[2] * (4.0 * zz - xx - 3.0 * yy), out[11][2] = -8.0 * kSh3[2] * y * z;
-  out[12][0] = -6.0 * kSh3[3] * x * z, out[12][1] = -6.0 * kSh3[3] * y * z, out[12][2] = kSh3[3] * (6.0 * zz - 3.0 * xx - 3.0 * yy);
-  out[13][0] = -kSh3[2] * (4.0 * zz - 3.0 * xx - yy), out[13][1] = 2.0 * kSh3[2] * x * y, out[13][2] = -8.0 * kSh3[2] * x * z;
+  out[11][0] = 2.0 * kSh3[2] * x * y, out[11][1] = -kSh3[2] * (4.0 * zz - xx - 3.0 * yy),
+  out[11][2] = -8.0 * kSh3[2] * y * z;
+  out[12][0] = -6.0 * kSh3[3] * x * z, out[12][1] = -6.0 * kSh3[3] * y * z,
+  out[12][2] = kSh3[3] * (6.0 * zz - 3.0 * xx - 3.0 * yy);
+  out[13][0] = -kSh3[2] * (4.0 * zz - 3.0 * xx - yy), out[13][1] = 2.0 * kSh3[2] * x * y,
+  out[13][2] = -8.0 * kSh3[2] * x * z;
   out[14][0] = 2.0 * kSh3[4] * x * z, out[14][1] = -2.0 * kSh3[4] * y * z, out[14][2] = kSh3[4] * (xx - yy);
   out[15][0] = -3.0 * kSh3[0] * (xx - yy), out[15][1] = 6.0 * kSh3[0] * x * y, out[15][2] = zero;
 }

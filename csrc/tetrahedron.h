@@ -15,7 +15,8 @@ struct Tetrahedron : Polyhedron<RealType, W, kRays> {
   using I = typename Base::I;
   using Meeting = typename Base::Meeting;
 
-  // Planes where the rays enter and leave; x and y are counted in pixels from the record's reference. kTrack: also which faces.
+  // Planes where the rays enter and leave; x and y are counted in pixels from the record's reference. kTrack: also
+  // which faces.
   template <bool kTrack>
   static M meet(const Record& r, const View& view, V x, V y, V, Meeting& m) {
     constexpr bool kExact = kRays == RayModel::kExact;
@@ -26,14 +27,15 @@ struct Tetrahedron : Polyhedron<RealType, W, kRays> {
       const V w = fma(V::set(r.b[f]), x, fma(V::set(r.c[f]), y, V::set(r.a[f])));
       const M front = M::all(r.flags >> f & 1), back = M::all(!(r.flags >> f & 1));
       const M enters = front & (w < m.in), leaves = back & (m.out < w);
-      if constexpr (kTrack) m.in_face = select(enters, I::set(f), m.in_face), m.out_face = select(leaves, I::set(f), m.out_face);
+      if constexpr (kTrack)
+        m.in_face = select(enters, I::set(f), m.in_face), m.out_face = select(leaves, I::set(f), m.out_face);
       m.in = select(enters, w, m.in), m.out = select(leaves, w, m.out);
     }
     return m.out < m.in;
   }
 
-  // Adds gradients to the planes of entry and exit (0 in lanes without a hit): with g the gradient to face f's plane, the sums of g,
-  // g x and g y at f, 4 + f and 8 + f; px and py are positions from the pair's origin.
+  // Adds gradients to the planes of entry and exit (0 in lanes without a hit): with g the gradient to face f's plane,
+  // the sums of g, g x and g y at f, 4 + f and 8 + f; px and py are positions from the pair's origin.
   static void add_planes(const Record&, const Meeting& m, M, V g_in, V g_out, V px, V py, V* sums) {
     const V zero = V::set(0);
     for (int f = 0; f < 4; ++f) {

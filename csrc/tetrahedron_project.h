@@ -1,7 +1,9 @@
-// Tetrahedra to records, and the adjoint: gradient sums of a record back to centre, rotation, vertex distances and density.
+// Tetrahedra to records, and the adjoint: gradient sums of a record back to centre, rotation, vertex distances and
+// density.
 //
-// Vertices are c + d_j e_j with e_j the four directions of a regular tetrahedron, turned. As sum e_j = 0 and e_i . e_j = -1/3, the face that
-// omits vertex j is n_j . (x - c) = 1 with n_j = 3/4 sum_(i != j) u_i (e_i - e_j), u = 1/d, which does not know d_j.
+// Vertices are c + d_j e_j with e_j the four directions of a regular tetrahedron, turned. As sum e_j = 0 and e_i . e_j
+// = -1/3, the face that omits vertex j is n_j . (x - c) = 1 with n_j = 3/4 sum_(i != j) u_i (e_i - e_j), u = 1/d, which
+// does not know d_j.
 #pragma once
 
 #include "polyhedron_project.h"
@@ -9,7 +11,10 @@
 namespace linprim::LINPRIM_ISA {
 
 constexpr double kCorner = 0.57735026918962576;  // 1 / sqrt(3)
-constexpr double kDirection[4][3] = {{kCorner, kCorner, kCorner}, {kCorner, -kCorner, -kCorner}, {-kCorner, kCorner, -kCorner}, {-kCorner, -kCorner, kCorner}};
+constexpr double kDirection[4][3] = {{kCorner, kCorner, kCorner},
+                                     {kCorner, -kCorner, -kCorner},
+                                     {-kCorner, kCorner, -kCorner},
+                                     {-kCorner, -kCorner, kCorner}};
 
 struct TetrahedronFrame {
   Pose pose;
@@ -29,7 +34,8 @@ struct TetrahedronFrame {
       extent[j] = clamp(raw, kSmallestExtent, kLargestExtent);
       u[j] = 1.0 / extent[j];
       for (int i = 0; i < 3; ++i) {
-        e[j][i] = kDirection[j][0] * pose.axis[0][i] + kDirection[j][1] * pose.axis[1][i] + kDirection[j][2] * pose.axis[2][i];
+        e[j][i] = kDirection[j][0] * pose.axis[0][i] + kDirection[j][1] * pose.axis[1][i] +
+                  kDirection[j][2] * pose.axis[2][i];
         arm[j][i] = e[j][i] * extent[j];
       }
       low_z = vmin(low_z, arm[j][2]), high_z = vmax(high_z, arm[j][2]);
@@ -130,7 +136,8 @@ void project_tetrahedra(const ProjectParams<Real>& P, int64_t begin, int64_t end
       record[l].w0 = Real(rays.w0[l]), record[l].density = Real(density[l]);
       record[l].ref_x = Real(rays.ref_x[l]), record[l].ref_y = Real(rays.ref_y[l]);
       print[l].ref_x = int(rays.ref_x[l]), print[l].ref_y = int(rays.ref_y[l]);
-      record[l].flags = (front[0][l] ? 1u : 0u) | (front[1][l] ? 2u : 0u) | (front[2][l] ? 4u : 0u) | (front[3][l] ? 8u : 0u);
+      record[l].flags =
+          (front[0][l] ? 1u : 0u) | (front[1][l] ? 2u : 0u) | (front[2][l] ? 4u : 0u) | (front[3][l] ? 8u : 0u);
     }
     evaluate_color(eye, f.pose, P.primitives, first, lanes, visible, P.color, &record[0].rgb[0], kRow);
     if (P.normals)
@@ -209,7 +216,8 @@ void chain_tetrahedra(const ChainParams<Real>& P, int64_t begin, int64_t end) {
     }
     for (int k = 0; k < 3; ++k)
       for (int i = 0; i < 3; ++i)
-        out.axis[k][i] = kDirection[0][k] * e_grad[0][i] + kDirection[1][k] * e_grad[1][i] + kDirection[2][k] * e_grad[2][i] + kDirection[3][k] * e_grad[3][i];
+        out.axis[k][i] = kDirection[0][k] * e_grad[0][i] + kDirection[1][k] * e_grad[1][i] +
+                         kDirection[2][k] * e_grad[2][i] + kDirection[3][k] * e_grad[3][i];
     // Movement on the screen, whole and tile by tile, as that of the centre at its depth.
     const D z = rays.crosses_near ? splat(0.0) : f.pose.center[2];
     out.screen_x = out.center[0] * z * (1.0 / view.fx), out.screen_y = out.center[1] * z * (1.0 / view.fy);
@@ -221,7 +229,8 @@ void chain_tetrahedra(const ChainParams<Real>& P, int64_t begin, int64_t end) {
         for (int j = 0; j < 4; ++j) {
           double g = double(slot[j]);
           if constexpr (kRays == RayModel::kExact) {
-            g = rays.w0[l] * g + planes.a[j][l] * g + planes.b[j][l] * double(slot[4 + j]) + planes.c[j][l] * double(slot[8 + j]);
+            g = rays.w0[l] * g + planes.a[j][l] * g + planes.b[j][l] * double(slot[4 + j]) +
+                planes.c[j][l] * double(slot[8 + j]);
           }
           x -= g * f.n[j][0][l] / planes.h[j][l], y -= g * f.n[j][1][l] / planes.h[j][l];
         }

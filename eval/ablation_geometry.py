@@ -1,14 +1,16 @@
-"""What each geometry-aware term of training buys, and costs: `python -m linprim_geo.eval.ablation_geometry -o runs/ablation`.
+"""What each geometry-aware term of training buys, and costs: `python -m linprim_geo.eval.ablation_geometry -o
+runs/ablation`.
 
-A scene is trained once with photographs alone. Every variant, and `plain` too, then repeats the last part of that run from the same
-checkpoint with one or more terms switched on, so nothing differs before. Each is meshed and scored against the exact surface, or where
-a capture has only depth images, against these. `ablation.json` and `ablation.txt` hold per scene and variant
+A scene is trained once with photographs alone. Every variant, and `plain` too, then repeats the last part of that run
+from the same checkpoint with one or more terms switched on, so nothing differs before. Each is meshed and scored
+against the exact surface, or where a capture has only depth images, against these. `ablation.json` and `ablation.txt`
+hold per scene and variant
 
-    PSNR of held-out views, depth AbsRel of held-out views, Chamfer distance in % of the reference's diagonal by extraction method,
-    normal consistency, and the CPU seconds of the steps that were repeated
+    PSNR of held-out views, depth AbsRel of held-out views, Chamfer distance in % of the reference's diagonal by
+    extraction method, normal consistency, and the CPU seconds of the steps that were repeated
 
-and the median over the scenes of each ratio to the plain run. What is trained already is taken from the output folder. The scenes `cad`,
-`smooth`, `room` and `wires` are built in; others are captures (`--data`).
+and the median over the scenes of each ratio to the plain run. What is trained already is taken from the output folder.
+The scenes `cad`, `smooth`, `room` and `wires` are built in; others are captures (`--data`).
 """
 
 from __future__ import annotations
@@ -58,7 +60,8 @@ COLUMNS = {
 
 
 def train_base(capture: Path, folder: Path, options: TrainOptions, scene_options: SceneOptions) -> None:
-    """Trains with photographs alone unless the folder holds that run; leaves the checkpoint where the terms would have begun."""
+    """Trains with photographs alone unless the folder holds that run; leaves the checkpoint where the terms would have
+    begun."""
     from linprim_geo.train import train
 
     if (folder / "run.json").exists():
@@ -68,7 +71,8 @@ def train_base(capture: Path, folder: Path, options: TrainOptions, scene_options
 
 
 def train_variant(base: Path, folder: Path, changed: dict) -> None:
-    """Repeats the last part of `base` with other options, unless the folder holds that run; leaves its CPU seconds in `seconds.json`."""
+    """Repeats the last part of `base` with other options, unless the folder holds that run; leaves its CPU seconds in
+    `seconds.json`."""
     from linprim_geo.run import Run
     from linprim_geo.train import train
 
@@ -147,7 +151,12 @@ def ratios(rows: dict[str, dict[str, dict]]) -> dict[str, dict]:
 def table(title: str, rows: dict[str, dict]) -> str:
     """A Markdown table of one scene, or of the medians."""
     names = [name for name in COLUMNS if any(name in row for row in rows.values())]
-    lines = [f"### {title}", "", "| variant | " + " | ".join(COLUMNS[n] for n in names) + " |", "|---" * (len(names) + 1) + "|"]
+    lines = [
+        f"### {title}",
+        "",
+        "| variant | " + " | ".join(COLUMNS[n] for n in names) + " |",
+        "|---" * (len(names) + 1) + "|",
+    ]
     for variant, row in rows.items():
         cells = [f"{row[n]:.4g}" if math.isfinite(row.get(n, math.nan)) else "-" for n in names]
         lines.append(f"| {variant} | " + " | ".join(cells) + " |")
@@ -157,11 +166,19 @@ def table(title: str, rows: dict[str, dict]) -> str:
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of runs and results")
-    parser.add_argument("--scenes", nargs="*", choices=BUILT_IN, default=list(BUILT_IN), help="built-in scenes (default: all)")
-    parser.add_argument("--data", nargs="*", type=Path, default=[], metavar="CAPTURE", help="folders of further captures")
-    parser.add_argument("--references", nargs="*", type=Path, default=[], metavar="MESH", help="their surfaces, in the same order")
+    parser.add_argument(
+        "--scenes", nargs="*", choices=BUILT_IN, default=list(BUILT_IN), help="built-in scenes (default: all)"
+    )
+    parser.add_argument(
+        "--data", nargs="*", type=Path, default=[], metavar="CAPTURE", help="folders of further captures"
+    )
+    parser.add_argument(
+        "--references", nargs="*", type=Path, default=[], metavar="MESH", help="their surfaces, in the same order"
+    )
     parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=list(VARIANTS), help="default: all")
-    parser.add_argument("--methods", nargs="+", default=["tsdf", "polyhedra"], help="of extraction (default: %(default)s)")
+    parser.add_argument(
+        "--methods", nargs="+", default=["tsdf", "polyhedra"], help="of extraction (default: %(default)s)"
+    )
     parser.add_argument("--size", type=int, default=256, help="pixels of the built-in scenes (default: %(default)s)")
     parser.add_argument("--iterations", type=int, default=4000, help="default: %(default)s")
     parser.add_argument("--max-primitives", type=int, default=4000, help="default: %(default)s")
@@ -182,7 +199,9 @@ def run(given: argparse.Namespace) -> None:
     from linprim_geo.synth import synthesize
 
     if given.references and len(given.references) != len(given.data):
-        raise LinprimError(f"{len(given.references)} references go with {len(given.data)} captures, wanted one for each")
+        raise LinprimError(
+            f"{len(given.references)} references go with {len(given.data)} captures, wanted one for each"
+        )
     options = TrainOptions(
         iterations=given.iterations,
         max_primitives=given.max_primitives,
@@ -196,7 +215,15 @@ def run(given: argparse.Namespace) -> None:
     for name in given.scenes:
         capture = given.output / f"{name}_{given.size}"
         if not capture.exists():
-            synthesize(capture, shape=name, views=60, test_views=12, size=(given.size, given.size), points=5000, seed=given.seed)
+            synthesize(
+                capture,
+                shape=name,
+                views=60,
+                test_views=12,
+                size=(given.size, given.size),
+                points=5000,
+                seed=given.seed,
+            )
         jobs.append((name, capture, capture / "reference.ply", SceneOptions()))
     for index, capture in enumerate(given.data):
         reference = given.references[index] if given.references else None
@@ -216,7 +243,9 @@ def run(given: argparse.Namespace) -> None:
             print(name, variant, json.dumps(rows[name][variant]), flush=True)
     summary = ratios({name: of_scene for name, of_scene in rows.items()})
     text = "\n".join(table(name, of_scene) for name, of_scene in rows.items())
-    text += "\n" + table("medians of the ratios to plain (PSNR: difference in dB)", {v: summary[v] for v in given.variants})
+    text += "\n" + table(
+        "medians of the ratios to plain (PSNR: difference in dB)", {v: summary[v] for v in given.variants}
+    )
     write_json(given.output / "ablation.json", {"options": asdict(options), "scenes": rows, "medians": summary})
     with atomic_write(given.output / "ablation.txt") as temporary:
         temporary.write_text(text)

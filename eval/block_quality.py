@@ -1,9 +1,11 @@
-"""What blocks cost in quality: a street trained whole and in blocks. `python -m linprim_geo.eval.block_quality -o runs/block_quality`.
+"""What blocks cost in quality: a street trained whole and in blocks. `python -m linprim_geo.eval.block_quality -o
+runs/block_quality`.
 
-Per number of blocks: held-out PSNR, Chamfer distance of the fused surface in % of the diagonal, the same within one margin of the borders
-between blocks and elsewhere, primitives, the most memory that a worker took, and seconds of all workers. The borders are those of the
-largest number of blocks, for all rows: what the whole run errs there is what a seam is compared with. What the output folder holds already
-is not done again.
+Per number of blocks: held-out PSNR, Chamfer distance of the fused surface in % of the diagonal, the same within one
+margin of the borders between blocks and elsewhere, primitives, the most memory that a worker took, and seconds of all
+workers. The borders are those of the
+largest number of blocks, for all rows: what the whole run errs there is what a seam is compared with. What the output
+folder holds already is not done again.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ COLUMNS = {
 
 
 def border_distance(blocks, xyz: np.ndarray) -> np.ndarray:
-    """(P,) distance of points (P, 3) to the nearest border of the block that holds each; infinite where there is none."""
+    """(P,) distance of points (P, 3) to the nearest border of the block that holds each; infinite where there is
+    none."""
     found = np.full(len(xyz), np.inf)
     for block in blocks:
         inside = block.holds(xyz)
@@ -52,7 +55,8 @@ def borders(run: Path) -> tuple[list, float]:
 
 
 def score(run: Path, reference: Path, blocks, margin: float) -> dict:
-    """Chamfer distance of what cameras see, and of points within a margin of the borders and elsewhere, whether seen or not."""
+    """Chamfer distance of what cameras see, and of points within a margin of the borders and elsewhere, whether seen or
+    not."""
     from linprim_geo.eval.mesh import score_mesh
     from linprim_geo.eval.surface_samples import SurfaceDistance, sample_surface
     from linprim_geo.extract import extract_mesh
@@ -95,16 +99,28 @@ def run(given: argparse.Namespace) -> list[dict]:
 
     output, scene = given.output, given.output / "scene"
     if not scene.is_dir():
-        size = {"views": given.views, "test_views": max(2, given.views // 10), "size": given.size, "points": given.points}
+        size = {
+            "views": given.views,
+            "test_views": max(2, given.views // 10),
+            "size": given.size,
+            "points": given.points,
+        }
         synthesize(scene, mesh=street(given.houses), **size, supersample=2, threads=given.threads)
     counts = sorted(set(given.blocks))
-    options = {"iterations": given.iterations, "max_primitives": given.max_primitives, "sh_degree": 1, "evaluate_every": 0}
+    options = {
+        "iterations": given.iterations,
+        "max_primitives": given.max_primitives,
+        "sh_degree": 1,
+        "evaluate_every": 0,
+    }
     for count in counts:
         folder = output / f"blocks_{count}"
         where = {"scene": str(scene.resolve()), "options": options, "blocks": count, "workers": given.workers}
         if count == 1:  # in a worker too, so that its memory is measured alike
             with open_executor(None, output, 1) as executor:
-                executor.run([Task("whole", "linprim_geo.eval.block_quality:train_task", where, folder)], Progress("whole", 1))
+                executor.run(
+                    [Task("whole", "linprim_geo.eval.block_quality:train_task", where, folder)], Progress("whole", 1)
+                )
         elif not (folder / "done.json").exists():
             write_json(folder / "done.json", {"result": train_task(folder, **where)})
     grid, margin = borders(output / f"blocks_{counts[-1]}" / "run")
@@ -116,7 +132,10 @@ def run(given: argparse.Namespace) -> list[dict]:
         names = ("task_peak_gib", "task_seconds") if count == 1 else ("block_peak_gib", "worker_seconds")
         row |= {"gib": trained[names[0]], "seconds": trained[names[1]]}
         rows.append(row | score(folder / "run", scene / "reference.ply", grid, margin))
-        write_json(output / "block_quality.json", {"given": {k: v for k, v in vars(given).items() if k != "output"}, "rows": rows})
+        write_json(
+            output / "block_quality.json",
+            {"given": {k: v for k, v in vars(given).items() if k != "output"}, "rows": rows},
+        )
         with atomic_write(output / "block_quality.md") as temporary:
             temporary.write_text(table(rows))
     return rows
@@ -127,12 +146,22 @@ def train_task(folder: Path, scene: str, options: dict, blocks: int, workers: in
     from linprim_geo.train import train
 
     chosen = TrainOptions(**options, threads=1)
-    return train(scene, folder / "run", options=chosen, blocks=blocks, workers=workers, resume=(folder / "run").exists(), quiet=blocks == 1)
+    return train(
+        scene,
+        folder / "run",
+        options=chosen,
+        blocks=blocks,
+        workers=workers,
+        resume=(folder / "run").exists(),
+        quiet=blocks == 1,
+    )
 
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the capture, runs and results")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the capture, runs and results"
+    )
     parser.add_argument("--houses", type=int, default=8, help="length of the street (default: %(default)s)")
     parser.add_argument("--views", type=int, default=600, help="training views (default: %(default)s)")
     parser.add_argument("--size", type=int, default=160, help="pixels (default: %(default)s)")

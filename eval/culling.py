@@ -40,9 +40,7 @@ def count_views(
         rows = np.flatnonzero(count < enough)
         pixel, depth = camera.project(points[rows])
         with np.errstate(invalid="ignore"):
-            inside = (
-                (depth > 0) & (pixel >= 0).all(axis=1) & (pixel < (camera.width, camera.height)).all(axis=1)
-            )
+            inside = (depth > 0) & (pixel >= 0).all(axis=1) & (pixel < (camera.width, camera.height)).all(axis=1)
         rows = rows[inside]
         if len(rows) == 0:
             continue

@@ -85,8 +85,7 @@ def aggregate(views: Sequence[dict]) -> dict:
     and `pixels` adds those pixels up. A score that no view has is NaN.
     """
     results = {
-        key: _mean([view[key] for view in views])
-        for key in (*_DEPTH_KEYS, "coverage", "phantom", *_NORMAL_KEYS)
+        key: _mean([view[key] for view in views]) for key in (*_DEPTH_KEYS, "coverage", "phantom", *_NORMAL_KEYS)
     }
     for name, key in (("l1", "mae"), ("l2", "rmse")):
         values = [view[key] for view in views if np.isfinite(view[key])]
@@ -119,9 +118,10 @@ def eval_depth_run(
         run: a run folder, or an open run.
         reference: path of a mesh, or a `Mesh`; None takes the depth images of the views.
         split: "test", "train" or "all".
-        depth: which depth is scored. "depth_overlap" (the headline): where the transmittance falls to one half, overlaps counted
-            exactly (`Run.surface_depths`), the depth that surfaces are made of but at a level of one half. Or one that is rendered,
-            "depth_median" (the same in the run's own order of blending), "depth_expected" or "depth_first".
+        depth: which depth is scored. "depth_overlap" (the headline): where the transmittance falls to one half,
+            overlaps counted exactly (`Run.surface_depths`), the depth that surfaces are made of but at a level of one
+            half. Or one that is rendered, "depth_median" (the same in the run's own order of blending),
+            "depth_expected" or "depth_first".
 
     Returns:
         the scores of `aggregate`, lengths in the data set's unit and each also as `*_percent_diagonal`;
@@ -153,9 +153,7 @@ def eval_depth_run(
                 f"view {view.name}: the reference depth is {truth.shape[1]}x{truth.shape[0]}, "
                 f"expected {predicted.shape[1]}x{predicted.shape[0]} like the render"
             )
-        rows.append(
-            {"name": view.name, **score_depth(predicted, truth, rendered.get("normal"), truth_normal)}
-        )
+        rows.append({"name": view.name, **score_depth(predicted, truth, rendered.get("normal"), truth_normal)})
         valid = _is_surface(truth)
         if mesh is None and valid.any():
             points = view.camera.center + view.camera.world_rays()[valid] * truth[valid][:, None]

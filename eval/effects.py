@@ -1,12 +1,14 @@
 """What switching an effect on is worth: pairs of built-in scenes, one that calls for it and one that does not.
 
-    python -m linprim_geo.eval.effects -o runs/effects --size 128 --iterations 1200 --seeds 2 [--only exposure lens ...] [--scenes ...]
+    python -m linprim_geo.eval.effects -o runs/effects --size 128 --iterations 1200 --seeds 2 [--only exposure lens ...]
+    [--scenes ...]
 
-For every effect the detector decides about the scenes of its pair; then they are trained with the effect on and off, everything else off.
-Then some scenes are trained as `--effects auto`, `none` and `all` would, and with all that photographs alone tell. `effects.md` has both
-tables: evidence and whether the decision is right, what the effect gains, whether that is more than the scatter of trainings with other
-seeds, and what it costs. Times are CPU seconds of the whole training on one thread. Depth errors are relative to the truth; the
-share of the pixels where the render has no surface counts as 100 %, so holes are no gain.
+For every effect the detector decides about the scenes of its pair; then they are trained with the effect on and off,
+everything else off. Then some scenes are trained as `--effects auto`, `none` and `all` would, and with all that
+photographs alone tell. `effects.md` has both tables: evidence and whether the decision is right, what the effect gains,
+whether that is more than the scatter of trainings with other seeds, and what it costs. Times are CPU seconds of the
+whole training on one thread. Depth errors are relative to the truth; the share of the pixels where the render has no
+surface counts as 100 %, so holes are no gain.
 """
 
 from __future__ import annotations
@@ -62,7 +64,8 @@ PAIRS = {
     "exact-rays": (("room",), ("telephoto",), "psnr"),
     "double": ((), ("plain",), "psnr"),
 }
-# What is compared with what everything costs; measured depth and normals are truth in built-in scenes, so all there is without them, too.
+# What is compared with what everything costs; measured depth and normals are truth in built-in scenes, so all there is
+# without them, too.
 WAYS = {
     "auto": Choice("auto"),
     "none": Choice("none"),
@@ -91,9 +94,7 @@ def all_off() -> dict:
 
 def base_options(size: Size) -> tuple[SceneOptions, TrainOptions]:
     """Options with every effect off but what costs nothing and is on as a rule: exact rays, masks and the lens."""
-    off = {k: v for k, v in all_off().items() if k in TrainOptions.__dataclass_fields__} | EFFECTS[
-        "exact-rays"
-    ].on
+    off = {k: v for k, v in all_off().items() if k in TrainOptions.__dataclass_fields__} | EFFECTS["exact-rays"].on
     options = TrainOptions(
         iterations=size.iterations,
         max_primitives=size.primitives,
@@ -121,11 +122,9 @@ def make_scene(folder: Path, name: str, size: Size) -> Path:
     return path
 
 
-def trained(
-    folder: Path, path: Path, label: str, choice: Choice, options: tuple[SceneOptions, TrainOptions]
-) -> dict:
-    """PSNR, depth error in percent (if there is truth, a mesh or depth images) and CPU seconds of a training; taken from the folder if it
-    is there."""
+def trained(folder: Path, path: Path, label: str, choice: Choice, options: tuple[SceneOptions, TrainOptions]) -> dict:
+    """PSNR, depth error in percent (if there is truth, a mesh or depth images) and CPU seconds of a training; taken
+    from the folder if it is there."""
     run = folder / "runs" / f"{path.name}.{label}.{options[1].seed}"
     result = run / "effects_scores.json"
     if result.is_file():
@@ -143,17 +142,15 @@ def trained(
 
 
 def switched(folder: Path, path: Path, name: str, on: bool, size: Size, seeds: int) -> list[dict]:
-    """Trainings with an effect on or off and everything else off, one for each seed. What changes no option is the same training."""
+    """Trainings with an effect on or off and everything else off, one for each seed. What changes no option is the same
+    training."""
     rows = []
     for seed in range(seeds):
         base = tuple(
-            replace(options, **({"seed": seed} if hasattr(options, "seed") else {}))
-            for options in base_options(size)
+            replace(options, **({"seed": seed} if hasattr(options, "seed") else {})) for options in base_options(size)
         )
         setting = EFFECTS[name].on if on else EFFECTS[name].off
-        options = tuple(
-            replace(each, **{k: v for k, v in setting.items() if k in vars(each)}) for each in base
-        )
+        options = tuple(replace(each, **{k: v for k, v in setting.items() if k in vars(each)}) for each in base)
         label = "base" if options == base else f"{name}.{'on' if on else 'off'}"
         rows.append(trained(folder, path, label, Choice("none"), options))
     return rows
@@ -201,9 +198,11 @@ def mean(rows: list[dict], name: str) -> float:
 
 
 def scatter(trainings: list[list[dict]], name: str) -> float | None:
-    """Standard deviation of a figure over trainings that differ in their seed alone, from the median over what was trained; None of one.
+    """Standard deviation of a figure over trainings that differ in their seed alone, from the median over what was
+    trained; None of one.
 
-    The median of the variances, which are chi-squared over their k degrees of freedom, is their mean times (1 - 2 / 9k)^3.
+    The median of the variances, which are chi-squared over their k degrees of freedom, is their mean times (1 - 2 /
+    9k)^3.
     """
     variances = {}
     for rows in trainings:
@@ -245,15 +244,17 @@ def table(rows: list[dict], comparisons: list[dict], seeds: int) -> str:
             "on" if row["decided_on"] else "off",
         ]
         cells += (
-            [f"{row['gain'][name]:+.2f}" for name in JUDGED] + [f"{row['cost']:.2f}"]
-            if "gain" in row
-            else ["–"] * 3
+            [f"{row['gain'][name]:+.2f}" for name in JUDGED] + [f"{row['cost']:.2f}"] if "gain" in row else ["–"] * 3
         )
         lines.append(f"| {' | '.join([*cells, verdict(row, spread, seeds)])} |")
     if rows and None not in spread.values():
-        lines += ["", "Gains in dB, and in % of depth, 100 where there is no surface; time with the effect by that without."]
+        lines += [
+            "",
+            "Gains in dB, and in % of depth, 100 where there is no surface; time with the effect by that without.",
+        ]
         lines[-1] += (
-            f" {seeds} seeds; one training scatters by {spread['psnr']:.2f} dB and {spread['depth']:.3f} % (standard deviation)."
+            f" {seeds} seeds; one training scatters by {spread['psnr']:.2f} dB and {spread['depth']:.3f} % "
+            "(standard deviation)."
         )
     if comparisons:
         lines += ["", "| scene | effects | PSNR dB | depth error % | CPU s |", "|---" * 5 + "|"]
@@ -266,9 +267,11 @@ def table(rows: list[dict], comparisons: list[dict], seeds: int) -> str:
 
 
 def verdict(row: dict, spread: dict, seeds: int) -> str:
-    """Whether a decision is right by what the effect is judged by; a change counts that is more than twice its standard error.
+    """Whether a decision is right by what the effect is judged by; a change counts that is more than twice its standard
+    error.
 
-    Where nothing calls for the effect, what it gains by that does not count if it loses as much, in standard errors, by the other.
+    Where nothing calls for the effect, what it gains by that does not count if it loses as much, in standard errors, by
+    the other.
     """
     if row["reason"] == "impossible":
         return "ruled out"
@@ -290,16 +293,12 @@ def verdict(row: dict, spread: dict, seeds: int) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", default="runs/effects", metavar="DIR")
     parser.add_argument("--size", type=int, default=128, metavar="PX")
     parser.add_argument("--iterations", type=int, default=1200, metavar="N")
     parser.add_argument("--primitives", type=int, default=2000, metavar="N")
-    parser.add_argument(
-        "--seeds", type=int, default=2, metavar="N", help="trainings of everything that is compared"
-    )
+    parser.add_argument("--seeds", type=int, default=2, metavar="N", help="trainings of everything that is compared")
     parser.add_argument("--only", nargs="*", choices=tuple(PAIRS), default=tuple(PAIRS), metavar="EFFECT")
     text = "start from the scenes' points alone: looking for more takes longer than a small training"
     parser.add_argument("--own-points", action="store_true", help=text)
@@ -335,9 +334,7 @@ def main() -> None:
     except LinprimError as error:
         raise SystemExit(str(error)) from None
     text = table(rows, comparisons, seeds)
-    write_json(
-        folder / "effects.json", {"size": vars(size), "seeds": seeds, "effects": rows, "modes": comparisons}
-    )
+    write_json(folder / "effects.json", {"size": vars(size), "seeds": seeds, "effects": rows, "modes": comparisons})
     (folder / "effects.md").write_text(text + "\n")
     print(text)
 

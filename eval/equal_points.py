@@ -23,8 +23,8 @@ def rising(points: Sequence[Sequence[float]]) -> list[tuple[float, ...]]:
 def at_psnr(points: Sequence[Sequence[float]], level: float) -> tuple[float, ...] | None:
     """All but the PSNR of (count, psnr, cost, ...), all > 0, where the curve through `rising(points)` has PSNR `level`.
 
-    Between neighbours the logarithms are linear in the PSNR: log x = (1 - f) log x0 + f log x1, f = (level - p0) / (p1 - p0).
-    None outside of the curve; of a single point only its own PSNR is inside.
+    Between neighbours the logarithms are linear in the PSNR: log x = (1 - f) log x0 + f log x1, f = (level - p0) / (p1
+    - p0). None outside of the curve; of a single point only its own PSNR is inside.
     """
     curve = rising(points)
     for point in curve:
@@ -39,9 +39,11 @@ def at_psnr(points: Sequence[Sequence[float]], level: float) -> tuple[float, ...
 
 
 def at_time(points: Sequence[Sequence[float]], seconds: float) -> float | None:
-    """PSNR after `seconds` on the curve through the (seconds, psnr), linear in the logarithm of time; None before its first point.
+    """PSNR after `seconds` on the curve through the (seconds, psnr), linear in the logarithm of time; None before its
+    first point.
 
-    Points without a larger PSNR than an earlier one do not count, and after the last one the PSNR stays: the best so far.
+    Points without a larger PSNR than an earlier one do not count, and after the last one the PSNR stays: the best so
+    far.
     """
     curve = [point for point in rising(points) if point[0] > 0]
     if not curve or seconds < curve[0][0]:
@@ -56,7 +58,8 @@ def shared_range(curves: Sequence[Sequence[float]]) -> tuple[float, float] | Non
 
 
 def equal_psnr(a: Sequence[Sequence[float]], b: Sequence[Sequence[float]]) -> list[dict]:
-    """Counts and frame times of two curves of (count, psnr, frame ms, core ms) at `LEVELS` PSNRs that both reach; [] if there are none."""
+    """Counts and frame times of two curves of (count, psnr, frame ms, core ms) at `LEVELS` PSNRs that both reach; [] if
+    there are none."""
     both = shared_range([[p[1] for p in rising(curve)] for curve in (a, b)])
     if both is None:
         return []

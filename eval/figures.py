@@ -73,9 +73,7 @@ def _write_points(path: Path, points: np.ndarray, quality: np.ndarray, colors: n
 # --- plots -----------------------------------------------------------------------------------------------
 
 
-def plot_rates(
-    path: Path, forward: Comparison, backward: Comparison, tau: float, title: str, unit: str
-) -> None:
+def plot_rates(path: Path, forward: Comparison, backward: Comparison, tau: float, title: str, unit: str) -> None:
     """Writes a PNG of precision, recall and F1 against the threshold, from tau / 100 to 10 tau.
 
     Raises:
@@ -92,26 +90,19 @@ def plot_rates(
     axes = _Axes(title, (math.log10(thresholds[0]), math.log10(thresholds[-1])), (0.0, 1.0))
     decades = range(math.floor(axes.x[0]), math.ceil(axes.x[1]) + 1)
     ticks = [math.log10(m) + decade for decade in decades for m in (1, 2, 5)]
-    axes.frame(
-        ticks, np.linspace(0, 1, 6), f"threshold ({unit})", "share within the threshold", _power, _percent
-    )
+    axes.frame(ticks, np.linspace(0, 1, 6), f"threshold ({unit})", "share within the threshold", _power, _percent)
     axes.line(math.log10(tau), f"tau = {tau:.3g}")
     colors = (PREDICTION_COLOR, REFERENCE_COLOR, F1_COLOR)
     # Thinner and thinner, so that curves that coincide can all be seen.
     for values, color, width in zip((precision, recall, f1), colors, (6, 3.5, 1.5), strict=True):
         axes.curve(np.log10(thresholds), values, color, width)
     at_tau = [float(np.interp(math.log10(tau), np.log10(thresholds), v)) for v in (precision, recall, f1)]
-    names = [
-        f"{name}, {100 * v:.1f} % at tau"
-        for name, v in zip(("precision", "recall", "F1"), at_tau, strict=True)
-    ]
+    names = [f"{name}, {100 * v:.1f} % at tau" for name, v in zip(("precision", "recall", "F1"), at_tau, strict=True)]
     axes.legend(names, colors)
     axes.save(path)
 
 
-def plot_histogram(
-    path: Path, forward: Comparison, backward: Comparison, tau: float, title: str, unit: str
-) -> None:
+def plot_histogram(path: Path, forward: Comparison, backward: Comparison, tau: float, title: str, unit: str) -> None:
     """Writes a PNG with the histograms of the distances of both directions, up to their 99 % quantiles.
 
     Raises:
@@ -125,9 +116,7 @@ def plot_histogram(
     shares = [np.histogram(d, bins)[0] / max(len(d), 1) for d in kept]
     top = max(float(share.max()) for share in shares) or 1.0
     axes = _Axes(title, (0.0, end), (0.0, 1.08 * top))
-    axes.frame(
-        _nice(0.0, end), _nice(0.0, 1.08 * top), f"distance ({unit})", "share of the points", _plain, _percent
-    )
+    axes.frame(_nice(0.0, end), _nice(0.0, 1.08 * top), f"distance ({unit})", "share of the points", _plain, _percent)
     if tau <= end:
         axes.line(tau, f"tau = {tau:.3g}")
     colors = (PREDICTION_COLOR, REFERENCE_COLOR)
@@ -170,9 +159,14 @@ class _Axes:
         return list(zip(np.atleast_1d(columns).tolist(), np.atleast_1d(rows).tolist(), strict=True))
 
     def frame(
-        self, x_ticks: Sequence[float], y_ticks: Sequence[float], x_label: str, y_label: str,
-        x_text: Callable[[float], str], y_text: Callable[[float], str],
-    ) -> None:  # fmt: skip
+        self,
+        x_ticks: Sequence[float],
+        y_ticks: Sequence[float],
+        x_label: str,
+        y_label: str,
+        x_text: Callable[[float], str],
+        y_text: Callable[[float], str],
+    ) -> None:
         k = SMOOTHING
         for value in x_ticks:
             if self.x[0] - 1e-9 <= value <= self.x[1] + 1e-9:

@@ -1,4 +1,5 @@
-"""What a sweep of a knob says: the settings that no other beats in both time and error, and whether the dearer ones are worth it."""
+"""What a sweep of a knob says: the settings that no other beats in both time and error, and whether the dearer ones are
+worth it."""
 
 from __future__ import annotations
 
@@ -7,18 +8,21 @@ from collections.abc import Sequence
 
 from linprim_geo.eval.knobs import ERRORS, Knob
 
-# The rule of the verdict. A dearer rung is worth its time if error ~ time^-r with r at least this: what averaging independent
-# samples gives, which is always there as another way to spend time. Less error than this share is none.
+# The rule of the verdict. A dearer rung is worth its time if error ~ time^-r with r at least this: what averaging
+# independent samples gives, which is always there as another way to spend time. Less error than this share is none.
 RETURN, LEAST_GAIN = 0.5, 0.01
 RULE = (
-    "A dearer rung is worth it if it divides the error by at least the root of what it multiplies the time by, as averaging "
-    "independent samples would, and removes at least 1 % of it. Rungs are looked at from the fastest on, along the frontier. Where "
+    "A dearer rung is worth it if it divides the error by at least the root of what it multiplies the time by, "
+    "as averaging "
+    "independent samples would, and removes at least 1 % of it. Rungs are looked at from the fastest on, along "
+    "the frontier. Where "
     "the middle halves of two timings overlap, they count as equal."
 )
 
 
 def frontier(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Indices of the (seconds, error) that no other beats in both, from the fastest on; of equal ones the first. NaN is beaten."""
+    """Indices of the (seconds, error) that no other beats in both, from the fastest on; of equal ones the first. NaN is
+    beaten."""
     order = sorted((p for p in range(len(points)) if all(map(math.isfinite, points[p]))), key=lambda p: (*points[p], p))
     kept: list[int] = []
     for k in order:
@@ -46,7 +50,8 @@ def same_time(one: dict, other: dict) -> bool:
 def verdict(knob: Knob, rows: Sequence[dict]) -> dict:
     """The sentence about a knob from its rows, and `error`, `cheapest`, `taken`, `most_accurate` (names of rungs).
 
-    A row has `rung`, `seconds`, `low`, `high`, `rounds`, and the errors; the first of the knob's errors that all rows have decides.
+    A row has `rung`, `seconds`, `low`, `high`, `rounds`, and the errors; the first of the knob's errors that all rows
+    have decides.
     """
     rows = [row for row in rows if math.isfinite(row.get("seconds", math.nan))]
     known = [name for name in knob.errors if rows and all(math.isfinite(row.get(name, math.nan)) for row in rows)]
@@ -85,7 +90,8 @@ def _step(cheap: dict, dear: dict, error: str, more: bool = False) -> str:
     share = "over 99" if less > 99 else f"{less:.0f}" if less >= 9.5 else f"{less:.1g}"
     verb = "would cost" if more else "costs"
     return (
-        f"{dear['rung']} {verb} {_times(cheap, dear)} the time of {cheap['rung']} and remove{'' if more else 's'} {share} % of the "
+        f"{dear['rung']} {verb} {_times(cheap, dear)} the time of {cheap['rung']} and "
+        f"remove{'' if more else 's'} {share} % of the "
         f"{ERRORS[error].title} ({a:.3g} to {b:.3g}{unit})"
     )
 

@@ -1,9 +1,9 @@
 """Hard cases of the rasterizer as seeded generators: many tiny scenes at once, one named class of difficulty each.
 
-A scene is a camera with a window of a few pixels and one or a few primitives; one of its rays is aimed at a point inside
-the first primitive, and the densities are chosen so that this ray neither misses nor is opaque, unless that is the point
-of the class. Everything is rounded to float32 values, held in float64, so that every rung of the accuracy ladder and the
-reference (`linprim_geo.eval.many_scenes`) see the same numbers.
+A scene is a camera with a window of a few pixels and one or a few primitives; one of its rays is aimed at a point
+inside the first primitive, and the densities are chosen so that this ray neither misses nor is opaque, unless that is
+the point of the class. Everything is rounded to float32 values, held in float64, so that every rung of the accuracy
+ladder and the reference (`linprim_geo.eval.many_scenes`) see the same numbers.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ KINDS = (*POLYHEDRA, "gaussian")
 class HardClass:
     """One class of hard cases: `make(rng, primitive, ray_model, count)` gives `count` scenes.
 
-    `value`: whether images and gradients are compared, or only looked through for NaN, infinity and transmittance; `ties`:
-    whether rays meet edges and vertices, where every one-sided gradient is right.
+    `value`: whether images and gradients are compared, or only looked through for NaN, infinity and transmittance;
+    `ties`: whether rays meet edges and vertices, where every one-sided gradient is right.
     """
 
     name: str
@@ -83,9 +83,7 @@ def _inside(rng: np.random.Generator, primitive: str, extent: np.ndarray, reach:
     """A point in each primitive, local axes, relative to its centre, (..., 3); `reach` 1 goes to its surface."""
     if primitive == "tetrahedron":
         share = rng.dirichlet(np.ones(4), extent.shape[:-1])
-        share = reach * share + (1 - reach) / extent / (1 / extent).sum(
-            -1, keepdims=True
-        )  # the centre's own weights
+        share = reach * share + (1 - reach) / extent / (1 / extent).sum(-1, keepdims=True)  # the centre's own weights
         return (share * extent) @ many_scenes.CORNERS.numpy()
     y = rng.normal(size=(*extent.shape[:-1], 3))
     y *= reach * rng.random((*extent.shape[:-1], 1)) ** (1 / 3) / np.abs(y).sum(-1, keepdims=True)
@@ -115,7 +113,8 @@ def build(
         center: (B, M, 3), camera space; extent: (B, M, 3 or 4).
         rotation: (B, M, 4) primitive to world, random without.
         pose: (B, 4, 4), random without.
-        density: (B, M); without, such that the aimed ray has the thickness `tau` (B, M) in each primitive, 0.01 to 3 without.
+        density: (B, M); without, such that the aimed ray has the thickness `tau` (B, M) in each primitive, 0.01 to 3
+            without.
         focal: (B,) px; without, such that the largest extent covers `footprint` (B,) px, 1 to 300 without.
         target: (B, 3) point that is aimed at, camera space; random inside the first primitive without.
     """
@@ -129,11 +128,21 @@ def build(
     if one_color:
         sh[:] = sh[:, :1]
     scenes = Scenes(
-        primitive=primitive, ray_model=ray_model, center=_rounded(world), rotation=_rounded(rotation), extent=_rounded(extent),
-        density=torch.ones(count, many, dtype=torch.float64), sh=_rounded(sh), pose=torch.from_numpy(pose.copy()),
-        focal=torch.ones(count, 2, dtype=torch.float64), middle=torch.zeros(count, 2, dtype=torch.float64),
-        near=torch.from_numpy(near.copy()), width=WINDOW, height=WINDOW, aimed=torch.zeros(count, dtype=torch.long),
-    )  # fmt: skip
+        primitive=primitive,
+        ray_model=ray_model,
+        center=_rounded(world),
+        rotation=_rounded(rotation),
+        extent=_rounded(extent),
+        density=torch.ones(count, many, dtype=torch.float64),
+        sh=_rounded(sh),
+        pose=torch.from_numpy(pose.copy()),
+        focal=torch.ones(count, 2, dtype=torch.float64),
+        middle=torch.zeros(count, 2, dtype=torch.float64),
+        near=torch.from_numpy(near.copy()),
+        width=WINDOW,
+        height=WINDOW,
+        aimed=torch.zeros(count, dtype=torch.long),
+    )
 
     # From here on with the rounded numbers, so that the ray hits.
     at, axes = (x.numpy()[:, 0] for x in many_scenes.camera_space(scenes))
@@ -157,9 +166,11 @@ def build(
     focal = np.stack([focal, focal * rng.uniform(0.9, 1.1, count)], -1)
     pixel = rng.integers(WINDOW, size=(count, 2))
     scenes = replace(
-        scenes, focal=torch.from_numpy(focal), middle=torch.from_numpy(pixel + 0.5 - focal * aim),
+        scenes,
+        focal=torch.from_numpy(focal),
+        middle=torch.from_numpy(pixel + 0.5 - focal * aim),
         aimed=torch.from_numpy(pixel[:, 1] * WINDOW + pixel[:, 0]),
-    )  # fmt: skip
+    )
     if density is None and primitive == "gaussian":
         density = rng.uniform(0.05, 1.0, (count, many))
     elif density is None:
@@ -171,19 +182,18 @@ def build(
 
 
 def _before(rng, extent: np.ndarray, low: float = 0.3, high: float = 1.5) -> np.ndarray:
-    """Centres in front of the camera, 10^low to 10^high times the largest extent away, (B, M, 3); others near the first."""
+    """Centres in front of the camera, 10^low to 10^high times the largest extent away, (B, M, 3); others near the
+    first."""
     count, many = extent.shape[:2]
     size = extent[:, 0].max(-1)
     z = size * log_uniform(rng, low, high, count)
     direction = np.concatenate([rng.uniform(-0.5, 0.5, (count, 2)), np.ones((count, 1))], 1)
-    return (z[:, None] * direction)[:, None] + 0.3 * size[:, None, None] * rng.normal(
-        size=(count, many, 3)
-    ) * (np.arange(many) > 0)[:, None]
+    return (z[:, None] * direction)[:, None] + 0.3 * size[:, None, None] * rng.normal(size=(count, many, 3)) * (
+        np.arange(many) > 0
+    )[:, None]
 
 
-def _shape(
-    rng, primitive: str, count: int, many: int = 1, low: float = -0.7, high: float = 0.3
-) -> np.ndarray:
+def _shape(rng, primitive: str, count: int, many: int = 1, low: float = -0.7, high: float = 0.3) -> np.ndarray:
     return log_uniform(rng, low, high, count, many, _extents(primitive))
 
 
@@ -198,9 +208,7 @@ def ordinary(rng, primitive, ray_model, count):
 def several(rng, primitive, ray_model, count):
     """Five that overlap."""
     extent = _shape(rng, primitive, count, 5, -0.3, 0.3)
-    return build(
-        rng, primitive, ray_model, _before(rng, extent), extent, footprint=log_uniform(rng, 0.5, 1.5, count)
-    )
+    return build(rng, primitive, ray_model, _before(rng, extent), extent, footprint=log_uniform(rng, 0.5, 1.5, count))
 
 
 def _thin(rng, primitive, ray_model, count, axes: int, low: float, high: float):
@@ -219,7 +227,8 @@ def _thin(rng, primitive, ray_model, count, axes: int, low: float, high: float):
 
 @hard_class("needles")
 def needles(rng, primitive, ray_model, count):
-    """Two half-axes (a tetrahedron: three vertices) 10 to 1e3 times shorter than the other; it covers 1 to 300 px along."""
+    """Two half-axes (a tetrahedron: three vertices) 10 to 1e3 times shorter than the other; it covers 1 to 300 px
+    along."""
     return _thin(rng, primitive, ray_model, count, 2, 1, 3)
 
 
@@ -263,8 +272,8 @@ def zero_axes(rng, primitive, ray_model, count):
     center = _before(rng, extent)
     scenes = build(rng, primitive, ray_model, center, extent)
     flat = scenes.extent.clone()
-    flat[torch.arange(count), 0, torch.from_numpy(rng.integers(_extents(primitive), size=count))] = (
-        torch.from_numpy(np.where((rng.random(count) < 0.5) & (primitive != "gaussian"), -0.5, 0.0))
+    flat[torch.arange(count), 0, torch.from_numpy(rng.integers(_extents(primitive), size=count))] = torch.from_numpy(
+        np.where((rng.random(count) < 0.5) & (primitive != "gaussian"), -0.5, 0.0)
     )
     return replace(scenes, extent=flat)
 
@@ -274,13 +283,9 @@ def denormal_axes(rng, primitive, ray_model, count):
     """One extent below the smallest normal float32, others 1e-30 to 1; thickness as it comes."""
     extent = _shape(rng, primitive, count, low=-30, high=0)
     center = _before(rng, _shape(rng, primitive, count))
-    extent[np.arange(count), 0, rng.integers(_extents(primitive), size=count)] = log_uniform(
-        rng, -44.8, -38, count
-    )
+    extent[np.arange(count), 0, rng.integers(_extents(primitive), size=count)] = log_uniform(rng, -44.8, -38, count)
     density = rng.random((count, 1)) if primitive == "gaussian" else log_uniform(rng, -3, 18, count, 1)
-    return build(
-        rng, primitive, ray_model, center, extent, density=density, focal=log_uniform(rng, 0, 4, count)
-    )
+    return build(rng, primitive, ray_model, center, extent, density=density, focal=log_uniform(rng, 0, 4, count))
 
 
 @hard_class("huge axes")
@@ -299,13 +304,12 @@ def overflowing_axes(rng, primitive, ray_model, count):
     extent = _shape(rng, primitive, count, low=10, high=38)
     density = rng.random((count, 1)) if primitive == "gaussian" else log_uniform(rng, -38, 18, count, 1)
     center = _before(rng, np.minimum(extent, 1e30)) * log_uniform(rng, -30, 0, count)[:, None, None]
-    return build(
-        rng, primitive, ray_model, center, extent, density=density, focal=log_uniform(rng, 0, 4, count)
-    )
+    return build(rng, primitive, ray_model, center, extent, density=density, focal=log_uniform(rng, 0, 4, count))
 
 
 def _about_face(rng, primitive, ray_model, count, outside: bool, gap: np.ndarray):
-    """The camera at height `gap` (in distances of the centre from the face) over a face's plane, beside the face or on it."""
+    """The camera at height `gap` (in distances of the centre from the face) over a face's plane, beside the face or on
+    it."""
     extent = _shape(rng, primitive, count)
     exact = rng.random(count) < 0.3
     extent[exact] = 2.0 ** np.round(np.log2(extent[exact]))
@@ -356,22 +360,31 @@ def camera_on_a_face(rng, primitive, ray_model, count):
 
 @hard_class("vertices and edges", primitives=POLYHEDRA, ties=True)
 def vertices_and_edges(rng, primitive, ray_model, count):
-    """Rays exactly through vertices, along edges and through points of edges: axes aligned, everything a power of two."""
+    """Rays exactly through vertices, along edges and through points of edges: axes aligned, everything a power of
+    two."""
     extent = 2.0 ** rng.integers(-3, 2, (count, 1, _extents(primitive)))
     extent[rng.random(count) < 0.5] = 0.5
     pose = np.tile(np.eye(4), (count, 1, 1))
     q = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1, 1))
-    center = np.stack(
-        [rng.integers(-2, 3, count), rng.integers(-2, 3, count), 2.0 ** rng.integers(2, 5, count)], -1
-    )[:, None].astype(float)
+    center = np.stack([rng.integers(-2, 3, count), rng.integers(-2, 3, count), 2.0 ** rng.integers(2, 5, count)], -1)[
+        :, None
+    ].astype(float)
     scenes = build(rng, primitive, ray_model, center, extent, rotation=q, pose=pose)
     arms, _ = many_scenes.vertices(scenes)
     arms = arms[:, 0].numpy()
     first, second = (arms[np.arange(count), rng.integers(arms.shape[1], size=count)] for _ in range(2))
     target = center[:, 0] + first + rng.choice([0.0, 0.0, 0.5, 0.25], count)[:, None] * (second - first)
     return build(
-        rng, primitive, ray_model, center, extent, rotation=q, pose=pose, target=target, focal=2.0 ** rng.integers(2, 10, count)
-    )  # fmt: skip
+        rng,
+        primitive,
+        ray_model,
+        center,
+        extent,
+        rotation=q,
+        pose=pose,
+        target=target,
+        focal=2.0 ** rng.integers(2, 10, count),
+    )
 
 
 @hard_class("camera inside")
@@ -448,9 +461,7 @@ def subpixel(rng, primitive, ray_model, count):
 def thousand_screens(rng, primitive, ray_model, count):
     """A thousand to 25,000 times as wide as the window: 4,000 to 100,000 px."""
     extent = _shape(rng, primitive, count)
-    return build(
-        rng, primitive, ray_model, _before(rng, extent), extent, footprint=log_uniform(rng, 3.6, 5, count)
-    )
+    return build(rng, primitive, ray_model, _before(rng, extent), extent, footprint=log_uniform(rng, 3.6, 5, count))
 
 
 @hard_class("a million units away")
@@ -464,14 +475,13 @@ def far_coordinates(rng, primitive, ray_model, count):
 def any_thickness(rng, primitive, ray_model, count):
     """Optical thickness 1e-12 to 1e4 of two that overlap."""
     extent = _shape(rng, primitive, count, 2)
-    return build(
-        rng, primitive, ray_model, _before(rng, extent), extent, tau=log_uniform(rng, -12, 4, count, 2)
-    )
+    return build(rng, primitive, ray_model, _before(rng, extent), extent, tau=log_uniform(rng, -12, 4, count, 2))
 
 
 @hard_class("ends of the opacity")
 def ends_of_opacity(rng, primitive, ray_model, count):
-    """Density from a raw value of -80 to 80 by softplus over the reference length; a Gaussian's by the logistic function."""
+    """Density from a raw value of -80 to 80 by softplus over the reference length; a Gaussian's by the logistic
+    function."""
     extent = _shape(rng, primitive, count)
     raw = rng.uniform(-80, 80, (count, 1)) * rng.choice([0.05, 1.0], (count, 1))
     if primitive == "gaussian":
@@ -489,9 +499,7 @@ def coincident(rng, primitive, ray_model, count, many: int = 200):
     tau = log_uniform(rng, -3, 0, count, many) * log_uniform(rng, -1, 1, count, 1) / many
     q = np.repeat(rng.normal(size=(count, 1, 4)), many, 1)
     density = np.clip(tau * many, 0.01, 1) if primitive == "gaussian" else None
-    scenes = build(
-        rng, primitive, ray_model, center, extent, rotation=q, tau=tau, density=density, one_color=True
-    )
+    scenes = build(rng, primitive, ray_model, center, extent, rotation=q, tau=tau, density=density, one_color=True)
     return replace(scenes, coincident=True)
 
 
@@ -502,9 +510,7 @@ def equal_depth(rng, primitive, ray_model, count):
     center = _before(rng, extent)
     center[:, :, 2] = center[:, :1, 2]
     pose = np.tile(np.eye(4), (count, 1, 1))
-    return build(
-        rng, primitive, ray_model, center, extent, pose=pose, footprint=log_uniform(rng, 0.5, 1.5, count)
-    )
+    return build(rng, primitive, ray_model, center, extent, pose=pose, footprint=log_uniform(rng, 0.5, 1.5, count))
 
 
 @hard_class("quaternions")
@@ -516,9 +522,7 @@ def quaternions(rng, primitive, ray_model, count):
     return build(rng, primitive, ray_model, _before(rng, extent), extent, rotation=q)
 
 
-def one_scene(
-    scenes: Scenes, index: int, dtype: torch.dtype = torch.float64
-) -> tuple[list[Tensor], Camera, dict]:
+def one_scene(scenes: Scenes, index: int, dtype: torch.dtype = torch.float64) -> tuple[list[Tensor], Camera, dict]:
     """The tensors, camera and options of scene `index`, as `linprim_geo.ops.rasterize` takes them."""
     s = scenes
     parameters = [x[index].to(dtype) for x in (s.center, s.rotation, s.extent, s.density, s.sh)]

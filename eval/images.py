@@ -119,18 +119,18 @@ def eval_images_run(
     Args:
         run: a run folder, or an open run.
         split: "test", "train" or "all".
-        lpips_weights: file or folder, see `lpips.find_lpips`; None takes what is installed or was downloaded before, "none" leaves
-            LPIPS out.
+        lpips_weights: file or folder, see `lpips.find_lpips`; None takes what is installed or was downloaded before,
+            "none" leaves LPIPS out.
 
     Returns:
         `psnr` in dB and `ssim`, means over the views, with `psnr_standard_error` and `ssim_standard_error`
         as for independent views (NaN of one); `views`, `split`, `protocol`, `background` and `seconds`.
-        Where weights are at hand likewise `lpips_alex`, `lpips_vgg` and `lpips_vgg_3dgs` (as the tables of 3DGS and LinPrim have it),
-        and `lpips_files`; where they are not, `lpips_missing` says so.
+        Where weights are at hand likewise `lpips_alex`, `lpips_vgg` and `lpips_vgg_3dgs` (as the tables of 3DGS and
+        LinPrim have it), and `lpips_files`; where they are not, `lpips_missing` says so.
 
     Raises:
-        LinprimError: the split is empty, a render is not finite or of another size than its photograph, or the weights that are given
-            cannot be used.
+        LinprimError: the split is empty, a render is not finite or of another size than its photograph, or the weights
+            that are given cannot be used.
     """
     start = time.perf_counter()
     run = open_run(run)
@@ -190,7 +190,9 @@ def _distances(views, weights: str | os.PathLike | None) -> tuple[list, str]:
     fitting = [lpips for lpips in found if lpips.network.smallest <= least]
     if found and not fitting:
         wanted = min(lpips.network.smallest for lpips in found)
-        missing = f"view {small.name} is {small.camera.width}x{small.camera.height}, LPIPS wants at least {wanted}x{wanted}"
+        missing = (
+            f"view {small.name} is {small.camera.width}x{small.camera.height}, LPIPS wants at least {wanted}x{wanted}"
+        )
         if weights is not None:
             raise LinprimError(missing)
     return fitting, missing

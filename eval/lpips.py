@@ -1,8 +1,9 @@
 """LPIPS, the learned perceptual distance of two images, by weights that are at hand: nothing is downloaded.
 
-Features of a classifier after five of its layers are divided by their length over the channels; their squared difference, weighted per
-channel by a linear head, is averaged over the image and added up over the layers. Source: Zhang et al., "The unreasonable effectiveness
-of deep features as a perceptual metric", CVPR 2018, eq. 1; version 0.1 of its weights.
+Features of a classifier after five of its layers are divided by their length over the channels; their squared
+difference, weighted per channel by a linear head, is averaged over the image and added up over the layers. Source:
+Zhang et al., "The unreasonable effectiveness of deep features as a perceptual metric", CVPR 2018, eq. 1; version 0.1 of
+its weights.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ _KEY = re.compile(r"(?:features|net\.slice\d+)\.(\d+)\.(weight|bias)")
 
 @dataclass(frozen=True)
 class Conv:
-    """A convolution with a ReLU after it: its `index` in torchvision's `features`, and the max-pooling, of stride 2, before it."""
+    """A convolution with a ReLU after it: its `index` in torchvision's `features`, and the max-pooling, of stride 2,
+    before it."""
 
     index: int
     channels: int
@@ -45,7 +47,8 @@ class Conv:
 
 @dataclass(frozen=True)
 class Network:
-    """A classifier's convolutions; `smallest` is the least edge in pixels that leaves something of the image in the last of them."""
+    """A classifier's convolutions; `smallest` is the least edge in pixels that leaves something of the image in the
+    last of them."""
 
     name: str
     title: str
@@ -72,23 +75,35 @@ NETWORKS = {
     network.name: network
     for network in (
         Network(
-            "alex", "AlexNet",
+            "alex",
+            "AlexNet",
             (Conv(0, 64, 11, 4, 2), Conv(3, 192, 5, 1, 2, pool=3), Conv(6, 384, pool=3), Conv(8, 256), Conv(10, 256)),
-            31, "alexnet-*.pth",
+            31,
+            "alexnet-*.pth",
         ),
         Network(
-            "vgg", "VGG16",
+            "vgg",
+            "VGG16",
             (
-                Conv(0, 64, tap=False), Conv(2, 64),
-                Conv(5, 128, pool=2, tap=False), Conv(7, 128),
-                Conv(10, 256, pool=2, tap=False), Conv(12, 256, tap=False), Conv(14, 256),
-                Conv(17, 512, pool=2, tap=False), Conv(19, 512, tap=False), Conv(21, 512),
-                Conv(24, 512, pool=2, tap=False), Conv(26, 512, tap=False), Conv(28, 512),
+                Conv(0, 64, tap=False),
+                Conv(2, 64),
+                Conv(5, 128, pool=2, tap=False),
+                Conv(7, 128),
+                Conv(10, 256, pool=2, tap=False),
+                Conv(12, 256, tap=False),
+                Conv(14, 256),
+                Conv(17, 512, pool=2, tap=False),
+                Conv(19, 512, tap=False),
+                Conv(21, 512),
+                Conv(24, 512, pool=2, tap=False),
+                Conv(26, 512, tap=False),
+                Conv(28, 512),
             ),
-            16, "vgg16-*.pth",
+            16,
+            "vgg16-*.pth",
         ),
     )
-}  # fmt: skip
+}
 
 
 class Lpips:
@@ -113,8 +128,8 @@ class Lpips:
     def distance(self, a: np.ndarray, b: np.ndarray, *, as_3dgs: bool = False) -> float:
         """The distance of two images (H, W, 3) of one shape, uint8 or float in [0, 1]; 0 for equal ones, symmetric.
 
-        With `as_3dgs` colours go in as they are, in [0, 1], where the network was calibrated for [-1, 1]: so do the tables of 3DGS and
-        of LinPrim, and distances come out smaller.
+        With `as_3dgs` colours go in as they are, in [0, 1], where the network was calibrated for [-1, 1]: so do the
+        tables of 3DGS and of LinPrim, and distances come out smaller.
 
         Raises:
             LinprimError: the images are smaller than the network takes.
@@ -130,18 +145,12 @@ class Lpips:
             x, y = self._after(conv, x), self._after(conv, y)
             if conv.tap:
                 difference = (_unit(x) - _unit(y)).square()
-                total += float(
-                    (difference * self.heads[layer][None, :, None, None]).sum(1).mean(dtype=torch.float64)
-                )
+                total += float((difference * self.heads[layer][None, :, None, None]).sum(1).mean(dtype=torch.float64))
                 layer += 1
         return total
 
     def _prepared(self, image: np.ndarray, as_3dgs: bool) -> torch.Tensor:
-        image = (
-            image.astype(np.float32) / np.float32(255)
-            if image.dtype == np.uint8
-            else image.astype(np.float32)
-        )
+        image = image.astype(np.float32) / np.float32(255) if image.dtype == np.uint8 else image.astype(np.float32)
         values = torch.from_numpy(np.ascontiguousarray(np.moveaxis(image, -1, 0)[None]))
         values = values if as_3dgs else 2 * values - 1
         return (values - torch.tensor(SHIFT)[None, :, None, None]) / torch.tensor(SCALE)[None, :, None, None]
@@ -163,9 +172,10 @@ def _unit(features: torch.Tensor) -> torch.Tensor:
 def find_lpips(weights: str | os.PathLike | None = None) -> tuple[list[Lpips], str]:
     """LPIPS by every network whose weights are at hand, and a sentence about what is missing if there is none.
 
-    A network wants two sets of weights: torchvision's of the classifier, and the heads. Both may be in `weights`, a file or a folder of
-    `.pth` and `.pt` files of any names (one file of the whole of the package `lpips` will do); what is not is taken from torch's cache of
-    downloads and out of the installed packages `lpips` and `torchmetrics`, which are not imported.
+    A network wants two sets of weights: torchvision's of the classifier, and the heads. Both may be in `weights`, a
+    file or a folder of `.pth` and `.pt` files of any names (one file of the whole of the package `lpips` will do); what
+    is not is taken from torch's cache of downloads and out of the installed packages `lpips` and `torchmetrics`, which
+    are not imported.
 
     Raises:
         LinprimError: `weights` is given and is missing, damaged, of another network, or not enough for any.
@@ -213,9 +223,7 @@ def _files(weights: str | os.PathLike | None) -> list[Path]:
     if path.is_dir():
         files = sorted(file for file in path.iterdir() if file.suffix in SUFFIXES and file.is_file())
         if not files:
-            raise LinprimError(
-                f"{path}: holds no {' and no '.join(SUFFIXES)} file, wanted the weights of LPIPS"
-            )
+            raise LinprimError(f"{path}: holds no {' and no '.join(SUFFIXES)} file, wanted the weights of LPIPS")
         return files
     if not path.is_file():
         raise LinprimError(f"{path}: no such file or folder, wanted the weights of LPIPS")
@@ -253,23 +261,18 @@ def _take(file: Path, backbones: dict[str, tuple[Path, dict]], heads: dict[str, 
         shapes = network.shapes()
         if first is not None and tuple(first.shape) == shapes["0.weight"]:
             backbone = {
-                name: _checked(file, f"features.{name}", convs.get(name), shape)
-                for name, shape in shapes.items()
+                name: _checked(file, f"features.{name}", convs.get(name), shape) for name, shape in shapes.items()
             }
             backbones.setdefault(network.name, (file, backbone))
     found = [state.get(f"lin{k}.model.1.weight") for k in range(len(NETWORKS["vgg"].taps))]
     if found[0] is None:
         return
     fitting = [
-        n
-        for n in NETWORKS.values()
-        if all(v is None or v.numel() == c for v, c in zip(found, n.taps, strict=True))
+        n for n in NETWORKS.values() if all(v is None or v.numel() == c for v, c in zip(found, n.taps, strict=True))
     ]
     network = fitting[0] if fitting and f"lin{len(found)}.model.1.weight" not in state else None
     if network is None:
-        raise LinprimError(
-            f"{file}: its heads are those of neither AlexNet nor VGG16, wanted alex.pth or vgg.pth"
-        )
+        raise LinprimError(f"{file}: its heads are those of neither AlexNet nor VGG16, wanted alex.pth or vgg.pth")
     taken = [
         _checked(file, f"lin{k}.model.1.weight", v, (1, c, 1, 1))
         for k, (v, c) in enumerate(zip(found, network.taps, strict=True))
@@ -280,13 +283,12 @@ def _take(file: Path, backbones: dict[str, tuple[Path, dict]], heads: dict[str, 
 def _read(file: Path) -> dict[str, torch.Tensor]:
     """The tensors of a file, without running what it says."""
     try:
-        # Weights of a classifier's last layers are the most of it, and are not wanted; only files that are archives can be mapped.
+        # Weights of a classifier's last layers are the most of it, and are not wanted; only files that are archives can
+        # be mapped.
         state = torch.load(file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file))
     except Exception as error:  # torch raises nearly anything for what is not its file
         reason = " ".join(str(error).split()).split(". ")[0][:120] or type(error).__name__
-        raise LinprimError(
-            f"{file}: cannot be read ({reason}), wanted weights that PyTorch has saved"
-        ) from None
+        raise LinprimError(f"{file}: cannot be read ({reason}), wanted weights that PyTorch has saved") from None
     if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):
         raise LinprimError(
             f"{file}: holds {type(state).__name__} with something else than tensors, wanted a table of weights"
@@ -296,13 +298,9 @@ def _read(file: Path) -> dict[str, torch.Tensor]:
 
 def _checked(file: Path, name: str, value: torch.Tensor | None, shape: tuple[int, ...]) -> torch.Tensor:
     if value is None:
-        raise LinprimError(
-            f"{file}: lacks {name}, wanted the weights of AlexNet or VGG16 and heads of five layers"
-        )
+        raise LinprimError(f"{file}: lacks {name}, wanted the weights of AlexNet or VGG16 and heads of five layers")
     if tuple(value.shape) != shape:
-        raise LinprimError(
-            f"{file}: {name} is {'x'.join(map(str, value.shape))}, wanted {'x'.join(map(str, shape))}"
-        )
+        raise LinprimError(f"{file}: {name} is {'x'.join(map(str, value.shape))}, wanted {'x'.join(map(str, shape))}")
     value = value.float()
     if not bool(torch.isfinite(value).all()):
         raise LinprimError(f"{file}: {name} holds NaN or infinity, wanted finite weights")

@@ -1,8 +1,8 @@
 """A float64 reference for thousands of tiny scenes at once, with the rounding that a rung may add to each ray.
 
-The same model as `linprim_geo.reference`, which takes one scene at a time: there, frames at the primitive and a walk over
-primitives; here, planes in camera space, tables over (scene, ray, primitive, face), and depths counted from the point of
-the ray that is nearest to the centre, so that a chord of a small primitive far away keeps its digits.
+The same model as `linprim_geo.reference`, which takes one scene at a time: there, frames at the primitive and a walk
+over primitives; here, planes in camera space, tables over (scene, ray, primitive, face), and depths counted from the
+point of the ray that is nearest to the centre, so that a chord of a small primitive far away keeps its digits.
 """
 
 from __future__ import annotations
@@ -79,7 +79,8 @@ def rays_of(s: Scenes) -> Tensor:
 
 
 def view_limits(s: Scenes) -> tuple[Tensor, Tensor]:
-    """(B, 1, 2) least and largest x/z, y/z at which an affine approximation is taken: the image and 0.15 of its size around it, in 1e4."""
+    """(B, 1, 2) least and largest x/z, y/z at which an affine approximation is taken: the image and 0.15 of its size
+    around it, in 1e4."""
     size = s.center.new_tensor([s.width, s.height])
     return tuple(((share * size - s.middle) / s.focal)[:, None].clamp(-1e4, 1e4) for share in (-0.15, 1.15))
 
@@ -96,7 +97,8 @@ def vertices(s: Scenes) -> tuple[Tensor, Tensor]:
 def faces(s: Scenes, axes: Tensor) -> Tensor:
     """(B, M, F, 3) normals n of the faces n . (x - c) = 1, camera space.
 
-    A tetrahedron's face through the vertices u_j = d_j e_j (j = 1, 2, 3) has n = (sum over cyclic of e_2 x e_3 / d_1) / det(e).
+    A tetrahedron's face through the vertices u_j = d_j e_j (j = 1, 2, 3) has n = (sum over cyclic of e_2 x e_3 / d_1) /
+    det(e).
     """
     if s.primitive != "tetrahedron":
         return (FACE_SIGNS / s.extent[..., None, :]) @ axes.mT
@@ -119,10 +121,11 @@ def drawn(s: Scenes, center: Tensor) -> Tensor:
 
 
 def _lines(s: Scenes, center: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Each ray as origin + s direction relative to each centre, (B, R, M, 3) both, and the t or distance at its origin, (B, R, M).
+    """Each ray as origin + s direction relative to each centre, (B, R, M, 3) both, and the t or distance at its origin,
+    (B, R, M).
 
-    The origin is the point of an exact ray nearest to the centre; that of an affine one lies in the plane through the centre
-    square to the view, which is taken within `view_limits`.
+    The origin is the point of an exact ray nearest to the centre; that of an affine one lies in the plane through the
+    centre square to the view, which is taken within `view_limits`.
     """
     c = center[:, None]
     if s.ray_model == "exact":
@@ -131,9 +134,7 @@ def _lines(s: Scenes, center: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Ten
         return t0[..., None] * v - c, v.expand(-1, -1, c.shape[2], -1), t0
     z, length = c[..., 2:], c.norm(dim=-1, keepdim=True)
     away = (
-        torch.cat(
-            [rays[:, :, None, :2] - c[..., :2] / z, torch.zeros_like(z).expand(-1, rays.shape[1], -1, -1)], -1
-        )
+        torch.cat([rays[:, :, None, :2] - c[..., :2] / z, torch.zeros_like(z).expand(-1, rays.shape[1], -1, -1)], -1)
         * z
     )
     low, high = view_limits(s)
@@ -155,7 +156,8 @@ class Chords:
     tau: Tensor
     t_in: Tensor  # z-depth; 0 without a hit
     t_out: Tensor
-    doubtful: Tensor  # both answers are right: a Gaussian's alpha within rounding of a threshold, a ray in the plane of a face
+    # Both answers are right: a Gaussian's alpha within rounding of a threshold, a ray in the plane of a face.
+    doubtful: Tensor
     of_entry: Tensor  # tau as far as the entry has made it, from an arbitrary point: of_exit - of_entry = tau
     of_exit: Tensor
 
@@ -163,8 +165,8 @@ class Chords:
 def chords(s: Scenes, entry: int = 0, leave: int = 0, grazing: bool = False) -> Chords:
     """Clips every ray to every primitive.
 
-    entry, leave: of several faces met at the same depth (to 1e-9 of the primitive's size), the one that the gradient goes
-    through, counted from 0; where there are fewer, the last.
+    entry, leave: of several faces met at the same depth (to 1e-9 of the primitive's size), the one that the gradient
+    goes through, counted from 0; where there are fewer, the last.
     """
     center, axes = camera_space(s)
     rays = rays_of(s)
@@ -192,13 +194,7 @@ def chords(s: Scenes, entry: int = 0, leave: int = 0, grazing: bool = False) -> 
         near = s.near[:, None, None] - t0
         entries = torch.where(entries > near, entries, near)
         exits = torch.minimum(exits, FAR - t0)
-    hit = (
-        inside
-        & there
-        & (exits > entries - (tolerance if grazing else 0))
-        & entries.isfinite()
-        & exits.isfinite()
-    )
+    hit = inside & there & (exits > entries - (tolerance if grazing else 0)) & entries.isfinite() & exits.isfinite()
     zero = torch.zeros_like(entries)
     start, end = torch.where(hit, entries, zero), torch.where(hit, exits, zero)
     if s.ray_model == "exact":
@@ -231,9 +227,7 @@ def _splats(s: Scenes, center: Tensor, axes: Tensor, rays: Tensor, there: Tensor
     power = -0.5 * _dot(across, across) / det[:, None]
     alpha = (s.density.clamp(0, 1)[:, None] * torch.exp(power)).clamp(max=GAUSSIAN_CAP)
     hit = there & ~flat[:, None] & (alpha >= GAUSSIAN_FLOOR)
-    tau = torch.where(
-        hit, -torch.log1p(-torch.where(hit, alpha, torch.zeros_like(alpha))), torch.zeros_like(alpha)
-    )
+    tau = torch.where(hit, -torch.log1p(-torch.where(hit, alpha, torch.zeros_like(alpha))), torch.zeros_like(alpha))
     depth = torch.where(hit, center[:, None, :, 2], torch.zeros_like(tau))
     near_floor = (alpha / GAUSSIAN_FLOOR - 1).abs() < 1e-3
     near_cap = (s.density.clamp(0, 1)[:, None] * torch.exp(power) / GAUSSIAN_CAP - 1).abs() < 1e-3
@@ -250,11 +244,9 @@ def _splats(s: Scenes, center: Tensor, axes: Tensor, rays: Tensor, there: Tensor
     )
 
 
-def gaussian_ellipse(
-    s: Scenes, center: Tensor, axes: Tensor
-) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, ...]]:
-    """The rows of H (B, M, 3), px, with the covariance M = H H^T; and M's xx, xy, yy, its determinant by Cauchy and Binet, and the
-    projected centre x/z, y/z; (B, M). H is taken where the centre is, but within `view_limits`."""
+def gaussian_ellipse(s: Scenes, center: Tensor, axes: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, ...]]:
+    """The rows of H (B, M, 3), px, with the covariance M = H H^T; and M's xx, xy, yy, its determinant by Cauchy and
+    Binet, and the projected centre x/z, y/z; (B, M). H is taken where the centre is, but within `view_limits`."""
     z = center[..., 2:]
     place = center[..., :2] / z
     held = torch.minimum(torch.maximum(place, view_limits(s)[0]), view_limits(s)[1])
@@ -269,9 +261,7 @@ def gaussian_ellipse(
     return (x, y), (_dot(x, x), _dot(x, y), _dot(y, y), _dot(area, area), place)
 
 
-def render(
-    s: Scenes, order: str, entry: int = 0, leave: int = 0, found: Chords | None = None
-) -> tuple[Tensor, Tensor]:
+def render(s: Scenes, order: str, entry: int = 0, leave: int = 0, found: Chords | None = None) -> tuple[Tensor, Tensor]:
     """rgb over black (B, 3, R) and opacity (B, R) of every scene; no ray is stopped."""
     found = found or chords(s, entry, leave)
     color = torch.relu(C0 * s.sh[:, :, 0] + 0.5)[:, None]  # (B, 1, M, 3)
@@ -307,9 +297,9 @@ def _overlapping(found: Chords, color: Tensor) -> tuple[Tensor, Tensor]:
     low, high = edges[..., :-1], edges[..., 1:]
     length = (high - low).clamp(min=0)
     middle = (0.5 * (low + high)).detach()[..., None]
-    within = (
-        found.hit[..., None, :] & (found.t_in[..., None, :] <= middle) & (middle < found.t_out[..., None, :])
-    ).to(length.dtype)
+    within = (found.hit[..., None, :] & (found.t_in[..., None, :] <= middle) & (middle < found.t_out[..., None, :])).to(
+        length.dtype
+    )
     span = torch.where(found.t_out > found.t_in, found.t_out - found.t_in, torch.ones_like(found.tau))
     rate = found.tau / span
     tau = (within * rate[..., None, :]).sum(-1) * length  # (B, R, E)
@@ -330,15 +320,16 @@ def aimed_chord(s: Scenes) -> Tensor:
 
 @torch.no_grad()
 def rounding(s: Scenes, found: Chords, eps: float, depths: bool = False) -> Tensor:
-    """(B, R, M) by how much the alpha of each ray and primitive may be off where planes are evaluated with unit roundoff `eps` / 2.
+    """(B, R, M) by how much the alpha of each ray and primitive may be off where planes are evaluated with unit
+    roundoff `eps` / 2.
 
-    A face is w = a + b dx + c dy over the pixels, dx and dy from the pixel nearest to the projected centre, with w the inverse
-    depth less that of the centre (affine rays: the centre's distance less the distance). Rounded coefficients and two
-    operations leave w off by 2 eps (|a| + |b dx| + |c dy|), and the set-up in double by 16 * 2^-53 of its terms; a face
-    within EDGE_ON of edge-on is moved to it. Entry and exit, being a minimum and a maximum, are off by no more, and alpha is
-    monotone in both: its range over them is the bound. With `depths` the chord is the difference of two depths, each good to
-    4 eps: what the order "overlap" does, whose segments end where several primitives' do.
-    A Gaussian's exponent is off by 4 eps of the sum of the sizes of its terms.
+    A face is w = a + b dx + c dy over the pixels, dx and dy from the pixel nearest to the projected centre, with w the
+    inverse depth less that of the centre (affine rays: the centre's distance less the distance). Rounded coefficients
+    and two operations leave w off by 2 eps (|a| + |b dx| + |c dy|), and the set-up in double by 16 * 2^-53 of its
+    terms; a face within EDGE_ON of edge-on is moved to it. Entry and exit, being a minimum and a maximum, are off by no
+    more, and alpha is monotone in both: its range over them is the bound. With `depths` the chord is the difference of
+    two depths, each good to 4 eps: what the order "overlap" does, whose segments end where several primitives' do. A
+    Gaussian's exponent is off by 4 eps of the sum of the sizes of its terms.
     """
     center, axes = camera_space(s)
     there = drawn(s, center)
@@ -361,25 +352,21 @@ def rounding(s: Scenes, found: Chords, eps: float, depths: bool = False) -> Tens
         )
         shift = eps * (torch.stack([dx, dy], 2) + 1) + 8 * tiny * (shift + s.middle.abs()[:, None, :, None])
         size_off = (yy * dx + xy * dy) * shift[:, :, 0] + (xx * dy + xy * dx) * shift[:, :, 1]
-        size_off = size_off + 0.5 * (
-            yy * shift[:, :, 0] ** 2 + 2 * xy * shift.prod(2) + xx * shift[:, :, 1] ** 2
-        )
+        size_off = size_off + 0.5 * (yy * shift[:, :, 0] ** 2 + 2 * xy * shift.prod(2) + xx * shift[:, :, 1] ** 2)
         off = alpha * torch.expm1((4 * eps + 64 * tiny) * size + size_off + 8 * eps).clamp(max=1e3)
         return torch.where(there[:, None], off.nan_to_num(1e3, 1e3), alpha)
     exact = s.ray_model == "exact"
     extent = torch.where((s.extent > 0).all(-1, keepdim=True), s.extent, torch.ones_like(s.extent))
     s = replace(s, extent=extent)
     arms, _ = vertices(s)
-    crosses = (
-        (center[..., 2] - arms[..., 2].abs().amax(-1) < s.near[:, None]) if exact else torch.zeros_like(there)
-    )
+    crosses = (center[..., 2] - arms[..., 2].abs().amax(-1) < s.near[:, None]) if exact else torch.zeros_like(there)
     usable = there & (~crosses if exact else there)
     safe = torch.where(usable[..., None], center, torch.ones_like(center))
     at = safe[..., :2] / safe[..., 2:]
     reference = torch.round(at * s.focal[:, None] + s.middle[:, None] - 0.5)
-    reference = torch.where(
-        usable[..., None], reference, torch.floor(s.middle)[:, None].expand_as(reference)
-    ).clamp(-4e6, 4e6)
+    reference = torch.where(usable[..., None], reference, torch.floor(s.middle)[:, None].expand_as(reference)).clamp(
+        -4e6, 4e6
+    )
     base = (reference + 0.5 - s.middle[:, None]) / s.focal[:, None]
     base = torch.cat([base, torch.ones_like(base[..., :1])], -1)
     n = faces(s, axes)  # (B, M, F, 3)
@@ -389,9 +376,9 @@ def rounding(s: Scenes, found: Chords, eps: float, depths: bool = False) -> Tens
         m = (n * center[..., None, :]).sum(-1)
         h, h_size = 1 + m, 1 + m.abs()
         lead = (n * (base - w0[..., None] * center)[..., None, :]).sum(-1) - w0[..., None]
-        terms = (
-            n.abs() * (base.abs() + w0[..., None] * (center.abs() + moved[..., None]))[..., None, :]
-        ).sum(-1) + w0[..., None]
+        terms = (n.abs() * (base.abs() + w0[..., None] * (center.abs() + moved[..., None]))[..., None, :]).sum(-1) + w0[
+            ..., None
+        ]
         gradient = n[..., :2]
         steep = gradient.abs()
         h_off = 16 * tiny * (1 + (n.abs() * (center.abs() + moved[..., None])[..., None, :]).sum(-1))
@@ -400,8 +387,7 @@ def rounding(s: Scenes, found: Chords, eps: float, depths: bool = False) -> Tens
         w0 = length
         along = (n * safe[..., None, :]).sum(-1)
         gradient = (
-            z[..., None, None] * n[..., :2]
-            - safe[..., None, :2] * (z / length**2)[..., None, None] * along[..., None]
+            z[..., None, None] * n[..., :2] - safe[..., None, :2] * (z / length**2)[..., None, None] * along[..., None]
         )
         steep = (
             z[..., None, None] * n[..., :2].abs()
@@ -410,18 +396,13 @@ def rounding(s: Scenes, found: Chords, eps: float, depths: bool = False) -> Tens
         h, h_size = along / length[..., None], n.norm(dim=-1)
         offset = base[..., :2] - at
         lead = (gradient * offset[..., None, :]).sum(-1) - 1
-        terms = (steep * (base[..., :2].abs() + at.abs() * (1 + moved / z)[..., None])[..., None, :]).sum(
-            -1
-        ) + 1
+        terms = (steep * (base[..., :2].abs() + at.abs() * (1 + moved / z)[..., None])[..., None, :]).sum(-1) + 1
         h_off = 16 * tiny * n.norm(dim=-1) * (1 + moved / z)[..., None]
     kept = torch.where(h < 0, -1.0, 1.0) * torch.maximum(h.abs(), EDGE_ON * h_size)
     slide, run = ((g[:, None] * step[..., None, :]).abs().sum(-1) for g in (gradient, steep))  # (B, R, M, F)
     signed = lead[:, None] + (gradient[:, None] * step[..., None, :]).sum(-1)
     w, off = signed / h[:, None], (signed / kept[:, None] - signed / h[:, None]).abs()
-    off = (
-        off
-        + (2 * eps * (lead.abs()[:, None] + slide) + 16 * tiny * (terms[:, None] + run)) / kept.abs()[:, None]
-    )
+    off = off + (2 * eps * (lead.abs()[:, None] + slide) + 16 * tiny * (terms[:, None] + run)) / kept.abs()[:, None]
     off = off + w.abs() * (h_off / kept.abs())[:, None]
     off, w = torch.nan_to_num(off, math.inf, math.inf), torch.nan_to_num(w, 0.0)
     inf = torch.full_like(w, math.inf)
@@ -440,14 +421,10 @@ def rounding(s: Scenes, found: Chords, eps: float, depths: bool = False) -> Tens
         else:
             chord = w_in - w_out
         if depths:
-            chord = chord + sign * 4 * eps * rays.norm(dim=-1)[:, :, None] * (
-                found.t_in.abs() + found.t_out.abs()
-            )
+            chord = chord + sign * 4 * eps * rays.norm(dim=-1)[:, :, None] * (found.t_in.abs() + found.t_out.abs())
         chord = torch.where(w_in > w_out, chord, torch.zeros_like(chord)).nan_to_num(0.0, 1e30)
         bounds.append(
-            -torch.expm1(
-                -s.density.clamp(0, LARGEST_DENSITY)[:, None] * chord.clamp(min=0) * (1 + sign * 8 * eps)
-            )
+            -torch.expm1(-s.density.clamp(0, LARGEST_DENSITY)[:, None] * chord.clamp(min=0) * (1 + sign * 8 * eps))
         )
     off_alpha = torch.maximum(bounds[0] - alpha, alpha - bounds[1]).clamp(min=0)
     return torch.where(there[:, None], off_alpha + 8 * eps * alpha, torch.zeros_like(alpha))

@@ -1,4 +1,5 @@
-"""Real arrays out of MATLAB files (version 5 to 7), which are walked first: scipy's reader crashes on some damaged ones."""
+"""Real arrays out of MATLAB files (version 5 to 7), which are walked first: scipy's reader crashes on some damaged
+ones."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ import numpy as np
 
 from linprim_geo.errors import LinprimError
 
-# Types of data elements: 8-bit to 64-bit numbers, a matrix, a compressed element. Classes of arrays: double to 64-bit whole numbers.
+# Types of data elements: 8-bit to 64-bit numbers, a matrix, a compressed element. Classes of arrays: double to 64-bit
+# whole numbers.
 _NUMBERS, _MATRIX, _COMPRESSED = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8}, 14, 15
 _REAL_CLASSES = range(6, 16)
 _COMPLEX = 0x0800

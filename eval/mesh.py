@@ -34,9 +34,7 @@ DEFAULT_TAU_SHARE = 0.01  # of the reference's diagonal
 # How far in front of a sample, in diagonals of its mesh, a ray may meet another face and the sample still
 # counts as seen: sixteen times the single-precision error of Embree in a centred scene.
 OCCLUSION_TOLERANCE = 1e-5
-HAUSDORFF_WARNING = (
-    "largest sampled distance: a lower bound of the Hausdorff distance, and one stray face decides it"
-)
+HAUSDORFF_WARNING = "largest sampled distance: a lower bound of the Hausdorff distance, and one stray face decides it"
 # The options that only some protocols take.
 TAKEN_BY = {
     "samples": ("headline", "linprim"),
@@ -104,9 +102,7 @@ def score_mesh(
     return results | {"dropped": {"prediction": clean[0][1], "reference": clean[1][1]}}
 
 
-def _score_headline(
-    prediction, reference, *, samples, tau, seed, cameras, unit
-) -> tuple[dict, Comparison, Comparison]:
+def _score_headline(prediction, reference, *, samples, tau, seed, cameras, unit) -> tuple[dict, Comparison, Comparison]:
     """`score_mesh` of clean meshes, without `dropped`, and the two directions."""
     start = time.perf_counter()
     diagonal = reference.diagonal
@@ -249,9 +245,7 @@ def _settings(protocol: str, given: dict, tau: float | None, seed: int):
     for name, protocols in TAKEN_BY.items():
         if given[name] is not None and protocol not in protocols:
             option = "--" + name.replace("_", "-")
-            raise LinprimError(
-                f"{option} does not belong to --protocol {protocol}, only to {' and '.join(protocols)}"
-            )
+            raise LinprimError(f"{option} does not belong to --protocol {protocol}, only to {' and '.join(protocols)}")
     if protocol == "headline":
         return None
     scale = given["meters_per_unit"] or METERS_PER_UNIT.get(protocol, 1.0)

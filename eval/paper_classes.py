@@ -22,15 +22,14 @@ ROOM_PARTS = {0: "wall", 1: "floor", 2: "ceiling"}
 def classes(case: Case) -> list[dict]:
     """Rows of table 3: per class PSNR of all its pixels in all held-out views together, of Gaussians and of octahedra.
 
-    `case.labels` is a folder with a PNG of whole numbers for each held-out view, named as the view and as large as its photograph, and
-    `names.json` with {"number": "name"}, or without. The number 255 of 8-bit images is what has no class.
+    `case.labels` is a folder with a PNG of whole numbers for each held-out view, named as the view and as large as its
+    photograph, and `names.json` with {"number": "name"}, or without. The number 255 of 8-bit images is what has no
+    class.
 
     Raises:
         LinprimError: an image of labels is missing, damaged, of another size, or of a distorted photograph.
     """
-    errors = {
-        kind: class_errors(case.trained(case.kinds[kind]), case.labels) for kind in ("gaussian", "octahedron")
-    }
+    errors = {kind: class_errors(case.trained(case.kinds[kind]), case.labels) for kind in ("gaussian", "octahedron")}
     names = _names(case.labels)
     pixels = {label: found[1] for label, found in errors["octahedron"].items()}
     rows = []
@@ -43,7 +42,8 @@ def classes(case: Case) -> list[dict]:
 
 
 def class_errors(folder: Path, labels: Path) -> dict[int, tuple[float, int]]:
-    """Of every label: the sum over its pixels of the squared error (mean over the channels, colours in [0, 1]), and their number."""
+    """Of every label: the sum over its pixels of the squared error (mean over the channels, colours in [0, 1]), and
+    their number."""
     run = Run.open(folder)
     views = run.scene().test
     if not views:
@@ -63,7 +63,8 @@ def class_errors(folder: Path, labels: Path) -> dict[int, tuple[float, int]]:
 
 
 def read_labels(folder: Path, view: View) -> np.ndarray:
-    """(H, W) whole numbers at the pixels of the view's camera; of pixels that are averaged down, the one at the middle."""
+    """(H, W) whole numbers at the pixels of the view's camera; of pixels that are averaged down, the one at the
+    middle."""
     from PIL import Image, UnidentifiedImageError
 
     file = next(
@@ -92,16 +93,10 @@ def read_labels(folder: Path, view: View) -> np.ndarray:
     if label.ndim == 2:
         label = label[first::k, first::k]
     # Averaging down crops what is left over of the last row and column.
-    fits = (
-        label.ndim == 2
-        and 0 <= label.shape[0] - camera.height <= 1
-        and 0 <= label.shape[1] - camera.width <= 1
-    )
+    fits = label.ndim == 2 and 0 <= label.shape[0] - camera.height <= 1 and 0 <= label.shape[1] - camera.width <= 1
     if not fits or label.dtype.kind not in "ui" or (k == 1 and label.shape != (camera.height, camera.width)):
         shape, size = "x".join(map(str, label.shape[1::-1])), f"{camera.width}x{camera.height}"
-        raise LinprimError(
-            f"{file}: is {shape} of {label.dtype}, wanted one whole number for each of {size} pixels"
-        )
+        raise LinprimError(f"{file}: is {shape} of {label.dtype}, wanted one whole number for each of {size} pixels")
     return label[: camera.height, : camera.width].astype(np.int64)
 
 

@@ -1,4 +1,5 @@
-"""LinPrim's tables 1, 6 and 8, kinds of primitives against each other: counts and cost, work, stages, equal quality and equal time."""
+"""LinPrim's tables 1, 6 and 8, kinds of primitives against each other: counts and cost, work, stages, equal quality and
+equal time."""
 
 from __future__ import annotations
 
@@ -15,14 +16,14 @@ COMPARED = (("octahedron", "gaussian"), ("tetrahedron", "octahedron"), ("tetrahe
 
 
 def compare(rows: Sequence[dict]) -> dict:
-    """The comparisons of one scene: `equal_psnr`, `equal_time` (finished trainings), `equal_time_curves` (along one training)."""
+    """The comparisons of one scene: `equal_psnr`, `equal_time` (finished trainings), `equal_time_curves` (along one
+    training)."""
     of = {name: [r for r in rows if r["model"] == name] for name in dict.fromkeys(r["model"] for r in rows)}
     result: dict = {"equal_psnr": [], "equal_time": [], "equal_time_curves": []}
     kinds = {name: members[0]["kind"] for name, members in of.items()}
     for a, b in [(a, b) for x, y in COMPARED for a in of for b in of if (kinds[a], kinds[b]) == (x, y)]:
         ends = [
-            [(r["count"], r["psnr"], r["frame_cpu_ms"], sum(r[s] for s in STAGES)) for r in of[name]]
-            for name in (a, b)
+            [(r["count"], r["psnr"], r["frame_cpu_ms"], sum(r[s] for s in STAGES)) for r in of[name]] for name in (a, b)
         ]
         ranges = [[rising(curve)[0][1], rising(curve)[-1][1]] for curve in ends]
         result["equal_psnr"].append({"pair": [a, b], "ranges": ranges, "points": equal_psnr(*ends)})
@@ -45,9 +46,7 @@ def scene_text(scene: str, rows: Sequence[dict], comparison: dict) -> str:
     """All tables of one scene as plain text."""
     names, first = list(dict.fromkeys(r["model"] for r in rows)), rows[0]
     steps = first["options"]["iterations"]
-    text = [
-        f"== {scene}: {first['held_out_views']} held-out views of {first['pixels']:.0f} rays, {steps} steps =="
-    ]
+    text = [f"== {scene}: {first['held_out_views']} held-out views of {first['pixels']:.0f} rays, {steps} steps =="]
 
     def table(title: str, header: Sequence[str], lines: Sequence[Sequence[str]]) -> None:
         text.append(f"\n{title}" + (f"\n{plain(header, lines)}" if lines else ""))
@@ -119,18 +118,12 @@ def scene_text(scene: str, rows: Sequence[dict], comparison: dict) -> str:
         return ["-" if psnr.get(name) is None else f"{psnr[name]:.2f}" for name in names]
 
     lines = [[f"{entry['seconds']:.1f} s", *scores(entry["psnr"])] for entry in comparison["equal_time"]]
-    table(
-        "Equal time, finished trainings of the size that takes it: PSNR dB", ["training CPU", *names], lines
-    )
+    table("Equal time, finished trainings of the size that takes it: PSNR dB", ["training CPU", *names], lines)
     if not lines:
         text.append("  no overlap: the slowest training of one kind is faster than the fastest of another")
-    lines = [
-        [f"{e['seconds']:.1f} s, cap {e['cap']}", *scores(e["psnr"])] for e in comparison["equal_time_curves"]
-    ]
+    lines = [[f"{e['seconds']:.1f} s, cap {e['cap']}", *scores(e["psnr"])] for e in comparison["equal_time_curves"]]
     table("Equal time, one size, when the first has finished: PSNR dB", ["training CPU", *names], lines)
-    starts = [
-        f"{r['model']} {r['cap']} from {r['start_count']} of thinness {r['start_thinness']:.2f}" for r in rows
-    ]
+    starts = [f"{r['model']} {r['cap']} from {r['start_count']} of thinness {r['start_thinness']:.2f}" for r in rows]
     text.append("\nStart: " + "; ".join(starts) + ".")
     return "\n".join(text)
 
@@ -138,25 +131,32 @@ def scene_text(scene: str, rows: Sequence[dict], comparison: dict) -> str:
 def footnotes(rows: Sequence[dict]) -> str:
     """What somebody who quotes the tables has to know."""
     lines = [
-        "Frames: of every view the median of interleaved repetitions, then the mean over views; CPU is the rendering thread's own time. "
-        "Core is the sum of the stages (wall): without the call from Python, its checks for NaN and the images' memory.",
-        f"Instruction set {', '.join(sorted({r['instruction_set'] for r in rows}))}. In frustum: not culled, its footprint holds a pixel. "
-        "Iterated: pixels, by blocks of 4x4, tested against a primitive of their tile's list; intersected: those hit by it while the "
+        "Frames: of every view the median of interleaved repetitions, then the mean over views; CPU is the "
+        "rendering thread's own time. "
+        "Core is the sum of the stages (wall): without the call from Python, its checks for NaN and the images' "
+        "memory.",
+        f"Instruction set {', '.join(sorted({r['instruction_set'] for r in rows}))}. In frustum: not culled, its "
+        "footprint holds a pixel. "
+        "Iterated: pixels, by blocks of 4x4, tested against a primitive of their tile's list; intersected: those "
+        "hit by it while the "
         "ray was alive.",
-        "Equal PSNR: log count and log ms linear in PSNR between neighbouring sizes, at both ends and the middle of what the two share.",
-        "Training CPU s: process time of the steps alone. PSNR linear in log time; sizes that cost more and score less are left out.",
-        "Along one training the step sizes are still large before its end, so the slower kinds look worse there than if they had been "
+        "Equal PSNR: log count and log ms linear in PSNR between neighbouring sizes, at both ends and the middle "
+        "of what the two share.",
+        "Training CPU s: process time of the steps alone. PSNR linear in log time; sizes that cost more and "
+        "score less are left out.",
+        "Along one training the step sizes are still large before its end, so the slower kinds look worse there "
+        "than if they had been "
         "planned for that time; the finished trainings do not have this flaw.",
-        "Start thinness: shortest by longest axis of the first primitives, 1 = as long in all directions. Where kinds differ in it, they "
+        "Start thinness: shortest by longest axis of the first primitives, 1 = as long in all directions. Where "
+        "kinds differ in it, they "
         "did not start alike: the trainer lays some kinds flat on the surface and others not.",
         "One seed: differences below 0.2 dB say nothing.",
     ]
     if any(r["held_out_views"] >= 2 * QUICK_VIEWS for r in rows):
-        lines.append(
-            f"During training some {QUICK_VIEWS} of the held-out views are scored, all of them at the end."
-        )
+        lines.append(f"During training some {QUICK_VIEWS} of the held-out views are scored, all of them at the end.")
     if any(r["options"]["samples"] == 1 for r in rows):
         lines.append(
-            "One ray per pixel: photographs average over a pixel, so sharp edges of polyhedra alias; --samples 2 averages too."
+            "One ray per pixel: photographs average over a pixel, so sharp edges of polyhedra alias; --samples 2 "
+            "averages too."
         )
     return "Notes\n" + "\n".join(f"* {line}" for line in lines)

@@ -1,4 +1,5 @@
-"""The models of the paper's tables: trained once by the function behind `linprim-geo train`, and what a frame of them costs."""
+"""The models of the paper's tables: trained once by the function behind `linprim-geo train`, and what a frame of them
+costs."""
 
 from __future__ import annotations
 
@@ -64,18 +65,18 @@ class Variant:
 
 @contextmanager
 def _watched(record: dict):
-    """Makes `train` count CPU seconds of this process, so that other work on the machine does not count, and notes its start.
+    """Makes `train` count CPU seconds of this process, so that other work on the machine does not count, and notes its
+    start.
 
-    `record` gets `start_count`, `start_thinness` (`thinness` before the first step) and `train_wall_seconds` of all steps.
+    `record` gets `start_count`, `start_thinness` (`thinness` before the first step) and `train_wall_seconds` of all
+    steps.
     """
 
     class Watched(training_start.Trainer):
         def __init__(self, *args, **named):
             super().__init__(*args, **named)
             record.update(start_count=len(self), train_wall_seconds=0.0)
-            record["start_thinness"] = thinness(
-                torch.exp(self.parameters["log_extent"]).detach().numpy(), self.kind
-            )
+            record["start_thinness"] = thinness(torch.exp(self.parameters["log_extent"]).detach().numpy(), self.kind)
 
         def advance(self) -> None:
             before, wall, cpu = self.seconds, time.perf_counter(), time.process_time()
@@ -93,14 +94,16 @@ def _watched(record: dict):
 
 @functools.cache
 def _warm_up(capture: Path, scene_options: SceneOptions) -> None:
-    """Two steps for nothing: the first ones of a process load code, which the first kind to be trained would pay for."""
+    """Two steps for nothing: the first ones of a process load code, which the first kind to be trained would pay
+    for."""
     with tempfile.TemporaryDirectory() as folder:
         options = TrainOptions(iterations=2, max_primitives=50, threads=1)
         train(capture, Path(folder) / "run", scene_options, options, quiet=True)
 
 
 def thinness(extent: np.ndarray, kind: str) -> float:
-    """Median over primitives of shortest by longest: square roots of the eigenvalues of their vertices' (or the Gaussian's) covariance."""
+    """Median over primitives of shortest by longest: square roots of the eigenvalues of their vertices' (or the
+    Gaussian's) covariance."""
     what = KINDS[kind]
     if not what.solid:
         return float(np.median(extent.min(1) / extent.max(1)))
@@ -168,7 +171,8 @@ def train_model(
 
 @dataclass(frozen=True)
 class Model:
-    """What renders: `primitives` and the frame of `cameras` are the training frame's, `how` the keywords of `ops.rasterize`."""
+    """What renders: `primitives` and the frame of `cameras` are the training frame's, `how` the keywords of
+    `ops.rasterize`."""
 
     primitives: Primitives
     background: np.ndarray
@@ -193,13 +197,14 @@ class Model:
 
 
 def measure(models: Sequence[Model], repeats: int) -> list[dict]:
-    """Times and counts per frame of every model, on one thread: of every view the median over `repeats`, of these the mean.
+    """Times and counts per frame of every model, on one thread: of every view the median over `repeats`, of these the
+    mean.
 
-    The models take turns, all views of one after those of another (after a frame that does not count, so that caches are as warm as
-    they are for somebody who looks around), so that a busy machine hurts all of them alike.
+    The models take turns, all views of one after those of another (after a frame that does not count, so that caches
+    are as warm as they are for somebody who looks around), so that a busy machine hurts all of them alike.
 
-    Returns: per model `frame_ms` (wall clock), `frame_cpu_ms` (the calling thread's, which renders alone), the `STAGES` (wall clock of
-        the core), the `COUNTS` and `pixels` of a frame.
+    Returns: per model `frame_ms` (wall clock), `frame_cpu_ms` (the calling thread's, which renders alone), the `STAGES`
+        (wall clock of the core), the `COUNTS` and `pixels` of a frame.
     """
     threads, torch_threads = ops.threads(), torch.get_num_threads()
     samples: list[list[list[dict]]] = [[[] for _ in model.cameras] for model in models]

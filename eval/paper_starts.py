@@ -1,4 +1,5 @@
-"""Trainings that no option asks for: from a worse first guess, and by density in place of opacity; each a context for `train`."""
+"""Trainings that no option asks for: from a worse first guess, and by density in place of opacity; each a context for
+`train`."""
 
 from __future__ import annotations
 
@@ -29,22 +30,19 @@ def camera_spread(capture: Path, options: SceneOptions) -> float:
 
 def noisy(cloud: PointCloud, deviation: float, seed: int) -> PointCloud:
     """The points moved by Gaussian noise of this standard deviation per axis."""
-    return PointCloud(
-        cloud.xyz + np.random.default_rng([seed, 11]).normal(0, deviation, cloud.xyz.shape), cloud.rgb
-    )
+    return PointCloud(cloud.xyz + np.random.default_rng([seed, 11]).normal(0, deviation, cloud.xyz.shape), cloud.rgb)
 
 
 def halved(cloud: PointCloud, seed: int) -> PointCloud:
     """Every second of the points, in an order drawn at random."""
-    keep = np.sort(
-        np.random.default_rng([seed, 12]).permutation(len(cloud.xyz))[: max(1, len(cloud.xyz) // 2)]
-    )
+    keep = np.sort(np.random.default_rng([seed, 12]).permutation(len(cloud.xyz))[: max(1, len(cloud.xyz) // 2)])
     return PointCloud(cloud.xyz[keep], cloud.rgb[keep])
 
 
 @contextmanager
 def started(start: str, deviation: float) -> Iterator[None]:
-    """While entered, `train` starts from what one of `STARTS` makes of its points; `deviation` is that of noise, in the data set's unit."""
+    """While entered, `train` starts from what one of `STARTS` makes of its points; `deviation` is that of noise, in the
+    data set's unit."""
     cloud_of, parameters_of = training_start.initial_cloud, training_start.initial_parameters
 
     def initial_cloud(cloud, options):
@@ -67,8 +65,9 @@ def started(start: str, deviation: float) -> Iterator[None]:
 def by_density() -> Iterator[None]:
     """While entered, `train` optimises the logarithm of the density, which the extents then do not change.
 
-    Usually it is the opacity along a reference length of each primitive, so that a thinner one is denser. The rate of learning is the
-    same number. Growth is decided, and halves are given their parent's opacity, as usual. Solid primitives only.
+    Usually it is the opacity along a reference length of each primitive, so that a thinner one is denser. The rate of
+    learning is the same number. Growth is decided, and halves are given their parent's opacity, as usual. Solid
+    primitives only.
     """
     usual = trainer_module.activate
 

@@ -1,7 +1,8 @@
-"""LinPrim's tables of single changes: degree of the colour, zooming out, worse starts, fixed counts, tetrahedra; and the two ablations that
-its authors promised, exact rays against affine ones and density against opacity.
+"""LinPrim's tables of single changes: degree of the colour, zooming out, worse starts, fixed counts, tetrahedra; and
+the two ablations that its authors promised, exact rays against affine ones and density against opacity.
 
-Every function takes a `Case` and returns the rows of its table for that scene: `scene`, `method`, `source` and the figures.
+Every function takes a `Case` and returns the rows of its table for that scene: `scene`, `method`, `source` and the
+figures.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ class Case:
         changed: Callable[[], AbstractContextManager] = nullcontext,
         **options,
     ) -> Path:
-        """Folder of the run of a variant with other options, trained unless it is there; `name` tells what `changed` does."""
+        """Folder of the run of a variant with other options, trained unless it is there; `name` tells what `changed`
+        does."""
         given = replace(self.options, primitive=variant.kind, population=variant.population)
         wanted = replace(given, **options)
         parts = [variant.name.replace(":", "_"), str(wanted.max_primitives)]
@@ -92,7 +94,8 @@ def degrees(case: Case) -> list[dict]:
 
 
 def zooming_out(case: Case) -> list[dict]:
-    """Table 4: trained at full size with and without both filters, seen from 1, 2, 4 and 8 times as far: PSNR of smaller images."""
+    """Table 4: trained at full size with and without both filters, seen from 1, 2, 4 and 8 times as far: PSNR of
+    smaller images."""
     rows = []
     for title, which in (("no filter", "none"), ("both filters", "3d+screen")):
         folder = case.trained(case.kinds["octahedron"], filter=which)
@@ -104,9 +107,7 @@ def zooming_out(case: Case) -> list[dict]:
             )
             output = folder / "eval" / f"images_{scale}"
             psnr[f"scale_{scale}"] = eval_images_run(smaller, output=output, lpips_weights="none")["psnr"]
-        rows.append(
-            case.row(f"{case.kinds['octahedron'].name}, {title}", **psnr, mean=sum(psnr.values()) / len(psnr))
-        )
+        rows.append(case.row(f"{case.kinds['octahedron'].name}, {title}", **psnr, mean=sum(psnr.values()) / len(psnr)))
     return rows
 
 
@@ -140,8 +141,7 @@ def fixed_counts(case: Case) -> list[dict]:
 def tetrahedra(case: Case) -> list[dict]:
     """Table 12: octahedra against tetrahedra."""
     return [
-        case.quality(case.kinds[kind].name, case.trained(case.kinds[kind]))
-        for kind in ("octahedron", "tetrahedron")
+        case.quality(case.kinds[kind].name, case.trained(case.kinds[kind])) for kind in ("octahedron", "tetrahedron")
     ]
 
 
@@ -149,19 +149,14 @@ def rays(case: Case) -> list[dict]:
     """Exact rays against the papers' affine ones, in training and in rendering."""
     return _costed(
         case,
-        {
-            f"{model} rays": case.trained(case.kinds["octahedron"], ray_model=model)
-            for model in ("exact", "affine")
-        },
+        {f"{model} rays": case.trained(case.kinds["octahedron"], ray_model=model) for model in ("exact", "affine")},
     )
 
 
 def density(case: Case) -> list[dict]:
     """Opacity along a reference length as what is optimised, against the logarithm of the density."""
     variant = case.kinds["octahedron"]
-    return _costed(
-        case, {"opacity": case.trained(variant), "density": case.trained(variant, "by density", by_density)}
-    )
+    return _costed(case, {"opacity": case.trained(variant), "density": case.trained(variant, "by density", by_density)})
 
 
 def _costed(case: Case, folders: dict[str, Path]) -> list[dict]:
@@ -170,7 +165,5 @@ def _costed(case: Case, folders: dict[str, Path]) -> list[dict]:
     rows = []
     for (method, folder), frame in zip(folders.items(), frames, strict=True):
         seconds = json.loads((folder / "model.json").read_text())["train_cpu_seconds"]
-        rows.append(
-            case.quality(method, folder, train_cpu_seconds=seconds, frame_cpu_ms=frame["frame_cpu_ms"])
-        )
+        rows.append(case.quality(method, folder, train_cpu_seconds=seconds, frame_cpu_ms=frame["frame_cpu_ms"]))
     return rows

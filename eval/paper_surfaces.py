@@ -18,7 +18,8 @@ KINDS = ("gaussian", "octahedron")
 
 
 def depths(case: Case) -> list[dict]:
-    """Table 9: of all photographs' median depth, mean and deviation over them of L1 and L2 (root mean square), and what it covers in %.
+    """Table 9: of all photographs' median depth, mean and deviation over them of L1 and L2 (root mean square), and what
+    it covers in %.
 
     Raises:
         LinprimError: the scene has neither a reference mesh nor depth images.
@@ -34,14 +35,13 @@ def depths(case: Case) -> list[dict]:
             "l2": scores["l2_mean"],
             "l2_std": scores["l2_std"],
         }
-        rows.append(
-            case.row(case.kinds[kind].name, **figures, coverage=100 * scores["coverage"], unit=scores["unit"])
-        )
+        rows.append(case.row(case.kinds[kind].name, **figures, coverage=100 * scores["coverage"], unit=scores["unit"]))
     return rows
 
 
 def chamfers(case: Case) -> list[dict]:
-    """Table 10: TSDF of the median depth at 5 cm, and nothing done to it, by the protocol `linprim`; wants `case.reference`.
+    """Table 10: TSDF of the median depth at 5 cm, and nothing done to it, by the protocol `linprim`; wants
+    `case.reference`.
 
     Raises:
         LinprimError: nothing comes out of a fusion.

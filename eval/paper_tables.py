@@ -2,18 +2,19 @@
 
     python -m linprim_geo.eval.paper_tables -o runs/paper [--tables 2 5 9 ...] [--data CAPTURE ...] [--quick]
 
-    1 6 8    octahedra, tetrahedra and Gaussians at every one of --caps: counts and cost, work, stages; frame time at equal PSNR, PSNR at
-             equal time
+    1 6 8    octahedra, tetrahedra and Gaussians at every one of --caps: counts and cost, work, stages; frame time at
+             equal PSNR, PSNR at equal time
     2        degree of the view-dependent colour             7 11     fixed counts, MCMC
     3        quality by class, given --labels                9        depth: L1, L2, coverage
     4        zooming out with and without filters            10       Chamfer distance of a TSDF at 5 cm, 5,000 samples
     5        worse initialisation                            12       octahedra against tetrahedra
     rays     exact against affine rays                       density  density against opacity as what is optimised
 
-Models are trained by the function behind `linprim-geo train`, and what is trained already is taken from the output folder. All but 1, 6, 8,
-7 and 11 use the largest of --caps alone. Written are table_N.txt and table_N.json, and for 1, 6 and 8 paper_tables.txt, .json and .csv.
-Everything but the times is the same in every run on one instruction set. The scenes `cad` and `room` are built in, others are captures.
-Source of the tables' layout: von Luetzow and Niessner, arXiv 2501.16312; there a GPU renders, and other scenes.
+Models are trained by the function behind `linprim-geo train`, and what is trained already is taken from the output
+folder. All but 1, 6, 8, 7 and 11 use the largest of --caps alone. Written are table_N.txt and table_N.json, and for 1,
+6 and 8 paper_tables.txt, .json and .csv. Everything but the times is the same in every run on one instruction set. The
+scenes `cad` and `room` are built in, others are captures. Source of the tables' layout: von Luetzow and Niessner, arXiv
+2501.16312; there a GPU renders, and other scenes.
 """
 
 from __future__ import annotations
@@ -60,20 +61,45 @@ QUICK = {
 }
 # Titles of columns, digits after the point, and whether a sign is shown.
 COLUMNS = {
-    "psnr_3": ("degree 3, dB", 2, False), "change_2": ("degree 2", 2, True), "change_1": ("1", 2, True), "change_0": ("0", 2, True),
-    "share": ("% of pixels", 1, False), "gaussians": ("Gaussians, dB", 2, False), "octahedra": ("octahedra, dB", 2, False),
+    "psnr_3": ("degree 3, dB", 2, False),
+    "change_2": ("degree 2", 2, True),
+    "change_1": ("1", 2, True),
+    "change_0": ("0", 2, True),
+    "share": ("% of pixels", 1, False),
+    "gaussians": ("Gaussians, dB", 2, False),
+    "octahedra": ("octahedra, dB", 2, False),
     "change": ("change", 2, True),
-    "scale_1": ("1, dB", 2, False), "scale_2": ("1/2", 2, False), "scale_4": ("1/4", 2, False), "scale_8": ("1/8", 2, False),
+    "scale_1": ("1, dB", 2, False),
+    "scale_2": ("1/2", 2, False),
+    "scale_4": ("1/4", 2, False),
+    "scale_8": ("1/8", 2, False),
     "mean": ("mean", 2, False),
-    "ssim": ("SSIM", 3, False), "psnr": ("PSNR, dB", 2, False), "lpips": ("LPIPS", 3, False), "count": ("count", 0, False),
-    "train_cpu_seconds": ("training CPU s", 1, False), "frame_cpu_ms": ("frame CPU ms", 2, False),
-    "l1": ("L1", 4, False), "l1_std": ("+-", 4, False), "l2": ("L2", 4, False), "l2_std": ("+-", 4, False),
-    "coverage": ("coverage %", 2, False), "voxel": ("voxel", 4, False), "chamfer": ("Chamfer", 4, False),
-    "standard_error": ("+-", 4, False), "accuracy": ("accuracy", 4, False), "completeness": ("completeness", 4, False),
-    "frame_ms": ("frame ms", 2, False), "preprocess_ms": ("preprocess ms", 2, False), "sort_tile_ms": ("sort+tile", 2, False),
-    "render_ms": ("render", 2, False), "file_mb": ("file MB", 0, False), "in_frustum": ("in frustum", 0, False),
-    "tile_entries": ("tile entries", 0, False), "iterated": ("iterated", 0, False), "intersected": ("intersected", 0, False),
-}  # fmt: skip
+    "ssim": ("SSIM", 3, False),
+    "psnr": ("PSNR, dB", 2, False),
+    "lpips": ("LPIPS", 3, False),
+    "count": ("count", 0, False),
+    "train_cpu_seconds": ("training CPU s", 1, False),
+    "frame_cpu_ms": ("frame CPU ms", 2, False),
+    "l1": ("L1", 4, False),
+    "l1_std": ("+-", 4, False),
+    "l2": ("L2", 4, False),
+    "l2_std": ("+-", 4, False),
+    "coverage": ("coverage %", 2, False),
+    "voxel": ("voxel", 4, False),
+    "chamfer": ("Chamfer", 4, False),
+    "standard_error": ("+-", 4, False),
+    "accuracy": ("accuracy", 4, False),
+    "completeness": ("completeness", 4, False),
+    "frame_ms": ("frame ms", 2, False),
+    "preprocess_ms": ("preprocess ms", 2, False),
+    "sort_tile_ms": ("sort+tile", 2, False),
+    "render_ms": ("render", 2, False),
+    "file_mb": ("file MB", 0, False),
+    "in_frustum": ("in frustum", 0, False),
+    "tile_entries": ("tile entries", 0, False),
+    "iterated": ("iterated", 0, False),
+    "intersected": ("intersected", 0, False),
+}
 
 
 @dataclass(frozen=True)
@@ -94,7 +120,8 @@ TABLES = {
     "3": Table(
         "Table 3: PSNR by class",
         classes,
-        "Of the mean squared error over all pixels of a class in all held-out views; the paper does not say how it averages.",
+        "Of the mean squared error over all pixels of a class in all held-out views; the paper does not say how "
+        "it averages.",
     ),
     "4": Table(
         "Table 4: zooming out, trained at full size",
@@ -104,7 +131,8 @@ TABLES = {
     "5": Table(
         "Table 5: worse initialisation",
         paper_studies.worse_starts,
-        "Noise: standard deviation per axis of 5 % of the largest distance of a training camera from their mean. All is done to what a "
+        "Noise: standard deviation per axis of 5 % of the largest distance of a training camera from their mean. "
+        "All is done to what a "
         "run starts from, points that it adds by itself included.",
     ),
     "7": Table(
@@ -115,14 +143,17 @@ TABLES = {
     "9": Table(
         "Table 9: depth",
         depths,
-        "Median depth of all photographs; L1 and L2 per photograph over pixels valid in both, mean and deviation over photographs, in the "
+        "Median depth of all photographs; L1 and L2 per photograph over pixels valid in both, mean and deviation "
+        "over photographs, in the "
         "data set's unit (published: metres).",
     ),
     "10": Table(
         "Table 10: Chamfer distance",
         chamfers,
-        "TSDF of depth at half transmittance, 5 cm voxels where the unit is the metre and 1/150 of the diagonal elsewhere, 5,000 points "
-        "per surface, mean of both directions, in the data set's unit (published: metres; perhaps the sum of the directions).",
+        "TSDF of depth at half transmittance, 5 cm voxels where the unit is the metre and 1/150 of the diagonal "
+        "elsewhere, 5,000 points "
+        "per surface, mean of both directions, in the data set's unit (published: metres; perhaps the sum of the "
+        "directions).",
     ),
     "12": Table(
         "Table 12: octahedra against tetrahedra",
@@ -164,9 +195,7 @@ def table_text(table: Table, rows: list[dict]) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("runs/paper"), metavar="DIR")
     names = (*OF_KINDS, *TABLES, *SAME, "all")
     parser.add_argument(
@@ -185,13 +214,14 @@ def _parser() -> argparse.ArgumentParser:
         metavar="CAPTURE",
         help="captures to train on beside --scenes",
     )
-    text = "surfaces of the captures in their frames, in the same order (default: reference.ply in the capture, else its depth images)"
+    text = (
+        "surfaces of the captures in their frames, in the same order (default: reference.ply in the capture, "
+        "else its depth images)"
+    )
     parser.add_argument("--references", type=Path, nargs="*", default=[], metavar="MESH", help=text)
     text = "folders of label images of the captures' held-out views, in the same order; built-in scenes have their own"
     parser.add_argument("--labels", type=Path, nargs="*", default=[], metavar="DIR", help=text)
-    parser.add_argument(
-        "--downscale", type=int, default=1, metavar="K", help="of the captures: average K by K pixels"
-    )
+    parser.add_argument("--downscale", type=int, default=1, metavar="K", help="of the captures: average K by K pixels")
     parser.add_argument(
         "--scenes",
         nargs="*",
@@ -206,9 +236,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="KIND[:POPULATION]",
         default=[Variant.parse(k) for k in KINDS],
     )
-    parser.add_argument(
-        "--caps", type=int, nargs="+", default=list(CAPS), metavar="N", help="largest populations"
-    )
+    parser.add_argument("--caps", type=int, nargs="+", default=list(CAPS), metavar="N", help="largest populations")
     parser.add_argument("--iterations", type=int, default=3000)
     parser.add_argument("--size", type=int, default=256, help="of the built-in scenes, pixels")
     parser.add_argument("--views", type=int, default=VIEWS)
@@ -218,7 +246,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--repeats", type=int, default=9, help="measured frames per view")
     parser.add_argument("--lpips-weights", metavar="PATH", help="as of linprim-geo eval-images")
-    text = "train the models of so many scenes at once, a worker each; 0: one per core; frames are measured alone after that (default: 1)"
+    text = (
+        "train the models of so many scenes at once, a worker each; 0: one per core; frames are measured "
+        "alone after that (default: 1)"
+    )
     parser.add_argument("--workers", type=int, default=1, metavar="N", help=text)
     parser.add_argument("--cluster", metavar="local|ADDRESS", help="train on Ray, as of linprim-geo train")
     parser.add_argument(
@@ -279,20 +310,25 @@ def _captures(args: argparse.Namespace) -> dict[str, Capture]:
 
 def _options(args: argparse.Namespace, cap: int) -> TrainOptions:
     return TrainOptions(
-        iterations=args.iterations, max_primitives=cap, sh_degree=args.sh_degree, samples=args.samples, seed=args.seed, threads=1,
-        checkpoint_every=args.iterations, evaluate_every=max(1, args.iterations // CURVE_POINTS),
-    )  # fmt: skip
+        iterations=args.iterations,
+        max_primitives=cap,
+        sh_degree=args.sh_degree,
+        samples=args.samples,
+        seed=args.seed,
+        threads=1,
+        checkpoint_every=args.iterations,
+        evaluate_every=max(1, args.iterations // CURVE_POINTS),
+    )
 
 
 def _models_of_kinds(args: argparse.Namespace, scene: str, capture: Capture) -> list[dict]:
-    """The models of tables 1, 6 and 8, by kind. They are trained by size, so that an early stop leaves complete comparisons."""
+    """The models of tables 1, 6 and 8, by kind. They are trained by size, so that an early stop leaves complete
+    comparisons."""
     rows = []
     for cap, variant in itertools.product(args.caps, args.kinds):
         folder = args.output / "models" / scene / f"{variant.name.replace(':', '_')}_{cap}"
         options = _options(args, cap)
-        options = TrainOptions(
-            **vars(options) | {"primitive": variant.kind, "population": variant.population}
-        )
+        options = TrainOptions(**vars(options) | {"primitive": variant.kind, "population": variant.population})
         row = train_model(scene, capture.folder, capture.options, variant, options, folder)
         rows.append(row | {"folder": str(folder)})
         cost = f"{row['train_cpu_seconds']:.0f} s CPU"
@@ -313,9 +349,7 @@ def _of_kinds(args: argparse.Namespace, captures: dict[str, Capture]) -> None:
     comparisons = {scene: compare(of_scene) for scene, of_scene in rows.items()}
     flat = [row for of_scene in rows.values() for row in of_scene]
     theirs = [row for name in OF_KINDS for row in published(name)]
-    write_json(
-        args.output / "paper_tables.json", {"rows": flat, "comparisons": comparisons, "published": theirs}
-    )
+    write_json(args.output / "paper_tables.json", {"rows": flat, "comparisons": comparisons, "published": theirs})
     with (
         atomic_write(args.output / "paper_tables.csv") as temporary,
         open(temporary, "w", newline="", encoding="utf-8") as file,
@@ -355,9 +389,18 @@ def _rows(name: str, args: argparse.Namespace, scene: str, capture: Capture) -> 
     if name in wanted and wanted[name][0] is None:
         return wanted[name][1]
     case = Case(
-        scene, capture.folder, capture.options, _options(args, max(args.caps)), args.caps, kinds, args.output / "models" / scene,
-        args.lpips_weights, args.repeats, capture.reference, labels,
-    )  # fmt: skip
+        scene,
+        capture.folder,
+        capture.options,
+        _options(args, max(args.caps)),
+        args.caps,
+        kinds,
+        args.output / "models" / scene,
+        args.lpips_weights,
+        args.repeats,
+        capture.reference,
+        labels,
+    )
     return TABLES[name].rows(case)
 
 
@@ -414,7 +457,9 @@ def _trained_by_workers(args: argparse.Namespace, arguments: list[str], captures
     # What is trained stays in `models`, so nothing is lost with the tasks' own folders.
     with TemporaryDirectory(prefix="tasks_", dir=args.output) as folder:
         function = "linprim_geo.eval.paper_tables:scene_task"
-        tasks = [Task(scene, function, {"arguments": arguments, "scene": scene}, Path(folder) / scene) for scene in captures]
+        tasks = [
+            Task(scene, function, {"arguments": arguments, "scene": scene}, Path(folder) / scene) for scene in captures
+        ]
         with open_executor(args.cluster, Path(folder), args.workers) as executor:
             executor.run(tasks, Progress("scenes", 1))
 

@@ -45,9 +45,7 @@ def lattice_points(mesh: Mesh, step: float) -> np.ndarray:
         done = ends[start - 1] if start else 0
         stop = max(start + 1, int(np.searchsorted(ends, done + LATTICE_CHUNK, side="right")))
         face = np.repeat(np.arange(start, stop), nodes[start:stop])
-        number = np.arange(len(face)) - np.repeat(
-            ends[start:stop] - nodes[start:stop] - done, nodes[start:stop]
-        )
+        number = np.arange(len(face)) - np.repeat(ends[start:stop] - nodes[start:stop] - done, nodes[start:stop])
         u = (number // rows[face] + 0.5) / columns[face]
         v = (number % rows[face] + 0.5) / rows[face]
         inside = u + v < 1.0

@@ -145,9 +145,7 @@ def read_crop(path: str | os.PathLike) -> CropVolume:
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise LinprimError(f"{path}: is not a crop volume in JSON ({error})") from error
     if polygon.ndim != 2 or polygon.shape[1] != 3 or len(polygon) < 3 or not np.isfinite(polygon).all():
-        raise LinprimError(
-            f"{path}: bounding_polygon is {polygon.shape}, expected at least three points (x, y, z)"
-        )
+        raise LinprimError(f"{path}: bounding_polygon is {polygon.shape}, expected at least three points (x, y, z)")
     if not -np.inf < low < high < np.inf:
         raise LinprimError(f"{path}: axis_min is {low:g} and axis_max {high:g}, expected an interval")
     return CropVolume(axis, low, high, np.delete(polygon, axis, axis=1))
@@ -171,9 +169,7 @@ def read_transform(path: str | os.PathLike) -> np.ndarray:
         or (matrix[3] != (0, 0, 0, 1)).any()
         or np.linalg.matrix_rank(matrix) < 4
     ):
-        raise LinprimError(
-            f"{path}: is {matrix.shape}, expected an invertible 4x4 matrix with last row 0 0 0 1"
-        )
+        raise LinprimError(f"{path}: is {matrix.shape}, expected an invertible 4x4 matrix with last row 0 0 0 1")
     return matrix
 
 

@@ -129,8 +129,8 @@ def score_by_protocol(
 def score_linprim(prediction: Mesh, reference: Mesh, settings: Settings, default_tau: float) -> Scored:
     """Chamfer distance of 5,000 independent uniform points on each mesh, nearest point to nearest point.
 
-    Source: LinPrim (von Luetzow and Niessner, NeurIPS 2025), table 10. Its meshes are fused from predicted depth at 5 cm voxels:
-    that is `extract-mesh --voxel-size 0.05`, not done here. The paper does not say whether its Chamfer
+    Source: LinPrim (von Luetzow and Niessner, NeurIPS 2025), table 10. Its meshes are fused from predicted depth at 5
+    cm voxels: that is `extract-mesh --voxel-size 0.05`, not done here. The paper does not say whether its Chamfer
     distance is the mean of the two directions, as here, or their sum, twice as much.
     """
     tau = settings.tau or default_tau
@@ -149,9 +149,7 @@ def score_linprim(prediction: Mesh, reference: Mesh, settings: Settings, default
     return Scored(results, forward, backward)
 
 
-def score_dtu(
-    prediction: Mesh, reference: Mesh | np.ndarray, settings: Settings, default_tau: float
-) -> Scored:
+def score_dtu(prediction: Mesh, reference: Mesh | np.ndarray, settings: Settings, default_tau: float) -> Scored:
     """Mean distances of the DTU benchmark as it is computed for meshes.
 
     The prediction becomes its vertices and a lattice of 0.2 mm on each face, thinned in a random order until
@@ -168,9 +166,7 @@ def score_dtu(
     step, seed = DTU_STEP * settings.metre, settings.seed
     tau = settings.tau or default_tau
     points, before = _dtu_points(prediction, step, (seed, 0))
-    truth, _ = (
-        (reference, 0) if isinstance(reference, np.ndarray) else _dtu_points(reference, step, (seed, 1))
-    )
+    truth, _ = (reference, 0) if isinstance(reference, np.ndarray) else _dtu_points(reference, step, (seed, 1))
     total = len(points)
     observed, culling = settings.observed, []
     seen = np.ones(total, bool)
@@ -179,9 +175,7 @@ def score_dtu(
         high = observed.high + DTU_ABOVE * settings.metre
         points = points[((points >= low) & (points < high)).all(axis=1)]
         seen = observed.holds(points)
-        culling.append(
-            "prediction in the box -60/+120 mm" + ("" if observed.cells is None else " and the mask")
-        )
+        culling.append("prediction in the box -60/+120 mm" + ("" if observed.cells is None else " and the mask"))
     above = np.ones(len(truth), bool)
     if settings.plane is not None:
         above = truth @ settings.plane[:3] + settings.plane[3] > 0
@@ -206,9 +200,7 @@ def score_dtu(
     return Scored(results, forward, backward)
 
 
-def score_tnt(
-    prediction: Mesh, reference: Mesh | np.ndarray, settings: Settings, default_tau: float
-) -> Scored:
+def score_tnt(prediction: Mesh, reference: Mesh | np.ndarray, settings: Settings, default_tau: float) -> Scored:
     """Precision, recall and F1 of Tanks and Temples at the scene's threshold tau; nothing is registered here.
 
     Both point sets are cut to the crop volume and averaged in cells of tau / 2; a point counts if the nearest
@@ -272,9 +264,7 @@ def score_scannetpp(prediction: Mesh, reference: Mesh, settings: Settings, defau
     to nearest point, normals of their faces without sign. `kept_*` are shares of the areas.
     """
     if not settings.cameras:
-        raise LinprimError(
-            "protocol scannetpp culls by cameras: give a scene's folder with --cameras, or --run"
-        )
+        raise LinprimError("protocol scannetpp culls by cameras: give a scene's folder with --cameras, or --run")
     metre = settings.metre
     tau = settings.tau if settings.tau is not None else SCANNETPP_TAU * metre
     sides, kept, recast = [], [], 0
@@ -370,6 +360,4 @@ def _seen_part(mesh: Mesh, name: str, cameras: Sequence[Camera], metre: float) -
 
 def _require(something: bool, name: str, what: str) -> None:
     if not something:
-        raise LinprimError(
-            f"{name}: nothing of it {what}; expected it in the frame and unit of the reference"
-        )
+        raise LinprimError(f"{name}: nothing of it {what}; expected it in the frame and unit of the reference")

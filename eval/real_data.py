@@ -2,8 +2,8 @@
 
     python -m linprim_geo.eval.real_data --data DIR -o runs/real
 
-A capture is any sub-folder that `load_scene` reads. Its reference is a mesh `reference.ply` or ScanNet++'s in it, or `DIR/meshes/NAME.*`
-whose NAME the folder's name begins with; depth is scored where the held-out views bring depth maps.
+A capture is any sub-folder that `load_scene` reads. Its reference is a mesh `reference.ply` or ScanNet++'s in it, or
+`DIR/meshes/NAME.*` whose NAME the folder's name begins with; depth is scored where the held-out views bring depth maps.
 """
 
 from __future__ import annotations
@@ -60,9 +60,7 @@ def reference_of(capture: Path, data: Path) -> Path | None:
     return max(fitting, key=lambda m: len(m.stem), default=None)
 
 
-def run_capture(
-    capture: Path, data: Path, output: Path, options: TrainOptions, scene_options: SceneOptions
-) -> dict:
+def run_capture(capture: Path, data: Path, output: Path, options: TrainOptions, scene_options: SceneOptions) -> dict:
     """Trains, meshes and scores one capture; every key of the result is a column of the table or a file."""
     from linprim_geo.eval.depth import eval_depth_run
     from linprim_geo.eval.images import eval_images_run
@@ -122,14 +120,19 @@ def capture_task(folder: Path, capture: str, data: str, output: str, options: di
         return tried(Path(capture), Path(data), Path(output), how, SceneOptions(**scene_options))
 
 
-def by_workers(found: list[Path], args: argparse.Namespace, options: TrainOptions, scene_options: SceneOptions) -> list[dict]:
+def by_workers(
+    found: list[Path], args: argparse.Namespace, options: TrainOptions, scene_options: SceneOptions
+) -> list[dict]:
     """The rows of all captures, several at a time."""
     args.output.mkdir(parents=True, exist_ok=True)
     given = {"data": str(args.data.resolve()), "output": str(args.output.resolve()), "options": asdict(options)}
     given |= {"scene_options": asdict(scene_options)}
     with TemporaryDirectory(prefix="tasks_", dir=args.output) as folder:
         function = "linprim_geo.eval.real_data:capture_task"
-        tasks = [Task(path.name, function, given | {"capture": str(path.resolve())}, Path(folder) / path.name) for path in found]
+        tasks = [
+            Task(path.name, function, given | {"capture": str(path.resolve())}, Path(folder) / path.name)
+            for path in found
+        ]
         with open_executor(args.cluster, Path(folder), args.workers) as executor:
             return executor.run(tasks, Progress("captures", 1))
 
@@ -150,26 +153,21 @@ def table(rows: list[dict]) -> str:
     ]
     lines = ["| " + " | ".join(c[0] for c in columns) + " |", "|" + "---|" * len(columns)]
     for row in rows:
-        lines.append(
-            "| " + " | ".join(form.format(row[key]) if key in row else "–" for _, key, form in columns) + " |"
-        )
+        lines.append("| " + " | ".join(form.format(row[key]) if key in row else "–" for _, key, form in columns) + " |")
     return "\n".join(lines)
 
 
 def curves(rows: list[dict]) -> str:
     """One line per capture: held-out PSNR over seconds of training (during it, of a part of the held-out views)."""
     return "\n".join(
-        f"* {row['name']}: "
-        + ", ".join(f"{psnr:.2f} dB after {seconds:.0f} s" for seconds, psnr in row["curve"])
+        f"* {row['name']}: " + ", ".join(f"{psnr:.2f} dB after {seconds:.0f} s" for seconds, psnr in row["curve"])
         for row in rows
     )
 
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--data", type=Path, required=True, metavar="DIR", help="a capture, or a folder of captures"
-    )
+    parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="a capture, or a folder of captures")
     parser.add_argument("--only", nargs="*", default=[], metavar="NAME", help="only these captures")
     parser.add_argument("-o", "--output", type=Path, default=Path("runs/real"), metavar="DIR")
     parser.add_argument("--iterations", type=int, default=TrainOptions.iterations)

@@ -1,14 +1,15 @@
-"""What larger captures cost: a block's processor time and memory over photographs, pixels and primitives, measured, fitted, and predicted
-for 10^4 and 10^6 photographs. `python -m linprim_geo.eval.scaling -o runs/scaling [--run RUN_IN_BLOCKS]`.
+"""What larger captures cost: a block's processor time and memory over photographs, pixels and primitives, measured,
+fitted, and predicted for 10^4 and 10^6 photographs. `python -m linprim_geo.eval.scaling -o runs/scaling [--run
+RUN_IN_BLOCKS]`.
 
 Measured are trainings in workers of their own, on a street. The fit is
 
     setup seconds   = s0 + s1 photos + s2 photos pixels          GiB = m0 + m1 photos pixels + m2 pixels + m3 primitives
     seconds a step  = t0 + t1 pixels + t2 primitives             filling up points, seconds = f0 + f1 photos
 
-with no negative number, by relative errors; it is checked on the largest size, which it has not seen. Processor time, not the clock's, is
-measured, so a machine that does other work beside is no matter. A prediction also takes what a run in blocks shows (--run): in how many
-blocks a photograph is used, and which part of it.
+with no negative number, by relative errors; it is checked on the largest size, which it has not seen. Processor time,
+not the clock's, is measured, so a machine that does other work beside is no matter. A prediction also takes what a run
+in blocks shows (--run): in how many blocks a photograph is used, and which part of it.
 """
 
 from __future__ import annotations
@@ -28,9 +29,17 @@ from linprim_geo.options import SceneOptions, TrainOptions
 
 # (photographs, downscale, primitives) of a capture of 1024x1024; the last is what the fit is checked on.
 SIZES = (
-    (20, 1, 4000), (20, 1, 40_000), (20, 2, 4000), (20, 2, 40_000), (60, 1, 10_000), (60, 2, 20_000), (120, 2, 10_000), (120, 1, 20_000),
-    (40, 4, 10_000), (160, 1, 30_000),
-)  # fmt: skip
+    (20, 1, 4000),
+    (20, 1, 40_000),
+    (20, 2, 4000),
+    (20, 2, 40_000),
+    (60, 1, 10_000),
+    (60, 2, 20_000),
+    (120, 2, 10_000),
+    (120, 1, 20_000),
+    (40, 4, 10_000),
+    (160, 1, 30_000),
+)
 STEPS, WARM_UP = 30, 5
 SIDE, VIEWS = 1024, 160
 BYTES_OF_PHOTO = 0.5
@@ -59,7 +68,8 @@ class Fit:
     filling: tuple[float, float]
 
     def seconds_of_filling(self, photos: float) -> float:
-        """Processor seconds of filling up the points before the first task of a block; of no more than so many views."""
+        """Processor seconds of filling up the points before the first task of a block; of no more than so many
+        views."""
         return float(np.dot(self.filling, _filling_terms(photos)))
 
     def seconds_of_setup(self, photos: float, pixels: float) -> float:
@@ -86,7 +96,8 @@ def _filling_terms(photos: float) -> tuple[float, float]:
 
 
 def fit(rows: list[dict]) -> Fit:
-    """The fit through rows of `photos`, `pixels`, `primitives`, `setup_seconds`, `step_seconds`, `gib`, `filling_seconds`."""
+    """The fit through rows of `photos`, `pixels`, `primitives`, `setup_seconds`, `step_seconds`, `gib`,
+    `filling_seconds`."""
     from scipy.optimize import nnls
 
     def solve(terms: list[tuple], wanted: list[float]) -> tuple[float, ...]:
@@ -98,7 +109,10 @@ def fit(rows: list[dict]) -> Fit:
     return Fit(
         solve([_setup_terms(row["photos"], row["pixels"]) for row in rows], [row["setup_seconds"] for row in rows]),
         solve([(1.0, row["pixels"], row["primitives"]) for row in rows], [row["step_seconds"] for row in rows]),
-        solve([(1.0, row["photos"] * row["pixels"], row["pixels"], row["primitives"]) for row in rows], [row["gib"] for row in rows]),
+        solve(
+            [(1.0, row["photos"] * row["pixels"], row["pixels"], row["primitives"]) for row in rows],
+            [row["gib"] for row in rows],
+        ),
         solve([_filling_terms(row["photos"]) for row in rows], [row["filling_seconds"] for row in rows]),
     )
 
@@ -111,7 +125,9 @@ def check(found: Fit, row: dict) -> dict:
         "gib": found.gib(row["photos"], row["pixels"], row["primitives"]),
         "filling_seconds": found.seconds_of_filling(row["photos"]),
     }
-    return {name: {"predicted": value, "measured": row[name], "ratio": value / row[name]} for name, value in said.items()}
+    return {
+        name: {"predicted": value, "measured": row[name], "ratio": value / row[name]} for name, value in said.items()
+    }
 
 
 def predict(found: Fit, photos: float, capture: Capture) -> dict:
@@ -136,11 +152,14 @@ def predict(found: Fit, photos: float, capture: Capture) -> dict:
     joined = held + min(MOST_BESIDE, primitives)
     steps = capture.steps_per_photo * capture.photos_per_block
     alone, tasks = until(TrainOptions(), 0), 1 + len(EXCHANGES)
-    # Forward only is a third of a step: every task renders the coarse depth of its views, and what stands beyond where that is coarse.
+    # Forward only is a third of a step: every task renders the coarse depth of its views, and what stands beyond where
+    # that is coarse.
     setup = found.seconds_of_setup(capture.photos_per_block, window) + capture.photos_per_block / 3 * (
         found.seconds_of_step(small, MOST_COARSE_PRIMITIVES) + found.seconds_of_step(window, joined)
     )
-    first = setup + found.seconds_of_filling(capture.photos_per_block) + alone * steps * found.seconds_of_step(window, held)
+    first = (
+        setup + found.seconds_of_filling(capture.photos_per_block) + alone * steps * found.seconds_of_step(window, held)
+    )
     block = first + len(EXCHANGES) * setup + (1 - alone) * steps * found.seconds_of_step(window, joined)
     views = min(photos, MOST_COARSE_VIEWS)
     coarse = found.seconds_of_setup(views, small) + found.seconds_of_filling(views)
@@ -148,8 +167,9 @@ def predict(found: Fit, photos: float, capture: Capture) -> dict:
     # It looks at every view twice.
     planning = 2 * photos * found.seconds_of_step(small, MOST_COARSE_PRIMITIVES) / 3
     photo = BYTES_OF_PHOTO * capture.pixels
-    # 27 numbers of colour and 11 others, 4 bytes each: a task leaves two checkpoints, with both of Adam's moments, and what it trained in
-    # three files. It reads those checkpoints of others that hold what it takes up, about twice as much.
+    # 27 numbers of colour and 11 others, 4 bytes each: a task leaves two checkpoints, with both of Adam's moments, and
+    # what it trained in three files. It reads those checkpoints of others that hold what it takes up, about twice as
+    # much.
     state = 4 * (11 + 27)
     saved = trained * (3 + 3) * state
     saves = steps / TrainOptions().checkpoint_every + tasks
@@ -161,7 +181,8 @@ def predict(found: Fit, photos: float, capture: Capture) -> dict:
         "core_hours": (blocks * block + coarse + planning) / 3600,
         "longest_task_hours": max(first, coarse, planning) / 3600,
         "gib_per_worker": found.gib(capture.photos_per_block, window, joined),
-        "storage_gib": (photos * photo + blocks * tasks * trained * (2 * 3 + 3) * state + 3 * primitives * state) / 2**30,
+        "storage_gib": (photos * photo + blocks * tasks * trained * (2 * 3 + 3) * state + 3 * primitives * state)
+        / 2**30,
         "network_gib": (photos * photo * (3 + tasks * capture.uses) + moved) / 2**30,
     }
 
@@ -202,7 +223,9 @@ def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitiv
     windows, shots = Windows(), []
     for view in loaded.train:
         rgb = view.load().rgb
-        shots.append(windows.shot(view.name, view.camera.transformed(similarity), rgb, np.full(rgb.shape[:2], 255, np.uint8)))
+        shots.append(
+            windows.shot(view.name, view.camera.transformed(similarity), rgb, np.full(rgb.shape[:2], 255, np.uint8))
+        )
     run = Run(folder / "run", Path(scene), SceneOptions(), how, similarity)
     trainer = start_trainer(loaded, run, shots, how, None, cloud)
     setup = time.process_time() - begin - filling
@@ -227,23 +250,41 @@ def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitiv
 def table(fitted: Fit, checked: dict, predictions: list[dict], capture: Capture) -> str:
     """The fit, its check, the predictions and what they assume, as Markdown."""
     lines = [
-        "| photographs | blocks | primitives | core-hours | longest task, h | GiB per worker | storage, GiB | network, GiB |",
+        "| photographs | blocks | primitives | core-hours | longest task, h | GiB per worker | storage, GiB | "
+        "network, GiB |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    names = ("photos", "blocks", "primitives", "core_hours", "longest_task_hours", "gib_per_worker", "storage_gib", "network_gib")
+    names = (
+        "photos",
+        "blocks",
+        "primitives",
+        "core_hours",
+        "longest_task_hours",
+        "gib_per_worker",
+        "storage_gib",
+        "network_gib",
+    )
     for row in predictions:
-        lines.append("| " + " | ".join(str(row[k]) if isinstance(row[k], int) else f"{row[k]:.3g}" for k in names) + " |")
+        lines.append(
+            "| " + " | ".join(str(row[k]) if isinstance(row[k], int) else f"{row[k]:.3g}" for k in names) + " |"
+        )
     lines += [
         "",
-        "Assumed: " + ", ".join(f"{name.replace('_', ' ')} {value:g}" for name, value in asdict(capture).items())
+        "Assumed: "
+        + ", ".join(f"{name.replace('_', ' ')} {value:g}" for name, value in asdict(capture).items())
         + f", {BYTES_OF_PHOTO:g} bytes per pixel of a photograph, cores like this one.",
         "",
-        "Fit: " + "; ".join(f"{name} " + ", ".join(f"{x:.3g}" for x in values) for name, values in asdict(fitted).items()) + ".",
+        "Fit: "
+        + "; ".join(f"{name} " + ", ".join(f"{x:.3g}" for x in values) for name, values in asdict(fitted).items())
+        + ".",
         "",
         "Checked on a size that was not fitted: "
-        + "; ".join(f"{name} {v['predicted']:.3g}, measured {v['measured']:.3g} ({v['ratio']:.2f})" for name, v in checked.items())
+        + "; ".join(
+            f"{name} {v['predicted']:.3g}, measured {v['measured']:.3g} ({v['ratio']:.2f})"
+            for name, v in checked.items()
+        )
         + ".",
-    ]  # fmt: skip
+    ]
     return "\n".join(lines) + "\n"
 
 
@@ -256,10 +297,25 @@ def run(given: argparse.Namespace) -> dict:
 
     output, scene = given.output, given.output / "scene"
     if not scene.is_dir():
-        synthesize(scene, mesh=street(4), views=given.views, test_views=0, size=given.side, points=20_000, supersample=1, threads=1)
+        synthesize(
+            scene,
+            mesh=street(4),
+            views=given.views,
+            test_views=0,
+            size=given.side,
+            points=20_000,
+            supersample=1,
+            threads=1,
+        )
     tasks = []
     for photos, downscale, primitives in given.sizes:
-        where = {"scene": str(scene.resolve()), "photos": photos, "downscale": downscale, "primitives": primitives, "steps": given.steps}
+        where = {
+            "scene": str(scene.resolve()),
+            "photos": photos,
+            "downscale": downscale,
+            "primitives": primitives,
+            "steps": given.steps,
+        }
         name = f"{photos}_{downscale}_{primitives}"
         tasks.append(Task(name, "linprim_geo.eval.scaling:measure_task", where, output / "sizes" / name))
     with open_executor(given.cluster, output / "sizes", given.workers) as executor:
@@ -271,7 +327,13 @@ def run(given: argparse.Namespace) -> dict:
         uses, window = shown_in_blocks(given.run)
         capture = Capture(uses=uses, window=window)
     predictions = [predict(fitted, photos, capture) for photos in (1e4, 1e6)]
-    result = {"rows": rows, "fit": asdict(fitted), "check": checked, "capture": asdict(capture), "predictions": predictions}
+    result = {
+        "rows": rows,
+        "fit": asdict(fitted),
+        "check": checked,
+        "capture": asdict(capture),
+        "predictions": predictions,
+    }
     write_json(output / "scaling.json", result)
     with atomic_write(output / "scaling.md") as temporary:
         temporary.write_text(table(fitted, checked, predictions, capture))
@@ -280,8 +342,12 @@ def run(given: argparse.Namespace) -> dict:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the capture and results")
-    parser.add_argument("--run", type=Path, metavar="RUN", help="a run in blocks, for how they share photographs (default: assumed)")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the capture and results"
+    )
+    parser.add_argument(
+        "--run", type=Path, metavar="RUN", help="a run in blocks, for how they share photographs (default: assumed)"
+    )
     parser.add_argument("--steps", type=int, default=STEPS, help="timed per size (default: %(default)s)")
     parser.add_argument("--cluster", metavar="local|ADDRESS", help="as of train")
     parser.add_argument("--workers", type=int, default=1, help="at once (default: %(default)s)")

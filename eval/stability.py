@@ -2,7 +2,8 @@
 
 Every class of `linprim_geo.eval.hard_cases` is rendered and differentiated on every rung (primitive, ray model, order,
 scalar) that the core has and compared with `linprim_geo.eval.many_scenes`. A forward case is one ray of one scene; a
-gradient case is one scene's gradient of a random weighting of its rgb and opacity. What must hold, else the exit status is 1:
+gradient case is one scene's gradient of a random weighting of its rgb and opacity. What must hold, else the exit status
+is 1:
 
     finite      no NaN or infinity in any image or gradient, of geometry too
     share       0 <= opacity <= 1
@@ -14,8 +15,8 @@ A scene is resolved where the same rounding leaves the sum of its rays' alphas k
 pixel wide has no gradient in single precision, nor has a face seen edge-on to 1e-6. The table says how many are.
 
 A gradient is the difference of what a ray's entry and its exit contribute, and is small behind opaque things: no scalar
-resolves one that cancels to less than RESOLUTION eps of these contributions without absorption. There, "relative" means to
-RESOLUTION eps / 1e-3 of them, see `gradient_errors`.
+resolves one that cancels to less than RESOLUTION eps of these contributions without absorption. There, "relative" means
+to RESOLUTION eps / 1e-3 of them, see `gradient_errors`.
 """
 
 from __future__ import annotations
@@ -42,31 +43,37 @@ BOUND = 1.0  # times the rounding of `many_scenes.rounding`
 CLOSE, SHARE_CLOSE = 1e-3, 0.999
 RESOLUTION = 16
 FACES_TIED = 4  # faces that meet in a vertex of an octahedron
-GEOMETRY_EVERY = (
-    4  # scenes of which the gradients of all geometric images are looked through for NaN, one in so many
-)
+GEOMETRY_EVERY = 4  # scenes of which the gradients of all geometric images are looked through for NaN, one in so many
 TABLE = 2_000_000  # (scene, ray, primitive, face) that the reference holds at once
 
 
-# (class, primitive or "", order or "", scalar): share of resolved gradients within CLOSE, largest error, reason. The first that fits.
+# (class, primitive or "", order or "", scalar): share of resolved gradients within CLOSE, largest error, reason. The
+# first that fits.
 LIMITS = {
     ("a thousandth of a pixel", "", "", "float32"): (
-        0.90, 0.02,
-        "positions are summed from the tile's corner in float32 and moved to the primitive afterwards: 16 px to 1e-7 leave 1e-6 px,"
+        0.90,
+        0.02,
+        "positions are summed from the tile's corner in float32 and moved to the primitive afterwards: 16 px to "
+        "1e-7 leave 1e-6 px,"
         " a thousandth of a primitive of 1e-3 px",
     ),
     ("needles 1e9", "gaussian", "", "float64"): (
-        0.85, 10.0, "Q = M^-1 of an ellipse 1e5 times longer than wide, and Q S Q in its adjoint, lose the square of that",
+        0.85,
+        10.0,
+        "Q = M^-1 of an ellipse 1e5 times longer than wide, and Q S Q in its adjoint, lose the square of that",
     ),
     ("mixed axes", "gaussian", "", "float64"): (0.90, 10.0, "as needles 1e9"),
     ("huge axes", "gaussian", "", "float64"): (
-        0.97, 100.0, "as needles 1e9: a Gaussian that reaches past the camera is projected to such an ellipse",
+        0.97,
+        100.0,
+        "as needles 1e9: a Gaussian that reaches past the camera is projected to such an ellipse",
     ),
-}  # fmt: skip
+}
 
 
 def limits(name: str, primitive: str, order: str, scalar: str) -> tuple[float, float, str]:
-    """What a row must hold: share of the resolved gradients within CLOSE, largest error of one, and why not the usual."""
+    """What a row must hold: share of the resolved gradients within CLOSE, largest error of one, and why not the
+    usual."""
     for kind, sequence in itertools.product((primitive, ""), (order, "")):
         if (name, kind, sequence, scalar) in LIMITS:
             return LIMITS[name, kind, sequence, scalar]
@@ -104,7 +111,8 @@ def rungs(scalars: Sequence[str] = tuple(SCALARS)) -> list[Rung]:
 
 @dataclass
 class Figures:
-    """What one class gave on one rung. `forward` is |rgb - reference| over the scene's largest reference value, or of opacity."""
+    """What one class gave on one rung. `forward` is |rgb - reference| over the scene's largest reference value, or of
+    opacity."""
 
     name: str
     primitive: str
@@ -137,9 +145,7 @@ class Figures:
         if (1 - self.close) * count > max(1.01, (1 - share) * count):
             found.append(f"only {100 * self.close:.2f} % of the gradients within {CLOSE:g}")
         if not self.gradient <= most:
-            found.append(
-                f"a gradient off by {self.gradient:.3g} of its magnitude (scene {self.worst_gradient_scene})"
-            )
+            found.append(f"a gradient off by {self.gradient:.3g} of its magnitude (scene {self.worst_gradient_scene})")
         return found
 
 
@@ -153,7 +159,8 @@ def run_core(
     """Renders every scene by itself and differentiates the first `gradients`.
 
     Returns:
-        rgb (B, 3, R), opacity (B, R), gradients to PARAMETERS (each `gradients` rows), all float64, and (B,) bool: everything finite.
+        rgb (B, 3, R), opacity (B, R), gradients to PARAMETERS (each `gradients` rows), all float64, and (B,) bool:
+        everything finite.
     """
     dtype = SCALARS[rung.scalar]
     tensors = [getattr(scenes, name).to(dtype) for name in PARAMETERS]
@@ -219,14 +226,12 @@ def _gradients(loss: Tensor, leaves: dict[str, Tensor]) -> list[Tensor]:
     grads = [torch.zeros_like(x) if g is None else g for x, g in zip(leaves.values(), grads, strict=True)]
     # Of a quaternion of length 1.
     length = leaves["rotation"].detach().norm(dim=-1, keepdim=True)
-    return [
-        g * torch.where(length > 0, length, torch.ones_like(length)) if i == 1 else g
-        for i, g in enumerate(grads)
-    ]
+    return [g * torch.where(length > 0, length, torch.ones_like(length)) if i == 1 else g for i, g in enumerate(grads)]
 
 
 def reference(scenes: Scenes, order: str, weights: Tensor, ties: bool, gradients: int) -> Truth:
-    """Images and, of the first `gradients` scenes, the gradients; with `ties` one for every choice of faces, and that of a miss."""
+    """Images and, of the first `gradients` scenes, the gradients; with `ties` one for every choice of faces, and that
+    of a miss."""
     images, sets, sizes = [], [], []
     choices = list(itertools.product(range(FACES_TIED), repeat=2)) if ties else [(0, 0)]
     for part in _chunks(scenes):
@@ -248,7 +253,8 @@ def reference(scenes: Scenes, order: str, weights: Tensor, ties: bool, gradients
             for contribution in ((found.of_entry * pull).sum(), (found.of_exit * pull).sum()):
                 sides = torch.stack([_norm(g) for g in _gradients(contribution, leaves)])
                 size = torch.maximum(sides, size.expand_as(sides)) if ties else size + sides
-        # Colours get the weights themselves, and a density the length of its chord, which is no less certain than the primitive's size.
+        # Colours get the weights themselves, and a density the length of its chord, which is no less certain than the
+        # primitive's size.
         if scenes.primitive != "gaussian":
             across = (found.hit * pull).sum(1) * some.extent.detach().abs().amax(-1)
             size[3] = torch.maximum(size[3], across.norm(dim=-1))
@@ -257,9 +263,7 @@ def reference(scenes: Scenes, order: str, weights: Tensor, ties: bool, gradients
         if ties:
             of_choice.append([torch.zeros_like(g) for g in of_choice[0]])
         sets.append(of_choice), sizes.append(size)
-    columns = [
-        [torch.cat(parts) for parts in zip(*choice, strict=True)] for choice in zip(*sets, strict=True)
-    ]
+    columns = [[torch.cat(parts) for parts in zip(*choice, strict=True)] for choice in zip(*sets, strict=True)]
     found = many_scenes.Chords(*[torch.cat([getattr(i[2], k) for i in images]) for k in vars(images[0][2])])
     contributions = list(torch.cat(sizes, 1)) if sizes else []
     rgb, opacity = (torch.cat([i[k] for i in images]) for k in (0, 1))
@@ -273,12 +277,10 @@ def _norm(x: Tensor) -> Tensor:
 def gradient_errors(
     scenes: Scenes, got: list[Tensor], wanted: list[Tensor], contributions: list[Tensor], eps: float
 ) -> Tensor:
-    """(B,) largest over PARAMETERS of |got - wanted| / max(|wanted|, RESOLUTION eps / CLOSE |contributions|), over whole scenes."""
+    """(B,) largest over PARAMETERS of |got - wanted| / max(|wanted|, RESOLUTION eps / CLOSE |contributions|), over
+    whole scenes."""
     length = scenes.rotation[: len(got[0])].norm(dim=-1, keepdim=True)
-    got = [
-        g * torch.where(length > 0, length, torch.ones_like(length)) if i == 1 else g
-        for i, g in enumerate(got)
-    ]
+    got = [g * torch.where(length > 0, length, torch.ones_like(length)) if i == 1 else g for i, g in enumerate(got)]
     errors = []
     for a, b, whole in zip(got, wanted, contributions, strict=True):
         off, size = _norm(a - b), torch.maximum(_norm(b), RESOLUTION * eps / CLOSE * whole)
@@ -300,10 +302,7 @@ def judge(name: str, rung: Rung, scenes: Scenes, truth: Truth, weights: Tensor, 
     opacity_off = (opacity - truth.opacity).abs() * clear
     overlap = rung.order == "overlap"
     off = torch.cat(
-        [
-            many_scenes.rounding(scenes.rows(p), _rows(truth.found, p), rung.eps, overlap)
-            for p in _chunks(scenes)
-        ]
+        [many_scenes.rounding(scenes.rows(p), _rows(truth.found, p), rung.eps, overlap) for p in _chunks(scenes)]
     )
     brightest = torch.relu(many_scenes.C0 * scenes.sh + 0.5).flatten(1).amax(1)[:, None]
     alpha = -torch.expm1(-truth.found.tau).sum(-1)
@@ -320,21 +319,14 @@ def judge(name: str, rung: Rung, scenes: Scenes, truth: Truth, weights: Tensor, 
     ratio = torch.maximum(color_off / color_bound, opacity_off / opacity_bound).nan_to_num(math.inf).amax(1)
     # Where a scene is nothing but rounding, relative to that.
     largest = torch.maximum(truth.rgb.flatten(1).amax(1), color_bound.amax(1))
-    figures.forward = float(
-        torch.maximum(color_off.amax(1) / largest, opacity_off.amax(1)).nan_to_num(math.inf).max()
-    )
+    figures.forward = float(torch.maximum(color_off.amax(1) / largest, opacity_off.amax(1)).nan_to_num(math.inf).max())
     figures.over_bound, figures.worst_scene = float(ratio.max()), int(ratio.argmax())
 
     if gradients:
-        errors = [
-            gradient_errors(scenes, grads, choice, truth.contributions, rung.eps)
-            for choice in truth.gradients
-        ]
+        errors = [gradient_errors(scenes, grads, choice, truth.contributions, rung.eps) for choice in truth.gradients]
         errors = torch.stack(errors).amin(0)
         errors = errors.nan_to_num(math.inf, math.inf)
-        resolved = (off.sum((1, 2)) <= CLOSE / 10 * alpha.sum(1))[:gradients] | (off.sum((1, 2)) == 0)[
-            :gradients
-        ]
+        resolved = (off.sum((1, 2)) <= CLOSE / 10 * alpha.sum(1))[:gradients] | (off.sum((1, 2)) == 0)[:gradients]
         figures.resolved = float(resolved.double().mean())
         if resolved.any():
             errors = torch.where(resolved, errors, torch.zeros_like(errors))
@@ -350,8 +342,8 @@ def _rows(found: many_scenes.Chords, part: slice) -> many_scenes.Chords:
 def measure(
     names: Sequence[str], chosen: Sequence[Rung], cases: int = 10_000, gradients: int = 200, seed: int = 0
 ) -> Iterator[Figures]:
-    """Figures of every class on every rung: at least `cases` rays and `gradients` scenes with a gradient on each; `chosen` as
-    `rungs` orders them."""
+    """Figures of every class on every rung: at least `cases` rays and `gradients` scenes with a gradient on each;
+    `chosen` as `rungs` orders them."""
     for name in names:
         what = hard_cases.CLASSES[name]
         groups = itertools.groupby(chosen, key=lambda r: (r.primitive, r.ray_model))
@@ -368,9 +360,7 @@ def measure(
                 only[torch.arange(count), 0, scenes.aimed] = 1
                 weights = weights * only
             with torch.no_grad():
-                doubtful = torch.cat(
-                    [many_scenes.chords(scenes.rows(p)).doubtful.any(-1) for p in _chunks(scenes)]
-                )
+                doubtful = torch.cat([many_scenes.chords(scenes.rows(p)).doubtful.any(-1) for p in _chunks(scenes)])
             weights = weights * ~doubtful[:, None]
             for order, same in itertools.groupby(group, key=lambda r: r.order):
                 truth = reference(scenes, order, weights, what.ties, gradients if what.value else 0)
@@ -396,13 +386,23 @@ def report(rows: Sequence[Figures], seed: int) -> dict:
     """The figures as the JSON document that `--json` prints."""
     classes = [
         {
-            "name": r.name, "primitive": r.primitive, "rung": r.rung, "cases": r.cases, "worst_relative_error": r.forward,
-            "nonfinite": r.nonfinite, "opacity_outside": r.outside, "worst_over_bound": r.over_bound,
-            "gradient_cases": r.gradient_cases, "gradient_resolved": r.resolved, "gradient_within": r.close,
-            "worst_gradient_error": r.gradient, "compared": hard_cases.CLASSES[r.name].value, "problems": r.problems(),
+            "name": r.name,
+            "primitive": r.primitive,
+            "rung": r.rung,
+            "cases": r.cases,
+            "worst_relative_error": r.forward,
+            "nonfinite": r.nonfinite,
+            "opacity_outside": r.outside,
+            "worst_over_bound": r.over_bound,
+            "gradient_cases": r.gradient_cases,
+            "gradient_resolved": r.resolved,
+            "gradient_within": r.close,
+            "worst_gradient_error": r.gradient,
+            "compared": hard_cases.CLASSES[r.name].value,
+            "problems": r.problems(),
         }
         for r in rows
-    ]  # fmt: skip
+    ]
     columns = ("name", "primitive", "order", "scalar", "within", "worst", "reason")
     reasons = [dict(zip(columns, (*key, *value), strict=True)) for key, value in LIMITS.items()]
     return {"instruction_set": ops.instruction_set(), "seed": seed, "limits": reasons, "classes": classes}
@@ -410,9 +410,7 @@ def report(rows: Sequence[Figures], seed: int) -> dict:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; 0 if everything holds."""
-    parser = argparse.ArgumentParser(
-        prog="python -m linprim_geo.eval.stability", description=__doc__.split("\n")[0]
-    )
+    parser = argparse.ArgumentParser(prog="python -m linprim_geo.eval.stability", description=__doc__.split("\n")[0])
     parser.add_argument("--json", action="store_true", help="print JSON in place of the table")
     parser.add_argument(
         "--cases",
@@ -422,9 +420,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="rays of each class on each rung (default: %(default)s)",
     )
     parser.add_argument(
-        "--gradients", type=int, default=2_000, metavar="N",
+        "--gradients",
+        type=int,
+        default=2_000,
+        metavar="N",
         help="scenes of each class and primitive whose gradient is taken, shared by its rungs (default: %(default)s)",
-    )  # fmt: skip
+    )
     parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
     parser.add_argument(
         "--classes",
@@ -463,13 +464,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(json.dumps(report(rows, options.seed), indent=1))
     else:
         print(
-            f"\n{sum(r.cases for r in rows)} rays, {sum(r.gradient_cases for r in rows)} gradients, {time.monotonic() - begin:.0f} s"
+            f"\n{sum(r.cases for r in rows)} rays, {sum(r.gradient_cases for r in rows)} gradients, "
+            f"{time.monotonic() - begin:.0f} s"
         )
         for (name, primitive, order, scalar), (share, most, why) in LIMITS.items():
             where = ", ".join(x for x in (name, primitive, order, scalar) if x)
-            print(
-                f"limit: {where}: {100 * share:g} % within {CLOSE:g}, none off by more than {most:g}: {why}"
-            )
+            print(f"limit: {where}: {100 * share:g} % within {CLOSE:g}, none off by more than {most:g}: {why}")
         for row, problem in failed:
             print(f"FAILED: {row.name}, {row.primitive}, {row.rung}: {problem}")
     return int(bool(failed))

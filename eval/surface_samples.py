@@ -16,9 +16,7 @@ MORTON_BITS = 16
 NAN = float("nan")
 
 
-def sample_surface(
-    mesh: Mesh, count: int, seed, *, independent: bool = False
-) -> tuple[np.ndarray, np.ndarray]:
+def sample_surface(mesh: Mesh, count: int, seed, *, independent: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Draws points uniformly by area: (count, 3) float64 points and the (count,) int64 faces they lie on.
 
     Inverse of the cumulative area over the faces in Morton order of their centroids, one draw in each of
@@ -38,9 +36,7 @@ def sample_surface(
     order = order[area[order] > 0]
     ends = np.cumsum(area[order])
     random = np.random.default_rng(seed)
-    share = (
-        np.sort(random.random(count)) if independent else (np.arange(count) + random.random(count)) / count
-    )
+    share = np.sort(random.random(count)) if independent else (np.arange(count) + random.random(count)) / count
     target = share * ends[-1]
     slot = np.minimum(np.searchsorted(ends, target, side="right"), len(order) - 1)
     face = order[slot]

@@ -1,12 +1,13 @@
-"""Every way to take a surface, on every built-in scene, against the exact mesh: `python -m linprim_geo.eval.surfaces -o runs/surfaces`.
+"""Every way to take a surface, on every built-in scene, against the exact mesh: `python -m linprim_geo.eval.surfaces -o
+runs/surfaces`.
 
-Each scene is photographed, trained once with octahedra and once with Gaussians (the baseline), and each training meshed by every method
-that it allows; `--data` adds captures, scored against their `--references`. `surfaces.json` and `surfaces.md` hold per mesh, of what the
-cameras see unless it says whole:
+Each scene is photographed, trained once with octahedra and once with Gaussians (the baseline), and each training meshed
+by every method that it allows; `--data` adds captures, scored against their `--references`. `surfaces.json` and
+`surfaces.md` hold per mesh, of what the cameras see unless it says whole:
 
-    Chamfer distance in % of the reference's diagonal (point to surface, both ways), and of the whole mesh; F1 at 1 %; normal consistency;
-    faces, boundary edges, what manifold3d says of closed meshes; the rank correlation of `quality` with the exact distance of vertices, and
-    the ratio of their means; seconds and peak memory of the extraction.
+    Chamfer distance in % of the reference's diagonal (point to surface, both ways), and of the whole mesh; F1 at 1 %;
+    normal consistency; faces, boundary edges, what manifold3d says of closed meshes; the rank correlation of `quality`
+    with the exact distance of vertices, and the ratio of their means; seconds and peak memory of the extraction.
 
 What the output folder holds already is not done again.
 """
@@ -85,20 +86,35 @@ def table(rows: list[dict]) -> str:
     """Markdown."""
     lines = ["| " + " | ".join(COLUMNS.values()) + " |", "|---" * len(COLUMNS) + "|"]
     for row in rows:
-        cells = ["–" if row[name] is None else f"{row[name]:.3g}" if isinstance(row[name], float) else str(row[name]) for name in COLUMNS]
+        cells = [
+            "–" if row[name] is None else f"{row[name]:.3g}" if isinstance(row[name], float) else str(row[name])
+            for name in COLUMNS
+        ]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of captures, runs, meshes and results")
-    parser.add_argument("--scenes", nargs="*", choices=BUILT_IN, default=list(BUILT_IN), help="built-in scenes (default: all)")
-    parser.add_argument("--data", nargs="*", type=Path, default=[], metavar="CAPTURE", help="folders of further captures")
-    parser.add_argument("--references", nargs="*", type=Path, default=[], metavar="MESH", help="their surfaces, in the same order")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="DIR", help="folder of captures, runs, meshes and results"
+    )
+    parser.add_argument(
+        "--scenes", nargs="*", choices=BUILT_IN, default=list(BUILT_IN), help="built-in scenes (default: all)"
+    )
+    parser.add_argument(
+        "--data", nargs="*", type=Path, default=[], metavar="CAPTURE", help="folders of further captures"
+    )
+    parser.add_argument(
+        "--references", nargs="*", type=Path, default=[], metavar="MESH", help="their surfaces, in the same order"
+    )
     parser.add_argument("--primitives", nargs="+", choices=list(METHODS), default=list(METHODS), help="default: all")
-    parser.add_argument("--methods", nargs="+", choices=METHODS["octahedron"], default=METHODS["octahedron"], help="default: all")
-    parser.add_argument("--refine", type=int, default=ExtractOptions.refine, help="rounds, see extract-mesh (default: %(default)s)")
+    parser.add_argument(
+        "--methods", nargs="+", choices=METHODS["octahedron"], default=METHODS["octahedron"], help="default: all"
+    )
+    parser.add_argument(
+        "--refine", type=int, default=ExtractOptions.refine, help="rounds, see extract-mesh (default: %(default)s)"
+    )
     parser.add_argument("--size", type=int, default=320, help="pixels of the built-in scenes (default: %(default)s)")
     parser.add_argument("--iterations", type=int, default=7000, help="default: %(default)s")
     parser.add_argument("--max-primitives", type=int, default=5000, help="default: %(default)s")
@@ -119,12 +135,16 @@ def run(given: argparse.Namespace) -> None:
     from linprim_geo.train import train
 
     if len(given.references) != len(given.data):
-        raise LinprimError(f"{len(given.references)} references go with {len(given.data)} captures, wanted one for each")
+        raise LinprimError(
+            f"{len(given.references)} references go with {len(given.data)} captures, wanted one for each"
+        )
     jobs = []
     for name in given.scenes:
         capture = given.output / f"{name}_{given.size}"
         if not capture.exists():
-            synthesize(capture, shape=name, views=60, test_views=8, size=(given.size, given.size), points=5000, seed=given.seed)
+            synthesize(
+                capture, shape=name, views=60, test_views=8, size=(given.size, given.size), points=5000, seed=given.seed
+            )
         jobs.append((name, capture, capture / "reference.ply", SceneOptions()))
     for capture, reference in zip(given.data, given.references, strict=True):
         jobs.append((capture.name, capture, reference, SceneOptions(downscale=given.downscale)))

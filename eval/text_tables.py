@@ -10,10 +10,7 @@ def plain(header: Sequence[str], lines: Sequence[Sequence[str]], words: int = 1)
     """Columns as wide as their widest cell; the first ones, so many as hold words, are flush left."""
     wide = [max(len(row[i]) for row in (header, *lines)) for i in range(len(header))]
     shown = [
-        [
-            cell.ljust(w) if i < words else cell.rjust(w)
-            for i, (cell, w) in enumerate(zip(row, wide, strict=True))
-        ]
+        [cell.ljust(w) if i < words else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, wide, strict=True))]
         for row in (header, *lines)
     ]
     return "\n".join("  " + "  ".join(row).rstrip() for row in shown)

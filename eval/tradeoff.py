@@ -1,8 +1,8 @@
 """What accuracy costs in time on a scene: every knob of `eval/knobs.py` swept one at a time around the defaults.
 
-Writes `tradeoff.csv`, `tradeoff.json` and `tradeoff.html`. All settings of a group are timed in turn, round after round, so that a noisy
-machine hurts all alike; a timing is the median of the rounds with its quartiles. What was measured is kept in `measured.json` of
-the folder, and taken from there.
+Writes `tradeoff.csv`, `tradeoff.json` and `tradeoff.html`. All settings of a group are timed in turn, round after
+round, so that a noisy machine hurts all alike; a timing is the median of the rounds with its quartiles. What was
+measured is kept in `measured.json` of the folder, and taken from there.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ from linprim_geo.options import SceneOptions, TrainOptions
 from linprim_geo.progress import Progress
 from linprim_geo.shots import photo_bytes
 
-# The training that knobs are swept around: a modest size of the defaults, images averaged down to at most so many pixels across.
+# The training that knobs are swept around: a modest size of the defaults, images averaged down to at most so many
+# pixels across.
 MODEST = {"iterations": 2000, "max_primitives": 2000}
 QUICK = {"iterations": 200, "max_primitives": 200}
 WIDEST, QUICK_WIDEST = 400, 128
@@ -73,14 +74,16 @@ def tradeoff(
 
     Args:
         knobs: names out of `KNOBS`; none means all.
-        run: a run of this scene that render, extraction and evaluation knobs are measured on, which is not changed; without it one
-            is trained with the defaults at the size `MODEST`, which is also what training knobs are swept around.
-        reference: mesh in the data set's frame for Chamfer distances and depth; default: `reference.ply` in the scene, if there.
+        run: a run of this scene that render, extraction and evaluation knobs are measured on, which is not changed;
+            without it one is trained with the defaults at the size `MODEST`, which is also what training knobs are
+            swept around.
+        reference: mesh in the data set's frame for Chamfer distances and depth; default: `reference.ply` in the scene,
+            if there.
         quick: the size `QUICK`, to see that all of it runs.
         rounds: how often everything is timed (default 3, quick 2).
         iterations, max_primitives: in place of those of `MODEST` or `QUICK`.
-        cluster, workers: where and how many trainings at once, see `executor.open_executor`; they share the cores of a machine, and are
-            timed so. Neither: here, one after another. Everything else is measured here in any case.
+        cluster, workers: where and how many trainings at once, see `executor.open_executor`; they share the cores of a
+            machine, and are timed so. Neither: here, one after another. Everything else is measured here in any case.
 
     Returns: what tradeoff.json holds: `rows` (one per rung of each knob), `sentences`, `rule`, `about`.
 
@@ -103,14 +106,17 @@ def tradeoff(
         return sweep.measure(chosen)
     cores, own_machines = os.cpu_count() or 1, cluster not in (None, "local")
     with open_executor(cluster, sweep.folder / "runs", workers or 0) as executor:
-        sweep.executor, sweep.cores = executor, threads or (cores if own_machines else max(1, cores // (workers or cores)))
+        sweep.executor, sweep.cores = (
+            executor,
+            threads or (cores if own_machines else max(1, cores // (workers or cores))),
+        )
         sweep.slot = sweep.cores if own_machines else 1
         return sweep.measure(chosen)
 
 
 class Sweep:
-    """One folder of measurements. `store[key]` of a setting holds `times`, `peak_gib`, and what was found of it once. With an `executor`
-    trainings are its tasks, on so many `cores` each, and count as `slot` of its own."""
+    """One folder of measurements. `store[key]` of a setting holds `times`, `peak_gib`, and what was found of it once.
+    With an `executor` trainings are its tasks, on so many `cores` each, and count as `slot` of its own."""
 
     executor: Executor | None = None
     cores = slot = 1
@@ -119,17 +125,23 @@ class Sweep:
         from linprim_geo.scene import load_scene
         from linprim_geo.structure_from_motion import prepare
 
-        self.scene_path, self.folder, self.given, self.quick, self.threads = Path(os.path.realpath(scene)), folder, run, quick, threads
+        self.scene_path, self.folder, self.given, self.quick, self.threads = (
+            Path(os.path.realpath(scene)),
+            folder,
+            run,
+            quick,
+            threads,
+        )
         self.rounds = rounds or (QUICK_ROUNDS if quick else ROUNDS)
         self.progress = Progress("tradeoff", 1, quiet=quiet)
-        self.warm = self.warm_score = self.warm_train = False  # the first time of all loads libraries, and is not counted
+        self.warm = self.warm_score = self.warm_train = (
+            False  # the first time of all loads libraries, and is not counted
+        )
         prepare(scene, threads=threads, log=self.progress.note)
         self.scene = load_scene(scene)
         widest = max(view.camera.width for view in self.scene.train)
         self.scene_options = SceneOptions(downscale=-(-widest // (QUICK_WIDEST if quick else WIDEST)))
-        self.options = TrainOptions(
-            **size, threads=threads, evaluate_every=0, checkpoint_every=10**9
-        )
+        self.options = TrainOptions(**size, threads=threads, evaluate_every=0, checkpoint_every=10**9)
         found = Path(reference) if reference else self.scene_path / "reference.ply"
         if reference and not found.exists():
             raise LinprimError(f"{found}: no such file, wanted a reference mesh")
@@ -170,11 +182,16 @@ class Sweep:
         try:
             knobs = [self._fitting(knob) for knob in knobs]
             for group, measure in (
-                ("train", self._train), ("render", self._render), ("extract", self._extract), ("evaluate", self._evaluate)
-            ):  # fmt: skip
+                ("train", self._train),
+                ("render", self._render),
+                ("extract", self._extract),
+                ("evaluate", self._evaluate),
+            ):
                 mine = [knob for knob in knobs if knob.group == group]
                 if group in ("extract", "evaluate") and self.reference is None and mine:
-                    self.progress.note(f"no reference mesh, so {', '.join(k.name for k in mine)}: time alone, or nothing")
+                    self.progress.note(
+                        f"no reference mesh, so {', '.join(k.name for k in mine)}: time alone, or nothing"
+                    )
                     if group == "evaluate":
                         continue
                 self._in_turn(group, mine, measure)
@@ -196,7 +213,11 @@ class Sweep:
 
     def _setting(self, knob: Knob, rung: Rung) -> dict:
         found = settings(knob, rung)
-        return found if knob.group != "render" else found | {"degree": rung.changes.get("degree", self.render_defaults["degree"])}
+        return (
+            found
+            if knob.group != "render"
+            else found | {"degree": rung.changes.get("degree", self.render_defaults["degree"])}
+        )
 
     def _in_turn(self, group: str, knobs: Sequence[Knob], measure: Callable[[str, dict, set, int], None]) -> None:
         """Every setting of a group once per round, unless it was measured in that round before."""
@@ -212,7 +233,9 @@ class Sweep:
                 self._train_at_once([setting for setting in each if "equal_time" in setting], turn)
             for key, (setting, errors) in wanted.items():
                 entry = self.store.setdefault(key, {"setting": setting, "times": [], "peak_gib": 0.0, "errors": {}})
-                if "failed" in entry or (len(entry["times"]) > turn and errors <= entry["errors"].keys() | {"photo_percent"}):
+                if "failed" in entry or (
+                    len(entry["times"]) > turn and errors <= entry["errors"].keys() | {"photo_percent"}
+                ):
                     continue
                 self.progress.note(f"{group}, round {turn + 1} of {self.rounds}: {_shown(setting)}")
                 try:
@@ -235,7 +258,8 @@ class Sweep:
 
     @cached_property
     def base(self) -> Path:
-        """Folder of the run that render, extraction and evaluation knobs are measured on: a copy of the given one, or the trained base."""
+        """Folder of the run that render, extraction and evaluation knobs are measured on: a copy of the given one, or
+        the trained base."""
         if self.given is None:
             key = _key("train", {})
             if not (self.store.get(key, {}).get("errors")):
@@ -253,7 +277,9 @@ class Sweep:
         copy.mkdir(parents=True, exist_ok=True)
         for name in ("config.json", "transform.json", "run.json", "training_frame.npz"):
             if not (Path(self.given) / name).exists():
-                raise LinprimError(f"{self.given}: {name} is missing, so this is not the folder of a run that has saved something")
+                raise LinprimError(
+                    f"{self.given}: {name} is missing, so this is not the folder of a run that has saved something"
+                )
             shutil.copy(Path(self.given) / name, copy / name)
         return copy
 
@@ -279,7 +305,8 @@ class Sweep:
     # --- render -----------------------------------------------------------------------------------------
 
     def draw(self, setting: dict, camera, geometry: bool = False, gradients: bool = False):
-        """The run seen by a camera under a setting; with `gradients` the tensors' as well, of the mean of the colour."""
+        """The run seen by a camera under a setting; with `gradients` the tensors' as well, of the mean of the
+        colour."""
         import torch
 
         from linprim_geo import ops
@@ -294,7 +321,9 @@ class Sweep:
         how = raster_options(self.run.train_options) | {"primitive": primitives.kind}
         how |= {"ray_model": setting["ray_model"], "order": setting["order"], "stop": setting["stop"]}
         if not ops.has_kernels(primitives.kind, how["ray_model"], how["order"]):
-            raise LinprimError(f"a {primitives.kind} is not drawn in the order {how['order']} with {how['ray_model']} rays")
+            raise LinprimError(
+                f"a {primitives.kind} is not drawn in the order {how['order']} with {how['ray_model']} rays"
+            )
         background = self.run.raster_arguments()[1].to(dtype)
         begin = time.perf_counter()
         out = ops.rasterize(*tensors, background, camera, geometry=geometry, **how)
@@ -327,7 +356,10 @@ class Sweep:
         if not errors <= entry["errors"].keys():
             truth = self.truth
             with torch.no_grad():
-                found = [self._render_errors(setting, camera, *t, errors) for camera, t in zip(self.cameras, truth, strict=True)]
+                found = [
+                    self._render_errors(setting, camera, *t, errors)
+                    for camera, t in zip(self.cameras, truth, strict=True)
+                ]
             entry["errors"] |= {name: float(np.mean([view[name] for view in found])) for name in found[0]}
         if len(entry["times"]) > turn:
             return
@@ -346,7 +378,9 @@ class Sweep:
         image, surface = out.rgb.double().numpy(), out.depth_median.double().numpy()
         found = {"image_percent": 100 * math.sqrt(np.mean((image - rgb) ** 2))}
         both = (surface > 0) & (depth > 0)
-        found["depth_percent"] = 100 * float(np.mean(np.abs(surface - depth)[both] / depth[both])) if both.any() else math.nan
+        found["depth_percent"] = (
+            100 * float(np.mean(np.abs(surface - depth)[both] / depth[both])) if both.any() else math.nan
+        )
         if "alone_percent" in errors:
             exact = setting | {name: RENDER_REFERENCE[name] for name in ("scalar", "stop")}
             alone = self.draw(exact, camera)[0].rgb.double().numpy()
@@ -370,7 +404,8 @@ class Sweep:
         return TrainOptions(**entry["options"][0]), SceneOptions(**entry["options"][1])
 
     def _train_at_once(self, settings: Sequence[dict], turn: int) -> None:
-        """The trainings of a round that are not measured yet, by the executor. Raises LinprimError for what ends them all."""
+        """The trainings of a round that are not measured yet, by the executor. Raises LinprimError for what ends them
+        all."""
         assert self.executor is not None
         tasks = {}
         folder = self.folder / "runs" / f"round_{turn}_{self.cores}"
@@ -421,7 +456,13 @@ class Sweep:
                 self.warm_train = True
                 aside = self.folder / "runs" / "warm_up"
                 shutil.rmtree(aside, ignore_errors=True)
-                train(self.scene_path, aside, scene_options, replace(options, iterations=min(20, options.iterations)), quiet=True)
+                train(
+                    self.scene_path,
+                    aside,
+                    scene_options,
+                    replace(options, iterations=min(20, options.iterations)),
+                    quiet=True,
+                )
                 shutil.rmtree(aside)
             stages = Stages(self.progress)
             trained = train(self.scene_path, folder, scene_options, options, quiet=True)
@@ -503,13 +544,25 @@ class Sweep:
             coarse = ExtractOptions(voxel_size=8 * self.supported_voxel)
             with contextlib.suppress(LinprimError):  # too coarse for a surface
                 extract_mesh(self.base, "tsdf", self.folder / "meshes" / "warm_up.ply", coarse, quiet=True)
-        options = ExtractOptions(voxel_size=self.supported_voxel * setting["voxel"]) if setting["method"] == "tsdf" else ExtractOptions()
+        options = (
+            ExtractOptions(voxel_size=self.supported_voxel * setting["voxel"])
+            if setting["method"] == "tsdf"
+            else ExtractOptions()
+        )
         target = self.folder / "meshes" / f"{_name(setting)}.ply"
         stats = extract_mesh(self.base, setting["method"], target, options, quiet=True)
         if len(entry["times"]) <= turn:
-            self._note(key, stats["seconds"]["total"], stats["peak_gib"]["total"], faces=stats["faces"], topology=stats["watertight"])
+            self._note(
+                key,
+                stats["seconds"]["total"],
+                stats["peak_gib"]["total"],
+                faces=stats["faces"],
+                topology=stats["watertight"],
+            )
         if not entry["errors"]:
-            found = {"boundary_edges": float(stats["boundary_edges"])} | dict.fromkeys(("chamfer_percent", "normal_percent"), math.nan)
+            found = {"boundary_edges": float(stats["boundary_edges"])} | dict.fromkeys(
+                ("chamfer_percent", "normal_percent"), math.nan
+            )
             if self.reference:
                 scores = self._score(load_mesh(target))
                 found["chamfer_percent"] = scores["chamfer_percent_diagonal"]
@@ -553,7 +606,8 @@ class Sweep:
 
 
 def train_task(folder: Path, scene: str, scene_options: dict, options: dict) -> dict:
-    """A training into folder/run, after a few steps that load the libraries. Returns its seconds and primitives, or why it `failed`."""
+    """A training into folder/run, after a few steps that load the libraries. Returns its seconds and primitives, or why
+    it `failed`."""
     from linprim_geo.train import train
 
     chosen = SceneOptions(**scene_options), TrainOptions(**options)

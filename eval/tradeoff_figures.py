@@ -1,9 +1,11 @@
-"""The two plots of the README out of a sweep: what the ladder of rendering costs, and what surfaces cost in training and in extraction.
+"""The two plots of the README out of a sweep: what the ladder of rendering costs, and what surfaces cost in training
+and in extraction.
 
     linprim-geo tradeoff SCENE -o SWEEP
     python -m linprim_geo.eval.tradeoff_figures SWEEP -o tools
 
-writes tradeoff_ladder.svg and tradeoff_surface.svg, each two panels on a ground of its own, light or dark as the reader has it.
+writes tradeoff_ladder.svg and tradeoff_surface.svg, each two panels on a ground of its own, light or dark as the reader
+has it.
 """
 
 from __future__ import annotations
@@ -23,21 +25,39 @@ from linprim_geo.files import atomic_write, read_json
 
 TOP, GAP = 26, 8
 LIGHT = {
-    "ground": "#ffffff", "ink": "#1b1f24", "plot": "#fafbfc", "edge": "#c8ced6", "line": "#e3e7ec", "blue": "#1f63b2", "dim": "#707a86",
-}  # fmt: skip
+    "ground": "#ffffff",
+    "ink": "#1b1f24",
+    "plot": "#fafbfc",
+    "edge": "#c8ced6",
+    "line": "#e3e7ec",
+    "blue": "#1f63b2",
+    "dim": "#707a86",
+}
 DARK = {
-    "ground": "#0d1117", "ink": "#d9dfe6", "plot": "#141a21", "edge": "#3a434e", "line": "#242c35", "blue": "#6cb0ff", "dim": "#8f99a5",
-}  # fmt: skip
+    "ground": "#0d1117",
+    "ink": "#d9dfe6",
+    "plot": "#141a21",
+    "edge": "#3a434e",
+    "line": "#242c35",
+    "blue": "#6cb0ff",
+    "dim": "#8f99a5",
+}
 # What a rung is called where several knobs are in one plot; knobs that are not here keep the names of their rungs.
 NAMES = {
-    "rays": "{} rays", "order": "{} order", "scalar": "{}", "iterations": "{} of the steps",
-    "primitives": "{} of the primitives", "scale": "{} image scale", "views": "{} of the views",
-}  # fmt: skip
+    "rays": "{} rays",
+    "order": "{} order",
+    "scalar": "{}",
+    "iterations": "{} of the steps",
+    "primitives": "{} of the primitives",
+    "scale": "{} image scale",
+    "views": "{} of the views",
+}
 TWICE = re.compile(r"^2 of the ")
 
 
 def rungs(rows: Sequence[dict], knobs: Sequence[str], error: str) -> list[dict]:
-    """The measured rungs of some knobs for one plot: named, the shared default once, and the frontier of all of them anew."""
+    """The measured rungs of some knobs for one plot: named, the shared default once, and the frontier of all of them
+    anew."""
     found, default = [], None
     for row in rows:
         if row["knob"] not in knobs or row.get(error) is None or row["seconds"] <= 0:
@@ -56,10 +76,13 @@ def figure(panels: Sequence[tuple[str, Sequence[dict], str]], name: str) -> str:
     """An SVG file of panels (title, rows, error) beside each other; `name` says what it is to who cannot see it."""
     width, height = len(panels) * svg.WIDTH + (len(panels) - 1) * GAP, svg.HEIGHT + TOP - 16
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" role="img" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" '
+        f'height="{height}" role="img" '
         f'aria-label="{escape(name)}">',
-        f"<style>svg {{ {_colors(LIGHT)} }} @media (prefers-color-scheme: dark) {{ svg {{ {_colors(DARK)} }} }}{svg.STYLE}"
-        "svg text { font-size: 12.5px; } svg .ground { fill: var(--ground); } svg .title { font-weight: 600; font-size: 14px; }</style>",
+        f"<style>svg {{ {_colors(LIGHT)} }} @media (prefers-color-scheme: dark) {{ svg {{ {_colors(DARK)} }} "
+        f"}}{svg.STYLE}"
+        "svg text { font-size: 12.5px; } svg .ground { fill: var(--ground); } svg .title { font-weight: 600; "
+        "font-size: 14px; }</style>",
         f'<rect class="ground" width="{width}" height="{height}" rx="6"/>',
     ]
     for index, (title, rows, error) in enumerate(panels):
@@ -80,9 +103,7 @@ def figures(sweep: Path, output: Path) -> list[Path]:
     try:
         rows = [row for row in results["rows"] if row["knob"] in KNOBS]
     except (KeyError, TypeError):
-        raise LinprimError(
-            f"{file}: has no rows of knobs, wanted what linprim-geo tradeoff has written"
-        ) from None
+        raise LinprimError(f"{file}: has no rows of knobs, wanted what linprim-geo tradeoff has written") from None
     ladder, training = ("rays", "order", "scalar"), ("iterations", "primitives", "scale", "views")
     plots = {
         "tradeoff_ladder.svg": (
@@ -107,7 +128,8 @@ def figures(sweep: Path, output: Path) -> list[Path]:
             of_panel = rungs(rows, knobs, error)
             if len(of_panel) < 2:
                 raise LinprimError(
-                    f"{file}: has no {error} of {', '.join(knobs)}, wanted a sweep of all knobs on a scene with a reference mesh"
+                    f"{file}: has no {error} of {', '.join(knobs)}, wanted a sweep of all knobs on a scene with "
+                    "a reference mesh"
                 )
             shown.append((title, of_panel, error))
         drawn[output / target] = figure(shown, name)
@@ -122,13 +144,9 @@ def _colors(colors: dict[str, str]) -> str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sweep", type=Path, metavar="SWEEP", help="folder that linprim-geo tradeoff has made")
-    parser.add_argument(
-        "-o", "--output", type=Path, default=Path("tools"), metavar="DIR", help="default tools"
-    )
+    parser.add_argument("-o", "--output", type=Path, default=Path("tools"), metavar="DIR", help="default tools")
     args = parser.parse_args(arguments)
     try:
         written = figures(args.sweep, args.output)

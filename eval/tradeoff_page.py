@@ -1,4 +1,5 @@
-"""The page of a sweep: one HTML file with a plot and a table per knob; well-formed XML, no script, nothing from elsewhere."""
+"""The page of a sweep: one HTML file with a plot and a table per knob; well-formed XML, no script, nothing from
+elsewhere."""
 
 from __future__ import annotations
 
@@ -29,9 +30,12 @@ def page(results: dict, knobs: dict[str, Knob]) -> str:
     parts = [
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/><title>What accuracy costs in time</title>',
         f"<style>{STYLE}{svg.STYLE}</style></head><body><h1>What accuracy costs in time</h1>",
-        f'<p class="small">Scene {escape(about["scene"])}, {about["options"]["iterations"]} steps and {about["options"]["max_primitives"]} '
-        f"primitives where a knob does not say otherwise; {about['rounds']} rounds, load {about['load']:.1f} on {about['cores']} cores. "
-        "Times are medians with their quartiles; blue points lie on the frontier, which no other setting beats in both time and error; a "
+        f'<p class="small">Scene {escape(about["scene"])}, {about["options"]["iterations"]} steps and '
+        f"{about['options']['max_primitives']} "
+        f"primitives where a knob does not say otherwise; {about['rounds']} rounds, load {about['load']:.1f} on "
+        f"{about['cores']} cores. "
+        "Times are medians with their quartiles; blue points lie on the frontier, which no other setting beats "
+        "in both time and error; a "
         "ring marks the default.</p>",
     ]
     for name, knob in knobs.items():
@@ -70,7 +74,8 @@ def table(rows: Sequence[dict], knob: Knob) -> str:
 
 
 def plot(rows: Sequence[dict], error: str) -> str:
-    """An SVG of error over seconds, both logarithmic, every point named, with the quartiles of its time, and the frontier drawn.
+    """An SVG of error over seconds, both logarithmic, every point named, with the quartiles of its time, and the
+    frontier drawn.
 
     An error of 0 is drawn a decade below the least that is not.
     """
@@ -87,10 +92,16 @@ def plot(rows: Sequence[dict], error: str) -> str:
     on = sorted((place for place, row in zip(places, rows, strict=True) if row["frontier"]), key=lambda p: p[0])
     if on:
         # What one can have: the error of the best that takes no longer, so the line goes in steps.
-        path = f"M{on[0][0]:.1f} {TOP}V{on[0][1]:.1f}" + "".join(f"H{x:.1f}V{y:.1f}" for x, y in on[1:]) + f"H{WIDTH - RIGHT}"
+        path = (
+            f"M{on[0][0]:.1f} {TOP}V{on[0][1]:.1f}"
+            + "".join(f"H{x:.1f}V{y:.1f}" for x, y in on[1:])
+            + f"H{WIDTH - RIGHT}"
+        )
         out.append(f'<path d="{path}" class="on" fill="none" stroke-width="1.5" stroke-opacity="0.6"/>')
     boxes = [(x - 6, y - 6, x + 6, y + 6) for x, y in places]
-    boxes += [(x_axis.at(row["low"]), y - 3, x_axis.at(row["high"]), y + 3) for row, (_, y) in zip(rows, places, strict=True)]
+    boxes += [
+        (x_axis.at(row["low"]), y - 3, x_axis.at(row["high"]), y + 3) for row, (_, y) in zip(rows, places, strict=True)
+    ]
     for (x0, y0), (x1, y1) in zip(on, [*on[1:], (WIDTH - RIGHT, on[-1][1])] if on else [], strict=True):
         boxes += [(x0, y0 - 3, x1, y0 + 3), (x1 - 3, min(y0, y1), x1 + 3, max(y0, y1))]
     for row, (x, y) in zip(rows, places, strict=True):
@@ -108,20 +119,29 @@ def plot(rows: Sequence[dict], error: str) -> str:
     return "".join(out) + "</svg>"
 
 
-def _free_place(x: float, y: float, width: float, boxes: Sequence[tuple[float, float, float, float]]) -> tuple[float, float]:
+def _free_place(
+    x: float, y: float, width: float, boxes: Sequence[tuple[float, float, float, float]]
+) -> tuple[float, float]:
     """Left and top of a label near a point, where it covers the least of other labels and points, and stays inside."""
     middle = y - LINE / 2
     places = [(x + 10, middle), (x - 10 - width, middle)]
     for away in (LINE, 1.8 * LINE, 2.6 * LINE):
-        places += [(x + 6, y - away - 4), (x + 6, y + away - LINE + 4), (x - 6 - width, y - away - 4), (x - 6 - width, y + away - LINE + 4)]
+        places += [
+            (x + 6, y - away - 4),
+            (x + 6, y + away - LINE + 4),
+            (x - 6 - width, y - away - 4),
+            (x - 6 - width, y + away - LINE + 4),
+        ]
     places = [
-        (min(max(left, LEFT + 3), WIDTH - RIGHT - width - 2), min(max(top, TOP + 2), HEIGHT - BOTTOM - LINE - 2)) for left, top in places
+        (min(max(left, LEFT + 3), WIDTH - RIGHT - width - 2), min(max(top, TOP + 2), HEIGHT - BOTTOM - LINE - 2))
+        for left, top in places
     ]
 
     def covered(place: tuple[float, float]) -> float:
         left, top = place
         return sum(
-            max(0.0, min(left + width, b[2]) - max(left, b[0])) * max(0.0, min(top + LINE, b[3]) - max(top, b[1])) for b in boxes
+            max(0.0, min(left + width, b[2]) - max(left, b[0])) * max(0.0, min(top + LINE, b[3]) - max(top, b[1]))
+            for b in boxes
         )
 
     return min(places, key=covered)

@@ -1,4 +1,5 @@
-"""What a sweep has measured as rows, with a verdict for each knob: `tradeoff.csv`, `tradeoff.json` and `tradeoff.html`."""
+"""What a sweep has measured as rows, with a verdict for each knob: `tradeoff.csv`, `tradeoff.json` and
+`tradeoff.html`."""
 
 from __future__ import annotations
 
@@ -16,12 +17,26 @@ from linprim_geo.eval.tradeoff_page import page
 from linprim_geo.files import atomic_write, write_json
 
 COLUMNS = (
-    "knob", "rung", "default", "frontier", "seconds", "low", "high", "rounds", "gradient_seconds", "peak_gib", *ERRORS, "psnr",
-    "primitives", "faces",
-)  # fmt: skip
+    "knob",
+    "rung",
+    "default",
+    "frontier",
+    "seconds",
+    "low",
+    "high",
+    "rounds",
+    "gradient_seconds",
+    "peak_gib",
+    *ERRORS,
+    "psnr",
+    "primitives",
+    "faces",
+)
 
 
-def write_report(folder: Path, about: dict, knobs: Sequence[Knob], measured: Mapping[str, Sequence[tuple[Rung, dict]]]) -> dict:
+def write_report(
+    folder: Path, about: dict, knobs: Sequence[Knob], measured: Mapping[str, Sequence[tuple[Rung, dict]]]
+) -> dict:
     """Writes the three files into `folder` and returns what the JSON holds.
 
     Args:
@@ -48,7 +63,9 @@ def write_report(folder: Path, about: dict, knobs: Sequence[Knob], measured: Map
         with open(temporary, "w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, fieldnames=list(COLUMNS), restval="", extrasaction="ignore")
             writer.writeheader()
-            writer.writerows({name: "" if value is None else value for name, value in row.items()} for row in results["rows"])
+            writer.writerows(
+                {name: "" if value is None else value for name, value in row.items()} for row in results["rows"]
+            )
     with atomic_write(folder / "tradeoff.html") as temporary:
         temporary.write_text(page(results, {knob.name: knob for knob in knobs}), encoding="utf-8")
     return results
@@ -69,7 +86,12 @@ def _row(knob: Knob, rung: Rung, entry: dict) -> dict:
     if entry.get("gradient_times"):
         row["gradient_seconds"] = float(np.median(entry["gradient_times"]))
     found = {name: entry["errors"][name] for name in (*knob.errors, "psnr") if entry["errors"].get(name) is not None}
-    return row | {name: math.nan for name in knob.errors} | found | {n: entry[n] for n in ("primitives", "faces") if n in entry}
+    return (
+        row
+        | {name: math.nan for name in knob.errors}
+        | found
+        | {n: entry[n] for n in ("primitives", "faces") if n in entry}
+    )
 
 
 def _without_nan(value):

@@ -1,7 +1,8 @@
 """Posed photographs to geometry that can be trusted: transparent polyhedra, trained and meshed on a CPU.
 
-`import linprim_geo as lg` offers a function for each command (`lg.train`, `lg.extract_mesh`, ...) and the types that they take and
-give; linprim_geo/PYTHON.md shows them at work. Each is imported where it is first used, so that the package itself costs nothing.
+`import linprim_geo as lg` offers a function for each command (`lg.train`, `lg.extract_mesh`, ...) and the types that
+they take and give; linprim_geo/PYTHON.md shows them at work. Each is imported where it is first used, so that the
+package itself costs nothing.
 """
 
 from __future__ import annotations
@@ -102,7 +103,8 @@ class _Command(ModuleType):
 
 
 class _Package(ModuleType):
-    """This package. The import system binds a submodule by setting it here, which is where those named as commands become callable."""
+    """This package. The import system binds a submodule by setting it here, which is where those named as commands
+    become callable."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         if isinstance(value, ModuleType) and _PUBLIC.get(name, ("",))[0] == name:

@@ -56,31 +56,32 @@ def adam_rows(
 ) -> None:
     """One sparse Adam step on the touched rows of several float32 tensors, in place and in one sweep.
 
-    A touched row's count of steps t goes up by one and its moments are corrected by 1 - beta^t: every row goes through exactly the
-    Adam of the steps that touched it, however rare they are. Of the other rows nothing changes, neither value, moments nor
-    count, where `adam_step` would let them glide on by their first moment and shrink both. With all rows touched in every step
-    the two are the same.
+    A touched row's count of steps t goes up by one and its moments are corrected by 1 - beta^t: every row goes through
+    exactly the Adam of the steps that touched it, however rare they are. Of the other rows nothing changes, neither
+    value, moments nor count, where `adam_step` would let them glide on by their first moment and shrink both. With all
+    rows touched in every step the two are the same.
 
     Args:
-        values, gradients, firsts, seconds: as many tensors each, with N rows of any shape; the gradients of untouched rows do not count.
+        values, gradients, firsts, seconds: as many tensors each, with N rows of any shape; the gradients of untouched
+            rows do not count.
         rates: learning rate of each tensor.
         steps: (N,) int32, 0 for a row without a history. To forget a row's history, set it and both moments to 0.
-        touched: (N,) bool; None: the rows where any of the tensors has a gradient that is not 0, which costs reading the gradients of the
-            others as well. After `rasterize`, `screen_grad[:, 2] > 0` is a row's being seen, as long as only the image gives gradients.
+        touched: (N,) bool; None: the rows where any of the tensors has a gradient that is not 0, which costs reading
+            the gradients of the others as well. After `rasterize`, `screen_grad[:, 2] > 0` is a row's being seen, as
+            long as only the image gives gradients.
 
     Raises:
         ValueError: shapes, dtypes or layouts that do not fit.
 
-    Source: Kingma and Ba, ICLR 2015, algorithm 1, by row. (The sparse Adam of 3DGS's later code freezes unseen rows alike, but corrects by
-        the global step, which takes a row seen rarely for one that has had zero gradients, and its first steps are too small or large.)
+    Source: Kingma and Ba, ICLR 2015, algorithm 1, by row. (The sparse Adam of 3DGS's later code freezes unseen rows
+        alike, but corrects by the global step, which takes a row seen rarely for one that has had zero gradients, and
+        its first steps are too small or large.)
     """
     for name, tensors in (("value", values), ("gradient", gradients), ("first", firsts), ("second", seconds)):
         for tensor in tensors:
             check_dtypes(torch.float32, **{name: tensor})
             if tensor.shape[:1] != steps.shape:
-                raise ValueError(
-                    f"{name} has {tuple(tensor.shape[:1])} rows, steps has shape {tuple(steps.shape)}"
-                )
+                raise ValueError(f"{name} has {tuple(tensor.shape[:1])} rows, steps has shape {tuple(steps.shape)}")
             if name != "gradient" and not tensor.is_contiguous():
                 raise ValueError(f"{name} is changed in place and has to be contiguous")
     check_dtypes(torch.int32, steps=steps)

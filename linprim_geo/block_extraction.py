@@ -1,7 +1,8 @@
-"""The fused surface in parts: workers have parts of one lattice of voxels; their surfaces together are the whole one's to the last bit.
+"""The fused surface in parts: workers have parts of one lattice of voxels; their surfaces together are the whole one's
+to the last bit.
 
-A part's field is that of the blocks that it owns and of their neighbours. It votes there in the order of the views, as the whole does,
-and hands on the triangles whose middle lies in a block of its own.
+A part's field is that of the blocks that it owns and of their neighbours. It votes there in the order of the views, as
+the whole does, and hands on the triangles whose middle lies in a block of its own.
 """
 
 from __future__ import annotations
@@ -40,7 +41,15 @@ class PartFusion:
     def __call__(self, lattice: Lattice, frames: DepthFrames) -> Mesh:
         count = min(self.count, len(lattice.blocks))
         digest = hashlib.sha256((self.run.path / "training_frame.npz").read_bytes())
-        options = (self.level, frames.limit, count, lattice.voxel, lattice.resolution, lattice.truncation, lattice.rules)
+        options = (
+            self.level,
+            frames.limit,
+            count,
+            lattice.voxel,
+            lattice.resolution,
+            lattice.truncation,
+            lattice.rules,
+        )
         digest.update(repr(options).encode())
         digest.update(lattice.blocks.tobytes() + lattice.origin.tobytes())
         place = self.folder / digest.hexdigest()[:16]
@@ -55,9 +64,21 @@ class PartFusion:
             size = int(halo(lattice.blocks, owner == part).sum())
             need = PROCESS_GIB + estimate_memory(size, lattice.resolution, largest) / 2**30
             where = {"run": str(self.run.path.resolve()), "level": self.level, "limit": frames.limit, "part": part}
-            tasks.append(Task(f"part {part}", "linprim_geo.block_extraction:part_task", where, place / f"{part:03d}", need, 1, REMEDY))
+            tasks.append(
+                Task(
+                    f"part {part}",
+                    "linprim_geo.block_extraction:part_task",
+                    where,
+                    place / f"{part:03d}",
+                    need,
+                    1,
+                    REMEDY,
+                )
+            )
         self.executor.run(tasks, Progress("parts", 1, quiet=self.quiet))
-        mesh = placed(together([load_part(place / f"{part:03d}" / "part.npz") for part in range(count)]), lattice.origin)
+        mesh = placed(
+            together([load_part(place / f"{part:03d}" / "part.npz") for part in range(count)]), lattice.origin
+        )
         shutil.rmtree(place)
         return mesh
 
@@ -117,16 +138,24 @@ def save_lattice(path: Path, lattice: Lattice, owner: np.ndarray) -> None:
     """Writes a lattice and who owns its blocks."""
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         np.savez(
-            file, blocks=lattice.blocks, owner=owner, origin=lattice.origin, voxel=lattice.voxel, resolution=lattice.resolution,
-            truncation=lattice.truncation, rules=lattice.rules,
-        )  # fmt: skip
+            file,
+            blocks=lattice.blocks,
+            owner=owner,
+            origin=lattice.origin,
+            voxel=lattice.voxel,
+            resolution=lattice.resolution,
+            truncation=lattice.truncation,
+            rules=lattice.rules,
+        )
 
 
 def load_lattice(path: Path) -> tuple[Lattice, np.ndarray]:
     """Reads what `save_lattice` wrote."""
     with np.load(path, allow_pickle=False) as file:
         rules, truncation = tuple(float(x) for x in file["rules"]), float(file["truncation"])
-        return Lattice(file["blocks"], file["origin"], float(file["voxel"]), int(file["resolution"]), truncation, rules), file["owner"]
+        return Lattice(
+            file["blocks"], file["origin"], float(file["voxel"]), int(file["resolution"]), truncation, rules
+        ), file["owner"]
 
 
 def load_part(path: Path) -> Mesh:
@@ -140,5 +169,3 @@ def load_part(path: Path) -> Mesh:
             return Mesh(file["vertices"], file["faces"])
     except (OSError, ValueError, KeyError) as error:
         raise LinprimError(f"{path}: cannot be read ({error})") from None
-
-

@@ -1,4 +1,5 @@
-"""The photographs of a block: the parts of views that show it, and in place of the rest what the coarse scene shows there."""
+"""The photographs of a block: the parts of views that show it, and in place of the rest what the coarse scene shows
+there."""
 
 from __future__ import annotations
 
@@ -29,18 +30,19 @@ LEVEL = 0.5
 
 
 def small_depths(coarse: Run, views: Sequence[View], factor: int) -> Iterator[tuple[Camera, np.ndarray]]:
-    """For every view its camera, `factor` times as small, and the (h, w) z-depths of the coarse surface, 0 for none, in the training
-    frame."""
+    """For every view its camera, `factor` times as small, and the (h, w) z-depths of the coarse surface, 0 for none, in
+    the training frame."""
     small = [replace(view, camera=smaller(view.camera, factor)) for view in views]
     for view, depth, _ in coarse.surface_depths(small, LEVEL):
         yield view.camera.transformed(coarse.similarity), depth * np.float32(coarse.similarity.scale)
 
 
 class Windows:
-    """Parts of photographs in a file in the system's folder for temporary ones, so that a worker's memory does not grow with them; where
-    that folder is itself memory, TMPDIR is to name another.
+    """Parts of photographs in a file in the system's folder for temporary ones, so that a worker's memory does not grow
+    with them; where that folder is itself memory, TMPDIR is to name another.
 
-    Reading one takes a hundredth of the time of a step. The file has no name: it is gone with the last of them, however this process ends.
+    Reading one takes a hundredth of the time of a step. The file has no name: it is gone with the last of them, however
+    this process ends.
     """
 
     def __init__(self) -> None:
@@ -48,13 +50,17 @@ class Windows:
         try:
             folder = Path(tempfile.gettempdir())
         except FileNotFoundError as error:
-            raise LinprimError(f"no folder for temporary files can be written ({error}): wanted TMPDIR to name one") from None
+            raise LinprimError(
+                f"no folder for temporary files can be written ({error}): wanted TMPDIR to name one"
+            ) from None
         self._what = folder / "windows of photographs (TMPDIR)"
         with writing(self._what):
             self._file = tempfile.TemporaryFile()
         self._recent: dict[str, Shot] = {}
 
-    def shot(self, name: str, camera: Camera, rgb: np.ndarray, alpha: np.ndarray, photo: tuple[int, int] | None = None) -> StoredShot:
+    def shot(
+        self, name: str, camera: Camera, rgb: np.ndarray, alpha: np.ndarray, photo: tuple[int, int] | None = None
+    ) -> StoredShot:
         """Takes up (H, W, 3) and (H, W) uint8; `photo` as of a `Shot`.
 
         Raises:
@@ -88,10 +94,10 @@ def block_shots(
 ) -> list[Shot]:
     """What a block is trained on.
 
-    A photograph is cut to the window that shows the block and its margin, and counts by that window's share of its pixels. Pixels whose
-    surface lies farther than `known` from the block, where the frozen primitives are coarse, are replaced by what these alone show there,
-    with their opacity for alpha: a block is neither to explain the rest of the scene nor to hide it. So are those that show the coarse
-    scene's environment.
+    A photograph is cut to the window that shows the block and its margin, and counts by that window's share of its
+    pixels. Pixels whose surface lies farther than `known` from the block, where the frozen primitives are coarse, are
+    replaced by what these alone show there, with their opacity for alpha: a block is neither to explain the rest of the
+    scene nor to hide it. So are those that show the coarse scene's environment.
 
     Raises:
         LinprimError: a photograph cannot be read, or the disk is full.

@@ -1,4 +1,5 @@
-"""What workers do when a scene is trained in blocks: the coarse scene, the plan, a block by itself, and it beside what others have become.
+"""What workers do when a scene is trained in blocks: the coarse scene, the plan, a block by itself, and it beside what
+others have become.
 
 Every task reads what those before it left in RUN/blocks, and goes on from its own last checkpoint.
 """
@@ -40,16 +41,18 @@ Arrays = dict[str, np.ndarray]
 FOLDER = "blocks"
 # Goes up whenever tasks need what those of before have not left.
 FORMAT = 3
-# The coarse scene: pixels averaged, parts of the steps and of the primitives of the whole, and the most of these and of the views.
+# The coarse scene: pixels averaged, parts of the steps and of the primitives of the whole, and the most of these and of
+# the views.
 COARSE_DOWNSCALE, COARSE_STEPS, COARSE_PRIMITIVES = 2, 0.25, 0.25
 MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS, LEAST_SIDE = 20_000, 1000, 32
-# Primitives are shared out as the coarse scene has grown them, but for this part, which goes by the pixels that show a block: the whole has
-# four times as long to grow them where pixels ask for more.
+# Primitives are shared out as the coarse scene has grown them, but for this part, which goes by the pixels that show a
+# block: the whole has four times as long to grow them where pixels ask for more.
 BY_PIXELS = 0.25
 # Steps of a block at least, as far as the whole has so many.
 LEAST_STEPS = 300
-# Blocks take up what others have become at these parts of the steps that are left once growth has ended. Then others stand in full, the
-# nearest first, up to about so many primitives with those that are trained in the margin; beyond these the coarse scene does.
+# Blocks take up what others have become at these parts of the steps that are left once growth has ended. Then others
+# stand in full, the nearest first, up to about so many primitives with those that are trained in the margin; beyond
+# these the coarse scene does.
 EXCHANGES, MOST_BESIDE = (0.125, 0.5, 0.8125), 100_000
 
 
@@ -66,7 +69,8 @@ def load_points(path: Path) -> PointCloud:
 
 
 def coarse_of(run: Run, scene: Scene) -> Run:
-    """The run of the whole scene with fewer pixels, views, steps and primitives that stands for what a block does not hold."""
+    """The run of the whole scene with fewer pixels, views, steps and primitives that stands for what a block does not
+    hold."""
     options, scene_options = run.train_options, run.scene_options
     side = min(min(view.camera.width, view.camera.height) for view in scene.train)
     factor = COARSE_DOWNSCALE if side >= COARSE_DOWNSCALE * LEAST_SIDE else 1
@@ -74,9 +78,15 @@ def coarse_of(run: Run, scene: Scene) -> Run:
     views = min(scene_options.views or len(scene.train), MOST_COARSE_VIEWS)
     coarse = replace(
         options,
-        iterations=max(min(LEAST_STEPS, options.iterations), round(COARSE_STEPS * options.iterations * views / len(scene.train))),
-        max_primitives=most, initial_primitives=0, sh_degree=0, samples=1, evaluate_every=0,
-    )  # fmt: skip
+        iterations=max(
+            min(LEAST_STEPS, options.iterations), round(COARSE_STEPS * options.iterations * views / len(scene.train))
+        ),
+        max_primitives=most,
+        initial_primitives=0,
+        sh_degree=0,
+        samples=1,
+        evaluate_every=0,
+    )
     seen = replace(scene_options, downscale=factor * scene_options.downscale, views=views)
     return replace(run, path=run.path / FOLDER / "coarse" / "run", scene_options=seen, train_options=coarse)
 
@@ -93,7 +103,8 @@ def _prepared(options: TrainOptions) -> None:
 
 
 def coarse_task(folder: Path, run: str) -> dict:
-    """Trains the coarse scene. Returns the background to train with, as the option says it, its colour, and whether that is fitted."""
+    """Trains the coarse scene. Returns the background to train with, as the option says it, its colour, and whether
+    that is fitted."""
     opened, scene = _opened(run)
     _prepared(opened.train_options)
     coarse = coarse_of(opened, scene)
@@ -123,7 +134,9 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
         for view, (camera, depth) in zip(scene.train, small_depths(coarse, scene.train, factor), strict=True):
             yield view, camera, depth
 
-    work = point_work(points, ((camera, depth, view.camera.width * view.camera.height) for view, camera, depth in looks()))
+    work = point_work(
+        points, ((camera, depth, view.camera.width * view.camera.height) for view, camera, depth in looks())
+    )
     used = work > 0
     if not used.any():
         raise LinprimError(f"{scene.root}: no camera sees a point of the scene, so no block can be made")
@@ -148,7 +161,9 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
                 pixels[k] += found[2] * found[3]
     for k, views in enumerate(seen_by):
         if len(views) < 2:
-            raise LinprimError(f"block {k} of {count} is seen by {len(views)} cameras, wanted two at least: fewer blocks")
+            raise LinprimError(
+                f"block {k} of {count} is seen by {len(views)} cameras, wanted two at least: fewer blocks"
+            )
     options = opened.train_options
     # Where the coarse scene has grown primitives the whole would, too, and none larger.
     grown = coarse.training_primitives().center
@@ -202,10 +217,12 @@ def apportioned(shares: Sequence[float] | np.ndarray, total: int) -> list[int]:
 
 
 def known_of(distances: np.ndarray, margin: float, primitives: int) -> float:
-    """How far from a block the nearest MOST_BESIDE primitives outside of it reach, its margin at least; infinite if there are fewer.
+    """How far from a block the nearest MOST_BESIDE primitives outside of it reach, its margin at least; infinite if
+    there are fewer.
 
     Args:
-        distances: (P,) of the primitives of the coarse scene from the block, 0 in it; each stands for its part of so many `primitives`.
+        distances: (P,) of the primitives of the coarse scene from the block, 0 in it; each stands for its part of so
+            many `primitives`.
     """
     outside = np.sort(distances[distances > 0])
     most = int(MOST_BESIDE * len(distances) / primitives)
@@ -219,7 +236,9 @@ def _plain(x: float) -> float | None:
 def block_of(plan: dict, k: int) -> Block:
     """A block of the plan."""
     part = plan["blocks"][k]
-    low, high = ([x if x is not None else end for x in part[name]] for name, end in (("low", -np.inf), ("high", np.inf)))
+    low, high = (
+        [x if x is not None else end for x in part[name]] for name, end in (("low", -np.inf), ("high", np.inf))
+    )
     return Block(tuple(low), tuple(high))
 
 
@@ -229,15 +248,19 @@ def block_task(folder: Path, run: str, block: int) -> dict:
     plan = worker.result_of_folder(opened.path / FOLDER / "plan")
     own, margin = block_of(plan, block), plan["margin"]
     coarse = Run.open(opened.path / FOLDER / "coarse" / "run").training_primitives()
-    return _trained(folder, opened, scene, plan, block, beyond(coarse, own, margin), margin, until(opened.train_options, 0), None)
+    return _trained(
+        folder, opened, scene, plan, block, beyond(coarse, own, margin), margin, until(opened.train_options, 0), None
+    )
 
 
 def join_task(folder: Path, run: str, block: int, exchange: int) -> dict:
-    """Trains a block from the `exchange`th of EXCHANGES, counted from 1, to the next or to the end, beside what its neighbours have become.
+    """Trains a block from the `exchange`th of EXCHANGES, counted from 1, to the next or to the end, beside what its
+    neighbours have become.
 
-    What they own in its margin is trained with it, so that both sides of a border fit each other, and then dropped: the restricted additive
-    Schwarz method (Cai and Sarkis, SIAM J. Sci. Comput. 21, 1999). Beyond the margin their primitives stand still, and farther off the
-    coarse scene does. Returns as `_trained`, and `owned`: so many, the first ones, are the block's.
+    What they own in its margin is trained with it, so that both sides of a border fit each other, and then dropped: the
+    restricted additive Schwarz method (Cai and Sarkis, SIAM J. Sci. Comput. 21, 1999). Beyond the margin their
+    primitives stand still, and farther off the coarse scene does. Returns as `_trained`, and `owned`: so many, the
+    first ones, are the block's.
     """
     opened, scene = _opened(run)
     plan = worker.result_of_folder(opened.path / FOLDER / "plan")
@@ -286,25 +309,41 @@ def _rows(state: dict, keep: np.ndarray) -> dict:
 def _together(parts: Sequence[dict]) -> dict:
     """That of all of them."""
     tables = {name: {key: torch.cat([part[name][key] for part in parts]) for key in parts[0][name]} for name in _TABLES}
-    return tables | {name: None if parts[0][name] is None else torch.cat([part[name] for part in parts]) for name in _TENSORS}
+    return tables | {
+        name: None if parts[0][name] is None else torch.cat([part[name] for part in parts]) for name in _TENSORS
+    }
 
 
 def until(options: TrainOptions, exchange: int) -> float:
-    """The part of its steps that a block has behind it when the task that begins with an exchange, 0 for the first task, ends."""
+    """The part of its steps that a block has behind it when the task that begins with an exchange, 0 for the first
+    task, ends."""
     grows = CONTROLS[options.population].GROWS_UNTIL
     return grows + (1 - grows) * (*EXCHANGES, 1.0)[exchange]
 
 
 def _trained(
-    folder: Path, opened: Run, scene: Scene, plan: dict, block: int, frozen: Arrays, known: float, end: float, begin: dict | None
+    folder: Path,
+    opened: Run,
+    scene: Scene,
+    plan: dict,
+    block: int,
+    frozen: Arrays,
+    known: float,
+    end: float,
+    begin: dict | None,
 ) -> dict:
-    """Trains a block in folder/run up to a part of its steps, from its last checkpoint there, else from the state `begin`, else from the
-    points in it and its margin. Up to `known` from the block the frozen primitives are those that the scene will have."""
+    """Trains a block in folder/run up to a part of its steps, from its last checkpoint there, else from the state
+    `begin`, else from the points in it and its margin. Up to `known` from the block the frozen primitives are those
+    that the scene will have."""
     _prepared(opened.train_options)
     part, own = plan["blocks"][block], block_of(plan, block)
     names = ("iterations", "max_primitives", "initial_primitives")
     options = replace(
-        opened.train_options, **{name: part[name] for name in names}, background=plan["background"], evaluate_every=0, threads=worker.cores
+        opened.train_options,
+        **{name: part[name] for name in names},
+        background=plan["background"],
+        evaluate_every=0,
+        threads=worker.cores,
     )
     path = folder / "run"
     seen = replace(scene, train=tuple(scene.train[k] for k in part["views"]), test=())
@@ -330,11 +369,15 @@ def _trained(
 
 
 def _points_of(scene: Scene, run: Run, plan: dict, number: int, options: TrainOptions) -> PointCloud:
-    """The scene's points in a block and its margin, filled up: at most as many in either as a training begins with that has the block's
-    own primitives in the one and the others of its `options` in the other."""
+    """The scene's points in a block and its margin, filled up: at most as many in either as a training begins with that
+    has the block's own primitives in the one and the others of its `options` in the other."""
     far = far_colors(scene) if plan["environment"] else None
     cloud = filled_points(scene, options.seed, np.asarray(plan["shown"]) if plan["fitted"] else None, far)
-    where, block, own = run.similarity.apply(cloud.xyz), block_of(plan, number), max(1, plan["blocks"][number]["own_primitives"])
+    where, block, own = (
+        run.similarity.apply(cloud.xyz),
+        block_of(plan, number),
+        max(1, plan["blocks"][number]["own_primitives"]),
+    )
     inside, beside = block.holds(where), block.holds(where, plan["margin"])
     if not beside.any():
         raise LinprimError(f"block {number} holds no point to start from: wanted fewer blocks")
@@ -352,7 +395,8 @@ def block_folder(run: Path, block: int, exchange: int = 0) -> Path:
 
 
 def is_owned(run: Path, plan: dict, block: int, exchange: int, state: dict) -> np.ndarray:
-    """(N,) which primitives of a block's state after an exchange are its own. That is decided at the first; later they may leave it."""
+    """(N,) which primitives of a block's state after an exchange are its own. That is decided at the first; later they
+    may leave it."""
     if exchange == 0:
         return block_of(plan, block).holds(_centers(state))
     return np.arange(len(_centers(state))) < worker.result_of_folder(block_folder(run, block, exchange))["owned"]

@@ -16,8 +16,8 @@ MARGIN = 0.2
 HIDDEN = 0.1
 # A camera sees a block if this share of its pixels shows it.
 LEAST_SHARE = 0.005
-# Pixels beyond those that show a block which belong to it, for depths are coarse, and pixels round them that a structural similarity
-# looks at.
+# Pixels beyond those that show a block which belong to it, for depths are coarse, and pixels round them that a
+# structural similarity looks at.
 DILATION, BORDER = 2, 8
 # Sides of the box that holds the bulk of some points are these quantiles.
 _BULK = (0.01, 0.99)
@@ -47,8 +47,8 @@ class Block:
 def split_space(xyz: np.ndarray, work: np.ndarray, count: int) -> list[Block]:
     """`count` boxes that fill space, each with about the same part of the `work` (P,) of the points `xyz` (P, 3).
 
-    A k-d tree: what holds the bulk of the points is cut across its longest side, in the ratio of the blocks that come to lie on either
-    side.
+    A k-d tree: what holds the bulk of the points is cut across its longest side, in the ratio of the blocks that come
+    to lie on either side.
 
     Raises:
         LinprimError: there are not so many places to cut at.
@@ -75,7 +75,9 @@ def _split(xyz, work, count, low, high) -> list[Block]:
             *_split(xyz[below], work[below], first, low, tuple(inner[0])),
             *_split(xyz[~below], work[~below], count - first, tuple(inner[1]), high),
         ]
-    raise LinprimError(f"--blocks is too large: there are {len(xyz)} points where {count} blocks are to be, wanted fewer blocks")
+    raise LinprimError(
+        f"--blocks is too large: there are {len(xyz)} points where {count} blocks are to be, wanted fewer blocks"
+    )
 
 
 def margin_of(blocks: Sequence[Block], xyz: np.ndarray) -> float:
@@ -89,7 +91,9 @@ def smaller(camera: Camera, factor: int) -> Camera:
     """The same view with `factor` by `factor` pixels averaged into one, as `scene.load_scene` does."""
     k = factor
     width, height = camera.width // k, camera.height // k
-    return replace(camera, width=width, height=height, fx=camera.fx / k, fy=camera.fy / k, cx=camera.cx / k, cy=camera.cy / k)
+    return replace(
+        camera, width=width, height=height, fx=camera.fx / k, fy=camera.fy / k, cx=camera.cx / k, cy=camera.cy / k
+    )
 
 
 def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
@@ -101,8 +105,8 @@ def point_work(xyz: np.ndarray, views: Iterable[tuple[Camera, np.ndarray, int]])
     """(P,) work of points (P, 3): the pixels of all views that see each.
 
     Args:
-        views: camera, its z-depths (H, W), 0 where nothing is, and the pixels of its photograph. A point that lies farther than the depth
-            of its pixel, by more than HIDDEN of it, is hidden.
+        views: camera, its z-depths (H, W), 0 where nothing is, and the pixels of its photograph. A point that lies
+            farther than the depth of its pixel, by more than HIDDEN of it, is hidden.
     """
     work = np.zeros(len(xyz))
     for camera, depth, pixels in views:
@@ -122,7 +126,8 @@ def surface_points(camera: Camera, depth: np.ndarray) -> np.ndarray:
 
 
 def enlarged(mask: np.ndarray, camera: Camera, factor: int) -> np.ndarray:
-    """(H, W) bool of the photograph's pixels, from a mask (h, w) of a view `factor` times as small, and those round it."""
+    """(H, W) bool of the photograph's pixels, from a mask (h, w) of a view `factor` times as small, and those round
+    it."""
     from scipy.ndimage import binary_dilation
 
     mask = binary_dilation(mask, iterations=DILATION)
@@ -133,8 +138,8 @@ def enlarged(mask: np.ndarray, camera: Camera, factor: int) -> np.ndarray:
 
 
 def window(mask: np.ndarray, camera: Camera, factor: int) -> tuple[int, int, int, int] | None:
-    """(left, top, width, height) of the part of a photograph that shows a block, from a mask (h, w) of a view `factor` times as small; None
-    where less than LEAST_SHARE of the pixels show it."""
+    """(left, top, width, height) of the part of a photograph that shows a block, from a mask (h, w) of a view `factor`
+    times as small; None where less than LEAST_SHARE of the pixels show it."""
     if mask.sum() < max(4, LEAST_SHARE * mask.size):
         return None
     full = enlarged(mask, camera, factor)

@@ -68,9 +68,7 @@ class Camera:
         depth = local[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = np.where(depth > 0, 1.0 / depth, np.nan)
-        pixels = np.stack(
-            [local[:, 0] * scale * self.fx + self.cx, local[:, 1] * scale * self.fy + self.cy], 1
-        )
+        pixels = np.stack([local[:, 0] * scale * self.fx + self.cx, local[:, 1] * scale * self.fy + self.cy], 1)
         return pixels, depth
 
     def pinhole(self) -> tuple[np.ndarray, tuple[float, float, float, float]]:

@@ -1,4 +1,5 @@
-"""Camera poses for synthetic captures: rings, spheres and hand-held arcs around an object, and stations inside a room."""
+"""Camera poses for synthetic captures: rings, spheres and hand-held arcs around an object, and stations inside a
+room."""
 
 from __future__ import annotations
 
@@ -71,9 +72,7 @@ def fibonacci_directions(count: int, low: float = -1.0, high: float = 1.0, turn:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
 
 
-def around(
-    path: str, views: int, center: np.ndarray, distance: float, *, held_out: bool = False
-) -> list[np.ndarray]:
+def around(path: str, views: int, center: np.ndarray, distance: float, *, held_out: bool = False) -> list[np.ndarray]:
     """(4, 4) world-to-camera poses that look at `center` from `distance`.
 
     `orbit`: three rings; `hemisphere`: evenly over directions from 5 to 85 degrees up; `sphere`: over all
@@ -96,9 +95,7 @@ def around(
         low, high = (np.sin(np.deg2rad((5.0, 85.0)))) if path == "hemisphere" else (-1.0, 1.0)
         directions = fibonacci_directions(views, low, high, turn=1.3 if held_out else 0.0)
     else:
-        raise LinprimError(
-            f"path {path!r} does not go around an object, orbit, hemisphere or sphere is wanted"
-        )
+        raise LinprimError(f"path {path!r} does not go around an object, orbit, hemisphere or sphere is wanted")
     return [look_at(center + distance * direction, center) for direction in directions]
 
 
@@ -141,9 +138,7 @@ def _held(center: np.ndarray, distance: float, azimuth: float, wander: np.ndarra
     return turn @ pose
 
 
-def fitting_distance(
-    path: str, vertices: np.ndarray, center: np.ndarray, views: int, camera: Camera
-) -> float:
+def fitting_distance(path: str, vertices: np.ndarray, center: np.ndarray, views: int, camera: Camera) -> float:
     """The smallest distance from `center` at which all vertices are in all pictures, with a margin.
 
     The size and focal lengths are those of `camera`, its principal point is taken to be the middle of the
@@ -215,9 +210,7 @@ def inside_out(
         picked = []
         for _ in range(count):
             if not free.any():
-                raise LinprimError(
-                    f"inside-out: free space has room for fewer than {views + test_views} views"
-                )
+                raise LinprimError(f"inside-out: free space has room for fewer than {views + test_views} views")
             gain = np.where(free, sees @ (1.0 / (1.0 + seen)), -1.0)
             best = int(np.argmax(gain))
             picked.append(candidates[best])

@@ -103,10 +103,15 @@ def _check_state(trainer: Trainer, state: dict) -> None:
     step, (low, high) = state["step"], state["bounds"]
     if type(step) is not int or not 0 <= step < 2**40 or not 0 < low <= high < math.inf:
         raise ValueError(f"step {step!r} or bounds {low!r}, {high!r}")
-    if not all(type(state[name]) is float for name in ("seconds", "loss", "psnr")) or not 0 <= state["seconds"] < math.inf:
+    if (
+        not all(type(state[name]) is float for name in ("seconds", "loss", "psnr"))
+        or not 0 <= state["seconds"] < math.inf
+    ):
         raise ValueError("seconds, loss and psnr are no numbers")
     numbers = trainer.control.state()
-    if len(state["control"]) != len(numbers) or not all(type(x) in (int, float) and math.isfinite(x) for x in state["control"]):
+    if len(state["control"]) != len(numbers) or not all(
+        type(x) in (int, float) and math.isfinite(x) for x in state["control"]
+    ):
         raise ValueError(f"control is {state['control']!r}")
     if trainer.exposure is not None:
         for name, like in trainer.exposure.state().items():
@@ -114,7 +119,16 @@ def _check_state(trainer: Trainer, state: dict) -> None:
 
 
 def _check_tensor(name: str, value, dtype: torch.dtype, shape: tuple) -> None:
-    if not isinstance(value, torch.Tensor) or value.dtype != dtype or tuple(value.shape) != tuple(shape) or value.layout != torch.strided:
+    if (
+        not isinstance(value, torch.Tensor)
+        or value.dtype != dtype
+        or tuple(value.shape) != tuple(shape)
+        or value.layout != torch.strided
+    ):
         raise ValueError(f"{name} is no {dtype} tensor of shape {tuple(shape)}")
-    if not value.is_contiguous() or value.requires_grad or (value.is_floating_point() and not bool(torch.isfinite(value).all())):
+    if (
+        not value.is_contiguous()
+        or value.requires_grad
+        or (value.is_floating_point() and not bool(torch.isfinite(value).all()))
+    ):
         raise ValueError(f"{name} is not finite")

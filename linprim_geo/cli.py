@@ -28,7 +28,8 @@ SPLITS = ("train", "test", "all")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command line and returns its exit status; argparse itself leaves with 0 (--help) or 2."""
-    # NumPy's matrices are small here, and OpenBLAS's threads wait for each other in a loop: on a busy machine many times the work.
+    # NumPy's matrices are small here, and OpenBLAS's threads wait for each other in a loop: on a busy machine many
+    # times the work.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # The two flags are known before and after the subcommand, so neither parser may set a default for them.
     parsed = build_parser().parse_args(arguments)
@@ -155,7 +156,10 @@ def add_options(parser: argparse._ActionsContainer, options: type) -> None:
 
 def add_effects(parser: argparse._ActionsContainer, default: str) -> None:
     """Adds --effects and --effect, by which options are chosen that were not given."""
-    text = "none: the options as they are (default of train); auto: what the data call for (default of inspect); all: everything on."
+    text = (
+        "none: the options as they are (default of train); auto: what the data call for (default of inspect); "
+        "all: everything on."
+    )
     text += " An option that is given stays"
     parser.add_argument("--effects", choices=("auto", "none", "all"), default=default, help=text)
     text = "decide about one by hand, such as exposure=on; may be repeated; linprim-geo inspect SCENE names them"
@@ -165,7 +169,10 @@ def add_effects(parser: argparse._ActionsContainer, default: str) -> None:
 def add_workers(parser: argparse.ArgumentParser, workers: int | None = 0) -> argparse._ArgumentGroup:
     """Adds --cluster and --workers, of default `workers`, which say where the parts of a job are done."""
     group = parser.add_argument_group("workers")
-    text = "local: Ray on this machine; an address such as 10.0.0.1:6379: the Ray cluster there, whose machines all see the folders"
+    text = (
+        "local: Ray on this machine; an address such as 10.0.0.1:6379: the Ray cluster there, whose machines "
+        "all see the folders"
+    )
     text += " (default: processes of this machine); needs pip install 'linprim-geo[cluster]'"
     group.add_argument("--cluster", metavar="local|ADDRESS", help=text)
     text = "at once at most; 0: one per core" + (" (default 0)" if workers == 0 else "")
@@ -254,9 +261,7 @@ def build_parser() -> argparse.ArgumentParser:
     common = argparse.ArgumentParser(add_help=False)
     group = common.add_argument_group("output")
     hidden = argparse.SUPPRESS
-    group.add_argument(
-        "--json", action="store_true", default=hidden, help="print one JSON object and nothing else"
-    )
+    group.add_argument("--json", action="store_true", default=hidden, help="print one JSON object and nothing else")
     group.add_argument("--debug", action="store_true", default=hidden, help="show the traceback of an error")
 
     parser = argparse.ArgumentParser(
@@ -272,9 +277,7 @@ def build_parser() -> argparse.ArgumentParser:
     def add_quiet(sub: argparse.ArgumentParser) -> None:
         sub.add_argument("--quiet", action="store_true", help="no progress")
 
-    def command(
-        name: str, handler: Callable[[argparse.Namespace], dict], text: str
-    ) -> argparse.ArgumentParser:
+    def command(name: str, handler: Callable[[argparse.Namespace], dict], text: str) -> argparse.ArgumentParser:
         sub = subparsers.add_parser(
             name,
             parents=[common],
@@ -286,12 +289,8 @@ def build_parser() -> argparse.ArgumentParser:
         return sub
 
     sub = command("train", commands.train, "train a scene: posed photographs to primitives")
-    sub.add_argument(
-        "scene", nargs="?", metavar="SCENE", help="folder of a capture, of plain photographs, or a video"
-    )
-    sub.add_argument(
-        "-s", "--source", "--source_path", dest="source", metavar="SCENE", help="the same, as in 3DGS"
-    )
+    sub.add_argument("scene", nargs="?", metavar="SCENE", help="folder of a capture, of plain photographs, or a video")
+    sub.add_argument("-s", "--source", "--source_path", dest="source", metavar="SCENE", help="the same, as in 3DGS")
     sub.add_argument(
         "-o",
         "--output",
@@ -303,17 +302,26 @@ def build_parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("--resume", action="store_true", help="go on from the latest checkpoint in RUN")
     add_quiet(sub)
-    text = "say what would be trained, how long it takes and how much memory, by timing a few steps; nothing but the cache is written"
+    text = (
+        "say what would be trained, how long it takes and how much memory, by timing a few steps; nothing but "
+        "the cache is written"
+    )
     sub.add_argument("--dry-run", action="store_true", help=text)
-    text = "choose steps and primitives so that everything takes this long, by what a step costs here; one of the two may be given"
+    text = (
+        "choose steps and primitives so that everything takes this long, by what a step costs here; one of "
+        "the two may be given"
+    )
     sub.add_argument("--time-budget", type=_seconds, metavar="TIME", help=text)
-    sub.add_argument("--view", action="store_true", help="show the run in a browser meanwhile, as linprim-geo view RUN --follow does")
+    sub.add_argument(
+        "--view", action="store_true", help="show the run in a browser meanwhile, as linprim-geo view RUN --follow does"
+    )
     resolution = "as in 3DGS: divide the size by 1, 2, 4 or 8, or a width to go down to; -1: to 1600 if it is more"
     sub.add_argument("-r", "--resolution", type=int, metavar="K", help=resolution)
     sub.add_argument("--eval", action="store_true", help="accepted as in 3DGS: views are always held out")
     add_effects(sub.add_argument_group("effects"), "none")
     text = (
-        "train in so many blocks of space, each by a worker of its own; auto: as few as a worker's memory allows (default 1); "
+        "train in so many blocks of space, each by a worker of its own; auto: as few as a worker's memory allows "
+        "(default 1); "
         "a block's photographs lie in a temporary file, see TMPDIR"
     )
     several = add_workers(sub)
@@ -321,7 +329,9 @@ def build_parser() -> argparse.ArgumentParser:
     add_options(sub.add_argument_group("scene"), SceneOptions)
     add_options(sub.add_argument_group("training"), TrainOptions)
 
-    sub = command("inspect", commands.inspect, "say which effects a scene calls for, by which evidence, and what they cost")
+    sub = command(
+        "inspect", commands.inspect, "say which effects a scene calls for, by which evidence, and what they cost"
+    )
     sub.add_argument("scene", metavar="SCENE", help="folder of a capture, of plain photographs, or a video")
     add_quiet(sub)
     add_effects(sub.add_argument_group("effects"), "auto")
@@ -336,12 +346,13 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("extract-mesh", commands.extract_mesh, "extract a triangle mesh from a run")
     sub.add_argument("run", metavar="RUN", help="folder that train has made")
-    text = "tsdf: fuse depth maps (default); polyhedra: unite the primitives, cut back to the surface, closed and manifold;"
+    text = (
+        "tsdf: fuse depth maps (default); polyhedra: unite the primitives, cut back to the surface, closed "
+        "and manifold;"
+    )
     text += " opacity-field: where light stops reaching the cameras, closed and without a grid"
     sub.add_argument("--method", choices=("tsdf", "polyhedra", "opacity-field"), default="tsdf", help=text)
-    sub.add_argument(
-        "-o", "--output", metavar="FILE", help=".ply .obj .glb .stl (default RUN/mesh/METHOD/mesh.ply)"
-    )
+    sub.add_argument("-o", "--output", metavar="FILE", help=".ply .obj .glb .stl (default RUN/mesh/METHOD/mesh.ply)")
     text = "choose the voxel size so that everything takes this long, by what coarse passes take"
     sub.add_argument("--time-budget", type=_seconds, metavar="TIME", help=text)
     add_quiet(sub)
@@ -353,11 +364,12 @@ def build_parser() -> argparse.ArgumentParser:
         "eval-depth", commands.eval_depth, "score a run's depth and normals against a mesh or the data set's depth"
     )
     sub.add_argument("run", metavar="RUN", help="folder that train has made")
-    sub.add_argument(
-        "--reference", metavar="MESH", help="mesh in the data set's frame (default: its depth images)"
-    )
+    sub.add_argument("--reference", metavar="MESH", help="mesh in the data set's frame (default: its depth images)")
     sub.add_argument("--split", choices=SPLITS, default="test", help="which views (default test)")
-    depth = "which depth: at half transmittance by exact overlap (default), or in the order of blending, the mean, the first surface"
+    depth = (
+        "which depth: at half transmittance by exact overlap (default), or in the order of blending, the "
+        "mean, the first surface"
+    )
     sub.add_argument("--depth", choices=("overlap", "median", "expected", "first"), default="overlap", help=depth)
     sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/eval/depth)")
 
@@ -365,7 +377,10 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("run", metavar="RUN", help="folder that train has made")
     sub.add_argument("--split", choices=SPLITS, default="test", help="which views (default test)")
     sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/eval/images)")
-    text = "weights of LPIPS, file or folder (default: torch's cache, and packages lpips or torchmetrics; none: leaves it out)"
+    text = (
+        "weights of LPIPS, file or folder (default: torch's cache, and packages lpips or torchmetrics; none: "
+        "leaves it out)"
+    )
     sub.add_argument("--lpips-weights", metavar="PATH", help=text)
 
     sub = command(
@@ -400,30 +415,51 @@ def build_parser() -> argparse.ArgumentParser:
     sub = command("report", commands.report, "write one self-contained HTML page about a run")
     sub.add_argument("run", metavar="RUN", help="folder that train has made")
     sub.add_argument("-o", "--output", metavar="FILE", help="page to write (default RUN/report.html)")
-    text = "mesh in the data set's frame to score depth and meshes against (default: what RUN/eval holds, and the data set's depth)"
+    text = (
+        "mesh in the data set's frame to score depth and meshes against (default: what RUN/eval holds, and "
+        "the data set's depth)"
+    )
     sub.add_argument("--reference", metavar="MESH", help=text)
 
     sub = command("view", commands.view, "show a run in a browser: primitives, meshes, cameras")
     sub.add_argument("run", metavar="RUN", help="folder that train has made")
-    sub.add_argument("--follow", action="store_true", help="wait for a run's first save, and show every save and mesh as it comes")
+    sub.add_argument(
+        "--follow", action="store_true", help="wait for a run's first save, and show every save and mesh as it comes"
+    )
     sub.add_argument("--reference", metavar="MESH", help="mesh in the data set's frame, for the true error of meshes")
     text = "port on this machine, which alone can reach it (default 8080; 0: any that is free)"
     sub.add_argument("--port", type=_whole, default=8080, metavar="N", help=text)
     sub.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
 
-    sub = command("tradeoff", commands.tradeoff, "sweep every knob that trades time for accuracy: tables, plots, and a sentence for each")
+    sub = command(
+        "tradeoff",
+        commands.tradeoff,
+        "sweep every knob that trades time for accuracy: tables, plots, and a sentence for each",
+    )
     sub.add_argument("scene", metavar="SCENE", help="folder of a capture, of plain photographs, or a video")
-    sub.add_argument("-o", "--output", metavar="DIR", help="folder to make, or to go on with (default runs/SCENE_tradeoff)")
+    sub.add_argument(
+        "-o", "--output", metavar="DIR", help="folder to make, or to go on with (default runs/SCENE_tradeoff)"
+    )
     text = "knobs to sweep; a wrong name lists them (default all)"
     sub.add_argument("--knobs", nargs="+", default=[], metavar="NAME", help=text)
-    text = "run of this scene that knobs of rendering, extraction and evaluation are measured on (default: trains one of modest size)"
+    text = (
+        "run of this scene that knobs of rendering, extraction and evaluation are measured on (default: "
+        "trains one of modest size)"
+    )
     sub.add_argument("--run", metavar="RUN", help=text)
     text = "mesh in the data set's frame (default: reference.ply in the scene, if there)"
     sub.add_argument("--reference", metavar="MESH", help=text)
     sub.add_argument("--quick", action="store_true", help="a tiny size, to see that all of it runs")
-    sub.add_argument("--rounds", type=_positive, metavar="N", help="how often everything is timed, in turn (default 3, quick 2)")
+    sub.add_argument(
+        "--rounds", type=_positive, metavar="N", help="how often everything is timed, in turn (default 3, quick 2)"
+    )
     for name in ("iterations", "max-primitives"):
-        sub.add_argument(f"--{name}", type=_positive, metavar="N", help="of the training that is swept around (default 2000, quick 200)")
+        sub.add_argument(
+            f"--{name}",
+            type=_positive,
+            metavar="N",
+            help="of the training that is swept around (default 2000, quick 200)",
+        )
     sub.add_argument("--threads", type=_whole, default=0, metavar="N", help="0 uses every core (default)")
     add_workers(sub, None).description = "trainings at once; without either, here, one after another"
     add_quiet(sub)
@@ -449,9 +485,7 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--points", type=_whole, default=20_000, metavar="N", help="on it (default 20000)")
     noise = "standard deviation per axis of the points, in the mesh's unit (default 0)"
     sub.add_argument("--point-noise", type=_not_negative, default=0.0, metavar="LENGTH", help=noise)
-    sub.add_argument(
-        "--supersample", type=_positive, default=3, metavar="K", help="K*K rays a pixel (default 3)"
-    )
+    sub.add_argument("--supersample", type=_positive, default=3, metavar="K", help="K*K rays a pixel (default 3)")
     sub.add_argument("--depth-format", choices=("png", "npy"), default="png", help="default png")
     detail = "contrast of a built-in scene's texture (default 1)"
     sub.add_argument("--detail", type=_not_negative, default=1.0, metavar="X", help=detail)
@@ -473,33 +507,33 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--noise", type=_not_negative, default=0.0, metavar="X", help=text)
     text = "photographs as .jpg of this quality (default 0, .png)"
     sub.add_argument("--jpeg", type=_whole, default=0, metavar="QUALITY", help=text)
-    sub.add_argument(
-        "--seed", type=_whole, default=0, metavar="N", help="seed of everything random (default 0)"
-    )
+    sub.add_argument("--seed", type=_whole, default=0, metavar="N", help="seed of everything random (default 0)")
     sub.add_argument("--threads", type=_whole, default=0, metavar="N", help="0 uses every core (default)")
     sub.add_argument("--overwrite", action="store_true", help="replace OUT if synth has made it")
 
     sub = command(
-        "convert", commands.convert, "convert primitives (npz, LinPrim's and 3DGS's ply) and meshes (ply, obj, glb, stl)"
+        "convert",
+        commands.convert,
+        "convert primitives (npz, LinPrim's and 3DGS's ply) and meshes (ply, obj, glb, stl)",
     )
     sub.add_argument("source", metavar="IN", help="run folder, .npz, .ply, .obj, .glb or .stl")
     sub.add_argument("target", metavar="OUT", help="file to write; its suffix says the format")
     sub.add_argument(
-        "--as", dest="write_as", choices=("auto", "primitives", "mesh", "gaussians"), default="auto",
-        help="what a .ply of primitives holds: their properties (default), triangles for MeshLab, or Gaussians like octahedra",
-    )  # fmt: skip
+        "--as",
+        dest="write_as",
+        choices=("auto", "primitives", "mesh", "gaussians"),
+        default="auto",
+        help="what a .ply of primitives holds: their properties (default), triangles for MeshLab, or Gaussians "
+        "like octahedra",
+    )
 
     sub = command(
         "doctor", commands.doctor, "check versions, libraries, cores and memory; exit 1 if something is missing"
     )
 
     sub = command("demo", commands.demo, "synthesize, train, extract and score a built-in scene")
-    sub.add_argument(
-        "-o", "--output", default="runs/demo", metavar="RUN", help="folder to make (default runs/demo)"
-    )
-    sub.add_argument(
-        "--size", choices=("small", "normal"), default="normal", help="small: a quick check of it all"
-    )
+    sub.add_argument("-o", "--output", default="runs/demo", metavar="RUN", help="folder to make (default runs/demo)")
+    sub.add_argument("--size", choices=("small", "normal"), default="normal", help="small: a quick check of it all")
     add_quiet(sub)
 
     sub = command("completion", commands.completion, "print a script that completes this command line in a shell")

@@ -1,4 +1,5 @@
-"""Tasks on a Ray cluster. Ray chooses the machine by cores and memory; retries are the executor's, which counts them."""
+"""Tasks on a Ray cluster. Ray chooses the machine by cores and memory; retries are the executor's, which counts
+them."""
 
 from __future__ import annotations
 
@@ -28,7 +29,9 @@ class RayCluster(Executor):
         try:
             import ray
         except ModuleNotFoundError:
-            raise LinprimError("--cluster wants Ray, which is not installed: pip install 'linprim-geo[cluster]'") from None
+            raise LinprimError(
+                "--cluster wants Ray, which is not installed: pip install 'linprim-geo[cluster]'"
+            ) from None
         if address not in ("local", "auto"):
             _check_answer(address)
         super().__init__(shared)
@@ -73,7 +76,9 @@ class RayCluster(Executor):
         return super()._has_room(task, []) and len(beside) < self.workers
 
     def start(self, spec, task):
-        return self.remote.options(num_cpus=min(task.cores, self.cores), memory=int(task.memory_gib * 2**30), name=task.name).remote(spec)
+        return self.remote.options(
+            num_cpus=min(task.cores, self.cores), memory=int(task.memory_gib * 2**30), name=task.name
+        ).remote(spec)
 
     def ended(self, handles, seconds):
         ready, _ = self.ray.wait(handles, num_returns=len(handles), timeout=0)
@@ -87,12 +92,19 @@ class RayCluster(Executor):
             return outcome_of(self.ray.get(handle))
         except errors.OutOfMemoryError:
             return Outcome(memory="Ray killed it, for the machine had hardly any left")
-        except (errors.WorkerCrashedError, errors.NodeDiedError, errors.ObjectLostError, errors.RaySystemError) as error:
+        except (
+            errors.WorkerCrashedError,
+            errors.NodeDiedError,
+            errors.ObjectLostError,
+            errors.RaySystemError,
+        ) as error:
             return Outcome(died=type(error).__name__)
         except errors.RayError as error:
             text = " ".join(str(error).split())
             if "linprim_geo" in text and "ModuleNotFoundError" in text:
-                return Outcome(error="a worker of the cluster has no linprim-geo: wanted the same version as here on all of them")
+                return Outcome(
+                    error="a worker of the cluster has no linprim-geo: wanted the same version as here on all of them"
+                )
             return Outcome(error=f"a worker of the cluster failed: {text[-300:]}")
 
     def stop(self):

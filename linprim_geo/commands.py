@@ -1,5 +1,5 @@
-"""What each subcommand of `linprim-geo` does with its parsed arguments: a table of results, of which `_text` is for people and `_status`
-the exit status. Large libraries are imported where a subcommand runs.
+"""What each subcommand of `linprim-geo` does with its parsed arguments: a table of results, of which `_text` is for
+people and `_status` the exit status. Large libraries are imported where a subcommand runs.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ def train(parsed: argparse.Namespace) -> dict:
         raise LinprimError("train wants one scene: its folder, or -s and its folder")
     if parsed.resolution is not None:
         if getattr(parsed, "downscale", 1) != 1:
-            raise LinprimError(f"-r {parsed.resolution} stands beside --downscale {parsed.downscale}, wanted one of them")
+            raise LinprimError(
+                f"-r {parsed.resolution} stands beside --downscale {parsed.downscale}, wanted one of them"
+            )
         parsed.downscale = _downscale_of(parsed.resolution, scene, parsed)
     run = parsed.run or Path("runs") / Path(os.path.abspath(scene)).name
     scene_options, options = from_args(SceneOptions, parsed), from_args(TrainOptions, parsed)
@@ -63,12 +65,15 @@ def train(parsed: argparse.Namespace) -> dict:
 def _several(parsed: argparse.Namespace) -> dict:
     """--blocks, --cluster and --workers as keywords."""
     if parsed.blocks == 1 and parsed.cluster is not None and not getattr(parsed, "resume", False):
-        raise LinprimError(f"--cluster is {parsed.cluster}, but there is one block, which is done here: wanted --blocks as well")
+        raise LinprimError(
+            f"--cluster is {parsed.cluster}, but there is one block, which is done here: wanted --blocks as well"
+        )
     return {"blocks": parsed.blocks, "cluster": parsed.cluster, "workers": parsed.workers}
 
 
 def _budget(parsed: argparse.Namespace) -> dict:
-    """`time_budget` from --time-budget as a keyword, counted from now, before large libraries are loaded; nothing without it."""
+    """`time_budget` from --time-budget as a keyword, counted from now, before large libraries are loaded; nothing
+    without it."""
     if parsed.time_budget is None:
         return {}
     from .time_budget import Budget
@@ -90,7 +95,8 @@ def _log(parsed: argparse.Namespace) -> Callable[[str], None]:
 
 
 def _downscale_of(resolution: int, scene: str, parsed: argparse.Namespace) -> int:
-    """3DGS's -r as --downscale. Where it names a width, the least whole divisor that does not exceed it: pixels are averaged."""
+    """3DGS's -r as --downscale. Where it names a width, the least whole divisor that does not exceed it: pixels are
+    averaged."""
     if resolution in (1, 2, 4, 8):
         return resolution
     width = WIDEST if resolution == -1 else resolution
@@ -181,7 +187,10 @@ def tradeoff(parsed: argparse.Namespace) -> dict:
         quiet=parsed.quiet,
     )
     files = [str(output / f"tradeoff.{suffix}") for suffix in ("html", "csv", "json")]
-    return results | {"files": files, "_text": "\n".join([*results["sentences"].values(), "", results["rule"], "", *files])}
+    return results | {
+        "files": files,
+        "_text": "\n".join([*results["sentences"].values(), "", results["rule"], "", *files]),
+    }
 
 
 def synth(parsed: argparse.Namespace) -> dict:

@@ -25,8 +25,8 @@ HELD = {
     ".stl": (),
 }
 AS_CHOICES = ("auto", "primitives", "mesh", "gaussians")
-# A Gaussian in a mesh is the ellipsoid one standard deviation large, where its opacity is 61 % of that of its middle: beyond
-# it neighbours would hide each other.
+# A Gaussian in a mesh is the ellipsoid one standard deviation large, where its opacity is 61 % of that of its middle:
+# beyond it neighbours would hide each other.
 MESH_SIGMAS = 1.0
 
 
@@ -35,17 +35,18 @@ def convert(source: str | os.PathLike, target: str | os.PathLike, write_as: str 
 
     Primitives are read from a run's folder (its scene.npz), the model folder of LinPrim or 3DGS (its latest
     iteration), .npz or .ply (LinPrim's octahedra and tetrahedra, 3DGS's Gaussians), and written as .npz, as .ply in the
-    layout of their kind, or as a triangle mesh: .obj, .glb and .stl always, .ply with `write_as="mesh"`. No kind becomes
+    layout of their kind, or as a triangle mesh: .obj, .glb and .stl always, .ply with `write_as="mesh"`. No kind
+    becomes
     another unless asked for: `write_as="gaussians"` writes octahedra as Gaussians for a 3DGS viewer (half-axes / 2.6).
     In a mesh every vertex has its primitive's colour without the view-dependent part, and in .ply and .glb its alpha:
     the share of light taken along the reference length, a Gaussian's opacity. Gaussians become ellipsoids one standard
-    deviation large. Meshes are read and written as .ply, .obj, .glb and .stl; a texture goes from .obj or .glb to .obj or .glb,
-    elsewhere the vertices get its colours.
+    deviation large. Meshes are read and written as .ply, .obj, .glb and .stl; a texture goes from .obj or .glb to .obj
+    or .glb, elsewhere the vertices get its colours.
 
     Returns:
         What was read and written: `source`, `target`, `read`, `wrote`, `count`; for primitives also `dropped`
-        (rows without volume) and `clamped` (rows thicker than LinPrim's file can hold), for meshes `left_out` (what OUT's
-        format cannot hold: normals, colors, quality, texture), where there are any.
+        (rows without volume) and `clamped` (rows thicker than LinPrim's file can hold), for meshes `left_out` (what
+        OUT's format cannot hold: normals, colors, quality, texture), where there are any.
 
     Raises:
         LinprimError: the input cannot be read, or the formats do not fit.
@@ -67,9 +68,7 @@ def convert(source: str | os.PathLike, target: str | os.PathLike, write_as: str 
         return report | _convert_mesh(source, target)
 
     if suffix == ".npz" and write_as == "mesh":
-        raise LinprimError(
-            f"{target}: an .npz holds primitives, wanted {', '.join(MESH_SUFFIXES)} with --as mesh"
-        )
+        raise LinprimError(f"{target}: an .npz holds primitives, wanted {', '.join(MESH_SUFFIXES)} with --as mesh")
     if suffix in (".obj", ".glb", ".stl") and write_as in ("primitives", "gaussians"):
         raise LinprimError(f"{target}: {suffix} holds a mesh, wanted .npz or .ply with --as {write_as}")
     primitives, found = read_primitives(source)
@@ -109,9 +108,7 @@ def _convert_mesh(source: Path, target: Path) -> dict:
         if getattr(mesh, name) is not None and name not in HELD[suffix]
     ]
     left_out += ["texture"] if textured else []
-    return {"read": "mesh", "wrote": "mesh", "count": len(mesh.faces)} | (
-        {"left_out": left_out} if left_out else {}
-    )
+    return {"read": "mesh", "wrote": "mesh", "count": len(mesh.faces)} | ({"left_out": left_out} if left_out else {})
 
 
 def describe(report: dict) -> str:
@@ -144,9 +141,7 @@ def find_scene_file(source: str | os.PathLike) -> Path:
             iterations.append((int(number), file))
     if iterations:
         return max(iterations)[1]
-    raise LinprimError(
-        f"{source}: has neither scene.npz nor point_cloud/iteration_*/point_cloud.ply, wanted a run"
-    )
+    raise LinprimError(f"{source}: has neither scene.npz nor point_cloud/iteration_*/point_cloud.ply, wanted a run")
 
 
 def holds_primitives(path: Path) -> bool:
@@ -185,9 +180,7 @@ def save_primitive_mesh(path: str | os.PathLike, primitives: Primitives) -> int:
 
     path = Path(path)
     mesh = primitives.triangle_mesh(sigmas=MESH_SIGMAS)
-    alpha = np.repeat(
-        np.rint(primitives.alpha * 255.0).astype(np.uint8), len(mesh.vertices) // len(primitives)
-    )
+    alpha = np.repeat(np.rint(primitives.alpha * 255.0).astype(np.uint8), len(mesh.vertices) // len(primitives))
     suffix = path.suffix.lower()
     if suffix == ".ply":
         _save_ply(path, mesh, alpha)

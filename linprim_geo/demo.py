@@ -15,11 +15,13 @@ SIZES = {"small": (40, 160, 1500, 2000), "normal": (60, 320, 7000, 5000)}
 
 
 def run_demo(output: str = "runs/demo", size: str = "normal", *, quiet: bool = False) -> dict:
-    """Makes OUTPUT/scene (images, depth, reference mesh), OUTPUT/run (trained, meshed, scored) and OUTPUT/report.html, prints the scores.
+    """Makes OUTPUT/scene (images, depth, reference mesh), OUTPUT/run (trained, meshed, scored) and OUTPUT/report.html,
+    prints the scores.
 
     Replaces what an earlier demo left in `output`; any other folder there is refused.
 
-    Returns: `psnr`, `ssim`, `chamfer_percent_diagonal`, `f1`, `abs_rel`, `normal_mean_deg`, `seconds`, `primitives`, and the paths.
+    Returns: `psnr`, `ssim`, `chamfer_percent_diagonal`, `f1`, `abs_rel`, `normal_mean_deg`, `seconds`, `primitives`,
+    and the paths.
     """
     from .eval.depth import eval_depth_run
     from .eval.images import eval_images_run
@@ -34,9 +36,7 @@ def run_demo(output: str = "runs/demo", size: str = "normal", *, quiet: bool = F
     root, marker = Path(output), Path(output) / "demo.json"
     if root.exists() and any(root.iterdir()):
         if not marker.exists():
-            raise LinprimError(
-                f"{root}: exists already and was not made by the demo; give another folder with -o"
-            )
+            raise LinprimError(f"{root}: exists already and was not made by the demo; give another folder with -o")
         shutil.rmtree(root)
     write_json(marker, {"size": size})
 

@@ -1,4 +1,5 @@
-"""Meshes to be looked at: made light enough for a page, with a set of colours to switch between, and which way is up."""
+"""Meshes to be looked at: made light enough for a page, with a set of colours to switch between, and which way is
+up."""
 
 from __future__ import annotations
 
@@ -15,13 +16,15 @@ TOP_QUANTILE = 95.0
 GREY = 205
 # Cells of clustering are made larger by at least this factor until few enough faces are left.
 _LEAST_GROWTH = 1.05
-# Below this share of the second smallest, the smallest spread of the cameras' x axes is taken for that along the vertical.
+# Below this share of the second smallest, the smallest spread of the cameras' x axes is taken for that along the
+# vertical.
 _CLEARLY_UPRIGHT = 0.2
 
 
 @dataclass(frozen=True)
 class Layer:
-    """One way to colour the vertices: (V, 3) uint8 `colors`, and for a figure its `top` in the mesh's unit and its `median`."""
+    """One way to colour the vertices: (V, 3) uint8 `colors`, and for a figure its `top` in the mesh's unit and its
+    `median`."""
 
     name: str
     colors: np.ndarray
@@ -30,13 +33,14 @@ class Layer:
 
 
 def light_mesh(mesh: Mesh, most: int) -> tuple[Mesh, np.ndarray, float]:
-    """At most `most` faces, by clustering vertices into cells of a grid and placing each cell's vertex by quadric error.
+    """At most `most` faces, by clustering vertices into cells of a grid and placing each cell's vertex by quadric
+    error.
 
     Quick in place of careful: for display alone. Holes and sheets nearer than a cell may close or stick together.
 
     Returns:
-        The mesh without attributes, the row of the nearest vertex of the old mesh for each of its vertices, and the edge of the cells in
-        the mesh's unit, 0 if nothing had to be done.
+        The mesh without attributes, the row of the nearest vertex of the old mesh for each of its vertices, and the
+        edge of the cells in the mesh's unit, 0 if nothing had to be done.
     """
     if len(mesh.faces) <= most:
         return Mesh(mesh.vertices, mesh.faces), np.arange(len(mesh.vertices)), 0.0
@@ -58,14 +62,13 @@ def light_mesh(mesh: Mesh, most: int) -> tuple[Mesh, np.ndarray, float]:
         if count <= most:
             break
         cell *= max(float(np.sqrt(count / most)), _LEAST_GROWTH)
-    light = clean_mesh(
-        Mesh(np.asarray(found.vertices) + middle, np.asarray(found.triangles)), "mesh for display"
-    )[0]
+    light = clean_mesh(Mesh(np.asarray(found.vertices) + middle, np.asarray(found.triangles)), "mesh for display")[0]
     return light, cKDTree(mesh.vertices).query(light.vertices)[1], cell
 
 
 def layers(mesh: Mesh, rows: np.ndarray, error: np.ndarray | None = None) -> list[Layer]:
-    """What vertices `rows` of a mesh can be coloured by: photographs, shape alone, predicted error (`quality`), true `error` (R,).
+    """What vertices `rows` of a mesh can be coloured by: photographs, shape alone, predicted error (`quality`), true
+    `error` (R,).
 
     Both errors have one scale, that of the true one if there is one, so that equal colours are equal lengths.
     """
@@ -91,8 +94,8 @@ def layers(mesh: Mesh, rows: np.ndarray, error: np.ndarray | None = None) -> lis
 def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
     """(3,) unit vector that points up in the photographs.
 
-    Photographers keep the horizon level: the direction that the cameras' x axes are at right angles to, as long as there is one, else the
-    mean of the images' upward directions.
+    Photographers keep the horizon level: the direction that the cameras' x axes are at right angles to, as long as
+    there is one, else the mean of the images' upward directions.
     """
     upward = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
     sideways = np.stack([camera.rotation[0] for camera in cameras])
@@ -106,6 +109,4 @@ def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
 def is_inside(mesh: Mesh, cameras: Sequence[Camera]) -> bool:
     """Whether most cameras stand within the box of a mesh, as in a room."""
     low, high = mesh.bounds
-    return (
-        float(np.mean([((camera.center > low) & (camera.center < high)).all() for camera in cameras])) > 0.5
-    )
+    return float(np.mean([((camera.center > low) & (camera.center < high)).all() for camera in cameras])) > 0.5

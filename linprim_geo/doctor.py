@@ -141,9 +141,7 @@ def _library(module: str, distributions: tuple[str, ...]) -> tuple[str | None, s
             found = found or importlib.metadata.version(name)
     try:
         importlib.import_module(module)
-    except (
-        Exception
-    ) as error:  # a broken library may raise anything, and the others are still to be looked at
+    except Exception as error:  # a broken library may raise anything, and the others are still to be looked at
         name = module.split(".")[0]
         if found is None:
             pip = f"{Path(sys.executable).name} -m pip install {distributions[0]}"

@@ -1,4 +1,5 @@
-"""What a training would take, before it is begun: images, primitives, minutes and memory, by timing a few steps of it."""
+"""What a training would take, before it is begun: images, primitives, minutes and memory, by timing a few steps of
+it."""
 
 from __future__ import annotations
 
@@ -25,8 +26,9 @@ from .training_start import SFM_START, begin_run, late_terms, start_trainer
 
 # Timing takes at most CALIBRATION_SHARE of so many seconds.
 TIMING = 125.0
-# Bytes that a primitive takes while a step is made: so many in any case, and so many for each of its numbers, with Adam's moments and
-# gradients. Fitted to 300,000 octahedra of degree 1 and 3 (1560 and 2340 bytes measured); Gaussians of degree 3 take 17 % less.
+# Bytes that a primitive takes while a step is made: so many in any case, and so many for each of its numbers, with
+# Adam's moments and gradients. Fitted to 300,000 octahedra of degree 1 and 3 (1560 and 2340 bytes measured); Gaussians
+# of degree 3 take 17 % less.
 PRIMITIVE_BYTES, NUMBER_BYTES = 1060, 21.6
 # What a process takes in any case, libraries above all, and each pixel of the image that is at work.
 PROCESS_GIB, PIXEL_BYTES = 0.45, 300
@@ -42,13 +44,15 @@ def dry_run(
     quiet: bool = False,
     effects: Choice | None = None,
 ) -> dict:
-    """What `train` with the same arguments would do and take. Nothing is written but the cache of points and undistorted photographs.
+    """What `train` with the same arguments would do and take. Nothing is written but the cache of points and
+    undistorted photographs.
 
-    Returns: `images` and `held_out`, `width` and `height` of the largest image, `photo_gib` that all would take, `photos_in_memory` (how
-        many stay there), `iterations`, `max_primitives`, `minutes`, `memory_gib` (at its peak), `available_gib`, `fits`, and `advice`,
-        what to change where it does not fit, else "".
+    Returns: `images` and `held_out`, `width` and `height` of the largest image, `photo_gib` that all would take,
+        `photos_in_memory` (how many stay there), `iterations`, `max_primitives`, `minutes`, `memory_gib` (at its peak),
+        `available_gib`, `fits`, and `advice`, what to change where it does not fit, else "".
 
-    Accuracy: memory within a quarter of what a training takes, or 0.3 GiB; minutes are those of this machine as busy as it is now.
+    Accuracy: memory within a quarter of what a training takes, or 0.3 GiB; minutes are those of this machine as busy as
+    it is now.
 
     Raises:
         LinprimError: what `train` would raise before its first step.
@@ -77,7 +81,16 @@ def dry_run(
         if budget:
             quick = len(held_out[:: max(1, len(held_out) // QUICK_VIEWS)])
             timed, pace = plan_run(
-                planned, shots, held_out, terms, budget, progress, start=start, score=evaluate, start_share=SFM_START, quick_views=quick
+                planned,
+                shots,
+                held_out,
+                terms,
+                budget,
+                progress,
+                start=start,
+                score=evaluate,
+                start_share=SFM_START,
+                quick_views=quick,
             )
             options, seconds = timed.train_options, budget.seconds
         else:
@@ -87,7 +100,13 @@ def dry_run(
             rounds = options.iterations // options.evaluate_every if options.evaluate_every else 0
             scored = len(held_out) + rounds * min(len(held_out), QUICK_VIEWS)
             steps = options.iterations * cost.seconds(options.max_primitives * mean_population(begun))
-            seconds = setup + starting + steps + scored * per_view + SAVE_SECONDS * (1 + options.iterations / options.checkpoint_every)
+            seconds = (
+                setup
+                + starting
+                + steps
+                + scored * per_view
+                + SAVE_SECONDS * (1 + options.iterations / options.checkpoint_every)
+            )
     finally:
         torch.set_num_threads(before)
     per_primitive = bytes_per_primitive(options)
@@ -119,9 +138,13 @@ def describe(report: dict, limit_gib: float) -> str:
     """The report as lines for a person; `limit_gib` is what photographs may take."""
     kept = "all in memory"
     if report["photos_in_memory"] < report["images"]:
-        kept = f"{report['photos_in_memory']} in memory, which is {limit_gib:.1f} GiB, and the others read when they are due"
+        kept = (
+            f"{report['photos_in_memory']} in memory, which is {limit_gib:.1f} GiB, and the others read when "
+            "they are due"
+        )
     lines = [
-        f"images: {report['images']} for training of {report['width']}x{report['height']}, {report['photo_gib']:.2f} GiB, {kept};"
+        f"images: {report['images']} for training of {report['width']}x{report['height']}, "
+        f"{report['photo_gib']:.2f} GiB, {kept};"
         f" {report['held_out']} held out",
         f"primitives: {report['max_primitives']} at most, {report['iterations']} steps",
         f"time: {duration(60 * report['minutes'])}",
@@ -136,7 +159,9 @@ def bytes_per_primitive(options: TrainOptions) -> float:
     return PRIMITIVE_BYTES + NUMBER_BYTES * numbers
 
 
-def memory_estimate(views: Sequence[View], options: TrainOptions, photos: int | None = None, largest: int | None = None) -> float:
+def memory_estimate(
+    views: Sequence[View], options: TrainOptions, photos: int | None = None, largest: int | None = None
+) -> float:
     """GiB that a process takes at its peak which trains these views, without trying; photographs count in full.
 
     Args:
@@ -153,4 +178,6 @@ def _advice(used: float, available: float, per_primitive: float, options: TrainO
     most = int((available - used) * 2**30 / per_primitive) // 1000 * 1000
     if most >= min(10_000, options.max_primitives):
         return f"it would not fit: wanted --max-primitives {most} or less, or more memory"
-    return "it would not fit: wanted --downscale 2 or more, or more memory, for the images alone take more than there is"
+    return (
+        "it would not fit: wanted --downscale 2 or more, or more memory, for the images alone take more than there is"
+    )

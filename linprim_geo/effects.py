@@ -1,7 +1,8 @@
-"""Which effects a scene calls for: for each one the evidence in the data, the threshold, what it costs, and the options that it stands for.
+"""Which effects a scene calls for: for each one the evidence in the data, the threshold, what it costs, and the options
+that it stands for.
 
-Evidence comes from photographs, cameras, points and what else the data set brings, never from a reference surface. What cannot be told
-keeps its usual setting. An option that the user has given is never changed.
+Evidence comes from photographs, cameras, points and what else the data set brings, never from a reference surface. What
+cannot be told keeps its usual setting. An option that the user has given is never changed.
 """
 
 from __future__ import annotations
@@ -53,7 +54,8 @@ class Data:
 
     @cached_property
     def start(self) -> tuple[np.ndarray, np.ndarray]:
-        """(N, 3) points in the training frame, as many as primitives at the start, and their mean distance to the three nearest."""
+        """(N, 3) points in the training frame, as many as primitives at the start, and their mean distance to the three
+        nearest."""
         from scipy.spatial import cKDTree
 
         assert self.scene.points is not None
@@ -71,11 +73,11 @@ class Data:
 class Effect:
     """One entry of the registry.
 
-    `measure` returns a figure in `unit`, larger the more the effect is needed, or None where the data do not say; the effect is on from
-    `threshold` upwards. `cost` is the time of a training with the effect by that without: for exact-rays from README's prices, for the
-    others as eval/effects.py measures it. `on` and `off` are the settings that it stands for; who gives an option of `off` decides by
-    that. `needs` returns why a scene or the options rule it out, "" if they do not. `on_request` says why evidence alone does not switch
-    it on, "" if it does.
+    `measure` returns a figure in `unit`, larger the more the effect is needed, or None where the data do not say; the
+    effect is on from `threshold` upwards. `cost` is the time of a training with the effect by that without: for
+    exact-rays from README's prices, for the others as eval/effects.py measures it. `on` and `off` are the settings that
+    it stands for; who gives an option of `off` decides by that. `needs` returns why a scene or the options rule it out,
+    "" if they do not. `on_request` says why evidence alone does not switch it on, "" if it does.
     """
 
     name: str
@@ -128,8 +130,8 @@ REASONS = {
 
 @dataclass(frozen=True)
 class Choice:
-    """How effects are decided: `mode` "auto" by the data, "all" on, "none" left as the options are; `asked` {name: on} comes before
-    that, and `given`, names of options that the user has set, before everything."""
+    """How effects are decided: `mode` "auto" by the data, "all" on, "none" left as the options are; `asked` {name: on}
+    comes before that, and `given`, names of options that the user has set, before everything."""
 
     mode: str = "auto"
     asked: dict[str, bool] = field(default_factory=dict)
@@ -163,7 +165,8 @@ def parse_asked(words: Iterable[str]) -> dict[str, bool]:
 def decide(scene: Scene, scene_options: SceneOptions, options: TrainOptions, choice: Choice) -> list[Decision]:
     """What the registry says about a scene, in its order.
 
-    `scene` as `scene_options` read it but for `pinhole_below` 0, with points to start from. Takes seconds; the same at every call.
+    `scene` as `scene_options` read it but for `pinhole_below` 0, with points to start from. Takes seconds; the same at
+    every call.
     """
     data = Data(scene, options)
     decisions = []
@@ -215,7 +218,8 @@ def _decide(effect: Effect, data: Data, settings: dict, choice: Choice) -> Decis
 
 
 def _is_on(effect: Effect, name: str, value: object) -> bool:
-    """Whether an option's value that was given stands for the effect: not that which switches it off, nor that of another effect."""
+    """Whether an option's value that was given stands for the effect: not that which switches it off, nor that of
+    another effect."""
     others = [other.on.get(name) for other in EFFECTS.values() if other is not effect]
     return value != effect.off.get(name, value) and value not in others
 
@@ -243,14 +247,17 @@ def inspect_scene(
     choice: Choice = Choice(),  # noqa: B008
     log=None,
 ) -> dict:
-    """Reads a scene and decides: `effects`, a list of decisions as tables, `options` that follow from them, and a `_text` for people.
+    """Reads a scene and decides: `effects`, a list of decisions as tables, `options` that follow from them, and a
+    `_text` for people.
 
     Raises:
         LinprimError: the scene or an option cannot be used.
     """
     from .training_start import decided_scene
 
-    decisions, scene, scene_options, options = decided_scene(path, scene_options, options, choice, log or (lambda text: None))
+    decisions, scene, scene_options, options = decided_scene(
+        path, scene_options, options, choice, log or (lambda text: None)
+    )
     chosen = chosen_options(decisions)
     result = {
         "scene": str(path),
@@ -293,8 +300,8 @@ def _view_dependence(data: Data) -> float | None:
 def _affine_error(data: Data) -> float | None:
     """Of the primitives of the start, the 90th percentile over them and the views that they are in.
 
-    With z and u the depth and the image-plane position (x / z) of a centre, a point at distance e from it is drawn by the affine
-    approximation off by at most F (e / z)^2 (|u| + sqrt(1 + u^2)) / 2, to second order in e / z.
+    With z and u the depth and the image-plane position (x / z) of a centre, a point at distance e from it is drawn by
+    the affine approximation off by at most F (e / z)^2 (|u| + sqrt(1 + u^2)) / 2, to second order in e / z.
     """
     xyz, spacing = data.start
     errors = []
@@ -312,7 +319,8 @@ def _affine_error(data: Data) -> float | None:
 
 
 def _surrounded(data: Data) -> float:
-    """Solid angles of the primitives of the start together, in % of the sphere, median over cameras. Hidden ones count, too."""
+    """Solid angles of the primitives of the start together, in % of the sphere, median over cameras. Hidden ones count,
+    too."""
     xyz, spacing = data.start
     shares = []
     for view in data.scene.train[:: max(1, len(data.scene.train) // START_VIEWS)]:
@@ -395,64 +403,147 @@ _TRUTH = "the data do not say whether it is there to train by or to score by"
 
 _REGISTRY = (
     Effect(
-        "view-dependence", "colour that depends on the direction it is seen from",
-        "change of the points' colour that neighbouring points share", "% of white", 0.4, 1.15, _view_dependence,
-        {"sh_degree": 2}, {"sh_degree": 0}, usually=True,
+        "view-dependence",
+        "colour that depends on the direction it is seen from",
+        "change of the points' colour that neighbouring points share",
+        "% of white",
+        0.4,
+        1.15,
+        _view_dependence,
+        {"sh_degree": 2},
+        {"sh_degree": 0},
+        usually=True,
     ),
     Effect(
-        "exact-rays", "exact perspective within a primitive, in place of LinPrim's affine approximation",
-        "bound on what the approximation shifts at the start", "px", 0.02, 1.02, _affine_error,
-        {"ray_model": "exact"}, {"ray_model": "affine"}, usually=True,
+        "exact-rays",
+        "exact perspective within a primitive, in place of LinPrim's affine approximation",
+        "bound on what the approximation shifts at the start",
+        "px",
+        0.02,
+        1.02,
+        _affine_error,
+        {"ray_model": "exact"},
+        {"ray_model": "affine"},
+        usually=True,
     ),
     Effect(
-        "overlap", "densities add up where primitives overlap, in place of blending by centres, in the last part of the run",
-        "how much of the sphere around a camera surfaces fill", "%", 30.0, 1.3, _surrounded,
-        {"order": "overlap", "order_from": 0.7}, {"order": "center"}, needs=_no_entry,
+        "overlap",
+        "densities add up where primitives overlap, in place of blending by centres, in the last part of the run",
+        "how much of the sphere around a camera surfaces fill",
+        "%",
+        30.0,
+        1.3,
+        _surrounded,
+        {"order": "overlap", "order_from": 0.7},
+        {"order": "center"},
+        needs=_no_entry,
     ),
     Effect(
-        "filter", "primitives are at least a part of a pixel of their nearest view",
-        "largest by smallest pixel over the views that see a point; a quarter of the points exceed it", "times", 2.5, 1.0, _scale_ratio,
-        {"filter": "3d"}, {"filter": "none"}, usually=True,
+        "filter",
+        "primitives are at least a part of a pixel of their nearest view",
+        "largest by smallest pixel over the views that see a point; a quarter of the points exceed it",
+        "times",
+        2.5,
+        1.0,
+        _scale_ratio,
+        {"filter": "3d"},
+        {"filter": "none"},
+        usually=True,
     ),
     Effect(
-        "lens", "photographs are undistorted",
-        "largest shift of a ray by the lens", "px", 0.1, 1.0, _displacement,
-        {"pinhole_below": 0.0}, {"pinhole_below": 1e6},
+        "lens",
+        "photographs are undistorted",
+        "largest shift of a ray by the lens",
+        "px",
+        0.1,
+        1.0,
+        _displacement,
+        {"pinhole_below": 0.0},
+        {"pinhole_below": 1e6},
     ),
     Effect(
-        "exposure", "a gain per channel for every training photograph",
-        "spread of how bright the photographs show the same points", "%", 3.0, 1.3, _gain_spread,
-        {"exposure": "gain"}, {"exposure": "none"},
+        "exposure",
+        "a gain per channel for every training photograph",
+        "spread of how bright the photographs show the same points",
+        "%",
+        3.0,
+        1.3,
+        _gain_spread,
+        {"exposure": "gain"},
+        {"exposure": "none"},
     ),
     Effect(
-        "background", "one colour behind everything is fitted; without it a random one makes everything opaque",
-        "border pixels of one colour", "%", 80.0, 1.0, _plain_border,
-        {"background": "fitted"}, {"background": "random"}, needs=_masked,
+        "background",
+        "one colour behind everything is fitted; without it a random one makes everything opaque",
+        "border pixels of one colour",
+        "%",
+        80.0,
+        1.0,
+        _plain_border,
+        {"background": "fitted"},
+        {"background": "random"},
+        needs=_masked,
     ),
     Effect(
-        "environment", "what is far away stands at infinity behind everything, and in no mesh",
-        "textured parts of the photographs that colours at infinity explain", "%", 100 * OPEN_SHARE, 1.3, _far,
-        {"background": "environment"}, {"background": "random"}, needs=_masked,
+        "environment",
+        "what is far away stands at infinity behind everything, and in no mesh",
+        "textured parts of the photographs that colours at infinity explain",
+        "%",
+        100 * OPEN_SHARE,
+        1.3,
+        _far,
+        {"background": "environment"},
+        {"background": "random"},
+        needs=_masked,
     ),
     Effect(
-        "masks", "background that masks or alpha channels mark is kept out",
-        "training views with a mask or alpha", "%", 1.0, 1.0, lambda data: _share(data, "has_alpha"),
-        {}, {"masks": "none"}, needs=_absent("has_alpha", "masks and no alpha"),
+        "masks",
+        "background that masks or alpha channels mark is kept out",
+        "training views with a mask or alpha",
+        "%",
+        1.0,
+        1.0,
+        lambda data: _share(data, "has_alpha"),
+        {},
+        {"masks": "none"},
+        needs=_absent("has_alpha", "masks and no alpha"),
     ),
     Effect(
-        "depth", "surfaces lie at the depths that the data set brings",
-        "training views with depth that agrees with the points", "%", 1.0, 1.2, _depth_share,
-        {"sensor_depth": 1.0}, {"sensor_depth": 0.0}, needs=_absent("depth_path", "depth"), on_request=_TRUTH,
+        "depth",
+        "surfaces lie at the depths that the data set brings",
+        "training views with depth that agrees with the points",
+        "%",
+        1.0,
+        1.2,
+        _depth_share,
+        {"sensor_depth": 1.0},
+        {"sensor_depth": 0.0},
+        needs=_absent("depth_path", "depth"),
+        on_request=_TRUTH,
     ),
     Effect(
-        "normals", "faces point as the normals that the data set brings",
-        "training views with normals", "%", 1.0, 1.2, lambda data: _share(data, "normal_path"),
-        {"sensor_normals": 0.1}, {"sensor_normals": 0.0}, needs=_absent("normal_path", "normals whose axes are known"), on_request=_TRUTH,
+        "normals",
+        "faces point as the normals that the data set brings",
+        "training views with normals",
+        "%",
+        1.0,
+        1.2,
+        lambda data: _share(data, "normal_path"),
+        {"sensor_normals": 0.1},
+        {"sensor_normals": 0.0},
+        needs=_absent("normal_path", "normals whose axes are known"),
+        on_request=_TRUTH,
     ),
     Effect(
-        "double", "rendering in float64; parameters and the optimiser stay in float32",
-        "largest coordinate by the smallest primitive", "times", 5e5, 2.3, _extent_ratio,
-        {"scalar": "float64"}, {"scalar": "float32"},
+        "double",
+        "rendering in float64; parameters and the optimiser stay in float32",
+        "largest coordinate by the smallest primitive",
+        "times",
+        5e5,
+        2.3,
+        _extent_ratio,
+        {"scalar": "float64"},
+        {"scalar": "float32"},
     ),
-)  # fmt: skip
+)
 EFFECTS: dict[str, Effect] = {effect.name: effect for effect in _REGISTRY}

@@ -1,8 +1,8 @@
 """The environment of a scene: a cube map of what stands at infinity behind everything.
 
-`FarColors` is what photographs say of it before anything is trained: the colour that most of them show in a direction, and how well
-that explains them. From it follow whether a scene is open, which points lie in front, and where the training of the map begins.
-`ops.environment_light` says how the six faces lie.
+`FarColors` is what photographs say of it before anything is trained: the colour that most of them show in a direction,
+and how well that explains them. From it follow whether a scene is open, which points lie in front, and where the
+training of the map begins. `ops.environment_light` says how the six faces lie.
 """
 
 from __future__ import annotations
@@ -25,15 +25,16 @@ from .scene import Scene
 
 # Its files in the folder of a run.
 FILE, PICTURE = "environment.npy", "environment.png"
-# A texel in the middle of a face covers so many pixels of the photographs' middle, and a side of a face has no more than so many.
+# A texel in the middle of a face covers so many pixels of the photographs' middle, and a side of a face has no more
+# than so many.
 TEXEL_PX, MOST_TEXELS = 4.0, 512
 # The photographs' own colours at infinity are gathered with fewer, from views spread over the capture.
 SURVEY_TEXELS, SURVEY_VIEWS = 128, 60
-# A scene is open where colours at infinity explain this share of the textured parts of its photographs: 0.31 to 0.39 of four objects before
-# far rooms, 0.06 at most of six captures of rooms, facades, and objects on black or near a wall.
+# A scene is open where colours at infinity explain this share of the textured parts of its photographs: 0.31 to 0.39 of
+# four objects before far rooms, 0.06 at most of six captures of rooms, facades, and objects on black or near a wall.
 OPEN_SHARE = 0.1
-# A patch is explained by the environment if its mean difference, of 255, is below this, or below this part of its variation: noise of 12
-# averages to this over 4 by 4 pixels, and what is finer than a texel is filtered.
+# A patch is explained by the environment if its mean difference, of 255, is below this, or below this part of its
+# variation: noise of 12 averages to this over 4 by 4 pixels, and what is finer than a texel is filtered.
 SAME_COLOR, EXPLAINED = 3.0, 1 / 3
 # Photographs that show a direction, at least, for its colour to be known.
 LEAST_VIEWS = 3
@@ -77,8 +78,9 @@ def nearest_texel(directions: np.ndarray, size: int) -> np.ndarray:
 class FarColors:
     """The colours that photographs show in each direction, as if everything were at infinity.
 
-    `texels` (T, 3) float32, 0 to 255, of T = 6 size^2, the colour that most photographs of a direction agree on, NaN without one; `views`
-    (T,) how many show it. Where some see past the scene that is the environment, for what stands before it differs from view to view.
+    `texels` (T, 3) float32, 0 to 255, of T = 6 size^2, the colour that most photographs of a direction agree on, NaN
+    without one; `views` (T,) how many show it. Where some see past the scene that is the environment, for what stands
+    before it differs from view to view.
     """
 
     def __init__(self, looks: Sequence[Look]):
@@ -112,8 +114,8 @@ class FarColors:
         return [self.compared(look) for look in self.looks]
 
     def compared(self, look: Look) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of a look, on the lattice of STRIDE pixels: (h, w) mean difference of a patch from the environment, (h, w) variation of its
-        colours, both of 255, and (h, w) how many views show the direction."""
+        """Of a look, on the lattice of STRIDE pixels: (h, w) mean difference of a patch from the environment, (h, w)
+        variation of its colours, both of 255, and (h, w) how many views show the direction."""
         from scipy.ndimage import uniform_filter
 
         image = self._image(look)
@@ -121,7 +123,9 @@ class FarColors:
         part = image[lattice]
         texel = nearest_texel(look.camera.world_rays()[lattice], self.size)
         texels = torch.from_numpy(np.nan_to_num(self.texels)).reshape(6, self.size, self.size, 3)
-        environment = ops.environment_light(torch.zeros(image.shape[:2]), texels, look.camera).numpy().transpose(1, 2, 0)
+        environment = (
+            ops.environment_light(torch.zeros(image.shape[:2]), texels, look.camera).numpy().transpose(1, 2, 0)
+        )
         difference = np.abs(part - environment[lattice]).mean(-1)
         mean = uniform_filter(part, (PATCH, PATCH, 1), mode="nearest")
         variance = uniform_filter(part * part, (PATCH, PATCH, 1), mode="nearest") - mean * mean
@@ -129,8 +133,8 @@ class FarColors:
         return uniform_filter(difference, PATCH, mode="nearest"), variation, self.views[texel]
 
     def difference(self, look: Look) -> Callable[[np.ndarray], np.ndarray]:
-        """A function of (Q, 2) positions in a look: (Q,) how much the patches there differ from the environment, of 255; NaN where too
-        few views tell."""
+        """A function of (Q, 2) positions in a look: (Q,) how much the patches there differ from the environment, of
+        255; NaN where too few views tell."""
         difference, _, views = self.compared(look)
         known = np.where(views >= LEAST_VIEWS, difference, np.nan)
 
@@ -141,9 +145,9 @@ class FarColors:
         return at
 
     def explained(self, points: np.ndarray) -> float | None:
-        """Share of the textured patches of all photographs that the environment explains, less the share of those that show the nearer
-        half of (P, 3) `points`, which it explains by chance, or because the cameras are too near to each other to tell. None without
-        textured patches."""
+        """Share of the textured patches of all photographs that the environment explains, less the share of those that
+        show the nearer half of (P, 3) `points`, which it explains by chance, or because the cameras are too near to
+        each other to tell. None without textured patches."""
         everywhere, at_points = [], []
         for look, (difference, variation, views) in zip(self.looks, self._all_compared, strict=True):
             usable = (views >= LEAST_VIEWS) & (variation > TEXTURED)
@@ -162,7 +166,8 @@ class FarColors:
         return float(rest.mean() - (chance.mean() if len(chance) else 0.0))
 
     def start(self, size: int) -> torch.Tensor:
-        """(6, size, size, 3) texels in [0, 1] that training begins with; a direction that too few photographs show is as those round it."""
+        """(6, size, size, 3) texels in [0, 1] that training begins with; a direction that too few photographs show is
+        as those round it."""
         square = (6, self.size, self.size, -1)
         colors, known = (
             torch.from_numpy(values.astype(np.float32)).reshape(square)
@@ -185,10 +190,12 @@ def far_share(far: FarColors, scene: Scene) -> float:
 
 
 def filled(texels: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """(6, S, S, C) texels, of which those without weight (6, S, S, 1) have the mean of those round them, from as near as there are any.
+    """(6, S, S, C) texels, of which those without weight (6, S, S, 1) have the mean of those round them, from as near
+    as there are any.
 
-    Means over 2 by 2 texels are taken again and again, then handed back from coarse to fine to where there was nothing (push and pull); a
-    face that has nothing has the mean of all. Source: Gortler et al., The Lumigraph (SIGGRAPH 1996), section 3.4, its idea.
+    Means over 2 by 2 texels are taken again and again, then handed back from coarse to fine to where there was nothing
+    (push and pull); a face that has nothing has the mean of all. Source: Gortler et al., The Lumigraph (SIGGRAPH 1996),
+    section 3.4, its idea.
     """
     pool = torch.nn.functional.avg_pool2d
     weight = (weight > 0).to(texels.dtype)
@@ -209,11 +216,11 @@ def filled(texels: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
 
 
 def contradiction(photo: torch.Tensor, passed: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
-    """Mean over the pixels of the transmittance `left` (H, W) times how much the environment differs from the photograph (3, H, W), beyond
-    SAME_COLOR; `passed` (3, H, W) is the transmittance times the environment.
+    """Mean over the pixels of the transmittance `left` (H, W) times how much the environment differs from the
+    photograph (3, H, W), beyond SAME_COLOR; `passed` (3, H, W) is the transmittance times the environment.
 
-    Where the two differ there is a surface, and no light of the environment: without this term a translucent surface of another colour
-    explains the photograph as well.
+    Where the two differ there is a surface, and no light of the environment: without this term a translucent surface of
+    another colour explains the photograph as well.
 
     Gradient: to `left`.
     """
@@ -223,7 +230,8 @@ def contradiction(photo: torch.Tensor, passed: torch.Tensor, left: torch.Tensor)
 
 
 def seen_through(size: int, views: Iterable[tuple[Camera, torch.Tensor]]) -> torch.Tensor:
-    """(6, size, size, 1) bool, the texels that cameras see past primitives of (H, W) opacity, where these let most of the light through."""
+    """(6, size, size, 1) bool, the texels that cameras see past primitives of (H, W) opacity, where these let most of
+    the light through."""
     weight = torch.zeros(6, size, size, 3)
     for camera, opacity in views:
         passing = torch.where(opacity < 0.5, opacity, 1.0)
@@ -232,7 +240,8 @@ def seen_through(size: int, views: Iterable[tuple[Camera, torch.Tensor]]) -> tor
 
 
 def _commonest(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """((T, 3) mean of the colours that lie near to the one that most of (T, V, 3) lie near to, NaN without any, (T,) how many there are).
+    """((T, 3) mean of the colours that lie near to the one that most of (T, V, 3) lie near to, NaN without any, (T,)
+    how many there are).
 
     Colours of NaN are none. Source: a mean shift of one step from the best of the samples.
     """
@@ -240,7 +249,9 @@ def _commonest(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     views = shown.sum(1)
     order = np.argsort(~shown, axis=1, kind="stable")[:, : max(1, int(views.max(initial=0)))]
     values = np.take_along_axis(values, order[..., None], 1)
-    values = values[:, np.unique(np.linspace(0, values.shape[1] - 1, min(values.shape[1], COMPARED)).round().astype(int))]
+    values = values[
+        :, np.unique(np.linspace(0, values.shape[1] - 1, min(values.shape[1], COMPARED)).round().astype(int))
+    ]
     result = np.empty((len(values), 3), np.float32)
     step = 4096
     for begin in range(0, len(values), step):

@@ -5,8 +5,9 @@ class LinprimError(Exception):
     """Something the user gave cannot be used.
 
     The message is one sentence that names the file, row or option, what was found there and what was wanted.
-    The command line prints it and exits with status 1; `--debug` shows the traceback as well. Whatever a file or a library has put into
-    it, it is one line of at most LONGEST characters: line breaks become spaces, and the middle is left out of one that is longer.
+    The command line prints it and exits with status 1; `--debug` shows the traceback as well. Whatever a file or a
+    library has put into it, it is one line of at most LONGEST characters: line breaks become spaces, and the middle is
+    left out of one that is longer.
     """
 
     LONGEST = 1000

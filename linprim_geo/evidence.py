@@ -1,7 +1,7 @@
 """What photographs and points say about how a scene was taken: the same points looked at from many views.
 
-Nothing here needs a trained model or a reference surface. Points may be hidden in views that they project into, so whatever is
-summed up over views is a median or is trimmed.
+Nothing here needs a trained model or a reference surface. Points may be hidden in views that they project into, so
+whatever is summed up over views is a median or is trimmed.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ from .scene import Scene
 
 # So many points and views say enough; more only take time.
 POINTS, VIEWS = 2500, 60
-# A point is hidden in a view if one of its 12 nearest in the image, within this share of its longer side, lies before its plane by this
-# share of its depth.
+# A point is hidden in a view if one of its 12 nearest in the image, within this share of its longer side, lies before
+# its plane by this share of its depth.
 _HIDDEN_REACH, _HIDDEN_BEFORE, _NEIGHBOURS = 0.04, 0.02, 12
 # Points count whose neighbours lie as flat as this, where their plane is seen under less than 66 degrees.
 _FLAT, _LEAST_COSINE = 0.4, 0.4
-# Colours are those of 5x5 pixels that differ by no more than this, of 1 (standard deviation): edges fall elsewhere in every view.
+# Colours are those of 5x5 pixels that differ by no more than this, of 1 (standard deviation): edges fall elsewhere in
+# every view.
 _PATCH, _PLAIN = 5, 0.06
 # Colours, of 1, that are neither black nor cut at white.
 _DARKEST, _BRIGHTEST = 0.06, 0.97
@@ -44,7 +45,8 @@ _NEIGHBOUR_PX = 7
 @dataclass(frozen=True)
 class Observations:
     """P points `xyz` (P, 3) in V views. `seen` (P, V) bool; where it holds, `footprint` (P, V), the length that a
-    pixel of the photograph covers there; where `plain` (P, V) holds, which is part of it, `color` (P, V, 3) float64 in [0, 1]."""
+    pixel of the photograph covers there; where `plain` (P, V) holds, which is part of it, `color` (P, V, 3) float64 in
+    [0, 1]."""
 
     xyz: np.ndarray
     seen: np.ndarray
@@ -54,10 +56,11 @@ class Observations:
 
     @cached_property
     def log_gains(self) -> tuple[np.ndarray, np.ndarray]:
-        """((V, 3) logarithm of how bright each photograph shows the points, (V, 3) its standard error), of mean 0 per channel.
+        """((V, 3) logarithm of how bright each photograph shows the points, (V, 3) its standard error), of mean 0 per
+        channel.
 
-        log colour = gain of the view + colour of the point, solved for all at once by least squares with Cauchy's weights. A view that
-        shows fewer than 30 points has a gain of 0 and an infinite error.
+        log colour = gain of the view + colour of the point, solved for all at once by least squares with Cauchy's
+        weights. A view that shows fewer than 30 points has a gain of 0 and an infinite error.
         """
         gains, errors = np.zeros((self.seen.shape[1], 3)), np.full((self.seen.shape[1], 3), np.inf)
         for channel in range(3):
@@ -78,8 +81,9 @@ class Observations:
 
     @property
     def gain_spread(self) -> float | None:
-        """Standard deviation over the photographs of the logarithm of their brightness, of the channel where it is largest, less what
-        the estimate itself scatters; without the most extreme of 20, which a highlight may have. None if fewer than three share points."""
+        """Standard deviation over the photographs of the logarithm of their brightness, of the channel where it is
+        largest, less what the estimate itself scatters; without the most extreme of 20, which a highlight may have.
+        None if fewer than three share points."""
         gains, error = self.log_gains
         spreads = []
         for channel in range(3):
@@ -93,11 +97,13 @@ class Observations:
 
     @property
     def view_dependence(self) -> float | None:
-        """By how much of 1 the points' colour changes with the direction that they are seen from, gains removed; None without enough views.
+        """By how much of 1 the points' colour changes with the direction that they are seen from, gains removed; None
+        without enough views.
 
-        A colour's deviation from the point's median is multiplied by that of a neighbouring point in the same view, some pixels away: noise
-        and texture finer than a pixel have no part that neighbours share, highlights and reflections have. The root of the mean without
-        the largest and the smallest twentieth: few products are of something else in front of both points, but those are large.
+        A colour's deviation from the point's median is multiplied by that of a neighbouring point in the same view,
+        some pixels away: noise and texture finer than a pixel have no part that neighbours share, highlights and
+        reflections have. The root of the mean without the largest and the smallest twentieth: few products are of
+        something else in front of both points, but those are large.
         """
         from scipy.spatial import cKDTree
 
@@ -123,7 +129,8 @@ class Observations:
 
     @property
     def scale_ratio(self) -> float | None:
-        """Largest by smallest length that a pixel covers at a point, over the views that see it: what a quarter of the points exceed."""
+        """Largest by smallest length that a pixel covers at a point, over the views that see it: what a quarter of the
+        points exceed."""
         footprint = np.where(self.seen, self.footprint, np.nan)
         rows = self.seen.sum(1) >= 3
         if rows.sum() < _LEAST_POINTS:
@@ -133,10 +140,12 @@ class Observations:
 
 
 def observe(scene: Scene, seed: int = 0, views: int = VIEWS) -> Observations | None:
-    """Looks at the scene's points in at most `views` of its training photographs, evenly spread; None if there are no points on surfaces.
+    """Looks at the scene's points in at most `views` of its training photographs, evenly spread; None if there are no
+    points on surfaces.
 
-    A point is seen by a view in whose image it lies, on the foreground if there is one, where no other points are in front of it, and
-    that does not look at it from behind: from the side of the plane through its neighbours on which photographs have its colour.
+    A point is seen by a view in whose image it lies, on the foreground if there is one, where no other points are in
+    front of it, and that does not look at it from behind: from the side of the plane through its neighbours on which
+    photographs have its colour.
     """
     cloud = scene.points
     if cloud is None or isinstance(cloud, VolumePoints) or len(cloud.xyz) < _LEAST_POINTS:
@@ -180,8 +189,8 @@ def _same_views(scene: Scene, looks: Sequence[Look]) -> list[Camera]:
 def _colors_in(
     look: Look, xyz: np.ndarray, rows: np.ndarray, facing: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Of the points `rows` of (N, 3) `xyz` in a view, whose planes have the normals (P, 3) `facing` it: (P,) whether it sees them,
-    (P,) whether also in plain surroundings, (P, 3) colours in [0, 1], (P,) z-depths."""
+    """Of the points `rows` of (N, 3) `xyz` in a view, whose planes have the normals (P, 3) `facing` it: (P,) whether it
+    sees them, (P,) whether also in plain surroundings, (P, 3) colours in [0, 1], (P,) z-depths."""
     from scipy.ndimage import minimum_filter, uniform_filter
     from scipy.spatial import cKDTree
 
@@ -217,7 +226,8 @@ def _normals(xyz: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _view_offsets(values: np.ndarray, usable: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """((V,) g, (V,) its standard error) of (P, V) values = g of the view + a of the point, where usable; g has mean 0."""
+    """((V,) g, (V,) its standard error) of (P, V) values = g of the view + a of the point, where usable; g has mean
+    0."""
     views = values.shape[1]
     weight, scale = usable.astype(float), 0.0
     for _ in range(_GAIN_ROUNDS):

@@ -1,7 +1,7 @@
 """Runs tasks on several workers: processes of this machine, or a Ray cluster.
 
-A task is idempotent, writes into a folder that all workers see, and leaves a marker there when it is done (worker.py). So one that dies is
-begun again, one that is done is not, and what is stopped altogether goes on where its folders say.
+A task is idempotent, writes into a folder that all workers see, and leaves a marker there when it is done (worker.py).
+So one that dies is begun again, one that is done is not, and what is stopped altogether goes on where its folders say.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ LOOK, PATIENCE = 0.5, 10.0
 
 @dataclass(frozen=True)
 class Task:
-    """`function` is "module:function" of this package, called as function(folder, **arguments) with arguments that JSON can hold; it gives
-    back a table of plain values. `memory_gib` and `cores` are what it will take, `remedy` what to change where that is too much."""
+    """`function` is "module:function" of this package, called as function(folder, **arguments) with arguments that JSON
+    can hold; it gives back a table of plain values. `memory_gib` and `cores` are what it will take, `remedy` what to
+    change where that is too much."""
 
     name: str
     function: str
@@ -80,8 +81,8 @@ class Executor:
             state: says how far a running task is, for the line of progress.
 
         Raises:
-            LinprimError: a task failed, took more memory than there is, or died ATTEMPTS times. The others are stopped; what they have
-                written is kept, and the next run goes on from it.
+            LinprimError: a task failed, took more memory than there is, or died ATTEMPTS times. The others are stopped;
+                what they have written is kept, and the next run goes on from it.
         """
         specs = [self._spec(task) for task in tasks]
         results = {k: result for k, spec in enumerate(specs) if (result := result_of(spec)) is not None}
@@ -105,12 +106,15 @@ class Executor:
                     raise LinprimError(outcome.error)
                 elif outcome.memory is not None:
                     estimate = f"estimated to take {task.memory_gib:.1f} GiB" if task.memory_gib else "of unknown need"
-                    raise LinprimError(f"{task.name}, {estimate}, ran out of memory ({outcome.memory}): wanted {task.remedy}")
+                    raise LinprimError(
+                        f"{task.name}, {estimate}, ran out of memory ({outcome.memory}): wanted {task.remedy}"
+                    )
                 else:
                     deaths[k] += 1
                     if deaths[k] == ATTEMPTS:
                         raise LinprimError(
-                            f"{task.name} has died {ATTEMPTS} times, the last time of {outcome.died}; a system short of memory kills so: "
+                            f"{task.name} has died {ATTEMPTS} times, the last time of {outcome.died}; a system "
+                            "short of memory kills so: "
                             f"wanted {task.remedy}"
                         )
                     progress.note(f"  {task.name} died of {outcome.died}, begun again")
@@ -132,7 +136,10 @@ class Executor:
             raise LinprimError(f"{task.name} would take {need}: wanted {task.remedy}")
         if not beside:
             return True
-        return task.cores + sum(t.cores for t in beside) <= cores and task.memory_gib + sum(t.memory_gib for t in beside) <= memory
+        return (
+            task.cores + sum(t.cores for t in beside) <= cores
+            and task.memory_gib + sum(t.memory_gib for t in beside) <= memory
+        )
 
     def capacity(self) -> tuple[float, float]:
         """(cores, GiB) that may be taken by all running tasks together."""
@@ -171,8 +178,11 @@ class Processes(Executor):
         # In a session of its own: Ctrl-C is for the driver, which then ends its workers.
         process = subprocess.Popen(
             [sys.executable, "-m", "linprim_geo.worker"],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=os.environ | ONE_THREAD, start_new_session=True,
-        )  # fmt: skip
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=os.environ | ONE_THREAD,
+            start_new_session=True,
+        )
         with suppress(BrokenPipeError):  # died already, which its exit status tells
             process.stdin.write(json.dumps(spec).encode() + b"\n")
             process.stdin.flush()
@@ -237,7 +247,8 @@ def _oom_kills() -> int:
 
 
 def open_executor(cluster: str | None, shared: Path, workers: int = 0) -> Executor:
-    """Processes of this machine without `cluster`, else Ray: "local" starts it here, an address joins the one that runs there.
+    """Processes of this machine without `cluster`, else Ray: "local" starts it here, an address joins the one that runs
+    there.
 
     Args:
         shared: a folder that all workers see.

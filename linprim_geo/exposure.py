@@ -1,7 +1,8 @@
 """Exposure and white balance of every training photograph: a gain per channel, fitted together with the scene.
 
-A photograph of gain g shows g times the scene's colours, cut at white. Scene and gains share a factor per channel, which is fixed by
-keeping the geometric mean of the gains over the photographs at 1: that is the exposure which renders have.
+A photograph of gain g shows g times the scene's colours, cut at white. Scene and gains share a factor per channel,
+which is fixed by keeping the geometric mean of the gains over the photographs at 1: that is the exposure which renders
+have.
 """
 
 from __future__ import annotations
@@ -64,8 +65,8 @@ class Exposure:
 def exposed(rgb: Tensor, log_gain: Tensor, target: Tensor, behind: Tensor | None = None) -> Tensor:
     """(3, H, W) a rendering as a photograph with these (3,) log gains shows it.
 
-    `behind` (3, H, W) is the part of it that the background makes up and the camera did not take, such as a random colour behind masks;
-    it has no gain. Where `target` is white the rendering is cut at white: brighter is right, too.
+    `behind` (3, H, W) is the part of it that the background makes up and the camera did not take, such as a random
+    colour behind masks; it has no gain. Where `target` is white the rendering is cut at white: brighter is right, too.
     Gradient: to `rgb`, `log_gain` and `behind`.
     """
     gain = torch.exp(log_gain)[:, None, None]
@@ -74,7 +75,8 @@ def exposed(rgb: Tensor, log_gain: Tensor, target: Tensor, behind: Tensor | None
 
 
 def best_gain(render: np.ndarray, photo: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
-    """(3,) factors of the channels of (H, W, 3) `render` that bring it nearest to `photo`: least squares over pixels, weighted (H, W)."""
+    """(3,) factors of the channels of (H, W, 3) `render` that bring it nearest to `photo`: least squares over pixels,
+    weighted (H, W)."""
     weight = np.ones(render.shape[:2]) if weight is None else weight
     both = np.einsum("hwc,hwc,hw->c", render, photo, weight)
     own = np.einsum("hwc,hwc,hw->c", render, render, weight)
@@ -82,7 +84,7 @@ def best_gain(render: np.ndarray, photo: np.ndarray, weight: np.ndarray | None =
 
 
 def with_best_gain(render: np.ndarray, photo: np.ndarray, alpha: np.ndarray | None = None) -> np.ndarray:
-    """(H, W, 3) `render` times the gain that brings it nearest to `photo`; where (H, W) `alpha` in [0, 1] lets the background through, this
-    has no gain, and only what is opaque is compared."""
+    """(H, W, 3) `render` times the gain that brings it nearest to `photo`; where (H, W) `alpha` in [0, 1] lets the
+    background through, this has no gain, and only what is opaque is compared."""
     gain = best_gain(render, photo, None if alpha is None else (alpha > 0.99).astype(float))
     return render * gain if alpha is None else render * (1 + alpha[..., None] * (gain - 1))

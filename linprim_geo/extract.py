@@ -1,4 +1,5 @@
-"""From a trained run to triangle meshes: take a surface by one of several methods, finish it, write it with its statistics."""
+"""From a trained run to triangle meshes: take a surface by one of several methods, finish it, write it with its
+statistics."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ from .texture import LARGEST as LARGEST_TEXTURE
 from .texture import check_texture
 from .time_budget import Budget, choose_voxel
 
-# Each is a function (run, options, stages) -> (mesh, statistics of its own), found when it is wanted: their libraries are large.
+# Each is a function (run, options, stages) -> (mesh, statistics of its own), found when it is wanted: their libraries
+# are large.
 METHODS = {
     "tsdf": "surface_tsdf.tsdf_surface",
     "polyhedra": "surface_polyhedra.polyhedra_surface",
@@ -67,26 +69,29 @@ def extract_mesh(
 ) -> dict:
     """Extracts the surface of a run and writes it, the part that cameras see, and statistics.
 
-    RUN/mesh/METHOD holds mesh.ply, mesh_visible.ply and stats.json; with `output` the two meshes go to OUTPUT and its sibling
-    *_visible, in the format of the suffix (.ply, .obj, .glb, .stl). Vertices have normals, colours and, as `quality`,
-    the predicted error (`photo_sweep.predicted_error`); everything is in the data set's frame and unit. The photographs move the vertices
-    to where they agree best (`photo_sweep.refine_surface`), then holes are closed, the surface smoothed, remeshed and simplified as the
-    options ask (`mesh_process`); with `texture` .obj and .glb have a texture out of the photographs in place of vertex colours.
+    RUN/mesh/METHOD holds mesh.ply, mesh_visible.ply and stats.json; with `output` the two meshes go to OUTPUT and its
+    sibling *_visible, in the format of the suffix (.ply, .obj, .glb, .stl). Vertices have normals, colours and, as
+    `quality`, the predicted error (`photo_sweep.predicted_error`); everything is in the data set's frame and unit. The
+    photographs move the vertices to where they agree best (`photo_sweep.refine_surface`), then holes are closed, the
+    surface smoothed, remeshed and simplified as the options ask (`mesh_process`); with `texture` .obj and .glb have a
+    texture out of the photographs in place of vertex colours.
 
-    With `time_budget`, in seconds, the voxel size is the smallest with which everything takes that time at most, by what coarse passes
-    take (`time_budget.choose_voxel`); stats.json has `time_budget`: what was chosen and why, and the seconds that it took.
+    With `time_budget`, in seconds, the voxel size is the smallest with which everything takes that time at most, by
+    what coarse passes take (`time_budget.choose_voxel`); stats.json has `time_budget`: what was chosen and why, and the
+    seconds that it took.
 
-    With `blocks` other than 1 the depth maps are fused in so many parts of one lattice by several workers, with the same result to the last
-    bit; `cluster` and `workers` say where, see `executor.open_executor`.
+    With `blocks` other than 1 the depth maps are fused in so many parts of one lattice by several workers, with the
+    same result to the last bit; `cluster` and `workers` say where, see `executor.open_executor`.
 
     Returns: what stats.json holds: topology of both meshes, options, before an environment
-        `seen_by_one_view` (`single_view.without_single_views`), `processing` step by step, `texture`, what manifold3d says of
-    a watertight mesh (`manifold_status`), `predicted_error` (median and 90 % quantile) of the vertices that cameras see, seconds and peak
-    memory per stage, and the paths.
+        `seen_by_one_view` (`single_view.without_single_views`), `processing` step by step, `texture`, what manifold3d
+        says of
+    a watertight mesh (`manifold_status`), `predicted_error` (median and 90 % quantile) of the vertices that cameras
+    see, seconds and peak memory per stage, and the paths.
 
     Raises:
-        LinprimError: nothing was trained, no ray crosses the level, the grid would not fit into memory, or the time is too little for
-            the coarsest surface.
+        LinprimError: nothing was trained, no ray crosses the level, the grid would not fit into memory, or the time is
+            too little for the coarsest surface.
     """
     options, budget = options or ExtractOptions(), Budget.of(time_budget)
     if method not in METHODS:
@@ -99,13 +104,17 @@ def extract_mesh(
             also = "auto, or " if name == "level" else ""
             raise LinprimError(f"--{name.replace('_', '-')} is {value}, wanted {also}{low:g} to {high:g}")
     if budget and method != "tsdf":
-        raise LinprimError(f"--time-budget chooses a voxel size, which --method {method} has none of: wanted --method tsdf")
+        raise LinprimError(
+            f"--time-budget chooses a voxel size, which --method {method} has none of: wanted --method tsdf"
+        )
     if budget and options.voxel_size > 0:
         raise LinprimError("--time-budget chooses the voxel size: wanted one of it and --voxel-size")
     if blocks < 1:
         raise LinprimError(f"--blocks is {blocks}, wanted a number from 1")
     if blocks > 1 and method != "tsdf":
-        raise LinprimError(f"--blocks fuses depth maps in parts, which --method {method} has none of: wanted --method tsdf")
+        raise LinprimError(
+            f"--blocks fuses depth maps in parts, which --method {method} has none of: wanted --method tsdf"
+        )
     opened = Run.open(run)
     folder = opened.path / "mesh" / method
     target = Path(output) if output else folder / "mesh.ply"
@@ -169,7 +178,9 @@ def _extract(
         mesh, about = surface(opened, options, stages, *kept)
     if opened.environment is not None:
         views = opened.surface_depths(opened.scene().train, float(options.level))
-        mesh, left_out = without_single_views(mesh, ((view.camera, depth) for view, depth, _ in views), options.smallest_part)
+        mesh, left_out = without_single_views(
+            mesh, ((view.camera, depth) for view, depth, _ in views), options.smallest_part
+        )
         about = about | {"seen_by_one_view": left_out}
         if left_out["pieces"]:
             stages.note(f"left out: {left_out['pieces']} parts that one camera alone sees before the open background")
@@ -200,7 +211,10 @@ def _extract(
     write_json(folder / "stats.json", stats)
     progress.note(f"{target}: {topology_line(stats)}")
     if predicted := stats["predicted_error"]:
-        stages.note(f"predicted error, seen part: median {predicted['median']:.3g}, 90 % below {predicted['q90']:.3g} ({opened.unit})")
+        stages.note(
+            f"predicted error, seen part: median {predicted['median']:.3g}, 90 % below {predicted['q90']:.3g} "
+            f"({opened.unit})"
+        )
     stages.note(stages.line())
     return stats
 

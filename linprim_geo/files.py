@@ -37,9 +37,9 @@ _SECONDS_BETWEEN_TRIES = 0.2
 def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
     """Yields a temporary path beside `path` (same suffix) that replaces it when the block ends without an error.
 
-    The data is on disk before the rename and the rename before this returns, so a crash at any moment leaves either the old file or
-    the new one, and files that are written one after the other are never lost the other way round. On an error, or Ctrl-C, the
-    temporary file is removed and the old file stays; `remove_torn` removes what a kill has left.
+    The data is on disk before the rename and the rename before this returns, so a crash at any moment leaves either the
+    old file or the new one, and files that are written one after the other are never lost the other way round. On an
+    error, or Ctrl-C, the temporary file is removed and the old file stays; `remove_torn` removes what a kill has left.
 
     Raises:
         LinprimError: the folder cannot be written, or the disk is full.
@@ -99,8 +99,9 @@ def is_remains(entry: Path) -> bool:
 def locked(folder: Path, what: str, file: str = "", wait: Callable[[], object] | None = None) -> Iterator[None]:
     """Holds a folder, which is made if need be, or only the name `file` in it, against other processes.
 
-    The system lets go of it when this process ends, however it does; where the file system knows no locks there is none. `what` goes
-    into the sentence of those that are refused: "trained into". With `wait` nobody is refused: it is called once, and the lock waited for.
+    The system lets go of it when this process ends, however it does; where the file system knows no locks there is
+    none. `what` goes into the sentence of those that are refused: "trained into". With `wait` nobody is refused: it is
+    called once, and the lock waited for.
 
     Raises:
         LinprimError: another process holds it, or the folder cannot be written.
@@ -121,13 +122,17 @@ def locked(folder: Path, what: str, file: str = "", wait: Callable[[], object] |
             if not _lock(handle):
                 os.close(handle)
                 if wait is None:
-                    raise LinprimError(f"{folder / file}: is being {what} by another process, wanted another place, or to wait for its end")
+                    raise LinprimError(
+                        f"{folder / file}: is being {what} by another process, wanted another place, or to wait "
+                        "for its end"
+                    )
                 if not told:
                     wait()
                     told = True
                 time.sleep(_SECONDS_BETWEEN_TRIES)
                 continue
-            # Who held it before may have removed the file while this process opened it; Windows lets nobody remove an open one.
+            # Who held it before may have removed the file while this process opened it; Windows lets nobody remove an
+            # open one.
             if os.name == "nt" or _is_at(handle, path):
                 held = handle
             else:
@@ -191,13 +196,22 @@ def _full(path: Path) -> LinprimError:
 def _sentence(path: Path, error: OSError) -> LinprimError | None:
     if error.errno in _FULL or (error.errno is None and _disk_is_full(path.parent)):
         return _full(path)
-    if error.errno in (errno.EACCES, errno.EROFS, errno.EPERM, errno.ENOTDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.EIO):
+    if error.errno in (
+        errno.EACCES,
+        errno.EROFS,
+        errno.EPERM,
+        errno.ENOTDIR,
+        errno.EEXIST,
+        errno.ENAMETOOLONG,
+        errno.EIO,
+    ):
         return LinprimError(f"{path}: cannot be written ({os.strerror(error.errno)})")
     return _full(path) if _disk_is_full(path.parent) else None
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a file, also for paths out of a file that no file can have: too long, or with characters that are none."""
+    """Whether there is a file, also for paths out of a file that no file can have: too long, or with characters that
+    are none."""
     try:
         return path.is_file()
     except (OSError, ValueError):

@@ -1,9 +1,9 @@
 """Points to start from where features found none: on plain walls, and on things that structure from motion overlooked.
 
-Growth only splits primitives that are there, so a surface without a start is either left open or covered by primitives that
-drift in front of it. Two sources fill the gaps, both checked against all the photographs: the points that surround a gap,
-between which inverse depth is linear on a plane, and where these are too far apart or too unlike, the depth at which
-other views show the same colours.
+Growth only splits primitives that are there, so a surface without a start is either left open or covered by primitives
+that drift in front of it. Two sources fill the gaps, both checked against all the photographs: the points that surround
+a gap, between which inverse depth is linear on a plane, and where these are too far apart or too unlike, the depth at
+which other views show the same colours.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from .environment import FarColors
 from .initial_points import Look, in_image, spread_looks
 from .scene import PointCloud, Scene
 
-# A cell of the image, as a share of its longer side, is to hold a point: about 1,400 cells of 4:3, fewer than the primitives that
-# a view ends up with, so that what is found by features is hardly ever doubled. Depths from colours are coarser: they match patches.
+# A cell of the image, as a share of its longer side, is to hold a point: about 1,400 cells of 4:3, fewer than the
+# primitives that a view ends up with, so that what is found by features is hardly ever doubled. Depths from colours are
+# coarser: they match patches.
 CELL, PATCH_CELL = 12 / 512, 18 / 512
 # Views that take part; more say little that is new.
 MOST_VIEWS = 100
@@ -27,24 +28,26 @@ MOST_VIEWS = 100
 _MAX_DEPTH_RATIO = 1.15
 # ... and speaks for the space in front of it if its sides are no longer than this many cells.
 _TRUSTED_CELLS = 2.0
-# Inverse depths that differ by less agree; interpolated points miss a surface by less than half of it in 90 of 100 cases.
+# Inverse depths that differ by less agree; interpolated points miss a surface by less than half of it in 90 of 100
+# cases.
 _TOLERANCE = 0.05
 # A point in front of a surface that others see through it is dropped unless this many times as many views confirm it.
 _CONFIRMATIONS = 4
 # A point is hidden in a view if two of its 8 nearest in the image, within two cells, are nearer by this factor.
 _HIDDEN_RATIO, _HIDDEN_BY, _NEIGHBOURS = 1.15, 2, 8
 _MIN_POINTS = 8
-# Views to compare colours with see the place from another angle, in degrees, the best of them near the middle one; fewer than
-# half of them may be hidden.
+# Views to compare colours with see the place from another angle, in degrees, the best of them near the middle one;
+# fewer than half of them may be hidden.
 _ANGLES = (4.0, 12.0, 40.0)
 _MIN_AXIS_COSINE = 0.7
 _SOURCES = 6
 # A patch is this many by this many samples, so many pixels of a look (512 on its longer side) apart.
 _PATCH, _PATCH_STEP = 5, 3
-# Patches are the same if their colours differ by less on average, of 255: noise and the interpolation of what is finer than a pixel.
+# Patches are the same if their colours differ by less on average, of 255: noise and the interpolation of what is finer
+# than a pixel.
 _SAME_COLOR = 6.0
-# One depth explains photographs better than another by this, of 255: three standard deviations of a patch's mean difference where
-# pixels have noise of 3.
+# One depth explains photographs better than another by this, of 255: three standard deviations of a patch's mean
+# difference where pixels have noise of 3.
 _BETTER = 1.5
 # Depths tried, evenly spread in inverse depth over what the view's points span, widened by the factors.
 _DEPTHS = 64
@@ -60,18 +63,20 @@ def fill_points(
 ) -> PointCloud:
     """The scene's points and, after them, new ones in the image cells of training views that hold none.
 
-    View by view, those with most points first, every cell that neither a given nor a new point falls into gets a candidate, at a
-    random place in it. Its depth is that between the three points round it (inverse depth is linear over a plane) if theirs agree,
-    or else, in a second round with larger cells, the one of 64 at which the patch round it looks the same in other views. A candidate
-    is kept if it looks the same in other views and if hardly any view sees surfaces through it. Masked
-    background, and pixels of the colour of a plain backdrop, get no points. Colours are those of the photograph.
+    View by view, those with most points first, every cell that neither a given nor a new point falls into gets a
+    candidate, at a random place in it. Its depth is that between the three points round it (inverse depth is linear
+    over a plane) if theirs agree, or else, in a second round with larger cells, the one of 64 at which the patch round
+    it looks the same in other views. A candidate is kept if it looks the same in other views and if hardly any view
+    sees surfaces through it. Masked background, and pixels of the colour of a plain backdrop, get no points. Colours
+    are those of the photograph.
 
     Args:
         scene: with points; held-out views are not used.
         seed: of the places in the cells.
         backdrop: (3,) colour in [0, 1] of a plain backdrop, or None.
-        far: of an open scene, what its photographs show at infinity. Then only candidates between points are made, and kept where
-            infinity does not explain the photographs better: a patch compared over all depths finds one for the background, too.
+        far: of an open scene, what its photographs show at infinity. Then only candidates between points are made, and
+            kept where infinity does not explain the photographs better: a patch compared over all depths finds one for
+            the background, too.
 
     Returns: the cloud, without errors in pixels; the scene's own if nothing was found.
     """
@@ -156,10 +161,13 @@ class _Gaps:
 
     @cached_property
     def image(self) -> np.ndarray:
-        """(H, W, 3) uint16, the sum over 3x3 pixels, so that bilinear samples of it do not alias. All views have theirs in memory."""
+        """(H, W, 3) uint16, the sum over 3x3 pixels, so that bilinear samples of it do not alias. All views have theirs
+        in memory."""
         from scipy.ndimage import uniform_filter
 
-        return np.rint(9 * uniform_filter(self.look.rgb.astype(np.float32), (3, 3, 1), mode="nearest")).astype(np.uint16)
+        return np.rint(9 * uniform_filter(self.look.rgb.astype(np.float32), (3, 3, 1), mode="nearest")).astype(
+            np.uint16
+        )
 
     def interpolate(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """((Q,) triangle or -1, (Q,) inverse depth inside it) at (Q, 2) positions."""
@@ -203,7 +211,8 @@ class _Gaps:
         return self.camera.center + _rays(self.camera, pixels) / inverse[..., None]
 
     def _nearest_of_each_place(self) -> np.ndarray:
-        """(K,) rows of the point nearest to the camera in each half by half cell: triangles need no more, and take time."""
+        """(K,) rows of the point nearest to the camera in each half by half cell: triangles need no more, and take
+        time."""
         size = 0.5 * CELL * self.longer_side
         column, row = (self.pixels / size).astype(np.int64).T
         order = np.lexsort((-self.inverse, column, row))
@@ -226,17 +235,17 @@ class _Gaps:
 def _not_farther(
     view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray, inverse: np.ndarray, at_infinity: Callable | None
 ) -> np.ndarray:
-    """(Q,) whether photographs at (Q, 2) positions agree at these inverse depths about as well as at infinity, as far as that is known."""
+    """(Q,) whether photographs at (Q, 2) positions agree at these inverse depths about as well as at infinity, as far
+    as that is known."""
     if at_infinity is None:
         return np.ones(len(pixels), dtype=bool)
     near = _differences(view, sources, pixels, inverse[:, None])[:, 0]
     return ~(near > at_infinity(pixels) + _BETTER)
 
 
-def _between_points(
-    view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Those of the (Q, 2) positions that lie in a triangle of points of similar depth, and their inverse depths there."""
+def _between_points(view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Those of the (Q, 2) positions that lie in a triangle of points of similar depth, and their inverse depths
+    there."""
     triangle, inverse = view.interpolate(pixels)
     usable = (triangle >= 0) & (view.ratio[triangle] <= _MAX_DEPTH_RATIO)
     pixels, inverse = pixels[usable], inverse[usable]
@@ -245,16 +254,15 @@ def _between_points(
 
 
 def _same_colors(view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Those of the (Q, 2) positions that other views show alike at some inverse depth, and the one where they do best."""
+    """Those of the (Q, 2) positions that other views show alike at some inverse depth, and the one where they do
+    best."""
     tried = view.depths_to_try()
     difference = _differences(view, sources, pixels, np.broadcast_to(tried, (len(pixels), len(tried))))
     alike = difference.min(1) <= _SAME_COLOR
     return pixels[alike], tried[difference[alike].argmin(1)]
 
 
-def _nearest_points(
-    view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _nearest_points(view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """All of the (Q, 2) positions, and the median inverse depth of the points nearest to them in the image."""
     from scipy.spatial import cKDTree
 
@@ -282,12 +290,12 @@ def _sources(views: Sequence[_Gaps], index: int) -> list[_Gaps]:
     return [views[i] for i in order[:_SOURCES] if fit[i]]
 
 
-def _differences(
-    view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray, inverse: np.ndarray
-) -> np.ndarray:
-    """(Q, D) mean difference of colour, of 255, between patches of a view and of the half of the sources where it is least.
+def _differences(view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """(Q, D) mean difference of colour, of 255, between patches of a view and of the half of the sources where it is
+    least.
 
-    Patches are parallel to the image, at (Q, 2) positions and (Q, D) inverse depths. Infinite where fewer than two sources see one.
+    Patches are parallel to the image, at (Q, 2) positions and (Q, D) inverse depths. Infinite where fewer than two
+    sources see one.
     """
     if len(pixels) > _AT_ONCE:
         parts = [slice(begin, begin + _AT_ONCE) for begin in range(0, len(pixels), _AT_ONCE)]

@@ -1,4 +1,5 @@
-"""What follows the extraction of any surface: refinement, holes and simplification, quality, colours, what cameras see, texture, files."""
+"""What follows the extraction of any surface: refinement, holes and simplification, quality, colours, what cameras see,
+texture, files."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ from .visibility import color_vertices, visible_faces
 
 @dataclass(frozen=True)
 class Finished:
-    """The mesh and the part that cameras see, as written; what was done step by step; what the texture says of itself, if there is one."""
+    """The mesh and the part that cameras see, as written; what was done step by step; what the texture says of itself,
+    if there is one."""
 
     mesh: Mesh
     visible: Mesh

@@ -97,8 +97,8 @@ def fuse_tsdf(
 
 @dataclass(frozen=True)
 class Lattice:
-    """Where a field is kept: `blocks` (B, 3) of `resolution`^3 voxels of edge `voxel`; block (0, 0, 0) starts at `origin` (3,).
-    `truncation` is in voxels, `rules` are `tsdf.vote_rules`."""
+    """Where a field is kept: `blocks` (B, 3) of `resolution`^3 voxels of edge `voxel`; block (0, 0, 0) starts at
+    `origin` (3,). `truncation` is in voxels, `rules` are `tsdf.vote_rules`."""
 
     blocks: np.ndarray
     origin: np.ndarray
@@ -250,7 +250,8 @@ def _find_blocks(frames, voxel, truncation, bounds, resolution, limit):
 def _blocks_of(points, voxel, truncation, footprint, resolution):
     if footprint > FINEST_PART * voxel:
         raise LinprimError(
-            f"voxel size {voxel:.4g} is less than 1/{FINEST_PART} of what a pixel covers on the surface ({footprint:.3g}), which no view "
+            f"voxel size {voxel:.4g} is less than 1/{FINEST_PART} of what a pixel covers on the surface "
+            f"({footprint:.3g}), which no view "
             f"can fill: wanted at least {footprint / FINEST_PART:.2g}"
         )
     reach = int(np.ceil(max(truncation, footprint / voxel)))

@@ -1,8 +1,9 @@
-"""Terms of the training loss that photographs alone do not give: surfaces that are smooth, opaque, and where other evidence puts them.
+"""Terms of the training loss that photographs alone do not give: surfaces that are smooth, opaque, and where other
+evidence puts them.
 
-Every term is a mean over pixels, points or primitives, has a weight of its own, and costs nothing at weight 0: the renderer's
-geometry is not even asked for. They act in the last part of a run only (`--geometry-from`): early on they hold misplaced
-primitives where they are.
+Every term is a mean over pixels, points or primitives, has a weight of its own, and costs nothing at weight 0: the
+renderer's geometry is not even asked for. They act in the last part of a run only (`--geometry-from`): early on they
+hold misplaced primitives where they are.
 """
 
 from __future__ import annotations
@@ -20,11 +21,12 @@ from .ops import Rendering
 from .options import GEOMETRY_WEIGHTS, TrainOptions
 from .scene import Scene
 
-# Depths that miss a point or a measured depth by more than this share of it count as much as this: they belong to another surface.
+# Depths that miss a point or a measured depth by more than this share of it count as much as this: they belong to
+# another surface.
 DEPTH_CAP = 0.1
-# Multi-view patches: how many a step compares, samples along an edge of one, least standard deviation of its grey values in [0, 1]
-# (a plain patch looks the same everywhere), and the largest distance in pixels by which a pixel may miss itself when it is sent to
-# the other view's surface and back.
+# Multi-view patches: how many a step compares, samples along an edge of one, least standard deviation of its grey
+# values in [0, 1] (a plain patch looks the same everywhere), and the largest distance in pixels by which a pixel may
+# miss itself when it is sent to the other view's surface and back.
 PATCHES, PATCH, PLAIN, ROUND_TRIP_PX = 1024, 7, 0.01, 1.0
 # Views to compare with: at most so many, whose rays to the same points make an angle between these, in degrees.
 SOURCES, LEAST_ANGLE, LARGEST_ANGLE = 4, 3.0, 30.0
@@ -36,8 +38,9 @@ COMPARED_POINTS = 2000
 class Evidence:
     """What a data set knows of a view's surface beside its photograph, in the training frame; each may be missing.
 
-    `depth` (H, W) z-depth, 0 = none; `normal` (3, H, W) unit normals in the camera's axes, 0 = none; `pixels` (P, 2) int64 columns and
-    rows of points of the scene that this view sees, their z-depths `point_depth` (P,) and weights `point_weight` (P,).
+    `depth` (H, W) z-depth, 0 = none; `normal` (3, H, W) unit normals in the camera's axes, 0 = none; `pixels` (P, 2)
+    int64 columns and rows of points of the scene that this view sees, their z-depths `point_depth` (P,) and weights
+    `point_weight` (P,).
     """
 
     depth: Tensor | None = None
@@ -57,8 +60,8 @@ class GeometryTerms:
         self.needs_geometry = any(getattr(options, name) > 0 for name in GEOMETRY_WEIGHTS if name != "binarisation")
 
     def loss(self, out: Rendering, index: int, step: int, raw_opacity: Tensor, render_depth) -> Tensor:
-        """Scalar. `out` is the rendering of view `index`, with its geometry where that is needed; `render_depth(camera)` gives the (H, W)
-        depth of another view."""
+        """Scalar. `out` is the rendering of view `index`, with its geometry where that is needed;
+        `render_depth(camera)` gives the (H, W) depth of another view."""
         o, shot, evidence = self.options, self.shots[index], self.evidence[index]
         total = raw_opacity.new_zeros(())
         if o.binarisation > 0:
@@ -89,7 +92,9 @@ class GeometryTerms:
         return total
 
 
-def gather_evidence(scene: Scene, options: TrainOptions, similarity: Similarity, log: Callable[[str], None]) -> list[Evidence]:
+def gather_evidence(
+    scene: Scene, options: TrainOptions, similarity: Similarity, log: Callable[[str], None]
+) -> list[Evidence]:
     """What the terms in use need of each training view. A term that finds nothing of its kind is named by `log`."""
     points, cloud = None, scene.points
     if options.point_depth > 0 and cloud is not None and not isinstance(cloud, VolumePoints):
@@ -113,7 +118,11 @@ def gather_evidence(scene: Scene, options: TrainOptions, similarity: Similarity,
     for weight, name, what in (
         (options.point_depth, "pixels", "--point-depth: the scene has no points on surfaces"),
         (options.sensor_depth, "depth", "--sensor-depth: the data set has no depth"),
-        (options.sensor_normals, "normal", "--sensor-normals: the data set has no normals, or does not say in what axes"),
+        (
+            options.sensor_normals,
+            "normal",
+            "--sensor-normals: the data set has no normals, or does not say in what axes",
+        ),
     ):
         if weight > 0 and all(getattr(evidence, name) is None for evidence in gathered):
             log(what + ", so it does nothing")
@@ -126,10 +135,11 @@ def grey(shot) -> Tensor:
 
 
 def depth_normals(depth: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Normals of the surface that a depth map describes: ((3, H, W) in the camera's axes towards the camera, (H, W) bool where).
+    """Normals of the surface that a depth map describes: ((3, H, W) in the camera's axes towards the camera, (H, W)
+    bool where).
 
-    Cross product of the central differences between the points of the four neighbours; all five need a depth (> 0). Of pixels without
-    a normal the vector is 0. Gradient: to `depth`.
+    Cross product of the central differences between the points of the four neighbours; all five need a depth (> 0). Of
+    pixels without a normal the vector is 0. Gradient: to `depth`.
     """
     x = (torch.arange(camera.width, dtype=depth.dtype) + 0.5 - camera.cx) / camera.fx
     y = (torch.arange(camera.height, dtype=depth.dtype) + 0.5 - camera.cy) / camera.fy
@@ -157,7 +167,8 @@ def _geometry(out: Rendering) -> tuple[Tensor, Tensor]:
 
 
 def normal_consistency(out: Rendering, camera: Camera) -> Tensor:
-    """Mean of 1 - n . N: n the blended normals of the entry faces, N the normal of the depth map; 2DGS (Huang et al. 2024)."""
+    """Mean of 1 - n . N: n the blended normals of the entry faces, N the normal of the depth map; 2DGS (Huang et al.
+    2024)."""
     depth, normal = _geometry(out)
     surface, valid = depth_normals(depth, camera)
     cosine = (normal * surface).sum(0)
@@ -186,8 +197,8 @@ def normal_error(normal: Tensor, wanted: Tensor, opacity: Tensor) -> Tensor:
 
 
 def source_views(cameras: list[Camera], points: np.ndarray) -> list[list[int]]:
-    """For every camera the indices of those to compare patches with, best first: they see most of the (P, 3) points that it sees
-    under an angle of LEAST_ANGLE to LARGEST_ANGLE to its own rays. Occlusion is left out of it."""
+    """For every camera the indices of those to compare patches with, best first: they see most of the (P, 3) points
+    that it sees under an angle of LEAST_ANGLE to LARGEST_ANGLE to its own rays. Occlusion is left out of it."""
     step = -(-len(points) // COMPARED_POINTS)
     points = points[::step]
     rays = np.stack([points - camera.center for camera in cameras])
@@ -204,7 +215,8 @@ def source_views(cameras: list[Camera], points: np.ndarray) -> list[list[int]]:
 
 
 def visible_pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of (P, 3) points: (P,) bool whether they lie in the image, and of those that do (Q, 2) int64 columns and rows, and (Q,) z-depths."""
+    """Of (P, 3) points: (P,) bool whether they lie in the image, and of those that do (Q, 2) int64 columns and rows,
+    and (Q,) z-depths."""
     pixels, depth = camera.project(points)
     with np.errstate(invalid="ignore"):
         inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
@@ -214,12 +226,13 @@ def visible_pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.n
 def patch_consistency(
     out: Rendering, camera: Camera, grey: Tensor, other: Camera, other_grey: Tensor, other_depth: Tensor, pixels: Tensor
 ) -> Tensor:
-    """How unlike the patches round pixels look in another view, if the surface there is the plane that the renderer says.
+    """How unlike the patches round pixels look in another view, if the surface there is the plane that the renderer
+    says.
 
-    A patch is sent into the other view by the homography of the plane through the pixel's median depth with the blended normal, and
-    compared by normalised cross-correlation: the mean of 1 - NCC over patches that are not plain, weighted by exp(-d), d the distance in
-    pixels by which a pixel misses itself on its way to the other view's depth map and back (none from ROUND_TRIP_PX on: hidden there).
-    Source: PGSR (Chen et al. 2024).
+    A patch is sent into the other view by the homography of the plane through the pixel's median depth with the blended
+    normal, and compared by normalised cross-correlation: the mean of 1 - NCC over patches that are not plain, weighted
+    by exp(-d), d the distance in pixels by which a pixel misses itself on its way to the other view's depth map and
+    back (none from ROUND_TRIP_PX on: hidden there). Source: PGSR (Chen et al. 2024).
 
     Args:
         grey, other_grey: (H, W) in [0, 1] of the two photographs.
@@ -272,7 +285,8 @@ def patch_consistency(
 
 
 def patch_pixels(opaque: Tensor, rng: np.random.Generator) -> Tensor:
-    """(P, 2) int64 columns and rows of at most PATCHES pixels of (H, W) bool `opaque`, whole patches inside the image."""
+    """(P, 2) int64 columns and rows of at most PATCHES pixels of (H, W) bool `opaque`, whole patches inside the
+    image."""
     half = PATCH // 2
     inside = opaque[half:-half, half:-half]
     if inside.numel() == 0:

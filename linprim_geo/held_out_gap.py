@@ -1,4 +1,5 @@
-"""A training that fits its photographs and not what lies between them: how far held-out views stay behind, why, and what to do."""
+"""A training that fits its photographs and not what lies between them: how far held-out views stay behind, why, and
+what to do."""
 
 from __future__ import annotations
 
@@ -12,12 +13,17 @@ LARGEST_GAP = 6.0
 FEW_VIEWS = 20
 # Effects whose evidence explains a gap where they are needed and off: the cause and the option.
 CAUSES = {
-    "environment": ("what stands far behind the scene is explained by primitives before single cameras", "--background environment"),
+    "environment": (
+        "what stands far behind the scene is explained by primitives before single cameras",
+        "--background environment",
+    ),
     "exposure": ("the photographs differ in exposure", "--exposure gain"),
 }
 
 
-def gap_advice(train_psnr: float, psnr: float, views: int, options: TrainOptions, decisions: Iterable[dict]) -> str | None:
+def gap_advice(
+    train_psnr: float, psnr: float, views: int, options: TrainOptions, decisions: Iterable[dict]
+) -> str | None:
     """One sentence for people where held-out views stay more than LARGEST_GAP behind training views, else None.
 
     Args:

@@ -1,5 +1,5 @@
-"""Folders beside a capture's photographs: masks, and the same photographs in another size, in a folder that is named or Mip-NeRF 360's
-`images_2`, `images_4` and `images_8`."""
+"""Folders beside a capture's photographs: masks, and the same photographs in another size, in a folder that is named or
+Mip-NeRF 360's `images_2`, `images_4` and `images_8`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from .scene import Frame
 
 
 def with_images(frames: Sequence[Frame], folder: Path) -> list[Frame]:
-    """The frames with their photographs from `folder`, found by path or name with any suffix, and cameras scaled to their size.
+    """The frames with their photographs from `folder`, found by path or name with any suffix, and cameras scaled to
+    their size.
 
     Raises:
         LinprimError: one is missing, is that of two cameras, or is of another shape than its camera's.
@@ -28,14 +29,13 @@ def with_images(frames: Sequence[Frame], folder: Path) -> list[Frame]:
         else:
             found.append(image)
     if missing:
-        raise LinprimError(
-            f"{folder}: no image for {len(missing)} of {len(frames)} cameras, the first is {missing[0]}"
-        )
+        raise LinprimError(f"{folder}: no image for {len(missing)} of {len(frames)} cameras, the first is {missing[0]}")
     out: dict[Path, Frame] = {}
     for frame, image in zip(frames, found, strict=True):
         if image in out:
             raise LinprimError(
-                f"{image}: the only image for both {out[image].relative} and {frame.relative}, wanted one for each camera"
+                f"{image}: the only image for both {out[image].relative} and {frame.relative}, wanted one for "
+                "each camera"
             )
         (width, height), lens = photos.image_header(image)[:2], frame.lens
         # Sizes that were rounded to whole pixels, either way, differ by less than a pixel each.
@@ -48,7 +48,8 @@ def with_images(frames: Sequence[Frame], folder: Path) -> list[Frame]:
 
 
 def with_smaller_images(frames: Sequence[Frame], root: Path, factor: int) -> list[Frame] | None:
-    """The frames with photographs that were made smaller by `factor` already, in a folder `NAME_factor` beside NAME, both below `root`.
+    """The frames with photographs that were made smaller by `factor` already, in a folder `NAME_factor` beside NAME,
+    both below `root`.
 
     None where one of them is missing or has another size, or where masks, depth maps or normals would not fit them.
     """
@@ -96,9 +97,7 @@ def with_masks(frames: Sequence[Frame], root: Path, folder: Path | None) -> list
     if folder is None and any(frame.mask_path for frame in frames):
         return list(frames)
     candidates = (
-        [folder]
-        if folder is not None
-        else [root / name for name in ("masks", "mask") if (root / name).is_dir()]
+        [folder] if folder is not None else [root / name for name in ("masks", "mask") if (root / name).is_dir()]
     )
     for candidate in candidates:
         found = [_mask_of(frame, candidate) for frame in frames]

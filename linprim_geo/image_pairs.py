@@ -1,11 +1,12 @@
-"""Which photographs are worth matching, before anything is known of their cameras: those that share their largest keypoints."""
+"""Which photographs are worth matching, before anything is known of their cameras: those that share their largest
+keypoints."""
 
 from __future__ import annotations
 
 import numpy as np
 
-# Up to this many photographs every pair is matched; of more, each with those that share most of their largest keypoints,
-# and with the next ones by name, as they were taken one after the other.
+# Up to this many photographs every pair is matched; of more, each with those that share most of their largest
+# keypoints, and with the next ones by name, as they were taken one after the other.
 _MATCH_ALL = 60
 _PARTNERS = 15
 _NEXT_BY_NAME = 5

@@ -1,4 +1,5 @@
-"""The steps of structure from motion by pycolmap on the CPU: keypoints, matches, incremental mapping, from one folder of photographs."""
+"""The steps of structure from motion by pycolmap on the CPU: keypoints, matches, incremental mapping, from one folder
+of photographs."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ from .image_pairs import pairs_to_match
 # Keypoints are looked for at this many pixels along the longer side; more takes long and finds few that can be matched.
 _WIDEST = 2000
 _MAX_FEATURES = 4096
-# Below COLMAP's 0.0067, as plain walls and renderings have few strong features; far below, weak ones crowd out the others.
+# Below COLMAP's 0.0067, as plain walls and renderings have few strong features; far below, weak ones crowd out the
+# others.
 _PEAK_THRESHOLD = 0.004
 # Work between two lines of progress, and two moments at which it can be interrupted.
 _IMAGES_AT_ONCE = 4
@@ -21,7 +23,8 @@ _SECONDS_BETWEEN_LINES = 20.0
 SEED = 0
 # A model of fewer photographs is none.
 MIN_REGISTERED = 3
-# Where COLMAP's demands on a photograph's match with the model (30 matches, a quarter of them right) leave some out, these are tried.
+# Where COLMAP's demands on a photograph's match with the model (30 matches, a quarter of them right) leave some out,
+# these are tried.
 _FEW_MATCHES, _FEW_RIGHT = 15, 0.1
 
 
@@ -91,9 +94,7 @@ def _register(database_path: Path, folder: Path, names: list[str], sizes: list[t
             database.write_frame(known.frame(index), use_frame_id=True)
 
 
-def _extract(
-    database_path: Path, folder: Path, names: list[str], threads: int, say: Callable[[str], None]
-) -> None:
+def _extract(database_path: Path, folder: Path, names: list[str], threads: int, say: Callable[[str], None]) -> None:
     from .load_pycolmap import pycolmap
 
     options = pycolmap.FeatureExtractionOptions(num_threads=threads, max_image_size=_WIDEST)
@@ -107,9 +108,7 @@ def _extract(
         )
 
 
-def _match(
-    database_path: Path, work: Path, names: list[str], threads: int, say: Callable[[str], None]
-) -> None:
+def _match(database_path: Path, work: Path, names: list[str], threads: int, say: Callable[[str], None]) -> None:
     from .load_pycolmap import pycolmap
 
     matching = pycolmap.FeatureMatchingOptions(num_threads=threads)
@@ -147,9 +146,7 @@ def _map(database_path: Path, folder: Path, work: Path, threads: int, count: int
     """The largest of the models that incremental mapping makes; None if there is none."""
     from .load_pycolmap import pycolmap
 
-    options = pycolmap.IncrementalPipelineOptions(
-        random_seed=SEED, num_threads=threads, min_model_size=MIN_REGISTERED
-    )
+    options = pycolmap.IncrementalPipelineOptions(random_seed=SEED, num_threads=threads, min_model_size=MIN_REGISTERED)
     output = work / "models"
     done, last = 0, time.monotonic()
 
@@ -184,8 +181,6 @@ def _in_parts(items: list, size: int, name: str, unit: str, say: Callable[[str],
         done, now = min(first + size, len(items)), time.monotonic()
         if now - last > _SECONDS_BETWEEN_LINES and done < len(items):
             last = now
-            say(
-                f"{name}: {done} of {len(items)} {unit}, {(now - start) / done * (len(items) - done):.0f} s left"
-            )
+            say(f"{name}: {done} of {len(items)} {unit}, {(now - start) / done * (len(items) - done):.0f} s left")
     if items:
         say(f"{name}: {len(items)} {unit} in {time.monotonic() - start:.0f} s")

@@ -46,8 +46,8 @@ _FRUSTA_BATCHES = 20
 _COLOR_VIEWS = 24
 
 
-# The plane round a point is that of so many of its nearest, itself among them. Where they lie in a plane to within this share of
-# their spread, more is not believed: points have errors.
+# The plane round a point is that of so many of its nearest, itself among them. Where they lie in a plane to within this
+# share of their spread, more is not believed: points have errors.
 _PLANE_POINTS = 10
 _THINNEST = 0.1
 
@@ -58,11 +58,11 @@ class VolumePoints(PointCloud):
 
 
 def local_planes(xyz: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """How (P, 3) points lie in space: (P, 4) unit quaternions (w, x, y, z) whose third axis is the normal of the plane through a
-    point and its 9 nearest, turned about it at random, and (P,) how flat these are.
+    """How (P, 3) points lie in space: (P, 4) unit quaternions (w, x, y, z) whose third axis is the normal of the plane
+    through a point and its 9 nearest, turned about it at random, and (P,) how flat these are.
 
-    Flatness is the root of the smallest by the middle eigenvalue of their covariance: 0.1 (and not less) for a plane, about 0.6 for
-    points anywhere in a volume. Fewer than 4 points are no plane: 1.
+    Flatness is the root of the smallest by the middle eigenvalue of their covariance: 0.1 (and not less) for a plane,
+    about 0.6 for points anywhere in a volume. Fewer than 4 points are no plane: 1.
     """
     from scipy.spatial import cKDTree
     from scipy.spatial.transform import Rotation
@@ -161,9 +161,7 @@ def visual_hull_points(scene: Scene, count: int, seed: int) -> VolumePoints:
         LinprimError: the views have no masks, or nothing is left.
     """
     if not scene.has_alpha:
-        raise LinprimError(
-            f"{scene.root}: the images have no alpha channel and no masks, wanted one for a visual hull"
-        )
+        raise LinprimError(f"{scene.root}: the images have no alpha channel and no masks, wanted one for a visual hull")
     rng = np.random.default_rng(seed)
     looks = spread_looks(scene.train, _MAX_LOOKS)
     box = _hull_box(scene, looks, rng)
@@ -200,9 +198,7 @@ def frusta_points(scene: Scene, count: int, seed: int) -> VolumePoints:
     distance = CAMERA_DISTANCE / scene_normalization(scene).scale
     cameras = [view.camera for view in scene.train]
     low, high = np.log(_FRUSTA_DEPTHS[0] * distance), np.log(_FRUSTA_DEPTHS[1] * distance)
-    found: list[list[np.ndarray]] = [
-        [] for _ in range(_FRUSTA_SEEN)
-    ]  # by the number of cameras that see them
+    found: list[list[np.ndarray]] = [[] for _ in range(_FRUSTA_SEEN)]  # by the number of cameras that see them
     for _ in range(_FRUSTA_BATCHES):
         points = _along_pixels(cameras, 2 * count, low, high, rng)
         seen = np.zeros(len(points), dtype=np.int64)
@@ -220,7 +216,8 @@ def frusta_points(scene: Scene, count: int, seed: int) -> VolumePoints:
 class Look:
     """A training view's camera and photograph, averaged down to what choosing points needs.
 
-    `rgb` (h, w, 3) uint8; `foreground` (h, w) bool, None without alpha; `open` says whether the object goes on outside of the image.
+    `rgb` (h, w, 3) uint8; `foreground` (h, w) bool, None without alpha; `open` says whether the object goes on outside
+    of the image.
     """
 
     def __init__(self, view: View):
@@ -261,9 +258,7 @@ def _hull_box(scene: Scene, looks: Sequence[Look], rng: np.random.Generator) -> 
         # The mean distance of samples, so that masks are grown by what lies between two of them.
         spacing = (np.prod(box[1] - box[0]) / _HULL_SAMPLES) ** (1 / 3)
         grow = [int(np.ceil(spacing * camera.fx / distance)) for camera in cameras]
-        grow = [
-            min(max(value, 1), max(look.rgb.shape[:2]) // 8) for value, look in zip(grow, looks, strict=True)
-        ]
+        grow = [min(max(value, 1), max(look.rgb.shape[:2]) // 8) for value, look in zip(grow, looks, strict=True)]
         inside = points[_inside_hull(points, looks, grow)]
         if not len(inside):
             break
@@ -309,9 +304,7 @@ def in_image(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray
     elsewhere)."""
     pixels, depth = camera.project(points)
     with np.errstate(invalid="ignore"):
-        inside = (
-            (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < [camera.width, camera.height]).all(axis=1)
-        )
+        inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < [camera.width, camera.height]).all(axis=1)
     cells = np.where(inside[:, None], pixels, 0.0).astype(np.int64)
     return inside, cells[:, 1], cells[:, 0]
 
@@ -341,9 +334,7 @@ def _colors(points: np.ndarray, looks: Sequence[Look]) -> np.ndarray:
             inside[inside] = look.foreground[row[inside], column[inside]]
         total[inside] += look.rgb[row[inside], column[inside]]
         weight[inside] += 1.0
-    shown = [
-        look.rgb.reshape(-1, 3) if look.foreground is None else look.rgb[look.foreground] for look in looks
-    ]
+    shown = [look.rgb.reshape(-1, 3) if look.foreground is None else look.rgb[look.foreground] for look in looks]
     usual = np.mean([pixels.mean(axis=0) for pixels in shown if len(pixels)] or [np.full(3, 128.0)], axis=0)
     mean = np.where(weight[:, None] > 0, total / np.maximum(weight, 1.0)[:, None], usual)
     return np.clip(mean + 0.5, 0, 255).astype(np.uint8)

@@ -80,26 +80,20 @@ def check_lens(lens: Lens, where: str) -> None:
     """
     known = model_parameter_counts()
     if lens.model not in known:
-        raise LinprimError(
-            f"{where}: unknown camera model {lens.model!r}, wanted one of {', '.join(sorted(known))}"
-        )
+        raise LinprimError(f"{where}: unknown camera model {lens.model!r}, wanted one of {', '.join(sorted(known))}")
     if lens.model == "EQUIRECTANGULAR":
         raise LinprimError(
             f"{where}: camera model EQUIRECTANGULAR is a panorama, wanted a perspective or fisheye camera"
         )
     wanted = known[lens.model][1]
     if len(lens.params) != wanted:
-        raise LinprimError(
-            f"{where}: camera model {lens.model} has {len(lens.params)} parameters, wanted {wanted}"
-        )
+        raise LinprimError(f"{where}: camera model {lens.model} has {len(lens.params)} parameters, wanted {wanted}")
     if lens.width < 1 or lens.height < 1:
         raise LinprimError(f"{where}: image size {lens.width}x{lens.height}, wanted at least one pixel")
     if not all(np.isfinite(lens.params)):
         raise LinprimError(f"{where}: camera parameters {_list(lens.params)} are not all finite numbers")
     if any(focal <= 0 for focal in _focal_lengths(lens)):
-        raise LinprimError(
-            f"{where}: camera parameters {_list(lens.params)} have a focal length that is not positive"
-        )
+        raise LinprimError(f"{where}: camera parameters {_list(lens.params)} have a focal length that is not positive")
 
 
 def undistorted(lens: Lens, where: str = "camera") -> Intrinsics:
@@ -120,9 +114,7 @@ def undistorted(lens: Lens, where: str = "camera") -> Intrinsics:
         pixels = _project_grid(lens, result, x, y)
     except (ValueError, RuntimeError, MemoryError) as error:
         raise LinprimError(f"{said} cannot be undistorted ({str(error).splitlines()[0]})") from error
-    inside = (pixels >= 0) & (
-        pixels <= np.array([lens.width, lens.height])
-    )  # false where the projection is NaN
+    inside = (pixels >= 0) & (pixels <= np.array([lens.width, lens.height]))  # false where the projection is NaN
     along_x, along_y = np.diff(pixels, axis=1)[:-1], np.diff(pixels, axis=0)[:, :-1]
     area = along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]
     if not inside.all() or not (area > 0).all():
@@ -134,8 +126,8 @@ def undistorted(lens: Lens, where: str = "camera") -> Intrinsics:
 
 
 def largest_displacement(lens: Lens) -> float:
-    """By how many pixels, at most, a lens puts a ray beside where the pinhole of its focal lengths and principal point would have it, over
-    the image; infinite where the lens does not show what that pinhole shows."""
+    """By how many pixels, at most, a lens puts a ray beside where the pinhole of its focal lengths and principal point
+    would have it, over the image; infinite where the lens does not show what that pinhole shows."""
     if lens.is_pinhole:
         return 0.0
     camera = _camera(lens)
@@ -161,7 +153,8 @@ def straightened(lens: Lens, below: float) -> Lens:
 
 
 def resized(lens: Lens, width: int, height: int) -> Lens:
-    """The lens of the same photographs in another size; where there is one focal length, its scale is the mean of both."""
+    """The lens of the same photographs in another size; where there is one focal length, its scale is the mean of
+    both."""
     camera = _camera(lens)
     camera.rescale(width, height)
     return Lens(lens.model, width, height, tuple(float(value) for value in camera.params))

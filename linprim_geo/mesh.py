@@ -34,8 +34,8 @@ class Mesh:
 
     `vertices` (V, 3) float64, `faces` (F, 3) int64, counter-clockwise seen from outside. `normals` (V, 3)
     float32 of unit length (zero where a vertex has none), `colors` (V, 3) uint8 sRGB as in the photographs,
-    `quality` (V,) float32: the uncertainty of the vertex, in scene units, `primitive` (F,) int32: the row of the primitive that
-    a face is a part of, -1 for none. Arrays of other types are converted.
+    `quality` (V,) float32: the uncertainty of the vertex, in scene units, `primitive` (F,) int32: the row of the
+    primitive that a face is a part of, -1 for none. Arrays of other types are converted.
 
     Raises:
         LinprimError: an array has the wrong shape.
@@ -100,7 +100,8 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
 def load_with_visual(path: str | os.PathLike, seams: bool = False) -> tuple[Mesh, Any]:
     """`load_mesh`, and what trimesh knows of its colours or texture (its `visual`; None of an STL file).
 
-    With `seams` the vertices of an OBJ file are split where its texture has seams, so that each has one place in the texture.
+    With `seams` the vertices of an OBJ file are split where its texture has seams, so that each has one place in the
+    texture.
     """
     path = Path(path)
     if not path.is_file():
@@ -130,7 +131,10 @@ def _load_mesh(path: Path, seams: bool) -> tuple[Mesh, Any]:
         raise LinprimError(f"{path}: holds no triangles, wanted a surface mesh")
     vertices, faces = np.array(loaded.vertices, dtype=np.float64), np.array(loaded.faces)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.dtype.kind not in "iu":
-        raise LinprimError(f"{path}: holds vertices of shape {vertices.shape}, faces of shape {faces.shape}, wanted three numbers for each")
+        raise LinprimError(
+            f"{path}: holds vertices of shape {vertices.shape}, faces of shape {faces.shape}, wanted three "
+            "numbers for each"
+        )
     _check_indices(vertices, faces, str(path))
     # Normals that the file stored sit in trimesh's cache; asking for the property would compute its own.
     normals = loaded._cache.cache.get("vertex_normals")
@@ -167,12 +171,12 @@ def _loaded_colors(loaded) -> np.ndarray | None:
 def save_mesh(path: str | Path, mesh: Mesh) -> None:
     """Writes a mesh as PLY, OBJ, GLB or STL, chosen by the suffix.
 
-    PLY is binary little-endian with normals, colours, `quality` and the faces' `primitive`; coordinates are float32, or double where
-    float32 would round by more than a millionth of the diagonal (a mesh far from its origin). OBJ is text
-    with nine digits (fifteen far from the origin) and colours as `v x y z r g b`. GLB stores float32 around
-    the mesh's centre and moves it back by a node, so a far origin costs nothing; colours are stored as they
-    are, which MeshLab and trimesh show unchanged (a viewer that follows glTF to the letter takes them as
-    linear and shows them brighter). STL has neither colours nor shared vertices and is float32.
+    PLY is binary little-endian with normals, colours, `quality` and the faces' `primitive`; coordinates are float32, or
+    double where float32 would round by more than a millionth of the diagonal (a mesh far from its origin). OBJ is text
+    with nine digits (fifteen far from the origin) and colours as `v x y z r g b`. GLB stores float32 around the mesh's
+    centre and moves it back by a node, so a far origin costs nothing; colours are stored as they are, which MeshLab and
+    trimesh show unchanged (a viewer that follows glTF to the letter takes them as linear and shows them brighter). STL
+    has neither colours nor shared vertices and is float32.
 
     Raises:
         LinprimError: unknown suffix, an empty mesh, or a folder that cannot be written.
@@ -214,7 +218,9 @@ def _write_ply(path: Path, mesh: Mesh) -> None:
     for (name, _), column in zip(fields, columns, strict=True):
         rows[name] = column
     traced = mesh.primitive is not None
-    triangles = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("index", "<i4", (3,)), *([("primitive", "<i4")] if traced else [])])
+    triangles = np.empty(
+        len(mesh.faces), dtype=[("count", "u1"), ("index", "<i4", (3,)), *([("primitive", "<i4")] if traced else [])]
+    )
     triangles["count"] = 3
     triangles["index"] = mesh.faces
     if traced:
@@ -303,8 +309,7 @@ def clean_mesh(mesh: Mesh, name: str = "mesh") -> tuple[Mesh, dict[str, int]]:
     """
     if len(mesh.vertices) == 0 or len(mesh.faces) == 0:
         raise LinprimError(
-            f"{name}: the mesh is empty ({len(mesh.vertices)} vertices, {len(mesh.faces)} faces), "
-            "wanted a surface"
+            f"{name}: the mesh is empty ({len(mesh.vertices)} vertices, {len(mesh.faces)} faces), wanted a surface"
         )
     _check_indices(mesh.vertices, mesh.faces, name)
     finite = np.isfinite(mesh.vertices).all(1)[mesh.faces].all(1)
@@ -330,8 +335,7 @@ def _check_indices(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         row = int(np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(1))[0])
         raise LinprimError(
-            f"{name}: face {row} uses vertices {faces[row].tolist()}, "
-            f"but the mesh has {len(vertices)} vertices"
+            f"{name}: face {row} uses vertices {faces[row].tolist()}, but the mesh has {len(vertices)} vertices"
         )
 
 

@@ -14,7 +14,8 @@ import numpy as np
 from .errors import LinprimError
 from .mesh import Mesh, face_areas, face_components, manifold_status, topology, vertex_normals
 
-# Taubin's own two factors. A sphere of 2,000 vertices grows by 0.17 % of its volume in 10 iterations, one of 66 shrinks by 1.4 %.
+# Taubin's own two factors. A sphere of 2,000 vertices grows by 0.17 % of its volume in 10 iterations, one of 66 shrinks
+# by 1.4 %.
 TAUBIN = {"lambda_": 0.33, "mu": -0.34}
 REMESH_ROUNDS = 5
 # Angle in degrees from which an edge is a feature that remeshing keeps, as MeshLab has it.
@@ -25,29 +26,34 @@ FEWEST_FACES = 4
 
 
 def process_mesh(mesh: Mesh, options, note: Callable[[str], None] | None = None) -> tuple[Mesh, list[dict]]:
-    """Applies what the options ask for in this order: `close_holes`, `smooth`, `remesh`, `target_faces`; 0 is off for each.
+    """Applies what the options ask for in this order: `close_holes`, `smooth`, `remesh`, `target_faces`; 0 is off for
+    each.
 
     Args:
         options: has these four attributes, as `ExtractOptions`.
         note: called with one line per step.
     Returns:
-        The mesh and one entry per step, as `stats.json` holds them: `step`, its parameter, `faces_before`, `faces_after`,
-        `boundary_edges`, `non_manifold_edges`, `watertight` (of the result), `topology_kept` (as many components, as many edges
-        with too many faces and the same Euler characteristic as before; closing holes changes the latter on purpose) and, where
-        something was not done or was done another way, `note`.
+        The mesh and one entry per step, as `stats.json` holds them: `step`, its parameter, `faces_before`,
+        `faces_after`, `boundary_edges`, `non_manifold_edges`, `watertight` (of the result), `topology_kept` (as many
+        components, as many edges with too many faces and the same Euler characteristic as before; closing holes changes
+        the latter on purpose) and, where something was not done or was done another way, `note`.
     Raises:
         LinprimError: an empty mesh, coordinates that are not finite, or a parameter that no mesh can be made with.
     """
     steps: list[tuple[str, str, float, Callable[[Mesh], tuple[Mesh, str | None]]]] = []
     entries = []
     if options.close_holes:
-        steps.append(("close_holes", "max_edges", options.close_holes, partial(_close_holes, max_edges=options.close_holes)))
+        steps.append(
+            ("close_holes", "max_edges", options.close_holes, partial(_close_holes, max_edges=options.close_holes))
+        )
     if options.smooth:
         steps.append(("smooth", "iterations", options.smooth, partial(_smooth, iterations=options.smooth)))
     if options.remesh:
         steps.append(("remesh", "edge_length", options.remesh, partial(_remesh, length=options.remesh)))
     if options.target_faces:
-        steps.append(("simplify", "target_faces", options.target_faces, partial(_simplify, target=options.target_faces)))
+        steps.append(
+            ("simplify", "target_faces", options.target_faces, partial(_simplify, target=options.target_faces))
+        )
     for name, parameter, value, function in steps:
         before = _shape(mesh)
         mesh, remark = function(mesh)
@@ -76,9 +82,9 @@ def process_mesh(mesh: Mesh, options, note: Callable[[str], None] | None = None)
 def simplify(mesh: Mesh, target_faces: int) -> Mesh:
     """Collapses edges by quadric error until `target_faces` are left; flat parts lose their faces first.
 
-    The topology and every boundary edge stay, so more faces can be left than asked for (close holes before); a closed mesh stays
-    closed. Colours and quality are those of the nearest points of the old surface. With as few faces as that already, the mesh
-    itself comes back.
+    The topology and every boundary edge stay, so more faces can be left than asked for (close holes before); a closed
+    mesh stays closed. Colours and quality are those of the nearest points of the old surface. With as few faces as that
+    already, the mesh itself comes back.
 
     Raises:
         LinprimError: an empty mesh, coordinates that are not finite, or fewer than 4 faces wanted.
@@ -111,11 +117,12 @@ def close_holes(mesh: Mesh, max_edges: int) -> Mesh:
 def remesh(mesh: Mesh, edge_length: float) -> Mesh:
     """Even triangles with edges of about `edge_length`, on the same surface; creases of more than 30 degrees stay.
 
-    Colours and quality are those of the nearest points of the old surface. A closed mesh stays closed: where remeshing would
-    break it, the mesh itself comes back.
+    Colours and quality are those of the nearest points of the old surface. A closed mesh stays closed: where remeshing
+    would break it, the mesh itself comes back.
 
     Raises:
-        LinprimError: an empty mesh, coordinates that are not finite, or a length that gives no faces or millions of them.
+        LinprimError: an empty mesh, coordinates that are not finite, or a length that gives no faces or millions of
+            them.
     Source: Botsch and Kobbelt, A remeshing approach to multiresolution modeling, 2004.
     """
     return _remesh(mesh, edge_length)[0]
@@ -209,8 +216,8 @@ def _cut_apart(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def paired_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges of faces (F, 3) that exactly two faces share, running along it in opposite directions: (E,) and (E,) numbers 3f+k
-    of the edge of face f from its corner k to the next."""
+    """Edges of faces (F, 3) that exactly two faces share, running along it in opposite directions: (E,) and (E,)
+    numbers 3f+k of the edge of face f from its corner k to the next."""
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     low, high = np.minimum(start, end), np.maximum(start, end)
     order = np.lexsort((high, low))
@@ -275,7 +282,9 @@ def _check(mesh: Mesh) -> None:
     if bad.any():
         raise LinprimError(f"vertex {int(np.argmax(bad))} of the mesh is not finite ({int(bad.sum())} are not)")
     if mesh.diagonal == 0:
-        raise LinprimError(f"all {len(mesh.vertices)} vertices of the mesh lie in one point, wanted a surface to finish")
+        raise LinprimError(
+            f"all {len(mesh.vertices)} vertices of the mesh lie in one point, wanted a surface to finish"
+        )
 
 
 def _filtered(mesh: Mesh, name: str, **parameters) -> Mesh:
@@ -294,7 +303,8 @@ def _filtered(mesh: Mesh, name: str, **parameters) -> Mesh:
 
 
 def _decimated(mesh: Mesh, target: int) -> Mesh:
-    """libigl's simplification, which only takes closed meshes (or edge-manifold ones) and collapses no edge that would open them."""
+    """libigl's simplification, which only takes closed meshes (or edge-manifold ones) and collapses no edge that would
+    open them."""
     import igl
 
     center, scale = mesh.bounds.mean(0), mesh.diagonal
@@ -304,7 +314,8 @@ def _decimated(mesh: Mesh, target: int) -> Mesh:
 
 
 def _with_attributes(made: Mesh, source: Mesh) -> Mesh:
-    """`made` with the colours and quality of `source` at the nearest points of its surface, and normals if that has them."""
+    """`made` with the colours and quality of `source` at the nearest points of its surface, and normals if that has
+    them."""
     colors = quality = None
     if source.colors is not None or source.quality is not None:
         corners, weights = _nearest(source, made.vertices)
@@ -318,7 +329,8 @@ def _with_attributes(made: Mesh, source: Mesh) -> Mesh:
 
 
 def _nearest(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (P, 3) of the faces nearest to points (P, 3), and the (P, 3) barycentric weights of the nearest points in them."""
+    """Corners (P, 3) of the faces nearest to points (P, 3), and the (P, 3) barycentric weights of the nearest points in
+    them."""
     import igl
 
     from .textured import barycentric

@@ -71,13 +71,11 @@ def check_finite(suffix: str, **tensors: Tensor) -> None:
         at = check(as_array(tensor))
         if at >= 0:
             row = at // max(1, tensor[0].numel()) if tensor.dim() else 0
-            raise LinprimError(
-                f"{name}: row {row} holds {tensor.reshape(-1)[at].item()}, finite numbers were wanted"
-            )
+            raise LinprimError(f"{name}: row {row} holds {tensor.reshape(-1)[at].item()}, finite numbers were wanted")
 
 
-# What the two operators take beside tensors. `numbers`: fx, fy, cx, cy, near, stop, level, screen_filter; `choices`: width, height,
-# and the indices of primitive, ray model and order in these lists, and whether the geometry is wanted.
+# What the two operators take beside tensors. `numbers`: fx, fy, cx, cy, near, stop, level, screen_filter; `choices`:
+# width, height, and the indices of primitive, ray model and order in these lists, and whether the geometry is wanted.
 KINDS = ("octahedron", "tetrahedron", "gaussian")
 RAY_MODELS = ("exact", "affine")
 ORDERS = ("center", "entry", "overlap")
@@ -120,9 +118,7 @@ def _rasterize(
     check_finite(suffix, **given)
     planes, color, max_weight, pixels = _outputs(center, choices)
     getattr(_core, f"rasterize_{suffix}")(
-        *_core_arguments(
-            [center, rotation, extent, density, sh, background], world_to_camera, numbers, choices
-        ),
+        *_core_arguments([center, rotation, extent, density, sh, background], world_to_camera, numbers, choices),
         [p.numpy() if p.numel() else None for p in planes],
         color.numpy(),
         max_weight.numpy(),
@@ -184,9 +180,7 @@ def _gradients(inputs: list[Tensor]) -> list[Tensor]:
 
 
 @_rasterize_grad.register_fake
-def _(
-    center, rotation, extent, density, sh, background, world_to_camera, numbers, choices, color, planes, grads
-):
+def _(center, rotation, extent, density, sh, background, world_to_camera, numbers, choices, color, planes, grads):
     return tuple(_gradients([center, rotation, extent, density, sh, background]))
 
 
@@ -252,8 +246,8 @@ def rasterize(
     samples: int = 1,
     screen: Tensor | None = None,
 ) -> Rendering:
-    """Renders transparent primitives, by default octahedra blended front to back in the order of their centres' depth, by exact
-    perspective.
+    """Renders transparent primitives, by default octahedra blended front to back in the order of their centres' depth,
+    by exact perspective.
 
     A ray of direction (u, v, 1) is inside a polyhedron for z-depths t_in < t < t_out; its optical thickness there is
     tau = density |(u, v, 1)| (t_out - t_in), its weight T (1 - exp(-tau)), and T is multiplied by exp(-tau).
@@ -261,43 +255,45 @@ def rasterize(
     Args:
         center: (N, 3) world positions. float32 or float64; all tensors alike.
         rotation: (N, 4) quaternions w, x, y, z of any length but 0, which means no rotation.
-        extent: (N, 3) half-axes of octahedra, (N, 4) distances of a tetrahedron's vertices along (1, 1, 1), (1, -1, -1), (-1, 1, -1) and
-            (-1, -1, 1), or (N, 3) standard deviations of Gaussians; world units. A primitive with one that is not positive is not drawn;
-            those below 1e-15 or above 1e12 are taken as these.
+        extent: (N, 3) half-axes of octahedra, (N, 4) distances of a tetrahedron's vertices along (1, 1, 1), (1, -1,
+            -1), (-1, 1, -1) and (-1, -1, 1), or (N, 3) standard deviations of Gaussians; world units. A primitive with
+            one that is not positive is not drawn; those below 1e-15 or above 1e12 are taken as these.
         density: (N,) optical thickness per world unit; below 0 counts as 0. Of Gaussians the peak opacity, 0 to 1.
-        sh: (N, K, 3) spherical harmonics, K = 1, 4, 9 or 16; colour = max(0, 0.5 + their sum at the direction from the camera
-            to the centre).
+        sh: (N, K, 3) spherical harmonics, K = 1, 4, 9 or 16; colour = max(0, 0.5 + their sum at the direction from the
+            camera to the centre).
         background: (3,) colour behind everything.
         camera: pinhole camera in the frame of the centres.
-        primitive: "octahedron", "tetrahedron", or "gaussian": 3D Gaussian splatting's, projected, alpha at most 0.99 and nothing below
-            1/255, one depth each.
-        ray_model: "exact" perspective, or "affine": inside one primitive rays are parallel in the ray space of its centre, nothing is cut
-            at the near plane, and a primitive whose centre is before it is not drawn. The ray space of a centre farther than 0.15 of the
-            image's size outside of it is that of the nearest place within. Gaussians are always affine.
-        order: "center": blended by the depth of their centres; "entry": by each ray's own entry depth; "overlap": absorbing where they are,
-            overlaps included, which depends on no order: the integral itself. Gaussians go with "center" only.
-        screen_filter: enlarges a polyhedron's box on the screen by half this many pixels on every side and thins it in proportion; to a
-            Gaussian's variance it is added, in square pixels. 0 is off.
+        primitive: "octahedron", "tetrahedron", or "gaussian": 3D Gaussian splatting's, projected, alpha at most 0.99
+            and nothing below 1/255, one depth each.
+        ray_model: "exact" perspective, or "affine": inside one primitive rays are parallel in the ray space of its
+            centre, nothing is cut at the near plane, and a primitive whose centre is before it is not drawn. The ray
+            space of a centre farther than 0.15 of the image's size outside of it is that of the nearest place within.
+            Gaussians are always affine.
+        order: "center": blended by the depth of their centres; "entry": by each ray's own entry depth; "overlap":
+            absorbing where they are, overlaps included, which depends on no order: the integral itself. Gaussians go
+            with "center" only.
+        screen_filter: enlarges a polyhedron's box on the screen by half this many pixels on every side and thins it in
+            proportion; to a Gaussian's variance it is added, in square pixels. 0 is off.
         near: z-depth at which rays begin, world units.
         stop: a ray ends when its transmittance is below this; 0 = never.
         level: transmittance at which `depth_median` is taken.
         geometry: also compute depths, normals, distortion and the per-primitive statistics (about twice the time).
-        samples: render this many by this many rays per pixel and average: photographs average over a pixel, so edges need it. The
-            geometry has no meaningful average, so it goes with 1 only.
-        screen: (N, 3) zeros. The gradient of the first two is that of the loss to the projected centres, per pixel; the third is no
-            gradient but the sum over 16x16 tiles of the length of each tile's part of it: how hard the image pulls, without
-            cancelling.
+        samples: render this many by this many rays per pixel and average: photographs average over a pixel, so edges
+            need it. The geometry has no meaningful average, so it goes with 1 only.
+        screen: (N, 3) zeros. The gradient of the first two is that of the loss to the projected centres, per pixel; the
+            third is no gradient but the sum over 16x16 tiles of the length of each tile's part of it: how hard the
+            image pulls, without cancelling.
 
     Raises:
-        LinprimError: a non-finite input (naming tensor and row; in sh, of primitives that are in view) or a dtype other than
-            float32, float64.
+        LinprimError: a non-finite input (naming tensor and row; in sh, of primitives that are in view) or a dtype other
+            than float32, float64.
         ValueError: shapes, dtypes, a camera or choices that do not fit.
 
     Gradient: to center, rotation, extent, density, sh, background and screen, of every image; once.
 
-    Accuracy: float64 agrees with `reference.rasterize` to 1e-9 relative; float32 to about 1e-5 of the image's range, except for a
-        plate thinner than 1e-2 that the near plane cuts (about 1e-7 * distance / thickness).
-    Bitwise the same at any number of threads.
+    Accuracy: float64 agrees with `reference.rasterize` to 1e-9 relative; float32 to about 1e-5 of the image's range,
+        except for a plate thinner than 1e-2 that the near plane cuts (about 1e-7 * distance / thickness). Bitwise the
+        same at any number of threads.
 
     Source: LinPrim (von Luetzow and Niessner, arXiv 2501.16312) for the primitive and its density.
     """
@@ -451,12 +447,13 @@ _environment.register_autograd(_environment_backward, setup_context=_environment
 
 
 def environment_light(opacity: Tensor, texels: Tensor, camera: Camera, least: float = 0.0) -> Tensor:
-    """(3, H, W) light of a cube map at infinity that passes primitives of (H, W) `opacity`: (1 - opacity) * colour of a pixel's direction.
-    Added to an image that was rendered over black, it is the image before that environment.
+    """(3, H, W) light of a cube map at infinity that passes primitives of (H, W) `opacity`: (1 - opacity) * colour of a
+    pixel's direction. Added to an image that was rendered over black, it is the image before that environment.
 
-    Face 2a of the map is that of directions d whose largest coordinate is d_a > 0, face 2a + 1 that of d_a < 0; columns go with
-    d_b / |d_a| and rows with d_c / |d_a| from -1 to 1, (a, b, c) cyclic. Colours between texel centres are bilinear; beyond a face's border
-    its neighbour's nearest texel counts, so that seams stay within the difference of two neighbouring texels.
+    Face 2a of the map is that of directions d whose largest coordinate is d_a > 0, face 2a + 1 that of d_a < 0; columns
+    go with d_b / |d_a| and rows with d_c / |d_a| from -1 to 1, (a, b, c) cyclic. Colours between texel centres are
+    bilinear; beyond a face's border its neighbour's nearest texel counts, so that seams stay within the difference of
+    two neighbouring texels.
 
     Args:
         opacity: (H, W) as `rasterize` gives it; float32 or float64, both tensors alike.
@@ -469,14 +466,15 @@ def environment_light(opacity: Tensor, texels: Tensor, camera: Camera, least: fl
 
     Gradient: to opacity (0 where it is 1) and texels; once.
 
-    Accuracy: places are computed in double, colours in the tensors' type; float64 agrees with `reference.environment_light` to 1e-12.
+    Accuracy: places are computed in double, colours in the tensors' type; float64 agrees with
+    `reference.environment_light` to 1e-12.
     """
     return torch.ops.linprim_geo.environment_light(opacity, texels, *_directions(camera), least)
 
 
 def environment_weights(values: Tensor, opacity: Tensor, size: int, camera: Camera) -> Tensor:
-    """(6, size, size, 3) sums over pixels of 1 - opacity times (3, H, W) `values` times the weight of each texel in the pixel: the adjoint
-    of `environment_light`."""
+    """(6, size, size, 3) sums over pixels of 1 - opacity times (3, H, W) `values` times the weight of each texel in the
+    pixel: the adjoint of `environment_light`."""
     return torch.ops.linprim_geo.environment_light_grad(values, opacity, size, *_directions(camera), 0.0)
 
 
@@ -499,11 +497,12 @@ def level_depth(
     screen_filter: float = 0.0,
     near: float = 0.01,
 ) -> tuple[Tensor, Tensor]:
-    """(H, W) z-depth at which the transmittance of each ray falls to `level`, 0 where it never does, and (H, W) opacity behind
-    everything; no gradients.
+    """(H, W) z-depth at which the transmittance of each ray falls to `level`, 0 where it never does, and (H, W) opacity
+    behind everything; no gradients.
 
-    Unlike `rasterize`'s depths it depends on no order: primitives absorb where they are, overlaps included, so the depth solves
-    sum_i density_i |v| clamp(t - t_in_i, 0, t_out_i - t_in_i) = ln(1 / level). Arguments as for `rasterize`, of polyhedra; 0 < level < 1.
+    Unlike `rasterize`'s depths it depends on no order: primitives absorb where they are, overlaps included, so the
+    depth solves sum_i density_i |v| clamp(t - t_in_i, 0, t_out_i - t_in_i) = ln(1 / level). Arguments as for
+    `rasterize`, of polyhedra; 0 < level < 1.
 
     Raises: as `rasterize`.
 
@@ -550,9 +549,7 @@ def _photometric(image: Tensor, target: Tensor, dssim: float, weight: Tensor | N
 
 @_photometric.register_fake
 def _(image, target, dssim, weight):
-    return image.new_empty(4, dtype=torch.float64), torch.empty_like(
-        image, memory_format=torch.contiguous_format
-    )
+    return image.new_empty(4, dtype=torch.float64), torch.empty_like(image, memory_format=torch.contiguous_format)
 
 
 def _photometric_setup(ctx, inputs, output):
@@ -569,24 +566,24 @@ def _photometric_backward(ctx, grad_parts, _):
 _photometric.register_autograd(_photometric_backward, setup_context=_photometric_setup)
 
 
-def photometric_loss(
-    image: Tensor, target: Tensor, dssim: float = 0.2, weight: Tensor | None = None
-) -> Tensor:
+def photometric_loss(image: Tensor, target: Tensor, dssim: float = 0.2, weight: Tensor | None = None) -> Tensor:
     """(1 - dssim) L1 + dssim (1 - SSIM) of two float32 images (3, H, W), with its analytic gradient to `image`.
 
-    SSIM: 11x11 Gaussian window of sigma 1.5, zeros beyond the border, C1 = 0.01^2, C2 = 0.03^2. `weight` (H, W) multiplies
-    both maps, whose means are over the weight.
+    SSIM: 11x11 Gaussian window of sigma 1.5, zeros beyond the border, C1 = 0.01^2, C2 = 0.03^2. `weight` (H, W)
+    multiplies both maps, whose means are over the weight.
 
-    Returns: (4,) float64: the loss, L1, SSIM and the mean squared error. Only the loss has a gradient, to `image`, once.
+    Returns: (4,) float64: the loss, L1, SSIM and the mean squared error. Only the loss has a gradient, to `image`,
+    once.
 
-    Accuracy: loss within 1e-6, gradient within 1e-4 relative of `reference.photometric_loss` in float64 on photographs; SSIM takes
-        variances as differences of float32 moments, so on bright images without any contrast 1e-5 and 5e-4.
+    Accuracy: loss within 1e-6, gradient within 1e-4 relative of `reference.photometric_loss` in float64 on photographs;
+        SSIM takes variances as differences of float32 moments, so on bright images without any contrast 1e-5 and 5e-4.
     """
     return torch.ops.linprim_geo.photometric_loss(image, target, dssim, weight)[0]
 
 
 def set_threads(count: int) -> None:
-    """Threads of the core, 0 for one per core. No result depends on it. Not to be called while another thread renders."""
+    """Threads of the core, 0 for one per core. No result depends on it. Not to be called while another thread
+    renders."""
     _core.set_threads(count)
 
 
@@ -607,8 +604,9 @@ def set_instruction_set(name: str) -> None:
 
 
 def machine_limits() -> dict[str, float]:
-    """What one core does at this moment with the instruction set in use: `fma_gflops`, `exp_ns` per value, and `pair_forward_ns` and
-    `pair_backward_ns` per (pixel, primitive) of octahedra by exact rays with all data in the first cache and every pixel hit.
+    """What one core does at this moment with the instruction set in use: `fma_gflops`, `exp_ns` per value, and
+    `pair_forward_ns` and `pair_backward_ns` per (pixel, primitive) of octahedra by exact rays with all data in the
+    first cache and every pixel hit.
 
     Takes some milliseconds on the calling thread; each is the shortest of fifteen.
     """

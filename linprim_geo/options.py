@@ -53,7 +53,8 @@ def check_train_options(options: TrainOptions) -> None:
             )
     if options.primitive == "gaussian" and options.order != "center":
         raise LinprimError(
-            f"--order is {options.order!r}, but a Gaussian has no place where a ray enters it: wanted center with --primitive gaussian"
+            f"--order is {options.order!r}, but a Gaussian has no place where a ray enters it: wanted center "
+            "with --primitive gaussian"
         )
     ranges = {
         "iterations": (1, 10**8),
@@ -72,16 +73,12 @@ def check_train_options(options: TrainOptions) -> None:
     } | dict.fromkeys(GEOMETRY_WEIGHTS, (0, 1e6))
     for name, (low, high) in ranges.items():
         if not low <= getattr(options, name) <= high:
-            raise LinprimError(
-                f"--{name.replace('_', '-')} is {getattr(options, name)}, wanted {low} to {high}"
-            )
+            raise LinprimError(f"--{name.replace('_', '-')} is {getattr(options, name)}, wanted {low} to {high}")
 
 
 def initial_count(options: TrainOptions, share: float) -> int:
     """Primitives at the start, `share` of the most there may be unless --initial-primitives says."""
-    return min(
-        options.max_primitives, options.initial_primitives or max(500, round(share * options.max_primitives))
-    )
+    return min(options.max_primitives, options.initial_primitives or max(500, round(share * options.max_primitives)))
 
 
 # Weights of the terms of geometry_terms.py.
@@ -94,10 +91,11 @@ GEOMETRY_WEIGHTS = (
     "sensor_normals",
     "patches",
 )
-# Screen filter in pixels that goes with --filter 3d+screen: LinPrim's kernel_size, and 3DGS's, which is a variance in px^2.
+# Screen filter in pixels that goes with --filter 3d+screen: LinPrim's kernel_size, and 3DGS's, which is a variance in
+# px^2.
 SCREEN_FILTER, SCREEN_FILTER_OF_GAUSSIANS = 0.1, 0.3
-# Depths, in the training frame, before which rays do not begin and Gaussians are not drawn. Projected near the camera's plane a
-# Gaussian would cover everything; 0.2 is 3DGS's. A polyhedron is cut exactly.
+# Depths, in the training frame, before which rays do not begin and Gaussians are not drawn. Projected near the camera's
+# plane a Gaussian would cover everything; 0.2 is 3DGS's. A polyhedron is cut exactly.
 NEAR, NEAR_OF_GAUSSIANS = 0.01, 0.2
 
 
@@ -125,7 +123,9 @@ class SceneOptions:
 
     downscale: int = option(1, "average K by K pixels into one", metavar="K")
     masks: str = option(
-        "", "folder of foreground masks, if they are not where data sets usually keep them; none: no masks and no alpha", metavar="DIR"
+        "",
+        "folder of foreground masks, if they are not where data sets usually keep them; none: no masks and no alpha",
+        metavar="DIR",
     )
     images: str = option(
         "", "folder of the photographs to use in place of those that the cameras name, in any size", metavar="DIR"
@@ -147,7 +147,8 @@ class TrainOptions:
     )
     ray_model: str = option(
         "exact",
-        "how rays meet them: exact perspective, or LinPrim's affine approximation at each centre (always so with gaussian)",
+        "how rays meet them: exact perspective, or LinPrim's affine approximation at each centre (always so with "
+        "gaussian)",
         choices=("exact", "affine"),
     )
     order: str = option(
@@ -166,20 +167,20 @@ class TrainOptions:
         choices=("gradient", "3dgs", "mcmc"),
     )
     max_primitives: int = option(20_000, "the population never grows past this")
-    initial_primitives: int = option(
-        0, "primitives at the start; 0 chooses from the points and --max-primitives"
-    )
+    initial_primitives: int = option(0, "primitives at the start; 0 chooses from the points and --max-primitives")
     sh_degree: int = option(2, "degree of the view-dependent colour, 0 to 3", choices=(0, 1, 2, 3))
     seed: int = option(0, "seed of everything random")
     threads: int = option(0, "worker threads; 0 uses every core; the result does not depend on it")
     background: str = option(
         "auto",
-        "auto, environment, fitted, random, black, white, or r,g,b in [0,1]; auto: an environment at infinity if the scene is open,"
+        "auto, environment, fitted, random, black, white, or r,g,b in [0,1]; auto: an environment at infinity if "
+        "the scene is open,"
         " fitted before a plain backdrop, else random",
     )
     exposure: str = option(
         "none",
-        "gain fits a factor per channel for every training photograph, of geometric mean 1; renders have the mean exposure",
+        "gain fits a factor per channel for every training photograph, of geometric mean 1; renders have the "
+        "mean exposure",
         choices=("none", "gain"),
     )
     scalar: str = option(
@@ -225,21 +226,20 @@ class ExtractOptions:
         metavar="T",
         number_or="auto",
     )
-    voxel_size: float = option(
-        0.0, "grid spacing in the data set's unit; 0 chooses from the views", metavar="LENGTH"
-    )
+    voxel_size: float = option(0.0, "grid spacing in the data set's unit; 0 chooses from the views", metavar="LENGTH")
     truncation: float = option(3.0, "truncation distance in voxels")
-    memory_limit: float = option(
-        0.0, "memory the grid may take, in GiB; 0 allows 60 % of what is free", metavar="GIB"
-    )
+    memory_limit: float = option(0.0, "memory the grid may take, in GiB; 0 allows 60 % of what is free", metavar="GIB")
     depth_limit: float = option(
         0.0,
-        "depths beyond this, in the data set's unit, only clear the space before them; 0: beyond what so many pixels can tell apart",
+        "depths beyond this, in the data set's unit, only clear the space before them; 0: beyond what so many "
+        "pixels can tell apart",
         metavar="LENGTH",
     )
     smallest_part: float = option(0.01, "drop components with less than this share of the largest one's area")
     refine: int = option(
-        2, "rounds in which vertices move to where the photographs agree best with each other; 0 leaves them", metavar="N"
+        2,
+        "rounds in which vertices move to where the photographs agree best with each other; 0 leaves them",
+        metavar="N",
     )
     close_holes: int = option(0, "fill holes with at most N edges around them; 0 fills none")
     smooth: int = option(0, "iterations of smoothing that keeps the volume; 0 leaves the surface as it is")
@@ -248,5 +248,7 @@ class ExtractOptions:
     )
     target_faces: int = option(0, "simplify to N faces; 0 keeps all")
     texture: int = option(
-        0, "give .obj and .glb a texture of SIZE by SIZE texels out of the photographs; 0 gives vertex colours", metavar="SIZE"
+        0,
+        "give .obj and .glb a texture of SIZE by SIZE texels out of the photographs; 0 gives vertex colours",
+        metavar="SIZE",
     )

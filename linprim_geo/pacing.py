@@ -1,4 +1,5 @@
-"""A training that keeps to a time: what a step costs is measured first, the run planned from it, and corrected once on the way."""
+"""A training that keeps to a time: what a step costs is measured first, the run planned from it, and corrected once on
+the way."""
 
 from __future__ import annotations
 
@@ -47,7 +48,8 @@ class Pace:
 
     @staticmethod
     def resumed(run: Run, trainer: Trainer) -> Pace:
-        """From config.json, with the seconds that the steps until now have taken; the correction that was made is repeated."""
+        """From config.json, with the seconds that the steps until now have taken; the correction that was made is
+        repeated."""
         try:
             record = dict(run.notes["time_budget"])
             correction = record.get("correction")
@@ -61,7 +63,9 @@ class Pace:
                 raise ValueError(f"seconds are {spent} and {finish}")
             return Pace(Budget(float(record["seconds"]), time.monotonic() - trainer.seconds - spent), record, finish)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise LinprimError(f"{run.path / 'config.json'}: its time_budget lacks what a run needs ({error})") from None
+            raise LinprimError(
+                f"{run.path / 'config.json'}: its time_budget lacks what a run needs ({error})"
+            ) from None
 
     def watch(self, trainer: Trainer, run: Run, progress: Progress, save: Callable[[], None]) -> None:
         """Called before every step: notes the pace, and when growth has ended corrects the number of steps, once."""
@@ -93,7 +97,8 @@ class Pace:
         trainer.correction = (trainer.step, last)
         progress.total = last
         progress.note(
-            f"  {self.budget.elapsed():.0f} s of {self.budget.seconds:.3g} s at step {trainer.step}, {1e3 * per_step:.1f} ms a step: "
+            f"  {self.budget.elapsed():.0f} s of {self.budget.seconds:.3g} s at step {trainer.step}, "
+            f"{1e3 * per_step:.1f} ms a step: "
             f"{last} steps in all in place of {planned}"
         )
 
@@ -150,10 +155,12 @@ def plan_run(
     if plan is None:
         least = (AIM * budget.seconds - left + least_training(cost, **given)) / AIM
         raise LinprimError(
-            f"--time-budget is {budget.seconds:.3g} s, but the least training of this scene that is of any use takes {least:.0f} s here"
+            f"--time-budget is {budget.seconds:.3g} s, but the least training of this scene that is of any use "
+            f"takes {least:.0f} s here"
         )
     progress.note(
-        f"  a step takes {1e3 * cost.base:.2f} ms + {1e6 * cost.per_primitive:.2f} ms per 1000 primitives: {plan.iterations} steps, "
+        f"  a step takes {1e3 * cost.base:.2f} ms + {1e6 * cost.per_primitive:.2f} ms per 1000 primitives: "
+        f"{plan.iterations} steps, "
         f"{plan.max_primitives} primitives at most ({plan.why}), {plan.seconds:.0f} s of the {budget.seconds:.3g} s"
     )
     options = replace(options, iterations=plan.iterations, max_primitives=plan.max_primitives)
@@ -180,7 +187,8 @@ def calibrate(
     start: Callable[[TrainOptions], Trainer],
     score: Callable[[Trainer, list[Shot]], object],
 ) -> tuple[StepCost, float, float, float]:
-    """(cost of a step, population at the start as a share of its limit, seconds to make the first population, seconds to score a view).
+    """(cost of a step, population at the start as a share of its limit, seconds to make the first population, seconds
+    to score a view).
 
     Steps of two throw-away trainers in turn, at the end of growth, where all degrees of the colour take part.
     """
@@ -196,10 +204,20 @@ def calibrate(
     fewer["log_extent"].clamp_(*(float(np.log(bound)) for bound in large.bounds))
     environment = None if large.environment is None else large.environment.clone()
     small = Trainer(
-        shots, fewer, options, large.bounds, large.background.clone(), large.fitted, large.random_background, terms, environment=environment
+        shots,
+        fewer,
+        options,
+        large.bounds,
+        large.background.clone(),
+        large.fitted,
+        large.random_background,
+        terms,
+        environment=environment,
     )
     large.terms = terms
-    late_from = min(options.geometry_from if terms else 1.0, options.order_from if options.order_from > GROWTH_END else 1.0)
+    late_from = min(
+        options.geometry_from if terms else 1.0, options.order_from if options.order_from > GROWTH_END else 1.0
+    )
     until = time.monotonic() + CALIBRATION_SHARE * budget.seconds
     times: dict[str, list[float]] = {"small": [], "large": [], "late": []}
     kinds = [("small", small, GROWTH_END), ("large", large, GROWTH_END)]
@@ -219,5 +237,7 @@ def calibrate(
     score(large, shots[:2])
     view_seconds = (time.monotonic() - begin) / len(shots[:2])
     late = mean.get("late", mean["large"]) / mean["large"]
-    cost = StepCost.fit((part, mean["small"]), (len(large), mean["large"]), late, 1 - late_from if late_from < 1 else 0.0)
+    cost = StepCost.fit(
+        (part, mean["small"]), (len(large), mean["large"]), late, 1 - late_from if late_from < 1 else 0.0
+    )
     return cost, begun, starting, view_seconds

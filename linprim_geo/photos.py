@@ -33,7 +33,9 @@ def files_in(folder: Path) -> list[Path]:
     """The images that lie in a folder itself, sorted by name; none if there is no such folder."""
     if not folder.is_dir():
         return []
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith("."))
+    return sorted(
+        path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+    )
 
 
 @contextmanager
@@ -77,7 +79,8 @@ def image_header(path: Path) -> tuple[int, int, bool]:
 
 
 def image_format(path: Path) -> str:
-    """Pillow's name of the format that the file has, whatever its suffix says: PNG, JPEG, MPO, WEBP, TIFF, BMP or another.
+    """Pillow's name of the format that the file has, whatever its suffix says: PNG, JPEG, MPO, WEBP, TIFF, BMP or
+    another.
 
     Raises:
         LinprimError: missing, empty, or not an image.
@@ -107,8 +110,7 @@ def read_photo(path: Path, size: tuple[int, int] | None = None) -> tuple[np.ndar
             image = ImageOps.exif_transpose(image)
         if size is not None and image.size != size:
             raise LinprimError(
-                f"{path}: the image is {image.width}x{image.height},"
-                f" wanted {size[0]}x{size[1]} as its camera says"
+                f"{path}: the image is {image.width}x{image.height}, wanted {size[0]}x{size[1]} as its camera says"
             )
         if image.mode.startswith("I") or image.mode == "F":
             grey = _to_byte(np.asarray(image))
@@ -171,17 +173,14 @@ def read_depth(path: Path, scale: float, size: tuple[int, int]) -> np.ndarray:
         )
     if values.shape != size[::-1]:
         raise LinprimError(
-            f"{path}: the depth map is {values.shape[1]}x{values.shape[0]},"
-            f" wanted {size[0]}x{size[1]} as its image"
+            f"{path}: the depth map is {values.shape[1]}x{values.shape[0]}, wanted {size[0]}x{size[1]} as its image"
         )
     with np.errstate(over="ignore", invalid="ignore"):
         depth = (values.astype(np.float64) * scale).astype(np.float32)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
-def box_downscale(
-    rgb: np.ndarray, alpha: np.ndarray | None, factor: int
-) -> tuple[np.ndarray, np.ndarray | None]:
+def box_downscale(rgb: np.ndarray, alpha: np.ndarray | None, factor: int) -> tuple[np.ndarray, np.ndarray | None]:
     """Averages blocks of factor x factor pixels, colours weighted by alpha; left-over rows and columns are
     cropped.
 
@@ -202,7 +201,8 @@ def box_downscale(
 def read_normals(path: Path, size: tuple[int, int]) -> np.ndarray:
     """(H, W, 3) float32 unit normals as they are stored, in whatever axes; 0 where there is none.
 
-    Reads 8-bit images, in which a byte b stands for 2 b / 255 - 1 and black for nothing, and .npy of three numbers per pixel.
+    Reads 8-bit images, in which a byte b stands for 2 b / 255 - 1 and black for nothing, and .npy of three numbers per
+    pixel.
 
     Raises:
         LinprimError: unreadable, not three numbers per pixel, or not of `size` (width, height).
@@ -258,9 +258,7 @@ def undistort_photo(rgb: np.ndarray, alpha: np.ndarray | None, lens: Lens, targe
     weight = alpha[..., None].astype(np.float32) / 255.0
     out = sample_bilinear(np.concatenate([rgb * weight, rgb, weight], axis=2), pixels)
     opacity = out[..., 6:]
-    straight = np.where(
-        opacity > 0, out[..., :3] / np.maximum(opacity, 1e-6), out[..., 3:6]
-    )  # 1e-6: far below 1/255
+    straight = np.where(opacity > 0, out[..., :3] / np.maximum(opacity, 1e-6), out[..., 3:6])  # 1e-6: far below 1/255
     return _round(straight), _round(opacity[..., 0] * 255.0)
 
 
@@ -273,18 +271,14 @@ def undistort_depth(depth: np.ndarray, lens: Lens, target: Intrinsics) -> np.nda
 class UndistortedCache:
     """Undistorted photographs as PNG files in `folder`, found by the content of what they were made from."""
 
-    def __init__(
-        self, folder: Path, lens: Lens, target: Intrinsics, sources: tuple[Path | None, ...], flavour: str
-    ):
+    def __init__(self, folder: Path, lens: Lens, target: Intrinsics, sources: tuple[Path | None, ...], flavour: str):
         digest = hashlib.blake2b(repr((_CACHE_VERSION, lens, target, flavour)).encode(), digest_size=16)
         for source in sources:
             if source is not None:
                 try:
                     content = source.read_bytes()
                 except OSError as error:
-                    raise LinprimError(
-                        f"{source}: cannot be read ({error.strerror}), wanted an image"
-                    ) from error
+                    raise LinprimError(f"{source}: cannot be read ({error.strerror}), wanted an image") from error
                 digest.update(len(content).to_bytes(8, "little"))
                 digest.update(content)
         self.path = folder / "undistorted" / digest.hexdigest()[:2] / f"{digest.hexdigest()}.png"

@@ -17,8 +17,8 @@ PLANES = 8
 """Most planes that cut one primitive: so many faces has an octahedron that is seen from all around."""
 
 SAME_PLANE = np.cos(np.radians(35.0))
-"""Points whose normals are closer than this to a direction belong to one plane: less than half of a right angle, which parts sides
-of a body, and more than the unevenness of a side."""
+"""Points whose normals are closer than this to a direction belong to one plane: less than half of a right angle, which
+parts sides of a body, and more than the unevenness of a side."""
 
 DIRECTION_CELLS = 3
 """Cells per unit of a coordinate of a normal, 19 degrees wide, the fullest of which a direction is looked for in."""
@@ -33,12 +33,14 @@ ROUNDS = 4
 """Reweighted rounds of a fit; the normal moves by less than its own uncertainty after three."""
 
 LEAST_SHARE_OF_PIXEL = 0.1
-"""Share of a pixel's footprint that the surface may move by to lose slivers: what the robust mean of many pixels still resolves."""
+"""Share of a pixel's footprint that the surface may move by to lose slivers: what the robust mean of many pixels still
+resolves."""
 
 
 @dataclass(frozen=True)
 class LevelPoints:
-    """(P, 3) points where light ends, their (P, 3) unit normals towards the cameras, and the median footprint of a pixel there."""
+    """(P, 3) points where light ends, their (P, 3) unit normals towards the cameras, and the median footprint of a
+    pixel there."""
 
     position: np.ndarray
     normal: np.ndarray
@@ -53,7 +55,8 @@ class LevelPoints:
 def level_points(depths: list[np.ndarray], cameras: list[Camera], wanted: int) -> LevelPoints:
     """Points of about `wanted` pixels of all depth maps, in a regular pattern that moves from view to view.
 
-    Normals are those of the surface through a pixel's four neighbours; pixels at the border, and beside one without depth, have none.
+    Normals are those of the surface through a pixel's four neighbours; pixels at the border, and beside one without
+    depth, have none.
     """
     stride = max(1, round(np.sqrt(sum(int((depth > 0).sum()) for depth in depths) / max(wanted, 1))))
     positions, normals, footprints = [], [], []
@@ -80,8 +83,8 @@ def level_points(depths: list[np.ndarray], cameras: list[Camera], wanted: int) -
 
 @dataclass(frozen=True)
 class Planes:
-    """Fitted planes { x : normal x = offset }, the body on the negative side; `row` of the primitive that each belongs to,
-    and `cuts` (K, PLANES) bool: which planes of its primitive bound the body where this one does."""
+    """Fitted planes { x : normal x = offset }, the body on the negative side; `row` of the primitive that each belongs
+    to, and `cuts` (K, PLANES) bool: which planes of its primitive bound the body where this one does."""
 
     row: np.ndarray
     slot: np.ndarray
@@ -91,12 +94,13 @@ class Planes:
 
 
 def fit_planes(primitives: Primitives, points: LevelPoints) -> tuple[Planes, np.ndarray]:
-    """Planes through the points around each primitive, at most PLANES each, and (N,) bool: whether it holds LEAST_POINTS of them;
-    one that does not gets no plane.
+    """Planes through the points around each primitive, at most PLANES each, and (N,) bool: whether it holds
+    LEAST_POINTS of them; one that does not gets no plane.
 
-    Points are parted by their normals: the strongest direction first, by mean shift, then the next among what is left. Each part gets a
-    plane by least squares, reweighted by a Cauchy weight of its own spread. Two planes of a primitive bound the body together if
-    the points of the one lie behind the other (a convex edge), else each for itself (a concave one).
+    Points are parted by their normals: the strongest direction first, by mean shift, then the next among what is left.
+    Each part gets a plane by least squares, reweighted by a Cauchy weight of its own spread. Two planes of a primitive
+    bound the body together if the points of the one lie behind the other (a convex edge), else each for itself (a
+    concave one).
     """
     center, position = primitives.center.astype(np.float64), np.ascontiguousarray(points.position)
     total, point = _core.points_within(center, *face_planes(primitives), position, NEIGHBOURHOOD, LEAST_POINTS)
@@ -158,8 +162,8 @@ def _medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
 
 
 def _strongest_direction(group: np.ndarray, normal: np.ndarray, count: int) -> np.ndarray:
-    """(count, 3) direction where most normals of each group are: the fullest of the cells of 1 / DIRECTION_CELLS, then mean shift.
-    Zero for a group without normals."""
+    """(count, 3) direction where most normals of each group are: the fullest of the cells of 1 / DIRECTION_CELLS, then
+    mean shift. Zero for a group without normals."""
     side = 2 * DIRECTION_CELLS + 1
     x, y, z = np.rint(normal * DIRECTION_CELLS).astype(np.int64).T + DIRECTION_CELLS
     cells, cell, size = np.unique(((group * side + x) * side + y) * side + z, return_inverse=True, return_counts=True)
@@ -180,8 +184,8 @@ def _strongest_direction(group: np.ndarray, normal: np.ndarray, count: int) -> n
 def _robust_planes(position: np.ndarray, normal: np.ndarray, group: np.ndarray, count: int):
     """(count, 3) normals, (count,) offsets and (count,) spreads (1.4826 median |residual|) of planes by group.
 
-    The normal is that of the points where they tell one (their flattest direction holds less than a tenth of the variance of the next),
-    else the mean of theirs.
+    The normal is that of the points where they tell one (their flattest direction holds less than a tenth of the
+    variance of the next), else the mean of theirs.
     """
     tiny = np.finfo(np.float64).tiny
     across = _sums(normal, group, count)

@@ -1,10 +1,10 @@
 """Primitives in the PLY files of LinPrim (octahedra, tetrahedra) and of 3DGS (Gaussians), read and written without
 trusting the header.
 
-All properties are float32, in this order: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_0..44 (channel by channel), opacity
-(a logit); then LinPrim's dist_0..2, rot_0..3 (w x y z), filter_3D, 63 in all, or 3DGS's scale_0..2 (logarithms), rot_0..3,
-62 in all. A tetrahedron has dist_0..3, the same layout with a fourth distance: LinPrim's own files of them are not public.
-What is rendered from them:
+All properties are float32, in this order: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_0..44 (channel by channel),
+opacity (a logit); then LinPrim's dist_0..2, rot_0..3 (w x y z), filter_3D, 63 in all, or 3DGS's scale_0..2
+(logarithms), rot_0..3, 62 in all. A tetrahedron has dist_0..3, the same layout with a fourth distance: LinPrim's own
+files of them are not public. What is rendered from them:
 
     o             = 1 / (1 + exp(-opacity))
     LinPrim       extent_k = |dist_k| + filter_3D / 2, density = -ln(1 - 0.99 o) / L,
@@ -42,11 +42,23 @@ LONGEST_HEADER = 1 << 16
 ROWS_AT_ONCE = 4096
 
 _TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
-    "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
-    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
-    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
-}  # fmt: skip
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
 
 
 @dataclass(frozen=True)
@@ -123,9 +135,7 @@ def read_ply_header(path: str | os.PathLike) -> PlyHeader:
                 case _:
                     raise ValueError
         except (ValueError, KeyError, IndexError):
-            raise LinprimError(
-                f"{path}: line {number} of the PLY header cannot be read: {line[:80]!r}"
-            ) from None
+            raise LinprimError(f"{path}: line {number} of the PLY header cannot be read: {line[:80]!r}") from None
     if layout not in ("ascii", "binary_little_endian", "binary_big_endian"):
         raise LinprimError(f"{path}: the PLY format is {layout!r}, wanted ascii or binary")
     return PlyHeader(layout, tuple(PlyElement(n, c, tuple(p)) for n, c, p in elements), newline + 1)
@@ -214,13 +224,13 @@ def read_primitive_ply(path: str | os.PathLike) -> tuple[Primitives, dict]:
 def write_primitive_ply(path: str | os.PathLike, primitives: Primitives) -> dict:
     """Writes LinPrim's properties, or 3DGS's of Gaussians; the filter is 0, the degree of the colours is padded to 3.
 
-    LinPrim cannot hold a reference length that is optically thicker than ln(100): such rows get the largest opacity that
-    it can hold and are counted.
+    LinPrim cannot hold a reference length that is optically thicker than ln(100): such rows get the largest opacity
+    that it can hold and are counted.
 
     Accuracy: reading it back gives the same centres, colours and polyhedra's extents bit by bit, rotations to float32
-    rounding, densities and opacities to 1e-5 relative and standard deviations to 1e-6 times the size of their logarithm,
-    because logits and logarithms are rounded to float32. A density of 0 comes back as one that takes less than 1e-37 of
-    the light.
+    rounding, densities and opacities to 1e-5 relative and standard deviations to 1e-6 times the size of their
+    logarithm, because logits and logarithms are rounded to float32. A density of 0 comes back as one that takes less
+    than 1e-37 of the light.
 
     Returns:
         {"rows": N, "clamped": rows that are thicker than LinPrim can hold}.
@@ -285,17 +295,13 @@ def _vertex_table(path: Path, header: PlyHeader) -> np.ndarray:
     vertex = header.elements[0]
     kinds = {name: kind for name, kind in vertex.properties if kind is not None}
     if len(kinds) < len(vertex.properties) or not kinds:
-        raise LinprimError(
-            f"{path}: the vertices have lists, repeated properties or none, wanted plain numbers"
-        )
+        raise LinprimError(f"{path}: the vertices have lists, repeated properties or none, wanted plain numbers")
     dtype = np.dtype([(name, "<" + kind) for name, kind in kinds.items()])
     size = path.stat().st_size
     wanted = header.data_start + vertex.count * dtype.itemsize
     if size < wanted:
         complete = max(0, size - header.data_start) // dtype.itemsize
-        raise LinprimError(
-            f"{path}: is truncated, it has {complete} of the {vertex.count} rows that its header names"
-        )
+        raise LinprimError(f"{path}: is truncated, it has {complete} of the {vertex.count} rows that its header names")
     if vertex.count == 0:
         raise LinprimError(f"{path}: holds no primitives")
     return np.memmap(path, dtype=dtype, mode="r", offset=header.data_start, shape=(vertex.count,))

@@ -1,4 +1,5 @@
-"""Union of many convex polyhedra as one closed surface whose faces know where they come from, and its connected shells."""
+"""Union of many convex polyhedra as one closed surface whose faces know where they come from, and its connected
+shells."""
 
 from __future__ import annotations
 
@@ -86,8 +87,8 @@ def morton_keys(points: np.ndarray) -> np.ndarray:
 def kept_shells(mesh: Mesh, wanted: np.ndarray) -> np.ndarray:
     """Which faces stay so that every wanted shell does and the surface still bounds a body.
 
-    A shell is a connected piece of a closed surface: the outside of a body, or a cavity of one. A shell that is not wanted is dropped
-    (a cavity is filled by that) unless a wanted one lies within it.
+    A shell is a connected piece of a closed surface: the outside of a body, or a cavity of one. A shell that is not
+    wanted is dropped (a cavity is filled by that) unless a wanted one lies within it.
 
     Args:
         mesh: closed, of disjoint shells.

@@ -1,8 +1,8 @@
 """How the number of primitives grows: where the image pulls hardest on a primitive, it is cut in two.
 
 Parents are drawn in proportion to the screen-space gradient gathered since the last event. Primitives that have become
-transparent or have shrunk to nothing are not deleted but become the second half of another parent. The rules of the papers
-that this is compared with are in population_papers.py; what they all have in common is `Control`.
+transparent or have shrunk to nothing are not deleted but become the second half of another parent. The rules of the
+papers that this is compared with are in population_papers.py; what they all have in common is `Control`.
 """
 
 from __future__ import annotations
@@ -24,14 +24,17 @@ Parameters = dict[str, torch.Tensor]
 GROWS_UNTIL = 0.6
 # A primitive whose opacity along its reference length is below this is moved to where it is needed.
 DEAD_OPACITY = 0.005
-# Two halves of a split octahedron: centres at +-0.4 of the half-axis that is cut, which becomes 0.6 of itself, the others 0.8.
+# Two halves of a split octahedron: centres at +-0.4 of the half-axis that is cut, which becomes 0.6 of itself, the
+# others 0.8.
 SPLIT_OFFSET, SPLIT_ALONG, SPLIT_ACROSS = 0.4, 0.6, 0.8
-# Two halves of a split tetrahedron keep one vertex of its longest edge each: the tetrahedron shrunk to TETRA_SHRUNK about that
-# vertex, and the vertex at the other end brought to TETRA_OTHER of its distance. All corners are convex combinations of the
-# parent's, so a half never leaves it. (Exact halves have 12 degrees of freedom, these primitives 10; see `split_tetrahedra`.)
+# Two halves of a split tetrahedron keep one vertex of its longest edge each: the tetrahedron shrunk to TETRA_SHRUNK
+# about that vertex, and the vertex at the other end brought to TETRA_OTHER of its distance. All corners are convex
+# combinations of the parent's, so a half never leaves it. (Exact halves have 12 degrees of freedom, these primitives
+# 10; see `split_tetrahedra`.)
 TETRA_SHRUNK, TETRA_OTHER = 0.82, 0.6
-# Two halves of a split Gaussian: middles at +-0.6 of the standard deviation that is cut, which becomes 0.8 of itself, so that the
-# second moment is kept (0.6^2 + 0.8^2 = 1); -ln(1 - opacity) becomes 1 / (2 * 0.8) of itself, so that its integral is.
+# Two halves of a split Gaussian: middles at +-0.6 of the standard deviation that is cut, which becomes 0.8 of itself,
+# so that the second moment is kept (0.6^2 + 0.8^2 = 1); -ln(1 - opacity) becomes 1 / (2 * 0.8) of itself, so that its
+# integral is.
 GAUSSIAN_OFFSET, GAUSSIAN_ALONG = 0.6, 0.8
 
 
@@ -66,9 +69,9 @@ class Growth:
 class Event:
     """One change of the population, N primitives before it and M after it.
 
-    Row i of the new tables, Adam's moments included, is row `source[i]` of the old ones; then `values[name]`, pairs of rows of the
-    new table and what they receive, is written. First moments become 0 in the rows `calm`, both in the rows `fresh`, and both
-    of the opacity everywhere with `calm_opacity`.
+    Row i of the new tables, Adam's moments included, is row `source[i]` of the old ones; then `values[name]`, pairs of
+    rows of the new table and what they receive, is written. First moments become 0 in the rows `calm`, both in the rows
+    `fresh`, and both of the opacity everywhere with `calm_opacity`.
     """
 
     source: np.ndarray
@@ -81,7 +84,8 @@ class Event:
 class Control:
     """A rule of growth. Whatever it draws comes from (seed, purpose, step), so that a resumed run repeats itself.
 
-    `gathered` holds a value per primitive for each name in `NAMES`; the trainer saves it and sets it to 0 after each event.
+    `gathered` holds a value per primitive for each name in `NAMES`; the trainer saves it and sets it to 0 after each
+    event.
     """
 
     NAMES: tuple[str, ...] = ()
@@ -107,8 +111,8 @@ class Control:
         return None
 
     def gather(self, parameters: Parameters, camera: Camera, size: tuple[int, int], screen_grad: torch.Tensor) -> None:
-        """Notes one view's gradient to the projected centres (N, 3), see `ops.rasterize`'s `screen`; `size`, (width, height), is that of
-        the photograph, of which the camera may see a part."""
+        """Notes one view's gradient to the projected centres (N, 3), see `ops.rasterize`'s `screen`; `size`, (width,
+        height), is that of the photograph, of which the camera may see a part."""
 
     def disturb(self, parameters: Parameters, step: int) -> None:
         """Changes parameters in place after the optimiser's step, `step` counted from 1."""
@@ -121,8 +125,11 @@ class Control:
         """The change after this step."""
         raise NotImplementedError
 
-    def limit_only(self, counts: Callable[[np.ndarray], np.ndarray], most: int, parameters: Parameters, step: int) -> None:
-        """Limits to `most` those alone whose centres (N, 3) `counts` says (N,) True of, where a rule can; the others limit all.
+    def limit_only(
+        self, counts: Callable[[np.ndarray], np.ndarray], most: int, parameters: Parameters, step: int
+    ) -> None:
+        """Limits to `most` those alone whose centres (N, 3) `counts` says (N,) True of, where a rule can; the others
+        limit all.
 
         To be called with the parameters and the step that a training, or its resumption, begins with.
         """
@@ -149,7 +156,9 @@ class GradientControl(Control):
     def limit_only(self, counts, most, parameters, step):
         self.counts = counts
         if step == 0:
-            self.growth = Growth.plan(self.options.iterations, int(counts(parameters["center"].detach().numpy()).sum()), most)
+            self.growth = Growth.plan(
+                self.options.iterations, int(counts(parameters["center"].detach().numpy()).sum()), most
+            )
 
     def gather(self, parameters, camera, size, screen_grad):
         # In units of the image's size, so that views of different resolution pull alike.
@@ -196,14 +205,15 @@ def grow(
     """Draws the parents of one event and computes their halves.
 
     Args:
-        parameters: raw trainable tensors, `center` (N, 3), `rotation` (N, 4), `log_extent` (N, 3 or 4), `raw_opacity` (N,), ...
+        parameters: raw trainable tensors, `center` (N, 3), `rotation` (N, 4), `log_extent` (N, 3 or 4), `raw_opacity`
+            (N,), ...
         pull: (N,) screen-space gradient gathered since the last event, >= 0.
         smallest_log_extent: a primitive with an extent at this floor counts as dead.
         counted: primitives that count towards the cap; default: all.
 
-    Returns: rows (P,) of the parents, overwritten by their first halves; rows (P,) that receive the second halves, from N on where
-        they are new; and what the halves have of their own, {"center": (2, P, 3), "log_extent": (2, P, 3 or 4), for
-        Gaussians also "raw_opacity": (2, P)}. All other parameters of a half are its parent's.
+    Returns: rows (P,) of the parents, overwritten by their first halves; rows (P,) that receive the second halves, from
+        N on where they are new; and what the halves have of their own, {"center": (2, P, 3), "log_extent": (2, P, 3 or
+        4), for Gaussians also "raw_opacity": (2, P)}. All other parameters of a half are its parent's.
     """
     log_extent = parameters["log_extent"].detach().numpy().astype(np.float64)
     opacity = 1 - np.exp(-np.logaddexp(0.0, parameters["raw_opacity"].detach().numpy().astype(np.float64)))
@@ -218,7 +228,8 @@ def grow(
         empty = np.zeros(0, dtype=np.int64)
         columns = log_extent.shape[1]
         return empty, empty, {"center": np.zeros((2, 0, 3)), "log_extent": np.zeros((2, 0, columns))}
-    # Drawing without replacement in proportion to the weight: the largest of log(u) / weight (Efraimidis and Spirakis 2006).
+    # Drawing without replacement in proportion to the weight: the largest of log(u) / weight (Efraimidis and Spirakis
+    # 2006).
     with np.errstate(divide="ignore"):
         keys = np.where(weight > 0, np.log(rng.random(count)) / np.where(weight > 0, weight, 1), -np.inf)
     parents = np.sort(np.argpartition(-keys, wanted - 1)[:wanted])
@@ -230,9 +241,7 @@ def grow(
         return parents, children, split_tetrahedra(center, rotation, log_extent[parents])
 
     extent = np.exp(log_extent[parents])
-    axis = (rng.random((wanted, 1)) > np.cumsum(extent**2, 1)[:, :2] / (extent**2).sum(1, keepdims=True)).sum(
-        1
-    )
+    axis = (rng.random((wanted, 1)) > np.cumsum(extent**2, 1)[:, :2] / (extent**2).sum(1, keepdims=True)).sum(1)
     chosen = np.eye(3)[axis]
     along, across, part = SPLIT_ALONG, SPLIT_ACROSS, SPLIT_OFFSET
     if kind == "gaussian":
@@ -249,15 +258,14 @@ def grow(
     return parents, children, halves
 
 
-def split_tetrahedra(
-    center: np.ndarray, rotation: np.ndarray, log_extent: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Two halves of each tetrahedron, at the two ends of its longest edge; `center` (P, 3), `rotation` (P, 4), `log_extent` (P, 4).
+def split_tetrahedra(center: np.ndarray, rotation: np.ndarray, log_extent: np.ndarray) -> dict[str, np.ndarray]:
+    """Two halves of each tetrahedron, at the two ends of its longest edge; `center` (P, 3), `rotation` (P, 4),
+    `log_extent` (P, 4).
 
-    Cutting at the middle of the edge would tile the parent, but such a half has no centre with these four directions (12 degrees
-    of freedom against 10): the best fits by least squares put 13 to 28 % of their volume outside of the parent and leave 19 to 30 %
-    of it empty. These lie inside, leave 25 to 27 % empty, keep the rotation, and have 0.85 to 0.88 of the volume together (the
-    halves of an octahedron 0.77); measured on distances that differ up to 1 : 8.
+    Cutting at the middle of the edge would tile the parent, but such a half has no centre with these four directions
+    (12 degrees of freedom against 10): the best fits by least squares put 13 to 28 % of their volume outside of the
+    parent and leave 19 to 30 % of it empty. These lie inside, leave 25 to 27 % empty, keep the rotation, and have 0.85
+    to 0.88 of the volume together (the halves of an octahedron 0.77); measured on distances that differ up to 1 : 8.
     """
     rows = np.arange(len(center))
     extent = np.exp(log_extent)
@@ -276,7 +284,8 @@ def split_tetrahedra(
 
 
 def thinned(raw_opacity: np.ndarray, part: float) -> np.ndarray:
-    """Raw opacity, float64, whose optical thickness softplus(raw) = -ln(1 - opacity) is `part` of that of `raw_opacity`."""
+    """Raw opacity, float64, whose optical thickness softplus(raw) = -ln(1 - opacity) is `part` of that of
+    `raw_opacity`."""
     thickness = part * np.logaddexp(0.0, raw_opacity.astype(np.float64))
     return thickness + np.log(-np.expm1(-thickness))  # ln(e^t - 1)
 

@@ -1,8 +1,9 @@
 """The rules of growth that the papers use, for comparison: 3DGS's clone, split, prune and reset, and MCMC's relocation.
 
-Source: Kerbl et al., "3D Gaussian Splatting" (2023), section 5; Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte
-Carlo" (2024); LinPrim (von Luetzow and Niessner, arXiv 2501.16312) for their constants with polyhedra. Steps are the papers'
-at 7,000 iterations and more, and shrink with shorter runs; growth ends at the papers' part of the run.
+Source: Kerbl et al., "3D Gaussian Splatting" (2023), section 5; Kheradmand et al., "3D Gaussian Splatting as Markov
+Chain Monte Carlo" (2024); LinPrim (von Luetzow and Niessner, arXiv 2501.16312) for their constants with polyhedra.
+Steps are the papers' at 7,000 iterations and more, and shrink with shorter runs; growth ends at the papers' part of the
+run.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ LONE_RADIUS = 2.6
 
 
 def scene_radius(cameras: list[Camera]) -> float:
-    """1.1 times the largest distance of a camera from the mean of all, the length that the papers' constants are parts of."""
+    """1.1 times the largest distance of a camera from the mean of all, the length that the papers' constants are parts
+    of."""
     centers = np.stack([camera.center for camera in cameras])
     return 1.1 * float(np.linalg.norm(centers - centers.mean(0), axis=1).max()) or LONE_RADIUS
 
@@ -47,7 +49,8 @@ class ClassicConstants:
     spread: float  # standard deviation of a half's centre, in extents
 
 
-# LinPrim spreads halves by whole extents, which puts 93 % of their centres outside of the parent; by extents / 2.6 it is 39 %.
+# LinPrim spreads halves by whole extents, which puts 93 % of their centres outside of the parent; by extents / 2.6 it
+# is 39 %.
 POLYHEDRA = ClassicConstants(250, 1.5e-4, 0.01, 0.4, 0.025, 1.2, 1 / DIST_TO_SCALE)
 GAUSSIANS = ClassicConstants(100, 2e-4, 0.01, 0.1, 0.005, 1.6, 1.0)
 RESET_EVERY = 3000
@@ -56,10 +59,10 @@ RESET_EVERY = 3000
 class ClassicControl(Control):
     """3DGS's rule. Where LinPrim's code errs, this does what was meant:
 
-    * Opacities are reset to twice the prune level, 3DGS's own ratio. LinPrim's 0.01 lies below its prune level of 0.025, so whatever
-      is not looked at before the next event is deleted.
-    * A clone would double the density: the two polyhedra share the optical thickness of the one, and look alike. (Gaussians as
-      in 3DGS.) Faint ones keep theirs, as they would be pruned else.
+    * Opacities are reset to twice the prune level, 3DGS's own ratio. LinPrim's 0.01 lies below its prune level of
+      0.025, so whatever is not looked at before the next event is deleted.
+    * A clone would double the density: the two polyhedra share the optical thickness of the one, and look alike.
+      (Gaussians as in 3DGS.) Faint ones keep theirs, as they would be pruned else.
     * Primitives that are large on the screen are not pruned: in both codes the record is cleared before it is read, so
       no published result has it.
     """
@@ -147,12 +150,12 @@ SIZE_PENALTY = OPACITY_PENALTY = 0.01
 
 
 class McmcControl(Control):
-    """MCMC's rule: dead primitives move onto opaque ones, five percent more by the same draw, noise on the centres of the
-    transparent ones, and penalties on size and opacity. A polyhedron counts as a Gaussian of standard deviations extent / 2.6, as in
-    LinPrim; relocation therefore changes its image.
+    """MCMC's rule: dead primitives move onto opaque ones, five percent more by the same draw, noise on the centres of
+    the transparent ones, and penalties on size and opacity. A polyhedron counts as a Gaussian of standard deviations
+    extent / 2.6, as in LinPrim; relocation therefore changes its image.
 
-    LinPrim subtracts the 3D filter from a relocated primitive and takes the absolute value, so one that ought to vanish grows; here
-    extents are kept without the filter and end at their lower bound.
+    LinPrim subtracts the 3D filter from a relocated primitive and takes the absolute value, so one that ought to vanish
+    grows; here extents are kept without the filter and end at their lower bound.
     """
 
     GROWS_UNTIL = 5 / 6
@@ -176,7 +179,8 @@ class McmcControl(Control):
         return self.first < step < self.last and step % self.every == 0
 
     def disturb(self, parameters, step):
-        """center += covariance noise 5e5 rate S(1 - opacity), S(x) = 1 / (1 + exp(-100 (x - 0.995))), rate the papers' for centres."""
+        """center += covariance noise 5e5 rate S(1 - opacity), S(x) = 1 / (1 + exp(-100 (x - 0.995))), rate the papers'
+        for centres."""
         opacity = torch.sigmoid(parameters["raw_opacity"]).numpy().astype(np.float64)
         # S is below 1e-9 for opacities over 0.22.
         rows = np.flatnonzero(opacity < 0.22)
@@ -230,8 +234,8 @@ class McmcControl(Control):
 def relocated(opacity: np.ndarray, copies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(P,) opacity of each of N `copies` that stand for one Gaussian, and (P,) factor of its standard deviations.
 
-    o' = 1 - (1 - o)^(1/N);  factor = o / sum_{i=1..N} sum_{k=0..i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1). The inner sums add up,
-    by sum_{i=k+1..N} C(i-1, k) = C(N, k+1), to sum_{k=1..N} C(N, k) (-1)^(k+1) o'^k / sqrt(k).
+    o' = 1 - (1 - o)^(1/N);  factor = o / sum_{i=1..N} sum_{k=0..i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1).
+    The inner sums add up, by sum_{i=k+1..N} C(i-1, k) = C(N, k+1), to sum_{k=1..N} C(N, k) (-1)^(k+1) o'^k / sqrt(k).
 
     o' is then kept within 0.005 and 1 - 1e-6. Source: Kheradmand et al. 2024, equation 9.
     """
@@ -253,9 +257,7 @@ def in_view(parameters, camera: Camera, kind: str) -> torch.Tensor:
     depth = z.clamp_min(1e-6)
     x, y = camera.fx * local[:, 0] / depth + camera.cx, camera.fy * local[:, 1] / depth + camera.cy
     wide, high = camera.fx * reach / depth, camera.fy * reach / depth
-    return (
-        (z > 0.01) & (x + wide > 0) & (x - wide < camera.width) & (y + high > 0) & (y - high < camera.height)
-    )
+    return (z > 0.01) & (x + wide > 0) & (x - wide < camera.width) & (y + high > 0) & (y - high < camera.height)
 
 
 def _normal(rng: np.random.Generator, extent: np.ndarray, kind: str) -> np.ndarray:

@@ -39,9 +39,9 @@ DIST_TO_SCALE = 2.6
 class Kind:
     """What one kind of primitive needs to know of itself; vertex v lies at center + extent[column[v]] R direction[v].
 
-    `directions` (V, 3) and `columns` (V,), both of length 0 without vertices; `faces` (F, 3) vertices, counter-clockwise
-    seen from outside; `size` the extent that looks as large as an octahedron's half-axes of 1; `solid` whether it is of
-    constant density, so that a chord l keeps exp(-density l) of the light.
+    `directions` (V, 3) and `columns` (V,), both of length 0 without vertices; `faces` (F, 3) vertices,
+    counter-clockwise seen from outside; `size` the extent that looks as large as an octahedron's half-axes of 1;
+    `solid` whether it is of constant density, so that a chord l keeps exp(-density l) of the light.
     """
 
     name: str
@@ -57,12 +57,7 @@ class Kind:
 # Vertex 2 k + (0 for -, 1 for +) of an octahedron lies on axis k. One face per octant, counter-clockwise seen from
 # outside: the order x, y, z is so where the product of the three signs is positive.
 _OCTAHEDRON_FACES = np.array(
-    [
-        (x, 2 + y, 4 + z) if (x + y + z) % 2 == 1 else (x, 4 + z, 2 + y)
-        for x in (0, 1)
-        for y in (0, 1)
-        for z in (0, 1)
-    ],
+    [(x, 2 + y, 4 + z) if (x + y + z) % 2 == 1 else (x, 4 + z, 2 + y) for x in (0, 1) for y in (0, 1) for z in (0, 1)],
     dtype=np.int64,
 )
 _OCTAHEDRON_VERTICES = np.repeat(np.eye(3), 2, axis=0) * np.tile([-1.0, 1.0], 3)[:, None]
@@ -74,31 +69,50 @@ KINDS = {
     kind.name: kind
     for kind in (
         Kind(
-            "octahedron", "octahedra", 3, 1.0, True,
-            _OCTAHEDRON_VERTICES, np.repeat(np.arange(3), 2), _OCTAHEDRON_FACES,
+            "octahedron",
+            "octahedra",
+            3,
+            1.0,
+            True,
+            _OCTAHEDRON_VERTICES,
+            np.repeat(np.arange(3), 2),
+            _OCTAHEDRON_FACES,
         ),
         # Of the same volume: 8 sqrt(3) / 27 size^3 = 4 / 3.
         Kind(
-            "tetrahedron", "tetrahedra", 4, (4.5 / math.sqrt(3)) ** (1 / 3), True,
-            _TETRAHEDRON_VERTICES, np.arange(4), _TETRAHEDRON_FACES,
+            "tetrahedron",
+            "tetrahedra",
+            4,
+            (4.5 / math.sqrt(3)) ** (1 / 3),
+            True,
+            _TETRAHEDRON_VERTICES,
+            np.arange(4),
+            _TETRAHEDRON_FACES,
         ),
         Kind(
-            "gaussian", "Gaussians", 3, 1 / DIST_TO_SCALE, False,
-            np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros((0, 3), np.int64),
+            "gaussian",
+            "Gaussians",
+            3,
+            1 / DIST_TO_SCALE,
+            False,
+            np.zeros((0, 3)),
+            np.zeros(0, np.int64),
+            np.zeros((0, 3), np.int64),
         ),
     )
-}  # fmt: skip
+}
 
 
 def reference_length(extent, kind: str):
     """(N,) length that opacity refers to: density = softplus(raw) / length, LinPrim's shortest diagonal made general.
 
     2 min_k extent_k of an octahedron, the diameter 6 V / A of the inscribed sphere of a tetrahedron. With e3 the sum of
-    the products of three of the four distances, V = 2 e3 / (9 sqrt 3); a face whose vertices are p, q, r away has the area
-    sqrt(2)/3 sqrt(x^2 + y^2 + z^2 + x y + y z + z x) with x = p q, y = q r, z = r p, because directions that meet at
-    cos = -1/3 have the cross products' inner products 8/9 and 4/9.
+    the products of three of the four distances, V = 2 e3 / (9 sqrt 3); a face whose vertices are p, q, r away has the
+    area sqrt(2)/3 sqrt(x^2 + y^2 + z^2 + x y + y z + z x) with x = p q, y = q r, z = r p, because directions that meet
+    at cos = -1/3 have the cross products' inner products 8/9 and 4/9.
 
-    `extent` (N, 3 or 4) of numpy or torch, > 0; differentiable in torch. At a regular tetrahedron of distances d: 2 d / 3.
+    `extent` (N, 3 or 4) of numpy or torch, > 0; differentiable in torch. At a regular tetrahedron of distances d: 2 d /
+    3.
     """
     if kind == "octahedron":
         return 2 * (extent.min(1) if isinstance(extent, np.ndarray) else extent.amin(1))
@@ -123,15 +137,15 @@ class Primitives:
     sum_k Y_k(direction) sh_k), the direction from the camera to the centre. All float32; other float types are
     converted. `kind` is one of KINDS:
 
-    octahedron   extent (N, 3) half-axes: { p : sum_k |R^T (p - center)|_k / extent_k <= 1 }. A ray that crosses a length
-                 l of it keeps exp(-density l) of its light; density >= 0 per unit of length.
+    octahedron   extent (N, 3) half-axes: { p : sum_k |R^T (p - center)|_k / extent_k <= 1 }. A ray that crosses a
+                 length l of it keeps exp(-density l) of its light; density >= 0 per unit of length.
     tetrahedron  extent (N, 4) distances to the vertices center + extent_j R b_j with b = (1,1,1), (1,-1,-1), (-1,1,-1),
                  (-1,-1,1), each / sqrt 3; density as above.
     gaussian     extent (N, 3) standard deviations along the local axes; `density` is the opacity of its middle, 0 to 1.
 
     Raises:
-        LinprimError: there is no row, a shape is wrong, or a row holds NaN, infinity, a zero quaternion, an extent that is not
-            positive or a density out of its range. The message names the first such row.
+        LinprimError: there is no row, a shape is wrong, or a row holds NaN, infinity, a zero quaternion, an extent that
+            is not positive or a density out of its range. The message names the first such row.
     """
 
     center: np.ndarray
@@ -166,9 +180,7 @@ class Primitives:
                         f"{what.plural}: sh has the shape {array.shape}, wanted ({count}, K, 3), K in 1, 4, 9, 16"
                     )
             elif array.shape != shapes[name]:
-                raise LinprimError(
-                    f"{what.plural}: {name} has the shape {array.shape}, wanted {shapes[name]}"
-                )
+                raise LinprimError(f"{what.plural}: {name} has the shape {array.shape}, wanted {shapes[name]}")
             object.__setattr__(self, name, array)
             bad = ~np.isfinite(array.reshape(count, -1)).all(axis=1)
             if bad.any():
@@ -191,11 +203,15 @@ class Primitives:
                     f" ({int(bad.sum())} of {count} rows), wanted {wanted}"
                 )
 
-    def tensors(self, dtype: torch.dtype | None = None) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    def tensors(
+        self, dtype: torch.dtype | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         """The arrays as `ops.rasterize` takes them, sharing their memory unless `dtype` is another than theirs."""
         import torch
 
-        center, rotation, extent, density, sh = (torch.from_numpy(getattr(self, name)).to(dtype or torch.float32) for name in ARRAYS)
+        center, rotation, extent, density, sh = (
+            torch.from_numpy(getattr(self, name)).to(dtype or torch.float32) for name in ARRAYS
+        )
         return center, rotation, extent, density, sh
 
     def __len__(self) -> int:
@@ -235,7 +251,8 @@ class Primitives:
 
     @property
     def alpha(self) -> np.ndarray:
-        """(N,) float64 share of light taken along the reference length, 1 - exp(-density length); a Gaussian's opacity."""
+        """(N,) float64 share of light taken along the reference length, 1 - exp(-density length); a Gaussian's
+        opacity."""
         density = self.density.astype(np.float64)
         if not KINDS[self.kind].solid:
             return density
@@ -251,8 +268,8 @@ class Primitives:
         """All primitives as one coloured mesh of N V vertices and N F outward faces; overlaps stay as they are.
 
         Vertices V i .. V i + V - 1 and faces F i .. F i + F - 1 belong to primitive i. A Gaussian has no surface: with
-        `sigmas` it becomes the ellipsoid so many standard deviations large, an icosahedron refined once (V = 42, F = 80)
-        with its vertices on it.
+        `sigmas` it becomes the ellipsoid so many standard deviations large, an icosahedron refined once (V = 42, F =
+        80) with its vertices on it.
 
         Raises:
             LinprimError: Gaussians without `sigmas`.

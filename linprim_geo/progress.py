@@ -18,7 +18,8 @@ def duration(seconds: float) -> str:
 def memory_gib(entry: str = "VmRSS") -> float:
     """Resident memory of this process in GiB; 0 where the system does not tell.
 
-    `entry` of Linux's /proc/self/status: VmRSS now, VmHWM the most since the peak was last forgotten; elsewhere the most ever.
+    `entry` of Linux's /proc/self/status: VmRSS now, VmHWM the most since the peak was last forgotten; elsewhere the
+    most ever.
     """
     try:
         with open("/proc/self/status") as status:
@@ -39,7 +40,8 @@ def memory_gib(entry: str = "VmRSS") -> float:
 class Progress:
     """Prints to stderr how far a job of `total` steps is, with rate and time left.
 
-    On a terminal the line is refreshed twice a second; elsewhere a line is printed every 20 seconds. `quiet` prints nothing.
+    On a terminal the line is refreshed twice a second; elsewhere a line is printed every 20 seconds. `quiet` prints
+    nothing.
     """
 
     def __init__(self, name: str, total: int, start: int = 0, quiet: bool = False):

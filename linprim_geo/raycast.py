@@ -38,8 +38,8 @@ SPHERE = 1.0 + 1e-5
 
 
 class Triangles(NamedTuple):
-    """Faces in the scaled frame: (F, 3) first corners, edges from there, and their cross products; -1 if they enclose a negative volume,
-    else 1."""
+    """Faces in the scaled frame: (F, 3) first corners, edges from there, and their cross products; -1 if they enclose a
+    negative volume, else 1."""
 
     origin: np.ndarray
     edge1: np.ndarray
@@ -184,9 +184,7 @@ class RayCaster:
         shape = (camera.height, camera.width)
         return depth.reshape(shape), face.reshape(shape), normal.reshape(*shape, 3)
 
-    def cast_single(
-        self, origins: np.ndarray, directions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def cast_single(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """First hits in Embree's own single precision: for colours, not for measuring.
 
         Returns distance (R,) float32 in units of the length of `directions` (inf: nothing), face (R,) int32
@@ -209,8 +207,8 @@ class RayCaster:
     def first_hits(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """What a camera sees at its pixel centres, by `cast_single`: to tell what is hidden, not for measuring.
 
-        Returns read-only depth (H, W) float32 along the optical axis, inf where nothing is hit, and face (H, W) int32, there -1.
-        Memory: 8 bytes per pixel are kept, at most KEPT_BYTES over all cameras.
+        Returns read-only depth (H, W) float32 along the optical axis, inf where nothing is hit, and face (H, W) int32,
+        there -1. Memory: 8 bytes per pixel are kept, at most KEPT_BYTES over all cameras.
         """
         lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
         key = (*lens, camera.world_to_camera.tobytes())
@@ -225,7 +223,8 @@ class RayCaster:
         return hits
 
     def occluded_single(self, origins: np.ndarray, directions: np.ndarray, tmax: np.ndarray) -> np.ndarray:
-        """`occluded` in single precision, as `cast_single`: quick to tell most of what is hidden; the rest wants `occluded`."""
+        """`occluded` in single precision, as `cast_single`: quick to tell most of what is hidden; the rest wants
+        `occluded`."""
         start, directions = self._single(origins, directions)
         finite, blocked = np.minimum(tmax * self._scale, 1e30).astype(np.float32), np.empty(len(directions), bool)
 
@@ -293,9 +292,7 @@ class RayCaster:
             slipped = len(changed)
             if slipped:
                 face_hit[changed] = replacement
-                t[changed], uv[changed], _ = self._solve(
-                    start[changed], unit[changed], replacement, np.zeros(slipped)
-                )
+                t[changed], uv[changed], _ = self._solve(start[changed], unit[changed], replacement, np.zeros(slipped))
         distance[rows] = t * factor[rows]
         face[rows] = face_hit
         bary[rows] = uv

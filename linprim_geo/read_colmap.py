@@ -75,7 +75,8 @@ def models_below(root: Path) -> list[Path]:
 
 
 def read_colmap(root: Path, model: Path, images: Path | None = None) -> Listing:
-    """The listing of a capture whose cameras come from `model` and whose images lie in `images`, or in one of the usual folders of `root`.
+    """The listing of a capture whose cameras come from `model` and whose images lie in `images`, or in one of the usual
+    folders of `root`.
 
     Raises:
         LinprimError: the model is damaged or empty, or registered images are not on disk.
@@ -118,18 +119,14 @@ def read_model(folder: Path) -> ColmapModel:
         (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(str(folder))
     except (ValueError, IndexError, RuntimeError, MemoryError, OSError) as error:
         reason = (str(error).splitlines() or ["damaged"])[0].split("Check failed:")[-1].strip()
-        raise LinprimError(
-            f"{folder}: the COLMAP model cannot be read ({reason}), wanted complete files"
-        ) from error
+        raise LinprimError(f"{folder}: the COLMAP model cannot be read ({reason}), wanted complete files") from error
     lenses = {}
     images = []
     for number in sorted(reconstruction.reg_image_ids()):
         image = reconstruction.image(number)
         if image.camera_id not in lenses:
             camera = reconstruction.camera(image.camera_id)
-            lens = Lens(
-                camera.model_name, camera.width, camera.height, tuple(float(value) for value in camera.params)
-            )
+            lens = Lens(camera.model_name, camera.width, camera.height, tuple(float(value) for value in camera.params))
             check_lens(lens, f"{folder / ('cameras' + suffix)} camera {image.camera_id}")
             lenses[image.camera_id] = lens
         pose = np.eye(4)
@@ -168,13 +165,10 @@ def _check_files(folder: Path) -> str:
             "a full set of .bin or of .txt files"
         ]
         raise LinprimError(
-            f"{folder}: the COLMAP model lacks {', '.join(missing)},"
-            " wanted cameras, images and points3D (.bin or .txt)"
+            f"{folder}: the COLMAP model lacks {', '.join(missing)}, wanted cameras, images and points3D (.bin or .txt)"
         )
     if (folder / f"rigs{suffix}").is_file() != (folder / f"frames{suffix}").is_file():
-        raise LinprimError(
-            f"{folder}: only one of rigs{suffix} and frames{suffix} is there, wanted both or neither"
-        )
+        raise LinprimError(f"{folder}: only one of rigs{suffix} and frames{suffix} is there, wanted both or neither")
     for table in _TABLES + ("rigs", "frames"):
         file = folder / f"{table}{suffix}"
         if not is_file(file):
@@ -206,9 +200,7 @@ def _check_binary(file: Path, table: str) -> None:
                 break
         else:
             if offset != len(data):
-                raise LinprimError(
-                    f"{file}: {len(data) - offset} bytes after the last of {count} records, wanted none"
-                )
+                raise LinprimError(f"{file}: {len(data) - offset} bytes after the last of {count} records, wanted none")
             return
     except (struct.error, IndexError, ValueError) as error:
         if not data:
@@ -221,9 +213,7 @@ def _walk_camera(data: bytes, offset: int, file: Path) -> int:
     counts = {number: parameters for number, parameters in model_parameter_counts().values()}
     if model not in counts:
         known = ", ".join(f"{number} {name}" for name, (number, _) in model_parameter_counts().items())
-        raise LinprimError(
-            f"{file}: camera {camera} has the unknown camera model {model}, wanted one of {known}"
-        )
+        raise LinprimError(f"{file}: camera {camera} has the unknown camera model {model}, wanted one of {known}")
     return offset + 24 + 8 * counts[model]
 
 
@@ -249,9 +239,7 @@ def _walk_rig(data: bytes, offset: int, file: Path) -> int:
 
 
 def _walk_frame(data: bytes, offset: int, file: Path) -> int:
-    (sensors,) = struct.unpack_from(
-        "<I", data, offset + 64
-    )  # id, rig, quaternion, translation; then the images
+    (sensors,) = struct.unpack_from("<I", data, offset + 64)  # id, rig, quaternion, translation; then the images
     return offset + 68 + 16 * sensors
 
 
@@ -280,9 +268,7 @@ def _check_text(file: Path, table: str) -> None:
     for row in rows:
         if table == "cameras" and len(row) > 1 and row[1] not in model_parameter_counts():
             known = ", ".join(sorted(model_parameter_counts()))
-            raise LinprimError(
-                f"{file}: camera {row[0]} has the unknown camera model {row[1]}, wanted one of {known}"
-            )
+            raise LinprimError(f"{file}: camera {row[0]} has the unknown camera model {row[1]}, wanted one of {known}")
         wanted = {"cameras": 4, "images": 10, "points3D": 8, "rigs": 2, "frames": 10}[table]
         if table == "cameras" and len(row) > 1:
             wanted += model_parameter_counts()[row[1]][1]
@@ -295,6 +281,5 @@ def _check_text(file: Path, table: str) -> None:
             )
     if promised is not None and len(rows) != promised:
         raise LinprimError(
-            f"{file}: {len(rows)} of the {promised} records that its header names are there,"
-            " wanted the complete file"
+            f"{file}: {len(rows)} of the {promised} records that its header names are there, wanted the complete file"
         )

@@ -29,11 +29,12 @@ def find_cameras(root: Path) -> Path | None:
 def read_dtu(root: Path, cameras: Path) -> Listing:
     """Reads `world_mat_i @ scale_mat_i`, which projects from the unit sphere's frame, of every image, sorted by name.
 
-    Photographs smaller than those of the matrices by a whole factor are noticed by the principal point and their cameras scaled. Pixel
-    centres of the matrices are at whole numbers, so half a pixel is added.
+    Photographs smaller than those of the matrices by a whole factor are noticed by the principal point and their
+    cameras scaled. Pixel centres of the matrices are at whole numbers, so half a pixel is added.
 
     Raises:
-        LinprimError: a damaged file, a missing matrix, another number of images or masks, or a matrix that is no camera.
+        LinprimError: a damaged file, a missing matrix, another number of images or masks, or a matrix that is no
+            camera.
     """
     folder = next((root / name for name in _IMAGE_FOLDERS if photos.files_in(root / name)), None)
     if folder is None:
@@ -60,7 +61,8 @@ def read_dtu(root: Path, cameras: Path) -> Listing:
 
 
 def decomposed(projection: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """(3, 3) calibration with a positive diagonal and last entry 1, and (4, 4) world-to-camera pose, of a (3, 4) projection matrix.
+    """(3, 3) calibration with a positive diagonal and last entry 1, and (4, 4) world-to-camera pose, of a (3, 4)
+    projection matrix.
 
     Raises:
         LinprimError: not finite, or without an inverse.

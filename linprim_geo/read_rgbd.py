@@ -1,5 +1,5 @@
-"""Reading RGB-D sequences, in metres: Redwood's and Open3D's (`trajectory.log`, a folder of colour and one of depth) and TUM's (`rgb.txt`,
-`depth.txt`, `groundtruth.txt`)."""
+"""Reading RGB-D sequences, in metres: Redwood's and Open3D's (`trajectory.log`, a folder of colour and one of depth)
+and TUM's (`rgb.txt`, `depth.txt`, `groundtruth.txt`)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from .scene import Frame, Listing
 _COLOR_FOLDERS = ("image", "color", "rgb", "images")
 _LOGS = ("trajectory.log", "scene/trajectory.log")
 _INTRINSICS = ("camera_intrinsic.json", "intrinsic.json", "intrinsics.json", "camera_primesense.json")
-# The PrimeSense that Redwood and TUM recorded with, where no file says otherwise: 319.5, 239.5 with pixel centres at whole numbers.
+# The PrimeSense that Redwood and TUM recorded with, where no file says otherwise: 319.5, 239.5 with pixel centres at
+# whole numbers.
 _PRIMESENSE = Lens("PINHOLE", 640, 480, (525.0, 525.0, 320.0, 240.0))
 # Metres per step of a depth map.
 _METRES_REDWOOD, _METRES_TUM = 1e-3, 1 / 5000
@@ -55,7 +56,8 @@ def read_tum(root: Path) -> Listing:
         depth_of = trajectories.nearest(depth_times, seconds, _MAX_SECONDS)
     if (pose_of < 0).all():
         raise LinprimError(
-            f"{root / 'groundtruth.txt'}: no pose within {_MAX_SECONDS} s of any of the {len(names)} photographs of rgb.txt"
+            f"{root / 'groundtruth.txt'}: no pose within {_MAX_SECONDS} s of any of the {len(names)} photographs "
+            "of rgb.txt"
         )
     frames, (lens, said) = [], _pinhole(root)
     for row, name in enumerate(names):
@@ -64,22 +66,23 @@ def read_tum(root: Path) -> Listing:
             where = f"{root / 'rgb.txt'} image {name}"
             _check_size(root / name, where, lens, said)
             pose = np.linalg.inv(poses[pose_of[row]])
-            frames.append(
-                Frame(where, name, root / name, lens, pose, depth_path=depth, depth_scale=_METRES_TUM)
-            )
+            frames.append(Frame(where, name, root / name, lens, pose, depth_path=depth, depth_scale=_METRES_TUM))
     return Listing("tum", tuple(frames), None, "m")
 
 
 def read_log(root: Path, log: Path) -> Listing:
-    """Every photograph that `log` has a pose of, with the depth map of its name, or of its place in the order if there are as many.
+    """Every photograph that `log` has a pose of, with the depth map of its name, or of its place in the order if there
+    are as many.
 
     Raises:
-        LinprimError: a trajectory that cannot be read, no photographs, or numbers of poses, photographs and depth maps that do not fit.
+        LinprimError: a trajectory that cannot be read, no photographs, or numbers of poses, photographs and depth maps
+            that do not fit.
     """
     folder = next((root / name for name in _COLOR_FOLDERS if photos.files_in(root / name)), None)
     if folder is None:
         raise LinprimError(
-            f"{root}: {log.name} and depth but no photographs, wanted a folder {', '.join(_COLOR_FOLDERS[:2])} or the like"
+            f"{root}: {log.name} and depth but no photographs, wanted a folder {', '.join(_COLOR_FOLDERS[:2])} "
+            "or the like"
         )
     images = photos.files_in(folder)
     depths = {path.stem: path for path in photos.files_in(root / "depth")}
@@ -111,14 +114,12 @@ def _check_size(image: Path, where: str, lens: Lens, said: str) -> None:
         raise LinprimError(f"{where}: the image {image} is not on disk")
     width, height, _ = photos.image_header(image)
     if (width, height) != (lens.width, lens.height):
-        raise LinprimError(
-            f"{image}: the image is {width}x{height}, wanted {lens.width}x{lens.height} as {said}"
-        )
+        raise LinprimError(f"{image}: the image is {width}x{height}, wanted {lens.width}x{lens.height} as {said}")
 
 
 def read_intrinsics(path: Path) -> Lens:
-    """The pinhole of Open3D's JSON: `width`, `height` and `intrinsic_matrix`, nine numbers column by column. Pixel centres are at whole
-    numbers there, so half a pixel is added to the principal point.
+    """The pinhole of Open3D's JSON: `width`, `height` and `intrinsic_matrix`, nine numbers column by column. Pixel
+    centres are at whole numbers there, so half a pixel is added to the principal point.
 
     Raises:
         LinprimError: unreadable, or not a pinhole.

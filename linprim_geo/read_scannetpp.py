@@ -1,6 +1,7 @@
 """Reading ScanNet++ scenes, `dslr` or `iphone`, in the frame of `scans/mesh_aligned_0.05.ply` and in metres.
 
-The masks of anonymised pixels say what was blurred, not what is empty, so they are no foreground masks and are not used.
+The masks of anonymised pixels say what was blurred, not what is empty, so they are no foreground masks and are not
+used.
 """
 
 from __future__ import annotations
@@ -24,9 +25,7 @@ _TRANSFORMS, _TRANSFORMS_UNDISTORTED = "nerfstudio/transforms.json", "nerfstudio
 def find_device(root: Path) -> Path | None:
     """The folder of one camera's images and poses: `dslr` or `iphone` in the scene's folder, or that folder itself."""
     folders = [root / name for name in _DEVICES]
-    if root.resolve().name in _DEVICES or any(
-        (root / name).is_dir() for name in (_DISTORTED[0], *_UNDISTORTED)
-    ):
+    if root.resolve().name in _DEVICES or any((root / name).is_dir() for name in (_DISTORTED[0], *_UNDISTORTED)):
         folders.append(root)
     for folder in folders:
         posed = read_colmap.has_model(folder / _MODEL) or (folder / _TRANSFORMS).is_file()
@@ -39,8 +38,8 @@ def read_scannetpp(device: Path) -> Listing:
     """Reads the images as they were taken (fisheye) if they are there, else the undistorted ones.
 
     Poses and points are those of `colmap`; without it poses are those of `nerfstudio`, turned back. Held out is what
-    `train_test_lists.json` calls test; of those, images that are not on disk are left out, as the benchmark keeps some. Images that
-    `nerfstudio` marks `is_bad` (blurred, most of them) are left out of both.
+    `train_test_lists.json` calls test; of those, images that are not on disk are left out, as the benchmark keeps some.
+    Images that `nerfstudio` marks `is_bad` (blurred, most of them) are left out of both.
 
     Raises:
         LinprimError: a file that is missing or damaged, or training images that are not on disk.
@@ -88,7 +87,8 @@ def _split(held_out: set[str], test: bool) -> str | None:
 
 
 def _of_transforms(path: Path, images: Path) -> tuple[dict[str, Lens], dict[str, np.ndarray]]:
-    """The cameras of a nerfstudio file whose paths are names in `images`, in the frame of the mesh: `applied_transform` undone."""
+    """The cameras of a nerfstudio file whose paths are names in `images`, in the frame of the mesh: `applied_transform`
+    undone."""
     if not path.is_file():
         raise LinprimError(f"{path}: no such file, wanted the cameras of {images}")
     frames, applied = read_transforms.read_cameras(path, images)

@@ -1,4 +1,5 @@
-"""Reading Tanks and Temples by its `NAME_COLMAP_SfM.log`, which has poses but no intrinsics: these come from a file beside it."""
+"""Reading Tanks and Temples by its `NAME_COLMAP_SfM.log`, which has poses but no intrinsics: these come from a file
+beside it."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ def read_tnt(root: Path, log: Path) -> Listing:
     file = next((root / name for name in _INTRINSICS if (root / name).is_file()), None)
     if file is None:
         raise LinprimError(
-            f"{log}: a trajectory without intrinsics, wanted a COLMAP model in sparse/0, or {_INTRINSICS[0]} with width, height and"
+            f"{log}: a trajectory without intrinsics, wanted a COLMAP model in sparse/0, or {_INTRINSICS[0]} "
+            "with width, height and"
             " intrinsic_matrix beside it"
         )
     lens = read_intrinsics(file)
@@ -50,6 +52,4 @@ def read_tnt(root: Path, log: Path) -> Listing:
 def _images(root: Path, log: Path) -> list[Path]:
     """In `images`, in a folder of the scene's name, or beside the trajectory."""
     name = log.name.removesuffix("_COLMAP_SfM.log")
-    return next(
-        (found for folder in ("images", "image", name, ".") if (found := photos.files_in(root / folder))), []
-    )
+    return next((found for folder in ("images", "image", name, ".") if (found := photos.files_in(root / folder))), [])

@@ -1,8 +1,9 @@
 """Reading `transforms*.json`: NeRF-synthetic, nerfstudio and instant-ngp captures, and the points that belong
 to them.
 
-Their camera-to-world matrices have OpenGL axes (x right, y up, z backward); their pixel centres are at +0.5. Poses and `ply_file_path` are
-taken to be in one frame, as they are written; points of a COLMAP model are brought into it by `applied_transform` and `applied_scale`.
+Their camera-to-world matrices have OpenGL axes (x right, y up, z backward); their pixel centres are at +0.5. Poses and
+`ply_file_path` are taken to be in one frame, as they are written; points of a COLMAP model are brought into it by
+`applied_transform` and `applied_scale`.
 """
 
 from __future__ import annotations
@@ -89,19 +90,15 @@ def read_transforms(root: Path, json_file: Path | None = None, sparse: Path | No
         frames.extend(_read_frames(path, header, split))
     points = _points(root, headers, frames, sparse)
     unit = next(
-        (
-            header[key]
-            for _, header in headers
-            for key in ("units", "unit")
-            if isinstance(header.get(key), str)
-        ),
+        (header[key] for _, header in headers for key in ("units", "unit") if isinstance(header.get(key), str)),
         None,
     )
     return Listing("transforms", tuple(frames), points, unit)
 
 
 def read_cameras(path: Path, images: Path) -> tuple[list[Frame], np.ndarray | None]:
-    """The frames of one file whose paths are names in the folder `images`, without side files, and its (3, 4) `applied_transform`.
+    """The frames of one file whose paths are names in the folder `images`, without side files, and its (3, 4)
+    `applied_transform`.
 
     Frames whose image is not on disk are there too, those that are marked `is_bad` are not.
 
@@ -114,7 +111,11 @@ def read_cameras(path: Path, images: Path) -> tuple[list[Frame], np.ndarray | No
         where = _checked(f"{path} frame {number}", entry)
         if _is_bad(entry, where):
             continue
-        bare = {key: value for key, value in entry.items() if not key.endswith(("mask_path", "depth_file_path", "normal_file_path"))}
+        bare = {
+            key: value
+            for key, value in entry.items()
+            if not key.endswith(("mask_path", "depth_file_path", "normal_file_path"))
+        }
         frames.append(_frame(path.parent, header, bare, where, images / entry["file_path"], None))
     return frames, _applied_transform([(path, header)])
 
@@ -265,7 +266,9 @@ def _number(values: dict, key: str, where: str, default: float | None = None) ->
     if value is None and default is not None:
         value = default
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST:
-        found = "missing" if value is None else f"{value!r:.40}" if isinstance(value, (int, float, str)) else "no number"
+        found = (
+            "missing" if value is None else f"{value!r:.40}" if isinstance(value, (int, float, str)) else "no number"
+        )
         raise LinprimError(f"{where}: '{key}' is {found}, wanted a finite number")
     return float(value)
 
@@ -288,9 +291,7 @@ def _lens(values: dict, where: str, image: Path) -> Lens:
             f"{where}: neither 'fl_x' nor 'camera_angle_x' is there, wanted a focal length or a view angle"
         )
     cx, cy = _number(values, "cx", where, width / 2), _number(values, "cy", where, height / 2)
-    k1, k2, k3, k4, p1, p2 = (
-        _number(values, key, where, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")
-    )
+    k1, k2, k3, k4, p1, p2 = (_number(values, key, where, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     model = str(values.get("camera_model") or "").upper()
     if model in _FISHEYE_MODELS or (values.get("is_fisheye") is True and model in ("", "OPENCV")):
         return Lens("OPENCV_FISHEYE", width, height, (fx, fy, cx, cy, k1, k2, k3, k4))
@@ -299,8 +300,7 @@ def _lens(values: dict, where: str, image: Path) -> Lens:
         raise LinprimError(f"{where}: unknown camera model {model!r}, wanted one of {known}")
     if k4:
         raise LinprimError(
-            f"{where}: 'k4' is {k4:g} for camera model {model or 'OPENCV'},"
-            " wanted 0 (only fisheye cameras have it)"
+            f"{where}: 'k4' is {k4:g} for camera model {model or 'OPENCV'}, wanted 0 (only fisheye cameras have it)"
         )
     if k3:
         return Lens("FULL_OPENCV", width, height, (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
@@ -316,9 +316,7 @@ def _focal(values: dict, key: str, angle_key: str, size: int, where: str) -> flo
         return None
     angle = _number(values, angle_key, where)
     if not 0 < angle < math.pi:
-        raise LinprimError(
-            f"{where}: '{angle_key}' is {angle:g}, wanted an angle in radians between 0 and pi"
-        )
+        raise LinprimError(f"{where}: '{angle_key}' is {angle:g}, wanted an angle in radians between 0 and pi")
     return size / 2 / math.tan(angle / 2)
 
 
@@ -345,8 +343,7 @@ def _points(root: Path, headers: list, frames: list[Frame], sparse: Path | None)
         cloud, difference = _model_points(model, frames, applied)
         if difference > 1:
             raise LinprimError(
-                f"{model}: its cameras are not those of {headers[0][0]},"
-                " wanted a COLMAP model in the same frame"
+                f"{model}: its cameras are not those of {headers[0][0]}, wanted a COLMAP model in the same frame"
             )
         return cloud
     for path, header in headers:
@@ -368,8 +365,8 @@ def _points(root: Path, headers: list, frames: list[Frame], sparse: Path | None)
 
 
 def _applied_transform(headers: list) -> np.ndarray | None:
-    """nerfstudio's (3, 4) matrix from COLMAP's world to that of the transforms, `applied_scale` times `applied_transform`; None where
-    neither is given."""
+    """nerfstudio's (3, 4) matrix from COLMAP's world to that of the transforms, `applied_scale` times
+    `applied_transform`; None where neither is given."""
     for path, header in headers:
         if header.get("applied_transform") is not None or header.get("applied_scale") is not None:
             given = header.get("applied_transform")
@@ -386,9 +383,7 @@ def _applied_transform(headers: list) -> np.ndarray | None:
     return None
 
 
-def _model_points(
-    model: Path, frames: Iterable[Frame], applied: np.ndarray | None
-) -> tuple[PointCloud | None, float]:
+def _model_points(model: Path, frames: Iterable[Frame], applied: np.ndarray | None) -> tuple[PointCloud | None, float]:
     """The model's points in the frame of the transforms, and how far its cameras are off (1: just
     acceptable)."""
     colmap = read_colmap.read_model(model)
@@ -414,8 +409,8 @@ def _model_points(
 
 
 def _pose_difference(pairs: list, matrix: np.ndarray, offset: np.ndarray) -> float:
-    """Worst of the differences in position and angle, as multiples of what is allowed, when `matrix`, a rotation that may scale, and
-    `offset` have moved the first of each pair."""
+    """Worst of the differences in position and angle, as multiples of what is allowed, when `matrix`, a rotation that
+    may scale, and `offset` have moved the first of each pair."""
     theirs = np.array([-pose[:3, :3].T @ pose[:3, 3] for pose, _ in pairs]) @ matrix.T + offset
     ours = np.array([-pose[:3, :3].T @ pose[:3, 3] for _, pose in pairs])
     spread = np.linalg.norm(ours - ours.mean(axis=0), axis=1).max()

@@ -227,9 +227,7 @@ def rasterize(
     shape = (center_camera, rotation_camera, extent, density, rays)
     limits = view_limits((width, height), (fx, fy), (cx, cy))
     if primitive == "gaussian":
-        chords = gaussian_chords(
-            *shape, screen_filter=screen_filter, focal=(fx, fy), limits=limits, near=near
-        )
+        chords = gaussian_chords(*shape, screen_filter=screen_filter, focal=(fx, fy), limits=limits, near=near)
     else:
         chords = polyhedron_chords(
             *shape,
@@ -248,17 +246,19 @@ def rasterize(
         key = chords.t_in if order == "entry" else center_camera[chords.primitive, 2]
         flat = blend_in_order(chords, key, color, background, len(rays), **options)
     statistics = {name: flat.pop(name) for name in ("max_weight", "pixels")}
-    return {
-        name: value.reshape(*value.shape[:-1], height, width) for name, value in flat.items()
-    } | statistics
+    return {name: value.reshape(*value.shape[:-1], height, width) for name, value in flat.items()} | statistics
 
 
 @torch.no_grad()
 def environment_light(opacity: Tensor, texels: Tensor, camera: Any, least: float = 0.0) -> Tensor:
-    """What `ops.environment_light` computes, differentiable by autograd: (3, H, W) (1 - opacity) * colour of the pixel's direction."""
+    """What `ops.environment_light` computes, differentiable by autograd: (3, H, W) (1 - opacity) * colour of the
+    pixel's direction."""
     size = texels.shape[1]
     rotation = torch.as_tensor(camera.rotation, dtype=opacity.dtype)
-    rays = pixel_rays(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, opacity).reshape(-1, 3) @ rotation
+    rays = (
+        pixel_rays(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, opacity).reshape(-1, 3)
+        @ rotation
+    )
     face, along, across = _cube_face(rays)
     column, row = (size * (coordinate + 1) / 2 - 0.5 for coordinate in (along, across))
     color = torch.zeros_like(rays)
@@ -356,9 +356,7 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     )
 
 
-def photometric_loss(
-    image: Tensor, target: Tensor, dssim_weight: float, weight: Tensor | None = None
-) -> Tensor:
+def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float, weight: Tensor | None = None) -> Tensor:
     """Returns (1 - l) mean |image - target| + l (1 - mean SSIM), l = dssim_weight, over channels and pixels.
 
     Args:

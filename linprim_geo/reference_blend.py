@@ -205,11 +205,7 @@ def blend_overlapping(
 
     def image(name: str, *shape: int) -> Tensor:
         zeros = background.new_zeros(*shape, count)
-        return (
-            zeros.index_copy(-1, crossed, torch.cat([block[name] for block in blocks], -1))
-            if blocks
-            else zeros
-        )
+        return zeros.index_copy(-1, crossed, torch.cat([block[name] for block in blocks], -1)) if blocks else zeros
 
     thickness = image("thickness")
     result = {
@@ -280,7 +276,5 @@ def _integrate(chords: Chords, table: Tensor, color: Tensor, stop: float, level:
     crossing = torch.minimum(crossing, edges[at, e + 1])
     result["depth_median"] = torch.zeros_like(edges[:, 0]).index_copy(0, at, crossing)
     share = inside[at, e] * rate[at] / rate_segment[at, e, None]
-    result["normal_median"] = torch.zeros_like(normals[..., 0]).index_copy(
-        1, at, (share * normals[:, at]).sum(-1)
-    )
+    result["normal_median"] = torch.zeros_like(normals[..., 0]).index_copy(1, at, (share * normals[:, at]).sum(-1))
     return result

@@ -87,9 +87,7 @@ def _tetrahedron(rotation: Tensor, extent: Tensor) -> _Solid:
 
 
 @torch.no_grad()
-def clip_to_faces(
-    direction: Tensor, origin: Tensor, faces: Tensor, room: Tensor, start: float
-) -> tuple[Tensor, ...]:
+def clip_to_faces(direction: Tensor, origin: Tensor, faces: Tensor, room: Tensor, start: float) -> tuple[Tensor, ...]:
     """Clips the half-lines y(t) = origin + t direction, t >= start, to the y with faces . y <= room.
 
     One half-space after another: t (n . direction) <= room - n . origin bounds t from above, from below or,
@@ -138,7 +136,8 @@ def ray_space_jacobian(center: Tensor) -> Tensor:
 
 
 def view_limits(size: tuple[int, int], focal: tuple[float, float], principal: tuple[float, float]) -> Tensor:
-    """Returns (2, 2) the least and the largest x/z, y/z of the image, in px, and 0.15 of its size around it, float64, within 1e4."""
+    """Returns (2, 2) the least and the largest x/z, y/z of the image, in px, and 0.15 of its size around it, float64,
+    within 1e4."""
     width, scale, middle = (torch.tensor(x, dtype=torch.float64) for x in (size, focal, principal))
     return torch.stack([(-0.15 * width - middle) / scale, (1.15 * width - middle) / scale]).clamp(-1e4, 1e4)
 
@@ -146,7 +145,8 @@ def view_limits(size: tuple[int, int], focal: tuple[float, float], principal: tu
 def held_in_view(center: Tensor, limits: Tensor) -> Tensor:
     """Returns where J is taken for `center` (3,): there, but x/z and y/z held within `limits` of `view_limits`.
 
-    Source: Kerbl et al., 3D Gaussian Splatting (2023), 1.3 times half the field of view: farther out J grows without bound.
+    Source: Kerbl et al., 3D Gaussian Splatting (2023), 1.3 times half the field of view: farther out J grows without
+    bound.
     """
     low, high = limits.to(center)
     held = torch.minimum(torch.maximum(center[:2] / center[2], low), high) * center[2]
@@ -195,8 +195,8 @@ def polyhedron_chords(
 
     exact: x = t v, t >= near, is met where it is. affine: ray-space points are (x/z, y/z, |c|) + J (p - c), so
     the ray of a pixel is the line p(s) = c + J^-1 ((X, Y, s) - (x/z, y/z, |c|)) and t = s / |v|, J that of
-    `held_in_view`; there is no near plane, but a primitive with z <= near is left out. screen_filter: the ray is first drawn towards the
-    centre, by s_x and s_y, and the density multiplied by s_x s_y; |v| stays.
+    `held_in_view`; there is no near plane, but a primitive with z <= near is left out. screen_filter: the ray is first
+    drawn towards the centre, by s_x and s_y, and the density multiplied by s_x s_y; |v| stays.
 
     Args:
         center: (N, 3), camera frame.
@@ -291,9 +291,7 @@ def gaussian_chords(
         if not c[2] > near:
             continue
         half = (
-            pixel_scale[:, None]
-            * ray_space_jacobian(held_in_view(c, limits))[:2]
-            @ (rotation[i] * extent[i]).double()
+            pixel_scale[:, None] * ray_space_jacobian(held_in_view(c, limits))[:2] @ (rotation[i] * extent[i]).double()
         )
         # det of half half^T by Cauchy-Binet: the squared area between its rows, without cancellation.
         area = torch.linalg.cross(half[0], half[1])

@@ -24,8 +24,9 @@ def render_run(
 ) -> dict:
     """Renders the views of a split to `output` (default RUN/renders).
 
-    Writes SPLIT/rgb/NAME.png, and for depth_median, depth_expected, depth_first, opacity (H, W) and normal (H, W, 3; world axes)
-    NAME.npy as float32 beside a NAME.png to look at. Depths are z-depths in the data set's unit, 0 where there is none.
+    Writes SPLIT/rgb/NAME.png, and for depth_median, depth_expected, depth_first, opacity (H, W) and normal (H, W, 3;
+    world axes) NAME.npy as float32 beside a NAME.png to look at. Depths are z-depths in the data set's unit, 0 where
+    there is none.
 
     Returns: `output`, `views`, `files`.
     """
@@ -64,7 +65,8 @@ def _write_view(folder: Path, name: str, images: dict[str, np.ndarray]) -> int:
 
 
 def depth_preview(depth: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 of a depth map: near is bright yellow, far dark blue, over the middle 98 % of its inverse depths; none is black."""
+    """(H, W, 3) uint8 of a depth map: near is bright yellow, far dark blue, over the middle 98 % of its inverse depths;
+    none is black."""
     valid = np.isfinite(depth) & (depth > 0)
     if not valid.any():
         return np.zeros((*depth.shape, 3), np.uint8)

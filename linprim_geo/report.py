@@ -1,4 +1,5 @@
-"""What goes into the report of a run: everything its folder and its capture say, with missing parts named; the page is report_page's."""
+"""What goes into the report of a run: everything its folder and its capture say, with missing parts named; the page is
+report_page's."""
 
 from __future__ import annotations
 
@@ -61,10 +62,11 @@ def report_run(
     output: str | os.PathLike | None = None,
     reference: str | os.PathLike | None = None,
 ) -> dict:
-    """Writes one HTML file about a run, RUN/report.html unless `output` says otherwise; nothing else in the run is changed.
+    """Writes one HTML file about a run, RUN/report.html unless `output` says otherwise; nothing else in the run is
+    changed.
 
-    The page needs nothing but itself. Scores that RUN/eval holds are taken if they are newer than the run's last save; what is missing of
-    colours, and of depth where the data set has depth or a `reference` mesh is given, is scored now.
+    The page needs nothing but itself. Scores that RUN/eval holds are taken if they are newer than the run's last save;
+    what is missing of colours, and of depth where the data set has depth or a `reference` mesh is given, is scored now.
 
     Returns: `report`, `bytes`, `views` (shown), `meshes` (methods), `missing` (sentences), `seconds`.
 
@@ -148,9 +150,7 @@ def _evidence(scene: Scene, notes: dict, missing: list[str]) -> list[tuple[str, 
         missing.append(f"The photographs could not be compared with each other: {error}")
         return []
     if seen is None:
-        missing.append(
-            "The capture brings no points on surfaces, so its photographs are not compared with each other"
-        )
+        missing.append("The capture brings no points on surfaces, so its photographs are not compared with each other")
         return []
     rows = (
         (
@@ -173,8 +173,7 @@ def _evidence(scene: Scene, notes: dict, missing: list[str]) -> list[tuple[str, 
         ),
     )
     return [
-        (what, "not measured" if value is None else f"{value * scale:.3g} {unit}")
-        for what, value, unit, scale in rows
+        (what, "not measured" if value is None else f"{value * scale:.3g} {unit}") for what, value, unit, scale in rows
     ]
 
 
@@ -204,9 +203,7 @@ def _score_views(report: Report, reference: str | os.PathLike | None) -> None:
             if report.depth is None and (has_depth or reference):
                 report.depth = eval_depth_run(run, reference, output=Path(scratch) / "depth")
             if report.depth is None:
-                missing.append(
-                    "The data set has no depth, and no --reference mesh was given, so depth is not scored"
-                )
+                missing.append("The data set has no depth, and no --reference mesh was given, so depth is not scored")
             report.views = _pictures(report, _chosen(scene.test, ranking))
         except LinprimError as error:
             missing.append(f"Held-out views could not be shown: {error}")
@@ -274,9 +271,7 @@ def _pictures(report: Report, views: list[View]) -> list[ShownView]:
             )
         if mesh is not None and mesh.light is not None:
             grey = np.full(mesh.light.vertices.shape, 205, np.uint8)
-            pictures.append(
-                (f"mesh of {mesh.method} from there", render_preview(mesh.light, view.camera, colors=grey))
-            )
+            pictures.append((f"mesh of {mesh.method} from there", render_preview(mesh.light, view.camera, colors=grey)))
         encoded = [(title, *_png(pixels)) for title, pixels in pictures]
         shown.append(ShownView(view.name, psnr(render, photo), ssim(render, photo), encoded))
     return shown
@@ -315,12 +310,7 @@ def commands(run: Run, report: Report, reference: str | os.PathLike | None) -> l
             ]
             lines.append(
                 shlex.join(
-                    words
-                    + (
-                        []
-                        if scores.get("protocol") == HEADLINE
-                        else ["--protocol", str(scores.get("protocol"))]
-                    )
+                    words + ([] if scores.get("protocol") == HEADLINE else ["--protocol", str(scores.get("protocol"))])
                 )
             )
     if report.images:
@@ -328,16 +318,15 @@ def commands(run: Run, report: Report, reference: str | os.PathLike | None) -> l
     if report.depth:
         truth = str(report.depth.get("reference", ""))
         words = ["linprim-geo", "eval-depth", str(run.path)]
-        lines.append(
-            shlex.join(words + ([] if truth == "depth images of the data set" else ["--reference", truth]))
-        )
+        lines.append(shlex.join(words + ([] if truth == "depth images of the data set" else ["--reference", truth])))
     words = ["linprim-geo", "report", str(run.path)]
     lines.append(shlex.join(words + (["--reference", str(reference)] if reference else [])))
     return lines
 
 
 def _extraction(run: Run, shown: ShownMesh) -> list[str]:
-    """The words that extract a mesh again, as far as its stats.json tells: what was chosen automatically is spelled out."""
+    """The words that extract a mesh again, as far as its stats.json tells: what was chosen automatically is spelled
+    out."""
     stats = shown.stats
     words = [
         "linprim-geo",

@@ -1,4 +1,5 @@
-"""The meshes of a run as a report shows them: found, scored against a reference, made light and packed for a browser."""
+"""The meshes of a run as a report shows them: found, scored against a reference, made light and packed for a
+browser."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ FIRST_LOOK = 0.4
 
 @dataclass
 class ShownMesh:
-    """One method's mesh: its statistics, the file that is shown, scores by protocol, and `packed`, what the page's script reads.
+    """One method's mesh: its statistics, the file that is shown, scores by protocol, and `packed`, what the page's
+    script reads.
 
     `problem` says what is missing or wrong, "" if nothing is.
     """
@@ -44,16 +46,15 @@ class ShownMesh:
 def find_meshes(run: Run, reference: str | os.PathLike | None, missing: list[str]) -> list[ShownMesh]:
     """Every mesh that RUN/mesh tells of, scored and ready to be shown; what is not there is said in `missing`.
 
-    Scores are those of RUN/eval/mesh that belong to the mesh; with `reference` they are taken anew where there are none of it.
+    Scores are those of RUN/eval/mesh that belong to the mesh; with `reference` they are taken anew where there are none
+    of it.
     """
     found = []
     for method in METHODS:
         file = run.path / "mesh" / method / "stats.json"
         if file.exists():
             stats = read_json(file, missing)
-            if stats and not (
-                isinstance(stats.get("mesh"), str) and isinstance(stats.get("level"), int | float)
-            ):
+            if stats and not (isinstance(stats.get("mesh"), str) and isinstance(stats.get("level"), int | float)):
                 missing.append(f"{file}: does not tell of a mesh and its level")
             elif stats:
                 found.append(ShownMesh(method, stats, mesh_file(run, method, stats)))
@@ -113,14 +114,14 @@ def _fill(
             unit = run.unit
             shown.scores.insert(
                 0,
-                score_mesh(mesh, load_mesh(truth), cameras=cameras or None, unit=unit)
-                | {"reference": str(truth)},
+                score_mesh(mesh, load_mesh(truth), cameras=cameras or None, unit=unit) | {"reference": str(truth)},
             )
     else:
         truth = next((place for scores in shown.scores if (place := _reference_of(scores, run))), None)
         if shown.scores and truth is None:
             missing.append(
-                f"{shown.scores[0].get('reference')}: is not there any more, so the true error of {shown.method} is not shown"
+                f"{shown.scores[0].get('reference')}: is not there any more, so the true error of {shown.method} "
+                "is not shown"
             )
     inside = bool(cameras) and is_inside(mesh, cameras)
     visible = path.with_name(f"{path.stem}_visible{path.suffix}")
@@ -137,11 +138,12 @@ def _fill(
     colors = layers(mesh, rows, error)
     said = f"{path.name} of {shown.method}: {len(mesh.faces)} faces"
     if cell:
-        said += f", shown with {len(light.faces)}: vertices are clustered in cells of {cell:.3g} {run.unit}, which makes small folds"
-    if inside:
         said += (
-            "; the cameras stand inside, so backs of faces are hidden, and what no camera sees is left out"
+            f", shown with {len(light.faces)}: vertices are clustered in cells of {cell:.3g} {run.unit}, "
+            "which makes small folds"
         )
+    if inside:
+        said += "; the cameras stand inside, so backs of faces are hidden, and what no camera sees is left out"
     shown.light = light
     shown.packed = pack(shown.method, light, colors, cameras, run.unit, said, inside)
 
@@ -155,7 +157,8 @@ def pack(
     said: str,
     inside: bool,
 ) -> dict:
-    """What viewer.js reads: places as 16-bit shares of the box (V, 4; the last is padding), corners as 32-bit rows, colours as bytes."""
+    """What viewer.js reads: places as 16-bit shares of the box (V, 4; the last is padding), corners as 32-bit rows,
+    colours as bytes."""
     low, high = mesh.bounds
     size = high - low
     places = np.zeros((len(mesh.vertices), 4), "<u2")
@@ -164,7 +167,8 @@ def pack(
     if cameras:
         up = up_direction(cameras)
         middle = (low + high) / 2
-        # The first look is a camera's, from somewhat above; from inside there is no place to stand, so it is into the room from above.
+        # The first look is a camera's, from somewhat above; from inside there is no place to stand, so it is into the
+        # room from above.
         directions = np.stack([camera.center - middle for camera in cameras])
         steepness = directions @ up / np.maximum(np.linalg.norm(directions, axis=1), 1e-12)
         direction = directions[np.argmin(np.abs(steepness - FIRST_LOOK))] + (
@@ -181,8 +185,7 @@ def pack(
         "places": _text(places),
         "index": _text(mesh.faces.astype("<u4")),
         "layers": [
-            {"name": layer.name, "colors": _text(layer.colors), "legend": _legend(layer, unit)}
-            for layer in colors
+            {"name": layer.name, "colors": _text(layer.colors), "legend": _legend(layer, unit)} for layer in colors
         ],
     }
 

@@ -75,13 +75,18 @@ def page(report: Report) -> Page:
     """The page of a report."""
     name = "/".join(report.run.path.resolve().parts[-2:])
     body = {
-        "input": _input(report), "decisions": _decisions(report), "training": _training(report), "views": _views(report),
-        "scores": _scores(report), "mesh": _mesh(report), "cost": _cost(report), "repeat": _repeat(report),
-    }  # fmt: skip
+        "input": _input(report),
+        "decisions": _decisions(report),
+        "training": _training(report),
+        "views": _views(report),
+        "scores": _scores(report),
+        "mesh": _mesh(report),
+        "cost": _cost(report),
+        "repeat": _repeat(report),
+    }
     packed = [shown.packed for shown in report.meshes if shown.packed]
     asset = {
-        file: (files(__package__) / "page" / file).read_text(encoding="utf-8")
-        for file in ("style.css", "viewer.js")
+        file: (files(__package__) / "page" / file).read_text(encoding="utf-8") for file in ("style.css", "viewer.js")
     }
     parts = [
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>',
@@ -137,7 +142,10 @@ def _summary(report: Report) -> str:
         cards.append((f"{state.get('primitives', 0):,}", f"{kind} after {state.get('iteration', 0):,} steps"))
         cards.append((duration(float(state.get("seconds") or 0)), "of training"))
     shown = "".join(f'<div class="card"><b>{escape(value)}</b>{escape(text)}</div>' for value, text in cards)
-    where = f"Run {report.run.path.resolve()}, trained on {report.run.scene_path}; page of {time.strftime('%Y-%m-%d %H:%M')}."
+    where = (
+        f"Run {report.run.path.resolve()}, trained on {report.run.scene_path}; page of "
+        f"{time.strftime('%Y-%m-%d %H:%M')}."
+    )
     advice = f"<p><b>{escape(str(report.notes['advice']))}</b></p>" if report.notes.get("advice") else ""
     return f'<p class="small">{escape(where)}</p><div class="cards">{shown}</div>{advice}'
 
@@ -162,9 +170,7 @@ def _input(report: Report) -> str:
         ("pixels", shown),
         (
             "points",
-            f"{len(points.xyz):,}"
-            if points is not None and len(points.xyz)
-            else "none: made by training itself",
+            f"{len(points.xyz):,}" if points is not None and len(points.xyz) else "none: made by training itself",
         ),
         ("masks", alpha),
         ("lenses", f"{sum(view.lens is not None for view in scene.views)} views are undistorted"),
@@ -195,15 +201,16 @@ def _decisions(report: Report) -> str:
                     )
                 )
     text = (
-        _words(rows, ("option", "value", "default", "what it is"))
-        if rows
-        else "<p>Every option has its default.</p>"
+        _words(rows, ("option", "value", "default", "what it is")) if rows else "<p>Every option has its default.</p>"
     )
     text = "<h3>Options that differ from their defaults</h3>" + text
     effects = report.notes.get("effects")
     if not effects:
         path = escape(str(report.run.scene_path))
-        said = f"Effects were not decided by the data (--effects none); linprim-geo inspect {path} says what they call for."
+        said = (
+            f"Effects were not decided by the data (--effects none); linprim-geo inspect {path} says what "
+            "they call for."
+        )
         return text + f"<p>{said}</p>"
     decided = []
     for each in effects:
@@ -211,14 +218,16 @@ def _decisions(report: Report) -> str:
         reason = REASONS.get(str(each.get("reason")), str(each.get("reason")))
         decided.append(
             (
-                str(each.get("name")), "on" if each.get("on") else "off", reason, f"{each.get('evidence')}: {value}",
-                f"{each.get('threshold'):g} {each.get('unit', '')}", str(each.get("what")),
+                str(each.get("name")),
+                "on" if each.get("on") else "off",
+                reason,
+                f"{each.get('evidence')}: {value}",
+                f"{each.get('threshold'):g} {each.get('unit', '')}",
+                str(each.get("what")),
             )
-        )  # fmt: skip
+        )
     return (
-        text
-        + "<h3>Effects</h3>"
-        + _words(decided, ("effect", "decision", "why", "evidence", "on from", "what it is"))
+        text + "<h3>Effects</h3>" + _words(decided, ("effect", "decision", "why", "evidence", "on from", "what it is"))
     )
 
 
@@ -235,28 +244,21 @@ def _training(report: Report) -> str:
             entries = [
                 entry
                 for entry in report.metrics
-                if isinstance(entry.get(key), int | float)
-                and math.isfinite(entry[key])
-                and (entry[key] > 0 or not log)
+                if isinstance(entry.get(key), int | float) and math.isfinite(entry[key]) and (entry[key] > 0 or not log)
             ]
             if entries:
                 series.append((name, [entry["step"] for entry in entries], [entry[key] for entry in entries]))
         if series:
-            plots.append(
-                f"<div>{svg.curves(series, 'step', title + (f', {unit}' if unit else ''), log=log)}</div>"
-            )
-    return (
-        f'<div class="plots">{"".join(plots)}</div>'
-        if plots
-        else "<p>metrics.jsonl holds nothing to draw.</p>"
-    )
+            plots.append(f"<div>{svg.curves(series, 'step', title + (f', {unit}' if unit else ''), log=log)}</div>")
+    return f'<div class="plots">{"".join(plots)}</div>' if plots else "<p>metrics.jsonl holds nothing to draw.</p>"
 
 
 def _views(report: Report) -> str:
     if not report.views:
         return "<p>No held-out view is shown; see the end of the page.</p>"
     parts = [
-        '<p class="small">By PSNR: the worst, the best, and some between. Pictures are averaged down; scores are of all pixels.</p>'
+        '<p class="small">By PSNR: the worst, the best, and some between. Pictures are averaged down; scores are '
+        "of all pixels.</p>"
     ]
     for view in report.views:
         pictures = []
@@ -290,10 +292,12 @@ def _scores(report: Report) -> str:
         depth = report.depth
         head = [title + (f", {unit}" if unit else "") for _, title, unit in DEPTH_SCORES]
         head = [text.format(unit=depth.get("unit", "")) for text in head]
-        said = f"Protocol: {depth.get('protocol')}; {depth.get('depth')} against {depth.get('reference')}; {depth.get('culling')}."
+        said = (
+            f"Protocol: {depth.get('protocol')}; {depth.get('depth')} against {depth.get('reference')}; "
+            f"{depth.get('culling')}."
+        )
         parts.append(
-            "<h3>Depth and normals</h3>"
-            + _table([[_short(depth.get(key)) for key, _, _ in DEPTH_SCORES]], head, said)
+            "<h3>Depth and normals</h3>" + _table([[_short(depth.get(key)) for key, _, _ in DEPTH_SCORES]], head, said)
         )
     scored: list[tuple[str, ...]] = []
     sources: list[str] = []
@@ -303,7 +307,10 @@ def _scores(report: Report) -> str:
                 if values:
                     cells = [_short(values.get(key)) for key, _, _ in MESH_SCORES]
                     scored.append((shown.method, str(scores.get("protocol")), part, *cells))
-            text = f"{scores.get('protocol')} of {shown.method} against {scores.get('reference')}: {scores.get('sampling', '')}; "
+            text = (
+                f"{scores.get('protocol')} of {shown.method} against {scores.get('reference')}: "
+                f"{scores.get('sampling', '')}; "
+            )
             text += f"rates within {_short(scores.get('tau'))} {scores.get('unit', '')}; "
             sources.append(f"{text}culling: {scores.get('culling', 'none')}.")
     if scored:
@@ -330,21 +337,26 @@ def _viewer(shown: Sequence[ShownMesh]) -> str:
 
     from .eval.figures import error_colors
 
-    stops = ", ".join(
-        "rgb({}, {}, {})".format(*color) for color in error_colors(np.linspace(0, 1, 9)).tolist()
+    stops = ", ".join("rgb({}, {}, {})".format(*color) for color in error_colors(np.linspace(0, 1, 9)).tolist())
+    text = (
+        f"The meshes of {', '.join(each.method for each in shown)}, to be turned; the pictures of held-out "
+        "views show them too."
     )
-    text = f"The meshes of {', '.join(each.method for each in shown)}, to be turned; the pictures of held-out views show them too."
     return (
         f'<canvas id="view" tabindex="0" role="img" aria-label="{escape(text)}"></canvas>'
         '<div class="controls"><label hidden="hidden">mesh <select id="view-mesh"></select></label>'
         '<fieldset id="view-layers" aria-label="colours"></fieldset>'
         '<label><input type="checkbox" id="view-backs"/> hide the backs of faces</label></div>'
-        f'<p id="view-legend" class="scale" hidden="hidden">0 <i style="background: linear-gradient(to right, {stops})"></i>'
+        '<p id="view-legend" class="scale" hidden="hidden">0 <i style="background: linear-gradient(to right, '
+        f'{stops})"></i>'
         ' <span id="view-top"></span></p>'
         '<p id="view-message" class="small"></p><noscript><p>The mesh needs JavaScript to be turned.</p></noscript>'
-        '<p class="small">Drag to turn; Shift and drag, or two fingers, to move; pinch, + and -, or the wheel once the mesh was clicked, '
-        "to zoom; double-click for the first look. The backs of faces are bluish. Predicted error is how far from a vertex "
-        "the surface is expected, given the photographs; both errors have one scale of colours, up to what 5 % of the vertices exceed, and "
+        '<p class="small">Drag to turn; Shift and drag, or two fingers, to move; pinch, + and -, or the wheel '
+        "once the mesh was clicked, "
+        "to zoom; double-click for the first look. The backs of faces are bluish. Predicted error is how far "
+        "from a vertex "
+        "the surface is expected, given the photographs; both errors have one scale of colours, up to what 5 % "
+        "of the vertices exceed, and "
         "grey where there is none.</p>"
     )
 
@@ -362,19 +374,14 @@ def _topology(shown: ShownMesh) -> str:
 
 
 def _cost(report: Report) -> str:
-    peaks = [
-        entry["memory_gib"] for entry in report.metrics if isinstance(entry.get("memory_gib"), int | float)
-    ]
+    peaks = [entry["memory_gib"] for entry in report.metrics if isinstance(entry.get("memory_gib"), int | float)]
     rows = []
     if report.state:
-        rows.append(
-            ("training", "steps", _short(report.state.get("seconds")), _short(max(peaks)) if peaks else "–")
-        )
+        rows.append(("training", "steps", _short(report.state.get("seconds")), _short(max(peaks)) if peaks else "–"))
     for shown in report.meshes:
         seconds, peak = shown.stats.get("seconds") or {}, shown.stats.get("peak_gib") or {}
         rows += [
-            (f"mesh, {shown.method}", name, _short(value), _short(peak.get(name)))
-            for name, value in seconds.items()
+            (f"mesh, {shown.method}", name, _short(value), _short(peak.get(name))) for name, value in seconds.items()
         ]
     for name, scores in (("eval-images", report.images), ("eval-depth", report.depth)):
         if scores:
@@ -384,28 +391,35 @@ def _cost(report: Report) -> str:
             (f"eval-mesh, {shown.method}", str(scores.get("protocol")), _short(scores.get("seconds")), "–")
             for scores in shown.scores
         ]
-    return (
-        _table(rows, ("job", "stage", "seconds", "peak GiB"), "")
-        if rows
-        else "<p>Nothing was measured yet.</p>"
-    )
+    return _table(rows, ("job", "stage", "seconds", "peak GiB"), "") if rows else "<p>Nothing was measured yet.</p>"
 
 
 def _repeat(report: Report) -> str:
     notes = report.notes
-    rows = [(name, str(notes[key])) for key, name in
-            (("linprim_geo", "linprim-geo"), ("python", "Python"), ("machine", "machine"), ("instruction_set", "vector kernels"))
-            if notes.get(key)]  # fmt: skip
-    rows.append(
-        ("this page", f"linprim-geo {__version__}, Python {platform.python_version()}, {platform.platform()}")
-    )
+    rows = [
+        (name, str(notes[key]))
+        for key, name in (
+            ("linprim_geo", "linprim-geo"),
+            ("python", "Python"),
+            ("machine", "machine"),
+            ("instruction_set", "vector kernels"),
+        )
+        if notes.get(key)
+    ]
+    rows.append(("this page", f"linprim-geo {__version__}, Python {platform.python_version()}, {platform.platform()}"))
     text = _words(rows, ("of the run", "version"))
     text += f"<h3>The same again</h3><pre>{escape(chr(10).join(report.commands))}</pre>"
-    text += '<p class="small">What was chosen automatically is spelled out; options of extraction that stats.json does not tell have their '
+    text += (
+        '<p class="small">What was chosen automatically is spelled out; options of extraction that '
+        "stats.json does not tell have their "
+    )
     text += "defaults. On one kind of processor the run comes out bitwise the same.</p>"
     budget = notes.get("time_budget")
     if isinstance(budget, dict):
-        text += f"<h3>Time budget</h3>{_words([(key, json.dumps(value)) for key, value in budget.items()], ('entry', 'value'))}"
+        text += (
+            "<h3>Time "
+            f"budget</h3>{_words([(key, json.dumps(value)) for key, value in budget.items()], ('entry', 'value'))}"
+        )
     return text
 
 
@@ -418,11 +432,12 @@ def _words(rows: Sequence[Sequence[str]], head: Sequence[str]) -> str:
 
 def _table(rows: Sequence[Sequence[str]], head: Sequence[str], caption: str, kind: str = "figures") -> str:
     top = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
-    lines = "".join(
-        "<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows
-    )
+    lines = "".join("<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
     shown = f"<caption>{escape(caption)}</caption>" if caption else ""
-    return f'<div class="scroll"><table class="{kind}">{shown}<thead><tr>{top}</tr></thead><tbody>{lines}</tbody></table></div>'
+    return (
+        '<div class="scroll"><table '
+        f'class="{kind}">{shown}<thead><tr>{top}</tr></thead><tbody>{lines}</tbody></table></div>'
+    )
 
 
 def _list(sentences: Sequence[str]) -> str:

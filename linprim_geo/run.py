@@ -67,9 +67,9 @@ class Run:
         time_budget: dict | None = None,
         blocks: int | None = None,
     ) -> Run:
-        """Makes the folder and writes its configuration. `instruction_set` is noted because results depend on it in their last bits,
-        `effects`, what was decided about the scene (`effects.Decision`), to be read, `time_budget`, a plan (`pacing.Pace`), and `blocks`,
-        their number where it is trained in several (`block_training`).
+        """Makes the folder and writes its configuration. `instruction_set` is noted because results depend on it in
+        their last bits, `effects`, what was decided about the scene (`effects.Decision`), to be read, `time_budget`, a
+        plan (`pacing.Pace`), and `blocks`, their number where it is trained in several (`block_training`).
 
         config.json comes last: without it nothing has begun, see `is_unused`.
 
@@ -124,13 +124,9 @@ class Run:
             scene.exists()  # raises for what no path can be
             saved = config["scene_options"], config["train_options"]
         except (KeyError, TypeError, ValueError, OverflowError, OSError) as error:
-            raise LinprimError(
-                f"{path}: config.json or transform.json lacks what a run needs ({error})"
-            ) from None
+            raise LinprimError(f"{path}: config.json or transform.json lacks what a run needs ({error})") from None
         if len(offset) != 3 or not np.isfinite([scale, *offset]).all() or scale <= 0:
-            raise LinprimError(
-                f"{path / 'transform.json'}: holds no positive scale with an offset of three numbers"
-            )
+            raise LinprimError(f"{path / 'transform.json'}: holds no positive scale with an offset of three numbers")
         similarity = Similarity(scale, (offset[0], offset[1], offset[2]))
         where = str(path / "config.json")
         options = from_saved(TrainOptions, saved[1], where)
@@ -144,9 +140,7 @@ class Run:
             LinprimError: the capture is still where it was, so this would be another one.
         """
         if self.scene_path.exists():
-            raise LinprimError(
-                f"{self.path}: was trained on {self.scene_path}, not on {scene_path.resolve()}"
-            )
+            raise LinprimError(f"{self.path}: was trained on {self.scene_path}, not on {scene_path.resolve()}")
         config = _read_json(self.path / "config.json", self.path)
         write_json(self.path / "config.json", config | {"scene": str(scene_path.resolve())})
         return replace(self, scene_path=scene_path.resolve())
@@ -193,9 +187,7 @@ class Run:
             or len(color) != 3
             or not all(isinstance(x, (int, float)) and 0 <= x <= 1 for x in color)
         ):
-            raise LinprimError(
-                f"{self.path / 'run.json'}: has no background colour of three numbers in [0, 1]"
-            )
+            raise LinprimError(f"{self.path / 'run.json'}: has no background colour of three numbers in [0, 1]")
         for name in ("iteration", "primitives", "seconds"):
             value = state.get(name, 0)
             if type(value) not in (int, float) or not 0 <= value < math.inf:
@@ -208,7 +200,8 @@ class Run:
         return np.asarray(self.state["background"], dtype=np.float64)
 
     def save(self, primitives: Primitives, state: dict, environment: torch.Tensor | None = None) -> None:
-        """Replaces the saved primitives (training frame), the environment if there is one, and run.json, each atomically."""
+        """Replaces the saved primitives (training frame), the environment if there is one, and run.json, each
+        atomically."""
         from .environment import save_environment
         from .ply import write_primitive_ply
 
@@ -223,8 +216,8 @@ class Run:
 
     @cached_property
     def environment(self) -> torch.Tensor | None:
-        """(6, S, S, 3) cube map of what stands at infinity behind everything, see `ops.environment_light`; None without one. Its axes are
-        those of the data set."""
+        """(6, S, S, 3) cube map of what stands at infinity behind everything, see `ops.environment_light`; None without
+        one. Its axes are those of the data set."""
         from .environment import load_environment
 
         return load_environment(self.path)
@@ -242,9 +235,10 @@ class Run:
     ) -> Iterator[tuple[View, dict[str, np.ndarray]]]:
         """Renders views over the run's background, one at a time.
 
-        Yields: (view, images) with float32 `rgb` (3, H, W), `opacity` (H, W) and, with `geometry`, the z-depths `depth_median`
-            (at transmittance `level`), `depth_first`, `depth_expected` (mean of what is there, divided by the opacity), each (H, W) in
-            the data set's unit with 0 where there is none, and `normal` (H, W, 3), the entry normal at the median depth in world axes.
+        Yields: (view, images) with float32 `rgb` (3, H, W), `opacity` (H, W) and, with `geometry`, the z-depths
+            `depth_median` (at transmittance `level`), `depth_first`, `depth_expected` (mean of what is there, divided
+            by the opacity), each (H, W) in the data set's unit with 0 where there is none, and `normal` (H, W, 3), the
+            entry normal at the median depth in world axes.
         """
         import torch
 
@@ -255,13 +249,9 @@ class Run:
         for view in views:
             camera, options = view.camera.transformed(self.similarity), self.train_options
             with torch.no_grad():
-                color = ops.rasterize(
-                    *tensors, background, camera, stop=options.stop, samples=options.samples, **how
-                )
+                color = ops.rasterize(*tensors, background, camera, stop=options.stop, samples=options.samples, **how)
                 out = (
-                    ops.rasterize(
-                        *tensors, background, camera, stop=options.stop, level=level, geometry=True, **how
-                    )
+                    ops.rasterize(*tensors, background, camera, stop=options.stop, level=level, geometry=True, **how)
                     if geometry
                     else color
                 )
@@ -277,18 +267,16 @@ class Run:
                 images["depth_median"] = (out.depth_median.numpy() * unit).astype(np.float32)
                 images["depth_first"] = (out.depth_first.numpy() * unit).astype(np.float32)
                 images["depth_expected"] = (out.depth_expected.numpy() * unit / opacity).astype(np.float32)
-                images["normal"] = (
-                    out.normal_median.numpy().transpose(1, 2, 0) @ view.camera.rotation
-                ).astype(np.float32)
+                images["normal"] = (out.normal_median.numpy().transpose(1, 2, 0) @ view.camera.rotation).astype(
+                    np.float32
+                )
             yield view, images
 
-    def surface_depths(
-        self, views: Iterable[View], level: float
-    ) -> Iterator[tuple[View, np.ndarray, np.ndarray]]:
+    def surface_depths(self, views: Iterable[View], level: float) -> Iterator[tuple[View, np.ndarray, np.ndarray]]:
         """Where the transmittance of every ray falls to `level`, overlaps counted exactly (`ops.level_depth`).
 
-        A Gaussian has no inside, so theirs is the median depth of `ops.rasterize`: the centre at which the transmittance jumps
-        over `level`. No screen filter: it would thicken what the surface is made from.
+        A Gaussian has no inside, so theirs is the median depth of `ops.rasterize`: the centre at which the
+        transmittance jumps over `level`. No screen filter: it would thicken what the surface is made from.
 
         Yields: (view, depth, opacity), each (H, W) float32; z-depth in the data set's unit, 0 where it never does.
         """
@@ -334,10 +322,13 @@ def to_data_set(primitives: Primitives, similarity: Similarity) -> Primitives:
 
 
 def is_unused(path: Path) -> bool:
-    """Whether a run can be made at `path`: nothing is there, or no more than a run leaves that was killed before it began."""
+    """Whether a run can be made at `path`: nothing is there, or no more than a run leaves that was killed before it
+    began."""
     if not path.exists():
         return True
-    return path.is_dir() and all(is_remains(entry) or entry.name in ("transform.json", FOUND_POSES) for entry in path.iterdir())
+    return path.is_dir() and all(
+        is_remains(entry) or entry.name in ("transform.json", FOUND_POSES) for entry in path.iterdir()
+    )
 
 
 def refuse_used(path: Path) -> None:

@@ -121,8 +121,9 @@ class View:
         return photos.downscale_depth(depth, self.downscale)
 
     def load_normals(self) -> np.ndarray | None:
-        """(H, W, 3) float32 unit normals at the camera's pixel centres in its axes (x right, y down, z forward), 0 = none; None without
-        a file. `normal_frame` says what axes the file has: "world", "camera", or "camera_opengl" (x right, y up, z back).
+        """(H, W, 3) float32 unit normals at the camera's pixel centres in its axes (x right, y down, z forward), 0 =
+        none; None without a file. `normal_frame` says what axes the file has: "world", "camera", or "camera_opengl" (x
+        right, y up, z back).
 
         Averaging down takes the normal of the pixel at, or just above and left of, the new centre.
 
@@ -141,7 +142,7 @@ class View:
             normals = np.stack(axes, -1)
         k, c = self.downscale, self.camera
         first = (k - 1) // 2
-        return np.ascontiguousarray(normals[first :: k, first :: k][: c.height, : c.width])
+        return np.ascontiguousarray(normals[first::k, first::k][: c.height, : c.width])
 
     def _file_size(self) -> tuple[int, int]:
         return self.file_size or (self.camera.width * self.downscale, self.camera.height * self.downscale)
@@ -174,7 +175,8 @@ class Scene:
         return any(view.has_alpha for view in self.views)
 
     def with_training_views(self, count: int) -> Scene:
-        """The same with `count` of the training views, evenly spread over them; with all of them for 0, or where there are fewer."""
+        """The same with `count` of the training views, evenly spread over them; with all of them for 0, or where there
+        are fewer."""
         if not 0 < count < len(self.train):
             return self
         kept = np.linspace(0, len(self.train), count, endpoint=False).astype(int)
@@ -224,8 +226,9 @@ def load_scene(
     cache: str | os.PathLike | None = None,
     pinhole_below: float = 0.0,
 ) -> Scene:
-    """Reads a posed capture: `transforms*.json` (NeRF-synthetic, nerfstudio, instant-ngp), ScanNet++, a COLMAP model, DTU's
-    `cameras_sphere.npz`, TUM's lists, or a trajectory (`.log`) with depth maps or of Tanks and Temples, in this order.
+    """Reads a posed capture: `transforms*.json` (NeRF-synthetic, nerfstudio, instant-ngp), ScanNet++, a COLMAP model,
+    DTU's `cameras_sphere.npz`, TUM's lists, or a trajectory (`.log`) with depth maps or of Tanks and Temples, in this
+    order.
 
     Photographs without poses, and videos, are read once `structure_from_motion.prepare` has found their poses.
 
@@ -236,17 +239,19 @@ def load_scene(
 
     Args:
         path: the data set's folder, or a `.json` in it, or a video.
-        downscale: average this many pixels squared into one; cameras are scaled exactly. Where all photographs are there in a folder such
-            as `images_4` beside `images`, smaller by that factor but for rounding, these are taken.
-        masks: folder of foreground masks named as the images; found by itself if it is `masks` or `mask`. With "none" neither masks
-            nor alpha channels are used.
-        images: folder of photographs that take the place of those that the cameras name; cameras are scaled to their size.
+        downscale: average this many pixels squared into one; cameras are scaled exactly. Where all photographs are
+            there in a folder such as `images_4` beside `images`, smaller by that factor but for rounding, these are
+            taken.
+        masks: folder of foreground masks named as the images; found by itself if it is `masks` or `mask`. With "none"
+            neither masks nor alpha channels are used.
+        images: folder of photographs that take the place of those that the cameras name; cameras are scaled to their
+            size.
         sparse: folder of the COLMAP model, if it is not `sparse/0`, `sparse`, `colmap/sparse/0` or the folder
             itself.
         frames: how many were taken of a video.
         cache: where undistorted images and poses that were found are kept, see `photos.cache_folder`.
-        pinhole_below: a lens that shifts no ray by this many pixels (of the averaged image) from where the pinhole of its focal lengths and
-            principal point has it is taken for that pinhole, and its photographs as they are.
+        pinhole_below: a lens that shifts no ray by this many pixels (of the averaged image) from where the pinhole of
+            its focal lengths and principal point has it is taken for that pinhole, and its photographs as they are.
 
     Raises:
         LinprimError: one sentence about the first thing that is missing, damaged or does not fit together.
@@ -309,7 +314,9 @@ def has_poses(path: Path, sparse: str | os.PathLike | None = None) -> bool:
     return _reader(root, json_file, _option_folder(sparse, root, "--sparse"), None) is not None
 
 
-def _reader(root: Path, json_file: Path | None, sparse: Path | None, images: Path | None) -> Callable[[], Listing] | None:
+def _reader(
+    root: Path, json_file: Path | None, sparse: Path | None, images: Path | None
+) -> Callable[[], Listing] | None:
     """What reads the first layout that the folder has; None if it has none."""
     from . import read_colmap, read_dtu, read_rgbd, read_scannetpp, read_tnt, read_transforms
 
@@ -392,10 +399,7 @@ def _names(frames: Sequence[Frame]) -> list[str]:
     paths = [Path(frame.relative.replace("\\", "/")) for frame in frames]
     options = (
         [path.stem for path in paths],
-        [
-            "_".join(part for part in path.with_suffix("").parts if part not in ("..", "/", "."))
-            for path in paths
-        ],
+        ["_".join(part for part in path.with_suffix("").parts if part not in ("..", "/", ".")) for path in paths],
         ["_".join(part for part in path.parts if part not in ("..", "/", ".")) for path in paths],
     )
     for names in options:
@@ -414,7 +418,11 @@ def _header_checks(frames: Sequence[Frame]) -> list[bool]:
             f" {missing[0].image_path}"
         )
     for frame in frames:
-        for kind, path in (("mask", frame.mask_path), ("depth map", frame.depth_path), ("normal map", frame.normal_path)):
+        for kind, path in (
+            ("mask", frame.mask_path),
+            ("depth map", frame.depth_path),
+            ("normal map", frame.normal_path),
+        ):
             if path is not None and not is_file(path):
                 raise LinprimError(f"{frame.where}: the {kind} {path} is not on disk")
     alphas = []
@@ -430,8 +438,7 @@ def _header_checks(frames: Sequence[Frame]) -> list[bool]:
         if frame.mask_path is not None and photos.image_header(frame.mask_path)[:2] != wanted:
             found = photos.image_header(frame.mask_path)
             raise LinprimError(
-                f"{frame.mask_path}: the mask is {found[0]}x{found[1]},"
-                f" wanted {wanted[0]}x{wanted[1]} as its image"
+                f"{frame.mask_path}: the mask is {found[0]}x{found[1]}, wanted {wanted[0]}x{wanted[1]} as its image"
             )
     return alphas
 
@@ -446,9 +453,7 @@ def _alpha_says_something(frames: Sequence[Frame], alphas: Sequence[bool]) -> bo
     return False
 
 
-def _view(
-    frame: Frame, name: str, factor: int, has_alpha: bool, cache: Path, pinholes: dict[Lens, Intrinsics]
-) -> View:
+def _view(frame: Frame, name: str, factor: int, has_alpha: bool, cache: Path, pinholes: dict[Lens, Intrinsics]) -> View:
     lens = frame.lens
     if lens not in pinholes:
         check_lens(lens, frame.where)
@@ -460,9 +465,7 @@ def _view(
             f"downscale {factor} leaves nothing of {frame.image_path}, which is {full.width}x{full.height}"
         )
     pose = check_pose(frame.world_to_camera, frame.where)
-    camera = Camera(
-        width, height, full.fx / factor, full.fy / factor, full.cx / factor, full.cy / factor, pose
-    )
+    camera = Camera(width, height, full.fx / factor, full.fy / factor, full.cx / factor, full.cy / factor, pose)
     return View(
         name=name,
         camera=camera,
@@ -487,8 +490,7 @@ def _split(frames: Sequence[Frame], views: Sequence[View]) -> tuple[tuple[View, 
         test = tuple(view for frame, view in zip(frames, views, strict=True) if frame.split == "test")
         if len(train) < 2:
             raise LinprimError(
-                f"{frames[0].where}: {len(train)} of {len(views)} images are for training,"
-                " wanted at least two"
+                f"{frames[0].where}: {len(train)} of {len(views)} images are for training, wanted at least two"
             )
         return train, test
     order = sorted(range(len(views)), key=lambda i: frames[i].relative)

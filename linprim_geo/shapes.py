@@ -197,9 +197,7 @@ def furnished_room(detail: float = 1.0, seed: int = 5) -> TexturedMesh:
     add(Manifold.sphere(0.19, SEGMENTS).translate((2.6, 2.1, 1.95)), 14)
     add(Manifold.sphere(0.26, SEGMENTS).translate((1.2, 3.7, 0.255)), 8)
     add(Manifold.sphere(0.11, SEGMENTS).translate((2.15, 1.95, 0.855)), 9)
-    vase = CrossSection(
-        [[(0, 0), (0.07, 0), (0.11, 0.1), (0.09, 0.2), (0.04, 0.27), (0.06, 0.34), (0, 0.34)]]
-    )
+    vase = CrossSection([[(0, 0), (0.07, 0), (0.11, 0.1), (0.09, 0.2), (0.04, 0.27), (0.06, 0.34), (0, 0.34)]])
     add(Manifold.revolve(vase, SEGMENTS).translate((3.05, 2.25, 0.745)), 15)
     add(drum(0.045, 0.11, (2.7, 1.9, 0.745)) - drum(0.037, 0.11, (2.7, 1.9, 0.765)), 6)
     add(box((2.3, 2.2, 0.74), (2.62, 2.42, 0.79)), 8)
@@ -222,11 +220,24 @@ def furnished_room(detail: float = 1.0, seed: int = 5) -> TexturedMesh:
     part[shell & level & (normal[:, 2] > 0)] = 1
     part[shell & level & (normal[:, 2] < 0)] = 2
     palette = (
-        (0.66, 0.64, 0.52), (0.50, 0.38, 0.28), (0.78, 0.77, 0.74), (0.42, 0.27, 0.18), (0.62, 0.33, 0.22),
-        (0.72, 0.60, 0.42), (0.72, 0.24, 0.20), (0.30, 0.32, 0.36), (0.20, 0.45, 0.62), (0.82, 0.64, 0.20),
-        (0.28, 0.42, 0.36), (0.70, 0.48, 0.40), (0.55, 0.45, 0.52), (0.48, 0.22, 0.30), (0.86, 0.80, 0.60),
-        (0.22, 0.50, 0.50), (0.60, 0.70, 0.78),
-    )  # fmt: skip
+        (0.66, 0.64, 0.52),
+        (0.50, 0.38, 0.28),
+        (0.78, 0.77, 0.74),
+        (0.42, 0.27, 0.18),
+        (0.62, 0.33, 0.22),
+        (0.72, 0.60, 0.42),
+        (0.72, 0.24, 0.20),
+        (0.30, 0.32, 0.36),
+        (0.20, 0.45, 0.62),
+        (0.82, 0.64, 0.20),
+        (0.28, 0.42, 0.36),
+        (0.70, 0.48, 0.40),
+        (0.55, 0.45, 0.52),
+        (0.48, 0.22, 0.30),
+        (0.86, 0.80, 0.60),
+        (0.22, 0.50, 0.50),
+        (0.60, 0.70, 0.78),
+    )
     albedo = procedural_albedo(part, scale=2.2, detail=detail, drift=0.04, seed=3, palette=palette)
     return TexturedMesh("furnished_room", vertices, faces, part, albedo, path="inside-out", unit="metre")
 
@@ -335,9 +346,7 @@ def _tube(path, radius: float, *, closed: bool = False, segments: int = 24):
     behind = path - np.roll(path, 1, axis=0)
     if not closed:
         ahead[-1], behind[0] = behind[-1], ahead[0]
-    tangent = (
-        ahead / np.linalg.norm(ahead, axis=1)[:, None] + behind / np.linalg.norm(behind, axis=1)[:, None]
-    )
+    tangent = ahead / np.linalg.norm(ahead, axis=1)[:, None] + behind / np.linalg.norm(behind, axis=1)[:, None]
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     side = np.zeros_like(tangent)
     side[0, np.argmin(np.abs(tangent[0]))] = 1.0

@@ -1,4 +1,5 @@
-"""Photographs as training uses them: bytes in memory as far as these take a part of it, else read from their files when they are due."""
+"""Photographs as training uses them: bytes in memory as far as these take a part of it, else read from their files when
+they are due."""
 
 from __future__ import annotations
 
@@ -16,8 +17,8 @@ from .errors import LinprimError
 from .fuse import available_memory
 from .scene import View
 
-# Photographs are kept in memory up to this share of what is available, and so many bytes: a step on large ones takes tens of times as
-# long as reading one. Of the others the last few that were read are kept.
+# Photographs are kept in memory up to this share of what is available, and so many bytes: a step on large ones takes
+# tens of times as long as reading one. Of the others the last few that were read are kept.
 MEMORY_SHARE, MOST_KEPT, RECENT = 0.25, 3 * 2**29, 2
 
 
@@ -76,7 +77,14 @@ class StoredShot(Shot):
         recent: dict[str, Shot],
         photo: tuple[int, int] | None = None,
     ):
-        given = {"name": name, "camera": camera, "photo": photo, "_read_it": read, "_recent": recent, "_has_alpha": has_alpha}
+        given = {
+            "name": name,
+            "camera": camera,
+            "photo": photo,
+            "_read_it": read,
+            "_recent": recent,
+            "_has_alpha": has_alpha,
+        }
         for key, value in given.items():
             object.__setattr__(self, key, value)
 
@@ -114,8 +122,8 @@ def photo_limit() -> int:
 
 
 def load_shots(views: tuple[View, ...], similarity: Similarity, limit: int | None = None) -> list[Shot]:
-    """The views in their order. The first of them that take up to `limit` bytes are decoded into memory, the others when they are used:
-    the results of training are the same.
+    """The views in their order. The first of them that take up to `limit` bytes are decoded into memory, the others
+    when they are used: the results of training are the same.
 
     Args:
         limit: bytes; default `photo_limit()`.

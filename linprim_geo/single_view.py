@@ -1,4 +1,5 @@
-"""Parts of a mesh that one camera alone sees: before an open background their depth is a guess, so they are left out."""
+"""Parts of a mesh that one camera alone sees: before an open background their depth is a guess, so they are left
+out."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ BEHIND = 0.02
 
 
 def seen_alone(vertices: np.ndarray, depths: Iterable[tuple[Camera, np.ndarray]]) -> np.ndarray:
-    """(V,) bool, whether one camera alone sees a vertex (`support.Support`), by the (H, W) z-depths of the cameras' surface."""
+    """(V,) bool, whether one camera alone sees a vertex (`support.Support`), by the (H, W) z-depths of the cameras'
+    surface."""
     support = Support(torch.from_numpy(vertices))
     for camera, depth in depths:
         inside, row, column = in_image(camera, vertices)
@@ -31,8 +33,8 @@ def seen_alone(vertices: np.ndarray, depths: Iterable[tuple[Camera, np.ndarray]]
 def without_single_views(mesh: Mesh, depths: Iterable[tuple[Camera, np.ndarray]], smallest: float) -> tuple[Mesh, dict]:
     """The mesh without what one camera alone sees, and for the statistics `pieces` and their `area`.
 
-    Of an open surface every connected patch of such faces is left out that has at least the share `smallest` of the area; of a closed
-    one whole components, if most of their area is so: it stays closed.
+    Of an open surface every connected patch of such faces is left out that has at least the share `smallest` of the
+    area; of a closed one whole components, if most of their area is so: it stays closed.
     """
     alone = seen_alone(mesh.vertices, depths)[mesh.faces].all(1)
     area = face_areas(mesh)

@@ -12,7 +12,8 @@ from .ops import KINDS, as_array, check_dtypes, check_finite, scalar_suffix
 
 
 class SolidTree:
-    """Polyhedra in a hierarchy of boxes, for the optical depth of many straight segments: closed form, overlaps included.
+    """Polyhedra in a hierarchy of boxes, for the optical depth of many straight segments: closed form, overlaps
+    included.
 
     Args:
         center, rotation, extent, density, primitive: as for `rasterize`, of octahedra or tetrahedra. Copied.
@@ -46,22 +47,25 @@ class SolidTree:
     def optical_depth(
         self, origin: Tensor, ends: Tensor, *, begin: Tensor | None = None, most: float = math.inf
     ) -> Tensor:
-        """(P,) float64 optical depths min(most, sum_i density_i length_i), length_i that of the part of a segment inside primitive i.
+        """(P,) float64 optical depths min(most, sum_i density_i length_i), length_i that of the part of a segment
+        inside primitive i.
 
         The transmittance of a segment is exp of minus that. No camera, no near plane, no order; no gradients.
 
         Args:
             origin: (3,) float64, the point that all segments start from.
             ends: (P, 3) float64. Where neighbours lie near each other this is many times faster.
-            begin: (P,) float64 share of the way at which a segment begins, to leave out what is before a near plane; default 0.
+            begin: (P,) float64 share of the way at which a segment begins, to leave out what is before a near plane;
+                default 0.
             most: optical depth above which none is needed: walks end there.
 
         Raises:
             LinprimError: a non-finite input.
             ValueError: shapes or dtypes that do not fit, or `most` not positive.
 
-        Accuracy: each length to 1e-14 of the distance from the origin to the primitive, times 1 / sin of the angle between the segment and
-            the nearest to parallel of the faces it meets. Bitwise the same at any number of threads and for any other ends.
+        Accuracy: each length to 1e-14 of the distance from the origin to the primitive, times 1 / sin of the angle
+            between the segment and the nearest to parallel of the faces it meets. Bitwise the same at any number of
+            threads and for any other ends.
         """
         check_dtypes(torch.float64, origin=origin, ends=ends, **({} if begin is None else {"begin": begin}))
         check_finite("f64", origin=origin, ends=ends, **({} if begin is None else {"begin": begin}))

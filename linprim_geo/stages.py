@@ -22,7 +22,8 @@ class Stages:
         self.progress.note("  " + text)
 
     def lap(self, name: str) -> None:
-        """Ends the stage `name`: its seconds, and the largest resident memory of this process during it (0 where unknown)."""
+        """Ends the stage `name`: its seconds, and the largest resident memory of this process during it (0 where
+        unknown)."""
         now = time.perf_counter()
         self.seconds[name] = round(self.seconds.get(name, 0.0) + now - self._begin, 3)
         self.peak_gib[name] = round(max(self.peak_gib.get(name, 0.0), memory_gib("VmHWM")), 3)
@@ -32,7 +33,9 @@ class Stages:
     def line(self) -> str:
         """One printed line of what `report` returns."""
         both = self.report()
-        return ", ".join(f"{name} {both['seconds'][name]:.1f} s {both['peak_gib'][name]:.2f} GiB" for name in both["seconds"])
+        return ", ".join(
+            f"{name} {both['seconds'][name]:.1f} s {both['peak_gib'][name]:.2f} GiB" for name in both["seconds"]
+        )
 
     def report(self) -> dict:
         """`seconds` and `peak_gib` per stage, each with the `total`: their sum and their largest."""
@@ -43,7 +46,8 @@ class Stages:
 
 
 def _forget_peak() -> None:
-    """Sets the peak that the system keeps to what is resident now; where that cannot be done the peaks are those since the start."""
+    """Sets the peak that the system keeps to what is resident now; where that cannot be done the peaks are those since
+    the start."""
     try:
         with open("/proc/self/clear_refs", "w") as file:
             file.write("5")

@@ -1,6 +1,8 @@
-"""Camera poses for photographs that come without: structure from motion by pycolmap on the CPU, kept in the cache folder.
+"""Camera poses for photographs that come without: structure from motion by pycolmap on the CPU, kept in the cache
+folder.
 
-Keypoints and matches are kept while they are made, so that a run that was stopped goes on where it was; the finished model stays.
+Keypoints and matches are kept while they are made, so that a run that was stopped goes on where it was; the finished
+model stays.
 """
 
 from __future__ import annotations
@@ -24,9 +26,11 @@ from .scene import has_poses
 
 # Changed whenever the poses come out differently, so that old cache entries are not found any more.
 _CACHE_VERSION = 1
-# Where photographs lie in a capture's folder; in the first that has any. Those in the folder itself are not looked for any deeper.
+# Where photographs lie in a capture's folder; in the first that has any. Those in the folder itself are not looked for
+# any deeper.
 _PHOTO_FOLDERS = ("images", "image", "input", "rgb", ".")
-# Pillow's names of the formats that pycolmap reads; photographs in others are copied, in the folder of the result while they are needed.
+# Pillow's names of the formats that pycolmap reads; photographs in others are copied, in the folder of the result while
+# they are needed.
 _FORMATS, _COPIES = ("JPEG", "MPO", "PNG", "TIFF", "BMP"), "copies"
 # Counts and pixels of a verdict are below this.
 _LARGEST = 1e12
@@ -39,8 +43,8 @@ _GOOD_TRACK = 3.0
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of the photographs: how many have a pose, the mean reprojection error in pixels, the mean number of photographs that
-    see a point, and the points."""
+    """What became of the photographs: how many have a pose, the mean reprojection error in pixels, the mean number of
+    photographs that see a point, and the points."""
 
     photographs: int
     registered: int
@@ -78,9 +82,7 @@ def photographs(root: Path) -> tuple[Path, list[str]]:
         folder = root / name
         if folder.is_dir():
             found = folder.iterdir() if name == "." else folder.rglob("*")
-            files = [
-                path for path in found if path.suffix.lower() in photos.IMAGE_SUFFIXES and path.is_file()
-            ]
+            files = [path for path in found if path.suffix.lower() in photos.IMAGE_SUFFIXES and path.is_file()]
             names = [path.relative_to(folder).as_posix() for path in files if not path.name.startswith(".")]
             if names:
                 return folder, sorted(names)
@@ -96,7 +98,8 @@ def prepare(
     threads: int = 0,
     log: Callable[[str], None] | None = None,
 ) -> None:
-    """Makes a folder of photographs without poses, or a video, readable by `load_scene`, which may take minutes; leaves all else alone.
+    """Makes a folder of photographs without poses, or a video, readable by `load_scene`, which may take minutes; leaves
+    all else alone.
 
     Args:
         path, sparse, frames, cache: as for `load_scene`.
@@ -154,11 +157,13 @@ def found_model(root: Path, cache: Path | None = None) -> Path | None:
 def find_poses(
     root: Path, cache: Path | None = None, *, threads: int = 0, log: Callable[[str], None] | None = None
 ) -> Path:
-    """Finds the poses of the photographs in `root`, unless that was done before; returns the folder of the COLMAP model.
+    """Finds the poses of the photographs in `root`, unless that was done before; returns the folder of the COLMAP
+    model.
 
-    SIFT keypoints, matches of every pair (of more than 60 photographs: of those that look alike or follow each other), incremental
-    mapping with one radial distortion; photographs of one folder, size and focal length (EXIF) share a camera. Of several models that do
-    not connect the largest is kept. The result is kept in the cache folder under the content of the photographs.
+    SIFT keypoints, matches of every pair (of more than 60 photographs: of those that look alike or follow each other),
+    incremental mapping with one radial distortion; photographs of one folder, size and focal length (EXIF) share a
+    camera. Of several models that do not connect the largest is kept. The result is kept in the cache folder under the
+    content of the photographs.
 
     Args:
         cache: see `photos.cache_folder`.
@@ -172,7 +177,8 @@ def find_poses(
     folder, names = photographs(root)
     if len(names) < MIN_REGISTERED:
         raise LinprimError(
-            f"{root}: {len(names)} photograph{'' if len(names) == 1 else 's'}, wanted at least {MIN_REGISTERED} to find their poses"
+            f"{root}: {len(names)} photograph{'' if len(names) == 1 else 's'}, wanted at least {MIN_REGISTERED} "
+            "to find their poses"
         )
     sizes = [photos.image_header(folder / name)[:2] for name in names]
     kept = _base(cache) / _key(folder, names)
@@ -211,9 +217,7 @@ def _key(folder: Path, names: Sequence[str]) -> str:
         try:
             content = hashlib.blake2b((folder / name).read_bytes(), digest_size=16).digest()
         except OSError as error:
-            raise LinprimError(
-                f"{folder / name}: cannot be read ({error.strerror}), wanted an image"
-            ) from error
+            raise LinprimError(f"{folder / name}: cannot be read ({error.strerror}), wanted an image") from error
         digest.update(repr((name, content)).encode())
     return digest.hexdigest()
 
@@ -241,9 +245,7 @@ def _reconstruct(
         model = largest_model(_readable(folder, names, kept), names, sizes, kept, threads, say)
     except (ValueError, RuntimeError, MemoryError) as error:
         reason = (str(error).splitlines() or ["out of memory"])[0]
-        raise LinprimError(
-            f"{folder}: poses cannot be found ({reason}); remove {kept} to begin anew"
-        ) from error
+        raise LinprimError(f"{folder}: poses cannot be found ({reason}); remove {kept} to begin anew") from error
     verdict = Verdict(len(names), 0)
     if model is not None:
         part = kept / "model.part"
@@ -261,7 +263,8 @@ def _reconstruct(
 
 
 def _readable(folder: Path, names: Sequence[str], kept: Path) -> Path:
-    """The folder itself if pycolmap can read all its photographs, else one of copies by the same names; those which it cannot, as PNG."""
+    """The folder itself if pycolmap can read all its photographs, else one of copies by the same names; those which it
+    cannot, as PNG."""
     from PIL import Image
 
     if all(photos.image_format(folder / name) in _FORMATS for name in names):
@@ -271,9 +274,7 @@ def _readable(folder: Path, names: Sequence[str], kept: Path) -> Path:
         if not copy.exists():
             with atomic_write(copy) as temporary:
                 if photos.image_format(source) not in _FORMATS:
-                    Image.fromarray(photos.read_photo(source)[0]).save(
-                        temporary, format="PNG", compress_level=1
-                    )
+                    Image.fromarray(photos.read_photo(source)[0]).save(temporary, format="PNG", compress_level=1)
                 else:
                     shutil.copyfile(source, temporary)
     return kept / _COPIES

@@ -6,7 +6,8 @@ import torch
 
 from .camera import Camera
 
-# A primitive is seen by one view alone if its directions lie a hundredth as far apart as is usual in the scene: a tenth of the angle.
+# A primitive is seen by one view alone if its directions lie a hundredth as far apart as is usual in the scene: a tenth
+# of the angle.
 SINGLE_VIEW = 0.01
 # What all views together see less of than this is hidden: nothing is known of it.
 HIDDEN = 0.5
@@ -15,8 +16,9 @@ HIDDEN = 0.5
 class Support:
     """How the weight of (N, 3) centres is spread over the directions that they are seen from.
 
-    With the largest weight w, T alpha, that a primitive has in each view, and the unit vector u from the camera to it, the spread is
-    1 - |sum of w u| / sum of w: 0 for one view, a^2 / 8 for two that see it alike under a small angle a, 1 for all around.
+    With the largest weight w, T alpha, that a primitive has in each view, and the unit vector u from the camera to it,
+    the spread is 1 - |sum of w u| / sum of w: 0 for one view, a^2 / 8 for two that see it alike under a small angle a,
+    1 for all around.
     """
 
     def __init__(self, center: torch.Tensor):

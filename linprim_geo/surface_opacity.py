@@ -1,8 +1,10 @@
-"""The surface of a run as a level of its opacity field: of how much light gets from a point to the cameras, in closed form.
+"""The surface of a run as a level of its opacity field: of how much light gets from a point to the cameras, in closed
+form.
 
-O(x) = 1 - T(x), where T(x) is a robust largest of the transmittances between x and the cameras that have it in view. What no camera
-sees into is solid, what none has in view is free. No grid and no depth maps: the field is sampled at the primitives' own points and around
-the surface that these give, the points are joined to tetrahedra, and the level is found on their edges.
+O(x) = 1 - T(x), where T(x) is a robust largest of the transmittances between x and the cameras that have it in view.
+What no camera sees into is solid, what none has in view is free. No grid and no depth maps: the field is sampled at the
+primitives' own points and around the surface that these give, the points are joined to tetrahedra, and the level is
+found on their edges.
 """
 
 from __future__ import annotations
@@ -27,21 +29,23 @@ NEAR = 0.01
 """Depth at which light begins to be absorbed, training frame: where the renderer's rays begin."""
 
 RANK_SHARE = 0.02
-"""The largest transmittance of a point is that of rank 1 + this share of its other cameras: of 60 about the second, so a leak that a
-single camera looks through carves nothing."""
+"""The largest transmittance of a point is that of rank 1 + this share of its other cameras: of 60 about the second, so
+a leak that a single camera looks through carves nothing."""
 
 TYPICAL_SHARE = 0.2
-"""The rank of a camera that is typical of those that look onto a surface: the best decide what is open, these where the surface lies."""
+"""The rank of a camera that is typical of those that look onto a surface: the best decide what is open, these where the
+surface lies."""
 
 LARGEST_MOVE = 1 / 8
-"""Vertices are moved towards where a typical camera's light falls to the level, by at most this share of the spacing, half a pixel by
-default: further away, as in holes that few cameras look into, the best ones are all there is."""
+"""Vertices are moved towards where a typical camera's light falls to the level, by at most this share of the spacing,
+half a pixel by default: further away, as in holes that few cameras look into, the best ones are all there is."""
 
 LADDER = (0.0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
 """Heights above the surface at which the light of a typical camera is looked at, as shares of the spacing."""
 
 FADE_SHARE = 0.03
-"""A camera's say goes from nothing at the border of its image to the whole this share of the image's smaller side further in."""
+"""A camera's say goes from nothing at the border of its image to the whole this share of the image's smaller side
+further in."""
 
 DARK = 0.02
 """Transmittance below which nothing depends on how small it is: walks through the primitives end there."""
@@ -50,11 +54,12 @@ CLEAR = 0.98
 """A primitive of whose points all have a larger transmittance, or all a smaller one than DARK, bounds nothing."""
 
 LIVE = 0.1
-"""Cameras that have the free end and the middle of an edge in view and see less light than this from both are left out while the level is
-sought on it."""
+"""Cameras that have the free end and the middle of an edge in view and see less light than this from both are left out
+while the level is sought on it."""
 
 SPACING_PIXELS, COARSEST, FINEST = 4.0, 1 / 50, 1 / 400
-"""Distance between the points of the second round: pixels of the median view, and its bounds as shares of the scene's diagonal."""
+"""Distance between the points of the second round: pixels of the median view, and its bounds as shares of the scene's
+diagonal."""
 
 ROUGH, RESOLUTION = 2e-3, 5e-5
 """Places on edges are found to these shares of the diagonal, in the first round and in the second, or in STEPS."""
@@ -62,15 +67,16 @@ ROUGH, RESOLUTION = 2e-3, 5e-5
 STEPS = 12
 
 JITTER = 1e-6
-"""Points are moved by this share of the diagonal at random: vertices of regular shapes lie on common spheres, where tetrahedra are flat."""
+"""Points are moved by this share of the diagonal at random: vertices of regular shapes lie on common spheres, where
+tetrahedra are flat."""
 
 MARGIN, GRID = 0.1, 9
-"""A box this share of the diagonal larger than that of all points is free by definition, at GRID x GRID points per side: the surface is
-closed."""
+"""A box this share of the diagonal larger than that of all points is free by definition, at GRID x GRID points per
+side: the surface is closed."""
 
 LONG = 4.0
-"""Edges longer than this many median ones are searched from their inner end, at PROBES of their length: beyond the first free place may lie
-the shadow of the scene in the few cameras that look there, which counts as solid."""
+"""Edges longer than this many median ones are searched from their inner end, at PROBES of their length: beyond the
+first free place may lie the shadow of the scene in the few cameras that look there, which counts as solid."""
 
 PROBES = (1 / 16, 1 / 8, 1 / 4)
 
@@ -84,24 +90,28 @@ VALUES_AT_ONCE = 1 << 22
 def opacity_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[Mesh, dict]:
     """Returns the closed mesh and `level`, `spacing` and the numbers of points for the statistics.
 
-    The surface is where the transmittance towards the cameras falls to `options.level`; `options.voxel_size`, if any, is the distance
-    between its sample points, and `options.smallest_part` the share of the largest component's area that others need. Components that no
-    camera sees are dropped. Vertices are moved from where the light of the best camera falls to the level towards where that of the typical
-    cameras does.
+    The surface is where the transmittance towards the cameras falls to `options.level`; `options.voxel_size`, if any,
+    is the distance between its sample points, and `options.smallest_part` the share of the largest component's area
+    that others need. Components that no camera sees are dropped. Vertices are moved from where the light of the best
+    camera falls to the level towards where that of the typical cameras does.
 
     Raises:
-        LinprimError: Gaussians, which have no inside; nothing crosses the level, or the tetrahedra would not fit into memory.
+        LinprimError: Gaussians, which have no inside; nothing crosses the level, or the tetrahedra would not fit into
+            memory.
     """
     primitives, views = run.training_primitives(), run.scene().train
     if not KINDS[primitives.kind].solid:
         raise LinprimError(
-            f"{run.path}: --method opacity-field needs primitives that have an inside, found {KINDS[primitives.kind].plural}; "
+            f"{run.path}: --method opacity-field needs primitives that have an inside, found "
+            f"{KINDS[primitives.kind].plural}; "
             "take --method tsdf"
         )
     cameras = [view.camera.transformed(run.similarity) for view in views]
     field = OpacityField(primitives, cameras)
     limit = int(options.memory_limit * 2**30) if options.memory_limit > 0 else int(0.6 * available_memory())
-    nothing = f"{run.path}: nothing that the training views see crosses transmittance {options.level}, so there is no surface"
+    nothing = (
+        f"{run.path}: nothing that the training views see crosses transmittance {options.level}, so there is no surface"
+    )
 
     points, light = _primitive_points(primitives, field)
     if len(points) == 0:
@@ -148,8 +158,8 @@ def opacity_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[
 class OpacityField:
     """How much light gets from points to cameras, all in the training frame.
 
-    A camera's transmittance is exp of minus the sum of density times length inside over all primitives, on the straight segment from
-    its near plane to the point: the order does not matter, and overlaps are exact.
+    A camera's transmittance is exp of minus the sum of density times length inside over all primitives, on the straight
+    segment from its near plane to the point: the order does not matter, and overlaps are exact.
     """
 
     def __init__(self, primitives: Primitives, cameras: Sequence[Camera]):
@@ -173,10 +183,9 @@ class OpacityField:
         step = max(1, VALUES_AT_ONCE // len(self._cameras))
         return [slice(start, start + step) for start in range(0, count, step)]
 
-    def per_camera(
-        self, points: np.ndarray, among: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """(V, P) float32 transmittances, no less than DARK or 0 where not in view, and (V, P) weights: 1 in view, less near the border.
+    def per_camera(self, points: np.ndarray, among: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """(V, P) float32 transmittances, no less than DARK or 0 where not in view, and (V, P) weights: 1 in view, less
+        near the border.
 
         `among` (V, P): where it is False the transmittance is not computed and taken as 0.
         """
@@ -204,7 +213,8 @@ class OpacityField:
         return light, weight
 
     def spread(self, mesh: Mesh, level: float, reach: float) -> np.ndarray:
-        """(V,) how far before each vertex, along the normal, the light of rank TYPICAL_SHARE falls to `level`, at most `reach`.
+        """(V,) how far before each vertex, along the normal, the light of rank TYPICAL_SHARE falls to `level`, at most
+        `reach`.
 
         That is how much further the best of the cameras, which make the surface, see than what many of them agree on.
         """
@@ -235,10 +245,11 @@ class OpacityField:
 
 
 def robust_largest(light: np.ndarray, weight: np.ndarray, rank_share: float = RANK_SHARE) -> np.ndarray:
-    """(P,) transmittance of the k-th best camera, k = 1 + rank_share (n - 1) of the n that have a point in view; continuous in all of them.
+    """(P,) transmittance of the k-th best camera, k = 1 + rank_share (n - 1) of the n that have a point in view;
+    continuous in all of them.
 
-    The (V, P) transmittances are put in descending order, each as wide as its weight, and averaged over the ranks k - 1 to k. Where the
-    weights sum to less than 1 the rest is free space.
+    The (V, P) transmittances are put in descending order, each as wide as its weight, and averaged over the ranks k - 1
+    to k. Where the weights sum to less than 1 the rest is free space.
     """
     order = np.argsort(np.where(weight > 0, -light, np.float32(1)), axis=0)
     light, weight = np.take_along_axis(light, order, 0), np.take_along_axis(weight, order, 0)
@@ -320,7 +331,8 @@ def _memory_line(count: int, limit: int, run: Run) -> str:
     need = count * BYTES_PER_SITE
     if need > limit:
         raise LinprimError(
-            f"{run.path}: tetrahedra of {count} points need {need / 2**30:.2g} GiB, {limit / 2**30:.2g} GiB are allowed: "
+            f"{run.path}: tetrahedra of {count} points need {need / 2**30:.2g} GiB, {limit / 2**30:.2g} GiB are "
+            "allowed: "
             "take a larger --voxel-size, or --method tsdf"
         )
     return f"opacity field: tetrahedra of {count} points, {need / 2**20:.0f} MiB of {limit / 2**20:.0f} MiB"
@@ -329,10 +341,9 @@ def _memory_line(count: int, limit: int, run: Run) -> str:
 # --- tetrahedra ------------------------------------------------------------------------------------------
 
 
-def _level_set(
-    field: OpacityField, points: np.ndarray, light: np.ndarray, level: float, resolution: float
-) -> Mesh:
-    """The closed surface that parts the points with less light than `level` from the others; empty if there are none."""
+def _level_set(field: OpacityField, points: np.ndarray, light: np.ndarray, level: float, resolution: float) -> Mesh:
+    """The closed surface that parts the points with less light than `level` from the others; empty if there are
+    none."""
     from scipy.spatial import Delaunay
 
     low, high = points.min(0), points.max(0)
@@ -363,13 +374,11 @@ def _level_set(
     return Mesh(vertices, faces)
 
 
-def march_tetrahedra(
-    points: np.ndarray, cells: np.ndarray, inside: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def march_tetrahedra(points: np.ndarray, cells: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Surface between the corners of tetrahedra that are `inside` and those that are not.
 
-    One vertex per edge with one end inside; a triangle where a tetrahedron has one or three such corners, two where it has two. If the
-    cells fill a body whose corners at the border are outside, the surface is a closed manifold.
+    One vertex per edge with one end inside; a triangle where a tetrahedron has one or three such corners, two where it
+    has two. If the cells fill a body whose corners at the border are outside, the surface is a closed manifold.
 
     Args:
         points: (P, 3) corners.
@@ -377,7 +386,8 @@ def march_tetrahedra(
         inside: (P,) bool.
 
     Returns:
-        (E, 2) ends of the edges, the inner one first, sorted; (F, 3) faces of the rows of that, counter-clockwise seen from outside.
+        (E, 2) ends of the edges, the inner one first, sorted; (F, 3) faces of the rows of that, counter-clockwise seen
+        from outside.
 
     Source: Doi and Koide, An efficient method of triangulating equi-valued surfaces by using tetrahedral cells, 1991.
     """
@@ -409,10 +419,12 @@ def march_tetrahedra(
 
 
 def _crossings(field, inner, outer, inner_light, outer_light, level, resolution) -> np.ndarray:
-    """(E, 3) points between `inner` and `outer` where the field crosses the level: halving, and lines through its logarithm.
+    """(E, 3) points between `inner` and `outer` where the field crosses the level: halving, and lines through its
+    logarithm.
 
-    The logarithm is piecewise linear along a ray, up to DARK. Brackets with an end as dark as that are halved, and so are all in every
-    third step: they shrink however the field bends. The place is the line's in what is left of the bracket.
+    The logarithm is piecewise linear along a ray, up to DARK. Brackets with an end as dark as that are halved, and so
+    are all in every third step: they shrink however the field bends. The place is the line's in what is left of the
+    bracket.
     """
 
     def excess(light):
@@ -444,9 +456,7 @@ def _crossings(field, inner, outer, inner_light, outer_light, level, resolution)
         halve = (solid[rows] > darkest) | (step % 3 == 0)
         share = np.where(halve, 0.5, np.clip(line, 0.05, 0.95))
         place = low[rows] + (high[rows] - low[rows]) * share
-        value = excess(
-            robust_largest(*field.per_camera(inner[rows] + place[:, None] * ray[rows], live[:, rows]))
-        )
+        value = excess(robust_largest(*field.per_camera(inner[rows] + place[:, None] * ray[rows], live[:, rows])))
         within = value > 0
         low[rows[within]], solid[rows[within]] = place[within], value[within]
         high[rows[~within]], free[rows[~within]] = place[~within], value[~within]

@@ -1,4 +1,5 @@
-"""The direct polyhedral surface of a run: its opaque primitives, cut back to where light ends in them, united exactly."""
+"""The direct polyhedral surface of a run: its opaque primitives, cut back to where light ends in them, united
+exactly."""
 
 from __future__ import annotations
 
@@ -21,14 +22,16 @@ LEAST_WEIGHT = 0.5
 """A primitive belongs to the surface if it takes more than this share of the light of a pixel of some training view."""
 
 CUT_DEPTH = 0.5
-"""Share of the light lost at the level of depth maps that is lost where primitives are cut. Depth maps are averaged; a union keeps the
-outermost of all overlapping pieces, but what is cut too deep of a thin part is gone."""
+"""Share of the light lost at the level of depth maps that is lost where primitives are cut. Depth maps are averaged; a
+union keeps the outermost of all overlapping pieces, but what is cut too deep of a thin part is gone."""
 
 POINTS_PER_PRIMITIVE, LEAST_POINTS_IN_ALL = 40, 20_000
-"""About so many points where light ends are wanted per primitive; pixels are left out in a regular pattern to get there."""
+"""About so many points where light ends are wanted per primitive; pixels are left out in a regular pattern to get
+there."""
 
 CORE_CELLS = 200
-"""Most cells along the longest side of the grid that tells what is inside; they have to be smaller than primitives are thick."""
+"""Most cells along the longest side of the grid that tells what is inside; they have to be smaller than primitives are
+thick."""
 
 CORE_MARGIN = np.sqrt(3.0) / 2
 """Cells by which the middle of a cell of the core lies behind the depth of every view, so that all of the cell does."""
@@ -38,13 +41,14 @@ NO_PRIMITIVE = -1
 
 
 def polyhedra_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[Mesh, dict]:
-    """The closed surface, with normals and, as `primitive`, the row in `run.primitives()` of each face (NO_PRIMITIVE for the core), and
-    counts for the statistics.
+    """The closed surface, with normals and, as `primitive`, the row in `run.primitives()` of each face (NO_PRIMITIVE
+    for the core), and counts for the statistics.
 
     1. Primitives that dominate a pixel of a training view are candidates.
-    2. Where the transmittance of the views' rays falls to 1 - CUT_DEPTH (1 - `options.level`), overlaps counted exactly, light ends:
-       points on the surface.
-    3. Planes are fitted to the points around each candidate, and it is cut by them; one without points inside is dropped.
+    2. Where the transmittance of the views' rays falls to 1 - CUT_DEPTH (1 - `options.level`), overlaps counted
+       exactly, light ends: points on the surface.
+    3. Planes are fitted to the points around each candidate, and it is cut by them; one without points inside is
+       dropped.
     4. What lies behind the depth of every view that looks there is inside: boxes fill it.
     5. All are united. Shells that no view sees and small ones are dropped, so cavities fill up.
 
@@ -56,7 +60,8 @@ def polyhedra_surface(run: Run, options: ExtractOptions, stages: Stages) -> tupl
     primitives = run.primitives()
     if not KINDS[primitives.kind].solid:
         raise LinprimError(
-            f"{run.path}: holds {KINDS[primitives.kind].plural}, which have no faces; --method polyhedra wants octahedra or tetrahedra"
+            f"{run.path}: holds {KINDS[primitives.kind].plural}, which have no faces; --method polyhedra wants "
+            "octahedra or tetrahedra"
         )
     rendered = run.training_primitives()
     order = canonical_order(rendered)
@@ -67,21 +72,25 @@ def polyhedra_surface(run: Run, options: ExtractOptions, stages: Stages) -> tupl
     candidates = np.flatnonzero(weight > LEAST_WEIGHT)
     if not len(candidates):
         raise LinprimError(
-            f"{run.path}: no primitive takes more than {LEAST_WEIGHT:.0%} of the light of any pixel, so there is no surface"
+            f"{run.path}: no primitive takes more than {LEAST_WEIGHT:.0%} of the light of any pixel, so there is "
+            "no surface"
         )
     stages.lap("render")
 
     points = level_points(depths, cameras, max(POINTS_PER_PRIMITIVE * len(candidates), LEAST_POINTS_IN_ALL))
     if not len(points.position):
         raise LinprimError(
-            f"{run.path}: no pixel of any training view crosses transmittance {level:g} together with its four neighbours,"
+            f"{run.path}: no pixel of any training view crosses transmittance {level:g} together with its four "
+            "neighbours,"
             " so there is no surface"
         )
     chosen = _take(primitives, candidates)
     planes, met = fit_planes(chosen, points)
     pieces, rows = cut(chosen, planes, met, points.noise)
     if not pieces:
-        raise LinprimError(f"{run.path}: light ends in none of {len(candidates)} opaque primitives, so there is no surface")
+        raise LinprimError(
+            f"{run.path}: light ends in none of {len(candidates)} opaque primitives, so there is no surface"
+        )
     stages.lap("cut")
 
     bounds = np.array([np.reshape(piece.bounding_box(), (2, 3)) for piece in pieces])
@@ -124,9 +133,11 @@ def _take(primitives: Primitives, rows: np.ndarray) -> Primitives:
     return replace(primitives, **{name: getattr(primitives, name)[rows] for name in ARRAYS})
 
 
-def _render(run: Run, primitives: Primitives, cameras: list[Camera], level: float) -> tuple[np.ndarray, list[np.ndarray]]:
-    """(N,) largest weight of each primitive (training frame) in any view, and each view's (H, W) float32 depth at the level, 0
-    where it sees through."""
+def _render(
+    run: Run, primitives: Primitives, cameras: list[Camera], level: float
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """(N,) largest weight of each primitive (training frame) in any view, and each view's (H, W) float32 depth at the
+    level, 0 where it sees through."""
     import torch
 
     from . import ops
@@ -162,9 +173,7 @@ def cut(primitives: Primitives, planes: Planes, met: np.ndarray, least: float) -
     for row, slots in of_row.items():
         whole = manifold3d.Manifold(manifold3d.Mesh64(np.ascontiguousarray(vertices[row]), faces))
         deep = {
-            slot
-            for slot, k in slots.items()
-            if (vertices[row] @ planes.normal[k]).max() - planes.offset[k] > least
+            slot for slot, k in slots.items() if (vertices[row] @ planes.normal[k]).max() - planes.offset[k] > least
         }
         bounding = [frozenset(np.flatnonzero(planes.cuts[k]).tolist()) & deep for k in slots.values()] or [frozenset()]
         for together in dict.fromkeys(bounding):
@@ -182,9 +191,9 @@ def cut(primitives: Primitives, planes: Planes, met: np.ndarray, least: float) -
 def core_boxes(depths: list[np.ndarray], cameras: list[Camera], bounds: np.ndarray, least: float) -> np.ndarray:
     """(B, 8, 3) corners of boxes that fill what lies behind the depth of every view that looks there.
 
-    Cells of a grid over `bounds` (2, 3), as large as `least` but at most CORE_CELLS along its longest side. A cell is inside if
-    at least one view has it in its frustum, and all that do find its middle further than CORE_MARGIN cells behind the deepest
-    of the pixel there and its eight neighbours; pixels without depth see through.
+    Cells of a grid over `bounds` (2, 3), as large as `least` but at most CORE_CELLS along its longest side. A cell is
+    inside if at least one view has it in its frustum, and all that do find its middle further than CORE_MARGIN cells
+    behind the deepest of the pixel there and its eight neighbours; pixels without depth see through.
     """
     from scipy.ndimage import maximum_filter
 
@@ -213,7 +222,8 @@ def core_boxes(depths: list[np.ndarray], cameras: list[Camera], bounds: np.ndarr
 
 
 def _merged_cells(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(B, 3) lower and upper corners of boxes that hold exactly the given (C, 3) cells: runs, then equal runs side by side."""
+    """(B, 3) lower and upper corners of boxes that hold exactly the given (C, 3) cells: runs, then equal runs side by
+    side."""
     low, high = cells, cells + 1
     for axis in (2, 1, 0):
         if not len(low):
@@ -236,8 +246,8 @@ def _merged_cells(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _kept_faces(mesh: Mesh, cameras: list[Camera], smallest_part: float) -> np.ndarray:
-    """(F,) bool: shells that the ray of some pixel meets first and that have the share `smallest_part` of the largest one's area, and
-    what they need."""
+    """(F,) bool: shells that the ray of some pixel meets first and that have the share `smallest_part` of the largest
+    one's area, and what they need."""
     from .raycast import RayCaster
     from .visibility import faces_of_pixels
 

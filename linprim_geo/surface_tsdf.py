@@ -1,4 +1,5 @@
-"""The surface of a run by fusing depth maps: depth of the training views at a transmittance level, into a signed distance field."""
+"""The surface of a run by fusing depth maps: depth of the training views at a transmittance level, into a signed
+distance field."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ SEEN_THROUGH = 0.5
 BYTES_PER_PIXEL, KEPT_BYTES = 6, 2**30
 
 SMALLEST_DISPARITY = 0.25
-"""Depths are trusted as far as this many pixels between the two cameras that are furthest apart move a point by a truncation."""
+"""Depths are trusted as far as this many pixels between the two cameras that are furthest apart move a point by a
+truncation."""
 
 SAMPLED = 2
 """One of so many rows and columns of a depth map is looked at to choose the limit."""
@@ -48,7 +50,9 @@ def tsdf_surface(
         )
     stages.lap("render")
     if frames.beyond:
-        stages.note(f"{frames.beyond:.1%} of the depths lie beyond {frames.limit:.4g} and only clear the space before it")
+        stages.note(
+            f"{frames.beyond:.1%} of the depths lie beyond {frames.limit:.4g} and only clear the space before it"
+        )
     voxel = options.voxel_size if options.voxel_size > 0 else auto_voxel_size(frames)
     mesh = fuse_tsdf(
         frames,
@@ -60,20 +64,27 @@ def tsdf_surface(
         fuse=fuse,
     )
     stages.lap("fuse")
-    return mesh, {"level": options.level, "voxel_size": voxel, "truncation_voxels": options.truncation, "depth_limit": frames.limit}
+    return mesh, {
+        "level": options.level,
+        "voxel_size": voxel,
+        "truncation_voxels": options.truncation,
+        "depth_limit": frames.limit,
+    }
 
 
 class DepthFrames(Sequence):
     """`tsdf.DepthFrame`s of the training views: depth at transmittance `level`, free background.
 
-    Depths beyond `limit` are clamped to it; 0 chooses one by `depth_limit`. `beyond` is their share. Frames are kept in memory if
-    they are at most KEPT_BYTES in all, else, and without `keep`, rendered whenever they are asked for.
+    Depths beyond `limit` are clamped to it; 0 chooses one by `depth_limit`. `beyond` is their share. Frames are kept in
+    memory if they are at most KEPT_BYTES in all, else, and without `keep`, rendered whenever they are asked for.
     """
 
     def __init__(self, run: Run, level: float, limit: float = 0.0, keep: bool = True):
         self.run, self.level, self.limit, self.beyond = run, level, limit or np.inf, 0.0
         self.views = run.scene().train
-        keep = keep and sum(view.camera.width * view.camera.height * BYTES_PER_PIXEL for view in self.views) <= KEPT_BYTES
+        keep = (
+            keep and sum(view.camera.width * view.camera.height * BYTES_PER_PIXEL for view in self.views) <= KEPT_BYTES
+        )
         self.kept, sample = [], [np.zeros(0, np.float32)]
         for frame in self._render(self.views) if keep or not limit else ():
             sample.append(frame.depth[::SAMPLED, ::SAMPLED].ravel())
@@ -110,8 +121,9 @@ class DepthFrames(Sequence):
 def depth_limit(cameras: Sequence[Camera], median: float, truncation: float = 3.0) -> float:
     """How far depths are worth fusing, from the median depth that the cameras see, in their unit.
 
-    A disparity of d pixels between cameras that are b apart moves a point at depth z by d z^2 / (b f) (a derivative of z = b f / d);
-    voxels are about as large as the median's pixel, median / f, so this exceeds the truncation beyond sqrt(truncation median b / d).
+    A disparity of d pixels between cameras that are b apart moves a point at depth z by d z^2 / (b f) (a derivative of
+    z = b f / d); voxels are about as large as the median's pixel, median / f, so this exceeds the truncation beyond
+    sqrt(truncation median b / d).
     """
     centers = np.array([camera.center for camera in cameras])
     baseline = float(np.linalg.norm(np.ptp(centers, axis=0)))

@@ -1,6 +1,8 @@
-"""Plots as inline SVG: an axis with round ticks, a frame with a grid, and curves over one axis; well-formed XML, no script.
+"""Plots as inline SVG: an axis with round ticks, a frame with a grid, and curves over one axis; well-formed XML, no
+script.
 
-Colours are the classes `frame`, `grid`, `series0`, `series1`, `on`, `off` of `STYLE`, so that a page can be light or dark.
+Colours are the classes `frame`, `grid`, `series0`, `series1`, `on`, `off` of `STYLE`, so that a page can be light or
+dark.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ svg .frame { fill: var(--plot, #fafbfc); stroke: var(--edge, #c8ced6); } svg .gr
 svg .series0 { stroke: var(--blue, #1f63b2); } svg .series1 { stroke: var(--orange, #c25e0c); }
 svg .on { stroke: var(--blue, #1f63b2); } svg .off { stroke: var(--dim, #8a939e); }
 svg .on.dot { fill: var(--blue, #1f63b2); } svg .off.dot { fill: var(--dim, #8a939e); } svg .dot { stroke: none; }
-svg .curve { fill: none; stroke-width: 1.6; stroke-linejoin: round; } svg .point { stroke-width: 5; stroke-linecap: round; }
+svg .curve { fill: none; stroke-width: 1.6; stroke-linejoin: round; }
+svg .point { stroke-width: 5; stroke-linecap: round; }
 """
 # A linear axis has round steps, about so many.
 _STEPS = 5
@@ -26,9 +29,7 @@ _STEPS = 5
 class Axis:
     """An axis over `values`, logarithmic (then they are positive) or linear, from pixel `start` to pixel `end`."""
 
-    def __init__(
-        self, values: Sequence[float], start: float, end: float, *, log: bool = True, room: float = 0.15
-    ):
+    def __init__(self, values: Sequence[float], start: float, end: float, *, log: bool = True, room: float = 0.15):
         """`room` is the share of the range that is added on either side."""
         self.log, self.start, self.end = log, start, end
         low, high = self._scaled(min(values)), self._scaled(max(values))
@@ -41,9 +42,7 @@ class Axis:
 
     def at(self, value: float) -> float:
         """The pixel of a value."""
-        return self.start + (self.end - self.start) * (self._scaled(value) - self.low) / (
-            self.high - self.low
-        )
+        return self.start + (self.end - self.start) * (self._scaled(value) - self.low) / (self.high - self.low)
 
     def ticks(self) -> list[float]:
         """Three to seven round values, or fewer of a short axis."""
@@ -81,9 +80,11 @@ def tick(value: float) -> str:
 
 
 def frame(x_axis: Axis, y_axis: Axis, x_label: str, y_label: str, name: str) -> list[str]:
-    """The opening tag, which says `name` to who cannot see it, the grid with its ticks, and both labels; the caller closes it."""
+    """The opening tag, which says `name` to who cannot see it, the grid with its ticks, and both labels; the caller
+    closes it."""
     out = [
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" height="{HEIGHT}" role="img" aria-label="{escape(name)}">',
+        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" height="{HEIGHT}" role="img" '
+        f'aria-label="{escape(name)}">',
         f'<rect class="frame" x="{LEFT}" y="{TOP}" width="{WIDTH - LEFT - RIGHT}" height="{HEIGHT - TOP - BOTTOM}"/>',
     ]
     for value in x_axis.ticks():
@@ -123,9 +124,7 @@ def curves(
     for index, ((_, xs, ys), label) in enumerate(zip(series, named, strict=True)):
         places = [f"{x_axis.at(x):.1f} {y_axis.at(y):.1f}" for x, y in zip(xs, ys, strict=True)]
         kind = "curve" if len(places) > 1 else "curve point"
-        out.append(
-            f'<path class="{kind} series{index}" d="M{"L".join(places)}{"h0" if len(places) == 1 else ""}"/>'
-        )
+        out.append(f'<path class="{kind} series{index}" d="M{"L".join(places)}{"h0" if len(places) == 1 else ""}"/>')
         out.append(f'<path class="curve series{index}" d="M{left} {TOP - 12}h18"/>')
         out.append(f'<text x="{left + 24}" y="{TOP - 8}">{escape(label)}</text>')
         left += 40 + 6.4 * len(label)

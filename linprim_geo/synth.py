@@ -101,8 +101,8 @@ def synthesize(
         mesh: a mesh file with texture or vertex colours, or a `TexturedMesh`.
         views, test_views: how many; the test views lie between the others.
         size: pixels, one number or (width, height).
-        path: `orbit` (three rings), `hemisphere`, `sphere`, `arc` (walked, camera in hand) or `inside-out`; default: what suits the
-            shape, and `arc` with a table.
+        path: `orbit` (three rings), `hemisphere`, `sphere`, `arc` (walked, camera in hand) or `inside-out`; default:
+            what suits the shape, and `arc` with a table.
         fov: horizontal field of view in degrees; default 45 around an object, 75 inside.
         distance: of the camera from the middle of the bounding box, in the mesh's unit; default: the object
             fills the frame. On an arc it is the mean distance.
@@ -117,17 +117,20 @@ def synthesize(
             points' error is their mean reprojection error in pixels.
         depth_format: `png` or `npy`.
         detail: contrast of the built-in texture's bands, blotches and grain.
-        exposure_drift: every training photograph is multiplied by a gain per channel, exp of a uniform number within this of 0, the same
-            for the channels, and a quarter of it for each; the geometric mean over the photographs is 1 per channel, as the gain of the
-            held-out ones is. What exceeds white is cut, as in a camera. The gains are in `synth.json`.
+        exposure_drift: every training photograph is multiplied by a gain per channel, exp of a uniform number within
+            this of 0, the same for the channels, and a quarter of it for each; the geometric mean over the photographs
+            is 1 per channel, as the gain of the held-out ones is. What exceeds white is cut, as in a camera. The gains
+            are in `synth.json`.
         distortion: k1 of OpenCV's radial distortion; images, depth, normals and masks are those of that lens.
         specular: strength of highlights of the two lamps (Phong's, exponent 12), added to either shading.
         zoom: every third camera has a focal length so many times as long.
-        table: the object stands on a square table of wood whose side is so many times its largest horizontal extent; 0 is none.
-            Everything that is written contains the table. Cameras look at the object, and stay above the table.
+        table: the object stands on a square table of wood whose side is so many times its largest horizontal extent; 0
+            is none. Everything that is written contains the table. Cameras look at the object, and stay above the
+            table.
         environment: seed of a room at infinity that stands behind everything, in place of `background`; None is none.
         arc: degrees of azimuth that the path `arc` covers; default 300.
-        noise: standard deviation of the sensor noise at middle grey, in units of 1/255; half of its variance grows with the signal.
+        noise: standard deviation of the sensor noise at middle grey, in units of 1/255; half of its variance grows with
+            the signal.
         jpeg: quality (1 to 100) of the photographs as .jpg; 0 writes .png. Not with a transparent background.
         seed: of the points, the noise, the gains, the wood, and the paths inside-out and arc.
         threads: 0 uses every core; the files do not depend on it.
@@ -143,10 +146,25 @@ def synthesize(
     start = time.perf_counter()
     out = Path(out)
     options = checked_options(
-        views=views, test_views=test_views, size=size, supersample=supersample, points=points, point_noise=point_noise,
-        shading=shading, depth_format=depth_format, seed=seed, exposure_drift=exposure_drift, distortion=distortion,
-        specular=specular, zoom=zoom, table=table, environment=environment, arc=arc, noise=noise, jpeg=jpeg,
-    )  # fmt: skip
+        views=views,
+        test_views=test_views,
+        size=size,
+        supersample=supersample,
+        points=points,
+        point_noise=point_noise,
+        shading=shading,
+        depth_format=depth_format,
+        seed=seed,
+        exposure_drift=exposure_drift,
+        distortion=distortion,
+        specular=specular,
+        zoom=zoom,
+        table=table,
+        environment=environment,
+        arc=arc,
+        noise=noise,
+        jpeg=jpeg,
+    )
     subject = _surface(shape, mesh, detail)
     path = choice("path", path or ("arc" if options.table else subject.path), campath.PATHS)
     inside = path == "inside-out"
@@ -156,9 +174,7 @@ def synthesize(
     workers = threads or os.cpu_count() or 1
     caster = RayCaster(surface.vertices, surface.faces, threads=workers)
     field = number("fov", fov if fov is not None else (75.0 if inside else 45.0), 1.0, 170.0)
-    train, test, distance = place_cameras(
-        subject, caster, options, path, field, distance, principal_point_offset
-    )
+    train, test, distance = place_cameras(subject, caster, options, path, field, distance, principal_point_offset)
     gains = _gains(options)
 
     temporary = prepare_folder(out, overwrite)
@@ -208,9 +224,7 @@ def synthesize(
     except BaseException as error:
         shutil.rmtree(temporary, ignore_errors=True)
         if isinstance(error, OSError):
-            raise LinprimError(
-                f"{out}: cannot be written ({error.strerror or error}); nothing was kept"
-            ) from error
+            raise LinprimError(f"{out}: cannot be written ({error.strerror or error}); nothing was kept") from error
         raise
     return {**report, "seconds": round(time.perf_counter() - start, 3)}
 
@@ -399,11 +413,7 @@ class _Renderer:
 
 def _depth_unit(surface: TexturedMesh, cameras: list[Camera]) -> float:
     """The smallest of 1, 2, 5 times a power of ten with which every depth of the scene fits 16 bits."""
-    corners = (
-        np.array(np.meshgrid(*np.stack([surface.vertices.min(0), surface.vertices.max(0)]).T))
-        .reshape(3, -1)
-        .T
-    )
+    corners = np.array(np.meshgrid(*np.stack([surface.vertices.min(0), surface.vertices.max(0)]).T)).reshape(3, -1).T
     farthest = max(float(camera.project(corners)[1].max()) for camera in cameras)
     exact = farthest / 65535.0
     power = 10.0 ** np.floor(np.log10(exact))
@@ -418,5 +428,3 @@ def _write_reference(path: Path, surface: TexturedMesh) -> None:
 
     vertices, faces, colors = surface.refined(REFINE * surface.diagonal)
     save_mesh(path, Mesh(vertices, faces, colors=colors))
-
-

@@ -38,7 +38,11 @@ def frame_entry(split: str, number: int, camera: Camera, options: Options) -> di
     """The entry of one view in a transforms file."""
     name = f"{split}/{number:03d}"
     opengl = camera.camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])
-    zoomed = {"fl_x": camera.fx, "fl_y": camera.fy, "camera_angle_x": 2.0 * float(np.arctan(0.5 * camera.width / camera.fx))}
+    zoomed = {
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "camera_angle_x": 2.0 * float(np.arctan(0.5 * camera.width / camera.fx)),
+    }
     return {
         **(zoomed if options.zoom != 1 else {}),
         "file_path": photo_name(split, number, options.jpeg),
@@ -56,9 +60,7 @@ def prepare_folder(out: Path, overwrite: bool) -> Path:
         if not overwrite:
             raise LinprimError(f"{out}: is a folder with files in it, a new or empty one is wanted")
         if not (out / "synth.json").is_file():
-            raise LinprimError(
-                f"{out}: was not made by synth (it has no synth.json), so it is not overwritten"
-            )
+            raise LinprimError(f"{out}: was not made by synth (it has no synth.json), so it is not overwritten")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         return Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".tmp", dir=out.parent))

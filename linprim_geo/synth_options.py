@@ -36,9 +36,26 @@ class Options:
 
 
 def checked_options(
-    *, views, test_views, size, supersample, points, point_noise, shading, depth_format, seed, exposure_drift,
-    distortion, specular, zoom, table, environment, arc, noise, jpeg,
-) -> Options:  # fmt: skip
+    *,
+    views,
+    test_views,
+    size,
+    supersample,
+    points,
+    point_noise,
+    shading,
+    depth_format,
+    seed,
+    exposure_drift,
+    distortion,
+    specular,
+    zoom,
+    table,
+    environment,
+    arc,
+    noise,
+    jpeg,
+) -> Options:
     """The options, each within its range.
 
     Raises:

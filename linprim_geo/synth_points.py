@@ -56,8 +56,8 @@ def sample_points(
     """Surface points, each seen by at least three of the cameras (two if there are no more).
 
     They are uniform by area or, `by_pixels`, as dense as the pixels that show the surface, as are the keypoints
-    of photographs. `light(color, face, direction)` turns albedo into the colour seen along `direction`. Fewer than `count`
-    points come back only if the cameras see almost nothing of the surface.
+    of photographs. `light(color, face, direction)` turns albedo into the colour seen along `direction`. Fewer than
+    `count` points come back only if the cameras see almost nothing of the surface.
     """
     rng = np.random.default_rng(seed + 1)
     wanted = count
@@ -105,7 +105,8 @@ def sample_points(
 def pixel_samples(
     caster: RayCaster, cameras: list[Camera], count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What rays through random positions in random pictures meet, as `campath.surface_samples`; no more than `count`."""
+    """What rays through random positions in random pictures meet, as `campath.surface_samples`; no more than
+    `count`."""
     chosen = rng.integers(len(cameras), size=count)
     place = rng.uniform(size=(count, 2))
     origins, rays = np.empty((count, 3)), np.empty((count, 3))
@@ -136,7 +137,8 @@ def project(camera: Camera, xyz: np.ndarray, distortion: float) -> tuple[np.ndar
 
 
 def camera_rays(camera: Camera, columns: np.ndarray, rows: np.ndarray, distortion: float) -> np.ndarray:
-    """(len(rows), len(columns), 3) camera-space rays with z = 1 through positions in the image, through a lens of distortion k1.
+    """(len(rows), len(columns), 3) camera-space rays with z = 1 through positions in the image, through a lens of
+    distortion k1.
 
     Raises:
         LinprimError: the lens folds over inside the image.
@@ -147,15 +149,16 @@ def camera_rays(camera: Camera, columns: np.ndarray, rows: np.ndarray, distortio
         # r' = r (1 + k1 r^2), solved for r / r' by Newton's method.
         squared = distortion * (x**2 + y**2)
         if squared.min() < -4.0 / 27.0:
-            raise LinprimError(f"distortion is {distortion:g}, with which the lens folds over inside the image; a smaller one is wanted")
+            raise LinprimError(
+                f"distortion is {distortion:g}, with which the lens folds over inside the image; a smaller one "
+                "is wanted"
+            )
         for _ in range(30):
             scale -= (scale + squared * scale**3 - 1.0) / (1.0 + 3.0 * squared * scale**2)
     return np.stack([x * scale, y * scale, np.ones_like(x)], axis=-1)
 
 
-def sees(
-    caster: RayCaster, camera: Camera, xyz: np.ndarray, normal: np.ndarray, distortion: float = 0.0
-) -> np.ndarray:
+def sees(caster: RayCaster, camera: Camera, xyz: np.ndarray, normal: np.ndarray, distortion: float = 0.0) -> np.ndarray:
     """(P,) bool: the point is in the picture, not hidden, and not at a grazing angle."""
     pixel, depth = project(camera, xyz, distortion)
     towards = xyz - camera.center
@@ -171,9 +174,7 @@ def sees(
     return seen
 
 
-def write_colmap(
-    folder: Path, cameras: list[Camera], cloud: Cloud, distortion: float = 0.0, jpeg: int = 0
-) -> None:
+def write_colmap(folder: Path, cameras: list[Camera], cloud: Cloud, distortion: float = 0.0, jpeg: int = 0) -> None:
     """A COLMAP model (binary) of the training views, with the points and their observations."""
     from .load_pycolmap import pycolmap
 
@@ -217,8 +218,7 @@ def write_colmap(
     # pycolmap does not say so when the disk is full.
     sizes = {
         "points3D.bin": 8 + 51 * len(cloud.xyz) + 8 * len(cloud.point),
-        "images.bin": 8
-        + sum(73 + len(image.name) + 24 * image.num_points2D() for image in model.images.values()),
+        "images.bin": 8 + sum(73 + len(image.name) + 24 * image.num_points2D() for image in model.images.values()),
     }
     for name, size in sizes.items():
         if (folder / name).stat().st_size != size:

@@ -124,8 +124,10 @@ def synthetic_environment(seed: int) -> SyntheticEnvironment:
     window, door, shelf, pictures = rng.permutation(4)
     reach = rng.uniform(1.9, 2.9, 4)
     hue = rng.uniform()
-    walls = [colorsys.hsv_to_rgb((hue + rng.uniform(-0.12, 0.12)) % 1.0, rng.uniform(0.03, 0.12), rng.uniform(0.74, 0.86))
-             for _ in range(4)]  # fmt: skip
+    walls = [
+        colorsys.hsv_to_rgb((hue + rng.uniform(-0.12, 0.12)) % 1.0, rng.uniform(0.03, 0.12), rng.uniform(0.74, 0.86))
+        for _ in range(4)
+    ]
     tone = np.array(colorsys.hsv_to_rgb(rng.uniform(0.05, 0.09), rng.uniform(0.4, 0.55), rng.uniform(0.42, 0.58)))
     # Boards enough for the longest room, 2.9 m each way and more at the corners.
     boards = tone * rng.uniform(0.88, 1.1, (26, 1))
@@ -199,7 +201,9 @@ def _pictures(rng: np.random.Generator, wall: int) -> list[Rectangle | BookRow]:
     ]
 
 
-def _picture(rng: np.random.Generator, wall: int, left: float, low: float, width: float, height: float) -> list[Rectangle]:
+def _picture(
+    rng: np.random.Generator, wall: int, left: float, low: float, width: float, height: float
+) -> list[Rectangle]:
     """A framed picture of two areas of colour, `width` in radians and `height` in metres."""
     horizon = low + height * rng.uniform(0.35, 0.6)
     inner = (left + 0.03, left + width - 0.03)
@@ -219,7 +223,12 @@ def _gray(value: float) -> np.ndarray:
 
 
 def _lay_over(
-    color: np.ndarray, item: Rectangle | BookRow, azimuth: np.ndarray, wall: np.ndarray, height: np.ndarray, height_blur: np.ndarray
+    color: np.ndarray,
+    item: Rectangle | BookRow,
+    azimuth: np.ndarray,
+    wall: np.ndarray,
+    height: np.ndarray,
+    height_blur: np.ndarray,
 ) -> None:
     """Paints an item over the colours (R, 3), with soft edges."""
     away = _wrapped(azimuth - np.float32(0.5 * np.pi * item.wall))

@@ -42,24 +42,51 @@ WAVES = {"grain": 16, "drift": 6}
 
 TABLETOPS: dict[str, dict] = {
     "large_table": {
-        "mesh": "egyptian_cat", "up": "y", "table": 5.0, "path": "arc", "arc": 300.0, "distance": 4.0, "views": 56,
-        "point_noise": 0.0032, "environment": 1, "seed": 1,
+        "mesh": "egyptian_cat",
+        "up": "y",
+        "table": 5.0,
+        "path": "arc",
+        "arc": 300.0,
+        "distance": 4.0,
+        "views": 56,
+        "point_noise": 0.0032,
+        "environment": 1,
+        "seed": 1,
     },
     "small_table": {
-        "mesh": "spot", "table": 1.8, "path": "arc", "arc": 360.0, "distance": 3.2, "views": 60,
-        "point_noise": 0.0024, "environment": 2, "seed": 2,
+        "mesh": "spot",
+        "table": 1.8,
+        "path": "arc",
+        "arc": 360.0,
+        "distance": 3.2,
+        "views": 60,
+        "point_noise": 0.0024,
+        "environment": 2,
+        "seed": 2,
     },
     "middle_table": {
-        "mesh": "bob", "table": 3.0, "path": "arc", "arc": 120.0, "distance": 4.8, "views": 49,
-        "point_noise": 0.0034, "environment": 3, "seed": 3,
+        "mesh": "bob",
+        "table": 3.0,
+        "path": "arc",
+        "arc": 120.0,
+        "distance": 4.8,
+        "views": 49,
+        "point_noise": 0.0034,
+        "environment": 3,
+        "seed": 3,
     },
-}  # fmt: skip
+}
 """Arguments of `synth.synthesize` by name; `mesh` is the stem of a file, `up` the axis of its coordinates that is
 to point upwards (default z). With the noise of the points their mean reprojection error is half a pixel."""
 
 ALL_TABLETOPS = {
-    "test_views": 8, "size": (480, 360), "noise": 2.0, "jpeg": 92, "points": 1500, "shading": "shaded",
-}  # fmt: skip
+    "test_views": 8,
+    "size": (480, 360),
+    "noise": 2.0,
+    "jpeg": 92,
+    "points": 1500,
+    "shading": "shaded",
+}
 """What the named captures have in common."""
 
 
@@ -130,7 +157,9 @@ def slab(top: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:
     heights = (top[2] - THICKNESS * side, top[2])
     vertices = np.concatenate([np.column_stack([square, np.full(4, height)]) for height in heights])
     quads = [[3, 2, 1, 0], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
-    return vertices, np.array([[q[i] for i in corner] for q in quads for corner in ((0, 1, 2), (0, 2, 3))], dtype=np.int64)
+    return vertices, np.array(
+        [[q[i] for i in corner] for q in quads for corner in ((0, 1, 2), (0, 2, 3))], dtype=np.int64
+    )
 
 
 @dataclass(frozen=True)

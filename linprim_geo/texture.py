@@ -1,7 +1,7 @@
 """Textures of extracted meshes: flat charts packed into a square image, baked from the photographs that see each texel.
 
-Charts are grown over faces that look along the same axis and are projected onto a plane, so that any mesh has them, in seconds:
-open, closed, or with edges of many faces.
+Charts are grown over faces that look along the same axis and are projected onto a plane, so that any mesh has them, in
+seconds: open, closed, or with edges of many faces.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ FEWEST_TEXELS = 4
 
 @dataclass(frozen=True)
 class Texture:
-    """An image over a mesh. `image` (S, S, 3) uint8 sRGB, row 0 on top; `uv` (F, 3, 2) float64 per face and corner in [0, 1],
-    v up from the lower edge of the image, as in OBJ. `about` holds what `stats.json` says of it."""
+    """An image over a mesh. `image` (S, S, 3) uint8 sRGB, row 0 on top; `uv` (F, 3, 2) float64 per face and corner in
+    [0, 1], v up from the lower edge of the image, as in OBJ. `about` holds what `stats.json` says of it."""
 
     image: np.ndarray
     uv: np.ndarray
@@ -71,20 +71,20 @@ def _check_suffix(path: Path) -> None:
         )
 
 
-def make_texture(
-    mesh: Mesh, size: int, views: Sequence[View], note: Callable[[str], None] | None = None
-) -> Texture:
+def make_texture(mesh: Mesh, size: int, views: Sequence[View], note: Callable[[str], None] | None = None) -> Texture:
     """Charts of a mesh and their colours out of photographs.
 
-    Each texel has a point of the surface; its colour is the robust mean of the views that see it (`visibility.photographed`), so
-    that highlights, exposure and things in the way do not show. What no view sees has the colours of the mesh's vertices, which
-    are taken from the photographs if it has none. Texels between charts have the colour of the nearest one in a chart, so that
-    mip-maps do not bleed. The same input gives the same texture to the last bit, whatever the number of threads.
+    Each texel has a point of the surface; its colour is the robust mean of the views that see it
+    (`visibility.photographed`), so that highlights, exposure and things in the way do not show. What no view sees has
+    the colours of the mesh's vertices, which are taken from the photographs if it has none. Texels between charts have
+    the colour of the nearest one in a chart, so that mip-maps do not bleed. The same input gives the same texture to
+    the last bit, whatever the number of threads.
 
     Args:
         size: texels along an edge of the image.
-        views: `scene.View`s, or anything with a `camera` and a `load()` that gives `rgb` (H, W, 3) uint8 and `alpha` (H, W) uint8
-            or None. They are decoded once if they take at most KEPT_BYTES in all, else again for every TEXELS_PER_PASS texels.
+        views: `scene.View`s, or anything with a `camera` and a `load()` that gives `rgb` (H, W, 3) uint8 and `alpha`
+            (H, W) uint8 or None. They are decoded once if they take at most KEPT_BYTES in all, else again for every
+            TEXELS_PER_PASS texels.
         note: called with lines for the user.
     Raises:
         LinprimError: an empty mesh or one that is not finite, or so many charts that they do not fit.
@@ -94,7 +94,10 @@ def make_texture(
     rows = np.flatnonzero(owner >= 0)
     density = len(rows) / len(mesh.faces)
     if note:
-        note(f"texture: {charts} charts of {len(mesh.faces)} faces, {100 * len(rows) / size**2:.0f} % of {size}x{size} texels")
+        note(
+            f"texture: {charts} charts of {len(mesh.faces)} faces, {100 * len(rows) / size**2:.0f} % of "
+            f"{size}x{size} texels"
+        )
         if density < FEWEST_TEXELS:
             note(f"texture: {density:.1f} texels per face show little more than vertex colours, see --target-faces")
     image, seen, well = _bake(mesh, corners, owner, rows, size, _Photographs(views))
@@ -111,7 +114,8 @@ def make_texture(
 
 
 class _Photographs:
-    """The photographs of views, (H, W, 3) uint8 or with alpha (H, W, 4), in order; decoded once if they fit into KEPT_BYTES."""
+    """The photographs of views, (H, W, 3) uint8 or with alpha (H, W, 4), in order; decoded once if they fit into
+    KEPT_BYTES."""
 
     def __init__(self, views: Sequence[View]):
         self.views, self.cameras = views, [view.camera for view in views]
@@ -141,8 +145,8 @@ def unwrap(mesh: Mesh, size: int) -> tuple[np.ndarray, int]:
     """Flattens a mesh into the square.
 
     Returns:
-        (F, 3, 2) float64 place of each corner in texels, x right and y down, no texel centre inside two faces; and the number of
-        charts.
+        (F, 3, 2) float64 place of each corner in texels, x right and y down, no texel centre inside two faces; and the
+        number of charts.
     Raises:
         LinprimError: an empty mesh or one that is not finite, or so many charts that they do not fit.
     """
@@ -167,7 +171,8 @@ def unwrap(mesh: Mesh, size: int) -> tuple[np.ndarray, int]:
 
 
 def _facing_axes(normals: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """(F,) axis of each face: 0 to 2 for +x, +y, +z and 3 to 5 for the opposite ones, mostly the same among neighbours."""
+    """(F,) axis of each face: 0 to 2 for +x, +y, +z and 3 to 5 for the opposite ones, mostly the same among
+    neighbours."""
     cosine = np.concatenate([normals, -normals], axis=1)
     # The best of six is at least 1 / sqrt(3), so a face with a normal always has a choice.
     allowed = (cosine >= LEAST_COSINE) | ~np.any(normals, axis=1)[:, None]
@@ -192,8 +197,11 @@ def _components(label: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
-def _split(centers: np.ndarray, axis: np.ndarray, chart: np.ndarray, crossing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Labels that take the `crossing` faces, which hide each other, out of their charts; and which faces are in such a chart.
+def _split(
+    centers: np.ndarray, axis: np.ndarray, chart: np.ndarray, crossing: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Labels that take the `crossing` faces, which hide each other, out of their charts; and which faces are in such a
+    chart.
 
     A chart that is nothing else is cut in two at the middle of its faces by height.
     """
@@ -214,7 +222,8 @@ def _split(centers: np.ndarray, axis: np.ndarray, chart: np.ndarray, crossing: n
 
 
 def _flatten(corners: np.ndarray, normals: np.ndarray, axis: np.ndarray, chart: np.ndarray) -> np.ndarray:
-    """(F, 3, 2) corners of each face in the plane of its chart, least coordinates of a chart 0, turned to lie in a small box.
+    """(F, 3, 2) corners of each face in the plane of its chart, least coordinates of a chart 0, turned to lie in a
+    small box.
 
     The plane is across the mean normal of the chart if all its faces look along that, else across its axis.
     """
@@ -292,7 +301,8 @@ def _pack(flat: np.ndarray, chart: np.ndarray, size: int) -> np.ndarray:
 
 
 def _shelves(extent: np.ndarray, size: int) -> np.ndarray | None:
-    """(C, 2) whole texels at which boxes with a padding start, tallest first from left to right; None if they do not fit."""
+    """(C, 2) whole texels at which boxes with a padding start, tallest first from left to right; None if they do not
+    fit."""
     boxes = np.ceil(extent).astype(np.int64) + 1 + 2 * PADDING
     if boxes.max() > size or boxes.prod(1).sum() > size**2:
         return None
@@ -323,12 +333,18 @@ def _crossing(corners: np.ndarray, size: int) -> np.ndarray:
         before = owner[texel]
         owner[texel] = face
         # Where a face is not the last one of this run to be written it has met another.
-        found += [face[before >= 0], before[before >= 0], face[owner[texel] != face], owner[texel][owner[texel] != face]]
+        found += [
+            face[before >= 0],
+            before[before >= 0],
+            face[owner[texel] != face],
+            owner[texel][owner[texel] != face],
+        ]
     return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *found]))
 
 
 def _rasterize(corners: np.ndarray, size: int) -> np.ndarray:
-    """(size * size,) int32 face that each texel centre belongs to: one that it lies in, else the nearest within RING, else -1."""
+    """(size * size,) int32 face that each texel centre belongs to: one that it lies in, else the nearest within RING,
+    else -1."""
     owner = np.full(size * size, -1, dtype=np.int32)
     for texel, face, points in _candidates(corners, size, 0.0):
         inner = _weights(points, corners[face]).min(1) >= 0
@@ -351,7 +367,8 @@ def _rasterize(corners: np.ndarray, size: int) -> np.ndarray:
 
 
 def _candidates(corners: np.ndarray, size: int, margin: float):
-    """Texels whose centres are in the boxes around faces, widened by `margin`, some at a time: texel, face, and centre (N, 2)."""
+    """Texels whose centres are in the boxes around faces, widened by `margin`, some at a time: texel, face, and centre
+    (N, 2)."""
     low = np.maximum(np.ceil(corners.min(1) - margin - 0.5).astype(np.int64), 0)
     high = np.minimum(np.floor(corners.max(1) + margin - 0.5).astype(np.int64), size - 1)
     wide, tall = np.maximum(high - low + 1, 0).T
@@ -391,7 +408,8 @@ def _weights(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def _nearest_in(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Barycentric weights (N, 3) of the points of triangles (N, 3, 2) nearest to points (N, 2), and the distances (N,)."""
+    """Barycentric weights (N, 3) of the points of triangles (N, 3, 2) nearest to points (N, 2), and the distances
+    (N,)."""
     weights = _weights(points, corners)
     distance = np.zeros(len(points))
     rows = np.flatnonzero(weights.min(1) < 0)
@@ -441,7 +459,8 @@ def _bake(mesh, corners, owner, rows, size, photographs):
                 behind = color_vertices(mesh, cameras, photographs)
             shades = behind[mesh.faces[face[hidden]]].astype(np.float64)
             color[np.arange(len(rows))[part][hidden]] = np.einsum("pk,pkc->pc", weights[hidden], shades)
-    # The colour of a texel that is only ever seen on an outline is a mixture: the next one that is seen well has a better one.
+    # The colour of a texel that is only ever seen on an outline is a mixture: the next one that is seen well has a
+    # better one.
     poor = np.flatnonzero(seen & ~good)
     if len(poor) and good.any():
         middle = mesh.bounds.mean(0)
@@ -464,7 +483,8 @@ def _bake(mesh, corners, owner, rows, size, photographs):
 
 
 def save_textured(path: str | Path, mesh: Mesh, texture: Texture) -> None:
-    """Writes a mesh with its texture: .obj with an .mtl and a .png of the same name beside it, or .glb with the image inside.
+    """Writes a mesh with its texture: .obj with an .mtl and a .png of the same name beside it, or .glb with the image
+    inside.
 
     Coordinates are as `save_mesh` writes them; colours and quality of the vertices are left out.
 

@@ -13,8 +13,8 @@ from .texture import Texture
 def load_texture(path: str | os.PathLike) -> tuple[Mesh, Texture] | None:
     """A mesh and the one texture over all of it, or None where the file has none, or several.
 
-    Vertices that the file splits along seams are merged where their coordinates are equal to the last bit; the colour of a
-    material, which multiplies its image, is put into the image.
+    Vertices that the file splits along seams are merged where their coordinates are equal to the last bit; the colour
+    of a material, which multiplies its image, is put into the image.
 
     Raises:
         LinprimError: the file cannot be read as a mesh.

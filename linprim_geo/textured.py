@@ -169,9 +169,7 @@ def procedural_albedo(
         # Evenly spread over the half-sphere, then turned at random: no direction prevails.
         z = (np.arange(count) + 0.5) / count
         turn = np.arange(count) * np.pi * (3.0 - np.sqrt(5.0))
-        direction = np.stack(
-            [np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1
-        )
+        direction = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
         direction = direction @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
         wavelength = scale * rng.uniform(*lengths[kind], (count, 1))
         waves.append(2.0 * np.pi * direction / wavelength)
@@ -198,9 +196,7 @@ def procedural_albedo(
     )
 
 
-def subdivide(
-    vertices: np.ndarray, faces: np.ndarray, max_edge: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def subdivide(vertices: np.ndarray, faces: np.ndarray, max_edge: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Splits edges longer than `max_edge` at their middle until none is left.
 
     Returns vertices, faces and the input face (F,) that each face is a part of. No cracks: an edge is split
@@ -241,9 +237,7 @@ def subdivide(
         faces, origin = np.concatenate(out), np.concatenate(source)
 
 
-def refine(
-    vertices: np.ndarray, faces: np.ndarray, max_edge: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def refine(vertices: np.ndarray, faces: np.ndarray, max_edge: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Subdivides a mesh without moving its surface: closed pieces by manifold3d, open ones by `subdivide`.
 
     Returns vertices, faces and the input face (F,) that each face is a part of.

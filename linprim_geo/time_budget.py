@@ -1,4 +1,5 @@
-"""How much to do in a given time: the cost of a training step and of a voxel size, measured first, and what is chosen from it."""
+"""How much to do in a given time: the cost of a training step and of a voxel size, measured first, and what is chosen
+from it."""
 
 from __future__ import annotations
 
@@ -9,11 +10,12 @@ from dataclasses import asdict, dataclass, field
 
 from .errors import LinprimError
 
-# Share of a budget that is planned for: what is left ends the program and takes up what the correction comes too late for.
+# Share of a budget that is planned for: what is left ends the program and takes up what the correction comes too late
+# for.
 AIM = 0.97
-# Steps per primitive of a run that is planned freely, the best of four at equal time on the built-in part (40 views of 128 px, 20 s of one
-# core): 0.12, 0.35, 1.4 and 5.6 give Chamfer distances of 0.247, 0.244, 0.303 and 0.421 % of the diagonal, and 32.9, 33.7, 33.2 and
-# 30.7 dB. `train`'s own defaults have it too.
+# Steps per primitive of a run that is planned freely, the best of four at equal time on the built-in part (40 views of
+# 128 px, 20 s of one core): 0.12, 0.35, 1.4 and 5.6 give Chamfer distances of 0.247, 0.244, 0.303 and 0.421 % of the
+# diagonal, and 32.9, 33.7, 33.2 and 30.7 dB. `train`'s own defaults have it too.
 STEPS_PER_PRIMITIVE = 0.35
 # Less than this gives no surface worth a name.
 LEAST_STEPS, LEAST_PRIMITIVES = 300, 300
@@ -25,8 +27,9 @@ GROWTH_END, FULL_AT = 0.6, 0.54
 LARGEST_CORRECTION = 10.0
 # Writing a checkpoint and the exported scene, before it has been measured.
 SAVE_SECONDS = 0.3
-# Coarse passes of extraction take these multiples of the voxel that the views support, which is the finest that is chosen: half of it
-# has 2 % more Chamfer distance and 17 times the open edges on the built-in part, for four times the time.
+# Coarse passes of extraction take these multiples of the voxel that the views support, which is the finest that is
+# chosen: half of it has 2 % more Chamfer distance and 17 times the open edges on the built-in part, for four times the
+# time.
 COARSE, FINEST = (4.0, 2.0), 1.0
 # The first pass of all, which also loads libraries, is not counted.
 WARM_UP = 8.0
@@ -59,8 +62,8 @@ class Budget:
 
 @dataclass(frozen=True)
 class StepCost:
-    """Seconds of one training step: `base` + `per_primitive` times the number of primitives; `late` times that in the share
-    `late_share` of the run that has more terms or a dearer order."""
+    """Seconds of one training step: `base` + `per_primitive` times the number of primitives; `late` times that in the
+    share `late_share` of the run that has more terms or a dearer order."""
 
     base: float
     per_primitive: float
@@ -94,21 +97,27 @@ class TrainingPlan:
 
 
 def mean_population(start: float) -> float:
-    """Mean number of primitives over a run, as a share of the limit, of one that begins with the share `start` and grows
-    exponentially."""
+    """Mean number of primitives over a run, as a share of the limit, of one that begins with the share `start` and
+    grows exponentially."""
     if not 0 < start < 1:
         return 1.0
     return FULL_AT * (1 - start) / -math.log(start) + 1 - FULL_AT
 
 
 def plan_training(
-    seconds: float, cost: StepCost, start: float, most: int, iterations: int | None = None, max_primitives: int | None = None
+    seconds: float,
+    cost: StepCost,
+    start: float,
+    most: int,
+    iterations: int | None = None,
+    max_primitives: int | None = None,
 ) -> TrainingPlan | None:
     """Steps and population for `seconds` of training steps; None where not even LEAST_STEPS of LEAST_PRIMITIVES fit.
 
-    With P primitives at most, S = r P steps (r = STEPS_PER_PRIMITIVE) of (base + per_primitive m P) each fill the time, m the
-    mean population as a share of P: a quadratic in P. If that is less than LEAST_STEPS there are as many, of fewer primitives, but no
-    less than LEAST_PRIMITIVES; if P is more than `most`, it is that, and the steps fill the time.
+    With P primitives at most, S = r P steps (r = STEPS_PER_PRIMITIVE) of (base + per_primitive m P) each fill the time,
+    m the mean population as a share of P: a quadratic in P. If that is less than LEAST_STEPS there are as many, of
+    fewer primitives, but no less than LEAST_PRIMITIVES; if P is more than `most`, it is that, and the steps fill the
+    time.
 
     Args:
         start: population at the start, as a share of its limit.
@@ -151,7 +160,8 @@ def least_training(cost: StepCost, iterations: int | None = None, max_primitives
 
 
 def corrected_steps(step: int, iterations: int, per_step: float, left: float) -> int:
-    """Steps of the whole run, at `step` of `iterations` planned ones, so that the rest of `per_step` seconds each fills `left`."""
+    """Steps of the whole run, at `step` of `iterations` planned ones, so that the rest of `per_step` seconds each fills
+    `left`."""
     rest = max(1, iterations - step)
     wanted = left / per_step if per_step > 0 else rest
     return step + int(min(max(wanted, rest / LARGEST_CORRECTION, 1), rest * LARGEST_CORRECTION))
@@ -159,15 +169,16 @@ def corrected_steps(step: int, iterations: int, per_step: float, left: float) ->
 
 @dataclass(frozen=True)
 class VoxelCost:
-    """Seconds of fusing and finishing with a voxel of size v: `base` + `per_area` / v^2, for what lies along a surface."""
+    """Seconds of fusing and finishing with a voxel of size v: `base` + `per_area` / v^2, for what lies along a
+    surface."""
 
     base: float
     per_area: float
 
     @staticmethod
     def fit(passes: Sequence[tuple[float, float]]) -> VoxelCost:
-        """Through one or two (voxel size, seconds), from coarse to fine. One alone counts as area in full, which is the dearer
-        guess; so do two of which the finer was not slower."""
+        """Through one or two (voxel size, seconds), from coarse to fine. One alone counts as area in full, which is the
+        dearer guess; so do two of which the finer was not slower."""
         v, t = passes[-1]
         if len(passes) > 1:
             (u, s), (v, t) = passes[-2:]
@@ -182,7 +193,8 @@ class VoxelCost:
 
 
 def plan_voxel(seconds: float, cost: VoxelCost, finest: float, coarsest: float) -> float | None:
-    """The smallest voxel size in [finest, coarsest] that takes at most `seconds`, to three digits; None if none does."""
+    """The smallest voxel size in [finest, coarsest] that takes at most `seconds`, to three digits; None if none
+    does."""
     if cost.seconds(coarsest) > seconds:
         return None
     voxel = max(finest, math.sqrt(cost.per_area / max(seconds - cost.base, 1e-12)))
@@ -196,7 +208,8 @@ def choose_voxel(run, options, target, stages, budget: Budget):
     Args:
         run: an open run. options: ExtractOptions with a level that is a number. target: the file that will be written.
 
-    Returns: (ExtractOptions with the voxel size, the depth maps that were rendered, what was chosen and why for the statistics).
+    Returns: (ExtractOptions with the voxel size, the depth maps that were rendered, what was chosen and why for the
+    statistics).
 
     Raises:
         LinprimError: not even the coarsest voxel fits; no ray crosses the level.
@@ -231,7 +244,8 @@ def choose_voxel(run, options, target, stages, budget: Budget):
     if voxel is None:
         least = (budget.elapsed() + cost.seconds(coarsest)) / AIM
         raise LinprimError(
-            f"--time-budget is {budget.seconds:.3g} s, but the coarsest surface of this run, voxels of {coarsest:.2g}, takes {least:.0f} s"
+            f"--time-budget is {budget.seconds:.3g} s, but the coarsest surface of this run, voxels of "
+            f"{coarsest:.2g}, takes {least:.0f} s"
         )
     why = "fills the time"
     if voxel <= 1.001 * finest:
@@ -240,7 +254,8 @@ def choose_voxel(run, options, target, stages, budget: Budget):
         why = "the coarsest that is taken"
     predicted = cost.seconds(voxel)
     stages.note(
-        f"voxel size {voxel:.3g}, {why}: {predicted:.1f} s of the {budget.seconds:.3g} s after {budget.elapsed():.1f} s "
+        f"voxel size {voxel:.3g}, {why}: {predicted:.1f} s of the {budget.seconds:.3g} s after "
+        f"{budget.elapsed():.1f} s "
         f"({supported:.3g} is what the views support)"
     )
     chosen = {

@@ -1,7 +1,7 @@
 """Training: photographs and a first guess of primitives in, a run folder with optimised primitives out.
 
-One view per step (trainer.py): render, L1 + D-SSIM, Adam, and now and then the population grows (population.py). training_start.py says
-where to start, training_loop.py what surrounds the steps.
+One view per step (trainer.py): render, L1 + D-SSIM, Adam, and now and then the population grows (population.py).
+training_start.py says where to start, training_loop.py what surrounds the steps.
 """
 
 from __future__ import annotations
@@ -48,23 +48,25 @@ def train(
 ) -> dict:
     """Trains a scene into a run folder.
 
-    With `resume` the folder's own options are used (but for `threads`): learning rates and growth depend on them. A capture that is no
-    longer where it was is looked for at `scene`. Interrupted (Ctrl-C), it finishes the step, saves, and raises KeyboardInterrupt.
+    With `resume` the folder's own options are used (but for `threads`): learning rates and growth depend on them. A
+    capture that is no longer where it was is looked for at `scene`. Interrupted (Ctrl-C), it finishes the step, saves,
+    and raises KeyboardInterrupt.
 
-    With `time_budget`, in seconds from now for everything, a calibration of some dozen steps says what a step costs, and
-    `time_budget.plan_training` chooses `iterations` and `max_primitives` from it; one of the two that differs from its default is
-    kept. When growth has ended the steps that are left are counted anew, once, from the pace so far. Both are in config.json under
-    `time_budget`, so that a resumed run repeats them, with the seconds that the run took.
+    With `time_budget`, in seconds from now for everything, a calibration of some dozen steps says what a step costs,
+    and `time_budget.plan_training` chooses `iterations` and `max_primitives` from it; one of the two that differs from
+    its default is kept. When growth has ended the steps that are left are counted anew, once, from the pace so far.
+    Both are in config.json under `time_budget`, so that a resumed run repeats them, with the seconds that the run took.
 
-    With `effects` the options that the scene calls for take the place of those that were not given (effects.py); without, all are taken as
-    they are. What was decided is in config.json, and a resumed run keeps it.
+    With `effects` the options that the scene calls for take the place of those that were not given (effects.py);
+    without, all are taken as they are. What was decided is in config.json, and a resumed run keeps it.
 
-    With `blocks` other than 1 the scene is trained in blocks of space by several workers, see `block_training.train_blocks`.
+    With `blocks` other than 1 the scene is trained in blocks of space by several workers, see
+    `block_training.train_blocks`.
 
-    Returns: `run`, `iterations`, `seconds` (of training steps alone), `primitives`, `psnr` (mean over held-out views), `views`; with
-    held-out views also `train_psnr`, the mean over at most 31 training views, and `advice` where these are far ahead
-    (`held_out_gap.gap_advice`), which is in config.json, too; with `--exposure gain` also `psnr_gain`, each render times the gain per
-    channel that brings it nearest to its photograph.
+    Returns: `run`, `iterations`, `seconds` (of training steps alone), `primitives`, `psnr` (mean over held-out views),
+    `views`; with held-out views also `train_psnr`, the mean over at most 31 training views, and `advice` where these
+    are far ahead (`held_out_gap.gap_advice`), which is in config.json, too; with `--exposure gain` also `psnr_gain`,
+    each render times the gain per channel that brings it nearest to its photograph.
 
     Raises:
         LinprimError: the scene or an option cannot be used, or the folder exists already.
@@ -76,9 +78,17 @@ def train(
         if time_budget:
             raise LinprimError("--time-budget plans one training: wanted without --blocks")
         return train_blocks(
-            scene, run, scene_options, options,
-            blocks=blocks, cluster=cluster, workers=workers, resume=resume, quiet=quiet, effects=effects,
-        )  # fmt: skip
+            scene,
+            run,
+            scene_options,
+            options,
+            blocks=blocks,
+            cluster=cluster,
+            workers=workers,
+            resume=resume,
+            quiet=quiet,
+            effects=effects,
+        )
     check_train_options(options := options or TrainOptions())
     scene_options = scene_options or SceneOptions()
     progress = Progress("train", options.iterations, quiet=quiet)
@@ -93,10 +103,16 @@ def train(
     if resume and budget:
         progress.note("--resume goes on with the run's own options: --time-budget ignored")
         budget = None
-    if budget and all(getattr(options, name) != getattr(TrainOptions, name) for name in ("iterations", "max_primitives")):
-        raise LinprimError("--time-budget leaves nothing to choose beside --iterations and --max-primitives: wanted at most one of the two")
+    if budget and all(
+        getattr(options, name) != getattr(TrainOptions, name) for name in ("iterations", "max_primitives")
+    ):
+        raise LinprimError(
+            "--time-budget leaves nothing to choose beside --iterations and --max-primitives: wanted at most one "
+            "of the two"
+        )
     try:
-        # torch only does small element-wise work here; its own threads would wait for each other longer than they compute.
+        # torch only does small element-wise work here; its own threads would wait for each other longer than they
+        # compute.
         torch.set_num_threads(1)
         with locked(run_path, "trained into"):
             ops.set_threads(options.threads)
@@ -189,7 +205,8 @@ def train_run(
     progress.start = trainer.step
     progress.note(
         f"{scene.root}: {scene.kind}, {len(scene.train)} training and {len(scene.test)} held-out views of "
-        f"{shots[0].camera.width}x{shots[0].camera.height}; {len(trainer)} primitives, {ops.instruction_set()}, {ops.threads()} threads"
+        f"{shots[0].camera.width}x{shots[0].camera.height}; {len(trainer)} primitives, {ops.instruction_set()}, "
+        f"{ops.threads()} threads"
     )
     held_out = load_shots(scene.test, run.similarity) if held_out is None else held_out
     seconds, score, score_gain = run_steps(trainer, run, held_out, progress, pace)

@@ -1,7 +1,7 @@
 """One training step and the state it changes: raw parameters, Adam's moments, the 3D filter, what growth has gathered.
 
-Whatever is random is drawn from a generator seeded by (seed, purpose, step), so the state needs no generator and a resumed run
-repeats the interrupted one bit for bit.
+Whatever is random is drawn from a generator seeded by (seed, purpose, step), so the state needs no generator and a
+resumed run repeats the interrupted one bit for bit.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ CONTROLS: dict[str, type[Control]] = {
     "mcmc": McmcControl,
 }
 
-# Learning rates at the start of a run, for the training frame, where cameras see their subject from a distance of 3; all fall
-# exponentially to the given part of themselves.
+# Learning rates at the start of a run, for the training frame, where cameras see their subject from a distance of 3;
+# all fall exponentially to the given part of themselves.
 RATES = {
     "center": (1.5e-3, 0.02),
     "rotation": (7e-3, 0.1),
@@ -52,7 +52,8 @@ RATES = {
 SHARED = frozenset({"background", "environment"})
 # Parts of the run after which all views are looked at together, before an environment.
 LOOKS_AROUND = (0.1, 0.2, 0.35, 0.5, 0.7)
-# Light that passes primitives to this part tells little of the environment: Adam would move its texels as fast as those in full view.
+# Light that passes primitives to this part tells little of the environment: Adam would move its texels as fast as those
+# in full view.
 FAINT = 0.5
 # Adam's epsilon elsewhere.
 ADAM_EPSILON = 1e-15
@@ -60,15 +61,15 @@ ADAM_EPSILON = 1e-15
 CONTRADICTION = 0.5
 # Raw opacity of a primitive that is to be moved: an opacity of 0.0003.
 TRANSPARENT = -8.0
-# An octahedron's half-axes, and as large extents of the other kinds (Kind.size), stay within these: a part of a pixel at the
-# distance of the subject, and of the scene's radius.
+# An octahedron's half-axes, and as large extents of the other kinds (Kind.size), stay within these: a part of a pixel
+# at the distance of the subject, and of the scene's radius.
 SMALLEST_PX, LARGEST_PART = 0.35, 0.5
 # Share of the run after which each further degree of view-dependent colour joins.
 DEGREE_EVERY = 0.07
 # A Gaussian's standard deviation at the start, in mean distances to the 3 nearest points.
 GAUSSIAN_START = 0.5
-# The 3D filter: sqrt(0.2) of a pixel, from views in which the primitive is farther than 0.2 and at most 15 % of the image's size
-# outside of it (LinPrim's box_factor and Mip-Splatting's limits); made again after so many steps.
+# The 3D filter: sqrt(0.2) of a pixel, from views in which the primitive is farther than 0.2 and at most 15 % of the
+# image's size outside of it (LinPrim's box_factor and Mip-Splatting's limits); made again after so many steps.
 FILTER_VARIANCE, FILTER_NEAR, FILTER_MARGIN, FILTER_EVERY = 0.2, 0.2, 0.15, 1000
 
 
@@ -80,11 +81,12 @@ def initial_parameters(
     bounds: tuple[float, float],
     kind: str = "octahedron",
 ) -> dict[str, torch.Tensor]:
-    """One primitive per point: opacity 0.5, random rotation, equal extents by the mean distance to the 3 nearest points.
+    """One primitive per point: opacity 0.5, random rotation, equal extents by the mean distance to the 3 nearest
+    points.
 
-    Octahedra have it for half-axes, tetrahedra the same volume, Gaussians half of it for standard deviation. (3DGS's start,
-    the whole of it at opacity 0.1, scores 0.4 to 2 dB less under every rule of growth, and MCMC's noise tears it apart.)
-    `xyz` (P, 3) in the training frame, `rgb` (P, 3) uint8, `bounds` the least and largest extent.
+    Octahedra have it for half-axes, tetrahedra the same volume, Gaussians half of it for standard deviation. (3DGS's
+    start, the whole of it at opacity 0.1, scores 0.4 to 2 dB less under every rule of growth, and MCMC's noise tears it
+    apart.) `xyz` (P, 3) in the training frame, `rgb` (P, 3) uint8, `bounds` the least and largest extent.
     """
     from scipy.spatial import cKDTree
 
@@ -104,10 +106,7 @@ def initial_parameters(
         "sh_dc": ((rgb / 255.0 - 0.5) / SH_Y0)[:, None, :],
         "sh_rest": np.zeros((count, (degree + 1) ** 2 - 1, 3)),
     }
-    return {
-        name: torch.from_numpy(np.ascontiguousarray(value, dtype=np.float32))
-        for name, value in values.items()
-    }
+    return {name: torch.from_numpy(np.ascontiguousarray(value, dtype=np.float32)) for name, value in values.items()}
 
 
 def activate(
@@ -118,9 +117,10 @@ def activate(
 ) -> Tensors:
     """Raw parameters to what the rasterizer takes: center, rotation, extent, density, sh.
 
-    extent = exp(log_extent), and with `filter_3d` f (N,), a constant, extent + f / 2, or sqrt(extent^2 + f^2) for Gaussians.
-    density = softplus(raw_opacity) / reference_length(extent), so that a ray along that length has alpha = 1 -
-    exp(-softplus(raw)) = sigmoid(raw), with no cap and no logarithm of 0; for Gaussians the opacity itself, sigmoid(raw).
+    extent = exp(log_extent), and with `filter_3d` f (N,), a constant, extent + f / 2, or sqrt(extent^2 + f^2) for
+    Gaussians. density = softplus(raw_opacity) / reference_length(extent), so that a ray along that length has alpha = 1
+    - exp(-softplus(raw)) = sigmoid(raw), with no cap and no logarithm of 0; for Gaussians the opacity itself,
+    sigmoid(raw).
     """
     extent = torch.exp(parameters["log_extent"])
     if kind == "gaussian":
@@ -130,26 +130,20 @@ def activate(
         extent = extent if filter_3d is None else extent + filter_3d[:, None] / 2
         density = torch.nn.functional.softplus(parameters["raw_opacity"]) / reference_length(extent, kind)
     count = (degree + 1) ** 2 - 1
-    sh = (
-        parameters["sh_dc"]
-        if count == 0
-        else torch.cat([parameters["sh_dc"], parameters["sh_rest"][:, :count]], 1)
-    )
+    sh = parameters["sh_dc"] if count == 0 else torch.cat([parameters["sh_dc"], parameters["sh_rest"][:, :count]], 1)
     return parameters["center"], parameters["rotation"], extent, density, sh
 
 
 def filter_lengths(center: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
     """(N,) float32 f = sqrt(0.2) z / F: part of a pixel, at the nearest camera that sees each of the (N, 3) centres.
 
-    z is the least depth over those cameras, F the largest focal length of all. A centre that no camera sees has the distance of the
-    nearest camera for z. Source: Mip-Splatting (Yu et al. 2024), LinPrim's box_factor.
+    z is the least depth over those cameras, F the largest focal length of all. A centre that no camera sees has the
+    distance of the nearest camera for z. Source: Mip-Splatting (Yu et al. 2024), LinPrim's box_factor.
     """
     xyz = center.detach().numpy()
     least = np.full(len(xyz), np.inf, np.float32)
     for camera in cameras:
-        x, y, z = (
-            xyz @ camera.rotation.astype(np.float32).T + camera.world_to_camera[:3, 3].astype(np.float32)
-        ).T
+        x, y, z = (xyz @ camera.rotation.astype(np.float32).T + camera.world_to_camera[:3, 3].astype(np.float32)).T
         seen = z > FILTER_NEAR
         for along, focal, middle, size in (
             (x, camera.fx, camera.cx, camera.width),
@@ -178,7 +172,8 @@ def _single(out: ops.Rendering) -> ops.Rendering:
 
 
 class Trainer:
-    """The state of a training and one step of it. `parameters`, `first` and `second` (Adam's moments) share their keys."""
+    """The state of a training and one step of it. `parameters`, `first` and `second` (Adam's moments) share their
+    keys."""
 
     def __init__(
         self,
@@ -193,8 +188,8 @@ class Trainer:
         log_gain: np.ndarray | None = None,
         environment: torch.Tensor | None = None,
     ):
-        """`log_gain` (V, 3): where the gains of the photographs begin, with `--exposure gain`. `environment` (6, S, S, 3): texels of
-        what stands behind everything, in place of a background, to begin with."""
+        """`log_gain` (V, 3): where the gains of the photographs begin, with `--exposure gain`. `environment` (6, S, S,
+        3): texels of what stands behind everything, in place of a background, to begin with."""
         self.shots, self.options, self.bounds, self.terms = shots, options, bounds, terms
         self.parameters = dict(parameters)
         self.fitted, self.random_background = fitted, random_background
@@ -202,7 +197,8 @@ class Trainer:
         if fitted:
             self.parameters["background"] = background
         self.looks_around = {round(share * options.iterations) for share in LOOKS_AROUND}
-        # Gradient of the loss to a texel through which a pixel's light passes to this part: below it Adam's steps get small.
+        # Gradient of the loss to a texel through which a pixel's light passes to this part: below it Adam's steps get
+        # small.
         camera = shots[0].camera
         self.faint = FAINT / (3 * camera.width * camera.height)
         if environment is not None:
@@ -211,15 +207,14 @@ class Trainer:
         self.second = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
         self.exposure = Exposure(len(shots), log_gain) if options.exposure == "gain" else None
         self.step = 0
-        # (step, iterations): from this step on the run is to end after so many, what is left of its schedules stretched to fit.
+        # (step, iterations): from this step on the run is to end after so many, what is left of its schedules stretched
+        # to fit.
         self.correction: tuple[int, int] | None = None
         self.steps = torch.zeros(len(self), dtype=torch.int32)  # sparse Adam: updates of each primitive
         self.seconds = 0.0
         self.loss = self.psnr = math.nan  # running means
         self.kind, self.how = options.primitive, raster_options(options)
-        self.control = CONTROLS[options.population](
-            options, len(self), [shot.camera for shot in shots], bounds
-        )
+        self.control = CONTROLS[options.population](options, len(self), [shot.camera for shot in shots], bounds)
         self.filter_3d: torch.Tensor | None = None
         # Primitives that stay as they are, as the rasterizer takes them: they stand for what others train.
         self.frozen: Tensors | None = None
@@ -241,7 +236,8 @@ class Trainer:
         return self.correction[1]
 
     def part(self) -> float:
-        """Share of the run's schedules, 0 to 1, that lies behind this step: of learning rates, and of what begins late."""
+        """Share of the run's schedules, 0 to 1, that lies behind this step: of learning rates, and of what begins
+        late."""
         if self.correction is None or self.step < self.correction[0]:
             return self.step / self.options.iterations
         bend, last = self.correction
@@ -295,7 +291,9 @@ class Trainer:
         shared = needed and self.options.samples == 1
         how = {"stop": self.options.stop, **self.how_now()}
         samples = self.options.samples
-        out = _single(ops.rasterize(*active, behind, shot.camera, samples=samples, geometry=shared, screen=screen, **how))
+        out = _single(
+            ops.rasterize(*active, behind, shot.camera, samples=samples, geometry=shared, screen=screen, **how)
+        )
         passed = None
         if self.environment is not None:
             passed = ops.environment_light(out.opacity, leaves["environment"], shot.camera, self.options.stop)
@@ -415,8 +413,8 @@ class Trainer:
 
     @torch.no_grad()
     def _look_around(self) -> None:
-        """Before an environment: makes primitives transparent that one view alone sees, so that growth moves them to where they are needed,
-        and gives texels that no view sees past the primitives the colours round them."""
+        """Before an environment: makes primitives transparent that one view alone sees, so that growth moves them to
+        where they are needed, and gives texels that no view sees past the primitives the colours round them."""
         if self.environment is None:
             return
         support = Support(self.parameters["center"])
@@ -425,7 +423,9 @@ class Trainer:
 
         def opacities() -> Iterator[tuple[Camera, Tensor]]:
             for shot in self.shots[:: max(1, len(self.shots) // SURVEY_VIEWS)]:
-                out = _single(ops.rasterize(*active, black, shot.camera, stop=self.options.stop, geometry=True, **self.how_now()))
+                out = _single(
+                    ops.rasterize(*active, black, shot.camera, stop=self.options.stop, geometry=True, **self.how_now())
+                )
                 assert out.max_weight is not None
                 support.add(shot.camera, out.max_weight[: len(self)])
                 yield shot.camera, out.opacity

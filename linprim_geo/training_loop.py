@@ -1,4 +1,5 @@
-"""The steps of a training and what surrounds them: scores on held-out views, the table of metrics, checkpoints, interruption."""
+"""The steps of a training and what surrounds them: scores on held-out views, the table of metrics, checkpoints,
+interruption."""
 
 from __future__ import annotations
 
@@ -27,15 +28,22 @@ QUICK_VIEWS = 16
 
 
 def run_steps(
-    trainer: Trainer, run: Run, held_out: list[Shot], progress: Progress, pace: Pace | None = None, until: int | None = None
+    trainer: Trainer,
+    run: Run,
+    held_out: list[Shot],
+    progress: Progress,
+    pace: Pace | None = None,
+    until: int | None = None,
 ) -> tuple[float, float | None, float | None]:
-    """Steps until the end, or to step `until` of all, with lines in metrics.jsonl, checkpoints, and scores on `held_out` now and then.
+    """Steps until the end, or to step `until` of all, with lines in metrics.jsonl, checkpoints, and scores on
+    `held_out` now and then.
 
-    Returns: seconds spent in steps, and the final mean held-out PSNR in dB, as rendered and, where exposures are fitted, with gains; None
-        without views.
+    Returns: seconds spent in steps, and the final mean held-out PSNR in dB, as rendered and, where exposures are
+        fitted, with gains; None without views.
 
     Raises:
-        LinprimError: training diverged, or a photograph or the run's folder is no longer there. What was saved is intact.
+        LinprimError: training diverged, or a photograph or the run's folder is no longer there. What was saved is
+            intact.
         KeyboardInterrupt: after the step that was begun, which is saved.
     """
     options = trainer.options
@@ -75,7 +83,8 @@ def run_steps(
                     if score_gain is not None:
                         entry["psnr_gain"] = round(score_gain, 4)
                     progress.note(
-                        f"  step {trainer.step}: held-out PSNR {score:.2f} dB, {len(trainer)} primitives, {duration(trainer.seconds)}"
+                        f"  step {trainer.step}: held-out PSNR {score:.2f} dB, {len(trainer)} primitives, "
+                        f"{duration(trainer.seconds)}"
                     )
                 log.write(json.dumps(entry) + "\n")
                 log.flush()
@@ -119,8 +128,8 @@ def cut_metrics(path: Path, step: int) -> None:
 def evaluate(trainer: Trainer, shots: list[Shot], gains: bool = False) -> float | None:
     """Mean PSNR over views, renders clamped and rounded to 8 bits as saved images are; None without views.
 
-    With `gains` each render is first multiplied by the gain per channel that brings it nearest to its photograph: what a photograph of
-    unknown exposure can say about it.
+    With `gains` each render is first multiplied by the gain per channel that brings it nearest to its photograph: what
+    a photograph of unknown exposure can say about it.
     """
     from .eval.images import psnr, to_8bit
 
@@ -137,7 +146,8 @@ def evaluate(trainer: Trainer, shots: list[Shot], gains: bool = False) -> float 
 
 @contextmanager
 def _interrupt_flag() -> Iterator[list]:
-    """A list that becomes non-empty on the first Ctrl-C, so that a step is never torn; a second one interrupts at once."""
+    """A list that becomes non-empty on the first Ctrl-C, so that a step is never torn; a second one interrupts at
+    once."""
     flag: list[int] = []
 
     def note(number, frame):
@@ -165,7 +175,8 @@ def save_training(trainer: Trainer, run: Run) -> None:
     for name, value in trainer.parameters.items():
         if not bool(torch.isfinite(value).all()):
             raise LinprimError(
-                f"{run.path}: training diverged at step {trainer.step} ({name} is not finite); what was saved before is intact"
+                f"{run.path}: training diverged at step {trainer.step} ({name} is not finite); what was saved "
+                "before is intact"
             )
     write_checkpoint(run.path / "checkpoints", trainer)
     run.save(

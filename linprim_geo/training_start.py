@@ -1,4 +1,5 @@
-"""Where a training starts: the scene with points, the run, new or reopened, and the trainer at its first step or at a checkpoint."""
+"""Where a training starts: the scene with points, the run, new or reopened, and the trainer at its first step or at a
+checkpoint."""
 
 from __future__ import annotations
 
@@ -45,8 +46,8 @@ BACKDROP_SHARE, BACKDROP_TOLERANCE = 0.8, 0.1
 def with_points(scene: Scene, options: TrainOptions, log: Callable[[str], None]) -> Scene:
     """The scene with points to start from: its own, triangulated under the known poses, or random where cameras look.
 
-    A scene with alpha and no points starts inside the visual hull. Without alpha, features are matched and triangulated; if they
-    are few, random points in the common field of view fill up.
+    A scene with alpha and no points starts inside the visual hull. Without alpha, features are matched and
+    triangulated; if they are few, random points in the common field of view fill up.
     """
     from .triangulate import triangulate_points
 
@@ -120,7 +121,8 @@ def begin_run(
     effects: Choice,
     progress: Progress,
 ) -> tuple[Run, Scene, list[Decision]]:
-    """A new run, whose folder is not made yet, its scene with points to start from, and what was decided about its effects.
+    """A new run, whose folder is not made yet, its scene with points to start from, and what was decided about its
+    effects.
 
     Raises:
         LinprimError: something is at `run_path` already, or the scene or an option cannot be used.
@@ -136,7 +138,8 @@ def begin_run(
 def reopen_run(
     scene: Path, run_path: Path, scene_options: SceneOptions, options: TrainOptions, progress: Progress
 ) -> tuple[Run, Scene]:
-    """An existing run and its scene; options that were given and differ from the run's, but for `threads`, are named as ignored.
+    """An existing run and its scene; options that were given and differ from the run's, but for `threads`, are named as
+    ignored.
 
     Raises:
         LinprimError: not a run folder, a file in it is damaged, or its scene is neither where it was nor at `scene`.
@@ -148,19 +151,17 @@ def reopen_run(
         "--" + field.name.replace("_", "-")
         for given, own in ((scene_options, opened.scene_options), (options, opened.train_options))
         for field in fields(given)
-        if field.name != "threads"
-        and getattr(given, field.name) not in (field.default, getattr(own, field.name))
+        if field.name != "threads" and getattr(given, field.name) not in (field.default, getattr(own, field.name))
     ]
     if ignored:
         progress.note(f"--resume goes on with the run's own options: {', '.join(ignored)} ignored")
     if opened.instruction_set not in ("", ops.instruction_set()):
         progress.note(
-            f"begun with {opened.instruction_set} kernels and going on with {ops.instruction_set()}: the last bits will differ"
+            f"begun with {opened.instruction_set} kernels and going on with {ops.instruction_set()}: the last "
+            "bits will differ"
         )
     progress.total = opened.train_options.iterations
-    return replace(
-        opened, train_options=replace(opened.train_options, threads=options.threads)
-    ), opened.scene()
+    return replace(opened, train_options=replace(opened.train_options, threads=options.threads)), opened.scene()
 
 
 def late_terms(run: Run, scene: Scene, shots: list[Shot], progress: Progress) -> GeometryTerms | None:
@@ -178,8 +179,8 @@ def late_terms(run: Run, scene: Scene, shots: list[Shot], progress: Progress) ->
 
 @dataclass(frozen=True)
 class Background:
-    """What training puts behind everything: a `color` (3,) float32 in [0, 1], which is `fitted`, or replaced by a `random` one in each
-    step or by an `environment`, which begins with the photographs' colours at infinity, `far`."""
+    """What training puts behind everything: a `color` (3,) float32 in [0, 1], which is `fitted`, or replaced by a
+    `random` one in each step or by an `environment`, which begins with the photographs' colours at infinity, `far`."""
 
     color: torch.Tensor
     fitted: bool = False
@@ -189,10 +190,12 @@ class Background:
 
 
 def chosen_background(text: str, scene: Scene, shots: list[Shot], begun: bool | None = None) -> Background:
-    """What the option's text stands for. Of a training that goes on, `begun` says whether it has an environment: that has its colours.
+    """What the option's text stands for. Of a training that goes on, `begun` says whether it has an environment: that
+    has its colours.
 
-    Without alpha a random background makes everything opaque: a fitted one would let a wall of its colour become transparent. It is
-    fitted only where photographs have a plain backdrop, and an environment is trained only where they say that a scene is open.
+    Without alpha a random background makes everything opaque: a fitted one would let a wall of its colour become
+    transparent. It is fitted only where photographs have a plain backdrop, and an environment is trained only where
+    they say that a scene is open.
 
     Raises:
         LinprimError: the text is no name and not three numbers in [0, 1].
@@ -224,7 +227,8 @@ def chosen_background(text: str, scene: Scene, shots: list[Shot], begun: bool | 
         color = ()
     if len(color) != 3 or not all(0 <= x <= 1 for x in color):
         raise LinprimError(
-            f"--background is {text!r}, wanted auto, fitted, environment, random, black, white, or three numbers in [0,1] such as 0.5,0.5,1"
+            f"--background is {text!r}, wanted auto, fitted, environment, random, black, white, or three numbers "
+            "in [0,1] such as 0.5,0.5,1"
         )
     return Background(torch.tensor(color, dtype=torch.float32))
 
@@ -287,9 +291,7 @@ def start_trainer(
         xyz, rgb = run.similarity.apply(cloud.xyz), cloud.rgb
         middle = np.median(xyz, 0)
         reach = np.linalg.norm(xyz - middle, axis=1)
-        radius = max(
-            float(np.percentile(reach, 98)), 0.2 * float(np.linalg.norm(centers - middle, axis=1).max()), 1e-3
-        )
+        radius = max(float(np.percentile(reach, 98)), 0.2 * float(np.linalg.norm(centers - middle, axis=1).max()), 1e-3)
     smallest = SMALLEST_PX * CAMERA_DISTANCE / focal
     like = KINDS[options.primitive].size
     largest = like * LARGEST_PART * radius if largest is None else largest
@@ -304,9 +306,19 @@ def start_trainer(
     environment = None
     if behind.environment:
         size = texels_for([shot.camera for shot in shots])
-        environment = torch.zeros(6, size, size, 3) if behind.far is None else behind.far.start(size)  # zeros: replaced below
+        environment = (
+            torch.zeros(6, size, size, 3) if behind.far is None else behind.far.start(size)
+        )  # zeros: replaced below
     trainer = Trainer(
-        shots, parameters, options, bounds, behind.color, behind.fitted, behind.random, log_gain=log_gain, environment=environment
+        shots,
+        parameters,
+        options,
+        bounds,
+        behind.color,
+        behind.fitted,
+        behind.random,
+        log_gain=log_gain,
+        environment=environment,
     )
     if state is not None:
         restore(trainer, state, run.path / "checkpoints")
@@ -314,7 +326,8 @@ def start_trainer(
 
 
 def _lay_down(parameters: dict[str, torch.Tensor], xyz: np.ndarray, seed: int, smallest: float) -> None:
-    """Lays primitives on the planes of their points, as thin across as these are flat, at least twice the smallest extent.
+    """Lays primitives on the planes of their points, as thin across as these are flat, at least twice the smallest
+    extent.
 
     A ball round a point of a plain wall stands out from it by its radius, and no photograph says that it does not.
     """

@@ -1,4 +1,5 @@
-"""Camera trajectories as text: the `.log` of Redwood, Open3D and Tanks and Temples, and the lists of TUM's RGB-D benchmark."""
+"""Camera trajectories as text: the `.log` of Redwood, Open3D and Tanks and Temples, and the lists of TUM's RGB-D
+benchmark."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ _UNIT_TOLERANCE = 0.01
 
 
 def is_log(path: Path) -> bool:
-    """Whether a file begins as a `.log` of poses does, with a line of three whole numbers; others have that suffix too."""
+    """Whether a file begins as a `.log` of poses does, with a line of three whole numbers; others have that suffix
+    too."""
     try:
         with open(path, encoding="utf-8") as file:
             words = file.readline(200).split()
@@ -25,7 +27,8 @@ def is_log(path: Path) -> bool:
 
 
 def read_log(path: Path) -> list[tuple[int, np.ndarray]]:
-    """(number, (4, 4) camera-to-world) of each frame of a `.log`: a line of three whole numbers, then a matrix in four lines.
+    """(number, (4, 4) camera-to-world) of each frame of a `.log`: a line of three whole numbers, then a matrix in four
+    lines.
 
     Frames whose second number is -1 have no pose and are left out.
 
@@ -44,9 +47,7 @@ def read_log(path: Path) -> list[tuple[int, np.ndarray]]:
             number, second = int(rows[first][0]), int(rows[first][1])
             matrix = np.array(rows[first + 1 : first + 5], dtype=np.float64)
         except (ValueError, IndexError) as error:
-            raise LinprimError(
-                f"{where}: not three whole numbers and a matrix, wanted those in five lines"
-            ) from error
+            raise LinprimError(f"{where}: not three whole numbers and a matrix, wanted those in five lines") from error
         if matrix.shape != (4, 4):
             raise LinprimError(f"{where}: the matrix has shape {matrix.shape}, wanted 4x4 numbers")
         if second != -1:
@@ -56,11 +57,9 @@ def read_log(path: Path) -> list[tuple[int, np.ndarray]]:
     return frames
 
 
-def log_by_image(
-    frames: list[tuple[int, np.ndarray]], images: list[Path], path: Path
-) -> list[tuple[Path, np.ndarray]]:
-    """Gives frames of a `.log` their photographs: in order where there are as many; where there are more photographs, the one of the
-    frame's number, counted from 0; where there are fewer, each the frame of the number that is its name.
+def log_by_image(frames: list[tuple[int, np.ndarray]], images: list[Path], path: Path) -> list[tuple[Path, np.ndarray]]:
+    """Gives frames of a `.log` their photographs: in order where there are as many; where there are more photographs,
+    the one of the frame's number, counted from 0; where there are fewer, each the frame of the number that is its name.
 
     Raises:
         LinprimError: numbers and photographs do not fit together.
@@ -68,9 +67,7 @@ def log_by_image(
     if len(frames) == len(images):
         return [(image, pose) for image, (_, pose) in zip(images, frames, strict=True)]
     poses = dict(frames)
-    wanted = (
-        f"wanted as many, or numbers of images, but the poses have numbers from {min(poses)} to {max(poses)}"
-    )
+    wanted = f"wanted as many, or numbers of images, but the poses have numbers from {min(poses)} to {max(poses)}"
     if len(images) > len(frames):
         if len(poses) < len(frames) or min(poses) < 0 or max(poses) >= len(images):
             raise LinprimError(f"{path}: {len(frames)} poses for {len(images)} images, {wanted}")
@@ -80,7 +77,8 @@ def log_by_image(
     strange = [image.name for image, pose in pose_of.items() if pose is None]
     if strange or len(poses) < len(frames):
         raise LinprimError(
-            f"{path}: {len(frames)} poses for {len(images)} images, such as {(strange or [images[0].name])[0]}, {wanted}"
+            f"{path}: {len(frames)} poses for {len(images)} images, such as {(strange or [images[0].name])[0]}, "
+            f"{wanted}"
         )
     return found
 
@@ -89,7 +87,8 @@ def read_tum_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """(F,) seconds, sorted, and (F, 4, 4) camera-to-world of lines `timestamp tx ty tz qx qy qz qw`.
 
     Raises:
-        LinprimError: unreadable, empty, not eight finite numbers in a line, or a quaternion that is far from unit length.
+        LinprimError: unreadable, empty, not eight finite numbers in a line, or a quaternion that is far from unit
+            length.
     """
     from scipy.spatial.transform import Rotation
 
@@ -99,13 +98,10 @@ def read_tum_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:
             values = [float(word) for word in row]
         except ValueError:
             values = []
-        if (
-            len(values) != 8
-            or not np.isfinite(values).all()
-            or abs(math.hypot(*values[4:]) - 1) > _UNIT_TOLERANCE
-        ):
+        if len(values) != 8 or not np.isfinite(values).all() or abs(math.hypot(*values[4:]) - 1) > _UNIT_TOLERANCE:
             raise LinprimError(
-                f"{path} row {number}: {' '.join(row)!r} is no pose, wanted timestamp tx ty tz and a unit quaternion qx qy qz qw"
+                f"{path} row {number}: {' '.join(row)!r} is no pose, wanted timestamp tx ty tz and a unit "
+                "quaternion qx qy qz qw"
             )
         table.append(values)
     values = np.array(sorted(table))
@@ -134,7 +130,8 @@ def read_tum_list(path: Path) -> tuple[np.ndarray, list[str]]:
 
 
 def nearest(seconds: np.ndarray, wanted: np.ndarray, within: float) -> np.ndarray:
-    """(W,) index into the sorted (F,) `seconds` of the one nearest to each `wanted`, -1 where none is `within` so many seconds."""
+    """(W,) index into the sorted (F,) `seconds` of the one nearest to each `wanted`, -1 where none is `within` so many
+    seconds."""
     after = np.clip(np.searchsorted(seconds, wanted), 0, len(seconds) - 1)
     before = np.maximum(after - 1, 0)
     index = np.where(np.abs(seconds[before] - wanted) <= np.abs(seconds[after] - wanted), before, after)
@@ -149,9 +146,7 @@ def _rows(path: Path) -> list[list[str]]:
         raise LinprimError(f"{path}: cannot be read ({error.strerror}), wanted a list of frames") from error
     except UnicodeDecodeError as error:
         raise LinprimError(f"{path}: not a text file, wanted a list of frames") from error
-    rows = [
-        line.replace(",", " ").split() for line in lines if line.strip() and not line.lstrip().startswith("#")
-    ]
+    rows = [line.replace(",", " ").split() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if not rows:
         raise LinprimError(f"{path}: no line that is not a comment, wanted a list of frames")
     return rows

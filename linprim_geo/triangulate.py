@@ -43,7 +43,8 @@ _ISOLATION_ROUNDS = 3
 _MIN_POINTS = 16
 
 
-# Per image. Every keypoint is compared with every one of the other image, about 0.1 s for a pair of images with this many.
+# Per image. Every keypoint is compared with every one of the other image, about 0.1 s for a pair of images with this
+# many.
 MOST_KEYPOINTS = 4096
 
 
@@ -91,10 +92,7 @@ def triangulate_points(
         )
     cloud = PointCloud(xyz, rgb, error)
     _store(stored, cloud)
-    say(
-        f"triangulated points: {len(xyz)},"
-        f" median error {np.median(error):.2f} px, {time.monotonic() - start:.1f} s"
-    )
+    say(f"triangulated points: {len(xyz)}, median error {np.median(error):.2f} px, {time.monotonic() - start:.1f} s")
     return cloud
 
 
@@ -125,9 +123,7 @@ def _triangulate(views: Sequence[View], seed: int, threads: int):
     views."""
     from .load_pycolmap import pycolmap
 
-    pycolmap.logging.minloglevel = max(
-        pycolmap.logging.minloglevel, 2
-    )  # progress of every image and pair otherwise
+    pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, 2)  # progress of every image and pair otherwise
     pycolmap.set_random_seed(seed)
     with tempfile.TemporaryDirectory(prefix="linprim-points-") as name:
         folder = Path(name)
@@ -139,9 +135,7 @@ def _triangulate(views: Sequence[View], seed: int, threads: int):
         extraction.sift.max_num_features = MOST_KEYPOINTS
         extraction.sift.max_num_features = _MAX_FEATURES
         extraction.sift.peak_threshold = _PEAK_THRESHOLD
-        pycolmap.extract_features(
-            database_path, images, extraction_options=extraction, device=pycolmap.Device.cpu
-        )
+        pycolmap.extract_features(database_path, images, extraction_options=extraction, device=pycolmap.Device.cpu)
         pairs = matching_pairs(views)
         if not pairs:
             return np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0, np.float32), []
@@ -229,9 +223,7 @@ def _verify(views: Sequence[View], database_path: Path, pairs: list) -> None:
                 database.write_two_view_geometry(first, second, geometry)
 
 
-def _sampson_px(
-    first: Camera, second: Camera, pixels_first: np.ndarray, pixels_second: np.ndarray
-) -> np.ndarray:
+def _sampson_px(first: Camera, second: Camera, pixels_first: np.ndarray, pixels_second: np.ndarray) -> np.ndarray:
     """(M,) distance in pixels of matched (M, 2) positions from the epipolar geometry of two cameras."""
     relative = second.world_to_camera @ first.camera_to_world
     x, y, z = relative[:3, 3]
@@ -313,9 +305,7 @@ def _key(scene: Scene, seed: int) -> str:
                 try:
                     digest.update(hashlib.blake2b(path.read_bytes(), digest_size=16).digest())
                 except OSError as error:
-                    raise LinprimError(
-                        f"{path}: cannot be read ({error.strerror}), wanted an image"
-                    ) from error
+                    raise LinprimError(f"{path}: cannot be read ({error.strerror}), wanted an image") from error
     return digest.hexdigest()
 
 
@@ -325,7 +315,11 @@ def _stored(path: Path) -> PointCloud | None:
         with np.load(path, allow_pickle=False) as arrays:
             xyz, rgb, error_px = (arrays[name] for name in ("xyz", "rgb", "error_px"))
         usable = xyz.shape == (len(error_px), 3) == rgb.shape and rgb.dtype == np.uint8 and error_px.ndim == 1
-        return PointCloud(xyz, rgb, error_px) if usable and np.isfinite(xyz).all() and np.isfinite(error_px).all() else None
+        return (
+            PointCloud(xyz, rgb, error_px)
+            if usable and np.isfinite(xyz).all() and np.isfinite(error_px).all()
+            else None
+        )
     except Exception:  # noqa: BLE001 - a cache entry that cannot be read is made again
         return None
 

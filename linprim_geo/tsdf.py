@@ -63,6 +63,7 @@ several would coincide. Moves the surface by at most 0.006 voxel at a truncation
 LEAST_SUPPORT = 1e-6
 """Voxels with less weight than this were seen by no view; far below the smallest weight a vote can have."""
 
+
 @dataclass(frozen=True)
 class DepthFrame:
     """One view's depth map.
@@ -70,8 +71,8 @@ class DepthFrame:
     `depth` (H, W) float is z along the optical axis at the pixel centres, in scene units; 0, negative, NaN
     and inf mean that there is no surface. `background` (H, W) bool marks those of them through which the ray
     is known to be free; the others are unknown. `confidence` (H, W) multiplies the
-    weight of each pixel. `clamped` (H, W) bool marks depths that are only a least one: the ray is free up to there, and where its
-    surface is is not known.
+    weight of each pixel. `clamped` (H, W) bool marks depths that are only a least one: the ray is free up to there, and
+    where its surface is is not known.
     """
 
     camera: Camera
@@ -85,9 +86,7 @@ class DepthFrame:
         for name in ("depth", "background", "confidence", "clamped"):
             value = getattr(self, name)
             if value is not None and np.shape(value)[:2] != wanted:
-                raise LinprimError(
-                    f"depth frame: {name} is {np.shape(value)}, but its camera has {wanted} pixels"
-                )
+                raise LinprimError(f"depth frame: {name} is {np.shape(value)}, but its camera has {wanted} pixels")
 
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
         """(P, 3) float64 world points of the pixels that see a surface, and their (P,) depths."""
@@ -205,7 +204,9 @@ class Grid:
         project[:, 3] = camera.K @ (camera.rotation @ self.origin + camera.world_to_camera[:3, 3])
         table = surfels(frame, self.voxel, self.truncation, self.origin)
         sums = (self.total, self.weight, self.free)
-        _core.add_votes(project, camera.width, camera.height, table, rules, rows, self.corner, self.voxel, self.resolution, *sums)
+        _core.add_votes(
+            project, camera.width, camera.height, table, rules, rows, self.corner, self.voxel, self.resolution, *sums
+        )
 
     def in_view(self, camera: Camera) -> np.ndarray:
         """Blocks whose bounding sphere meets the frustum."""
@@ -250,9 +251,14 @@ class Grid:
         np.copyto(field, gap, where=np.abs(field) < ZERO_GAP)
         del weight, free, gap, voted
         grid = open3d.t.geometry.VoxelBlockGrid(
-            ("tsdf", "weight"), (core.float32, core.float32), (core.SizeVector([1]), core.SizeVector([1])),
-            self.voxel, self.resolution, len(self.blocks), cpu,
-        )  # fmt: skip
+            ("tsdf", "weight"),
+            (core.float32, core.float32),
+            (core.SizeVector([1]), core.SizeVector([1])),
+            self.voxel,
+            self.resolution,
+            len(self.blocks),
+            cpu,
+        )
         keys = core.Tensor(np.ascontiguousarray(self.blocks.astype(np.int32)), core.int32, cpu)
         grid.hashmap().activate(keys)
         slots, _ = grid.hashmap().find(keys)
@@ -271,7 +277,8 @@ class Grid:
 
 
 def placed(surface: Mesh, origin: np.ndarray) -> Mesh:
-    """A surface that `Grid.surface` gave, or several together, in the order of its coordinates and the frame of the cameras."""
+    """A surface that `Grid.surface` gave, or several together, in the order of its coordinates and the frame of the
+    cameras."""
     if len(surface.faces) == 0:
         return surface
     mesh = _canonical(surface)

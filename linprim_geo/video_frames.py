@@ -43,11 +43,12 @@ def extract_frames(
 ) -> Path:
     """Writes `count` frames, or all there are, as JPEG files unless that was done before; returns their folder.
 
-    Of each of `count` equal parts the frame is taken whose grey values have the largest variance of their Laplacian. Frames of a phone
-    that was held upright are turned as the video says.
+    Of each of `count` equal parts the frame is taken whose grey values have the largest variance of their Laplacian.
+    Frames of a phone that was held upright are turned as the video says.
 
     Raises:
-        LinprimError: PyAV is not installed, the file holds no video that can be decoded, or the frames cannot be written.
+        LinprimError: PyAV is not installed, the file holds no video that can be decoded, or the frames cannot be
+            written.
     """
     folder = frames_folder(video, count, cache)
     if folder.is_dir():
@@ -105,7 +106,8 @@ def _pyav():
         import av
     except ModuleNotFoundError as error:
         raise LinprimError(
-            "videos are decoded by PyAV, which is not installed: pip install 'linprim-geo[video]', or give a folder of photographs"
+            "videos are decoded by PyAV, which is not installed: pip install 'linprim-geo[video]', or give a "
+            "folder of photographs"
         ) from error
     return av
 
@@ -118,7 +120,8 @@ def _count(av, video: Path) -> int:
 
 
 def _upright(frame) -> np.ndarray:
-    """(H, W, 3) uint8 colours of a frame as a player shows it: turned by quarters and mirrored as its display matrix says."""
+    """(H, W, 3) uint8 colours of a frame as a player shows it: turned by quarters and mirrored as its display matrix
+    says."""
     image = frame.to_ndarray(format="rgb24")
     side_data = frame.side_data.get("DISPLAYMATRIX")
     if side_data is None:

@@ -1,4 +1,5 @@
-"""The interactive view of a run in a browser: primitives, meshes, cameras; served by viser, from this machine to this machine."""
+"""The interactive view of a run in a browser: primitives, meshes, cameras; served by viser, from this machine to this
+machine."""
 
 from __future__ import annotations
 
@@ -38,7 +39,8 @@ TRAIN_COLOR, TEST_COLOR = (90, 110, 140), (220, 120, 30)
 FRUSTUM, FRUSTUM_LINE = 0.12, 0.005
 # The first look is that of the first camera, from so far behind and above it.
 BEHIND, ABOVE = 0.6, 0.4
-# Light of an intensity of pi from everywhere shows colours as they are; some of it comes from two sides, so that shapes can be told.
+# Light of an intensity of pi from everywhere shows colours as they are; some of it comes from two sides, so that shapes
+# can be told.
 AMBIENT, FROM_ABOVE, FROM_BELOW = 1.9, 1.7, 0.9
 
 
@@ -62,13 +64,14 @@ def view_run(
 ) -> dict:
     """Serves the view of a run until Ctrl-C.
 
-    With `follow` it waits for a run that has not saved yet, and shows every save and every mesh as it comes. Only this machine can reach
-    it. With a `reference` mesh the true error of meshes can be shown too.
+    With `follow` it waits for a run that has not saved yet, and shows every save and every mesh as it comes. Only this
+    machine can reach it. With a `reference` mesh the true error of meshes can be shown too.
 
     Returns: `address`, `loads` (how often the run was read), `seconds`.
 
     Raises:
-        LinprimError: viser is not installed, the port is taken, there is no such run (unless it is followed), or a file is damaged.
+        LinprimError: viser is not installed, the port is taken, there is no such run (unless it is followed), or a file
+            is damaged.
     """
     start = time.perf_counter()
     check_installed()
@@ -95,7 +98,8 @@ def view_run(
 
 @contextlib.contextmanager
 def watched(run: str | os.PathLike) -> Iterator[None]:
-    """Shows a run that is being trained in the block: a process of its own, which ends with the block, or with this process.
+    """Shows a run that is being trained in the block: a process of its own, which ends with the block, or with this
+    process.
 
     Raises:
         LinprimError: viser is not installed.
@@ -115,9 +119,7 @@ def watched(run: str | os.PathLike) -> Iterator[None]:
 class Viewer:
     """A server with the scene and the controls of one run; `look` reads the run again if it has changed."""
 
-    def __init__(
-        self, path: Path, port: int, *, follow: bool = False, reference: str | os.PathLike | None = None
-    ):
+    def __init__(self, path: Path, port: int, *, follow: bool = False, reference: str | os.PathLike | None = None):
         """`port` 0 takes any that is free."""
         import viser
 
@@ -131,9 +133,7 @@ class Viewer:
             Run.open(path)
         _check_port(port)
         with _quiet():
-            self.server = viser.ViserServer(
-                host=HOST, port=port, label=f"linprim-geo: {path.name}", verbose=False
-            )
+            self.server = viser.ViserServer(host=HOST, port=port, label=f"linprim-geo: {path.name}", verbose=False)
         try:
             if port and self.server.get_port() != port:  # taken since: viser goes on to the next
                 raise _taken(port)
@@ -160,7 +160,8 @@ class Viewer:
         return f"{self.path}, step {self.seen.step}, {self.seen.count} primitives, {len(self.seen.meshes)} meshes"
 
     def look(self) -> bool:
-        """Reads the run if it has saved since; whether it did. A run that is not there yet, or is being written, is looked at later."""
+        """Reads the run if it has saved since; whether it did. A run that is not there yet, or is being written, is
+        looked at later."""
         now = stamps(self.path)
         if not now or now == self._stamps or not any(name.endswith(".npz") for name in now):
             return False
@@ -317,9 +318,7 @@ class Viewer:
         mesh = primitive_mesh(select(seen.primitives, keep))
         if self._color.value == "opacity":
             each = len(mesh.vertices) // int(keep.sum())
-            mesh = Mesh(
-                mesh.vertices, mesh.faces, colors=np.repeat(error_colors(seen.opacity[keep]), each, axis=0)
-            )
+            mesh = Mesh(mesh.vertices, mesh.faces, colors=np.repeat(error_colors(seen.opacity[keep]), each, axis=0))
         return mesh
 
     def _chosen_mesh(self) -> tuple[Mesh | None, bool]:
@@ -336,7 +335,8 @@ class Viewer:
         return (mesh if keep.all() else select_faces(mesh, keep)), chosen.inside
 
     def _kept(self, points: np.ndarray) -> np.ndarray:
-        """(P,) bool: on the side of the clipping plane that is kept, which has so many per cent of the primitives' centres."""
+        """(P,) bool: on the side of the clipping plane that is kept, which has so many per cent of the primitives'
+        centres."""
         share = self._plane.value / 100.0
         if share >= 1.0 or self.seen.primitives is None:
             return np.ones(len(points), dtype=bool)
@@ -346,12 +346,14 @@ class Viewer:
 
 
 def as_text(line: str) -> str:
-    """Markdown that shows the line as it is. Names and units come out of files, and viser runs scripts that stand in Markdown."""
+    """Markdown that shows the line as it is. Names and units come out of files, and viser runs scripts that stand in
+    Markdown."""
     return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", " ".join(line.split()))
 
 
 def _glb(mesh: Mesh, double_sided: bool) -> bytes:
-    """GLB of a mesh with flat faces. Colours of vertices are linear there, so those of photographs are taken out of sRGB."""
+    """GLB of a mesh with flat faces. Colours of vertices are linear there, so those of photographs are taken out of
+    sRGB."""
     import trimesh
     from trimesh.visual.material import PBRMaterial
 
@@ -408,7 +410,8 @@ def _quiet() -> contextlib.AbstractContextManager:
 
 
 def _end_when_asked() -> None:
-    """Lets a request to terminate end the view as Ctrl-C does: pycolmap, which reading a capture loads, would print a stack trace."""
+    """Lets a request to terminate end the view as Ctrl-C does: pycolmap, which reading a capture loads, would print a
+    stack trace."""
 
     def end(number, frame):
         raise KeyboardInterrupt
@@ -419,6 +422,4 @@ def _end_when_asked() -> None:
 
 def _has_screen() -> bool:
     """Whether a browser with a window can be opened; in a terminal alone one of letters would take it over."""
-    return sys.platform in ("darwin", "win32") or bool(
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    )
+    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,4 +1,5 @@
-"""What the viewer shows of a run: primitives, meshes and cameras, all in the training frame, where a scene has a handy size."""
+"""What the viewer shows of a run: primitives, meshes and cameras, all in the training frame, where a scene has a handy
+size."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ MOST_CAMERAS, PHOTO_PX = 60, 128
 
 @dataclass(frozen=True)
 class SeenMesh:
-    """A mesh in the training frame, light enough to be shown; `inside` if cameras stand in it; layers' lengths are the data set's."""
+    """A mesh in the training frame, light enough to be shown; `inside` if cameras stand in it; layers' lengths are the
+    data set's."""
 
     mesh: Mesh
     layers: list[Layer]
@@ -36,7 +38,8 @@ class SeenMesh:
 
 @dataclass
 class Seen:
-    """Everything to show. `opacity` (N,) is of the `primitives`, the largest by area times opacity if all would be too many of `count`."""
+    """Everything to show. `opacity` (N,) is of the `primitives`, the largest by area times opacity if all would be too
+    many of `count`."""
 
     run: Run | None = None
     step: int = 0
@@ -55,10 +58,9 @@ def stamps(path: Path) -> dict[str, int]:
     return {str(file): file.stat().st_mtime_ns for file in files if file.exists()}
 
 
-def load_seen(
-    path: str | os.PathLike, before: Seen | None = None, reference: str | os.PathLike | None = None
-) -> Seen:
-    """Reads a run as it is now; the cameras are those of `before` as long as it is of the same capture in the same frame.
+def load_seen(path: str | os.PathLike, before: Seen | None = None, reference: str | os.PathLike | None = None) -> Seen:
+    """Reads a run as it is now; the cameras are those of `before` as long as it is of the same capture in the same
+    frame.
 
     Raises:
         LinprimError: no run, nothing saved yet, or a damaged file.
@@ -70,9 +72,7 @@ def load_seen(
     kind = KINDS[primitives.kind]
     most = MOST_PRIMITIVE_FACES // (len(kind.faces) or 80)
     if len(primitives) > most:
-        share = (
-            primitives.extent.astype(np.float64).prod(1) ** (2 / primitives.extent.shape[1]) * seen.opacity
-        )
+        share = primitives.extent.astype(np.float64).prod(1) ** (2 / primitives.extent.shape[1]) * seen.opacity
         keep = np.sort(np.argsort(-share, kind="stable")[:most])
         primitives, seen.opacity = select(primitives, keep), seen.opacity[keep]
         seen.notes.append(f"the {most:,} largest and densest of {seen.count:,} {kind.plural} are shown")
@@ -93,10 +93,7 @@ def select(primitives: Primitives, rows: np.ndarray) -> Primitives:
     """Some of the primitives."""
     return replace(
         primitives,
-        **{
-            name: getattr(primitives, name)[rows]
-            for name in ("center", "rotation", "extent", "density", "sh")
-        },
+        **{name: getattr(primitives, name)[rows] for name in ("center", "rotation", "extent", "density", "sh")},
     )
 
 

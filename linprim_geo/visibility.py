@@ -38,7 +38,8 @@ AROUND = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], bool)
 """The four neighbours of a pixel."""
 
 BEHIND_SHARE = 1e-3
-"""Points this share of their depth, and of the diagonal, behind all that the pixels around them see may still be seen."""
+"""Points this share of their depth, and of the diagonal, behind all that the pixels around them see may still be
+seen."""
 
 FAR = 1e3
 """Depth of a ray that hits nothing, in diagonals: finite, so that differences stay numbers."""
@@ -62,8 +63,8 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera], caster: RayCaster | Non
     """Which faces any of the cameras sees, from either side.
 
     A face is seen if the ray through the centre of a pixel hits it first, or if one of four points on it lies
-    in the image of a camera with nothing in between. A point farther than what the four pixel centres around it see is taken
-    to be hidden, so a gap narrower than a pixel shows nothing. `caster`: of the mesh, if there is one already.
+    in the image of a camera with nothing in between. A point farther than what the four pixel centres around it see is
+    taken to be hidden, so a gap narrower than a pixel shows nothing. `caster`: of the mesh, if there is one already.
 
     Returns:
         (F,) bool.
@@ -97,8 +98,8 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera], caster: RayCaster | Non
 def faces_of_pixels(caster: RayCaster, cameras: Sequence[Camera]) -> np.ndarray:
     """(F,) bool: faces of the mesh that the ray through the centre of a pixel hits first.
 
-    A ray that sees further than those of all four pixels around it has slipped through an edge, or looks through a gap narrower than
-    a pixel, and is not believed.
+    A ray that sees further than those of all four pixels around it has slipped through an edge, or looks through a gap
+    narrower than a pixel, and is not believed.
     """
     from scipy.ndimage import maximum_filter
 
@@ -121,8 +122,8 @@ def color_vertices(
     take the colour of their neighbours; if no vertex is seen, all are mid-grey.
 
     Args:
-        images: one (H, W, 3), or with alpha (H, W, 4), uint8, or float in [0, 1], per camera; iterated once, one in memory at a
-            time.
+        images: one (H, W, 3), or with alpha (H, W, 4), uint8, or float in [0, 1], per camera; iterated once, one in
+            memory at a time.
         caster: of the mesh, if there is one already.
     Returns:
         (V, 3) uint8.
@@ -153,12 +154,13 @@ def photographed(
 
     Args:
         caster: of the mesh that hides points.
-        images: one (H, W, 3 or 4) uint8, or float in [0, 1], per camera; iterated once. With a fourth channel, alpha, pixels of
-            less than one half show what is behind, and those between are taken for an outline.
-        slack: a point this far behind the surface of a pixel is not hidden, beside what the slope explains; at least a pixel's
-            footprint.
+        images: one (H, W, 3 or 4) uint8, or float in [0, 1], per camera; iterated once. With a fourth channel, alpha,
+            pixels of less than one half show what is behind, and those between are taken for an outline.
+        slack: a point this far behind the surface of a pixel is not hidden, beside what the slope explains; at least a
+            pixel's footprint.
     Returns:
-        colors (P, 3) float32 from 0 to 255, good (P,) bool: some view sees it well, seen (P,) bool: some view sees it at all.
+        colors (P, 3) float32 from 0 to 255, good (P,) bool: some view sees it well, seen (P,) bool: some view sees it
+        at all.
     Raises:
         LinprimError: an image does not have the size of its camera.
     """
@@ -251,9 +253,7 @@ def _fill_unseen(mesh: Mesh, colors: np.ndarray, good: np.ndarray, seen: np.ndar
 
 
 # Anchors of the colours of a scalar, from low to high.
-SCALE = np.array(
-    [[48, 40, 120], [40, 120, 200], [60, 190, 120], [235, 210, 60], [215, 50, 40]], dtype=np.float64
-)
+SCALE = np.array([[48, 40, 120], [40, 120, 200], [60, 190, 120], [235, 210, 60], [215, 50, 40]], dtype=np.float64)
 
 
 def color_scale(values: np.ndarray, top: float | None = None) -> np.ndarray:
@@ -297,9 +297,14 @@ def render_preview(
 
     k = supersample
     fine = Camera(
-        camera.width * k, camera.height * k, camera.fx * k, camera.fy * k, camera.cx * k, camera.cy * k,
+        camera.width * k,
+        camera.height * k,
+        camera.fx * k,
+        camera.fy * k,
+        camera.cx * k,
+        camera.cy * k,
         camera.world_to_camera,
-    )  # fmt: skip
+    )
     rays = fine.world_rays().reshape(-1, 3)
     caster = RayCaster(mesh.vertices, mesh.faces)
     _, face, bary = caster.cast(camera.center, rays)

@@ -1,8 +1,10 @@
-"""What a worker does with one task: makes sure that it is the program and the folder that were meant, computes, leaves a done-marker.
+"""What a worker does with one task: makes sure that it is the program and the folder that were meant, computes, leaves
+a done-marker.
 
-As a program (`python -m linprim_geo.worker`) it takes one task as a line of JSON on stdin and answers with a line of JSON on stdout. It
-ends when its stdin does, so that no worker outlives whoever started it. A task is the name of a function, `module:function` of this
-package, which is called with the task's folder and its arguments and gives back a table of plain values.
+As a program (`python -m linprim_geo.worker`) it takes one task as a line of JSON on stdin and answers with a line of
+JSON on stdout. It ends when its stdin does, so that no worker outlives whoever started it. A task is the name of a
+function, `module:function` of this package, which is called with the task's folder and its arguments and gives back a
+table of plain values.
 """
 
 from __future__ import annotations
@@ -35,7 +37,8 @@ _NO_MEMORY = re.compile(r"not enough memory|can't allocate memory|bad_alloc|[Cc]
 
 
 def versions() -> dict[str, str]:
-    """What has to be the same on all workers for results to be: the versions, and a digest of this package's sources."""
+    """What has to be the same on all workers for results to be: the versions, and a digest of this package's
+    sources."""
     digest = hashlib.sha256()
     for file in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(file.name.encode() + b"\0" + file.read_bytes())
@@ -68,7 +71,9 @@ def result_of(task: dict) -> dict | None:
         return None
     done = read_json(file, "the marker of a task that is done")
     if not isinstance(done, dict) or done.get("task") != key_of(task) or not isinstance(done.get("result"), dict):
-        raise LinprimError(f"{file}: is the result of other options than those of {task['name']}, or was moved: wanted another folder")
+        raise LinprimError(
+            f"{file}: is the result of other options than those of {task['name']}, or was moved: wanted another folder"
+        )
     return done["result"]
 
 
@@ -85,7 +90,8 @@ def result_of_folder(folder: Path) -> dict:
 
 
 def run_task(task: dict) -> dict:
-    """Does a task unless it is done already. Returns {"result"}, or {"error"} or {"memory"} with a sentence about what stopped it."""
+    """Does a task unless it is done already. Returns {"result"}, or {"error"} or {"memory"} with a sentence about what
+    stopped it."""
     try:
         return {"result": _run_task(task)}
     except LinprimError as error:
@@ -127,7 +133,9 @@ def _check_worker(task: dict) -> None:
     for name, wanted in task["versions"].items():
         if here.get(name) != wanted:
             same = "the same linprim-geo, Python, numpy and torch on all workers"
-            raise LinprimError(f"{where} has {name} {here.get(name)}, where this was started it is {wanted}: wanted {same}")
+            raise LinprimError(
+                f"{where} has {name} {here.get(name)}, where this was started it is {wanted}: wanted {same}"
+            )
     file = Path(task["shared"]) / TOKEN
     try:
         seen = file.is_file() and json.loads(file.read_text()) == task["token"]
@@ -135,7 +143,8 @@ def _check_worker(task: dict) -> None:
         seen = False
     if not seen:
         raise LinprimError(
-            f"{task['shared']}: {where} does not see this folder, or sees another one there: wanted a folder that all workers share"
+            f"{task['shared']}: {where} does not see this folder, or sees another one there: wanted a folder "
+            "that all workers share"
         )
 
 

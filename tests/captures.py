@@ -14,9 +14,7 @@ from linprim_geo.camera import Camera
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def look_at(
-    center, target=(0.0, 0.0, 0.0), size=(32, 24), focal=30.0, up=(0.0, 0.0, 1.0), shift=(0.0, 0.0)
-) -> Camera:
+def look_at(center, target=(0.0, 0.0, 0.0), size=(32, 24), focal=30.0, up=(0.0, 0.0, 1.0), shift=(0.0, 0.0)) -> Camera:
     """A camera at `center` that looks at `target`; `shift` moves the principal point off the middle."""
     center = np.asarray(center, dtype=np.float64)
     z = np.asarray(target) - center
@@ -33,10 +31,7 @@ def look_at(
 def ring(count=10, radius=4.0, **options) -> list[Camera]:
     """Cameras round the z axis at changing heights, looking at the origin."""
     angles = 2 * np.pi * np.arange(count) / count
-    return [
-        look_at((radius * np.cos(a), radius * np.sin(a), 1.0 + 0.5 * np.sin(3 * a)), **options)
-        for a in angles
-    ]
+    return [look_at((radius * np.cos(a), radius * np.sin(a), 1.0 + 0.5 * np.sin(3 * a)), **options) for a in angles]
 
 
 def picture(index: int, size=(32, 24), alpha=None) -> Image.Image:
@@ -84,9 +79,7 @@ def reconstruction(cameras, names, xyz, model="PINHOLE", params=None):
     out = pycolmap.Reconstruction()
     for number, (camera, name) in enumerate(zip(cameras, names, strict=True), start=1):
         values = params or [camera.fx, camera.fy, camera.cx, camera.cy]
-        lens = pycolmap.Camera(
-            model=model, width=camera.width, height=camera.height, params=values, camera_id=number
-        )
+        lens = pycolmap.Camera(model=model, width=camera.width, height=camera.height, params=values, camera_id=number)
         out.add_camera_with_trivial_rig(lens)
         image = pycolmap.Image(name=name, camera_id=number, image_id=number)
         if number <= 2:
@@ -102,9 +95,7 @@ def reconstruction(cameras, names, xyz, model="PINHOLE", params=None):
     return out
 
 
-def write_colmap(
-    root: Path, count=10, points=20, folder="sparse/0", text=False, model="PINHOLE", params=None
-):
+def write_colmap(root: Path, count=10, points=20, folder="sparse/0", text=False, model="PINHOLE", params=None):
     """A folder with `images/00.png` ... and a COLMAP model; returns (cameras, (P, 3) points)."""
     cameras = ring(count)
     names = [f"{i:02d}.png" for i in range(count)]

@@ -8,7 +8,8 @@ import re
 import shutil
 from pathlib import Path
 
-# The matrices here are small, and OpenBLAS's threads wait for each other in a loop: on a busy machine a hundredfold of the work.
+# The matrices here are small, and OpenBLAS's threads wait for each other in a loop: on a busy machine a hundredfold of
+# the work.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
@@ -25,7 +26,8 @@ MESHES = shutil.ignore_patterns("mesh")
 
 
 def with_budget(call, seconds: float):
-    """(what `call(seconds)` returns, the seconds). A loaded machine that needs more gets twice as much, up to three times."""
+    """(what `call(seconds)` returns, the seconds). A loaded machine that needs more gets twice as much, up to three
+    times."""
     for _ in range(3):
         try:
             return call(seconds), seconds
@@ -84,9 +86,14 @@ def tiny_options():
     from linprim_geo.options import TrainOptions
 
     return TrainOptions(
-        iterations=400, max_primitives=300, initial_primitives=200, sh_degree=1, threads=1,
-        checkpoint_every=150, evaluate_every=200,
-    )  # fmt: skip
+        iterations=400,
+        max_primitives=300,
+        initial_primitives=200,
+        sh_degree=1,
+        threads=1,
+        checkpoint_every=150,
+        evaluate_every=200,
+    )
 
 
 @pytest.fixture(scope="session")
@@ -140,9 +147,7 @@ def octahedron_run(folder: Path, density: float = DENSITY, views: int = 24, size
         one.density / similarity.scale,
         one.sh,
     )
-    run.save(
-        scaled, {"iteration": 1, "iterations": 1, "primitives": 1, "background": [1, 1, 1], "seconds": 0}
-    )
+    run.save(scaled, {"iteration": 1, "iterations": 1, "primitives": 1, "background": [1, 1, 1], "seconds": 0})
     return run.path
 
 

@@ -60,7 +60,12 @@ def drive(shared: str, cluster: str, workers: str, seconds: str, count: str) -> 
 
     folder = Path(shared)
     tasks = [
-        Task(f"chain {k}", "executor_tasks:chain", {"start": str(k), "steps": 40, "seconds": float(seconds)}, folder / f"{k:02d}")
+        Task(
+            f"chain {k}",
+            "executor_tasks:chain",
+            {"start": str(k), "steps": 40, "seconds": float(seconds)},
+            folder / f"{k:02d}",
+        )
         for k in range(int(count))
     ]
     with open_executor(cluster or None, folder, int(workers)) as executor:

@@ -1,7 +1,8 @@
-"""A process that has loaded the libraries and copies itself for every job, so that fifty of them can be started and killed in a minute.
+"""A process that has loaded the libraries and copies itself for every job, so that fifty of them can be started and
+killed in a minute.
 
-Run as a program it reads one JSON object per line, {"call", "arguments", "delay", "at"}, and answers with one. A copy of itself does the
-call; after `delay` seconds, or in the middle of a write, it is killed, or with neither waited for.
+Run as a program it reads one JSON object per line, {"call", "arguments", "delay", "at"}, and answers with one. A copy
+of itself does the call; after `delay` seconds, or in the middle of a write, it is killed, or with neither waited for.
 """
 
 from __future__ import annotations
@@ -23,7 +24,11 @@ class Jobs:
 
     def __enter__(self) -> Jobs:
         self.process = subprocess.Popen(
-            [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=os.environ | ONE_THREAD
+            [sys.executable, __file__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ | ONE_THREAD,
         )
         return self
 
@@ -32,11 +37,13 @@ class Jobs:
         self.process.wait()
 
     def run(self, call: str, *arguments, delay: float | None = None, at: tuple[int, int | None] | None = None) -> dict:
-        """`killed` (whether it was still at it), `seconds` that it ran, `error`, what it raised, and the `writes` of one that came to its
-        end: names of files beside or below its arguments that were opened for writing or renamed, in order.
+        """`killed` (whether it was still at it), `seconds` that it ran, `error`, what it raised, and the `writes` of
+        one that came to its end: names of files beside or below its arguments that were opened for writing or renamed,
+        in order.
 
-        With `at` = (number, None) it kills itself with SIGKILL just before that one of its writes; with (number, bytes) the system lets it
-        write so many bytes into any file from then on, and ends it in the middle of the next write beyond them.
+        With `at` = (number, None) it kills itself with SIGKILL just before that one of its writes; with (number, bytes)
+        the system lets it write so many bytes into any file from then on, and ends it in the middle of the next write
+        beyond them.
         """
         job = {"call": call, "arguments": [str(x) for x in arguments], "delay": delay, "at": at}
         self.process.stdin.write(json.dumps(job) + "\n")
@@ -123,7 +130,9 @@ def _serve() -> None:
             os._exit(0)
         os.close(writer)
         if job["delay"] is not None:
-            while time.monotonic() < begin + job["delay"] and not os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT):
+            while time.monotonic() < begin + job["delay"] and not os.waitid(
+                os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT
+            ):
                 time.sleep(0.001)
             os.kill(child, signal.SIGKILL)
         with open(reader, "rb") as file:

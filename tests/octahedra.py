@@ -88,7 +88,8 @@ def random_scene(seed, count, coefficients=4, width=17, height=13, depth=3.0, sp
 
 
 def hard_scene(seed):
-    """1 to 8 octahedra with half-axes 1e-6 to 1e3, alignments, coincidences and extreme views; its camera and options."""
+    """1 to 8 octahedra with half-axes 1e-6 to 1e3, alignments, coincidences and extreme views; its camera and
+    options."""
     rng = np.random.default_rng(seed)
 
     def now_and_then(share):
@@ -130,7 +131,9 @@ def hard_scene(seed):
         pose = random_pose(rng, rng.choice([0.0, 0.1, 1.0]))
         center = to_world(center, pose)
     options = {
-        "near": 10 ** rng.uniform(-4, 0), "stop": float(rng.choice([0, 1e-3, 0.3])), "level": float(rng.choice([0.5, 0.01, 0.99])),
+        "near": 10 ** rng.uniform(-4, 0),
+        "stop": float(rng.choice([0, 1e-3, 0.3])),
+        "level": float(rng.choice([0.5, 0.01, 0.99])),
     }
     sh = rng.normal(size=(n, int(rng.choice([1, 4, 9, 16])), 3))
     values = (center, rotation, extent, density, sh, rng.random(3))
@@ -146,8 +149,15 @@ def leaves(parameters, dtype=None) -> list[torch.Tensor]:
 def twin(parameters, view: Camera, **options) -> dict[str, torch.Tensor]:
     """`reference.rasterize` of the same scene in float64."""
     return reference.rasterize(
-        *[p.double() for p in parameters], world_to_camera=torch.from_numpy(view.world_to_camera), fx=view.fx, fy=view.fy,
-        cx=view.cx, cy=view.cy, width=view.width, height=view.height, **options,
+        *[p.double() for p in parameters],
+        world_to_camera=torch.from_numpy(view.world_to_camera),
+        fx=view.fx,
+        fy=view.fy,
+        cx=view.cx,
+        cy=view.cy,
+        width=view.width,
+        height=view.height,
+        **options,
     )
 
 
@@ -187,4 +197,6 @@ def assert_identical(a, b):
     assert len(a) == len(b)
     for i, (x, y) in enumerate(zip(a, b, strict=True)):
         same = (x == y) | (x.isnan() & y.isnan()) if x.is_floating_point() else x == y
-        assert x.shape == y.shape and bool(same.all()), f"tensor {i}: {int((~same).sum())} of {same.numel()} values differ"
+        assert x.shape == y.shape and bool(same.all()), (
+            f"tensor {i}: {int((~same).sum())} of {same.numel()} values differ"
+        )

@@ -98,6 +98,4 @@ def random_scene(seed, count, coefficients=4, width=6, height=5, depth=3.0, spre
 
 def assert_same(a, b, names=IMAGES + ("max_weight", "pixels"), **tolerance):
     for name in names:
-        torch.testing.assert_close(
-            a[name], b[name], **(tolerance or EXACT), msg=lambda m, name=name: f"{name}: {m}"
-        )
+        torch.testing.assert_close(a[name], b[name], **(tolerance or EXACT), msg=lambda m, name=name: f"{name}: {m}")

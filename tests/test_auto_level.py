@@ -1,4 +1,5 @@
-"""The level of a surface chosen by photographs: found where the depth is true, left alone where photographs do not say."""
+"""The level of a surface chosen by photographs: found where the depth is true, left alone where photographs do not
+say."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ def scene(tmp_path_factory):
 
 
 def run_of(scene, true_level: float, share: float = 0.04):
-    """A run whose surface at `true_level` is the true one, and at other levels lies off by `share` of the depth per level."""
+    """A run whose surface at `true_level` is the true one, and at other levels lies off by `share` of the depth per
+    level."""
 
     def surface_depths(views, level):
         for view in views:

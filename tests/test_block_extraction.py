@@ -88,7 +88,11 @@ def test_a_lattice_comes_back_from_its_file(lattice, tmp_path):
     made, owner = lattice[0], owners(lattice[0].blocks, 3)
     save_lattice(tmp_path / "lattice.npz", made, owner)
     found, other = load_lattice(tmp_path / "lattice.npz")
-    assert np.array_equal(found.blocks, made.blocks) and np.array_equal(other, owner) and np.array_equal(found.origin, made.origin)
+    assert (
+        np.array_equal(found.blocks, made.blocks)
+        and np.array_equal(other, owner)
+        and np.array_equal(found.origin, made.origin)
+    )
     assert (found.voxel, found.resolution, found.rules) == (made.voxel, made.resolution, made.rules)
     (tmp_path / "part.npz").write_bytes(b"PK")
     with pytest.raises(LinprimError, match="part.npz: cannot be read"):
@@ -125,7 +129,10 @@ def test_parts_that_are_done_are_not_done_again_and_those_of_other_options_go(ru
     ("how", "sentence"),
     [
         ({"blocks": 0}, "--blocks is 0"),
-        ({"blocks": 2, "method": "polyhedra"}, "--blocks fuses depth maps in parts, which --method polyhedra has none of"),
+        (
+            {"blocks": 2, "method": "polyhedra"},
+            "--blocks fuses depth maps in parts, which --method polyhedra has none of",
+        ),
         ({"blocks": 2, "options": ExtractOptions(level=LEVEL, voxel_size=1e-5)}, "voxel size 1e-05 is less than"),
     ],
 )

@@ -1,4 +1,5 @@
-"""A scene trained in blocks is a run like any other; killed anywhere it ends in the same bits; one block is today's path."""
+"""A scene trained in blocks is a run like any other; killed anywhere it ends in the same bits; one block is today's
+path."""
 
 from __future__ import annotations
 
@@ -46,8 +47,12 @@ from linprim_geo.shots import RECENT, Shot, StoredShot
 from linprim_geo.train import train
 from linprim_geo.trainer import Trainer, initial_parameters
 
-OPTIONS = TrainOptions(iterations=160, max_primitives=300, sh_degree=1, threads=1, checkpoint_every=20, evaluate_every=0)
-ARGUMENTS = "--iterations 160 --max-primitives 300 --sh-degree 1 --threads 1 --checkpoint-every 20 --evaluate-every 0 --quiet".split()
+OPTIONS = TrainOptions(
+    iterations=160, max_primitives=300, sh_degree=1, threads=1, checkpoint_every=20, evaluate_every=0
+)
+ARGUMENTS = (
+    "--iterations 160 --max-primitives 300 --sh-degree 1 --threads 1 --checkpoint-every 20 --evaluate-every 0 --quiet"
+).split()
 SAVED = ("training_frame.npz", "scene.npz", "scene.ply")
 COUNT = 2
 
@@ -68,7 +73,9 @@ def test_the_run_renders_extracts_and_scores_as_any_other(whole, tmp_path):
     run, done = whole
     opened = Run.open(run)
     assert done["blocks"] == COUNT and done["views"] == 3 and done["psnr"] > 18
-    assert opened.train_options == OPTIONS and opened.state["primitives"] == done["primitives"] == len(opened.primitives())
+    assert opened.train_options == OPTIONS and opened.state["primitives"] == done["primitives"] == len(
+        opened.primitives()
+    )
     assert eval_images_run(run)["psnr"] == pytest.approx(done["psnr"], abs=0.01)
     stats = extract_mesh(run, output=tmp_path / "mesh.ply", options=ExtractOptions(level=0.5, refine=0), quiet=True)
     assert stats["faces"] > 300
@@ -80,7 +87,9 @@ def test_every_block_keeps_what_it_owns(whole):
     plan = worker.result_of_folder(run / "blocks" / "plan")
     kept = []
     for k in range(COUNT):
-        begun, ended = (load_primitives(block_folder(run, k, at) / "run" / "training_frame.npz") for at in (0, len(EXCHANGES)))
+        begun, ended = (
+            load_primitives(block_folder(run, k, at) / "run" / "training_frame.npz") for at in (0, len(EXCHANGES))
+        )
         own = block_of(plan, k).holds(begun.center)
         assert 0 < own.sum() < len(begun)  # the margin is trained and dropped
         neighbour = load_primitives(block_folder(run, 1 - k) / "run" / "training_frame.npz").center
@@ -97,7 +106,9 @@ def test_every_block_keeps_what_it_owns(whole):
 @pytest.mark.parametrize("lost", [(0,), (0, 1)])
 def test_a_block_that_has_lost_all_it_owned_adds_nothing(lost, whole, tmp_path, monkeypatch):
     run, is_owned = whole[0], block_tasks.is_owned
-    monkeypatch.setattr(block_tasks, "is_owned", lambda run, plan, k, at, state: is_owned(run, plan, k, at, state) & (k not in lost))
+    monkeypatch.setattr(
+        block_tasks, "is_owned", lambda run, plan, k, at, state: is_owned(run, plan, k, at, state) & (k not in lost)
+    )
     result = join_task(tmp_path, str(run), 0, 1)
     assert result["owned"] == 0 < result["primitives"]
 
@@ -134,7 +145,9 @@ def test_others_stand_in_full_as_far_as_they_are_known(whole, tmp_path, monkeypa
 
 def test_a_run_begun_by_another_version_is_one_sentence(whole, tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(block_training, "FORMAT", 1)
-    with pytest.raises(LinprimError, match="was begun in blocks by another version of linprim-geo, wanted a new folder"):
+    with pytest.raises(
+        LinprimError, match="was begun in blocks by another version of linprim-geo, wanted a new folder"
+    ):
         train(tiny_scene, whole[0], options=OPTIONS, resume=True, quiet=True)
 
 
@@ -240,7 +253,9 @@ def test_a_block_sees_its_own_pixels_and_the_frozen_scene_elsewhere(whole):
     shots = block_shots(coarse, scene.train[:2], everything, 0.1, 0.1, factor, run.similarity, OPTIONS, tensors(frozen))
     photo = scene.train[0].load()
     camera = shots[0].camera
-    left, top = (round(a - b) for a, b in ((scene.train[0].camera.cx, camera.cx), (scene.train[0].camera.cy, camera.cy)))
+    left, top = (
+        round(a - b) for a, b in ((scene.train[0].camera.cx, camera.cx), (scene.train[0].camera.cy, camera.cy))
+    )
     part = photo.rgb[top : top + camera.height, left : left + camera.width]
     alpha = shots[0].alpha.numpy() > 0
     assert np.array_equal(shots[0].rgb.numpy().transpose(1, 2, 0)[alpha], part[alpha])
@@ -249,7 +264,9 @@ def test_a_block_sees_its_own_pixels_and_the_frozen_scene_elsewhere(whole):
     assert len(frozen["center"]) > 0 and not own.holds(frozen["center"], 0.05).any()
     shots = block_shots(coarse, scene.train, own, 0.05, 0.05, factor, run.similarity, OPTIONS, tensors(frozen))
     assert all(shot.weight == shot.camera.width * shot.camera.height / 48**2 for shot in shots)
-    assert all(shot.camera.width <= 48 and shot.rgb.shape[1:] == (shot.camera.height, shot.camera.width) for shot in shots)
+    assert all(
+        shot.camera.width <= 48 and shot.rgb.shape[1:] == (shot.camera.height, shot.camera.width) for shot in shots
+    )
     assert sum(shot.camera.width * shot.camera.height for shot in shots) < 0.9 * len(scene.train) * 48 * 48
     assert all(shot.size == (48, 48) for shot in shots)
 
@@ -264,7 +281,10 @@ def test_windows_are_in_no_memory_and_leave_no_file(whole, tmp_path, monkeypatch
     assert not list(tmp_path.iterdir())
     assert all(type(shot) is StoredShot for shot in shots) and len(shots) > RECENT
     first = [(shot.rgb.clone(), shot.alpha.clone()) for shot in shots]
-    assert all(torch.equal(shot.rgb, rgb) and torch.equal(shot.alpha, alpha) for shot, (rgb, alpha) in zip(shots, first, strict=True))
+    assert all(
+        torch.equal(shot.rgb, rgb) and torch.equal(shot.alpha, alpha)
+        for shot, (rgb, alpha) in zip(shots, first, strict=True)
+    )
     assert len({rgb.numpy().tobytes() for rgb, _ in first}) == len(shots)
     monkeypatch.setattr(tempfile, "tempdir", "/dev/null/nowhere")
     with pytest.raises(LinprimError, match="/dev/null/nowhere"):
@@ -303,7 +323,9 @@ def test_frozen_primitives_are_drawn_and_stay(whole):
     scene, coarse = run.scene(), Run.open(whole[0] / "blocks" / "coarse" / "run")
     own = block_of(worker.result_of_folder(run.path / "blocks" / "plan"), 0)
     frozen = tensors(beyond(coarse.training_primitives(), own, 0.05))
-    shots = block_shots(coarse, scene.train, own, 0.05, 0.05, coarse.scene_options.downscale, run.similarity, OPTIONS, frozen)
+    shots = block_shots(
+        coarse, scene.train, own, 0.05, 0.05, coarse.scene_options.downscale, run.similarity, OPTIONS, frozen
+    )
     rng = np.random.default_rng(0)
     start = initial_parameters(rng.normal(size=(40, 3)), rng.integers(0, 255, (40, 3)), 1, 0, (0.01, 1.0))
     trainer = Trainer(shots, start, replace(OPTIONS, iterations=20), (0.01, 1.0), torch.ones(3), False, True)
@@ -314,9 +336,14 @@ def test_frozen_primitives_are_drawn_and_stay(whole):
     for _ in range(20):
         trainer.advance()
     assert all(torch.equal(a, b) for a, b in zip(before, frozen, strict=True))
-    assert len(trainer) == len(trainer.primitives()) == len(trainer.state()["parameters"]["center"]) < 40 + len(frozen[0])
+    assert (
+        len(trainer) == len(trainer.primitives()) == len(trainer.state()["parameters"]["center"]) < 40 + len(frozen[0])
+    )
     empty = tuple(tensor[:0] for tensor in frozen)
-    twins = [Trainer(shots, {k: v.clone() for k, v in start.items()}, OPTIONS, (0.01, 1.0), torch.ones(3), False, True) for _ in range(2)]
+    twins = [
+        Trainer(shots, {k: v.clone() for k, v in start.items()}, OPTIONS, (0.01, 1.0), torch.ones(3), False, True)
+        for _ in range(2)
+    ]
     twins[1].frozen = empty
     for twin in twins:
         twin.advance()
@@ -348,9 +375,23 @@ def workers_of(driver: int) -> list[int]:
     return [pid for pid in found if is_below(pid)]
 
 
-def train_killed_at_random(scene: Path, run: Path, kills: int, rng: random.Random, longest: float, *arguments: str) -> int:
+def train_killed_at_random(
+    scene: Path, run: Path, kills: int, rng: random.Random, longest: float, *arguments: str
+) -> int:
     """Trains in two blocks, killing a worker or the driver `kills` times; returns how many drivers it took."""
-    command = [sys.executable, "-m", "linprim_geo", "train", str(scene), "-o", str(run), "--blocks", str(COUNT), "--workers", "2"]
+    command = [
+        sys.executable,
+        "-m",
+        "linprim_geo",
+        "train",
+        str(scene),
+        "-o",
+        str(run),
+        "--blocks",
+        str(COUNT),
+        "--workers",
+        "2",
+    ]
     drivers = done = in_a_row = 0
     while True:
         driver = subprocess.Popen([*command, *ARGUMENTS, *arguments, *(["--resume"] if run.exists() else [])])
@@ -420,4 +461,8 @@ def test_twenty_kills_end_in_the_same_bits(arguments, whole, tiny_scene, tmp_pat
 
 def test_the_result_has_the_line_of_a_table(whole):
     (line,) = [json.loads(text) for text in (whole[0] / "metrics.jsonl").read_text().splitlines()]
-    assert line["step"] == OPTIONS.iterations and line["psnr"] == pytest.approx(whole[1]["psnr"], abs=1e-3) and line["memory_gib"] > 0
+    assert (
+        line["step"] == OPTIONS.iterations
+        and line["psnr"] == pytest.approx(whole[1]["psnr"], abs=1e-3)
+        and line["memory_gib"] > 0
+    )

@@ -36,14 +36,13 @@ HEAVY = {
     "viser",
 }
 COMMANDS = (
-    "train inspect render extract-mesh eval-depth eval-images eval-mesh report view tradeoff synth convert doctor demo completion".split()
-)  # fmt: skip
+    "train inspect render extract-mesh eval-depth eval-images eval-mesh report view tradeoff synth "
+    "convert doctor demo completion"
+).split()
 
 
 def run_python(code: str, *flags: str, **settings) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, *flags, "-c", code], capture_output=True, text=True, timeout=60, **settings
-    )
+    return subprocess.run([sys.executable, *flags, "-c", code], capture_output=True, text=True, timeout=60, **settings)
 
 
 def run_with_convert(body: str, *arguments: str) -> str:
@@ -161,9 +160,13 @@ def test_options_of_3dgs_are_understood(recorded_train, tiny_scene):
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
-    [("-r 0", "-r is 0, wanted 1, 2, 4, 8"), ("-r -7", "-r is -7"), ("-r 2 --downscale 2", "wanted one of them"),
-     ("-r 300", "data/lego")],
-)  # fmt: skip
+    [
+        ("-r 0", "-r is 0, wanted 1, 2, 4, 8"),
+        ("-r -7", "-r is -7"),
+        ("-r 2 --downscale 2", "wanted one of them"),
+        ("-r 300", "data/lego"),
+    ],
+)
 def test_a_resolution_that_makes_no_sense_is_refused(arguments, sentence, recorded_train, capsys):
     assert cli.main(["train", "-s", "data/lego", *arguments.split()]) == 1
     error = capsys.readouterr().err
@@ -186,11 +189,22 @@ def test_train_wants_exactly_one_scene(arguments, capsys):
 
 @pytest.mark.parametrize(
     "arguments",
-    ["", "nonsense", "train a --iter 5", "train a --iterations x", "eval-mesh a", "eval-mesh a b --tau -1",
-     "train a --primitive cube", "train a --filter 2d", "synth out --size 3x",
-     "synth out --views 0", "synth out --scene cad --mesh x.ply", "convert a",
-     "render run --split x"],
-)  # fmt: skip
+    [
+        "",
+        "nonsense",
+        "train a --iter 5",
+        "train a --iterations x",
+        "eval-mesh a",
+        "eval-mesh a b --tau -1",
+        "train a --primitive cube",
+        "train a --filter 2d",
+        "synth out --size 3x",
+        "synth out --views 0",
+        "synth out --scene cad --mesh x.ply",
+        "convert a",
+        "render run --split x",
+    ],
+)
 def test_wrong_arguments_exit_with_2(arguments, capsys):
     with pytest.raises(SystemExit) as leaving:
         cli.main(arguments.split())
@@ -326,9 +340,7 @@ def test_the_functions_have_the_arguments_that_the_commands_pass(line):
     path, renamed = PASSED_ON[line]
     module, _, name = path.rpartition(".")
     function = getattr(importlib.import_module(f"linprim_geo.{module}"), name)
-    options = (
-        {field.name for field in dataclasses.fields(ExtractOptions)} if line.startswith("extract") else set()
-    )
+    options = {field.name for field in dataclasses.fields(ExtractOptions)} if line.startswith("extract") else set()
     passed = vars(cli.build_parser().parse_args(line.split())).keys() - {"handler", "command"} - options
     assert {renamed.get(key, key) for key in passed} <= set(inspect.signature(function).parameters)
 
@@ -422,7 +434,9 @@ def talkative(monkeypatch):
 
 
 @pytest.mark.parametrize(("line", "key"), REPORTING.items())
-def test_quiet_prints_one_object_and_nothing_else(line, key, tiny_scene, tiny_run, tmp_path, talkative, monkeypatch, capfd):
+def test_quiet_prints_one_object_and_nothing_else(
+    line, key, tiny_scene, tiny_run, tmp_path, talkative, monkeypatch, capfd
+):
     monkeypatch.chdir(tmp_path)
     words = line.replace("SCENE", str(tiny_scene)).replace("RUN", str(tiny_run)).split()
     capfd.readouterr()
@@ -444,16 +458,33 @@ def test_quiet_is_an_option_where_something_is_reported():
 
 
 def command_help(command: str) -> str:
-    (commands,) = (action.choices for action in cli.build_parser()._actions if isinstance(action, cli.argparse._SubParsersAction))
+    (commands,) = (
+        action.choices for action in cli.build_parser()._actions if isinstance(action, cli.argparse._SubParsersAction)
+    )
     return commands[command].format_help()
 
 
 @pytest.mark.parametrize(
     "line",
-    ["synth .", "train gone", "train . -o x", "render gone", "extract-mesh gone", "eval-images gone", "eval-depth gone",
-     "eval-mesh gone.ply gone.ply", "convert gone a.ply", "convert here b.xyz", "train gone -o here --resume",
-     "synth x --mesh gone.glb", "synth x --size 4", "synth x --background pink", "extract-mesh . --level 2", "demo -o ."],
-)  # fmt: skip
+    [
+        "synth .",
+        "train gone",
+        "train . -o x",
+        "render gone",
+        "extract-mesh gone",
+        "eval-images gone",
+        "eval-depth gone",
+        "eval-mesh gone.ply gone.ply",
+        "convert gone a.ply",
+        "convert here b.xyz",
+        "train gone -o here --resume",
+        "synth x --mesh gone.glb",
+        "synth x --size 4",
+        "synth x --background pink",
+        "extract-mesh . --level 2",
+        "demo -o .",
+    ],
+)
 def test_input_that_cannot_be_used_is_one_sentence_and_leaves_nothing(line, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "here").write_text("mine")
@@ -480,9 +511,7 @@ def test_doctor_shows_the_cache(monkeypatch, tmp_path, capsys):
 
 
 def test_doctor_names_what_is_missing(monkeypatch, capsys):
-    monkeypatch.setattr(
-        doctor, "LIBRARIES", (("numpy", ("numpy",)), ("no_such_module", ("no-such-package",)))
-    )
+    monkeypatch.setattr(doctor, "LIBRARIES", (("numpy", ("numpy",)), ("no_such_module", ("no-such-package",))))
     assert cli.main(["doctor", "--json"]) == 1
     report = json.loads(capsys.readouterr().out)
     assert report["libraries"]["numpy"] and report["libraries"]["no_such_module"] is None
@@ -527,7 +556,12 @@ def test_faces_that_are_not_finite_are_named_and_the_rest_is_scored(tmp_path, ca
     head += "element face 2\nproperty list uchar int vertex_indices\nend_header"
     (tmp_path / "whole.ply").write_text(head + square.format(0))
     (tmp_path / "broken.ply").write_text(head + square.format("nan"))
-    assert cli.main(["eval-mesh", str(tmp_path / "broken.ply"), str(tmp_path / "whole.ply"), "--samples", "100", "--json"]) == 0
+    assert (
+        cli.main(["eval-mesh", str(tmp_path / "broken.ply"), str(tmp_path / "whole.ply"), "--samples", "100", "--json"])
+        == 0
+    )
     shown = capsys.readouterr()
     assert json.loads(shown.out)["dropped"]["prediction"]["not_finite"] == 1
-    assert shown.err == f"linprim-geo: {tmp_path / 'broken.ply'}: faces left out because a coordinate is not finite: 1\n"
+    assert (
+        shown.err == f"linprim-geo: {tmp_path / 'broken.ply'}: faces left out because a coordinate is not finite: 1\n"
+    )

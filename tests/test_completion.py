@@ -1,4 +1,5 @@
-"""Completion: what bash offers for the beginning of a line, and that the other shells' scripts hold every command and option."""
+"""Completion: what bash offers for the beginning of a line, and that the other shells' scripts hold every command and
+option."""
 
 from __future__ import annotations
 
@@ -61,9 +62,7 @@ def test_bash_completes_commands_options_choices_and_files(line, offered, bash_s
     assert set(done.stdout.split()) == offered, done.stderr
 
 
-@pytest.mark.parametrize(
-    ("shell", "first"), [("zsh", "#compdef linprim-geo"), ("fish", "complete -c linprim-geo")]
-)
+@pytest.mark.parametrize(("shell", "first"), [("zsh", "#compdef linprim-geo"), ("fish", "complete -c linprim-geo")])
 def test_the_other_shells_know_every_command_and_option(shell, first, capsys):
     assert cli.main(["completion", shell]) == 0
     script = capsys.readouterr().out

@@ -97,9 +97,7 @@ def test_primitives_become_meshes(tmp_path, suffix, capsys):
     assert json.loads(capsys.readouterr().out)["wrote"] == "mesh"
     mesh = trimesh.load(target, force="mesh", process=suffix == ".stl")
     # .stl and .ply hold float32, and a centre of size 4 next to half-axes of 0.01 loses digits.
-    assert mesh.volume == pytest.approx(
-        4 / 3 * octahedra.extent.astype(np.float64).prod(axis=1).sum(), rel=1e-4
-    )
+    assert mesh.volume == pytest.approx(4 / 3 * octahedra.extent.astype(np.float64).prod(axis=1).sum(), rel=1e-4)
 
 
 MESH_FORMATS = (".ply", ".obj", ".glb", ".stl")
@@ -193,9 +191,7 @@ def test_the_colour_of_a_material_is_in_the_texture(tmp_path):
     box.visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=material)
     box.export(tmp_path / "a.glb")
     convert(tmp_path / "a.glb", tmp_path / "b.obj")
-    assert np.unique(np.asarray(Image.open(tmp_path / "b.png")).reshape(-1, 3), axis=0).tolist() == [
-        [255, 128, 0]
-    ]
+    assert np.unique(np.asarray(Image.open(tmp_path / "b.png")).reshape(-1, 3), axis=0).tolist() == [[255, 128, 0]]
 
 
 @pytest.mark.parametrize(
@@ -239,9 +235,7 @@ def test_a_run_and_a_model_folder_stand_for_their_primitives(tmp_path):
     assert find_scene_file(run) == run / "scene.npz"
     model = tmp_path / "model" / "point_cloud"
     for iteration in (7000, 30000, 900):
-        write_primitive_ply(
-            model / f"iteration_{iteration}" / "point_cloud.ply", random_octahedra(iteration // 100)
-        )
+        write_primitive_ply(model / f"iteration_{iteration}" / "point_cloud.ply", random_octahedra(iteration // 100))
     assert find_scene_file(model.parent) == model / "iteration_30000" / "point_cloud.ply"
     assert convert(model.parent, tmp_path / "y.npz")["count"] == 300
     assert len(load_primitives(tmp_path / "y.npz")) == 300
@@ -249,9 +243,7 @@ def test_a_run_and_a_model_folder_stand_for_their_primitives(tmp_path):
         find_scene_file(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("make", "plural"), [(random_tetrahedra, "tetrahedra"), (random_gaussians, "Gaussians")]
-)
+@pytest.mark.parametrize(("make", "plural"), [(random_tetrahedra, "tetrahedra"), (random_gaussians, "Gaussians")])
 def test_other_kinds_stay_what_they_are(make, plural, tmp_path):
     before = make(20)
     save_primitives(tmp_path / "x.npz", before)

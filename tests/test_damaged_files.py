@@ -1,4 +1,5 @@
-"""Damaged and hostile files: every reader answers with one sentence or a correct result, and nothing in a file is ever executed."""
+"""Damaged and hostile files: every reader answers with one sentence or a correct result, and nothing in a file is ever
+executed."""
 
 from __future__ import annotations
 
@@ -120,7 +121,16 @@ def test_depth_and_normals_that_hold_code_are_refused_and_not_run(tmp_path):
 
 def test_no_module_unpickles_or_evaluates():
     package = Path(fuzz.__file__).parents[1]
-    banned = ("import pickle", "pickle.load", "allow_pickle=True", "weights_only=False", "yaml.load", " eval(", " exec(", "os.system(")
+    banned = (
+        "import pickle",
+        "pickle.load",
+        "allow_pickle=True",
+        "weights_only=False",
+        "yaml.load",
+        " eval(",
+        " exec(",
+        "os.system(",
+    )
     files = [*(package / "linprim_geo").rglob("*.py"), *(package / "eval").rglob("*.py")]
     assert len(files) > 60
     for path in files:
@@ -202,7 +212,10 @@ def test_an_npz_that_unpacks_to_more_than_it_can_takes_no_memory(tmp_path):
     with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("format.npy", as_npy(np.array("linprim-geo primitives 2")))
         archive.writestr("kind.npy", as_npy(np.array("octahedron")))
-        archive.writestr("center.npy", as_npy(np.zeros(9, np.float32), f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}}}"))
+        archive.writestr(
+            "center.npy",
+            as_npy(np.zeros(9, np.float32), f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}}}"),
+        )
     assert "center claims" in refused(load_primitives, tmp_path / "bomb.npz")
 
 
@@ -276,7 +289,9 @@ def test_a_damaged_time_budget_of_a_run_is_one_sentence(budget, tiny_scene, run_
 
 
 def test_points_with_a_coordinate_twice_are_one_sentence(tmp_path):
-    header = "ply\nformat binary_little_endian 1.0\nelement vertex 1\n" + "".join(f"property float {x}\n" for x in "xyyz")
+    header = "ply\nformat binary_little_endian 1.0\nelement vertex 1\n" + "".join(
+        f"property float {x}\n" for x in "xyyz"
+    )
     (tmp_path / "points.ply").write_bytes(header.encode() + b"end_header\n" + bytes(16))
     assert "nothing twice" in refused(read_points_ply, tmp_path / "points.ply")
 
@@ -298,7 +313,12 @@ def test_a_matlab_array_of_a_type_that_does_not_exist_is_one_sentence(tmp_path):
 
 def test_a_sentence_stays_one_line_of_bounded_length():
     text = str(LinprimError("a.ply: \n\n line" + "x" * 100_000 + " wanted y"))
-    assert text.startswith("a.ply: line") and text.endswith("wanted y") and len(text) <= LinprimError.LONGEST and "\n" not in text
+    assert (
+        text.startswith("a.ply: line")
+        and text.endswith("wanted y")
+        and len(text) <= LinprimError.LONGEST
+        and "\n" not in text
+    )
 
 
 # --- the fuzzing itself -----------------------------------------------------------------------------------

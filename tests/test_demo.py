@@ -37,26 +37,29 @@ def test_the_demo_makes_a_scored_mesh_and_a_second_one_replaces_it(tiny_size, tm
     assert all(math.isfinite(first[name]) for name in SCORES)
     assert first["psnr"] > 15 and first["chamfer_percent_diagonal"] < 10 and first["primitives"] <= 120
     for file in (
-        "scene/reference.ply", "run/mesh/tsdf/mesh.ply", "run/mesh/tsdf/mesh_visible.ply", "run/renders/test/rgb",
-        "run/eval/images/results.json", "run/eval/depth/results.json", "run/eval/mesh/error_pred.ply", "demo.json", "report.html",
-    ):  # fmt: skip
+        "scene/reference.ply",
+        "run/mesh/tsdf/mesh.ply",
+        "run/mesh/tsdf/mesh_visible.ply",
+        "run/renders/test/rgb",
+        "run/eval/images/results.json",
+        "run/eval/depth/results.json",
+        "run/eval/mesh/error_pred.ply",
+        "demo.json",
+        "report.html",
+    ):
         assert (root / file).exists(), file
     for name in ("run", "mesh", "renders", "reference", "report"):
         assert first[name] in first["_text"] or name == "run"
     written = json.loads((root / "demo.json").read_text())
     assert written["psnr"] == pytest.approx(first["psnr"])
-    assert (
-        json.loads((root / "run" / "eval" / "images" / "results.json").read_text())["psnr"] == written["psnr"]
-    )
+    assert json.loads((root / "run" / "eval" / "images" / "results.json").read_text())["psnr"] == written["psnr"]
 
     # The command prints it as one object.
     with monkeypatch.context() as patch:
         patch.setattr(demo, "run_demo", lambda *_, **__: dict(first))
         assert cli.main(["demo", "--json"]) == 0
     shown = capsys.readouterr()
-    assert shown.out.count("\n") == 1 and json.loads(shown.out) == {
-        k: v for k, v in first.items() if k != "_text"
-    }
+    assert shown.out.count("\n") == 1 and json.loads(shown.out) == {k: v for k, v in first.items() if k != "_text"}
 
     # A second one, stopped early: nothing of the first is left to be taken for its result.
     def stop(*_, **__):

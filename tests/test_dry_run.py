@@ -1,4 +1,5 @@
-"""What --dry-run says holds for the training, it writes nothing, and photographs that stay on disk train to the same bits."""
+"""What --dry-run says holds for the training, it writes nothing, and photographs that stay on disk train to the same
+bits."""
 
 from __future__ import annotations
 
@@ -20,7 +21,9 @@ from linprim_geo.shots import Shot, StoredShot, load_shots, photo_bytes
 from linprim_geo.train import train
 from linprim_geo.trainer import Trainer
 
-OPTIONS = TrainOptions(iterations=120, max_primitives=300, initial_primitives=200, sh_degree=1, threads=1, evaluate_every=40)
+OPTIONS = TrainOptions(
+    iterations=120, max_primitives=300, initial_primitives=200, sh_degree=1, threads=1, evaluate_every=40
+)
 
 
 def everything(folder) -> dict:
@@ -48,7 +51,10 @@ def test_photographs_on_disk_train_to_the_same_bits(kept, tiny_scene, tmp_path, 
     assert [type(shot) is Shot for shot in seen[0]] == [True] * kept + [False] * (12 - kept)
     for name in ("training_frame.npz", "scene.npz", "scene.ply"):
         assert (tmp_path / "memory" / name).read_bytes() == (tmp_path / "disk" / name).read_bytes(), name
-    scores = [json.loads((tmp_path / run / "metrics.jsonl").read_text().splitlines()[-1])["psnr"] for run in ("memory", "disk")]
+    scores = [
+        json.loads((tmp_path / run / "metrics.jsonl").read_text().splitlines()[-1])["psnr"]
+        for run in ("memory", "disk")
+    ]
     assert scores[0] == scores[1]
 
 
@@ -118,20 +124,45 @@ def test_it_says_what_training_does_and_writes_nothing(tiny_scene, tmp_path, cap
     assert (report["iterations"], report["max_primitives"], report["photos_in_memory"]) == (300, 400, 12)
     assert report["photo_gib"] * 2**30 == 12 * 48 * 48 * 4
     assert report["fits"] is True and report["advice"] == "" and 0.1 < report["memory_gib"] < 3
-    begun = train(tiny_scene, tmp_path / "run", options=TrainOptions(iterations=300, max_primitives=400, threads=1), quiet=True)
+    begun = train(
+        tiny_scene, tmp_path / "run", options=TrainOptions(iterations=300, max_primitives=400, threads=1), quiet=True
+    )
     assert begun["seconds"] / 4 < 60 * report["minutes"] < 4 * begun["seconds"] + 4
 
 
 def test_people_read_lines(tiny_scene, tmp_path, capsys):
-    assert cli.main(["train", str(tiny_scene), "-o", str(tmp_path / "run"), "--iterations", "100", "--threads", "1", "--dry-run"]) == 0
+    assert (
+        cli.main(
+            [
+                "train",
+                str(tiny_scene),
+                "-o",
+                str(tmp_path / "run"),
+                "--iterations",
+                "100",
+                "--threads",
+                "1",
+                "--dry-run",
+            ]
+        )
+        == 0
+    )
     out = capsys.readouterr().out
-    for word in ("images: 12 for training of 48x48", "all in memory", "primitives: ", "time: ", "GiB that are", "nothing was written"):
+    for word in (
+        "images: 12 for training of 48x48",
+        "all in memory",
+        "primitives: ",
+        "time: ",
+        "GiB that are",
+        "nothing was written",
+    ):
         assert word in out
     assert "internal" not in out and not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
-    ("available", "primitives", "advice"), [(5.0, 100_000_000, r"--max-primitives \d+000 or less"), (0.0, 20_000, "--downscale 2 or more")]
+    ("available", "primitives", "advice"),
+    [(5.0, 100_000_000, r"--max-primitives \d+000 or less"), (0.0, 20_000, "--downscale 2 or more")],
 )
 def test_what_does_not_fit_comes_with_what_to_change(available, primitives, advice, tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(dry_run, "available_memory", lambda: int(available * 2**30))
@@ -145,7 +176,9 @@ def test_what_does_not_fit_comes_with_what_to_change(available, primitives, advi
     assert re.search(advice, report["advice"]) and report["advice"] in report["_text"]
     if available:
         most = int(re.search(r"--max-primitives (\d+)", report["advice"])[1])
-        assert dry_run.dry_run(tiny_scene, tmp_path / "run", options=replace(options, max_primitives=most), quiet=True)["fits"]
+        assert dry_run.dry_run(tiny_scene, tmp_path / "run", options=replace(options, max_primitives=most), quiet=True)[
+            "fits"
+        ]
 
 
 def test_photographs_that_are_read_when_they_are_due_are_said(tiny_scene, tmp_path, monkeypatch):
@@ -156,7 +189,10 @@ def test_photographs_that_are_read_when_they_are_due_are_said(tiny_scene, tmp_pa
 
 def test_a_budget_is_planned_with(tiny_scene, tmp_path):
     report, seconds = with_budget(
-        lambda budget: dry_run.dry_run(tiny_scene, tmp_path / "run", options=TrainOptions(threads=1), time_budget=budget, quiet=True), 30
+        lambda budget: dry_run.dry_run(
+            tiny_scene, tmp_path / "run", options=TrainOptions(threads=1), time_budget=budget, quiet=True
+        ),
+        30,
     )
     assert report["minutes"] == seconds / 60 and report["iterations"] >= 300 and not (tmp_path / "run").exists()
 

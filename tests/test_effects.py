@@ -20,7 +20,16 @@ from linprim_geo.scene import load_scene
 from linprim_geo.synth import synthesize
 from linprim_geo.train import train
 
-SMALL = {"shape": "smooth", "shading": "shaded", "views": 30, "test_views": 2, "size": 80, "points": 3000, "supersample": 1, "detail": 0.4}
+SMALL = {
+    "shape": "smooth",
+    "shading": "shaded",
+    "views": 30,
+    "test_views": 2,
+    "size": 80,
+    "points": 3000,
+    "supersample": 1,
+    "detail": 0.4,
+}
 SCENES = {
     "plain": {},
     "highlights": {"specular": 0.5},
@@ -75,9 +84,15 @@ def test_a_plain_scene_calls_for_what_is_free_and_for_its_masks(scenes):
 
 @pytest.mark.parametrize(
     ("scene", "name", "least"),
-    [("highlights", "view-dependence", 0.45), ("exposure", "exposure", 10), ("zoom", "filter", 3), ("lens", "lens", 0.4),
-     ("white", "background", 90), ("room", "overlap", 50)],
-)  # fmt: skip
+    [
+        ("highlights", "view-dependence", 0.45),
+        ("exposure", "exposure", 10),
+        ("zoom", "filter", 3),
+        ("lens", "lens", 0.4),
+        ("white", "background", 90),
+        ("room", "overlap", 50),
+    ],
+)
 def test_each_effect_is_seen_where_it_is(scene, name, least, scenes):
     found = decisions(scenes(scene))
     assert found[name].on and found[name].value > least and found[name].reason == "data"
@@ -227,7 +242,13 @@ def test_the_lens_of_synth_is_opencvs(scenes):
 def test_training_decides_records_and_resumes_by_it(scenes, tmp_path, own_points):
     options = replace(OPTIONS, iterations=12, evaluate_every=0, checkpoint_every=6, max_primitives=100)
     given = frozenset({"iterations", "max_primitives"})
-    train(scenes("exposure"), tmp_path / "run", options=options, quiet=True, effects=Choice("auto", {"depth": True}, given))
+    train(
+        scenes("exposure"),
+        tmp_path / "run",
+        options=options,
+        quiet=True,
+        effects=Choice("auto", {"depth": True}, given),
+    )
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     recorded = {entry["name"]: entry for entry in config["effects"]}
     assert recorded["exposure"]["on"] and recorded["exposure"]["value"] > 10 and recorded["depth"]["reason"] == "asked"
@@ -275,9 +296,13 @@ def test_inspect_prints_and_gives_json(scenes, capsys):
 
 @pytest.mark.parametrize(
     ("word", "sentence"),
-    [("glare=on", "no effect 'glare', wanted one of view-dependence, exact-rays"), ("exposure", "wanted exposure=on or exposure=off"),
-     ("exposure=yes", "wanted exposure=on or exposure=off"), ("=on", "no effect ''")],
-)  # fmt: skip
+    [
+        ("glare=on", "no effect 'glare', wanted one of view-dependence, exact-rays"),
+        ("exposure", "wanted exposure=on or exposure=off"),
+        ("exposure=yes", "wanted exposure=on or exposure=off"),
+        ("=on", "no effect ''"),
+    ],
+)
 def test_an_effect_that_makes_no_sense_is_refused(word, sentence, capsys, tmp_path):
     with pytest.raises(LinprimError, match="--effect"):
         parse_asked([word])
@@ -299,6 +324,12 @@ def test_every_effect_names_options_that_exist():
 def test_synth_without_effects_is_as_before(scenes, tmp_path):
     """The switches, left alone, change no file."""
     synthesize(tmp_path / "again", **SMALL, exposure_drift=0.0, distortion=0.0, specular=0.0, zoom=1.0)
-    for name in ("train/003.png", "depth/train/003.png", "normal/test/001.png", "transforms_train.json", "points3D.ply"):
+    for name in (
+        "train/003.png",
+        "depth/train/003.png",
+        "normal/test/001.png",
+        "transforms_train.json",
+        "points3D.ply",
+    ):
         assert (tmp_path / "again" / name).read_bytes() == (scenes("plain") / name).read_bytes()
     shutil.rmtree(tmp_path / "again")

@@ -104,8 +104,11 @@ def test_a_linear_colour_is_continuous_over_edges_and_corners():
         camera = camera_of(seed, 40, 40, 12.0)
         rays = camera.world_rays()
         wanted = 0.5 + 0.4 * rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-        found = ops.environment_light(torch.zeros(40, 40, dtype=torch.float64), texels, camera).numpy().transpose(1, 2, 0)
-        # Inside of a face the error is of second order, (2 / size)^2; across an edge the neighbour's texel is off by at most half of one.
+        found = (
+            ops.environment_light(torch.zeros(40, 40, dtype=torch.float64), texels, camera).numpy().transpose(1, 2, 0)
+        )
+        # Inside of a face the error is of second order, (2 / size)^2; across an edge the neighbour's texel is off by at
+        # most half of one.
         assert np.abs(found - wanted).max() < 0.4 * 2 / size
 
 
@@ -139,8 +142,10 @@ def test_texels_are_seen_where_most_light_passes():
     everything = seen_through(size, [(camera, opacity)])
     opacity[:, :30] = 0.9  # a surface hides this half
     half = seen_through(size, [(camera, opacity)])
-    inside = in_image(replace(camera, world_to_camera=np.block([[camera.rotation, np.zeros((3, 1))], [np.zeros((1, 3)), 1]])),
-                      texel_directions(size).reshape(-1, 3))  # fmt: skip
+    inside = in_image(
+        replace(camera, world_to_camera=np.block([[camera.rotation, np.zeros((3, 1))], [np.zeros((1, 3)), 1]])),
+        texel_directions(size).reshape(-1, 3),
+    )
     assert everything.ravel()[torch.from_numpy(inside[0])].all()
     left = torch.from_numpy(inside[0] & (inside[2] < 25))
     assert everything.sum() > half.sum() > 0 and not half.ravel()[left].all()
@@ -191,9 +196,18 @@ def tabletop(tmp_path_factory):
     """An object on a table before a far room, photographed with noise."""
     folder = tmp_path_factory.mktemp("tabletop")
     synthesize(
-        folder / "scene", shape="smooth", table=2.5, environment=4, views=24, test_views=5, size=(160, 120), points=700, noise=2,
-        shading="shaded", supersample=2,
-    )  # fmt: skip
+        folder / "scene",
+        shape="smooth",
+        table=2.5,
+        environment=4,
+        views=24,
+        test_views=5,
+        size=(160, 120),
+        points=700,
+        noise=2,
+        shading="shaded",
+        supersample=2,
+    )
     return folder
 
 
@@ -201,8 +215,9 @@ OPTIONS = TrainOptions(iterations=600, max_primitives=3000, sh_degree=1, evaluat
 
 
 def test_an_object_on_a_table_before_a_far_room(tabletop):
-    """Seeds 0, 1, 2 (AVX-512), 0 and 3 (scalar): 27.4 to 27.6 dB held out, 1.7 to 1.9 dB behind training views, no vertex farther off than
-    4.4 % of the diagonal; over a random background 20.0 dB, and half of the vertices are 5 % off, the farthest 31 %."""
+    """Seeds 0, 1, 2 (AVX-512), 0 and 3 (scalar): 27.4 to 27.6 dB held out, 1.7 to 1.9 dB behind training views, no
+    vertex farther off than 4.4 % of the diagonal; over a random background 20.0 dB, and half of the vertices are 5 %
+    off, the farthest 31 %."""
     decided = inspect_scene(tabletop / "scene", options=OPTIONS)["options"]
     assert decided["background"] == "environment"
     run = tabletop / "run"
@@ -237,7 +252,12 @@ def test_closed_scenes_masks_and_plain_backdrops_have_none(tiny_run, tabletop, t
     tiny_run = Run.open(tiny_run)
     assert tiny_run.environment is None  # alpha says what is background
     with pytest.raises(LinprimError, match="--background environment: masks or alpha"):
-        train(tiny_run.scene_path, tmp_path / "masked", options=TrainOptions(iterations=1, background="environment"), quiet=True)
+        train(
+            tiny_run.scene_path,
+            tmp_path / "masked",
+            options=TrainOptions(iterations=1, background="environment"),
+            quiet=True,
+        )
     synthesize(tmp_path / "room", shape="room", views=24, test_views=0, size=(96, 72), points=600, supersample=1)
     found = inspect_scene(tmp_path / "room", options=OPTIONS)
     (entry,) = (effect for effect in found["effects"] if effect["name"] == "environment")

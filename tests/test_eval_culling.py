@@ -33,9 +33,7 @@ def test_junk_behind_the_surface_counts_only_without_culling():
     front, behind = grid(20, 10), grid(20, 10, height=-0.4)
     cameras = [camera_above(2.0, target=(1.0, 0.5))]
     result = score_mesh(join(front, behind), front, samples=4000, cameras=cameras)
-    assert result["accuracy"] == pytest.approx(0.2, abs=1e-3) and result["precision"] == pytest.approx(
-        0.5, abs=1e-3
-    )
+    assert result["accuracy"] == pytest.approx(0.2, abs=1e-3) and result["precision"] == pytest.approx(0.5, abs=1e-3)
     visible = result["visible"]
     assert visible["accuracy"] < ROUNDING and visible["precision"] == 1.0 and visible["f1"] == 1.0
     # Seen from 2 above, the junk 0.4 lower peeps out nowhere: the upper sheet hides 1.2 times its own size.
@@ -104,9 +102,7 @@ def test_along_rays_an_offset_plane_is_further_by_the_slant():
     assert math.isnan(result["phantom"])  # there is no ray without a reference
     swapped = compare_along_rays(plane, lower, [camera], rays=5000, tau=0.3, seed=2)
     assert swapped["rays"] == 5000 and swapped["distance_signed_mean"] < 0
-    assert swapped["distance_mean"] == pytest.approx(
-        result["distance_mean"], abs=4 * swapped["standard_error"]
-    )
+    assert swapped["distance_mean"] == pytest.approx(result["distance_mean"], abs=4 * swapped["standard_error"])
 
 
 def test_misses_and_phantoms_are_shares_of_the_rays_that_could():
@@ -116,9 +112,7 @@ def test_misses_and_phantoms_are_shares_of_the_rays_that_could():
     camera = camera_above(1.0, focal=100.0, target=(0.5, 0.5))
     result = compare_along_rays(right, left, [camera, camera], rays=10**6, tau=0.1)
     assert result["rays"] == 2 * 200 * 200
-    assert result["both"] == pytest.approx(1 / 8, abs=0.01) and result["miss"] == pytest.approx(
-        1 / 2, abs=0.01
-    )
+    assert result["both"] == pytest.approx(1 / 8, abs=0.01) and result["miss"] == pytest.approx(1 / 2, abs=0.01)
     assert result["phantom"] == pytest.approx(1 / 6, abs=0.01)  # 1/8 of the 3/4 without left
     assert result["within_tau"] == pytest.approx(1 / 2, abs=0.01) and result["distance_mean"] < 1e-12
     nobody = compare_along_rays(right, left, [], rays=100, tau=0.1)
@@ -136,8 +130,10 @@ def test_rays_into_edges_and_vertices_are_caught():
     far = replace(camera, world_to_camera=camera.world_to_camera @ move)
     lower = replace(plane, vertices=plane.vertices - [0, 0, 1.0])
     for eye, shift in ((camera, 0.0), (far, away)):
-        pair = [join(replace(m, vertices=m.vertices + shift), replace(lower, vertices=lower.vertices + shift))
-                for m in (plane, plane)]  # fmt: skip
+        pair = [
+            join(replace(m, vertices=m.vertices + shift), replace(lower, vertices=lower.vertices + shift))
+            for m in (plane, plane)
+        ]
         result = compare_along_rays(*pair, [eye], rays=10**6, tau=0.1)
         assert result["distance_mean"] == 0.0
         depth = RayCaster(pair[0].vertices, pair[0].faces).render_depth(eye)[0]

@@ -66,9 +66,7 @@ def test_nothing_in_common_scores_nan():
 def rotated(angle_deg, shape):
     """Normals along z, and the same turned by `angle_deg` (an array of `shape`) about x."""
     angle = np.radians(np.broadcast_to(angle_deg, shape))
-    return np.stack([0 * angle, np.sin(angle), np.cos(angle)], -1), np.broadcast_to(
-        [0.0, 0.0, 1.0], (*shape, 3)
-    )
+    return np.stack([0 * angle, np.sin(angle), np.cos(angle)], -1), np.broadcast_to([0.0, 0.0, 1.0], (*shape, 3))
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-7, 12.0, 90.0, 180.0 - 1e-7, 180.0])
@@ -89,9 +87,7 @@ def test_missing_normals_are_left_out():
     depth = REFERENCE.copy()
     depth[1] = 0.0
     scores = score_depth(depth, REFERENCE, predicted, reference)
-    assert scores["normal_mean_deg"] == pytest.approx(20.0) and scores["normal_median_deg"] == pytest.approx(
-        20.0
-    )
+    assert scores["normal_mean_deg"] == pytest.approx(20.0) and scores["normal_median_deg"] == pytest.approx(20.0)
     assert scores["coverage"] == pytest.approx(50 / 60)
     assert math.isnan(score_depth(depth, REFERENCE, 0 * predicted, reference)["normal_mean_deg"])
     assert math.isnan(score_depth(depth, REFERENCE)["normal_mean_deg"])
@@ -236,9 +232,7 @@ def test_run_against_depth_images(tmp_path):
     result = eval_depth_run(FakeRun(tmp_path, tuple(views), height=0.0))
     assert result["abs_rel"] == pytest.approx(0.5, abs=1e-6) and result["views"] == 2
     assert math.isnan(result["normal_mean_deg"])
-    points = [
-        v.camera.center + (v.camera.world_rays() * v.depth[..., None]).reshape(-1, 3) for v in views[:2]
-    ]
+    points = [v.camera.center + (v.camera.world_rays() * v.depth[..., None]).reshape(-1, 3) for v in views[:2]]
     points = np.concatenate(points)
     assert result["reference_diagonal"] == pytest.approx(np.linalg.norm(np.ptp(points, axis=0)), rel=1e-6)
 

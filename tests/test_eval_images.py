@@ -32,11 +32,7 @@ def ssim_direct(a, b):
                 mu_u, mu_v = (window * u).sum(), (window * v).sum()
                 var_u, var_v = (window * (u - mu_u) ** 2).sum(), (window * (v - mu_v) ** 2).sum()
                 cov = (window * (u - mu_u) * (v - mu_v)).sum()
-                total += (
-                    (2 * mu_u * mu_v + C1)
-                    * (2 * cov + C2)
-                    / ((mu_u**2 + mu_v**2 + C1) * (var_u + var_v + C2))
-                )
+                total += (2 * mu_u * mu_v + C1) * (2 * cov + C2) / ((mu_u**2 + mu_v**2 + C1) * (var_u + var_v + C2))
     return total / a.size
 
 
@@ -174,9 +170,7 @@ def test_run_scores_and_files(tmp_path):
     masked[:, :, :8] = background[:, None, None]
     masked[:, :, 8:] = 100 / 255
     off = np.full((3, 12, 16), 110 / 255, np.float32)
-    run = make_run(
-        tmp_path, {"a": off, "b": masked + 0.4 / 255}, {"a": Photo(truth), "b": Photo(truth, half)}
-    )
+    run = make_run(tmp_path, {"a": off, "b": masked + 0.4 / 255}, {"a": Photo(truth), "b": Photo(truth, half)})
     results = eval_images_run(run)
     rows = list(csv.DictReader((tmp_path / "eval" / "images" / "per_view.csv").open()))
     assert [row["name"] for row in rows] == ["a", "b"]

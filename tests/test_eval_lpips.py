@@ -1,4 +1,5 @@
-"""LPIPS: the closed forms of constructed weights, the definition restated, weights of all layouts, and files that are none."""
+"""LPIPS: the closed forms of constructed weights, the definition restated, weights of all layouts, and files that are
+none."""
 
 from __future__ import annotations
 
@@ -74,13 +75,24 @@ def images(height, width, seed=3):
 
 
 def layers_of(network):
-    """torchvision's `features` down to the last compared layer, as plain modules, by the papers: (module, compared after it)."""
+    """torchvision's `features` down to the last compared layer, as plain modules, by the papers: (module, compared
+    after it)."""
     conv, relu, pool = torch.nn.Conv2d, torch.nn.ReLU, torch.nn.MaxPool2d
     if network == "alex":
         return [
-            conv(3, 64, 11, 4, 2), relu(), pool(3, 2), conv(64, 192, 5, 1, 2), relu(), pool(3, 2), conv(192, 384, 3, 1, 1), relu(),
-            conv(384, 256, 3, 1, 1), relu(), conv(256, 256, 3, 1, 1), relu(),
-        ], (1, 4, 7, 9, 11)  # fmt: skip
+            conv(3, 64, 11, 4, 2),
+            relu(),
+            pool(3, 2),
+            conv(64, 192, 5, 1, 2),
+            relu(),
+            pool(3, 2),
+            conv(192, 384, 3, 1, 1),
+            relu(),
+            conv(384, 256, 3, 1, 1),
+            relu(),
+            conv(256, 256, 3, 1, 1),
+            relu(),
+        ], (1, 4, 7, 9, 11)
     modules, before = [], 3
     for block in ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512)):
         modules += [pool(2, 2)] if modules else []
@@ -114,12 +126,8 @@ def test_it_is_the_distance_of_the_definition(network, as_3dgs, both):
     expected = 0.0
     for x, y, head in zip(*found, heads(network).values(), strict=True):
         x, y = (v / (np.sqrt((v**2).sum(0)) + 1e-10) for v in (x, y))
-        expected += float(
-            np.mean(np.einsum("c,chw->hw", head.numpy().ravel().astype(np.float64), (x - y) ** 2))
-        )
-    assert (
-        both[network].distance(a, b, as_3dgs=as_3dgs) == pytest.approx(expected, rel=2e-5) and expected > 0.05
-    )
+        expected += float(np.mean(np.einsum("c,chw->hw", head.numpy().ravel().astype(np.float64), (x - y) ** 2)))
+    assert both[network].distance(a, b, as_3dgs=as_3dgs) == pytest.approx(expected, rel=2e-5) and expected > 0.05
 
 
 @pytest.mark.parametrize("network", NETWORKS)
@@ -129,13 +137,12 @@ def test_equal_images_are_0_apart_and_it_is_symmetric(network, both):
     assert each.distance(a, a) == 0
     assert each.distance(a, b) == pytest.approx(each.distance(b, a), rel=1e-12) and each.distance(a, b) > 0
     rounded = (a * 255).astype(np.uint8)
-    assert each.distance(rounded, b) == pytest.approx(
-        each.distance(rounded.astype(np.float32) / 255, b), rel=1e-6
-    )
+    assert each.distance(rounded, b) == pytest.approx(each.distance(rounded.astype(np.float32) / 255, b), rel=1e-6)
 
 
 def test_constructed_weights_have_the_value_of_the_closed_form():
-    """Only the first layer is compared, and its first two channels are red and 1: one image's feature is (r, 1) / |(r, 1)|."""
+    """Only the first layer is compared, and its first two channels are red and 1: one image's feature is (r, 1) / |(r,
+    1)|."""
     network = NETWORKS["vgg"]
     weights = {name: torch.zeros(shape) for name, shape in network.shapes().items()}
     for index in ("0", "2"):
@@ -150,9 +157,7 @@ def test_constructed_weights_have_the_value_of_the_closed_form():
     assert each.distance(a, b) == pytest.approx(3 * (u[0] - v[0]) ** 2 + 5 * (u[1] - v[1]) ** 2, rel=1e-5)
     # Half of the image: half of the distance.
     b[:, :12] = a[:, :12]
-    assert each.distance(a, b) == pytest.approx(
-        0.5 * (3 * (u[0] - v[0]) ** 2 + 5 * (u[1] - v[1]) ** 2), rel=1e-5
-    )
+    assert each.distance(a, b) == pytest.approx(0.5 * (3 * (u[0] - v[0]) ** 2 + 5 * (u[1] - v[1]) ** 2), rel=1e-5)
 
 
 @pytest.mark.parametrize("network", NETWORKS)
@@ -200,9 +205,7 @@ def test_torchs_cache_and_installed_packages_are_looked_at(tmp_path, monkeypatch
         (folder / f"{network}.pth").write_bytes((files / f"{network}_heads.pth").read_bytes())
     spec = importlib.machinery.ModuleSpec("torchmetrics", None, is_package=True)
     spec.submodule_search_locations = [str(package)]
-    monkeypatch.setattr(
-        module.importlib.util, "find_spec", lambda name: spec if name == "torchmetrics" else None
-    )
+    monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: spec if name == "torchmetrics" else None)
     (found,), missing = find_lpips()
     a, b = images(40, 40)
     assert missing == "" and found.distance(a, b) == both["alex"].distance(a, b)
@@ -283,9 +286,7 @@ def test_places_without_enough_are_refused_in_a_sentence(files, tmp_path):
         find_lpips(tmp_path)
     with pytest.raises(LinprimError, match="is not enough, LPIPS wants its linear heads"):
         find_lpips(files / "alex_features.pth")
-    with pytest.raises(
-        LinprimError, match="is not enough, LPIPS wants torchvision's weights of AlexNet or VGG16"
-    ):
+    with pytest.raises(LinprimError, match="is not enough, LPIPS wants torchvision's weights of AlexNet or VGG16"):
         find_lpips(files / "alex_heads.pth")
     for name in ("alex_features.pth", "vgg_heads.pth"):
         (tmp_path / name).write_bytes((files / name).read_bytes())
@@ -298,9 +299,7 @@ def test_places_without_enough_are_refused_in_a_sentence(files, tmp_path):
 
 def test_the_command_scores_with_weights_and_says_so_without(tiny_run, files, tmp_path, capfd):
     def command(*more, status=0):
-        assert (
-            cli.main(["eval-images", str(tiny_run), "-o", str(tmp_path / "out"), "--json", *more]) == status
-        )
+        assert cli.main(["eval-images", str(tiny_run), "-o", str(tmp_path / "out"), "--json", *more]) == status
         shown = capfd.readouterr()
         return json.loads(shown.out) if status == 0 else shown.err
 
@@ -318,25 +317,19 @@ def test_the_command_scores_with_weights_and_says_so_without(tiny_run, files, tm
 
     plain = command()
     assert "lpips_vgg" not in plain and plain["psnr"] == scores["psnr"]
-    assert plain["lpips_missing"].startswith(
-        "LPIPS wants torchvision's weights of AlexNet or VGG16 (none in "
-    )
+    assert plain["lpips_missing"].startswith("LPIPS wants torchvision's weights of AlexNet or VGG16 (none in ")
     assert plain["lpips_missing"].endswith(": give them with --lpips-weights")
     with open(tmp_path / "out" / "per_view.csv", newline="") as table:
         assert list(csv.DictReader(table))[0].keys() == {"name", "psnr", "ssim"}
     assert not any("lpips" in name for name in command("--lpips-weights", "none"))
-    assert "gone.pth: no such file or folder" in command(
-        "--lpips-weights", str(tmp_path / "gone.pth"), status=1
-    )
+    assert "gone.pth: no such file or folder" in command("--lpips-weights", str(tmp_path / "gone.pth"), status=1)
 
 
 def test_views_that_are_too_small_are_named(files, tmp_path):
     from linprim_geo.synth import synthesize
     from linprim_geo.train import SceneOptions, TrainOptions, train
 
-    synthesize(
-        tmp_path / "scene", shape="cad", views=6, test_views=2, size=(40, 24), points=200, supersample=1
-    )
+    synthesize(tmp_path / "scene", shape="cad", views=6, test_views=2, size=(40, 24), points=200, supersample=1)
     options = TrainOptions(iterations=5, max_primitives=50, sh_degree=0, threads=1)
     train(tmp_path / "scene", tmp_path / "run", SceneOptions(), options, quiet=True)
     scores = eval_images_run(tmp_path / "run", lpips_weights=files)  # VGG16 takes them, AlexNet does not

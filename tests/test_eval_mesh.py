@@ -69,9 +69,7 @@ def test_tau_is_inclusive_and_by_default_one_percent_of_the_references_diagonal(
     assert score_mesh(prediction, reference, samples=100, tau=0.5 - 1e-9)["f1"] == 0.0
     larger = grid(size=(20.0, 10.0))
     result = score_mesh(larger, reference, samples=100)
-    assert result["tau"] == pytest.approx(0.01 * math.sqrt(5)) and result[
-        "tau_percent_diagonal"
-    ] == pytest.approx(1)
+    assert result["tau"] == pytest.approx(0.01 * math.sqrt(5)) and result["tau_percent_diagonal"] == pytest.approx(1)
 
 
 def test_half_a_rectangle_against_the_whole():
@@ -138,16 +136,12 @@ def test_subdivision_moves_the_headline_by_less_than_its_standard_error():
 
 def test_samples_are_uniform_by_area():
     # Faces of very different areas, one of them zero.
-    vertices = np.array(
-        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [3, 0, 0], [9, 7, 0], [0.1, 0, 5], [2, 0, 0]], float
-    )
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [3, 0, 0], [9, 7, 0], [0.1, 0, 5], [2, 0, 0]], float)
     mesh = Mesh(vertices, np.array([[0, 1, 2], [1, 3, 4], [0, 1, 5], [0, 1, 6]]))
     count = 60_000
     points, face = sample_surface(mesh, count, 5)
     corners = vertices[mesh.faces]
-    area = 0.5 * np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     # One sample per share of the area: a face can only gain or lose at the two shares it has in part.
     assert np.abs(np.bincount(face, minlength=4) - count * area / area.sum()).max() <= 2
     for number in range(3):
@@ -163,9 +157,7 @@ def test_samples_are_uniform_by_area():
 
 def test_distances_equal_an_exhaustive_search():
     random = np.random.default_rng(3)
-    mesh = Mesh(
-        random.standard_normal((60, 3)), np.array([random.choice(60, 3, replace=False) for _ in range(80)])
-    )
+    mesh = Mesh(random.standard_normal((60, 3)), np.array([random.choice(60, 3, replace=False) for _ in range(80)]))
     points = 2 * random.standard_normal((300, 3))
     distance, face = SurfaceDistance(mesh).query(points)
     exhaustive = np.stack([distance_to_triangle(points, mesh.vertices[row]) for row in mesh.faces], 1)
@@ -215,9 +207,7 @@ def test_scores_move_with_the_meshes_and_scale_with_them():
     result = score_mesh(*scaled, samples=5000)
     for key in LENGTHS:
         assert result[key] == pytest.approx(factor * original[key], rel=1e-12)
-        assert result[f"{key}_percent_diagonal"] == pytest.approx(
-            original[f"{key}_percent_diagonal"], rel=1e-12
-        )
+        assert result[f"{key}_percent_diagonal"] == pytest.approx(original[f"{key}_percent_diagonal"], rel=1e-12)
     assert result["f1"] == original["f1"]
     turn, move = rotation(), np.array([3.0, -1.0, 8.0])
     moved = [replace(mesh, vertices=mesh.vertices @ turn.T + move) for mesh in (prediction, reference)]
@@ -257,10 +247,7 @@ def test_morton_order_is_a_permutation_that_keeps_neighbours_together():
     assert step < 0.25 * np.linalg.norm(np.diff(points, axis=0), axis=1).mean()
     octant = (points[order] > points.mean()).astype(int) @ [1, 2, 4]
     assert (np.diff(octant) != 0).sum() < 200  # eight runs but for the cells along the middle
-    assert (
-        morton_order(np.zeros((5, 3))).tolist() == [0, 1, 2, 3, 4]
-        and len(morton_order(np.zeros((0, 3)))) == 0
-    )
+    assert morton_order(np.zeros((5, 3))).tolist() == [0, 1, 2, 3, 4] and len(morton_order(np.zeros((0, 3)))) == 0
 
 
 # --- meshes that break libraries ----------------------------------------------------------------------------
@@ -289,9 +276,7 @@ def test_degenerate_repeated_and_nan_faces_change_nothing():
     assert as_prediction["dropped"]["prediction"]["duplicate"] == 2
     swapped = score_mesh(grid(), clean, samples=3000)
     assert as_reference["chamfer"] == swapped["chamfer"]
-    assert (
-        as_reference["tau"] == swapped["tau"]
-    )  # a far vertex that no face uses does not stretch the diagonal
+    assert as_reference["tau"] == swapped["tau"]  # a far vertex that no face uses does not stretch the diagonal
 
 
 def test_non_manifold_and_self_intersecting_meshes_are_scored():
@@ -341,9 +326,7 @@ def test_meshes_without_a_surface_are_refused():
             score_mesh(grid(), bad)
 
 
-@pytest.mark.parametrize(
-    "options", [{"samples": 1}, {"samples": -5}, {"tau": 0.0}, {"tau": math.nan}, {"seed": -1}]
-)
+@pytest.mark.parametrize("options", [{"samples": 1}, {"samples": -5}, {"tau": 0.0}, {"tau": math.nan}, {"seed": -1}])
 def test_options_out_of_range_are_refused(options):
     with pytest.raises(LinprimError, match=f"^--{next(iter(options))} is "):
         score_mesh(grid(), grid(), **options)
@@ -353,9 +336,7 @@ def test_options_out_of_range_are_refused(options):
 
 
 def test_files_are_scored_and_error_colours_written(tmp_path):
-    save_mesh(
-        tmp_path / "a.ply", replace(grid(1, 1), vertices=grid(1, 1).vertices * [1, 1, 0] + [0, 0, 0.125])
-    )
+    save_mesh(tmp_path / "a.ply", replace(grid(1, 1), vertices=grid(1, 1).vertices * [1, 1, 0] + [0, 0, 0.125]))
     save_mesh(tmp_path / "b.obj", grid(2, 2, size=(1.0, 1.0)))
     result = eval_mesh_files(tmp_path / "a.ply", tmp_path / "b.obj", tmp_path / "out", samples=2000, seed=3)
     assert SCORES | CONTEXT <= set(result) and {f"{key}_percent_diagonal" for key in LENGTHS} <= set(result)

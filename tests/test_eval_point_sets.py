@@ -14,18 +14,14 @@ from linprim_geo.mesh import Mesh
 def test_a_lattice_has_one_point_per_cell_of_the_area_inside_the_faces():
     mesh = sphere(1.0, 2)
     corners = mesh.vertices[mesh.faces]
-    area = 0.5 * np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     points = lattice_points(mesh, 0.01)
     # A face loses up to a row of cells along two edges of its own, some 30 cells long.
     assert 0.93 * area.sum() / 1e-4 < len(points) < area.sum() / 1e-4
     assert SurfaceDistance(mesh).query(points)[0].max() < 1e-14
     assert len(lattice_points(mesh, 2.0)) == 0  # faces too small for a cell: the vertices alone are left
     one = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]]))
-    expected = [
-        (i, j) for i in (0.125, 0.375, 0.625, 0.875) for j in (0.125, 0.375, 0.625, 0.875) if i + j < 1
-    ]
+    expected = [(i, j) for i in (0.125, 0.375, 0.625, 0.875) for j in (0.125, 0.375, 0.625, 0.875) if i + j < 1]
     assert lattice_points(one, 0.25)[:, :2].tolist() == [list(pair) for pair in expected]
 
 
@@ -33,9 +29,7 @@ def test_a_lattice_has_one_point_per_cell_of_the_area_inside_the_faces():
 def test_thinning_is_that_of_going_through_the_points_one_by_one(monkeypatch, start):
     monkeypatch.setattr("linprim_geo.eval.point_sets.THIN_START", start)
     random = np.random.default_rng(1)
-    points = np.concatenate(
-        [random.random((300, 3)), 0.1 * random.integers(0, 4, (100, 3))]
-    )  # repeats, and ties
+    points = np.concatenate([random.random((300, 3)), 0.1 * random.integers(0, 4, (100, 3))])  # repeats, and ties
     for radius in (0.1, 0.25):
         order = np.random.default_rng((3, 0)).permutation(len(points))
         removed, stays = np.zeros(len(points), bool), []

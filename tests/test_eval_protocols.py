@@ -87,9 +87,7 @@ def test_dtu_has_a_floor_of_a_tenth_of_a_millimetre_under_every_offset(planes, o
     result = score("dtu", moved(planes[0], 0, 0, offset), planes[1], metre=1000.0)
     # Which points the shuffle leaves moves the third digit.
     assert result["chamfer"] == pytest.approx(expected, abs=0.0015)
-    assert (
-        result["kept_prediction"] == result["kept_reference"] == 1.0 and result["normal_consistency"] is None
-    )
+    assert result["kept_prediction"] == result["kept_reference"] == 1.0 and result["normal_consistency"] is None
     assert result["points_before_thinning"] > result["samples"] > 40_000
 
 
@@ -151,9 +149,7 @@ def test_tnt_recall_of_a_perfect_plane_depends_on_its_triangles_unless_points_ar
     # Discs of radius 1 around the vertices (one per two triangles) and the centroids (two); those of the
     # right-angled triangles are 4 sqrt(2) / 3 apart and share a lens of 0.04.
     triangle = 4 * math.sqrt(3) if equilateral else 8.0
-    assert result["recall"] == pytest.approx(
-        1.5 * math.pi / triangle - (0 if equilateral else 0.01), abs=0.01
-    )
+    assert result["recall"] == pytest.approx(1.5 * math.pi / triangle - (0 if equilateral else 0.01), abs=0.01)
     by_vertices = PointDistance(mesh.vertices).query(
         cell_means(sample_surface(mesh, 60_000, 0, independent=True)[0], 0.5)
     )[0]
@@ -179,9 +175,7 @@ def test_tnt_threshold_is_exclusive_and_the_scenes_own():
 
 
 def test_tnt_crops_both_to_the_polygon():
-    crop = CropVolume(
-        2, -1.0, 1.0, np.array([[0.0, 0], [60, 0], [60, 60]])
-    )  # the lower right half of a square
+    crop = CropVolume(2, -1.0, 1.0, np.array([[0.0, 0], [60, 0], [60, 60]]))  # the lower right half of a square
     mesh = grid(60, 60, (60.0, 60.0))
     result = score("tnt", join(mesh, moved(mesh, 0, 0, 5.0)), mesh, tau=1.0, crop=crop)
     assert result["kept_reference"] == pytest.approx(0.5, abs=0.01)
@@ -202,15 +196,11 @@ def test_scannetpp_keeps_what_more_than_three_cameras_see():
     result = score("scannetpp", join(floor, cellar), floor, cameras=cameras)
     # The cellar is hidden by more than 2 cm; 10,000 points on a square metre have their floor.
     assert result["kept_prediction"] == pytest.approx(0.5, abs=0.01) and result["kept_reference"] == 1.0
-    assert (
-        result["accuracy"] == pytest.approx(0.005, rel=0.04) and result["f1"] == 1.0 and result["tau"] == 0.05
-    )
+    assert result["accuracy"] == pytest.approx(0.005, rel=0.04) and result["f1"] == 1.0 and result["tau"] == 0.05
     assert result["samples"] == pytest.approx(10_000, rel=0.02) and result["normal_consistency"] == 1.0
     close = score("scannetpp", join(floor, moved(cellar, 0, 0, 0.085)), floor, cameras=cameras)
     assert close["kept_prediction"] == pytest.approx(1.0)  # 1.5 cm below hides nothing
-    with pytest.raises(
-        LinprimError, match="^prediction: nothing of it is seen by more than 3 of the 3 cameras"
-    ):
+    with pytest.raises(LinprimError, match="^prediction: nothing of it is seen by more than 3 of the 3 cameras"):
         score("scannetpp", floor, floor, cameras=cameras[:3])
     with pytest.raises(LinprimError, match="--cameras"):
         score("scannetpp", floor, floor)
@@ -218,17 +208,17 @@ def test_scannetpp_keeps_what_more_than_three_cameras_see():
         score("scannetpp", replace(floor, vertices=1000 * floor.vertices), floor, cameras=cameras)
     # The same in millimetres.
     pose = cameras[0].world_to_camera
-    millimetres = [replace(c, world_to_camera=np.vstack([np.c_[pose[:3, :3], 1000 * c.world_to_camera[:3, 3]], pose[3]]))
-                   for c in cameras]  # fmt: skip
+    millimetres = [
+        replace(c, world_to_camera=np.vstack([np.c_[pose[:3, :3], 1000 * c.world_to_camera[:3, 3]], pose[3]]))
+        for c in cameras
+    ]
     large = [replace(m, vertices=1000 * m.vertices) for m in (join(floor, cellar), floor)]
     scaled = score("scannetpp", *large, cameras=millimetres, metre=1000.0)
     assert scaled["chamfer"] == pytest.approx(1000 * result["chamfer"], rel=1e-6) and scaled["tau"] == 50.0
 
 
 def test_rays_to_vertices_that_slip_are_counted_and_do_no_harm():
-    mesh = refine(
-        sphere(1.0, 0), 0.04
-    )  # an octahedron, cut finely: faces towards the camera are those of z > 0
+    mesh = refine(sphere(1.0, 0), 0.04)  # an octahedron, cut finely: faces towards the camera are those of z > 0
     caster = RayCaster(mesh.vertices, mesh.faces)
     views = count_views(caster, mesh.vertices, [camera_above(3.0)] * 5, 1e-3, enough=4)
     clear = np.abs(mesh.vertices[:, 2]) > 0.01
@@ -315,18 +305,14 @@ def test_dtu_by_command_with_the_files_of_the_benchmark(meshes, capsys):
     assert result["kept_reference"] == pytest.approx(0.5, abs=0.01)
     assert result["chamfer"] == pytest.approx(0.235, abs=0.01)
     assert json.loads((meshes / "out" / "results.json").read_text())["chamfer"] == result["chamfer"]
-    by_text, _ = run_command(
-        "eval-mesh a.ply b.ply --protocol dtu --box=0,0,-1,1,9,1 --plane=0,1,0,-30", capsys
-    )
+    by_text, _ = run_command("eval-mesh a.ply b.ply --protocol dtu --box=0,0,-1,1,9,1 --plane=0,1,0,-30", capsys)
     assert by_text["kept_reference"] == result["kept_reference"] and by_text["kept_prediction"] == 1.0
 
 
 def test_tnt_by_command_with_a_scan_a_crop_and_a_transform(meshes, capsys):
     scan = np.random.default_rng(0).random((30_000, 3)) * [60, 60, 0]
     rows = "\n".join(f"{x} {y} {z}" for x, y, z in scan)
-    head = (
-        "ply\nformat ascii 1.0\nelement vertex 30000\nproperty float x\nproperty float y\nproperty float z\n"
-    )
+    head = "ply\nformat ascii 1.0\nelement vertex 30000\nproperty float x\nproperty float y\nproperty float z\n"
     (meshes / "scan.ply").write_text(f"{head}end_header\n{rows}\n")
     crop = {"orthogonal_axis": "Z", "axis_min": -1, "axis_max": 1, "class_name": "SelectionPolygonVolume"}
     crop["bounding_polygon"] = [[0, 0, 7], [30, 0, 7], [30, 60, 7], [0, 60, 7]]
@@ -381,8 +367,7 @@ def test_a_run_keeps_each_protocol_in_a_folder_of_its_own(meshes):
             picture = np.asarray(Image.open(meshes / "run" / "eval" / "mesh" / protocol / name))
             assert picture.shape == (590, 900, 3)
             blue, orange = (
-                np.abs(picture.astype(int) - color).max(axis=2) < 30
-                for color in ((31, 99, 178), (214, 112, 18))
+                np.abs(picture.astype(int) - color).max(axis=2) < 30 for color in ((31, 99, 178), (214, 112, 18))
             )
             assert blue.sum() > 100 and orange.sum() > 100 and (picture == 255).all(axis=2).mean() > 0.3
 
@@ -433,9 +418,7 @@ def test_points_are_a_reference_only_where_the_protocol_has_scans(meshes, capsys
     (meshes / "scan.ply").write_text(head + "0 0 0\n1 1 0\n")
     (meshes / "nan.ply").write_text(head + "nan 0 0\nnan 1 0\n")
     for protocol in ("headline", "linprim"):
-        assert (
-            "holds no triangles" in run_command(f"eval-mesh a.ply scan.ply --protocol {protocol}", capsys)[1]
-        )
+        assert "holds no triangles" in run_command(f"eval-mesh a.ply scan.ply --protocol {protocol}", capsys)[1]
     assert "no finite points" in run_command("eval-mesh a.ply nan.ply --protocol dtu", capsys)[1]
     assert run_command("eval-mesh a.ply scan.ply --protocol dtu", capsys)[0]["samples_reference"] == 2
 

@@ -92,7 +92,9 @@ def test_tasks_are_done_once_with_one_thread_each(executor, tmp_path):
 
 
 def test_a_worker_that_dies_is_begun_again_and_goes_on(executor, tmp_path):
-    results = run([task(tmp_path, "die", times=2), task(tmp_path, "chain", "c", start="a", steps=5)], tmp_path, executor)
+    results = run(
+        [task(tmp_path, "die", times=2), task(tmp_path, "chain", "c", start="a", steps=5)], tmp_path, executor
+    )
     assert results[0]["deaths"] == 2 and (tmp_path / "t" / "deaths").read_text() == "xxx"
     assert results[1]["value"] == chained("a", 5) and len((tmp_path / "c" / "attempts").read_text().splitlines()) == 1
 
@@ -131,8 +133,17 @@ def test_a_worker_that_the_system_kills_for_memory_is_not_begun_again(tmp_path, 
 
 
 def test_more_memory_than_there_is_is_refused_before_anything_begins(tmp_path):
-    big = Task("big", "executor_tasks:chain", {"start": "a", "steps": 1}, tmp_path / "big", memory_gib=1e6, remedy="more blocks")
-    with pytest.raises(LinprimError, match="big would take 1000000.0 GiB of the .* GiB of a worker: wanted more blocks"):
+    big = Task(
+        "big",
+        "executor_tasks:chain",
+        {"start": "a", "steps": 1},
+        tmp_path / "big",
+        memory_gib=1e6,
+        remedy="more blocks",
+    )
+    with pytest.raises(
+        LinprimError, match="big would take 1000000.0 GiB of the .* GiB of a worker: wanted more blocks"
+    ):
         run([big], tmp_path)
     assert not (tmp_path / "big").exists()
 
@@ -159,8 +170,16 @@ class Recorded(Executor):
 
 
 def test_as_many_run_together_as_cores_and_memory_allow(tmp_path):
-    tasks = [Task(name, "m:f", {}, tmp_path / name, memory_gib=gib) for name, gib in (("a", 3.0), ("b", 2.0), ("c", 1.0), ("d", 1.0))]
-    for limits, wanted in (((2, 9.0), {"a", "b"}), ((4, 4.0), {"a", "c"}), ((4, 9.0), {"a", "b", "c", "d"}), ((1, 9.0), {"a"})):
+    tasks = [
+        Task(name, "m:f", {}, tmp_path / name, memory_gib=gib)
+        for name, gib in (("a", 3.0), ("b", 2.0), ("c", 1.0), ("d", 1.0))
+    ]
+    for limits, wanted in (
+        ((2, 9.0), {"a", "b"}),
+        ((4, 4.0), {"a", "c"}),
+        ((4, 9.0), {"a", "b", "c", "d"}),
+        ((1, 9.0), {"a"}),
+    ):
         executor = Recorded(tmp_path, *limits)
         executor.run(tasks, Progress("tasks", 1, quiet=True))
         assert executor.together[0] == wanted, limits
@@ -180,9 +199,15 @@ def test_mixed_versions_and_another_folder_are_one_sentence_each(executor, tmp_p
     about = executor.about
     try:
         for change, sentence in (
-            ({"versions": executor.about["versions"] | {"torch": "0.4"}}, "worker on .* has torch .*, where this was started it is 0.4"),
+            (
+                {"versions": executor.about["versions"] | {"torch": "0.4"}},
+                "worker on .* has torch .*, where this was started it is 0.4",
+            ),
             ({"versions": executor.about["versions"] | {"source": "ab"}}, "has source .* wanted the same linprim-geo"),
-            ({"token": "other"}, "does not see this folder, or sees another one there: wanted a folder that all workers share"),
+            (
+                {"token": "other"},
+                "does not see this folder, or sees another one there: wanted a folder that all workers share",
+            ),
             ({"shared": str(tmp_path / "elsewhere")}, "elsewhere: the worker on .* does not see this folder"),
         ):
             executor.about = about | change
@@ -196,7 +221,9 @@ def test_mixed_versions_and_another_folder_are_one_sentence_each(executor, tmp_p
 @pytest.mark.slow
 def test_a_cluster_that_is_not_there_is_one_sentence(tmp_path):
     for address in ("127.0.0.1:9", "ray://127.0.0.1:9"):
-        with pytest.raises(LinprimError, match=f"--cluster {address}: no Ray cluster answers there .* wanted local, or the address"):
+        with pytest.raises(
+            LinprimError, match=f"--cluster {address}: no Ray cluster answers there .* wanted local, or the address"
+        ):
             open_executor(address, tmp_path)
     with pytest.raises(LinprimError, match="--cluster is 'nowhere', wanted local, auto, or an address"):
         open_executor("nowhere", tmp_path)
@@ -209,7 +236,10 @@ def test_without_ray_the_extra_is_named(tmp_path, monkeypatch):
 
 
 def test_ray_is_not_imported_unless_it_is_asked_for():
-    text = "import sys, linprim_geo.executor, linprim_geo.cli; linprim_geo.cli.build_parser(); sys.exit('ray' in sys.modules)"
+    text = (
+        "import sys, linprim_geo.executor, linprim_geo.cli; linprim_geo.cli.build_parser(); sys.exit('ray' in "
+        "sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", text]).returncode == 0
 
 
@@ -231,7 +261,8 @@ def workers_at(shared: Path) -> list[int]:
 
 
 def killed_at_random(shared: Path, cluster: str, kills: int, seconds: float, rng: random.Random) -> int:
-    """Drives six chains, killing a worker or the driver `kills` times, until all is done; returns how many drivers it took."""
+    """Drives six chains, killing a worker or the driver `kills` times, until all is done; returns how many drivers it
+    took."""
     command = [sys.executable, str(HERE / "executor_tasks.py"), str(shared), cluster, "2", str(seconds), "6"]
     drivers = done = 0
     while not (shared / "results.json").exists():

@@ -1,4 +1,5 @@
-"""Exposure: gains of photographs are found, keep their gauge, survive a kill bit for bit, and are told to whoever scores."""
+"""Exposure: gains of photographs are found, keep their gauge, survive a kill bit for bit, and are told to whoever
+scores."""
 
 from __future__ import annotations
 
@@ -25,7 +26,15 @@ QUICK = TrainOptions(
 def drifting(tmp_path_factory):
     out = tmp_path_factory.mktemp("drift") / "scene"
     synthesize(
-        out, shape="smooth", views=12, test_views=2, size=64, points=1500, supersample=1, exposure_drift=0.3, background="0.4,0.4,0.4"
+        out,
+        shape="smooth",
+        views=12,
+        test_views=2,
+        size=64,
+        points=1500,
+        supersample=1,
+        exposure_drift=0.3,
+        background="0.4,0.4,0.4",
     )
     return out
 

@@ -20,10 +20,29 @@ from linprim_geo.run import Run
 from linprim_geo.surface_tsdf import DepthFrames, depth_limit
 
 STATS = {
-    "mesh", "mesh_visible", "method", "level", "voxel_size", "truncation_voxels", "depth_limit", "unit", "views", "primitives",
-    "vertices", "faces", "components", "boundary_edges", "non_manifold_edges", "genus", "watertight", "area", "volume",
-    "visible", "seconds", "peak_gib",
-}  # fmt: skip
+    "mesh",
+    "mesh_visible",
+    "method",
+    "level",
+    "voxel_size",
+    "truncation_voxels",
+    "depth_limit",
+    "unit",
+    "views",
+    "primitives",
+    "vertices",
+    "faces",
+    "components",
+    "boundary_edges",
+    "non_manifold_edges",
+    "genus",
+    "watertight",
+    "area",
+    "volume",
+    "visible",
+    "seconds",
+    "peak_gib",
+}
 
 
 @pytest.fixture(scope="module")
@@ -41,14 +60,27 @@ def test_what_is_written(extracted, solid):
     assert outputs(folder) == ["mesh.ply", "mesh_visible.ply", "stats.json"]
     assert STATS <= stats.keys()
     assert json.loads((folder / "stats.json").read_text()) == json.loads(json.dumps(stats))
-    assert stats["mesh"] == str(folder / "mesh.ply") and stats["mesh_visible"] == str(
-        folder / "mesh_visible.ply"
-    )
+    assert stats["mesh"] == str(folder / "mesh.ply") and stats["mesh_visible"] == str(folder / "mesh_visible.ply")
     assert stats["views"] == 24 and stats["primitives"] == 1
-    assert stats["seconds"].keys() == {"level", "render", "fuse", "refine", "quality", "colours", "visibility", "write", "total"}
-    assert stats["peak_gib"].keys() == stats["seconds"].keys() and 0 < stats["peak_gib"]["fuse"] <= stats["peak_gib"]["total"]
+    assert stats["seconds"].keys() == {
+        "level",
+        "render",
+        "fuse",
+        "refine",
+        "quality",
+        "colours",
+        "visibility",
+        "write",
+        "total",
+    }
+    assert (
+        stats["peak_gib"].keys() == stats["seconds"].keys()
+        and 0 < stats["peak_gib"]["fuse"] <= stats["peak_gib"]["total"]
+    )
     predicted = load_mesh(folder / "mesh_visible.ply").quality
-    assert stats["predicted_error"] == pytest.approx({"median": np.median(predicted), "q90": np.quantile(predicted, 0.9)})
+    assert stats["predicted_error"] == pytest.approx(
+        {"median": np.median(predicted), "q90": np.quantile(predicted, 0.9)}
+    )
     assert stats["visible"].keys() == topology(load_mesh(folder / "mesh.ply")).keys()
 
 
@@ -57,9 +89,7 @@ def test_the_mesh_is_the_surface(extracted, solid):
     mesh, reference = load_mesh(folder / "mesh.ply"), load_mesh(solid.parent / "scene" / "reference.ply")
     scores = score_mesh(mesh, reference, samples=20_000)
     # Edges and corners are rounded within a voxel; the faces themselves are exact.
-    assert (
-        scores["accuracy"] < 0.5 * stats["voxel_size"] and scores["completeness"] < 0.5 * stats["voxel_size"]
-    )
+    assert scores["accuracy"] < 0.5 * stats["voxel_size"] and scores["completeness"] < 0.5 * stats["voxel_size"]
     assert scores["chamfer_percent_diagonal"] < 0.6 and scores["normal_consistency"] > 0.97
     truth = topology(reference)
     assert stats["components"] == 1 and stats["genus"] == 0
@@ -102,9 +132,7 @@ def test_every_format_holds_the_same_surface(suffix, solid, extracted, tmp_path)
 
 def test_a_coarser_grid_gives_fewer_triangles(solid, extracted, tmp_path):
     fine, coarse = (
-        extract_mesh(
-            solid, output=tmp_path / f"{size}.ply", options=ExtractOptions(voxel_size=size), quiet=True
-        )
+        extract_mesh(solid, output=tmp_path / f"{size}.ply", options=ExtractOptions(voxel_size=size), quiet=True)
         for size in (0.05, 0.1)
     )
     assert 2.5 < fine["faces"] / coarse["faces"] < 6
@@ -143,15 +171,19 @@ def test_no_surface_at_the_level_writes_nothing(tmp_path):
 
 @pytest.mark.parametrize(
     ("change", "match"),
-    [({"level": 0.0}, "--level"), ({"level": 1.0}, "--level"), ({"level": float("nan")}, "--level"),
-     ({"memory_limit": 1e-4, "voxel_size": 0.01}, "GiB"),
-     ({"voxel_size": -1.0}, "voxel"), ({"truncation": 0.0}, "truncation"), ({"smallest_part": 2.0}, "smallest")],
-)  # fmt: skip
+    [
+        ({"level": 0.0}, "--level"),
+        ({"level": 1.0}, "--level"),
+        ({"level": float("nan")}, "--level"),
+        ({"memory_limit": 1e-4, "voxel_size": 0.01}, "GiB"),
+        ({"voxel_size": -1.0}, "voxel"),
+        ({"truncation": 0.0}, "truncation"),
+        ({"smallest_part": 2.0}, "smallest"),
+    ],
+)
 def test_options_that_cannot_be_used_are_refused(change, match, solid, tmp_path):
     with pytest.raises(LinprimError, match=match):
-        extract_mesh(
-            solid, output=tmp_path / "m.ply", options=replace(ExtractOptions(), **change), quiet=True
-        )
+        extract_mesh(solid, output=tmp_path / "m.ply", options=replace(ExtractOptions(), **change), quiet=True)
     assert outputs(tmp_path) == []
 
 
@@ -198,7 +230,9 @@ def test_depths_that_no_disparity_can_tell_apart_are_clamped(solid):
 
 
 def test_the_depth_limit_is_where_a_quarter_of_a_pixel_is_a_truncation():
-    cameras = [replace(Camera(64, 48, 500.0, 500.0, 32.0, 24.0, np.eye(4)), world_to_camera=_shifted(x)) for x in (0.0, 6.0)]
+    cameras = [
+        replace(Camera(64, 48, 500.0, 500.0, 32.0, 24.0, np.eye(4)), world_to_camera=_shifted(x)) for x in (0.0, 6.0)
+    ]
     limit = depth_limit(cameras, 2.0)
     # Disparity 500 * 6 / z: a quarter of a pixel less moves the point by three footprints of the median depth.
     moved = 500 * 6 / (500 * 6 / limit - 0.25) - limit

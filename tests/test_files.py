@@ -145,7 +145,10 @@ def test_a_folder_that_is_a_file_is_one_sentence(old):
 
 def test_what_is_written_below_a_file_names_the_file(old):
     for name in ("", "mesh.ply"):
-        with pytest.raises(LinprimError, match=r"mesh\.ply: is a file, wanted a folder"), locked(old / "runs" / "one", "written", name):
+        with (
+            pytest.raises(LinprimError, match=r"mesh\.ply: is a file, wanted a folder"),
+            locked(old / "runs" / "one", "written", name),
+        ):
             pass
     assert_untouched(old)
 

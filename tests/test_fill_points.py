@@ -1,4 +1,5 @@
-"""Points where features find none: a room whose walls are bare but for patches, backgrounds, and clouds that cannot be filled."""
+"""Points where features find none: a room whose walls are bare but for patches, backgrounds, and clouds that cannot be
+filled."""
 
 from __future__ import annotations
 

@@ -92,9 +92,7 @@ def test_a_sphere_comes_out_round_and_closed(ball):
 
 
 def test_normals_point_outward(ball):
-    along = np.einsum(
-        "ij,ij->i", ball.normals, ball.vertices / np.linalg.norm(ball.vertices, axis=1)[:, None]
-    )
+    along = np.einsum("ij,ij->i", ball.normals, ball.vertices / np.linalg.norm(ball.vertices, axis=1)[:, None])
     assert along.min() > 0.9 and along.mean() > 0.995
 
 
@@ -192,7 +190,11 @@ def test_clamped_depths_clear_the_space_before_them_and_nothing_else(ball):
     assert pieces(mesh) == 1 and np.abs(radial_error(mesh)).max() < 0.25 * 0.05
     taken = fuse_tsdf([replace(f, clamped=None) for f in clear], voxel_size=0.05, min_component=0)
     assert np.abs(radial_error(taken)).max() > 1  # shells behind the sphere
-    assert fuse.auto_voxel_size(clear) == fuse.auto_voxel_size(frames) < fuse.auto_voxel_size([replace(f, clamped=None) for f in clear])
+    assert (
+        fuse.auto_voxel_size(clear)
+        == fuse.auto_voxel_size(frames)
+        < fuse.auto_voxel_size([replace(f, clamped=None) for f in clear])
+    )
     # Cameras whose every depth is clamped before the sphere do not contradict those that see it.
     views, everywhere = sphere_frames(around(24)), np.ones((SIZE, SIZE), bool)
     before = [replace(f, depth=np.ones((SIZE, SIZE)), clamped=everywhere, background=None) for f in views]
@@ -243,7 +245,9 @@ def votes_in_float64(table, rules, position, pixel, inverse):
     along = value / cosine
     past, hidden = value > 1, along < -1
     plane = (value > -grazed) & (along > -grazed_reach)
-    share = np.where(value > 0, np.maximum(1 / (1 + (value / near) ** 2), far_front), np.clip(2 + along / behind, behind_weight, 1))
+    share = np.where(
+        value > 0, np.maximum(1 / (1 + (value / near) ** 2), far_front), np.clip(2 + along / behind, behind_weight, 1)
+    )
     late = np.maximum(np.where(plane, weight * grazed_weight, 0), free * occluded)
     if occluded:
         value = np.where(hidden & ~plane, -1, value)
@@ -265,7 +269,9 @@ def test_votes_are_those_of_the_rules(occluded):
     sums = (grid.total, grid.weight, grid.free)
     rows = np.array([0, 1, 2, 3])
     for _ in range(2):
-        tsdf._core.add_votes(project, camera.width, camera.height, table, rules, rows, grid.corner, grid.voxel, 8, *sums)
+        tsdf._core.add_votes(
+            project, camera.width, camera.height, table, rules, rows, grid.corner, grid.voxel, 8, *sums
+        )
     k, j, i = (axis.ravel() for axis in np.meshgrid(*[np.arange(8)] * 3, indexing="ij"))
     for b in range(len(blocks)):
         position = grid.corner[b] + 0.1 * np.stack([i, j, k], 1)
@@ -333,9 +339,7 @@ def test_an_iterator_is_refused_because_it_ends():
 def test_a_surface_that_every_other_view_denies_is_no_surface():
     frames = with_phantom(sphere_frames(around(24)), 3.0)
     blind = [replace(frames[0], depth=np.where(frames[0].depth == 3.0, 3.0, 0.0), background=None)]
-    blind += [
-        replace(f, depth=np.zeros_like(f.depth), background=np.ones_like(f.background)) for f in frames[1:]
-    ]
+    blind += [replace(f, depth=np.zeros_like(f.depth), background=np.ones_like(f.background)) for f in frames[1:]]
     with pytest.raises(LinprimError, match="gave no surface"):
         fuse_tsdf(blind, voxel_size=0.05)
 

@@ -1,4 +1,5 @@
-"""Terms of the training loss beside the photographs: closed forms, gradients that point the right way, and runs that use them."""
+"""Terms of the training loss beside the photographs: closed forms, gradients that point the right way, and runs that
+use them."""
 
 from __future__ import annotations
 
@@ -55,17 +56,23 @@ def test_the_normals_of_a_plane_are_its_own():
 
 def test_normal_consistency_is_one_minus_the_cosine():
     depth = plane_depth(camera(), NORMAL, OFFSET)
-    assert float(terms.normal_consistency(rendering(depth, constant_normals(NORMAL, depth)), camera())) == pytest.approx(0, abs=1e-12)
+    assert float(
+        terms.normal_consistency(rendering(depth, constant_normals(NORMAL, depth)), camera())
+    ) == pytest.approx(0, abs=1e-12)
     tilted = np.array([0.0, 0.0, -1.0])
     wanted = 1 - float(NORMAL @ tilted)
-    assert float(terms.normal_consistency(rendering(depth, constant_normals(tilted, depth)), camera())) == pytest.approx(wanted)
+    assert float(
+        terms.normal_consistency(rendering(depth, constant_normals(tilted, depth)), camera())
+    ) == pytest.approx(wanted)
     empty = torch.zeros_like(depth)
     assert float(terms.normal_consistency(rendering(empty, constant_normals(tilted, depth), 0.0), camera())) == 0
 
 
 def test_normal_consistency_has_the_gradient_of_its_differences():
     small = replace(camera(), width=6, height=5)
-    depth = plane_depth(small, NORMAL, OFFSET) + 0.05 * torch.rand(5, 6, dtype=torch.float64, generator=torch.manual_seed(0))
+    depth = plane_depth(small, NORMAL, OFFSET) + 0.05 * torch.rand(
+        5, 6, dtype=torch.float64, generator=torch.manual_seed(0)
+    )
     normal = torch.randn(3, 5, 6, dtype=torch.float64, generator=torch.manual_seed(1))
     inputs = (depth.requires_grad_(), normal.requires_grad_())
     assert torch.autograd.gradcheck(lambda d, n: terms.normal_consistency(rendering(d, n), small), inputs)
@@ -118,7 +125,8 @@ def two_views(normal, offset):
 
 
 def patch_loss(shift: float, tilt: float = 0.0) -> tuple[float, float]:
-    """(loss, its derivative by a shift of all depths) where the surface is rendered `shift` too deep and its normal tilted."""
+    """(loss, its derivative by a shift of all depths) where the surface is rendered `shift` too deep and its normal
+    tilted."""
     (one, grey), (other, other_grey) = two_views(NORMAL, OFFSET)[0]
     other_depth = two_views(NORMAL, OFFSET)[1]
     moved = torch.tensor(shift, requires_grad=True)
@@ -197,7 +205,9 @@ def test_without_weights_the_renderer_is_not_asked_for_geometry(tiny_scene, opti
     trained(tiny_scene, tmp_path / "late", replace(options, iterations=20, distortion=1.0))
     assert asked[:20] == [False] * 10 + [True] * 10
     asked.clear()
-    trained(tiny_scene, tmp_path / "opaque", replace(options, iterations=20, binarisation=1.0))  # looks at opacities alone
+    trained(
+        tiny_scene, tmp_path / "opaque", replace(options, iterations=20, binarisation=1.0)
+    )  # looks at opacities alone
     assert asked and not any(asked[:20])
 
 
@@ -213,7 +223,9 @@ def test_patches_change_a_run_of_views_that_overlap_and_say_when_none_do(tiny_sc
     from linprim_geo.train import train
 
     synthesize(tmp_path / "scene", shape="smooth", views=30, test_views=2, size=48, points=300, supersample=1)
-    found = [trained(tmp_path / "scene", tmp_path / f"{weight}", replace(options, patches=weight)) for weight in (0.0, 1.0)]
+    found = [
+        trained(tmp_path / "scene", tmp_path / f"{weight}", replace(options, patches=weight)) for weight in (0.0, 1.0)
+    ]
     assert not np.array_equal(found[0].center, found[1].center)
     # The tiny scene's views are too far apart from each other.
     train(tiny_scene, tmp_path / "far", options=replace(options, patches=1.0))
@@ -236,7 +248,10 @@ def test_a_run_with_every_term_resumes_to_the_last_bit(tiny_scene, options, tmp_
     from linprim_geo.run import Run
 
     again = Run.open(tmp_path / "part").training_primitives()
-    assert all(np.array_equal(getattr(whole, key), getattr(again, key)) for key in ("center", "rotation", "extent", "density", "sh"))
+    assert all(
+        np.array_equal(getattr(whole, key), getattr(again, key))
+        for key in ("center", "rotation", "extent", "density", "sh")
+    )
 
 
 def test_sensor_depth_brings_the_surface_to_it(tiny_scene, options, tmp_path):
@@ -261,7 +276,10 @@ def test_normals_of_the_data_set_are_those_of_its_surface(tiny_scene):
         full = load_scene(tiny_scene).train[3].camera
         _, face, normal = caster.render_depth(full)
         found, wanted = view.load_normals(), (normal @ full.rotation.T)[::downscale, ::downscale]
-        wanted, hit = wanted[: len(found), : found.shape[1]], (face >= 0)[::downscale, ::downscale][: len(found), : found.shape[1]]
+        wanted, hit = (
+            wanted[: len(found), : found.shape[1]],
+            (face >= 0)[::downscale, ::downscale][: len(found), : found.shape[1]],
+        )
         assert found.shape[:2] == (view.camera.height, view.camera.width) and not found[~hit].any()
         assert (np.einsum("pc,pc->p", found[hit], wanted[hit]) > 0.999).mean() > 0.99
         assert (found[hit][:, 2] < 0.1).all()  # towards the camera

@@ -31,5 +31,3 @@ def test_nothing_is_said_up_to_the_limit():
 def test_the_cause_that_has_evidence_is_named(decisions, options, views, named):
     advice = gap_advice(29.0, 15.3, views, options, decisions)
     assert advice.startswith("held-out views are 13.7 dB behind training views: ") and named in advice
-
-

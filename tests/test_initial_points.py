@@ -147,9 +147,7 @@ def test_colors_come_from_the_foreground_alone(tmp_path):
 
 def test_visual_hull_where_images_cut_the_object_off(tmp_path):
     # so close that the ball fills the image: nothing is known outside, and nothing inside of it is lost
-    near = [
-        look_at(PLACE + 0.45 * (c.center - PLACE), PLACE, size=(96, 80), focal=150.0) for c in sphere_ring()
-    ]
+    near = [look_at(PLACE + 0.45 * (c.center - PLACE), PLACE, size=(96, 80), focal=150.0) for c in sphere_ring()]
     scene = silhouettes(tmp_path, sphere_ring()[:12] + near[12:])
     distance = np.linalg.norm(visual_hull_points(scene, 3000, seed=0).xyz - PLACE, axis=1)
     assert np.quantile(distance, 0.99) < RADIUS * 1.6
@@ -193,8 +191,6 @@ def test_frusta_points_of_two_cameras_that_share_nothing(tmp_path):
     frames = []
     for i, camera in enumerate(poses):
         picture(i).save(tmp_path / f"{i}.png")
-        frames.append(
-            {"file_path": f"{i}.png", "transform_matrix": (camera.camera_to_world @ OPENGL).tolist()}
-        )
+        frames.append({"file_path": f"{i}.png", "transform_matrix": (camera.camera_to_world @ OPENGL).tolist()})
     (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 30.0, "frames": frames}))
     assert frusta_points(load_scene(tmp_path), 100, seed=0).xyz.shape == (100, 3)

@@ -25,9 +25,7 @@ def run(wanted: str | None, *words: str) -> subprocess.CompletedProcess:
     environment = {key: value for key, value in os.environ.items() if key != "LINPRIM_GEO_ISA"}
     if wanted is not None:
         environment["LINPRIM_GEO_ISA"] = wanted
-    return subprocess.run(
-        [sys.executable, *words], capture_output=True, text=True, timeout=120, env=environment
-    )
+    return subprocess.run([sys.executable, *words], capture_output=True, text=True, timeout=120, env=environment)
 
 
 @pytest.mark.parametrize("name", KERNELS)

@@ -1,5 +1,5 @@
-"""Killed at random moments and in the middle of their writes, training, extraction and conversion lose nothing; two processes never write
-into one folder."""
+"""Killed at random moments and in the middle of their writes, training, extraction and conversion lose nothing; two
+processes never write into one folder."""
 
 from __future__ import annotations
 
@@ -33,9 +33,14 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="processes are c
 TRAINING_KILLS, EXTRACTION_KILLS, CONVERSION_KILLS = 26, 12, 12
 # Saved so often that most moments lie near a save.
 OPTIONS = {
-    "iterations": 60, "max_primitives": 300, "initial_primitives": 200, "sh_degree": 1, "threads": 1,
-    "checkpoint_every": 4, "evaluate_every": 20,
-}  # fmt: skip
+    "iterations": 60,
+    "max_primitives": 300,
+    "initial_primitives": 200,
+    "sh_degree": 1,
+    "threads": 1,
+    "checkpoint_every": 4,
+    "evaluate_every": 20,
+}
 SAVED = ("training_frame.npz", "scene.npz", "scene.ply")
 
 
@@ -173,7 +178,12 @@ def test_extraction_killed_leaves_whole_meshes(suffix, jobs, whole, tmp_path):
 def test_conversion_killed_leaves_the_old_file_or_the_new(jobs, tmp_path):
     # So many that writing is what takes the time.
     rng, source, count = np.random.default_rng(0), tmp_path / "source.npz", 20_000
-    arrays = rng.normal(size=(count, 3)), rng.normal(size=(count, 4)), rng.uniform(0.1, 1, (count, 3)), rng.random(count)
+    arrays = (
+        rng.normal(size=(count, 3)),
+        rng.normal(size=(count, 4)),
+        rng.uniform(0.1, 1, (count, 3)),
+        rng.random(count),
+    )
     save_primitives(source, Primitives(*arrays, rng.normal(size=(count, 1, 3))))
     for target in (tmp_path / "x.ply", tmp_path / "x.obj", tmp_path / "x.npz"):
         done = jobs.run("convert", source, target)
@@ -234,14 +244,18 @@ def refused(call, place: Path, what: str) -> None:
 def test_a_second_training_into_a_folder_is_refused_until_the_first_is_killed(scene, tmp_path):
     run, options = tmp_path / "run", TrainOptions(**OPTIONS | {"iterations": 100_000, "evaluate_every": 0})
     command = [sys.executable, "-m", "linprim_geo", "train", str(scene), "-o", str(run), "--quiet", "--threads", "1"]
-    first = subprocess.Popen([*command, "--iterations", "100000", "--checkpoint-every", "20", "--max-primitives", "300"])
+    first = subprocess.Popen(
+        [*command, "--iterations", "100000", "--checkpoint-every", "20", "--max-primitives", "300"]
+    )
     try:
         end = time.monotonic() + 300
         while not (run / "checkpoints" / "latest").exists():
             assert first.poll() is None and time.monotonic() < end
             time.sleep(0.02)
         for resume in (False, True):
-            refused(lambda resume=resume: train(scene, run, options=options, resume=resume, quiet=True), run, "trained into")
+            refused(
+                lambda resume=resume: train(scene, run, options=options, resume=resume, quiet=True), run, "trained into"
+            )
         second = subprocess.run([*command, "--resume"], capture_output=True, text=True, timeout=300)
         assert second.returncode == 1 and len(second.stderr.splitlines()) == 1 and str(run) in second.stderr
         assert first.poll() is None

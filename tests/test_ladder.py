@@ -38,7 +38,8 @@ def scene_of(
         parameters[2] = parameters[2] * 0.5
         parameters[3] = torch.from_numpy(rng.uniform(0.05, 1.0, count))
     leaves = [p.to(dtype).requires_grad_() for p in parameters]
-    # Where a ray stops inside an overlap, the twin's gradient knows which of the boundaries it stopped at, the core's does not.
+    # Where a ray stops inside an overlap, the twin's gradient knows which of the boundaries it stopped at, the core's
+    # does not.
     return (
         leaves,
         view,
@@ -78,9 +79,7 @@ def both(leaves, view, options, geometry=True):
             }
         loss = sum((image.double() * weights[name]).sum() for name, image in images.items())
         grads = torch.autograd.grad(loss, inputs, allow_unused=True)
-        results.append(
-            (images, [torch.zeros_like(p) if g is None else g for p, g in zip(inputs, grads, strict=True)])
-        )
+        results.append((images, [torch.zeros_like(p) if g is None else g for p, g in zip(inputs, grads, strict=True)]))
     return results
 
 
@@ -114,7 +113,8 @@ def test_single_precision_is_near_the_twin(rung, isa):
 
 
 def beside_the_view(primitive: str, count: int, least: float, size: float):
-    """Primitives before the camera, `least` to 3 times `least` halves of the image from its middle, of `size` times their distance."""
+    """Primitives before the camera, `least` to 3 times `least` halves of the image from its middle, of `size` times
+    their distance."""
     rng = np.random.default_rng(1)
     view = camera(21, 17, 12.0)
     z = rng.uniform(0.05, 1.5, count)
@@ -154,16 +154,15 @@ def test_affine_rays_keep_beside_the_view_what_is_there(primitive):
 @pytest.mark.parametrize("screen_filter", [0.0, 0.7], ids=["plain", "filtered"])
 def test_affine_rays_of_a_centre_outside_of_the_image_equal_the_twin(primitive, order, screen_filter):
     leaves, view = beside_the_view(primitive, 40, 1.1, 0.8)
-    options = dict(
-        primitive=primitive, ray_model="affine", order=order, stop=0.0, screen_filter=screen_filter
-    )
+    options = dict(primitive=primitive, ray_model="affine", order=order, stop=0.0, screen_filter=screen_filter)
     assert ops.rasterize(*[p.detach() for p in leaves], view, **options).opacity.mean() > 0.2
     assert_alike(leaves, view, options, True, 1e-9, 1e-7)
 
 
 @pytest.mark.parametrize("rung", [rung for rung in RUNGS if rung[1] == "affine"], ids="-".join)
 def test_an_image_cut_out_of_another_shows_the_same(rung):
-    """The part of an image far from the principal point: what is in view there is not drawn as if it were far outside."""
+    """The part of an image far from the principal point: what is in view there is not drawn as if it were far
+    outside."""
     primitive, ray_model, order = rung
     rng = np.random.default_rng(4)
     whole = camera(61, 13, 40.0)
@@ -172,9 +171,7 @@ def test_an_image_cut_out_of_another_shows_the_same(rung):
     slope = (pixels - [whole.cx, whole.cy]) / [whole.fx, whole.fy]
     center = np.concatenate([slope, np.ones((12, 1))], 1) * z[:, None]
     extent = rng.uniform(0.05, 0.15, (12, 4 if primitive == "tetrahedron" else 3))
-    tensors = octahedra(
-        center.tolist(), extent.tolist(), [0.9] * 12, rotation=rng.normal(size=(12, 4)).tolist()
-    )
+    tensors = octahedra(center.tolist(), extent.tolist(), [0.9] * 12, rotation=rng.normal(size=(12, 4)).tolist())
     options = dict(primitive=primitive, ray_model=ray_model, order=order)
     images = [ops.rasterize(*tensors, view, **options).rgb for view in (whole, part)]
     assert float((images[1] - tensors[5][:, None, None]).abs().max()) > 0.05

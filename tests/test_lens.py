@@ -56,15 +56,11 @@ def test_blobs_are_where_the_pinhole_sees_them(tmp_path, model):
     camera = Camera(**vars(target), world_to_camera=pose)
     # points on a grid of the final image, at different depths
     u, v = np.meshgrid(np.linspace(15, target.width - 15, 6), np.linspace(15, target.height - 15, 5))
-    rays = np.stack(
-        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1
-    ).reshape(-1, 3)
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1).reshape(-1, 3)
     local = rays * np.random.default_rng(0).uniform(2, 6, (len(rays), 1))
     world = camera.center + local @ camera.rotation
     taken = np.asarray(
-        pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=list(lens.params)).img_from_cam(
-            local
-        )
+        pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=list(lens.params)).img_from_cam(local)
     )
     assert ((taken > 0) & (taken < SIZE)).all()
     x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)

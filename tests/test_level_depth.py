@@ -13,7 +13,8 @@ pytestmark = pytest.mark.usefixtures("few_threads")
 
 
 def overlap_depth(scene, view, near, level):
-    """Where the summed thickness of a ray reaches ln(1 / level): the twin's intervals, cut at all their ends; 0 where never."""
+    """Where the summed thickness of a ray reaches ln(1 / level): the twin's intervals, cut at all their ends; 0 where
+    never."""
     center, rotation, extent, density = (p.double() for p in scene[:4])
     pose = torch.from_numpy(view.world_to_camera)
     local = center @ pose[:3, :3].T + pose[:3, 3]
@@ -21,7 +22,9 @@ def overlap_depth(scene, view, near, level):
     rays = reference.pixel_rays(view.width, view.height, view.fx, view.fy, view.cx, view.cy, center)
     spans = []
     for i in range(len(center)):
-        start, end, *_ = reference.clip_to_octahedron(rays @ turn[i] / extent[i], -(local[i] @ turn[i]) / extent[i], near)
+        start, end, *_ = reference.clip_to_octahedron(
+            rays @ turn[i] / extent[i], -(local[i] @ turn[i]) / extent[i], near
+        )
         spans.append(torch.where(end > start, torch.stack([start, end]), torch.zeros(())))
     spans = torch.stack(spans)  # (N, 2, pixels)
     out = torch.zeros(len(rays), dtype=torch.float64)
@@ -46,7 +49,8 @@ def test_level_depth_equals_the_sum_of_the_twins_intervals(seed, depth, near, le
         with kernels(isa):
             got = ops.level_depth(*inputs[:5], view, level=level, near=near)[0].double()
             again = ops.level_depth(*[p.flip(0) for p in inputs[:5]], view, level=level, near=near)[0].double()
-        # Thickness is good to 400 eps (test_rasterize.py); the depth to that over density |v|, at least 0.1 in sum where little is behind.
+        # Thickness is good to 400 eps (test_rasterize.py); the depth to that over density |v|, at least 0.1 in sum
+        # where little is behind.
         eps = torch.finfo(getattr(torch, dtype)).eps
         for image in (got, again):
             both = (image > 0) & (wanted > 0)
@@ -72,7 +76,13 @@ def test_level_depth_keeps_its_digits_before_a_far_background(isa):
         with kernels(isa):
             results.append(
                 ops.level_depth(
-                    center, turn, extent[:, None].repeat(1, 3), density, torch.zeros(len(rows), 1, 3), camera(8, 8), level=0.6
+                    center,
+                    turn,
+                    extent[:, None].repeat(1, 3),
+                    density,
+                    torch.zeros(len(rows), 1, 3),
+                    camera(8, 8),
+                    level=0.6,
                 )
             )
     (alone, alone_opacity), (before, opacity) = results

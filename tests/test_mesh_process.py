@@ -1,4 +1,5 @@
-"""Finishing: shapes whose volume, topology and attributes are known stay what they are, and what cannot be done is said."""
+"""Finishing: shapes whose volume, topology and attributes are known stay what they are, and what cannot be done is
+said."""
 
 from __future__ import annotations
 
@@ -61,7 +62,11 @@ def radii(mesh):
 
 def test_simplified_flat_parts_lose_their_faces_and_the_outline_stays():
     flat = simplify(grid(20, 10), 64)
-    assert 58 <= len(flat.faces) <= 64 and topology(flat)["boundary_edges"] == 60 and topology(flat)["non_manifold_edges"] == 0
+    assert (
+        58 <= len(flat.faces) <= 64
+        and topology(flat)["boundary_edges"] == 60
+        and topology(flat)["non_manifold_edges"] == 0
+    )
     assert topology(flat)["area"] == pytest.approx(2.0, abs=1e-9) and np.abs(flat.vertices[:, 2]).max() < 1e-9
 
 
@@ -206,10 +211,15 @@ def test_meshes_that_cannot_be_used_are_one_sentence(step):
 
 @pytest.mark.parametrize(
     ("call", "match"),
-    [(lambda m: simplify(m, 3), "--target-faces is 3"), (lambda m: smooth(m, -1), "--smooth is -1"),
-     (lambda m: close_holes(m, -2), "--close-holes is -2"), (lambda m: remesh(m, 9.0), "--remesh is 9"),
-     (lambda m: remesh(m, 1e-5), "--remesh is 1e-05.*0.0012 or more"), (lambda m: remesh(m, float("nan")), "--remesh is nan")],
-)  # fmt: skip
+    [
+        (lambda m: simplify(m, 3), "--target-faces is 3"),
+        (lambda m: smooth(m, -1), "--smooth is -1"),
+        (lambda m: close_holes(m, -2), "--close-holes is -2"),
+        (lambda m: remesh(m, 9.0), "--remesh is 9"),
+        (lambda m: remesh(m, 1e-5), "--remesh is 1e-05.*0.0012 or more"),
+        (lambda m: remesh(m, float("nan")), "--remesh is nan"),
+    ],
+)
 def test_parameters_that_cannot_be_used_are_one_sentence(call, match):
     with pytest.raises(LinprimError, match=match):
         call(sphere(rounds=2))

@@ -98,7 +98,8 @@ def test_textured_meshes(name, suffix, extracted):
         uv = mesh.wedge_tex_coord_matrix().reshape(-1, 3, 2)
     else:
         uv = mesh.vertex_tex_coord_matrix()[mesh.face_matrix()]
-    # Where the middles of the faces are in the image it has the colour of the octahedron; the two files hold the same image.
+    # Where the middles of the faces are in the image it has the colour of the octahedron; the two files hold the same
+    # image.
     image = np.asarray(Image.open(extracted / f"{name}.png")).astype(int)
     middle = uv.mean(1)
     texels = image[((1 - middle[:, 1]) * 128).astype(int), (middle[:, 0] * 128).astype(int)]
@@ -140,13 +141,9 @@ def test_converted_meshes(source, target, extracted, tmp_path):
     assert_same_surface(mesh, extracted / f"part{source}")
     if ".stl" not in (source, target):
         assert np.abs(np.median(colors(mesh), axis=0) - GREY).max() <= 2
-        np.testing.assert_allclose(
-            mesh.vertex_normal_matrix(), load_mesh(extracted / "part.ply").normals, atol=1e-5
-        )
+        np.testing.assert_allclose(mesh.vertex_normal_matrix(), load_mesh(extracted / "part.ply").normals, atol=1e-5)
     if source == target == ".ply":
-        np.testing.assert_allclose(
-            mesh.vertex_scalar_array(), load_mesh(extracted / "part.ply").quality, rtol=1e-6
-        )
+        np.testing.assert_allclose(mesh.vertex_scalar_array(), load_mesh(extracted / "part.ply").quality, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("source", "target"), [(".obj", ".glb"), (".glb", ".obj")])
@@ -168,9 +165,7 @@ def test_error_colours(extracted, solid, tmp_path):
         quality, shown = mesh.vertex_scalar_array(), colors(mesh)
         assert mesh.has_vertex_scalar() and mesh.has_vertex_color()
         np.testing.assert_allclose(quality, load_mesh(tmp_path / f"{name}.ply").quality, rtol=1e-6)
-        assert np.isclose(
-            np.median(quality), scores["accuracy" if name == "error_pred" else "completeness"], rtol=0.5
-        )
+        assert np.isclose(np.median(quality), scores["accuracy" if name == "error_pred" else "completeness"], rtol=0.5)
         # From dark blue to yellow: where the error is larger, there is more green.
         order = np.argsort(quality)
         tenth = len(order) // 10

@@ -62,7 +62,9 @@ def test_each_row_goes_through_the_adam_of_its_own_steps(given, isa):
     state = State(n)
     rows = [[torch.nn.Parameter(v[i].double()) for v in state.values] for i in range(n)]
     twins = [
-        torch.optim.Adam([{"params": [p], "lr": r} for p, r in zip(row, RATES, strict=True)], betas=(0.9, 0.99), eps=1e-12)
+        torch.optim.Adam(
+            [{"params": [p], "lr": r} for p, r in zip(row, RATES, strict=True)], betas=(0.9, 0.99), eps=1e-12
+        )
         for row in rows
     ]
     counts = torch.zeros(n, dtype=torch.int32)
@@ -79,7 +81,8 @@ def test_each_row_goes_through_the_adam_of_its_own_steps(given, isa):
                     p.grad = g[i].double()
                 twins[i].step()
     assert torch.equal(state.steps, counts) and counts.min() < 4 < counts.max()
-    # As for the dense step: a step is at most its rate and good to some 40 EPS, a value of 4 at most is rounded once per step.
+    # As for the dense step: a step is at most its rate and good to some 40 EPS, a value of 4 at most is rounded once
+    # per step.
     for t, (values, rate) in enumerate(zip(state.values, RATES, strict=True)):
         wanted = torch.stack([row[t].detach() for row in rows])
         torch.testing.assert_close(values.double(), wanted, rtol=0, atol=rounds * (2 * EPS + 40 * EPS * rate))
@@ -108,7 +111,9 @@ def test_untouched_rows_keep_every_bit(isa):
         before = [t.clone() for t in state.everything()]
         touched = rows_drawn(n, 0.3, 2)
         # A mask wins over gradients that are not 0, even over those that are not finite.
-        gradients = [torch.where(touched.reshape(-1, *[1] * (g.dim() - 1)), g, torch.nan) for g in gradients_of(n, touched, 3)]
+        gradients = [
+            torch.where(touched.reshape(-1, *[1] * (g.dim() - 1)), g, torch.nan) for g in gradients_of(n, touched, 3)
+        ]
         state.advance(gradients, touched)
     for now, then in zip(state.everything(), before, strict=True):
         assert torch.equal(now[~touched], then[~touched]) and torch.isfinite(now).all()
@@ -197,4 +202,3 @@ def test_what_does_not_fit_is_refused():
         with pytest.raises((ValueError, LinprimError), match=message):
             adam_rows(**(good | dict(steps=steps) | change))
     assert not steps.any() and not good["values"][0].any()
-

@@ -1,4 +1,5 @@
-"""The paper's tables of single changes: what each study changes, known figures by class, and a quick run of all tables."""
+"""The paper's tables of single changes: what each study changes, known figures by class, and a quick run of all
+tables."""
 
 from __future__ import annotations
 
@@ -92,9 +93,7 @@ def test_a_training_starts_from_what_was_asked_for(start, tiny_scene, tmp_path):
                 begun[name] = {key: value.detach().numpy().copy() for key, value in self.parameters.items()}
                 begun[name]["bounds"] = self.bounds
 
-        options = TrainOptions(
-            iterations=1, max_primitives=200, initial_primitives=150, sh_degree=0, threads=1
-        )
+        options = TrainOptions(iterations=1, max_primitives=200, initial_primitives=150, sh_degree=0, threads=1)
         with context, pytest.MonkeyPatch.context() as patch:
             patch.setattr(training_start, "Trainer", Looking)
             train(tiny_scene, tmp_path / name, SceneOptions(), options, quiet=True)
@@ -114,13 +113,9 @@ def test_a_training_starts_from_what_was_asked_for(start, tiny_scene, tmp_path):
         assert {tuple(p) for p in after["center"].tolist()} <= {tuple(p) for p in center.tolist()}
     else:
         assert np.array_equal(after["center"], center)
-        free = before["log_extent"][:, :2] > math.log(
-            2.1 * before["bounds"][0]
-        )  # those are laid flat across the third
+        free = before["log_extent"][:, :2] > math.log(2.1 * before["bounds"][0])  # those are laid flat across the third
         assert free.sum() > 100
-        assert (before["log_extent"] - after["log_extent"])[:, :2][free] == pytest.approx(
-            math.log(2), abs=1e-5
-        )
+        assert (before["log_extent"] - after["log_extent"])[:, :2][free] == pytest.approx(math.log(2), abs=1e-5)
 
 
 # --- density against opacity -----------------------------------------------------------------------------
@@ -134,7 +129,8 @@ def test_the_logarithm_of_the_density_and_the_opacity_are_each_others_inverse():
 
 
 def test_by_density_the_extent_leaves_the_density_alone(tiny_scene, tmp_path):
-    """The same start, no step that differs before the first; then the gradient by the extent is that at constant density."""
+    """The same start, no step that differs before the first; then the gradient by the extent is that at constant
+    density."""
     import torch
 
     seen = {}
@@ -145,12 +141,8 @@ def test_by_density_the_extent_leaves_the_density_alone(tiny_scene, tmp_path):
             seen.setdefault("first", [t.detach().numpy().copy() for t in active])
             if self.step == 0:
                 leaf = self.parameters["log_extent"].clone().requires_grad_()
-                density = trainer_module.activate(self.parameters | {"log_extent": leaf}, 0, self.kind, None)[
-                    3
-                ]
-                seen["gradient"] = (
-                    torch.autograd.grad(density.sum() + 0 * leaf.sum(), leaf)[0].abs().sum().item()
-                )
+                density = trainer_module.activate(self.parameters | {"log_extent": leaf}, 0, self.kind, None)[3]
+                seen["gradient"] = torch.autograd.grad(density.sum() + 0 * leaf.sum(), leaf)[0].abs().sum().item()
             super().advance()
 
         def _grow(self):
@@ -167,9 +159,7 @@ def test_by_density_the_extent_leaves_the_density_alone(tiny_scene, tmp_path):
                 trained = train(tiny_scene, tmp_path / name, SceneOptions(), options, quiet=True)
             else:
                 with by_density():
-                    trained = train(
-                        tiny_scene, tmp_path / name, SceneOptions(), options, quiet=True
-                    )
+                    trained = train(tiny_scene, tmp_path / name, SceneOptions(), options, quiet=True)
         found[name] = {**seen, "trained": trained, "saved": Run.open(tmp_path / name).training_primitives()}
     assert usual() == USUAL
     for a, b in zip(found["opacity"]["first"], found["density"]["first"], strict=True):
@@ -268,8 +258,12 @@ def test_published_figures_are_those_of_the_authors_and_marked_as_such():
 
 def test_numbers_of_a_table():
     assert [number(1.234, 2), number(1.234, 1, True), number(-0.5, 2, True), number(None, 2), number(math.nan, 2)] == [
-        "1.23", "+1.2", "-0.50", "", "-",
-    ]  # fmt: skip
+        "1.23",
+        "+1.2",
+        "-0.50",
+        "",
+        "-",
+    ]
 
 
 # --- the whole -------------------------------------------------------------------------------------------
@@ -310,9 +304,7 @@ def test_a_quick_run_makes_the_table(name, quick):
     for row in ours:
         assert row["scene"] == "cad" and all(math.isfinite(row[column]) for column in columns)
         assert row["method"] in text
-    assert ("published" in text) == (name not in ("rays", "density")) and paper_tables.TABLES[
-        name
-    ].title in text
+    assert ("published" in text) == (name not in ("rays", "density")) and paper_tables.TABLES[name].title in text
     assert len([row for row in table["rows"] if row["source"] == "published"]) == len(published(name))
     # What a study changes makes a difference.
     assert len({tuple(row[column] for column in columns[:2]) for row in ours}) > 1

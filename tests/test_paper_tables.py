@@ -21,20 +21,16 @@ from linprim_geo.trainer import Trainer
 
 NEAR = 0.01  # of ops.rasterize
 SMALLEST_ALPHA = 1 / 255  # of a Gaussian that counts as hit
-DOUBTFUL = (
-    1e-4  # share of its own size by which float32 may take a pixel on the edge for inside or outside: 1e3 eps
-)
+DOUBTFUL = 1e-4  # share of its own size by which float32 may take a pixel on the edge for inside or outside: 1e3 eps
 
 
 # --- interpolation -----------------------------------------------------------------------------------------
 
 
 def power_law(counts, offset=0.0, factor=1.0):
-    """(count, psnr, frame ms, core ms) with psnr = 20 + offset + 5 log10(count / 1000), ms = factor count^0.8 / 100, core half of it."""
-    return [
-        (n, 20 + offset + 5 * math.log10(n / 1000), factor * n**0.8 / 100, factor * n**0.8 / 200)
-        for n in counts
-    ]
+    """(count, psnr, frame ms, core ms) with psnr = 20 + offset + 5 log10(count / 1000), ms = factor count^0.8 / 100,
+    core half of it."""
+    return [(n, 20 + offset + 5 * math.log10(n / 1000), factor * n**0.8 / 100, factor * n**0.8 / 200) for n in counts]
 
 
 def test_what_costs_more_without_scoring_more_is_no_part_of_a_curve():
@@ -51,9 +47,7 @@ def test_a_power_law_is_interpolated_exactly_between_any_points():
         ((_, level, *wanted),) = power_law([count])
         assert equal_points.at_psnr(curve, level) == pytest.approx((count, *wanted), rel=1e-12)
     # A larger model that scores less does not bend it.
-    assert equal_points.at_psnr([*curve, (25_000, 21.0, 99.0, 99.0)], 22.0)[0] == pytest.approx(
-        1000 * 10**0.4
-    )
+    assert equal_points.at_psnr([*curve, (25_000, 21.0, 99.0, 99.0)], 22.0)[0] == pytest.approx(1000 * 10**0.4)
 
 
 def test_nothing_is_extrapolated():
@@ -64,9 +58,7 @@ def test_nothing_is_extrapolated():
 
 def test_frame_times_are_compared_where_the_psnr_is_the_same():
     # B needs 10^(1 / 5) times fewer primitives for the same PSNR and three times longer for each of them.
-    found = equal_points.equal_psnr(
-        power_law([1000, 4000, 9000]), power_law([900, 8000], offset=1.0, factor=3.0)
-    )
+    found = equal_points.equal_psnr(power_law([1000, 4000, 9000]), power_law([900, 8000], offset=1.0, factor=3.0))
     both = 21 + 5 * math.log10(0.9), 20 + 5 * math.log10(9)
     assert [p["psnr"] for p in found] == pytest.approx([both[0], sum(both) / 2, both[1]])
     for point in found:
@@ -91,8 +83,7 @@ def test_a_comparison_of_made_up_models():
             row = {"model": kind, "kind": kind, "cap": n, "count": n, "psnr": psnr, "frame_cpu_ms": ms}
             row |= {"preprocess_ms": core / 4, "sort_tile_ms": core / 4, "render_ms": core / 2}
             rows.append(
-                row
-                | {"train_cpu_seconds": slow * n / 100, "curve": [[n / 1000, 15.0], [slow * n / 100, psnr]]}
+                row | {"train_cpu_seconds": slow * n / 100, "curve": [[n / 1000, 15.0], [slow * n / 100, psnr]]}
             )
     found = paper_kinds.compare(rows)
     (pair,) = found["equal_psnr"]
@@ -106,7 +97,8 @@ def test_a_comparison_of_made_up_models():
     assert [e["seconds"] for e in found["equal_time"]] == pytest.approx([20, 20 * 2**0.5, 40])
     for entry in found["equal_time"]:
         assert entry["psnr"]["octahedron"] - entry["psnr"]["gaussian"] == pytest.approx(5 * math.log10(2) - 1)
-    # Along one training: when the octahedra have finished after n / 100 s, the Gaussians are ln 10 of ln 20 on their way.
+    # Along one training: when the octahedra have finished after n / 100 s, the Gaussians are ln 10 of ln 20 on their
+    # way.
     for n, entry in zip((1000, 2000, 4000), found["equal_time_curves"], strict=True):
         end = 21 + 5 * math.log10(n / 1000)
         assert entry["seconds"] == n / 100
@@ -124,7 +116,8 @@ def test_thinness_is_that_of_the_shape():
 
 
 def some_primitives(kind: str, rng) -> Primitives:
-    """24 primitives of 2 pixels and more in the image of `CAMERA`, 3 behind the camera and 3 far beside what it sees."""
+    """24 primitives of 2 pixels and more in the image of `CAMERA`, 3 behind the camera and 3 far beside what it
+    sees."""
     center = rng.uniform((-1.2, -1.0, 2.5), (1.2, 1.0, 4.0), (30, 3))
     center[24:27, 2] *= -1
     center[27:, 0] += 40
@@ -144,7 +137,8 @@ CAMERA = Camera(40, 32, 33.0, 35.0, 20.3, 15.8, np.eye(4))
 
 
 def brute_force(p: Primitives, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """(N, H, W) whether a pixel's ray meets a primitive, and whether that is within rounding; camera in the world's frame."""
+    """(N, H, W) whether a pixel's ray meets a primitive, and whether that is within rounding; camera in the world's
+    frame."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     axes = rotation_matrix(torch.from_numpy(p.rotation.astype(np.float64))).numpy()
     center, extent = p.center.astype(np.float64), p.extent.astype(np.float64)
@@ -163,9 +157,7 @@ def brute_force(p: Primitives, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
             doubtful.append(abs(chord) < DOUBTFUL * extent[i].min())
         else:
             u, v, w = center[i]
-            jacobian = np.array(
-                [[camera.fx / w, 0, -camera.fx * u / w**2], [0, camera.fy / w, -camera.fy * v / w**2]]
-            )
+            jacobian = np.array([[camera.fx / w, 0, -camera.fx * u / w**2], [0, camera.fy / w, -camera.fy * v / w**2]])
             arms = jacobian @ (axes[i] * extent[i])
             off = np.stack([x - camera.fx * u / w - camera.cx, y - camera.fy * v / w - camera.cy], -1)
             exponent = np.einsum("hwi,ij,hwj->hw", off, np.linalg.inv(arms @ arms.T), off) / 2
@@ -230,9 +222,7 @@ def test_counts_of_something_that_fills_the_image_are_all_its_pixels():
 
 
 def test_a_quick_run_writes_all_tables_and_a_second_one_trains_nothing(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(
-        training_start, "fill_points", lambda scene, *_: scene.points
-    )  # seconds for every model
+    monkeypatch.setattr(training_start, "fill_points", lambda scene, *_: scene.points)  # seconds for every model
     command = ["--quick", "-o", str(tmp_path), "--iterations", "50"]
     paper_tables.main(command)
     assert training_start.Trainer is Trainer
@@ -274,9 +264,9 @@ def test_a_quick_run_writes_all_tables_and_a_second_one_trains_nothing(tmp_path,
     (models / "octahedron_100" / "model.json").unlink()  # stopped before it was done
     paper_tables.main(command)
     second = json.loads((tmp_path / "paper_tables.json").read_text())
-    assert [
-        name for name, old in before.items() if (models / name / "model.json").stat().st_mtime_ns != old
-    ] == ["octahedron_100"]
+    assert [name for name, old in before.items() if (models / name / "model.json").stat().st_mtime_ns != old] == [
+        "octahedron_100"
+    ]
     for a, b in zip(first["rows"], second["rows"], strict=True):
         for name in ("psnr", "ssim", "count", "start_thinness", *paper_models.COUNTS):
             assert a[name] == b[name]
@@ -288,17 +278,16 @@ def test_a_quick_run_writes_all_tables_and_a_second_one_trains_nothing(tmp_path,
 
 
 def test_a_variant_is_a_kind_and_a_rule_of_growth():
-    assert (
-        Variant.parse("gaussian").name == "gaussian"
-        and Variant.parse("gaussian:3dgs").name == "gaussian:3dgs"
-    )
+    assert Variant.parse("gaussian").name == "gaussian" and Variant.parse("gaussian:3dgs").name == "gaussian:3dgs"
     with pytest.raises(argparse.ArgumentTypeError, match="none of octahedron"):
         Variant.parse("cube")
 
 
 def test_workers_train_what_a_table_wants(tmp_path, capsys, monkeypatch):
     command = ["--quick", "-o", str(tmp_path), "--iterations", "30", "--tables", "12", "--workers", "2"]
-    begun = tmp_path / "models" / "cad" / "octahedron_200"  # a training that ended before it wrote anything leaves its lock
+    begun = (
+        tmp_path / "models" / "cad" / "octahedron_200"
+    )  # a training that ended before it wrote anything leaves its lock
     begun.mkdir(parents=True)
     (begun / ".lock").touch()
     trained = []

@@ -1,4 +1,5 @@
-"""Where photographs agree best along the normals of a mesh, against a textured plane whose photographs are known exactly."""
+"""Where photographs agree best along the normals of a mesh, against a textured plane whose photographs are known
+exactly."""
 
 from __future__ import annotations
 
@@ -82,7 +83,9 @@ def test_exposures_are_found_on_a_wrong_surface_and_taken_out():
     true = np.exp(0.25 * np.cos(2.3 * np.arange(8)))
     true /= np.exp(np.log(true).mean())
     views = ring()
-    drifting = [Shown(view, lambda x, y, gain=gain: 0.6 * gain * texture(x, y)) for view, gain in zip(views, true, strict=True)]
+    drifting = [
+        Shown(view, lambda x, y, gain=gain: 0.6 * gain * texture(x, y)) for view, gain in zip(views, true, strict=True)
+    ]
     mesh = sheet(lambda x, y: 0.7 * FOOTPRINT * np.cos(3 * x))
     gains = photo_gains(mesh, views, (s.load() for s in drifting))
     np.testing.assert_allclose(gains, true, rtol=0.02)
@@ -175,7 +178,9 @@ def test_vertices_that_fewer_than_two_photographs_see_take_that_of_the_nearest(s
     assert np.isfinite(told).all()
     known = np.flatnonzero(found.known)
     for row in hidden[:3]:
-        nearest = known[np.argsort(np.linalg.norm(below.vertices[known] - below.vertices[row], axis=1))[: photo_sweep.NEIGHBOURS]]
+        nearest = known[
+            np.argsort(np.linalg.norm(below.vertices[known] - below.vertices[row], axis=1))[: photo_sweep.NEIGHBOURS]
+        ]
         assert told[row] == pytest.approx(told[nearest].mean(), rel=0.05)  # others are as near
     assert np.isnan(predicted(mesh, shown[:1])).all()
     assert (refine_surface(mesh, shown[:1], 1).vertices == mesh.vertices).all()
@@ -206,7 +211,9 @@ def test_the_core_adds_what_the_formulas_say(shown):
             x, y = pixel.T - 0.5
             j, i = np.floor(x).astype(int), np.floor(y).astype(int)
             a, b = x - j, y - i
-            value = (1 - b) * ((1 - a) * image[i, j] + a * image[i, j + 1]) + b * ((1 - a) * image[i + 1, j] + a * image[i + 1, j + 1])
+            value = (1 - b) * ((1 - a) * image[i, j] + a * image[i, j + 1]) + b * (
+                (1 - a) * image[i + 1, j] + a * image[i + 1, j + 1]
+            )
             sums[:, :, k] += [cosine, cosine * value, cosine * value**2]
     mean = sums[1] / sums[0]
     spread = np.sqrt(np.maximum(sums[2] / sums[0] - mean**2, 0))

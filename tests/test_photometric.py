@@ -33,22 +33,30 @@ def images(height, width, seed=0, noise=0.3):
     b = 0.5 + 0.3 * np.sin(7 * x + 3 * y + np.arange(3)[:, None, None]) + noise * rng.normal(size=(3, height, width))
     weight = rng.random((height, width)) * (rng.random((height, width)) < 0.8)
     weight[0, 0] = 1.0
-    return [torch.from_numpy(v.clip(0, 1)).float() if v.ndim == 3 else torch.from_numpy(v).float() for v in (a, b, weight)]
+    return [
+        torch.from_numpy(v.clip(0, 1)).float() if v.ndim == 3 else torch.from_numpy(v).float() for v in (a, b, weight)
+    ]
 
 
 def compare(image, target, share=0.2, weight=None):
-    """Error of the loss, and the largest and the root mean square error of the gradient, relative to those of the gradient."""
+    """Error of the loss, and the largest and the root mean square error of the gradient, relative to those of the
+    gradient."""
     inputs, exact = image.clone().requires_grad_(), image.double().requires_grad_()
     parts = ops.photometric_loss(inputs, target, share, weight)
     parts[0].backward()
     wanted = reference.photometric_loss(exact, target.double(), share, None if weight is None else weight.double())
     wanted.backward()
     off = inputs.grad.double() - exact.grad
-    return abs((parts[0] - wanted).item()), (off.abs().max() / exact.grad.abs().max()).item(), (off.norm() / exact.grad.norm()).item()
+    return (
+        abs((parts[0] - wanted).item()),
+        (off.abs().max() / exact.grad.abs().max()).item(),
+        (off.norm() / exact.grad.norm()).item(),
+    )
 
 
-# float32 moments of values up to 1 are rounded to EPS, and a variance is a difference of two of them beside C2 = 9e-4: on noise
-# of variance 0.05 the SSIM is off by some EPS / 0.05, and the gradient in that proportion; means over pixels hide most of it.
+# float32 moments of values up to 1 are rounded to EPS, and a variance is a difference of two of them beside C2 = 9e-4:
+# on noise of variance 0.05 the SSIM is off by some EPS / 0.05, and the gradient in that proportion; means over pixels
+# hide most of it.
 SIZES = [(1, 1), (1, 50), (50, 1), (3, 4), (10, 10), (11, 11), (12, 37), (64, 48), (97, 33), (200, 17)]
 
 
@@ -80,8 +88,8 @@ def test_the_parts_are_what_they_are_called(isa):
 
 @pytest.mark.parametrize("isa", KERNELS)
 def test_smooth_bright_images_are_within_a_few_hundred_roundings(isa):
-    # White against nearly white: the variances are 1e-6 and less and cancel to EPS, so that SSIM is off by up to EPS / C2 = 1.3e-4 in
-    # a pixel, and its gradient by as much of 2 / C2.
+    # White against nearly white: the variances are 1e-6 and less and cancel to EPS, so that SSIM is off by up to EPS /
+    # C2 = 1.3e-4 in a pixel, and its gradient by as much of 2 / C2.
     white = torch.ones(3, 64, 64)
     noise = torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(0))
     with kernels(isa):
@@ -117,7 +125,8 @@ def test_the_gradient_is_scaled_and_may_be_asked_for_again():
 
 
 def test_gradient_by_finite_differences():
-    # In float32 a difference over a step h is good to EPS / h of the loss; the loss is smooth but for the L1 kinks, which lie far off.
+    # In float32 a difference over a step h is good to EPS / h of the loss; the loss is smooth but for the L1 kinks,
+    # which lie far off.
     a, b, weight = images(9, 8, 4)
     inputs = a.clone().requires_grad_()
     ops.photometric_loss(inputs, b, 0.8, weight)[0].backward()
@@ -127,7 +136,9 @@ def test_gradient_by_finite_differences():
     def loss(t):
         return ops.photometric_loss(a + t * direction, b, 0.8, weight)[0].item()
 
-    assert (inputs.grad * direction).sum().item() == pytest.approx((loss(step) - loss(-step)) / (2 * step), rel=2e-3, abs=2e-4)
+    assert (inputs.grad * direction).sum().item() == pytest.approx(
+        (loss(step) - loss(-step)) / (2 * step), rel=2e-3, abs=2e-4
+    )
 
 
 def test_layout_does_not_matter_and_inputs_stay():
@@ -154,7 +165,12 @@ def test_the_operator_is_registered_correctly(weighted):
 
 def test_wrong_shapes_are_named():
     a, b, weight = images(9, 8, 8)
-    cases = {"target": (a, b[:, :-1]), "image has": (a[0], b), "weight": (a, b, 0.2, weight[:-1]), "empty": (a[:, :0], b[:, :0])}
+    cases = {
+        "target": (a, b[:, :-1]),
+        "image has": (a[0], b),
+        "weight": (a, b, 0.2, weight[:-1]),
+        "empty": (a[:, :0], b[:, :0]),
+    }
     for name, args in cases.items():
         with pytest.raises(ValueError, match=name):
             ops.photometric_loss(*args)
@@ -204,8 +220,8 @@ def test_adam_equals_torch(n, isa):
             theirs.grad = before.double()
             optimiser.step()
             assert torch.equal(gradient, before)
-    # A step is at most 0.02 * (1 - 0.9) / sqrt(1 - 0.99) = 0.02 and is good to some 20 EPS; 1 - 0.9f and 1 - 0.99f are rounded to
-    # 2^-25 / 0.1 and 2^-25 / 0.01 of themselves. The value, about 4 at most, is rounded once per step.
+    # A step is at most 0.02 * (1 - 0.9) / sqrt(1 - 0.99) = 0.02 and is good to some 20 EPS; 1 - 0.9f and 1 - 0.99f are
+    # rounded to 2^-25 / 0.1 and 2^-25 / 0.01 of themselves. The value, about 4 at most, is rounded once per step.
     state = optimiser.state[theirs]
     torch.testing.assert_close(first.double(), state["exp_avg"], rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(second.double(), state["exp_avg_sq"], rtol=1e-5, atol=1e-9)

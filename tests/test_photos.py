@@ -22,9 +22,7 @@ def test_average_of_straight_colours_is_weighted_by_alpha():
     np.testing.assert_array_equal(small[0, 0], [150, 25, 0])
     assert small_alpha[0, 0] == 85
     # premultiplied, nothing is lost: sum of rgb * alpha is the same
-    np.testing.assert_allclose(
-        small[0, 0] * 85.0 * 4, (rgb * alpha[..., None].astype(float)).sum((0, 1)), atol=170
-    )
+    np.testing.assert_allclose(small[0, 0] * 85.0 * 4, (rgb * alpha[..., None].astype(float)).sum((0, 1)), atol=170)
 
 
 def test_wholly_transparent_blocks_keep_a_plain_mean():
@@ -51,9 +49,7 @@ def test_depth_of_a_plane_is_exact_at_the_new_pixel_centres(factor):
 
     small = photos.downscale_depth(plane(camera), factor)
     k = factor
-    half = type(camera)(
-        40 // k, 30 // k, 35 / k, 35 / k, camera.cx / k, camera.cy / k, camera.world_to_camera
-    )
+    half = type(camera)(40 // k, 30 // k, 35 / k, 35 / k, camera.cx / k, camera.cy / k, camera.world_to_camera)
     np.testing.assert_allclose(small, plane(half), rtol=1e-6)
 
 
@@ -97,9 +93,7 @@ def distorted_view(tmp_path, **options) -> View:
     target = undistorted(BARREL)
     camera = look_at((0, -3, 0), size=(target.width, target.height))
     camera = type(camera)(**{**vars(target), "world_to_camera": camera.world_to_camera})
-    return View(
-        "a", camera, tmp_path / "a.png", file_size=(60, 44), lens=BARREL, cache=tmp_path / "cache", **options
-    )
+    return View("a", camera, tmp_path / "a.png", file_size=(60, 44), lens=BARREL, cache=tmp_path / "cache", **options)
 
 
 def test_undistorted_alpha_does_not_bleed_hidden_colours(tmp_path):

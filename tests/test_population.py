@@ -257,9 +257,7 @@ def test_halves_of_a_gaussian_keep_its_moments_and_its_thickness():
     np.testing.assert_allclose(after, before, atol=1e-6)
     thickness = np.logaddexp(0, table["raw_opacity"].numpy().astype(np.float64)[parents])
     both = np.logaddexp(0, halves["raw_opacity"])
-    size = np.exp(
-        halves["log_extent"].sum(2) - table["log_extent"].numpy().astype(np.float64)[parents].sum(1)
-    )
+    size = np.exp(halves["log_extent"].sum(2) - table["log_extent"].numpy().astype(np.float64)[parents].sum(1))
     np.testing.assert_allclose((both * size).sum(0), thickness, rtol=1e-5)
 
 

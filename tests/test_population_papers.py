@@ -1,4 +1,5 @@
-"""The papers' rules of growth: who is cloned, cut, pruned, reset, moved; what is kept by it; and that everything repeats."""
+"""The papers' rules of growth: who is cloned, cut, pruned, reset, moved; what is kept by it; and that everything
+repeats."""
 
 from __future__ import annotations
 
@@ -69,9 +70,7 @@ def classic(count, kind="octahedron", **options):
 
 
 def mcmc(count, kind="octahedron", **options):
-    return McmcControl(
-        TrainOptions(primitive=kind, population="mcmc", **(OPTIONS | options)), count, CAMERAS, BOUNDS
-    )
+    return McmcControl(TrainOptions(primitive=kind, population="mcmc", **(OPTIONS | options)), count, CAMERAS, BOUNDS)
 
 
 # --- 3DGS -------------------------------------------------------------------------------------------------
@@ -201,9 +200,7 @@ def test_the_limit_on_the_population_takes_what_pulls_hardest():
 
 
 def test_relocation_is_the_papers_double_sum():
-    opacity, copies = (
-        np.array(x) for x in zip(*product((0.006, 0.3, 0.9, 0.999), (1, 2, 3, 7, 20)), strict=True)
-    )
+    opacity, copies = (np.array(x) for x in zip(*product((0.006, 0.3, 0.9, 0.999), (1, 2, 3, 7, 20)), strict=True))
     shared, factor = relocated(opacity, copies)
     for row, (o, n) in enumerate(zip(opacity, copies, strict=True)):
         new = 1 - (1 - o) ** (1 / n)
@@ -253,8 +250,7 @@ def test_parents_are_drawn_in_proportion_to_their_opacity():
     counts = np.zeros(3)
     control.options = TrainOptions(**(OPTIONS | {"max_primitives": 4}))
     parameters = {
-        name: torch.cat([value, value.new_full((1, *value.shape[1:]), -9.0)])
-        for name, value in parameters.items()
+        name: torch.cat([value, value.new_full((1, *value.shape[1:]), -9.0)]) for name, value in parameters.items()
     }
     for step in range(600, 2600):
         counts[control.change(parameters, step).source[3]] += 1

@@ -128,9 +128,7 @@ def test_gaussians_follow_the_formulas_of_3dgs(tmp_path):
         )
         assert gaussians.density[row] == pytest.approx(1 / (1 + np.exp(-float(raw["opacity"]))), rel=1e-6)
         quaternion = np.array([float(raw[f"rot_{k}"]) for k in range(4)])
-        np.testing.assert_allclose(
-            gaussians.rotation[row], quaternion / np.linalg.norm(quaternion), rtol=1e-6
-        )
+        np.testing.assert_allclose(gaussians.rotation[row], quaternion / np.linalg.norm(quaternion), rtol=1e-6)
         for channel in range(3):
             expected = [raw[f"f_dc_{channel}"], *(raw[f"f_rest_{15 * channel + k}"] for k in range(15))]
             np.testing.assert_array_equal(gaussians.sh[row, :, channel], expected)
@@ -146,9 +144,7 @@ def test_a_3d_filter_of_gaussians_keeps_their_mass(tmp_path):
     (tmp_path / "filtered.ply").write_bytes(ply_bytes(filtered))
     plain, wide = (read_primitive_ply(tmp_path / f"{name}.ply")[0] for name in ("plain", "filtered"))
     np.testing.assert_allclose(wide.extent, np.hypot(plain.extent, 0.3), rtol=1e-6)
-    np.testing.assert_allclose(
-        wide.density * wide.extent.prod(1), plain.density * plain.extent.prod(1), rtol=1e-5
-    )
+    np.testing.assert_allclose(wide.density * wide.extent.prod(1), plain.density * plain.extent.prod(1), rtol=1e-5)
 
 
 def test_a_round_trip_through_3dgs_file(tmp_path):

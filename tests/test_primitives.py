@@ -1,4 +1,5 @@
-"""Kinds of primitives: vertices, faces, volumes and reference lengths against geometry computed another way, and the file."""
+"""Kinds of primitives: vertices, faces, volumes and reference lengths against geometry computed another way, and the
+file."""
 
 from __future__ import annotations
 
@@ -93,14 +94,13 @@ def test_the_reference_length_of_a_tetrahedron_is_its_inscribed_spheres_diameter
         np.linalg.norm(np.cross(vertices[b] - vertices[a], vertices[c] - vertices[a])) / 2
         for a, b, c in KINDS["tetrahedron"].faces
     )
-    # The determinant loses what its products cancel: 1e-16 times the ratio of the largest to the smallest volume in it, e^15.
+    # The determinant loses what its products cancel: 1e-16 times the ratio of the largest to the smallest volume in it,
+    # e^15.
     tolerance = 1e-9
     assert reference_length(extent, "tetrahedron")[0] == pytest.approx(6 * volume / area, rel=tolerance)
     # numpy and torch agree, and the length is homogeneous of degree 1.
     tensor = torch.from_numpy(extent)
-    assert float(reference_length(tensor, "tetrahedron")[0]) == pytest.approx(
-        6 * volume / area, rel=tolerance
-    )
+    assert float(reference_length(tensor, "tetrahedron")[0]) == pytest.approx(6 * volume / area, rel=tolerance)
     assert reference_length(3 * extent, "tetrahedron")[0] == pytest.approx(18 * volume / area, rel=tolerance)
 
 
@@ -179,7 +179,7 @@ def test_a_file_without_a_kind_holds_octahedra(tmp_path):
         ("octahedron", {"extent": np.ones((20, 4))}, "octahedra: extent has the shape"),
         ("octahedron", {"kind": "cube"}, "of the kind 'cube', wanted one of octahedron, tetrahedron, gaussian"),
     ],
-)  # fmt: skip
+)
 def test_what_a_kind_cannot_be_is_one_sentence(kind, change, sentence):
     with pytest.raises(LinprimError, match=sentence):
         dataclasses.replace(some(kind), **change)

@@ -1,4 +1,5 @@
-"""The package as a library: names that are imported when they are used, and every Python example of the pages as it stands there."""
+"""The package as a library: names that are imported when they are used, and every Python example of the pages as it
+stands there."""
 
 from __future__ import annotations
 
@@ -20,12 +21,10 @@ README, PYTHON = ROOT / "README.md", ROOT / "linprim_geo" / "PYTHON.md"
 
 
 def examples(page: Path) -> list[str]:
-    """The Python blocks of a page, each with as many empty lines before it as the page has, so that errors name the page's lines."""
+    """The Python blocks of a page, each with as many empty lines before it as the page has, so that errors name the
+    page's lines."""
     text = page.read_text(encoding="utf-8")
-    found = [
-        (m.start(1), m.group(1))
-        for m in re.finditer(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
-    ]
+    found = [(m.start(1), m.group(1)) for m in re.finditer(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)]
     return ["\n" * text[:start].count("\n") + code for start, code in found]
 
 
@@ -62,9 +61,7 @@ def test_the_examples_of_the_page_run(tmp_path, monkeypatch):
 def test_the_page_names_every_command():
     text = PYTHON.read_text(encoding="utf-8")
     (commands,) = (
-        action.choices
-        for action in cli.build_parser()._actions
-        if action.dest == "==SUPPRESS==" and action.choices
+        action.choices for action in cli.build_parser()._actions if action.dest == "==SUPPRESS==" and action.choices
     )
     for command in commands.keys() - {"completion"}:
         assert f"lg.{command.replace('-', '_')}(" in text, command

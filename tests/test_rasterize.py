@@ -34,15 +34,15 @@ pytestmark = pytest.mark.usefixtures("few_threads")
 
 # --- the twin ---
 #
-# Tolerances, in units of eps = 2^-52 or 2^-23, derived once for all comparisons below. A face's inverse depth is a + b dx + c dy;
-# each term and their sums are rounded: the face is off by about 4 eps of the tile's 16 pixels where it is steep, by 4 eps t of
-# depth t where it is seen square on. The thickness of a slice is thus off by
-#     d_tau = 4 eps density (|v| t + 16 |d chord / d pixel|)
-# and colour, opacity and normal, being sums of weights of sum at most 1, by no more than the sum of w d_tau / tau, as a thick
-# slice does not pass its error on. With t = 5 and chords of half a unit that vary over a pixel or two, this is 40 to 400 eps;
-# depths are that good relative to their own range, the distortion to depth squared. Gradients start from sums that cancel a
-# digit: ten times more. In double the mean depth inside a thin slice adds the first terms that its series leaves out, at
-# tau = 0.3: tau^7 / 1209600 and, for the derivative, tau^6 / 172800.
+# Tolerances, in units of eps = 2^-52 or 2^-23, derived once for all comparisons below. A face's inverse depth is a + b
+# dx + c dy; each term and their sums are rounded: the face is off by about 4 eps of the tile's 16 pixels where it is
+# steep, by 4 eps t of depth t where it is seen square on. The thickness of a slice is thus off by d_tau = 4 eps density
+# (|v| t + 16 |d chord / d pixel|) and colour, opacity and normal, being sums of weights of sum at most 1, by no more
+# than the sum of w d_tau / tau, as a thick slice does not pass its error on. With t = 5 and chords of half a unit that
+# vary over a pixel or two, this is 40 to 400 eps; depths are that good relative to their own range, the distortion to
+# depth squared. Gradients start from sums that cancel a digit: ten times more. In double the mean depth inside a thin
+# slice adds the first terms that its series leaves out, at tau = 0.3: tau^7 / 1209600 and, for the derivative, tau^6 /
+# 172800.
 VALUE, GRADIENT = 400, 4000
 SERIES, SERIES_GRADIENT = 0.3**7 / 1209600, 0.3**6 / 172800
 USES_SERIES = ("depth_expected", "distortion", "all")
@@ -137,48 +137,119 @@ def far_away(dtype):
 
 
 TURNED = (0.9, 0.3, -0.2, 0.4)
-# name: centres, half-axes, densities, rotations, options of rasterize, camera, and by how much the tolerances of value and gradient are
-# larger than above: t over the thickness of plates and needles, 1e3, of which the twin itself loses as much; the distance in pixels
-# of the tile from the reference; and behind something opaque the rest of a ray is a difference good to 4 eps, which the density multiplies.
+# name: centres, half-axes, densities, rotations, options of rasterize, camera, and by how much the tolerances of value
+# and gradient are larger than above: t over the thickness of plates and needles, 1e3, of which the twin itself loses as
+# much; the distance in pixels of the tile from the reference; and behind something opaque the rest of a ray is a
+# difference good to 4 eps, which the density multiplies.
 HARD = {
     "camera inside": ([[0.1, 0.05, 0.2]], [[1.0, 0.9, 1.1]], [0.7], [TURNED], {}, {}, 1, 1),
     "camera inside several": (
-        [[0.1, 0, 0.2], [0, 0.2, -0.1], [0.3, 0, 0.4]], [[1, 0.9, 1.1]] * 3, [0.7, 0.2, 1.5], None, {}, {}, 1, 1,
+        [[0.1, 0, 0.2], [0, 0.2, -0.1], [0.3, 0, 0.4]],
+        [[1, 0.9, 1.1]] * 3,
+        [0.7, 0.2, 1.5],
+        None,
+        {},
+        {},
+        1,
+        1,
     ),
     "near plane crossed": ([[0.1, 0.2, 1.0]], [[0.8, 0.7, 0.9]], [1.5], [TURNED], {"near": 0.9}, {}, 1, 1),
     "centre behind, body in front": (
-        [[0.2, 0.1, -1.0]], [[2.0, 1.5, 4.0]], [0.6], [(1.0, 0.05, 0.1, 0.0)], {}, {}, 1, 1,
+        [[0.2, 0.1, -1.0]],
+        [[2.0, 1.5, 4.0]],
+        [0.6],
+        [(1.0, 0.05, 0.1, 0.0)],
+        {},
+        {},
+        1,
+        1,
     ),
     "behind entirely": ([[0.0, 0.1, -3.0]], [[1.0, 1.0, 1.0]], [1.0], [TURNED], {}, {}, 1, 1),
     "behind the near plane": ([[0.0, 0.1, 0.5]], [[0.3, 0.3, 0.3]], [1.0], [TURNED], {"near": 1.0}, {}, 1, 1),
     "off screen": ([[9.0, 0.1, 3.0]], [[1.0, 1.0, 1.0]], [1.0], [TURNED], {}, {}, 1, 1),
     "between the planes of a slab": ([[0.05, 0.02, 5.0]], [[0.3, 0.25, 4.9]], [2.0], None, {}, {}, 1, 1),
     "long towards the camera, turned": (
-        [[0.3, 0.1, 4.0]], [[0.5, 0.2, 3.2]], [2.0], [(1.0, 0.03, -0.05, 0.2)], {}, {}, 1, 1,
+        [[0.3, 0.1, 4.0]],
+        [[0.5, 0.2, 3.2]],
+        [2.0],
+        [(1.0, 0.03, -0.05, 0.2)],
+        {},
+        {},
+        1,
+        1,
     ),
     "needle": (
-        [[0.1, 0.05, 3.0]], [[2.0, 1.2e-3, 0.9e-3]], [500.0], [TURNED], {}, {"width": 30, "height": 30, "focal": 600.0}, 20, 10,
+        [[0.1, 0.05, 3.0]],
+        [[2.0, 1.2e-3, 0.9e-3]],
+        [500.0],
+        [TURNED],
+        {},
+        {"width": 30, "height": 30, "focal": 600.0},
+        20,
+        10,
     ),
     "plate seen edge-on": (
-        [[0.0, 0.4, 3.0]], [[1.4, 2e-3, 1.2]], [40.0], [(1.0, -0.0585, 0.0, 0.0)], {}, {"focal": 200.0, "cy": -17.2}, 5, 10,
+        [[0.0, 0.4, 3.0]],
+        [[1.4, 2e-3, 1.2]],
+        [40.0],
+        [(1.0, -0.0585, 0.0, 0.0)],
+        {},
+        {"focal": 200.0, "cy": -17.2},
+        5,
+        10,
     ),
     "plate seen square on": (
-        [[0.1, 0.05, 3.0]], [[1.3, 1.2, 1e-3]], [700.0], [(1.0, 0.02, 0.05, 0.3)], {}, {}, 30, 100,
+        [[0.1, 0.05, 3.0]],
+        [[1.3, 1.2, 1e-3]],
+        [700.0],
+        [(1.0, 0.02, 0.05, 0.3)],
+        {},
+        {},
+        30,
+        100,
     ),
     "below a pixel": ([[0.10, 0.06, 4.0]], [[0.02, 0.03, 0.02]], [30.0], None, {}, {"cx": 8.05, "cy": 6.2}, 4, 20),
     "covers the image a thousand times": (
-        [[30.0, 10.0, 700.0]], [[600.0, 500.0, 690.0]], [3e-3], [(1.0, 0.02, 0.03, 0.1)], {}, {}, 1, 1,
+        [[30.0, 10.0, 700.0]],
+        [[600.0, 500.0, 690.0]],
+        [3e-3],
+        [(1.0, 0.02, 0.03, 0.1)],
+        {},
+        {},
+        1,
+        1,
     ),
     "thickness from 1e-9 to 1e4": (
-        [[0, 0, 2.0], [0.1, 0, 4.0], [0, 0.1, 7.0]], [[1, 0.9, 0.8]] * 3, [1e-9, 0.3, 1e4], None, {}, {}, 1, 500,
+        [[0, 0, 2.0], [0.1, 0, 4.0], [0, 0.1, 7.0]],
+        [[1, 0.9, 0.8]] * 3,
+        [1e-9, 0.3, 1e4],
+        None,
+        {},
+        {},
+        1,
+        500,
     ),
     "opaque behind opaque": (
-        [[0, 0, 2.0], [0.1, 0, 4.0]], [[1, 0.9, 0.8]] * 2, [300.0, 300.0], None, {"stop": 0.0}, {}, 1, 1,
+        [[0, 0, 2.0], [0.1, 0, 4.0]],
+        [[1, 0.9, 0.8]] * 2,
+        [300.0, 300.0],
+        None,
+        {"stop": 0.0},
+        {},
+        1,
+        1,
     ),
     "no density": ([[0, 0, 2.0], [0.1, 0, 4.0]], [[1, 0.9, 0.8]] * 2, [0.0, 0.0], [TURNED] * 2, {}, {}, 1, 1),
     "coincident": ([[0.1, 0, 3.0]] * 5, [[1, 0.9, 0.8]] * 5, [0.2, 0.5, 1.0, 0.1, 0.3], [TURNED] * 5, {}, {}, 1, 1),
     "quaternions of any length": (
-        [[0.1, 0, 3.0]] * 3, [[1, 0.5, 0.8]] * 3, [0.5] * 3, [[x * s for x in TURNED] for s in (1e-6, 3.0, 1e6)], {}, {}, 1, 1,
+        [[0.1, 0, 3.0]] * 3,
+        [[1, 0.5, 0.8]] * 3,
+        [0.5] * 3,
+        [[x * s for x in TURNED] for s in (1e-6, 3.0, 1e6)],
+        {},
+        {},
+        1,
+        1,
     ),
     "nothing": ([], [], [], None, {}, {}, 1, 1),
 }
@@ -189,7 +260,9 @@ def hard(name, dtype):
     center, extent, density, rotation, options, view, *_ = HARD[name]
     parameters = octahedra(center, extent, density, rotation)
     if not center:
-        parameters = [p.reshape(0, *shape) for p, shape in zip(parameters, ((3,), (4,), (3,), (), (1, 3)), strict=False)] + parameters[5:]
+        parameters = [
+            p.reshape(0, *shape) for p, shape in zip(parameters, ((3,), (4,), (3,), (), (1, 3)), strict=False)
+        ] + parameters[5:]
     return parameters, camera(**view), options, dtype
 
 
@@ -197,7 +270,9 @@ def hard(name, dtype):
 def test_hard_cases_equal_the_twin(name):
     value, gradient = HARD[name][-2:]
     for dtype, isa in BUILDS:
-        images = assert_like_twin(hard, name, getattr(torch, dtype), isa=isa, value=value * VALUE, gradient=gradient * GRADIENT)
+        images = assert_like_twin(
+            hard, name, getattr(torch, dtype), isa=isa, value=value * VALUE, gradient=gradient * GRADIENT
+        )
     hidden = name in ("behind entirely", "behind the near plane", "off screen", "nothing")
     assert bool((images["pixels"] > 0).any()) != hidden
 
@@ -210,15 +285,17 @@ def test_principal_point_far_outside_the_image(dtype, isa):
 
 
 def test_a_million_units_from_the_origin():
-    # Both subtract the same 1e6 from sums of three products: each loses up to 3e6 eps of position, and half-axes are a tenth.
+    # Both subtract the same 1e6 from sums of three products: each loses up to 3e6 eps of position, and half-axes are a
+    # tenth.
     images = assert_like_twin(far_away, torch.float64, value=6e7, gradient=6e8)
     assert (images["opacity"] > 0.3).any()
 
 
 @pytest.mark.parametrize("gap", [1e-12, 1e-9, -1e-9, 1e-7])
 def test_edge_on_faces_move_by_two_parts_in_a_million(gap):
-    # sum(|m|) = 1 + gap: the camera is that near to the plane of a face, whose distance is kept above 2e-6 of the primitive. The
-    # face therefore moves by 2e-6 of its distance from the centre, 0.5 here, and the thickness by density |v| as much.
+    # sum(|m|) = 1 + gap: the camera is that near to the plane of a face, whose distance is kept above 2e-6 of the
+    # primitive. The face therefore moves by 2e-6 of its distance from the centre, 0.5 here, and the thickness by
+    # density |v| as much.
     center = torch.tensor([0.3, 0.2, 3.0], dtype=torch.float64)
     extent = torch.tensor([1.2, 1.0, 0.0], dtype=torch.float64)
     extent[2] = center[2] / (1 + gap - (center[:2] / extent[:2]).sum())
@@ -283,7 +360,9 @@ def test_a_density_below_zero_counts_as_zero():
 
 @pytest.mark.parametrize("dtype,isa", BUILDS)
 def test_a_zero_quaternion_is_no_rotation(dtype, isa):
-    scene = [p.to(getattr(torch, dtype)) for p in octahedra([[0.1, 0.2, 3.0], [0, 0, 4.0]], [[1, 0.5, 0.7]] * 2, [0.8, 1.0])]
+    scene = [
+        p.to(getattr(torch, dtype)) for p in octahedra([[0.1, 0.2, 3.0], [0, 0, 4.0]], [[1, 0.5, 0.7]] * 2, [0.8, 1.0])
+    ]
     view = camera()
     with kernels(isa):
         wanted = everything(scene, view)
@@ -364,7 +443,13 @@ def test_a_rigid_motion_and_a_change_of_unit_change_nothing():
     axis = np.array([skew[2, 1], skew[0, 2], skew[1, 0]]) / (2 * np.sin(angle))
     a, (b, c, d) = np.cos(angle / 2), np.sin(angle / 2) * axis
     turned = torch.stack(
-        [a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y, a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w], 1
+        [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ],
+        1,
     )
     pose = view.world_to_camera @ np.linalg.inv(motion)
     k = 37.0

@@ -1,4 +1,5 @@
-"""Gradients of the compiled rasterizer by differences, its operators, and what the backward pass keeps of the forward."""
+"""Gradients of the compiled rasterizer by differences, its operators, and what the backward pass keeps of the
+forward."""
 
 from __future__ import annotations
 
@@ -56,7 +57,9 @@ def test_the_operator_is_registered_correctly(geometry, dtype):
 
 
 def test_the_operator_without_gradients_is_registered_correctly():
-    torch.library.opcheck(torch.ops.linprim_geo.rasterize.default, operator_arguments(screen=False, requires_grad=False))
+    torch.library.opcheck(
+        torch.ops.linprim_geo.rasterize.default, operator_arguments(screen=False, requires_grad=False)
+    )
 
 
 @pytest.mark.parametrize("geometry", [False, True])
@@ -81,8 +84,8 @@ def test_gradient_of_each_input_alone_equals_that_of_all():
 
 @pytest.mark.parametrize("dtype,isa", BUILDS)
 def test_weights_of_the_adjoint_are_those_of_the_forward_pass_bit_by_bit(dtype, isa):
-    # One pixel at a time, no sum is rounded: the gradient to a primitive's coefficient of degree 0 is C0 times its weight, and
-    # `max_weight` is that weight. It is 0 exactly where the forward pass did not hit.
+    # One pixel at a time, no sum is rounded: the gradient to a primitive's coefficient of degree 0 is C0 times its
+    # weight, and `max_weight` is that weight. It is 0 exactly where the forward pass did not hit.
     met = 0
     with kernels(isa):
         for seed in range(80):
@@ -105,7 +108,9 @@ def test_colour_does_not_depend_on_whether_geometry_is_asked_for(dtype, isa):
         images = [fields(ops.rasterize(*scene, view, geometry=g), COLOR) for g in (False, True)]
     # The two kernels may be contracted differently: each rounding counts once.
     for name in COLOR:
-        torch.testing.assert_close(images[0][name], images[1][name], rtol=0, atol=200 * torch.finfo(images[0][name].dtype).eps)
+        torch.testing.assert_close(
+            images[0][name], images[1][name], rtol=0, atol=200 * torch.finfo(images[0][name].dtype).eps
+        )
 
 
 def test_gradient_to_the_background_is_the_transmittance():
@@ -119,7 +124,8 @@ def test_gradient_to_the_background_is_the_transmittance():
 
 @pytest.mark.parametrize("samples", [1, 3])
 def test_screen_gradient_is_that_of_moving_a_centre_by_a_pixel(samples):
-    # Degree 0: the colour does not turn with the centre. The loss's own third derivative bounds the difference quotient.
+    # Degree 0: the colour does not turn with the centre. The loss's own third derivative bounds the difference
+    # quotient.
     scene, view = random_scene(65, 4, 1, 25, 21, depth=4.0, spread=0.3)
     screen = torch.zeros(4, 3, dtype=torch.float64, requires_grad=True)
     weight = torch.rand(3, view.height, view.width, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
@@ -146,7 +152,9 @@ def test_two_graphs_may_be_differentiated_in_any_order_and_twice():
     first, second = (random_scene(seed, 30, 4, 40, 30) for seed in (66, 67))
     alone = [everything(*first), everything(*second)]
     inputs = [leaves(first[0]), leaves(second[0])]
-    out = [fields(ops.rasterize(*x, view, geometry=True)) for x, view in zip(inputs, (first[1], second[1]), strict=True)]
+    out = [
+        fields(ops.rasterize(*x, view, geometry=True)) for x, view in zip(inputs, (first[1], second[1]), strict=True)
+    ]
     for k in (0, 1, 1, 0):
         grads = gradients(out[k], inputs[k], cotangents(out[k]))
         assert_identical(grads, alone[k][10:16])
@@ -179,7 +187,12 @@ def test_a_list_is_taken_again_only_for_the_very_same_content():
     pose = view.world_to_camera.copy()
     pose[0, 3] += 0.1
     others = [({name: 1.3}, {}, {}) for name in NAMES]
-    others += [({}, {"fx": view.fx * 1.1}, {}), ({}, {"cy": view.cy + 2}, {}), ({}, {"world_to_camera": pose}, {}), ({}, {}, {"near": 2.9})]
+    others += [
+        ({}, {"fx": view.fx * 1.1}, {}),
+        ({}, {"cy": view.cy + 2}, {}),
+        ({}, {"world_to_camera": pose}, {}),
+        ({}, {}, {"near": 2.9}),
+    ]
     wanted = everything(scene, view)[10:16]
     for factors, numbers, options in others:
         inputs = leaves(scene)

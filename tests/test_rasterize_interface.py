@@ -37,11 +37,18 @@ def assert_finite_everywhere(scene, view, options):
     screen = torch.zeros(len(inputs[0]), 3, dtype=inputs[0].dtype, requires_grad=True)
     out = ops.rasterize(*inputs, view, geometry=True, screen=screen, **options)
     images = fields(out)
-    total = sum((image * torch.linspace(-1, 1, image.numel(), dtype=image.dtype).view_as(image)).sum() for image in images.values())
+    total = sum(
+        (image * torch.linspace(-1, 1, image.numel(), dtype=image.dtype).view_as(image)).sum()
+        for image in images.values()
+    )
     grads = torch.autograd.grad(total, [*inputs, screen])
     assert all(bool(x.isfinite().all()) for x in (*images.values(), out.max_weight, *grads))
     # 1 - T with 0 <= T <= 1, and weights T alpha with alpha <= 1 to a rounding.
-    assert 0 <= out.opacity.min() and out.opacity.max() <= 1 and out.max_weight.max() <= 1 + 4 * torch.finfo(inputs[0].dtype).eps
+    assert (
+        0 <= out.opacity.min()
+        and out.opacity.max() <= 1
+        and out.max_weight.max() <= 1 + 4 * torch.finfo(inputs[0].dtype).eps
+    )
     return bool((out.pixels > 0).any())
 
 
@@ -68,7 +75,10 @@ def test_a_thickness_beyond_float_gives_finite_numbers(isa):
 
 @pytest.mark.parametrize("isa", KERNELS)
 def test_a_denormal_axis_gives_finite_gradients(isa):
-    scene = [p.float() for p in octahedra([[0.0, 0.0, 0.0]], [[0.0255, 0.281, 2.55e-41]], [1.0], [(-0.186, -1.351, 2.53, -0.4255)])]
+    scene = [
+        p.float()
+        for p in octahedra([[0.0, 0.0, 0.0]], [[0.0255, 0.281, 2.55e-41]], [1.0], [(-0.186, -1.351, 2.53, -0.4255)])
+    ]
     inputs = leaves(scene)
     with kernels(isa):
         out = ops.rasterize(*inputs, Camera(50, 1, 3014.0, 3652.0, 25.0, 0.5, np.eye(4)), near=0.0185)
@@ -129,12 +139,19 @@ def test_impossible_cameras_are_refused(change):
     values = {k: getattr(view, k) for k in ("width", "height", "fx", "fy", "cx", "cy", "world_to_camera")}
     with pytest.raises((ValueError, RuntimeError)):
         ops.rasterize(*scene, Camera(**values | change))
-    for options, name in (({"near": 0.0}, "near"), ({"near": -1.0}, "near"), ({"stop": -1.0}, "stop"), ({"stop": 1.0}, "stop")):
+    for options, name in (
+        ({"near": 0.0}, "near"),
+        ({"near": -1.0}, "near"),
+        ({"stop": -1.0}, "stop"),
+        ({"stop": 1.0}, "stop"),
+    ):
         with pytest.raises(ValueError, match=name):
             ops.rasterize(*scene, view, **options)
 
 
-@pytest.mark.parametrize("change", [{"cx": float("nan")}, {"world_to_camera": np.full((4, 4), np.nan)}, {"fx": float("inf")}])
+@pytest.mark.parametrize(
+    "change", [{"cx": float("nan")}, {"world_to_camera": np.full((4, 4), np.nan)}, {"fx": float("inf")}]
+)
 def test_cameras_that_are_not_finite_are_refused(change):
     scene, view = random_scene(86, 5, 4)
     values = {k: getattr(view, k) for k in ("width", "height", "fx", "fy", "cx", "cy", "world_to_camera")}

@@ -127,9 +127,7 @@ def test_a_camera_aimed_at_the_apex_sees_the_apex_also_if_the_mesh_is_inside_out
         # |x| + z = 1 and depth = 3 - z with x = depth * ray_x.
         ray = (np.arange(33, 45) + 0.5 - 32.5) / 90.0
         assert np.abs(column - 2.0 / (1.0 - ray)).max() < 1e-9
-        assert normal[32, 40] == pytest.approx(
-            np.array([0.57735027, 0.57735027, 0.57735027]) * np.sign(normal[32, 40])
-        )
+        assert normal[32, 40] == pytest.approx(np.array([0.57735027, 0.57735027, 0.57735027]) * np.sign(normal[32, 40]))
         assert (normal[face >= 0][:, 2] > 0).all()
 
 
@@ -212,8 +210,12 @@ def test_single_precision_casts_agree_with_the_exact_ones():
 
 def test_first_hits_of_a_camera_are_those_of_its_pixels_and_are_kept_within_a_limit(monkeypatch):
     vertices, faces = sphere(0.1)
-    camera = Camera(40, 30, 50.0, 55.0, 19.0, 16.0, np.array([[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1.0]]))
-    other = Camera(40, 30, 50.0, 55.0, 19.0, 16.0, np.array([[1, 0, 0, 0.2], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1.0]]))
+    camera = Camera(
+        40, 30, 50.0, 55.0, 19.0, 16.0, np.array([[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1.0]])
+    )
+    other = Camera(
+        40, 30, 50.0, 55.0, 19.0, 16.0, np.array([[1, 0, 0, 0.2], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1.0]])
+    )
     monkeypatch.setattr(raycast, "KEPT_BYTES", 8 * 40 * 30)
     caster = RayCaster(vertices, faces)
     depth, face = caster.first_hits(camera)
@@ -227,7 +229,11 @@ def test_first_hits_of_a_camera_are_those_of_its_pixels_and_are_kept_within_a_li
         depth[0, 0] = 0
     # No room is left for another one, which is cast again.
     again = caster.first_hits(other)[0]
-    assert caster.first_hits(other)[0] is not again and (caster.first_hits(other)[0] == again).all() and (again != depth).any()
+    assert (
+        caster.first_hits(other)[0] is not again
+        and (caster.first_hits(other)[0] == again).all()
+        and (again != depth).any()
+    )
 
 
 def test_rays_without_meaning_and_degenerate_faces_hit_nothing():

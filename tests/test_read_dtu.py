@@ -1,4 +1,5 @@
-"""DTU scans as NeuS and IDR lay them out: projections are taken apart into the cameras they were made of, damage is named."""
+"""DTU scans as NeuS and IDR lay them out: projections are taken apart into the cameras they were made of, damage is
+named."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ SCALE = np.array([[200.0, 0, 0, 30], [0, 200, 0, -20], [0, 0, 200, 600], [0, 0, 
 
 
 def write_dtu(root, count=9, images="image", masks="mask", smaller=1, name="cameras_sphere.npz", change=None):
-    """Photographs of 32x24 and a file of cameras for photographs `smaller` times as large; returns the cameras in the sphere's frame."""
+    """Photographs of 32x24 and a file of cameras for photographs `smaller` times as large; returns the cameras in the
+    sphere's frame."""
     cameras, arrays = ring(count, shift=(1.5, -0.75)), {}
     (root / images).mkdir(parents=True)
     if masks:

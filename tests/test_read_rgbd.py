@@ -1,5 +1,5 @@
-"""RGB-D sequences of Redwood, Open3D and TUM, and Tanks and Temples' trajectories: which pose, depth map and pinhole belong to a
-photograph."""
+"""RGB-D sequences of Redwood, Open3D and TUM, and Tanks and Temples' trajectories: which pose, depth map and pinhole
+belong to a photograph."""
 
 from __future__ import annotations
 
@@ -75,9 +75,7 @@ def write_tum(root, count=6):
     return cameras
 
 
-@pytest.mark.parametrize(
-    "color, depth_name", [("image", "{:05d}"), ("color", "{:05d}"), ("rgb", "{:04d}-100")]
-)
+@pytest.mark.parametrize("color, depth_name", [("image", "{:05d}"), ("color", "{:05d}"), ("rgb", "{:04d}-100")])
 def test_redwood_frames_have_their_pose_depth_and_pinhole(tmp_path, color, depth_name):
     cameras = write_redwood(tmp_path, color=color, depth_name=depth_name)
     scene = load_scene(tmp_path)
@@ -105,9 +103,7 @@ def test_fewer_photographs_than_poses_are_named_by_the_number_of_their_pose(tmp_
     views = load_scene(tmp_path).views
     assert sorted(view.name for view in views) == ["00000", "00002", "00004", "00006"]
     for view in views:
-        np.testing.assert_allclose(
-            view.camera.world_to_camera, cameras[int(view.name)].world_to_camera, atol=1e-8
-        )
+        np.testing.assert_allclose(view.camera.world_to_camera, cameras[int(view.name)].world_to_camera, atol=1e-8)
     (tmp_path / "image" / "00002.jpg").rename(tmp_path / "image" / "two.jpg")
     (tmp_path / "depth" / "00002.png").rename(tmp_path / "depth" / "two.png")
     assert "7 poses for 4 images, such as two.jpg" in refusal(tmp_path)
@@ -231,17 +227,10 @@ def test_tanks_and_temples_by_its_trajectory(tmp_path, folder):
         picture(i).save(tmp_path / folder / f"{i + 1:06d}.jpg")
     (tmp_path / "Barn_COLMAP_SfM.log").write_text(log(cameras).replace("5 5 6\n", "5 -1 0\n"))
     (tmp_path / "Barn.json").write_text("{}")
-    assert (
-        "a trajectory without intrinsics, wanted a COLMAP model in sparse/0, or intrinsics.json"
-        in refusal(tmp_path)
-    )
+    assert "a trajectory without intrinsics, wanted a COLMAP model in sparse/0, or intrinsics.json" in refusal(tmp_path)
     (tmp_path / "intrinsics.json").write_text(json.dumps(JSON))
     scene = load_scene(tmp_path)
-    assert (
-        scene.kind == "tnt" and "000006" not in {view.name for view in scene.views} and len(scene.views) == 7
-    )
+    assert scene.kind == "tnt" and "000006" not in {view.name for view in scene.views} and len(scene.views) == 7
     for view in scene.views:
-        np.testing.assert_allclose(
-            view.camera.world_to_camera, cameras[int(view.name) - 1].world_to_camera, atol=1e-8
-        )
+        np.testing.assert_allclose(view.camera.world_to_camera, cameras[int(view.name) - 1].world_to_camera, atol=1e-8)
         assert (view.camera.fx, view.camera.cx) == (30, 16)

@@ -85,10 +85,7 @@ def test_the_fisheye_images_with_the_poses_of_colmap(tmp_path, inside):
     cameras, xyz = write_dslr(tmp_path, undistorted=True)
     scene = load_scene(tmp_path / inside)
     check(scene, cameras)
-    assert (
-        scene.train[0].lens.model == "OPENCV_FISHEYE"
-        and scene.train[0].image_path.parent.name == "resized_images"
-    )
+    assert scene.train[0].lens.model == "OPENCV_FISHEYE" and scene.train[0].image_path.parent.name == "resized_images"
     np.testing.assert_allclose(scene.points.xyz, xyz, atol=1e-9)
 
 
@@ -113,9 +110,7 @@ def test_the_phone_has_no_split_of_its_own(tmp_path):
         (phone / folder).mkdir(parents=True)
     for i in range(90):
         picture(i).save(phone / "rgb" / f"frame_{i:06d}.jpg")
-    reconstruction(cameras, [f"video/{name}" for name in names], [[0, 0, 0]]).write_text(
-        str(phone / "colmap")
-    )
+    reconstruction(cameras, [f"video/{name}" for name in names], [[0, 0, 0]]).write_text(str(phone / "colmap"))
     for path in (tmp_path, phone):
         scene = load_scene(path)
         assert len(scene.views) == 9 and [view.name for view in scene.test] == [
@@ -134,9 +129,7 @@ def test_images_of_the_benchmark_that_are_not_given_out_are_no_error_but_others_
     scene = load_scene(tmp_path)
     assert [view.name for view in scene.test] == ["DSC00007"] and len(scene.train) == 7
     (tmp_path / "dslr/resized_images/DSC00003.JPG").unlink()
-    with pytest.raises(
-        LinprimError, match="1 of the 9 images of .* are not on disk, the first is DSC00003.JPG"
-    ):
+    with pytest.raises(LinprimError, match="1 of the 9 images of .* are not on disk, the first is DSC00003.JPG"):
         load_scene(tmp_path)
 
 

@@ -81,7 +81,8 @@ def test_distortion_keys(tmp_path, keys, model, params):
 
 
 def test_what_instant_ngp_writes(tmp_path):
-    """Its script's keys: one lens for all, whole numbers as floats, sharpness per image, and a cube that nothing else asks for."""
+    """Its script's keys: one lens for all, whole numbers as floats, sharpness per image, and a cube that nothing else
+    asks for."""
     cameras = ring(5)
     content = transforms(cameras, [f"./images/{i:04d}.png" for i in range(5)])
     angles = {"camera_angle_x": 2 * math.atan(16 / 30), "camera_angle_y": 2 * math.atan(12 / 30)}
@@ -300,9 +301,7 @@ def test_training_frames_must_be_left(tmp_path):
         paths = [f"{i}.png" for i in indices]
         for i in indices:
             picture(i).save(tmp_path / f"{i}.png")
-        (tmp_path / f"transforms_{split}.json").write_text(
-            json.dumps(transforms([cameras[i] for i in indices], paths))
-        )
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(transforms([cameras[i] for i in indices], paths)))
     assert "1 of 3 images are for training" in refusal(tmp_path)
 
 

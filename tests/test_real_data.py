@@ -13,7 +13,9 @@ from linprim_geo.synth import synthesize
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data")
-    synthesize(folder / "part_small", shape="cad", views=10, test_views=2, size=40, points=300, supersample=1, threads=1)
+    synthesize(
+        folder / "part_small", shape="cad", views=10, test_views=2, size=40, points=300, supersample=1, threads=1
+    )
     (folder / "notes").mkdir()
     return folder
 
@@ -54,7 +56,9 @@ def test_a_table_is_written(data, tmp_path, capsys):
     assert row["visible_chamfer_percent_diagonal"] < 10 and row["abs_rel"] < 0.5
     assert [len(point) for point in row["curve"]] == [2, 2]
     text = (tmp_path / "real_data.md").read_text()
-    assert text.strip() in capsys.readouterr().out and "| part_small | 10+2 | 40x40 |" in text and "* part_small: " in text
+    assert (
+        text.strip() in capsys.readouterr().out and "| part_small | 10+2 | 40x40 |" in text and "* part_small: " in text
+    )
 
 
 def test_workers_give_the_same_scores(data, tmp_path, capsys):

@@ -71,9 +71,7 @@ def literal_render(parameters, camera, near=0.01, stop=1e-3, level=0.5):
     out |= {"max_weight": np.zeros(len(center)), "pixels": np.zeros(len(center), dtype=np.int64)}
     for i in range(height):
         for j in range(width):
-            ray = np.array(
-                [(j + 0.5 - camera["cx"]) / camera["fx"], (i + 0.5 - camera["cy"]) / camera["fy"], 1.0]
-            )
+            ray = np.array([(j + 0.5 - camera["cx"]) / camera["fx"], (i + 0.5 - camera["cy"]) / camera["fy"], 1.0])
             transmittance, terms = 1.0, []
             for n in sorted(range(len(center)), key=lambda n: (center[n, 2], n)):
                 t_in, t_out, outward = triangle_interval(center[n], rotation[n], extent[n], ray, near)
@@ -130,9 +128,7 @@ def test_thickness_equals_sampled_density(depth):
     rays = reference.pixel_rays(*intrinsics, parameters[0])
     turn, shift = camera["world_to_camera"][:3, :3], camera["world_to_camera"][:3, 3]
     t = tensor([[near, far]]).expand(len(rays), 2)
-    sampled = quadrature_transmittance(
-        *parameters[:4], (-turn.T @ shift).expand(len(rays), 3), rays @ turn, t, samples
-    )
+    sampled = quadrature_transmittance(*parameters[:4], (-turn.T @ shift).expand(len(rays), 3), rays @ turn, t, samples)
     bound = parameters[3].sum() * rays.norm(dim=1) * (far - near) / samples
     error = (torch.log(sampled) - torch.log(1 - result["opacity"].reshape(-1))).abs()
     assert (error <= bound).all()
@@ -166,9 +162,7 @@ def test_depths_equal_sampled_transmittance_where_nothing_overlaps():
 
 
 def test_octahedron_on_the_axis():
-    result = rasterize(
-        *octahedra([[0, 0, 5]], [[1.0, 1.0, 0.7]], [0.9], background=(0.2, 0.2, 0.2)), **axis_camera()
-    )
+    result = rasterize(*octahedra([[0, 0, 5]], [[1.0, 1.0, 0.7]], [0.9], background=(0.2, 0.2, 0.2)), **axis_camera())
     tau, t_in = 0.9 * 2 * 0.7, 5 - 0.7
     alpha = 1 - math.exp(-tau)
     assert result["opacity"][4, 4].item() == pytest.approx(alpha, rel=1e-14)
@@ -201,9 +195,7 @@ def test_entry_normals():
 def test_two_primitives_on_the_axis():
     parameters = octahedra([[0, 0, 8], [0, 0, 4]], [[1, 1, 1], [1, 1, 0.5]], [0.6, 0.5], color=[0.3, 0.9])
     pixel = {
-        name: value[..., 4, 4]
-        for name, value in rasterize(*parameters, **axis_camera()).items()
-        if value.ndim > 1
+        name: value[..., 4, 4] for name, value in rasterize(*parameters, **axis_camera()).items() if value.ndim > 1
     }
     front, back = 1 - math.exp(-0.5), math.exp(-0.5) * (1 - math.exp(-1.2))
     z = [3.5 + 2 - math.exp(-0.5) / front, 7 + 1 / 0.6 - 2 * math.exp(-1.2) / (1 - math.exp(-1.2))]
@@ -277,9 +269,7 @@ def test_parallel_faces():
 
 
 def test_order_of_ties():
-    parameters = octahedra(
-        [[0, 0, 5], [0, 0, 5], [0, 0, 4.9]], [[1, 1, 1]] * 3, [0.5] * 3, color=[0.1, 0.5, 0.9]
-    )
+    parameters = octahedra([[0, 0, 5], [0, 0, 5], [0, 0, 4.9]], [[1, 1, 1]] * 3, [0.5] * 3, color=[0.1, 0.5, 0.9])
     pixel = rasterize(*parameters, **axis_camera())["rgb"][0, 4, 4].item()
     left = math.exp(-1.0)
     assert pixel == pytest.approx((1 - left) * (0.9 + left * 0.1 + left**2 * 0.5), rel=1e-13)
@@ -399,8 +389,7 @@ def test_mean_depth_fraction():
             x = Fraction(tau)
             terms = [x**k / math.factorial(k + 2) for k in range(12)]
             expected = float(
-                sum((k + 1) * t for k, t in enumerate(terms))
-                / sum(x**k / math.factorial(k + 1) for k in range(13))
+                sum((k + 1) * t for k, t in enumerate(terms)) / sum(x**k / math.factorial(k + 1) for k in range(13))
             )
             expected = 1 - expected
         else:
@@ -423,9 +412,7 @@ def test_harmonics_are_orthonormal():
     direction = tensor(np.stack([x, y, np.broadcast_to(z[:, None], x.shape)], -1).reshape(-1, 3))
     basis = reference.sh_basis(direction, 16)
     weight = tensor(np.repeat(weight * 2 * np.pi / 16, 16))
-    torch.testing.assert_close(
-        basis.T @ (weight[:, None] * basis), torch.eye(16, dtype=torch.float64), **EXACT
-    )
+    torch.testing.assert_close(basis.T @ (weight[:, None] * basis), torch.eye(16, dtype=torch.float64), **EXACT)
 
 
 def test_harmonics_are_the_legendre_functions_with_the_condon_shortley_sign():
@@ -449,9 +436,7 @@ def test_harmonics_are_the_legendre_functions_with_the_condon_shortley_sign():
 def test_values_of_harmonics():
     basis = reference.sh_basis(tensor([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]]), 4)
     c1 = 0.4886025119029199
-    torch.testing.assert_close(
-        basis, tensor([[C0, 0, 0, -c1], [C0, -c1, 0, 0], [C0, 0, c1, 0]]), rtol=1e-15, atol=0
-    )
+    torch.testing.assert_close(basis, tensor([[C0, 0, 0, -c1], [C0, -c1, 0, 0], [C0, 0, c1, 0]]), rtol=1e-15, atol=0)
 
 
 def test_colour_is_seen_from_the_camera_to_the_centre_in_world_axes():

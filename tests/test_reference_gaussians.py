@@ -83,9 +83,7 @@ def test_gaussians_equal_the_splatting_formula(count, blur, more):
 
 def one_gaussian(extent, opacity=0.8, z=4.0, **more):
     parameters = octahedra([[0, 0, z]], [extent], [opacity])
-    return rasterize(
-        *parameters, **axis_camera(**more), primitive="gaussian", screen_filter=more.pop("k", 0.0)
-    )
+    return rasterize(*parameters, **axis_camera(**more), primitive="gaussian", screen_filter=more.pop("k", 0.0))
 
 
 def test_gaussian_on_the_axis_cap_and_floor():
@@ -113,9 +111,7 @@ def test_flat_gaussians():
             assert (result["pixels"].item() > 0) == drawn
             for name in IMAGES:
                 if result[name].requires_grad:
-                    grads = torch.autograd.grad(
-                        result[name].sum(), parameters, retain_graph=True, allow_unused=True
-                    )
+                    grads = torch.autograd.grad(result[name].sum(), parameters, retain_graph=True, allow_unused=True)
                     assert all(g is None or g.isfinite().all() for g in grads)
     # Ratios of standard deviations on either side of 1e-6, in float32 too.
     for dtype in (torch.float64, torch.float32):

@@ -65,9 +65,7 @@ def test_gradients_are_finite_through_edges_and_vertices(center, near, dtype):
     # Focal length and offsets are whole numbers, so slopes, ties and parallel faces come out exactly.
     parameters = [
         p.to(dtype).requires_grad_()
-        for p in octahedra(
-            [center, (0.0, 0.0, 4.0)], [[1, 1, 1], [2, 1, 1]], [1.0, 0.0], rotation=[IDENTITY] * 2
-        )
+        for p in octahedra([center, (0.0, 0.0, 4.0)], [[1, 1, 1], [2, 1, 1]], [1.0, 0.0], rotation=[IDENTITY] * 2)
     ]
     sh = torch.cat([parameters[4], torch.full((2, 3, 3), 0.1, dtype=dtype)], 1)
     parameters[4] = sh.detach().requires_grad_()

@@ -27,9 +27,7 @@ class Body:
     def __init__(self, primitive, center, rotation, extent):
         self.primitive, self.center, self.rotation, self.extent = primitive, center, rotation, extent
         if primitive == "octahedron":
-            self.vertices = (
-                np.array([s * extent[k] * rotation[:, k] for k in range(3) for s in (1, -1)]) + center
-            )
+            self.vertices = np.array([s * extent[k] * rotation[:, k] for k in range(3) for s in (1, -1)]) + center
         else:
             self.vertices = center + extent[:, None] * (BASIS @ rotation.T)
             self.barycentric = np.linalg.inv(np.concatenate([self.vertices, np.ones((4, 1))], 1))
@@ -112,9 +110,7 @@ def segments(chords):
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(30)
 
 
-def literal_render(
-    parameters, camera, primitive, model, order, k=0.0, near=0.01, stop=1e-3, level=0.5, far=40.0
-):
+def literal_render(parameters, camera, primitive, model, order, k=0.0, near=0.01, stop=1e-3, level=0.5, far=40.0):
     """Every output by the words of its definition, in numpy; overlap by Gauss-Legendre in each segment."""
     center, quaternion, extent, density, sh, background = (p.detach().numpy() for p in parameters)
     pose = camera["world_to_camera"].numpy()
@@ -141,9 +137,7 @@ def literal_render(
         outward[n] = body.outward(points(np.where(np.isfinite(entry[n]), entry[n], 1.0)))
         outward[n][entry[n] == near] = 0
 
-    out = {
-        name: np.zeros((3, count) if name in ("rgb", "normal", "normal_median") else count) for name in IMAGES
-    }
+    out = {name: np.zeros((3, count) if name in ("rgb", "normal", "normal_median") else count) for name in IMAGES}
     out |= {"max_weight": np.zeros(total), "pixels": np.zeros(total, dtype=np.int64)}
     for p in range(count):
         chords = {n: (entry[n][p], leave[n][p]) for n in entry if entry[n][p] < leave[n][p]}
@@ -164,13 +158,9 @@ def literal_render(
                 terms += zip(rate * absorbed, t, strict=True)
                 after = left * math.exp(-rate * (b - a))
                 if left > level >= after:
-                    median = brentq(
-                        lambda t, a=a, x=left, r=rate: x * math.exp(-r * (t - a)) - level, a, b, xtol=1e-15
-                    )
+                    median = brentq(lambda t, a=a, x=left, r=rate: x * math.exp(-r * (t - a)) - level, a, b, xtol=1e-15)
                     out["depth_median"][p] = median
-                    out["normal_median"][:, p] = sum(sigma[n] * outward[n, p] for n in inside) / (
-                        rate / length[p]
-                    )
+                    out["normal_median"][:, p] = sum(sigma[n] * outward[n, p] for n in inside) / (rate / length[p])
                 left = after
             hits = [n for n in chords if chords[n][0] < ended]
         else:
@@ -216,9 +206,7 @@ def test_equals_a_program_that_only_asks_whether_points_are_inside(primitive, mo
     seed = 40 + RUNGS.index((primitive, model, order))
     parameters, camera = scene(primitive, seed, 9, width=7, height=6, **more)
     definition = {name: camera[name] for name in ("near", "stop", "level") if name in camera}
-    result = rasterize(
-        *parameters, **camera, primitive=primitive, ray_model=model, order=order, screen_filter=k
-    )
+    result = rasterize(*parameters, **camera, primitive=primitive, ray_model=model, order=order, screen_filter=k)
     expected = literal_render(parameters, camera, primitive, model, order, k, **definition)
     assert (expected["pixels"] > 0).sum() >= 3 and (expected["depth_median"] != 0).any()
     # The search stops at 1e-15 of 40 times a slope of up to 1e2 where a ray grazes.
@@ -240,9 +228,7 @@ def moeller_trumbore(ray, a, b, c):
 
 def test_tetrahedron_is_its_four_triangles():
     quaternion, extent = [0.9, 0.3, -0.2, 0.4], [0.7, 1.4, 0.9, 1.1]
-    parameters = [
-        tensor(x) for x in ([[0.2, -0.1, 4.0]], [quaternion], [extent], [0.8], [gray(1.0)], [0.0] * 3)
-    ]
+    parameters = [tensor(x) for x in ([[0.2, -0.1, 4.0]], [quaternion], [extent], [0.8], [gray(1.0)], [0.0] * 3)]
     camera = axis_camera(24, 24, 26.0)
     result = rasterize(*parameters, **camera, primitive="tetrahedron", stop=0.0)
     turn = reference.rotation_matrix(tensor(quaternion)).numpy()
@@ -280,25 +266,22 @@ def test_tetrahedron_on_the_axis():
     ]
     parameters[0][0, :2] = tensor([1e-7, 2e-7])  # off the vertex, so that one face is entered and not three
     for model in MODELS:
-        pixel = pixel_of(
-            rasterize(*parameters, **axis_camera(), primitive="tetrahedron", ray_model=model), 4, 4
-        )
+        pixel = pixel_of(rasterize(*parameters, **axis_camera(), primitive="tetrahedron", ray_model=model), 4, 4)
         assert pixel["depth_first"].item() == pytest.approx(5 - 0.6, abs=1e-5)
         assert pixel["opacity"].item() == pytest.approx(-math.expm1(-0.9 * 0.8), abs=1e-5)
         assert (pixel["normal"] / pixel["opacity"])[2].item() == pytest.approx(-1 / 3, abs=1e-6)
 
 
 def cut_tetrahedron():
-    """A regular tetrahedron, and the octahedron and the four tetrahedra that planes through its edges' middles cut it into."""
+    """A regular tetrahedron, and the octahedron and the four tetrahedra that planes through its edges' middles cut it
+    into."""
     d, density = 1.2, 0.7
     center, turn = np.array([0.1, -0.2, 4.0]), [0.8, 0.1, 0.5, -0.3]
     vertices = d * BASIS @ reference.rotation_matrix(tensor(turn)).numpy().T
 
     def shape(kind, centers, size):
         n, columns = len(centers), 3 if kind == "octahedron" else 4
-        return [
-            tensor(x) for x in (centers, [turn] * n, [[size] * columns] * n, [density] * n, [gray(0.8)] * n)
-        ]
+        return [tensor(x) for x in (centers, [turn] * n, [[size] * columns] * n, [density] * n, [gray(0.8)] * n)]
 
     whole = shape("tetrahedron", center[None], d)
     middle = shape("octahedron", center[None], d / math.sqrt(3))
@@ -401,14 +384,10 @@ def test_every_gradient_of_overlap_with_a_filter(primitive):
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize(
-    "center,near", [((0, 0, 2), 0.01), ((1, 0, 2), 0.01), ((0, 0, 2), 1), ((0.5, 0, 0.5), 0.01)]
-)
+@pytest.mark.parametrize("center,near", [((0, 0, 2), 0.01), ((1, 0, 2), 0.01), ((0, 0, 2), 1), ((0.5, 0, 0.5), 0.01)])
 def test_gradients_are_finite_everywhere(center, near, dtype):
     # Through vertices and edges, parallel faces, coincident copies, no density, and an opaque one.
-    for (primitive, model, order), k in itertools.product(
-        [*RUNGS, ("gaussian", "exact", "center")], (0.0, 0.5)
-    ):
+    for (primitive, model, order), k in itertools.product([*RUNGS, ("gaussian", "exact", "center")], (0.0, 0.5)):
         parameters = octahedra([center, center, (0, 0, 4), (0, 0, 5)], [[1, 1, 1]] * 4, [1.0, 1.0, 0.0, 1e6])
         if primitive == "tetrahedron":
             parameters[2] = torch.full((4, 4), math.sqrt(3), dtype=torch.float64)

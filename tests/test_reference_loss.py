@@ -49,9 +49,7 @@ def test_loss_equals_windows_one_by_one(weighted):
     ssim = np.stack([literal_ssim(a[c].numpy(), b[c].numpy()) for c in range(3)])
     w = np.broadcast_to(weight.numpy() if weighted else 1.0, ssim.shape)
     for share in (0.0, 0.2, 1.0):
-        expected = (
-            (1 - share) * (w * (a - b).abs().numpy()).sum() + share * (w * (1 - ssim)).sum()
-        ) / w.sum()
+        expected = ((1 - share) * (w * (a - b).abs().numpy()).sum() + share * (w * (1 - ssim)).sum()) / w.sum()
         loss = photometric_loss(a, b, share, weight if weighted else None)
         assert loss.item() == pytest.approx(expected, rel=1e-12)
 
@@ -66,9 +64,7 @@ def test_loss_of_equal_images_is_zero():
 def test_weight_of_one_is_no_weight_and_its_scale_does_not_matter():
     a, b, weight = random_images(2)
     ones = torch.ones_like(weight)
-    assert photometric_loss(a, b, 0.2, ones).item() == pytest.approx(
-        photometric_loss(a, b, 0.2).item(), rel=1e-13
-    )
+    assert photometric_loss(a, b, 0.2, ones).item() == pytest.approx(photometric_loss(a, b, 0.2).item(), rel=1e-13)
     scaled = photometric_loss(a, b, 0.2, 7 * weight).item()
     assert scaled == pytest.approx(photometric_loss(a, b, 0.2, weight).item(), rel=1e-13)
 

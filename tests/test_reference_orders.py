@@ -29,17 +29,12 @@ def test_orders_agree_where_nothing_overlaps(primitive, model):
     spaced[:, 2] = 3.0 + 3.2 * torch.arange(6)  # extents are below 1.5
     parameters[0] = (spaced - shift) @ turn
     parameters[2], parameters[3] = 0.8 * parameters[2] + 0.2, 0.4 * parameters[3]
-    a, b, c = (
-        rasterize(*parameters, **camera, primitive=primitive, ray_model=model, order=order)
-        for order in ORDERS
-    )
+    a, b, c = (rasterize(*parameters, **camera, primitive=primitive, ray_model=model, order=order) for order in ORDERS)
     assert (a["pixels"] > 0).sum() >= 5 and (a["depth_median"] > 0).any()
     assert_same(a, b, rtol=0, atol=0)
     # Only the distortion of overlap counts the spread inside a primitive.
     assert_same(a, c, [name for name in a if name != "distortion"], rtol=1e-10, atol=1e-12)
-    assert (c["distortion"] >= a["distortion"] - 1e-13).all() and (
-        c["distortion"] > a["distortion"] + 1e-4
-    ).any()
+    assert (c["distortion"] >= a["distortion"] - 1e-13).all() and (c["distortion"] > a["distortion"] + 1e-4).any()
 
 
 def nested(order, **more):
@@ -159,9 +154,7 @@ def test_depth_variance_and_mean_transmittance():
         for tau in (1e-9, 1e-3, 0.1, 0.2499, 0.25, 0.3, 1.0, 5.0, 40.0, 1e3):
             x = mpmath.mpf(tau)
             variance = float(1 / x**2 - mpmath.exp(-x) / mpmath.expm1(-x) ** 2)
-            assert reference_blend.depth_variance_fraction(tensor(tau)).item() == pytest.approx(
-                variance, rel=4.5e-14
-            )
+            assert reference_blend.depth_variance_fraction(tensor(tau)).item() == pytest.approx(variance, rel=4.5e-14)
             mean = float(-mpmath.expm1(-x) / x)
             assert reference_blend.mean_transmittance(tensor(tau)).item() == pytest.approx(mean, rel=2e-15)
     assert reference_blend.depth_variance_fraction(tensor(0.0)).item() == pytest.approx(1 / 12, rel=1e-15)
@@ -225,8 +218,7 @@ def test_screen_filter_keeps_the_thickness_of_the_screen(primitive, model):
     # Small, so that |v| hardly changes over it: exact thickness carries the |v| of the true pixel.
     extent = [0.003, 0.004, 0.002] if primitive == "octahedron" else [0.003, 0.004, 0.002, 0.005]
     parameters = [
-        tensor(x)
-        for x in ([[0.1, 0.2, 2.0]], [[0.9, 0.2, -0.4, 0.1]], [extent], [3.0], [gray(1.0)], [0.0] * 3)
+        tensor(x) for x in ([[0.1, 0.2, 2.0]], [[0.9, 0.2, -0.4, 0.1]], [extent], [3.0], [gray(1.0)], [0.0] * 3)
     ]
     focal = 4e4
     camera = axis_camera(300, 300, focal) | dict(cx=150.2 - focal * 0.05, cy=149.7 - focal * 0.1)
@@ -235,11 +227,7 @@ def test_screen_filter_keeps_the_thickness_of_the_screen(primitive, model):
     options = dict(primitive=primitive, ray_model=model)
     wide, narrow = (
         [
-            np.ptp(
-                np.nonzero(rasterize(*parameters, **camera, **options, screen_filter=k)["opacity"].numpy())[
-                    axis
-                ]
-            )
+            np.ptp(np.nonzero(rasterize(*parameters, **camera, **options, screen_filter=k)["opacity"].numpy())[axis])
             for axis in (0, 1)
         ]
         for k in (90.0, 0.0)

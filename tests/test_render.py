@@ -40,9 +40,7 @@ def test_files_of_every_view(tiny_run, tmp_path):
     assert report == {"output": str(tmp_path / "r"), "views": 3, "files": 33}
     written = sorted(str(path.relative_to(tmp_path / "r")) for path in (tmp_path / "r").rglob("*.*"))
     wanted = [f"test/rgb/test_00{i}.png" for i in range(3)]
-    wanted += [
-        f"test/{kind}/test_00{i}.{suffix}" for kind in FLOATS for i in range(3) for suffix in ("npy", "png")
-    ]
+    wanted += [f"test/{kind}/test_00{i}.{suffix}" for kind in FLOATS for i in range(3) for suffix in ("npy", "png")]
     assert written == sorted(wanted)
     for kind in FLOATS:
         array = np.load(tmp_path / "r" / "test" / kind / "test_001.npy", allow_pickle=False)

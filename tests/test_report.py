@@ -48,9 +48,7 @@ def made(meshed) -> tuple[dict, str, ElementTree.Element]:
     before = {file: file.stat().st_mtime_ns for file in meshed.rglob("*") if file.is_file()}
     result = report_run(meshed)
     after = {
-        file: file.stat().st_mtime_ns
-        for file in meshed.rglob("*")
-        if file.is_file() and file.name != "report.html"
+        file: file.stat().st_mtime_ns for file in meshed.rglob("*") if file.is_file() and file.name != "report.html"
     }
     assert after == before  # nothing else in the run is touched
     text = Path(result["report"]).read_text(encoding="utf-8")
@@ -79,9 +77,7 @@ def test_all_parts_are_there(made):
         assert said in words, words
     cost = "".join(sections["cost"].itertext())
     assert all(stage in cost for stage in ("training", "fuse", "visibility", "total"))
-    assert "v" in "".join(sections["repeat"].itertext()) and "boundary" in "".join(
-        sections["mesh"].itertext()
-    )
+    assert "v" in "".join(sections["repeat"].itertext()) and "boundary" in "".join(sections["mesh"].itertext())
 
 
 def test_nothing_is_fetched_and_names_are_escaped(made, meshed):
@@ -113,9 +109,7 @@ def test_pictures_are_those_of_the_views(made, meshed):
         for image in figure.iter("img"):
             assert image.get("alt").endswith(f"of {name}") and len(image.get("alt")) > len(name) + 4
             data = base64.b64decode(image.get("src").partition(",")[2])
-            pictures[image.get("alt").split(",")[0].split(" of ")[0]] = np.asarray(
-                Image.open(io.BytesIO(data))
-            )
+            pictures[image.get("alt").split(",")[0].split(" of ")[0]] = np.asarray(Image.open(io.BytesIO(data)))
         assert list(pictures) == [
             "photograph",
             "render",
@@ -127,9 +121,7 @@ def test_pictures_are_those_of_the_views(made, meshed):
         ]
         assert np.array_equal(pictures["photograph"], composite(by_name[name].load(), run.background))
         (_, images) = next(run.render_views([by_name[name]]))
-        assert (
-            np.abs(pictures["render"] - 255.0 * np.clip(images["rgb"], 0, 1).transpose(1, 2, 0)).max() <= 0.51
-        )
+        assert np.abs(pictures["render"] - 255.0 * np.clip(images["rgb"], 0, 1).transpose(1, 2, 0)).max() <= 0.51
         assert all(len(np.unique(each.reshape(-1, 3), axis=0)) > 5 for each in pictures.values())
         shown_psnr.append(float(re.search(r"PSNR ([\d.]+) dB", figure.find("figcaption").text)[1]))
     assert shown_psnr == sorted(shown_psnr)  # from the worst to the best
@@ -143,10 +135,7 @@ def test_the_mesh_of_the_page_is_the_mesh_of_the_file(made, meshed, tiny_scene):
     places, index = array(shown["places"], "<u2", 4), array(shown["index"], "<u4", 3)
     assert np.array_equal(index, mesh.faces) and shown["faces"] == len(mesh.faces)
     low, high = mesh.bounds
-    assert (
-        np.abs(low + places[:, :3] / 65535 * (high - low) - mesh.vertices).max()
-        <= 0.51 * (high - low).max() / 65535
-    )
+    assert np.abs(low + places[:, :3] / 65535 * (high - low) - mesh.vertices).max() <= 0.51 * (high - low).max() / 65535
     names = [layer["name"] for layer in shown["layers"]]
     assert names == ["photographs", "shape", "predicted error", "true error"]
     colors = {layer["name"]: array(layer["colors"], "u1", 3) for layer in shown["layers"]}
@@ -188,24 +177,29 @@ def test_a_run_without_mesh_scores_and_capture_says_so(run_copy, tiny_scene, tmp
     assert "capture cannot be read" in said and "gone" in said and "run.json is missing" in said
     text = Path(result["report"]).read_text()
     tree = ElementTree.fromstring(text.removeprefix("<!DOCTYPE html>\n"))
-    assert (
-        sum(1 for _ in tree.iter("svg")) == 1
-        and not list(tree.iter("canvas"))
-        and not list(tree.iter("script"))
-    )
+    assert sum(1 for _ in tree.iter("svg")) == 1 and not list(tree.iter("canvas")) and not list(tree.iter("script"))
     assert all(html.escape(sentence) in text for sentence in result["missing"])
 
 
 def test_effects_that_were_decided_are_shown(run_copy):
     config = json.loads((run_copy / "config.json").read_text())
-    effect = {"name": "exposure", "what": "a gain <each>", "evidence": "spread", "value": 7.25, "unit": "%", "threshold": 3.0,
-              "on": True, "reason": "data", "cost": 1.03, "options": {}, "note": ""}  # fmt: skip
+    effect = {
+        "name": "exposure",
+        "what": "a gain <each>",
+        "evidence": "spread",
+        "value": 7.25,
+        "unit": "%",
+        "threshold": 3.0,
+        "on": True,
+        "reason": "data",
+        "cost": 1.03,
+        "options": {},
+        "note": "",
+    }
     (run_copy / "config.json").write_text(
         json.dumps(config | {"effects": [effect, effect | {"name": "lens", "value": None, "on": False}]})
     )
-    tree = ElementTree.fromstring(
-        Path(report_run(run_copy)["report"]).read_text().removeprefix("<!DOCTYPE html>\n")
-    )
+    tree = ElementTree.fromstring(Path(report_run(run_copy)["report"]).read_text().removeprefix("<!DOCTYPE html>\n"))
     section = next(each for each in tree.iter("section") if each.get("id") == "decisions")
     rows = [[cell.text for cell in row.iter("td")] for row in section.iter("tr")]
     assert ["exposure", "on", "the data say so", "spread: 7.25 %", "3 %", "a gain <each>"] in rows
@@ -251,9 +245,7 @@ def test_a_reference_is_scored_against_without_leaving_results(run_copy, tiny_sc
 def test_the_command_prints_one_object(run_copy, capfd, tmp_path):
     assert cli.main(["report", str(run_copy), "-o", str(tmp_path / "r.html"), "--json"]) == 0
     shown = capfd.readouterr()
-    assert (
-        json.loads(shown.out)["views"] == 3 and shown.out.count("\n") == 1 and (tmp_path / "r.html").exists()
-    )
+    assert json.loads(shown.out)["views"] == 3 and shown.out.count("\n") == 1 and (tmp_path / "r.html").exists()
     assert cli.main(["report", str(tmp_path)]) == 1
     assert "config.json is missing" in capfd.readouterr().err
 
@@ -275,11 +267,7 @@ def test_a_light_mesh_is_near_the_old_one():
     assert np.abs(np.linalg.norm(light.vertices - [500.0, -20.0, 3.0], axis=1) - 2.0).max() < 0.1 * cell
     assert np.linalg.norm(mesh.vertices[rows] - light.vertices, axis=1).max() < cell
     same, rows, cell = light_mesh(mesh, len(mesh.faces))
-    assert (
-        cell == 0
-        and np.array_equal(same.faces, mesh.faces)
-        and np.array_equal(rows, np.arange(len(mesh.vertices)))
-    )
+    assert cell == 0 and np.array_equal(same.faces, mesh.faces) and np.array_equal(rows, np.arange(len(mesh.vertices)))
 
 
 def test_errors_share_one_scale_and_unknown_ones_are_grey():
@@ -322,18 +310,14 @@ def test_cameras_within_a_mesh_are_told_from_those_around_it(tiny_scene):
 
 
 def test_curves_go_through_their_points():
-    text = svg.curves(
-        [("a & b", [0, 50, 100], [1.0, 10.0, 100.0]), ("held", [100], [50])], "step", "loss", log=True
-    )
+    text = svg.curves([("a & b", [0, 50, 100], [1.0, 10.0, 100.0]), ("held", [100], [50])], "step", "loss", log=True)
     tree = ElementTree.fromstring(text)
     assert "a & b: 100" in tree.get("aria-label") and "held: 50" in tree.get("aria-label")
     curve = next(each for each in tree.iter("path") if each.get("d").startswith(f"M{svg.LEFT}.0 "))
     point = next(each for each in tree.iter("path") if "point" in each.get("class"))
     places = np.array([[float(x) for x in place.split()] for place in curve.get("d")[1:].split("L")])
     assert places[0, 0] == svg.LEFT and places[2, 0] == svg.WIDTH - svg.RIGHT
-    assert places[1, 1] == pytest.approx(
-        places[[0, 2], 1].mean(), abs=0.1
-    )  # 10 lies half-way between 1 and 100
+    assert places[1, 1] == pytest.approx(places[[0, 2], 1].mean(), abs=0.1)  # 10 lies half-way between 1 and 100
     assert point.get("d").startswith(f"M{places[2, 0]:.1f}")
     axis = svg.Axis([0, 7000], 0, 100, log=False, room=0.0)
     assert axis.ticks() == [0, 2000, 4000, 6000] and axis.at(3500) == 50

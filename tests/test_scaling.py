@@ -21,7 +21,11 @@ def rows_of(true: scaling.Fit, noise: float = 0.0) -> list[dict]:
     rng, rows = np.random.default_rng(0), []
     for photos, downscale, primitives in scaling.SIZES:
         pixels = (160 // downscale) ** 2
-        values = (true.seconds_of_setup(photos, pixels), true.seconds_of_step(pixels, primitives), true.gib(photos, pixels, primitives))
+        values = (
+            true.seconds_of_setup(photos, pixels),
+            true.seconds_of_step(pixels, primitives),
+            true.gib(photos, pixels, primitives),
+        )
         size = {"photos": photos, "pixels": pixels, "primitives": primitives}
         values = (*values, true.seconds_of_filling(photos))
         factors = np.exp(noise * rng.normal(size=4))
@@ -50,9 +54,9 @@ def test_predictions_grow_with_the_photographs_and_a_worker_does_not():
     for name in ("core_hours", "storage_gib", "network_gib"):
         assert 90 < many[name] / some[name] <= 101, name
     assert many["gib_per_worker"] == pytest.approx(some["gib_per_worker"], rel=1e-6)
-    # By hand: a block of 24,000 is 60 x 200 steps over 60 % of 2 million pixels, the first 65 % of them with a margin of a fifth of its
-    # side all round and before 20,000 coarse ones, the others before 100,000 of the nearest blocks, too; four setups, each with two renders
-    # of 200 photographs at a third of a step; and points filled up once.
+    # By hand: a block of 24,000 is 60 x 200 steps over 60 % of 2 million pixels, the first 65 % of them with a margin
+    # of a fifth of its side all round and before 20,000 coarse ones, the others before 100,000 of the nearest blocks,
+    # too; four setups, each with two renders of 200 photographs at a third of a step; and points filled up once.
     alone, joined = 1.4**2 * 24_000 + 20_000, 1.4**2 * 24_000 + 120_000
     first_step, step = (0.002 + 4e-7 * 1.2e6 + 3e-6 * held for held in (alone, joined))
     coarse_step = 0.002 + 4e-7 * 5e5 + 3e-6 * 20_000
@@ -80,7 +84,9 @@ def test_a_street_is_a_closed_surface_seen_from_inside():
     directions = np.random.default_rng(0).normal(size=(500, 3))
     assert (caster.cast_single(np.array([HOUSE, WIDTH / 2, 1.5]), directions.astype(np.float32))[1] >= 0).all()
     again = street(2)
-    assert np.array_equal(mesh.vertices, again.vertices) and not np.array_equal(street(2, seed=1).vertices.shape, mesh.vertices.shape)
+    assert np.array_equal(mesh.vertices, again.vertices) and not np.array_equal(
+        street(2, seed=1).vertices.shape, mesh.vertices.shape
+    )
 
 
 def test_distances_are_to_borders_between_blocks_only():
@@ -105,10 +111,17 @@ def test_scaling_measures_fits_and_writes_its_table(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_block_quality_writes_its_table(tmp_path):
     given = ["--houses", "3", "--views", "24", "--size", "48", "--points", "6000", "--blocks", "1", "2"]
-    assert block_quality.main(["-o", str(tmp_path), *given, "--iterations", "120", "--max-primitives", "400", "--workers", "2"]) == 0
+    assert (
+        block_quality.main(
+            ["-o", str(tmp_path), *given, "--iterations", "120", "--max-primitives", "400", "--workers", "2"]
+        )
+        == 0
+    )
     rows = json.loads((tmp_path / "block_quality.json").read_text())["rows"]
     assert [row["blocks"] for row in rows] == [1, 2]
     for row in rows:
-        assert row["psnr"] > 12 and 0 < row["chamfer"] < 5 and 0 < row["near"] < 1 and row["seam"] > 0 and row["gib"] > 0.1
+        assert (
+            row["psnr"] > 12 and 0 < row["chamfer"] < 5 and 0 < row["near"] < 1 and row["seam"] > 0 and row["gib"] > 0.1
+        )
     assert "| 2 |" in (tmp_path / "block_quality.md").read_text()
     assert block_quality.main(["-o", str(tmp_path / "x"), "--blocks", "1"]) == 1

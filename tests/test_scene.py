@@ -29,9 +29,7 @@ def test_every_eighth_by_name_is_held_out(tmp_path):
     assert [view.name for view in scene.test] == ["00", "08"]
     assert [view.name for view in scene.train] == ["01", "02", "03", "04", "05", "06", "07", "09"]
     for view in scene.views:
-        np.testing.assert_allclose(
-            view.camera.world_to_camera, cameras[int(view.name)].world_to_camera, atol=1e-12
-        )
+        np.testing.assert_allclose(view.camera.world_to_camera, cameras[int(view.name)].world_to_camera, atol=1e-12)
 
 
 def test_the_split_does_not_depend_on_the_order_of_frames(tmp_path):
@@ -111,9 +109,7 @@ def test_alpha_channel_is_foreground_and_all_opaque_counts_as_none(tmp_path):
     assert full.train[0].load().alpha is None
 
 
-@pytest.mark.parametrize(
-    "folder, pattern", [("masks", "{}.png"), ("mask", "{}.png"), ("masks", "{}.png.png")]
-)
+@pytest.mark.parametrize("folder, pattern", [("masks", "{}.png"), ("mask", "{}.png"), ("masks", "{}.png.png")])
 def test_mask_folders_are_found(tmp_path, folder, pattern):
     write_transforms(tmp_path, 4)
     (tmp_path / folder).mkdir()

@@ -1,4 +1,5 @@
-"""Optical depths of segments by the compiled tree against closed forms and a float64 sum over every face of every primitive."""
+"""Optical depths of segments by the compiled tree against closed forms and a float64 sum over every face of every
+primitive."""
 
 from __future__ import annotations
 
@@ -36,11 +37,14 @@ def tree_of(p: Primitives, dtype=torch.float64) -> SolidTree:
 def depths(tree, origin, ends, begin=None, most=np.inf) -> np.ndarray:
     start = None if begin is None else torch.from_numpy(np.asarray(begin, dtype=np.float64))
     points = torch.from_numpy(np.asarray(ends, dtype=np.float64).reshape(-1, 3))
-    return tree.optical_depth(torch.from_numpy(np.asarray(origin, dtype=np.float64)), points, begin=start, most=most).numpy()
+    return tree.optical_depth(
+        torch.from_numpy(np.asarray(origin, dtype=np.float64)), points, begin=start, most=most
+    ).numpy()
 
 
 def sum_over_faces(p: Primitives, origin, ends, begin=0.0) -> np.ndarray:
-    """Each segment is clipped by the plane of each face of each primitive, as its vertices give it: no slabs, no tree."""
+    """Each segment is clipped by the plane of each face of each primitive, as its vertices give it: no slabs, no
+    tree."""
     faces = KINDS[p.kind].faces
     corners = p.vertices[:, faces]
     normal = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
@@ -88,8 +92,8 @@ def test_one_octahedron_in_closed_form():
 
 
 def test_one_tetrahedron_in_closed_form():
-    # From the middle to a vertex at distance e, and away from it to the face opposite: barycentric coordinates are equal to
-    # 1 / 4 in the middle of a regular one, so the face lies a third as far.
+    # From the middle to a vertex at distance e, and away from it to the face opposite: barycentric coordinates are
+    # equal to 1 / 4 in the middle of a regular one, so the face lies a third as far.
     one = Primitives([[1, 2, 3]], [[1, 0, 0, 0]], [[0.6, 0.6, 0.6, 0.6]], [5.0], np.zeros((1, 1, 3)), "tetrahedron")
     tree, axis = tree_of(one), np.array([1.0, -1.0, -1.0]) / np.sqrt(3)
     middle, extent = np.array([1.0, 2.0, 3.0]), float(np.float32(0.6))
@@ -116,7 +120,8 @@ def test_segments_parallel_to_faces_and_axes():
         start = np.array([shift / 2 - 5, shift / 2 + 5, 0.25])
         assert depths(tree, start, [start + [10, -10, 0]]) == pytest.approx(wanted, abs=1e-12)
     assert depths(tree, (-3, 0, 1.0 + 1e-9), [(3, 0, 1.0 + 1e-9)]) == 0
-    # In the plane of a face, along an edge and through a vertex: the result is finite, and that of one side or of the other.
+    # In the plane of a face, along an edge and through a vertex: the result is finite, and that of one side or of the
+    # other.
     for start, end in (((-4, 5, 0), (6, -5, 0)), ((1, -3, 0), (1, 3, 0)), ((0, 0, 1), (5, 0, 1))):
         assert 0 <= depths(tree, start, [end])[0] <= np.sqrt(2) + 1e-9
 
@@ -137,7 +142,9 @@ def test_what_does_not_absorb_is_left_out():
     tensors[1][5] = 0
     tree = SolidTree(*tensors)
     assert len(tree) == 2
-    plain = Primitives(p.center[[0, 5]], [p.rotation[0], [1, 0, 0, 0]], p.extent[[0, 5]], p.density[[0, 5]], p.sh[[0, 5]])
+    plain = Primitives(
+        p.center[[0, 5]], [p.rotation[0], [1, 0, 0, 0]], p.extent[[0, 5]], p.density[[0, 5]], p.sh[[0, 5]]
+    )
     ends = np.concatenate([p.center + 1e-3, p.center - 0.05])
     assert np.abs(depths(tree, ORIGIN, ends) - sum_over_faces(plain, ORIGIN, ends)).max() < 1e-11
 
@@ -166,7 +173,9 @@ def test_no_value_depends_on_threads_or_on_other_ends(name):
 
 def test_primitives_in_the_same_place():
     p = primitives(8, 1)
-    same = Primitives(*(np.repeat(getattr(p, n), 37, axis=0) for n in ("center", "rotation", "extent", "density", "sh")))
+    same = Primitives(
+        *(np.repeat(getattr(p, n), 37, axis=0) for n in ("center", "rotation", "extent", "density", "sh"))
+    )
     ends = p.center + np.array([[0.01, 0, 0], [0, 0.02, 0.5], [3, 3, 3]])
     assert depths(tree_of(same), ORIGIN, ends) == pytest.approx(37 * depths(tree_of(p), ORIGIN, ends), rel=1e-12)
 

@@ -46,7 +46,9 @@ def square(z: float, x: float, half: float, count: int) -> tuple[np.ndarray, np.
     vertices = np.column_stack([grid, np.full(len(grid), z)])
     corner = (np.arange(count - 1)[:, None] * count + np.arange(count - 1)).ravel()
     below = corner + count
-    return vertices, np.concatenate([np.stack([corner, corner + 1, below], 1), np.stack([corner + 1, below + 1, below], 1)])
+    return vertices, np.concatenate(
+        [np.stack([corner, corner + 1, below], 1), np.stack([corner + 1, below + 1, below], 1)]
+    )
 
 
 def test_a_piece_that_floats_before_one_camera_is_left_out():

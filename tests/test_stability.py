@@ -1,4 +1,5 @@
-"""The hard cases on every rung of the ladder, properties that random scenes must have, and the table's own reference."""
+"""The hard cases on every rung of the ladder, properties that random scenes must have, and the table's own
+reference."""
 
 from __future__ import annotations
 
@@ -81,24 +82,28 @@ def test_the_reference_of_many_scenes_is_the_twin(name, ray_model):
         count = 2
         scenes = generate(name, primitive, ray_model, count, seed=2)
         if name == "coincident":
-            scenes = many_scenes.replace(
-                scenes, **{k: getattr(scenes, k)[:, :10] for k in many_scenes.PARAMETERS}
-            )
+            scenes = many_scenes.replace(scenes, **{k: getattr(scenes, k)[:, :10] for k in many_scenes.PARAMETERS})
         for order in ("center", "entry", "overlap")[: 1 if primitive == "gaussian" else 3]:
             rgb, opacity = many_scenes.render(scenes, order)
             for i in range(count):
                 parameters, view, options = one_scene(scenes, i)
-                if (
-                    primitive == "octahedron"
-                    and not (parameters[2] > 0).all()
-                    or not parameters[1].any(dim=1).all()
-                ):
+                if primitive == "octahedron" and not (parameters[2] > 0).all() or not parameters[1].any(dim=1).all():
                     continue  # what the twin does not take
                 wanted = reference.rasterize(
-                    *parameters, world_to_camera=torch.from_numpy(view.world_to_camera), fx=view.fx, fy=view.fy, cx=view.cx, cy=view.cy,
-                    width=view.width, height=view.height, order=order, geometry=False, **options,
-                )  # fmt: skip
-                # The twin loses the digits of distance over thickness, and those that the kernel's own double set-up may lose.
+                    *parameters,
+                    world_to_camera=torch.from_numpy(view.world_to_camera),
+                    fx=view.fx,
+                    fy=view.fy,
+                    cx=view.cx,
+                    cy=view.cy,
+                    width=view.width,
+                    height=view.height,
+                    order=order,
+                    geometry=False,
+                    **options,
+                )
+                # The twin loses the digits of distance over thickness, and those that the kernel's own double set-up
+                # may lose.
                 off = many_scenes.rounding(scenes, many_scenes.chords(scenes), 2.0**-52, True)[i].sum()
                 bound = 1e-11 + 100 * float(off)
                 if primitive == "tetrahedron":  # nor are its normals, from differences of vertices
@@ -115,11 +120,13 @@ def exact_thickness(scenes, index: int) -> float:
         w, x, y, z = (mpmath.mpf(v) for v in s.rotation[0, 0].tolist())
         n = mpmath.sqrt(w * w + x * x + y * y + z * z)
         w, x, y, z = w / n, x / n, y / n, z / n
-        turn = mpmath.matrix([
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ])  # fmt: skip
+        turn = mpmath.matrix(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
         pose = m(s.pose[0])
         axes, center = pose[:3, :3] * turn, pose[:3, :3] * m(s.center[0, 0]) + pose[:3, 3]
         row, column = divmod(int(s.aimed[0]), s.width)
@@ -159,20 +166,14 @@ def test_every_class_is_drawn_and_says_what_it_is():
 
 def test_scenes_are_the_same_for_the_same_seed():
     a, b, c = (generate("needles", "octahedron", "exact", 5, seed) for seed in (4, 4, 5))
-    assert (
-        torch.equal(a.center, b.center)
-        and torch.equal(a.density, b.density)
-        and not torch.equal(a.center, c.center)
-    )
+    assert torch.equal(a.center, b.center) and torch.equal(a.density, b.density) and not torch.equal(a.center, c.center)
 
 
 # --- the table ---
 
 
 def test_the_command_prints_its_table_as_json(capsys):
-    status = stability.main(
-        ["--json", "--cases", "32", "--gradients", "4", "--classes", "ordinary", "needles"]
-    )
+    status = stability.main(["--json", "--cases", "32", "--gradients", "4", "--classes", "ordinary", "needles"])
     document = json.loads(capsys.readouterr().out)
     assert status == 0 and {row["name"] for row in document["classes"]} == {"ordinary", "needles"}
     for row in document["classes"]:
@@ -190,13 +191,18 @@ def test_the_command_fails_where_a_figure_does(capsys, monkeypatch):
 
 @pytest.mark.parametrize(
     "change,word",
-    [({"nonfinite": 1}, "NaN"), ({"outside": 1}, "opacity"), ({"over_bound": 1.5}, "bound"), ({"over_bound": math.nan}, "bound"),
-     ({"close": 0.5}, "within"), ({"gradient": 1.5}, "magnitude"), ({"gradient": math.nan}, "magnitude")],
-)  # fmt: skip
+    [
+        ({"nonfinite": 1}, "NaN"),
+        ({"outside": 1}, "opacity"),
+        ({"over_bound": 1.5}, "bound"),
+        ({"over_bound": math.nan}, "bound"),
+        ({"close": 0.5}, "within"),
+        ({"gradient": 1.5}, "magnitude"),
+        ({"gradient": math.nan}, "magnitude"),
+    ],
+)
 def test_figures_name_what_does_not_hold(change, word):
-    good = dict(
-        name="ordinary", primitive="octahedron", rung="exact-center-float32", cases=100, gradient_cases=100
-    )
+    good = dict(name="ordinary", primitive="octahedron", rung="exact-center-float32", cases=100, gradient_cases=100)
     assert not stability.Figures(**good).problems()
     (problem,) = stability.Figures(**good, **change).problems()
     assert word in problem
@@ -233,16 +239,22 @@ def test_no_primitive_and_one_in_images_of_any_shape(rung, dtype):
     options = options_of(rung)
     for (width, height), count in itertools.product(((1, 1), (1, 5000), (5000, 1)), (0, 1)):
         focal = max(4.0, 0.8 * max(width, height))
-        parameters, view = scene_of(
-            rung, 5, 1, width=width, height=height, depth=2.0, spread=0.05, focal=focal
-        )
+        parameters, view = scene_of(rung, 5, 1, width=width, height=height, depth=2.0, spread=0.05, focal=focal)
         parameters = [p[:count] if i < 5 else p for i, p in enumerate(parameters)]
         assert assert_finite([p.to(dtype) for p in parameters], view, options) == (count == 1)
         if width == height == count == 1:
             wanted = reference.rasterize(
-                *parameters, world_to_camera=torch.from_numpy(view.world_to_camera), fx=view.fx, fy=view.fy, cx=view.cx, cy=view.cy,
-                width=1, height=1, geometry=False, **options,
-            )  # fmt: skip
+                *parameters,
+                world_to_camera=torch.from_numpy(view.world_to_camera),
+                fx=view.fx,
+                fy=view.fy,
+                cx=view.cx,
+                cy=view.cy,
+                width=1,
+                height=1,
+                geometry=False,
+                **options,
+            )
             got = ops.rasterize(*[p.to(dtype) for p in parameters], view, **options).rgb.double()
             torch.testing.assert_close(got, wanted["rgb"], rtol=0, atol=1e3 * torch.finfo(dtype).eps)
 
@@ -256,9 +268,7 @@ def test_nothing_in_view_leaves_the_background_and_no_gradient(rung, dtype):
     inputs = leaves(parameters, dtype)
     view = Camera(view.width, view.height, view.fx, view.fy, view.cx, view.cy, pose)
     out = ops.rasterize(*inputs, view, geometry=True, **options)
-    assert (
-        torch.equal(out.rgb, inputs[5].detach()[:, None, None].expand_as(out.rgb)) and not out.opacity.any()
-    )
+    assert torch.equal(out.rgb, inputs[5].detach()[:, None, None].expand_as(out.rgb)) and not out.opacity.any()
     assert not any(getattr(out, name).any() for name in IMAGES[1:]) and not out.pixels.any()
     grads = torch.autograd.grad(out.rgb.sum() + out.depth_expected.sum(), inputs, allow_unused=True)
     assert not any(g.any() for g in grads[:5] if g is not None)
@@ -268,28 +278,28 @@ def test_nothing_in_view_leaves_the_background_and_no_gradient(rung, dtype):
 
 # Deterministic: a failure is the same for everybody, and is then kept as a named case below.
 PROPERTY = settings(
-    max_examples=8, deadline=None, derandomize=True, database=None,
+    max_examples=8,
+    deadline=None,
+    derandomize=True,
+    database=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)  # fmt: skip
+)
 seeds = st.integers(0, 10**6)
 
 
 def quaternion_product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Of (4,) and (N, 4), w x y z."""
     aw, av, bw, bv = a[0], a[1:], b[:, :1], b[:, 1:]
-    return torch.cat(
-        [aw * bw - (bv @ av)[:, None], aw * bv + bw * av + torch.linalg.cross(av.expand_as(bv), bv)], 1
-    )
+    return torch.cat([aw * bw - (bv @ av)[:, None], aw * bv + bw * av + torch.linalg.cross(av.expand_as(bv), bv)], 1)
 
 
 def assert_near(rung, got, wanted, units, eps: float, names=IMAGES):
-    """Images that agree to 400 roundings of their range, but for a ray in a thousand that meets an edge or a tie of depths."""
+    """Images that agree to 400 roundings of their range, but for a ray in a thousand that meets an edge or a tie of
+    depths."""
     for name, unit in zip(names, units, strict=True):
         a, b = getattr(got, name).double(), unit * getattr(wanted, name).double()
         off = (a - b).abs() > 400 * eps * (unit * (10 if name.startswith(("depth", "dist")) else 1) + b.abs())
-        assert int(off.sum()) <= max(1, off.numel() // 200), (
-            f"{name}: {int(off.sum())} of {off.numel()} pixels differ"
-        )
+        assert int(off.sum()) <= max(1, off.numel() // 200), f"{name}: {int(off.sum())} of {off.numel()} pixels differ"
 
 
 @given(seeds, st.floats(-3, 3))
@@ -309,10 +319,7 @@ def test_a_rigid_motion_of_scene_and_camera_changes_nothing(rung, seed, distance
     pose[:3, :3] = pose[:3, :3] @ matrix.numpy().T
     pose[:3, 3] -= pose[:3, :3] @ shift
     other = Camera(view.width, view.height, view.fx, view.fy, view.cx, view.cy, pose)
-    images = [
-        ops.rasterize(*p, v, geometry=True, stop=0.0, **options)
-        for p, v in ((moved, other), (parameters, view))
-    ]
+    images = [ops.rasterize(*p, v, geometry=True, stop=0.0, **options) for p, v in ((moved, other), (parameters, view))]
     assert_near(rung, *images, [1.0] * len(IMAGES), 1e3 * 2.3e-16 * (1 + 10**distance))
 
 
@@ -333,8 +340,7 @@ def test_a_change_of_unit_changes_nothing(rung, dtype, seed, exponent):
     other = Camera(view.width, view.height, view.fx, view.fy, view.cx, view.cy, pose)
     cases = ((scaled, other, 0.01 * k), (parameters, view, 0.01))
     images = [
-        ops.rasterize(*[x.to(dtype) for x in p], v, geometry=True, stop=0.0, near=n, **options)
-        for p, v, n in cases
+        ops.rasterize(*[x.to(dtype) for x in p], v, geometry=True, stop=0.0, near=n, **options) for p, v, n in cases
     ]
     assert_near(rung, *images, (1, 1, k, k, k, k * k, 1, 1), torch.finfo(dtype).eps)
 
@@ -361,9 +367,7 @@ def test_the_order_of_the_input_is_irrelevant(rung, dtype, seed):
         assert_identical(list(fields(got).values()), list(fields(wanted).values()))
     else:
         assert_near(rung, got, wanted, [1.0] * len(IMAGES), torch.finfo(dtype).eps)
-    torch.testing.assert_close(
-        got.max_weight, wanted.max_weight[mixed], rtol=0, atol=400 * torch.finfo(dtype).eps
-    )
+    torch.testing.assert_close(got.max_weight, wanted.max_weight[mixed], rtol=0, atol=400 * torch.finfo(dtype).eps)
 
 
 @given(seeds)
@@ -380,9 +384,7 @@ def test_coincident_primitives_may_be_swapped_under_overlap(rung, dtype, seed):
     if rung[2] == "overlap":
         assert_near(rung, *images, [1.0] * 2, torch.finfo(dtype).eps, COLOR)
     # The light behind them is the same in any order.
-    torch.testing.assert_close(
-        images[0].opacity, images[1].opacity, rtol=0, atol=400 * torch.finfo(dtype).eps
-    )
+    torch.testing.assert_close(images[0].opacity, images[1].opacity, rtol=0, atol=400 * torch.finfo(dtype).eps)
 
 
 @given(seeds, st.integers(2, 200))
@@ -437,9 +439,17 @@ def test_the_number_of_threads_changes_no_bit(rung, dtype, seed, threads):
 
 def test_the_distortion_of_a_length_of_1e12_has_a_finite_gradient():
     pose = np.eye(4)
-    pose[:3] = [[0.2375, 0.9251, -0.2964, 0.4593], [0.9511, -0.1594, 0.2647, -1.8639], [0.1977, -0.3448, -0.9176, 0.0787]]
+    pose[:3] = [
+        [0.2375, 0.9251, -0.2964, 0.4593],
+        [0.9511, -0.1594, 0.2647, -1.8639],
+        [0.1977, -0.3448, -0.9176, 0.0787],
+    ]
     view = Camera(4, 4, 86.0239, 82.3206, 153.2871, -79.6595, pose)
-    rows = ([[239230.375, 152163.4375, -1350907.875]], [[-0.7587, -0.9164, 0.1832, -0.441]], [[1.2543e25, 1.0934e28, 1.7432e36]])
+    rows = (
+        [[239230.375, 152163.4375, -1350907.875]],
+        [[-0.7587, -0.9164, 0.1832, -0.441]],
+        [[1.2543e25, 1.0934e28, 1.7432e36]],
+    )
     values = [torch.tensor(row, requires_grad=True) for row in (*rows, [1.1603e-17], [[[0.2104, 0.328, 0.5226]]])]
     out = ops.rasterize(*values, torch.zeros(3), view, order="overlap", geometry=True, stop=0.0)
     cotangent = torch.linspace(-1, 1, out.distortion.numel()).view_as(out.distortion)

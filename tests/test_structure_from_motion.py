@@ -1,4 +1,5 @@
-"""Poses of photographs that come without: against cameras known exactly, kept, gone on with after a stop, and judged."""
+"""Poses of photographs that come without: against cameras known exactly, kept, gone on with after a stop, and
+judged."""
 
 from __future__ import annotations
 
@@ -58,7 +59,8 @@ def copied(room, tmp_path) -> Path:
 
 
 def aligned(found: np.ndarray, wanted: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Scale, rotation and moved points of the similarity that brings (N, 3) `found` nearest to `wanted` (Umeyama 1991)."""
+    """Scale, rotation and moved points of the similarity that brings (N, 3) `found` nearest to `wanted` (Umeyama
+    1991)."""
     a, b = found - found.mean(0), wanted - wanted.mean(0)
     u, singular, vt = np.linalg.svd(b.T @ a)
     signs = np.array([1, 1, np.linalg.det(u @ vt)])
@@ -76,7 +78,8 @@ def test_poses_and_points_are_the_true_ones_but_for_a_similarity(room, posed):
     centers = np.array([camera.center for camera in truth])
     scale, rotation, moved = aligned(np.array([view.camera.center for view in views]), centers)
     spread = np.linalg.norm(centers - centers.mean(0), axis=1).max()
-    # The cameras nearly stand on a line, which leaves the turn about it to noise, so axes are compared with each other instead.
+    # The cameras nearly stand on a line, which leaves the turn about it to noise, so axes are compared with each other
+    # instead.
     assert np.linalg.norm(moved - centers, axis=1).max() < 0.02 * spread
     for first, second in zip(views, views[1:], strict=False):
         turn = first.camera.rotation @ second.camera.rotation.T
@@ -93,9 +96,7 @@ def test_what_was_found_is_found_again_by_content(room, posed, copied, monkeypat
     cache, _ = posed
     monkeypatch.setattr(structure_from_motion, "_reconstruct", lambda *_: pytest.fail("made again"))
     lines: list[str] = []
-    assert (
-        find_poses(copied, cache, log=lines.append) == found_model(room, cache) == found_model(copied, cache)
-    )
+    assert find_poses(copied, cache, log=lines.append) == found_model(room, cache) == found_model(copied, cache)
     assert len(lines) == 1 and "from" in lines[0]
     assert not list(cache.rglob("database.db*"))
     with open(copied / "3.png", "ab") as file:
@@ -148,9 +149,7 @@ def test_photographs_that_show_nothing_or_break_off_are_left_out(copied, tmp_pat
     (copied / "cut.png").write_bytes((copied / "2.png").read_bytes()[:5000])
     lines: list[str] = []
     find_poses(copied, tmp_path / "cache", threads=1, log=lines.append)
-    assert lines[-1].startswith("warning: the poses are poor") and lines[-1].endswith(
-        ": 2 photographs are left out"
-    )
+    assert lines[-1].startswith("warning: the poses are poor") and lines[-1].endswith(": 2 photographs are left out")
     found = sorted(view.name for view in load_scene(copied, cache=tmp_path / "cache").views)
     assert found == [*"01245678", "my  photo 3"]
 
@@ -176,10 +175,7 @@ def test_captures_with_poses_are_left_alone(tmp_path, monkeypatch):
 
 def test_verdicts():
     assert (
-        Verdict(4, 2).unusable
-        and Verdict(10, 4).unusable
-        and not Verdict(6, 3).unusable
-        and not Verdict(3, 3).unusable
+        Verdict(4, 2).unusable and Verdict(10, 4).unusable and not Verdict(6, 3).unusable and not Verdict(3, 3).unusable
     )
     assert Verdict(10, 10, 500, 0.5, 4.0).doubts == ""
     assert Verdict(10, 8, 500, 0.5, 4.0).doubts == "2 photographs are left out"
@@ -232,9 +228,7 @@ def test_photographs_that_are_alike_share_a_camera_and_exif_gives_its_focal_leng
         assert [image.name for image in images] == names
         used = [database.read_camera(image.camera_id) for image in images]
     assert used[0].camera_id == used[1].camera_id and len({camera.camera_id for camera in used}) == 4
-    assert used[0].has_prior_focal_length and used[2].focal_length == pytest.approx(
-        2 * used[0].focal_length, rel=1e-6
-    )
+    assert used[0].has_prior_focal_length and used[2].focal_length == pytest.approx(2 * used[0].focal_length, rel=1e-6)
 
 
 class _Database:
@@ -356,9 +350,7 @@ def test_a_photograph_whose_suffix_is_wrong_is_copied_as_png(tmp_path):
     ],
 )
 def test_a_result_that_is_damaged_is_not_taken(copied, posed, tmp_path, damaged):
-    kept = shutil.copytree(
-        found_model(copied, posed[0]).parent, tmp_path / "structure_from_motion" / "k"
-    ).parent
+    kept = shutil.copytree(found_model(copied, posed[0]).parent, tmp_path / "structure_from_motion" / "k").parent
     kept = (kept / "k").rename(kept / found_model(copied, posed[0]).parent.name)
     assert found_model(copied, tmp_path) == kept / "model"
     (kept / "verdict.json").write_bytes(damaged)

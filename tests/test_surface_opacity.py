@@ -1,4 +1,5 @@
-"""Surfaces as levels of the opacity field: the field itself, marching tetrahedra, and meshes of runs whose surface is known."""
+"""Surfaces as levels of the opacity field: the field itself, marching tetrahedra, and meshes of runs whose surface is
+known."""
 
 from __future__ import annotations
 
@@ -84,7 +85,9 @@ def test_a_fading_camera_changes_the_field_without_a_jump():
 def test_light_from_one_camera():
     (camera,) = looking_at_origin((0, 0, -3))
     field = opacity.OpacityField(one_octahedron(), [camera])
-    points = np.array([[0, 0, -1], [0, 0, -0.5], [0, 0, 0], [0, 0, 0.25], [0, 0, 2], [0.2, 0, 2], [0, 0, -4], [5, 0, 0]])
+    points = np.array(
+        [[0, 0, -1], [0, 0, -0.5], [0, 0, 0], [0, 0, 0.25], [0, 0, 2], [0.2, 0, 2], [0, 0, -4], [5, 0, 0]]
+    )
     light, weight = field.per_camera(points)
     # Behind a half of it exp(-2 * 0.5); the ray to (0.2, 0, 2) meets the faces x + z = 0.5 and x - z = 0.5.
     chord = (0.38 / 0.96 + 0.38 / 1.04) * np.hypot(0.04, 1)
@@ -191,7 +194,9 @@ def test_components_that_no_camera_sees_are_dropped():
     )
     found = opacity._seen_components(both, looking_at_origin((0, 0, -3)))
     assert len(found.faces) == len(outer.faces) and topology(found)["watertight"]
-    apart = replace(both, vertices=both.vertices + np.repeat([[0.0], [1.5]], [len(outer.vertices), len(inner.vertices)], axis=0))
+    apart = replace(
+        both, vertices=both.vertices + np.repeat([[0.0], [1.5]], [len(outer.vertices), len(inner.vertices)], axis=0)
+    )
     assert len(opacity._seen_components(apart, looking_at_origin((0, 0, -5))).faces) == len(both.faces)
 
 
@@ -238,7 +243,11 @@ def test_uncertainty_is_larger_where_few_cameras_look():
     eyes[1] = 0.2, -0.1, 1.0
     cameras = looking_at_origin(*(3 * eyes / np.linalg.norm(eyes, axis=1, keepdims=True)))
     shape = one_octahedron(30.0).triangle_mesh()
-    mesh = Mesh(shape.vertices[shape.faces].mean(1) * 0.97, np.zeros((0, 3)), normals=shape.vertices[shape.faces].mean(1) * 3.4641)
+    mesh = Mesh(
+        shape.vertices[shape.faces].mean(1) * 0.97,
+        np.zeros((0, 3)),
+        normals=shape.vertices[shape.faces].mean(1) * 3.4641,
+    )
     spread = opacity.OpacityField(one_octahedron(30.0), cameras).spread(mesh, 0.75, 0.2)
     front = mesh.vertices[:, 2] < 0
     assert (0 <= spread).all() and (spread <= 0.2).all() and spread[front].mean() < 0.3 * spread[~front].mean()
@@ -252,7 +261,8 @@ def test_the_level_moves_the_surface_of_a_soft_body(kind, tmp_path):
         four = np.repeat(1.1 * p.extent[:, :1], 4, axis=1)
         save_primitives(run / "training_frame.npz", replace(p, extent=four, kind="tetrahedron"))
     stats = [
-        extract_mesh(run, METHOD, options=ExtractOptions(level=level, voxel_size=0.08), quiet=True) for level in (0.9, 0.5)
+        extract_mesh(run, METHOD, options=ExtractOptions(level=level, voxel_size=0.08), quiet=True)
+        for level in (0.9, 0.5)
     ]
     assert all(s["watertight"] and s["spacing"] == pytest.approx(0.08) for s in stats)
     # Half of the light is gone ln 2 / 6 = 0.12 behind the surface, of a body some 0.7 in radius.

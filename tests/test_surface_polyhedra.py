@@ -1,4 +1,5 @@
-"""The direct surface: unions of known volume, cuts at known planes, what is dropped, and what the order of the input may change."""
+"""The direct surface: unions of known volume, cuts at known planes, what is dropped, and what the order of the input
+may change."""
 
 from __future__ import annotations
 
@@ -47,7 +48,9 @@ def octahedra(count, seed=0, size=0.12):
 
 def traced(run, level=0.75):
     """The surface, the primitive of each face, and counts."""
-    mesh, about = polyhedra_surface(Run.open(run), ExtractOptions(level=level), Stages(Progress("extract", 1, quiet=True)))
+    mesh, about = polyhedra_surface(
+        Run.open(run), ExtractOptions(level=level), Stages(Progress("extract", 1, quiet=True))
+    )
     return mesh, mesh.primitive, about
 
 
@@ -75,7 +78,8 @@ def test_two_boxes_overlap_in_a_known_volume():
 
 
 def test_two_octahedra_overlap_in_a_known_volume():
-    # |x| + |y| + |z| <= 1 and its copy moved by d along x meet in two caps of half-axis 1 - d / 2: pyramids back to back.
+    # |x| + |y| + |z| <= 1 and its copy moved by d along x meet in two caps of half-axis 1 - d / 2: pyramids back to
+    # back.
     d = 0.6
     tips = np.concatenate([np.eye(3), -np.eye(3)])
     mesh, _ = unite([convex_piece(tips), convex_piece(tips + [d, 0, 0])], [0, 1])
@@ -195,9 +199,12 @@ def test_a_convex_edge_is_cut_by_both_planes_and_a_concave_one_by_each():
 def test_a_primitive_without_points_is_dropped_and_one_with_its_surface_at_the_points_is_whole():
     pair = octahedra(1)
     pair = Primitives(
-        np.array([[0.0, 0, 0], [5.0, 0, 0]]), np.repeat(one_octahedron().rotation, 2, 0), np.ones((2, 3)), np.ones(2),
+        np.array([[0.0, 0, 0], [5.0, 0, 0]]),
+        np.repeat(one_octahedron().rotation, 2, 0),
+        np.ones((2, 3)),
+        np.ones(2),
         np.zeros((2, 1, 3)),
-    )  # fmt: skip
+    )
     points = wall_points((2, 0.99999, (0, 9.0)))
     points = replace(points, position=points.position * [0, 0, 1], footprint=1e-2)
     planes, met = fit_planes(pair, points)
@@ -209,7 +216,9 @@ def test_a_primitive_without_points_is_dropped_and_one_with_its_surface_at_the_p
 def test_the_core_is_inside_and_closed():
     # One camera straight above a plate at depth 1 that fills its image; the box reaches to depth 2.
     camera = Camera(32, 32, 16.0, 16.0, 16.0, 16.0, np.eye(4))
-    boxes = core_boxes([np.full((32, 32), 1.0, np.float32)], [camera], np.array([[-0.3, -0.3, 0.8], [0.3, 0.3, 2.0]]), 0.03)
+    boxes = core_boxes(
+        [np.full((32, 32), 1.0, np.float32)], [camera], np.array([[-0.3, -0.3, 0.8], [0.3, 0.3, 2.0]]), 0.03
+    )
     mesh, _ = unite([convex_piece(corners) for corners in boxes], range(len(boxes)))
     assert is_closed(mesh) and topology(mesh)["components"] == 1
     assert 1.0 < mesh.vertices[:, 2].min() < 1.0 + 2 * 0.03
@@ -257,8 +266,9 @@ def test_a_trained_part_is_closed_and_traced(tiny_run):
     middle, rows = mesh.vertices[mesh.faces[owned]].mean(1), primitive[owned]
     normals, offsets = face_planes(primitives)
     ahead = np.einsum("fki,fi->fk", normals[rows], middle - primitives.center[rows].astype(float)) - offsets[rows]
-    # On the primitive, or inside it where it was cut; a sliver that went let the surface move by the tolerance, and one after another by
-    # more: which ones do depends on the last bits of a training, so that is held to a hundredth of the area.
+    # On the primitive, or inside it where it was cut; a sliver that went let the surface move by the tolerance, and one
+    # after another by more: which ones do depends on the last bits of a training, so that is held to a hundredth of the
+    # area.
     area = face_areas(mesh)[owned]
     assert area[ahead.max(1) > 2 * about["tolerance"]].sum() < 0.01 * area.sum()
 
@@ -274,7 +284,9 @@ def test_the_file_says_which_primitive_a_face_is_a_part_of(tiny_run, tmp_path):
         read = trimesh.load(file, process=False)
         found = read.metadata["_ply_raw"]["face"]["data"]["primitive"].ravel()
         # Faces in the file are those of the surface, or some of them: each by its corners.
-        wanted = dict(zip(map(tuple, mesh.vertices[mesh.faces].astype(np.float32).reshape(-1, 9).tolist()), owner, strict=True))
+        wanted = dict(
+            zip(map(tuple, mesh.vertices[mesh.faces].astype(np.float32).reshape(-1, 9).tolist()), owner, strict=True)
+        )
         corners = np.asarray(read.vertices, np.float32)[read.faces].reshape(-1, 9)
         assert [wanted[tuple(row)] for row in corners.tolist()] == found.tolist() and found.max() > 0
         meshes = pymeshlab.MeshSet()
@@ -325,9 +337,7 @@ def test_what_cannot_become_a_surface_is_one_sentence(solid, tmp_path):
 
 
 def test_a_speck_of_one_pixel_is_one_sentence(solid, tmp_path):
-    speck = with_primitives(
-        solid, tmp_path / "s", lambda p: replace(p, extent=p.extent * 0.04, density=p.density * 25)
-    )
+    speck = with_primitives(solid, tmp_path / "s", lambda p: replace(p, extent=p.extent * 0.04, density=p.density * 25))
     with pytest.raises(LinprimError, match="no pixel.*four neighbours"):
         traced(speck)
 

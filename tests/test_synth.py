@@ -25,9 +25,7 @@ def built():
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory, built):
     out = tmp_path_factory.mktemp("synth") / "cad"
-    report = synthesize(
-        out, mesh=built["cad"], principal_point_offset=(5.0, -3.5), point_noise=0.004, seed=3, **SMALL
-    )
+    report = synthesize(out, mesh=built["cad"], principal_point_offset=(5.0, -3.5), point_noise=0.004, seed=3, **SMALL)
     return out, report
 
 
@@ -139,9 +137,7 @@ def test_shapes_and_their_colours_are_the_same_every_time(built):
         colors = first.colors(points, face, bary)
         assert np.array_equal(colors, again.colors(points, face, bary))
         # Blocks inside must not show.
-        assert np.allclose(
-            colors[1500:1600], first.colors(points[1500:1600], face[1500:1600], bary[:100]), atol=1e-6
-        )
+        assert np.allclose(colors[1500:1600], first.colors(points[1500:1600], face[1500:1600], bary[:100]), atol=1e-6)
         assert colors.min() >= 0.0 and colors.max() <= 1.0
 
 
@@ -172,9 +168,7 @@ def test_refining_keeps_the_surface_the_seams_and_the_topology(built):
         assert np.sort(np.bincount(edge_uses(faces)))[-1] == (edge_uses(faces) == 2).sum()
         assert (edge_uses(faces) == 1).sum() >= (edge_uses(shape.faces) == 1).sum()
         assert (edge_uses(faces) <= 2).all()
-        assert areas(vertices, faces).sum() == pytest.approx(
-            areas(shape.vertices, shape.faces).sum(), rel=1e-9
-        )
+        assert areas(vertices, faces).sum() == pytest.approx(areas(shape.vertices, shape.faces).sum(), rel=1e-9)
         assert colors.shape == (len(vertices), 3) and colors.std() > 5
     euler = len(vertices) - len(edge_uses(faces)) + len(faces)
     assert euler == len(shape.vertices) - len(edge_uses(shape.faces)) + len(shape.faces)

@@ -94,9 +94,7 @@ def test_colours_of_the_object_do_not_change_on_a_table(tmp_path, part, kind):
     # Among points of the table, whose blocks are others.
     table = rng.integers(len(surface.faces), len(both.faces), 1500)
     mixed = rng.permutation(3000)
-    together = both.colors(
-        np.tile(points, (2, 1))[mixed], np.append(face, table)[mixed], np.tile(bary, (2, 1))[mixed]
-    )
+    together = both.colors(np.tile(points, (2, 1))[mixed], np.append(face, table)[mixed], np.tile(bary, (2, 1))[mixed])
     assert np.abs(together[np.argsort(mixed)][:1500] - alone).max() < 1e-6
 
 
@@ -264,7 +262,15 @@ def test_noise_has_the_stated_variance_half_of_which_grows_with_the_signal():
 
 
 def test_noise_of_a_capture_is_that_of_its_strength_and_differs_from_view_to_view(tmp_path, part):
-    gray = {**SMALL, "views": 2, "test_views": 1, "points": 0, "background": (0.5, 0.5, 0.5), "fov": 90.0, "distance": 9.0}
+    gray = {
+        **SMALL,
+        "views": 2,
+        "test_views": 1,
+        "points": 0,
+        "background": (0.5, 0.5, 0.5),
+        "fov": 90.0,
+        "distance": 9.0,
+    }
     synthesize(tmp_path / "a", mesh=part, noise=4.0, seed=1, **gray)
     synthesize(tmp_path / "b", mesh=part, noise=4.0, seed=2, **gray)
     views = []

@@ -1,4 +1,5 @@
-"""Textures against scenes whose colour is known at every point, charts on every kind of mesh, and files as trimesh reads them."""
+"""Textures against scenes whose colour is known at every point, charts on every kind of mesh, and files as trimesh
+reads them."""
 
 from __future__ import annotations
 
@@ -197,7 +198,9 @@ def test_a_face_keeps_most_of_its_area_and_a_flat_one_its_shape():
     corners, charts = unwrap(mesh, 128)
     one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     flat = np.abs(one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0])
-    solid = np.linalg.norm(np.cross(*(mesh.vertices[mesh.faces[:, k]] - mesh.vertices[mesh.faces[:, 0]] for k in (1, 2))), axis=1)
+    solid = np.linalg.norm(
+        np.cross(*(mesh.vertices[mesh.faces[:, k]] - mesh.vertices[mesh.faces[:, 0]] for k in (1, 2))), axis=1
+    )
     share = flat / solid
     # Faces are at worst LEAST_COSINE from across their plane, which their area is multiplied by.
     assert share.min() / share.max() > texture_module.LEAST_COSINE * 0.99 and charts <= 12
@@ -272,7 +275,9 @@ def test_only_obj_and_glb_hold_a_texture(ball, ball_texture, tmp_path):
 def test_extraction_writes_textures(solid, tmp_path):
     options = ExtractOptions(voxel_size=0.12, target_faces=300, texture=128)
     stats = extract_mesh(solid, output=tmp_path / "m.obj", options=options, quiet=True)
-    assert {p.name for p in tmp_path.iterdir()} == {f"{stem}.{s}" for stem in ("m", "m_visible") for s in ("obj", "mtl", "png")}
+    assert {p.name for p in tmp_path.iterdir()} == {
+        f"{stem}.{s}" for stem in ("m", "m_visible") for s in ("obj", "mtl", "png")
+    }
     assert stats["texture"]["size"] == 128 and stats["texture"]["texels_seen"] > 0.9 and "texture" in stats["seconds"]
     # One flat colour, 0.5 + 0.7 Y0 = 0.697 of 255 in every channel.
     image = np.asarray(Image.open(tmp_path / "m.png")).astype(int)

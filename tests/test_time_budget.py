@@ -69,7 +69,9 @@ def test_the_plan_fills_the_time_at_the_stated_ratio(cost, start):
 def test_without_a_slope_the_plan_is_the_time_over_the_step():
     assert STEPS_PER_PRIMITIVE > 0
     plan = plan_training(10.0, StepCost(0.002, 0.0), 1.0, MANY)
-    assert plan.iterations == pytest.approx(5000, abs=1) and plan.max_primitives == pytest.approx(5000 / STEPS_PER_PRIMITIVE, abs=1)
+    assert plan.iterations == pytest.approx(5000, abs=1) and plan.max_primitives == pytest.approx(
+        5000 / STEPS_PER_PRIMITIVE, abs=1
+    )
 
 
 def test_limits_of_the_population_leave_the_rest_to_the_steps():
@@ -166,7 +168,10 @@ def test_a_run_keeps_its_time(budgeted):
     assert noted["correction"]["step"] == round(0.6 * noted["iterations"])
     assert result["iterations"] == noted["correction"]["iterations"]
     opened = Run.open(run)
-    assert (opened.train_options.iterations, opened.train_options.max_primitives) == (noted["iterations"], noted["max_primitives"])
+    assert (opened.train_options.iterations, opened.train_options.max_primitives) == (
+        noted["iterations"],
+        noted["max_primitives"],
+    )
     assert opened.state["iterations"] == result["iterations"] and result["primitives"] <= noted["max_primitives"]
     assert result["psnr"] > 20
 
@@ -217,7 +222,9 @@ def test_a_kill_right_before_the_correction_is_followed_by_it(tiny_scene, tmp_pa
 
 def test_an_extraction_keeps_its_time(tiny_run, tmp_path):
     begin = time.monotonic()
-    stats = extract_mesh(tiny_run, output=tmp_path / "mesh.ply", options=ExtractOptions(level=0.5), time_budget=30.0, quiet=True)
+    stats = extract_mesh(
+        tiny_run, output=tmp_path / "mesh.ply", options=ExtractOptions(level=0.5), time_budget=30.0, quiet=True
+    )
     seconds = time.monotonic() - begin
     chosen = stats["time_budget"]
     # It may well be done sooner: a voxel below what the views support shows nothing more.
@@ -226,20 +233,29 @@ def test_an_extraction_keeps_its_time(tiny_run, tmp_path):
     cost = VoxelCost(**chosen["cost"])
     assert chosen["predicted_seconds"] == pytest.approx(cost.seconds(chosen["voxel_size"]))
     assert chosen["predicted_seconds"] <= time_budget.AIM * 30.0
-    assert json.loads((tiny_run / "mesh" / "tsdf" / "stats.json").read_text())["time_budget"]["voxel_size"] == chosen["voxel_size"]
+    assert (
+        json.loads((tiny_run / "mesh" / "tsdf" / "stats.json").read_text())["time_budget"]["voxel_size"]
+        == chosen["voxel_size"]
+    )
 
 
 def test_a_budget_that_fits_a_coarser_surface_gets_one(tiny_run, tmp_path, monkeypatch):
     """With passes that cost 1 + 1e-2 / voxel^2 s, and none left for the finest."""
     cost = VoxelCost(1.0, 1e-2)
     monkeypatch.setattr(time_budget, "_timed_pass", lambda run, options, *_: cost.seconds(options.voxel_size))
-    supported = extract_mesh(tiny_run, output=tmp_path / "a.ply", options=ExtractOptions(level=0.5), quiet=True)["voxel_size"]
+    supported = extract_mesh(tiny_run, output=tmp_path / "a.ply", options=ExtractOptions(level=0.5), quiet=True)[
+        "voxel_size"
+    ]
     cost = VoxelCost(1.0, 80.0 * supported**2)
-    stats = extract_mesh(tiny_run, output=tmp_path / "b.ply", options=ExtractOptions(level=0.5), time_budget=40.0, quiet=True)
+    stats = extract_mesh(
+        tiny_run, output=tmp_path / "b.ply", options=ExtractOptions(level=0.5), time_budget=40.0, quiet=True
+    )
     left = time_budget.AIM * 40.0 - 1.0
     assert stats["voxel_size"] == pytest.approx(supported * math.sqrt(80.0 / left), rel=0.15)
     with pytest.raises(LinprimError, match=r"--time-budget is 1 s, but the coarsest surface .* takes \d+ s"):
-        extract_mesh(tiny_run, output=tmp_path / "c.ply", options=ExtractOptions(level=0.5), time_budget=1.0, quiet=True)
+        extract_mesh(
+            tiny_run, output=tmp_path / "c.ply", options=ExtractOptions(level=0.5), time_budget=1.0, quiet=True
+        )
     assert not (tmp_path / "c.ply").exists()
 
 
@@ -262,7 +278,13 @@ def test_a_time_has_to_be_positive(seconds, tiny_scene, tmp_path):
 
 def test_a_budget_needs_something_to_choose(tiny_scene, tiny_run, tmp_path):
     with pytest.raises(LinprimError, match="nothing to choose"):
-        train(tiny_scene, tmp_path / "run", options=TrainOptions(iterations=10, max_primitives=50), time_budget=5.0, quiet=True)
+        train(
+            tiny_scene,
+            tmp_path / "run",
+            options=TrainOptions(iterations=10, max_primitives=50),
+            time_budget=5.0,
+            quiet=True,
+        )
     with pytest.raises(LinprimError, match="--voxel-size"):
         extract_mesh(tiny_run, options=ExtractOptions(voxel_size=0.1), time_budget=5.0, quiet=True)
     with pytest.raises(LinprimError, match="--method polyhedra has none"):

@@ -1,4 +1,5 @@
-"""The sweep of knobs: every rung sets something that runs, the frontier and the sentences follow their rules, the files agree."""
+"""The sweep of knobs: every rung sets something that runs, the frontier and the sentences follow their rules, the files
+agree."""
 
 from __future__ import annotations
 
@@ -21,9 +22,20 @@ from linprim_geo.options import SceneOptions, TrainOptions, check_train_options
 
 # What the design lists: every knob that trades time for accuracy.
 LISTED = {
-    "rays", "order", "scalar", "stop", "degree", "trained-degree", "primitive", "primitives", "iterations", "scale", "views",
-    "extraction", "samples",
-}  # fmt: skip
+    "rays",
+    "order",
+    "scalar",
+    "stop",
+    "degree",
+    "trained-degree",
+    "primitive",
+    "primitives",
+    "iterations",
+    "scale",
+    "views",
+    "extraction",
+    "samples",
+}
 
 
 def row(rung, seconds, error, name="depth_percent", spread=0.0, rounds=3):
@@ -44,16 +56,29 @@ def test_the_registry_is_complete():
         assert each.name == name and each.group in GROUPS and set(each.errors) <= set(ERRORS) and each.errors
         names = [r.name for r in each.rungs]
         assert len(set(names)) == len(names) >= 2 and each.default in names
-    shown = [json.dumps(settings(each, r), sort_keys=True) for each in KNOBS.values() for r in each.rungs if r.name != each.default]
+    shown = [
+        json.dumps(settings(each, r), sort_keys=True)
+        for each in KNOBS.values()
+        for r in each.rungs
+        if r.name != each.default
+    ]
     assert len(set(shown)) == len(shown), "two rungs that are not the default set the same"
 
 
 def test_defaults_of_the_registry_are_those_of_the_options():
     assert settings(KNOBS["rays"], knobs.rung(KNOBS["rays"], "exact")) == knobs.RENDER_DEFAULTS
     options = TrainOptions()
-    for name, value in (("ray_model", options.ray_model), ("order", options.order), ("stop", options.stop), ("degree", options.sh_degree)):
+    for name, value in (
+        ("ray_model", options.ray_model),
+        ("order", options.order),
+        ("stop", options.stop),
+        ("degree", options.sh_degree),
+    ):
         assert knobs.RENDER_DEFAULTS[name] == value
-    assert settings(KNOBS["primitive"], knobs.rung(KNOBS["primitive"], "octahedron")) == {} and options.primitive == "octahedron"
+    assert (
+        settings(KNOBS["primitive"], knobs.rung(KNOBS["primitive"], "octahedron")) == {}
+        and options.primitive == "octahedron"
+    )
     assert KNOBS["trained-degree"].default == str(options.sh_degree)
     for name in ("order", "stop", "scalar", "degree", "extraction", "samples"):
         each = KNOBS[name]
@@ -66,13 +91,21 @@ def test_every_training_rung_changes_an_option_that_is_allowed():
     for each in KNOBS.values():
         if each.group != "train":
             continue
-        found = [training_options(options, scene, 24, settings(each, r)) for r in each.rungs if "equal_time" not in r.changes]
+        found = [
+            training_options(options, scene, 24, settings(each, r)) for r in each.rungs if "equal_time" not in r.changes
+        ]
         assert len({(str(a), str(b)) for a, b in found}) == len(found), each.name
         for changed, _ in found:
             check_train_options(changed)
-    changed = {name: training_options(options, scene, 24, change) for name, change in {
-        "half": {"iterations_times": 0.5}, "cap": {"max_primitives_times": 2.0}, "scale": {"downscale_times": 4}, "views": {"views": 0.25},
-    }.items()}  # fmt: skip
+    changed = {
+        name: training_options(options, scene, 24, change)
+        for name, change in {
+            "half": {"iterations_times": 0.5},
+            "cap": {"max_primitives_times": 2.0},
+            "scale": {"downscale_times": 4},
+            "views": {"views": 0.25},
+        }.items()
+    }
     assert (changed["half"][0].iterations, changed["cap"][0].max_primitives) == (50, 160)
     assert (changed["scale"][1].downscale, changed["views"][1].views) == (8, 6)
 
@@ -81,7 +114,17 @@ def test_every_training_rung_changes_an_option_that_is_allowed():
 
 
 def test_the_frontier_of_known_points():
-    points = [(1.0, 5.0), (2.0, 3.0), (2.5, 3.0), (3.0, 4.0), (4.0, 1.0), (0.5, 9.0), (4.0, 2.0), (math.nan, 0.0), (9.0, math.nan)]
+    points = [
+        (1.0, 5.0),
+        (2.0, 3.0),
+        (2.5, 3.0),
+        (3.0, 4.0),
+        (4.0, 1.0),
+        (0.5, 9.0),
+        (4.0, 2.0),
+        (math.nan, 0.0),
+        (9.0, math.nan),
+    ]
     assert frontier(points) == [5, 0, 1, 4]
     assert frontier([(1.0, 1.0), (1.0, 1.0)]) == [0] and frontier([]) == []
     rng = np.random.default_rng(0)
@@ -96,7 +139,9 @@ def test_a_step_pays_if_the_error_falls_with_the_root_of_the_time():
     assert pays(row("a", 1.0, 1.0), row("b", 4.0, 0.5), "depth_percent")
     assert not pays(row("a", 1.0, 1.0), row("b", 4.0, 0.51), "depth_percent")
     assert not pays(row("a", 1.0, 1.0), row("b", 1.0, 0.995), "depth_percent")  # less than 1 % is nothing
-    assert pays(row("a", 1.0, 1.0, spread=0.2), row("b", 1.3, 0.95, spread=0.2), "depth_percent")  # equal within the spread
+    assert pays(
+        row("a", 1.0, 1.0, spread=0.2), row("b", 1.3, 0.95, spread=0.2), "depth_percent"
+    )  # equal within the spread
     assert not pays(row("a", 1.0, 1.0, spread=0.01), row("b", 1.3, 0.95, spread=0.01), "depth_percent")
     assert pays(row("a", 1.0, 1.0), row("b", 99.0, 0.0), "depth_percent")
 
@@ -108,7 +153,9 @@ def test_the_sentences_follow_the_rule():
     )
     assert (said["cheapest"], said["taken"], said["most_accurate"]) == ("affine", "exact", "exact")
     said = verdict(knob("a", "b"), [row("a", 1.0, 1.0), row("b", 4.0, 0.9)])
-    assert said["sentence"].endswith("b costs 4.00x the time of a and removes 10 % of the depth error (1 to 0.9 %): not worth it.")
+    assert said["sentence"].endswith(
+        "b costs 4.00x the time of a and removes 10 % of the depth error (1 to 0.9 %): not worth it."
+    )
     said = verdict(knob("a", "b", "c"), [row("a", 1.0, 1.0), row("b", 1.5, 0.5), row("c", 9.0, 0.45)])
     assert "worth it; c would cost 6.00x the time of b and remove 10 %" in said["sentence"] and said["taken"] == "b"
     said = verdict(knob("a", "b", "c"), [row("a", 1.0, 1.0), row("b", 2.0, 0.9), row("c", 3.0, 0.1)])
@@ -167,12 +214,16 @@ def test_the_errors_are_those_of_the_knob(swept):
     # The integral itself differs from the reference by rounding and the early stop alone, the order of centres by more.
     assert rows["order", "overlap"]["image_percent"] < 0.2 * rows["order", "center"]["image_percent"]
     assert rows["stop", "0"]["alone_percent"] < 0.1 * rows["stop", "1e-2"]["alone_percent"]
-    assert rows["scalar", "float32"]["alone_percent"] > rows["scalar", "float64"]["alone_percent"] > 0  # both stop early
+    assert (
+        rows["scalar", "float32"]["alone_percent"] > rows["scalar", "float64"]["alone_percent"] > 0
+    )  # both stop early
     assert rows["order", "overlap"]["popping_percent"] < 0.5 * rows["order", "center"]["popping_percent"]
     assert rows["degree", "1"]["image_percent"] < rows["degree", "0"]["image_percent"]
     # Settings in common are measured once.
     assert rows["rays", "exact"]["seconds"] == rows["order", "center"]["seconds"] == rows["stop", "1e-3"]["seconds"]
-    assert rows["samples", "200,000"]["standard_error_percent"] < 0.2 * rows["samples", "1,000"]["standard_error_percent"]
+    assert (
+        rows["samples", "200,000"]["standard_error_percent"] < 0.2 * rows["samples", "1,000"]["standard_error_percent"]
+    )
     assert rows["extraction", "tsdf x1"]["chamfer_percent"] < rows["extraction", "tsdf x4"]["chamfer_percent"]
 
 
@@ -225,13 +276,17 @@ def test_what_was_measured_is_taken_from_the_folder(swept, tiny_scene, tiny_run,
     out, results = swept
     for name in ("_render", "_extract", "_evaluate", "_train"):
         monkeypatch.setattr(sweeping.Sweep, name, lambda *_: pytest.fail("measured again"))
-    again = tradeoff(tiny_scene, out, knobs=("rays", "samples"), run=tiny_run, quick=True, rounds=1, threads=1, quiet=True)
+    again = tradeoff(
+        tiny_scene, out, knobs=("rays", "samples"), run=tiny_run, quick=True, rounds=1, threads=1, quiet=True
+    )
     assert again["rows"] == [row for row in results["rows"] if row["knob"] in ("rays", "samples")]
 
 
 def test_training_knobs_run_on_every_rung(tiny_scene, tmp_path, monkeypatch):
     """A few steps each; how runs are scored is tested by the ones that score."""
-    monkeypatch.setattr("linprim_geo.training_start.fill_points", lambda scene, *_: scene.points)  # seconds for every rung
+    monkeypatch.setattr(
+        "linprim_geo.training_start.fill_points", lambda scene, *_: scene.points
+    )  # seconds for every rung
     scored = []
 
     def score(self, folder):
@@ -244,7 +299,9 @@ def test_training_knobs_run_on_every_rung(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(sweeping.Sweep, "_train_errors", score)
     chosen = [name for name, each in KNOBS.items() if each.group == "train"]
     size = {"iterations": 8, "max_primitives": 60}
-    results = tradeoff(tiny_scene, tmp_path / "sweep", knobs=chosen, quick=True, rounds=1, **size, threads=1, quiet=True)
+    results = tradeoff(
+        tiny_scene, tmp_path / "sweep", knobs=chosen, quick=True, rounds=1, **size, threads=1, quiet=True
+    )
     assert results["about"]["options"].items() >= size.items()
     assert len(results["rows"]) == sum(len(KNOBS[name].rungs) for name in chosen)
     assert {run.train_options.primitive for run in scored} == {"octahedron", "tetrahedron", "gaussian"}
@@ -260,7 +317,14 @@ def test_training_knobs_run_on_every_rung(tiny_scene, tmp_path, monkeypatch):
 
 def test_trainings_by_workers_are_those_of_this_process(monkeypatch, tiny_scene, tmp_path):
     monkeypatch.setattr(sweeping, "POINTS", 3000)
-    how = {"knobs": ["iterations", "primitive"], "quick": True, "iterations": 12, "max_primitives": 60, "threads": 1, "quiet": True}
+    how = {
+        "knobs": ["iterations", "primitive"],
+        "quick": True,
+        "iterations": 12,
+        "max_primitives": 60,
+        "threads": 1,
+        "quiet": True,
+    }
     here = tradeoff(tiny_scene, tmp_path / "here", rounds=1, **how)
     there = tradeoff(tiny_scene, tmp_path / "there", rounds=2, workers=2, **how)
     assert len(there["rows"]) == len(here["rows"]) > 4
@@ -274,7 +338,15 @@ def test_trainings_by_workers_are_those_of_this_process(monkeypatch, tiny_scene,
 
 def test_a_sweep_by_workers_goes_on_and_tells_what_fails(monkeypatch, tiny_scene, tmp_path):
     monkeypatch.setattr(sweeping, "POINTS", 3000)
-    how = {"knobs": ["iterations"], "quick": True, "iterations": 12, "max_primitives": 60, "rounds": 1, "quiet": True, "workers": 2}
+    how = {
+        "knobs": ["iterations"],
+        "quick": True,
+        "iterations": 12,
+        "max_primitives": 60,
+        "rounds": 1,
+        "quiet": True,
+        "workers": 2,
+    }
     save = sweeping.Sweep._note
     noted = []
 
@@ -317,7 +389,9 @@ def test_a_trained_run_is_scored_by_image_depth_and_surface(swept, tiny_scene, t
 def test_names_of_near_points_do_not_cover_each_other():
     rows = [row(f"rung number {k}", 1.0 + 0.02 * k, 1.0 - 0.005 * k) | {"frontier": True} for k in range(5)]
     tree = ElementTree.fromstring(tradeoff_page.plot(rows, "depth_percent"))
-    labels = [(float(t.get("x")), float(t.get("y")), t.text) for t in tree.iter("text") if (t.text or "").startswith("rung")]
+    labels = [
+        (float(t.get("x")), float(t.get("y")), t.text) for t in tree.iter("text") if (t.text or "").startswith("rung")
+    ]
     assert len(labels) == 5
     for i, (x, y, text) in enumerate(labels):
         width = len(text) * tradeoff_page.LETTER

@@ -1,4 +1,5 @@
-"""The README's plots out of a sweep: what they show of known rows, that they are well-formed and light or dark, and what is refused."""
+"""The README's plots out of a sweep: what they show of known rows, that they are well-formed and light or dark, and
+what is refused."""
 
 from __future__ import annotations
 
@@ -95,8 +96,11 @@ def test_the_shared_default_is_one_point_and_the_frontier_is_that_of_all_of_them
     rows += [row("scalar", "float64", 0.0, 0.1), row("scalar", "float32", 3.0, None)]
     found = rungs(rows, ("rays", "order", "scalar"), "depth_percent")
     assert {r["rung"]: r["frontier"] for r in found} == {
-        "affine rays": False, "default": True, "overlap order": True, "entry order": False,
-    }  # fmt: skip
+        "affine rays": False,
+        "default": True,
+        "overlap order": True,
+        "entry order": False,
+    }
     rows = [row("extraction", "tsdf x1", 1.0, 2.0, True), row("extraction", "polyhedra", 2.0, 3.0)]
     alone = rungs(rows, ("extraction",), "depth_percent")
     assert [r["rung"] for r in alone] == ["tsdf x1", "polyhedra"]

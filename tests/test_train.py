@@ -74,9 +74,7 @@ def test_the_checkpoint_and_the_exported_primitives_agree(tiny_run):
 def room(tmp_path_factory):
     """Seen from inside: opaque images, no alpha."""
     out = tmp_path_factory.mktemp("room") / "scene"
-    synthesize(
-        out, shape="cad", views=10, test_views=2, size=40, points=300, supersample=1, background="0.2,0.6,0.4"
-    )
+    synthesize(out, shape="cad", views=10, test_views=2, size=40, points=300, supersample=1, background="0.2,0.6,0.4")
     return out
 
 
@@ -175,9 +173,16 @@ def test_an_off_centre_principal_point(tmp_path):
     for name, offset in (("a", (0.0, 0.0)), ("b", (6.0, -4.0))):
         # Far enough that the shifted image still holds all of it.
         synthesize(
-            tmp_path / name, shape="cad", views=10, test_views=2, size=40, points=300, supersample=1,
-            distance=5.0, principal_point_offset=offset,
-        )  # fmt: skip
+            tmp_path / name,
+            shape="cad",
+            views=10,
+            test_views=2,
+            size=40,
+            points=300,
+            supersample=1,
+            distance=5.0,
+            principal_point_offset=offset,
+        )
         options = replace(QUICK, iterations=250, max_primitives=100)
         psnr.append(train(tmp_path / name, tmp_path / f"run_{name}", options=options, quiet=True)["psnr"])
         camera = Run.open(tmp_path / f"run_{name}").scene().train[0].camera
@@ -193,27 +198,21 @@ def test_cameras_of_two_sizes(tmp_path):
     shutil.rmtree(wide / "masks")
     shutil.copytree(tall, wide / "tall")
     for split in ("train", "test"):
-        one, other = (
-            json.loads((folder / f"transforms_{split}.json").read_text()) for folder in (wide, tall)
-        )
+        one, other = (json.loads((folder / f"transforms_{split}.json").read_text()) for folder in (wide, tall))
         for frame in other["frames"]:
             frame |= {key: other[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x")}
             frame["file_path"] = f"tall/{frame['file_path']}"
             frame["depth_file_path"] = f"tall/{frame['depth_file_path']}"
             one["frames"].append(frame)
         (wide / f"transforms_{split}.json").write_text(json.dumps(one))
-    result = train(
-        wide, tmp_path / "run", options=replace(QUICK, iterations=300, max_primitives=150), quiet=True
-    )
+    result = train(wide, tmp_path / "run", options=replace(QUICK, iterations=300, max_primitives=150), quiet=True)
     run = Run.open(tmp_path / "run")
     assert {(v.camera.width, v.camera.height) for v in run.scene().test} == {(48, 32), (28, 40)}
     assert result["views"] == 4 and result["psnr"] > 20
 
 
 def test_downscaled_photographs(tiny_scene, tmp_path):
-    result = train(
-        tiny_scene, tmp_path / "run", SceneOptions(downscale=2), replace(QUICK, iterations=100), quiet=True
-    )
+    result = train(tiny_scene, tmp_path / "run", SceneOptions(downscale=2), replace(QUICK, iterations=100), quiet=True)
     assert Run.open(tmp_path / "run").scene().train[0].camera.width == 24 and result["psnr"] > 15
 
 
@@ -241,9 +240,18 @@ def test_the_degree_of_the_colour_is_what_was_asked_for(degree, tiny_scene, tmp_
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"iterations": 0}, {"max_primitives": 0}, {"sh_degree": 4}, {"seed": -1}, {"threads": -1}, {"dssim": 1.5},
-     {"stop": float("nan")}, {"samples": 0}, {"checkpoint_every": 0}],
-)  # fmt: skip
+    [
+        {"iterations": 0},
+        {"max_primitives": 0},
+        {"sh_degree": 4},
+        {"seed": -1},
+        {"threads": -1},
+        {"dssim": 1.5},
+        {"stop": float("nan")},
+        {"samples": 0},
+        {"checkpoint_every": 0},
+    ],
+)
 def test_an_option_out_of_range_is_refused(wrong, tiny_scene, tmp_path):
     name = next(iter(wrong)).replace("_", "-")
     with pytest.raises(LinprimError, match=f"--{name} is "):
@@ -253,11 +261,14 @@ def test_an_option_out_of_range_is_refused(wrong, tiny_scene, tmp_path):
 
 @pytest.mark.parametrize(
     ("wrong", "sentence"),
-    [({"primitive": "cube"}, "--primitive is 'cube', wanted one of octahedron, tetrahedron, gaussian"),
-     ({"filter": "2d"}, "--filter is '2d'"), ({"population": ""}, "--population is ''"),
-     ({"primitive": "gaussian", "order": "overlap"}, "--order is 'overlap', but a Gaussian has no place"),
-     ({"primitive": "gaussian", "order": "entry"}, "wanted center with --primitive gaussian")],
-)  # fmt: skip
+    [
+        ({"primitive": "cube"}, "--primitive is 'cube', wanted one of octahedron, tetrahedron, gaussian"),
+        ({"filter": "2d"}, "--filter is '2d'"),
+        ({"population": ""}, "--population is ''"),
+        ({"primitive": "gaussian", "order": "overlap"}, "--order is 'overlap', but a Gaussian has no place"),
+        ({"primitive": "gaussian", "order": "entry"}, "wanted center with --primitive gaussian"),
+    ],
+)
 def test_kinds_and_rules_that_do_not_go_together_are_refused(wrong, sentence, tiny_scene, tmp_path):
     with pytest.raises(LinprimError, match=sentence):
         train(tiny_scene, tmp_path / "run", options=replace(QUICK, **wrong), quiet=True)
@@ -273,9 +284,18 @@ def test_kinds_and_rules_that_do_not_go_together_are_refused(wrong, sentence, ti
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_learns_under_every_rule_and_goes_on_bit_for_bit(kind, population, adam, tiny_scene, tmp_path):
     options = TrainOptions(
-        iterations=300, max_primitives=260, initial_primitives=200, sh_degree=1, threads=1, primitive=kind,
-        population=population, adam=adam, filter="3d", checkpoint_every=100, evaluate_every=100,
-    )  # fmt: skip
+        iterations=300,
+        max_primitives=260,
+        initial_primitives=200,
+        sh_degree=1,
+        threads=1,
+        primitive=kind,
+        population=population,
+        adam=adam,
+        filter="3d",
+        checkpoint_every=100,
+        evaluate_every=100,
+    )
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     result = train(tiny_scene, whole, options=options, quiet=True)
     lines = metrics(whole)
@@ -298,17 +318,19 @@ def test_every_kind_learns_under_every_rule_and_goes_on_bit_for_bit(kind, popula
 
 
 HOW = [
-    ("octahedron", "exact", "entry", "3d+screen"), ("octahedron", "exact", "overlap", "none"),
-    ("octahedron", "affine", "center", "3d+screen"), ("octahedron", "affine", "overlap", "none"),
-    ("tetrahedron", "exact", "overlap", "3d"), ("tetrahedron", "affine", "center", "3d+screen"),
-    ("tetrahedron", "affine", "entry", "none"), ("gaussian", "affine", "center", "3d+screen"),
-]  # fmt: skip
+    ("octahedron", "exact", "entry", "3d+screen"),
+    ("octahedron", "exact", "overlap", "none"),
+    ("octahedron", "affine", "center", "3d+screen"),
+    ("octahedron", "affine", "overlap", "none"),
+    ("tetrahedron", "exact", "overlap", "3d"),
+    ("tetrahedron", "affine", "center", "3d+screen"),
+    ("tetrahedron", "affine", "entry", "none"),
+    ("gaussian", "affine", "center", "3d+screen"),
+]
 
 
 @pytest.mark.parametrize(("kind", "ray_model", "order", "smooth"), HOW)
-def test_every_way_of_rendering_trains_and_is_used_by_renders(
-    kind, ray_model, order, smooth, tiny_scene, tmp_path
-):
+def test_every_way_of_rendering_trains_and_is_used_by_renders(kind, ray_model, order, smooth, tiny_scene, tmp_path):
     options = replace(
         QUICK,
         iterations=150,
@@ -350,16 +372,17 @@ def test_the_frame_of_the_data_set_comes_back(tmp_path):
         center = body.center
         # The texture is a function of the place in the shape's own frame, so it is asked for there.
         moved = TexturedMesh(
-            name, body.vertices * factor + shift, body.faces, body.part,
+            name,
+            body.vertices * factor + shift,
+            body.faces,
+            body.part,
             lambda points, face, bary, factor=factor: body.albedo((points / factor).astype(np.float32), face, bary),
             body.path,
-        )  # fmt: skip
+        )
         assert np.allclose(moved.center, center * factor + shift)
         scene, run = tmp_path / name, tmp_path / f"run_{name}"
         synthesize(scene, mesh=moved, views=14, test_views=2, size=48, points=400, supersample=2)
-        options = TrainOptions(
-            iterations=400, max_primitives=200, sh_degree=0, threads=1, checkpoint_every=400
-        )
+        options = TrainOptions(iterations=400, max_primitives=200, sh_degree=0, threads=1, checkpoint_every=400)
         results.append(train(scene, run, options=options, quiet=True)["psnr"])
         opened = Run.open(run)
         _, images = next(opened.render_views(opened.scene().test[:1]))

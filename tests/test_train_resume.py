@@ -40,9 +40,14 @@ from linprim_geo.trainer import Trainer
 def test_a_killed_run_goes_on_bit_for_bit(tiny_scene, tmp_path):
     # Growth, colour of degree 1, a random background: everything that draws random numbers or has state.
     options = TrainOptions(
-        iterations=200, max_primitives=260, initial_primitives=150, sh_degree=1, threads=1,
-        checkpoint_every=7, evaluate_every=20,
-    )  # fmt: skip
+        iterations=200,
+        max_primitives=260,
+        initial_primitives=150,
+        sh_degree=1,
+        threads=1,
+        checkpoint_every=7,
+        evaluate_every=20,
+    )
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     train(tiny_scene, whole, options=options, quiet=True)
     process = start_slow_training(tiny_scene, killed, options, 4.0, "--quiet")
@@ -58,9 +63,7 @@ def test_a_killed_run_goes_on_bit_for_bit(tiny_scene, tmp_path):
     assert_same_run(whole, killed)
 
 
-@pytest.mark.parametrize(
-    "torn", ["before the first checkpoint", "before the last export", "in a line of metrics"]
-)
+@pytest.mark.parametrize("torn", ["before the first checkpoint", "before the last export", "in a line of metrics"])
 def test_a_kill_at_the_worst_moment_loses_nothing(torn, tiny_scene, tiny_run, run_copy):
     if torn == "before the first checkpoint":
         for path in run_copy.iterdir():
@@ -79,9 +82,7 @@ def test_a_kill_at_the_worst_moment_loses_nothing(torn, tiny_scene, tiny_run, ru
 
 def test_resuming_a_finished_run_changes_nothing(tiny_scene, tiny_run, run_copy):
     result = train(tiny_scene, run_copy, resume=True, quiet=True)
-    assert result["iterations"] == 400 and result["psnr"] == pytest.approx(
-        metrics(tiny_run)[-1]["psnr"], abs=1e-3
-    )
+    assert result["iterations"] == 400 and result["psnr"] == pytest.approx(metrics(tiny_run)[-1]["psnr"], abs=1e-3)
     assert_same_run(tiny_run, run_copy)
 
 
@@ -155,9 +156,7 @@ def test_resume_wants_a_run_and_its_own_scene(tiny_scene, tiny_run, tmp_path):
 
 
 DAMAGE = {
-    "cut": lambda folder: (folder / "step_000400.pt").write_bytes(
-        (folder / "step_000400.pt").read_bytes()[:5000]
-    ),
+    "cut": lambda folder: (folder / "step_000400.pt").write_bytes((folder / "step_000400.pt").read_bytes()[:5000]),
     "empty": lambda folder: (folder / "step_000400.pt").write_bytes(b""),
     "no archive": lambda folder: (folder / "step_000400.pt").write_bytes(b"hello" * 500),
     "gone": lambda folder: (folder / "step_000400.pt").unlink(),

@@ -17,10 +17,13 @@ from linprim_geo.trainer import Trainer
 def test_activation_gives_the_opacity_of_the_raw_value():
     raw = torch.tensor([-30.0, -2.0, 0.0, 3.0, 40.0])
     parameters = {
-        "center": torch.zeros(5, 3), "rotation": torch.tensor([[1.0, 0, 0, 0]]).repeat(5, 1), "raw_opacity": raw,
-        "log_extent": torch.log(torch.tensor([0.2, 0.05, 3.0])).repeat(5, 1), "sh_dc": torch.zeros(5, 1, 3),
+        "center": torch.zeros(5, 3),
+        "rotation": torch.tensor([[1.0, 0, 0, 0]]).repeat(5, 1),
+        "raw_opacity": raw,
+        "log_extent": torch.log(torch.tensor([0.2, 0.05, 3.0])).repeat(5, 1),
+        "sh_dc": torch.zeros(5, 1, 3),
         "sh_rest": torch.zeros(5, 8, 3),
-    }  # fmt: skip
+    }
     _, _, extent, density, sh = training_step.activate(parameters, 1)
     # Along the shortest diagonal, 2 * 0.05 long, the light that is left is exp(-density * 0.1).
     expected = torch.sigmoid(raw.double())
@@ -54,9 +57,7 @@ def test_half_axes_stay_within_their_bounds_and_rotations_are_of_length_one(trai
         trainer.advance()
     extent = torch.exp(trainer.parameters["log_extent"])
     assert extent.min() >= 0.04 * (1 - 1e-6) and extent.max() <= 0.05 * (1 + 1e-6)
-    assert torch.allclose(
-        torch.linalg.vector_norm(trainer.parameters["rotation"], dim=1), torch.ones(len(trainer))
-    )
+    assert torch.allclose(torch.linalg.vector_norm(trainer.parameters["rotation"], dim=1), torch.ones(len(trainer)))
 
 
 def test_degrees_of_the_colour_join_one_after_the_other(trainer):
@@ -78,9 +79,7 @@ def test_a_child_has_its_parents_state_but_no_momentum(trainer):
     dc, second = trainer.parameters["sh_dc"].clone(), trainer.second["center"].clone()
     trainer._grow()
     assert 40 < len(trainer) <= 50
-    assert torch.equal(trainer.parameters["sh_dc"][:40], dc) and torch.equal(
-        trainer.second["center"][:40], second
-    )
+    assert torch.equal(trainer.parameters["sh_dc"][:40], dc) and torch.equal(trainer.second["center"][:40], second)
     for row in range(40, len(trainer)):
         assert (dc == trainer.parameters["sh_dc"][row]).all((1, 2)).any()
         assert (trainer.first["center"][row] == 0).all()
@@ -131,9 +130,13 @@ def test_the_start_of_every_kind(kind):
 def test_the_3d_filter_widens_what_is_rendered(kind):
     columns, raw = KINDS[kind].extents, torch.tensor([-2.0, 0.0, 3.0])
     parameters = {
-        "center": torch.zeros(3, 3), "rotation": torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1), "raw_opacity": raw,
-        "log_extent": torch.log(torch.full((3, columns), 0.2)), "sh_dc": torch.zeros(3, 1, 3), "sh_rest": torch.zeros(3, 0, 3),
-    }  # fmt: skip
+        "center": torch.zeros(3, 3),
+        "rotation": torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1),
+        "raw_opacity": raw,
+        "log_extent": torch.log(torch.full((3, columns), 0.2)),
+        "sh_dc": torch.zeros(3, 1, 3),
+        "sh_rest": torch.zeros(3, 0, 3),
+    }
     length = torch.tensor([0.0, 0.1, 0.3])
     _, _, extent, density, _ = training_step.activate(parameters, 0, kind, length)
     wider = torch.sqrt(0.04 + length**2) if kind == "gaussian" else 0.2 + length / 2

@@ -31,13 +31,9 @@ def room(tmp_path_factory):
     root = tmp_path_factory.mktemp("room")
     frames = []
     for i in range(7):
-        camera = look_at(
-            (-0.9 + 0.25 * i, -1.0 + 0.1 * i, 0.3 * np.sin(2.0 * i)), (1.5, 2.0, 0.2), SIZE, FOCAL
-        )
+        camera = look_at((-0.9 + 0.25 * i, -1.0 + 0.1 * i, 0.3 * np.sin(2.0 * i)), (1.5, 2.0, 0.2), SIZE, FOCAL)
         Image.fromarray(photograph(camera)).save(root / f"{i}.png")
-        frames.append(
-            {"file_path": f"{i}.png", "transform_matrix": (camera.camera_to_world @ OPENGL).tolist()}
-        )
+        frames.append({"file_path": f"{i}.png", "transform_matrix": (camera.camera_to_world @ OPENGL).tolist()})
     header = {"w": SIZE[0], "h": SIZE[1], "fl_x": FOCAL, "fl_y": FOCAL, "frames": frames}
     (root / "transforms.json").write_text(json.dumps(header))
     return root
@@ -112,9 +108,7 @@ def test_points_without_company_are_dropped():
 def test_unreliable_points_are_dropped(room):
     views = load_scene(room).train
     rng = np.random.default_rng(0)
-    wall = np.concatenate(
-        [rng.uniform(-1, 1, (200, 1)), np.full((200, 1), 2.0), rng.uniform(-1, 1, (200, 1))], axis=1
-    )
+    wall = np.concatenate([rng.uniform(-1, 1, (200, 1)), np.full((200, 1), 2.0), rng.uniform(-1, 1, (200, 1))], axis=1)
     odd = {
         "error of three": (1.6, [0, 2, 5]),
         "error of two": (0.6, [0, 5]),
@@ -153,9 +147,7 @@ def test_matches_that_the_poses_forbid_are_dropped(room, tmp_path):
     views = load_scene(room).train
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (6, 3)) + [1.5, 2.0, 0.2]
     one, two = (views[i].camera.project(points)[0] for i in (0, 4))
-    two[4:] += 20 * np.array(
-        [0.5, np.sqrt(0.75)]
-    )  # far off any epipolar line of these cameras, which run sideways
+    two[4:] += 20 * np.array([0.5, np.sqrt(0.75)])  # far off any epipolar line of these cameras, which run sideways
     _posed(views, tmp_path / "db")
     with pycolmap.Database.open(tmp_path / "db") as database:
         for i in range(len(views)):

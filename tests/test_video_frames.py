@@ -1,4 +1,5 @@
-"""Frames of a video: the sharpest of each part, kept under the video's content, and one sentence for what cannot be decoded."""
+"""Frames of a video: the sharpest of each part, kept under the video's content, and one sentence for what cannot be
+decoded."""
 
 from __future__ import annotations
 
@@ -43,8 +44,7 @@ def video(tmp_path_factory):
     path = tmp_path_factory.mktemp("video") / "walk.mp4"
     images = [picture(i, (64, 48)).resize((96, 64)) for i in range(24)]
     images = [
-        image if i in (1, 6, 13, 23) else image.filter(ImageFilter.GaussianBlur(3))
-        for i, image in enumerate(images)
+        image if i in (1, 6, 13, 23) else image.filter(ImageFilter.GaussianBlur(3)) for i, image in enumerate(images)
     ]
     write_video(path, images)
     return path
@@ -124,18 +124,14 @@ def test_videos_that_cannot_be_decoded_are_named(video, tmp_path, monkeypatch):
     with pytest.raises(LinprimError, match="--frames is 2, wanted at least 3"):
         prepare(video, frames=2)
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(
-        LinprimError, match="PyAV, which is not installed: pip install 'linprim-geo\\[video\\]'"
-    ):
+    with pytest.raises(LinprimError, match="PyAV, which is not installed: pip install 'linprim-geo\\[video\\]'"):
         extract_frames(video, 4, tmp_path / "cache")
 
 
 def test_a_video_is_a_capture_once_its_poses_are_found(tmp_path):
     path, images = tmp_path / "walk.mp4", []
     for i in range(16):
-        camera = look_at(
-            (-0.9 + 0.1 * i, -1.0 + 0.05 * i, 0.3 * np.sin(i)), (1.5, 2.0, 0.2), (192, 144), 165.0
-        )
+        camera = look_at((-0.9 + 0.1 * i, -1.0 + 0.05 * i, 0.3 * np.sin(i)), (1.5, 2.0, 0.2), (192, 144), 165.0)
         images.append(Image.fromarray(photograph(camera)))
     write_video(path, images)
     with pytest.raises(LinprimError, match="a video of which no 8 frames were taken yet"):

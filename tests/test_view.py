@@ -1,4 +1,5 @@
-"""The view of a run: what a browser is served, what the controls do, and that it follows a run that is being trained."""
+"""The view of a run: what a browser is served, what the controls do, and that it follows a run that is being
+trained."""
 
 from __future__ import annotations
 
@@ -92,9 +93,7 @@ def test_primitives_are_polyhedra_from_an_opacity_on(viewer, meshed):
     change(viewer, opacity=0.0, color="opacity")
     colors = shown(viewer, "/primitives").visual.vertex_attributes["color"][::6, :3]
     brightest = colors.sum(1).astype(int)
-    assert (
-        np.corrcoef(np.argsort(np.argsort(brightest)), np.argsort(np.argsort(primitives.alpha)))[0, 1] > 0.95
-    )
+    assert np.corrcoef(np.argsort(np.argsort(brightest)), np.argsort(np.argsort(primitives.alpha)))[0, 1] > 0.95
     change(viewer, primitives=False)
     assert shown(viewer, "/primitives") is None
 
@@ -133,9 +132,7 @@ def test_the_clipping_plane_cuts_both(viewer, meshed):
 
 def test_cameras_stand_where_photographs_were_taken(viewer, meshed):
     run = Run.open(meshed)
-    frusta = {
-        name: handle for name, handle in viewer._shown.items() if name.startswith(("/train/", "/test/"))
-    }
+    frusta = {name: handle for name, handle in viewer._shown.items() if name.startswith(("/train/", "/test/"))}
     assert len(frusta) == 15 and sum(name.startswith("/test/") for name in frusta) == 3
     first = run.scene().train[0].camera.transformed(run.similarity)
     handle = frusta["/train/0"]
@@ -165,7 +162,8 @@ def test_what_stands_in_files_is_shown_and_not_run(meshed, tmp_path):
     try:
         change(made, mesh="tsdf", layer="predicted error")
         for content in (made._legend.content, made._text.content):
-            # In CommonMark a backslash before any ASCII punctuation leaves that as it is, and no other punctuation is left.
+            # In CommonMark a backslash before any ASCII punctuation leaves that as it is, and no other punctuation is
+            # left.
             assert not re.search(r"[!-/:-@\[-`{-~]", re.sub(r"\\[!-/:-@\[-`{-~]", "", content))
         assert evil in re.sub(r"\\([!-/:-@\[-`{-~])", r"\1", made._legend.content)
     finally:
@@ -252,9 +250,13 @@ def test_training_is_watched_only_if_asked(monkeypatch):
 def started(words: list[str], **settings) -> tuple[subprocess.Popen, str]:
     """A process that has said where its view is; Ctrl-C reaches it even if those who started this one ignore it."""
     process = subprocess.Popen(
-        [sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL), **settings,
-    )  # fmt: skip
+        [sys.executable, *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        **settings,
+    )
     line = process.stderr.readline()
     found = re.match(r"(http://localhost:\d+): ", line)
     assert found, line + process.stderr.read()
@@ -263,15 +265,11 @@ def started(words: list[str], **settings) -> tuple[subprocess.Popen, str]:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_and_a_request_to_end_are_no_errors(meshed, number):
-    process, address = started(
-        ["-m", "linprim_geo", "view", str(meshed), "--no-browser", "--port", "0", "--json"]
-    )
+    process, address = started(["-m", "linprim_geo", "view", str(meshed), "--no-browser", "--port", "0", "--json"])
     assert page(address)
     process.send_signal(number)
     out, error = process.communicate(timeout=30)
-    assert (
-        process.returncode == 0 and error == "" and f'"address": "{address}"' in out and out.count("\n") == 1
-    )
+    assert process.returncode == 0 and error == "" and f'"address": "{address}"' in out and out.count("\n") == 1
 
 
 def test_a_view_of_training_ends_with_it(meshed):

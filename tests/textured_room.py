@@ -1,4 +1,5 @@
-"""Photographs of a cubic room seen from inside, with a texture that keypoints are found on and cameras known exactly."""
+"""Photographs of a cubic room seen from inside, with a texture that keypoints are found on and cameras known
+exactly."""
 
 from __future__ import annotations
 

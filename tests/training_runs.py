@@ -67,16 +67,16 @@ def assert_same_run(one, other):
 
 def option_list(options: TrainOptions) -> list[str]:
     """The options as the command line writes them."""
-    return [
-        word for name, value in vars(options).items() for word in (f"--{name.replace('_', '-')}", str(value))
-    ]
+    return [word for name, value in vars(options).items() for word in (f"--{name.replace('_', '-')}", str(value))]
 
 
 def start_slow_training(scene, run, options, milliseconds=4.0, *more):
     return subprocess.Popen(
         [sys.executable, "-c", SLOW_TRAINING, str(scene), str(run), str(milliseconds), *option_list(options), *more],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
 
 
 def wait_for(condition, process, seconds=60.0):

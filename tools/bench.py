@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Times the rasterizer on a furnished room of N primitives made by code: ns per (pixel, primitive) hit, forward and backward, and what
-the core can do at that moment.
+"""Times the rasterizer on a furnished room of N primitives made by code: ns per (pixel, primitive) hit, forward and
+backward, and what the core can do at that moment.
 
     python tools/bench.py --primitives 50000 --threads 1 --json
 
-Primitives lie on the surfaces of a 6 x 3 x 5 m room with boxes and spheres, sized so that the number over a surface point does
-not depend on N; the camera looks in from the open front. Forward, backward and the limits alternate; figures are medians. The limits
-are of one thread and instruction set: peak multiply-adds, the vector exponential, and the bare pair kernels of octahedra with all data
-in the first cache and every pixel hit (csrc/machine_limits.h).
+Primitives lie on the surfaces of a 6 x 3 x 5 m room with boxes and spheres, sized so that the number over a surface
+point does not depend on N; the camera looks in from the open front. Forward, backward and the limits alternate; figures
+are medians. The limits are of one thread and instruction set: peak multiply-adds, the vector exponential, and the bare
+pair kernels of octahedra with all data in the first cache and every pixel hit (csrc/machine_limits.h).
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ import numpy as np
 
 
 def room(count: int, seed: int = 0, overlap: float = 0.60) -> dict[str, np.ndarray]:
-    """`count` flat octahedra on the room's surfaces: half-axes 2.6 s with s = overlap sqrt(area / count) in the surface, 0.15 s across."""
+    """`count` flat octahedra on the room's surfaces: half-axes 2.6 s with s = overlap sqrt(area / count) in the
+    surface, 0.15 s across."""
     rng = np.random.default_rng(seed)
     walls: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
@@ -43,9 +44,7 @@ def room(count: int, seed: int = 0, overlap: float = 0.60) -> dict[str, np.ndarr
         (np.array([-1.3, -0.5, 4.2]), 0.45),
         (np.array([1.6, -0.7, 5.6]), 0.6),
     ]
-    areas = np.array(
-        [np.linalg.norm(np.cross(u, v)) for _, u, v in walls] + [4 * np.pi * r * r for _, r in balls]
-    )
+    areas = np.array([np.linalg.norm(np.cross(u, v)) for _, u, v in walls] + [4 * np.pi * r * r for _, r in balls])
     which = rng.choice(len(areas), count, p=areas / areas.sum())
     center, normal = np.zeros((count, 3)), np.zeros((count, 3))
     for k, (origin, u, v) in enumerate(walls):
@@ -86,7 +85,8 @@ def room(count: int, seed: int = 0, overlap: float = 0.60) -> dict[str, np.ndarr
 
 
 def as_kind(arrays: dict[str, np.ndarray], kind: str) -> dict[str, np.ndarray]:
-    """The same room of Gaussians (half-axes are 2.6 standard deviations, opacity along the shortest) or tetrahedra of equal volume."""
+    """The same room of Gaussians (half-axes are 2.6 standard deviations, opacity along the shortest) or tetrahedra of
+    equal volume."""
     if kind == "gaussian":
         opacity = -np.expm1(-2 * arrays["density"] * arrays["extent"].min(1))
         return arrays | {"extent": arrays["extent"] / np.float32(2.6), "density": opacity}
@@ -171,9 +171,7 @@ def measure(
         "pairs": stats["pairs"],
         "visited_per_hit": stats["visited_lanes"] / hits,
         "pairs_per_tile": stats["pairs"] / (-(-width // 16) * -(-height // 16)),
-        "forward_ns_per_hit": 1e6
-        * sum(stages[s]["median"] for s in ("project", "sort", "bin", "forward"))
-        / hits,
+        "forward_ns_per_hit": 1e6 * sum(stages[s]["median"] for s in ("project", "sort", "bin", "forward")) / hits,
         "backward_ns_per_hit": 1e6 * sum(stages[s]["median"] for s in ("backward", "chain")) / hits,
         "raster_forward_ns_per_hit": 1e6 * stages["forward"]["median"] / hits,
         "raster_backward_ns_per_hit": 1e6 * stages["backward"]["median"] / hits,
@@ -212,12 +210,14 @@ def main() -> None:
     for r in results:
         s = {k: v["median"] for k, v in r["stages_ms"].items()}
         print(
-            f"{r['primitives']:>7} primitives, {r['threads']} thread(s), {r['instruction_set']}: {r['hits'] / 1e6:.2f} M hits, "
+            f"{r['primitives']:>7} primitives, {r['threads']} thread(s), {r['instruction_set']}: "
+            f"{r['hits'] / 1e6:.2f} M hits, "
             f"{r['visited_per_hit']:.2f} visited per hit, {r['pairs']} pairs"
         )
         print(
             f"        forward {r['forward_ns_per_hit']:.2f} ns/hit (tiles alone {r['raster_forward_ns_per_hit']:.2f}), "
-            f"backward {r['backward_ns_per_hit']:.2f} ({r['raster_backward_ns_per_hit']:.2f}), iteration {r['iteration_ms']:.1f} ms"
+            f"backward {r['backward_ns_per_hit']:.2f} ({r['raster_backward_ns_per_hit']:.2f}), iteration "
+            f"{r['iteration_ms']:.1f} ms"
         )
         forward = r["raster_forward_ns_per_hit"] / r["visited_per_hit"] / r["limit_forward_ns"]
         backward = r["raster_backward_ns_per_hit"] / r["limit_backward_ns"]

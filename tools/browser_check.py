@@ -1,5 +1,6 @@
 #!/usr/bin/env python3
-"""Opens pages in a headless Chromium and fails on errors in the console, requests to elsewhere, and canvases that stay blank.
+"""Opens pages in a headless Chromium and fails on errors in the console, requests to elsewhere, and canvases that stay
+blank.
 
 python tools/browser_check.py                       makes a tiny run, and checks its report and its view
 python tools/browser_check.py PAGE -o shot.png      checks a file or an address
@@ -28,9 +29,17 @@ from pathlib import Path
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 # WebGL is computed by the processor, so that no graphics card is needed.
 FLAGS = (
-    "--headless=new", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--remote-debugging-port=0",
-    "--no-first-run", "--disable-extensions", "--disable-background-networking", "--disable-component-update", "--hide-scrollbars",
-)  # fmt: skip
+    "--headless=new",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--remote-debugging-port=0",
+    "--no-first-run",
+    "--disable-extensions",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--hide-scrollbars",
+)
 START_SECONDS, ANSWER_SECONDS = 60, 120
 # A canvas with fewer colours than this shows nothing.
 LEAST_COLORS = 12
@@ -47,14 +56,13 @@ class Browser:
         program = next((found for name in BROWSERS if (found := shutil.which(name))), None)
         if program is None:
             raise SystemExit(
-                f"browser_check: no browser was found (tried {', '.join(BROWSERS)}); on Debian: apt-get install -y chromium"
+                f"browser_check: no browser was found (tried {', '.join(BROWSERS)}); on Debian: apt-get install "
+                "-y chromium"
             )
         try:
             from websockets.sync.client import connect
         except ModuleNotFoundError:
-            raise SystemExit(
-                "browser_check: the library websockets is not installed: pip install websockets"
-            ) from None
+            raise SystemExit("browser_check: the library websockets is not installed: pip install websockets") from None
         root = ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
         words = [program, *FLAGS, *root, f"--user-data-dir={folder}", "about:blank"]
         self.process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -131,8 +139,7 @@ class Browser:
                 found.append("exception: " + details.get("exception", {}).get("description", details["text"]))
             elif kind == "Runtime.consoleAPICalled" and what["type"] in ("error", "assert"):
                 found.append(
-                    "console: "
-                    + " ".join(str(each.get("value", each.get("description"))) for each in what["args"])
+                    "console: " + " ".join(str(each.get("value", each.get("description"))) for each in what["args"])
                 )
             elif kind == "Log.entryAdded" and what["entry"]["level"] == "error":
                 found.append(f"log: {what['entry']['text']} {what['entry'].get('url', '')}")
@@ -166,8 +173,10 @@ class Browser:
         self.value(
             "new Promise(done => setTimeout(() => requestAnimationFrame(() => requestAnimationFrame(done)), 300))"
         )
-        box = self.value(f"(() => {{ const b = document.querySelectorAll('canvas')[{element}].getBoundingClientRect();"
-                         " return [b.x, b.y, b.right, b.bottom]; })()")  # fmt: skip
+        box = self.value(
+            f"(() => {{ const b = document.querySelectorAll('canvas')[{element}].getBoundingClientRect();"
+            " return [b.x, b.y, b.right, b.bottom]; })()"
+        )
         image = Image.open(io.BytesIO(self.screenshot())).convert("RGB").crop([round(side) for side in box])
         # The middle, where controls that lie over a canvas do not count.
         width, height = image.size
@@ -195,9 +204,19 @@ def browser() -> Iterator[Browser]:
             opened.close()
 
 
-def check(opened: Browser, address: str, *, size=DESK, dark: bool = False, seconds: float = 1.0, canvas: bool | None = None,
-          shot: Path | None = None, whole: bool = False) -> list[str]:  # fmt: skip
-    """What is wrong with a page: complaints, wider than its window, blank canvases; none at all if `canvas` asks for one."""
+def check(
+    opened: Browser,
+    address: str,
+    *,
+    size=DESK,
+    dark: bool = False,
+    seconds: float = 1.0,
+    canvas: bool | None = None,
+    shot: Path | None = None,
+    whole: bool = False,
+) -> list[str]:
+    """What is wrong with a page: complaints, wider than its window, blank canvases; none at all if `canvas` asks for
+    one."""
     opened.open(address, size, dark, seconds)
     found = []
     for element in range(opened.value("document.querySelectorAll('canvas').length")):
@@ -217,13 +236,9 @@ def check(opened: Browser, address: str, *, size=DESK, dark: bool = False, secon
 def use_viewer(opened: Browser) -> list[str]:
     """Turns the mesh of a report that is open, and switches its colours; what did not change the picture is a fault."""
     found, canvas = [], "document.getElementById('view')"
-    picture = (
-        f"new Promise(done => setTimeout(() => requestAnimationFrame(() => done({canvas}.toDataURL())), 100))"
-    )
+    picture = f"new Promise(done => setTimeout(() => requestAnimationFrame(() => done({canvas}.toDataURL())), 100))"
     before = opened.value(picture)
-    opened.value(
-        f"{canvas}.focus(); {canvas}.dispatchEvent(new KeyboardEvent('keydown', {{key: 'ArrowLeft'}}))"
-    )
+    opened.value(f"{canvas}.focus(); {canvas}.dispatchEvent(new KeyboardEvent('keydown', {{key: 'ArrowLeft'}}))")
     if (turned := opened.value(picture)) == before:
         found.append("an arrow key does not turn the mesh")
     box = opened.value(
@@ -231,9 +246,7 @@ def use_viewer(opened: Browser) -> list[str]:
     )
     for kind, shift, buttons in (("mousePressed", 0, 1), ("mouseMoved", 60, 1), ("mouseReleased", 60, 0)):
         place = {"x": box[0] + shift, "y": box[1] + shift / 3}
-        opened.call(
-            "Input.dispatchMouseEvent", type=kind, button="left", buttons=buttons, clickCount=1, **place
-        )
+        opened.call("Input.dispatchMouseEvent", type=kind, button="left", buttons=buttons, clickCount=1, **place)
     if (dragged := opened.value(picture)) == turned:
         found.append("dragging does not turn the mesh")
     layers = opened.value("[...document.querySelectorAll('#view-layers input')].map(each => each.value)")
@@ -255,17 +268,13 @@ def check_report(opened: Browser, page: Path, folder: Path) -> list[str]:
         )
         faults += use_viewer(opened) + opened.complaints(address)
         found += [f"{page} ({name}): {fault}" for fault in dict.fromkeys(faults)]
-    (folder / "report.pdf").write_bytes(
-        base64.b64decode(opened.call("Page.printToPDF", printBackground=True)["data"])
-    )
+    (folder / "report.pdf").write_bytes(base64.b64decode(opened.call("Page.printToPDF", printBackground=True)["data"]))
     return found
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "page", nargs="?", help="file or address (default: a tiny run's report and view, made for it)"
-    )
+    parser.add_argument("page", nargs="?", help="file or address (default: a tiny run's report and view, made for it)")
     parser.add_argument(
         "-o",
         "--output",
@@ -273,9 +282,7 @@ def main() -> int:
         default=Path("runs/browser_check"),
         help="folder of screenshots, or .png of a page",
     )
-    parser.add_argument(
-        "--seconds", type=float, default=1.0, help="to wait after a page has loaded (default 1)"
-    )
+    parser.add_argument("--seconds", type=float, default=1.0, help="to wait after a page has loaded (default 1)")
     args = parser.parse_args()
     with browser() as opened:
         if args.page is None:
@@ -304,9 +311,7 @@ def check_all(opened: Browser, folder: Path) -> list[str]:
         synthesize(scene, shape="cad", views=20, test_views=3, size=64, points=500, supersample=2)
         train(scene, run, options=TrainOptions(iterations=400, max_primitives=400, sh_degree=1), quiet=True)
         extract_mesh(run, quiet=True)
-        found = check_report(
-            opened, Path(report_run(run, reference=scene / "reference.ply")["report"]), folder
-        )
+        found = check_report(opened, Path(report_run(run, reference=scene / "reference.ply")["report"]), folder)
         return found + check_view(opened, run, scene / "reference.ply", folder)
 
 

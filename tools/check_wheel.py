@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
-"""Builds the sdist and, from it, the wheel; installs the wheel into a fresh environment and runs it there: `python tools/check_wheel.py`.
+"""Builds the sdist and, from it, the wheel; installs the wheel into a fresh environment and runs it there: `python
+tools/check_wheel.py`.
 
-The wheel is looked through for what it has to hold, then commands from `doctor` to `report` run in a folder of their own, with a PATH that
-has no compiler on it. --python chooses the interpreter (from 3.12 on the wheel serves every later Python too), --output keeps the two
-files, otherwise nothing is left. Downloads the libraries of constraints.txt; takes several minutes.
-Exit status: 0, or 1 with one sentence about the first thing that failed.
+The wheel is looked through for what it has to hold, then commands from `doctor` to `report` run in a folder of their
+own, with a PATH that has no compiler on it. --python chooses the interpreter (from 3.12 on the wheel serves every later
+Python too), --output keeps the two files, otherwise nothing is left. Downloads the libraries of constraints.txt; takes
+several minutes. Exit status: 0, or 1 with one sentence about the first thing that failed.
 """
 
 from __future__ import annotations
@@ -44,9 +45,7 @@ def run(*words: str | Path, **settings) -> str:
     done = subprocess.run([str(word) for word in words], capture_output=True, text=True, **settings)
     if done.returncode:
         said = (done.stderr.strip() or done.stdout.strip()).splitlines()[-12:]
-        raise Failed(
-            f"{' '.join(str(word) for word in words)} ended with {done.returncode}:\n" + "\n".join(said)
-        )
+        raise Failed(f"{' '.join(str(word) for word in words)} ended with {done.returncode}:\n" + "\n".join(said))
     return done.stdout
 
 
@@ -65,7 +64,8 @@ def build(python: Path, output: Path) -> tuple[Path, Path]:
 
 
 def check_contents(wheel: Path) -> int:
-    """Every file of the packages is in the wheel, and the core, the entry point and the licence; returns the number of files."""
+    """Every file of the packages is in the wheel, and the core, the entry point and the licence; returns the number of
+    files."""
     packed = set(zipfile.ZipFile(wheel).namelist())
     for source, target in PACKAGES.items():
         for file in (ROOT / source).rglob("*"):
@@ -114,9 +114,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description="Builds sdist and wheel, installs the wheel into a fresh environment and runs it."
     )
-    parser.add_argument(
-        "--python", default=sys.executable, metavar="PROGRAM", help="interpreter (default: this one)"
-    )
+    parser.add_argument("--python", default=sys.executable, metavar="PROGRAM", help="interpreter (default: this one)")
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="keep the two files here")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="linprim-geo-wheel-") as temporary:

@@ -1,11 +1,12 @@
-"""Damaged inputs for every reader: each must be read correctly or refused with one sentence, in bounded time and memory.
+"""Damaged inputs for every reader: each must be read correctly or refused with one sentence, in bounded time and
+memory.
 
     python tools/fuzz.py --inputs 100000 --seed 0
     python tools/fuzz.py --only "mesh glb" --seed 0 --at 123      one input again, with its traceback; its file is kept
 
-An input is a whole file that was damaged by mutations drawn from (seed, reader, number). Readers run in a process of their own that may
-take 1 GiB more than it has, and that is started again after a crash; every input is on disk before it is tried. Exit status 1 if there
-is a finding.
+An input is a whole file that was damaged by mutations drawn from (seed, reader, number). Readers run in a process of
+their own that may take 1 GiB more than it has, and that is started again after a crash; every input is on disk before
+it is tried. Exit status 1 if there is a finding.
 """
 
 from __future__ import annotations
@@ -85,7 +86,9 @@ def attempt(case: Case, path: Path) -> tuple[str, str]:
 
 def _place(trace) -> str:
     """The innermost line of the package in a traceback."""
-    frames = [frame for frame in traceback.extract_tb(trace) if "linprim_geo" in frame.filename or "fuzz_" in frame.filename]
+    frames = [
+        frame for frame in traceback.extract_tb(trace) if "linprim_geo" in frame.filename or "fuzz_" in frame.filename
+    ]
     return f"[{Path(frames[-1].filename).name}:{frames[-1].lineno}]" if frames else ""
 
 
@@ -94,7 +97,8 @@ def _alarm(*_):
 
 
 def work(names: list[str], counts: list[int], seed: int, start: int, folder: Path) -> None:
-    """The process that reads: inputs from `start` of the first reader on; counts and findings go to a file in `folder`."""
+    """The process that reads: inputs from `start` of the first reader on; counts and findings go to a file in
+    `folder`."""
     import resource
 
     _prepare(folder)
@@ -116,7 +120,9 @@ def work(names: list[str], counts: list[int], seed: int, start: int, folder: Pat
                 if outcome in seen:
                     seen[outcome] += 1
                 else:
-                    print(json.dumps({"reader": name, "finding": outcome, "said": said, "number": number}), file=results)
+                    print(
+                        json.dumps({"reader": name, "finding": outcome, "said": said, "number": number}), file=results
+                    )
                 if number % 100 == 99 or number == count - 1:
                     print(json.dumps({"reader": name, "upto": number, **seen}), file=results)
                     seen = dict.fromkeys(seen, 0)
@@ -150,7 +156,10 @@ def _case(name: str, folder: Path) -> Case:
 
 def run(names: list[str], counts: list[int], seed: int, folder: Path) -> dict[str, dict]:
     """{reader: read, refused, and a list of findings}, from as many processes, one after the other, as it takes."""
-    table = {name: {"inputs": count, "read": 0, "refused": 0, "findings": []} for name, count in zip(names, counts, strict=True)}
+    table = {
+        name: {"inputs": count, "read": 0, "refused": 0, "findings": []}
+        for name, count in zip(names, counts, strict=True)
+    }
     first, start = 0, 0
     while first < len(names):
         arguments = [json.dumps(names[first:]), json.dumps(counts[first:]), str(seed), str(start), str(folder)]
@@ -172,7 +181,9 @@ def run(names: list[str], counts: list[int], seed: int, folder: Path) -> dict[st
             return table
         text = (folder / "current").read_text().split("\n")[0]
         if not text:
-            raise SystemExit(f"fuzz: the reading process ended with {status} before its first input: see {folder / 'log'}")
+            raise SystemExit(
+                f"fuzz: the reading process ended with {status} before its first input: see {folder / 'log'}"
+            )
         name, number, path = json.loads(text)
         said = f"the process ended with {status}"
         shutil.copy(path, folder / f"crash_{name.replace(' ', '_')}_{number}{Path(path).suffix}")
@@ -201,13 +212,17 @@ def show(table: dict[str, dict]) -> str:
     for name, row in table.items():
         lines.append(f"{name:18}{row['inputs']:9}{row['refused']:9}{row['read']:9}{len(row['findings']):10}")
     total = [sum(row[key] for row in table.values()) for key in ("inputs", "refused", "read")]
-    lines.append(f"{'total':18}{total[0]:9}{total[1]:9}{total[2]:9}{sum(len(row['findings']) for row in table.values()):10}")
+    lines.append(
+        f"{'total':18}{total[0]:9}{total[1]:9}{total[2]:9}{sum(len(row['findings']) for row in table.values()):10}"
+    )
     groups: dict[tuple, list] = {}
     for row in table.values():
         for entry in row["findings"]:
             groups.setdefault((entry["reader"], entry["finding"], entry["said"].split("[")[-1]), []).append(entry)
     for (reader, finding, _), entries in groups.items():
-        lines.append(f"{reader}: {finding} x{len(entries)}, --only {reader!r} --at {entries[0]['number']}: {entries[0]['said']}")
+        lines.append(
+            f"{reader}: {finding} x{len(entries)}, --only {reader!r} --at {entries[0]['number']}: {entries[0]['said']}"
+        )
     return "\n".join(lines)
 
 

@@ -29,7 +29,11 @@ def make_transforms(folder: Path) -> None:
         image(folder / "images" / f"{number}.png", "RGBA")
         image(folder / f"depth_{number}.png", "I;16")
         image(folder / f"normal_{number}.png", "RGB")
-        frame = {"file_path": f"images/{number}.png", "transform_matrix": pose.tolist(), "depth_file_path": f"depth_{number}.png"}
+        frame = {
+            "file_path": f"images/{number}.png",
+            "transform_matrix": pose.tolist(),
+            "depth_file_path": f"depth_{number}.png",
+        }
         frames.append(frame | {"normal_file_path": f"normal_{number}.png", "mask_path": f"normal_{number}.png"})
     make_points(folder)
     header = {"camera_angle_x": 0.8, "w": 12, "h": 9, "fl_x": 10.0, "fl_y": 11.0, "cx": 6.0, "cy": 4.5, "units": "m"}
@@ -126,7 +130,9 @@ def _log(folder: Path, name: str) -> None:
         rows += [f"{number} {number} 0", *(" ".join(map(str, row)) for row in pose.tolist())]
     (folder / name).write_text("\n".join(rows) + "\n")
     matrix = [10.0, 0, 0, 0, 11.0, 0, SIZE[0] / 2, SIZE[1] / 2, 1]
-    (folder / "intrinsic.json").write_text(json.dumps({"width": SIZE[0], "height": SIZE[1], "intrinsic_matrix": matrix}))
+    (folder / "intrinsic.json").write_text(
+        json.dumps({"width": SIZE[0], "height": SIZE[1], "intrinsic_matrix": matrix})
+    )
 
 
 def make_redwood(folder: Path) -> None:
@@ -152,7 +158,11 @@ def make_tum(folder: Path) -> None:
     from PIL import Image
     from scipy.spatial.transform import Rotation
 
-    lists = {"rgb": ["# timestamp filename"], "depth": ["# timestamp filename"], "groundtruth": ["# timestamp tx ty tz qx qy qz qw"]}
+    lists = {
+        "rgb": ["# timestamp filename"],
+        "depth": ["# timestamp filename"],
+        "groundtruth": ["# timestamp tx ty tz qx qy qz qw"],
+    }
     for name, mode in (("rgb", "RGB"), ("depth", "I;16")):
         (folder / name).mkdir()
         for number in range(3):
@@ -169,13 +179,29 @@ def make_tum(folder: Path) -> None:
 def make_scannetpp(folder: Path) -> None:
     device = folder / "dslr"
     (device / "nerfstudio").mkdir(parents=True)
-    frames = [{"file_path": f"{number}.png", "transform_matrix": pose.tolist()} for number, pose in enumerate(_poses(3))]
+    frames = [
+        {"file_path": f"{number}.png", "transform_matrix": pose.tolist()} for number, pose in enumerate(_poses(3))
+    ]
     for name in ("resized_images", "resized_undistorted_images"):
         (device / name).mkdir()
         for number in range(3):
             image(device / name / f"{number}.png", "RGB")
-    header = {"w": SIZE[0], "h": SIZE[1], "fl_x": 10.0, "fl_y": 11.0, "cx": 6.0, "cy": 4.5, "camera_model": "OPENCV_FISHEYE"}
-    header |= {"k1": 0.0, "k2": 0.0, "k3": 0.0, "k4": 0.0, "applied_transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]}
+    header = {
+        "w": SIZE[0],
+        "h": SIZE[1],
+        "fl_x": 10.0,
+        "fl_y": 11.0,
+        "cx": 6.0,
+        "cy": 4.5,
+        "camera_model": "OPENCV_FISHEYE",
+    }
+    header |= {
+        "k1": 0.0,
+        "k2": 0.0,
+        "k3": 0.0,
+        "k4": 0.0,
+        "applied_transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]],
+    }
     for name, model in (("transforms", "OPENCV_FISHEYE"), ("transforms_undistorted", "PINHOLE")):
         text = json.dumps(header | {"camera_model": model, "frames": frames[:2], "test_frames": frames[2:]})
         (device / "nerfstudio" / f"{name}.json").write_text(text)
@@ -222,7 +248,10 @@ def make_protocol(folder: Path) -> None:
     crop = {"orthogonal_axis": "Z", "axis_min": -1, "axis_max": 2.5, "bounding_polygon": corners}
     (folder / "crop.json").write_text(json.dumps(crop))
     (folder / "matrix.txt").write_text("1 0 0 2\n0 1 0 3\n0 0 1 4.5\n0 0 0 1\n")
-    savemat(folder / "mask.mat", {"ObsMask": np.ones((3, 4, 5), np.uint8), "BB": np.array([[0, 0, 0], [3, 4, 5.0]]), "Res": 1.0})
+    savemat(
+        folder / "mask.mat",
+        {"ObsMask": np.ones((3, 4, 5), np.uint8), "BB": np.array([[0, 0, 0], [3, 4, 5.0]]), "Res": 1.0},
+    )
     savemat(folder / "plane.mat", {"P": np.array([0, 0, 1, -0.5])}, do_compression=True)
 
 
@@ -253,11 +282,21 @@ def make_run(folder: Path) -> None:
     make_transforms(folder / "scene")
     options = TrainOptions(max_primitives=20, iterations=10, threads=1, sh_degree=1)
     where = folder / "run", load_scene(folder / "scene" / "bare.json"), folder / "scene"
-    run = Run.create(*where, SceneOptions(), options, Similarity(0.5, (1.0, 2.0, 3.0)), "x", [], {"seconds": 9.0, "finish_seconds": 1.0})
+    run = Run.create(
+        *where,
+        SceneOptions(),
+        options,
+        Similarity(0.5, (1.0, 2.0, 3.0)),
+        "x",
+        [],
+        {"seconds": 9.0, "finish_seconds": 1.0},
+    )
     trainer = _trainer(options)
     for _ in range(3):
         trainer.advance()
-    run.save(trainer.primitives(), {"iteration": 3, "primitives": len(trainer), "background": [1, 1, 1], "seconds": 1.5})
+    run.save(
+        trainer.primitives(), {"iteration": 3, "primitives": len(trainer), "background": [1, 1, 1], "seconds": 1.5}
+    )
     lines = [json.dumps({"step": step, "loss": 0.5, "psnr": 20.0}) for step in (1, 2, 3)]
     (folder / "run" / "metrics.jsonl").write_text("\n".join(lines) + "\n")
     import torch
@@ -296,7 +335,10 @@ def read_run_file(file: Path) -> None:
     run = Run.open(folder)
     finite(run.background, (3,), "background")
     check_primitives(run.primitives())
-    check(isinstance(run.notes, dict) and isinstance(run.unit, str) and isinstance(run.instruction_set, str), "notes are no table")
+    check(
+        isinstance(run.notes, dict) and isinstance(run.unit, str) and isinstance(run.instruction_set, str),
+        "notes are no table",
+    )
     if "time_budget" in run.notes:
         from linprim_geo.pacing import Pace
 

@@ -37,11 +37,19 @@ def _primitives(kind: str, degree: int, count: int = 5):
 
 def check_primitives(primitives) -> None:
     count = len(primitives)
-    for name, shape in (("center", (count, 3)), ("rotation", (count, 4)), ("density", (count,)), ("sh", (count, None, 3))):
+    for name, shape in (
+        ("center", (count, 3)),
+        ("rotation", (count, 4)),
+        ("density", (count,)),
+        ("sh", (count, None, 3)),
+    ):
         finite(getattr(primitives, name), shape, name)
     finite(primitives.extent, (count, None), "extent")
     finite(primitives.axes, (count, 3, 3), "axes")
-    check(bool((primitives.extent > 0).all() and (primitives.density >= 0).all()), "an extent or density is out of its range")
+    check(
+        bool((primitives.extent > 0).all() and (primitives.density >= 0).all()),
+        "an extent or density is out of its range",
+    )
 
 
 def make_primitive_ply(folder: Path) -> None:
@@ -81,7 +89,9 @@ def make_points(folder: Path) -> None:
     for name, layout in (("ascii", "ascii"), ("little", "binary_little_endian"), ("big", "binary_big_endian")):
         header = "\n".join(["ply", f"format {layout} 1.0", "element vertex 6", *properties, "end_header", ""]).encode()
         if layout == "ascii":
-            body = "".join(" ".join(map(str, [*p, *c])) + "\n" for p, c in zip(xyz.tolist(), rgb.tolist(), strict=True)).encode()
+            body = "".join(
+                " ".join(map(str, [*p, *c])) + "\n" for p, c in zip(xyz.tolist(), rgb.tolist(), strict=True)
+            ).encode()
         else:
             order = "<" if name == "little" else ">"
             table = np.zeros(6, [("x", order + "f4"), ("y", order + "f8"), ("z", order + "f4"), ("rgb", "u1", 3)])
@@ -115,12 +125,15 @@ def make_meshes(folder: Path) -> None:
         save_mesh(folder / f"far{suffix}", far)
     rows = "".join(" ".join(map(str, [*p, 9, 99, 199])) + "\n" for p in vertices.tolist())
     (folder / "ascii.ply").write_text(
-        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nproperty uchar red\n"
-        "property uchar green\nproperty uchar blue\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
-        + rows + "4 0 1 2 3\n3 0 1 2\n"
-    )  # fmt: skip
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nproperty "
+        "uchar red\n"
+        "property uchar green\nproperty uchar blue\nelement face 2\nproperty list uchar int "
+        "vertex_indices\nend_header\n" + rows + "4 0 1 2 3\n3 0 1 2\n"
+    )
     (folder / "ascii.stl").write_text(
-        "solid a\n" + "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n" * 2 + "endsolid a\n"
+        "solid a\n"
+        + "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n" * 2
+        + "endsolid a\n"
     )
     (folder / "picture.mtl").write_text("newmtl a\nKd 1 0.5 0\nmap_Kd picture.png\n")
     image(folder / "picture.png", "RGB")
@@ -161,15 +174,29 @@ def image(path: Path, mode: str, **how) -> None:
     elif mode == "F":
         Image.fromarray(rng.random(SIZE[::-1]).astype(np.float32)).save(path, **how)
     elif mode == "P":
-        Image.fromarray(rng.integers(0, 256, (*shape, 3)).astype(np.uint8), "RGB").quantize(16).save(path, transparency=3, **how)
+        Image.fromarray(rng.integers(0, 256, (*shape, 3)).astype(np.uint8), "RGB").quantize(16).save(
+            path, transparency=3, **how
+        )
     else:
         Image.fromarray(rng.integers(0, 256, shape).astype(np.uint8), mode).save(path, **how)
 
 
 def make_photos(folder: Path) -> None:
-    for name, mode in (("rgb.png", "RGB"), ("rgba.png", "RGBA"), ("grey.png", "L"), ("palette.png", "P"), ("deep.png", "I;16")):
+    for name, mode in (
+        ("rgb.png", "RGB"),
+        ("rgba.png", "RGBA"),
+        ("grey.png", "L"),
+        ("palette.png", "P"),
+        ("deep.png", "I;16"),
+    ):
         image(folder / name, mode)
-    for name, mode in (("photo.jpg", "RGB"), ("photo.webp", "RGB"), ("photo.bmp", "RGB"), ("photo.tif", "RGB"), ("float.tiff", "F")):
+    for name, mode in (
+        ("photo.jpg", "RGB"),
+        ("photo.webp", "RGB"),
+        ("photo.bmp", "RGB"),
+        ("photo.tif", "RGB"),
+        ("float.tiff", "F"),
+    ):
         image(folder / name, mode)
     from PIL import Image
 
@@ -186,7 +213,10 @@ def read_photo_file(file: Path) -> None:
     photos.fits(file, SIZE)
     rgb, alpha = photos.read_photo(file, SIZE if file.name != "turned.jpg" else SIZE[::-1])
     finite(rgb, (None, None, 3), "rgb")
-    check(rgb.dtype == np.uint8 and (alpha is None or alpha.shape == rgb.shape[:2]), "colours and alpha do not fit together")
+    check(
+        rgb.dtype == np.uint8 and (alpha is None or alpha.shape == rgb.shape[:2]),
+        "colours and alpha do not fit together",
+    )
 
 
 def make_masks(folder: Path) -> None:

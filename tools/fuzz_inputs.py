@@ -1,4 +1,5 @@
-"""Damaged inputs out of whole ones: seeded mutations of bytes, of text, of JSON, and of the formats that checksums or lengths protect."""
+"""Damaged inputs out of whole ones: seeded mutations of bytes, of text, of JSON, and of the formats that checksums or
+lengths protect."""
 
 from __future__ import annotations
 
@@ -13,17 +14,142 @@ import zlib
 import numpy as np
 
 # What counts, sizes and offsets become.
-WHOLE = (0, 1, 2, 3, 127, 255, 256, 65535, 65536, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63 - 1, 2**64 - 1, -1, -(2**31), -(2**63))
-REAL = (0.0, -0.0, 1e-300, 1e-38, 5e-324, 1e30, 3.5e38, 1e300, 1e308, -1.0, -1e30, -1e300, float("nan"), float("inf"), float("-inf"))
+WHOLE = (
+    0,
+    1,
+    2,
+    3,
+    127,
+    255,
+    256,
+    65535,
+    65536,
+    2**31 - 1,
+    2**31,
+    2**32 - 1,
+    2**40,
+    2**62,
+    2**63 - 1,
+    2**64 - 1,
+    -1,
+    -(2**31),
+    -(2**63),
+)
+REAL = (
+    0.0,
+    -0.0,
+    1e-300,
+    1e-38,
+    5e-324,
+    1e30,
+    3.5e38,
+    1e300,
+    1e308,
+    -1.0,
+    -1e30,
+    -1e300,
+    float("nan"),
+    float("inf"),
+    float("-inf"),
+)
 WORDS = (
-    *("0", "-1", "1e400", "-1e400", "nan", "NaN", "inf", "-inf", "1e-400", "99999999999999999999", "18446744073709551616", "2147483648"),
-    *("0x10", "1_000", "1,5", "1.5", "--", "", "\x00", "é", "\u2028", "٣", "𝟙", "\ufeff", "x" * 5000, "a/" * 3000, "../" * 40, "/dev/null"),
-    *("/", ".", "..", "~", "con", "a\x00b", "%s%n", "{}", "'", '"', "\\", "#", "end_header", "element vertex 9", "format ascii 1.0"),
+    *(
+        "0",
+        "-1",
+        "1e400",
+        "-1e400",
+        "nan",
+        "NaN",
+        "inf",
+        "-inf",
+        "1e-400",
+        "99999999999999999999",
+        "18446744073709551616",
+        "2147483648",
+    ),
+    *(
+        "0x10",
+        "1_000",
+        "1,5",
+        "1.5",
+        "--",
+        "",
+        "\x00",
+        "é",
+        "\u2028",
+        "٣",
+        "𝟙",
+        "\ufeff",
+        "x" * 5000,
+        "a/" * 3000,
+        "../" * 40,
+        "/dev/null",
+    ),
+    *(
+        "/",
+        ".",
+        "..",
+        "~",
+        "con",
+        "a\x00b",
+        "%s%n",
+        "{}",
+        "'",
+        '"',
+        "\\",
+        "#",
+        "end_header",
+        "element vertex 9",
+        "format ascii 1.0",
+    ),
 )
 VALUES = (
-    *(None, True, False, 0, -1, 1, 2**31, 2**63, 10**400, 1e308, -1e308, 1e-320, float("nan"), float("inf"), float("-inf")),
-    *("", "é\u2028", "\ud800", "a\x00b", "x" * 300, "x" * 5000, "a/" * 3000, "../" * 60, "/dev/null", "/", ".", "1", "OPENCV", "FISHEYE"),
-    *([], {}, [[]], [[1, 2], [3]], [1, "x", None], {"a": {}}, [[1e308] * 4] * 4, [[0] * 4] * 4, [float("nan")] * 3, [1.5] * 3, [[[[[]]]]]),
+    *(
+        None,
+        True,
+        False,
+        0,
+        -1,
+        1,
+        2**31,
+        2**63,
+        10**400,
+        1e308,
+        -1e308,
+        1e-320,
+        float("nan"),
+        float("inf"),
+        float("-inf"),
+    ),
+    *(
+        "",
+        "é\u2028",
+        "\ud800",
+        "a\x00b",
+        "x" * 300,
+        "x" * 5000,
+        "a/" * 3000,
+        "../" * 60,
+        "/dev/null",
+        "/",
+        ".",
+        "1",
+        "OPENCV",
+        "FISHEYE",
+    ),
+    *(
+        [],
+        {},
+        [[]],
+        [[1, 2], [3]],
+        [1, "x", None],
+        {"a": {}},
+        [[1e308] * 4] * 4,
+        [[0] * 4] * 4,
+        [float("nan")] * 3,
+        [1.5] * 3,
+        [[[[[]]]]],
+    ),
 )
 
 
@@ -147,7 +273,8 @@ def _change(rng: np.random.Generator, value) -> None:
 
 
 def _zip(rng: np.random.Generator, data: bytes) -> bytes:
-    """Members changed, removed, doubled or renamed, with checksums that fit; arrays and pickles inside are bytes like others."""
+    """Members changed, removed, doubled or renamed, with checksums that fit; arrays and pickles inside are bytes like
+    others."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = [(info.filename, archive.read(info)) for info in archive.infolist()]
@@ -198,7 +325,9 @@ def _npy(rng: np.random.Generator, content: bytes) -> bytes:
     with np.errstate(all="ignore"):
         if what == 1:
             numbers = ("<f8", ">f4", "<i4", "|b1", "<c16", "<f2", "<U5", "|S3")
-            array = np.array(array).astype(_pick(rng, numbers if array.dtype.kind in "fiub" else ("<U5", "<U30", ">U24")))
+            array = np.array(array).astype(
+                _pick(rng, numbers if array.dtype.kind in "fiub" else ("<U5", "<U30", ">U24"))
+            )
         elif what == 2 and array.size:
             flat = np.array(array).ravel()
             if flat.dtype.kind in "fiu":

@@ -1,4 +1,5 @@
-"""Every reader of the package: whole inputs for it, which of them are damaged and how, and the check of what is read."""
+"""Every reader of the package: whole inputs for it, which of them are damaged and how, and the check of what is
+read."""
 
 from __future__ import annotations
 
@@ -12,8 +13,8 @@ import fuzz_files as files
 
 @dataclass(frozen=True)
 class Reader:
-    """`make` writes whole inputs into a folder; `files` are those that are damaged, each with its kind of mutation; `read` reads what
-    one of them belongs to and checks the result."""
+    """`make` writes whole inputs into a folder; `files` are those that are damaged, each with its kind of mutation;
+    `read` reads what one of them belongs to and checks the result."""
 
     name: str
     make: Callable[[Path], None]
@@ -79,9 +80,7 @@ READERS = (
         (("dslr/*.json", "json"), ("dslr/nerfstudio/*.json", "json")),
         captures.read_scannetpp_file,
     ),
-    Reader(
-        "found poses", captures.make_found_poses, (("**/verdict.json", "json"),), captures.read_verdict_file
-    ),
+    Reader("found poses", captures.make_found_poses, (("**/verdict.json", "json"),), captures.read_verdict_file),
     Reader(
         "colmap bin",
         lambda folder: captures.make_colmap(folder, False),

@@ -50,9 +50,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("run", type=Path, help="folder of a trained and meshed run")
     parser.add_argument("output", type=Path, help=".png to write")
-    parser.add_argument(
-        "--views", type=int, nargs="+", default=[1, 5], help="which held-out views (default 1 5)"
-    )
+    parser.add_argument("--views", type=int, nargs="+", default=[1, 5], help="which held-out views (default 1 5)")
     parser.add_argument("--mesh", type=Path, help="mesh to show (default RUN/mesh/tsdf/mesh.ply)")
     args = parser.parse_args()
     Image.fromarray(picture(args.run, args.views, args.mesh)).save(args.output)

@@ -1,9 +1,9 @@
 """Runs the core's tests under AddressSanitizer and UndefinedBehaviorSanitizer: `python tools/sanitize.py`.
 
-Builds the core with -DLINPRIM_SANITIZE=ON in a folder of its own (--keep FOLDER to build again faster next time), puts that
-module in the place of the installed one, and runs pytest with the sanitizers' runtimes preloaded. The first error ends the
-run. Exit status: pytest's, or 1 where the build fails or a sanitizer has spoken. Takes GCC or Clang on Linux, several
-minutes, and the environment that `make env` makes.
+Builds the core with -DLINPRIM_SANITIZE=ON in a folder of its own (--keep FOLDER to build again faster next time), puts
+that module in the place of the installed one, and runs pytest with the sanitizers' runtimes preloaded. The first error
+ends the run. Exit status: pytest's, or 1 where the build fails or a sanitizer has spoken. Takes GCC or Clang on Linux,
+several minutes, and the environment that `make env` makes.
 """
 
 from __future__ import annotations
@@ -71,11 +71,10 @@ def build(folder: Path, jobs: int) -> Path:
 
 
 def runtimes(folder: Path) -> str:
-    """LD_PRELOAD of the sanitizers' runtimes of the compiler that built `folder`, and the C++ library they hook into."""
+    """LD_PRELOAD of the sanitizers' runtimes of the compiler that built `folder`, and the C++ library they hook
+    into."""
     cache = (folder / "CMakeCache.txt").read_text()
-    compiler = next(
-        line.split("=", 1)[1] for line in cache.splitlines() if line.startswith("CMAKE_CXX_COMPILER:")
-    )
+    compiler = next(line.split("=", 1)[1] for line in cache.splitlines() if line.startswith("CMAKE_CXX_COMPILER:"))
     names = ("libasan.so", "libubsan.so", "libstdc++.so.6")
     if "clang" in Path(compiler).name:
         arch = sysconfig.get_platform().rsplit("-", 1)[1]
@@ -86,9 +85,7 @@ def runtimes(folder: Path) -> str:
             [compiler, f"-print-file-name={name}"], check=True, capture_output=True, text=True
         ).stdout.strip()
         if os.sep not in path:
-            raise SystemExit(
-                f"sanitize: {compiler} has no {name}; on Debian the packages libasan and libubsan hold it"
-            )
+            raise SystemExit(f"sanitize: {compiler} has no {name}; on Debian the packages libasan and libubsan hold it")
         paths.append(os.path.realpath(path))
     return ":".join(paths)
 
@@ -105,24 +102,18 @@ def test(module: Path, folder: Path, arguments: list[str]) -> int:
     }
     runner = folder / "run_tests.py"
     runner.write_text(RUNNER)
-    return subprocess.run(
-        [sys.executable, str(runner), str(module), *arguments], env=environment, cwd=ROOT
-    ).returncode
+    return subprocess.run([sys.executable, str(runner), str(module), *arguments], env=environment, cwd=ROOT).returncode
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "--keep", type=Path, metavar="FOLDER", help="build here and leave it (default: a temporary folder)"
     )
     parser.add_argument(
         "--jobs", type=int, default=os.cpu_count() or 1, help="compilers at once (default: %(default)s)"
     )
-    parser.add_argument(
-        "pytest", nargs="*", help="arguments of pytest in place of the core's test files, after --"
-    )
+    parser.add_argument("pytest", nargs="*", help="arguments of pytest in place of the core's test files, after --")
     options = parser.parse_args(arguments)
     if not sys.platform.startswith("linux"):
         print("sanitize: this preloads the sanitizers the way of Linux only", file=sys.stderr)
