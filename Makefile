@@ -16,7 +16,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3
-CORE := CMakeLists.txt csrc $(wildcard csrc/*)
+CPP := $(wildcard csrc/*.h csrc/*/*.h csrc/*/*.cpp)
+CORE := CMakeLists.txt csrc $(wildcard csrc/*.h csrc/*/*)
 
 .PHONY: env demo test lint format wheel browser-check clean
 
@@ -29,13 +30,13 @@ test: env
 lint: env
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check -q .
-	$(BIN)/clang-format --dry-run --Werror csrc/*.h csrc/*.cpp
+	$(BIN)/clang-format --dry-run --Werror $(CPP)
 	$(BIN)/mypy
 
 format: env
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
-	$(BIN)/clang-format -i csrc/*.h csrc/*.cpp
+	$(BIN)/clang-format -i $(CPP)
 
 wheel: env
 	$(BIN)/python tools/check_wheel.py -o dist
@@ -49,7 +50,7 @@ clean:
 	rm -rf build dist $(VENV)/.core
 
 # The stamps live in the environment, so that deleting .venv starts over.
-$(VENV)/.checked: tools/check_system.py linprim_geo/system.py
+$(VENV)/.checked: tools/check_system.py linprim_geo/base/system.py
 	@set -e; \
 	python="$(PYTHON)"; \
 	if [ -z "$$python" ]; then for candidate in $(CANDIDATES); do \

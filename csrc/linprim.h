@@ -8,7 +8,7 @@
 
 #include <cstdint>
 
-#include "kernels.h"
+#include "raster/kernel_table.h"
 
 namespace linprim {
 

@@ -10,8 +10,8 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from linprim_geo.errors import LinprimError
-from linprim_geo.files import atomic_write, write_json
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import atomic_write, write_json
 
 SPLITS = ("test", "train", "all")
 
@@ -38,7 +38,7 @@ def write_results(folder: str | os.PathLike, results: Mapping, rows: Sequence[Ma
 def open_run(run):
     """Returns `run` itself if it is already open, else opens the run folder of that path."""
     if isinstance(run, (str, os.PathLike)):
-        from linprim_geo.run import Run
+        from linprim_geo.runs.run import Run
 
         return Run.open(run)
     return run

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from linprim_geo.camera import Camera
-from linprim_geo.errors import LinprimError
+from linprim_geo.base.errors import LinprimError
 from linprim_geo.eval.surface_samples import NAN, QUANTILES, mean
-from linprim_geo.mesh import Mesh
-from linprim_geo.raycast import RayCaster
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.geometry.raycast import RayCaster
 
 
 def count_views(
@@ -117,7 +117,7 @@ def training_cameras(scene: str) -> list[Camera]:
     Raises:
         LinprimError: the folder is no capture, or no view of it is for training.
     """
-    from linprim_geo.scene import load_scene
+    from linprim_geo.capture.load import load_scene
 
     cameras = [view.camera for view in load_scene(scene).train]
     if not cameras:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from linprim_geo.errors import LinprimError
+from linprim_geo.base.errors import LinprimError
 from linprim_geo.eval import open_run, views_of, write_results
 
 DELTA_BASE = 1.25
@@ -188,8 +188,9 @@ def _open_reference(reference):
     """(mesh or None, its RayCaster or None, what to call it in messages and results)."""
     if reference is None:
         return None, None, "depth images of the data set"
-    from linprim_geo.mesh import load_mesh, validate_mesh
-    from linprim_geo.raycast import RayCaster
+    from linprim_geo.geometry.mesh import validate_mesh
+    from linprim_geo.geometry.mesh_files import load_mesh
+    from linprim_geo.geometry.raycast import RayCaster
 
     is_path = isinstance(reference, (str, os.PathLike))
     name = os.fspath(reference) if is_path else "reference mesh"

@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
+from linprim_geo.base.files import atomic_write
 from linprim_geo.eval.surface_samples import Comparison, PointDistance, SurfaceDistance, refine
-from linprim_geo.files import atomic_write
-from linprim_geo.mesh import Mesh, save_mesh
+from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.geometry.mesh_files import save_mesh
+from linprim_geo.imaging.colors import error_colors
 
 # Error-coloured meshes are refined until no edge is longer than this share of the diagonal, so that a wall
 # made of two triangles shows what lies between its corners.
@@ -239,48 +240,3 @@ def _power(value: float) -> str:
 
 def _percent(value: float) -> str:
     return f"{100.0 * value:.3g} %"
-
-
-# --- colours ---------------------------------------------------------------------------------------------
-
-
-def error_colors(share: np.ndarray) -> np.ndarray:
-    """Colours for values in [0, 1] (clamped), (..., 3) uint8 sRGB: dark blue through green to light yellow.
-
-    A straight line in CIE lightness L* from 15 to 92 with the hue turning from 290 to 100 degrees, so equal
-    steps look equal, also in grey and to the colour-blind; chroma 55 at most, less where sRGB cannot show it.
-
-    Source: CIE 15 (L*a*b*, white point D65) and IEC 61966-2-1 (sRGB).
-    """
-    share = np.clip(np.asarray(share, np.float64), 0.0, 1.0)
-    table = _error_color_table()
-    return table[np.floor(share * (len(table) - 1) + 0.5).astype(np.int64)]
-
-
-@lru_cache
-def _error_color_table(size: int = 256) -> np.ndarray:
-    """(size, 3) uint8 sRGB of the line that `error_colors` describes."""
-    share = np.linspace(0.0, 1.0, size)
-    lightness, hue = 15.0 + 77.0 * share, np.radians(290.0 - 190.0 * share)
-    low, high = np.zeros(size), np.full(size, 55.0)
-    # Bisection for the largest chroma in the gamut; 55 / 2^30 is far below one of 255 steps.
-    for _ in range(30):
-        chroma = np.where(_in_gamut(_lab_to_linear(lightness, high, hue)), high, 0.5 * (low + high))
-        fits = _in_gamut(_lab_to_linear(lightness, chroma, hue))
-        low, high = np.where(fits, chroma, low), np.where(fits, high, chroma)
-    linear = np.clip(_lab_to_linear(lightness, low, hue), 0.0, 1.0)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return np.floor(encoded * 255.0 + 0.5).astype(np.uint8)
-
-
-def _lab_to_linear(lightness: np.ndarray, chroma: np.ndarray, hue: np.ndarray) -> np.ndarray:
-    """CIE L*, chroma, hue (radians) under D65 to linear sRGB (..., 3), outside [0, 1] where out of gamut."""
-    y = (lightness + 16.0) / 116.0
-    f = np.stack([y + chroma * np.cos(hue) / 500.0, y, y - chroma * np.sin(hue) / 200.0], axis=-1)
-    xyz = np.where(f > 6 / 29, f**3, 3 * (6 / 29) ** 2 * (f - 4 / 29)) * (0.95047, 1.0, 1.08883)
-    to_rgb = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
-    return xyz @ to_rgb.T
-
-
-def _in_gamut(linear: np.ndarray) -> np.ndarray:
-    return (linear >= 0.0).all(axis=-1) & (linear <= 1.0).all(axis=-1)

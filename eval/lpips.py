@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from linprim_geo.errors import LinprimError
+from linprim_geo.base.errors import LinprimError
 
 # Colours in [-1, 1] become what the classifiers were trained on: ImageNet's mean and deviation, in that range.
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)

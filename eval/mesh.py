@@ -17,17 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from linprim_geo.camera import Camera
-from linprim_geo.errors import LinprimError
+from linprim_geo.base.errors import LinprimError
 from linprim_geo.eval import open_run, write_results
-from linprim_geo.eval.surface_samples import (
-    Comparison,
-    SurfaceDistance,
-    reduce_scores,
-    sample_surface,
-    with_percent,
-)
-from linprim_geo.mesh import Mesh, clean_mesh, face_normals, load_mesh
+from linprim_geo.eval.surface_samples import Comparison, SurfaceDistance, reduce_scores, sample_surface, with_percent
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.mesh import Mesh, clean_mesh, face_normals
+from linprim_geo.geometry.mesh_files import load_mesh
 
 DEFAULT_SAMPLES = 200_000
 DEFAULT_TAU_SHARE = 0.01  # of the reference's diagonal
@@ -192,8 +187,8 @@ def eval_mesh_files(
     if transform is not None:
         prediction = _transformed(prediction, transform)
     prediction, dropped_prediction = clean_mesh(prediction, os.fspath(prediction_path))
-    from linprim_geo.eval.protocol_files import read_reference
-    from linprim_geo.eval.protocols import TAKES_POINTS, score_by_protocol
+    from linprim_geo.eval.protocols.files import read_reference
+    from linprim_geo.eval.protocols.score import TAKES_POINTS, score_by_protocol
 
     reference, dropped_reference = read_reference(reference_path, protocol in TAKES_POINTS)
     unit, seen_by = "unit of the files", None
@@ -236,8 +231,8 @@ def check_options(samples: int, tau: float | None, seed: int) -> None:
 
 def _settings(protocol: str, given: dict, tau: float | None, seed: int):
     """The `Settings` of a published protocol, with the small files read; None for the headline."""
-    from linprim_geo.eval.protocol_files import read_crop, read_observed_volume, read_plane
-    from linprim_geo.eval.protocols import METERS_PER_UNIT, PROTOCOLS, Settings
+    from linprim_geo.eval.protocols.files import read_crop, read_observed_volume, read_plane
+    from linprim_geo.eval.protocols.score import METERS_PER_UNIT, PROTOCOLS, Settings
 
     if protocol != "headline" and protocol not in PROTOCOLS:
         names = ", ".join(("headline", *PROTOCOLS))
@@ -264,7 +259,7 @@ def _settings(protocol: str, given: dict, tau: float | None, seed: int):
 
 
 def _transformed(mesh: Mesh, path: str | os.PathLike) -> Mesh:
-    from linprim_geo.eval.protocol_files import read_transform
+    from linprim_geo.eval.protocols.files import read_transform
 
     matrix = read_transform(path)
     return Mesh(mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3], mesh.faces)
@@ -292,7 +287,7 @@ def _compare(mesh: Mesh, other: SurfaceDistance, samples: int, seed) -> Comparis
 def _seen(mesh: Mesh, side: Comparison, cameras: Sequence[Camera]) -> tuple[np.ndarray, int]:
     """(samples,) bool: some camera sees the sample; and how many rays were re-cast."""
     from linprim_geo.eval.culling import count_views
-    from linprim_geo.raycast import RayCaster
+    from linprim_geo.geometry.raycast import RayCaster
 
     caster = RayCaster(mesh.vertices, mesh.faces)
     slack = OCCLUSION_TOLERANCE * mesh.diagonal

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from linprim_geo.mesh import Mesh, face_areas, face_normals
+from linprim_geo.geometry.mesh import Mesh, face_areas, face_normals
 
 QUANTILES = (50, 90, 95)
 # Points sorted along a Morton curve visit the tree in an order that finds its nodes in the

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from linprim_geo.camera import Camera
+from linprim_geo.geometry.camera import Camera
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 

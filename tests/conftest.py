@@ -15,7 +15,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import pytest
 
-from linprim_geo.errors import LinprimError
+from linprim_geo.base.errors import LinprimError
 
 # Half-axes and rotation (w, x, y, z) of the one octahedron of `solid`, whose middle is at CENTER.
 EXTENT, ROTATION, CENTER = (0.9, 0.6, 0.7), (0.8, 0.2, -0.4, 0.4), (3.0, -2.0, 1.0)
@@ -61,7 +61,7 @@ def one_thread():
 @pytest.fixture
 def few_threads(one_thread):
     """The core with one thread as well; what a test does to its threads and instruction set is undone."""
-    from linprim_geo import ops
+    from linprim_geo.kernels import ops
 
     before = ops.threads(), ops.instruction_set()
     ops.set_threads(1)
@@ -73,7 +73,7 @@ def few_threads(one_thread):
 @pytest.fixture(scope="session")
 def tiny_scene(tmp_path_factory) -> Path:
     """The built-in part with transparent background: 12 + 3 views of 48x48, 400 points, depth, reference.ply."""
-    from linprim_geo.synth import synthesize
+    from linprim_geo.synthetic.synth import synthesize
 
     out = tmp_path_factory.mktemp("tiny") / "scene"
     synthesize(out, shape="cad", views=12, test_views=3, size=48, points=400, supersample=2)
@@ -83,7 +83,7 @@ def tiny_scene(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def tiny_options():
     """Options of `tiny_run`: it grows from 200 to 300 primitives and has two checkpoints."""
-    from linprim_geo.options import TrainOptions
+    from linprim_geo.base.options import TrainOptions
 
     return TrainOptions(
         iterations=400,
@@ -99,7 +99,7 @@ def tiny_options():
 @pytest.fixture(scope="session")
 def tiny_run(tiny_scene, tiny_options, tmp_path_factory) -> Path:
     """A run trained on `tiny_scene`. Tests that change it copy it."""
-    from linprim_geo.train import train
+    from linprim_geo.training.train import train
 
     out = tmp_path_factory.mktemp("tiny_run") / "run"
     train(tiny_scene, out, options=tiny_options, quiet=True)
@@ -114,13 +114,13 @@ def run_copy(tiny_run, tmp_path) -> Path:
 
 def octahedron_run(folder: Path, density: float = DENSITY, views: int = 24, size: int = 64) -> Path:
     """A run that holds the one octahedron of this module, photographed from all around, without training."""
-    from linprim_geo.initial_points import scene_normalization
-    from linprim_geo.options import SceneOptions, TrainOptions
-    from linprim_geo.primitives import Primitives
-    from linprim_geo.run import Run
-    from linprim_geo.scene import load_scene
-    from linprim_geo.synth import synthesize
-    from linprim_geo.textured import TexturedMesh
+    from linprim_geo.base.options import SceneOptions, TrainOptions
+    from linprim_geo.capture.load import load_scene
+    from linprim_geo.geometry.primitives import Primitives
+    from linprim_geo.points.initial_points import scene_normalization
+    from linprim_geo.runs.run import Run
+    from linprim_geo.synthetic.synth import synthesize
+    from linprim_geo.synthetic.textured import TexturedMesh
 
     one = Primitives(
         np.array([CENTER]),

@@ -9,8 +9,8 @@ import signal
 import time
 from pathlib import Path
 
-from linprim_geo.errors import LinprimError
-from linprim_geo.files import write_json
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import write_json
 
 
 def chain(folder: Path, start: str, steps: int, seconds: float = 0.0) -> dict:
@@ -55,8 +55,9 @@ def die(folder: Path, times: int) -> dict:
 
 def drive(shared: str, cluster: str, workers: str, seconds: str, count: str) -> None:
     """A driver: `count` chains, its process to be killed."""
-    from linprim_geo.executor import Task, open_executor
-    from linprim_geo.progress import Progress
+    from linprim_geo.base.progress import Progress
+    from linprim_geo.jobs.executor import Task
+    from linprim_geo.jobs.open import open_executor
 
     folder = Path(shared)
     tasks = [

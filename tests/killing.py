@@ -76,21 +76,21 @@ class Writes:
 
 
 def train(scene: str, run: str, options: str, resume: str) -> None:
-    from linprim_geo.options import TrainOptions
-    from linprim_geo.train import train
+    from linprim_geo.base.options import TrainOptions
+    from linprim_geo.training.train import train
 
     train(scene, run, options=TrainOptions(**json.loads(options)), resume=resume == "True", quiet=True)
 
 
 def extract(run: str, output: str) -> None:
-    from linprim_geo.extract import extract_mesh
-    from linprim_geo.options import ExtractOptions
+    from linprim_geo.base.options import ExtractOptions
+    from linprim_geo.surface.extract import extract_mesh
 
     extract_mesh(run, output=output, options=ExtractOptions(level=0.5), quiet=True)
 
 
 def convert(source: str, target: str) -> None:
-    from linprim_geo.convert import convert
+    from linprim_geo.surface.convert import convert
 
     convert(source, target)
 
@@ -102,11 +102,11 @@ def _serve() -> None:
     import torch._dynamo  # noqa: F401
     import trimesh  # noqa: F401
 
-    import linprim_geo.extract
-    import linprim_geo.fuse
-    import linprim_geo.surface_tsdf
-    import linprim_geo.train
-    import linprim_geo.triangulate  # noqa: F401
+    import linprim_geo.points.triangulate
+    import linprim_geo.surface.extract
+    import linprim_geo.surface.method_tsdf
+    import linprim_geo.surface.tsdf_fusion
+    import linprim_geo.training.train  # noqa: F401
 
     answers = os.dup(1)
     os.dup2(2, 1)  # what libraries print is no answer

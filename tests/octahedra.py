@@ -7,9 +7,10 @@ from contextlib import contextmanager
 import numpy as np
 import torch
 
-from linprim_geo import ops, reference
-from linprim_geo.camera import Camera
-from linprim_geo.errors import LinprimError
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.kernels import ops
+from linprim_geo.kernels.reference import rasterize as reference
 
 NAMES = ("center", "rotation", "extent", "density", "sh", "background")
 COLOR = ("rgb", "opacity")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from linprim_geo.primitives import Primitives, reference_length, unit_quaternions
+from linprim_geo.geometry.primitives import Primitives, reference_length, unit_quaternions
 
 FIELDS = ("center", "rotation", "extent", "density", "sh")
 

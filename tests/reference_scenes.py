@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from linprim_geo import reference
+from linprim_geo.kernels.reference import rasterize as reference
 
 IMAGES = (
     "rgb",

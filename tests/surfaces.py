@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from linprim_geo.camera import Camera
 from linprim_geo.eval.surface_samples import refine
-from linprim_geo.mesh import Mesh
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.mesh import Mesh
 
 # What others rely on finding in the scores of a mesh: the scores, and what they were made with.
 SCORES = {

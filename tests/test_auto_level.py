@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from linprim_geo.auto_level import LEVELS, USUAL_LEVEL, choose_level, color_differences, nearest_good
-from linprim_geo.scene import load_scene
-from linprim_geo.synth import synthesize
+from linprim_geo.capture.load import load_scene
+from linprim_geo.surface.choose_level import LEVELS, USUAL_LEVEL, choose_level, color_differences, nearest_good
+from linprim_geo.synthetic.synth import synthesize
 
 
 @pytest.fixture(scope="module")

@@ -9,23 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from linprim_geo import worker
-from linprim_geo.block_extraction import (
-    halo,
-    load_lattice,
-    load_part,
-    owners,
-    part_task,
-    save_lattice,
-    together,
-)
-from linprim_geo.errors import LinprimError
-from linprim_geo.extract import extract_mesh
-from linprim_geo.fuse import Lattice, _find_blocks, fuse_lattice
-from linprim_geo.options import ExtractOptions
-from linprim_geo.run import Run
-from linprim_geo.surface_tsdf import DepthFrames
-from linprim_geo.tsdf import placed, vote_rules
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import ExtractOptions
+from linprim_geo.jobs import worker
+from linprim_geo.runs.run import Run
+from linprim_geo.surface.extract import extract_mesh
+from linprim_geo.surface.method_tsdf import DepthFrames
+from linprim_geo.surface.tsdf_field import placed, vote_rules
+from linprim_geo.surface.tsdf_fusion import Lattice, _find_blocks, fuse_lattice
+from linprim_geo.surface.tsdf_parts import halo, load_lattice, load_part, owners, part_task, save_lattice, together
 
 LEVEL = 0.5
 

@@ -19,33 +19,28 @@ import pytest
 import torch
 from test_executor import is_alive
 
-from linprim_geo import block_tasks, block_training, worker
-from linprim_geo.block_shots import Windows, block_shots
-from linprim_geo.block_tasks import (
-    EXCHANGES,
-    apportioned,
-    beyond,
-    block_folder,
-    block_of,
-    join_task,
-    known_of,
-    tensors,
-)
-from linprim_geo.block_training import blocks_that_fit, train_blocks
-from linprim_geo.blocks import Block, cropped
-from linprim_geo.camera import Camera
-from linprim_geo.cli import main
-from linprim_geo.errors import LinprimError
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import ExtractOptions, TrainOptions
+from linprim_geo.capture.load import load_scene
+from linprim_geo.cli.main import main
 from linprim_geo.eval.images import eval_images_run
-from linprim_geo.executor import Processes
-from linprim_geo.extract import extract_mesh
-from linprim_geo.options import ExtractOptions, TrainOptions
-from linprim_geo.primitives import load_primitives
-from linprim_geo.run import Run
-from linprim_geo.scene import load_scene
-from linprim_geo.shots import RECENT, Shot, StoredShot
-from linprim_geo.train import train
-from linprim_geo.trainer import Trainer, initial_parameters
+from linprim_geo.geometry.boxes import Block, cropped
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.primitives import load_primitives
+from linprim_geo.jobs import worker
+from linprim_geo.jobs.processes import Processes
+from linprim_geo.runs.run import Run
+from linprim_geo.surface.extract import extract_mesh
+from linprim_geo.training.blocks import driver as block_training
+from linprim_geo.training.blocks import plan
+from linprim_geo.training.blocks import tasks as block_tasks
+from linprim_geo.training.blocks.driver import blocks_that_fit, train_blocks
+from linprim_geo.training.blocks.plan import EXCHANGES, apportioned, block_of, known_of
+from linprim_geo.training.blocks.tasks import beyond, block_folder, join_task, tensors
+from linprim_geo.training.blocks.windows import Windows, block_shots
+from linprim_geo.training.step.trainer import Trainer, initial_parameters
+from linprim_geo.training.step.training_images import RECENT, Shot, StoredShot
+from linprim_geo.training.train import train
 
 OPTIONS = TrainOptions(
     iterations=160, max_primitives=300, sh_degree=1, threads=1, checkpoint_every=20, evaluate_every=0
@@ -116,7 +111,7 @@ def test_a_block_that_has_lost_all_it_owned_adds_nothing(lost, whole, tmp_path, 
 def test_the_nearest_that_memory_allows_stand_in_full(monkeypatch):
     distances = np.concatenate([np.zeros(100), np.linspace(0.01, 9.0, 900)])
     assert known_of(distances, 0.5, 100_000) == np.inf  # 90,000 lie outside
-    monkeypatch.setattr(block_tasks, "MOST_BESIDE", 10_000)
+    monkeypatch.setattr(plan, "MOST_BESIDE", 10_000)
     assert known_of(distances, 0.5, 100_000) == pytest.approx(1.01)
     assert known_of(distances, 2.0, 100_000) == 2.0
 
@@ -224,9 +219,9 @@ def test_what_blocks_cannot_do_is_one_sentence(options, blocks, sentence, tiny_s
 
 def test_blocks_that_no_camera_sees_are_one_sentence(whole, monkeypatch):
     run, _ = whole
-    monkeypatch.setattr(block_tasks, "window", lambda *_: None)
+    monkeypatch.setattr(plan, "window", lambda *_: None)
     with pytest.raises(LinprimError, match="block 0 of 2 is seen by 0 cameras, wanted two at least: fewer blocks"):
-        block_tasks.plan_task(run / "blocks" / "plan", str(run), 2)
+        plan.plan_task(run / "blocks" / "plan", str(run), 2)
 
 
 def test_a_time_budget_and_a_lone_cluster_are_refused(tiny_scene, tmp_path, capsys):
@@ -362,7 +357,7 @@ def workers_of(driver: int) -> list[int]:
                 parents[int(entry.name)] = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
                 line = (entry / "cmdline").read_bytes()
                 of_ray = tuple(b"ray::" + name for name in (b"coarse", b"plan", b"block", b"end", b"_work"))
-                if b"linprim_geo.worker" in line or line.startswith(of_ray):
+                if b"linprim_geo.jobs.worker" in line or line.startswith(of_ray):
                     found.append(int(entry.name))
         except OSError:
             continue
@@ -430,7 +425,7 @@ def test_a_driver_that_is_asked_to_end_lets_its_workers_save(tiny_scene, tmp_pat
     run = tmp_path / "run"
     # What starts the tests may ignore Ctrl-C, which a process inherits.
     program = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    program += "; from linprim_geo.cli import main; sys.exit(main(sys.argv[1:]))"
+    program += "; from linprim_geo.cli.main import main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", program, "train", str(tiny_scene), "-o", str(run), "--blocks", str(COUNT)]
     driver = subprocess.Popen([*command, *ARGUMENTS, "--iterations", "100000"], stderr=subprocess.PIPE, text=True)
     try:

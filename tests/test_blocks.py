@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from linprim_geo.blocks import (
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.geometry.boxes import (
     BORDER,
     DILATION,
     Block,
@@ -18,8 +19,7 @@ from linprim_geo.blocks import (
     surface_points,
     window,
 )
-from linprim_geo.camera import Camera
-from linprim_geo.errors import LinprimError
+from linprim_geo.geometry.camera import Camera
 
 RNG = np.random.default_rng(0)
 

@@ -13,13 +13,16 @@ import re
 import signal
 import subprocess
 import sys
+import time
 import types
 
 import pytest
 
-from linprim_geo import cli, commands, doctor, progress, system
-from linprim_geo.errors import LinprimError
-from linprim_geo.options import ExtractOptions, SceneOptions, TrainOptions, option
+from linprim_geo.base import progress, system
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import ExtractOptions, SceneOptions, TrainOptions, option
+from linprim_geo.cli import commands, doctor
+from linprim_geo.cli import main as cli
 
 HEAVY = {
     "torch",
@@ -48,7 +51,7 @@ def run_python(code: str, *flags: str, **settings) -> subprocess.CompletedProces
 def run_with_convert(body: str, *arguments: str) -> str:
     """Source of a program that runs `linprim-geo convert a b` with `body` in the place of the conversion."""
     return (
-        "import os, sys, time\nimport linprim_geo.convert as module\nfrom linprim_geo.cli import main\n"
+        "import os, sys, time\nimport linprim_geo.surface.convert as module\nfrom linprim_geo.cli.main import main\n"
         "module.describe = str\n"
         f"def convert(*_):\n    {body}\nmodule.convert = convert\n"
         f"sys.exit(main(['convert', 'a', 'b', *{arguments!r}]))"
@@ -61,7 +64,7 @@ def failing_convert(monkeypatch):
         def convert(*_):
             raise error
 
-        monkeypatch.setattr("linprim_geo.convert.convert", convert)
+        monkeypatch.setattr("linprim_geo.surface.convert.convert", convert)
 
     return replace
 
@@ -75,13 +78,13 @@ def recorded_train(monkeypatch):
         calls.append((str(scene), str(run), scene_options, train_options, settings))
         return {"psnr": float("nan"), "primitives": 7}
 
-    monkeypatch.setitem(sys.modules, "linprim_geo.train", types.SimpleNamespace(train=train))
+    monkeypatch.setitem(sys.modules, "linprim_geo.training.train", types.SimpleNamespace(train=train))
     return calls
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["train", "--help"], ["--version"]])
 def test_help_imports_no_library(arguments):
-    done = run_python(f"from linprim_geo.cli import main; main({arguments!r})", "-X", "importtime")
+    done = run_python(f"from linprim_geo.cli.main import main; main({arguments!r})", "-X", "importtime")
     assert done.returncode == 0 and done.stdout
     imported = {line.split("|")[-1].strip().split(".")[0] for line in done.stderr.splitlines()}
     assert "argparse" in imported
@@ -303,7 +306,7 @@ def test_python_m_runs_the_same_program():
 def test_synth_leaves_what_is_not_said_to_the_library(monkeypatch, capsys):
     calls = []
     stand_in = types.SimpleNamespace(synthesize=lambda out, **settings: calls.append((out, settings)) or {})
-    monkeypatch.setitem(sys.modules, "linprim_geo.synth", stand_in)
+    monkeypatch.setitem(sys.modules, "linprim_geo.synthetic.synth", stand_in)
     room = "synth out --scene room --size 64x48 --fov 60 --background 0,0.5,1 --overwrite"
     for line in ("synth out", room, "synth out --mesh x.glb --size 64 --point-noise 0.01"):
         assert cli.main(line.split()) == 0
@@ -321,12 +324,12 @@ def test_synth_leaves_what_is_not_said_to_the_library(monkeypatch, capsys):
 
 # The function behind each command whose arguments are passed on by name, and the names that differ.
 PASSED_ON = {
-    "synth out": ("synth.synthesize", {"output": "out", "scene": "shape"}),
-    "render run": ("render.render_run", {}),
-    "extract-mesh run": ("extract.extract_mesh", {}),
+    "synth out": ("synthetic.synth.synthesize", {"output": "out", "scene": "shape"}),
+    "render run": ("runs.render.render_run", {}),
+    "extract-mesh run": ("surface.extract.extract_mesh", {}),
     "eval-depth run": ("eval.depth.eval_depth_run", {}),
-    "report run": ("report.report_run", {}),
-    "view run": ("view.view_run", {}),
+    "report run": ("display.report.report_run", {}),
+    "view run": ("display.viewer.view_run", {}),
     "eval-images run": ("eval.images.eval_images_run", {}),
     "eval-mesh a b": (
         "eval.mesh.eval_mesh_files",
@@ -348,7 +351,7 @@ def test_the_functions_have_the_arguments_that_the_commands_pass(line):
 def test_principal_point_and_detail_reach_synth(monkeypatch):
     calls = []
     stand_in = types.SimpleNamespace(synthesize=lambda out, **settings: calls.append(settings) or {})
-    monkeypatch.setitem(sys.modules, "linprim_geo.synth", stand_in)
+    monkeypatch.setitem(sys.modules, "linprim_geo.synthetic.synth", stand_in)
     assert cli.main("synth out --principal-point-offset=-5,3.5 --detail 0.5 --distance 4".split()) == 0
     assert cli.main("synth out --principal-point-offset 5,-3".split()) == 0
     assert [call["principal_point_offset"] for call in calls] == [(-5.0, 3.5), (5.0, -3.0)]
@@ -430,7 +433,11 @@ REPORTING = {
 @pytest.fixture
 def talkative(monkeypatch):
     """Lines of progress are far apart in a log; here every one of them is due."""
-    monkeypatch.setattr(progress, "time", types.SimpleNamespace(monotonic=itertools.count(0, 30).__next__))
+    monkeypatch.setattr(
+        progress,
+        "time",
+        types.SimpleNamespace(monotonic=itertools.count(0, 30).__next__, perf_counter=time.perf_counter),
+    )
 
 
 @pytest.mark.parametrize(("line", "key"), REPORTING.items())

@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from linprim_geo import cli
-from linprim_geo.completion import _parsers
+from linprim_geo.cli import main as cli
+from linprim_geo.cli.completion import _parsers
 
 # Does in bash what it does itself at a tab.
 TAB = """

@@ -16,14 +16,16 @@ from primitive_sets import (
     raw_table,
 )
 
-from linprim_geo import cli
-from linprim_geo.convert import HELD, convert, find_scene_file, save_primitive_mesh
-from linprim_geo.errors import LinprimError
-from linprim_geo.mesh import Mesh, load_mesh, save_mesh
-from linprim_geo.ply import read_primitive_ply, write_primitive_ply
-from linprim_geo.primitives import Primitives, load_primitives, save_primitives
-from linprim_geo.texture import Texture, save_textured, unwrap
-from linprim_geo.texture_files import load_texture
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.cli import main as cli
+from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.geometry.mesh_files import load_mesh, save_mesh
+from linprim_geo.geometry.primitive_files import read_primitive_ply, write_primitive_ply
+from linprim_geo.geometry.primitives import Primitives, load_primitives, save_primitives
+from linprim_geo.surface.convert import HELD, convert, find_scene_file, save_primitive_mesh
+from linprim_geo.surface.texture import Texture
+from linprim_geo.surface.texture_charts import unwrap
+from linprim_geo.surface.texture_files import load_texture, save_textured
 
 # --- meshes ----------------------------------------------------------------------------------------------
 

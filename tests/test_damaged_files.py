@@ -18,16 +18,16 @@ import pytest
 import torch
 from scipy.io import savemat
 
-from linprim_geo import photos
-from linprim_geo.checkpoint import read_checkpoint
-from linprim_geo.errors import LinprimError
-from linprim_geo.eval.protocol_files import read_crop, read_plane
-from linprim_geo.mesh import load_mesh
-from linprim_geo.ply_points import read_points_ply
-from linprim_geo.primitives import load_primitives
-from linprim_geo.run import Run
-from linprim_geo.scene import load_scene
-from linprim_geo.train import train
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.capture.load import load_scene
+from linprim_geo.capture.readers.ply_points import read_points_ply
+from linprim_geo.eval.protocols.files import read_crop, read_plane
+from linprim_geo.geometry.mesh_files import load_mesh
+from linprim_geo.geometry.primitives import load_primitives
+from linprim_geo.imaging import photos
+from linprim_geo.runs.run import Run
+from linprim_geo.training.checkpoint import read_checkpoint
+from linprim_geo.training.train import train
 
 TOOLS = Path(__file__).resolve().parents[1] / "tools"
 sys.path.insert(0, str(TOOLS))

@@ -7,8 +7,9 @@ import math
 
 import pytest
 
-from linprim_geo import cli, demo
-from linprim_geo.errors import LinprimError
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.cli import demo
+from linprim_geo.cli import main as cli
 
 SCORES = (
     "psnr",
@@ -66,7 +67,7 @@ def test_the_demo_makes_a_scored_mesh_and_a_second_one_replaces_it(tiny_size, tm
         raise LinprimError("stopped")
 
     (root / "left over").write_text("from the first")
-    monkeypatch.setattr("linprim_geo.synth.synthesize", stop)
+    monkeypatch.setattr("linprim_geo.synthetic.synth.synthesize", stop)
     with pytest.raises(LinprimError, match="stopped"):
         demo.run_demo(str(root), "small")
     assert [path.name for path in root.iterdir()] == ["demo.json"]
@@ -92,10 +93,10 @@ def test_quiet_reaches_every_stage(tmp_path, monkeypatch, capfd):
 
         return stand_in
 
-    monkeypatch.setattr("linprim_geo.synth.synthesize", stage("synth"))
-    monkeypatch.setattr("linprim_geo.train.train", stage("train"))
-    monkeypatch.setattr("linprim_geo.render.render_run", stage("render"))
-    monkeypatch.setattr("linprim_geo.extract.extract_mesh", stage("extract", last=True))
+    monkeypatch.setattr("linprim_geo.synthetic.synth.synthesize", stage("synth"))
+    monkeypatch.setattr("linprim_geo.training.train.train", stage("train"))
+    monkeypatch.setattr("linprim_geo.runs.render.render_run", stage("render"))
+    monkeypatch.setattr("linprim_geo.surface.extract.extract_mesh", stage("extract", last=True))
     assert cli.main(["demo", "-o", str(tmp_path / "d"), "--quiet"]) == 1
     assert called == [("synth", None), ("train", True), ("render", True), ("extract", True)]
     assert capfd.readouterr().err == "linprim-geo: error: stopped\n"

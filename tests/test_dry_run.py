@@ -12,14 +12,16 @@ import pytest
 import torch
 from conftest import with_budget
 
-from linprim_geo import cli, dry_run, shots
-from linprim_geo import train as training
-from linprim_geo.errors import LinprimError
-from linprim_geo.options import SceneOptions, TrainOptions
-from linprim_geo.scene import load_scene
-from linprim_geo.shots import Shot, StoredShot, load_shots, photo_bytes
-from linprim_geo.train import train
-from linprim_geo.trainer import Trainer
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import SceneOptions, TrainOptions
+from linprim_geo.capture.load import load_scene
+from linprim_geo.cli import main as cli
+from linprim_geo.training import single
+from linprim_geo.training.budget import dry_run
+from linprim_geo.training.step import training_images as shots
+from linprim_geo.training.step.trainer import Trainer
+from linprim_geo.training.step.training_images import Shot, StoredShot, load_shots, photo_bytes
+from linprim_geo.training.train import train
 
 OPTIONS = TrainOptions(
     iterations=120, max_primitives=300, initial_primitives=200, sh_degree=1, threads=1, evaluate_every=40
@@ -40,13 +42,13 @@ def test_photographs_on_disk_train_to_the_same_bits(kept, tiny_scene, tmp_path, 
     one = photo_bytes(load_scene(tiny_scene).train[:1])
     monkeypatch.setattr(shots, "available_memory", lambda: int(one * (kept + 0.5) / shots.MEMORY_SHARE))
     seen = []
-    original = training.load_shots
+    original = single.load_shots
 
     def loading(views, similarity):
         seen.append(original(views, similarity))
         return seen[-1]
 
-    monkeypatch.setattr(training, "load_shots", loading)
+    monkeypatch.setattr(single, "load_shots", loading)
     train(tiny_scene, tmp_path / "disk", options=options, quiet=True)
     assert [type(shot) is Shot for shot in seen[0]] == [True] * kept + [False] * (12 - kept)
     for name in ("training_frame.npz", "scene.npz", "scene.ply"):
@@ -60,7 +62,7 @@ def test_photographs_on_disk_train_to_the_same_bits(kept, tiny_scene, tmp_path, 
 
 def test_a_photograph_on_disk_is_the_one_in_memory_and_few_are_kept(tiny_scene):
     scene = load_scene(tiny_scene)
-    from linprim_geo.initial_points import scene_normalization
+    from linprim_geo.points.initial_points import scene_normalization
 
     similarity = scene_normalization(scene)
     memory, disk = (load_shots(scene.train, similarity, limit) for limit in (10**9, 0))

@@ -9,16 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from linprim_geo import cli
-from linprim_geo.effects import EFFECTS, Choice, Data, decide, inspect_scene, parse_asked, settle
-from linprim_geo.errors import LinprimError
-from linprim_geo.evidence import Observations
-from linprim_geo.lens import Lens, largest_displacement, straightened
-from linprim_geo.options import SceneOptions, TrainOptions
-from linprim_geo.run import Run
-from linprim_geo.scene import load_scene
-from linprim_geo.synth import synthesize
-from linprim_geo.train import train
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import SceneOptions, TrainOptions
+from linprim_geo.capture.load import load_scene
+from linprim_geo.cli import main as cli
+from linprim_geo.geometry.lens import Lens, largest_displacement, straightened
+from linprim_geo.points.photo_evidence import Observations
+from linprim_geo.runs.run import Run
+from linprim_geo.synthetic.synth import synthesize
+from linprim_geo.training.effects import EFFECTS, Choice, Data, decide, parse_asked, settle
+from linprim_geo.training.inspect import inspect_scene
+from linprim_geo.training.train import train
 
 SMALL = {
     "shape": "smooth",
@@ -59,7 +60,7 @@ def scenes(tmp_path_factory):
 @pytest.fixture
 def own_points(monkeypatch):
     """Trainings start from the scene's points alone: looking for more is slow, and no matter of effects."""
-    monkeypatch.setattr("linprim_geo.training_start.fill_points", lambda scene, *_: scene.points)
+    monkeypatch.setattr("linprim_geo.points.start_points.fill_points", lambda scene, *_: scene.points)
 
 
 def decisions(scene, choice=None, options=OPTIONS, scene_options=None):
@@ -142,7 +143,7 @@ def test_exposure_is_as_large_as_it_was_made(scenes):
 
 def test_points_that_say_nothing_leave_the_usual_setting(scenes):
     loaded = load_scene(scenes("plain"))
-    from linprim_geo.initial_points import VolumePoints
+    from linprim_geo.points.initial_points import VolumePoints
 
     anywhere = replace(loaded, points=VolumePoints(loaded.points.xyz, loaded.points.rgb))
     found = decisions(anywhere)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from linprim_geo.eval import effects
-from linprim_geo.files import write_json
+from linprim_geo.base.files import write_json
+from linprim_geo.eval.studies import effects
 
 SPREAD, SEEDS = {"psnr": 0.1, "depth": 0.05}, 8
 """With eight seeds a change counts from 0.1 dB and 0.05 % upwards."""

@@ -11,29 +11,30 @@ import numpy as np
 import pytest
 import torch
 
-from linprim_geo import ops, reference
-from linprim_geo.camera import Camera
-from linprim_geo.effects import Choice, inspect_scene
-from linprim_geo.environment import (
-    SAME_COLOR,
-    contradiction,
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import ExtractOptions, TrainOptions
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.environment_map import (
     filled,
     load_environment,
     nearest_texel,
     panorama,
     save_environment,
-    seen_through,
     texel_directions,
 )
-from linprim_geo.errors import LinprimError
-from linprim_geo.extract import extract_mesh
-from linprim_geo.initial_points import in_image
-from linprim_geo.mesh import load_mesh
-from linprim_geo.options import ExtractOptions, TrainOptions
-from linprim_geo.run import Run
-from linprim_geo.synth import synthesize
-from linprim_geo.synthetic_environment import synthetic_environment
-from linprim_geo.train import train
+from linprim_geo.geometry.mesh_files import load_mesh
+from linprim_geo.kernels import ops
+from linprim_geo.kernels.reference import rasterize as reference
+from linprim_geo.points.far_colors import SAME_COLOR
+from linprim_geo.points.initial_points import in_image
+from linprim_geo.runs.run import Run
+from linprim_geo.surface.extract import extract_mesh
+from linprim_geo.synthetic.environment import synthetic_environment
+from linprim_geo.synthetic.synth import synthesize
+from linprim_geo.training.effects import Choice
+from linprim_geo.training.inspect import inspect_scene
+from linprim_geo.training.step.environment import contradiction, seen_through
+from linprim_geo.training.train import train
 
 
 def camera_of(seed: int, width: int = 13, height: int = 9, focal: float = 7.0) -> Camera:

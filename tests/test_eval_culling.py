@@ -10,7 +10,7 @@ from surfaces import SCORES, camera_above, grid, join, sphere
 from linprim_geo.eval.culling import compare_along_rays, count_views
 from linprim_geo.eval.mesh import score_mesh
 from linprim_geo.eval.surface_samples import sample_surface
-from linprim_geo.raycast import RayCaster
+from linprim_geo.geometry.raycast import RayCaster
 
 ROUNDING = 1e-14
 

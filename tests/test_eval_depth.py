@@ -9,10 +9,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from linprim_geo.camera import Camera
-from linprim_geo.errors import LinprimError
+from linprim_geo.base.errors import LinprimError
 from linprim_geo.eval.depth import aggregate, eval_depth_run, score_depth
-from linprim_geo.mesh import Mesh, save_mesh
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.geometry.mesh_files import save_mesh
 
 WANTED_KEYS = {
     *("abs_rel", "sq_rel", "rmse", "rmse_log", "mae", "delta1", "delta2", "delta3", "coverage"),

@@ -9,10 +9,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from linprim_geo.camera import Camera
-from linprim_geo.errors import LinprimError
-from linprim_geo.eval.images import composite, eval_images_run, psnr, score_images, ssim, to_8bit
-from linprim_geo.scene import Photo
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.capture.types import Photo
+from linprim_geo.eval.images import eval_images_run, score_images
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.imaging.metrics import composite, psnr, ssim, to_8bit
 
 C1, C2 = 0.01**2, 0.03**2
 

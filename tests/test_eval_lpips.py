@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from linprim_geo import cli
-from linprim_geo.errors import LinprimError
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.cli import main as cli
 from linprim_geo.eval import lpips as module
 from linprim_geo.eval.images import eval_images_run
 from linprim_geo.eval.lpips import NETWORKS, Lpips, find_lpips
@@ -326,8 +326,9 @@ def test_the_command_scores_with_weights_and_says_so_without(tiny_run, files, tm
 
 
 def test_views_that_are_too_small_are_named(files, tmp_path):
-    from linprim_geo.synth import synthesize
-    from linprim_geo.train import SceneOptions, TrainOptions, train
+    from linprim_geo.base.options import SceneOptions, TrainOptions
+    from linprim_geo.synthetic.synth import synthesize
+    from linprim_geo.training.train import train
 
     synthesize(tmp_path / "scene", shape="cad", views=6, test_views=2, size=(40, 24), points=200, supersample=1)
     options = TrainOptions(iterations=5, max_primitives=50, sh_degree=0, threads=1)

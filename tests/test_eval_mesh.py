@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from surfaces import CONTEXT, SCORES, camera_above, grid, inradius, join, rotation, sphere, wavy
 
-from linprim_geo.errors import LinprimError
-from linprim_geo.eval.figures import error_colors
+from linprim_geo.base.errors import LinprimError
 from linprim_geo.eval.mesh import eval_mesh_files, score_mesh
 from linprim_geo.eval.surface_samples import SurfaceDistance, morton_order, refine, sample_surface
-from linprim_geo.mesh import Mesh, load_mesh, save_mesh
+from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.geometry.mesh_files import load_mesh, save_mesh
+from linprim_geo.imaging.colors import error_colors
 
 LENGTHS = ("accuracy", "completeness", "chamfer", "hausdorff", "tau", "standard_error", "accuracy_q90")
 # Rounding of a distance between points of a scene of size 1: a few float64 operations.

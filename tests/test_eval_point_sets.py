@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from surfaces import grid, sphere
 
-from linprim_geo.eval.point_sets import cell_means, lattice_points, thin
+from linprim_geo.eval.protocols.point_sets import cell_means, lattice_points, thin
 from linprim_geo.eval.surface_samples import PointDistance, SurfaceDistance, sample_surface
-from linprim_geo.mesh import Mesh
+from linprim_geo.geometry.mesh import Mesh
 
 
 def test_a_lattice_has_one_point_per_cell_of_the_area_inside_the_faces():
@@ -27,7 +27,7 @@ def test_a_lattice_has_one_point_per_cell_of_the_area_inside_the_faces():
 
 @pytest.mark.parametrize("start", [7, 60, 10**6])
 def test_thinning_is_that_of_going_through_the_points_one_by_one(monkeypatch, start):
-    monkeypatch.setattr("linprim_geo.eval.point_sets.THIN_START", start)
+    monkeypatch.setattr("linprim_geo.eval.protocols.point_sets.THIN_START", start)
     random = np.random.default_rng(1)
     points = np.concatenate([random.random((300, 3)), 0.1 * random.integers(0, 4, (100, 3))])  # repeats, and ties
     for radius in (0.1, 0.25):

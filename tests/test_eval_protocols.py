@@ -11,16 +11,17 @@ from PIL import Image
 from scipy.io import savemat
 from surfaces import CONTEXT, SCORES, camera_above, grid, join, sphere, wavy
 
-from linprim_geo import cli
-from linprim_geo.errors import LinprimError
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.cli import main as cli
 from linprim_geo.eval.culling import count_views
 from linprim_geo.eval.mesh import eval_mesh_files
-from linprim_geo.eval.point_sets import cell_means
-from linprim_geo.eval.protocol_files import CropVolume, ObservedVolume, read_observed_volume, read_plane
-from linprim_geo.eval.protocols import PROTOCOLS, TNT_TAU, Settings, score_by_protocol
+from linprim_geo.eval.protocols.files import CropVolume, ObservedVolume, read_observed_volume, read_plane
+from linprim_geo.eval.protocols.point_sets import cell_means
+from linprim_geo.eval.protocols.score import PROTOCOLS, TNT_TAU, Settings, score_by_protocol
 from linprim_geo.eval.surface_samples import PointDistance, refine, sample_surface
-from linprim_geo.mesh import Mesh, load_mesh, save_mesh
-from linprim_geo.raycast import RayCaster
+from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.geometry.mesh_files import load_mesh, save_mesh
+from linprim_geo.geometry.raycast import RayCaster
 
 MILLIMETRES = Settings(metre=1000.0)
 

@@ -14,11 +14,13 @@ from pathlib import Path
 
 import pytest
 
-from linprim_geo import executor as executors
-from linprim_geo import worker
-from linprim_geo.errors import LinprimError
-from linprim_geo.executor import ATTEMPTS, Executor, Outcome, Processes, Task, open_executor
-from linprim_geo.progress import Progress, memory_gib
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.memory import memory_gib
+from linprim_geo.base.progress import Progress
+from linprim_geo.jobs import worker
+from linprim_geo.jobs.executor import ATTEMPTS, Executor, Outcome, Task
+from linprim_geo.jobs.open import open_executor
+from linprim_geo.jobs.processes import Processes
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="workers are killed by SIGKILL")
 
@@ -126,7 +128,7 @@ def test_a_worker_without_memory_is_reported_with_what_to_change(executor, tmp_p
 
 def test_a_worker_that_the_system_kills_for_memory_is_not_begun_again(tmp_path, monkeypatch):
     kills = iter(range(10))
-    monkeypatch.setattr(executors, "_oom_kills", lambda: next(kills))
+    monkeypatch.setattr("linprim_geo.jobs.processes._oom_kills", lambda: next(kills))
     with pytest.raises(LinprimError, match=r"ran out of memory \(the system killed it\): wanted fewer"):
         run([task(tmp_path, "die", times=99)], tmp_path)
     assert (tmp_path / "t" / "deaths").read_text() == "x"
@@ -237,7 +239,8 @@ def test_without_ray_the_extra_is_named(tmp_path, monkeypatch):
 
 def test_ray_is_not_imported_unless_it_is_asked_for():
     text = (
-        "import sys, linprim_geo.executor, linprim_geo.cli; linprim_geo.cli.build_parser(); sys.exit('ray' in "
+        "import sys, linprim_geo.jobs.executor, linprim_geo.cli.main; linprim_geo.cli.main.build_parser(); "
+        "sys.exit('ray' in "
         "sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", text]).returncode == 0

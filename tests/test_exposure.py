@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from linprim_geo.evidence import observe
-from linprim_geo.exposure import Exposure, best_gain, exposed, with_best_gain
-from linprim_geo.options import TrainOptions
-from linprim_geo.scene import load_scene
-from linprim_geo.synth import synthesize
-from linprim_geo.train import train
+from linprim_geo.base.options import TrainOptions
+from linprim_geo.capture.load import load_scene
+from linprim_geo.points.photo_evidence import observe
+from linprim_geo.synthetic.synth import synthesize
+from linprim_geo.training.step.exposure import Exposure, best_gain, exposed, with_best_gain
+from linprim_geo.training.train import train
 
 QUICK = TrainOptions(
     iterations=60, max_primitives=300, initial_primitives=300, sh_degree=0, threads=1, exposure="gain", evaluate_every=0
@@ -42,7 +42,7 @@ def drifting(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def own_points(monkeypatch):
     """Trainings start from the scene's points alone: looking for more is slow, and no matter of exposure."""
-    monkeypatch.setattr("linprim_geo.training_start.fill_points", lambda scene, *_: scene.points)
+    monkeypatch.setattr("linprim_geo.points.start_points.fill_points", lambda scene, *_: scene.points)
 
 
 def true_gains(scene):
@@ -78,7 +78,7 @@ def test_training_finds_the_gains_and_keeps_their_mean(drifting, tmp_path):
 
 
 def test_a_resumed_run_repeats_the_gains_bit_for_bit(drifting, tmp_path, monkeypatch):
-    from linprim_geo.trainer import Trainer
+    from linprim_geo.training.step.trainer import Trainer
 
     options = replace(QUICK, checkpoint_every=25)
     train(drifting, tmp_path / "whole", options=options, quiet=True)

@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 from conftest import CENTER, octahedron_run
 
-from linprim_geo.camera import Camera
-from linprim_geo.errors import LinprimError
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import ExtractOptions
 from linprim_geo.eval.mesh import score_mesh
-from linprim_geo.extract import extract_mesh
-from linprim_geo.mesh import load_mesh, topology, validate_mesh
-from linprim_geo.options import ExtractOptions
-from linprim_geo.raycast import RayCaster
-from linprim_geo.run import Run
-from linprim_geo.surface_tsdf import DepthFrames, depth_limit
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.mesh import validate_mesh
+from linprim_geo.geometry.mesh_files import load_mesh
+from linprim_geo.geometry.raycast import RayCaster
+from linprim_geo.geometry.topology import topology
+from linprim_geo.runs.run import Run
+from linprim_geo.surface.extract import extract_mesh
+from linprim_geo.surface.method_tsdf import DepthFrames, depth_limit
 
 STATS = {
     "mesh",
@@ -248,6 +250,6 @@ def _shifted(x: float) -> np.ndarray:
 
 def test_frames_that_are_rendered_on_demand_give_the_same_mesh(tiny_run, tmp_path, monkeypatch):
     extract_mesh(tiny_run, output=tmp_path / "kept.ply", quiet=True)
-    monkeypatch.setattr("linprim_geo.surface_tsdf.KEPT_BYTES", 0)
+    monkeypatch.setattr("linprim_geo.surface.method_tsdf.KEPT_BYTES", 0)
     extract_mesh(tiny_run, output=tmp_path / "rendered.ply", quiet=True)
     assert (tmp_path / "kept.ply").read_bytes() == (tmp_path / "rendered.ply").read_bytes()

@@ -11,8 +11,8 @@ import sys
 
 import pytest
 
-from linprim_geo.errors import LinprimError
-from linprim_geo.files import atomic_write, locked, remove_torn, write_json
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import atomic_write, locked, remove_torn, write_json
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def test_folders_are_made(tmp_path):
 
 def test_permissions_follow_the_umask(tmp_path):
     # In a process of its own: the mask is read once, when the module is imported.
-    code = "import os, sys; os.umask(0o027); from linprim_geo.files import write_json; write_json(sys.argv[1], {})"
+    code = "import os, sys; os.umask(0o027); from linprim_geo.base.files import write_json; write_json(sys.argv[1], {})"
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "x.json")], check=True)
     assert stat.S_IMODE((tmp_path / "x.json").stat().st_mode) == 0o640
 

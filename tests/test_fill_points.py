@@ -10,10 +10,11 @@ import pytest
 from captures import look_at, transforms
 from PIL import Image
 
-from linprim_geo import fill_points as filling
-from linprim_geo.fill_points import _differences, _Gaps, _not_in_free_space, _sources, fill_points
-from linprim_geo.initial_points import local_planes, spread_looks
-from linprim_geo.scene import PointCloud, Scene, load_scene
+from linprim_geo.capture.load import load_scene
+from linprim_geo.capture.types import PointCloud, Scene
+from linprim_geo.points import densify as filling
+from linprim_geo.points.densify import _differences, _Gaps, _not_in_free_space, _sources, fill_points
+from linprim_geo.points.initial_points import local_planes, spread_looks
 
 # A room of 4 x 4 x 3: the far wall at y = 2, the floor at z = -1.5, a box in front of the wall.
 BOX_LOW, BOX_HIGH = np.array([-0.5, 0.6, -1.5]), np.array([0.5, 1.4, -0.3])

@@ -7,13 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from linprim_geo import fuse, ops, tsdf, visibility
-from linprim_geo.camera import Camera
-from linprim_geo.errors import LinprimError
-from linprim_geo.fuse import DepthFrame, fuse_tsdf
-from linprim_geo.mesh import Mesh, face_components, manifold_status, topology
-from linprim_geo.raycast import RayCaster
-from linprim_geo.tsdf import Grid, vote_rules
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.mesh import Mesh, face_components
+from linprim_geo.geometry.raycast import RayCaster
+from linprim_geo.geometry.topology import manifold_status, topology
+from linprim_geo.imaging import colors
+from linprim_geo.kernels import ops, surface_ops
+from linprim_geo.surface import tsdf_fusion as fuse
+from linprim_geo.surface import visibility
+from linprim_geo.surface.tsdf_field import DepthFrame, Grid, vote_rules
+from linprim_geo.surface.tsdf_fusion import fuse_tsdf
 
 SIZE = 128
 
@@ -269,7 +273,7 @@ def test_votes_are_those_of_the_rules(occluded):
     sums = (grid.total, grid.weight, grid.free)
     rows = np.array([0, 1, 2, 3])
     for _ in range(2):
-        tsdf._core.add_votes(
+        surface_ops.add_votes(
             project, camera.width, camera.height, table, rules, rows, grid.corner, grid.voxel, 8, *sums
         )
     k, j, i = (axis.ravel() for axis in np.meshgrid(*[np.arange(8)] * 3, indexing="ij"))
@@ -432,8 +436,8 @@ def test_a_preview_shows_the_mesh(ball):
     drawn = (picture != 255).any(2)
     assert (drawn == inside).mean() > 0.99
     assert picture[SIZE // 2, SIZE // 2].min() > 200  # lit from the front
-    scale = visibility.color_scale(np.array([0.0, 1.0, np.nan]), top=1.0)
-    np.testing.assert_array_equal(scale, [visibility.SCALE[0], visibility.SCALE[-1], [128] * 3])
+    scale = colors.color_scale(np.array([0.0, 1.0, np.nan]), top=1.0)
+    np.testing.assert_array_equal(scale, [colors.SCALE[0], colors.SCALE[-1], [128] * 3])
     error = visibility.render_preview(ball, camera, colors=np.tile(scale[1], (len(ball.vertices), 1)))
     assert error[SIZE // 2, SIZE // 2, 0] > 2 * error[SIZE // 2, SIZE // 2, 2]
     flipped = visibility.render_preview(replace(ball, faces=ball.faces[:, ::-1]), camera)

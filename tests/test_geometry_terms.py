@@ -11,12 +11,13 @@ import pytest
 import torch
 from conftest import octahedron_run
 
-from linprim_geo import geometry_terms as terms
-from linprim_geo import ops
-from linprim_geo.camera import Camera
-from linprim_geo.errors import LinprimError
-from linprim_geo.ops import Rendering
-from linprim_geo.options import GEOMETRY_WEIGHTS, TrainOptions, check_train_options
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import GEOMETRY_WEIGHTS, TrainOptions, check_train_options
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.kernels import ops
+from linprim_geo.kernels.ops import Rendering
+from linprim_geo.points import view_pairs
+from linprim_geo.training.step import geometry_terms as terms
 
 
 def camera(x: float = 0.0, size: int = 64) -> Camera:
@@ -173,8 +174,8 @@ def test_sources_see_the_same_points_from_another_angle():
     away = camera(0.5)
     turned = away.world_to_camera @ np.diag([-1.0, 1, -1, 1])
     cameras = [camera(0.0), camera(0.02), camera(0.3), camera(-0.5), replace(away, world_to_camera=turned)]
-    assert sorted(terms.source_views(cameras, points)[0]) == [2, 3]  # the second is too near, the last looks away
-    assert terms.source_views(cameras[:1], points) == [[]]
+    assert sorted(view_pairs.source_views(cameras, points)[0]) == [2, 3]  # the second is too near, the last looks away
+    assert view_pairs.source_views(cameras[:1], points) == [[]]
 
 
 @pytest.fixture(scope="module")
@@ -183,8 +184,8 @@ def options(tiny_options):
 
 
 def trained(scene, folder, options, **more):
-    from linprim_geo.run import Run
-    from linprim_geo.train import train
+    from linprim_geo.runs.run import Run
+    from linprim_geo.training.train import train
 
     train(scene, folder, options=options, quiet=True, **more)
     return Run.open(folder).training_primitives()
@@ -219,8 +220,8 @@ def test_every_term_changes_the_run(name, tiny_scene, options, plain, tmp_path):
 
 
 def test_patches_change_a_run_of_views_that_overlap_and_say_when_none_do(tiny_scene, options, plain, tmp_path, capsys):
-    from linprim_geo.synth import synthesize
-    from linprim_geo.train import train
+    from linprim_geo.synthetic.synth import synthesize
+    from linprim_geo.training.train import train
 
     synthesize(tmp_path / "scene", shape="smooth", views=30, test_views=2, size=48, points=300, supersample=1)
     found = [
@@ -230,13 +231,13 @@ def test_patches_change_a_run_of_views_that_overlap_and_say_when_none_do(tiny_sc
     # The tiny scene's views are too far apart from each other.
     train(tiny_scene, tmp_path / "far", options=replace(options, patches=1.0))
     assert "--patches: no two views see the same places" in capsys.readouterr().err
-    from linprim_geo.run import Run
+    from linprim_geo.runs.run import Run
 
     assert np.array_equal(Run.open(tmp_path / "far").training_primitives().center, plain.center)
 
 
 def test_a_run_with_every_term_resumes_to_the_last_bit(tiny_scene, options, tmp_path):
-    from linprim_geo.train import train
+    from linprim_geo.training.train import train
 
     every = replace(options, order="overlap", order_from=0.6, **dict.fromkeys(GEOMETRY_WEIGHTS, 0.05))
     whole = trained(tiny_scene, tmp_path / "whole", every)
@@ -245,7 +246,7 @@ def test_a_run_with_every_term_resumes_to_the_last_bit(tiny_scene, options, tmp_
         (tmp_path / "part" / "checkpoints" / name).unlink()
     (tmp_path / "part" / "checkpoints" / "latest").write_text("step_000060.pt\n")
     train(tiny_scene, tmp_path / "part", options=every, resume=True, quiet=True)
-    from linprim_geo.run import Run
+    from linprim_geo.runs.run import Run
 
     again = Run.open(tmp_path / "part").training_primitives()
     assert all(
@@ -265,9 +266,9 @@ def test_sensor_depth_brings_the_surface_to_it(tiny_scene, options, tmp_path):
 
 
 def test_normals_of_the_data_set_are_those_of_its_surface(tiny_scene):
-    from linprim_geo.mesh import load_mesh
-    from linprim_geo.raycast import RayCaster
-    from linprim_geo.scene import load_scene
+    from linprim_geo.capture.load import load_scene
+    from linprim_geo.geometry.mesh_files import load_mesh
+    from linprim_geo.geometry.raycast import RayCaster
 
     mesh = load_mesh(tiny_scene / "reference.ply")
     caster = RayCaster(mesh.vertices, mesh.faces)
@@ -286,8 +287,8 @@ def test_normals_of_the_data_set_are_those_of_its_surface(tiny_scene):
 
 
 def test_a_term_without_evidence_says_so(tmp_path):
-    from linprim_geo.camera import Similarity
-    from linprim_geo.scene import load_scene
+    from linprim_geo.capture.load import load_scene
+    from linprim_geo.geometry.camera import Similarity
 
     run = octahedron_run(tmp_path, views=4, size=24)
     scene = load_scene(run.parent / "scene")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from linprim_geo.held_out_gap import FEW_VIEWS, LARGEST_GAP, gap_advice
-from linprim_geo.options import TrainOptions
+from linprim_geo.base.options import TrainOptions
+from linprim_geo.training.held_out_gap import FEW_VIEWS, LARGEST_GAP, gap_advice
 
 FAR = {"name": "environment", "value": 30.0, "threshold": 10.0}
 DRIFT = {"name": "exposure", "value": 9.0, "threshold": 3.0}

@@ -9,8 +9,8 @@ import pytest
 from captures import picture, write_colmap, write_transforms
 from PIL import Image
 
-from linprim_geo.errors import LinprimError
-from linprim_geo.scene import load_scene
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.capture.load import load_scene
 
 SIZE = (32, 24)
 

@@ -10,8 +10,10 @@ import pytest
 from captures import OPENGL, look_at, picture, ring, transforms
 from PIL import Image
 
-from linprim_geo.errors import LinprimError
-from linprim_geo.initial_points import (
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.capture.load import load_scene
+from linprim_geo.capture.types import PointCloud, Scene, View
+from linprim_geo.points.initial_points import (
     CAMERA_DISTANCE,
     _colors,
     focus_point,
@@ -20,7 +22,6 @@ from linprim_geo.initial_points import (
     spread_looks,
     visual_hull_points,
 )
-from linprim_geo.scene import PointCloud, Scene, View, load_scene
 
 PLACE = np.array([100.0, -40.0, 7.0])
 RADIUS = 0.8

@@ -12,8 +12,8 @@ from octahedra import KERNELS
 # Renders one octahedron and prints the instruction set in force and what a pixel of it shows.
 PROGRAM = """
 import numpy, torch
-from linprim_geo import ops
-from linprim_geo.camera import Camera
+from linprim_geo.kernels import ops
+from linprim_geo.geometry.camera import Camera
 one = [torch.tensor([row]) for row in ([0.0, 0.0, 3.0], [1.0, 0.0, 0.0, 0.0], [1.0, 0.5, 0.7], 0.5)]
 camera = Camera(width=9, height=9, fx=9.0, fy=9.0, cx=4.5, cy=4.5, world_to_camera=numpy.eye(4))
 image = ops.rasterize(*one, torch.full((1, 1, 3), 0.5), torch.zeros(3), camera)

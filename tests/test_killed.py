@@ -15,17 +15,17 @@ import numpy as np
 import pytest
 from killing import Jobs
 
-from linprim_geo.checkpoint import read_checkpoint
-from linprim_geo.convert import read_primitives
-from linprim_geo.errors import LinprimError
-from linprim_geo.extract import extract_mesh
-from linprim_geo.files import locked
-from linprim_geo.mesh import load_mesh
-from linprim_geo.options import TrainOptions
-from linprim_geo.primitives import Primitives, load_primitives, save_primitives
-from linprim_geo.run import Run
-from linprim_geo.synth import synthesize
-from linprim_geo.train import train
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import locked
+from linprim_geo.base.options import TrainOptions
+from linprim_geo.geometry.mesh_files import load_mesh
+from linprim_geo.geometry.primitives import Primitives, load_primitives, save_primitives
+from linprim_geo.runs.run import Run
+from linprim_geo.surface.convert import read_primitives
+from linprim_geo.surface.extract import extract_mesh
+from linprim_geo.synthetic.synth import synthesize
+from linprim_geo.training.checkpoint import read_checkpoint
+from linprim_geo.training.train import train
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="processes are copied by fork, killed by SIGKILL")
 
@@ -206,7 +206,7 @@ def test_conversion_killed_leaves_the_old_file_or_the_new(jobs, tmp_path):
 HOLD = """
 import sys, time
 from pathlib import Path
-from linprim_geo.files import locked
+from linprim_geo.base.files import locked
 with locked(Path(sys.argv[1]), "held"):
     print("held", flush=True)
     time.sleep(60)

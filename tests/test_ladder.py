@@ -10,7 +10,8 @@ import pytest
 import torch
 from octahedra import IMAGES, KERNELS, camera, fields, kernels, octahedra, random_scene
 
-from linprim_geo import ops, reference
+from linprim_geo.kernels import ops
+from linprim_geo.kernels.reference import rasterize as reference
 
 # What the core has: an order other than the centres' needs an entry, which a Gaussian has not.
 RUNGS = [

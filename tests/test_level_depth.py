@@ -7,7 +7,8 @@ import pytest
 import torch
 from octahedra import BUILDS, KERNELS, camera, kernels, octahedra, random_scene
 
-from linprim_geo import ops, reference
+from linprim_geo.kernels import ops
+from linprim_geo.kernels.reference import rasterize as reference
 
 pytestmark = pytest.mark.usefixtures("few_threads")
 

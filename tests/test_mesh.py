@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from linprim_geo import mesh as lm
-from linprim_geo.errors import LinprimError
-from linprim_geo.mesh import Mesh
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.geometry import mesh as lm
+from linprim_geo.geometry import mesh_files, topology
+from linprim_geo.geometry.mesh import Mesh
 
 CUBE_VERTICES = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64)
 CUBE_FACES = np.array(
@@ -65,11 +66,11 @@ def painted(offset=0.0) -> Mesh:
 # --- files -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("suffix", lm.SUFFIXES)
+@pytest.mark.parametrize("suffix", mesh_files.SUFFIXES)
 def test_a_written_mesh_comes_back(tmp_path, suffix):
     mesh = painted()
-    lm.save_mesh(tmp_path / f"m{suffix}", mesh)
-    back = lm.load_mesh(tmp_path / f"m{suffix}")
+    mesh_files.save_mesh(tmp_path / f"m{suffix}", mesh)
+    back = mesh_files.load_mesh(tmp_path / f"m{suffix}")
     if suffix == ".stl":  # keeps triangles only: same faces, vertices merged, in another order
         assert len(back.vertices) == len(mesh.vertices)
         corners = back.vertices[back.faces] - mesh.vertices[mesh.faces]
@@ -83,12 +84,12 @@ def test_a_written_mesh_comes_back(tmp_path, suffix):
         np.testing.assert_array_equal(back.quality, mesh.quality)
 
 
-@pytest.mark.parametrize("suffix", lm.SUFFIXES)
+@pytest.mark.parametrize("suffix", mesh_files.SUFFIXES)
 def test_meshlab_reads_what_is_written(tmp_path, suffix):
     import pymeshlab
 
     mesh = painted()
-    lm.save_mesh(tmp_path / f"m{suffix}", mesh)
+    mesh_files.save_mesh(tmp_path / f"m{suffix}", mesh)
     meshes = pymeshlab.MeshSet()
     meshes.load_new_mesh(str(tmp_path / f"m{suffix}"))
     read = meshes.current_mesh()
@@ -106,14 +107,14 @@ def test_meshlab_reads_what_is_written(tmp_path, suffix):
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb"])
 def test_far_from_the_origin_nothing_is_lost(tmp_path, suffix):
     mesh = painted(offset=1e6)
-    lm.save_mesh(tmp_path / f"m{suffix}", mesh)
-    back = lm.load_mesh(tmp_path / f"m{suffix}")
+    mesh_files.save_mesh(tmp_path / f"m{suffix}", mesh)
+    back = mesh_files.load_mesh(tmp_path / f"m{suffix}")
     np.testing.assert_allclose(back.vertices, mesh.vertices, rtol=0, atol=1e-7)  # float32 steps by 0.06 there
 
 
 def test_a_mesh_without_attributes_has_none_after_reading(tmp_path):
-    lm.save_mesh(tmp_path / "m.ply", sphere())
-    back = lm.load_mesh(tmp_path / "m.ply")
+    mesh_files.save_mesh(tmp_path / "m.ply", sphere())
+    back = mesh_files.load_mesh(tmp_path / "m.ply")
     assert back.normals is None and back.colors is None and back.quality is None
 
 
@@ -129,15 +130,15 @@ def test_a_moved_and_turned_scene_is_flattened(tmp_path):
     scene.add_geometry(box)
     scene.export(tmp_path / "two.glb")
     np.testing.assert_allclose(
-        lm.load_mesh(tmp_path / "one.glb").bounds, [[3.5, -0.5, -0.5], [6.5, 0.5, 0.5]], atol=1e-6
+        mesh_files.load_mesh(tmp_path / "one.glb").bounds, [[3.5, -0.5, -0.5], [6.5, 0.5, 0.5]], atol=1e-6
     )
-    assert lm.topology(lm.merge_vertices(lm.load_mesh(tmp_path / "two.glb")))["components"] == 2
+    assert topology.topology(lm.merge_vertices(mesh_files.load_mesh(tmp_path / "two.glb")))["components"] == 2
 
 
 def test_bad_files_are_named_in_one_sentence(tmp_path):
     with pytest.raises(LinprimError, match="nothing.ply: no such"):
-        lm.load_mesh(tmp_path / "nothing.ply")
-    lm.save_mesh(tmp_path / "whole.ply", painted())
+        mesh_files.load_mesh(tmp_path / "nothing.ply")
+    mesh_files.save_mesh(tmp_path / "whole.ply", painted())
     data = (tmp_path / "whole.ply").read_bytes()
     (tmp_path / "cut.ply").write_bytes(data[: len(data) // 2])
     (tmp_path / "noise.ply").write_bytes(bytes(range(256)) * 4)
@@ -151,14 +152,14 @@ def test_bad_files_are_named_in_one_sentence(tmp_path):
     )
     for name in ("cut", "noise", "points", "index"):
         with pytest.raises(LinprimError, match=f"{name}.ply"):
-            lm.load_mesh(tmp_path / f"{name}.ply")
+            mesh_files.load_mesh(tmp_path / f"{name}.ply")
 
 
 def test_nothing_is_written_for_an_empty_mesh_or_an_unknown_suffix(tmp_path):
     with pytest.raises(LinprimError, match="no faces"):
-        lm.save_mesh(tmp_path / "m.ply", Mesh(np.zeros((0, 3)), np.zeros((0, 3))))
+        mesh_files.save_mesh(tmp_path / "m.ply", Mesh(np.zeros((0, 3)), np.zeros((0, 3))))
     with pytest.raises(LinprimError, match="'.xyz'"):
-        lm.save_mesh(tmp_path / "m.xyz", cube())
+        mesh_files.save_mesh(tmp_path / "m.xyz", cube())
     assert list(tmp_path.iterdir()) == []
 
 
@@ -203,12 +204,12 @@ def test_unusable_meshes_are_refused():
 
 
 def test_topology_of_a_cube():
-    stats = lm.topology(cube(offset=100.0))
+    stats = topology.topology(cube(offset=100.0))
     expected = dict(vertices=8, faces=12, components=1, boundary_edges=0, non_manifold_edges=0, genus=0)
     assert {key: stats[key] for key in expected} == expected
-    assert stats["watertight"] and lm.manifold_status(cube()) == "NoError"
+    assert stats["watertight"] and topology.manifold_status(cube()) == "NoError"
     assert stats["area"] == pytest.approx(6.0) and stats["volume"] == pytest.approx(1.0)
-    assert lm.topology(replace(cube(), faces=CUBE_FACES[:, ::-1]))["volume"] == pytest.approx(-1.0)
+    assert topology.topology(replace(cube(), faces=CUBE_FACES[:, ::-1]))["volume"] == pytest.approx(-1.0)
 
 
 def test_genus_is_that_of_the_surface():
@@ -216,8 +217,8 @@ def test_genus_is_that_of_the_surface():
 
     torus = trimesh.creation.torus(1.0, 0.3)
     ring = Mesh(torus.vertices, torus.faces)
-    assert lm.topology(ring)["genus"] == 1
-    both = lm.topology(joined(ring, sphere(), cube(5.0)))
+    assert topology.topology(ring)["genus"] == 1
+    both = topology.topology(joined(ring, sphere(), cube(5.0)))
     assert (both["genus"], both["components"]) == (1, 3)
 
 
@@ -225,21 +226,21 @@ def test_bodies_that_touch_in_a_vertex_are_two_spheres():
     tetrahedron = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]])
     other = np.array([0, 4, 5, 6])[tetrahedron]
-    stats = lm.topology(Mesh(vertices, np.concatenate([tetrahedron, other[:, ::-1]])))
+    stats = topology.topology(Mesh(vertices, np.concatenate([tetrahedron, other[:, ::-1]])))
     assert (stats["watertight"], stats["components"], stats["genus"]) == (True, 1, 0)
     assert stats["volume"] == pytest.approx(2 / 6)
 
 
 def test_holes_and_fins_are_counted():
-    open_cube = lm.topology(replace(cube(), faces=CUBE_FACES[1:]))
+    open_cube = topology.topology(replace(cube(), faces=CUBE_FACES[1:]))
     assert (open_cube["boundary_edges"], open_cube["watertight"], open_cube["genus"]) == (3, False, None)
     assert open_cube["volume"] is None
-    fins = lm.topology(Mesh(np.eye(5, 3), [[0, 1, 2], [1, 0, 3], [0, 1, 4]]))
+    fins = topology.topology(Mesh(np.eye(5, 3), [[0, 1, 2], [1, 0, 3], [0, 1, 4]]))
     assert fins["non_manifold_edges"] == 1
     turned = CUBE_FACES.copy()
     turned[0] = turned[0, ::-1]
-    assert lm.topology(replace(cube(), faces=turned))["non_manifold_edges"] == 3
-    assert lm.manifold_status(replace(cube(), faces=turned)) != "NoError"
+    assert topology.topology(replace(cube(), faces=turned))["non_manifold_edges"] == 3
+    assert topology.manifold_status(replace(cube(), faces=turned)) != "NoError"
 
 
 # --- editing ---------------------------------------------------------------------------------------------
@@ -258,9 +259,9 @@ def test_specks_go_and_attributes_follow():
 
 def test_equal_vertices_are_merged():
     soup = Mesh(CUBE_VERTICES[CUBE_FACES].reshape(-1, 3), np.arange(36).reshape(-1, 3))
-    assert lm.topology(soup)["components"] == 12
+    assert topology.topology(soup)["components"] == 12
     merged = lm.merge_vertices(soup)
-    assert lm.topology(merged)["watertight"] and len(merged.vertices) == 8
+    assert topology.topology(merged)["watertight"] and len(merged.vertices) == 8
 
 
 def test_vertex_normals_of_a_sphere_and_of_a_cube():

@@ -10,13 +10,13 @@ import pytest
 from conftest import CENTER
 from PIL import Image
 
-from linprim_geo.convert import convert
+from linprim_geo.base.options import ExtractOptions
 from linprim_geo.eval.mesh import eval_mesh_files
-from linprim_geo.extract import extract_mesh
-from linprim_geo.mesh import load_mesh
-from linprim_geo.options import ExtractOptions
-from linprim_geo.run import Run
-from linprim_geo.texture_files import load_texture
+from linprim_geo.geometry.mesh_files import load_mesh
+from linprim_geo.runs.run import Run
+from linprim_geo.surface.convert import convert
+from linprim_geo.surface.extract import extract_mesh
+from linprim_geo.surface.texture_files import load_texture
 
 SUFFIXES = (".ply", ".obj", ".glb", ".stl")
 TEXTURED = (".obj", ".glb")

@@ -7,9 +7,9 @@ import pytest
 import torch
 from octahedra import KERNELS, assert_identical, kernels
 
-from linprim_geo import ops
-from linprim_geo.adam import adam_rows, adam_step
-from linprim_geo.errors import LinprimError
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.kernels import ops
+from linprim_geo.kernels.adam import adam_rows, adam_step
 
 EPS = torch.finfo(torch.float32).eps
 # Rows of every length that the kernels treat apart, and those of training.

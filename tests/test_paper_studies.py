@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from linprim_geo import trainer as trainer_module
-from linprim_geo import training_start
-from linprim_geo.errors import LinprimError
-from linprim_geo.eval import paper_tables
-from linprim_geo.eval.images import composite, psnr, to_8bit
-from linprim_geo.eval.paper_classes import class_errors, read_labels, stand_in_labels
-from linprim_geo.eval.paper_starts import (
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import SceneOptions, TrainOptions
+from linprim_geo.capture.load import load_scene
+from linprim_geo.capture.types import PointCloud
+from linprim_geo.eval.paper import tables as paper_tables
+from linprim_geo.eval.paper.classes import class_errors, read_labels, stand_in_labels
+from linprim_geo.eval.paper.published import PUBLISHED, published
+from linprim_geo.eval.paper.starts import (
     STARTS,
     by_density,
     camera_spread,
@@ -27,17 +28,18 @@ from linprim_geo.eval.paper_starts import (
     raw_opacity,
     started,
 )
-from linprim_geo.eval.published import PUBLISHED, published
-from linprim_geo.eval.text_tables import number
-from linprim_geo.options import SceneOptions, TrainOptions
-from linprim_geo.primitives import reference_length
-from linprim_geo.run import Run
-from linprim_geo.scene import PointCloud, load_scene
-from linprim_geo.train import train
+from linprim_geo.eval.paper.text_tables import number
+from linprim_geo.geometry.primitives import reference_length
+from linprim_geo.imaging.metrics import composite, psnr, to_8bit
+from linprim_geo.points import start_points
+from linprim_geo.runs.run import Run
+from linprim_geo.training import start as training_start
+from linprim_geo.training.step import trainer as trainer_module
+from linprim_geo.training.train import train
 
 USUAL = (
     training_start.Trainer,
-    training_start.initial_cloud,
+    start_points.initial_cloud,
     training_start.initial_parameters,
     trainer_module.activate,
 )
@@ -46,7 +48,7 @@ USUAL = (
 def usual():
     return (
         training_start.Trainer,
-        training_start.initial_cloud,
+        start_points.initial_cloud,
         training_start.initial_parameters,
         trainer_module.activate,
     )
@@ -55,7 +57,7 @@ def usual():
 @pytest.fixture(autouse=True)
 def points_as_they_are(monkeypatch):
     """Looking for more points takes seconds for every training."""
-    monkeypatch.setattr(training_start, "fill_points", lambda scene, *_: scene.points)
+    monkeypatch.setattr("linprim_geo.points.start_points.fill_points", lambda scene, *_: scene.points)
 
 
 # --- starts ----------------------------------------------------------------------------------------------
@@ -226,7 +228,7 @@ def test_labels_that_do_not_fit_are_refused_in_a_sentence(tiny_scene, tmp_path):
 
 
 def test_the_labels_of_a_built_in_scene_are_its_parts(tiny_scene, tmp_path):
-    from linprim_geo.shapes import SHAPES
+    from linprim_geo.synthetic.shapes import SHAPES
 
     views = load_scene(tiny_scene).test
     folder = stand_in_labels(tmp_path / "labels", "cad", views)
@@ -333,7 +335,7 @@ def test_tables_share_models_and_a_second_run_trains_nothing(quick, capsys):
 
 
 def test_a_capture_without_truth_is_left_out_and_named(quick, tmp_path, capsys):
-    from linprim_geo.synth import synthesize
+    from linprim_geo.synthetic.synth import synthesize
 
     synthesize(tmp_path / "bare", shape="cad", views=6, test_views=2, size=32, points=200, supersample=1)
     (tmp_path / "bare" / "reference.ply").unlink()

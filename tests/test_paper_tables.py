@@ -11,13 +11,17 @@ import numpy as np
 import pytest
 import torch
 
-from linprim_geo import training_start
-from linprim_geo.camera import Camera
-from linprim_geo.eval import equal_points, paper_kinds, paper_models, paper_studies, paper_tables
-from linprim_geo.eval.paper_models import Model, Variant
-from linprim_geo.primitives import KINDS, Primitives
-from linprim_geo.reference import rotation_matrix
-from linprim_geo.trainer import Trainer
+from linprim_geo.eval.paper import equal_points
+from linprim_geo.eval.paper import kinds as paper_kinds
+from linprim_geo.eval.paper import models as paper_models
+from linprim_geo.eval.paper import studies as paper_studies
+from linprim_geo.eval.paper import tables as paper_tables
+from linprim_geo.eval.paper.models import Model, Variant
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.primitives import KINDS, Primitives
+from linprim_geo.kernels.reference.rasterize import rotation_matrix
+from linprim_geo.training import start as training_start
+from linprim_geo.training.step.trainer import Trainer
 
 NEAR = 0.01  # of ops.rasterize
 SMALLEST_ALPHA = 1 / 255  # of a Gaussian that counts as hit
@@ -222,7 +226,9 @@ def test_counts_of_something_that_fills_the_image_are_all_its_pixels():
 
 
 def test_a_quick_run_writes_all_tables_and_a_second_one_trains_nothing(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(training_start, "fill_points", lambda scene, *_: scene.points)  # seconds for every model
+    monkeypatch.setattr(
+        "linprim_geo.points.start_points.fill_points", lambda scene, *_: scene.points
+    )  # seconds for every model
     command = ["--quick", "-o", str(tmp_path), "--iterations", "50"]
     paper_tables.main(command)
     assert training_start.Trainer is Trainer

@@ -11,8 +11,8 @@ import pytest
 import torch
 from octahedra import BUILDS, KERNELS, assert_identical, everything, kernels, leaves, random_scene
 
-from linprim_geo import ops
-from linprim_geo.adam import adam_step
+from linprim_geo.kernels import ops
+from linprim_geo.kernels.adam import adam_step
 
 COUNTS = (1, 2, 3, 7)
 
@@ -121,8 +121,8 @@ def test_both_precisions_at_once():
 
 FORK = """
 import os, sys, torch
-from linprim_geo import ops
-from linprim_geo.adam import adam_step
+from linprim_geo.kernels import ops
+from linprim_geo.kernels.adam import adam_step
 torch.set_num_threads(1)  # torch itself cannot fork with more
 ops.set_threads(2)
 def step():

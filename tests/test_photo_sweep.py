@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from linprim_geo import ops, photo_sweep
-from linprim_geo.camera import Camera
-from linprim_geo.campath import look_at
-from linprim_geo.mesh import Mesh, vertex_normals
-from linprim_geo.photo_sweep import best_agreement, photo_gains, predicted_error, refine_surface
-from linprim_geo.scene import Photo
+from linprim_geo.capture.types import Photo
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.mesh import Mesh, vertex_normals
+from linprim_geo.kernels import ops
+from linprim_geo.surface import photo_consistency as photo_sweep
+from linprim_geo.surface.photo_consistency import best_agreement, photo_gains, predicted_error, refine_surface
+from linprim_geo.synthetic.camera_paths import look_at
 
 SIZE, FOCAL, DISTANCE = 96, 90.0, 3.0
 FOOTPRINT = DISTANCE / FOCAL

@@ -7,9 +7,10 @@ import pytest
 import torch
 from octahedra import KERNELS, kernels
 
-from linprim_geo import ops, reference
-from linprim_geo.adam import adam_step
-from linprim_geo.errors import LinprimError
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.kernels import ops
+from linprim_geo.kernels.adam import adam_step
+from linprim_geo.kernels.reference import rasterize as reference
 
 EPS = torch.finfo(torch.float32).eps
 

@@ -8,10 +8,10 @@ import pytest
 from captures import look_at
 from PIL import Image
 
-from linprim_geo import photos
-from linprim_geo.errors import LinprimError
-from linprim_geo.lens import Lens, undistorted
-from linprim_geo.scene import View
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.capture.types import View
+from linprim_geo.geometry.lens import Lens, undistorted
+from linprim_geo.imaging import photos
 
 
 def test_average_of_straight_colours_is_weighted_by_alpha():

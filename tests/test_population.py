@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from linprim_geo import population
-from linprim_geo.options import TrainOptions
-from linprim_geo.population import DEAD_OPACITY, GradientControl, Growth, grow
-from linprim_geo.primitives import KINDS, Primitives
+from linprim_geo.base.options import TrainOptions
+from linprim_geo.geometry.primitives import KINDS, Primitives
+from linprim_geo.training.step import population
+from linprim_geo.training.step.population import DEAD_OPACITY, GradientControl, Growth, grow
 
 SMALLEST = math.log(1e-3)
 

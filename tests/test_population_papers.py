@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from linprim_geo.camera import Camera
-from linprim_geo.options import TrainOptions
-from linprim_geo.population_papers import (
+from linprim_geo.base.options import TrainOptions
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.primitives import KINDS
+from linprim_geo.training.step.population_papers import (
     GAUSSIANS,
     POLYHEDRA,
     ClassicControl,
@@ -21,7 +22,6 @@ from linprim_geo.population_papers import (
     relocated,
     scene_radius,
 )
-from linprim_geo.primitives import KINDS
 
 BOUNDS = (1e-3, 1.0)
 OPTIONS = {"iterations": 30_000, "max_primitives": 1000}

@@ -22,9 +22,9 @@ from primitive_sets import (
     raw_table,
 )
 
-from linprim_geo.errors import LinprimError
-from linprim_geo.ply import read_ply_header, read_primitive_ply, write_primitive_ply
-from linprim_geo.primitives import Primitives, load_primitives, save_primitives
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.geometry.primitive_files import read_ply_header, read_primitive_ply, write_primitive_ply
+from linprim_geo.geometry.primitives import Primitives, load_primitives, save_primitives
 
 # --- the formulas ----------------------------------------------------------------------------------------
 

@@ -12,9 +12,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from linprim_geo.errors import LinprimError
-from linprim_geo.options import TrainOptions
-from linprim_geo.primitives import (
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import TrainOptions
+from linprim_geo.geometry.primitives import (
     ARRAYS,
     KINDS,
     Primitives,

@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 
 import linprim_geo as lg
-from linprim_geo import cli
+from linprim_geo.cli import main as cli
 
 ROOT = Path(__file__).resolve().parent.parent
-README, PYTHON = ROOT / "README.md", ROOT / "linprim_geo" / "PYTHON.md"
+README, PYTHON = ROOT / "README.md", ROOT / "docs" / "python.md"
 
 
 def examples(page: Path) -> list[str]:
@@ -71,25 +71,6 @@ def test_importing_the_package_imports_no_library():
     code = "import sys, linprim_geo as lg; print('torch' in sys.modules or 'numpy' in sys.modules, 'train' in dir(lg))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout) == (0, "False True\n"), done.stderr
-
-
-@pytest.mark.parametrize("before", ["", "import linprim_geo.train, linprim_geo.convert, linprim_geo.report"])
-def test_a_module_that_is_named_as_a_command_is_both(before):
-    code = f"""
-import linprim_geo as lg
-{before}
-try:
-    lg.convert("a.npz", "b.xyz")
-except lg.LinprimError as error:
-    print(error)
-import linprim_geo.convert as module
-from linprim_geo import train
-print(module.convert.__name__, module is lg.convert, train.train.__name__, callable(lg.report))
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    first, second = done.stdout.splitlines()
-    assert "wanted .npz" in first and second == "convert True train True"
 
 
 def test_every_public_name_is_there_and_no_other():

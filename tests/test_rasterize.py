@@ -26,8 +26,8 @@ from octahedra import (
     twin,
 )
 
-from linprim_geo import ops
-from linprim_geo.camera import Camera
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.kernels import ops
 
 pytestmark = pytest.mark.usefixtures("few_threads")
 

@@ -21,9 +21,9 @@ from octahedra import (
     random_scene,
 )
 
-from linprim_geo import ops
-from linprim_geo.camera import Camera
-from linprim_geo.errors import LinprimError
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.kernels import ops
 
 pytestmark = pytest.mark.usefixtures("few_threads")
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from linprim_geo import raycast
-from linprim_geo.camera import Camera
-from linprim_geo.campath import look_at
-from linprim_geo.errors import LinprimError
-from linprim_geo.raycast import RayCaster
-from linprim_geo.textured import subdivide
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.geometry import raycast
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.raycast import RayCaster
+from linprim_geo.synthetic.camera_paths import look_at
+from linprim_geo.synthetic.textured import subdivide
 
 OCTAHEDRON = (
     np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float),

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from captures import picture, reconstruction, ring, write_colmap
 
-from linprim_geo.errors import LinprimError
-from linprim_geo.lens import model_parameter_counts
-from linprim_geo.read_colmap import find_model, read_model
-from linprim_geo.scene import load_scene
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.capture.load import load_scene
+from linprim_geo.capture.readers.colmap import find_model, read_model
+from linprim_geo.geometry.lens import model_parameter_counts
 
 
 def refusal(path, **options) -> str:

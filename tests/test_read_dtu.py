@@ -8,9 +8,9 @@ import pytest
 from captures import picture, ring
 from PIL import Image
 
-from linprim_geo.errors import LinprimError
-from linprim_geo.read_dtu import decomposed
-from linprim_geo.scene import load_scene
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.capture.load import load_scene
+from linprim_geo.capture.readers.dtu import decomposed
 
 # The unit sphere's frame to the scan's, in mm.
 SCALE = np.array([[200.0, 0, 0, 30], [0, 200, 0, -20], [0, 0, 200, 600], [0, 0, 0, 1]])

@@ -11,9 +11,9 @@ from captures import picture, ring
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from linprim_geo.errors import LinprimError
-from linprim_geo.scene import load_scene
-from linprim_geo.trajectories import nearest
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.capture.load import load_scene
+from linprim_geo.capture.readers.trajectories import nearest
 
 SIZE = (640, 480)
 JSON = {"width": 32, "height": 24, "intrinsic_matrix": [30, 0, 0, 0, 30, 0, 15.5, 11.5, 1]}

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from captures import OPENGL, picture, reconstruction, ring
 
-from linprim_geo.errors import LinprimError
-from linprim_geo.scene import load_scene
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.capture.load import load_scene
 
 FISHEYE = [30.0, 30.0, 16.0, 12.0, 0.01, -0.002, 0.001, 0.0]
 # nerfstudio's world, from COLMAP's.

@@ -11,9 +11,9 @@ import pytest
 from captures import edit, look_at, picture, reconstruction, ring, transforms, write_transforms
 from PIL import Image
 
-from linprim_geo.errors import LinprimError
-from linprim_geo.ply_points import read_points_ply
-from linprim_geo.scene import has_poses, load_scene
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.capture.load import has_poses, load_scene
+from linprim_geo.capture.readers.ply_points import read_points_ply
 
 
 def refusal(path, **options) -> str:

@@ -4,10 +4,10 @@ import json
 
 import pytest
 
-from linprim_geo.errors import LinprimError
-from linprim_geo.eval import real_data
-from linprim_geo.options import SceneOptions, TrainOptions
-from linprim_geo.synth import synthesize
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import SceneOptions, TrainOptions
+from linprim_geo.eval.studies import real_data
+from linprim_geo.synthetic.synth import synthesize
 
 
 @pytest.fixture(scope="module")

@@ -21,8 +21,8 @@ from reference_scenes import (
     tensor,
 )
 
-from linprim_geo import reference
-from linprim_geo.reference import quadrature_transmittance, rasterize
+from linprim_geo.kernels.reference import rasterize as reference
+from linprim_geo.kernels.reference.rasterize import quadrature_transmittance, rasterize
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -11,8 +11,8 @@ import torch
 from reference_ladder import MODELS, scene
 from reference_scenes import IMAGES, assert_same, axis_camera, octahedra, tensor
 
-from linprim_geo import reference
-from linprim_geo.reference import rasterize
+from linprim_geo.kernels.reference import rasterize as reference
+from linprim_geo.kernels.reference.rasterize import rasterize
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

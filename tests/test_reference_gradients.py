@@ -8,7 +8,7 @@ import pytest
 import torch
 from reference_scenes import IDENTITY, IMAGES, axis_camera, octahedra, random_scene
 
-from linprim_geo.reference import rasterize
+from linprim_geo.kernels.reference.rasterize import rasterize
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

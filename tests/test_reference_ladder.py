@@ -12,8 +12,10 @@ from reference_ladder import BASIS, FINITE_DIFFERENCES, MODELS, ORDERS, POLYHEDR
 from reference_scenes import IMAGES, assert_same, axis_camera, gray, octahedra, tensor
 from scipy.optimize import brentq
 
-from linprim_geo import reference, reference_blend, reference_shapes
-from linprim_geo.reference import rasterize
+from linprim_geo.kernels.reference import blend as reference_blend
+from linprim_geo.kernels.reference import rasterize as reference
+from linprim_geo.kernels.reference import shapes as reference_shapes
+from linprim_geo.kernels.reference.rasterize import rasterize
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

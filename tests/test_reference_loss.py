@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from linprim_geo.reference import photometric_loss
+from linprim_geo.kernels.reference.rasterize import photometric_loss
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

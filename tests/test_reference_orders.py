@@ -12,8 +12,8 @@ import torch
 from reference_ladder import MODELS, ORDERS, POLYHEDRA, pixel_of, scene
 from reference_scenes import EXACT, IMAGES, assert_same, axis_camera, gray, octahedra, tensor
 
-from linprim_geo import reference_blend
-from linprim_geo.reference import rasterize
+from linprim_geo.kernels.reference import blend as reference_blend
+from linprim_geo.kernels.reference.rasterize import rasterize
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

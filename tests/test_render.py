@@ -9,11 +9,12 @@ import pytest
 from conftest import CENTER, DENSITY, EXTENT, octahedron_run
 from PIL import Image
 
-from linprim_geo.errors import LinprimError
-from linprim_geo.mesh import load_mesh
-from linprim_geo.raycast import RayCaster
-from linprim_geo.render import depth_preview, render_run
-from linprim_geo.run import Run
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.geometry.mesh_files import load_mesh
+from linprim_geo.geometry.raycast import RayCaster
+from linprim_geo.imaging.colors import depth_preview
+from linprim_geo.runs.render import render_run
+from linprim_geo.runs.run import Run
 
 FLOATS = ("depth_median", "depth_expected", "depth_first", "opacity", "normal")
 
@@ -141,8 +142,8 @@ def test_a_split_without_views_is_refused(run_copy, tmp_path):
     import json
 
     scene = tmp_path / "scene"
-    from linprim_geo.scene import load_scene
-    from linprim_geo.synth import synthesize
+    from linprim_geo.capture.load import load_scene
+    from linprim_geo.synthetic.synth import synthesize
 
     synthesize(scene, views=2, test_views=0, size=16, points=10, supersample=1)
     (scene / "transforms_test.json").unlink(missing_ok=True)

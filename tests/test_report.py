@@ -18,17 +18,21 @@ import pytest
 from conftest import MESHES
 from PIL import Image
 
-from linprim_geo import cli, commands, svg
-from linprim_geo.display import is_inside, layers, light_mesh, up_direction
-from linprim_geo.errors import LinprimError
-from linprim_geo.eval.images import composite, eval_images_run
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import ExtractOptions, SceneOptions, TrainOptions
+from linprim_geo.cli import commands
+from linprim_geo.cli import main as cli
+from linprim_geo.display.meshes import is_inside, layers, light_mesh, up_direction
+from linprim_geo.display.report import report_run
+from linprim_geo.display.report_page import SECTIONS
+from linprim_geo.eval.images import eval_images_run
 from linprim_geo.eval.mesh import eval_mesh_files
-from linprim_geo.extract import extract_mesh
-from linprim_geo.mesh import Mesh, load_mesh
-from linprim_geo.options import ExtractOptions, SceneOptions, TrainOptions
-from linprim_geo.report import report_run
-from linprim_geo.report_page import SECTIONS
-from linprim_geo.run import Run
+from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.geometry.mesh_files import load_mesh
+from linprim_geo.imaging import plots as svg
+from linprim_geo.imaging.metrics import composite
+from linprim_geo.runs.run import Run
+from linprim_geo.surface.extract import extract_mesh
 
 XHTML_VOID = {"meta", "img", "input"}
 
@@ -140,8 +144,8 @@ def test_the_mesh_of_the_page_is_the_mesh_of_the_file(made, meshed, tiny_scene):
     assert names == ["photographs", "shape", "predicted error", "true error"]
     colors = {layer["name"]: array(layer["colors"], "u1", 3) for layer in shown["layers"]}
     assert np.array_equal(colors["photographs"], mesh.colors)
-    from linprim_geo.eval.figures import error_colors
     from linprim_geo.eval.surface_samples import SurfaceDistance
+    from linprim_geo.imaging.colors import error_colors
 
     error = SurfaceDistance(load_mesh(tiny_scene / "reference.ply")).query(mesh.vertices)[0]
     assert np.array_equal(colors["true error"], error_colors(error / np.percentile(error, 95)))
@@ -285,7 +289,7 @@ def test_errors_share_one_scale_and_unknown_ones_are_grey():
 
 
 def test_up_is_what_level_cameras_agree_on(tiny_scene):
-    from linprim_geo.scene import load_scene
+    from linprim_geo.capture.load import load_scene
 
     cameras = [view.camera for view in load_scene(tiny_scene).train]
     up = up_direction(cameras)
@@ -295,13 +299,13 @@ def test_up_is_what_level_cameras_agree_on(tiny_scene):
 
 
 def test_cameras_within_a_mesh_are_told_from_those_around_it(tiny_scene):
-    from linprim_geo.scene import load_scene
+    from linprim_geo.capture.load import load_scene
 
     cameras = [view.camera for view in load_scene(tiny_scene).train]
     part = load_mesh(tiny_scene / "reference.ply")
     assert not is_inside(part, cameras)
     assert is_inside(Mesh(part.vertices * 20, part.faces), cameras)
-    from linprim_geo.report_mesh import pack
+    from linprim_geo.display.report_mesh import pack
 
     for inside in (False, True):
         packed = pack("x", part, layers(part, np.arange(len(part.vertices))), cameras, "unit", "", inside)

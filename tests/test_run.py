@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from linprim_geo.camera import Similarity
-from linprim_geo.errors import LinprimError
-from linprim_geo.options import SceneOptions, TrainOptions
-from linprim_geo.ply import read_primitive_ply
-from linprim_geo.primitives import Primitives, load_primitives
-from linprim_geo.run import Run, to_data_set
-from linprim_geo.scene import load_scene
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import SceneOptions, TrainOptions
+from linprim_geo.capture.load import load_scene
+from linprim_geo.geometry.camera import Similarity
+from linprim_geo.geometry.primitive_files import read_primitive_ply
+from linprim_geo.geometry.primitives import Primitives, load_primitives
+from linprim_geo.runs.run import Run, to_data_set
 
 
 def edit(path, change):

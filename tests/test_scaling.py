@@ -8,11 +8,11 @@ from argparse import Namespace
 import numpy as np
 import pytest
 
-from linprim_geo.blocks import Block
-from linprim_geo.campath import inside_out
-from linprim_geo.eval import block_quality, scaling
-from linprim_geo.eval.street import HEIGHT, HOUSE, WIDTH, street
-from linprim_geo.raycast import RayCaster
+from linprim_geo.eval.studies import block_quality, scaling
+from linprim_geo.eval.studies.street import HEIGHT, HOUSE, WIDTH, street
+from linprim_geo.geometry.boxes import Block
+from linprim_geo.geometry.raycast import RayCaster
+from linprim_geo.synthetic.camera_paths import inside_out
 
 TRUE = scaling.Fit((1.0, 0.05, 2e-7), (0.002, 4e-7, 3e-6), (0.4, 4e-9, 2e-7, 1.5e-6), (2.0, 0.1))
 

@@ -11,8 +11,9 @@ import pytest
 from captures import OPENGL, edit, picture, ring, transforms, write_colmap, write_transforms
 from PIL import Image
 
-from linprim_geo.errors import LinprimError
-from linprim_geo.scene import check_pose, load_scene
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.capture.load import load_scene
+from linprim_geo.capture.types import check_pose
 
 
 def refusal(path, **options) -> str:

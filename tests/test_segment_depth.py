@@ -8,11 +8,11 @@ import pytest
 import torch
 from octahedra import KERNELS, kernels
 
-from linprim_geo import ops
-from linprim_geo.camera import Camera
-from linprim_geo.errors import LinprimError
-from linprim_geo.primitives import KINDS, Primitives
-from linprim_geo.solid_tree import SolidTree
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.primitives import KINDS, Primitives
+from linprim_geo.kernels import ops
+from linprim_geo.kernels.solid_tree import SolidTree
 
 ORIGIN = np.array([0.3, -0.2, -4.0])
 

@@ -7,12 +7,12 @@ import math
 import numpy as np
 import torch
 
-from linprim_geo.camera import Camera
-from linprim_geo.campath import look_at
-from linprim_geo.initial_points import in_image
-from linprim_geo.mesh import Mesh
-from linprim_geo.single_view import mesh_is_closed, without_single_views
-from linprim_geo.support import Support
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.geometry.view_support import Support
+from linprim_geo.points.initial_points import in_image
+from linprim_geo.surface.single_view import mesh_is_closed, without_single_views
+from linprim_geo.synthetic.camera_paths import look_at
 
 
 def camera_at(x: float, y: float = 0.0) -> Camera:

@@ -16,10 +16,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from octahedra import COLOR, IMAGES, NAMES, assert_identical, everything, fields, leaves, random_scene
 
-from linprim_geo import ops, reference
-from linprim_geo.camera import Camera
-from linprim_geo.errors import LinprimError
-from linprim_geo.eval import many_scenes, stability
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.eval.hard_cases import many_scenes, stability
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.kernels import ops
+from linprim_geo.kernels.reference import rasterize as reference
 
 LADDER = [
     *itertools.product(("octahedron", "tetrahedron"), ("exact", "affine"), ("center", "entry", "overlap")),
@@ -66,7 +67,7 @@ def scene_of(rung, seed, count=8, coefficients=1, **camera):
 
 @pytest.mark.parametrize("primitive,name", [(p, n) for n, c in CLASSES.items() for p in c.primitives])
 def test_hard_classes_hold(primitive, name):
-    # A few of the many cases of `python -m linprim_geo.eval.stability`; each of those is as good.
+    # A few of the many cases of `python -m linprim_geo.eval.hard_cases.stability`; each of those is as good.
     chosen = [r for r in stability.rungs() if r.primitive == primitive]
     count = {"coincident": 4, "denormal axes": 40, "overflowing axes": 40}.get(name, 20)
     rows = list(stability.measure([name], chosen, cases=16 * count, gradients=count // 2, seed=1))

@@ -16,14 +16,17 @@ from captures import look_at, picture, write_transforms
 from PIL import Image
 from textured_room import photograph
 
-from linprim_geo import image_pairs, incremental_mapping, structure_from_motion
-from linprim_geo.cli import main
-from linprim_geo.errors import LinprimError
-from linprim_geo.files import locked
-from linprim_geo.image_pairs import pairs_to_match
-from linprim_geo.run import Run
-from linprim_geo.scene import PHOTOGRAPHS, load_scene
-from linprim_geo.structure_from_motion import Verdict, find_poses, found_model, photographs, prepare
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import locked
+from linprim_geo.capture import found_poses, incremental_mapping, structure_from_motion
+from linprim_geo.capture import incremental_mapping as image_pairs
+from linprim_geo.capture.found_poses import Verdict, found_model, photographs
+from linprim_geo.capture.incremental_mapping import pairs_to_match
+from linprim_geo.capture.load import load_scene
+from linprim_geo.capture.structure_from_motion import find_poses, prepare
+from linprim_geo.capture.types import PHOTOGRAPHS
+from linprim_geo.cli.main import main
+from linprim_geo.runs.run import Run
 
 SIZE, FOCAL, COUNT = (200, 150), 170.0, 9
 
@@ -261,7 +264,7 @@ def test_of_many_photographs_those_that_look_alike_or_follow_each_other_are_matc
 
 
 def test_two_processes_do_not_find_the_same_poses_twice(copied, posed, tmp_path, monkeypatch):
-    kept = structure_from_motion._base(tmp_path / "cache") / structure_from_motion._key(*photographs(copied))
+    kept = found_poses._base(tmp_path / "cache") / found_poses._key(*photographs(copied))
     model = found_model(copied, posed[0])
     lines, waiting, done = [], threading.Event(), threading.Event()
 
@@ -330,7 +333,7 @@ def test_a_photograph_whose_suffix_is_wrong_is_copied_as_png(tmp_path):
     names = ["0.png", "1.png"]
     for index, (name, kind) in enumerate(zip(names, ("PNG", "GIF"), strict=True)):
         picture(index).convert("L").save(tmp_path / name, format=kind)
-    folder = structure_from_motion._readable(tmp_path, names, tmp_path / "kept")
+    folder = found_poses._readable(tmp_path, names, tmp_path / "kept")
     for index, name in enumerate(names):
         with Image.open(folder / name) as image:
             assert image.format == "PNG"
@@ -368,7 +371,7 @@ def test_png_files_can_be_saved_after_pycolmap_was_loaded():
     program = """
 import io, sys
 sys.modules["zlib"] = None
-from linprim_geo.load_pycolmap import pycolmap
+from linprim_geo.geometry.load_pycolmap import pycolmap
 del sys.modules["zlib"]
 import numpy
 from PIL import Image

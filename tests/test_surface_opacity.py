@@ -11,16 +11,18 @@ import numpy as np
 import pytest
 from conftest import CENTER, octahedron_run
 
-from linprim_geo import ops
-from linprim_geo import surface_opacity as opacity
-from linprim_geo.camera import Camera
-from linprim_geo.cli import main
-from linprim_geo.errors import LinprimError
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import ExtractOptions
+from linprim_geo.cli.main import main
 from linprim_geo.eval.mesh import score_mesh
-from linprim_geo.extract import extract_mesh
-from linprim_geo.mesh import Mesh, load_mesh, manifold_status, topology, vertex_normals
-from linprim_geo.options import ExtractOptions
-from linprim_geo.primitives import Primitives, load_primitives, save_primitives
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.mesh import Mesh, vertex_normals
+from linprim_geo.geometry.mesh_files import load_mesh
+from linprim_geo.geometry.primitives import Primitives, load_primitives, save_primitives
+from linprim_geo.geometry.topology import manifold_status, topology
+from linprim_geo.kernels import ops
+from linprim_geo.surface import method_opacity_field as opacity
+from linprim_geo.surface.extract import extract_mesh
 
 METHOD = "opacity-field"
 

@@ -12,19 +12,20 @@ import numpy as np
 import pytest
 from conftest import CENTER, octahedron_run
 
-from linprim_geo import plane_fit
-from linprim_geo.camera import Camera
-from linprim_geo.errors import LinprimError
-from linprim_geo.extract import extract_mesh
-from linprim_geo.mesh import face_areas, face_normals, load_mesh, manifold_status, topology
-from linprim_geo.options import ExtractOptions
-from linprim_geo.plane_fit import LevelPoints, face_planes, fit_planes
-from linprim_geo.polyhedra_union import GROUP, convex_piece, kept_shells, shells, unite
-from linprim_geo.primitives import ARRAYS, Primitives, load_primitives, save_primitives
-from linprim_geo.progress import Progress
-from linprim_geo.run import Run
-from linprim_geo.stages import Stages
-from linprim_geo.surface_polyhedra import NO_PRIMITIVE, core_boxes, cut, polyhedra_surface
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import ExtractOptions
+from linprim_geo.base.progress import Progress, Stages
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.mesh import face_areas, face_normals
+from linprim_geo.geometry.mesh_files import load_mesh
+from linprim_geo.geometry.primitives import ARRAYS, Primitives, load_primitives, save_primitives
+from linprim_geo.geometry.topology import manifold_status, topology
+from linprim_geo.kernels import surface_ops
+from linprim_geo.runs.run import Run
+from linprim_geo.surface.extract import extract_mesh
+from linprim_geo.surface.method_polyhedra import NO_PRIMITIVE, core_boxes, cut, polyhedra_surface
+from linprim_geo.surface.polyhedra_planes import LevelPoints, face_planes, fit_planes
+from linprim_geo.surface.polyhedra_union import GROUP, convex_piece, kept_shells, shells, unite
 
 CUBE = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
@@ -349,14 +350,14 @@ def test_points_within_bodies_are_those_that_all_planes_say(shift):
     normal, offset = face_planes(bodies)
     center = bodies.center.astype(np.float64) + shift
     points = np.concatenate([random.random((3000, 3)), np.full((40, 3), 0.5), np.array([[9.0, 9, 9]])]) + shift
-    size, rows = plane_fit._core.points_within(center, normal, offset, points, 1.5, 60)
+    size, rows = surface_ops.points_within(center, normal, offset, points, 1.5, 60)
     ahead = sum(normal[:, :, None, k] * (points[None, None, :, k] - center[:, None, None, k]) for k in range(3))
     level = (ahead / offset[:, :, None]).max(1)
     wanted = [np.flatnonzero(of <= 1.5) if (of <= 1).sum() >= 60 else np.zeros(0, int) for of in level]
     assert 0 < np.count_nonzero(size) < len(size)
     assert size.tolist() == [len(each) for each in wanted]
     assert rows.tolist() == np.concatenate(wanted).tolist()
-    none = plane_fit._core.points_within(center, normal, offset, np.zeros((0, 3)), 1.5, 0)
+    none = surface_ops.points_within(center, normal, offset, np.zeros((0, 3)), 1.5, 0)
     assert none[0].tolist() == [0] * 60 and len(none[1]) == 0
     with pytest.raises(ValueError, match="offset has shape"):
-        plane_fit._core.points_within(center, normal, offset[:, :3].copy(), points, 1.5, 60)
+        surface_ops.points_within(center, normal, offset[:, :3].copy(), points, 1.5, 60)

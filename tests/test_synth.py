@@ -5,14 +5,16 @@ import json
 import numpy as np
 import pytest
 
-from linprim_geo import campath, shapes, synth
-from linprim_geo.camera import Camera
-from linprim_geo.errors import LinprimError
-from linprim_geo.raycast import RayCaster
-from linprim_geo.scene import load_scene
-from linprim_geo.synth import synthesize
-from linprim_geo.synth_points import MAX_TRACK, sees
-from linprim_geo.textured import TexturedMesh, barycentric, load_textured, procedural_albedo, subdivide
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.capture.load import load_scene
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.mesh import barycentric
+from linprim_geo.geometry.raycast import RayCaster
+from linprim_geo.synthetic import camera_paths as campath
+from linprim_geo.synthetic import shapes, synth
+from linprim_geo.synthetic.points import MAX_TRACK, sees
+from linprim_geo.synthetic.synth import synthesize
+from linprim_geo.synthetic.textured import TexturedMesh, load_textured, procedural_albedo, subdivide
 
 SMALL = {"views": 8, "test_views": 3, "size": (72, 64), "supersample": 2, "points": 400}
 
@@ -371,7 +373,7 @@ def test_the_reader_of_scenes_agrees_with_the_writer(capture):
 
 
 def test_reference_mesh_is_the_surface_in_the_frame_of_the_cameras(capture, built):
-    from linprim_geo.mesh import load_mesh
+    from linprim_geo.geometry.mesh_files import load_mesh
 
     out, _ = capture
     reference = load_mesh(out / "reference.ply")

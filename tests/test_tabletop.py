@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from linprim_geo import campath, cli, shapes, synth, tabletop
-from linprim_geo.camera import Camera
-from linprim_geo.errors import LinprimError
-from linprim_geo.scene import load_scene
-from linprim_geo.synth import synthesize
-from linprim_geo.synth_photos import sensor_noise
-from linprim_geo.synthetic_environment import synthetic_environment
-from linprim_geo.tabletop import on_table
-from linprim_geo.textured import TexturedMesh, load_textured
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.capture.load import load_scene
+from linprim_geo.cli import main as cli
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.synthetic import camera_paths as campath
+from linprim_geo.synthetic import shapes, synth, tabletop_captures
+from linprim_geo.synthetic.environment import synthetic_environment
+from linprim_geo.synthetic.photos import sensor_noise
+from linprim_geo.synthetic.synth import synthesize
+from linprim_geo.synthetic.tabletop import on_table
+from linprim_geo.synthetic.textured import TexturedMesh, load_textured
 
 SMALL = {"views": 7, "test_views": 3, "size": (64, 48), "supersample": 1, "points": 150, "threads": 1}
 
@@ -128,7 +130,7 @@ def test_wood_is_continuous_nowhere_flat_and_not_finer_than_its_limit(part):
 
 
 def test_depth_normals_masks_points_and_reference_contain_the_table(capture, part):
-    from linprim_geo.mesh import load_mesh
+    from linprim_geo.geometry.mesh_files import load_mesh
 
     out, report = capture
     top = part.vertices[:, 2].min()
@@ -361,35 +363,35 @@ def test_named_captures_are_made_of_meshes_in_a_folder_the_right_way_up(tmp_path
     color = np.where(rod.vertices[:, 1:2] > 0, (20, 20, 230), (200, 40, 30)).astype(np.uint8)
     trimesh.Trimesh(rod.vertices, rod.faces, vertex_colors=color, process=False).export(tmp_path / "egyptian_cat.ply")
     few = {**SMALL, "size": 24, "points": 30}
-    report = tabletop.tabletop("large_table", tmp_path / "out", tmp_path, **few)
+    report = tabletop_captures.tabletop("large_table", tmp_path / "out", tmp_path, **few)
     assert (report["table"], report["arc"], report["jpeg"], report["noise"]) == (5.0, 300.0, 92, 2.0)
     assert (report["shape"], report["shading"], report["points"]) == ("egyptian_cat", "shaded", 30)
-    from linprim_geo.mesh import load_mesh
+    from linprim_geo.geometry.mesh_files import load_mesh
 
     reference = load_mesh(tmp_path / "out/reference.ply")
     upper = reference.vertices[:, 2] > 0.75
     assert reference.vertices[:, 2].max() == pytest.approx(0.8)
     assert (reference.colors[upper][:, 2] > 200).all()
     with pytest.raises(LinprimError, match="spot.glb"):
-        tabletop.tabletop("small_table", tmp_path / "other", tmp_path)
+        tabletop_captures.tabletop("small_table", tmp_path / "other", tmp_path)
     with pytest.raises(LinprimError, match="large_table"):
-        tabletop.tabletop("round_table", tmp_path / "other", tmp_path)
+        tabletop_captures.tabletop("round_table", tmp_path / "other", tmp_path)
 
 
 def test_every_named_capture_has_arguments_of_synthesize_within_their_ranges():
     known = inspect.signature(synthesize).parameters
-    tables = [settings["table"] for settings in tabletop.TABLETOPS.values()]
+    tables = [settings["table"] for settings in tabletop_captures.TABLETOPS.values()]
     assert len(set(tables)) == len(tables) == 3
-    for settings in tabletop.TABLETOPS.values():
+    for settings in tabletop_captures.TABLETOPS.values():
         assert set(settings) - {"up"} <= set(known)
         assert 49 <= settings["views"] <= 60 and settings["path"] == "arc"
-    assert set(tabletop.ALL_TABLETOPS) <= set(known)
+    assert set(tabletop_captures.ALL_TABLETOPS) <= set(known)
 
 
 def test_the_command_passes_them_on(monkeypatch):
     calls = []
     stand_in = types.SimpleNamespace(synthesize=lambda out, **settings: calls.append(settings) or {})
-    monkeypatch.setitem(sys.modules, "linprim_geo.synth", stand_in)
+    monkeypatch.setitem(sys.modules, "linprim_geo.synthetic.synth", stand_in)
     line = "synth out --table 2.5 --environment 3 --path arc --arc 120 --noise 1.5 --jpeg 90"
     assert cli.main(line.split()) == 0 and cli.main(["synth", "out"]) == 0
     full, plain = calls

@@ -12,17 +12,22 @@ import trimesh
 from PIL import Image
 from surfaces import grid, join, sphere
 
-from linprim_geo import texture as texture_module
-from linprim_geo.errors import LinprimError
-from linprim_geo.extract import extract_mesh
-from linprim_geo.mesh import Mesh, load_mesh, select_faces, vertex_normals
-from linprim_geo.options import ExtractOptions
-from linprim_geo.run import Run
-from linprim_geo.scene import Photo, load_scene
-from linprim_geo.synth import synthesize
-from linprim_geo.texture import make_texture, save_textured, unwrap
-from linprim_geo.textured import TexturedMesh, procedural_albedo
-from linprim_geo.visibility import color_vertices
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import ExtractOptions
+from linprim_geo.capture.load import load_scene
+from linprim_geo.capture.types import Photo
+from linprim_geo.geometry.mesh import Mesh, select_faces, vertex_normals
+from linprim_geo.geometry.mesh_files import load_mesh
+from linprim_geo.runs.run import Run
+from linprim_geo.surface import texture as texture_module
+from linprim_geo.surface import texture_charts, texture_raster
+from linprim_geo.surface.extract import extract_mesh
+from linprim_geo.surface.texture import make_texture
+from linprim_geo.surface.texture_charts import unwrap
+from linprim_geo.surface.texture_files import save_textured
+from linprim_geo.surface.visibility import color_vertices
+from linprim_geo.synthetic.synth import synthesize
+from linprim_geo.synthetic.textured import TexturedMesh, procedural_albedo
 
 SIZE = 256
 
@@ -125,7 +130,7 @@ def test_what_no_view_sees_has_the_colours_of_the_vertices(ball):
 
 
 def test_texels_between_charts_have_a_colour_of_a_chart(ball_texture):
-    owner = texture_module._rasterize(np.stack([ball_texture.uv[..., 0], 1 - ball_texture.uv[..., 1]], 2) * SIZE, SIZE)
+    owner = texture_raster._rasterize(np.stack([ball_texture.uv[..., 0], 1 - ball_texture.uv[..., 1]], 2) * SIZE, SIZE)
     inside = (owner >= 0).reshape(SIZE, SIZE)
     assert 0.3 < inside.mean() < 0.95
     known = {tuple(color) for color in ball_texture.image[inside]}
@@ -136,7 +141,7 @@ def test_the_passes_and_kept_photographs_do_not_change_the_texture(ball, ball_te
     monkeypatch.setattr(texture_module, "TEXELS_PER_PASS", 10_000)
     monkeypatch.setattr(texture_module, "CANDIDATES", 5_000)
     monkeypatch.setattr(texture_module, "KEPT_BYTES", 0)
-    monkeypatch.setattr("linprim_geo.visibility.POINTS_PER_TASK", 3_000)
+    monkeypatch.setattr("linprim_geo.surface.visibility.POINTS_PER_TASK", 3_000)
     again = make_texture(ball[0], SIZE, ball[1])
     np.testing.assert_array_equal(again.image, ball_texture.image)
     np.testing.assert_array_equal(again.uv, ball_texture.uv)
@@ -179,7 +184,7 @@ def test_no_texel_is_inside_two_faces_of_any_mesh(name):
     mesh, size = CASES[name], 96
     corners, charts = unwrap(mesh, size)
     assert corners.shape == (len(mesh.faces), 3, 2) and np.isfinite(corners).all() and 1 <= charts <= len(mesh.faces)
-    assert corners.min() >= texture_module.PADDING and corners.max() <= size - texture_module.PADDING
+    assert corners.min() >= texture_charts.PADDING and corners.max() <= size - texture_charts.PADDING
     y, x = np.mgrid[0:size, 0:size] + 0.5
     inside = np.zeros((size, size), dtype=int)
     for a, b, c in corners:
@@ -203,7 +208,7 @@ def test_a_face_keeps_most_of_its_area_and_a_flat_one_its_shape():
     )
     share = flat / solid
     # Faces are at worst LEAST_COSINE from across their plane, which their area is multiplied by.
-    assert share.min() / share.max() > texture_module.LEAST_COSINE * 0.99 and charts <= 12
+    assert share.min() / share.max() > texture_charts.LEAST_COSINE * 0.99 and charts <= 12
 
 
 def test_too_many_charts_and_unusable_meshes_are_one_sentence(ball):

@@ -12,28 +12,31 @@ import pytest
 from conftest import with_budget
 from training_runs import assert_same_run
 
-from linprim_geo import cli, pacing, time_budget
-from linprim_geo.errors import LinprimError
-from linprim_geo.extract import extract_mesh
-from linprim_geo.options import ExtractOptions, TrainOptions
-from linprim_geo.run import Run
-from linprim_geo.shots import load_shots
-from linprim_geo.time_budget import (
+from linprim_geo.base import budget
+from linprim_geo.base.budget import Budget
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import ExtractOptions, TrainOptions
+from linprim_geo.cli import main as cli
+from linprim_geo.runs.run import Run
+from linprim_geo.surface import voxel_budget
+from linprim_geo.surface.extract import extract_mesh
+from linprim_geo.surface.voxel_budget import VoxelCost, plan_voxel
+from linprim_geo.training.budget import pacing
+from linprim_geo.training.budget import plan as time_budget
+from linprim_geo.training.budget.plan import (
     LARGEST_CORRECTION,
     LEAST_PRIMITIVES,
     LEAST_STEPS,
     STEPS_PER_PRIMITIVE,
-    Budget,
     StepCost,
-    VoxelCost,
     corrected_steps,
     mean_population,
     plan_training,
-    plan_voxel,
 )
-from linprim_geo.train import train
-from linprim_geo.trainer import Trainer
-from linprim_geo.training_start import start_trainer
+from linprim_geo.training.start import start_trainer
+from linprim_geo.training.step.trainer import Trainer
+from linprim_geo.training.step.training_images import load_shots
+from linprim_geo.training.train import train
 
 MANY = 10**9
 
@@ -232,7 +235,7 @@ def test_an_extraction_keeps_its_time(tiny_run, tmp_path):
     assert stats["voxel_size"] == chosen["voxel_size"] >= chosen["supported_voxel_size"] * (1 - 1e-9)
     cost = VoxelCost(**chosen["cost"])
     assert chosen["predicted_seconds"] == pytest.approx(cost.seconds(chosen["voxel_size"]))
-    assert chosen["predicted_seconds"] <= time_budget.AIM * 30.0
+    assert chosen["predicted_seconds"] <= budget.AIM * 30.0
     assert (
         json.loads((tiny_run / "mesh" / "tsdf" / "stats.json").read_text())["time_budget"]["voxel_size"]
         == chosen["voxel_size"]
@@ -242,7 +245,7 @@ def test_an_extraction_keeps_its_time(tiny_run, tmp_path):
 def test_a_budget_that_fits_a_coarser_surface_gets_one(tiny_run, tmp_path, monkeypatch):
     """With passes that cost 1 + 1e-2 / voxel^2 s, and none left for the finest."""
     cost = VoxelCost(1.0, 1e-2)
-    monkeypatch.setattr(time_budget, "_timed_pass", lambda run, options, *_: cost.seconds(options.voxel_size))
+    monkeypatch.setattr(voxel_budget, "_timed_pass", lambda run, options, *_: cost.seconds(options.voxel_size))
     supported = extract_mesh(tiny_run, output=tmp_path / "a.ply", options=ExtractOptions(level=0.5), quiet=True)[
         "voxel_size"
     ]
@@ -250,7 +253,7 @@ def test_a_budget_that_fits_a_coarser_surface_gets_one(tiny_run, tmp_path, monke
     stats = extract_mesh(
         tiny_run, output=tmp_path / "b.ply", options=ExtractOptions(level=0.5), time_budget=40.0, quiet=True
     )
-    left = time_budget.AIM * 40.0 - 1.0
+    left = budget.AIM * 40.0 - 1.0
     assert stats["voxel_size"] == pytest.approx(supported * math.sqrt(80.0 / left), rel=0.15)
     with pytest.raises(LinprimError, match=r"--time-budget is 1 s, but the coarsest surface .* takes \d+ s"):
         extract_mesh(

@@ -12,13 +12,14 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from linprim_geo.errors import LinprimError
-from linprim_geo.eval import knobs, tradeoff_page
-from linprim_geo.eval import tradeoff as sweeping
-from linprim_geo.eval.frontier import frontier, pays, verdict
-from linprim_geo.eval.knobs import ERRORS, GROUPS, KNOBS, Knob, Rung, settings, training_options
-from linprim_geo.eval.tradeoff import tradeoff
-from linprim_geo.options import SceneOptions, TrainOptions, check_train_options
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import SceneOptions, TrainOptions, check_train_options
+from linprim_geo.eval.tradeoff import knobs
+from linprim_geo.eval.tradeoff import page as tradeoff_page
+from linprim_geo.eval.tradeoff import sweep as sweeping
+from linprim_geo.eval.tradeoff.frontier import frontier, pays, verdict
+from linprim_geo.eval.tradeoff.knobs import ERRORS, GROUPS, KNOBS, Knob, Rung, settings, training_options
+from linprim_geo.eval.tradeoff.sweep import tradeoff
 
 # What the design lists: every knob that trades time for accuracy.
 LISTED = {
@@ -285,12 +286,12 @@ def test_what_was_measured_is_taken_from_the_folder(swept, tiny_scene, tiny_run,
 def test_training_knobs_run_on_every_rung(tiny_scene, tmp_path, monkeypatch):
     """A few steps each; how runs are scored is tested by the ones that score."""
     monkeypatch.setattr(
-        "linprim_geo.training_start.fill_points", lambda scene, *_: scene.points
+        "linprim_geo.points.start_points.fill_points", lambda scene, *_: scene.points
     )  # seconds for every rung
     scored = []
 
     def score(self, folder):
-        from linprim_geo.run import Run
+        from linprim_geo.runs.run import Run
 
         run = Run.open(folder)
         scored.append(run)

@@ -8,9 +8,9 @@ import xml.etree.ElementTree as ElementTree
 
 import pytest
 
-from linprim_geo.eval import tradeoff_figures
-from linprim_geo.eval.knobs import KNOBS
-from linprim_geo.eval.tradeoff_figures import figures, rungs
+from linprim_geo.eval.tradeoff import figures as tradeoff_figures
+from linprim_geo.eval.tradeoff.figures import figures, rungs
+from linprim_geo.eval.tradeoff.knobs import KNOBS
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -133,8 +133,8 @@ def test_what_is_no_whole_sweep_is_refused_and_nothing_is_written(made, said, tm
 
 def test_a_page_of_a_sweep_still_has_colours(tmp_path):
     """The page's plots take the same classes, with the colours that its style falls back to."""
-    from linprim_geo import svg
-    from linprim_geo.eval.tradeoff_page import plot
+    from linprim_geo.eval.tradeoff.page import plot
+    from linprim_geo.imaging import plots as svg
 
     rows = json.loads((sweep(tmp_path) / "tradeoff.json").read_text())["rows"]
     drawn = ElementTree.fromstring(plot([row for row in rows if row["knob"] == "rays"], "depth_percent"))

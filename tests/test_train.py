@@ -12,16 +12,16 @@ import torch
 from PIL import Image
 from training_runs import QUICK, assert_same_run, checkpoint, metrics, no_temporary_files
 
-from linprim_geo import trainer as training_step
-from linprim_geo.errors import LinprimError
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.eval.depth import eval_depth_run
 from linprim_geo.eval.images import eval_images_run
-from linprim_geo.options import SceneOptions, TrainOptions
-from linprim_geo.primitives import KINDS, load_primitives
-from linprim_geo.run import Run
-from linprim_geo.synth import synthesize
-from linprim_geo.textured import TexturedMesh
-from linprim_geo.train import train
+from linprim_geo.geometry.primitives import KINDS, load_primitives
+from linprim_geo.runs.run import Run
+from linprim_geo.synthetic.synth import synthesize
+from linprim_geo.synthetic.textured import TexturedMesh
+from linprim_geo.training.step import trainer as training_step
+from linprim_geo.training.train import train
 
 # --- what a run leaves behind ----------------------------------------------------------------------------
 
@@ -350,7 +350,7 @@ def test_every_way_of_rendering_trains_and_is_used_by_renders(kind, ray_model, o
     ("kind", "ray_model"), [("tetrahedron", "exact"), ("octahedron", "affine"), ("gaussian", "exact")]
 )
 def test_surfaces_of_every_kind_can_be_extracted(kind, ray_model, tiny_scene, tmp_path):
-    from linprim_geo.extract import extract_mesh
+    from linprim_geo.surface.extract import extract_mesh
 
     options = replace(QUICK, iterations=300, max_primitives=250, primitive=kind, ray_model=ray_model)
     train(tiny_scene, tmp_path / "run", options=options, quiet=True)
@@ -364,7 +364,7 @@ def test_surfaces_of_every_kind_can_be_extracted(kind, ray_model, tiny_scene, tm
 
 
 def test_the_frame_of_the_data_set_comes_back(tmp_path):
-    from linprim_geo.shapes import smooth_body
+    from linprim_geo.synthetic.shapes import smooth_body
 
     body, scale, offset = smooth_body(), 100.0, np.array([1e4, -2e4, 5e3])
     results, depths, clouds = [], [], []

@@ -24,15 +24,16 @@ from training_runs import (
     wait_for,
 )
 
-from linprim_geo import ops, training_loop
-from linprim_geo import trainer as training_step
-from linprim_geo.errors import LinprimError
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import TrainOptions
 from linprim_geo.eval.images import eval_images_run
-from linprim_geo.options import TrainOptions
-from linprim_geo.primitives import load_primitives
-from linprim_geo.run import Run
-from linprim_geo.train import train
-from linprim_geo.trainer import Trainer
+from linprim_geo.geometry.primitives import load_primitives
+from linprim_geo.kernels import ops
+from linprim_geo.runs.run import Run
+from linprim_geo.training import loop as training_loop
+from linprim_geo.training.step import trainer as training_step
+from linprim_geo.training.step.trainer import Trainer
+from linprim_geo.training.train import train
 
 # --- going on ---------------------------------------------------------------------------------------------
 

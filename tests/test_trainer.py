@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from linprim_geo import trainer as training_step
-from linprim_geo.options import TrainOptions
-from linprim_geo.primitives import KINDS, Primitives
-from linprim_geo.scene import load_scene
-from linprim_geo.shots import load_shots
-from linprim_geo.trainer import Trainer
+from linprim_geo.base.options import TrainOptions
+from linprim_geo.capture.load import load_scene
+from linprim_geo.geometry.primitives import KINDS, Primitives
+from linprim_geo.training.step import trainer as training_step
+from linprim_geo.training.step.trainer import Trainer
+from linprim_geo.training.step.training_images import load_shots
 
 
 def test_activation_gives_the_opacity_of_the_raw_value():
@@ -33,7 +33,7 @@ def test_activation_gives_the_opacity_of_the_raw_value():
 
 @pytest.fixture
 def trainer(tiny_scene):
-    from linprim_geo.initial_points import scene_normalization
+    from linprim_geo.points.initial_points import scene_normalization
 
     scene = load_scene(tiny_scene)
     similarity = scene_normalization(scene)

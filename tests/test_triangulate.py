@@ -10,9 +10,9 @@ from captures import OPENGL, look_at
 from PIL import Image
 from textured_room import HALF, photograph, wall_texture
 
-from linprim_geo.errors import LinprimError
-from linprim_geo.scene import load_scene
-from linprim_geo.triangulate import (
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.capture.load import load_scene
+from linprim_geo.points.triangulate import (
     _posed,
     _reliable,
     _sampson_px,

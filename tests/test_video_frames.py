@@ -15,12 +15,13 @@ from captures import look_at, picture
 from PIL import Image, ImageFilter
 from textured_room import photograph
 
-from linprim_geo import video_frames
-from linprim_geo.errors import LinprimError
-from linprim_geo.files import locked
-from linprim_geo.scene import PHOTOGRAPHS, load_scene
-from linprim_geo.structure_from_motion import prepare
-from linprim_geo.video_frames import extract_frames, is_video
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import locked
+from linprim_geo.capture import video_frames
+from linprim_geo.capture.load import load_scene
+from linprim_geo.capture.structure_from_motion import prepare
+from linprim_geo.capture.types import PHOTOGRAPHS
+from linprim_geo.capture.video_frames import extract_frames, is_video
 
 
 def write_video(path, images, rate=10, matrix=None):

@@ -21,14 +21,16 @@ import numpy as np
 import pytest
 from conftest import MESHES
 
-from linprim_geo import cli, view, view_scene
-from linprim_geo.errors import LinprimError
-from linprim_geo.extract import extract_mesh
-from linprim_geo.mesh import load_mesh
-from linprim_geo.options import ExtractOptions
-from linprim_geo.run import Run
-from linprim_geo.view import Viewer
-from linprim_geo.view_scene import primitive_mesh, select
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import ExtractOptions
+from linprim_geo.cli import main as cli
+from linprim_geo.display import viewer as view
+from linprim_geo.display import viewer_scene as view_scene
+from linprim_geo.display.viewer import Viewer
+from linprim_geo.display.viewer_scene import primitive_mesh, select
+from linprim_geo.geometry.mesh_files import load_mesh
+from linprim_geo.runs.run import Run
+from linprim_geo.surface.extract import extract_mesh
 
 
 @pytest.fixture(scope="module")
@@ -241,7 +243,7 @@ def test_training_is_watched_only_if_asked(monkeypatch):
 
     monkeypatch.setattr(view, "watched", watched)
     stand_in = types.SimpleNamespace(train=lambda *_, **__: log.append("train") or {"psnr": 1.0})
-    monkeypatch.setitem(sys.modules, "linprim_geo.train", stand_in)
+    monkeypatch.setitem(sys.modules, "linprim_geo.training.train", stand_in)
     assert cli.main(["train", "scene", "-o", "r"]) == 0 and log == ["train"]
     log.clear()
     assert cli.main(["train", "scene", "-o", "r", "--view"]) == 0 and log == ["begin r", "train", "end"]
@@ -273,7 +275,7 @@ def test_ctrl_c_and_a_request_to_end_are_no_errors(meshed, number):
 
 
 def test_a_view_of_training_ends_with_it(meshed):
-    program = "import sys, time, os\nfrom linprim_geo.view import watched\n"
+    program = "import sys, time, os\nfrom linprim_geo.display.viewer import watched\n"
     for end in ("", "    os._exit(1)\n"):  # the block ends, or the whole process does
         words = ["-c", f"{program}with watched(sys.argv[1]):\n    sys.stdin.readline()\n{end}", str(meshed)]
         process, address = started(

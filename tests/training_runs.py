@@ -9,8 +9,8 @@ import time
 
 import torch
 
-from linprim_geo.options import TrainOptions
-from linprim_geo.primitives import load_primitives
+from linprim_geo.base.options import TrainOptions
+from linprim_geo.geometry.primitives import load_primitives
 
 QUICK = TrainOptions(iterations=12, max_primitives=60, sh_degree=0, threads=1)
 # What time and memory may change in a line of metrics.jsonl.

@@ -7,7 +7,7 @@ backward, and what the core can do at that moment.
 Primitives lie on the surfaces of a 6 x 3 x 5 m room with boxes and spheres, sized so that the number over a surface
 point does not depend on N; the camera looks in from the open front. Forward, backward and the limits alternate; figures
 are medians. The limits are of one thread and instruction set: peak multiply-adds, the vector exponential, and the bare
-pair kernels of octahedra with all data in the first cache and every pixel hit (csrc/machine_limits.h).
+pair kernels of octahedra with all data in the first cache and every pixel hit (csrc/raster/machine_limits.h).
 """
 
 from __future__ import annotations
@@ -112,9 +112,9 @@ def measure(
     """
     import torch
 
-    from linprim_geo import ops
-    from linprim_geo.adam import adam_step
-    from linprim_geo.camera import Camera
+    from linprim_geo.geometry.camera import Camera
+    from linprim_geo.kernels import ops
+    from linprim_geo.kernels.adam import adam_step
 
     torch.set_num_threads(threads)
     ops.set_threads(threads)
@@ -199,7 +199,7 @@ def main() -> None:
     parser.add_argument("--geometry", action="store_true", help="also depths, normals, distortion")
     parser.add_argument("--json", action="store_true", help="print one JSON object (a list for several N)")
     args = parser.parse_args()
-    from linprim_geo import ops
+    from linprim_geo.kernels import ops
 
     ops.set_instruction_set(args.instruction_set)
     rung = {"primitive": args.primitive, "ray_model": args.ray_model, "order": args.order}

@@ -300,11 +300,11 @@ def main() -> int:
 
 def check_all(opened: Browser, folder: Path) -> list[str]:
     """Makes a tiny run with a mesh, its report and its view, and checks both."""
-    from linprim_geo.extract import extract_mesh
-    from linprim_geo.options import TrainOptions
-    from linprim_geo.report import report_run
-    from linprim_geo.synth import synthesize
-    from linprim_geo.train import train
+    from linprim_geo.base.options import TrainOptions
+    from linprim_geo.display.report import report_run
+    from linprim_geo.surface.extract import extract_mesh
+    from linprim_geo.synthetic.synth import synthesize
+    from linprim_geo.training.train import train
 
     with tempfile.TemporaryDirectory() as scratch:
         scene, run = Path(scratch) / "scene", Path(scratch) / "run"
@@ -317,7 +317,7 @@ def check_all(opened: Browser, folder: Path) -> list[str]:
 
 def check_view(opened: Browser, run: Path, reference: Path, folder: Path) -> list[str]:
     """The view of a run: primitives, then its mesh by true error with all cameras."""
-    from linprim_geo.view import Viewer
+    from linprim_geo.display.viewer import Viewer
 
     viewer = Viewer(run, 0, reference=reference)
     try:

@@ -15,9 +15,9 @@ from pathlib import Path
 
 
 def load_system():
-    """linprim_geo/system.py, by its path: the package itself cannot be imported before its dependencies are
+    """linprim_geo/base/system.py, by its path: the package itself cannot be imported before its dependencies are
     there."""
-    path = Path(__file__).resolve().parent.parent / "linprim_geo" / "system.py"
+    path = Path(__file__).resolve().parent.parent / "linprim_geo" / "base" / "system.py"
     spec = importlib.util.spec_from_file_location("linprim_geo_system", path)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module

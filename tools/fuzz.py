@@ -65,7 +65,7 @@ class Case:
 
 def attempt(case: Case, path: Path) -> tuple[str, str]:
     """(read, refused or a finding's name, what was said)."""
-    from linprim_geo.errors import LinprimError
+    from linprim_geo.base.errors import LinprimError
 
     signal.setitimer(signal.ITIMER_REAL, HANG)
     try:
@@ -138,9 +138,9 @@ def _prepare(folder: Path) -> None:
     import torch
     import trimesh  # noqa: F401
 
-    import linprim_geo.eval.protocol_files
-    import linprim_geo.train  # noqa: F401
-    from linprim_geo import ops
+    import linprim_geo.eval.protocols.files
+    import linprim_geo.training.train  # noqa: F401
+    from linprim_geo.kernels import ops
 
     torch.set_num_threads(1)
     ops.set_threads(1)

@@ -50,7 +50,7 @@ def read_scene_file(file: Path) -> None:
 
 
 def check_scene(capture: Path, cache: Path | None = None) -> None:
-    from linprim_geo.scene import load_scene
+    from linprim_geo.capture.load import load_scene
 
     scene = load_scene(capture, cache=cache)
     for view in scene.views:
@@ -96,8 +96,8 @@ def make_colmap(folder: Path, text: bool) -> None:
 
 
 def read_colmap_file(file: Path) -> None:
-    from linprim_geo.read_colmap import read_model
-    from linprim_geo.scene import check_pose
+    from linprim_geo.capture.readers.colmap import read_model
+    from linprim_geo.capture.types import check_pose
 
     model = read_model(file.parent)
     for posed in model.images:
@@ -222,12 +222,12 @@ def read_scannetpp_file(file: Path) -> None:
 
 
 def make_found_poses(folder: Path) -> None:
-    from linprim_geo import structure_from_motion
+    from linprim_geo.capture import found_poses
 
     (folder / "photos").mkdir()
     for number in range(1, 4):
         image(folder / "photos" / f"{number}.png", "RGB")
-    key = structure_from_motion._key(*structure_from_motion.photographs(folder / "photos"))
+    key = found_poses._key(*found_poses.photographs(folder / "photos"))
     kept = folder / "structure_from_motion" / key
     (kept / "model").mkdir(parents=True)
     make_colmap(kept / "model", False)
@@ -256,7 +256,7 @@ def make_protocol(folder: Path) -> None:
 
 
 def read_protocol_file(file: Path) -> None:
-    from linprim_geo.eval import protocol_files
+    from linprim_geo.eval.protocols import files as protocol_files
 
     points = np.random.default_rng(3).normal(size=(9, 3))
     if file.name == "crop.json":
@@ -273,10 +273,10 @@ def read_protocol_file(file: Path) -> None:
 
 
 def make_run(folder: Path) -> None:
-    from linprim_geo.camera import Similarity
-    from linprim_geo.options import SceneOptions, TrainOptions
-    from linprim_geo.run import Run
-    from linprim_geo.scene import load_scene
+    from linprim_geo.base.options import SceneOptions, TrainOptions
+    from linprim_geo.capture.load import load_scene
+    from linprim_geo.geometry.camera import Similarity
+    from linprim_geo.runs.run import Run
 
     (folder / "scene").mkdir()
     make_transforms(folder / "scene")
@@ -309,9 +309,9 @@ def make_run(folder: Path) -> None:
 def _trainer(options):
     import torch
 
-    from linprim_geo.camera import Camera
-    from linprim_geo.shots import Shot
-    from linprim_geo.trainer import Trainer, initial_parameters
+    from linprim_geo.geometry.camera import Camera
+    from linprim_geo.training.step.trainer import Trainer, initial_parameters
+    from linprim_geo.training.step.training_images import Shot
 
     rng = np.random.default_rng(7)
     shots = []
@@ -323,8 +323,8 @@ def _trainer(options):
 
 
 def read_run_file(file: Path) -> None:
-    from linprim_geo.run import Run
-    from linprim_geo.training_loop import cut_metrics
+    from linprim_geo.runs.run import Run
+    from linprim_geo.training.loop import cut_metrics
 
     folder = file.parent
     if file.name == "metrics.jsonl":
@@ -340,7 +340,7 @@ def read_run_file(file: Path) -> None:
         "notes are no table",
     )
     if "time_budget" in run.notes:
-        from linprim_geo.pacing import Pace
+        from linprim_geo.training.budget.pacing import Pace
 
         check(bool(np.isfinite(Pace.resumed(run, _trainer(run.train_options)).finish)), "the time is not finite")
 
@@ -348,8 +348,8 @@ def read_run_file(file: Path) -> None:
 def read_checkpoint_file(file: Path) -> None:
     import torch
 
-    from linprim_geo.checkpoint import read_checkpoint, restore
-    from linprim_geo.options import TrainOptions
+    from linprim_geo.base.options import TrainOptions
+    from linprim_geo.training.checkpoint import read_checkpoint, restore
 
     run = file.parents[1]
     state = read_checkpoint(run)

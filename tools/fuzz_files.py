@@ -28,7 +28,7 @@ def finite(array: np.ndarray, shape: tuple, what: str) -> None:
 
 
 def _primitives(kind: str, degree: int, count: int = 5):
-    from linprim_geo.primitives import KINDS, Primitives
+    from linprim_geo.geometry.primitives import KINDS, Primitives
 
     rng = np.random.default_rng(3)
     arrays = rng.normal(size=(count, 3)), rng.normal(size=(count, 4)), rng.uniform(0.1, 1, (count, KINDS[kind].extents))
@@ -53,27 +53,27 @@ def check_primitives(primitives) -> None:
 
 
 def make_primitive_ply(folder: Path) -> None:
-    from linprim_geo.ply import write_primitive_ply
+    from linprim_geo.geometry.primitive_files import write_primitive_ply
 
     for kind in ("octahedron", "tetrahedron", "gaussian"):
         write_primitive_ply(folder / f"{kind}.ply", _primitives(kind, 1))
 
 
 def read_primitive_ply_file(file: Path) -> None:
-    from linprim_geo.ply import read_primitive_ply
+    from linprim_geo.geometry.primitive_files import read_primitive_ply
 
     check_primitives(read_primitive_ply(file)[0])
 
 
 def make_npz(folder: Path) -> None:
-    from linprim_geo.primitives import save_primitives
+    from linprim_geo.geometry.primitives import save_primitives
 
     for kind in ("octahedron", "gaussian"):
         save_primitives(folder / f"{kind}.npz", _primitives(kind, 2))
 
 
 def read_npz_file(file: Path) -> None:
-    from linprim_geo.primitives import load_primitives
+    from linprim_geo.geometry.primitives import load_primitives
 
     check_primitives(load_primitives(file))
 
@@ -101,7 +101,7 @@ def make_points(folder: Path) -> None:
 
 
 def read_points_file(file: Path) -> None:
-    from linprim_geo.ply_points import read_points_ply
+    from linprim_geo.capture.readers.ply_points import read_points_ply
 
     cloud = read_points_ply(file)
     if cloud is not None:
@@ -110,7 +110,8 @@ def read_points_file(file: Path) -> None:
 
 
 def make_meshes(folder: Path) -> None:
-    from linprim_geo.mesh import Mesh, save_mesh
+    from linprim_geo.geometry.mesh import Mesh
+    from linprim_geo.geometry.mesh_files import save_mesh
 
     rng = np.random.default_rng(3)
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
@@ -144,7 +145,8 @@ def make_meshes(folder: Path) -> None:
 
 
 def read_mesh_file(file: Path) -> None:
-    from linprim_geo.mesh import clean_mesh, load_mesh
+    from linprim_geo.geometry.mesh import clean_mesh
+    from linprim_geo.geometry.mesh_files import load_mesh
 
     if file.suffix in (".mtl", ".png"):
         file = file.with_name("textured.obj")
@@ -206,7 +208,7 @@ def make_photos(folder: Path) -> None:
 
 
 def read_photo_file(file: Path) -> None:
-    from linprim_geo import photos
+    from linprim_geo.imaging import photos
 
     width, height, _ = photos.image_header(file)
     check(width > 0 and height > 0, f"the size is {width}x{height}")
@@ -225,7 +227,7 @@ def make_masks(folder: Path) -> None:
 
 
 def read_mask_file(file: Path) -> None:
-    from linprim_geo.photos import read_mask
+    from linprim_geo.imaging.photos import read_mask
 
     finite(read_mask(file, SIZE), SIZE[::-1], "mask")
 
@@ -240,7 +242,7 @@ def make_depths(folder: Path) -> None:
 
 
 def read_depth_file(file: Path) -> None:
-    from linprim_geo.photos import read_depth
+    from linprim_geo.imaging.photos import read_depth
 
     depth = read_depth(file, 0.5, SIZE)
     finite(depth, SIZE[::-1], "depth")
@@ -255,7 +257,7 @@ def make_normals(folder: Path) -> None:
 
 
 def read_normals_file(file: Path) -> None:
-    from linprim_geo.photos import read_normals
+    from linprim_geo.imaging.photos import read_normals
 
     normals = read_normals(file, SIZE)
     finite(normals, (*SIZE[::-1], 3), "normals")

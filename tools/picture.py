@@ -14,11 +14,11 @@ import numpy as np
 
 def picture(run_path: Path, views: list[int], mesh_path: Path | None) -> np.ndarray:
     """(rows, 5 columns) of photograph, render, median depth, normal and shaded mesh as (H, W, 3) uint8."""
-    from linprim_geo.eval.images import composite
-    from linprim_geo.mesh import load_mesh
-    from linprim_geo.render import depth_preview
-    from linprim_geo.run import Run
-    from linprim_geo.visibility import render_preview
+    from linprim_geo.geometry.mesh_files import load_mesh
+    from linprim_geo.imaging.colors import depth_preview
+    from linprim_geo.imaging.metrics import composite
+    from linprim_geo.runs.run import Run
+    from linprim_geo.surface.visibility import render_preview
 
     run = Run.open(run_path)
     mesh = load_mesh(mesh_path or run.path / "mesh" / "tsdf" / "mesh.ply")

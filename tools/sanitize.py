@@ -43,7 +43,7 @@ sys.modules["linprim_geo._core"] = module
 spec.loader.exec_module(module)
 import linprim_geo
 linprim_geo._core = module
-from linprim_geo import ops
+from linprim_geo.kernels import ops
 assert ops._core.__file__ == sys.argv[1], ops._core.__file__
 print("testing", ops._core.__file__, "with the kernels", ops.instruction_set(), flush=True)
 import pytest

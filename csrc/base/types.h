@@ -1,0 +1,120 @@
+// What every part of the core shares: the camera, primitives and their records, the planes of an image.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+namespace linprim {
+
+constexpr int kTile = 16;                   // pixels along a tile's side
+constexpr int kBlock = 4;                   // pixels along a block's side; a tile has 4x4 blocks
+constexpr int kBlocks = 16;                 // blocks per tile, one bit each in a pair's mask
+constexpr int kTilePixels = kTile * kTile;  // stored block after block, row by row inside a block
+constexpr int kMaxShCoefficients = 16;      // degree 3
+constexpr int kColorSums = 16;              // gradient sums per (tile, primitive) pair, see Sum
+constexpr int kGeometrySums = 32;           // the same with the entry normals' sums (28 used)
+
+// What the tile kernels are compiled for, beside the scalar and the set of outputs. Numbers cross into Python.
+enum class PrimitiveKind : int { kOctahedron, kTetrahedron, kGaussian };
+constexpr int kKinds = 3;
+// Exact perspective, or the rays of one primitive parallel in the ray space of its centre (EWA). A Gaussian knows only
+// the latter.
+enum class RayModel : int { kExact, kAffine };
+constexpr int kRayModels = 2;
+// Primitives blended one after another by the depth of their centres, or by each ray's entry; or absorbing where they
+// are, overlaps included.
+enum class Order : int { kCenter, kEntry, kOverlap };
+constexpr int kOrders = 3;
+
+// A pinhole camera and what a ray does. Pixel (row, column) has its centre at (column + 0.5, row + 0.5).
+struct View {
+  double world_to_camera[12];  // 3x4, row major, rigid
+  double fx, fy, cx, cy;       // pixels
+  int width, height;           // pixels
+  double near;                 // depth where rays begin, > 0
+  double stop;                 // a ray ends when its transmittance is below this; 0 = never
+  double level;                // transmittance at which the median depth is taken
+  double screen_filter;        // pixels (polyhedra) or pixels^2 (Gaussians); 0 = none
+  RayModel rays;
+  Order order;
+};
+
+// Arrays of n primitives, row major: center (n,3), rotation (n,4) as w,x,y,z of any length, extent (n, extents()):
+// half-axes, vertex distances or standard deviations; density (n) per world unit, or a Gaussian's peak opacity; sh (n,
+// sh_count, 3) with sh_count 1, 4, 9 or 16.
+template <class Real>
+struct Primitives {
+  PrimitiveKind kind;
+  int64_t n;
+  const Real *center, *rotation, *extent, *density, *sh;
+  int sh_count;
+  int extents() const { return kind == PrimitiveKind::kTetrahedron ? 4 : 3; }
+};
+
+// Gradients with the layout of Primitives. screen (n,3): the gradient to the centre's position in pixels, and the sum
+// over tiles of the lengths of each tile's part of it, which does not cancel where a texture pulls a large primitive
+// both ways.
+template <class Real>
+struct PrimitiveGradients {
+  Real *center, *rotation, *extent, *density, *sh, *screen;
+};
+
+// Projected primitives, as the tile kernels read them, one type per kind.
+//
+// The faces of a polyhedron are planes w_f(x, y) = a_f + b_f (x - ref_x) + c_f (y - ref_y), x and y counted in pixels,
+// with w the inverse depth less w0, the inverse depth of the reference (exact rays), or the centre's distance w0 less
+// the distance (affine rays): either way a ray is inside for w from the largest of the back faces to the smallest of
+// the front faces.
+//
+// An octahedron's slots 0-3 hold, of each pair of opposite faces, the one turned to the camera; slots 4-7 their
+// opposites, always back faces.
+template <class Real>
+struct alignas(64) OctahedronRecord {
+  Real a[8], b[8], c[8];
+  Real w0, density, rgb[3];
+  Real ref_x, ref_y;  // integers
+  uint32_t flags;   // bits 0-3: slot 0-3 is a front face; bit 4: take the general path (not all are, or the near plane
+                    // is crossed)
+  Real face[3][8];  // s_k / h_s: derivative of the face's w with respect to the local form p_k
+};
+constexpr uint32_t kGeneral = 16;
+template <class Real>
+struct alignas(16) TetrahedronRecord {
+  Real a[4], b[4], c[4];
+  Real w0, density, rgb[3];
+  Real ref_x, ref_y;
+  uint32_t flags;  // bits 0-3: face 0-3 is a front face
+};
+template <class Real>
+struct alignas(16) GaussianRecord {
+  Real xx, xy, yy;           // inverse covariance, 1 / pixel^2
+  Real mean_x, mean_y;       // projected centre, relative to the reference
+  Real w0, density, rgb[3];  // depth of the centre, peak opacity, colour
+  Real ref_x, ref_y;
+};
+
+// Order of the gradient sums of a pair. The first twelve are the kind's own (see its add_gradient); then density and
+// colour; with geometry also the gradient to the unit normals of slots 0-3 and to the distance of the centre that
+// depths count from.
+struct Sum {
+  static constexpr int g = 0, density = 12, rgb = 13, normal = 16, distance = 28;
+};
+
+// Where a primitive can be seen: the inclusive box of pixels (empty: x1 < x0) and half-planes
+// a + b (x - ref_x) + c (y - ref_y) > 0 whose intersection with the box holds its silhouette. `a` is already raised
+// so that the test at a block's first pixel is the test of the block's most favourable pixel.
+struct Footprint {
+  int32_t x0, x1, y0, y1, ref_x, ref_y;
+  float a[6], b[6], c[6];
+};
+
+// Image planes of H x W. Null pointers are allowed only where said.
+template <class Real>
+struct Planes {
+  Real *rgb, *opacity;                                                                      // (3,H,W), (H,W)
+  Real *depth_expected, *depth_median, *depth_first, *distortion, *normal, *normal_median;  // geometry only
+  Real* state;  // (4,H,W), geometry only: reference depth, first and second moment about it, 1/(density |v|) at the
+                // median
+};
+
+}  // namespace linprim

@@ -1,0 +1,17 @@
+// The kernels in force: the choice made by set_instruction_set, the environment's LINPRIM_GEO_ISA, or the best
+// available.
+#pragma once
+
+#include "raster/kernel_table.h"
+
+namespace linprim {
+
+template <class Real>
+const Kernels<Real>& kernels();
+template <>
+const Kernels<float>& kernels<float>();
+template <>
+const Kernels<double>& kernels<double>();
+const ImageKernels& image_kernels();
+
+}  // namespace linprim

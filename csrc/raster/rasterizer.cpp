@@ -1,0 +1,480 @@
+// The rasterizer's pipeline: project, sort by depth, bin into tiles, blend; and back: tiles, reduction per primitive,
+// chain.
+#include <algorithm>
+#include <array>
+#include <bit>
+#include <chrono>
+#include <cstring>
+#include <memory>
+#include <mutex>
+#include <new>
+#include <utility>
+#include <vector>
+
+#include "raster/instruction_set.h"
+#include "linprim.h"
+#include "base/parallel.h"
+
+namespace linprim {
+namespace {
+
+constexpr int64_t kPrimitivesPerTask = 512;
+
+class Stopwatch {
+ public:
+  double lap() {
+    const auto now = std::chrono::steady_clock::now();
+    const double ms = std::chrono::duration<double, std::milli>(now - last_).count();
+    last_ = now;
+    return ms;
+  }
+
+ private:
+  std::chrono::steady_clock::time_point last_ = std::chrono::steady_clock::now();
+};
+
+Statistics last_statistics{};
+
+// 64-bit content hash: four interleaved multiply-xor lanes over 8-byte words (the finaliser is Stafford's variant 13).
+uint64_t hash_bytes(uint64_t seed, const void* data, size_t bytes) {
+  constexpr uint64_t kOdd = 0x9e3779b97f4a7c15ull;
+  const char* p = static_cast<const char*>(data);
+  uint64_t lane[4] = {seed ^ kOdd, seed + 1, seed + 2, seed + 3};
+  size_t i = 0;
+  for (; i + 32 <= bytes; i += 32)
+    for (int l = 0; l < 4; ++l) {
+      uint64_t word;
+      std::memcpy(&word, p + i + 8 * l, 8);
+      lane[l] = std::rotl(lane[l] ^ word, 29) * kOdd;
+    }
+  uint64_t h = bytes;
+  for (uint64_t l : lane) h = (std::rotl(h, 17) ^ l) * kOdd;
+  for (; i < bytes; ++i) h = (h ^ uint8_t(p[i])) * 0x100000001b3ull;
+  h = (h ^ (h >> 30)) * 0xbf58476d1ce4e5b9ull;
+  h = (h ^ (h >> 27)) * 0x94d049bb133111ebull;
+  return h ^ (h >> 31);
+}
+
+template <class Real>
+uint64_t content_hash(const View& view, const Primitives<Real>& p, bool geometry, const Real* color) {
+  const double numbers[] = {view.fx,
+                            view.fy,
+                            view.cx,
+                            view.cy,
+                            double(view.width),
+                            double(view.height),
+                            view.near,
+                            view.stop,
+                            view.level,
+                            double(p.n),
+                            double(geometry),
+                            double(sizeof(Real)),
+                            view.screen_filter,
+                            double(view.rays),
+                            double(view.order),
+                            double(p.kind)};
+  constexpr int64_t kPerTask = 4096;
+  std::vector<uint64_t> parts(size_t((p.n + kPerTask - 1) / kPerTask) + 2);
+  parts[0] = hash_bytes(1, view.world_to_camera, sizeof view.world_to_camera);
+  parts[1] = hash_bytes(2, numbers, sizeof numbers);
+  parallel_for(int64_t(parts.size()) - 2, [&](int64_t task, int) {  // memory sets its time
+    const int64_t begin = task * kPerTask, rows = std::min(p.n - begin, kPerTask);
+    uint64_t h = 3;
+    auto add = [&](const Real* values, int columns) {
+      h = hash_bytes(h, values + begin * columns, size_t(rows) * columns * sizeof(Real));
+    };
+    add(p.center, 3), add(p.rotation, 4), add(p.extent, p.extents()), add(p.density, 1), add(color, 3);
+    parts[size_t(task) + 2] = h;
+  });
+  return hash_bytes(4, parts.data(), parts.size() * sizeof parts[0]);
+}
+
+// Memory for records of any kind.
+struct alignas(64) Line {
+  char bytes[64];
+};
+
+// Everything between the primitives and the pixels of one view. Buffers only grow, so a view after the first allocates
+// nothing.
+template <class Real>
+struct Frame {
+  uint64_t hash = 0, used = 0;
+  int tiles_x = 0, tiles_y = 0;
+  int64_t rows = 0, visible = 0, pair_count = 0;
+  const SolidKernels<Real>* solid = nullptr;
+  std::vector<Line> records;
+  std::vector<std::array<std::array<Real, 3>, 4>> normals;
+  std::vector<Footprint> footprints;
+  std::vector<Real> key;
+  std::vector<uint32_t> order, order_swap, keys, keys_swap;
+  // What a projection task found: its visible rows, and its pairs, in the list of the thread that ran it.
+  struct Task {
+    uint32_t visible, first_slot;
+    int thread;
+    int64_t pairs_begin, pairs;
+  };
+  std::vector<Task> tasks;
+  std::vector<std::vector<LoosePair>> loose;  // of every thread
+  std::vector<int64_t> loose_count;
+  std::vector<uint32_t> tile_count;  // threads x tiles
+  std::vector<uint32_t> chunk_tile;  // chunks x tiles: counts, then write positions
+  std::vector<uint32_t> tile_begin, first_slot, slot_count;
+  std::vector<uint32_t> pair_primitive, pair_slot, pair_blocks;
+  std::vector<Real> pair_weight, sums, background_sums;
+  std::vector<uint32_t> pair_pixels;
+  std::vector<Line> scratch;  // of every thread
+
+  int tiles() const { return tiles_x * tiles_y; }
+
+  void build(const View& view, const Primitives<Real>& p, bool geometry, Real* color, Statistics& stats) {
+    Stopwatch watch;
+    tiles_x = (view.width + kTile - 1) / kTile, tiles_y = (view.height + kTile - 1) / kTile;
+    solid = &kernels<Real>().solids[int(p.kind)][int(view.rays)];
+    grow(records, (p.n * solid->record_bytes + 63) / 64);
+    grow(footprints, p.n), grow(key, p.n), grow(first_slot, p.n), grow(slot_count, p.n);
+    if (geometry) grow(normals, p.n);
+    const ProjectParams<Real> project{view,
+                                      p,
+                                      records.data(),
+                                      footprints.data(),
+                                      key.data(),
+                                      color,
+                                      geometry ? reinterpret_cast<Real(*)[4][3]>(normals.data()) : nullptr};
+    rows = p.n;
+    grow(order, p.n), grow(order_swap, p.n), grow(keys, p.n), grow(keys_swap, p.n);
+    tasks.resize(size_t((p.n + kPrimitivesPerTask - 1) / kPrimitivesPerTask));
+    if (int(loose.size()) < threads()) loose.resize(threads());
+    loose_count.assign(threads(), 0), tile_count.assign(size_t(threads()) * tiles(), 0u);
+    parallel_for(int64_t(tasks.size()), [&](int64_t task, int thread) {
+      const int64_t begin = task * kPrimitivesPerTask, end = std::min(p.n, begin + kPrimitivesPerTask);
+      solid->project(project, begin, end);
+      collect(task, begin, end, thread);
+    });
+    stats.project_ms = watch.lap();
+    sort();
+    stats.sort_ms = watch.lap();
+    bin();
+    stats.bin_ms = watch.lap();
+    stats.primitives = p.n, stats.visible = visible, stats.pairs = pair_count;
+    stats.working_set_bytes = bytes();
+  }
+
+  // The bits of a key as an unsigned number of the same order; -0 as 0.
+  static uint32_t ordered_bits(float key) {
+    const uint32_t bits = std::bit_cast<uint32_t>(key + 0.0f);
+    return bits ^ ((bits >> 31) ? 0xffffffffu : 0x80000000u);
+  }
+
+  // The part of sorting and binning that belongs to the rows of one projection task, while their footprints are in the
+  // cache: the visible ones with their keys, at the beginning of the task's rows of `order` and `keys`, and their
+  // pairs.
+  void collect(int64_t index, int64_t begin, int64_t end, int thread) {
+    Task& task = tasks[index];
+    int64_t count = begin;
+    for (int64_t i = begin; i < end; ++i) {
+      slot_count[i] = 0;
+      order[count] = uint32_t(i);
+      if constexpr (sizeof(Real) == 4) keys[count] = ordered_bits(key[i]);
+      count += footprints[i].x0 <= footprints[i].x1;
+    }
+    std::vector<LoosePair>& list = loose[thread];
+    task.visible = uint32_t(count - begin), task.thread = thread, task.pairs_begin = loose_count[thread];
+    const BinParams params{footprints.data(), order.data(), tiles_x, slot_count.data(),
+                           &tile_count[int64_t(thread) * tiles()]};
+    for (int64_t at = begin;;) {
+      int64_t written = 0;
+      at = kernels<Real>().bin(params, at, count, list.data() + loose_count[thread],
+                               int64_t(list.size()) - loose_count[thread], &written);
+      loose_count[thread] += written;
+      if (at == count) break;
+      list.resize(list.size() * 2 + 2 * size_t(tiles()));
+    }
+    task.pairs = loose_count[thread] - task.pairs_begin;
+  }
+
+  // Visible primitives by ascending key; ties keep the order of input.
+  void sort() {
+    int64_t at = 0;
+    for (int64_t t = 0; t < int64_t(tasks.size()); ++t) {  // close the gaps between the tasks
+      const int64_t begin = t * kPrimitivesPerTask;
+      std::copy_n(order.begin() + begin, tasks[t].visible, order.begin() + at);
+      if constexpr (sizeof(Real) == 4) std::copy_n(keys.begin() + begin, tasks[t].visible, keys.begin() + at);
+      at += tasks[t].visible;
+    }
+    visible = at;
+    if constexpr (sizeof(Real) == 8) {
+      std::stable_sort(order.begin(), order.begin() + visible, [&](uint32_t a, uint32_t b) { return key[a] < key[b]; });
+      return;
+    }
+    // Radix sort on the bits in which the keys differ, as many passes as they need of at most kMaxBits.
+    constexpr int kMaxBits = 11, kMaxPasses = 3;
+    uint32_t low = ~0u, high = 0;
+    for (int64_t i = 0; i < visible; ++i) low = std::min(low, keys[i]), high = std::max(high, keys[i]);
+    const int width = visible ? std::bit_width(high - low) : 0, passes = (width + kMaxBits - 1) / kMaxBits;
+    if (passes == 0) return;
+    const int bits = (width + passes - 1) / passes;
+    const uint32_t mask = (1u << bits) - 1;
+    static thread_local uint32_t histogram[kMaxPasses][1 << kMaxBits];
+    for (int pass = 0; pass < passes; ++pass) std::fill_n(histogram[pass], mask + 1, 0u);
+    for (int64_t i = 0; i < visible; ++i) {
+      keys[i] -= low;
+      for (int pass = 0; pass < passes; ++pass) ++histogram[pass][keys[i] >> (bits * pass) & mask];
+    }
+    for (int pass = 0; pass < passes; ++pass) {
+      uint32_t total = 0, *next = histogram[pass];
+      for (uint32_t b = 0; b <= mask; ++b) total += std::exchange(next[b], total);
+      for (int64_t i = 0; i < visible; ++i) {
+        const uint32_t to = next[keys[i] >> (bits * pass) & mask]++;
+        keys_swap[to] = keys[i], order_swap[to] = order[i];
+      }
+      keys.swap(keys_swap), order.swap(order_swap);
+    }
+  }
+
+  // Tile lists, each in the order of `order`; the gradient slots of a primitive are consecutive, in the order of input.
+  void bin() {
+    int64_t pairs_in_all = 0;
+    for (const Task& task : tasks) pairs_in_all += task.pairs;
+    if (pairs_in_all >= int64_t(1) << 32)
+      throw std::bad_alloc();  // slots are counted in 32 bits; this is above 200 GiB of them
+    pair_count = pairs_in_all;
+    uint32_t slot = 0;
+    for (int64_t t = 0, i = 0; t < int64_t(tasks.size()); ++t) {
+      tasks[t].first_slot = slot;
+      for (const int64_t end = std::min(i + kPrimitivesPerTask, int64_t(rows)); i < end; ++i)
+        first_slot[i] = slot, slot += slot_count[i];
+    }
+    // Chunks of the order are put in place at the same time: each begins in a tile's list where those before it end.
+    const int chunks = threads() == 1 ? 1 : 4 * threads();
+    auto begin_of = [&](int64_t chunk) { return visible * chunk / chunks; };
+    auto pairs_of = [&](uint32_t primitive) {
+      const Task& task = tasks[primitive / kPrimitivesPerTask];
+      return loose[task.thread].data() + task.pairs_begin + (first_slot[primitive] - task.first_slot);
+    };
+    auto each_pair = [&](int64_t chunk, auto body) {
+      constexpr int64_t
+          kFar = 24,
+          kNear = 12;  // how far ahead of its use, in primitives, memory is fetched: order is not order of input
+      const int64_t end = begin_of(chunk + 1);
+      for (int64_t i = begin_of(chunk); i < end; ++i) {
+        if (i + kFar < end)
+          __builtin_prefetch(&first_slot[order[i + kFar]]), __builtin_prefetch(&slot_count[order[i + kFar]]);
+        if (i + kNear < end) __builtin_prefetch(pairs_of(order[i + kNear]));
+        const uint32_t primitive = order[i], first = first_slot[primitive], count = slot_count[primitive];
+        const LoosePair* pairs = pairs_of(primitive);
+        for (uint32_t k = 0; k < count; ++k) body(pairs[k], primitive, first + k);
+      }
+    };
+    grow(chunk_tile, int64_t(chunks) * tiles()), grow(tile_begin, tiles() + 1);
+    if (chunks > 1)
+      parallel_for(chunks, [&](int64_t chunk, int) {
+        uint32_t* counts = &chunk_tile[chunk * tiles()];
+        std::fill(counts, counts + tiles(), 0u);
+        each_pair(chunk, [&](const LoosePair& pair, uint32_t, uint32_t) { ++counts[pair.tile]; });
+      });
+    else
+      std::copy_n(tile_count.begin(), tiles(), chunk_tile.begin());
+    uint32_t total = 0;
+    for (int tile = 0; tile < tiles(); ++tile) {
+      tile_begin[tile] = total;
+      for (int chunk = 0; chunk < chunks; ++chunk)
+        total += std::exchange(chunk_tile[int64_t(chunk) * tiles() + tile], total);
+    }
+    tile_begin[tiles()] = total;
+    grow(pair_primitive, pair_count), grow(pair_slot, pair_count), grow(pair_blocks, pair_count);
+    parallel_for(chunks, [&](int64_t chunk, int) {
+      uint32_t* position = &chunk_tile[chunk * tiles()];
+      each_pair(chunk, [&](const LoosePair& pair, uint32_t primitive, uint32_t slot) {
+        const uint32_t at = position[pair.tile]++;
+        pair_primitive[at] = primitive, pair_slot[at] = slot, pair_blocks[at] = pair.blocks;
+      });
+    });
+  }
+
+  // Calls body(tile, thread, scratch) for every tile; each thread has scratch of its own.
+  template <class Body>
+  void each_tile(int64_t scratch_bytes, Body body) {
+    const int64_t lines = (scratch_bytes + 63) / 64;
+    grow(scratch, lines * threads());
+    parallel_for(tiles(), [&](int64_t tile, int thread) { body(int(tile), thread, scratch.data() + lines * thread); });
+  }
+  int64_t longest_list() const {
+    uint32_t longest = 0;
+    for (int tile = 0; tile < tiles(); ++tile) longest = std::max(longest, tile_begin[tile + 1] - tile_begin[tile]);
+    return longest;
+  }
+
+  RasterParams<Real> raster(const View& view, const Real* background, const Planes<Real>& out) {
+    return {view,
+            tiles_x,
+            tiles_y,
+            records.data(),
+            key.data(),
+            reinterpret_cast<const Real(*)[4][3]>(normals.data()),
+            {tile_begin.data(), pair_primitive.data(), pair_slot.data(), pair_blocks.data()},
+            background,
+            out,
+            pair_weight.data(),
+            pair_pixels.data(),
+            {},
+            sums.data(),
+            background_sums.data()};
+  }
+
+  template <class T>
+  static void grow(std::vector<T>& v, int64_t size) {
+    if (int64_t(v.size()) < size) v.resize(size);
+  }
+  int64_t bytes() const {
+    auto of = [](const auto& v) { return int64_t(v.capacity() * sizeof(v[0])); };
+    int64_t total = of(records) + of(normals) + of(footprints) + of(key) + of(order) + of(order_swap) + of(keys) +
+                    of(keys_swap) + of(tasks) + of(tile_count) + of(chunk_tile) + of(tile_begin) + of(first_slot) +
+                    of(slot_count) + of(pair_primitive) + of(pair_slot) + of(pair_blocks) + of(scratch) +
+                    of(pair_weight) + of(sums) + of(background_sums) + of(pair_pixels);
+    for (const auto& list : loose) total += of(list);
+    return total;
+  }
+};
+
+// The last few frames, so that a backward pass finds the tile lists of its forward pass.
+template <class Real>
+struct Cache {
+  std::mutex mutex;
+  uint64_t clock = 0;
+  std::array<std::unique_ptr<Frame<Real>>, 2> frames;
+
+  Frame<Real>* find(uint64_t hash) {
+    for (auto& frame : frames)
+      if (frame && frame->hash == hash) return frame->used = ++clock, frame.get();
+    return nullptr;
+  }
+  Frame<Real>& oldest() {
+    std::unique_ptr<Frame<Real>>* chosen = &frames[0];
+    for (auto& frame : frames)
+      if (!frame || (*chosen && frame->used < (*chosen)->used)) chosen = &frame;
+    if (!*chosen) *chosen = std::make_unique<Frame<Real>>();
+    (*chosen)->used = ++clock;
+    (*chosen)->hash = 0;
+    return **chosen;
+  }
+};
+template <class Real>
+Cache<Real>& cache() {
+  static auto* instance = new Cache<Real>;
+  return *instance;
+}
+
+}  // namespace
+
+Statistics statistics() { return last_statistics; }
+
+template <class Real>
+void rasterize(const View& view, const Primitives<Real>& primitives, const Real* background, bool geometry,
+               const Planes<Real>& out, Real* color, Real* max_weight, int32_t* pixels) {
+  std::lock_guard lock(cache<Real>().mutex);
+  Statistics stats{};
+  Frame<Real>& frame = cache<Real>().oldest();
+  frame.build(view, primitives, geometry, color, stats);
+  Stopwatch watch;
+  if (geometry) frame.grow(frame.pair_weight, frame.pair_count), frame.grow(frame.pair_pixels, frame.pair_count);
+  const RasterParams<Real> params = frame.raster(view, background, out);
+  std::vector<Counts> counts(threads(), Counts{});
+  frame.each_tile(frame.solid->scratch_bytes(view.order, geometry, frame.longest_list()),
+                  [&](int tile, int thread, void* scratch) {
+                    const Counts c = frame.solid->forward[int(view.order)][geometry](params, tile, scratch);
+                    counts[thread].visited_lanes += c.visited_lanes, counts[thread].hit_lanes += c.hit_lanes;
+                  });
+  for (const Counts& c : counts)
+    stats.visited_lanes += int64_t(c.visited_lanes), stats.hit_lanes += int64_t(c.hit_lanes);
+  if (geometry) {
+    for (int64_t i = 0; i < primitives.n; ++i) {
+      Real largest = 0;
+      uint32_t sum = 0;
+      for (uint32_t s = 0; s < frame.slot_count[i]; ++s) {
+        largest = std::max(largest, frame.pair_weight[frame.first_slot[i] + s]);
+        sum += frame.pair_pixels[frame.first_slot[i] + s];
+      }
+      max_weight[i] = largest, pixels[i] = int32_t(sum);
+    }
+  }
+  stats.forward_ms = watch.lap();
+  frame.hash = content_hash(view, primitives, geometry, color);
+  last_statistics = stats;
+}
+
+template <class Real>
+void rasterize_grad(const View& view, const Primitives<Real>& primitives, const Real* background, bool geometry,
+                    const Planes<Real>& out, const Real* color, const Planes<Real>& grad,
+                    const PrimitiveGradients<Real>& gradients, Real* background_grad) {
+  std::lock_guard lock(cache<Real>().mutex);
+  Statistics stats = last_statistics;
+  const uint64_t hash = content_hash(view, primitives, geometry, color);
+  Frame<Real>* frame = cache<Real>().find(hash);
+  if (!frame) {
+    frame = &cache<Real>().oldest();
+    std::vector<Real> scratch(size_t(primitives.n) * 3);
+    frame->build(view, primitives, geometry, scratch.data(), stats);
+    frame->hash = hash;
+  }
+  Stopwatch watch;
+  const int per_slot = frame->solid->sums_per_slot[int(view.order)][geometry];
+  frame->grow(frame->sums, frame->pair_count * per_slot),
+      frame->grow(frame->background_sums, int64_t(frame->tiles()) * 3);
+  RasterParams<Real> params = frame->raster(view, background, out);
+  params.grad = grad;
+  frame->each_tile(
+      frame->solid->scratch_bytes(view.order, geometry, frame->longest_list()),
+      [&](int tile, int, void* scratch) { frame->solid->backward[int(view.order)][geometry](params, tile, scratch); });
+  double total[3] = {0, 0, 0};
+  for (int tile = 0; tile < frame->tiles(); ++tile)
+    for (int k = 0; k < 3; ++k) total[k] += double(frame->background_sums[3 * tile + k]);
+  for (int k = 0; k < 3; ++k) background_grad[k] = Real(total[k]);
+  stats.backward_ms = watch.lap();
+  const ChainParams<Real> chain{view,
+                                primitives,
+                                frame->footprints.data(),
+                                color,
+                                frame->first_slot.data(),
+                                frame->slot_count.data(),
+                                frame->sums.data(),
+                                per_slot,
+                                gradients};
+  parallel_for((primitives.n + kPrimitivesPerTask - 1) / kPrimitivesPerTask, [&](int64_t task, int) {
+    const int64_t begin = task * kPrimitivesPerTask;
+    frame->solid->chain(chain, begin, std::min(primitives.n, begin + kPrimitivesPerTask));
+  });
+  stats.chain_ms = watch.lap();
+  last_statistics = stats;
+}
+
+template <class Real>
+void level_depth(const View& view, const Primitives<Real>& primitives, Real* depth, Real* opacity) {
+  std::lock_guard lock(cache<Real>().mutex);
+  Statistics stats{};
+  Frame<Real>& frame = cache<Real>().oldest();
+  std::vector<Real> color(size_t(primitives.n) * 3);
+  frame.build(view, primitives, false, color.data(), stats);
+  Planes<Real> out{};
+  out.depth_median = depth, out.opacity = opacity;
+  const RasterParams<Real> params = frame.raster(view, nullptr, out);
+  frame.each_tile(frame.longest_list() * 3 * kBlocks * int64_t(sizeof(Real)), [&](int tile, int, void* scratch) {
+    frame.solid->level_depth(params, tile, static_cast<Real*>(scratch));
+  });
+}
+
+template <class Real>
+bool has_kernels(PrimitiveKind kind, RayModel rays, Order order) {
+  return kernels<Real>().solids[int(kind)][int(rays)].forward[int(order)][0] != nullptr;
+}
+
+#define LINPRIM_INSTANTIATE(Real)                                                                                    \
+  template void rasterize<Real>(const View&, const Primitives<Real>&, const Real*, bool, const Planes<Real>&, Real*, \
+                                Real*, int32_t*);                                                                    \
+  template bool has_kernels<Real>(PrimitiveKind, RayModel, Order);                                                   \
+  template void level_depth<Real>(const View&, const Primitives<Real>&, Real*, Real*);                               \
+  template void rasterize_grad<Real>(const View&, const Primitives<Real>&, const Real*, bool, const Planes<Real>&,   \
+                                     const Real*, const Planes<Real>&, const PrimitiveGradients<Real>&, Real*);
+LINPRIM_INSTANTIATE(float)
+LINPRIM_INSTANTIATE(double)
+
+}  // namespace linprim

@@ -1,0 +1,198 @@
+// The hierarchy of boxes behind segment optical depths: built by halves, walked by the kernels of the instruction set
+// in use.
+#include "surface/segment_depth.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstring>
+#include <limits>
+#include <numeric>
+
+#include "linprim.h"
+#include "base/parallel.h"
+
+namespace linprim {
+namespace {
+
+constexpr int64_t kLeaf = 4;  // solids in a leaf at most
+constexpr int64_t kSegmentsPerTask = 512;
+// As in primitive_pose.h.
+constexpr double kLargestDensity = 1e20, kSmallestExtent = 1e-15, kLargestExtent = 1e12;
+
+struct Box {
+  std::array<double, 3> low, high;
+};
+
+// Columns are the local axes in the world.
+void rotation_matrix(const double q_raw[4], double r[3][3]) {
+  double scale = 0, q[4];
+  for (int k = 0; k < 4; ++k) scale = std::max(scale, std::abs(q_raw[k]));
+  double length2 = 0;
+  for (int k = 0; k < 4; ++k) {
+    q[k] = scale > 0 ? q_raw[k] / scale : (k == 0 ? 1.0 : 0.0);
+    length2 += q[k] * q[k];
+  }
+  for (double& x : q) x /= std::sqrt(length2);
+  const double a = q[0], x = q[1], y = q[2], z = q[3];
+  const double m[3][3] = {{1 - 2 * (y * y + z * z), 2 * (x * y - a * z), 2 * (x * z + a * y)},
+                          {2 * (x * y + a * z), 1 - 2 * (x * x + z * z), 2 * (y * z - a * x)},
+                          {2 * (x * z - a * y), 2 * (y * z + a * x), 1 - 2 * (x * x + y * y)}};
+  std::memcpy(r, m, sizeof m);
+}
+
+// |sum_k s_k (R^T x)_k / extent_k| <= 1 for the four sign patterns of which no two are opposite.
+void set_octahedron(const double r[3][3], const double* extent, SlabSolid& solid, Box& box) {
+  constexpr double kSigns[4][3] = {{1, 1, 1}, {1, 1, -1}, {1, -1, 1}, {-1, 1, 1}};
+  for (int i = 0; i < 3; ++i) {
+    double half = 0;
+    for (int k = 0; k < 3; ++k) half = std::max(half, std::abs(r[i][k]) * extent[k]);
+    box.low[i] = solid.center[i] - half, box.high[i] = solid.center[i] + half;
+    for (int j = 0; j < 4; ++j) {
+      solid.normal[j][i] = 0;
+      for (int k = 0; k < 3; ++k) solid.normal[j][i] += kSigns[j][k] * r[i][k] / extent[k];
+    }
+  }
+  for (double& s : solid.shift) s = 0;
+}
+
+// Barycentric coordinates l_j of p = sum_j l_j e_j b_j, where b_i . b_j = -1/3 and sum b_j = 0: with m_j = l_j e_j and
+// M their sum, p . b_j = (4 m_j - M) / 3, so m_j = (3 p . b_j + M) / 4, and sum l_j = 1 gives M = (4 - 3 p . sum_i b_i
+// / e_i) / sum_i 1 / e_i. The slabs are |2 l_j - 1| <= 1.
+void set_tetrahedron(const double r[3][3], const double* extent, SlabSolid& solid, Box& box) {
+  const double u = 1 / std::sqrt(3.0), b[4][3] = {{u, u, u}, {u, -u, -u}, {-u, u, -u}, {-u, -u, u}};
+  double inverses = 0, w[3] = {0, 0, 0};
+  for (int j = 0; j < 4; ++j) {
+    inverses += 1 / extent[j];
+    for (int k = 0; k < 3; ++k) w[k] += b[j][k] / extent[j];
+  }
+  for (int j = 0; j < 4; ++j) {
+    double local[3];
+    for (int k = 0; k < 3; ++k) local[k] = 1.5 * (b[j][k] - w[k] / inverses) / extent[j];
+    for (int i = 0; i < 3; ++i) solid.normal[j][i] = r[i][0] * local[0] + r[i][1] * local[1] + r[i][2] * local[2];
+    solid.shift[j] = 2 / (inverses * extent[j]) - 1;
+  }
+  for (int i = 0; i < 3; ++i) {
+    box.low[i] = std::numeric_limits<double>::infinity(), box.high[i] = -box.low[i];
+    for (int j = 0; j < 4; ++j) {
+      const double arm = extent[j] * (r[i][0] * b[j][0] + r[i][1] * b[j][1] + r[i][2] * b[j][2]);
+      box.low[i] = std::min(box.low[i], solid.center[i] + arm),
+      box.high[i] = std::max(box.high[i], solid.center[i] + arm);
+    }
+  }
+}
+
+struct Builder {
+  const std::vector<Box>& boxes;
+  const std::vector<SlabSolid>& from;
+  std::vector<int32_t> order;
+  std::vector<SlabSolid>& solids;
+  std::vector<SolidNode>& nodes;
+
+  void build(int64_t begin, int64_t end) {
+    const size_t at = nodes.size();
+    nodes.emplace_back();
+    SolidNode node{};
+    Box middles;
+    for (int k = 0; k < 3; ++k) {
+      node.low[k] = middles.low[k] = std::numeric_limits<double>::infinity();
+      node.high[k] = middles.high[k] = -node.low[k];
+      for (int64_t i = begin; i < end; ++i) {
+        const Box& box = boxes[order[i]];
+        node.low[k] = std::min(node.low[k], box.low[k]), node.high[k] = std::max(node.high[k], box.high[k]);
+        const double middle = from[order[i]].center[k];
+        middles.low[k] = std::min(middles.low[k], middle), middles.high[k] = std::max(middles.high[k], middle);
+      }
+      if (middles.high[k] - middles.low[k] > middles.high[node.axis] - middles.low[node.axis]) node.axis = k;
+    }
+    if (end - begin <= kLeaf) {
+      node.first = int32_t(solids.size()), node.count = int32_t(end - begin);
+      std::sort(order.begin() + begin, order.begin() + end);
+      for (int64_t i = begin; i < end; ++i) solids.push_back(from[order[i]]);
+      nodes[at] = node;
+      return;
+    }
+    const int64_t middle = begin + (end - begin) / 2;
+    const int axis = node.axis;
+    std::nth_element(order.begin() + begin, order.begin() + middle, order.begin() + end, [&](int32_t a, int32_t b) {
+      const double x = from[a].center[axis], y = from[b].center[axis];
+      return x < y || (x == y && a < b);
+    });
+    node.split = from[order[middle]].center[axis];
+    build(begin, middle);
+    node.first = int32_t(nodes.size());
+    nodes[at] = node;
+    build(middle, end);
+  }
+};
+
+SegmentKernel kernel_in_use() {
+  const char* name = instruction_set();
+#if defined(__x86_64__) || defined(_M_X64)
+  if (std::strcmp(name, "v4") == 0) return segment_kernel_v4();
+  if (std::strcmp(name, "v3") == 0) return segment_kernel_v3();
+  if (std::strcmp(name, "v2") == 0) return segment_kernel_v2();
+#else
+  if (std::strcmp(name, "neon") == 0) return segment_kernel_neon();
+#endif
+  return segment_kernel_scalar();
+}
+
+}  // namespace
+
+template <class Real>
+SolidTree::SolidTree(PrimitiveKind kind, int64_t n, const Real* center, const Real* rotation, const Real* extent,
+                     const Real* density) {
+  const int extents = kind == PrimitiveKind::kTetrahedron ? 4 : 3;
+  std::vector<SlabSolid> from;
+  std::vector<Box> boxes;
+  for (int64_t i = 0; i < n; ++i) {
+    bool absorbs = density[i] > 0;
+    double e[4], q[4], r[3][3];
+    for (int k = 0; k < extents; ++k) {
+      absorbs = absorbs && extent[i * extents + k] > 0;
+      e[k] = std::clamp(double(extent[i * extents + k]), kSmallestExtent, kLargestExtent);
+    }
+    if (!absorbs) continue;
+    for (int k = 0; k < 4; ++k) q[k] = double(rotation[4 * i + k]);
+    rotation_matrix(q, r);
+    SlabSolid solid;
+    Box box;
+    for (int k = 0; k < 3; ++k) solid.center[k] = double(center[3 * i + k]);
+    solid.density = std::min(double(density[i]), kLargestDensity);
+    (extents == 4 ? set_tetrahedron : set_octahedron)(r, e, solid, box);
+    from.push_back(solid), boxes.push_back(box);
+  }
+  if (from.empty()) return;
+  solids_.reserve(from.size());
+  Builder builder{boxes, from, std::vector<int32_t>(from.size()), solids_, nodes_};
+  std::iota(builder.order.begin(), builder.order.end(), 0);
+  builder.build(0, int64_t(from.size()));
+}
+template SolidTree::SolidTree(PrimitiveKind, int64_t, const float*, const float*, const float*, const float*);
+template SolidTree::SolidTree(PrimitiveKind, int64_t, const double*, const double*, const double*, const double*);
+
+void SolidTree::optical_depth(const double* origin, const double* ends, const double* begin, int64_t count, double most,
+                              double* depth) const {
+  if (solids_.empty()) {
+    std::fill(depth, depth + count, 0.0);
+    return;
+  }
+  std::vector<SeenSolid> seen(solids_.size());
+  for (size_t i = 0; i < seen.size(); ++i) {
+    const SlabSolid& from = solids_[i];
+    std::memcpy(seen[i].normal, from.normal, sizeof from.normal);
+    seen[i].density = from.density;
+    for (int j = 0; j < 4; ++j) {
+      seen[i].at[j] = from.shift[j];
+      for (int k = 0; k < 3; ++k) seen[i].at[j] += from.normal[j][k] * (origin[k] - from.center[k]);
+    }
+  }
+  const SegmentParams params{seen.data(), nodes_.data(), origin, ends, begin, most, depth};
+  const SegmentKernel kernel = kernel_in_use();
+  parallel_for((count + kSegmentsPerTask - 1) / kSegmentsPerTask, [&](int64_t task, int) {
+    kernel(params, task * kSegmentsPerTask, std::min(count, (task + 1) * kSegmentsPerTask));
+  });
+}
+
+}  // namespace linprim

@@ -1,0 +1,73 @@
+// Optical depth of straight segments through homogeneous polyhedra: closed form, overlaps included, from one point to
+// many.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "base/types.h"
+
+namespace linprim {
+
+// A polyhedron as the intersection of four slabs |normal . (x - center) + shift| <= 1: the pairs of opposite faces of
+// an octahedron; of a tetrahedron the barycentric coordinates, each between 0 and 1.
+struct SlabSolid {
+  double center[3], normal[4][3], shift[4], density;
+};
+
+// The same seen from a point: x is inside where |at + normal . (x - point)| <= 1 for all four.
+struct SeenSolid {
+  double normal[4][3], at[4], density;
+};
+
+// A box of the hierarchy. Inner (count 0): the one child is the next node, the other is `first`, and the next one's
+// solids lie below `split` along `axis`. Leaf: solids first .. first + count - 1.
+struct SolidNode {
+  double low[3], high[3], split;
+  int32_t first, count, axis;
+};
+
+struct SegmentParams {
+  const SeenSolid* solids;
+  const SolidNode* nodes;  // the root first
+  const double* origin;    // 3
+  const double* ends;      // (count, 3)
+  const double* begin;     // (count) share of the way from the origin at which a segment begins, or null for 0
+  double most;             // sums are cut off here
+  double* depth;           // (count)
+};
+
+// Bounding boxes around the primitives that absorb, for optical depths along many segments. Primitives with an extent
+// or a density that is not positive are left out; other extreme ones are held within the bounds of primitive_pose.h. No
+// Gaussians.
+class SolidTree {
+ public:
+  template <class Real>
+  SolidTree(PrimitiveKind kind, int64_t n, const Real* center, const Real* rotation, const Real* extent,
+            const Real* density);
+
+  // depth[i] = min(most, sum over solids of density times the length of the segment inside), the segment running from
+  // origin + begin[i] (ends[i] - origin) to ends[i]. Ends whose neighbours lie near them are many times faster. A value
+  // depends neither on the other ends nor on threads.
+  void optical_depth(const double* origin, const double* ends, const double* begin, int64_t count, double most,
+                     double* depth) const;
+
+  int64_t size() const { return int64_t(solids_.size()); }
+
+ private:
+  std::vector<SlabSolid> solids_;
+  std::vector<SolidNode> nodes_;
+};
+
+// segment_kernel.cpp, once per instruction set: segments [begin, end).
+using SegmentKernel = void (*)(const SegmentParams&, int64_t begin, int64_t end);
+SegmentKernel segment_kernel_scalar();
+#if defined(__x86_64__) || defined(_M_X64)
+SegmentKernel segment_kernel_v2();
+SegmentKernel segment_kernel_v3();
+SegmentKernel segment_kernel_v4();
+#else
+SegmentKernel segment_kernel_neon();
+#endif
+
+}  // namespace linprim

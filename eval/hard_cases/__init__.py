@@ -1,0 +1,1 @@
+"""Numerical stability: hard cases against a reference in double precision."""

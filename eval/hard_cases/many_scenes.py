@@ -1,0 +1,431 @@
+"""A float64 reference for thousands of tiny scenes at once, with the rounding that a rung may add to each ray.
+
+The same model as `linprim_geo.kernels.reference.rasterize`, which takes one scene at a time: there, frames at the
+primitive and a walk over primitives; here, planes in camera space, tables over (scene, ray, primitive, face), and
+depths counted from the point of the ray that is nearest to the centre, so that a chord of a small primitive far away
+keeps its digits.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from linprim_geo.kernels.reference.rasterize import pixel_rays, rotation_matrix
+
+C0 = 0.5 / math.sqrt(math.pi)  # the spherical harmonic of degree 0
+CORNERS = torch.tensor([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)], dtype=torch.float64) / math.sqrt(3)
+FACE_SIGNS = torch.tensor(list(itertools.product((1.0, -1.0), repeat=3)), dtype=torch.float64)
+
+FAR = 1e12  # z-depth where the core ends every exact ray
+EDGE_ON = 1e-6  # a face nearer to edge-on than this part of its terms is moved to it by the core
+LARGEST_DENSITY = 1e20
+GAUSSIAN_CAP, GAUSSIAN_FLOOR, GAUSSIAN_SINGULAR = 0.99, 1 / 255, 1e-12
+
+PARAMETERS = ("center", "rotation", "extent", "density", "sh")
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """B scenes of M primitives of one kind, each with a camera of its own; float64."""
+
+    primitive: str
+    ray_model: str
+    center: Tensor  # (B, M, 3) world
+    rotation: Tensor  # (B, M, 4) w, x, y, z, any length; 0 is no rotation
+    extent: Tensor  # (B, M, 3 or 4)
+    density: Tensor  # (B, M)
+    sh: Tensor  # (B, M, 1, 3)
+    pose: Tensor  # (B, 4, 4) world to camera
+    focal: Tensor  # (B, 2) px
+    middle: Tensor  # (B, 2) principal point, px
+    near: Tensor  # (B,)
+    width: int
+    height: int
+    aimed: Tensor  # (B,) index of the pixel whose ray is aimed at the first primitive
+    coincident: bool = False  # the primitives of each scene are copies of one but for their densities
+
+    def __len__(self) -> int:
+        return len(self.center)
+
+    def rows(self, index) -> Scenes:
+        """The scenes of a slice."""
+        return replace(self, **{k: v[index] for k, v in vars(self).items() if isinstance(v, Tensor)})
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    return (a * b).sum(-1)
+
+
+def camera_space(s: Scenes) -> tuple[Tensor, Tensor]:
+    """Centres (B, M, 3) and axes (B, M, 3, 3), columns, in camera space."""
+    turn = s.pose[:, None, :3, :3]
+    zero = (s.rotation == 0).all(-1, keepdim=True)
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=s.rotation.dtype).expand_as(s.rotation)
+    # A scale of its own first: the square of a length of 1e-18 is a normal number, that of 1e-180 is none.
+    size = torch.where(zero, torch.ones_like(s.rotation), s.rotation).detach().abs().amax(-1, keepdim=True)
+    q = torch.where(zero, identity, s.rotation / size)
+    return (turn @ s.center[..., None])[..., 0] + s.pose[:, None, :3, 3], turn @ rotation_matrix(q)
+
+
+def rays_of(s: Scenes) -> Tensor:
+    """(B, R, 3) rays (X, Y, 1) through the pixel centres."""
+    grid = pixel_rays(s.width, s.height, 1.0, 1.0, 0.0, 0.0, s.center)
+    xy = (grid[None, :, :2] - s.middle[:, None]) / s.focal[:, None]
+    return torch.cat([xy, torch.ones_like(xy[..., :1])], -1)
+
+
+def view_limits(s: Scenes) -> tuple[Tensor, Tensor]:
+    """(B, 1, 2) least and largest x/z, y/z at which an affine approximation is taken: the image and 0.15 of its size
+    around it, in 1e4."""
+    size = s.center.new_tensor([s.width, s.height])
+    return tuple(((share * size - s.middle) / s.focal)[:, None].clamp(-1e4, 1e4) for share in (-0.15, 1.15))
+
+
+def vertices(s: Scenes) -> tuple[Tensor, Tensor]:
+    """Vertices relative to their centres (B, M, V, 3) and the centres (B, M, 3), camera space."""
+    center, axes = camera_space(s)
+    if s.primitive == "tetrahedron":
+        return s.extent[..., None] * (CORNERS @ axes.mT), center
+    half = (axes * s.extent[..., None, :]).mT
+    return torch.cat([half, -half], -2), center
+
+
+def faces(s: Scenes, axes: Tensor) -> Tensor:
+    """(B, M, F, 3) normals n of the faces n . (x - c) = 1, camera space.
+
+    A tetrahedron's face through the vertices u_j = d_j e_j (j = 1, 2, 3) has n = (sum over cyclic of e_2 x e_3 / d_1) /
+    det(e).
+    """
+    if s.primitive != "tetrahedron":
+        return (FACE_SIGNS / s.extent[..., None, :]) @ axes.mT
+    rows = []
+    for j in range(4):
+        a, b, c = (CORNERS[k] for k in range(4) if k != j)
+        i, k, m = (k for k in range(4) if k != j)
+        det = torch.dot(a, torch.linalg.cross(b, c))
+        parts = [torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)]
+        rows.append(sum(p / det / s.extent[..., v, None] for p, v in zip(parts, (i, k, m), strict=True)))
+    return torch.stack(rows, -2) @ axes.mT
+
+
+def drawn(s: Scenes, center: Tensor) -> Tensor:
+    """(B, M) whether a primitive is drawn at all."""
+    positive = (s.extent >= 0 if s.primitive == "gaussian" else s.extent > 0).all(-1)
+    if s.ray_model == "exact" and s.primitive != "gaussian":
+        return positive
+    return positive & (center[..., 2] > s.near[:, None])
+
+
+def _lines(s: Scenes, center: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Each ray as origin + s direction relative to each centre, (B, R, M, 3) both, and the t or distance at its origin,
+    (B, R, M).
+
+    The origin is the point of an exact ray nearest to the centre; that of an affine one lies in the plane through the
+    centre square to the view, which is taken within `view_limits`.
+    """
+    c = center[:, None]
+    if s.ray_model == "exact":
+        v = rays[:, :, None]
+        t0 = (_dot(c, v) / _dot(v, v)).detach()
+        return t0[..., None] * v - c, v.expand(-1, -1, c.shape[2], -1), t0
+    z, length = c[..., 2:], c.norm(dim=-1, keepdim=True)
+    away = (
+        torch.cat([rays[:, :, None, :2] - c[..., :2] / z, torch.zeros_like(z).expand(-1, rays.shape[1], -1, -1)], -1)
+        * z
+    )
+    low, high = view_limits(s)
+    held = torch.minimum(torch.maximum(c[..., :2] / z, low[:, None]), high[:, None])
+    along = torch.cat([held, torch.ones_like(z)], -1)
+    along = along / along.norm(dim=-1, keepdim=True)
+    return (
+        away - along * _dot(away, along)[..., None],
+        along.expand_as(away),
+        length[..., 0].expand(-1, rays.shape[1], -1),
+    )
+
+
+@dataclass(frozen=True)
+class Chords:
+    """What each ray crosses of each primitive, (B, R, M)."""
+
+    hit: Tensor
+    tau: Tensor
+    t_in: Tensor  # z-depth; 0 without a hit
+    t_out: Tensor
+    # Both answers are right: a Gaussian's alpha within rounding of a threshold, a ray in the plane of a face.
+    doubtful: Tensor
+    of_entry: Tensor  # tau as far as the entry has made it, from an arbitrary point: of_exit - of_entry = tau
+    of_exit: Tensor
+
+
+def chords(s: Scenes, entry: int = 0, leave: int = 0, grazing: bool = False) -> Chords:
+    """Clips every ray to every primitive.
+
+    entry, leave: of several faces met at the same depth (to 1e-9 of the primitive's size), the one that the gradient
+    goes through, counted from 0; where there are fewer, the last.
+    """
+    center, axes = camera_space(s)
+    rays = rays_of(s)
+    there = drawn(s, center)[:, None]
+    if s.primitive == "gaussian":
+        return _splats(s, center, axes, rays, there)
+    if s.ray_model == "affine":  # what is not drawn must not divide by its depth
+        center = torch.where(there[:, 0, :, None], center, torch.ones_like(center))
+    extent = torch.where((s.extent > 0).all(-1, keepdim=True), s.extent, torch.ones_like(s.extent))
+    normals = faces(replace(s, extent=extent), axes)[:, None]
+    origin, direction, t0 = _lines(s, center, rays)
+    slope = (normals * direction[..., None, :]).sum(-1)
+    left = 1 - (normals * origin[..., None, :]).sum(-1)
+    flat = slope == 0
+    t = left / torch.where(flat, torch.ones_like(slope), slope)
+    infinite = torch.full_like(t, math.inf)
+    tolerance = 1e-9 * s.extent.detach().abs().amax(-1)[:, None]
+    # A ray in the plane of a face is inside and outside.
+    in_plane = ((slope.abs() * tolerance[..., None] < 1e-18) & (left.abs() < 1e-9)).any(-1) & there
+    entries = _ranked(torch.where(slope < 0, t, -infinite), entry, tolerance, largest=True)
+    exits = _ranked(torch.where(slope > 0, t, infinite), leave, tolerance, largest=False)
+    inside = ~(flat & (left < 0)).any(-1)
+    length = rays.norm(dim=-1)[:, :, None]
+    if s.ray_model == "exact":
+        near = s.near[:, None, None] - t0
+        entries = torch.where(entries > near, entries, near)
+        exits = torch.minimum(exits, FAR - t0)
+    hit = inside & there & (exits > entries - (tolerance if grazing else 0)) & entries.isfinite() & exits.isfinite()
+    zero = torch.zeros_like(entries)
+    start, end = torch.where(hit, entries, zero), torch.where(hit, exits, zero)
+    if s.ray_model == "exact":
+        chord, t_in, t_out = length * (end - start), t0 + start, t0 + end
+    else:
+        chord, t_in, t_out = end - start, (t0 + start) / length, (t0 + end) / length
+    density = s.density.clamp(0, LARGEST_DENSITY)[:, None]
+    rate = density * length if s.ray_model == "exact" else density
+    t_in, t_out = torch.where(hit, t_in, zero), torch.where(hit, t_out, zero)
+    return Chords(hit, density * chord, t_in, t_out, in_plane, rate * start, rate * end)
+
+
+def _ranked(t: Tensor, rank: int, tolerance: Tensor, largest: bool) -> Tensor:
+    # One of several equal ones: `amax` would share the gradient among them.
+    values, index = t.detach().topk(rank + 1, dim=-1, largest=largest)
+    tied = (values - values[..., :1]).abs() <= tolerance[..., None]
+    place = tied.sum(-1, keepdim=True).clamp(min=1) - 1
+    return t.gather(-1, index.gather(-1, place))[..., 0]
+
+
+def _splats(s: Scenes, center: Tensor, axes: Tensor, rays: Tensor, there: Tensor) -> Chords:
+    center = torch.where(there[:, 0, :, None], center, torch.ones_like(center))
+    (half_x, half_y), (xx, xy, yy, det, place) = gaussian_ellipse(s, center, axes)
+    flat = ~(det > GAUSSIAN_SINGULAR * (xx + yy) ** 2)
+    det = torch.where(flat, torch.ones_like(det), det)
+    d = (rays[:, :, None, :2] - place[:, None]) * s.focal[:, None, None]
+    dx, dy = d[..., 0], d[..., 1]
+    # d^T M^-1 d for M = H H^T, as a sum of squares: the expanded form cancels for a long ellipse.
+    across = half_y[:, None] * dx[..., None] - half_x[:, None] * dy[..., None]
+    power = -0.5 * _dot(across, across) / det[:, None]
+    alpha = (s.density.clamp(0, 1)[:, None] * torch.exp(power)).clamp(max=GAUSSIAN_CAP)
+    hit = there & ~flat[:, None] & (alpha >= GAUSSIAN_FLOOR)
+    tau = torch.where(hit, -torch.log1p(-torch.where(hit, alpha, torch.zeros_like(alpha))), torch.zeros_like(alpha))
+    depth = torch.where(hit, center[:, None, :, 2], torch.zeros_like(tau))
+    near_floor = (alpha / GAUSSIAN_FLOOR - 1).abs() < 1e-3
+    near_cap = (s.density.clamp(0, 1)[:, None] * torch.exp(power) / GAUSSIAN_CAP - 1).abs() < 1e-3
+    near_flat = (det / (GAUSSIAN_SINGULAR * (xx + yy) ** 2) - 1).abs() < 1e-3
+    doubtful = (near_floor | near_cap | near_flat[:, None]) & there
+    return Chords(
+        hit,
+        tau,
+        depth,
+        depth,
+        doubtful,
+        torch.zeros_like(tau),
+        torch.where(hit, alpha, torch.zeros_like(alpha)),
+    )
+
+
+def gaussian_ellipse(s: Scenes, center: Tensor, axes: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, ...]]:
+    """The rows of H (B, M, 3), px, with the covariance M = H H^T; and M's xx, xy, yy, its determinant by Cauchy and
+    Binet, and the projected centre x/z, y/z; (B, M). H is taken where the centre is, but within `view_limits`."""
+    z = center[..., 2:]
+    place = center[..., :2] / z
+    held = torch.minimum(torch.maximum(place, view_limits(s)[0]), view_limits(s)[1])
+    half = (
+        (axes[..., :2, :] - held[..., None] * axes[..., 2:, :])
+        / z[..., None]
+        * s.extent[..., None, :]
+        * s.focal[:, None, :, None]
+    )
+    x, y = half[..., 0, :], half[..., 1, :]
+    area = torch.linalg.cross(x, y)
+    return (x, y), (_dot(x, x), _dot(x, y), _dot(y, y), _dot(area, area), place)
+
+
+def render(s: Scenes, order: str, entry: int = 0, leave: int = 0, found: Chords | None = None) -> tuple[Tensor, Tensor]:
+    """rgb over black (B, 3, R) and opacity (B, R) of every scene; no ray is stopped."""
+    found = found or chords(s, entry, leave)
+    color = torch.relu(C0 * s.sh[:, :, 0] + 0.5)[:, None]  # (B, 1, M, 3)
+    if order == "overlap" and s.coincident:
+        # Copies of one colour: the sum of the thicknesses.
+        total = found.tau.sum(-1, keepdim=True)
+        rgb = (
+            (-torch.expm1(-total))
+            * (found.tau[..., None] * color).sum(2)
+            / torch.where(total > 0, total, torch.ones_like(total))
+        )
+        return rgb.mT, -torch.expm1(-total[..., 0])
+    if order == "overlap" and found.tau.shape[2] > 1:
+        return _overlapping(found, color)
+    key = found.t_in if order == "entry" else camera_space(s)[0][:, None, :, 2].expand_as(found.tau)
+    index = torch.where(found.hit, key, torch.full_like(key, math.inf)).detach().argsort(dim=-1, stable=True)
+    tau = found.tau.gather(-1, index)
+    color = color.expand(-1, tau.shape[1], -1, -1).gather(2, index[..., None].expand(-1, -1, -1, 3))
+    weight = torch.exp(-_before(tau)) * -torch.expm1(-tau)
+    return (weight[..., None] * color).sum(2).mT, -torch.expm1(-tau.sum(-1))
+
+
+def _before(tau: Tensor) -> Tensor:
+    """Sums of what comes before each, without a subtraction."""
+    return torch.cat([torch.zeros_like(tau[..., :1]), torch.cumsum(tau[..., :-1], -1)], -1)
+
+
+def _overlapping(found: Chords, color: Tensor) -> tuple[Tensor, Tensor]:
+    """Emission and absorption over the segments between all entries and exits."""
+    none = torch.where(found.hit, 0.0, math.inf)
+    edges = torch.sort(torch.cat([(found.t_in + none), (found.t_out + none)], -1), -1).values
+    edges = torch.where(edges.isinf(), torch.zeros_like(edges), edges)
+    low, high = edges[..., :-1], edges[..., 1:]
+    length = (high - low).clamp(min=0)
+    middle = (0.5 * (low + high)).detach()[..., None]
+    within = (found.hit[..., None, :] & (found.t_in[..., None, :] <= middle) & (middle < found.t_out[..., None, :])).to(
+        length.dtype
+    )
+    span = torch.where(found.t_out > found.t_in, found.t_out - found.t_in, torch.ones_like(found.tau))
+    rate = found.tau / span
+    tau = (within * rate[..., None, :]).sum(-1) * length  # (B, R, E)
+    before = _before(tau)
+    safe = torch.where(tau > 0, tau, torch.ones_like(tau))
+    mean = torch.where(tau > 0, -torch.expm1(-safe) / safe, torch.ones_like(tau))
+    covered = torch.exp(-before) * length * mean
+    weight = (within * covered[..., None]).sum(-2) * rate
+    return (weight[..., None] * color).sum(2).mT, -torch.expm1(-tau.sum(-1))
+
+
+@torch.no_grad()
+def aimed_chord(s: Scenes) -> Tensor:
+    """(B, M) thickness per density of the aimed ray, 0 where it misses."""
+    found = chords(replace(s, density=torch.ones_like(s.density)))
+    return found.tau[torch.arange(len(s)), s.aimed]
+
+
+@torch.no_grad()
+def rounding(s: Scenes, found: Chords, eps: float, depths: bool = False) -> Tensor:
+    """(B, R, M) by how much the alpha of each ray and primitive may be off where planes are evaluated with unit
+    roundoff `eps` / 2.
+
+    A face is w = a + b dx + c dy over the pixels, dx and dy from the pixel nearest to the projected centre, with w the
+    inverse depth less that of the centre (affine rays: the centre's distance less the distance). Rounded coefficients
+    and two operations leave w off by 2 eps (|a| + |b dx| + |c dy|), and the set-up in double by 16 * 2^-53 of its
+    terms; a face within EDGE_ON of edge-on is moved to it. Entry and exit, being a minimum and a maximum, are off by no
+    more, and alpha is monotone in both: its range over them is the bound. With `depths` the chord is the difference of
+    two depths, each good to 4 eps: what the order "overlap" does, whose segments end where several primitives' do. A
+    Gaussian's exponent is off by 4 eps of the sum of the sizes of its terms.
+    """
+    center, axes = camera_space(s)
+    there = drawn(s, center)
+    rays = rays_of(s)
+    tiny = 2.0**-53
+    # By how many `tiny` the subtraction of the camera's position may move a centre.
+    moved = s.center.abs().sum(-1) + s.pose[:, None, :3, 3].abs().sum(-1)
+    alpha = -torch.expm1(-found.tau)
+    if s.primitive == "gaussian":
+        center = torch.where(there[..., None], center, torch.ones_like(center))
+        _, (xx, xy, yy, det, place) = gaussian_ellipse(s, center, axes)
+        d = (rays[:, :, None, :2] - place[:, None]) * s.focal[:, None, None]
+        dx, dy = d[..., 0].abs(), d[..., 1].abs()
+        det = torch.where(det > 0, det, torch.ones_like(det))
+        xx, xy, yy = (q[:, None] / det[:, None] for q in (xx, xy.abs(), yy))
+        size = 0.5 * (yy * dx * dx + 2 * xy * dx * dy + xx * dy * dy)
+        shift = (
+            s.focal[:, None, :, None]
+            * (place.abs() + (place.abs() + 1) * (moved / center[..., 2])[..., None]).mT[:, None]
+        )
+        shift = eps * (torch.stack([dx, dy], 2) + 1) + 8 * tiny * (shift + s.middle.abs()[:, None, :, None])
+        size_off = (yy * dx + xy * dy) * shift[:, :, 0] + (xx * dy + xy * dx) * shift[:, :, 1]
+        size_off = size_off + 0.5 * (yy * shift[:, :, 0] ** 2 + 2 * xy * shift.prod(2) + xx * shift[:, :, 1] ** 2)
+        off = alpha * torch.expm1((4 * eps + 64 * tiny) * size + size_off + 8 * eps).clamp(max=1e3)
+        return torch.where(there[:, None], off.nan_to_num(1e3, 1e3), alpha)
+    exact = s.ray_model == "exact"
+    extent = torch.where((s.extent > 0).all(-1, keepdim=True), s.extent, torch.ones_like(s.extent))
+    s = replace(s, extent=extent)
+    arms, _ = vertices(s)
+    crosses = (center[..., 2] - arms[..., 2].abs().amax(-1) < s.near[:, None]) if exact else torch.zeros_like(there)
+    usable = there & (~crosses if exact else there)
+    safe = torch.where(usable[..., None], center, torch.ones_like(center))
+    at = safe[..., :2] / safe[..., 2:]
+    reference = torch.round(at * s.focal[:, None] + s.middle[:, None] - 0.5)
+    reference = torch.where(usable[..., None], reference, torch.floor(s.middle)[:, None].expand_as(reference)).clamp(
+        -4e6, 4e6
+    )
+    base = (reference + 0.5 - s.middle[:, None]) / s.focal[:, None]
+    base = torch.cat([base, torch.ones_like(base[..., :1])], -1)
+    n = faces(s, axes)  # (B, M, F, 3)
+    step = rays[:, :, None, :2] - base[:, None, :, :2]  # (B, R, M, 2)
+    if exact:
+        w0 = torch.where(usable, 1 / safe[..., 2], torch.zeros_like(safe[..., 2]))
+        m = (n * center[..., None, :]).sum(-1)
+        h, h_size = 1 + m, 1 + m.abs()
+        lead = (n * (base - w0[..., None] * center)[..., None, :]).sum(-1) - w0[..., None]
+        terms = (n.abs() * (base.abs() + w0[..., None] * (center.abs() + moved[..., None]))[..., None, :]).sum(-1) + w0[
+            ..., None
+        ]
+        gradient = n[..., :2]
+        steep = gradient.abs()
+        h_off = 16 * tiny * (1 + (n.abs() * (center.abs() + moved[..., None])[..., None, :]).sum(-1))
+    else:
+        z, length = safe[..., 2], safe.norm(dim=-1)
+        w0 = length
+        along = (n * safe[..., None, :]).sum(-1)
+        gradient = (
+            z[..., None, None] * n[..., :2] - safe[..., None, :2] * (z / length**2)[..., None, None] * along[..., None]
+        )
+        steep = (
+            z[..., None, None] * n[..., :2].abs()
+            + safe[..., None, :2].abs() * (n.norm(dim=-1) * (z / length)[..., None])[..., None]
+        )
+        h, h_size = along / length[..., None], n.norm(dim=-1)
+        offset = base[..., :2] - at
+        lead = (gradient * offset[..., None, :]).sum(-1) - 1
+        terms = (steep * (base[..., :2].abs() + at.abs() * (1 + moved / z)[..., None])[..., None, :]).sum(-1) + 1
+        h_off = 16 * tiny * n.norm(dim=-1) * (1 + moved / z)[..., None]
+    kept = torch.where(h < 0, -1.0, 1.0) * torch.maximum(h.abs(), EDGE_ON * h_size)
+    slide, run = ((g[:, None] * step[..., None, :]).abs().sum(-1) for g in (gradient, steep))  # (B, R, M, F)
+    signed = lead[:, None] + (gradient[:, None] * step[..., None, :]).sum(-1)
+    w, off = signed / h[:, None], (signed / kept[:, None] - signed / h[:, None]).abs()
+    off = off + (2 * eps * (lead.abs()[:, None] + slide) + 16 * tiny * (terms[:, None] + run)) / kept.abs()[:, None]
+    off = off + w.abs() * (h_off / kept.abs())[:, None]
+    off, w = torch.nan_to_num(off, math.inf, math.inf), torch.nan_to_num(w, 0.0)
+    inf = torch.full_like(w, math.inf)
+    front, back = (h < 0)[:, None].expand_as(w), (h > 0)[:, None].expand_as(w)
+    if exact:
+        lowest, highest = (1 / FAR - w0)[:, None], (1 / s.near[:, None] - w0)[:, None]
+    else:
+        lowest, highest = -inf.amax(-1), inf.amax(-1)
+    bounds = []
+    for sign in (1, -1):  # the longest and the shortest chord
+        w_in = torch.minimum(torch.where(front, w + sign * off, inf).amin(-1), highest)
+        w_out = torch.maximum(torch.where(back, w - sign * off, -inf).amax(-1), lowest)
+        if exact:
+            i, o = (w_in + w0[:, None]), (w_out + w0[:, None])
+            chord = rays.norm(dim=-1)[:, :, None] * (1 / o.clamp(min=1 / FAR) - 1 / i.clamp(min=1 / FAR))
+        else:
+            chord = w_in - w_out
+        if depths:
+            chord = chord + sign * 4 * eps * rays.norm(dim=-1)[:, :, None] * (found.t_in.abs() + found.t_out.abs())
+        chord = torch.where(w_in > w_out, chord, torch.zeros_like(chord)).nan_to_num(0.0, 1e30)
+        bounds.append(
+            -torch.expm1(-s.density.clamp(0, LARGEST_DENSITY)[:, None] * chord.clamp(min=0) * (1 + sign * 8 * eps))
+        )
+    off_alpha = torch.maximum(bounds[0] - alpha, alpha - bounds[1]).clamp(min=0)
+    return torch.where(there[:, None], off_alpha + 8 * eps * alpha, torch.zeros_like(alpha))

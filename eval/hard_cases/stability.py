@@ -1,0 +1,483 @@
+"""How far the compiled rasterizer is from float64 truth on hard cases: `python -m linprim_geo.eval.hard_cases.stability
+[--json]`.
+
+Every class of `linprim_geo.eval.hard_cases.classes` is rendered and differentiated on every rung (primitive, ray model,
+order, scalar) that the core has and compared with `linprim_geo.eval.hard_cases.many_scenes`. A forward case is one ray
+of one scene; a gradient case is one scene's gradient of a random weighting of its rgb and opacity. What must hold, else
+the exit status is 1:
+
+    finite      no NaN or infinity in any image or gradient, of geometry too
+    share       0 <= opacity <= 1
+    forward     every ray within the rounding that `many_scenes.rounding` derives for it, times BOUND
+    gradient    of resolved scenes within 1e-3 of the reference on 99.9 % of the cases, and never off by more than its
+                own magnitude; or within what LIMITS states, with the reason
+
+A scene is resolved where the same rounding leaves the sum of its rays' alphas known to 1e-4: a needle a millionth of a
+pixel wide has no gradient in single precision, nor has a face seen edge-on to 1e-6. The table says how many are.
+
+A gradient is the difference of what a ray's entry and its exit contribute, and is small behind opaque things: no scalar
+resolves one that cancels to less than RESOLUTION eps of these contributions without absorption. There, "relative" means
+to RESOLUTION eps / 1e-3 of them, see `gradient_errors`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import math
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from linprim_geo.eval.hard_cases import classes as hard_cases
+from linprim_geo.eval.hard_cases import many_scenes
+from linprim_geo.eval.hard_cases.many_scenes import PARAMETERS, Scenes
+from linprim_geo.kernels import ops
+
+SCALARS = {"float32": torch.float32, "float64": torch.float64}
+BOUND = 1.0  # times the rounding of `many_scenes.rounding`
+CLOSE, SHARE_CLOSE = 1e-3, 0.999
+RESOLUTION = 16
+FACES_TIED = 4  # faces that meet in a vertex of an octahedron
+GEOMETRY_EVERY = 4  # scenes of which the gradients of all geometric images are looked through for NaN, one in so many
+TABLE = 2_000_000  # (scene, ray, primitive, face) that the reference holds at once
+
+
+# (class, primitive or "", order or "", scalar): share of resolved gradients within CLOSE, largest error, reason. The
+# first that fits.
+LIMITS = {
+    ("a thousandth of a pixel", "", "", "float32"): (
+        0.90,
+        0.02,
+        "positions are summed from the tile's corner in float32 and moved to the primitive afterwards: 16 px to "
+        "1e-7 leave 1e-6 px,"
+        " a thousandth of a primitive of 1e-3 px",
+    ),
+    ("needles 1e9", "gaussian", "", "float64"): (
+        0.85,
+        10.0,
+        "Q = M^-1 of an ellipse 1e5 times longer than wide, and Q S Q in its adjoint, lose the square of that",
+    ),
+    ("mixed axes", "gaussian", "", "float64"): (0.90, 10.0, "as needles 1e9"),
+    ("huge axes", "gaussian", "", "float64"): (
+        0.97,
+        100.0,
+        "as needles 1e9: a Gaussian that reaches past the camera is projected to such an ellipse",
+    ),
+}
+
+
+def limits(name: str, primitive: str, order: str, scalar: str) -> tuple[float, float, str]:
+    """What a row must hold: share of the resolved gradients within CLOSE, largest error of one, and why not the
+    usual."""
+    for kind, sequence in itertools.product((primitive, ""), (order, "")):
+        if (name, kind, sequence, scalar) in LIMITS:
+            return LIMITS[name, kind, sequence, scalar]
+    return SHARE_CLOSE, 1.0, ""
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One rung of the accuracy ladder."""
+
+    primitive: str
+    ray_model: str
+    order: str
+    scalar: str
+
+    @property
+    def name(self) -> str:
+        """ray model-order-scalar."""
+        return f"{self.ray_model}-{self.order}-{self.scalar}"
+
+    @property
+    def eps(self) -> float:
+        """Distance from 1 to the next number."""
+        return torch.finfo(SCALARS[self.scalar]).eps
+
+
+def rungs(scalars: Sequence[str] = tuple(SCALARS)) -> list[Rung]:
+    """What the core can do; a Gaussian's two ray models are one."""
+    return [
+        Rung(*rung)
+        for rung in itertools.product(ops.KINDS, ops.RAY_MODELS, ops.ORDERS, scalars)
+        if ops.has_kernels(*rung[:3]) and rung[:2] != ("gaussian", "exact")
+    ]
+
+
+@dataclass
+class Figures:
+    """What one class gave on one rung. `forward` is |rgb - reference| over the scene's largest reference value, or of
+    opacity."""
+
+    name: str
+    primitive: str
+    rung: str
+    cases: int = 0
+    gradient_cases: int = 0
+    nonfinite: int = 0
+    outside: int = 0  # scenes with an opacity below 0 or above 1
+    resolved: float = 1.0  # share of the gradient cases
+    forward: float = 0.0
+    over_bound: float = 0.0  # worst error in units of its own bound
+    gradient: float = 0.0  # worst of the resolved
+    close: float = 1.0  # share of the resolved gradients within CLOSE
+    worst_scene: int = -1
+    worst_gradient_scene: int = -1
+
+    def problems(self) -> list[str]:
+        """What does not hold."""
+        _, order, scalar = self.rung.split("-")
+        share, most, _ = limits(self.name, self.primitive, order, scalar)
+        found = []
+        if self.nonfinite:
+            found.append(f"{self.nonfinite} cases with NaN or infinity")
+        if self.outside:
+            found.append(f"{self.outside} scenes with an opacity outside [0, 1]")
+        if not self.over_bound <= BOUND:
+            found.append(f"forward {self.over_bound:.3g} times its bound (scene {self.worst_scene})")
+        # A single gradient more than the share allows is within the chance of a small sample.
+        count = self.resolved * self.gradient_cases
+        if (1 - self.close) * count > max(1.01, (1 - share) * count):
+            found.append(f"only {100 * self.close:.2f} % of the gradients within {CLOSE:g}")
+        if not self.gradient <= most:
+            found.append(f"a gradient off by {self.gradient:.3g} of its magnitude (scene {self.worst_gradient_scene})")
+        return found
+
+
+def _finite(tensors: Sequence[Tensor]) -> bool:
+    return bool(np.isfinite(np.concatenate([t.numpy().ravel() for t in tensors])).all())
+
+
+def run_core(
+    scenes: Scenes, rung: Rung, weights: Tensor, gradients: int
+) -> tuple[Tensor, Tensor, list[Tensor], Tensor]:
+    """Renders every scene by itself and differentiates the first `gradients`.
+
+    Returns:
+        rgb (B, 3, R), opacity (B, R), gradients to PARAMETERS (each `gradients` rows), all float64, and (B,) bool:
+        everything finite.
+    """
+    dtype = SCALARS[rung.scalar]
+    tensors = [getattr(scenes, name).to(dtype) for name in PARAMETERS]
+    background = torch.zeros(3, dtype=dtype)
+    cotangent = weights.to(dtype).reshape(len(scenes), 4, scenes.height, scenes.width)
+    focal, middle, near = scenes.focal.tolist(), scenes.middle.tolist(), scenes.near.tolist()
+    kinds = [
+        ops.KINDS.index(rung.primitive),
+        ops.RAY_MODELS.index(rung.ray_model),
+        ops.ORDERS.index(rung.order),
+    ]
+    rgb, opacity, grads, finite = [], [], [], []
+    with torch.no_grad():
+        for i in range(len(scenes)):
+            inputs, geometry = [*(t[i] for t in tensors), background], int(i % 2 == 0)
+            numbers, choices = (
+                [*focal[i], *middle[i], near[i], 0.0, 0.5, 0.0],
+                [scenes.width, scenes.height, *kinds, geometry],
+            )
+            out = torch.ops.linprim_geo.rasterize(*inputs, None, scenes.pose[i], numbers, choices)
+            *planes, color, _, _ = out
+            good = _finite(planes)
+            rgb.append(planes[0].flatten(1).clone()), opacity.append(planes[1].flatten().clone())
+            if i < gradients:
+                given = [cotangent[i, :3], cotangent[i, 3], *[None] * 6]
+                adjoint = torch.ops.linprim_geo.rasterize_grad
+                got = adjoint(*inputs, scenes.pose[i], numbers, choices, color, planes, given)
+                good &= _finite(got)
+                grads.append([g.double() for g in got[:5]])
+                if i % GEOMETRY_EVERY == 0:
+                    given = [torch.linspace(-1, 1, p.numel(), dtype=dtype).view_as(p) for p in planes[:8]]
+                    got = adjoint(*inputs, scenes.pose[i], numbers, choices, color, planes, given)
+                    good &= _finite(got)
+            finite.append(good)
+    columns = [torch.stack(c) for c in zip(*grads, strict=True)] if grads else []
+    return torch.stack(rgb).double(), torch.stack(opacity).double(), columns, torch.tensor(finite)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The reference of some scenes in one order."""
+
+    rgb: Tensor  # (B, 3, R)
+    opacity: Tensor  # (B, R)
+    gradients: list[list[Tensor]]  # one list for each choice among tied faces
+    contributions: list[
+        Tensor
+    ]  # (B,) each: size of what entries and exits contribute to each gradient, nothing absorbed
+    doubtful: Tensor  # (B, R)
+    found: many_scenes.Chords
+
+
+def _chunks(scenes: Scenes) -> Iterator[slice]:
+    count, many = scenes.center.shape[:2]
+    step = max(1, TABLE // (scenes.width * scenes.height * many * 8))
+    return (slice(i, min(i + step, count)) for i in range(0, count, step))
+
+
+def _gradients(loss: Tensor, leaves: dict[str, Tensor]) -> list[Tensor]:
+    grads = [None] * len(leaves)
+    if loss.requires_grad:
+        grads = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True, retain_graph=True)
+    grads = [torch.zeros_like(x) if g is None else g for x, g in zip(leaves.values(), grads, strict=True)]
+    # Of a quaternion of length 1.
+    length = leaves["rotation"].detach().norm(dim=-1, keepdim=True)
+    return [g * torch.where(length > 0, length, torch.ones_like(length)) if i == 1 else g for i, g in enumerate(grads)]
+
+
+def reference(scenes: Scenes, order: str, weights: Tensor, ties: bool, gradients: int) -> Truth:
+    """Images and, of the first `gradients` scenes, the gradients; with `ties` one for every choice of faces, and that
+    of a miss."""
+    images, sets, sizes = [], [], []
+    choices = list(itertools.product(range(FACES_TIED), repeat=2)) if ties else [(0, 0)]
+    for part in _chunks(scenes):
+        with torch.no_grad():
+            found = many_scenes.chords(scenes.rows(part))
+            images.append((*many_scenes.render(scenes.rows(part), order, found=found), found))
+        part = slice(part.start, min(part.stop, gradients))
+        if part.start >= part.stop:
+            continue
+        leaves = {name: getattr(scenes, name)[part].clone().requires_grad_() for name in PARAMETERS}
+        some, weight, of_choice = replace(scenes.rows(part), **leaves), weights[part], []
+        size = torch.zeros(len(PARAMETERS), 1, dtype=torch.float64)
+        for entry, leave in choices:
+            found = many_scenes.chords(some, entry, leave, grazing=ties)
+            rgb, opacity = many_scenes.render(some, order, found=found)
+            of_choice.append(_gradients((rgb * weight[:, :3]).sum() + (opacity * weight[:, 3]).sum(), leaves))
+            color = torch.relu(many_scenes.C0 * some.sh[:, :, 0] + 0.5)
+            pull = (weight[:, :3].abs().mT @ color.mT + weight[:, 3, :, None].abs()).detach()
+            for contribution in ((found.of_entry * pull).sum(), (found.of_exit * pull).sum()):
+                sides = torch.stack([_norm(g) for g in _gradients(contribution, leaves)])
+                size = torch.maximum(sides, size.expand_as(sides)) if ties else size + sides
+        # Colours get the weights themselves, and a density the length of its chord, which is no less certain than the
+        # primitive's size.
+        if scenes.primitive != "gaussian":
+            across = (found.hit * pull).sum(1) * some.extent.detach().abs().amax(-1)
+            size[3] = torch.maximum(size[3], across.norm(dim=-1))
+        shown = (found.hit[..., None] * weight[:, :3].abs().mT[:, :, None]).sum((1, 2))
+        size[4] = many_scenes.C0 * shown.norm(dim=-1)
+        if ties:
+            of_choice.append([torch.zeros_like(g) for g in of_choice[0]])
+        sets.append(of_choice), sizes.append(size)
+    columns = [[torch.cat(parts) for parts in zip(*choice, strict=True)] for choice in zip(*sets, strict=True)]
+    found = many_scenes.Chords(*[torch.cat([getattr(i[2], k) for i in images]) for k in vars(images[0][2])])
+    contributions = list(torch.cat(sizes, 1)) if sizes else []
+    rgb, opacity = (torch.cat([i[k] for i in images]) for k in (0, 1))
+    return Truth(rgb, opacity, columns, contributions, found.doubtful.any(-1), found)
+
+
+def _norm(x: Tensor) -> Tensor:
+    return x.detach().flatten(1).norm(dim=1)
+
+
+def gradient_errors(
+    scenes: Scenes, got: list[Tensor], wanted: list[Tensor], contributions: list[Tensor], eps: float
+) -> Tensor:
+    """(B,) largest over PARAMETERS of |got - wanted| / max(|wanted|, RESOLUTION eps / CLOSE |contributions|), over
+    whole scenes."""
+    length = scenes.rotation[: len(got[0])].norm(dim=-1, keepdim=True)
+    got = [g * torch.where(length > 0, length, torch.ones_like(length)) if i == 1 else g for i, g in enumerate(got)]
+    errors = []
+    for a, b, whole in zip(got, wanted, contributions, strict=True):
+        off, size = _norm(a - b), torch.maximum(_norm(b), RESOLUTION * eps / CLOSE * whole)
+        errors.append(torch.where(off <= 1e-37, torch.zeros_like(off), off / size.clamp(min=1e-300)))
+    return torch.stack(errors).amax(0)
+
+
+def judge(name: str, rung: Rung, scenes: Scenes, truth: Truth, weights: Tensor, gradients: int) -> Figures:
+    """Runs the core on the scenes and compares."""
+    what = hard_cases.CLASSES[name]
+    rgb, opacity, grads, finite = run_core(scenes, rung, weights, gradients)
+    figures = Figures(name, rung.primitive, rung.name, cases=opacity.numel(), gradient_cases=gradients)
+    figures.nonfinite = int((~finite).sum())
+    figures.outside = int(((opacity < 0) | (opacity > 1)).any(1).sum())
+    if not what.value:
+        return figures
+    clear = ~truth.doubtful
+    color_off = (rgb - truth.rgb).abs().amax(1) * clear
+    opacity_off = (opacity - truth.opacity).abs() * clear
+    overlap = rung.order == "overlap"
+    off = torch.cat(
+        [many_scenes.rounding(scenes.rows(p), _rows(truth.found, p), rung.eps, overlap) for p in _chunks(scenes)]
+    )
+    brightest = torch.relu(many_scenes.C0 * scenes.sh + 0.5).flatten(1).amax(1)[:, None]
+    alpha = -torch.expm1(-truth.found.tau).sum(-1)
+    # Each of M factors exp(-tau) is good to 3e-7 = 2.5 eps in single precision.
+    allowed = off.sum(-1) + 4 * rung.eps * off.shape[2] * alpha
+    if overlap and off.shape[2] > 1:
+        # An end that is off by d also lets each primitive absorb over d more of the others' light.
+        found = truth.found
+        length = torch.where(found.hit, found.t_out - found.t_in, torch.ones_like(found.tau))
+        ends = 4 * rung.eps * (found.t_in.abs() + found.t_out.abs()).sum(-1, keepdim=True)
+        allowed = allowed - torch.expm1(-found.tau / length.clamp(min=1e-30) * ends).sum(-1)
+    color_bound = brightest * (2 * allowed + 16 * rung.eps * alpha) + 1e-30
+    opacity_bound = allowed + 4 * rung.eps * off.shape[2]
+    ratio = torch.maximum(color_off / color_bound, opacity_off / opacity_bound).nan_to_num(math.inf).amax(1)
+    # Where a scene is nothing but rounding, relative to that.
+    largest = torch.maximum(truth.rgb.flatten(1).amax(1), color_bound.amax(1))
+    figures.forward = float(torch.maximum(color_off.amax(1) / largest, opacity_off.amax(1)).nan_to_num(math.inf).max())
+    figures.over_bound, figures.worst_scene = float(ratio.max()), int(ratio.argmax())
+
+    if gradients:
+        errors = [gradient_errors(scenes, grads, choice, truth.contributions, rung.eps) for choice in truth.gradients]
+        errors = torch.stack(errors).amin(0)
+        errors = errors.nan_to_num(math.inf, math.inf)
+        resolved = (off.sum((1, 2)) <= CLOSE / 10 * alpha.sum(1))[:gradients] | (off.sum((1, 2)) == 0)[:gradients]
+        figures.resolved = float(resolved.double().mean())
+        if resolved.any():
+            errors = torch.where(resolved, errors, torch.zeros_like(errors))
+            figures.gradient, figures.worst_gradient_scene = float(errors.max()), int(errors.argmax())
+            figures.close = float((errors[resolved] <= CLOSE).double().mean())
+    return figures
+
+
+def _rows(found: many_scenes.Chords, part: slice) -> many_scenes.Chords:
+    return many_scenes.Chords(*[getattr(found, k)[part] for k in vars(found)])
+
+
+def measure(
+    names: Sequence[str], chosen: Sequence[Rung], cases: int = 10_000, gradients: int = 200, seed: int = 0
+) -> Iterator[Figures]:
+    """Figures of every class on every rung: at least `cases` rays and `gradients` scenes with a gradient on each;
+    `chosen` as `rungs` orders them."""
+    for name in names:
+        what = hard_cases.CLASSES[name]
+        groups = itertools.groupby(chosen, key=lambda r: (r.primitive, r.ray_model))
+        for (primitive, ray_model), group in groups:
+            if primitive not in what.primitives:
+                continue
+            count = max(1, gradients, math.ceil(cases / hard_cases.WINDOW**2))
+            scenes = hard_cases.generate(name, primitive, ray_model, count, seed)
+            weights = torch.from_numpy(
+                np.random.default_rng(seed).normal(size=(count, 4, scenes.width * scenes.height))
+            )
+            if what.ties:
+                only = torch.zeros(count, 1, weights.shape[2], dtype=torch.float64)
+                only[torch.arange(count), 0, scenes.aimed] = 1
+                weights = weights * only
+            with torch.no_grad():
+                doubtful = torch.cat([many_scenes.chords(scenes.rows(p)).doubtful.any(-1) for p in _chunks(scenes)])
+            weights = weights * ~doubtful[:, None]
+            for order, same in itertools.groupby(group, key=lambda r: r.order):
+                truth = reference(scenes, order, weights, what.ties, gradients if what.value else 0)
+                for rung in same:
+                    yield judge(name, rung, scenes, truth, weights, gradients)
+
+
+def table(rows: Sequence[Figures]) -> str:
+    """The figures as text."""
+    lines = [
+        f"{'class':26} {'primitive':12} {'rung':24} {'cases':>7} {'worst':>9} {'of bound':>9}"
+        f" {'gradients':>9} {'resolved':>9} {'<= 1e-3':>9} {'worst':>9} {'NaN':>4}"
+    ]
+    for r in rows:
+        lines.append(
+            f"{r.name:26} {r.primitive:12} {r.rung:24} {r.cases:7} {r.forward:9.1e} {r.over_bound:9.2g}"
+            f" {r.gradient_cases:9} {100 * r.resolved:8.2f}% {100 * r.close:8.2f}% {r.gradient:9.1e} {r.nonfinite:4}"
+        )
+    return "\n".join(lines)
+
+
+def report(rows: Sequence[Figures], seed: int) -> dict:
+    """The figures as the JSON document that `--json` prints."""
+    classes = [
+        {
+            "name": r.name,
+            "primitive": r.primitive,
+            "rung": r.rung,
+            "cases": r.cases,
+            "worst_relative_error": r.forward,
+            "nonfinite": r.nonfinite,
+            "opacity_outside": r.outside,
+            "worst_over_bound": r.over_bound,
+            "gradient_cases": r.gradient_cases,
+            "gradient_resolved": r.resolved,
+            "gradient_within": r.close,
+            "worst_gradient_error": r.gradient,
+            "compared": hard_cases.CLASSES[r.name].value,
+            "problems": r.problems(),
+        }
+        for r in rows
+    ]
+    columns = ("name", "primitive", "order", "scalar", "within", "worst", "reason")
+    reasons = [dict(zip(columns, (*key, *value), strict=True)) for key, value in LIMITS.items()]
+    return {"instruction_set": ops.instruction_set(), "seed": seed, "limits": reasons, "classes": classes}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command; 0 if everything holds."""
+    parser = argparse.ArgumentParser(
+        prog="python -m linprim_geo.eval.hard_cases.stability", description=__doc__.split("\n")[0]
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON in place of the table")
+    parser.add_argument(
+        "--cases",
+        type=int,
+        default=10_000,
+        metavar="N",
+        help="rays of each class on each rung (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--gradients",
+        type=int,
+        default=2_000,
+        metavar="N",
+        help="scenes of each class and primitive whose gradient is taken, shared by its rungs (default: %(default)s)",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
+    parser.add_argument(
+        "--classes",
+        nargs="+",
+        choices=hard_cases.CLASSES,
+        metavar="CLASS",
+        help="only these; --list names them",
+    )
+    parser.add_argument("--primitives", nargs="+", choices=ops.KINDS, default=ops.KINDS)
+    parser.add_argument("--scalars", nargs="+", choices=tuple(SCALARS), default=tuple(SCALARS))
+    parser.add_argument("--list", action="store_true", help="say what each class holds, and end")
+    options = parser.parse_args(arguments)
+    if options.list:
+        for name, what in hard_cases.CLASSES.items():
+            print(f"{name:26} {' '.join(what.about.split())}")
+        return 0
+    if options.cases < 1 or options.gradients < 1:
+        parser.error("--cases and --gradients have to be at least 1")
+    chosen = [r for r in rungs(options.scalars) if r.primitive in options.primitives]
+    before, rows, begin = (torch.get_num_threads(), ops.threads()), [], time.monotonic()
+    torch.set_num_threads(1), ops.set_threads(1)  # the scenes are tiny
+    try:
+        if not options.json:
+            print(table([]), flush=True)
+        for name, primitive in itertools.product(options.classes or hard_cases.CLASSES, options.primitives):
+            mine = [r for r in chosen if r.primitive == primitive]
+            gradients = math.ceil(options.gradients / max(1, len(mine)))
+            for row in measure([name], mine, options.cases, gradients, options.seed):
+                rows.append(row)
+                if not options.json:
+                    print(table([row]).splitlines()[1], flush=True)
+    finally:
+        torch.set_num_threads(before[0]), ops.set_threads(before[1])
+    failed = [(row, problem) for row in rows for problem in row.problems()]
+    if options.json:
+        print(json.dumps(report(rows, options.seed), indent=1))
+    else:
+        print(
+            f"\n{sum(r.cases for r in rows)} rays, {sum(r.gradient_cases for r in rows)} gradients, "
+            f"{time.monotonic() - begin:.0f} s"
+        )
+        for (name, primitive, order, scalar), (share, most, why) in LIMITS.items():
+            where = ", ".join(x for x in (name, primitive, order, scalar) if x)
+            print(f"limit: {where}: {100 * share:g} % within {CLOSE:g}, none off by more than {most:g}: {why}")
+        for row, problem in failed:
+            print(f"FAILED: {row.name}, {row.primitive}, {row.rung}: {problem}")
+    return int(bool(failed))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""The tables of the LinPrim paper, made again here."""

@@ -1,0 +1,162 @@
+"""LinPrim's tables 1, 6 and 8, kinds of primitives against each other: counts and cost, work, stages, equal quality and
+equal time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from linprim_geo.eval.paper.equal_points import LEVELS, at_time, equal_psnr, rising, shared_range
+from linprim_geo.eval.paper.models import COUNTS, STAGES
+from linprim_geo.eval.paper.text_tables import plain, short
+from linprim_geo.training.loop import QUICK_VIEWS
+
+COMPARED = (("octahedron", "gaussian"), ("tetrahedron", "octahedron"), ("tetrahedron", "gaussian"))
+
+
+def compare(rows: Sequence[dict]) -> dict:
+    """The comparisons of one scene: `equal_psnr`, `equal_time` (finished trainings), `equal_time_curves` (along one
+    training)."""
+    of = {name: [r for r in rows if r["model"] == name] for name in dict.fromkeys(r["model"] for r in rows)}
+    result: dict = {"equal_psnr": [], "equal_time": [], "equal_time_curves": []}
+    kinds = {name: members[0]["kind"] for name, members in of.items()}
+    for a, b in [(a, b) for x, y in COMPARED for a in of for b in of if (kinds[a], kinds[b]) == (x, y)]:
+        ends = [
+            [(r["count"], r["psnr"], r["frame_cpu_ms"], sum(r[s] for s in STAGES)) for r in of[name]] for name in (a, b)
+        ]
+        ranges = [[rising(curve)[0][1], rising(curve)[-1][1]] for curve in ends]
+        result["equal_psnr"].append({"pair": [a, b], "ranges": ranges, "points": equal_psnr(*ends)})
+    finished = {name: [(r["train_cpu_seconds"], r["psnr"]) for r in members] for name, members in of.items()}
+    both = shared_range([[p[0] for p in curve] for curve in finished.values()])
+    for seconds in [] if both is None else np.geomspace(*both, LEVELS).tolist():
+        seconds = min(max(seconds, both[0]), both[1])
+        result["equal_time"].append(
+            {"seconds": seconds, "psnr": {name: at_time(curve, seconds) for name, curve in finished.items()}}
+        )
+    for cap in sorted({r["cap"] for r in rows}):
+        mine = [r for r in rows if r["cap"] == cap]
+        seconds = min(r["curve"][-1][0] for r in mine)
+        psnr = {r["model"]: at_time(r["curve"], seconds) for r in mine}
+        result["equal_time_curves"].append({"cap": cap, "seconds": seconds, "psnr": psnr})
+    return result
+
+
+def scene_text(scene: str, rows: Sequence[dict], comparison: dict) -> str:
+    """All tables of one scene as plain text."""
+    names, first = list(dict.fromkeys(r["model"] for r in rows)), rows[0]
+    steps = first["options"]["iterations"]
+    text = [f"== {scene}: {first['held_out_views']} held-out views of {first['pixels']:.0f} rays, {steps} steps =="]
+
+    def table(title: str, header: Sequence[str], lines: Sequence[Sequence[str]]) -> None:
+        text.append(f"\n{title}" + (f"\n{plain(header, lines)}" if lines else ""))
+
+    table(
+        "Counts and cost (table 1): per frame, one thread",
+        ["model", "count", "CPU ms", "wall ms", "PSNR dB", "SSIM", "training CPU s", "wall s"],
+        [
+            [
+                r["model"],
+                f"{r['count']}",
+                f"{r['frame_cpu_ms']:.2f}",
+                f"{r['frame_ms']:.2f}",
+                f"{r['psnr']:.2f}",
+                f"{r['ssim']:.4f}",
+            ]
+            + [f"{r['train_cpu_seconds']:.1f}", f"{r['train_wall_seconds']:.1f}"]
+            for r in rows
+        ],
+    )
+    table(
+        "Work (table 6): means over frames",
+        [
+            "model",
+            "count",
+            "in frustum",
+            "tile entries",
+            "iterated",
+            "intersected",
+            "hit share",
+            "hits/pixel",
+        ],
+        [
+            [r["model"], f"{r['count']}", *(short(r[key]) for key in COUNTS)]
+            + [f"{r['intersected'] / max(1, r['iterated']):.2f}", f"{r['intersected'] / r['pixels']:.1f}"]
+            for r in rows
+        ],
+    )
+    table(
+        "Stages (table 8): wall ms",
+        ["model", "preprocess", "sort+tile", "render", "ns/hit", "count", "file MB"],
+        [
+            [
+                r["model"],
+                *(f"{r[key]:.2f}" for key in STAGES),
+                f"{1e6 * r['render_ms'] / max(1, r['intersected']):.2f}",
+            ]
+            + [f"{r['count']}", f"{r['file_mb']:.2f}"]
+            for r in rows
+        ],
+    )
+    lines, notes = [], []
+    for pair in comparison["equal_psnr"]:
+        name = " / ".join(pair["pair"])
+        for p in pair["points"]:
+            times = (*p["ms"], p["ms_ratio"], *p["core_ms"], p["core_ratio"])
+            lines.append([name, f"{p['psnr']:.2f}", *map(short, p["count"]), *(f"{x:.2f}" for x in times)])
+        if not pair["points"]:
+            ranges = " against ".join(f"{low:.2f} to {high:.2f} dB" for low, high in pair["ranges"])
+            notes.append(f"  {name}: no overlap, {ranges}")
+    table(
+        "Equal PSNR: A / B",
+        ["A / B", "PSNR dB", "count A", "B", "CPU ms A", "B", "A/B", "core ms A", "B", "A/B"],
+        lines,
+    )
+    text += notes
+
+    def scores(psnr: dict) -> list[str]:
+        return ["-" if psnr.get(name) is None else f"{psnr[name]:.2f}" for name in names]
+
+    lines = [[f"{entry['seconds']:.1f} s", *scores(entry["psnr"])] for entry in comparison["equal_time"]]
+    table("Equal time, finished trainings of the size that takes it: PSNR dB", ["training CPU", *names], lines)
+    if not lines:
+        text.append("  no overlap: the slowest training of one kind is faster than the fastest of another")
+    lines = [[f"{e['seconds']:.1f} s, cap {e['cap']}", *scores(e["psnr"])] for e in comparison["equal_time_curves"]]
+    table("Equal time, one size, when the first has finished: PSNR dB", ["training CPU", *names], lines)
+    starts = [f"{r['model']} {r['cap']} from {r['start_count']} of thinness {r['start_thinness']:.2f}" for r in rows]
+    text.append("\nStart: " + "; ".join(starts) + ".")
+    return "\n".join(text)
+
+
+def footnotes(rows: Sequence[dict]) -> str:
+    """What somebody who quotes the tables has to know."""
+    lines = [
+        "Frames: of every view the median of interleaved repetitions, then the mean over views; CPU is the "
+        "rendering thread's own time. "
+        "Core is the sum of the stages (wall): without the call from Python, its checks for NaN and the images' "
+        "memory.",
+        f"Instruction set {', '.join(sorted({r['instruction_set'] for r in rows}))}. In frustum: not culled, its "
+        "footprint holds a pixel. "
+        "Iterated: pixels, by blocks of 4x4, tested against a primitive of their tile's list; intersected: those "
+        "hit by it while the "
+        "ray was alive.",
+        "Equal PSNR: log count and log ms linear in PSNR between neighbouring sizes, at both ends and the middle "
+        "of what the two share.",
+        "Training CPU s: process time of the steps alone. PSNR linear in log time; sizes that cost more and "
+        "score less are left out.",
+        "Along one training the step sizes are still large before its end, so the slower kinds look worse there "
+        "than if they had been "
+        "planned for that time; the finished trainings do not have this flaw.",
+        "Start thinness: shortest by longest axis of the first primitives, 1 = as long in all directions. Where "
+        "kinds differ in it, they "
+        "did not start alike: the trainer lays some kinds flat on the surface and others not.",
+        "One seed: differences below 0.2 dB say nothing.",
+    ]
+    if any(r["held_out_views"] >= 2 * QUICK_VIEWS for r in rows):
+        lines.append(f"During training some {QUICK_VIEWS} of the held-out views are scored, all of them at the end.")
+    if any(r["options"]["samples"] == 1 for r in rows):
+        lines.append(
+            "One ray per pixel: photographs average over a pixel, so sharp edges of polyhedra alias; --samples 2 "
+            "averages too."
+        )
+    return "Notes\n" + "\n".join(f"* {line}" for line in lines)

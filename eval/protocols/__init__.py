@@ -1,0 +1,1 @@
+"""How public benchmarks score meshes."""

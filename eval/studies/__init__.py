@@ -1,0 +1,1 @@
+"""Studies that make the tables of the documents."""

@@ -1,0 +1,179 @@
+"""Every way to take a surface, on every built-in scene, against the exact mesh: `python -m
+linprim_geo.eval.studies.surfaces -o runs/surfaces`.
+
+Each scene is photographed, trained once with octahedra and once with Gaussians (the baseline), and each training meshed
+by every method that it allows; `--data` adds captures, scored against their `--references`. `surfaces.json` and
+`surfaces.md` hold per mesh, of what the cameras see unless it says whole:
+
+    Chamfer distance in % of the reference's diagonal (point to surface, both ways), and of the whole mesh; F1 at 1 %;
+    normal consistency; faces, boundary edges, what manifold3d says of closed meshes; the rank correlation of `quality`
+    with the exact distance of vertices, and the ratio of their means; seconds and peak memory of the extraction.
+
+What the output folder holds already is not done again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import atomic_write, write_json
+from linprim_geo.base.options import ExtractOptions, SceneOptions, TrainOptions
+
+BUILT_IN = ("cad", "smooth", "room", "wires")
+METHODS = {"octahedron": ("tsdf", "polyhedra", "opacity-field"), "gaussian": ("tsdf",)}
+# Points per surface: the standard error of a Chamfer distance is about 0.3 % of it.
+SAMPLES = 100_000
+COLUMNS = {
+    "scene": "scene",
+    "primitive": "primitives",
+    "method": "method",
+    "chamfer": "Chamfer %",
+    "chamfer_whole": "whole %",
+    "f1": "F1",
+    "normal_consistency": "normals",
+    "faces": "faces",
+    "boundary_edges": "boundary edges",
+    "manifold": "manifold3d",
+    "quality_correlation": "quality: correlation",
+    "quality_ratio": "error / quality",
+    "seconds": "s",
+    "gib": "GiB",
+}
+
+
+def score(run: Path, reference: Path, method: str, options: ExtractOptions, target: Path) -> dict:
+    """Extracts one mesh to `target` and returns its row."""
+    from scipy.stats import spearmanr
+
+    from linprim_geo.eval.mesh import score_mesh
+    from linprim_geo.eval.surface_samples import SurfaceDistance
+    from linprim_geo.geometry.mesh import clean_mesh
+    from linprim_geo.geometry.mesh_files import load_mesh
+    from linprim_geo.runs.run import Run
+    from linprim_geo.surface.extract import extract_mesh
+
+    stats = extract_mesh(run, method, target, options, quiet=True)
+    cameras = [view.camera for view in Run.open(run).scene().train]
+    truth = load_mesh(reference)
+    whole = score_mesh(load_mesh(target), truth, samples=SAMPLES, cameras=cameras)
+    seen, shown = whole["visible"], load_mesh(stats["mesh_visible"])
+    error, _ = SurfaceDistance(clean_mesh(truth)[0]).query(shown.vertices)
+    told = np.isfinite(shown.quality)
+    return {
+        "method": method,
+        "level": stats["level"],
+        "chamfer": seen["chamfer_percent_diagonal"],
+        "chamfer_whole": whole["chamfer_percent_diagonal"],
+        "f1": seen["f1"],
+        "normal_consistency": seen["normal_consistency"],
+        "faces": stats["faces"],
+        "boundary_edges": stats["boundary_edges"],
+        "manifold": stats["manifold_status"],
+        "quality_correlation": float(spearmanr(shown.quality[told], error[told])[0]),
+        "quality_ratio": float(error[told].mean() / shown.quality[told].mean()),
+        "seconds": stats["seconds"]["total"],
+        "gib": max(stats["peak_gib"].values()),
+    }
+
+
+def table(rows: list[dict]) -> str:
+    """Markdown."""
+    lines = ["| " + " | ".join(COLUMNS.values()) + " |", "|---" * len(COLUMNS) + "|"]
+    for row in rows:
+        cells = [
+            "–" if row[name] is None else f"{row[name]:.3g}" if isinstance(row[name], float) else str(row[name])
+            for name in COLUMNS
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="DIR", help="folder of captures, runs, meshes and results"
+    )
+    parser.add_argument(
+        "--scenes", nargs="*", choices=BUILT_IN, default=list(BUILT_IN), help="built-in scenes (default: all)"
+    )
+    parser.add_argument(
+        "--data", nargs="*", type=Path, default=[], metavar="CAPTURE", help="folders of further captures"
+    )
+    parser.add_argument(
+        "--references", nargs="*", type=Path, default=[], metavar="MESH", help="their surfaces, in the same order"
+    )
+    parser.add_argument("--primitives", nargs="+", choices=list(METHODS), default=list(METHODS), help="default: all")
+    parser.add_argument(
+        "--methods", nargs="+", choices=METHODS["octahedron"], default=METHODS["octahedron"], help="default: all"
+    )
+    parser.add_argument(
+        "--refine", type=int, default=ExtractOptions.refine, help="rounds, see extract-mesh (default: %(default)s)"
+    )
+    parser.add_argument("--size", type=int, default=320, help="pixels of the built-in scenes (default: %(default)s)")
+    parser.add_argument("--iterations", type=int, default=7000, help="default: %(default)s")
+    parser.add_argument("--max-primitives", type=int, default=5000, help="default: %(default)s")
+    parser.add_argument("--downscale", type=int, default=1, help="of the captures (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
+    given = parser.parse_args(arguments)
+    try:
+        run(given)
+    except LinprimError as error:
+        print(f"surfaces: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def run(given: argparse.Namespace) -> None:
+    """Everything that the command does."""
+    from linprim_geo.synthetic.synth import synthesize
+    from linprim_geo.training.train import train
+
+    if len(given.references) != len(given.data):
+        raise LinprimError(
+            f"{len(given.references)} references go with {len(given.data)} captures, wanted one for each"
+        )
+    jobs = []
+    for name in given.scenes:
+        capture = given.output / f"{name}_{given.size}"
+        if not capture.exists():
+            synthesize(
+                capture, shape=name, views=60, test_views=8, size=(given.size, given.size), points=5000, seed=given.seed
+            )
+        jobs.append((name, capture, capture / "reference.ply", SceneOptions()))
+    for capture, reference in zip(given.data, given.references, strict=True):
+        jobs.append((capture.name, capture, reference, SceneOptions(downscale=given.downscale)))
+    rows, options = [], None
+    for name, capture, reference, scene_options in jobs:
+        for primitive in given.primitives:
+            options = TrainOptions(
+                primitive=primitive,
+                iterations=given.iterations,
+                max_primitives=given.max_primitives,
+                sh_degree=1,
+                seed=given.seed,
+                evaluate_every=0,
+            )
+            trained = given.output / f"{name}_{primitive}"
+            train(capture, trained, scene_options, options, resume=trained.exists(), quiet=True)
+            for method in [m for m in METHODS[primitive] if m in given.methods]:
+                target = given.output / "meshes" / f"{name}_{primitive}_{method}_{given.refine}.ply"
+                saved = target.with_suffix(".json")
+                if not saved.exists():
+                    write_json(saved, score(trained, reference, method, ExtractOptions(refine=given.refine), target))
+                rows.append({"scene": name, "primitive": primitive, **json.loads(saved.read_text())})
+                print(json.dumps(rows[-1]), flush=True)
+    write_json(given.output / "surfaces.json", {"train_options": asdict(options), "refine": given.refine, "rows": rows})
+    with atomic_write(given.output / "surfaces.md") as temporary:
+        temporary.write_text(table(rows))
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,159 @@
+"""The two plots of the README out of a sweep: what the ladder of rendering costs, and what surfaces cost in training
+and in extraction.
+
+    linprim-geo tradeoff SCENE -o SWEEP
+    python -m linprim_geo.eval.tradeoff.figures SWEEP -o tools
+
+writes tradeoff_ladder.svg and tradeoff_surface.svg, each two panels on a ground of its own, light or dark as the reader
+has it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import atomic_write, read_json
+from linprim_geo.eval.tradeoff.frontier import frontier
+from linprim_geo.eval.tradeoff.knobs import KNOBS
+from linprim_geo.eval.tradeoff.page import plot
+from linprim_geo.imaging import plots as svg
+
+TOP, GAP = 26, 8
+LIGHT = {
+    "ground": "#ffffff",
+    "ink": "#1b1f24",
+    "plot": "#fafbfc",
+    "edge": "#c8ced6",
+    "line": "#e3e7ec",
+    "blue": "#1f63b2",
+    "dim": "#707a86",
+}
+DARK = {
+    "ground": "#0d1117",
+    "ink": "#d9dfe6",
+    "plot": "#141a21",
+    "edge": "#3a434e",
+    "line": "#242c35",
+    "blue": "#6cb0ff",
+    "dim": "#8f99a5",
+}
+# What a rung is called where several knobs are in one plot; knobs that are not here keep the names of their rungs.
+NAMES = {
+    "rays": "{} rays",
+    "order": "{} order",
+    "scalar": "{}",
+    "iterations": "{} of the steps",
+    "primitives": "{} of the primitives",
+    "scale": "{} image scale",
+    "views": "{} of the views",
+}
+TWICE = re.compile(r"^2 of the ")
+
+
+def rungs(rows: Sequence[dict], knobs: Sequence[str], error: str) -> list[dict]:
+    """The measured rungs of some knobs for one plot: named, the shared default once, and the frontier of all of them
+    anew."""
+    found, default = [], None
+    for row in rows:
+        if row["knob"] not in knobs or row.get(error) is None or row["seconds"] <= 0:
+            continue
+        if row["default"] and len(knobs) > 1:
+            default = default or row | {"rung": "default"}
+            continue
+        name = NAMES.get(row["knob"], "{}").format(row["rung"]) if len(knobs) > 1 else row["rung"]
+        found.append(row | {"rung": TWICE.sub("twice the ", name)})
+    found += [default] if default else []
+    on = set(frontier([(row["seconds"], row[error]) for row in found]))
+    return [row | {"frontier": index in on} for index, row in enumerate(found)]
+
+
+def figure(panels: Sequence[tuple[str, Sequence[dict], str]], name: str) -> str:
+    """An SVG file of panels (title, rows, error) beside each other; `name` says what it is to who cannot see it."""
+    width, height = len(panels) * svg.WIDTH + (len(panels) - 1) * GAP, svg.HEIGHT + TOP - 16
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" '
+        f'height="{height}" role="img" '
+        f'aria-label="{escape(name)}">',
+        f"<style>svg {{ {_colors(LIGHT)} }} @media (prefers-color-scheme: dark) {{ svg {{ {_colors(DARK)} }} "
+        f"}}{svg.STYLE}"
+        "svg text { font-size: 12.5px; } svg .ground { fill: var(--ground); } svg .title { font-weight: 600; "
+        "font-size: 14px; }</style>",
+        f'<rect class="ground" width="{width}" height="{height}" rx="6"/>',
+    ]
+    for index, (title, rows, error) in enumerate(panels):
+        left = index * (svg.WIDTH + GAP)
+        parts.append(f'<text class="title" x="{left + svg.LEFT}" y="{TOP - 4}">{escape(title)}</text>')
+        parts.append(f'<g transform="translate({left} {TOP - 16})">{plot(rows, error)}</g>')
+    return "\n".join([*parts, "</svg>\n"])
+
+
+def figures(sweep: Path, output: Path) -> list[Path]:
+    """Writes both files from the `tradeoff.json` in the folder `sweep` into `output`; returns their paths.
+
+    Raises:
+        LinprimError: it cannot be read, or lacks a knob or an error of a panel, as without a reference mesh.
+    """
+    file = sweep / "tradeoff.json"
+    results = read_json(file, "what linprim-geo tradeoff has written")
+    try:
+        rows = [row for row in results["rows"] if row["knob"] in KNOBS]
+    except (KeyError, TypeError):
+        raise LinprimError(f"{file}: has no rows of knobs, wanted what linprim-geo tradeoff has written") from None
+    ladder, training = ("rays", "order", "scalar"), ("iterations", "primitives", "scale", "views")
+    plots = {
+        "tradeoff_ladder.svg": (
+            "Image and depth error of the rungs of rendering over the seconds of a frame",
+            (
+                ("Image error of a frame", ladder, "image_percent"),
+                ("Depth error of a frame", ladder, "depth_percent"),
+            ),
+        ),
+        "tradeoff_surface.svg": (
+            "Chamfer distance of the surface over the seconds of training and of extraction",
+            (
+                ("Surface over training", training, "chamfer_percent"),
+                ("Surface over extraction", ("extraction",), "chamfer_percent"),
+            ),
+        ),
+    }
+    drawn = {}
+    for target, (name, panels) in plots.items():
+        shown = []
+        for title, knobs, error in panels:
+            of_panel = rungs(rows, knobs, error)
+            if len(of_panel) < 2:
+                raise LinprimError(
+                    f"{file}: has no {error} of {', '.join(knobs)}, wanted a sweep of all knobs on a scene with "
+                    "a reference mesh"
+                )
+            shown.append((title, of_panel, error))
+        drawn[output / target] = figure(shown, name)
+    for path, text in drawn.items():
+        with atomic_write(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    return list(drawn)
+
+
+def _colors(colors: dict[str, str]) -> str:
+    return " ".join(f"--{name}: {color};" for name, color in colors.items())
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sweep", type=Path, metavar="SWEEP", help="folder that linprim-geo tradeoff has made")
+    parser.add_argument("-o", "--output", type=Path, default=Path("tools"), metavar="DIR", help="default tools")
+    args = parser.parse_args(arguments)
+    try:
+        written = figures(args.sweep, args.output)
+    except LinprimError as error:
+        raise SystemExit(f"tradeoff_figures: error: {error}") from None
+    print("\n".join(map(str, written)))
+
+
+if __name__ == "__main__":
+    main()

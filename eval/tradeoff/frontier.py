@@ -1,0 +1,101 @@
+"""What a sweep of a knob says: the settings that no other beats in both time and error, and whether the dearer ones are
+worth it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from linprim_geo.eval.tradeoff.knobs import ERRORS, Knob
+
+# The rule of the verdict. A dearer rung is worth its time if error ~ time^-r with r at least this: what averaging
+# independent samples gives, which is always there as another way to spend time. Less error than this share is none.
+RETURN, LEAST_GAIN = 0.5, 0.01
+RULE = (
+    "A dearer rung is worth it if it divides the error by at least the root of what it multiplies the time by, "
+    "as averaging "
+    "independent samples would, and removes at least 1 % of it. Rungs are looked at from the fastest on, along "
+    "the frontier. Where "
+    "the middle halves of two timings overlap, they count as equal."
+)
+
+
+def frontier(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Indices of the (seconds, error) that no other beats in both, from the fastest on; of equal ones the first. NaN is
+    beaten."""
+    order = sorted((p for p in range(len(points)) if all(map(math.isfinite, points[p]))), key=lambda p: (*points[p], p))
+    kept: list[int] = []
+    for k in order:
+        if not kept or points[k][1] < points[kept[-1]][1]:
+            kept.append(k)
+    return kept
+
+
+def pays(cheap: dict, dear: dict, error: str) -> bool:
+    """Whether the step from one row to a dearer one follows RULE."""
+    a, b = cheap[error], dear[error]
+    if not b < (1 - LEAST_GAIN) * a:
+        return False
+    ratio = 1.0 if same_time(cheap, dear) else dear["seconds"] / cheap["seconds"]
+    return b <= 0 or ratio <= 1 or math.log(a / b) >= RETURN * math.log(ratio)
+
+
+def same_time(one: dict, other: dict) -> bool:
+    """Whether the middle halves of two timings overlap; single timings do not count as equal."""
+    if min(one["rounds"], other["rounds"]) < 2:
+        return False
+    return one["low"] <= other["high"] and other["low"] <= one["high"]
+
+
+def verdict(knob: Knob, rows: Sequence[dict]) -> dict:
+    """The sentence about a knob from its rows, and `error`, `cheapest`, `taken`, `most_accurate` (names of rungs).
+
+    A row has `rung`, `seconds`, `low`, `high`, `rounds`, and the errors; the first of the knob's errors that all rows
+    have decides.
+    """
+    rows = [row for row in rows if math.isfinite(row.get("seconds", math.nan))]
+    known = [name for name in knob.errors if rows and all(math.isfinite(row.get(name, math.nan)) for row in rows)]
+    title = knob.title[0].upper() + knob.title[1:]
+    if not known or len(rows) < 2:
+        return {"sentence": f"{title}: nothing here to judge it by.", "error": None}
+    error = known[0]
+    on = [rows[k] for k in frontier([(row["seconds"], row[error]) for row in rows])]
+    cheapest, best = on[0], on[-1]
+    taken = cheapest
+    for row in on[1:]:
+        if pays(taken, row, error):
+            taken = row
+    what = ERRORS[error].title
+    if taken is not cheapest:
+        text = f"{title}: {_step(cheapest, taken, error)}: worth it"
+        if best is not taken:
+            text += f"; {_step(taken, best, error, more=True)}: not worth it"
+    elif best is not cheapest:
+        text = f"{title}: {_step(cheapest, best, error)}: not worth it"
+    else:
+        others = [row for row in rows if row is not cheapest]
+        dearest = max(others, key=lambda row: row["seconds"])
+        text = (
+            f"{title}: {cheapest['rung']} is the fastest, and no other removes any of the {what} "
+            f"({dearest['rung']} costs {_times(cheapest, dearest)}): others are not worth it"
+        )
+    names = {"cheapest": cheapest["rung"], "taken": taken["rung"], "most_accurate": best["rung"]}
+    return {"sentence": text + ".", "error": error, **names}
+
+
+def _step(cheap: dict, dear: dict, error: str, more: bool = False) -> str:
+    a, b = cheap[error], dear[error]
+    unit = f" {ERRORS[error].unit}" if ERRORS[error].unit else ""
+    less = 100 * (1 - b / a) if a > 0 else 0.0
+    share = "over 99" if less > 99 else f"{less:.0f}" if less >= 9.5 else f"{less:.1g}"
+    verb = "would cost" if more else "costs"
+    return (
+        f"{dear['rung']} {verb} {_times(cheap, dear)} the time of {cheap['rung']} and "
+        f"remove{'' if more else 's'} {share} % of the "
+        f"{ERRORS[error].title} ({a:.3g} to {b:.3g}{unit})"
+    )
+
+
+def _times(cheap: dict, dear: dict) -> str:
+    text = f"{dear['seconds'] / cheap['seconds']:.2f}x"
+    return text + (" (within the spread of the timings)" if same_time(cheap, dear) else "")

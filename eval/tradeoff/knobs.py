@@ -1,0 +1,231 @@
+"""Every knob that trades time for accuracy: its rungs from cheap to dear, how a rung is set, and the error that it is
+judged by.
+
+What a rung sets is a table of changes to the defaults; `eval/tradeoff.py` sweeps one knob at a time. Of the four
+groups, `render` changes keywords of `ops.rasterize` (and the scalar and the degree of its tensors) on a trained run,
+`train` changes options or the photographs of a training, `extract` the method and the voxel size, `evaluate` the points
+of a score.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from linprim_geo.base.options import SceneOptions, TrainOptions
+
+GROUPS = ("render", "train", "extract", "evaluate")
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One setting of a knob: its `name` as shown, and what it changes of the defaults (nothing for the default
+    itself)."""
+
+    name: str
+    changes: dict = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Knob:
+    """A knob. `errors` are keys of `ERRORS`: the first that a scene allows decides, the others are reported beside
+    it."""
+
+    name: str
+    title: str
+    group: str
+    rungs: tuple[Rung, ...]
+    default: str  # name of a rung
+    errors: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Error:
+    """A measure of what is lost: how it is called, its unit, and whether it falls to 0 for a perfect result."""
+
+    title: str
+    unit: str = ""
+
+
+ERRORS = {
+    "depth_percent": Error("depth error", "%"),
+    "image_percent": Error("image error", "% of the range"),
+    "alone_percent": Error("image error of this knob alone", "% of the range"),
+    "popping_percent": Error("popping", "% of the range"),
+    "photo_percent": Error("held-out image error", "% of the range"),
+    "chamfer_percent": Error("Chamfer distance", "% of the diagonal"),
+    "normal_percent": Error("normal inconsistency", "%"),
+    "boundary_edges": Error("boundary edges"),
+    "standard_error_percent": Error("standard error of the score", "% of the diagonal"),
+}
+# What rendering is without any changes: `train`'s defaults; a run of a lower degree has no rungs above it. The
+# reference is the integral itself, in double precision, of all degrees that the run has.
+RENDER_DEFAULTS = {"ray_model": "exact", "order": "center", "scalar": "float32", "stop": 1e-3, "degree": 2}
+RENDER_REFERENCE = {"ray_model": "exact", "order": "overlap", "scalar": "float64", "stop": 0.0, "degree": 3}
+# Extraction without changes: the voxel that the views support, times 1.
+EXTRACT_DEFAULTS = {"method": "tsdf", "voxel": 1.0}
+EVALUATE_DEFAULTS = {"samples": 200_000}
+
+RENDER_ERRORS = ("depth_percent", "image_percent")
+TRAIN_ERRORS = ("chamfer_percent", "depth_percent", "photo_percent")
+
+
+def _rungs(key: str, values: dict) -> tuple[Rung, ...]:
+    """A rung for each name, that sets `key` to its value."""
+    return tuple(Rung(name, {key: value}) for name, value in values.items())
+
+
+KNOBS = {
+    knob.name: knob
+    for knob in (
+        Knob(
+            "rays",
+            "ray model",
+            "render",
+            _rungs("ray_model", {"affine": "affine", "exact": "exact"}),
+            "exact",
+            RENDER_ERRORS,
+        ),
+        Knob(
+            "order",
+            "order of blending",
+            "render",
+            _rungs("order", {x: x for x in ("center", "entry", "overlap")}),
+            "center",
+            (*RENDER_ERRORS, "popping_percent"),
+        ),
+        Knob(
+            "scalar",
+            "scalar",
+            "render",
+            _rungs("scalar", {x: x for x in ("float32", "float64")}),
+            "float32",
+            ("image_percent", "depth_percent", "alone_percent"),
+        ),
+        Knob(
+            "stop",
+            "transmittance at which rays end",
+            "render",
+            _rungs("stop", {"1e-2": 1e-2, "1e-3": 1e-3, "1e-4": 1e-4, "0": 0.0}),
+            "1e-3",
+            ("image_percent", "depth_percent", "alone_percent"),
+        ),
+        Knob(
+            "degree",
+            "degree of the colour that is drawn",
+            "render",
+            _rungs("degree", {str(d): d for d in range(4)}),
+            "2",
+            ("image_percent",),
+        ),
+        Knob(
+            "trained-degree",
+            "degree of the colour that is trained",
+            "train",
+            _rungs("sh_degree", {str(d): d for d in range(4)}),
+            "2",
+            ("photo_percent",),
+        ),
+        Knob(
+            "primitive",
+            "primitive",
+            "train",
+            (
+                *_rungs("primitive", {x: x for x in ("octahedron", "tetrahedron", "gaussian")}),
+                Rung("tetrahedron, equal time", {"primitive": "tetrahedron", "equal_time": True}),
+                Rung("gaussian, equal time", {"primitive": "gaussian", "equal_time": True}),
+            ),
+            "octahedron",
+            TRAIN_ERRORS,
+        ),
+        Knob(
+            "primitives",
+            "most primitives",
+            "train",
+            _rungs("max_primitives_times", {"1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0}),
+            "1",
+            TRAIN_ERRORS,
+        ),
+        Knob(
+            "iterations",
+            "training steps",
+            "train",
+            _rungs("iterations_times", {"1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0}),
+            "1",
+            TRAIN_ERRORS,
+        ),
+        Knob(
+            "scale",
+            "image scale",
+            "train",
+            _rungs("downscale_times", {"1/4": 4, "1/2": 2, "1": 1}),
+            "1",
+            TRAIN_ERRORS,
+        ),
+        Knob(
+            "views",
+            "training views",
+            "train",
+            _rungs("views", {"1/4": 0.25, "1/2": 0.5, "all": 1.0}),
+            "all",
+            TRAIN_ERRORS,
+        ),
+        Knob(
+            "extraction",
+            "extraction, method and voxel",
+            "extract",
+            (
+                *(Rung(f"tsdf x{v:g}", {"method": "tsdf", "voxel": v}) for v in (4.0, 2.0, 1.0, 0.5)),
+                Rung("polyhedra", {"method": "polyhedra"}),
+            ),
+            "tsdf x1",
+            ("chamfer_percent", "normal_percent", "boundary_edges"),
+        ),
+        Knob(
+            "samples",
+            "points of an evaluation",
+            "evaluate",
+            _rungs("samples", {f"{n:,}": n for n in (1_000, 5_000, 30_000, 200_000)}),
+            "200,000",
+            ("standard_error_percent",),
+        ),
+    )
+}
+
+
+def rung(knob: Knob, name: str) -> Rung:
+    """The rung of that name."""
+    return next(r for r in knob.rungs if r.name == name)
+
+
+def settings(knob: Knob, rung: Rung) -> dict:
+    """What is measured for a rung: the defaults of the knob's group with its changes, so that a setting that several
+    knobs have in common is measured once. Of training only what differs from the base, and nothing for a rung that is
+    the base."""
+    base = {"render": RENDER_DEFAULTS, "extract": EXTRACT_DEFAULTS, "evaluate": EVALUATE_DEFAULTS, "train": {}}[
+        knob.group
+    ]
+    if knob.group == "train" and rung.name == knob.default:
+        return {}
+    return base | rung.changes
+
+
+def training_options(
+    options: TrainOptions, scene: SceneOptions, views: int, changes: dict
+) -> tuple[TrainOptions, SceneOptions]:
+    """The base's options with the changes of a rung of the group `train`; `views` is the number of training views of
+    the scene.
+
+    `*_times` multiply the base's value, `views` is a share, `equal_time` is the sweep's business; everything else is an
+    option.
+    """
+    at_once = {}
+    for name, value in changes.items():
+        if name == "downscale_times":
+            scene = replace(scene, downscale=scene.downscale * value)
+        elif name == "views":
+            scene = replace(scene, views=max(2, round(views * value)))
+        elif name.endswith("_times"):
+            at_once[name.removesuffix("_times")] = max(1, round(getattr(options, name.removesuffix("_times")) * value))
+        elif name != "equal_time":
+            at_once[name] = value
+    return replace(options, **at_once), scene

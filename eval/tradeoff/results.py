@@ -1,0 +1,102 @@
+"""What a sweep has measured as rows, with a verdict for each knob: `tradeoff.csv`, `tradeoff.json` and
+`tradeoff.html`."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from linprim_geo.base.files import atomic_write, write_json
+from linprim_geo.eval.tradeoff.frontier import RULE, frontier, verdict
+from linprim_geo.eval.tradeoff.knobs import ERRORS, Knob, Rung
+from linprim_geo.eval.tradeoff.page import page
+
+COLUMNS = (
+    "knob",
+    "rung",
+    "default",
+    "frontier",
+    "seconds",
+    "low",
+    "high",
+    "rounds",
+    "gradient_seconds",
+    "peak_gib",
+    *ERRORS,
+    "psnr",
+    "primitives",
+    "faces",
+)
+
+
+def write_report(
+    folder: Path, about: dict, knobs: Sequence[Knob], measured: Mapping[str, Sequence[tuple[Rung, dict]]]
+) -> dict:
+    """Writes the three files into `folder` and returns what the JSON holds.
+
+    Args:
+        about: what was swept, and how.
+        measured: by the knob's name its rungs and what `tradeoff.Sweep` has stored of each.
+    """
+    rows, verdicts = [], {}
+    for knob in knobs:
+        mine = [_row(knob, rung, entry) for rung, entry in measured[knob.name]]
+        verdicts[knob.name] = verdict(knob, mine)
+        error = verdicts[knob.name]["error"]
+        on = {mine[k]["rung"] for k in frontier([(row["seconds"], row[error]) for row in mine])} if error else set()
+        rows += [row | {"frontier": row["rung"] in on} for row in mine]
+    results = {
+        "about": about,
+        "rule": RULE,
+        "sentences": {name: found["sentence"] for name, found in verdicts.items()},
+        "verdicts": verdicts,
+        "rows": rows,
+    }
+    results = json.loads(json.dumps(_without_nan(results)))
+    write_json(folder / "tradeoff.json", results)
+    with atomic_write(folder / "tradeoff.csv") as temporary:
+        with open(temporary, "w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, fieldnames=list(COLUMNS), restval="", extrasaction="ignore")
+            writer.writeheader()
+            writer.writerows(
+                {name: "" if value is None else value for name, value in row.items()} for row in results["rows"]
+            )
+    with atomic_write(folder / "tradeoff.html") as temporary:
+        temporary.write_text(page(results, {knob.name: knob for knob in knobs}), encoding="utf-8")
+    return results
+
+
+def _row(knob: Knob, rung: Rung, entry: dict) -> dict:
+    low, middle, high = np.percentile(entry["times"], [25, 50, 75])
+    row = {
+        "knob": knob.name,
+        "rung": rung.name,
+        "default": rung.name == knob.default,
+        "seconds": float(middle),
+        "low": float(low),
+        "high": float(high),
+        "rounds": len(entry["times"]),
+        "peak_gib": entry["peak_gib"],
+    }
+    if entry.get("gradient_times"):
+        row["gradient_seconds"] = float(np.median(entry["gradient_times"]))
+    found = {name: entry["errors"][name] for name in (*knob.errors, "psnr") if entry["errors"].get(name) is not None}
+    return (
+        row
+        | {name: math.nan for name in knob.errors}
+        | found
+        | {n: entry[n] for n in ("primitives", "faces") if n in entry}
+    )
+
+
+def _without_nan(value):
+    if isinstance(value, dict):
+        return {name: _without_nan(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

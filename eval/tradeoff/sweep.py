@@ -1,0 +1,643 @@
+"""What accuracy costs in time on a scene: every knob of `eval/knobs.py` swept one at a time around the defaults.
+
+Writes `tradeoff.csv`, `tradeoff.json` and `tradeoff.html`. All settings of a group are timed in turn, round after
+round, so that a noisy machine hurts all alike; a timing is the median of the rounds with its quartiles. What was
+measured is kept in `measured.json` of the folder, and taken from there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import write_json
+from linprim_geo.base.options import SceneOptions, TrainOptions
+from linprim_geo.base.progress import Progress
+from linprim_geo.eval.tradeoff.knobs import (
+    KNOBS,
+    RENDER_DEFAULTS,
+    RENDER_REFERENCE,
+    Knob,
+    Rung,
+    settings,
+    training_options,
+)
+from linprim_geo.eval.tradeoff.results import write_report
+from linprim_geo.jobs.executor import Executor, Task
+from linprim_geo.jobs.open import open_executor
+from linprim_geo.training.budget.memory import memory_estimate
+from linprim_geo.training.step.training_images import photo_bytes
+
+# The training that knobs are swept around: a modest size of the defaults, images averaged down to at most so many
+# pixels across.
+MODEST = {"iterations": 2000, "max_primitives": 2000}
+QUICK = {"iterations": 200, "max_primitives": 200}
+WIDEST, QUICK_WIDEST = 400, 128
+ROUNDS, QUICK_ROUNDS = 3, 2
+# Held-out views that render knobs are measured on.
+RENDERED_VIEWS, QUICK_VIEWS = 8, 2
+# A view is drawn so many times in a round, and the shortest counts.
+REPEATS = 3
+# A view is rotated by this many pixels at its middle to see what pops.
+POP_PX = 0.5
+# Points of a score that is not the knob itself.
+POINTS = 30_000
+
+
+def tradeoff(
+    scene: str | os.PathLike,
+    output: str | os.PathLike,
+    *,
+    knobs: Sequence[str] = (),
+    run: str | os.PathLike | None = None,
+    reference: str | os.PathLike | None = None,
+    quick: bool = False,
+    rounds: int | None = None,
+    iterations: int | None = None,
+    max_primitives: int | None = None,
+    threads: int = 0,
+    cluster: str | None = None,
+    workers: int | None = None,
+    quiet: bool = False,
+) -> dict:
+    """Sweeps the knobs on a scene and writes the tables and the page into the folder `output`.
+
+    Args:
+        knobs: names out of `KNOBS`; none means all.
+        run: a run of this scene that render, extraction and evaluation knobs are measured on, which is not changed;
+            without it one is trained with the defaults at the size `MODEST`, which is also what training knobs are
+            swept around.
+        reference: mesh in the data set's frame for Chamfer distances and depth; default: `reference.ply` in the scene,
+            if there.
+        quick: the size `QUICK`, to see that all of it runs.
+        rounds: how often everything is timed (default 3, quick 2).
+        iterations, max_primitives: in place of those of `MODEST` or `QUICK`.
+        cluster, workers: where and how many trainings at once, see `executor.open_executor`; they share the cores of a
+            machine, and are timed so. Neither: here, one after another. Everything else is measured here in any case.
+
+    Returns: what tradeoff.json holds: `rows` (one per rung of each knob), `sentences`, `rule`, `about`.
+
+    Raises:
+        LinprimError: a knob has another name, the scene or the run cannot be used, or the folder holds another sweep.
+    """
+    unknown = [name for name in knobs if name not in KNOBS]
+    if unknown:
+        raise LinprimError(f"--knobs {unknown[0]} is unknown, wanted some of {', '.join(KNOBS)}")
+    if rounds is not None and rounds < 1:
+        raise LinprimError(f"--rounds is {rounds}, wanted at least 1")
+    size = {"iterations": iterations, "max_primitives": max_primitives}
+    for name, value in size.items():
+        if value is not None and value < 1:
+            raise LinprimError(f"--{name.replace('_', '-')} is {value}, wanted at least 1")
+    size = (QUICK if quick else MODEST) | {name: value for name, value in size.items() if value is not None}
+    sweep = Sweep(Path(scene), Path(output), run, reference, quick, rounds, size, threads, quiet)
+    chosen = [KNOBS[name] for name in KNOBS if not knobs or name in knobs]
+    if cluster is None and workers is None:
+        return sweep.measure(chosen)
+    cores, own_machines = os.cpu_count() or 1, cluster not in (None, "local")
+    with open_executor(cluster, sweep.folder / "runs", workers or 0) as executor:
+        sweep.executor, sweep.cores = (
+            executor,
+            threads or (cores if own_machines else max(1, cores // (workers or cores))),
+        )
+        sweep.slot = sweep.cores if own_machines else 1
+        return sweep.measure(chosen)
+
+
+class Sweep:
+    """One folder of measurements. `store[key]` of a setting holds `times`, `peak_gib`, and what was found of it once.
+    With an `executor` trainings are its tasks, on so many `cores` each, and count as `slot` of its own."""
+
+    executor: Executor | None = None
+    cores = slot = 1
+
+    def __init__(self, scene, folder, run, reference, quick, rounds, size, threads, quiet):
+        from linprim_geo.capture.load import load_scene
+        from linprim_geo.capture.structure_from_motion import prepare
+
+        self.scene_path, self.folder, self.given, self.quick, self.threads = (
+            Path(os.path.realpath(scene)),
+            folder,
+            run,
+            quick,
+            threads,
+        )
+        self.rounds = rounds or (QUICK_ROUNDS if quick else ROUNDS)
+        self.progress = Progress("tradeoff", 1, quiet=quiet)
+        self.warm = self.warm_score = self.warm_train = (
+            False  # the first time of all loads libraries, and is not counted
+        )
+        prepare(scene, threads=threads, log=self.progress.note)
+        self.scene = load_scene(scene)
+        widest = max(view.camera.width for view in self.scene.train)
+        self.scene_options = SceneOptions(downscale=-(-widest // (QUICK_WIDEST if quick else WIDEST)))
+        self.options = TrainOptions(**size, threads=threads, evaluate_every=0, checkpoint_every=10**9)
+        found = Path(reference) if reference else self.scene_path / "reference.ply"
+        if reference and not found.exists():
+            raise LinprimError(f"{found}: no such file, wanted a reference mesh")
+        self.reference = found if found.exists() else None
+        about = {
+            "scene": str(self.scene_path),
+            "run": str(Path(run).resolve()) if run else None,
+            "reference": str(self.reference) if self.reference else None,
+            "options": asdict(self.options) | {"threads": threads},
+            "scene_options": asdict(self.scene_options),
+        }
+        self.about = json.loads(json.dumps(about))
+        self.store: dict[str, dict] = {}
+        saved = folder / "measured.json"
+        if saved.exists():
+            try:
+                held = json.loads(saved.read_text())
+                before, self.store = held["about"], held["measured"]
+            except (OSError, ValueError, KeyError, TypeError):
+                raise LinprimError(f"{saved}: is damaged, wanted what an earlier sweep has written") from None
+            if before != self.about:
+                what = next(name for name in self.about if before.get(name) != self.about[name])
+                raise LinprimError(f"{folder}: holds a sweep of another {what}; give another folder with -o")
+        elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise LinprimError(f"{folder}: exists already and holds no sweep; give another folder with -o")
+
+    # --- what is measured -------------------------------------------------------------------------------
+
+    def measure(self, knobs: Sequence[Knob]) -> dict:
+        """Measures what is missing, and writes the results."""
+        import torch
+
+        from linprim_geo.kernels import ops
+
+        before = torch.get_num_threads()
+        torch.set_num_threads(1)
+        ops.set_threads(self.threads)
+        try:
+            knobs = [self._fitting(knob) for knob in knobs]
+            for group, measure in (
+                ("train", self._train),
+                ("render", self._render),
+                ("extract", self._extract),
+                ("evaluate", self._evaluate),
+            ):
+                mine = [knob for knob in knobs if knob.group == group]
+                if group in ("extract", "evaluate") and self.reference is None and mine:
+                    self.progress.note(
+                        f"no reference mesh, so {', '.join(k.name for k in mine)}: time alone, or nothing"
+                    )
+                    if group == "evaluate":
+                        continue
+                self._in_turn(group, mine, measure)
+        finally:
+            torch.set_num_threads(before)
+        return self._report(knobs)
+
+    def _fitting(self, knob: Knob) -> Knob:
+        """The knob without the rungs that the run, or this installation, does not have."""
+        from linprim_geo.surface.extract import METHODS
+
+        rungs = knob.rungs
+        if knob.name == "degree":
+            degree = self.render_defaults["degree"]
+            return replace(knob, rungs=tuple(r for r in rungs if r.changes["degree"] <= degree), default=str(degree))
+        if knob.group == "extract":
+            return replace(knob, rungs=tuple(r for r in rungs if r.changes["method"] in METHODS))
+        return knob
+
+    def _setting(self, knob: Knob, rung: Rung) -> dict:
+        found = settings(knob, rung)
+        return (
+            found
+            if knob.group != "render"
+            else found | {"degree": rung.changes.get("degree", self.render_defaults["degree"])}
+        )
+
+    def _in_turn(self, group: str, knobs: Sequence[Knob], measure: Callable[[str, dict, set, int], None]) -> None:
+        """Every setting of a group once per round, unless it was measured in that round before."""
+        wanted: dict[str, tuple[dict, set]] = {}
+        for knob in knobs:
+            for rung in knob.rungs:
+                setting = self._setting(knob, rung)
+                wanted.setdefault(_key(group, setting), (setting, set()))[1].update(knob.errors)
+        for turn in range(self.rounds):
+            if group == "train" and self.executor:
+                each = [setting for setting, _ in wanted.values()]
+                self._train_at_once([setting for setting in each if "equal_time" not in setting], turn)
+                self._train_at_once([setting for setting in each if "equal_time" in setting], turn)
+            for key, (setting, errors) in wanted.items():
+                entry = self.store.setdefault(key, {"setting": setting, "times": [], "peak_gib": 0.0, "errors": {}})
+                if "failed" in entry or (
+                    len(entry["times"]) > turn and errors <= entry["errors"].keys() | {"photo_percent"}
+                ):
+                    continue
+                self.progress.note(f"{group}, round {turn + 1} of {self.rounds}: {_shown(setting)}")
+                try:
+                    measure(key, setting, errors, turn)
+                except LinprimError as error:
+                    entry["failed"] = str(error)
+                    self.progress.note(f"  {error}")
+                self._save()
+
+    def _save(self) -> None:
+        write_json(self.folder / "measured.json", {"about": self.about, "measured": self.store})
+
+    def _note(self, key: str, seconds: float, peak_gib: float = 0.0, **more) -> None:
+        entry = self.store[key]
+        entry["times"].append(seconds)
+        entry["peak_gib"] = max(entry["peak_gib"], peak_gib)
+        entry.update(more)
+
+    # --- the run that is looked at ----------------------------------------------------------------------
+
+    @cached_property
+    def base(self) -> Path:
+        """Folder of the run that render, extraction and evaluation knobs are measured on: a copy of the given one, or
+        the trained base."""
+        if self.given is None:
+            key = _key("train", {})
+            if not (self.store.get(key, {}).get("errors")):
+                self.store.setdefault(key, {"setting": {}, "times": [], "peak_gib": 0.0, "errors": {}})
+                self.progress.note("training with the defaults")
+                self._train(key, {}, set(KNOBS["primitive"].errors), 0)
+                if self.executor:
+                    self.store[key]["times"].clear()  # it was alone; the others share the cores
+                self._save()
+            return self.folder / "runs" / _name({})
+        from linprim_geo.runs.run import Run
+
+        Run.open(self.given)
+        copy = self.folder / "runs" / "given"
+        copy.mkdir(parents=True, exist_ok=True)
+        for name in ("config.json", "transform.json", "run.json", "training_frame.npz"):
+            if not (Path(self.given) / name).exists():
+                raise LinprimError(
+                    f"{self.given}: {name} is missing, so this is not the folder of a run that has saved something"
+                )
+            shutil.copy(Path(self.given) / name, copy / name)
+        return copy
+
+    @cached_property
+    def run(self):
+        from linprim_geo.runs.run import Run
+
+        return Run.open(self.base)
+
+    @cached_property
+    def render_defaults(self) -> dict:
+        """The defaults with the degree of the run's colour."""
+        count = self.run.training_primitives().sh.shape[1]
+        return RENDER_DEFAULTS | {"degree": math.isqrt(count) - 1}
+
+    @cached_property
+    def cameras(self) -> list:
+        """Cameras, in the training frame, that render knobs are measured on."""
+        scene = self.run.scene()
+        views, most = scene.test or scene.train, QUICK_VIEWS if self.quick else RENDERED_VIEWS
+        return [view.camera.transformed(self.run.similarity) for view in views[:: -(-len(views) // most)]]
+
+    # --- render -----------------------------------------------------------------------------------------
+
+    def draw(self, setting: dict, camera, geometry: bool = False, gradients: bool = False):
+        """The run seen by a camera under a setting; with `gradients` the tensors' as well, of the mean of the
+        colour."""
+        import torch
+
+        from linprim_geo.base.options import raster_options
+        from linprim_geo.kernels import ops
+
+        primitives = self.run.training_primitives() if "primitives" not in self.__dict__ else self.primitives
+        self.primitives = primitives
+        dtype = torch.float64 if setting["scalar"] == "float64" else torch.float32
+        arrays = [primitives.center, primitives.rotation, primitives.extent, primitives.density]
+        arrays.append(primitives.sh[:, : (setting["degree"] + 1) ** 2])
+        tensors = [torch.from_numpy(np.ascontiguousarray(a)).to(dtype).requires_grad_(gradients) for a in arrays]
+        how = raster_options(self.run.train_options) | {"primitive": primitives.kind}
+        how |= {"ray_model": setting["ray_model"], "order": setting["order"], "stop": setting["stop"]}
+        if not ops.has_kernels(primitives.kind, how["ray_model"], how["order"]):
+            raise LinprimError(
+                f"a {primitives.kind} is not drawn in the order {how['order']} with {how['ray_model']} rays"
+            )
+        background = self.run.raster_arguments()[1].to(dtype)
+        begin = time.perf_counter()
+        out = ops.rasterize(*tensors, background, camera, geometry=geometry, **how)
+        if gradients:
+            torch.autograd.grad(out.rgb.mean(), tensors)
+        return out, time.perf_counter() - begin
+
+    @cached_property
+    def truth(self) -> list:
+        """Per camera the integral itself: (colour, depth, colour after the small rotation)."""
+        import torch
+
+        exact = RENDER_REFERENCE | {"degree": self.render_defaults["degree"]}
+        if self.run.training_primitives().kind == "gaussian":
+            exact |= {"order": "center"}
+        found = []
+        with torch.no_grad():
+            for camera in self.cameras:
+                out, _ = self.draw(exact, camera, geometry=True)
+                turned, _ = self.draw(exact, rotated(camera))
+                found.append((out.rgb.numpy(), out.depth_median.numpy(), turned.rgb.numpy()))
+        return found
+
+    def _render(self, key: str, setting: dict, errors: set, turn: int) -> None:
+        import torch
+
+        from linprim_geo.base.progress import Stages
+
+        entry = self.store[key]
+        if not errors <= entry["errors"].keys():
+            truth = self.truth
+            with torch.no_grad():
+                found = [
+                    self._render_errors(setting, camera, *t, errors)
+                    for camera, t in zip(self.cameras, truth, strict=True)
+                ]
+            entry["errors"] |= {name: float(np.mean([view[name] for view in found])) for name in found[0]}
+        if len(entry["times"]) > turn:
+            return
+        stages = Stages(self.progress)
+        with torch.no_grad():
+            frame = [min(self.draw(setting, camera)[1] for _ in range(REPEATS)) for camera in self.cameras]
+        with_gradient = [
+            min(self.draw(setting, camera, gradients=True)[1] for _ in range(REPEATS)) for camera in self.cameras
+        ]
+        stages.lap("draw")
+        self._note(key, float(np.mean(frame)), stages.peak_gib["draw"])
+        entry.setdefault("gradient_times", []).append(float(np.mean(with_gradient)))
+
+    def _render_errors(self, setting, camera, rgb, depth, rgb_turned, errors: set) -> dict:
+        out, _ = self.draw(setting, camera, geometry=True)
+        image, surface = out.rgb.double().numpy(), out.depth_median.double().numpy()
+        found = {"image_percent": 100 * math.sqrt(np.mean((image - rgb) ** 2))}
+        both = (surface > 0) & (depth > 0)
+        found["depth_percent"] = (
+            100 * float(np.mean(np.abs(surface - depth)[both] / depth[both])) if both.any() else math.nan
+        )
+        if "alone_percent" in errors:
+            exact = setting | {name: RENDER_REFERENCE[name] for name in ("scalar", "stop")}
+            alone = self.draw(exact, camera)[0].rgb.double().numpy()
+            found["alone_percent"] = 100 * math.sqrt(np.mean((image - alone) ** 2))
+        if "popping_percent" in errors:
+            turned = self.draw(setting, rotated(camera))[0].rgb.double().numpy()
+            beyond = np.abs(turned - image) - np.abs(rgb_turned - rgb)
+            found["popping_percent"] = 100 * float(np.mean(np.maximum(beyond, 0)))
+        return found
+
+    # --- train ------------------------------------------------------------------------------------------
+
+    def _options(self, key: str, setting: dict) -> tuple[TrainOptions, SceneOptions]:
+        """Those of a training, chosen once."""
+        entry = self.store[key]
+        if "options" not in entry:
+            options, scene_options = training_options(self.options, self.scene_options, len(self.scene.train), setting)
+            if setting.get("equal_time"):
+                options = replace(options, iterations=self._equal_time(setting, options.iterations))
+            entry["options"] = asdict(options), asdict(scene_options)
+        return TrainOptions(**entry["options"][0]), SceneOptions(**entry["options"][1])
+
+    def _train_at_once(self, settings: Sequence[dict], turn: int) -> None:
+        """The trainings of a round that are not measured yet, by the executor. Raises LinprimError for what ends them
+        all."""
+        assert self.executor is not None
+        tasks = {}
+        folder = self.folder / "runs" / f"round_{turn}_{self.cores}"
+        largest = max(view.camera.width * view.camera.height for view in self.scene.train)
+        for setting in settings:
+            key = _key("train", setting)
+            entry = self.store.setdefault(key, {"setting": setting, "times": [], "peak_gib": 0.0, "errors": {}})
+            if "failed" in entry or len(entry["times"]) > turn:
+                continue
+            options, scene_options = self._options(key, setting)
+            square = scene_options.downscale**2
+            arguments = {"scene": str(self.scene_path), "scene_options": asdict(scene_options)}
+            tasks[key] = Task(
+                _shown(setting),
+                "linprim_geo.eval.tradeoff.sweep:train_task",
+                arguments | {"options": asdict(replace(options, threads=self.cores))},
+                folder / _name(setting),
+                memory_estimate((), options, photo_bytes(self.scene.train) // square, largest // square),
+                self.slot,
+                "fewer --workers, or more memory",
+            )
+        self._save()
+        progress = Progress(f"train, round {turn + 1} of {self.rounds}", 1, quiet=self.progress.quiet)
+        for key, found in zip(tasks, self.executor.run(list(tasks.values()), progress), strict=True):
+            if "failed" in found:
+                self.store[key]["failed"] = found["failed"]
+                self.progress.note(f"  {found['failed']}")
+                self._save()
+                continue
+            trained, kept = tasks[key].folder / "run", self.folder / "runs" / _name(self.store[key]["setting"])
+            if not self.store[key]["errors"] and trained.exists():
+                shutil.rmtree(kept, ignore_errors=True)
+                trained.rename(kept)
+            self._note(key, found["seconds"], found["task_peak_gib"], primitives=found["primitives"])
+            self._save()
+        shutil.rmtree(folder, ignore_errors=True)
+
+    def _train(self, key: str, setting: dict, errors: set, turn: int) -> None:
+        from linprim_geo.base.progress import Stages
+        from linprim_geo.training.train import train
+
+        entry = self.store[key]
+        options, scene_options = self._options(key, setting)
+        if len(entry["times"]) <= turn:
+            folder = self.folder / "runs" / (_name(setting) if not entry["errors"] else "again")
+            shutil.rmtree(folder, ignore_errors=True)
+            if not self.warm_train:
+                self.warm_train = True
+                aside = self.folder / "runs" / "warm_up"
+                shutil.rmtree(aside, ignore_errors=True)
+                train(
+                    self.scene_path,
+                    aside,
+                    scene_options,
+                    replace(options, iterations=min(20, options.iterations)),
+                    quiet=True,
+                )
+                shutil.rmtree(aside)
+            stages = Stages(self.progress)
+            trained = train(self.scene_path, folder, scene_options, options, quiet=True)
+            stages.lap("train")
+            self._note(key, trained["seconds"], stages.peak_gib["train"], primitives=trained["primitives"])
+            if folder.name == "again":
+                shutil.rmtree(folder)
+        if not entry["errors"]:
+            entry["errors"] = self._train_errors(self.folder / "runs" / _name(setting))
+
+    def _equal_time(self, setting: dict, iterations: int) -> int:
+        """Steps that take as long as the base's, by the timings of both at equal count."""
+        count = {name: value for name, value in setting.items() if name != "equal_time"}
+        both = [_key("train", {}), _key("train", count)]
+        for key, of in zip(both, ({}, count), strict=True):
+            if not self.store.get(key, {}).get("times"):
+                self.store.setdefault(key, {"setting": of, "times": [], "peak_gib": 0.0, "errors": {}})
+                self._train(key, of, set(), 0)
+        base, other = (float(np.median(self.store[key]["times"])) for key in both)
+        return max(1, round(iterations * base / other))
+
+    def _train_errors(self, folder: Path) -> dict:
+        """Held-out images and depth at the base's scale, and the surface, of a trained run."""
+        from linprim_geo.eval.depth import eval_depth_run
+        from linprim_geo.eval.images import eval_images_run
+        from linprim_geo.geometry.mesh_files import load_mesh
+        from linprim_geo.runs.run import Run
+        from linprim_geo.surface.extract import extract_mesh
+
+        run = Run.open(folder)
+        run = replace(run, scene_options=replace(run.scene_options, downscale=self.scene_options.downscale))
+        found = {}
+        if run.scene().test:
+            found["psnr"] = eval_images_run(run, lpips_weights="none")["psnr"]
+            found["photo_percent"] = 100 * 10 ** (-found["psnr"] / 20)
+            if self.reference or any(view.depth_path for view in run.scene().test):
+                found["depth_percent"] = 100 * eval_depth_run(run, self.reference)["abs_rel"]
+        if self.reference:
+            try:
+                mesh = load_mesh(extract_mesh(folder, quiet=True)["mesh"])
+            except LinprimError as error:
+                self.progress.note(f"  {error}")
+                found["chamfer_percent"] = math.nan
+            else:
+                found["chamfer_percent"] = self._score(mesh)["chamfer_percent_diagonal"]
+        return found
+
+    @cached_property
+    def reference_mesh(self):
+        from linprim_geo.geometry.mesh_files import load_mesh
+
+        return load_mesh(self.reference)
+
+    def _score(self, mesh) -> dict:
+        """Scores of the parts of both surfaces that the scene's training cameras see."""
+        from linprim_geo.eval.mesh import score_mesh
+
+        cameras = [view.camera for view in self.scene.train]
+        return score_mesh(mesh, self.reference_mesh, samples=POINTS, cameras=cameras)["visible"]
+
+    # --- extract and evaluate ---------------------------------------------------------------------------
+
+    @cached_property
+    def supported_voxel(self) -> float:
+        """The voxel size that the run's views support."""
+        from linprim_geo.surface.method_tsdf import DepthFrames
+        from linprim_geo.surface.tsdf_fusion import auto_voxel_size
+
+        return auto_voxel_size(DepthFrames(self.run, 0.5))
+
+    def _extract(self, key: str, setting: dict, errors: set, turn: int) -> None:
+        from linprim_geo.base.options import ExtractOptions
+        from linprim_geo.geometry.mesh_files import load_mesh
+        from linprim_geo.surface.extract import extract_mesh
+
+        entry = self.store[key]
+        if not self.warm:
+            self.warm = True
+            coarse = ExtractOptions(voxel_size=8 * self.supported_voxel)
+            with contextlib.suppress(LinprimError):  # too coarse for a surface
+                extract_mesh(self.base, "tsdf", self.folder / "meshes" / "warm_up.ply", coarse, quiet=True)
+        options = (
+            ExtractOptions(voxel_size=self.supported_voxel * setting["voxel"])
+            if setting["method"] == "tsdf"
+            else ExtractOptions()
+        )
+        target = self.folder / "meshes" / f"{_name(setting)}.ply"
+        stats = extract_mesh(self.base, setting["method"], target, options, quiet=True)
+        if len(entry["times"]) <= turn:
+            self._note(
+                key,
+                stats["seconds"]["total"],
+                stats["peak_gib"]["total"],
+                faces=stats["faces"],
+                topology=stats["watertight"],
+            )
+        if not entry["errors"]:
+            found = {"boundary_edges": float(stats["boundary_edges"])} | dict.fromkeys(
+                ("chamfer_percent", "normal_percent"), math.nan
+            )
+            if self.reference:
+                scores = self._score(load_mesh(target))
+                found["chamfer_percent"] = scores["chamfer_percent_diagonal"]
+                found["normal_percent"] = 100 * (1 - scores["normal_consistency"])
+            entry["errors"] = found
+
+    @cached_property
+    def scored_mesh(self):
+        """The surface of the run by the defaults."""
+        from linprim_geo.geometry.mesh_files import load_mesh
+        from linprim_geo.surface.extract import extract_mesh
+
+        target = self.folder / "meshes" / "scored.ply"
+        if not target.exists():
+            extract_mesh(self.base, output=target, quiet=True)
+        return load_mesh(target)
+
+    def _evaluate(self, key: str, setting: dict, errors: set, turn: int) -> None:
+        from linprim_geo.base.progress import Stages
+        from linprim_geo.eval.mesh import score_mesh
+
+        prediction, reference = self.scored_mesh, self.reference_mesh
+        if not self.warm_score:
+            self.warm_score = True
+            score_mesh(prediction, reference, samples=1000)
+        stages = Stages(self.progress)
+        scores = score_mesh(prediction, reference, samples=setting["samples"])
+        stages.lap("score")
+        self._note(key, scores["seconds"], stages.peak_gib["score"], chamfer=scores["chamfer_percent_diagonal"])
+        self.store[key]["errors"] = {"standard_error_percent": scores["standard_error_percent_diagonal"]}
+
+    # --- results ----------------------------------------------------------------------------------------
+
+    def _report(self, knobs: Sequence[Knob]) -> dict:
+        measured: dict[str, list[tuple[Rung, dict]]] = {}
+        for knob in knobs:
+            entries = [(rung, self.store.get(_key(knob.group, self._setting(knob, rung)))) for rung in knob.rungs]
+            measured[knob.name] = [(rung, entry) for rung, entry in entries if entry and entry["times"]]
+        about = self.about | {"rounds": self.rounds, "load": os.getloadavg()[0], "cores": os.cpu_count()}
+        return write_report(self.folder, about, knobs, measured)
+
+
+def train_task(folder: Path, scene: str, scene_options: dict, options: dict) -> dict:
+    """A training into folder/run, after a few steps that load the libraries. Returns its seconds and primitives, or why
+    it `failed`."""
+    from linprim_geo.training.train import train
+
+    chosen = SceneOptions(**scene_options), TrainOptions(**options)
+    try:
+        for name, iterations in (("warm_up", min(20, chosen[1].iterations)), ("run", chosen[1].iterations)):
+            shutil.rmtree(folder / name, ignore_errors=True)
+            trained = train(scene, folder / name, chosen[0], replace(chosen[1], iterations=iterations), quiet=True)
+    except LinprimError as error:
+        return {"failed": str(error)}
+    shutil.rmtree(folder / "warm_up")
+    return {"seconds": trained["seconds"], "primitives": trained["primitives"]}
+
+
+def rotated(camera):
+    """The camera turned about its own upright axis by POP_PX pixels at the middle of its image."""
+    angle = POP_PX / camera.fx
+    turn = np.eye(4)
+    turn[0, 0] = turn[2, 2] = math.cos(angle)
+    turn[0, 2], turn[2, 0] = math.sin(angle), -math.sin(angle)
+    return replace(camera, world_to_camera=turn @ camera.world_to_camera)
+
+
+def _key(group: str, setting: dict) -> str:
+    return f"{group} {json.dumps(setting, sort_keys=True)}"
+
+
+def _shown(setting: dict) -> str:
+    return ", ".join(f"{name} {value}" for name, value in setting.items()) or "defaults"
+
+
+def _name(setting: dict) -> str:
+    return "_".join(f"{name}-{value}" for name, value in setting.items()) or "base"

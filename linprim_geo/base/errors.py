@@ -1,0 +1,21 @@
+"""The one exception a user is meant to read: a single sentence, shown without a traceback."""
+
+from __future__ import annotations
+
+
+class LinprimError(Exception):
+    """Something the user gave cannot be used.
+
+    The message is one sentence that names the file, row or option, what was found there and what was wanted.
+    The command line prints it and exits with status 1; `--debug` shows the traceback as well. Whatever a file or a
+    library has put into it, it is one line of at most LONGEST characters: line breaks become spaces, and the middle is
+    left out of one that is longer.
+    """
+
+    LONGEST = 1000
+
+    def __init__(self, sentence: str = ""):
+        sentence = " ".join(str(sentence).split())
+        if len(sentence) > self.LONGEST:
+            sentence = f"{sentence[:600]} ... {sentence[-(self.LONGEST - 605) :]}"
+        super().__init__(sentence)

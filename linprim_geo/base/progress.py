@@ -1,0 +1,110 @@
+"""Progress of a long job: one line that is rewritten on a terminal, plain lines now and then in a log."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+from linprim_geo.base.memory import memory_gib
+
+
+def duration(seconds: float) -> str:
+    """12 s, 3:04 or 1:02:03."""
+    whole = int(round(seconds))
+    if whole < 60:
+        return f"{whole} s"
+    hours, minutes = divmod(whole // 60, 60)
+    return f"{hours}:{minutes:02d}:{whole % 60:02d}" if hours else f"{minutes}:{whole % 60:02d}"
+
+
+class Progress:
+    """Prints to stderr how far a job of `total` steps is, with rate and time left.
+
+    On a terminal the line is refreshed twice a second; elsewhere a line is printed every 20 seconds. `quiet` prints
+    nothing.
+    """
+
+    def __init__(self, name: str, total: int, start: int = 0, quiet: bool = False):
+        self.name, self.total, self.start, self.quiet = name, total, start, quiet
+        self.terminal = sys.stderr.isatty()
+        self.begin = self.last = time.monotonic()
+        self.width = 0
+
+    def update(self, done: int, text: str = "") -> None:
+        """Says that `done` steps are finished; `text` goes at the end of the line."""
+        now = time.monotonic()
+        if self.quiet or now - self.last < (0.5 if self.terminal else 20.0):
+            return
+        self.last = now
+        rate = (done - self.start) / max(now - self.begin, 1e-9)
+        left = duration((self.total - done) / rate) if rate > 0 else "?"
+        pace = f"{rate:.0f}/s" if rate >= 10 else f"{rate:.2g}/s"
+        self._show(f"{self.name} {done}/{self.total}  {pace}  {left} left  {text}")
+
+    def note(self, text: str) -> None:
+        """Prints a line that stays."""
+        if self.quiet:
+            return
+        self.clear()
+        print(text, file=sys.stderr, flush=True)
+
+    def clear(self) -> None:
+        """Removes the line that is being rewritten."""
+        if self.terminal and self.width and not self.quiet:
+            print("\r" + " " * self.width + "\r", end="", file=sys.stderr, flush=True)
+            self.width = 0
+
+    def _show(self, line: str) -> None:
+        if self.terminal:
+            print("\r" + line.ljust(self.width), end="", file=sys.stderr, flush=True)
+            self.width = len(line)
+        else:
+            print(line, file=sys.stderr, flush=True)
+
+
+class Stages:
+    """Clock of a job made of named stages; `lap` ends the one that is running."""
+
+    def __init__(self, progress: Progress):
+        self.progress = progress
+        self.seconds: dict[str, float] = {}
+        self.peak_gib: dict[str, float] = {}
+        self._begin = time.perf_counter()
+        _forget_peak()
+
+    def note(self, text: str) -> None:
+        """Prints a line that stays, indented under its job."""
+        self.progress.note("  " + text)
+
+    def lap(self, name: str) -> None:
+        """Ends the stage `name`: its seconds, and the largest resident memory of this process during it (0 where
+        unknown)."""
+        now = time.perf_counter()
+        self.seconds[name] = round(self.seconds.get(name, 0.0) + now - self._begin, 3)
+        self.peak_gib[name] = round(max(self.peak_gib.get(name, 0.0), memory_gib("VmHWM")), 3)
+        self._begin = now
+        _forget_peak()
+
+    def line(self) -> str:
+        """One printed line of what `report` returns."""
+        both = self.report()
+        return ", ".join(
+            f"{name} {both['seconds'][name]:.1f} s {both['peak_gib'][name]:.2f} GiB" for name in both["seconds"]
+        )
+
+    def report(self) -> dict:
+        """`seconds` and `peak_gib` per stage, each with the `total`: their sum and their largest."""
+        return {
+            "seconds": self.seconds | {"total": round(sum(self.seconds.values()), 3)},
+            "peak_gib": self.peak_gib | {"total": max(self.peak_gib.values(), default=0.0)},
+        }
+
+
+def _forget_peak() -> None:
+    """Sets the peak that the system keeps to what is resident now; where that cannot be done the peaks are those since
+    the start."""
+    try:
+        with open("/proc/self/clear_refs", "w") as file:
+            file.write("5")
+    except OSError:
+        pass

@@ -1,0 +1,172 @@
+"""Poses that were found for plain photographs: where they are kept, and whether they can be used."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
+from pathlib import Path
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import atomic_write
+from linprim_geo.capture import video_frames
+from linprim_geo.capture.incremental_mapping import MIN_REGISTERED, SEED
+from linprim_geo.capture.readers.colmap import has_model
+from linprim_geo.imaging import photos
+
+# Changed whenever the poses come out differently, so that old cache entries are not found any more.
+_CACHE_VERSION = 1
+# Where photographs lie in a capture's folder; in the first that has any. Those in the folder itself are not looked for
+# any deeper.
+_PHOTO_FOLDERS = ("images", "image", "input", "rgb", ".")
+# Pillow's names of the formats that pycolmap reads; photographs in others are copied, in the folder of the result while
+# they are needed.
+_FORMATS, _COPIES = ("JPEG", "MPO", "PNG", "TIFF", "BMP"), "copies"
+# Counts and pixels of a verdict are below this.
+_LARGEST = 1e12
+# What can be trained, and what is trained with a warning.
+_MIN_SHARE = 0.5
+_GOOD_SHARE = 0.9
+_GOOD_ERROR_PX = 1.0
+_GOOD_TRACK = 3.0
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of the photographs: how many have a pose, the mean reprojection error in pixels, the mean number of
+    photographs that see a point, and the points."""
+
+    photographs: int
+    registered: int
+    points: int = 0
+    error_px: float = 0.0
+    track_length: float = 0.0
+
+    def __str__(self) -> str:
+        return (
+            f"{self.registered} of {self.photographs} photographs have poses; {self.points} points,"
+            f" mean reprojection error {self.error_px:.2f} px, mean track length {self.track_length:.1f}"
+        )
+
+    @property
+    def unusable(self) -> bool:
+        """Whether too few photographs are left to train: fewer than three, or less than half."""
+        return self.registered < max(MIN_REGISTERED, _MIN_SHARE * self.photographs)
+
+    @property
+    def doubts(self) -> str:
+        """What makes the poses poor, "" if nothing does."""
+        poor = []
+        if self.registered < _GOOD_SHARE * self.photographs:
+            poor.append(f"{self.photographs - self.registered} photographs are left out")
+        if self.error_px > _GOOD_ERROR_PX:
+            poor.append(f"points miss their keypoints by {self.error_px:.2f} px")
+        if self.track_length < _GOOD_TRACK:
+            poor.append(f"a point is seen by {self.track_length:.1f} photographs only")
+        return ", ".join(poor)
+
+
+def photographs(root: Path) -> tuple[Path, list[str]]:
+    """The folder of a capture's photographs and their paths in it, sorted; an empty list if there are none."""
+    for name in _PHOTO_FOLDERS:
+        folder = root / name
+        if folder.is_dir():
+            found = folder.iterdir() if name == "." else folder.rglob("*")
+            files = [path for path in found if path.suffix.lower() in photos.IMAGE_SUFFIXES and path.is_file()]
+            names = [path.relative_to(folder).as_posix() for path in files if not path.name.startswith(".")]
+            if names:
+                return folder, sorted(names)
+    return root, []
+
+
+def frames_of(path: Path, frames: int, cache: Path | None = None) -> Path:
+    """The folder that `prepare` has extracted a video's frames to; anything else is returned as it is.
+
+    Raises:
+        LinprimError: they were not extracted yet.
+    """
+    if not video_frames.is_video(path):
+        return path
+    folder = video_frames.frames_folder(path, _checked_count(frames), cache)
+    if not folder.is_dir():
+        raise LinprimError(
+            f"{path}: a video of which no {frames} frames were taken yet; linprim-geo inspect and train do"
+        )
+    return folder
+
+
+def _checked_count(frames: int) -> int:
+    if frames < MIN_REGISTERED:
+        raise LinprimError(f"--frames is {frames}, wanted at least {MIN_REGISTERED}")
+    return frames
+
+
+def found_model(root: Path, cache: Path | None = None) -> Path | None:
+    """The folder of the COLMAP model that `find_poses` has made of the photographs in `root`; None if it has not.
+
+    Raises:
+        LinprimError: it has, and the model cannot be used.
+    """
+    folder, names = photographs(root)
+    if not names or not (base := _base(cache)).is_dir():
+        return None
+    kept = base / _key(folder, names)
+    verdict = _stored(kept)
+    if verdict is None:
+        return None
+    _refuse(root, verdict)
+    return kept / "model"
+
+
+def _refuse(root: Path, verdict: Verdict) -> None:
+    if verdict.unusable:
+        raise LinprimError(
+            f"{root}: poses were found for {verdict.registered} of {verdict.photographs} photographs, wanted at least"
+            f" {MIN_REGISTERED} and half of them (do they overlap by two thirds, is there texture, did nothing move?)"
+        )
+
+
+def _base(cache: Path | None) -> Path:
+    return photos.cache_folder(cache) / "structure_from_motion"
+
+
+def _key(folder: Path, names: Sequence[str]) -> str:
+    """Of the names and contents of the photographs; neither where they lie nor the number of threads matter."""
+    digest = hashlib.blake2b(repr((_CACHE_VERSION, SEED)).encode(), digest_size=16)
+    for name in names:
+        try:
+            content = hashlib.blake2b((folder / name).read_bytes(), digest_size=16).digest()
+        except OSError as error:
+            raise LinprimError(f"{folder / name}: cannot be read ({error.strerror}), wanted an image") from error
+        digest.update(repr((name, content)).encode())
+    return digest.hexdigest()
+
+
+def _stored(kept: Path) -> Verdict | None:
+    """What is said of the result in a folder; None if there is none, or one that is of no use and made again."""
+    try:
+        verdict = Verdict(**json.loads((kept / "verdict.json").read_text(encoding="utf-8")))
+        usable = all(type(value) in (int, float) and 0 <= value < _LARGEST for value in astuple(verdict))
+        return verdict if usable and (not verdict.registered or has_model(kept / "model")) else None
+    except (OSError, ValueError, TypeError, RecursionError):
+        return None
+
+
+def _readable(folder: Path, names: Sequence[str], kept: Path) -> Path:
+    """The folder itself if pycolmap can read all its photographs, else one of copies by the same names; those which it
+    cannot, as PNG."""
+    from PIL import Image
+
+    if all(photos.image_format(folder / name) in _FORMATS for name in names):
+        return folder
+    for name in names:
+        source, copy = folder / name, kept / _COPIES / name
+        if not copy.exists():
+            with atomic_write(copy) as temporary:
+                if photos.image_format(source) not in _FORMATS:
+                    Image.fromarray(photos.read_photo(source)[0]).save(temporary, format="PNG", compress_level=1)
+                else:
+                    shutil.copyfile(source, temporary)
+    return kept / _COPIES

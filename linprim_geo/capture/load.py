@@ -1,0 +1,290 @@
+"""A capture as the rest of the package sees it: posed views, their photographs, and the points that come with
+them.
+
+`load_scene` finds out how a folder is laid out and checks everything that can be checked without decoding
+pixels; `View.load` decodes, undistorts and averages down.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import is_file
+from linprim_geo.capture import found_poses
+from linprim_geo.capture.types import PHOTOGRAPHS, Frame, Listing, Scene, View, check_pose
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.lens import Intrinsics, Lens, check_lens, straightened, undistorted
+from linprim_geo.imaging import photos
+
+# Of the images sorted by name, those whose index is a multiple of this are held out if the data set does
+# not say.
+HOLD_OUT_EVERY = 8
+# Images decoded at load time to see whether an alpha channel holds anything but 255.
+_ALPHA_SAMPLES = 6
+
+
+def load_scene(
+    path: str | os.PathLike,
+    *,
+    downscale: int = 1,
+    masks: str | os.PathLike | None = None,
+    images: str | os.PathLike | None = None,
+    sparse: str | os.PathLike | None = None,
+    frames: int = 150,
+    cache: str | os.PathLike | None = None,
+    pinhole_below: float = 0.0,
+) -> Scene:
+    """Reads a posed capture: `transforms*.json` (NeRF-synthetic, nerfstudio, instant-ngp), ScanNet++, a COLMAP model,
+    DTU's `cameras_sphere.npz`, TUM's lists, or a trajectory (`.log`) with depth maps or of Tanks and Temples, in this
+    order.
+
+    Photographs without poses, and videos, are read once `structure_from_motion.prepare` has found their poses.
+
+    Held out are the frames that the data set names so (`transforms_test.json`, else `_val`;
+    `test_filenames`; ScanNet++'s lists), else every 8th of the images sorted by name. Points come with the transforms
+    (`ply_file_path`) or from a COLMAP model in the folder whose poses agree with them. Image headers are
+    read, pixels are not (but for a few with alpha).
+
+    Args:
+        path: the data set's folder, or a `.json` in it, or a video.
+        downscale: average this many pixels squared into one; cameras are scaled exactly. Where all photographs are
+            there in a folder such as `images_4` beside `images`, smaller by that factor but for rounding, these are
+            taken.
+        masks: folder of foreground masks named as the images; found by itself if it is `masks` or `mask`. With "none"
+            neither masks nor alpha channels are used.
+        images: folder of photographs that take the place of those that the cameras name; cameras are scaled to their
+            size.
+        sparse: folder of the COLMAP model, if it is not `sparse/0`, `sparse`, `colmap/sparse/0` or the folder
+            itself.
+        frames: how many were taken of a video.
+        cache: where undistorted images and poses that were found are kept, see `photos.cache_folder`.
+        pinhole_below: a lens that shifts no ray by this many pixels (of the averaged image) from where the pinhole of
+            its focal lengths and principal point has it is taken for that pinhole, and its photographs as they are.
+
+    Raises:
+        LinprimError: one sentence about the first thing that is missing, damaged or does not fit together.
+    """
+    from linprim_geo.capture.image_folders import with_images, with_masks, with_smaller_images
+    from linprim_geo.capture.readers import colmap as read_colmap
+
+    if isinstance(downscale, bool) or int(downscale) != downscale or downscale < 1:
+        raise LinprimError(f"downscale is {downscale}, wanted a whole number from 1")
+    cache = Path(cache) if cache else None
+    path = found_poses.frames_of(Path(path), frames, cache)
+    root, json_file = _root(path)
+    sparse_folder = _option_folder(sparse, root, "--sparse")
+    unmasked = masks == "none"
+    masks_folder = None if unmasked else _option_folder(masks, root, "--masks")
+    images_folder = _option_folder(images, root, "--images")
+    read = _reader(root, json_file, sparse_folder, images_folder)
+    if read is not None:
+        listing = read()
+    elif (model := found_poses.found_model(root, cache)) is not None:
+        listing = replace(read_colmap.read_colmap(root, model), kind=PHOTOGRAPHS)
+    else:
+        raise LinprimError(
+            f"{root}: no camera poses found ({_contents(root)}), wanted transforms.json, transforms_train.json,"
+            " a COLMAP model in sparse/0 or the like; linprim-geo inspect and train find those of plain photographs"
+        )
+    if len(listing.frames) < 2:
+        raise LinprimError(f"{root}: {len(listing.frames)} posed image found, wanted at least two")
+    posed = [replace(frame, mask_path=None) for frame in listing.frames] if unmasked else list(listing.frames)
+    if images_folder is not None:
+        posed = with_images(posed, images_folder)
+    if not unmasked:
+        posed = with_masks(posed, root, masks_folder)
+    smaller = with_smaller_images(posed, root, int(downscale)) if images_folder is None else None
+    if smaller is not None:
+        posed, downscale = smaller, 1
+    names = _names(posed)
+    alphas = _header_checks(posed)
+    has_alpha = any(frame.mask_path for frame in posed) or _alpha_says_something(posed, alphas)
+    has_alpha = has_alpha and not unmasked
+    folder = photos.cache_folder(cache)
+    pinholes: dict[Lens, Intrinsics] = {}
+    if pinhole_below > 0:
+        straight = {lens: straightened(lens, pinhole_below * downscale) for lens in {frame.lens for frame in posed}}
+        posed = [replace(frame, lens=straight[frame.lens]) for frame in posed]
+    views = []
+    for frame, name in zip(posed, names, strict=True):
+        views.append(_view(frame, name, int(downscale), has_alpha, folder, pinholes))
+    train, test = _split(posed, views)
+    return Scene(root, listing.kind, train, test, listing.points, listing.unit or "unit of the data set")
+
+
+def has_poses(path: Path, sparse: str | os.PathLike | None = None) -> bool:
+    """Whether `load_scene` finds poses in a capture's folder, whatever they are worth; false for photographs alone.
+
+    Raises:
+        LinprimError: there is no such folder.
+    """
+    root, json_file = _root(path)
+    return _reader(root, json_file, _option_folder(sparse, root, "--sparse"), None) is not None
+
+
+def _reader(
+    root: Path, json_file: Path | None, sparse: Path | None, images: Path | None
+) -> Callable[[], Listing] | None:
+    """What reads the first layout that the folder has; None if it has none."""
+    from linprim_geo.capture.readers import colmap as read_colmap
+    from linprim_geo.capture.readers import dtu as read_dtu
+    from linprim_geo.capture.readers import rgbd as read_rgbd
+    from linprim_geo.capture.readers import scannetpp as read_scannetpp
+    from linprim_geo.capture.readers import tanks_and_temples as read_tnt
+    from linprim_geo.capture.readers import transforms as read_transforms
+
+    if json_file is not None or read_transforms.is_there(root):
+        return partial(read_transforms.read_transforms, root, json_file, sparse)
+    if sparse is None and (device := read_scannetpp.find_device(root)) is not None:
+        return partial(read_scannetpp.read_scannetpp, device)
+    if (model := read_colmap.find_model(root, sparse)) is not None:
+        return partial(read_colmap.read_colmap, root, model, images)
+    if (cameras := read_dtu.find_cameras(root)) is not None:
+        return partial(read_dtu.read_dtu, root, cameras)
+    if read_rgbd.find_tum(root):
+        return partial(read_rgbd.read_tum, root)
+    if (log := read_rgbd.find_log(root)) is not None:
+        return partial(read_rgbd.read_log, root, log)
+    if (log := read_tnt.find_log(root)) is not None:
+        return partial(read_tnt.read_tnt, root, log)
+    return None
+
+
+def _root(path: Path) -> tuple[Path, Path | None]:
+    if path.is_dir():
+        return path, None
+    if path.is_file() and path.suffix == ".json":
+        return path.parent, path
+    if path.exists():
+        raise LinprimError(f"{path}: a file, wanted the folder of a capture or its transforms.json")
+    raise LinprimError(f"{path}: no such folder, wanted the folder of a capture")
+
+
+def _option_folder(value: str | os.PathLike | None, root: Path, option: str) -> Path | None:
+    """A folder given as an option, relative to the working folder or else to the scene."""
+    if not value:
+        return None
+    for folder in (Path(value), root / value):
+        if folder.is_dir():
+            return folder
+    raise LinprimError(f"{option} {value}: no such folder, neither here nor in {root}")
+
+
+def _contents(root: Path) -> str:
+    entries = sorted(entry.name for entry in root.iterdir())
+    images = sum(1 for entry in root.rglob("*") if entry.suffix.lower() in photos.IMAGE_SUFFIXES)
+    if not entries:
+        return "the folder is empty"
+    shown = ", ".join(entries[:6]) + (", ..." if len(entries) > 6 else "")
+    return f"{images} images; it holds {shown}" if images else f"it holds {shown}"
+
+
+def _names(frames: Sequence[Frame]) -> list[str]:
+    """A name for every frame, unique and fit for a file: the image's stem, else as much of its path as it
+    takes."""
+    paths = [Path(frame.relative.replace("\\", "/")) for frame in frames]
+    options = (
+        [path.stem for path in paths],
+        ["_".join(part for part in path.with_suffix("").parts if part not in ("..", "/", ".")) for path in paths],
+        ["_".join(part for part in path.parts if part not in ("..", "/", ".")) for path in paths],
+    )
+    for names in options:
+        if len(set(names)) == len(names):
+            return names
+    return [f"{i:05d}_{name}" for i, name in enumerate(options[-1])]
+
+
+def _header_checks(frames: Sequence[Frame]) -> list[bool]:
+    """Compares every image, mask and depth file with its camera; returns which images have an alpha
+    channel."""
+    missing = [frame for frame in frames if not is_file(frame.image_path)]
+    if missing:
+        raise LinprimError(
+            f"{missing[0].where}: {len(missing)} of {len(frames)} images are not on disk, the first is"
+            f" {missing[0].image_path}"
+        )
+    for frame in frames:
+        for kind, path in (
+            ("mask", frame.mask_path),
+            ("depth map", frame.depth_path),
+            ("normal map", frame.normal_path),
+        ):
+            if path is not None and not is_file(path):
+                raise LinprimError(f"{frame.where}: the {kind} {path} is not on disk")
+    alphas = []
+    for frame in frames:
+        width, height, alpha = photos.image_header(frame.image_path)
+        alphas.append(alpha)
+        wanted = (frame.lens.width, frame.lens.height)
+        if (width, height) != wanted and not photos.fits(frame.image_path, wanted):
+            raise LinprimError(
+                f"{frame.image_path}: the image is {width}x{height}, wanted {wanted[0]}x{wanted[1]} as its"
+                f" camera in {frame.where} says"
+            )
+        if frame.mask_path is not None and photos.image_header(frame.mask_path)[:2] != wanted:
+            found = photos.image_header(frame.mask_path)
+            raise LinprimError(
+                f"{frame.mask_path}: the mask is {found[0]}x{found[1]}, wanted {wanted[0]}x{wanted[1]} as its image"
+            )
+    return alphas
+
+
+def _alpha_says_something(frames: Sequence[Frame], alphas: Sequence[bool]) -> bool:
+    candidates = [frame for frame, alpha in zip(frames, alphas, strict=True) if alpha]
+    step = max(1, len(candidates) // _ALPHA_SAMPLES)
+    for frame in candidates[::step]:
+        _, alpha = photos.read_photo(frame.image_path)
+        if alpha is not None and alpha.min() < 255:
+            return True
+    return False
+
+
+def _view(frame: Frame, name: str, factor: int, has_alpha: bool, cache: Path, pinholes: dict[Lens, Intrinsics]) -> View:
+    lens = frame.lens
+    if lens not in pinholes:
+        check_lens(lens, frame.where)
+        pinholes[lens] = undistorted(lens, frame.where)
+    full = pinholes[lens]
+    width, height = full.width // factor, full.height // factor
+    if width < 1 or height < 1:
+        raise LinprimError(
+            f"downscale {factor} leaves nothing of {frame.image_path}, which is {full.width}x{full.height}"
+        )
+    pose = check_pose(frame.world_to_camera, frame.where)
+    camera = Camera(width, height, full.fx / factor, full.fy / factor, full.cx / factor, full.cy / factor, pose)
+    return View(
+        name=name,
+        camera=camera,
+        image_path=frame.image_path,
+        mask_path=frame.mask_path,
+        depth_path=frame.depth_path,
+        normal_path=frame.normal_path,
+        normal_frame=frame.normal_frame,
+        depth_scale=frame.depth_scale,
+        file_size=(lens.width, lens.height),
+        lens=None if lens.is_pinhole else lens,
+        downscale=factor,
+        has_alpha=has_alpha,
+        cache=cache,
+    )
+
+
+def _split(frames: Sequence[Frame], views: Sequence[View]) -> tuple[tuple[View, ...], tuple[View, ...]]:
+    """By what the frames say, else every 8th by name; never fewer than two training views."""
+    if any(frame.split is not None for frame in frames):
+        train = tuple(view for frame, view in zip(frames, views, strict=True) if frame.split != "test")
+        test = tuple(view for frame, view in zip(frames, views, strict=True) if frame.split == "test")
+        if len(train) < 2:
+            raise LinprimError(
+                f"{frames[0].where}: {len(train)} of {len(views)} images are for training, wanted at least two"
+            )
+        return train, test
+    order = sorted(range(len(views)), key=lambda i: frames[i].relative)
+    held_out = order[::HOLD_OUT_EVERY] if len(views) > 2 else []
+    chosen = set(held_out)
+    return tuple(views[i] for i in order if i not in chosen), tuple(views[i] for i in held_out)

@@ -1,0 +1,1 @@
+"""One module per data format that a capture may come in."""

@@ -1,0 +1,134 @@
+"""Camera poses for photographs that come without: structure from motion by pycolmap on the CPU, kept in the cache
+folder.
+
+Keypoints and matches are kept while they are made, so that a run that was stopped goes on where it was; the finished
+model stays.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import locked, write_json
+from linprim_geo.capture import video_frames
+from linprim_geo.capture.found_poses import (
+    _COPIES,
+    Verdict,
+    _base,
+    _checked_count,
+    _key,
+    _readable,
+    _refuse,
+    _stored,
+    photographs,
+)
+from linprim_geo.capture.incremental_mapping import MIN_REGISTERED, largest_model, remove_work
+from linprim_geo.capture.load import has_poses
+from linprim_geo.imaging import photos
+
+
+def prepare(
+    path: str | os.PathLike,
+    sparse: str | None = None,
+    frames: int = 150,
+    cache: Path | None = None,
+    *,
+    threads: int = 0,
+    log: Callable[[str], None] | None = None,
+) -> None:
+    """Makes a folder of photographs without poses, or a video, readable by `load_scene`, which may take minutes; leaves
+    all else alone.
+
+    Args:
+        path, sparse, frames, cache: as for `load_scene`.
+        threads, log: as for `find_poses`.
+
+    Raises:
+        LinprimError: as `video_frames.extract_frames` and `find_poses`, or there is nothing at `path`.
+    """
+    path = Path(path)
+    if video_frames.is_video(path):
+        path = video_frames.extract_frames(path, _checked_count(frames), cache, log)
+    if not has_poses(path, sparse) and photographs(path)[1]:
+        find_poses(path, cache, threads=threads, log=log)
+
+
+def find_poses(
+    root: Path, cache: Path | None = None, *, threads: int = 0, log: Callable[[str], None] | None = None
+) -> Path:
+    """Finds the poses of the photographs in `root`, unless that was done before; returns the folder of the COLMAP
+    model.
+
+    SIFT keypoints, matches of every pair (of more than 60 photographs: of those that look alike or follow each other),
+    incremental mapping with one radial distortion; photographs of one folder, size and focal length (EXIF) share a
+    camera. Of several models that do not connect the largest is kept. The result is kept in the cache folder under the
+    content of the photographs.
+
+    Args:
+        cache: see `photos.cache_folder`.
+        threads: 0 uses all cores.
+        log: is called with lines of progress and with the verdict.
+
+    Raises:
+        LinprimError: no photographs, one that cannot be read, or too few of them that get a pose.
+    """
+    say = log or (lambda line: None)
+    folder, names = photographs(root)
+    if len(names) < MIN_REGISTERED:
+        raise LinprimError(
+            f"{root}: {len(names)} photograph{'' if len(names) == 1 else 's'}, wanted at least {MIN_REGISTERED} "
+            "to find their poses"
+        )
+    sizes = [photos.image_header(folder / name)[:2] for name in names]
+    kept = _base(cache) / _key(folder, names)
+    wait = partial(say, "another process is finding these poses; waiting for it ...")
+    with locked(kept, "worked on", wait=wait):
+        verdict = _stored(kept)
+        if verdict is None:
+            start = time.monotonic()
+            say(f"finding the poses of {len(names)} photographs in {folder} ...")
+            verdict = _reconstruct(folder, names, sizes, kept, threads, say)
+            say(f"{verdict}; {time.monotonic() - start:.0f} s")
+        else:
+            say(f"{verdict}; from {kept}")
+    _refuse(root, verdict)
+    if verdict.doubts:
+        say(f"warning: the poses are poor, and so may be the result: {verdict.doubts}")
+    return kept / "model"
+
+
+def _reconstruct(
+    folder: Path,
+    names: list[str],
+    sizes: list[tuple[int, int]],
+    kept: Path,
+    threads: int,
+    say: Callable[[str], None],
+) -> Verdict:
+    """Goes on with what is in `kept`, and leaves the largest model and the verdict there."""
+    try:
+        model = largest_model(_readable(folder, names, kept), names, sizes, kept, threads, say)
+    except (ValueError, RuntimeError, MemoryError) as error:
+        reason = (str(error).splitlines() or ["out of memory"])[0]
+        raise LinprimError(f"{folder}: poses cannot be found ({reason}); remove {kept} to begin anew") from error
+    verdict = Verdict(len(names), 0)
+    if model is not None:
+        part = kept / "model.part"
+        for place in (part, kept / "model"):
+            shutil.rmtree(place, ignore_errors=True)
+        part.mkdir()
+        model.write_binary(str(part))
+        part.rename(kept / "model")
+        errors = model.compute_mean_reprojection_error(), model.compute_mean_track_length()
+        verdict = Verdict(len(names), model.num_reg_images(), model.num_points3D(), *errors)
+    write_json(kept / "verdict.json", asdict(verdict))
+    remove_work(kept)
+    shutil.rmtree(kept / _COPIES, ignore_errors=True)
+    return verdict

@@ -1,0 +1,149 @@
+"""Photographs from a video: the sharpest frame of each of as many equal parts, through PyAV (the extra `video`)."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import locked, writing
+from linprim_geo.imaging import photos
+
+SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+# Changed whenever other frames are chosen, so that old cache entries are not found any more.
+_CACHE_VERSION = 2
+_JPEG_QUALITY = 95
+_READ_BYTES = 1 << 22
+
+
+def is_video(path: Path) -> bool:
+    """Whether this is a file with the suffix of a video."""
+    return path.suffix.lower() in SUFFIXES and path.is_file()
+
+
+def frames_folder(video: Path, count: int, cache: Path | None = None) -> Path:
+    """Where `extract_frames` leaves the frames of a video: in the cache folder, under its content and their number."""
+    digest = hashlib.blake2b(repr((_CACHE_VERSION, count)).encode(), digest_size=16)
+    try:
+        with open(video, "rb") as file:
+            while block := file.read(_READ_BYTES):
+                digest.update(block)
+    except OSError as error:
+        raise LinprimError(f"{video}: cannot be read ({error.strerror}), wanted a video") from error
+    return photos.cache_folder(cache) / "video" / digest.hexdigest()
+
+
+def extract_frames(
+    video: Path, count: int, cache: Path | None = None, log: Callable[[str], None] | None = None
+) -> Path:
+    """Writes `count` frames, or all there are, as JPEG files unless that was done before; returns their folder.
+
+    Of each of `count` equal parts the frame is taken whose grey values have the largest variance of their Laplacian.
+    Frames of a phone that was held upright are turned as the video says.
+
+    Raises:
+        LinprimError: PyAV is not installed, the file holds no video that can be decoded, or the frames cannot be
+            written.
+    """
+    folder = frames_folder(video, count, cache)
+    if folder.is_dir():
+        return folder
+    av, say = _pyav(), log or (lambda line: None)
+    wait = partial(say, "another process is taking these frames; waiting for it ...")
+    with locked(folder.parent, "worked on", folder.name, wait):
+        if not folder.is_dir():
+            _extract(av, video, count, folder, say)
+    return folder
+
+
+def _extract(av, video: Path, count: int, folder: Path, say: Callable[[str], None]) -> None:
+    """Makes the folder, complete at once."""
+    part = folder.with_name(folder.name + ".part")
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir()
+    try:
+        kept, total = _save_sharpest(av, video, count, part)
+    except (av.FFmpegError, IndexError, OSError, ValueError) as error:
+        reason = (str(error).splitlines() or ["damaged"])[0]
+        shutil.rmtree(part, ignore_errors=True)
+        raise LinprimError(f"{video}: cannot be decoded ({reason}), wanted a complete video") from error
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+    if not kept:
+        shutil.rmtree(part, ignore_errors=True)
+        raise LinprimError(f"{video}: no frame could be decoded, wanted a complete video")
+    part.rename(folder)
+    say(f"{kept} frames of {video}, the sharpest of each part of its {total}, in {folder}")
+
+
+def _save_sharpest(av, video: Path, count: int, folder: Path) -> tuple[int, int]:
+    """Saves the frames; returns how many, and how many the video has."""
+    total, kept, interval = _count(av, video), 0, 0
+    best: tuple[float, int, np.ndarray] | None = None
+    with av.open(str(video)) as container:
+        for index, frame in enumerate(container.decode(video=0)):
+            if index * count // total > interval and best is not None and total > count:
+                kept, best = kept + _save(folder, best), None
+            interval = index * count // total
+            sharpness = _sharpness(frame.to_ndarray(format="gray"))
+            if total <= count:
+                kept += _save(folder, (sharpness, index, _upright(frame)))
+            elif best is None or sharpness > best[0]:
+                best = sharpness, index, _upright(frame)
+    if best is not None:
+        kept += _save(folder, best)
+    return kept, total
+
+
+def _pyav():
+    try:
+        import av
+    except ModuleNotFoundError as error:
+        raise LinprimError(
+            "videos are decoded by PyAV, which is not installed: pip install 'linprim-geo[video]', or give a "
+            "folder of photographs"
+        ) from error
+    return av
+
+
+def _count(av, video: Path) -> int:
+    """Frames in the first video stream: as the file says, else counted."""
+    with av.open(str(video)) as container:
+        stream = container.streams.video[0]
+        return stream.frames or max(1, sum(1 for packet in container.demux(stream) if packet.size))
+
+
+def _upright(frame) -> np.ndarray:
+    """(H, W, 3) uint8 colours of a frame as a player shows it: turned by quarters and mirrored as its display matrix
+    says."""
+    image = frame.to_ndarray(format="rgb24")
+    side_data = frame.side_data.get("DISPLAYMATRIX")
+    if side_data is None:
+        return image
+    # (x, y) is shown at (a x + c y, b x + d y), in numbers of 16.16 bits.
+    (a, b), (c, d) = np.frombuffer(bytes(side_data), "=i4").reshape(3, 3)[:2, :2].astype(float)
+    if abs(b) + abs(c) > abs(a) + abs(d):
+        image, a, d = image.transpose(1, 0, 2), c, b
+    return np.ascontiguousarray(image[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])
+
+
+def _sharpness(grey: np.ndarray) -> float:
+    values = grey.astype(np.float32)
+    middle = values[1:-1, 1:-1]
+    laplacian = values[:-2, 1:-1] + values[2:, 1:-1] + values[1:-1, :-2] + values[1:-1, 2:] - 4 * middle
+    return float(laplacian.var()) if laplacian.size else 0.0
+
+
+def _save(folder: Path, frame: tuple[float, int, np.ndarray]) -> int:
+    from PIL import Image
+
+    path = folder / f"{frame[1]:06d}.jpg"
+    with writing(path):
+        Image.fromarray(frame[2]).save(path, quality=_JPEG_QUALITY, subsampling=0)
+    return 1

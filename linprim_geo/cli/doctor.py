@@ -1,0 +1,189 @@
+"""What `linprim-geo doctor` finds: versions, cores, memory, instruction set, libraries, and what to do about
+them."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.metadata
+import math
+import os
+import platform
+import shutil
+import sys
+from pathlib import Path
+
+from linprim_geo.base.system import compiler_problem, find_compiler, install_command, missing_libraries, python_problem
+from linprim_geo.base.version import __version__
+
+# Module, and the distributions that may have brought it. The bare `embreex` is an empty package.
+LIBRARIES = (
+    ("torch", ("torch",)),
+    ("numpy", ("numpy",)),
+    ("scipy", ("scipy",)),
+    ("PIL", ("pillow",)),
+    ("open3d", ("open3d-cpu", "open3d")),
+    ("pymeshlab", ("pymeshlab",)),
+    ("trimesh", ("trimesh",)),
+    ("manifold3d", ("manifold3d",)),
+    ("igl", ("libigl",)),
+    ("pycolmap", ("pycolmap",)),
+    ("embreex.rtcore_scene", ("embreex",)),
+)
+
+# Below this a training of the default size starts to swap.
+LITTLE_MEMORY = 4 << 30
+LITTLE_DISK = 2 << 30
+
+
+def doctor() -> dict:
+    """Imports every library and looks at the machine.
+
+    Returns:
+        `version`, `python`, `platform`, `cores` (that this process may use), `memory_bytes`,
+        `memory_available_bytes`, `disk_free_bytes`, `cache` (folder of undistorted images and triangulated
+        points; None without numpy), `cache_bytes` (what it holds), `compiler`, `instruction_set` (None
+        without the core), `libraries` ({module: version, or None if it cannot be imported}),
+        `missing_system_libraries`, and `problems`: one sentence each that says what to do; empty if
+        everything works.
+    """
+    problems = [problem for problem in (python_problem(),) if problem]
+    missing = missing_libraries()
+    if missing:
+        names = ", ".join(library.soname for library in missing)
+        command = install_command(missing)
+        do = f"run: {' '.join(command)}" if command else "install them with your package manager"
+        problems.append(f"shared libraries are missing ({names}); {do}")
+    versions = {}
+    for module, distributions in LIBRARIES:
+        name = module.split(".")[0]
+        versions[name], problem = _library(module, distributions)
+        if problem:
+            problems.append(problem)
+    instruction_set, problem = _instruction_set()
+    if problem:
+        problems += [each for each in (problem, compiler_problem()) if each]
+    memory, available = memory_bytes()
+    disk = shutil.disk_usage(Path.cwd()).free
+    if available is not None and available < LITTLE_MEMORY:
+        free = _gigabytes(available)
+        problems.append(f"only {free} of memory are free; train with --downscale, or close other programs")
+    if disk < LITTLE_DISK:
+        problems.append(f"only {_gigabytes(disk)} are free on the disk of {Path.cwd()}; free some space")
+    cache = _cache_folder()
+    if cache is not None and not _can_be_written(cache):
+        problems.append(f"the cache folder {cache} cannot be written; set LINPRIM_GEO_CACHE to one that can")
+    return {
+        "version": __version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "cores": usable_cores(),
+        "memory_bytes": memory,
+        "memory_available_bytes": available,
+        "disk_free_bytes": disk,
+        "cache": None if cache is None else str(cache),
+        "cache_bytes": None if cache is None else _size_of(cache),
+        "compiler": find_compiler(),
+        "instruction_set": instruction_set,
+        "libraries": versions,
+        "missing_system_libraries": [library.soname for library in missing],
+        "problems": problems,
+    }
+
+
+def describe(report: dict) -> str:
+    """The report of `doctor` as text for a person."""
+    free = _gigabytes(report["memory_available_bytes"])
+    libraries = [f"{name} {version or 'MISSING'}" for name, version in report["libraries"].items()]
+    lines = [
+        f"linprim-geo {report['version']}, Python {report['python']}, {report['platform']}",
+        f"{report['cores']} cores, {_gigabytes(report['memory_bytes'])} of memory ({free} free), "
+        f"{_gigabytes(report['disk_free_bytes'])} free on this disk",
+        f"instruction set: {report['instruction_set'] or 'unknown, the core is not built'}",
+        f"C++20 compiler: {report['compiler'] or 'none'}",
+        f"cache: {report['cache'] or '?'}, {_gigabytes(report['cache_bytes'])} (may be deleted at any time)",
+        f"libraries: {', '.join(libraries)}",
+    ]
+    if report["problems"]:
+        lines += ["what to do:", *(f"  * {problem}" for problem in report["problems"])]
+    else:
+        lines.append("everything is there")
+    return "\n".join(lines)
+
+
+def usable_cores() -> int:
+    """Cores that this process may use: the affinity mask, and a container's quota rounded up."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with contextlib.suppress(OSError, ValueError):
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
+        if quota != "max":
+            cores = min(cores, max(1, math.ceil(int(quota) / int(period))))
+    return cores
+
+
+def memory_bytes() -> tuple[int | None, int | None]:
+    """(total, available) main memory in bytes; None where the system does not say."""
+    total = available = None
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                available = int(line.split()[1]) * 1024
+    return total, available
+
+
+def _library(module: str, distributions: tuple[str, ...]) -> tuple[str | None, str | None]:
+    """(version, None), or (None, what is wrong and what to do)."""
+    found = None
+    for name in distributions:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found = found or importlib.metadata.version(name)
+    try:
+        importlib.import_module(module)
+    except Exception as error:  # a broken library may raise anything, and the others are still to be looked at
+        name = module.split(".")[0]
+        if found is None:
+            pip = f"{Path(sys.executable).name} -m pip install {distributions[0]}"
+            return None, f"{name} is not installed; run: {pip}"
+        reason = " ".join(str(error).split())
+        return None, f"{name} {found} is installed but cannot be imported ({reason})"
+    return found or "unknown version", None
+
+
+def _instruction_set() -> tuple[str | None, str | None]:
+    try:
+        from linprim_geo.kernels.ops import instruction_set
+
+        return str(instruction_set()), None
+    except ImportError as error:
+        reason = " ".join(str(error).split())
+        do = "run make env, or pip install . in the source"
+        return None, f"the compiled core cannot be imported ({reason}); {do}"
+
+
+def _cache_folder() -> Path | None:
+    try:
+        from linprim_geo.imaging.photos import cache_folder
+    except ImportError:
+        return None
+    return cache_folder()
+
+
+def _can_be_written(folder: Path) -> bool:
+    """Whether files can be made in `folder`, or the folder itself where its first existing parent is."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
+
+
+def _size_of(folder: Path) -> int:
+    total = 0
+    for file in folder.rglob("*"):
+        with contextlib.suppress(OSError):
+            total += file.lstat().st_size
+    return total
+
+
+def _gigabytes(count: int | None) -> str:
+    return "?" if count is None else f"{count / 2**30:.1f} GiB"

@@ -1,0 +1,50 @@
+"""What goes into the report of a run: everything its folder and its capture say, with missing parts named; the page is
+report_page's."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+from linprim_geo.base.files import atomic_write
+from linprim_geo.display.report_data import gather
+from linprim_geo.runs.run import Run
+
+
+def report_run(
+    run: str | os.PathLike,
+    output: str | os.PathLike | None = None,
+    reference: str | os.PathLike | None = None,
+) -> dict:
+    """Writes one HTML file about a run, RUN/report.html unless `output` says otherwise; nothing else in the run is
+    changed.
+
+    The page needs nothing but itself. Scores that RUN/eval holds are taken if they are newer than the run's last save;
+    what is missing of colours, and of depth where the data set has depth or a `reference` mesh is given, is scored now.
+
+    Returns: `report`, `bytes`, `views` (shown), `meshes` (methods), `missing` (sentences), `seconds`.
+
+    Raises:
+        LinprimError: not a run folder, `reference` cannot be read, or the page cannot be written.
+    """
+    from linprim_geo.display.report_page import page
+
+    start = time.perf_counter()
+    opened = Run.open(run)
+    if reference is not None:
+        from linprim_geo.geometry.mesh_files import load_mesh
+
+        load_mesh(reference)
+    target = Path(output) if output else opened.path / "report.html"
+    text = page(gather(opened, reference))
+    with atomic_write(target) as temporary:
+        temporary.write_text(text.html, encoding="utf-8")
+    return {
+        "report": str(target),
+        "bytes": target.stat().st_size,
+        "views": text.views,
+        "meshes": text.meshes,
+        "missing": text.missing,
+        "seconds": time.perf_counter() - start,
+    }

@@ -1,0 +1,332 @@
+"""What a report shows: views with their errors, meshes, evidence, commands."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+import json
+import os
+import shlex
+import tempfile
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+
+import numpy as np
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import ExtractOptions, SceneOptions, TrainOptions
+from linprim_geo.capture.types import Scene, View
+from linprim_geo.display.report_mesh import HEADLINE, ShownMesh, find_meshes, read_json
+from linprim_geo.runs.run import Run
+
+# Held-out views that are shown, and the longer side of their pictures: they make the page's size.
+VIEWS, PIXELS = 4, 320
+# Differences of colours, of white, and of depths, of the truth, that have the last colour.
+COLOR_TOP, DEPTH_TOP = 0.2, 0.05
+
+
+@dataclass
+class ShownView:
+    """A held-out view: its scores and (title, PNG as a data URI, width, height) per picture."""
+
+    name: str
+    psnr: float
+    ssim: float
+    pictures: list[tuple[str, str, int, int]]
+
+
+@dataclass
+class Report:
+    """All that the page shows. What could not be had is None or empty, and a sentence in `missing` says why."""
+
+    run: Run
+    notes: dict
+    state: dict | None = None
+    scene: Scene | None = None
+    evidence: list[tuple[str, str]] = field(default_factory=list)
+    metrics: list[dict] = field(default_factory=list)
+    views: list[ShownView] = field(default_factory=list)
+    images: dict | None = None
+    depth: dict | None = None
+    meshes: list[ShownMesh] = field(default_factory=list)
+    commands: list[str] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
+
+
+def gather(run: Run, reference: str | os.PathLike | None = None) -> Report:
+    """Reads, renders and scores what the page shows."""
+    report = Report(run, run.notes)
+    missing = report.missing
+    try:
+        report.state = run.state
+    except LinprimError as error:
+        missing.append(f"{error}: nothing was saved yet, so nothing can be rendered or meshed")
+    report.metrics = _metrics(run.path / "metrics.jsonl", missing)
+    try:
+        report.scene = run.scene()
+    except LinprimError as error:
+        missing.append(f"The capture cannot be read: {error}")
+    if report.scene is not None:
+        report.evidence = _evidence(report.scene, report.notes, missing)
+    report.meshes = find_meshes(run, reference, missing)
+    if report.scene is not None and report.state is not None:
+        if report.scene.test:
+            _score_views(report, reference)
+        else:
+            missing.append("The capture has no held-out views, so nothing is compared with photographs")
+    report.commands = commands(run, report, reference)
+    return report
+
+
+def _metrics(file: Path, missing: list[str]) -> list[dict]:
+    entries = []
+    try:
+        lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    for line in lines:
+        try:
+            entry = json.loads(line)
+        except ValueError:  # a line that was torn when the run was killed
+            continue
+        if isinstance(entry, dict) and isinstance(entry.get("step"), int):
+            entries.append(entry)
+    if not entries:
+        missing.append(f"{file}: holds no entry, so there are no curves of training")
+    return entries
+
+
+def _evidence(scene: Scene, notes: dict, missing: list[str]) -> list[tuple[str, str]]:
+    """(what, figure) that the photographs and points say, measured now unless the run decided about effects by them."""
+    from linprim_geo.points.photo_evidence import observe
+
+    if notes.get("effects"):
+        return []
+    try:
+        seen = observe(scene)
+    except LinprimError as error:
+        missing.append(f"The photographs could not be compared with each other: {error}")
+        return []
+    if seen is None:
+        missing.append("The capture brings no points on surfaces, so its photographs are not compared with each other")
+        return []
+    rows = (
+        (
+            "brightness that varies from photograph to photograph (standard deviation)",
+            seen.gain_spread,
+            "%",
+            100.0,
+        ),
+        (
+            "colour that changes with the direction it is seen from, of white",
+            seen.view_dependence,
+            "%",
+            100.0,
+        ),
+        (
+            "largest by smallest pixel over the views of a point; a quarter of the points exceed it",
+            seen.scale_ratio,
+            "times",
+            1.0,
+        ),
+    )
+    return [
+        (what, "not measured" if value is None else f"{value * scale:.3g} {unit}") for what, value, unit, scale in rows
+    ]
+
+
+def _score_views(report: Report, reference: str | os.PathLike | None) -> None:
+    """Scores of colours and depth, stored or taken now, and the pictures."""
+    from linprim_geo.eval.depth import eval_depth_run
+    from linprim_geo.eval.images import eval_images_run
+
+    run, missing, scene = report.run, report.missing, report.scene
+    assert scene is not None
+    has_depth = any(view.depth_path is not None for view in scene.test)
+    with tempfile.TemporaryDirectory() as scratch:
+        try:
+            folder = run.path / "eval" / "images"
+            report.images = _stored(run, folder, missing)
+            if report.images is None:
+                folder = Path(scratch)
+                report.images = eval_images_run(run, output=folder)
+            ranking = _ranking(folder / "per_view.csv")
+            report.depth = _stored(run, run.path / "eval" / "depth", missing)
+            if (
+                report.depth
+                and reference
+                and Path(str(report.depth.get("reference"))).resolve() != Path(reference).resolve()
+            ):
+                report.depth = None
+            if report.depth is None and (has_depth or reference):
+                report.depth = eval_depth_run(run, reference, output=Path(scratch) / "depth")
+            if report.depth is None:
+                missing.append("The data set has no depth, and no --reference mesh was given, so depth is not scored")
+            report.views = _pictures(report, _chosen(scene.test, ranking))
+        except LinprimError as error:
+            missing.append(f"Held-out views could not be shown: {error}")
+
+
+def _stored(run: Run, folder: Path, missing: list[str]) -> dict | None:
+    """Scores of the held-out views that eval-images or eval-depth left, unless the run went on since."""
+    results = read_json(folder / "results.json", missing)
+    if results is None or results.get("split") != "test":
+        return None
+    fresh = (folder / "results.json").stat().st_mtime >= (run.path / "training_frame.npz").stat().st_mtime
+    return results if fresh else None
+
+
+def _ranking(file: Path) -> list[str]:
+    """Names of the views from the worst PSNR to the best; empty if it is not known."""
+    try:
+        with open(file, newline="", encoding="utf-8") as rows:
+            return [row["name"] for row in sorted(csv.DictReader(rows), key=lambda row: float(row["psnr"]))]
+    except (OSError, KeyError, TypeError, ValueError):
+        return []
+
+
+def _chosen(views: tuple[View, ...], ranking: list[str]) -> list[View]:
+    """The worst and the best held-out view by PSNR and some evenly between; by name where that is not known."""
+    by_name = {view.name: view for view in views}
+    if set(ranking) != set(by_name):
+        ranking = list(by_name)
+    places = np.unique(np.linspace(0, len(ranking) - 1, min(VIEWS, len(ranking))).round().astype(int))
+    return [by_name[ranking[place]] for place in places]
+
+
+def _pictures(report: Report, views: list[View]) -> list[ShownView]:
+    from linprim_geo.imaging.colors import depth_preview, error_colors
+    from linprim_geo.imaging.metrics import composite, psnr, ssim, to_8bit
+    from linprim_geo.surface.visibility import render_preview
+
+    run, shown = report.run, []
+    mesh = next((each for each in report.meshes if each.light is not None), None)
+    for view, images in run.render_views(views):
+        photo, render = composite(view.load(), run.background), to_8bit(images["rgb"].transpose(1, 2, 0))
+        difference = np.abs(render.astype(np.float64) - photo).mean(2) / 255.0
+        depth, covered = images["depth_median"], images["opacity"][..., None] > 0.5
+        pictures = [
+            ("photograph", photo),
+            ("render", render),
+            (f"colour error, 0 to {100 * COLOR_TOP:.0f} % of white", error_colors(difference / COLOR_TOP)),
+            ("median depth, near is yellow", depth_preview(depth)),
+            (
+                "normals, axes of the world",
+                np.where(covered, to_8bit(images["normal"] * 0.5 + 0.5), 255).astype(np.uint8),
+            ),
+        ]
+        truth = view.load_depth()
+        if truth is not None:
+            both = (truth > 0) & (depth > 0)
+            share = np.abs(depth - truth) / np.where(truth > 0, truth, 1.0) / DEPTH_TOP
+            colors = np.where(both[..., None], error_colors(np.where(both, share, 0.0)), 128).astype(np.uint8)
+            pictures.append(
+                (
+                    f"depth error, 0 to {100 * DEPTH_TOP:.0f} % of the depth, grey where either has none",
+                    colors,
+                )
+            )
+        if mesh is not None and mesh.light is not None:
+            grey = np.full(mesh.light.vertices.shape, 205, np.uint8)
+            pictures.append((f"mesh of {mesh.method} from there", render_preview(mesh.light, view.camera, colors=grey)))
+        encoded = [(title, *_png(pixels)) for title, pixels in pictures]
+        shown.append(ShownView(view.name, psnr(render, photo), ssim(render, photo), encoded))
+    return shown
+
+
+def _png(pixels: np.ndarray) -> tuple[str, int, int]:
+    """(data URI, width, height) of an image, averaged down to at most PIXELS along its longer side."""
+    from PIL import Image
+
+    image = Image.fromarray(np.ascontiguousarray(pixels))
+    share = PIXELS / max(image.size)
+    if share < 1:
+        image = image.resize([max(1, round(side * share)) for side in image.size], Image.Resampling.BOX)
+    file = io.BytesIO()
+    image.save(file, format="PNG", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode("ascii"), *image.size
+
+
+def commands(run: Run, report: Report, reference: str | os.PathLike | None) -> list[str]:
+    """The command lines that make this run, its meshes and its scores again."""
+    words = ["linprim-geo", "train", str(run.scene_path), "-o", str(run.path)]
+    for options in (run.scene_options, run.train_options):
+        words += _given(options)
+    # What the data called for is among the options: nothing is to be decided again.
+    lines = [shlex.join([*words, "--effects", "none"])]
+    for shown in report.meshes:
+        lines.append(shlex.join(_extraction(run, shown)))
+        for scores in shown.scores:
+            words = [
+                "linprim-geo",
+                "eval-mesh",
+                str(shown.stats["mesh"]),
+                str(scores.get("reference")),
+                "--run",
+                str(run.path),
+            ]
+            lines.append(
+                shlex.join(
+                    words + ([] if scores.get("protocol") == HEADLINE else ["--protocol", str(scores.get("protocol"))])
+                )
+            )
+    if report.images:
+        lines.append(shlex.join(["linprim-geo", "eval-images", str(run.path)]))
+    if report.depth:
+        truth = str(report.depth.get("reference", ""))
+        words = ["linprim-geo", "eval-depth", str(run.path)]
+        lines.append(shlex.join(words + ([] if truth == "depth images of the data set" else ["--reference", truth])))
+    words = ["linprim-geo", "report", str(run.path)]
+    lines.append(shlex.join(words + (["--reference", str(reference)] if reference else [])))
+    return lines
+
+
+def _extraction(run: Run, shown: ShownMesh) -> list[str]:
+    """The words that extract a mesh again, as far as its stats.json tells: what was chosen automatically is spelled
+    out."""
+    stats = shown.stats
+    words = [
+        "linprim-geo",
+        "extract-mesh",
+        str(run.path),
+        "--method",
+        shown.method,
+        "--level",
+        f"{stats['level']:.12g}",
+    ]
+    for name, flag, usual in (
+        ("voxel_size", "--voxel-size", 0.0),
+        ("truncation_voxels", "--truncation", ExtractOptions.truncation),
+        ("depth_limit", "--depth-limit", ExtractOptions.depth_limit),
+        ("refine", "--refine", ExtractOptions.refine),
+    ):
+        if stats.get(name, usual) != usual:
+            words += [flag, f"{stats[name]:.12g}"]
+    flags = {
+        "max_edges": "--close-holes",
+        "iterations": "--smooth",
+        "edge_length": "--remesh",
+        "target_faces": "--target-faces",
+    }
+    for step in stats.get("processing") or []:
+        words += [word for key, flag in flags.items() if key in step for word in (flag, f"{step[key]:.12g}")]
+    if stats.get("texture"):
+        words += ["--texture", str(stats["texture"]["size"])]
+    usual = run.path / "mesh" / shown.method / "mesh.ply"
+    return words + ([] if Path(stats["mesh"]).parts[-3:] == usual.parts[-3:] else ["-o", str(stats["mesh"])])
+
+
+def _given(options: SceneOptions | TrainOptions) -> list[str]:
+    """The words of a command line that set what differs from its default."""
+    words = []
+    for entry in fields(options):
+        value, flag = getattr(options, entry.name), "--" + entry.name.replace("_", "-")
+        if value == entry.default:
+            continue
+        if isinstance(value, bool):
+            words.append(flag if value else flag.replace("--", "--no-", 1))
+        else:
+            words.append(f"{flag}={value}" if str(value).startswith("-") else flag)
+            words += [] if str(value).startswith("-") else [str(value)]
+    return words

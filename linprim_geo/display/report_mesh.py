@@ -1,0 +1,234 @@
+"""The meshes of a run as a report shows them: found, scored against a reference, made light and packed for a
+browser."""
+
+from __future__ import annotations
+
+import base64
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from linprim_geo.base import files
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.display.meshes import Layer, is_inside, layers, light_mesh, up_direction
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.geometry.mesh_files import load_mesh
+from linprim_geo.runs.run import Run
+from linprim_geo.surface.extract import METHODS
+
+# Triangles of all meshes of a page together: about 4 MB of it.
+MOST_FACES = 150_000
+HEADLINE = "headline"
+# Sine of the angle above the horizon that a mesh is first looked at from.
+FIRST_LOOK = 0.4
+
+
+@dataclass
+class ShownMesh:
+    """One method's mesh: its statistics, the file that is shown, scores by protocol, and `packed`, what the page's
+    script reads.
+
+    `problem` says what is missing or wrong, "" if nothing is.
+    """
+
+    method: str
+    stats: dict
+    path: Path | None = None
+    light: Mesh | None = None
+    packed: dict | None = None
+    scores: list[dict] = field(default_factory=list)
+    problem: str = ""
+
+
+def find_meshes(run: Run, reference: str | os.PathLike | None, missing: list[str]) -> list[ShownMesh]:
+    """Every mesh that RUN/mesh tells of, scored and ready to be shown; what is not there is said in `missing`.
+
+    Scores are those of RUN/eval/mesh that belong to the mesh; with `reference` they are taken anew where there are none
+    of it.
+    """
+    found = []
+    for method in METHODS:
+        file = run.path / "mesh" / method / "stats.json"
+        if file.exists():
+            stats = read_json(file, missing)
+            if stats and not (isinstance(stats.get("mesh"), str) and isinstance(stats.get("level"), int | float)):
+                missing.append(f"{file}: does not tell of a mesh and its level")
+            elif stats:
+                found.append(ShownMesh(method, stats, mesh_file(run, method, stats)))
+    if not found:
+        missing.append(f"No mesh was extracted yet: linprim-geo extract-mesh {run.path}")
+        return found
+    try:
+        cameras = [view.camera for view in run.scene().train]
+    except LinprimError:
+        cameras = []
+    results = sorted((run.path / "eval" / "mesh").glob("**/results.json"))
+    stored = [(file, scores) for file in results if (scores := read_json(file, missing))]
+    for shown in found:
+        if shown.path is None:
+            shown.problem = (
+                f"{shown.stats.get('mesh')}: the mesh that stats.json of {shown.method} tells of is not there"
+            )
+        else:
+            try:
+                _fill(shown, stored, reference, cameras, run, MOST_FACES // len(found), missing)
+            except LinprimError as error:
+                shown.problem = str(error)
+        if shown.problem:
+            missing.append(shown.problem)
+    if not any(shown.scores for shown in found):
+        missing.append(
+            "No mesh was scored: linprim-geo eval-mesh MESH REFERENCE --run RUN, or report with --reference MESH"
+        )
+    return found
+
+
+def _fill(
+    shown: ShownMesh,
+    stored: list[tuple[Path, dict]],
+    reference: str | os.PathLike | None,
+    cameras: list[Camera],
+    run: Run,
+    most: int,
+    missing: list[str],
+) -> None:
+    path = shown.path
+    assert path is not None
+    mesh = load_mesh(path)
+    for file, scores in stored:
+        if refers_to(scores.get("prediction"), path):
+            if file.stat().st_mtime < path.stat().st_mtime:
+                missing.append(f"{file}: is older than {path}, so its scores are left out")
+            else:
+                shown.scores.append(scores)
+    truth: Path | None
+    if reference is not None:
+        truth = given = Path(reference)
+        shown.scores = [scores for scores in shown.scores if refers_to(scores.get("reference"), given)]
+        if not any(scores.get("protocol") == HEADLINE for scores in shown.scores):
+            from linprim_geo.eval.mesh import score_mesh
+
+            unit = run.unit
+            shown.scores.insert(
+                0,
+                score_mesh(mesh, load_mesh(truth), cameras=cameras or None, unit=unit) | {"reference": str(truth)},
+            )
+    else:
+        truth = next((place for scores in shown.scores if (place := _reference_of(scores, run))), None)
+        if shown.scores and truth is None:
+            missing.append(
+                f"{shown.scores[0].get('reference')}: is not there any more, so the true error of {shown.method} "
+                "is not shown"
+            )
+    inside = bool(cameras) and is_inside(mesh, cameras)
+    visible = path.with_name(f"{path.stem}_visible{path.suffix}")
+    if inside and visible.exists():  # what lies behind walls would hide the room
+        path, mesh = visible, load_mesh(visible)
+        shown.path = path
+    light, rows, cell = light_mesh(mesh, most)
+    error = None
+    if truth is not None:
+        from linprim_geo.eval.surface_samples import SurfaceDistance
+        from linprim_geo.geometry.mesh import validate_mesh
+
+        error, _ = SurfaceDistance(validate_mesh(load_mesh(truth), str(truth))).query(mesh.vertices[rows])
+    colors = layers(mesh, rows, error)
+    said = f"{path.name} of {shown.method}: {len(mesh.faces)} faces"
+    if cell:
+        said += (
+            f", shown with {len(light.faces)}: vertices are clustered in cells of {cell:.3g} {run.unit}, "
+            "which makes small folds"
+        )
+    if inside:
+        said += "; the cameras stand inside, so backs of faces are hidden, and what no camera sees is left out"
+    shown.light = light
+    shown.packed = pack(shown.method, light, colors, cameras, run.unit, said, inside)
+
+
+def pack(
+    name: str,
+    mesh: Mesh,
+    colors: Sequence[Layer],
+    cameras: Sequence[Camera],
+    unit: str,
+    said: str,
+    inside: bool,
+) -> dict:
+    """What viewer.js reads: places as 16-bit shares of the box (V, 4; the last is padding), corners as 32-bit rows,
+    colours as bytes."""
+    low, high = mesh.bounds
+    size = high - low
+    places = np.zeros((len(mesh.vertices), 4), "<u2")
+    places[:, :3] = np.rint((mesh.vertices - low) / np.where(size > 0, size, 1.0) * 65535)
+    up, direction = np.array([0.0, 0.0, 1.0]), np.array([0.6, -0.7, 0.4])
+    if cameras:
+        up = up_direction(cameras)
+        middle = (low + high) / 2
+        # The first look is a camera's, from somewhat above; from inside there is no place to stand, so it is into the
+        # room from above.
+        directions = np.stack([camera.center - middle for camera in cameras])
+        steepness = directions @ up / np.maximum(np.linalg.norm(directions, axis=1), 1e-12)
+        direction = directions[np.argmin(np.abs(steepness - FIRST_LOOK))] + (
+            0.6 * mesh.diagonal * up if inside else 0.0
+        )
+    return {
+        "name": name,
+        "said": said,
+        "faces": len(mesh.faces),
+        "size": size.tolist(),
+        "up": up.tolist(),
+        "from": direction.tolist(),
+        "inside": inside,
+        "places": _text(places),
+        "index": _text(mesh.faces.astype("<u4")),
+        "layers": [
+            {"name": layer.name, "colors": _text(layer.colors), "legend": _legend(layer, unit)} for layer in colors
+        ],
+    }
+
+
+def _legend(layer: Layer, unit: str) -> str:
+    if layer.top is None:
+        return ""
+    middle = "" if layer.median is None else f"; median {layer.median:.3g}"
+    return f"{layer.top:.3g} {unit} and more{middle}"
+
+
+def _text(values: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode("ascii")
+
+
+def mesh_file(run: Run, method: str, stats: dict) -> Path | None:
+    """The file that stats.json is about: where it was written, or in the run's folder if that was moved."""
+    name = Path(str(stats.get("mesh", "mesh.ply")))
+    return next((place for place in (name, run.path / "mesh" / method / name.name) if place.is_file()), None)
+
+
+def _reference_of(scores: dict, run: Run) -> Path | None:
+    name = Path(str(scores.get("reference", "")))
+    return next((place for place in (name, run.scene_path / name.name) if place.is_file()), None)
+
+
+def refers_to(name: object, path: Path) -> bool:
+    """Whether a path that was noted, perhaps in another working folder, means this file."""
+    noted = Path(str(name or ""))
+    return noted.resolve() == path.resolve() or (not noted.exists() and noted.parts[-3:] == path.parts[-3:])
+
+
+def read_json(file: Path, missing: list[str]) -> dict | None:
+    """The object in a JSON file; None if there is no file, and if it is damaged, which is said in `missing`."""
+    if not file.exists():
+        return None
+    try:
+        value = files.read_json(file, "what an earlier command left")
+    except LinprimError as error:
+        missing.append(str(error))
+        return None
+    if not isinstance(value, dict):
+        missing.append(f"{file}: holds no JSON object")
+        return None
+    return value

@@ -1,0 +1,1 @@
+"""Cameras, lenses, meshes, primitives, ray casting, and their files."""

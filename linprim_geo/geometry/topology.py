@@ -1,0 +1,95 @@
+"""What is wrong with a mesh: open edges, edges and vertices that are not manifold, faces that cross."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from linprim_geo.geometry.mesh import Mesh, face_areas, face_components
+
+# --- topology --------------------------------------------------------------------------------------------
+
+
+def topology(mesh: Mesh) -> dict:
+    """Counts and measures of a mesh, as `stats.json` holds them.
+
+    Returns:
+        `vertices` (those in use), `faces`, `components` (faces that share a vertex), `boundary_edges` (one
+        face), `non_manifold_edges` (more than two faces, or two that run along it the same way), `watertight`
+        (neither of these), `genus` (summed over the pieces, None unless watertight), `area`, `volume`
+        (signed, positive if faces are counter-clockwise seen from outside; None unless watertight).
+    """
+    used = len(np.unique(mesh.faces))
+    pieces, _ = face_components(mesh)
+    edges, uses, balance = _edges(mesh.faces, len(mesh.vertices))
+    boundary = int((uses == 1).sum())
+    non_manifold = int(((uses > 2) | ((uses == 2) & (balance != 0))).sum())
+    watertight = len(mesh.faces) > 0 and boundary == 0 and non_manifold == 0
+    genus = volume = None
+    if watertight:
+        fans, bodies = _fans_and_bodies(mesh.faces)
+        genus = int(bodies - (fans - len(edges) + len(mesh.faces)) // 2)
+        a, b, c = (mesh.vertices[mesh.faces[:, k]] - mesh.vertices[mesh.faces[0, 0]] for k in range(3))
+        volume = float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
+    return {
+        "vertices": used,
+        "faces": len(mesh.faces),
+        "components": pieces,
+        "boundary_edges": boundary,
+        "non_manifold_edges": non_manifold,
+        "genus": genus,
+        "watertight": watertight,
+        "area": float(face_areas(mesh).sum()),
+        "volume": volume,
+    }
+
+
+def _edges(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Keys of the undirected edges, how many faces use each, and uses one way minus uses the other way."""
+    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    keys = np.minimum(start, end) * np.int64(count) + np.maximum(start, end)
+    edges, index, uses = np.unique(keys, return_inverse=True, return_counts=True)
+    balance = np.bincount(index, weights=np.where(start < end, 1.0, -1.0), minlength=len(edges))
+    return edges, uses, balance
+
+
+def _fans_and_bodies(faces: np.ndarray) -> tuple[int, int]:
+    """Number of fans (faces around a vertex, joined by edges) and of pieces joined by edges, if watertight.
+
+    Where bodies touch in a vertex it has several fans, and a manifold would hold it once for each.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    def count(rows, columns, size):
+        graph = coo_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(size, size))
+        return int(connected_components(graph, directed=False, return_labels=False))
+
+    # Corner 3f+k is face f at its k-th vertex; corners of two faces join where they share an edge there.
+    corner = np.arange(faces.size).reshape(faces.shape)
+    start, end = faces, np.roll(faces, -1, axis=1)
+    low = np.where(start < end, corner, np.roll(corner, -1, axis=1)).ravel()
+    high = np.where(start < end, np.roll(corner, -1, axis=1), corner).ravel()
+    order = np.lexsort((np.maximum(start, end).ravel(), np.minimum(start, end).ravel()))
+    one, other = order[0::2], order[1::2]
+    rows, columns = np.concatenate([low[one], high[one]]), np.concatenate([low[other], high[other]])
+    return count(rows, columns, faces.size), count(one // 3, other // 3, len(faces))
+
+
+def manifold_status(mesh: Mesh) -> str:
+    """What manifold3d says of a mesh that should be closed: `NoError`, or why it is no manifold."""
+    import manifold3d
+
+    body = manifold3d.Manifold(manifold3d.Mesh64(mesh.vertices, mesh.faces.astype(np.uint64)))
+    return body.status().name
+
+
+def topology_line(stats: dict) -> str:
+    """One printed line of what `topology` returns."""
+    text = (
+        f"{stats['vertices']} vertices, {stats['faces']} faces, {stats['components']} components, "
+        f"{stats['boundary_edges']} boundary and {stats['non_manifold_edges']} non-manifold edges, "
+        f"area {stats['area']:.6g}"
+    )
+    if stats["watertight"]:
+        text += f", watertight, genus {stats['genus']}, volume {stats['volume']:.6g}"
+    return text

@@ -1,0 +1,1 @@
+"""Photographs from files, sampling, image metrics, colours, plots."""

@@ -1,0 +1,1 @@
+"""Tasks on several processes of this machine or on Ray."""

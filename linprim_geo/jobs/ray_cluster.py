@@ -1,0 +1,138 @@
+"""Tasks on a Ray cluster. Ray chooses the machine by cores and memory; retries are the executor's, which counts
+them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+from contextlib import suppress
+from pathlib import Path
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.jobs.executor import Executor, Outcome, outcome_of
+from linprim_geo.jobs.worker import ONE_THREAD
+
+# Seconds in which a running cluster has to answer, and how often a start of one is tried that does not come up in time.
+ANSWER_SECONDS, STARTS = 10, 3
+
+
+class RayCluster(Executor):
+    """Ray on this machine ("local"), or the cluster at an address such as 10.0.0.1:6379."""
+
+    what = "Ray"
+
+    def __init__(self, shared: Path, address: str, workers: int = 0):
+        # Nothing is reported to Ray's makers, and nothing warned of that concerns GPUs.
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+        try:
+            import ray
+        except ModuleNotFoundError:
+            raise LinprimError(
+                "--cluster wants Ray, which is not installed: pip install 'linprim-geo[cluster]'"
+            ) from None
+        if address not in ("local", "auto"):
+            _check_answer(address)
+        super().__init__(shared)
+        self.ray = ray
+        how = {"runtime_env": {"env_vars": ONE_THREAD}, "logging_level": "ERROR", "log_to_driver": False}
+        if ray.is_initialized():
+            raise LinprimError("--cluster: this process has joined a Ray cluster already, wanted one that has not")
+        if address == "local":
+            how |= {"num_cpus": workers or os.cpu_count() or 1, "include_dashboard": False}
+            # No other machine is to reach it, and it wants no name service.
+            how["_node_ip_address"] = "127.0.0.1"
+        ending = signal.getsignal(signal.SIGTERM)
+        try:
+            self._join(address, how)
+        except Exception as error:  # noqa: BLE001 - Ray raises a plain Exception where its start takes too long
+            raise _no_answer(address, error) from None
+        finally:
+            with suppress(ValueError):  # Ray sets one of its own
+                signal.signal(signal.SIGTERM, ending)
+        self.workers = workers or 10**9
+        nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        self.cores = max((int(node.get("CPU", 0)) for node in nodes), default=1) or 1
+        self.memory_gib = max((node.get("memory", 0.0) for node in nodes), default=0.0) / 2**30
+        # A process for every task: what one has taken is free when the next begins.
+        self.remote = ray.remote(max_retries=0, max_calls=1)(_work)
+
+    def _join(self, address: str, how: dict) -> None:
+        for attempt in range(STARTS):
+            try:
+                self.ray.init(address=address, **how)
+                return
+            except Exception as error:  # noqa: BLE001 - a plain one on a machine too busy to start it in time
+                self.ray.shutdown()
+                if address != "local" or attempt + 1 == STARTS or "timed out" not in str(error):
+                    raise
+
+    def capacity(self):
+        # How many fit at once, and where, is Ray's to say; a single task has to fit a machine.
+        return self.workers, self.memory_gib
+
+    def _has_room(self, task, beside):
+        return super()._has_room(task, []) and len(beside) < self.workers
+
+    def start(self, spec, task):
+        return self.remote.options(
+            num_cpus=min(task.cores, self.cores), memory=int(task.memory_gib * 2**30), name=task.name
+        ).remote(spec)
+
+    def ended(self, handles, seconds):
+        ready, _ = self.ray.wait(handles, num_returns=len(handles), timeout=0)
+        if not ready:
+            ready, _ = self.ray.wait(handles, num_returns=1, timeout=seconds)
+        return [(handle, self._outcome(handle)) for handle in ready]
+
+    def _outcome(self, handle) -> Outcome:
+        errors = self.ray.exceptions
+        try:
+            return outcome_of(self.ray.get(handle))
+        except errors.OutOfMemoryError:
+            return Outcome(memory="Ray killed it, for the machine had hardly any left")
+        except (
+            errors.WorkerCrashedError,
+            errors.NodeDiedError,
+            errors.ObjectLostError,
+            errors.RaySystemError,
+        ) as error:
+            return Outcome(died=type(error).__name__)
+        except errors.RayError as error:
+            text = " ".join(str(error).split())
+            if "linprim_geo" in text and "ModuleNotFoundError" in text:
+                return Outcome(
+                    error="a worker of the cluster has no linprim-geo: wanted the same version as here on all of them"
+                )
+            return Outcome(error=f"a worker of the cluster failed: {text[-300:]}")
+
+    def stop(self):
+        self.ray.shutdown()
+
+
+def _check_answer(address: str) -> None:
+    """Raises LinprimError unless something listens at host:port, which Ray itself waits minutes for."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not (host and port.isdigit()):
+        raise LinprimError(f"--cluster is {address!r}, wanted local, auto, or an address such as 10.0.0.1:6379")
+    try:
+        socket.create_connection((host, int(port)), ANSWER_SECONDS).close()
+    except (OSError, OverflowError) as error:
+        raise _no_answer(address, error) from None
+
+
+def _no_answer(address: str, error: Exception) -> LinprimError:
+    reason = (" ".join(str(error).split()) or type(error).__name__)[:160]
+    wanted = "local, or the address that ray start --head has printed"
+    return LinprimError(f"--cluster {address}: no Ray cluster answers there ({reason}), wanted {wanted}")
+
+
+def _work(task: dict) -> dict:
+    """`worker.run_task` where Ray has started a process for it."""
+    import torch
+
+    from linprim_geo.jobs.worker import run_task
+
+    torch.set_num_threads(1)
+    return run_task(task)

@@ -1,0 +1,1 @@
+"""The only door to the compiled core: the rasterizer, the losses, Adam."""

@@ -1,0 +1,1 @@
+"""The rasterizer and the losses again, in plain torch: slow, independent, for any float type."""

@@ -1,0 +1,86 @@
+"""The core's functions on surface points and voxels: votes of depth maps, brightness and colours from photographs.
+
+All arrays are C-contiguous numpy arrays; those named as sums are changed in place. `pose` is a camera's 12 numbers
+(rotation rows, then translation) and `lens` its (fx, fy, cx, cy), both as `Camera.pinhole` gives them. Results are the
+same to the last bit for any number of threads. Arrays whose shape or type does not fit raise ValueError.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from linprim_geo import _core
+
+
+def add_photo(
+    pose, lens, image, depth, jump, rules, offset, point, normal, footprint, views, weight, value, square
+) -> None:
+    """Adds a photograph's brightness along the normals of P points to the sums.
+
+    Args:
+        image, depth, jump: (H, W) float32 brightness, depth of the surface, and largest less least depth of 3x3 pixels.
+        rules: least cosine of a view onto a point, and how many times the slope's depth jump makes an outline.
+        offset: (K,) float64 places along the normal, in footprints.
+        point, normal, footprint: (P, 3), (P, 3), (P,) float64.
+        views, weight, value, square: (P,) int32, (P,) float32, (P, K), (P, K) float32 sums.
+    """
+    _core.add_photo(
+        pose, lens, image, depth, jump, rules, offset, point, normal, footprint, views, weight, value, square
+    )
+
+
+def least_footprints(pose, lens, width: int, height: int, least_cosine: float, point, normal, least) -> None:
+    """Lowers `least` (P,) float64 to the length that a pixel of this view covers at (P, 3) float64 points, where the
+    view looks at them under more than `least_cosine` and they lie in the image."""
+    _core.least_footprints(pose, lens, width, height, least_cosine, point, normal, least)
+
+
+def add_colors(pose, lens, image, depth, near, far, rules, point, normal, best, shade, good) -> None:
+    """Offers a photograph's colours to P points, of which each keeps its best samples.
+
+    Args:
+        image: (H, W, 3) float32, or (H, W, 4) with alpha from 0 to 255, by which the others are multiplied already.
+        depth, near, far: (H, W) float32 depth of the surface, least and largest depth of 3x3 pixels.
+        rules: four numbers, see csrc/surface/point_colors.h.
+        point, normal: (P, 3) float64.
+        best, shade, good: (P, K) float32 weights, (P, K, 3) float32 colours, (P,) uint8 how many good ones; the sums.
+    """
+    _core.add_colors(pose, lens, image, depth, near, far, rules, point, normal, best, shade, good)
+
+
+def face_samples(pose, lens, depth, vertex, corner, bary, behind: float, slack: float, skip, found) -> None:
+    """Sets bit s of `found` (F,) uint8 where sample s of a face may be seen: it lies in the image, and no farther than
+    (1 + behind) d + slack for the largest depth d of the four pixels round it.
+
+    Args:
+        depth: (H, W) float32.
+        vertex, corner: (V, 3) float64, (F, 3) int64.
+        bary: (S, 3) float64 barycentric coordinates of the samples.
+        skip: (F,) uint8, faces that are left out.
+    """
+    _core.face_samples(pose, lens, depth, vertex, corner, bary, behind, slack, skip, found)
+
+
+def points_within(center, normal, offset, point, enlarged: float, least: int) -> tuple[np.ndarray, np.ndarray]:
+    """The points within each of N convex bodies: (N,) int64 how many, and the rows of them all, body by body.
+
+    A body { x : normal_f . (x - center) <= offset_f } is `enlarged` about its centre; one in which fewer than `least`
+    points lie as it is has none. `center` (N, 3), `normal` (N, F, 3), `offset` (N, F), `point` (P, 3) are float64.
+    """
+    return _core.points_within(center, normal, offset, point, enlarged, least)
+
+
+def add_votes(
+    project, width: int, height: int, surfels, rules, rows, corner, voxel: float, resolution: int, total, weight, free
+) -> None:
+    """Adds the votes of a depth map to the voxels of the blocks `rows` of a sparse grid.
+
+    Args:
+        project: 12 numbers, rows of world to pixels times depth.
+        surfels: (H W, columns) float32, a plane per pixel, see csrc/surface/fuse.h.
+        rules: eight numbers, how much a vote weighs by its distance, see csrc/surface/fuse.h.
+        rows: (K,) int64 blocks.
+        corner: (B, 3) float64, the first voxel of each block.
+        total, weight, free: (B, resolution^3) float32 sums.
+    """
+    _core.add_votes(project, width, height, surfels, rules, rows, corner, voxel, resolution, total, weight, free)

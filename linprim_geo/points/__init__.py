@@ -1,0 +1,1 @@
+"""Where a training starts: the capture's points, new ones, and what photographs say of them."""

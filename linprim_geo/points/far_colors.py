@@ -1,0 +1,189 @@
+"""The environment of a scene: a cube map of what stands at infinity behind everything.
+
+`FarColors` is what photographs say of it before anything is trained: the colour that most of them show in a direction,
+and how well that explains them. From it follow whether a scene is open, which points lie in front, and where the
+training of the map begins. `ops.environment_light` says how the six faces lie.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+import torch
+
+from linprim_geo.capture.types import Scene
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.environment_map import filled, nearest_texel, texel_directions, texels_for
+from linprim_geo.kernels import ops
+from linprim_geo.points.initial_points import Look, VolumePoints, in_image, spread_looks
+
+# The photographs' own colours at infinity are gathered with fewer, from views spread over the capture.
+SURVEY_TEXELS, SURVEY_VIEWS = 128, 60
+# A scene is open where colours at infinity explain this share of the textured parts of its photographs: 0.31 to 0.39 of
+# four objects before far rooms, 0.06 at most of six captures of rooms, facades, and objects on black or near a wall.
+OPEN_SHARE = 0.1
+# A patch is explained by the environment if its mean difference, of 255, is below this, or below this part of its
+# variation: noise of 12 averages to this over 4 by 4 pixels, and what is finer than a texel is filtered.
+SAME_COLOR, EXPLAINED = 3.0, 1 / 3
+# Photographs that show a direction, at least, for its colour to be known.
+LEAST_VIEWS = 3
+# Of more photographs of a direction than this, so many are compared with each other.
+COMPARED = 24
+# One pixel of so many rows and columns is compared with the environment, averaged over as many by as many of these.
+STRIDE, PATCH = 4, 3
+# Where colours vary by more than this in a patch, of 255 (standard deviation), there is something to recognise.
+TEXTURED = 12.0
+
+
+class FarColors:
+    """The colours that photographs show in each direction, as if everything were at infinity.
+
+    `texels` (T, 3) float32, 0 to 255, of T = 6 size^2, the colour that most photographs of a direction agree on, NaN
+    without one; `views` (T,) how many show it. Where some see past the scene that is the environment, for what stands
+    before it differs from view to view.
+    """
+
+    def __init__(self, looks: Sequence[Look]):
+        self.looks = looks
+        self.size = texels_for([look.camera for look in looks], most=SURVEY_TEXELS)
+        focal = float(np.median([look.camera.fx for look in looks]))
+        self.width = max(3, round(2 * focal / self.size)) | 1  # of a texel in pixels
+        directions = texel_directions(self.size).reshape(6, -1, 3)
+        images = [self._image(look) for look in looks]
+        faces = [self._face(each, images) for each in directions]
+        self.texels, self.views = (np.concatenate(parts) for parts in zip(*faces, strict=True))
+
+    def _image(self, look: Look) -> np.ndarray:
+        """(H, W, 3) float32, averaged as a texel averages."""
+        from scipy.ndimage import uniform_filter
+
+        return uniform_filter(look.rgb.astype(np.float32), (self.width, self.width, 1), mode="nearest")
+
+    def _face(self, directions: np.ndarray, images: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        seen = [np.full((len(directions), 3), np.nan, np.float32)]
+        for look, image in zip(self.looks, images, strict=True):
+            inside, row, column = in_image(_at_origin(look.camera), directions)
+            if inside.any():
+                colors = np.full((len(directions), 3), np.nan, np.float32)
+                colors[inside] = image[row[inside], column[inside]]
+                seen.append(colors)
+        return _commonest(np.stack(seen[1:] or seen, 1))
+
+    @cached_property
+    def _all_compared(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        return [self.compared(look) for look in self.looks]
+
+    def compared(self, look: Look) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of a look, on the lattice of STRIDE pixels: (h, w) mean difference of a patch from the environment, (h, w)
+        variation of its colours, both of 255, and (h, w) how many views show the direction."""
+        from scipy.ndimage import uniform_filter
+
+        image = self._image(look)
+        lattice = _lattice(image)
+        part = image[lattice]
+        texel = nearest_texel(look.camera.world_rays()[lattice], self.size)
+        texels = torch.from_numpy(np.nan_to_num(self.texels)).reshape(6, self.size, self.size, 3)
+        environment = (
+            ops.environment_light(torch.zeros(image.shape[:2]), texels, look.camera).numpy().transpose(1, 2, 0)
+        )
+        difference = np.abs(part - environment[lattice]).mean(-1)
+        mean = uniform_filter(part, (PATCH, PATCH, 1), mode="nearest")
+        variance = uniform_filter(part * part, (PATCH, PATCH, 1), mode="nearest") - mean * mean
+        variation = np.sqrt(np.maximum(variance.max(-1), 0))
+        return uniform_filter(difference, PATCH, mode="nearest"), variation, self.views[texel]
+
+    def difference(self, look: Look) -> Callable[[np.ndarray], np.ndarray]:
+        """A function of (Q, 2) positions in a look: (Q,) how much the patches there differ from the environment, of
+        255; NaN where too few views tell."""
+        difference, _, views = self.compared(look)
+        known = np.where(views >= LEAST_VIEWS, difference, np.nan)
+
+        def at(pixels: np.ndarray) -> np.ndarray:
+            row, column = (np.clip((pixels[:, 1 - k] / STRIDE).astype(np.int64), 0, known.shape[k] - 1) for k in (0, 1))
+            return known[row, column]
+
+        return at
+
+    def explained(self, points: np.ndarray) -> float | None:
+        """Share of the textured patches of all photographs that the environment explains, less the share of those that
+        show the nearer half of (P, 3) `points`, which it explains by chance, or because the cameras are too near to
+        each other to tell. None without textured patches."""
+        everywhere, at_points = [], []
+        for look, (difference, variation, views) in zip(self.looks, self._all_compared, strict=True):
+            usable = (views >= LEAST_VIEWS) & (variation > TEXTURED)
+            if look.foreground is not None:
+                usable &= look.foreground[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
+            good = difference < EXPLAINED * variation
+            everywhere.append(good[usable])
+            inside = in_image(look.camera, points)[0]
+            pixels, depth = look.camera.project(points[inside])
+            nearer = pixels[depth <= np.median(depth)] if len(depth) else pixels
+            row, column = (np.clip((nearer[:, 1 - k] / STRIDE).astype(np.int64), 0, views.shape[k] - 1) for k in (0, 1))
+            at_points.append(good[row, column][usable[row, column]])
+        rest, chance = np.concatenate(everywhere), np.concatenate(at_points)
+        if not len(rest):
+            return None
+        return float(rest.mean() - (chance.mean() if len(chance) else 0.0))
+
+    def start(self, size: int) -> torch.Tensor:
+        """(6, size, size, 3) texels in [0, 1] that training begins with; a direction that too few photographs show is
+        as those round it."""
+        square = (6, self.size, self.size, -1)
+        colors, known = (
+            torch.from_numpy(values.astype(np.float32)).reshape(square)
+            for values in (np.nan_to_num(self.texels) / 255, self.views >= LEAST_VIEWS)
+        )
+        coarse = filled(colors, known).movedim(-1, 1)
+        fine = torch.nn.functional.interpolate(coarse, size=(size, size), mode="bilinear", align_corners=False)
+        return fine.movedim(1, -1).contiguous()
+
+
+def far_colors(scene: Scene) -> FarColors:
+    """What the photographs of a scene show at infinity."""
+    return FarColors(spread_looks(scene.train, SURVEY_VIEWS))
+
+
+def far_share(far: FarColors, scene: Scene) -> float:
+    """`FarColors.explained` by the scene's points; 0 where the photographs do not tell."""
+    points = scene.points
+    return far.explained(np.zeros((0, 3)) if points is None or isinstance(points, VolumePoints) else points.xyz) or 0.0
+
+
+def _commonest(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """((T, 3) mean of the colours that lie near to the one that most of (T, V, 3) lie near to, NaN without any, (T,)
+    how many there are).
+
+    Colours of NaN are none. Source: a mean shift of one step from the best of the samples.
+    """
+    shown = np.isfinite(values[..., 0])
+    views = shown.sum(1)
+    order = np.argsort(~shown, axis=1, kind="stable")[:, : max(1, int(views.max(initial=0)))]
+    values = np.take_along_axis(values, order[..., None], 1)
+    values = values[
+        :, np.unique(np.linspace(0, values.shape[1] - 1, min(values.shape[1], COMPARED)).round().astype(int))
+    ]
+    result = np.empty((len(values), 3), np.float32)
+    step = 4096
+    for begin in range(0, len(values), step):
+        part = values[begin : begin + step]
+        near = np.abs(part[:, :, None] - part[:, None]).mean(-1) <= SAME_COLOR
+        best = near[np.arange(len(part)), near.sum(2).argmax(1)]
+        total = np.where(best[..., None], np.nan_to_num(part), 0).sum(1)
+        with np.errstate(invalid="ignore"):
+            result[begin : begin + step] = total / best.sum(1, keepdims=True)
+    return result, views
+
+
+def _lattice(image: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Index of one pixel of STRIDE rows and columns of an (H, W, ...) image."""
+    return np.ix_(*(np.arange(STRIDE // 2, size, STRIDE) for size in image.shape[:2]))
+
+
+def _at_origin(camera: Camera) -> Camera:
+    """The camera moved to the origin: points at infinity in the directions d project as the points d do."""
+    pose = camera.world_to_camera.copy()
+    pose[:3, 3] = 0
+    return replace(camera, world_to_camera=pose)

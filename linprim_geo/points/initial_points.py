@@ -1,0 +1,355 @@
+"""Where a capture is and where its surfaces may be, from cameras, points and masks: the frame that training
+works in, and points to start from where no others are to be had."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.capture.types import PointCloud, Scene, View
+from linprim_geo.geometry.camera import Camera, Similarity
+from linprim_geo.imaging import photos
+
+# The frame of training has its cameras at this median distance from what they look at; learning rates
+# assume it.
+CAMERA_DISTANCE = 3.0
+# Distances below this share of the coordinates are rounding errors of the poses.
+_SAME_PLACE = 1e-9
+# A camera counts for the normalisation if it sees at least this many points.
+_MIN_POINTS_SEEN = 8
+# Axes meet in a focus if it lies before this share of the cameras, if they miss it by at most this share of
+# their distance (median), and if they are not parallel: the smallest eigenvalue of mean(1 - d d^T), sin^2
+# of their spread.
+_FOCUS_IN_FRONT = 0.75
+_FOCUS_MAX_MISS = 0.35
+_FOCUS_MIN_EIGENVALUE = 1e-3
+_FOCUS_ROUNDS = 5
+# Photographs are looked at with about so many pixels on the longer side, and no more than so many of them.
+_LOOK_SIZE = 512
+_MAX_LOOKS = 200
+# Alpha from here on is foreground: half-covered edge pixels are.
+_FOREGROUND = 16
+# Of the views, this share may say background and be overruled: masks have errors.
+_MASK_ERRORS = 0.02
+# A point of the hull lies inside at least this share of the images, and in two.
+_HULL_MIN_SEEN = 0.3
+_HULL_ROUNDS = 4
+_HULL_SAMPLES = 100_000
+_HULL_MAX_BATCHES = 400
+# Depths of `frusta_points`, as shares of the typical distance to what the cameras look at.
+_FRUSTA_DEPTHS = (0.15, 4.0)
+_FRUSTA_SEEN = 3
+_FRUSTA_BATCHES = 20
+_COLOR_VIEWS = 24
+
+
+# The plane round a point is that of so many of its nearest, itself among them. Where they lie in a plane to within this
+# share of their spread, more is not believed: points have errors.
+_PLANE_POINTS = 10
+_THINNEST = 0.1
+
+
+@dataclass(frozen=True)
+class VolumePoints(PointCloud):
+    """Points that say where surfaces may be, not where they are."""
+
+
+def local_planes(xyz: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """How (P, 3) points lie in space: (P, 4) unit quaternions (w, x, y, z) whose third axis is the normal of the plane
+    through a point and its 9 nearest, turned about it at random, and (P,) how flat these are.
+
+    Flatness is the root of the smallest by the middle eigenvalue of their covariance: 0.1 (and not less) for a plane,
+    about 0.6 for points anywhere in a volume. Fewer than 4 points are no plane: 1.
+    """
+    from scipy.spatial import cKDTree
+    from scipy.spatial.transform import Rotation
+
+    rng = np.random.default_rng([seed, 7])
+    count = min(_PLANE_POINTS, len(xyz))
+    if count < 4:
+        rotation = rng.normal(size=(len(xyz), 4))
+        return rotation / np.linalg.norm(rotation, axis=1, keepdims=True), np.ones(len(xyz))
+    near = xyz[cKDTree(xyz).query(xyz, k=count)[1]]
+    near = near - near.mean(axis=1, keepdims=True)
+    spread, axes = np.linalg.eigh(np.einsum("pki,pkj->pij", near, near))
+    spread = np.maximum(spread, 0.0)
+    middle = np.maximum(spread[:, 1], np.finfo(float).tiny)
+    flat = np.clip(np.sqrt(spread[:, 0] / middle), _THINNEST, 1.0)
+    normal, across = axes[:, :, 0], axes[:, :, 1]
+    turn = rng.uniform(0.0, 2.0 * np.pi, (len(xyz), 1))
+    first = np.cos(turn) * across + np.sin(turn) * np.cross(normal, across)
+    frame = np.stack([first, np.cross(normal, first), normal], axis=2)
+    return np.roll(Rotation.from_matrix(frame).as_quat(), 1, axis=1), flat
+
+
+def scene_normalization(scene: Scene) -> Similarity:
+    """The similarity to the frame of training: what is looked at is round the origin, cameras at 3 (median).
+
+    With points, a camera looks at those in its image: at their median position, from their median depth.
+    Without, at the point closest to all optical axes (least squares, outliers left out), if there is such a
+    point. Cameras that look outward or in parallel, and have no points, are centred themselves, their spread
+    taken for the distance.
+
+    Raises:
+        LinprimError: all cameras are in one place and there are no points.
+    """
+    target, distance = looked_at(scene)
+    size = max(np.abs(view.camera.center).max() for view in scene.train)
+    if not distance > _SAME_PLACE * size:
+        raise LinprimError(
+            f"{scene.root}: all cameras are in one place and there are no points, wanted one or the other"
+        )
+    x, y, z = (float(value) for value in target)
+    return Similarity(CAMERA_DISTANCE / distance, (x, y, z))
+
+
+def looked_at(scene: Scene) -> tuple[np.ndarray, float]:
+    """((3,) centre of what the training cameras look at, median distance to it), in the data set's frame."""
+    cameras = [view.camera for view in scene.train]
+    if scene.points is not None:
+        found = _looked_at_points(cameras, scene.points.xyz)
+        if found is not None:
+            return found
+    centers = np.array([camera.center for camera in cameras])
+    axes = np.array([camera.rotation[2] for camera in cameras])
+    focus = focus_point(centers, axes)
+    if focus is not None:
+        return focus, float(np.median(((focus - centers) * axes).sum(axis=1)))
+    center = np.median(centers, axis=0)
+    return center, float(np.median(np.linalg.norm(centers - center, axis=1)))
+
+
+def focus_point(centers: np.ndarray, axes: np.ndarray) -> np.ndarray | None:
+    """The (3,) point nearest to the lines through (N, 3) `centers` along unit `axes`, or None if they have no
+    focus.
+
+    Minimises the sum of squared distances |(1 - d d^T)(x - c)|^2, then again over those within twice the
+    median.
+    """
+    use = np.ones(len(centers), dtype=bool)
+    for _ in range(_FOCUS_ROUNDS):
+        across = np.eye(3) - axes[use, :, None] * axes[use, None, :]
+        normal = across.mean(axis=0)
+        if np.linalg.eigvalsh(normal)[0] < _FOCUS_MIN_EIGENVALUE:
+            return None
+        focus = np.linalg.solve(normal, np.einsum("nij,nj->i", across, centers[use]) / use.sum())
+        along = ((focus - centers) * axes).sum(axis=1)
+        miss = np.linalg.norm(focus - centers - along[:, None] * axes, axis=1)
+        closer = miss <= 2.0 * np.median(miss) + np.finfo(float).eps * np.abs(along).max()
+        if (closer == use).all() or closer.sum() < 2:
+            break
+        use = closer
+    if (along > 0).mean() < _FOCUS_IN_FRONT or np.median(miss) > _FOCUS_MAX_MISS * np.median(along):
+        return None
+    return focus
+
+
+def visual_hull_points(scene: Scene, count: int, seed: int) -> VolumePoints:
+    """`count` points, uniform in the volume that the masks of the training views leave, coloured from the
+    images.
+
+    A point is carved away where more than 2 % of the views see background. Outside of an image is background
+    if the foreground touches none of its borders, else unknown. The box to draw from starts as the cube round
+    what the cameras look at that reaches to the farthest camera, and shrinks on what is left, with masks
+    grown by a few pixels so that no thin part is lost. A colour is the mean over views of the pixel, without
+    regard to what hides it.
+
+    Raises:
+        LinprimError: the views have no masks, or nothing is left.
+    """
+    if not scene.has_alpha:
+        raise LinprimError(f"{scene.root}: the images have no alpha channel and no masks, wanted one for a visual hull")
+    rng = np.random.default_rng(seed)
+    looks = spread_looks(scene.train, _MAX_LOOKS)
+    box = _hull_box(scene, looks, rng)
+    kept, total, batches = [], 0, 0
+    while total < count and batches < _HULL_MAX_BATCHES:
+        points = rng.uniform(box[0], box[1], (_HULL_SAMPLES, 3))
+        kept.append(points[_inside_hull(points, looks, grow=0)])
+        total += len(kept[-1])
+        batches += 1
+        if batches == 20 and not total:
+            break
+    if not total:
+        raise LinprimError(
+            f"{scene.root}: no point is foreground in the masks of all {len(looks)} training views,"
+            " wanted masks that fit the cameras"
+        )
+    xyz = np.concatenate(kept)[:count]
+    if len(xyz) < count:  # a hull of hair-thin parts: what was found stands for the rest
+        xyz = xyz[rng.integers(0, len(xyz), count)]
+    return VolumePoints(xyz, _colors(xyz, looks))
+
+
+def frusta_points(scene: Scene, count: int, seed: int) -> VolumePoints:
+    """`count` points in the space that several training cameras see, with mean colours: the last resort.
+
+    Drawn along pixels of random cameras with a depth that is uniform in its logarithm, from 0.15 to 4 times
+    the distance to what the cameras look at; kept if three cameras see them, or as many as do if that leaves
+    too few.
+
+    Raises:
+        LinprimError: there is no scale, as for `scene_normalization`.
+    """
+    rng = np.random.default_rng(seed)
+    distance = CAMERA_DISTANCE / scene_normalization(scene).scale
+    cameras = [view.camera for view in scene.train]
+    low, high = np.log(_FRUSTA_DEPTHS[0] * distance), np.log(_FRUSTA_DEPTHS[1] * distance)
+    found: list[list[np.ndarray]] = [[] for _ in range(_FRUSTA_SEEN)]  # by the number of cameras that see them
+    for _ in range(_FRUSTA_BATCHES):
+        points = _along_pixels(cameras, 2 * count, low, high, rng)
+        seen = np.zeros(len(points), dtype=np.int64)
+        for camera in cameras:
+            seen += in_image(camera, points)[0]
+        for number in range(_FRUSTA_SEEN):
+            exact = seen == number + 1 if number + 1 < _FRUSTA_SEEN else seen >= _FRUSTA_SEEN
+            found[number].append(points[exact])
+        if sum(len(points) for points in found[-1]) >= count:
+            break
+    xyz = np.concatenate([np.concatenate(points) for points in reversed(found)])[:count]
+    return VolumePoints(xyz, _colors(xyz, spread_looks(scene.train, _COLOR_VIEWS)))
+
+
+class Look:
+    """A training view's camera and photograph, averaged down to what choosing points needs.
+
+    `rgb` (h, w, 3) uint8; `foreground` (h, w) bool, None without alpha; `open` says whether the object goes on outside
+    of the image.
+    """
+
+    def __init__(self, view: View):
+        photo = view.load()
+        factor = max(1, max(view.camera.width, view.camera.height) // _LOOK_SIZE)
+        self.rgb, alpha = photos.box_downscale(photo.rgb, photo.alpha, factor)
+        height, width = self.rgb.shape[:2]
+        c = view.camera
+        self.camera = Camera(
+            width, height, c.fx / factor, c.fy / factor, c.cx / factor, c.cy / factor, c.world_to_camera
+        )
+        self.foreground = None if alpha is None else alpha >= _FOREGROUND
+        self.open = False
+        if self.foreground is not None:
+            edges = self.foreground[[0, -1]].any() or self.foreground[:, [0, -1]].any()
+            self.open = bool(edges)
+
+
+def spread_looks(views: Sequence[View], limit: int) -> list[Look]:
+    """Looks at no more than `limit` of the views, evenly spread over their order.
+
+    Raises:
+        LinprimError: a photograph cannot be read.
+    """
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(limit, len(views))).round().astype(int))
+    return [Look(views[i]) for i in chosen]
+
+
+def _hull_box(scene: Scene, looks: Sequence[Look], rng: np.random.Generator) -> np.ndarray:
+    """(2, 3) corners of a box round the visual hull, from coarse to fine."""
+    cameras = [look.camera for look in looks]
+    center, distance = looked_at(scene)
+    half = max(np.linalg.norm(camera.center - center) for camera in cameras)
+    half = max(half, distance)
+    box = np.stack([center - half, center + half])
+    for _ in range(_HULL_ROUNDS):
+        points = rng.uniform(box[0], box[1], (_HULL_SAMPLES, 3))
+        # The mean distance of samples, so that masks are grown by what lies between two of them.
+        spacing = (np.prod(box[1] - box[0]) / _HULL_SAMPLES) ** (1 / 3)
+        grow = [int(np.ceil(spacing * camera.fx / distance)) for camera in cameras]
+        grow = [min(max(value, 1), max(look.rgb.shape[:2]) // 8) for value, look in zip(grow, looks, strict=True)]
+        inside = points[_inside_hull(points, looks, grow)]
+        if not len(inside):
+            break
+        box_new = np.stack([inside.min(axis=0) - spacing, inside.max(axis=0) + spacing])
+        box = np.stack([np.maximum(box[0], box_new[0]), np.minimum(box[1], box_new[1])])
+    return box
+
+
+def _inside_hull(points: np.ndarray, looks: Sequence[Look], grow: int | Sequence[int]) -> np.ndarray:
+    """(P,) whether enough views see the points and hardly any sees background there."""
+    allowed = int(_MASK_ERRORS * len(looks))
+    needed = max(2, int(np.ceil(_HULL_MIN_SEEN * len(looks))))
+    alive = np.arange(len(points))
+    against, seen = np.zeros(len(points), dtype=np.int64), np.zeros(len(points), dtype=np.int64)
+    grow = [grow] * len(looks) if isinstance(grow, int) else grow
+    for look, radius in zip(looks, grow, strict=True):
+        assert look.foreground is not None, "a visual hull is made of masks"
+        mask = _grown(look.foreground, radius)
+        inside, row, column = in_image(look.camera, points[alive])
+        background = np.zeros(len(alive), dtype=bool) if look.open else ~inside
+        background[inside] = ~mask[row[inside], column[inside]]
+        against[alive] += background
+        seen[alive] += inside
+        alive = alive[against[alive] <= allowed]
+        if not len(alive):
+            break
+    result = np.zeros(len(points), dtype=bool)
+    result[alive] = seen[alive] >= needed
+    return result
+
+
+def _grown(mask: np.ndarray, radius: int) -> np.ndarray:
+    """The mask with everything within `radius` pixels (a square) added."""
+    if radius == 0:
+        return mask
+    from scipy.ndimage import maximum_filter
+
+    return maximum_filter(mask, size=2 * radius + 1, mode="nearest")
+
+
+def in_image(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """((P,) whether in front and in the image, (P,) row, (P,) column; rows and columns mean nothing
+    elsewhere)."""
+    pixels, depth = camera.project(points)
+    with np.errstate(invalid="ignore"):
+        inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < [camera.width, camera.height]).all(axis=1)
+    cells = np.where(inside[:, None], pixels, 0.0).astype(np.int64)
+    return inside, cells[:, 1], cells[:, 0]
+
+
+def _along_pixels(cameras: Sequence[Camera], count: int, low: float, high: float, rng) -> np.ndarray:
+    """(count, 3) points on rays of random pixels of random cameras, ln(depth) uniform in [low, high]."""
+    which = rng.integers(0, len(cameras), count)
+    position, depth = rng.uniform(0, 1, (count, 2)), np.exp(rng.uniform(low, high, count))
+    points = np.empty((count, 3))
+    for index, camera in enumerate(cameras):
+        mine = which == index
+        x = (position[mine, 0] * camera.width - camera.cx) / camera.fx
+        y = (position[mine, 1] * camera.height - camera.cy) / camera.fy
+        rays = np.stack([x, y, np.ones(len(x))], axis=1) @ camera.rotation
+        points[mine] = camera.center + depth[mine, None] * rays
+    return points
+
+
+def _colors(points: np.ndarray, looks: Sequence[Look]) -> np.ndarray:
+    """(P, 3) uint8 mean of the foreground pixels that the points fall on; the images' mean where there is
+    none."""
+    total, weight = np.zeros((len(points), 3)), np.zeros(len(points))
+    step = max(1, len(looks) // _COLOR_VIEWS)
+    for look in looks[::step]:
+        inside, row, column = in_image(look.camera, points)
+        if look.foreground is not None:
+            inside[inside] = look.foreground[row[inside], column[inside]]
+        total[inside] += look.rgb[row[inside], column[inside]]
+        weight[inside] += 1.0
+    shown = [look.rgb.reshape(-1, 3) if look.foreground is None else look.rgb[look.foreground] for look in looks]
+    usual = np.mean([pixels.mean(axis=0) for pixels in shown if len(pixels)] or [np.full(3, 128.0)], axis=0)
+    mean = np.where(weight[:, None] > 0, total / np.maximum(weight, 1.0)[:, None], usual)
+    return np.clip(mean + 0.5, 0, 255).astype(np.uint8)
+
+
+def _looked_at_points(cameras: Sequence[Camera], xyz: np.ndarray) -> tuple[np.ndarray, float] | None:
+    """From the points in each image, their median position and depth, the median of both over the cameras."""
+    targets, depths = [], []
+    for camera in cameras:
+        inside = in_image(camera, xyz)[0]
+        if inside.sum() < _MIN_POINTS_SEEN:
+            continue
+        seen = xyz[inside]
+        targets.append(np.median(seen, axis=0))
+        depths.append(np.median((seen - camera.center) @ camera.rotation[2]))
+    if len(targets) < max(2, len(cameras) // 4):
+        return None
+    return np.median(np.array(targets), axis=0), float(np.median(depths))

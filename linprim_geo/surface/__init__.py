@@ -1,0 +1,1 @@
+"""From trained primitives to a mesh with colours, texture and predicted error."""

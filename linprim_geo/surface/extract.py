@@ -1,0 +1,229 @@
+"""From a trained run to triangle meshes: take a surface by one of several methods, finish it, write it with its
+statistics."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+
+from linprim_geo.base.budget import Budget
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import locked, remove_torn, write_json
+from linprim_geo.base.options import ExtractOptions
+from linprim_geo.base.progress import Progress, Stages
+from linprim_geo.geometry.mesh_files import SUFFIXES
+from linprim_geo.geometry.topology import manifold_status, topology, topology_line
+from linprim_geo.jobs.executor import Executor
+from linprim_geo.jobs.open import open_executor
+from linprim_geo.runs.run import Run
+from linprim_geo.surface.choose_level import USUAL_LEVEL, choose_level
+from linprim_geo.surface.postprocess import finish_surface, visible_file
+from linprim_geo.surface.single_view import without_single_views
+from linprim_geo.surface.texture import LARGEST as LARGEST_TEXTURE
+from linprim_geo.surface.texture import check_texture
+from linprim_geo.surface.voxel_budget import choose_voxel
+
+# Each is a function (run, options, stages) -> (mesh, statistics of its own), found when it is wanted: their libraries
+# are large.
+METHODS = {
+    "tsdf": "method_tsdf.tsdf_surface",
+    "polyhedra": "method_polyhedra.polyhedra_surface",
+    "opacity-field": "method_opacity_field.opacity_surface",
+}
+
+# Folder of what workers have done, in that of the method.
+PARTS = "parts"
+
+RANGES = {
+    "level": (1e-6, 1 - 1e-6),
+    "voxel_size": (0, 1e30),
+    "truncation": (1, 100),
+    "memory_limit": (0, 1e9),
+    "depth_limit": (0, 1e30),
+    "smallest_part": (0, 1),
+    "refine": (0, 100),
+    "close_holes": (0, 10**9),
+    "smooth": (0, 10_000),
+    "remesh": (0, 1e30),
+    "target_faces": (0, 10**9),
+    "texture": (0, LARGEST_TEXTURE),
+}
+
+
+def extract_mesh(
+    run: str | os.PathLike,
+    method: str = "tsdf",
+    output: str | os.PathLike | None = None,
+    options: ExtractOptions | None = None,
+    *,
+    time_budget: Budget | float | None = None,
+    quiet: bool = False,
+    blocks: int = 1,
+    cluster: str | None = None,
+    workers: int = 0,
+) -> dict:
+    """Extracts the surface of a run and writes it, the part that cameras see, and statistics.
+
+    RUN/mesh/METHOD holds mesh.ply, mesh_visible.ply and stats.json; with `output` the two meshes go to OUTPUT and its
+    sibling *_visible, in the format of the suffix (.ply, .obj, .glb, .stl). Vertices have normals, colours and, as
+    `quality`, the predicted error (`photo_sweep.predicted_error`); everything is in the data set's frame and unit. The
+    photographs move the vertices to where they agree best (`photo_sweep.refine_surface`), then holes are closed, the
+    surface smoothed, remeshed and simplified as the options ask (`mesh_process`); with `texture` .obj and .glb have a
+    texture out of the photographs in place of vertex colours.
+
+    With `time_budget`, in seconds, the voxel size is the smallest with which everything takes that time at most, by
+    what coarse passes take (`time_budget.choose_voxel`); stats.json has `time_budget`: what was chosen and why, and the
+    seconds that it took.
+
+    With `blocks` other than 1 the depth maps are fused in so many parts of one lattice by several workers, with the
+    same result to the last bit; `cluster` and `workers` say where, see `executor.open_executor`.
+
+    Returns: what stats.json holds: topology of both meshes, options, before an environment
+        `seen_by_one_view` (`single_view.without_single_views`), `processing` step by step, `texture`, what manifold3d
+        says of
+    a watertight mesh (`manifold_status`), `predicted_error` (median and 90 % quantile) of the vertices that cameras
+    see, seconds and peak memory per stage, and the paths.
+
+    Raises:
+        LinprimError: nothing was trained, no ray crosses the level, the grid would not fit into memory, or the time is
+            too little for the coarsest surface.
+    """
+    options, budget = options or ExtractOptions(), Budget.of(time_budget)
+    if method not in METHODS:
+        raise LinprimError(f"--method is {method!r}, wanted {' or '.join(METHODS)}")
+    for name, (low, high) in RANGES.items():
+        value = getattr(options, name)
+        if name == "level" and value == "auto":
+            continue
+        if isinstance(value, str) or not low <= value <= high:
+            also = "auto, or " if name == "level" else ""
+            raise LinprimError(f"--{name.replace('_', '-')} is {value}, wanted {also}{low:g} to {high:g}")
+    if budget and method != "tsdf":
+        raise LinprimError(
+            f"--time-budget chooses a voxel size, which --method {method} has none of: wanted --method tsdf"
+        )
+    if budget and options.voxel_size > 0:
+        raise LinprimError("--time-budget chooses the voxel size: wanted one of it and --voxel-size")
+    if blocks < 1:
+        raise LinprimError(f"--blocks is {blocks}, wanted a number from 1")
+    if blocks > 1 and method != "tsdf":
+        raise LinprimError(
+            f"--blocks fuses depth maps in parts, which --method {method} has none of: wanted --method tsdf"
+        )
+    opened = Run.open(run)
+    folder = opened.path / "mesh" / method
+    target = Path(output) if output else folder / "mesh.ply"
+    if target.suffix.lower() not in SUFFIXES:
+        raise LinprimError(f"{target}: the suffix is {target.suffix!r}, wanted .ply, .obj, .glb or .stl")
+    if options.texture:
+        check_texture(options.texture, target)
+    with ExitStack() as held:
+        held.enter_context(locked(folder, "extracted into"))
+        if output:
+            held.enter_context(locked(target.parent, "written", target.name))
+        several = None
+        if blocks > 1:
+            several = lambda: held.enter_context(open_executor(cluster, folder / PARTS, workers))  # noqa: E731
+        progress = Progress("extract", 1, quiet=quiet)
+        return _extract(opened, method, folder, target, options, budget, progress, blocks, several)
+
+
+def _extract(
+    opened: Run,
+    method: str,
+    folder: Path,
+    target: Path,
+    options: ExtractOptions,
+    budget: Budget | None,
+    progress: Progress,
+    blocks: int = 1,
+    executor: Callable[[], Executor] | None = None,
+) -> dict:
+    """What `extract_mesh` does when everything is in order and its folder is held."""
+    visible_target = visible_file(target)
+    written = [target, visible_target, folder / "stats.json"]
+    if options.texture:
+        written += [file.with_suffix(suffix) for file in (target, visible_target) for suffix in (".png", ".mtl")]
+    for file in written:
+        remove_torn(file)
+    stages = Stages(progress)
+
+    agreement = None
+    if options.level == "auto":
+        level, agreement = choose_level(opened)
+        options = replace(options, level=level)
+        said = "the photographs do not tell" if level == USUAL_LEVEL else "the nearest at which the photographs agree"
+        stages.note(f"level {level:g}: {said}")
+        stages.lap("level")
+    module, function = METHODS[method].split(".")
+    surface = getattr(import_module(f".{module}", __package__), function)
+    kept: tuple = ()
+    chosen: dict = {}
+    if budget:
+        options, frames, chosen = choose_voxel(opened, options, target, stages, budget)
+        kept = (frames,)
+    if executor is not None:
+        from linprim_geo.surface.tsdf_parts import PartFusion
+
+        fuse = PartFusion(opened, float(options.level), blocks, executor(), folder / PARTS, progress.quiet)
+        mesh, about = surface(opened, options, stages, *kept, fuse=fuse)
+        shutil.rmtree(folder / PARTS)
+        about = about | {"blocks": blocks}
+    else:
+        mesh, about = surface(opened, options, stages, *kept)
+    if opened.environment is not None:
+        views = opened.surface_depths(opened.scene().train, float(options.level))
+        mesh, left_out = without_single_views(
+            mesh, ((view.camera, depth) for view, depth, _ in views), options.smallest_part
+        )
+        about = about | {"seen_by_one_view": left_out}
+        if left_out["pieces"]:
+            stages.note(f"left out: {left_out['pieces']} parts that one camera alone sees before the open background")
+        stages.lap("support")
+    done = finish_surface(mesh, opened, options, target, stages)
+    shape = topology(done.mesh)
+    stats = {
+        "mesh": str(target),
+        "mesh_visible": str(visible_target),
+        "method": method,
+        **about,
+        "level_differences": agreement,
+        "unit": opened.unit,
+        "views": len(opened.scene().train),
+        "primitives": opened.state.get("primitives"),
+        **shape,
+        "manifold_status": manifold_status(done.mesh) if shape["watertight"] else None,
+        "refine": options.refine,
+        "processing": done.processing,
+        "texture": done.texture,
+        "visible": topology(done.visible),
+        "predicted_error": error_summary(done.visible.quality),
+        **stages.report(),
+    }
+    if budget:
+        stats["time_budget"] = chosen | {"actual_seconds": budget.elapsed()}
+        stages.note(f"{budget.elapsed():.1f} s of the {budget.seconds:.3g} s")
+    write_json(folder / "stats.json", stats)
+    progress.note(f"{target}: {topology_line(stats)}")
+    if predicted := stats["predicted_error"]:
+        stages.note(
+            f"predicted error, seen part: median {predicted['median']:.3g}, 90 % below {predicted['q90']:.3g} "
+            f"({opened.unit})"
+        )
+    stages.note(stages.line())
+    return stats
+
+
+def error_summary(quality: np.ndarray | None) -> dict[str, float] | None:
+    """Median and 90 % quantile of the (V,) predicted errors of vertices, None where none is known."""
+    known = np.zeros(0) if quality is None else quality[np.isfinite(quality)]
+    if not len(known):
+        return None
+    return {"median": float(np.median(known)), "q90": float(np.quantile(known, 0.9))}

@@ -1,0 +1,130 @@
+"""The surface of a run by fusing depth maps: depth of the training views at a transmittance level, into a signed
+distance field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import ExtractOptions
+from linprim_geo.base.progress import Stages
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.runs.run import Run
+from linprim_geo.surface.tsdf_field import DepthFrame
+from linprim_geo.surface.tsdf_fusion import auto_voxel_size, fuse_tsdf
+
+# A ray with less opacity than this has seen through the scene: it votes for free space.
+SEEN_THROUGH = 0.5
+# Depth, background and whether it is clamped, of a pixel; frames of more than this in all are not kept.
+BYTES_PER_PIXEL, KEPT_BYTES = 6, 2**30
+
+SMALLEST_DISPARITY = 0.25
+"""Depths are trusted as far as this many pixels between the two cameras that are furthest apart move a point by a
+truncation."""
+
+SAMPLED = 2
+"""One of so many rows and columns of a depth map is looked at to choose the limit."""
+
+NEAREST_LIMIT = 4.0
+"""And at least this many median depths: cameras that are close together fuse what they see all the same."""
+
+
+def tsdf_surface(
+    run: Run, options: ExtractOptions, stages: Stages, frames: DepthFrames | None = None, fuse: Callable | None = None
+) -> tuple[Mesh, dict]:
+    """Returns the fused mesh and `level`, `voxel_size` and `truncation_voxels` for the statistics.
+
+    `frames` of the same level, if there are any already, are taken in place of new ones. `fuse`: see `fuse_tsdf`.
+
+    Raises:
+        LinprimError: no ray crosses the level, or the grid would not fit into memory.
+    """
+    frames = DepthFrames(run, float(options.level), options.depth_limit) if frames is None else frames
+    if not any((frame.depth > 0).any() for frame in frames):
+        raise LinprimError(
+            f"{run.path}: no ray of any training view crosses transmittance {options.level}, so there is no surface"
+        )
+    stages.lap("render")
+    if frames.beyond:
+        stages.note(
+            f"{frames.beyond:.1%} of the depths lie beyond {frames.limit:.4g} and only clear the space before it"
+        )
+    voxel = options.voxel_size if options.voxel_size > 0 else auto_voxel_size(frames)
+    mesh = fuse_tsdf(
+        frames,
+        voxel_size=voxel,
+        truncation_voxels=options.truncation,
+        memory_limit=int(options.memory_limit * 2**30) if options.memory_limit > 0 else None,
+        min_component=options.smallest_part,
+        log=stages.note,
+        fuse=fuse,
+    )
+    stages.lap("fuse")
+    return mesh, {
+        "level": options.level,
+        "voxel_size": voxel,
+        "truncation_voxels": options.truncation,
+        "depth_limit": frames.limit,
+    }
+
+
+class DepthFrames(Sequence):
+    """`tsdf.DepthFrame`s of the training views: depth at transmittance `level`, free background.
+
+    Depths beyond `limit` are clamped to it; 0 chooses one by `depth_limit`. `beyond` is their share. Frames are kept in
+    memory if they are at most KEPT_BYTES in all, else, and without `keep`, rendered whenever they are asked for.
+    """
+
+    def __init__(self, run: Run, level: float, limit: float = 0.0, keep: bool = True):
+        self.run, self.level, self.limit, self.beyond = run, level, limit or np.inf, 0.0
+        self.views = run.scene().train
+        keep = (
+            keep and sum(view.camera.width * view.camera.height * BYTES_PER_PIXEL for view in self.views) <= KEPT_BYTES
+        )
+        self.kept, sample = [], [np.zeros(0, np.float32)]
+        for frame in self._render(self.views) if keep or not limit else ():
+            sample.append(frame.depth[::SAMPLED, ::SAMPLED].ravel())
+            if keep:
+                self.kept.append(frame)
+        depths = np.concatenate(sample)
+        depths = depths[depths > 0]
+        if len(depths):
+            self.limit = limit or depth_limit([view.camera for view in self.views], float(np.median(depths)))
+            self.beyond = float((depths > self.limit).mean())
+        self.kept = [self._clamp(frame) for frame in self.kept]
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __getitem__(self, index):
+        return self.kept[index] if self.kept else self._clamp(next(self._render([self.views[index]])))
+
+    def __iter__(self):
+        return iter(self.kept) if self.kept else map(self._clamp, self._render(self.views))
+
+    def _render(self, views):
+        for view, depth, opacity in self.run.surface_depths(views, self.level):
+            free = opacity < SEEN_THROUGH
+            yield DepthFrame(view.camera, np.where(free, np.float32(0), depth), background=free)
+
+    def _clamp(self, frame: DepthFrame) -> DepthFrame:
+        beyond = frame.depth > self.limit
+        if not beyond.any():
+            return frame
+        return replace(frame, depth=np.where(beyond, np.float32(self.limit), frame.depth), clamped=beyond)
+
+
+def depth_limit(cameras: Sequence[Camera], median: float, truncation: float = 3.0) -> float:
+    """How far depths are worth fusing, from the median depth that the cameras see, in their unit.
+
+    A disparity of d pixels between cameras that are b apart moves a point at depth z by d z^2 / (b f) (a derivative of
+    z = b f / d); voxels are about as large as the median's pixel, median / f, so this exceeds the truncation beyond
+    sqrt(truncation median b / d).
+    """
+    centers = np.array([camera.center for camera in cameras])
+    baseline = float(np.linalg.norm(np.ptp(centers, axis=0)))
+    return max(NEAREST_LIMIT * median, float(np.sqrt(truncation * median * baseline / SMALLEST_DISPARITY)))

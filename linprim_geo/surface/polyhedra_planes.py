@@ -1,0 +1,211 @@
+"""Planes fitted to the points where light ends, that primitives are cut by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.primitives import KINDS, Primitives
+from linprim_geo.kernels import surface_ops
+
+NEIGHBOURHOOD = 1.5
+"""Planes are fitted to the points within a primitive enlarged by this, so that those of neighbours agree."""
+
+PLANES = 8
+"""Most planes that cut one primitive: so many faces has an octahedron that is seen from all around."""
+
+SAME_PLANE = np.cos(np.radians(35.0))
+"""Points whose normals are closer than this to a direction belong to one plane: less than half of a right angle, which
+parts sides of a body, and more than the unevenness of a side."""
+
+DIRECTION_CELLS = 3
+"""Cells per unit of a coordinate of a normal, 19 degrees wide, the fullest of which a direction is looked for in."""
+
+SAME_DIRECTION = np.cos(np.radians(20.0))
+"""Window of the mean shift that finds a direction: less than half of what parts two planes."""
+
+LEAST_POINTS, LEAST_SHARE = 6, 0.06
+"""A plane needs so many points, and this share of those around its primitive."""
+
+ROUNDS = 4
+"""Reweighted rounds of a fit; the normal moves by less than its own uncertainty after three."""
+
+LEAST_SHARE_OF_PIXEL = 0.1
+"""Share of a pixel's footprint that the surface may move by to lose slivers: what the robust mean of many pixels still
+resolves."""
+
+
+@dataclass(frozen=True)
+class LevelPoints:
+    """(P, 3) points where light ends, their (P, 3) unit normals towards the cameras, and the median footprint of a
+    pixel there."""
+
+    position: np.ndarray
+    normal: np.ndarray
+    footprint: float
+
+    @property
+    def noise(self) -> float:
+        """Length below which the views tell nothing."""
+        return LEAST_SHARE_OF_PIXEL * self.footprint
+
+
+def level_points(depths: list[np.ndarray], cameras: list[Camera], wanted: int) -> LevelPoints:
+    """Points of about `wanted` pixels of all depth maps, in a regular pattern that moves from view to view.
+
+    Normals are those of the surface through a pixel's four neighbours; pixels at the border, and beside one without
+    depth, have none.
+    """
+    stride = max(1, round(np.sqrt(sum(int((depth > 0).sum()) for depth in depths) / max(wanted, 1))))
+    positions, normals, footprints = [], [], []
+    for number, (depth, camera) in enumerate(zip(depths, cameras, strict=True)):
+        there = depth > 0
+        if min(depth.shape) < 3 or not there.any():
+            continue
+        footprints.append(np.median(depth[there]) / np.sqrt(camera.fx * camera.fy))
+        local = camera.ray_grid() * depth[..., None].astype(np.float64)
+        across = np.cross(local[1:-1, 2:] - local[1:-1, :-2], local[2:, 1:-1] - local[:-2, 1:-1])
+        inner = there[1:-1, 1:-1] & there[1:-1, 2:] & there[1:-1, :-2] & there[2:, 1:-1] & there[:-2, 1:-1]
+        pattern = np.zeros_like(inner)
+        pattern[number % stride :: stride, number // stride % stride :: stride] = True
+        point, normal = local[1:-1, 1:-1][inner & pattern], across[inner & pattern]
+        length = np.linalg.norm(normal, axis=1)
+        point, normal = point[length > 0], normal[length > 0] / length[length > 0, None]
+        normal *= np.where(np.einsum("ij,ij->i", normal, point) > 0, -1.0, 1.0)[:, None]
+        positions.append((point - camera.world_to_camera[:3, 3]) @ camera.rotation)
+        normals.append(normal @ camera.rotation)
+    if not positions:
+        return LevelPoints(np.zeros((0, 3)), np.zeros((0, 3)), 0.0)
+    return LevelPoints(np.concatenate(positions), np.concatenate(normals), float(np.median(footprints)))
+
+
+@dataclass(frozen=True)
+class Planes:
+    """Fitted planes { x : normal x = offset }, the body on the negative side; `row` of the primitive that each belongs
+    to, and `cuts` (K, PLANES) bool: which planes of its primitive bound the body where this one does."""
+
+    row: np.ndarray
+    slot: np.ndarray
+    normal: np.ndarray
+    offset: np.ndarray
+    cuts: np.ndarray
+
+
+def fit_planes(primitives: Primitives, points: LevelPoints) -> tuple[Planes, np.ndarray]:
+    """Planes through the points around each primitive, at most PLANES each, and (N,) bool: whether it holds
+    LEAST_POINTS of them; one that does not gets no plane.
+
+    Points are parted by their normals: the strongest direction first, by mean shift, then the next among what is left.
+    Each part gets a plane by least squares, reweighted by a Cauchy weight of its own spread. Two planes of a primitive
+    bound the body together if the points of the one lie behind the other (a convex edge), else each for itself (a
+    concave one).
+    """
+    center, position = primitives.center.astype(np.float64), np.ascontiguousarray(points.position)
+    total, point = surface_ops.points_within(center, *face_planes(primitives), position, NEIGHBOURHOOD, LEAST_POINTS)
+    count, position, normal = len(primitives), position[point], points.normal[point]
+    owner = np.repeat(np.arange(count), total)
+    slot = np.full(len(owner), -1)
+    for k in range(PLANES):
+        left = np.flatnonzero(slot < 0)
+        direction = _strongest_direction(owner[left], normal[left], count)
+        near = left[np.einsum("ij,ij->i", normal[left], direction[owner[left]]) > SAME_PLANE]
+        size = np.bincount(owner[near], minlength=count)
+        enough = (size >= LEAST_POINTS) & (size >= LEAST_SHARE * total)
+        slot[near[enough[owner[near]]]] = k
+    used = np.flatnonzero(slot >= 0)
+    key = owner[used] * PLANES + slot[used]
+    order = used[np.argsort(key, kind="stable")]
+    keys, group = np.unique(owner[order] * PLANES + slot[order], return_inverse=True)
+    across, offset, spread = _robust_planes(position[order], normal[order], group, len(keys))
+    row, number = keys // PLANES, keys % PLANES
+    table = np.full((count, PLANES), -1)
+    table[row, number] = np.arange(len(keys))
+    cuts = np.zeros((len(keys), PLANES), dtype=bool)
+    for k in range(PLANES):
+        other = table[row, k]
+        signed = np.einsum("ij,ij->i", position[order], across[other[group]]) - offset[other[group]]
+        cuts[:, k] = (other >= 0) & (_medians(signed, group, len(keys)) < 0)
+    cuts[np.arange(len(keys)), number] = True
+    # Points that scatter by more than a pixel make no plane.
+    flat = np.append(spread <= points.footprint, False)
+    cuts &= flat[table[row]]
+    return Planes(row, number, across, offset, cuts), total > 0
+
+
+def face_planes(primitives: Primitives) -> tuple[np.ndarray, np.ndarray]:
+    """(N, F, 3) outward unit normals of the faces and (N, F) their distances from the centre."""
+    local = primitives.vertices - primitives.center.astype(np.float64)[:, None]
+    a, b, c = (local[:, KINDS[primitives.kind].faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), np.finfo(np.float64).tiny)
+    return normal, np.maximum(np.einsum("nfi,nfi->nf", normal, a), np.finfo(np.float64).tiny)
+
+
+def _sums(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
+    """(count, ...) sums of (M, ...) values by group."""
+    flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
+    out = [np.bincount(group, weights=column, minlength=count).astype(np.float64) for column in flat.T]
+    return np.stack(out, axis=-1).reshape((count,) + values.shape[1:])
+
+
+def _medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
+    """(count,) lower medians by group; every group has a value."""
+    from scipy.sparse import coo_matrix
+
+    # By value, then by group: the conversion to rows keeps the order within each, and is faster than sorting again.
+    order = np.argsort(values)
+    order = coo_matrix((order, (group[order], np.arange(len(order)))), shape=(count, len(order))).tocsr().data
+    size = np.bincount(group, minlength=count)
+    return values[order[np.cumsum(size) - size + (size - 1) // 2]]
+
+
+def _strongest_direction(group: np.ndarray, normal: np.ndarray, count: int) -> np.ndarray:
+    """(count, 3) direction where most normals of each group are: the fullest of the cells of 1 / DIRECTION_CELLS, then
+    mean shift. Zero for a group without normals."""
+    side = 2 * DIRECTION_CELLS + 1
+    x, y, z = np.rint(normal * DIRECTION_CELLS).astype(np.int64).T + DIRECTION_CELLS
+    cells, cell, size = np.unique(((group * side + x) * side + y) * side + z, return_inverse=True, return_counts=True)
+    of_cell = cells // side**3
+    order = np.lexsort((-cells, size, of_cell))
+    fullest = np.full(count, -1)
+    fullest[of_cell[order]] = order
+    chosen = cell == fullest[group]
+    direction = np.zeros((count, 3))
+    for _ in range(ROUNDS):
+        mean = _sums(normal[chosen], group[chosen], count)
+        length = np.linalg.norm(mean, axis=1, keepdims=True)
+        direction = np.where(length > 0, mean / np.maximum(length, np.finfo(np.float64).tiny), direction)
+        chosen = np.einsum("ij,ij->i", normal, direction[group]) > SAME_DIRECTION
+    return direction
+
+
+def _robust_planes(position: np.ndarray, normal: np.ndarray, group: np.ndarray, count: int):
+    """(count, 3) normals, (count,) offsets and (count,) spreads (1.4826 median |residual|) of planes by group.
+
+    The normal is that of the points where they tell one (their flattest direction holds less than a tenth of the
+    variance of the next), else the mean of theirs.
+    """
+    tiny = np.finfo(np.float64).tiny
+    across = _sums(normal, group, count)
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), tiny)
+    origin = _sums(position, group, count) / np.bincount(group, minlength=count)[:, None]
+    weight = np.ones(len(group))
+    for step in range(ROUNDS + 1):
+        away = np.einsum("ij,ij->i", position - origin[group], across[group])
+        middle = _medians(away, group, count)
+        spread = 1.4826 * _medians(np.abs(away - middle[group]), group, count)
+        if step == ROUNDS:
+            break
+        scaled = (away - middle[group]) / np.maximum(2 * spread[group], tiny)
+        weight = 1 / (1 + np.minimum(np.abs(scaled), 1e6) ** 2)
+        mass = _sums(weight, group, count)
+        origin = _sums(weight[:, None] * position, group, count) / mass[:, None]
+        centered = position - origin[group]
+        moment = _sums((weight[:, None] * centered)[:, :, None] * centered[:, None, :], group, count)
+        variance, axes = np.linalg.eigh(moment)
+        flattest = axes[:, :, 0] * np.where(np.einsum("ij,ij->i", axes[:, :, 0], across) < 0, -1.0, 1.0)[:, None]
+        told = variance[:, 0] < 0.1 * variance[:, 1]
+        across = np.where(told[:, None], flattest, across)
+    return across, np.einsum("ij,ij->i", origin, across) + middle, spread

@@ -1,0 +1,69 @@
+"""What follows the extraction of any surface: refinement, holes and simplification, quality, colours, what cameras see,
+texture, files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from linprim_geo.base.options import ExtractOptions
+from linprim_geo.base.progress import Stages
+from linprim_geo.geometry.mesh import Mesh, select_faces
+from linprim_geo.geometry.mesh_files import save_mesh
+from linprim_geo.geometry.mesh_process import process_mesh
+from linprim_geo.geometry.raycast import RayCaster
+from linprim_geo.runs.run import Run
+from linprim_geo.surface.photo_consistency import photo_gains, predicted_error, refine_surface
+from linprim_geo.surface.texture import make_texture
+from linprim_geo.surface.texture_files import save_textured
+from linprim_geo.surface.visibility import color_vertices, visible_faces
+
+
+@dataclass(frozen=True)
+class Finished:
+    """The mesh and the part that cameras see, as written; what was done step by step; what the texture says of itself,
+    if there is one."""
+
+    mesh: Mesh
+    visible: Mesh
+    processing: list[dict]
+    texture: dict | None
+
+
+def visible_file(target: Path) -> Path:
+    """Where the part of a mesh goes that cameras see."""
+    return target.with_name(f"{target.stem}_visible{target.suffix}")
+
+
+def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, stages: Stages) -> Finished:
+    """Finishes a surface as the options ask, and writes it to `target` and `visible_file(target)`."""
+    views = run.scene().train
+    cameras = [view.camera for view in views]
+    caster = RayCaster(mesh.vertices, mesh.faces)
+    gains = photo_gains(mesh, cameras, (view.load() for view in views), caster)
+    if options.refine:
+        mesh = refine_surface(mesh, views, options.refine, gains, caster)
+        stages.lap("refine")
+    mesh, processing = process_mesh(mesh, options, stages.note)
+    if processing:
+        stages.lap("process")
+    if options.refine or processing:
+        caster = RayCaster(mesh.vertices, mesh.faces)
+    mesh = replace(mesh, quality=predicted_error(mesh, cameras, (view.load() for view in views), gains, caster))
+    stages.lap("quality")
+    mesh = replace(mesh, colors=color_vertices(mesh, cameras, (view.load().rgb for view in views), caster))
+    stages.lap("colours")
+    seen = visible_faces(mesh, cameras, caster)
+    visible = select_faces(mesh, seen)
+    stages.lap("visibility")
+    if not options.texture:
+        save_mesh(target, mesh)
+        save_mesh(visible_file(target), visible)
+        stages.lap("write")
+        return Finished(mesh, visible, processing, None)
+    texture = make_texture(mesh, options.texture, views, stages.note)
+    stages.lap("texture")
+    save_textured(target, mesh, texture)
+    save_textured(visible_file(target), visible, texture.select(seen))
+    stages.lap("write")
+    return Finished(mesh, visible, processing, texture.about)

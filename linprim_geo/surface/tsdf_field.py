@@ -1,0 +1,301 @@
+"""A block-sparse truncated signed distance field: pixels become planes, planes vote, a mesh comes out.
+
+Every pixel is a small plane (a surfel): for a plane, 1/z is linear in the pixel, so position and tilt
+follow in closed form from the inverse depths around it. A voxel takes its distance from the plane of the
+pixel it falls on, which is exact on flat surfaces at any angle and resolution; `VoxelBlockGrid.integrate`
+takes the difference of depths at the nearest pixel instead, a staircase across the pixels that grows with
+the angle. Votes weigh what they are worth: a distance in front of a surface bounds the true one from above,
+so near ones count more, and a view knows nothing of what lies far behind the surface it sees. Open3D holds
+the blocks and runs marching cubes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.mesh import Mesh, merge_vertices
+from linprim_geo.kernels import surface_ops
+
+NEAR_VOXELS = 1.5
+"""Votes in front of a surface weigh 1 / (1 + (distance / this)^2): the surface that is close decides."""
+
+BEHIND_VOXELS = 0.75
+"""Votes behind a surface keep their weight this far along the ray and lose it over as much again. Sheets
+thinner than this many voxels still come out with two sides; noise in the depths above it roughens the
+surface."""
+
+BEHIND_WEIGHT = 0.05
+"""What is left of their weight up to the truncation: decides only where no view says anything better."""
+
+FREE_WEIGHT = 0.3
+"""Weight of "this ray passes here and goes on" against 1 for a surface right here. It speaks up only where
+the others say "behind": a few wrong depths are overruled, and free space does not push surfaces away."""
+
+FAR_FRONT_WEIGHT = 0.15
+"""Least weight of a vote in front of a surface, so that free space close to it stays free."""
+
+COSINE_POWER = 0.5
+"""Weight of a pixel by the cosine between its ray and its surface normal."""
+
+GRAZED_WEIGHT = 1e-3
+GRAZED_VOXELS = 1.25
+GRAZED_REACH = 4.0
+"""A surface that is only ever seen at a low angle has no voxel within a truncation behind it along the ray.
+So votes hold up to this many truncations along the ray, as long as the plane is within so many voxels, with a
+weight that loses against anything that any view says."""
+
+LEAST_COSINE = 0.05
+"""Planes tilted further than this (87 degrees) are jumps between surfaces; such a pixel is made to face its
+ray."""
+
+SLOPE_RATIO = 3.0
+"""The slopes towards two neighbours are averaged if they differ by no more than this; else the flatter one
+holds."""
+
+ZERO_GAP = 2e-3
+"""Field values are kept this far from 0 (in truncations), so no vertex falls onto a voxel corner where
+several would coincide. Moves the surface by at most 0.006 voxel at a truncation of 3."""
+
+LEAST_SUPPORT = 1e-6
+"""Voxels with less weight than this were seen by no view; far below the smallest weight a vote can have."""
+
+
+@dataclass(frozen=True)
+class DepthFrame:
+    """One view's depth map.
+
+    `depth` (H, W) float is z along the optical axis at the pixel centres, in scene units; 0, negative, NaN
+    and inf mean that there is no surface. `background` (H, W) bool marks those of them through which the ray
+    is known to be free; the others are unknown. `confidence` (H, W) multiplies the
+    weight of each pixel. `clamped` (H, W) bool marks depths that are only a least one: the ray is free up to there, and
+    where its surface is is not known.
+    """
+
+    camera: Camera
+    depth: np.ndarray
+    background: np.ndarray | None = None
+    confidence: np.ndarray | None = None
+    clamped: np.ndarray | None = None
+
+    def __post_init__(self):
+        wanted = (self.camera.height, self.camera.width)
+        for name in ("depth", "background", "confidence", "clamped"):
+            value = getattr(self, name)
+            if value is not None and np.shape(value)[:2] != wanted:
+                raise LinprimError(f"depth frame: {name} is {np.shape(value)}, but its camera has {wanted} pixels")
+
+    def surface(self) -> tuple[np.ndarray, np.ndarray]:
+        """(P, 3) float64 world points of the pixels that see a surface, and their (P,) depths."""
+        depth = np.asarray(self.depth, dtype=np.float64)
+        valid = np.isfinite(depth) & (depth > 0)
+        if self.clamped is not None:
+            valid &= ~self.clamped
+        depth = depth[valid]
+        return self.camera.world_rays()[valid] * depth[:, None] + self.camera.center, depth
+
+
+# Columns of a frame's table, one row per pixel. The signed distance of a point x of the grid's frame, in
+# truncations, is table[:, OFFSET] - table[:, :3] . x.
+OFFSET, WEIGHT, COSINE, NEAREST, FREE = 3, 4, 5, 6, 7
+
+
+def _slope(inverse: np.ndarray, tolerance: np.ndarray, axis: int) -> np.ndarray:
+    """Derivative of the inverse depth along an axis, taken on the side that belongs to the same surface."""
+    step = np.diff(inverse, axis=axis)
+    gap = np.full_like(np.take(inverse, [0], axis=axis), np.nan)
+    after = np.concatenate([step, gap], axis=axis)
+    before = np.concatenate([gap, step], axis=axis)
+    size_after, size_before = np.abs(after), np.abs(before)
+    similar = np.fmax(size_after, size_before) <= SLOPE_RATIO * np.fmin(size_after, size_before) + tolerance
+    flatter = np.where((size_after <= size_before) | np.isnan(before), after, before)
+    slope = np.where(similar & np.isfinite(after + before), 0.5 * (after + before), flatter)
+    return np.nan_to_num(slope)
+
+
+def surfels(frame: DepthFrame, voxel: float, truncation: float, origin: np.ndarray) -> np.ndarray:
+    """(H*W, 8) float32 table of a frame: plane, weight, cosine, nearest 1/z around, weight of free votes.
+
+    A plane a X + b Y + c Z = 1 in camera space has the inverse depth a rx + b ry + c along the ray
+    (rx, ry, 1), so a and b are the slopes of the inverse depth times the focal lengths, and the signed
+    distance of a point is (1 - a X - b Y - c Z) / |(a, b, c)|, positive on the camera's side.
+    """
+    from scipy.ndimage import maximum_filter
+
+    camera = frame.camera
+    depth = np.asarray(frame.depth, dtype=np.float64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        valid = np.isfinite(depth) & (depth > 0)
+        inverse = np.where(valid, 1.0 / depth, np.nan)
+    rays = camera.ray_grid()
+    rx, ry = rays[..., 0], rays[..., 1]
+    square = rx * rx + ry * ry + 1.0
+    # Half a voxel of depth between neighbours is no sign of an edge.
+    tolerance = 0.5 * voxel * inverse * inverse
+    a = _slope(inverse, tolerance, 1) * camera.fx
+    b = _slope(inverse, tolerance, 0) * camera.fy
+    c = inverse - a * rx - b * ry
+    with np.errstate(invalid="ignore"):
+        cosine = inverse / np.sqrt((a * a + b * b + c * c) * square)
+        steep = valid & ~(cosine > LEAST_COSINE)
+    a = np.where(steep, inverse * rx / square, a)
+    b = np.where(steep, inverse * ry / square, b)
+    c = np.where(steep, inverse / square, c)
+    cosine = np.where(steep, LEAST_COSINE, cosine)
+    scale = 1.0 / (np.sqrt(a * a + b * b + c * c) * truncation)
+    plane = np.stack([a * scale, b * scale, c * scale], axis=-1)
+    offset = scale - plane @ (camera.rotation @ origin + camera.world_to_camera[:3, 3])
+    plane = plane @ camera.rotation
+
+    background = ~valid & (False if frame.background is None else np.asarray(frame.background, dtype=bool))
+    confidence = 1.0
+    if frame.confidence is not None:
+        confidence = np.nan_to_num(np.clip(frame.confidence, 0.0, None))
+    table = np.zeros((*depth.shape, 8), dtype=np.float32)
+    table[..., :3] = np.where(valid[..., None], plane, 0.0)
+    table[..., OFFSET] = np.where(valid, offset, np.float32(1e9))  # background: far in front of anything
+    surface = valid if frame.clamped is None else valid & ~frame.clamped
+    table[..., WEIGHT] = np.where(surface, cosine**COSINE_POWER, 0.0) * confidence
+    table[..., COSINE] = np.where(valid, cosine, 1.0)
+    # A pixel beside the outline of something nearer says nothing about what is level with that: its free
+    # votes hold only in front of all its neighbours.
+    table[..., NEAREST] = maximum_filter(np.nan_to_num(inverse), size=3, mode="nearest")
+    table[..., FREE] = (valid | background) * confidence
+    return table.reshape(-1, 8)
+
+
+def vote_rules(truncation: float, behind: float, occluded: float) -> tuple[float, ...]:
+    """The numbers of `VoteRules` in csrc/surface/fuse.h; `truncation` and `behind` are in voxels."""
+    return (
+        NEAR_VOXELS / truncation,
+        FAR_FRONT_WEIGHT,
+        behind / truncation,
+        BEHIND_WEIGHT,
+        GRAZED_VOXELS / truncation,
+        GRAZED_REACH,
+        GRAZED_WEIGHT,
+        occluded,
+    )
+
+
+class Grid:
+    """The field in its blocks. Coordinates are float32, relative to `origin`."""
+
+    def __init__(self, blocks, origin, voxel, truncation, resolution):
+        self.blocks, self.origin = blocks, origin
+        self.voxel, self.truncation, self.resolution = voxel, truncation, resolution
+        size = resolution**3
+        self.total = np.zeros((len(blocks), size), dtype=np.float32)
+        self.weight = np.zeros((len(blocks), size), dtype=np.float32)
+        self.free = np.zeros((len(blocks), size), dtype=np.float32)
+        self.corner = np.ascontiguousarray(blocks * (resolution * voxel), np.float64)
+
+    def integrate(self, frame: DepthFrame, rules: tuple[float, ...]) -> None:
+        """Adds the votes of one frame to every block in its frustum; `rules` are `vote_rules`."""
+        camera = frame.camera
+        rows = self.in_view(camera)
+        if len(rows) == 0:
+            return
+        project = np.empty((3, 4))
+        project[:, :3] = camera.K @ camera.rotation
+        project[:, 3] = camera.K @ (camera.rotation @ self.origin + camera.world_to_camera[:3, 3])
+        table = surfels(frame, self.voxel, self.truncation, self.origin)
+        sums = (self.total, self.weight, self.free)
+        surface_ops.add_votes(
+            project, camera.width, camera.height, table, rules, rows, self.corner, self.voxel, self.resolution, *sums
+        )
+
+    def in_view(self, camera: Camera) -> np.ndarray:
+        """Blocks whose bounding sphere meets the frustum."""
+        middle = 0.5 * (self.resolution - 1) * self.voxel
+        centers = (self.corner + middle + self.origin) @ camera.rotation.T + camera.world_to_camera[:3, 3]
+        radius = np.sqrt(3.0) * middle
+        seen = centers[:, 2] > -radius
+        width, height = camera.width, camera.height
+        for side in (
+            (camera.fx, 0.0, camera.cx),
+            (-camera.fx, 0.0, width - camera.cx),
+            (0.0, camera.fy, camera.cy),
+            (0.0, -camera.fy, height - camera.cy),
+        ):
+            seen &= centers @ (np.array(side) / np.linalg.norm(side)) > -radius
+        return np.flatnonzero(seen)
+
+    def extract(self) -> Mesh:
+        """The surface in the order of its coordinates; empty if the field never changes sign. Uses the field up."""
+        return placed(self.surface(), self.origin)
+
+    def surface(self) -> Mesh:
+        """Marching cubes between voxels that any view has voted on, relative to `origin`, in any order.
+
+        Uses the field up, to have its memory for the mesh.
+        """
+        import open3d
+
+        core, cpu = open3d.core, open3d.core.Device("CPU:0")
+        field, weight, free = self.total, self.weight, self.free
+        self.total = self.weight = self.free = None
+        known = weight + free > LEAST_SUPPORT
+        # Free votes say on which side a voxel is, not how far: they only speak up against "behind".
+        free *= np.float32(FREE_WEIGHT)
+        free[field >= 0] = 0.0
+        field += free
+        weight += free
+        voted = weight > LEAST_SUPPORT
+        np.divide(field, weight, out=field, where=voted)
+        field[~voted] = 1.0
+        gap = np.where(field < 0, np.float32(-ZERO_GAP), np.float32(ZERO_GAP))
+        np.copyto(field, gap, where=np.abs(field) < ZERO_GAP)
+        del weight, free, gap, voted
+        grid = open3d.t.geometry.VoxelBlockGrid(
+            ("tsdf", "weight"),
+            (core.float32, core.float32),
+            (core.SizeVector([1]), core.SizeVector([1])),
+            self.voxel,
+            self.resolution,
+            len(self.blocks),
+            cpu,
+        )
+        keys = core.Tensor(np.ascontiguousarray(self.blocks.astype(np.int32)), core.int32, cpu)
+        grid.hashmap().activate(keys)
+        slots, _ = grid.hashmap().find(keys)
+        slots = slots.numpy().astype(np.int64)
+        # The arrays alias the grid's memory.
+        grid.attribute("tsdf").numpy().reshape(-1, self.resolution**3)[slots] = field
+        grid.attribute("weight").numpy().reshape(-1, self.resolution**3)[slots] = known
+        del field, known
+        try:
+            raw = grid.extract_triangle_mesh(0.5)
+            vertices = raw.vertex.positions.numpy().astype(np.float64)
+            faces = raw.triangle.indices.numpy().astype(np.int64)
+        except RuntimeError:  # what Open3D raises where there is no surface
+            return Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+        return Mesh(vertices, faces)
+
+
+def placed(surface: Mesh, origin: np.ndarray) -> Mesh:
+    """A surface that `Grid.surface` gave, or several together, in the order of its coordinates and the frame of the
+    cameras."""
+    if len(surface.faces) == 0:
+        return surface
+    mesh = _canonical(surface)
+    return replace(mesh, vertices=mesh.vertices + origin)
+
+
+def _canonical(mesh: Mesh) -> Mesh:
+    """Vertices in the order of their coordinates, faces in the order of their vertices, coincident ones
+    merged.
+
+    Open3D's threads number vertices as they come; the set of them is always the same.
+    """
+    order = np.lexsort(mesh.vertices.T[::-1])
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    mesh = merge_vertices(Mesh(mesh.vertices[order], rank[mesh.faces]))
+    faces = mesh.faces
+    first = np.argmin(faces, axis=1)
+    faces = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
+    return replace(mesh, faces=faces[np.lexsort(faces.T[::-1])])

@@ -1,0 +1,172 @@
+"""The fused surface in parts: workers have parts of one lattice of voxels; their surfaces together are the whole one's
+to the last bit.
+
+A part's field is that of the blocks that it owns and of their neighbours. It votes there in the order of the views, as
+the whole does, and hands on the triangles whose middle lies in a block of its own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import atomic_write
+from linprim_geo.base.memory import PROCESS_GIB
+from linprim_geo.base.progress import Progress
+from linprim_geo.geometry.boxes import split_space
+from linprim_geo.geometry.mesh import Mesh, select_faces
+from linprim_geo.jobs import worker
+from linprim_geo.jobs.executor import Executor, Task
+from linprim_geo.kernels import ops
+from linprim_geo.runs.run import Run
+from linprim_geo.surface.method_tsdf import DepthFrames
+from linprim_geo.surface.tsdf_field import placed
+from linprim_geo.surface.tsdf_fusion import Lattice, block_keys, estimate_memory
+
+REMEDY = "more --blocks, a larger --voxel-size, fewer --workers, or more memory"
+
+
+class PartFusion:
+    """Fuses a lattice in `count` parts, for `fuse.fuse_tsdf`. What is done is in `folder` until all is."""
+
+    def __init__(self, run: Run, level: float, count: int, executor: Executor, folder: Path, quiet: bool = False):
+        self.run, self.level, self.count = run, level, count
+        self.executor, self.folder, self.quiet = executor, folder, quiet
+
+    def __call__(self, lattice: Lattice, frames: DepthFrames) -> Mesh:
+        count = min(self.count, len(lattice.blocks))
+        digest = hashlib.sha256((self.run.path / "training_frame.npz").read_bytes())
+        options = (
+            self.level,
+            frames.limit,
+            count,
+            lattice.voxel,
+            lattice.resolution,
+            lattice.truncation,
+            lattice.rules,
+        )
+        digest.update(repr(options).encode())
+        digest.update(lattice.blocks.tobytes() + lattice.origin.tobytes())
+        place = self.folder / digest.hexdigest()[:16]
+        for other in self.folder.iterdir():  # of other options
+            if other.is_dir() and other != place:
+                shutil.rmtree(other)
+        owner = owners(lattice.blocks, count)
+        save_lattice(place / "lattice.npz", lattice, owner)
+        largest = max(view.camera.width * view.camera.height for view in self.run.scene().train)
+        tasks = []
+        for part in range(count):
+            size = int(halo(lattice.blocks, owner == part).sum())
+            need = PROCESS_GIB + estimate_memory(size, lattice.resolution, largest) / 2**30
+            where = {"run": str(self.run.path.resolve()), "level": self.level, "limit": frames.limit, "part": part}
+            tasks.append(
+                Task(
+                    f"part {part}",
+                    "linprim_geo.surface.tsdf_parts:part_task",
+                    where,
+                    place / f"{part:03d}",
+                    need,
+                    1,
+                    REMEDY,
+                )
+            )
+        self.executor.run(tasks, Progress("parts", 1, quiet=self.quiet))
+        mesh = placed(
+            together([load_part(place / f"{part:03d}" / "part.npz") for part in range(count)]), lattice.origin
+        )
+        shutil.rmtree(place)
+        return mesh
+
+
+def owners(blocks: np.ndarray, count: int) -> np.ndarray:
+    """(B,) which of `count` parts each block (B, 3) belongs to; as many in each, near each other."""
+    owner = np.zeros(len(blocks), dtype=np.int64)
+    for part, box in enumerate(split_space(blocks, np.ones(len(blocks)), count)):
+        owner[box.holds(blocks)] = part
+    return owner
+
+
+def halo(blocks: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """(B,) bool: the blocks of (B, 3) that are `own` (B,) or touch one that is."""
+    steps = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
+    near = np.unique(np.concatenate([block_keys(blocks[own] + step) for step in steps]))
+    return np.isin(block_keys(blocks), near)
+
+
+def part_task(folder: Path, run: str, level: float, limit: float, part: int) -> dict:
+    """Fuses what a part owns and writes it to part.npz."""
+    import torch
+
+    torch.set_num_threads(1)
+    ops.set_threads(worker.cores)
+    lattice, owner = load_lattice(folder.parent / "lattice.npz")
+    own = owner == part
+    inside = halo(lattice.blocks, own)
+    grid = replace(lattice, blocks=lattice.blocks[inside]).grid()
+    frames = DepthFrames(Run.open(run), level, limit, keep=False)
+    used = 0
+    for number, view in enumerate(frames.views):
+        if len(grid.in_view(view.camera)):
+            grid.integrate(frames[number], lattice.rules)
+            used += 1
+    surface = grid.surface()
+    if len(surface.faces):
+        middle = surface.vertices[surface.faces].mean(1)
+        block = np.floor(middle / (lattice.voxel * lattice.resolution)).astype(np.int64)
+        surface = select_faces(surface, np.isin(block_keys(block), block_keys(lattice.blocks[own])))
+    with atomic_write(folder / "part.npz") as temporary, open(temporary, "wb") as file:
+        np.savez(file, vertices=surface.vertices, faces=surface.faces)
+    return {"faces": len(surface.faces), "views": used, "blocks": int(own.sum())}
+
+
+def together(parts: Iterable[Mesh]) -> Mesh:
+    """All parts as one mesh; vertices on seams are there more than once."""
+    vertices, faces, first = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
+    for part in parts:
+        vertices.append(part.vertices)
+        faces.append(part.faces + first)
+        first += len(part.vertices)
+    return Mesh(np.concatenate(vertices), np.concatenate(faces))
+
+
+def save_lattice(path: Path, lattice: Lattice, owner: np.ndarray) -> None:
+    """Writes a lattice and who owns its blocks."""
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        np.savez(
+            file,
+            blocks=lattice.blocks,
+            owner=owner,
+            origin=lattice.origin,
+            voxel=lattice.voxel,
+            resolution=lattice.resolution,
+            truncation=lattice.truncation,
+            rules=lattice.rules,
+        )
+
+
+def load_lattice(path: Path) -> tuple[Lattice, np.ndarray]:
+    """Reads what `save_lattice` wrote."""
+    with np.load(path, allow_pickle=False) as file:
+        rules, truncation = tuple(float(x) for x in file["rules"]), float(file["truncation"])
+        return Lattice(
+            file["blocks"], file["origin"], float(file["voxel"]), int(file["resolution"]), truncation, rules
+        ), file["owner"]
+
+
+def load_part(path: Path) -> Mesh:
+    """Reads what `part_task` wrote.
+
+    Raises:
+        LinprimError: it is damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return Mesh(file["vertices"], file["faces"])
+    except (OSError, ValueError, KeyError) as error:
+        raise LinprimError(f"{path}: cannot be read ({error})") from None

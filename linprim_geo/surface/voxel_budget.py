@@ -1,0 +1,142 @@
+"""The voxel size that a time budget allows, by what coarse passes take."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+from linprim_geo.base.budget import AIM, Budget
+from linprim_geo.base.errors import LinprimError
+
+# Coarse passes of extraction take these multiples of the voxel that the views support, which is the finest that is
+# chosen: half of it has 2 % more Chamfer distance and 17 times the open edges on the built-in part, for four times the
+# time.
+COARSE, FINEST = (4.0, 2.0), 1.0
+# The first pass of all, which also loads libraries, is not counted.
+WARM_UP = 8.0
+
+
+@dataclass(frozen=True)
+class VoxelCost:
+    """Seconds of fusing and finishing with a voxel of size v: `base` + `per_area` / v^2, for what lies along a
+    surface."""
+
+    base: float
+    per_area: float
+
+    @staticmethod
+    def fit(passes: Sequence[tuple[float, float]]) -> VoxelCost:
+        """Through one or two (voxel size, seconds), from coarse to fine. One alone counts as area in full, which is the
+        dearer guess; so do two of which the finer was not slower."""
+        v, t = passes[-1]
+        if len(passes) > 1:
+            (u, s), (v, t) = passes[-2:]
+            slope = (t - s) / (1 / v**2 - 1 / u**2)
+            if slope > 0 and slope / v**2 <= t:
+                return VoxelCost(t - slope / v**2, slope)
+        return VoxelCost(0.0, t * v**2)
+
+    def seconds(self, voxel: float) -> float:
+        """Of fusing and finishing."""
+        return self.base + self.per_area / voxel**2
+
+
+def plan_voxel(seconds: float, cost: VoxelCost, finest: float, coarsest: float) -> float | None:
+    """The smallest voxel size in [finest, coarsest] that takes at most `seconds`, to three digits; None if none
+    does."""
+    if cost.seconds(coarsest) > seconds:
+        return None
+    voxel = max(finest, math.sqrt(cost.per_area / max(seconds - cost.base, 1e-12)))
+    digit = 10.0 ** (math.floor(math.log10(voxel)) - 2)
+    return min(coarsest, max(finest, math.ceil(voxel / digit - 1e-9) * digit))
+
+
+def choose_voxel(run, options, target, stages, budget: Budget):
+    """Measures coarse passes of the TSDF surface and chooses the voxel size that fills the budget.
+
+    Args:
+        run: an open run. options: ExtractOptions with a level that is a number. target: the file that will be written.
+
+    Returns: (ExtractOptions with the voxel size, the depth maps that were rendered, what was chosen and why for the
+    statistics).
+
+    Raises:
+        LinprimError: not even the coarsest voxel fits; no ray crosses the level.
+    """
+    from dataclasses import replace
+
+    from linprim_geo.surface.method_tsdf import DepthFrames
+    from linprim_geo.surface.tsdf_fusion import auto_voxel_size
+
+    begin = time.monotonic()
+    frames = DepthFrames(run, options.level, options.depth_limit)
+    supported = auto_voxel_size(frames)
+    stages.lap("render")
+    rendering = time.monotonic() - begin
+    passes: list[tuple[float, float]] = []
+    for multiple in (WARM_UP, *COARSE):
+        voxel = multiple * supported
+        if passes and budget.left() < (passes[0][0] / voxel) ** 2 * passes[0][1]:
+            break  # a second pass might leave no time for the surface itself
+        try:
+            seconds = _timed_pass(run, replace(options, voxel_size=voxel), frames, target, stages)
+        except LinprimError:  # too coarse for a surface
+            if multiple == COARSE[-1]:
+                raise
+            continue
+        if multiple != WARM_UP:
+            passes.append((voxel, seconds))
+    stages.lap("coarse passes")
+    cost = VoxelCost.fit(passes)
+    left, coarsest, finest = budget.left(), passes[0][0], FINEST * supported
+    voxel = plan_voxel(left, cost, finest, coarsest)
+    if voxel is None:
+        least = (budget.elapsed() + cost.seconds(coarsest)) / AIM
+        raise LinprimError(
+            f"--time-budget is {budget.seconds:.3g} s, but the coarsest surface of this run, voxels of "
+            f"{coarsest:.2g}, takes {least:.0f} s"
+        )
+    why = "fills the time"
+    if voxel <= 1.001 * finest:
+        why = "what the views support: a finer one shows nothing more"
+    elif voxel >= 0.999 * coarsest:
+        why = "the coarsest that is taken"
+    predicted = cost.seconds(voxel)
+    stages.note(
+        f"voxel size {voxel:.3g}, {why}: {predicted:.1f} s of the {budget.seconds:.3g} s after "
+        f"{budget.elapsed():.1f} s "
+        f"({supported:.3g} is what the views support)"
+    )
+    chosen = {
+        "seconds": budget.seconds,
+        "voxel_size": voxel,
+        "why": why,
+        "supported_voxel_size": supported,
+        "render_seconds": rendering,
+        "coarse_passes": [{"voxel_size": v, "seconds": t} for v, t in passes],
+        "cost": asdict(cost),
+        "predicted_seconds": predicted,
+        "aim_seconds": AIM * budget.seconds,
+    }
+    return replace(options, voxel_size=voxel), frames, chosen
+
+
+def _timed_pass(run, options, frames, target, stages) -> float:
+    """Seconds of everything that follows the depth maps, written to a folder that is thrown away."""
+    import tempfile
+    from pathlib import Path
+
+    from linprim_geo.base.progress import Progress, Stages
+    from linprim_geo.surface.method_tsdf import tsdf_surface
+    from linprim_geo.surface.postprocess import finish_surface
+
+    quiet = Stages(Progress("coarse pass", 1, quiet=True))
+    with tempfile.TemporaryDirectory(prefix="linprim_geo_") as folder:
+        begin = time.monotonic()
+        mesh, _ = tsdf_surface(run, options, quiet, frames)
+        mesh = finish_surface(mesh, run, options, Path(folder) / target.name, quiet).mesh
+        seconds = time.monotonic() - begin
+    stages.note(f"coarse pass with voxels of {options.voxel_size:.3g}: {seconds:.2f} s, {len(mesh.faces)} triangles")
+    return seconds

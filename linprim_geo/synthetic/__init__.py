@@ -1,0 +1,1 @@
+"""Scenes with exact geometry, and photographs of them."""

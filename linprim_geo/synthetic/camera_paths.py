@@ -1,0 +1,269 @@
+"""Camera poses for synthetic captures: rings, spheres and hand-held arcs around an object, and stations inside a
+room."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.raycast import RayCaster
+
+PATHS = ("orbit", "hemisphere", "sphere", "arc", "inside-out")
+
+RING_ELEVATIONS_DEG = (-38.0, 6.0, 42.0)
+"""The rings of `orbit`: below, level and above, so that every side of an object is seen."""
+
+FIT_MARGIN = 0.04
+"""Share of the image's width and height that stays free on each side of an object."""
+
+GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+
+ARC_DEG = 300.0
+"""Azimuth that the path `arc` covers unless another is said."""
+
+ARC_ELEVATIONS_DEG = (12.0, 45.0)
+ARC_DISTANCE = 0.1
+ARC_AIM = 0.06
+ARC_ROLL_DEG = 2.0
+"""A hand-held arc: lowest and highest elevation; largest deviations of the distance from its mean, of the aim
+from the object's middle (both in units of the mean distance), and of the horizon."""
+
+ARC_JITTER = 0.15
+"""Share of those deviations that differs from view to view; the larger part changes slowly along the arc."""
+
+CLEARANCE = 0.03
+NEAR = 0.08
+OPEN = 0.12
+"""Inside a room, in its sizes (`room_size`): cameras keep CLEARANCE from every surface, at most a fifth of a
+view is nearer than NEAR, and half of all directions see at least OPEN (or the camera would sit in a
+cupboard)."""
+
+LONGEST = 1.6
+"""A room whose diagonal is longer than this many times that across it, a street, has the size of a shorter one."""
+
+ROUNDS = 12
+"""Batches of random positions that are tried: enough for rooms of which a tenth is free."""
+
+
+def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray | None = None) -> np.ndarray:
+    """(4, 4) world-to-camera of a camera at `position` looking at `target`, `up` (default z) upwards in the
+    image."""
+    forward = np.asarray(target, dtype=np.float64) - position
+    forward = forward / np.linalg.norm(forward)
+    up = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, dtype=np.float64)
+    if abs(forward @ up) > 0.999 * np.linalg.norm(up):
+        up = np.array([0.0, 1.0, 0.0])
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = -rotation @ position
+    return pose
+
+
+def fibonacci_directions(count: int, low: float = -1.0, high: float = 1.0, turn: float = 0.0) -> np.ndarray:
+    """(count, 3) unit vectors spread evenly over the zone of the sphere with z between `low` and `high`."""
+    index = np.arange(count)
+    z = high - (high - low) * (index + 0.5) / count
+    angle = GOLDEN_ANGLE * index + turn
+    radius = np.sqrt(np.maximum(1.0 - z * z, 0.0))
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+
+
+def around(path: str, views: int, center: np.ndarray, distance: float, *, held_out: bool = False) -> list[np.ndarray]:
+    """(4, 4) world-to-camera poses that look at `center` from `distance`.
+
+    `orbit`: three rings; `hemisphere`: evenly over directions from 5 to 85 degrees up; `sphere`: over all
+    directions. `held_out` gives other poses between those: other elevations, other azimuths.
+    """
+    if path == "orbit":
+        rings = np.deg2rad(RING_ELEVATIONS_DEG)
+        if held_out:
+            rings = 0.5 * (rings[:-1] + rings[1:])
+        index = np.arange(views)
+        elevation = rings[index % len(rings)]
+        per_ring = -(-views // len(rings))
+        stagger = (index % len(rings)) / len(rings) + (0.37 if held_out else 0.0)
+        azimuth = 2.0 * np.pi * (index // len(rings) + stagger) / per_ring
+        directions = np.stack(
+            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)],
+            axis=1,
+        )
+    elif path in ("hemisphere", "sphere"):
+        low, high = (np.sin(np.deg2rad((5.0, 85.0)))) if path == "hemisphere" else (-1.0, 1.0)
+        directions = fibonacci_directions(views, low, high, turn=1.3 if held_out else 0.0)
+    else:
+        raise LinprimError(f"path {path!r} does not go around an object, orbit, hemisphere or sphere is wanted")
+    return [look_at(center + distance * direction, center) for direction in directions]
+
+
+def arc(
+    views: int, test_views: int, center: np.ndarray, distance: float, degrees: float, seed: int
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Training and held-out (4, 4) world-to-camera poses of somebody who walks round `center`, camera in hand.
+
+    The azimuths of the training views are equally spaced over `degrees`; elevation, distance, aim and roll
+    wander slowly along the way within the limits above, and jitter from view to view. Every held-out view lies
+    between two training views, at least a quarter of their spacing from both, and jitters independently.
+    """
+    rng = np.random.default_rng([seed, 7])
+    # Elevation, distance, aim along x, y and z, roll: one to two and two to four waves along the way.
+    frequency = rng.uniform((1.0, 2.0), (2.0, 4.0), (6, 2))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (6, 2))
+    step = (np.arange(test_views) + 0.5) / max(test_views, 1) * (views - 1)
+    between = np.floor(step) + 0.25 + 0.5 * (step - np.floor(step))
+    poses = []
+    for place in (np.arange(views, dtype=float), between):
+        way = (place + 0.5) / views
+        waves = np.sin(2.0 * np.pi * way[:, None, None] * frequency + phase) @ (0.65, 0.35)
+        wander = (1.0 - ARC_JITTER) * waves + ARC_JITTER * rng.uniform(-1.0, 1.0, waves.shape)
+        azimuth = np.deg2rad(degrees * (way - 0.5))
+        poses.append([_held(center, distance, *item) for item in zip(azimuth, wander, strict=True)])
+    return poses[0], poses[1]
+
+
+def _held(center: np.ndarray, distance: float, azimuth: float, wander: np.ndarray) -> np.ndarray:
+    """(4, 4) world-to-camera of one view of `arc`; `wander` (6,) in [-1, 1] for elevation, distance, aim and roll."""
+    low, high = np.deg2rad(ARC_ELEVATIONS_DEG)
+    elevation = 0.5 * (low + high) + 0.5 * (high - low) * wander[0]
+    direction = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    # The three axes together deviate by no more than ARC_AIM.
+    target = center + ARC_AIM * distance / np.sqrt(3.0) * wander[2:5]
+    pose = look_at(center + distance * (1.0 + ARC_DISTANCE * wander[1]) * direction, target)
+    roll = np.deg2rad(ARC_ROLL_DEG) * wander[5]
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]]
+    return turn @ pose
+
+
+def fitting_distance(path: str, vertices: np.ndarray, center: np.ndarray, views: int, camera: Camera) -> float:
+    """The smallest distance from `center` at which all vertices are in all pictures, with a margin.
+
+    The size and focal lengths are those of `camera`, its principal point is taken to be the middle of the
+    image.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    points = vertices - center
+    try:
+        points = points[ConvexHull(points).vertices]
+    except (QhullError, ValueError):
+        pass  # flat meshes have no hull; all vertices do as well
+    room_x = (0.5 - FIT_MARGIN) * camera.width / camera.fx
+    room_y = (0.5 - FIT_MARGIN) * camera.height / camera.fy
+    needed = 1.0001 * float(np.linalg.norm(points, axis=1).max())
+    for pose in around(path, views, np.zeros(3), 1.0):
+        x, y, z = pose[:3, :3] @ points.T
+        # |x| / (z + distance) <= room
+        needed = max(needed, float((np.abs(x) / room_x - z).max()), float((np.abs(y) / room_y - z).max()))
+    return needed
+
+
+def inside_out(
+    caster: RayCaster, views: int, test_views: int, half_angles: tuple[float, float], seed: int
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Training and held-out (4, 4) world-to-camera poses in the free space of a closed scene, looking around.
+
+    Positions at eye heights that keep clear of every surface (checked by rays in all directions); of many
+    candidate views those are chosen one after the other that see most of what has been seen least, so that
+    the surface is covered evenly and from different places.
+
+    Args:
+        half_angles: half the horizontal and vertical field of view, radians.
+
+    Raises:
+        LinprimError: no free space with surfaces all around it.
+    """
+    rng = np.random.default_rng(seed)
+    positions, reach, probe = _free_positions(caster, max(160, 3 * (views + test_views)), rng)
+    points, normals = surface_samples(caster, 3000, rng)[:2]
+    candidates, sees, station = [], [], []
+    tan_x, tan_y = np.tan(half_angles)
+    for number, position in enumerate(positions):
+        offset = points - position
+        length = np.linalg.norm(offset, axis=1)
+        facing = np.abs((offset * normals).sum(1)) > 0.2 * length
+        # 1 % short of the point: the point's own face does not hide it.
+        visible = facing & ~caster.occluded(position, offset, 0.99)
+        for direction in fibonacci_directions(8, -0.6, 0.5, turn=rng.uniform(0.0, 2.0 * np.pi)):
+            pose = look_at(position, position + direction)
+            x, y, z = pose[:3, :3] @ probe.T
+            framed = (z > 0) & (np.abs(x) < tan_x * z) & (np.abs(y) < tan_y * z)
+            if framed.any() and np.mean(reach[number][framed] < NEAR * room_size(caster)) > 0.2:
+                continue
+            x, y, z = pose[:3, :3] @ offset.T
+            candidates.append(pose)
+            sees.append(visible & (z > 0) & (np.abs(x) < tan_x * z) & (np.abs(y) < tan_y * z))
+            station.append(number)
+    if len(candidates) < views + test_views:
+        raise LinprimError(
+            f"inside-out: only {len(candidates)} unobstructed views were found in the free space,"
+            f" {views + test_views} are wanted; use fewer views or another path"
+        )
+    sees, station = np.array(sees, dtype=np.float32), np.array(station)
+    free = np.ones(len(candidates), dtype=bool)
+    chosen = []
+    for count in (views, test_views):
+        seen = np.zeros(len(points), dtype=np.float32)
+        picked = []
+        for _ in range(count):
+            if not free.any():
+                raise LinprimError(f"inside-out: free space has room for fewer than {views + test_views} views")
+            gain = np.where(free, sees @ (1.0 / (1.0 + seen)), -1.0)
+            best = int(np.argmax(gain))
+            picked.append(candidates[best])
+            seen += sees[best]
+            free &= station != station[best]
+        chosen.append(picked)
+    return chosen[0], chosen[1]
+
+
+def surface_samples(
+    caster: RayCaster, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Area-uniform points (N, 3) on the mesh, their unit normals (N, 3), faces (N,) and barycentrics (N,
+    2)."""
+    corners = caster.vertices[caster.faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(cross, axis=1)
+    total = np.cumsum(area)
+    face = np.minimum(np.searchsorted(total, rng.uniform(0.0, total[-1], count), side="right"), len(area) - 1)
+    root, v = np.sqrt(rng.uniform(size=count)), rng.uniform(size=count)
+    bary = np.stack([root * (1.0 - v), root * v], axis=1)
+    weight = np.concatenate([1.0 - bary.sum(1, keepdims=True), bary], axis=1)
+    normals = cross[face] / area[face, None]
+    return np.einsum("nc,ncd->nd", weight, corners[face]), normals, face, bary
+
+
+def room_size(caster: RayCaster) -> float:
+    """The bounding box's diagonal, but at most LONGEST times that of its two smaller sides."""
+    return min(caster.diagonal, LONGEST * float(np.linalg.norm(np.sort(caster.upper - caster.lower)[:2])))
+
+
+def _free_positions(caster: RayCaster, wanted: int, rng: np.random.Generator):
+    """Camera positions (P, 3), the distances (P, D) seen from them, and the probing directions (D, 3)."""
+    probe = fibonacci_directions(192)
+    extent = caster.upper - caster.lower
+    low = caster.lower + extent * np.array([0.04, 0.04, 0.3])
+    high = caster.upper - extent * np.array([0.04, 0.04, 0.2])
+    kept, reach, size = [], [], room_size(caster)
+    for _ in range(ROUNDS):
+        positions = rng.uniform(low, high, (wanted, 3))
+        rays = np.tile(probe, (wanted, 1))
+        distance = caster.cast(np.repeat(positions, len(probe), axis=0), rays)[0].reshape(wanted, -1)
+        good = distance.min(1) > CLEARANCE * size
+        good &= np.median(distance, axis=1) > OPEN * size
+        good &= np.isfinite(distance).mean(axis=1) > 0.9
+        kept.append(positions[good])
+        reach.append(distance[good])
+        if sum(map(len, kept)) >= wanted:
+            break
+    positions, reach = np.concatenate(kept)[:wanted], np.concatenate(reach)[:wanted]
+    if len(positions) == 0:
+        raise LinprimError(
+            "inside-out: no free space with surfaces all around it was found in the mesh;"
+            " orbit or hemisphere is for objects seen from outside"
+        )
+    return positions, reach, probe

@@ -1,0 +1,1 @@
+"""Large scenes, trained in blocks of space."""

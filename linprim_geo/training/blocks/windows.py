@@ -1,0 +1,141 @@
+"""The photographs of a block: the parts of views that show it, and in place of the rest what the coarse scene shows
+there."""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import writing
+from linprim_geo.base.options import TrainOptions, raster_options
+from linprim_geo.capture.types import View
+from linprim_geo.geometry.boxes import Block, cropped, enlarged, smaller, surface_points, window
+from linprim_geo.geometry.camera import Camera, Similarity
+from linprim_geo.geometry.primitives import Tensors
+from linprim_geo.kernels import ops
+from linprim_geo.runs.run import Run
+from linprim_geo.training.step.training_images import Shot, StoredShot
+
+# Transmittance at which the coarse surface is taken.
+LEVEL = 0.5
+
+
+def small_depths(coarse: Run, views: Sequence[View], factor: int) -> Iterator[tuple[Camera, np.ndarray]]:
+    """For every view its camera, `factor` times as small, and the (h, w) z-depths of the coarse surface, 0 for none, in
+    the training frame."""
+    small = [replace(view, camera=smaller(view.camera, factor)) for view in views]
+    for view, depth, _ in coarse.surface_depths(small, LEVEL):
+        yield view.camera.transformed(coarse.similarity), depth * np.float32(coarse.similarity.scale)
+
+
+class Windows:
+    """Parts of photographs in a file in the system's folder for temporary ones, so that a worker's memory does not grow
+    with them; where that folder is itself memory, TMPDIR is to name another.
+
+    Reading one takes a hundredth of the time of a step. The file has no name: it is gone with the last of them, however
+    this process ends.
+    """
+
+    def __init__(self) -> None:
+        """Raises LinprimError where no such folder can be written."""
+        try:
+            folder = Path(tempfile.gettempdir())
+        except FileNotFoundError as error:
+            raise LinprimError(
+                f"no folder for temporary files can be written ({error}): wanted TMPDIR to name one"
+            ) from None
+        self._what = folder / "windows of photographs (TMPDIR)"
+        with writing(self._what):
+            self._file = tempfile.TemporaryFile()
+        self._recent: dict[str, Shot] = {}
+
+    def shot(
+        self, name: str, camera: Camera, rgb: np.ndarray, alpha: np.ndarray, photo: tuple[int, int] | None = None
+    ) -> StoredShot:
+        """Takes up (H, W, 3) and (H, W) uint8; `photo` as of a `Shot`.
+
+        Raises:
+            LinprimError: the disk is full.
+        """
+        with writing(self._what):
+            begin = self._file.seek(0, os.SEEK_END)
+            self._file.write(rgb.transpose(2, 0, 1).tobytes() + alpha.tobytes())
+        return StoredShot(name, camera, partial(self._read, begin, name, camera), True, self._recent, photo)
+
+    def _read(self, begin: int, name: str, camera: Camera) -> Shot:
+        with writing(self._what):
+            self._file.seek(begin)
+            planes = bytearray(self._file.read(4 * camera.height * camera.width))
+        if len(planes) != 4 * camera.height * camera.width:
+            raise LinprimError(f"{self._what}: what was written of {name} cannot be read again")
+        rgba = torch.frombuffer(planes, dtype=torch.uint8).reshape(4, camera.height, camera.width)
+        return Shot(name, camera, rgba[:3], rgba[3])
+
+
+def block_shots(
+    coarse: Run,
+    views: Sequence[View],
+    block: Block,
+    margin: float,
+    known: float,
+    factor: int,
+    similarity: Similarity,
+    options: TrainOptions,
+    frozen: Tensors,
+) -> list[Shot]:
+    """What a block is trained on.
+
+    A photograph is cut to the window that shows the block and its margin, and counts by that window's share of its
+    pixels. Pixels whose surface lies farther than `known` from the block, where the frozen primitives are coarse, are
+    replaced by what these alone show there, with their opacity for alpha: a block is neither to explain the rest of the
+    scene nor to hide it. So are those that show the coarse scene's environment.
+
+    Raises:
+        LinprimError: a photograph cannot be read, or the disk is full.
+    """
+    how = raster_options(options) | {"stop": options.stop}
+    shots: list[Shot] = []
+    windows = Windows()
+    for view, (camera, depth) in zip(views, small_depths(coarse, views, factor), strict=True):
+        surface = surface_points(camera, depth)
+        found = window(block.holds(surface, margin), view.camera, factor)
+        if found is None:
+            continue
+        left, top, width, height = found
+        small = cropped(view.camera.transformed(similarity), left, top, width, height)
+        photo = view.load()
+        part = np.s_[top : top + height, left : left + width]
+        explained = block.holds(surface, known) | math.isinf(known)
+        if coarse.environment is not None:
+            explained &= depth > 0
+        rgb, mask = photo.rgb[part], enlarged(explained, view.camera, factor)[part]
+        alpha = np.full(mask.shape, 255, np.uint8) if photo.alpha is None else photo.alpha[part]
+        if not mask.all():
+            instead, opacity = _rendered(frozen, small, how)
+            rgb, alpha = np.where(mask[..., None], rgb, instead), np.where(mask, alpha, opacity)
+        shots.append(windows.shot(view.name, small, rgb, alpha, (view.camera.width, view.camera.height)))
+    return shots
+
+
+def _rendered(frozen: Tensors, camera: Camera, how: dict) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W, 3) straight colours and (H, W) opacities of the frozen primitives, uint8."""
+    if len(frozen[0]) == 0:
+        return np.zeros((camera.height, camera.width, 3), np.uint8), np.zeros((camera.height, camera.width), np.uint8)
+    with torch.no_grad():
+        out = ops.rasterize(*frozen, torch.zeros(3), camera, **how)
+    opacity = out.opacity.float().numpy()
+    rgb = out.rgb.float().numpy().transpose(1, 2, 0) / np.maximum(opacity, 1e-3)[..., None]
+    return (_bytes(rgb), _bytes(opacity))
+
+
+def _bytes(values: np.ndarray) -> np.ndarray:
+    return np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)

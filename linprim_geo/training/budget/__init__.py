@@ -1,0 +1,1 @@
+"""Plans for a given time and memory."""

@@ -1,0 +1,157 @@
+"""What a training would take, before it is begun: images, primitives, minutes and memory, by timing a few steps of
+it."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import torch
+
+from linprim_geo.base.budget import Budget
+from linprim_geo.base.memory import available_memory, memory_gib
+from linprim_geo.base.options import SceneOptions, TrainOptions, check_train_options
+from linprim_geo.base.progress import Progress, duration
+from linprim_geo.kernels import ops
+from linprim_geo.points.start_points import SFM_START
+from linprim_geo.training.budget.memory import bytes_per_primitive
+from linprim_geo.training.budget.pacing import calibrate, plan_run
+from linprim_geo.training.budget.plan import SAVE_SECONDS, mean_population
+from linprim_geo.training.effects import Choice
+from linprim_geo.training.loop import QUICK_VIEWS, evaluate
+from linprim_geo.training.start import begin_run, late_terms, start_trainer
+from linprim_geo.training.step.trainer import Trainer
+from linprim_geo.training.step.training_images import StoredShot, load_shots, photo_bytes, photo_limit
+
+# Timing takes at most CALIBRATION_SHARE of so many seconds.
+TIMING = 125.0
+
+
+def dry_run(
+    scene: str | os.PathLike,
+    run: str | os.PathLike,
+    scene_options: SceneOptions | None = None,
+    options: TrainOptions | None = None,
+    *,
+    time_budget: Budget | float | None = None,
+    quiet: bool = False,
+    effects: Choice | None = None,
+) -> dict:
+    """What `train` with the same arguments would do and take. Nothing is written but the cache of points and
+    undistorted photographs.
+
+    Returns: `images` and `held_out`, `width` and `height` of the largest image, `photo_gib` that all would take,
+        `photos_in_memory` (how many stay there), `iterations`, `max_primitives`, `minutes`, `memory_gib` (at its peak),
+        `available_gib`, `fits`, and `advice`, what to change where it does not fit, else "".
+
+    Accuracy: memory within a quarter of what a training takes, or 0.3 GiB; minutes are those of this machine as busy as
+    it is now.
+
+    Raises:
+        LinprimError: what `train` would raise before its first step.
+    """
+    check_train_options(options := options or TrainOptions())
+    budget, began = Budget.of(time_budget), time.monotonic()
+    progress = Progress("dry run", options.iterations, quiet=quiet)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        ops.set_threads(options.threads)
+        effects, scene_options = effects or Choice("none"), scene_options or SceneOptions()
+        planned, loaded, _ = begin_run(Path(scene), Path(run), scene_options, options, effects, progress)
+        # What is there now is what would be there for all of it.
+        limit = photo_limit()
+        shots, held_out = (load_shots(views, planned.similarity) for views in (loaded.train, loaded.test))
+        terms = late_terms(planned, loaded, shots, progress)
+
+        counts = []
+
+        def start(options: TrainOptions) -> Trainer:
+            trainer = start_trainer(loaded, planned, shots, options, None)
+            counts.append(len(trainer))
+            return trainer
+
+        if budget:
+            quick = len(held_out[:: max(1, len(held_out) // QUICK_VIEWS)])
+            timed, pace = plan_run(
+                planned,
+                shots,
+                held_out,
+                terms,
+                budget,
+                progress,
+                start=start,
+                score=evaluate,
+                start_share=SFM_START,
+                quick_views=quick,
+            )
+            options, seconds = timed.train_options, budget.seconds
+        else:
+            options = planned.train_options
+            setup = time.monotonic() - began
+            cost, begun, starting, per_view = calibrate(options, shots, terms, Budget(TIMING), start, evaluate)
+            rounds = options.iterations // options.evaluate_every if options.evaluate_every else 0
+            scored = len(held_out) + rounds * min(len(held_out), QUICK_VIEWS)
+            steps = options.iterations * cost.seconds(options.max_primitives * mean_population(begun))
+            seconds = (
+                setup
+                + starting
+                + steps
+                + scored * per_view
+                + SAVE_SECONDS * (1 + options.iterations / options.checkpoint_every)
+            )
+    finally:
+        torch.set_num_threads(before)
+    per_primitive = bytes_per_primitive(options)
+    used = (memory_gib("VmHWM") or memory_gib()) - per_primitive * counts[0] / 2**30  # without those that were timed
+    available = available_memory() / 2**30 + memory_gib()
+    needed = used + per_primitive * options.max_primitives / 2**30
+    held = sum(not isinstance(shot, StoredShot) for shot in shots)
+    size = max((view.camera for view in loaded.train), key=lambda camera: camera.width * camera.height)
+    photos = photo_bytes(loaded.train)
+    report = {
+        "images": len(shots),
+        "held_out": len(held_out),
+        "width": size.width,
+        "height": size.height,
+        "photo_gib": photos / 2**30,
+        "photos_in_memory": held,
+        "iterations": options.iterations,
+        "max_primitives": options.max_primitives,
+        "minutes": seconds / 60,
+        "memory_gib": needed,
+        "available_gib": available,
+        "fits": needed <= available,
+        "advice": "" if needed <= available else _advice(used, available, per_primitive, options),
+    }
+    return report | {"_text": describe(report, limit / 2**30)}
+
+
+def describe(report: dict, limit_gib: float) -> str:
+    """The report as lines for a person; `limit_gib` is what photographs may take."""
+    kept = "all in memory"
+    if report["photos_in_memory"] < report["images"]:
+        kept = (
+            f"{report['photos_in_memory']} in memory, which is {limit_gib:.1f} GiB, and the others read when "
+            "they are due"
+        )
+    lines = [
+        f"images: {report['images']} for training of {report['width']}x{report['height']}, "
+        f"{report['photo_gib']:.2f} GiB, {kept};"
+        f" {report['held_out']} held out",
+        f"primitives: {report['max_primitives']} at most, {report['iterations']} steps",
+        f"time: {duration(60 * report['minutes'])}",
+        f"memory: {report['memory_gib']:.1f} GiB of {report['available_gib']:.1f} GiB that are available",
+    ]
+    return "\n".join([*lines, *([report["advice"]] if report["advice"] else []), "nothing was written"])
+
+
+def _advice(used: float, available: float, per_primitive: float, options: TrainOptions) -> str:
+    """What to change so that it fits: fewer primitives if these are what does not, else smaller images."""
+    most = int((available - used) * 2**30 / per_primitive) // 1000 * 1000
+    if most >= min(10_000, options.max_primitives):
+        return f"it would not fit: wanted --max-primitives {most} or less, or more memory"
+    return (
+        "it would not fit: wanted --downscale 2 or more, or more memory, for the images alone take more than there is"
+    )

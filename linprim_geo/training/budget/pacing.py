@@ -1,0 +1,242 @@
+"""A training that keeps to a time: what a step costs is measured first, the run planned from it, and corrected once on
+the way."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+import torch
+
+from linprim_geo.base.budget import AIM, Budget
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import TrainOptions
+from linprim_geo.base.progress import Progress
+from linprim_geo.runs.run import Run
+from linprim_geo.training.budget.plan import (
+    GROWTH_END,
+    PIXELS_PER_PRIMITIVE,
+    SAVE_SECONDS,
+    StepCost,
+    corrected_steps,
+    least_training,
+    plan_training,
+)
+from linprim_geo.training.step.geometry_terms import GeometryTerms
+from linprim_geo.training.step.trainer import SHARED, Trainer
+from linprim_geo.training.step.training_images import Shot
+
+# A calibration: steps of each of two populations, the smaller one this part of the larger, in turn after the
+# warm-up, and the share of the budget after which no further ones are timed.
+CALIBRATION_STEPS, CALIBRATION_PART, CALIBRATION_WARM_UP, CALIBRATION_SHARE = 20, 0.25, 2, 0.08
+# The pace of a run is taken over the part of it between this and the end of growth.
+PACE_FROM = 0.5
+
+
+@dataclass
+class Pace:
+    """The time budget of a run while it trains, and what config.json says of it (`record`)."""
+
+    budget: Budget
+    record: dict
+    finish: float  # seconds from the last step to the end
+    mark: tuple[int, float] | None = None  # step and time.monotonic() from which the pace is taken
+
+    @staticmethod
+    def resumed(run: Run, trainer: Trainer) -> Pace:
+        """From config.json, with the seconds that the steps until now have taken; the correction that was made is
+        repeated."""
+        try:
+            record = dict(run.notes["time_budget"])
+            correction = record.get("correction")
+            if correction:
+                bend, last = int(correction["step"]), int(correction["iterations"])
+                if not 0 < bend < last:
+                    raise ValueError(f"corrected at step {bend} to {last}")
+                trainer.correction = (bend, last)
+            spent, finish = (float(record.get(name, 0.0)) for name in ("before_seconds", "finish_seconds"))
+            if not (math.isfinite(spent) and math.isfinite(finish)):
+                raise ValueError(f"seconds are {spent} and {finish}")
+            return Pace(Budget(float(record["seconds"]), time.monotonic() - trainer.seconds - spent), record, finish)
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise LinprimError(
+                f"{run.path / 'config.json'}: its time_budget lacks what a run needs ({error})"
+            ) from None
+
+    def watch(self, trainer: Trainer, run: Run, progress: Progress, save: Callable[[], None]) -> None:
+        """Called before every step: notes the pace, and when growth has ended corrects the number of steps, once."""
+        planned = trainer.options.iterations
+        end = max(1, round(GROWTH_END * planned))
+        if trainer.correction is not None or trainer.step > end:
+            return
+        if self.mark is None and trainer.step >= PACE_FROM * planned:
+            self.mark = (trainer.step, time.monotonic())
+        if trainer.step < end or trainer.step >= planned:
+            return
+        begin = time.monotonic()
+        save()
+        saving = time.monotonic() - begin
+        finish = self.finish - SAVE_SECONDS + saving
+        since, then = self.mark if self.mark and self.mark[0] < trainer.step else (0, self.budget.began)
+        per_step = (begin - then) / (trainer.step - since)
+        # What begins only after this step was measured beforehand.
+        late = 1 + (self.record["cost"]["late"] - 1) * self.record["cost"]["late_share"] / (1 - GROWTH_END)
+        last = corrected_steps(trainer.step, planned, per_step * late, self.budget.left() - finish)
+        self.record["correction"] = {
+            "step": trainer.step,
+            "iterations": last,
+            "planned": planned,
+            "elapsed_seconds": self.budget.elapsed(),
+            "step_seconds": per_step * late,
+        }
+        run.note("time_budget", self.record)
+        trainer.correction = (trainer.step, last)
+        progress.total = last
+        progress.note(
+            f"  {self.budget.elapsed():.0f} s of {self.budget.seconds:.3g} s at step {trainer.step}, "
+            f"{1e3 * per_step:.1f} ms a step: "
+            f"{last} steps in all in place of {planned}"
+        )
+
+    def close(self, run: Run, progress: Progress) -> dict:
+        """Notes the seconds that the run took, unless a finished run was only looked at again."""
+        if "actual_seconds" in self.record:
+            return self.record
+        self.record["actual_seconds"] = self.budget.elapsed()
+        run.note("time_budget", self.record)
+        progress.note(f"  {self.budget.elapsed():.1f} s of the {self.budget.seconds:.3g} s")
+        return self.record
+
+
+def plan_run(
+    run: Run,
+    shots: list[Shot],
+    held_out: list[Shot],
+    terms: GeometryTerms | None,
+    budget: Budget,
+    progress: Progress,
+    *,
+    start: Callable[[TrainOptions], Trainer],
+    score: Callable[[Trainer, list[Shot]], object],
+    start_share: float,
+    quick_views: int,
+) -> tuple[Run, Pace]:
+    """The run with the steps and the population that fill the budget, by what a step costs here and now.
+
+    Args:
+        start: makes a trainer at its start with these options. score: scores one on some views.
+        start_share: the least share of its limit that the population begins with.
+        quick_views: held-out views that are scored on the way.
+
+    Raises:
+        LinprimError: not even a little training fits.
+    """
+    options = run.train_options
+    given = {
+        name: value
+        for name, value in (("iterations", options.iterations), ("max_primitives", options.max_primitives))
+        if value != getattr(TrainOptions, name)
+    }
+    begin = time.monotonic()
+    cost, begun, starting, view_seconds = calibrate(run.train_options, shots, terms, budget, start, score)
+    calibrating = time.monotonic() - begin
+    # What goes on beside the steps: scores and checkpoints on the way, and both at the end.
+    beside = SAVE_SECONDS / options.checkpoint_every
+    beside += view_seconds * quick_views / options.evaluate_every if options.evaluate_every else 0.0
+    cost = replace(cost, base=cost.base + beside)
+    finish = SAVE_SECONDS + view_seconds * len(held_out)
+    pixels = sum(shot.camera.width * shot.camera.height for shot in shots)
+    left = budget.left() - starting - SAVE_SECONDS - finish
+    plan = plan_training(left, cost, max(begun, start_share), max(1, pixels // PIXELS_PER_PRIMITIVE), **given)
+    if plan is None:
+        least = (AIM * budget.seconds - left + least_training(cost, **given)) / AIM
+        raise LinprimError(
+            f"--time-budget is {budget.seconds:.3g} s, but the least training of this scene that is of any use "
+            f"takes {least:.0f} s here"
+        )
+    progress.note(
+        f"  a step takes {1e3 * cost.base:.2f} ms + {1e6 * cost.per_primitive:.2f} ms per 1000 primitives: "
+        f"{plan.iterations} steps, "
+        f"{plan.max_primitives} primitives at most ({plan.why}), {plan.seconds:.0f} s of the {budget.seconds:.3g} s"
+    )
+    options = replace(options, iterations=plan.iterations, max_primitives=plan.max_primitives)
+    options = replace(options, initial_primitives=min(options.initial_primitives, options.max_primitives))
+    record = {
+        "seconds": budget.seconds,
+        "iterations": plan.iterations,
+        "max_primitives": plan.max_primitives,
+        "why": plan.why,
+        "cost": asdict(cost),
+        "calibration_seconds": calibrating,
+        "before_seconds": budget.elapsed() + starting,
+        "finish_seconds": finish,
+        "planned_seconds": plan.seconds,
+    }
+    return replace(run, train_options=options), Pace(budget, record, finish)
+
+
+def calibrate(
+    options: TrainOptions,
+    shots: list[Shot],
+    terms: GeometryTerms | None,
+    budget: Budget,
+    start: Callable[[TrainOptions], Trainer],
+    score: Callable[[Trainer, list[Shot]], object],
+) -> tuple[StepCost, float, float, float]:
+    """(cost of a step, population at the start as a share of its limit, seconds to make the first population, seconds
+    to score a view).
+
+    Steps of two throw-away trainers in turn, at the end of growth, where all degrees of the colour take part.
+    """
+    options = replace(options, iterations=TrainOptions.iterations)
+    begin = time.monotonic()
+    large = start(options)
+    starting = time.monotonic() - begin
+    begun = len(large) / options.max_primitives
+    part = max(1, round(CALIBRATION_PART * len(large)))
+    keep = torch.from_numpy(np.sort(np.random.default_rng([options.seed, 1]).choice(len(large), part, replace=False)))
+    fewer = {name: value[keep].clone() for name, value in large.parameters.items() if name not in SHARED}
+    fewer["log_extent"] += float(np.log(len(large) / part)) / 2  # as many over a place of the surface
+    fewer["log_extent"].clamp_(*(float(np.log(bound)) for bound in large.bounds))
+    environment = None if large.environment is None else large.environment.clone()
+    small = Trainer(
+        shots,
+        fewer,
+        options,
+        large.bounds,
+        large.background.clone(),
+        large.fitted,
+        large.random_background,
+        terms,
+        environment=environment,
+    )
+    large.terms = terms
+    late_from = min(
+        options.geometry_from if terms else 1.0, options.order_from if options.order_from > GROWTH_END else 1.0
+    )
+    until = time.monotonic() + CALIBRATION_SHARE * budget.seconds
+    times: dict[str, list[float]] = {"small": [], "large": [], "late": []}
+    kinds = [("small", small, GROWTH_END), ("large", large, GROWTH_END)]
+    if late_from < 1:
+        kinds.append(("late", large, max(late_from, GROWTH_END) + 0.01))
+    for turn in range(CALIBRATION_WARM_UP + CALIBRATION_STEPS):
+        if turn > CALIBRATION_WARM_UP + 2 and time.monotonic() > until:
+            break
+        for name, trainer, at in kinds:
+            trainer.step = round(at * options.iterations) + 1 + turn
+            trainer.seconds = 0.0
+            trainer.advance()
+            if turn >= CALIBRATION_WARM_UP:
+                times[name].append(trainer.seconds)
+    mean = {name: float(np.mean(values)) for name, values in times.items() if values}
+    begin = time.monotonic()
+    score(large, shots[:2])
+    view_seconds = (time.monotonic() - begin) / len(shots[:2])
+    late = mean.get("late", mean["large"]) / mean["large"]
+    cost = StepCost.fit(
+        (part, mean["small"]), (len(large), mean["large"]), late, 1 - late_from if late_from < 1 else 0.0
+    )
+    return cost, begun, starting, view_seconds

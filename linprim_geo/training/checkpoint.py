@@ -1,0 +1,134 @@
+"""Checkpoints of a training: written so that the latest whole one is always there, read without trusting the file."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from pathlib import Path
+
+import torch
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import atomic_write
+from linprim_geo.training.step.trainer import SHARED, Trainer
+
+KEPT = 2
+
+
+def write_checkpoint(folder: Path, trainer: Trainer) -> None:
+    """Writes step_N.pt, then `latest`, which names it, then removes all but the last KEPT."""
+    name = f"step_{trainer.step:06d}.pt"
+    # By an open file: its errors keep their names, and the bytes do not depend on the temporary's.
+    with atomic_write(folder / name) as temporary, open(temporary, "wb") as file:
+        torch.save(trainer.state(), file)
+    with atomic_write(folder / "latest") as temporary:
+        temporary.write_text(name + "\n")
+    for old in sorted(folder.glob("step_*.pt"), key=lambda file: (len(file.name), file.name))[:-KEPT]:
+        if old.name != name:
+            old.unlink()
+
+
+def read_checkpoint(path: Path) -> dict | None:
+    """The latest checkpoint of a run's folder, None where it has none yet. Nothing in it is executed.
+
+    Raises:
+        LinprimError: it is missing, damaged (a checksum is wrong), or holds anything but tensors and plain values.
+    """
+    folder = path / "checkpoints"
+    try:
+        name = (folder / "latest").read_text(encoding="utf-8").strip()
+    except FileNotFoundError:
+        return None
+    except (OSError, UnicodeDecodeError) as error:
+        raise LinprimError(f"{folder / 'latest'}: cannot be read ({error})") from None
+    if not name.isprintable() or Path(name).name != name or len(name) > 100:
+        raise LinprimError(f"{folder / 'latest'}: names {name[:100]!r}, wanted a checkpoint in this folder")
+    file = folder / name
+    try:
+        _check_archive(file)
+        state = torch.load(file, weights_only=True)
+    except FileNotFoundError:
+        raise LinprimError(f"{file}: the latest checkpoint is missing") from None
+    except LinprimError:
+        raise
+    except Exception as error:  # torch raises many kinds for a damaged file
+        raise LinprimError(f"{file}: is damaged and cannot be read ({type(error).__name__})") from None
+    if not isinstance(state, dict):
+        raise LinprimError(f"{file}: holds no checkpoint")
+    return state
+
+
+def restore(trainer: Trainer, state: dict, folder: Path) -> None:
+    """Puts a checkpoint's state into a trainer of the same run.
+
+    Raises:
+        LinprimError: something is missing, not finite, or does not fit together.
+    """
+    try:
+        _check_state(trainer, state)
+        trainer.restore(state)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, RuntimeError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise LinprimError(f"{folder}: the latest checkpoint lacks what a run needs ({reason})") from None
+
+
+def _check_archive(file: Path) -> None:
+    """torch itself compares no checksums: a flipped bit would be trained on with."""
+    with zipfile.ZipFile(file) as archive:
+        if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
+            raise LinprimError(f"{file}: is damaged and cannot be read (it is compressed, which no checkpoint is)")
+        broken = archive.testzip()
+    if broken is not None:
+        raise LinprimError(f"{file}: is damaged and cannot be read (the checksum of {broken[:100]!r} is wrong)")
+
+
+def _check_state(trainer: Trainer, state: dict) -> None:
+    """Raises ValueError, or what a wrong type raises, unless every table is finite and has a row per primitive."""
+    count = len(state["parameters"]["center"])
+    if count < 1:
+        raise ValueError("there are no primitives")
+    for table in ("parameters", "first", "second"):
+        for name, like in getattr(trainer, table).items():
+            shape = like.shape if name in SHARED else (count, *like.shape[1:])
+            _check_tensor(f"{table} {name}", state[table][name], like.dtype, shape)
+    if any(bool((value < 0).any()) for value in state["second"].values()):
+        raise ValueError("a second moment is negative")
+    _check_tensor("steps", state["steps"], torch.int32, (count,))
+    for name in trainer.control.NAMES:
+        _check_tensor(f"gathered {name}", state["gathered"][name], torch.float32, (count,))
+    if (state["filter_3d"] is None) != (trainer.filter_3d is None):
+        raise ValueError("filter_3d belongs to a run with another --filter")
+    if state["filter_3d"] is not None:
+        _check_tensor("filter_3d", state["filter_3d"], torch.float32, (count,))
+    step, (low, high) = state["step"], state["bounds"]
+    if type(step) is not int or not 0 <= step < 2**40 or not 0 < low <= high < math.inf:
+        raise ValueError(f"step {step!r} or bounds {low!r}, {high!r}")
+    if (
+        not all(type(state[name]) is float for name in ("seconds", "loss", "psnr"))
+        or not 0 <= state["seconds"] < math.inf
+    ):
+        raise ValueError("seconds, loss and psnr are no numbers")
+    numbers = trainer.control.state()
+    if len(state["control"]) != len(numbers) or not all(
+        type(x) in (int, float) and math.isfinite(x) for x in state["control"]
+    ):
+        raise ValueError(f"control is {state['control']!r}")
+    if trainer.exposure is not None:
+        for name, like in trainer.exposure.state().items():
+            _check_tensor(f"exposure {name}", state["exposure"][name], like.dtype, like.shape)
+
+
+def _check_tensor(name: str, value, dtype: torch.dtype, shape: tuple) -> None:
+    if (
+        not isinstance(value, torch.Tensor)
+        or value.dtype != dtype
+        or tuple(value.shape) != tuple(shape)
+        or value.layout != torch.strided
+    ):
+        raise ValueError(f"{name} is no {dtype} tensor of shape {tuple(shape)}")
+    if (
+        not value.is_contiguous()
+        or value.requires_grad
+        or (value.is_floating_point() and not bool(torch.isfinite(value).all()))
+    ):
+        raise ValueError(f"{name} is not finite")

@@ -1,0 +1,51 @@
+"""What `linprim-geo inspect` says: the effects that a scene calls for, with the evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict
+
+from linprim_geo.base.options import SceneOptions, TrainOptions
+from linprim_geo.training.effects import FREE, REASONS, Choice, Decision, chosen_options
+
+
+def inspect_scene(
+    path,
+    scene_options: SceneOptions = SceneOptions(),  # noqa: B008 (all three are frozen)
+    options: TrainOptions = TrainOptions(),  # noqa: B008
+    choice: Choice = Choice(),  # noqa: B008
+    log=None,
+) -> dict:
+    """Reads a scene and decides: `effects`, a list of decisions as tables, `options` that follow from them, and a
+    `_text` for people.
+
+    Raises:
+        LinprimError: the scene or an option cannot be used.
+    """
+    from linprim_geo.training.start import decided_scene
+
+    decisions, scene, scene_options, options = decided_scene(
+        path, scene_options, options, choice, log or (lambda text: None)
+    )
+    chosen = chosen_options(decisions)
+    result = {
+        "scene": str(path),
+        "views": len(scene.train),
+        "held_out_views": len(scene.test),
+        "points": 0 if scene.points is None else len(scene.points.xyz),
+        "effects": [asdict(decision) for decision in decisions],
+        "options": chosen,
+    }
+    return result | {"_text": describe(decisions)}
+
+
+def describe(decisions: Iterable[Decision]) -> str:
+    """A block per effect: on or off and why, what it costs, and the evidence."""
+    lines = []
+    for d in decisions:
+        cost = "no time" if d.cost < FREE else f"about {d.cost:.2f} times the time"
+        why = f"{REASONS[d.reason]}{': ' + d.note if d.note else ''}"
+        lines.append(f"{d.name:<15} {'on ' if d.on else 'off'}  {why}. Costs {cost}: {d.what}")
+        value = "not measured" if d.value is None else f"{d.value:.3g} {d.unit}"
+        lines.append(f"{'':<20}{d.evidence}: {value}; on from {d.threshold:g} {d.unit}")
+    return "\n".join(lines)

@@ -1,0 +1,121 @@
+"""One training of a whole scene, without blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+
+from linprim_geo.base.budget import Budget
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import GEOMETRY_WEIGHTS
+from linprim_geo.base.progress import Progress, duration
+from linprim_geo.capture.types import Scene
+from linprim_geo.kernels import ops
+from linprim_geo.points.initial_points import VolumePoints
+from linprim_geo.points.start_points import SFM_START, with_points
+from linprim_geo.runs.run import Run
+from linprim_geo.training.budget.pacing import Pace, plan_run
+from linprim_geo.training.effects import Decision
+from linprim_geo.training.held_out_gap import gap_advice
+from linprim_geo.training.loop import QUICK_VIEWS, evaluate, run_steps
+from linprim_geo.training.start import late_terms, start_trainer
+from linprim_geo.training.step.training_images import Shot, load_shots
+
+
+def train_run(
+    run: Run,
+    scene: Scene,
+    state: dict | None,
+    progress: Progress,
+    decisions: Sequence[Decision] = (),
+    budget: Budget | None = None,
+) -> dict:
+    """Trains from a checkpoint's `state`, or from the start: what is random does not depend on when a run was stopped.
+
+    Args:
+        run: a new run has no folder yet.
+        decisions, budget: of a new run, for its config.json.
+
+    Returns, raises: as `train`.
+    """
+    options = run.train_options
+    wanted = [name for name in GEOMETRY_WEIGHTS if getattr(options, name) > 0]
+    if state is None or wanted:
+        scene = with_points(scene, options, progress.note)
+    shots = load_shots(scene.train, run.similarity)
+    if all(shot.alpha is not None and int(shot.alpha.max()) == 0 for shot in shots):
+        raise LinprimError(f"{scene.root}: the masks leave no pixel of any training image")
+    held_out: list[Shot] | None = None
+    pace = None
+    if budget:
+        held_out = load_shots(scene.test, run.similarity)
+        volume = isinstance(scene.points, VolumePoints)
+        run, pace = plan_run(
+            run,
+            shots,
+            held_out,
+            late_terms(run, scene, shots, progress),
+            budget,
+            progress,
+            start=lambda options: start_trainer(scene, run, shots, options, None),
+            score=evaluate,
+            # The smaller limit that is chosen leaves too many points, not too few, and volumes are filled anew.
+            start_share=0.0 if volume else SFM_START,
+            quick_views=len(held_out[:: max(1, len(held_out) // QUICK_VIEWS)]),
+        )
+        options, progress.total = run.train_options, run.train_options.iterations
+        if volume:  # as many as the population begins with
+            scene = with_points(replace(scene, points=None), options, progress.note)
+    trainer = start_trainer(scene, run, shots, options, state)
+    trainer.terms = late_terms(run, scene, shots, progress)
+    if not (run.path / "config.json").exists():
+        Run.create(
+            run.path,
+            scene,
+            run.scene_path,
+            run.scene_options,
+            run.train_options,
+            run.similarity,
+            ops.instruction_set(),
+            [asdict(decision) for decision in decisions],
+            pace.record if pace else None,
+        )
+    elif "time_budget" in run.notes:
+        pace = Pace.resumed(run, trainer)
+    for torn in [*run.path.glob(".*.tmp*"), *run.path.glob("checkpoints/.*.tmp*")]:  # what a kill left half-written
+        torn.unlink()
+    progress.start = trainer.step
+    progress.note(
+        f"{scene.root}: {scene.kind}, {len(scene.train)} training and {len(scene.test)} held-out views of "
+        f"{shots[0].camera.width}x{shots[0].camera.height}; {len(trainer)} primitives, {ops.instruction_set()}, "
+        f"{ops.threads()} threads"
+    )
+    held_out = load_shots(scene.test, run.similarity) if held_out is None else held_out
+    seconds, score, score_gain = run_steps(trainer, run, held_out, progress, pace)
+    result = {
+        "run": str(run.path),
+        "iterations": trainer.step,
+        "seconds": seconds,
+        "primitives": len(trainer),
+        "psnr": score,
+        "views": len(held_out),
+    }
+    if trainer.exposure is not None:
+        result["psnr_gain"] = score_gain
+    progress.note(
+        f"{run.path}: {trainer.step} steps in {duration(seconds)}, {len(trainer)} primitives"
+        + (f", held-out PSNR {score:.2f} dB over {len(held_out)} views" if held_out else "")
+        + (f", {score_gain:.2f} dB with the best gain of each" if held_out and score_gain is not None else "")
+    )
+    if score is not None:
+        train_score = evaluate(trainer, shots[:: max(1, len(shots) // QUICK_VIEWS)])
+        assert train_score is not None
+        result["train_psnr"] = train_score
+        effects = run.notes.get("effects")
+        if advice := gap_advice(train_score, score, len(shots), options, effects if isinstance(effects, list) else []):
+            progress.note(advice)
+            result["advice"] = advice
+            run.note("advice", advice)
+    if pace:
+        result["time_budget"] = pace.close(run, progress)
+    return result

@@ -1,0 +1,218 @@
+"""Where a training starts: the scene with points, the run, new or reopened, and the trainer at its first step or at a
+checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import GEOMETRY_WEIGHTS, SceneOptions, TrainOptions, check_train_options
+from linprim_geo.base.progress import Progress
+from linprim_geo.capture.load import load_scene
+from linprim_geo.capture.structure_from_motion import prepare
+from linprim_geo.capture.types import PointCloud, Scene
+from linprim_geo.geometry.environment_map import texels_for
+from linprim_geo.geometry.primitives import KINDS
+from linprim_geo.kernels import ops
+from linprim_geo.points.initial_points import (
+    CAMERA_DISTANCE,
+    VolumePoints,
+    local_planes,
+    scene_normalization,
+)
+from linprim_geo.points.photo_evidence import observe
+from linprim_geo.points.start_points import filled_points, initial_cloud, with_points
+from linprim_geo.runs.run import Run, refuse_used
+from linprim_geo.training.background import chosen_background
+from linprim_geo.training.checkpoint import restore
+from linprim_geo.training.effects import Choice, Decision, decide, settle, summary
+from linprim_geo.training.step.geometry_terms import GeometryTerms, gather_evidence
+from linprim_geo.training.step.trainer import LARGEST_PART, SMALLEST_PX, Trainer, initial_parameters
+from linprim_geo.training.step.training_images import Shot
+
+
+def decided_scene(
+    path: Path, scene_options: SceneOptions, options: TrainOptions, choice: Choice, log: Callable[[str], None]
+) -> tuple[list[Decision], Scene, SceneOptions, TrainOptions]:
+    """Reads a scene, decides about its effects, and reads it again if that changes how.
+
+    Returns: the decisions, the scene with points to start from, and both options with what was decided put in.
+    """
+
+    def read(how: SceneOptions) -> Scene:
+        loaded = load_scene(
+            path,
+            downscale=how.downscale,
+            masks=how.masks or None,
+            images=how.images or None,
+            sparse=how.sparse or None,
+            frames=how.frames,
+            pinhole_below=how.pinhole_below,
+        ).with_training_views(how.views)
+        return with_points(loaded, options, log)
+
+    if scene_options.views < 0:
+        raise LinprimError(f"--views is {scene_options.views}, wanted a number of training views, or 0 for all")
+    prepare(path, scene_options.sparse or None, scene_options.frames, threads=options.threads, log=log)
+    scene = read(scene_options)
+    if choice.mode == "none" and not choice.asked:
+        return [], scene, scene_options, options
+    decisions = decide(scene, scene_options, options, choice)
+    settled, options = settle(scene_options, options, decisions)
+    check_train_options(options)
+    distorted = any(view.lens is not None for view in scene.views)
+    if replace(settled, pinhole_below=scene_options.pinhole_below) != scene_options or (
+        distorted and settled.pinhole_below != scene_options.pinhole_below
+    ):
+        scene = read(settled)
+    return decisions, scene, settled, options
+
+
+def begin_run(
+    scene: Path,
+    run_path: Path,
+    scene_options: SceneOptions,
+    options: TrainOptions,
+    effects: Choice,
+    progress: Progress,
+) -> tuple[Run, Scene, list[Decision]]:
+    """A new run, whose folder is not made yet, its scene with points to start from, and what was decided about its
+    effects.
+
+    Raises:
+        LinprimError: something is at `run_path` already, or the scene or an option cannot be used.
+    """
+    refuse_used(run_path)
+    decisions, loaded, scene_options, options = decided_scene(scene, scene_options, options, effects, progress.note)
+    if decisions:
+        progress.note(summary(decisions))
+    run = Run(run_path, scene, scene_options, options, scene_normalization(loaded), loaded.unit)
+    return run, loaded, decisions
+
+
+def reopen_run(
+    scene: Path, run_path: Path, scene_options: SceneOptions, options: TrainOptions, progress: Progress
+) -> tuple[Run, Scene]:
+    """An existing run and its scene; options that were given and differ from the run's, but for `threads`, are named as
+    ignored.
+
+    Raises:
+        LinprimError: not a run folder, a file in it is damaged, or its scene is neither where it was nor at `scene`.
+    """
+    opened = Run.open(run_path)
+    if scene.resolve() != opened.scene_path:
+        opened = opened.with_scene_at(scene)
+    ignored = [
+        "--" + field.name.replace("_", "-")
+        for given, own in ((scene_options, opened.scene_options), (options, opened.train_options))
+        for field in fields(given)
+        if field.name != "threads" and getattr(given, field.name) not in (field.default, getattr(own, field.name))
+    ]
+    if ignored:
+        progress.note(f"--resume goes on with the run's own options: {', '.join(ignored)} ignored")
+    if opened.instruction_set not in ("", ops.instruction_set()):
+        progress.note(
+            f"begun with {opened.instruction_set} kernels and going on with {ops.instruction_set()}: the last "
+            "bits will differ"
+        )
+    progress.total = opened.train_options.iterations
+    return replace(opened, train_options=replace(opened.train_options, threads=options.threads)), opened.scene()
+
+
+def late_terms(run: Run, scene: Scene, shots: list[Shot], progress: Progress) -> GeometryTerms | None:
+    """The late terms for geometry that have a weight, of a scene with points; None if none has."""
+    options = run.train_options
+    if not any(getattr(options, name) > 0 for name in GEOMETRY_WEIGHTS):
+        return None
+    assert scene.points is not None
+    evidence = gather_evidence(scene, options, run.similarity, progress.note)
+    terms = GeometryTerms(options, shots, evidence, run.similarity.apply(scene.points.xyz))
+    if terms.sources is not None and not any(terms.sources):
+        progress.note("--patches: no two views see the same places from angles that suit it, so it does nothing")
+    return terms
+
+
+def start_trainer(
+    scene: Scene,
+    run: Run,
+    shots: list[Shot],
+    options: TrainOptions,
+    state: dict | None,
+    cloud: PointCloud | None = None,
+    largest: float | None = None,
+) -> Trainer:
+    """A trainer at step 0, or at the step of a checkpoint's `state`.
+
+    Args:
+        scene: with points to start from; those of a checkpoint need none.
+        shots: its training views in the training frame.
+        cloud: the points to start from; default: `filled_points` of the scene.
+        largest: extent that a primitive may have, in the training frame; default: by what the points reach.
+
+    Raises:
+        LinprimError: the background is none, or the checkpoint does not fit the options.
+    """
+    focal = float(np.median([max(s.camera.fx, s.camera.fy) for s in shots]))
+    centers = np.stack([s.camera.center for s in shots])
+    begun = None if state is None else "environment" in state.get("parameters", {})
+    behind = chosen_background(options.background, scene, shots, begun)
+    surface = state is None and not isinstance(scene.points, VolumePoints)
+    if state is not None:
+        xyz, rgb, radius = np.zeros((4, 3)), np.zeros((4, 3)), 1.0  # replaced below
+    else:
+        if cloud is None:
+            cloud = filled_points(scene, options.seed, behind.color.numpy() if behind.fitted else None, behind.far)
+        cloud = initial_cloud(cloud, options)
+        xyz, rgb = run.similarity.apply(cloud.xyz), cloud.rgb
+        middle = np.median(xyz, 0)
+        reach = np.linalg.norm(xyz - middle, axis=1)
+        radius = max(float(np.percentile(reach, 98)), 0.2 * float(np.linalg.norm(centers - middle, axis=1).max()), 1e-3)
+    smallest = SMALLEST_PX * CAMERA_DISTANCE / focal
+    like = KINDS[options.primitive].size
+    largest = like * LARGEST_PART * radius if largest is None else largest
+    bounds = (like * smallest, max(largest, like * 4 * smallest))
+    parameters = initial_parameters(xyz, rgb, options.sh_degree, options.seed, bounds, options.primitive)
+    if surface and parameters["log_extent"].shape[1] == 3:
+        _lay_down(parameters, xyz, options.seed, bounds[0])
+    log_gain = None
+    if options.exposure == "gain" and state is None:
+        seen = observe(scene, options.seed, views=len(shots))
+        log_gain = None if seen is None else seen.log_gains[0]
+    environment = None
+    if behind.environment:
+        size = texels_for([shot.camera for shot in shots])
+        environment = (
+            torch.zeros(6, size, size, 3) if behind.far is None else behind.far.start(size)
+        )  # zeros: replaced below
+    trainer = Trainer(
+        shots,
+        parameters,
+        options,
+        bounds,
+        behind.color,
+        behind.fitted,
+        behind.random,
+        log_gain=log_gain,
+        environment=environment,
+    )
+    if state is not None:
+        restore(trainer, state, run.path / "checkpoints")
+    return trainer
+
+
+def _lay_down(parameters: dict[str, torch.Tensor], xyz: np.ndarray, seed: int, smallest: float) -> None:
+    """Lays primitives on the planes of their points, as thin across as these are flat, at least twice the smallest
+    extent.
+
+    A ball round a point of a plain wall stands out from it by its radius, and no photograph says that it does not.
+    """
+    rotation, flat = local_planes(xyz, seed)
+    parameters["rotation"].copy_(torch.from_numpy(rotation))
+    across = parameters["log_extent"][:, 2]
+    thin = across + torch.from_numpy(np.log(flat)).float()
+    across.copy_(torch.maximum(thin, across.clamp_max(float(np.log(2 * smallest)))))

@@ -1,0 +1,273 @@
+"""The rules of growth that the papers use, for comparison: 3DGS's clone, split, prune and reset, and MCMC's relocation.
+
+Source: Kerbl et al., "3D Gaussian Splatting" (2023), section 5; Kheradmand et al., "3D Gaussian Splatting as Markov
+Chain Monte Carlo" (2024); LinPrim (von Luetzow and Niessner, arXiv 2501.16312) for their constants with polyhedra.
+Steps are the papers' at 7,000 iterations and more, and shrink with shorter runs; growth ends at the papers' part of the
+run.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.primitives import DIST_TO_SCALE, KINDS
+from linprim_geo.training.step.population import Control, Event, rotate, thinned
+
+# Shorter runs have proportionally shorter intervals.
+FULL_ITERATIONS = 7000
+FIRST = 500
+# Radius of a scene whose cameras are all in one place (LinPrim).
+LONE_RADIUS = 2.6
+
+
+def scene_radius(cameras: list[Camera]) -> float:
+    """1.1 times the largest distance of a camera from the mean of all, the length that the papers' constants are parts
+    of."""
+    centers = np.stack([camera.center for camera in cameras])
+    return 1.1 * float(np.linalg.norm(centers - centers.mean(0), axis=1).max()) or LONE_RADIUS
+
+
+def _steps(count: int, iterations: int) -> int:
+    return max(10, round(count * min(1.0, iterations / FULL_ITERATIONS)))
+
+
+@dataclass(frozen=True)
+class ClassicConstants:
+    """Lengths are parts of `scene_radius`; sizes are full diameters of polyhedra, standard deviations of Gaussians."""
+
+    every: int
+    threshold: float  # mean gradient to the projected centre, which reaches from -1 to 1 across the image
+    small: float  # clone up to this size, split above
+    largest: float  # prune above, once opacities have been reset
+    faintest: float  # prune opacities below
+    shrink: float  # a half's extents are divided by it
+    spread: float  # standard deviation of a half's centre, in extents
+
+
+# LinPrim spreads halves by whole extents, which puts 93 % of their centres outside of the parent; by extents / 2.6 it
+# is 39 %.
+POLYHEDRA = ClassicConstants(250, 1.5e-4, 0.01, 0.4, 0.025, 1.2, 1 / DIST_TO_SCALE)
+GAUSSIANS = ClassicConstants(100, 2e-4, 0.01, 0.1, 0.005, 1.6, 1.0)
+RESET_EVERY = 3000
+
+
+class ClassicControl(Control):
+    """3DGS's rule. Where LinPrim's code errs, this does what was meant:
+
+    * Opacities are reset to twice the prune level, 3DGS's own ratio. LinPrim's 0.01 lies below its prune level of
+      0.025, so whatever is not looked at before the next event is deleted.
+    * A clone would double the density: the two polyhedra share the optical thickness of the one, and look alike.
+      (Gaussians as in 3DGS.) Faint ones keep theirs, as they would be pruned else.
+    * Primitives that are large on the screen are not pruned: in both codes the record is cleared before it is read, so
+      no published result has it.
+    """
+
+    NAMES = ("gradient", "seen")
+    GROWS_UNTIL = 0.5
+
+    def __init__(self, options, count, cameras, bounds):
+        super().__init__(options, count, cameras, bounds)
+        self.constants = POLYHEDRA if KINDS[self.kind].solid else GAUSSIANS
+        self.radius = scene_radius(cameras)
+        total = options.iterations
+        self.every, self.reset_every = _steps(self.constants.every, total), _steps(RESET_EVERY, total)
+        self.first, self.last = _steps(FIRST, total), round(self.GROWS_UNTIL * total)
+
+    def gather(self, parameters, camera, size, screen_grad):
+        half = torch.tensor([size[0] / 2, size[1] / 2])
+        seen = in_view(parameters, camera, self.kind)
+        pull = torch.linalg.vector_norm(screen_grad[:, :2] * half, dim=1)
+        self.gathered["gradient"] += torch.where(seen, pull, 0.0)
+        self.gathered["seen"] += seen
+
+    def is_due(self, step):
+        grows = step > self.first and step % self.every == 0
+        return step < self.last and (grows or step % self.reset_every == 0)
+
+    def change(self, parameters, step):
+        constants, rng = self.constants, self.rng(7, step)
+        raw = parameters["raw_opacity"].detach().numpy().astype(np.float64)
+        log_extent = parameters["log_extent"].detach().numpy().astype(np.float64)
+        keep = split = clone = np.zeros(0, np.int64)
+        if step > self.first and step % self.every == 0:
+            opacity = 1 / (1 + np.exp(-raw))
+            size = np.exp(log_extent).max(1)
+            if KINDS[self.kind].solid:
+                size = 2 * size / KINDS[self.kind].size
+            alive = opacity >= constants.faintest
+            if step > self.reset_every:
+                alive &= size <= constants.largest * self.radius
+            if not alive.any():
+                alive[np.argmax(opacity)] = True
+            pull, seen = (self.gathered[name].numpy().astype(np.float64) for name in self.NAMES)
+            pull = np.where(alive, pull / np.maximum(seen, 1), 0)
+            hot = np.flatnonzero(pull >= constants.threshold)
+            # The limit on the population is ours: what pulls hardest goes first.
+            room = max(0, self.options.max_primitives - int(alive.sum()))
+            hot = np.sort(hot[np.argsort(-pull[hot], kind="stable")[:room]])
+            is_small = size[hot] <= constants.small * self.radius
+            clone, split = hot[is_small], hot[~is_small]
+            alive[split] = False
+            keep = np.flatnonzero(alive)
+        else:
+            keep = np.arange(len(raw))
+        source = np.concatenate([keep, clone, split, split])
+        fresh = np.arange(len(keep), len(source))
+        children = fresh[len(clone) :]
+        values = {}
+        if len(split):
+            center = parameters["center"].detach().numpy().astype(np.float64)
+            parents = source[children]
+            local = constants.spread * _normal(rng, np.exp(log_extent[parents]), self.kind)
+            offset = rotate(parameters["rotation"].detach().numpy()[parents].astype(np.float64), local)
+            values["center"] = children, center[parents] + offset
+            values["log_extent"] = children, log_extent[parents] - math.log(constants.shrink)
+        raw, changed = raw[source], False
+        if len(clone) and KINDS[self.kind].solid:
+            shared = thinned(raw, 0.5)
+            twin = np.zeros(len(source), bool)
+            twin[len(keep) : len(keep) + len(clone)] = True
+            twin[: len(keep)] = np.isin(keep, clone)
+            raw = np.where(twin & (shared >= _logit(constants.faintest)), shared, raw)
+            changed = True
+        reset = step % self.reset_every == 0
+        if reset:
+            raw, changed = np.minimum(raw, _logit(2 * constants.faintest)), True
+        if changed:
+            values["raw_opacity"] = np.arange(len(source)), raw
+        return Event(source, values, fresh=fresh, calm_opacity=reset)
+
+
+MCMC_EVERY, MCMC_RATE = 100, 0.05
+DEAD, MOST_COPIES = 0.005, 50
+NOISE_RATE, NOISE_CENTER = 5e5, (1.6e-4, 1.6e-6)
+SIZE_PENALTY = OPACITY_PENALTY = 0.01
+
+
+class McmcControl(Control):
+    """MCMC's rule: dead primitives move onto opaque ones, five percent more by the same draw, noise on the centres of
+    the transparent ones, and penalties on size and opacity. A polyhedron counts as a Gaussian of standard deviations
+    extent / 2.6, as in LinPrim; relocation therefore changes its image.
+
+    LinPrim subtracts the 3D filter from a relocated primitive and takes the absolute value, so one that ought to vanish
+    grows; here extents are kept without the filter and end at their lower bound.
+    """
+
+    GROWS_UNTIL = 5 / 6
+
+    def __init__(self, options, count, cameras, bounds):
+        super().__init__(options, count, cameras, bounds)
+        self.radius = scene_radius(cameras)
+        self.every, self.first = (
+            _steps(MCMC_EVERY, options.iterations),
+            _steps(FIRST, options.iterations),
+        )
+        self.last = round(self.GROWS_UNTIL * options.iterations)
+        # Standard deviations per extent.
+        self.scale = 1.0 if self.kind == "gaussian" else 1 / (DIST_TO_SCALE * KINDS[self.kind].size)
+
+    def penalty(self, parameters):
+        size = self.scale * torch.exp(parameters["log_extent"]).mean()
+        return SIZE_PENALTY * size + OPACITY_PENALTY * torch.sigmoid(parameters["raw_opacity"]).mean()
+
+    def is_due(self, step):
+        return self.first < step < self.last and step % self.every == 0
+
+    def disturb(self, parameters, step):
+        """center += covariance noise 5e5 rate S(1 - opacity), S(x) = 1 / (1 + exp(-100 (x - 0.995))), rate the papers'
+        for centres."""
+        opacity = torch.sigmoid(parameters["raw_opacity"]).numpy().astype(np.float64)
+        # S is below 1e-9 for opacities over 0.22.
+        rows = np.flatnonzero(opacity < 0.22)
+        first, last = NOISE_CENTER
+        rate = self.radius * first * (last / first) ** (step / self.options.iterations)
+        strength = NOISE_RATE * rate / (1 + np.exp(-100 * (0.995 - opacity[rows])))
+        noise = self.rng(6, step).normal(size=(len(rows), 3))
+        q = parameters["rotation"].numpy()[rows].astype(np.float64)
+        extent = self.scale * np.exp(parameters["log_extent"].numpy()[rows].astype(np.float64))
+        local = rotate(q * [1, -1, -1, -1], noise)
+        if self.kind == "tetrahedron":
+            b = KINDS[self.kind].directions
+            local = 0.75 * (extent**2 * (local @ b.T)) @ b
+        else:
+            local = extent**2 * local
+        moved = parameters["center"].numpy()[rows] + strength[:, None] * rotate(q, local)
+        parameters["center"][torch.from_numpy(rows)] = torch.from_numpy(moved.astype(np.float32))
+
+    def change(self, parameters, step):
+        rng = self.rng(8, step)
+        raw = parameters["raw_opacity"].detach().numpy().astype(np.float64)
+        opacity = 1 / (1 + np.exp(-raw))
+        log_extent = parameters["log_extent"].detach().numpy().astype(np.float64)
+        count = len(opacity)
+        dead = opacity <= DEAD
+        total = max(count, min(self.options.max_primitives, int((1 + MCMC_RATE) * count)))
+        source = np.arange(total)
+        changed = np.zeros(total, bool)
+        opacity = np.concatenate([opacity, np.zeros(total - count)])
+        log_extent = np.concatenate([log_extent, np.zeros((total - count, log_extent.shape[1]))])
+        for rows, drawable in (
+            (np.flatnonzero(dead), np.concatenate([~dead, np.zeros(total - count, bool)])),
+            (np.arange(count, total), np.arange(total) < count),
+        ):
+            if not len(rows) or not drawable.any():
+                continue
+            chance = np.where(drawable, opacity, 0)
+            parents = rng.choice(total, len(rows), p=chance / chance.sum())
+            copies = np.bincount(parents, minlength=total)[parents] + 1
+            shared, factor = relocated(opacity[parents], np.minimum(copies, MOST_COPIES))
+            opacity[parents] = opacity[rows] = shared
+            log_extent[parents] = log_extent[rows] = log_extent[parents] + np.log(factor)[:, None]
+            source[rows] = source[parents]
+            changed[parents] = changed[rows] = True
+        fresh = np.flatnonzero(changed)
+        log_extent = np.clip(log_extent[fresh], *np.log(self.bounds))
+        values = {"raw_opacity": (fresh, _logit(opacity[fresh])), "log_extent": (fresh, log_extent)}
+        return Event(source, values, fresh=fresh)
+
+
+def relocated(opacity: np.ndarray, copies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(P,) opacity of each of N `copies` that stand for one Gaussian, and (P,) factor of its standard deviations.
+
+    o' = 1 - (1 - o)^(1/N);  factor = o / sum_{i=1..N} sum_{k=0..i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1).
+    The inner sums add up, by sum_{i=k+1..N} C(i-1, k) = C(N, k+1), to sum_{k=1..N} C(N, k) (-1)^(k+1) o'^k / sqrt(k).
+
+    o' is then kept within 0.005 and 1 - 1e-6. Source: Kheradmand et al. 2024, equation 9.
+    """
+    opacity = np.minimum(opacity, 1 - 1e-6)
+    shared = -np.expm1(np.log1p(-opacity) / copies)
+    total = np.zeros_like(opacity)
+    for k in range(1, int(copies.max(initial=0)) + 1):
+        choices = np.array([math.comb(int(n), k) for n in copies], dtype=np.float64)
+        total += (-1) ** (k + 1) * choices * shared**k / math.sqrt(k)
+    return np.clip(shared, DEAD, 1 - 1e-6), opacity / total
+
+
+def in_view(parameters, camera: Camera, kind: str) -> torch.Tensor:
+    """(N,) bool: the primitive's bounding sphere (3 standard deviations of a Gaussian) may reach into the image."""
+    pose = torch.from_numpy(camera.world_to_camera[:3].astype(np.float32))
+    local = parameters["center"].detach() @ pose[:, :3].T + pose[:, 3]
+    reach = torch.exp(parameters["log_extent"].detach().amax(1)) * (1 if KINDS[kind].solid else 3)
+    z = local[:, 2]
+    depth = z.clamp_min(1e-6)
+    x, y = camera.fx * local[:, 0] / depth + camera.cx, camera.fy * local[:, 1] / depth + camera.cy
+    wide, high = camera.fx * reach / depth, camera.fy * reach / depth
+    return (z > 0.01) & (x + wide > 0) & (x - wide < camera.width) & (y + high > 0) & (y - high < camera.height)
+
+
+def _normal(rng: np.random.Generator, extent: np.ndarray, kind: str) -> np.ndarray:
+    """(P, 3) normal draws in the local frame whose standard deviations are the extents; a tetrahedron's covariance is
+    3/4 sum_j extent_j^2 b_j b_j^T, which is extent^2 if all are equal."""
+    draws = rng.normal(size=extent.shape)
+    if kind != "tetrahedron":
+        return extent * draws
+    return math.sqrt(0.75) / KINDS[kind].size * (extent * draws) @ KINDS[kind].directions
+
+
+def _logit(opacity):
+    return np.log(opacity) - np.log1p(-np.asarray(opacity))

@@ -1,0 +1,529 @@
+"""One training step and the state it changes: raw parameters, Adam's moments, the 3D filter, what growth has gathered.
+
+Whatever is random is drawn from a generator seeded by (seed, purpose, step), so the state needs no generator and a
+resumed run repeats the interrupted one bit for bit.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import fields, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import TrainOptions, raster_options
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.environment_map import filled
+from linprim_geo.geometry.primitives import KINDS, SH_Y0, Primitives, Tensors, reference_length
+from linprim_geo.geometry.view_support import Support
+from linprim_geo.kernels import ops
+from linprim_geo.kernels.adam import adam_rows, adam_step
+from linprim_geo.points.far_colors import SURVEY_VIEWS
+from linprim_geo.training.step.environment import contradiction, seen_through
+from linprim_geo.training.step.exposure import Exposure, exposed
+from linprim_geo.training.step.geometry_terms import GeometryTerms
+from linprim_geo.training.step.population import Control, GradientControl
+from linprim_geo.training.step.population_papers import ClassicControl, McmcControl
+from linprim_geo.training.step.training_images import Shot
+
+CONTROLS: dict[str, type[Control]] = {
+    "gradient": GradientControl,
+    "3dgs": ClassicControl,
+    "mcmc": McmcControl,
+}
+
+# Learning rates at the start of a run, for the training frame, where cameras see their subject from a distance of 3;
+# all fall exponentially to the given part of themselves.
+RATES = {
+    "center": (1.5e-3, 0.02),
+    "rotation": (7e-3, 0.1),
+    "log_extent": (1.5e-2, 0.1),
+    "raw_opacity": (5e-2, 0.1),
+    "sh_dc": (5e-3, 0.1),
+    "sh_rest": (5e-4, 0.1),
+    "background": (5e-3, 0.1),
+    "environment": (5e-3, 0.1),
+}
+# Parameters of the whole scene; the others have a row per primitive.
+SHARED = frozenset({"background", "environment"})
+# Parts of the run after which all views are looked at together, before an environment.
+LOOKS_AROUND = (0.1, 0.2, 0.35, 0.5, 0.7)
+# Light that passes primitives to this part tells little of the environment: Adam would move its texels as fast as those
+# in full view.
+FAINT = 0.5
+# Adam's epsilon elsewhere.
+ADAM_EPSILON = 1e-15
+# Weight of `contradiction` in the loss.
+CONTRADICTION = 0.5
+# Raw opacity of a primitive that is to be moved: an opacity of 0.0003.
+TRANSPARENT = -8.0
+# An octahedron's half-axes, and as large extents of the other kinds (Kind.size), stay within these: a part of a pixel
+# at the distance of the subject, and of the scene's radius.
+SMALLEST_PX, LARGEST_PART = 0.35, 0.5
+# Share of the run after which each further degree of view-dependent colour joins.
+DEGREE_EVERY = 0.07
+# A Gaussian's standard deviation at the start, in mean distances to the 3 nearest points.
+GAUSSIAN_START = 0.5
+# The 3D filter: sqrt(0.2) of a pixel, from views in which the primitive is farther than 0.2 and at most 15 % of the
+# image's size outside of it (LinPrim's box_factor and Mip-Splatting's limits); made again after so many steps.
+FILTER_VARIANCE, FILTER_NEAR, FILTER_MARGIN, FILTER_EVERY = 0.2, 0.2, 0.15, 1000
+
+
+def initial_parameters(
+    xyz: np.ndarray,
+    rgb: np.ndarray,
+    degree: int,
+    seed: int,
+    bounds: tuple[float, float],
+    kind: str = "octahedron",
+) -> dict[str, torch.Tensor]:
+    """One primitive per point: opacity 0.5, random rotation, equal extents by the mean distance to the 3 nearest
+    points.
+
+    Octahedra have it for half-axes, tetrahedra the same volume, Gaussians half of it for standard deviation. (3DGS's
+    start, the whole of it at opacity 0.1, scores 0.4 to 2 dB less under every rule of growth, and MCMC's noise tears it
+    apart.) `xyz` (P, 3) in the training frame, `rgb` (P, 3) uint8, `bounds` the least and largest extent.
+    """
+    from scipy.spatial import cKDTree
+
+    count, what = len(xyz), KINDS[kind]
+    rng = np.random.default_rng([seed, 2])
+    neighbours = min(4, count)
+    distance = cKDTree(xyz).query(xyz, k=neighbours)[0].reshape(count, -1)[:, 1:]
+    size = np.full(count, bounds[1])
+    if distance.shape[1]:
+        size = distance.mean(1) * (what.size if what.solid else GAUSSIAN_START)
+    rotation = rng.normal(size=(count, 4))
+    values = {
+        "center": xyz,
+        "rotation": rotation / np.linalg.norm(rotation, axis=1, keepdims=True),
+        "log_extent": np.repeat(np.log(np.clip(size, *bounds))[:, None], what.extents, 1),
+        "raw_opacity": np.zeros(count),
+        "sh_dc": ((rgb / 255.0 - 0.5) / SH_Y0)[:, None, :],
+        "sh_rest": np.zeros((count, (degree + 1) ** 2 - 1, 3)),
+    }
+    return {name: torch.from_numpy(np.ascontiguousarray(value, dtype=np.float32)) for name, value in values.items()}
+
+
+def activate(
+    parameters: dict[str, torch.Tensor],
+    degree: int,
+    kind: str = "octahedron",
+    filter_3d: torch.Tensor | None = None,
+) -> Tensors:
+    """Raw parameters to what the rasterizer takes: center, rotation, extent, density, sh.
+
+    extent = exp(log_extent), and with `filter_3d` f (N,), a constant, extent + f / 2, or sqrt(extent^2 + f^2) for
+    Gaussians. density = softplus(raw_opacity) / reference_length(extent), so that a ray along that length has alpha = 1
+    - exp(-softplus(raw)) = sigmoid(raw), with no cap and no logarithm of 0; for Gaussians the opacity itself,
+    sigmoid(raw).
+    """
+    extent = torch.exp(parameters["log_extent"])
+    if kind == "gaussian":
+        extent = extent if filter_3d is None else torch.sqrt(extent**2 + filter_3d[:, None] ** 2)
+        density = torch.sigmoid(parameters["raw_opacity"])
+    else:
+        extent = extent if filter_3d is None else extent + filter_3d[:, None] / 2
+        density = torch.nn.functional.softplus(parameters["raw_opacity"]) / reference_length(extent, kind)
+    count = (degree + 1) ** 2 - 1
+    sh = parameters["sh_dc"] if count == 0 else torch.cat([parameters["sh_dc"], parameters["sh_rest"][:, :count]], 1)
+    return parameters["center"], parameters["rotation"], extent, density, sh
+
+
+def filter_lengths(center: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
+    """(N,) float32 f = sqrt(0.2) z / F: part of a pixel, at the nearest camera that sees each of the (N, 3) centres.
+
+    z is the least depth over those cameras, F the largest focal length of all. A centre that no camera sees has the
+    distance of the nearest camera for z. Source: Mip-Splatting (Yu et al. 2024), LinPrim's box_factor.
+    """
+    xyz = center.detach().numpy()
+    least = np.full(len(xyz), np.inf, np.float32)
+    for camera in cameras:
+        x, y, z = (xyz @ camera.rotation.astype(np.float32).T + camera.world_to_camera[:3, 3].astype(np.float32)).T
+        seen = z > FILTER_NEAR
+        for along, focal, middle, size in (
+            (x, camera.fx, camera.cx, camera.width),
+            (y, camera.fy, camera.cy, camera.height),
+        ):
+            # -margin size < focal along / z + middle < (1 + margin) size
+            reach = (0.5 + FILTER_MARGIN) * size
+            seen &= np.abs(focal * along + (middle - size / 2) * z) < reach * z
+        np.minimum(least, z, out=least, where=seen)
+    unseen = ~np.isfinite(least)
+    centers = np.stack([camera.center for camera in cameras]).astype(np.float32)
+    for position in centers if unseen.any() else ():
+        least[unseen] = np.minimum(least[unseen], np.linalg.norm(xyz[unseen] - position, axis=1))
+    focal = max(max(camera.fx, camera.fy) for camera in cameras)
+    return torch.from_numpy((math.sqrt(FILTER_VARIANCE) / focal * least).astype(np.float32))
+
+
+def _single(out: ops.Rendering) -> ops.Rendering:
+    """The rendering in float32, in which the loss and the optimiser work."""
+    if out.rgb.dtype == torch.float32:
+        return out
+    planes = {field.name: getattr(out, field.name) for field in fields(out)}
+    return ops.Rendering(
+        **{name: v if v is None or not v.is_floating_point() else v.float() for name, v in planes.items()}
+    )
+
+
+class Trainer:
+    """The state of a training and one step of it. `parameters`, `first` and `second` (Adam's moments) share their
+    keys."""
+
+    def __init__(
+        self,
+        shots: list[Shot],
+        parameters: dict[str, torch.Tensor],
+        options: TrainOptions,
+        bounds: tuple[float, float],
+        background: torch.Tensor,
+        fitted: bool,
+        random_background: bool,
+        terms: GeometryTerms | None = None,
+        log_gain: np.ndarray | None = None,
+        environment: torch.Tensor | None = None,
+    ):
+        """`log_gain` (V, 3): where the gains of the photographs begin, with `--exposure gain`. `environment` (6, S, S,
+        3): texels of what stands behind everything, in place of a background, to begin with."""
+        self.shots, self.options, self.bounds, self.terms = shots, options, bounds, terms
+        self.parameters = dict(parameters)
+        self.fitted, self.random_background = fitted, random_background
+        self.background = background
+        if fitted:
+            self.parameters["background"] = background
+        self.looks_around = {round(share * options.iterations) for share in LOOKS_AROUND}
+        # Gradient of the loss to a texel through which a pixel's light passes to this part: below it Adam's steps get
+        # small.
+        camera = shots[0].camera
+        self.faint = FAINT / (3 * camera.width * camera.height)
+        if environment is not None:
+            self.parameters["environment"] = environment
+        self.first = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
+        self.second = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
+        self.exposure = Exposure(len(shots), log_gain) if options.exposure == "gain" else None
+        self.step = 0
+        # (step, iterations): from this step on the run is to end after so many, what is left of its schedules stretched
+        # to fit.
+        self.correction: tuple[int, int] | None = None
+        self.steps = torch.zeros(len(self), dtype=torch.int32)  # sparse Adam: updates of each primitive
+        self.seconds = 0.0
+        self.loss = self.psnr = math.nan  # running means
+        self.kind, self.how = options.primitive, raster_options(options)
+        self.control = CONTROLS[options.population](options, len(self), [shot.camera for shot in shots], bounds)
+        self.filter_3d: torch.Tensor | None = None
+        # Primitives that stay as they are, as the rasterizer takes them: they stand for what others train.
+        self.frozen: Tensors | None = None
+        self._refilter()
+
+    @property
+    def environment(self) -> torch.Tensor | None:
+        """(6, S, S, 3) texels of what stands behind everything, if there is an environment."""
+        return self.parameters.get("environment")
+
+    def __len__(self) -> int:
+        return len(self.parameters["center"])
+
+    @property
+    def iterations(self) -> int:
+        """Steps of the whole run, as far as this step knows."""
+        if self.correction is None or self.step < self.correction[0]:
+            return self.options.iterations
+        return self.correction[1]
+
+    def part(self) -> float:
+        """Share of the run's schedules, 0 to 1, that lies behind this step: of learning rates, and of what begins
+        late."""
+        if self.correction is None or self.step < self.correction[0]:
+            return self.step / self.options.iterations
+        bend, last = self.correction
+        begun = bend / self.options.iterations
+        return begun + (1 - begun) * (self.step - bend) / (last - bend)
+
+    def has_reached(self, share: float) -> bool:
+        """Whether this step lies in what follows the first `share` of the run."""
+        if self.correction is None or self.step < self.correction[0]:
+            return self.step >= share * self.options.iterations
+        return self.part() >= share
+
+    @property
+    def degree(self) -> int:
+        """Degree of the view-dependent colour at this step."""
+        return min(self.options.sh_degree, int(self.step / (DEGREE_EVERY * self.options.iterations)))
+
+    def how_now(self) -> dict:
+        """The keywords of `ops.rasterize` at this step: until --order-from blending takes the order of the centres."""
+        return self.how if self.has_reached(self.options.order_from) else self.how | {"order": "center"}
+
+    def view_of(self, step: int) -> int:
+        """Index of the view of a step: every view once per round, in an order drawn per round."""
+        turn, place = divmod(step, len(self.shots))
+        return int(np.random.default_rng([self.options.seed, 3, turn]).permutation(len(self.shots))[place])
+
+    def advance(self) -> None:
+        """One training step.
+
+        Raises:
+            LinprimError: a parameter or the loss is no longer finite.
+        """
+        begin = time.perf_counter()
+        index = self.view_of(self.step)
+        shot = self.shots[index]
+        background = self.background
+        if self.fitted:
+            background = self.parameters["background"]
+        elif self.random_background:
+            background = torch.from_numpy(
+                np.random.default_rng([self.options.seed, 4, self.step]).random(3, dtype=np.float32)
+            )
+        target = shot.over(background.detach())
+        leaves = {k: v.requires_grad_() for k, v in self.parameters.items()}
+        active = self._cast(*self._with_frozen(activate(leaves, self.degree, self.kind, self.filter_3d)))
+        screen = torch.zeros(len(active[0]), 3, dtype=active[0].dtype, requires_grad=True)
+        behind = self._flat(background).to(active[0].dtype)
+        terms = self.terms if self.has_reached(self.options.geometry_from) else None
+        # Geometry has no average over the rays of a pixel: with several of them it is rendered by itself.
+        needed = terms is not None and terms.needs_geometry
+        shared = needed and self.options.samples == 1
+        how = {"stop": self.options.stop, **self.how_now()}
+        samples = self.options.samples
+        out = _single(
+            ops.rasterize(*active, behind, shot.camera, samples=samples, geometry=shared, screen=screen, **how)
+        )
+        passed = None
+        if self.environment is not None:
+            passed = ops.environment_light(out.opacity, leaves["environment"], shot.camera, self.options.stop)
+            out = replace(out, rgb=out.rgb + passed)
+        shown, log_gain = out.rgb, None
+        if self.exposure is not None:
+            log_gain = self.exposure.row(index)
+            # A colour that was drawn, or that stands for what a mask left out, is not in the photograph.
+            drawn = self.random_background or shot.alpha is not None
+            rest = background[:, None, None] * (1 - out.opacity) if drawn else None
+            shown = exposed(out.rgb, log_gain, target, rest)
+        parts = ops.photometric_loss(shown, target, self.options.dssim)
+        penalty = self.control.penalty(leaves)
+        photometric = parts[0] if shot.weight == 1 else shot.weight * parts[0]
+        objective = photometric if penalty is None else photometric + penalty
+        if passed is not None:
+            photo = target if log_gain is None else target * torch.exp(-log_gain.detach())[:, None, None]
+            objective = objective + CONTRADICTION * contradiction(photo, passed.detach(), 1 - out.opacity)
+        if terms is not None:
+
+            def surface(camera: Camera, tensors: Tensors) -> ops.Rendering:
+                return _single(ops.rasterize(*tensors, behind, camera, geometry=True, **how))
+
+            def depth_of(camera: Camera) -> torch.Tensor:
+                center, rotation, extent, density, sh = (tensor.detach() for tensor in active)
+                depth = surface(camera, (center, rotation, extent, density, sh)).depth_median
+                assert depth is not None
+                return depth
+
+            geometry = surface(shot.camera, active) if needed and not shared else out
+            objective = objective + terms.loss(geometry, index, self.step, leaves["raw_opacity"], depth_of)
+        wanted = [*leaves.values(), screen] + ([] if log_gain is None else [log_gain])
+        grads = torch.autograd.grad(objective, wanted, allow_unused=True)
+        screen_grad = grads[len(leaves)].float()[: len(self)]
+        with torch.no_grad():
+            if self.exposure is not None:
+                self.exposure.update(index, grads[-1], self.part())
+            grads = grads[: len(leaves)]
+            # A penalty or a term on opacities reaches every primitive, whether the view touched it or not.
+            touched = screen_grad[:, 2] > 0 if penalty is None and terms is None else None
+            self._update(dict(zip(leaves, grads, strict=True)), touched)
+            self.control.disturb(self.parameters, self.step + 1)
+            self.control.gather(self.parameters, shot.camera, shot.size, screen_grad)
+        self.step += 1
+        if self.step in self.looks_around:
+            self._look_around()
+        if self.control.is_due(self.step):
+            self._grow()
+        elif self.step % FILTER_EVERY == 0:
+            self._refilter()
+        loss, _, _, error = parts.detach().tolist()
+        psnr = -10 * math.log10(max(error, 1e-12)) if math.isfinite(error) else math.nan
+        self.loss = 0.98 * self.loss + 0.02 * loss if self.step > 1 else loss
+        self.psnr = 0.98 * self.psnr + 0.02 * psnr if self.step > 1 else psnr
+        self.seconds += time.perf_counter() - begin
+        if not math.isfinite(loss):
+            raise LinprimError(f"the loss is {loss}")
+
+    def _update(self, grads: dict[str, torch.Tensor | None], touched: torch.Tensor | None) -> None:
+        part = self.part()
+        rates = {name: rate * final**part for name, (rate, final) in RATES.items()}
+        wanted = {name: grad for name in self.parameters if (grad := grads[name]) is not None}
+        names = list(wanted)
+        for value in self.parameters.values():
+            value.requires_grad_(False)
+        if self.options.adam == "sparse":
+            rows = [name for name in names if name not in SHARED]
+            adam_rows(
+                [self.parameters[name] for name in rows],
+                [wanted[name] for name in rows],
+                [self.first[name] for name in rows],
+                [self.second[name] for name in rows],
+                [rates[name] for name in rows],
+                self.steps,
+                touched,
+            )
+            names = [name for name in names if name in SHARED]
+        for name in names:
+            adam_step(
+                self.parameters[name],
+                wanted[name],
+                self.first[name],
+                self.second[name],
+                rates[name],
+                self.step + 1,
+                epsilon=self.faint if name == "environment" else ADAM_EPSILON,
+            )
+        rotation = self.parameters["rotation"]
+        rotation /= torch.linalg.vector_norm(rotation, dim=1, keepdim=True).clamp_min(1e-12)
+        self.parameters["log_extent"].clamp_(math.log(self.bounds[0]), math.log(self.bounds[1]))
+        for name in SHARED & self.parameters.keys():
+            self.parameters[name].clamp_(0, 1)
+
+    def _grow(self) -> None:
+        event = self.control.change(self.parameters, self.step)
+        source = torch.from_numpy(event.source)
+        for name in self.parameters:
+            if name in SHARED:
+                continue
+            for table in (self.parameters, self.first, self.second):
+                table[name] = table[name][source]
+            if name in event.values:
+                rows, values = event.values[name]
+                self.parameters[name][torch.from_numpy(rows)] = torch.from_numpy(values.astype(np.float32))
+            moments: list[tuple[dict[str, Tensor], np.ndarray | slice | None]]
+            moments = [(self.first, event.calm), (self.first, event.fresh), (self.second, event.fresh)]
+            if name == "raw_opacity" and event.calm_opacity:
+                moments += [(self.first, slice(None)), (self.second, slice(None))]
+            for table, calmed in moments:
+                if calmed is not None:
+                    table[name][calmed] = 0
+        self.steps = self.steps[source]
+        if event.fresh is not None:
+            self.steps[event.fresh] = 0
+        self.control.reset(len(self))
+        self._refilter()
+
+    @torch.no_grad()
+    def _look_around(self) -> None:
+        """Before an environment: makes primitives transparent that one view alone sees, so that growth moves them to
+        where they are needed, and gives texels that no view sees past the primitives the colours round them."""
+        if self.environment is None:
+            return
+        support = Support(self.parameters["center"])
+        active = self._cast(*self._with_frozen(activate(self.parameters, self.degree, self.kind, self.filter_3d)))
+        black = torch.zeros(3, dtype=active[0].dtype)
+
+        def opacities() -> Iterator[tuple[Camera, Tensor]]:
+            for shot in self.shots[:: max(1, len(self.shots) // SURVEY_VIEWS)]:
+                out = _single(
+                    ops.rasterize(*active, black, shot.camera, stop=self.options.stop, geometry=True, **self.how_now())
+                )
+                assert out.max_weight is not None
+                support.add(shot.camera, out.max_weight[: len(self)])
+                yield shot.camera, out.opacity
+
+        seen = seen_through(len(self.environment[0]), opacities())
+        self.parameters["environment"] = filled(self.environment, seen)
+        self.parameters["raw_opacity"][support.alone()] = TRANSPARENT
+
+    def _refilter(self) -> None:
+        """Makes the 3D filter for where the primitives are now."""
+        if self.options.filter != "none":
+            cameras = [shot.camera for shot in self.shots]
+            self.filter_3d = filter_lengths(self.parameters["center"], cameras)
+
+    @torch.no_grad()
+    def render(self, camera: Camera, background: torch.Tensor) -> torch.Tensor:
+        """(3, H, W) colour of a camera in the training frame, at the photographs' mean exposure."""
+        active = self._cast(*self._with_frozen(activate(self.parameters, self.degree, self.kind, self.filter_3d)))
+        out = _single(
+            ops.rasterize(
+                *active,
+                self._flat(background).to(active[0].dtype),
+                camera,
+                stop=self.options.stop,
+                samples=self.options.samples,
+                **self.how,
+            )
+        )
+        if self.environment is None:
+            return out.rgb
+        return out.rgb + ops.environment_light(out.opacity, self.environment, camera, self.options.stop)
+
+    def _flat(self, background: torch.Tensor) -> torch.Tensor:
+        """The background that primitives are rendered over: black where an environment follows."""
+        return background if self.environment is None else torch.zeros(3)
+
+    def _with_frozen(self, active: Tensors) -> Tensors:
+        """The active tensors, and after them the frozen ones with as many harmonics."""
+        if self.frozen is None:
+            return active
+        *rest, sh = self.frozen
+        wanted = active[-1].shape[1]
+        sh = torch.nn.functional.pad(sh, (0, 0, 0, max(0, wanted - sh.shape[1])))[:, :wanted]
+        center, rotation, extent, density, colors = (torch.cat(pair) for pair in zip(active, (*rest, sh), strict=True))
+        return center, rotation, extent, density, colors
+
+    def _cast(self, center: Tensor, rotation: Tensor, extent: Tensor, density: Tensor, sh: Tensor) -> Tensors:
+        """What the kernels take: with `--scalar float64` the same numbers in double."""
+        if self.options.scalar == "float64":
+            return center.double(), rotation.double(), extent.double(), density.double(), sh.double()
+        return center, rotation, extent, density, sh
+
+    def shown_background(self) -> torch.Tensor:
+        """(3,) the background that renders and scores use."""
+        return self.parameters["background"].detach() if self.fitted else self.background
+
+    def primitives(self) -> Primitives:
+        """The primitives as the rasterizer takes them, the 3D filter included, in the training frame."""
+        with torch.no_grad():
+            active = activate(self.parameters, self.options.sh_degree, self.kind, self.filter_3d)
+            center, rotation, extent, density, sh = (tensor.numpy().copy() for tensor in active)
+            return Primitives(center, rotation, extent, density, sh, self.kind)
+
+    def state(self) -> dict:
+        """Everything a resumed run needs, as tensors and numbers."""
+        return {
+            "parameters": self.parameters,
+            "first": self.first,
+            "second": self.second,
+            "gathered": self.control.gathered,
+            "filter_3d": self.filter_3d,
+            "steps": self.steps,
+            "step": self.step,
+            "bounds": list(self.bounds),
+            "seconds": self.seconds,
+            "loss": self.loss,
+            "psnr": self.psnr,
+            "control": self.control.state(),
+        } | ({} if self.exposure is None else {"exposure": self.exposure.state()})
+
+    def restore(self, state: dict) -> None:
+        """Takes back what `state` returned."""
+        for name in ("parameters", "first", "second"):
+            if set(state[name]) != set(getattr(self, name)):
+                raise ValueError(f"{name} has {sorted(state[name])}, wanted {sorted(getattr(self, name))}")
+            setattr(self, name, dict(state[name]))
+        if self.exposure is not None:
+            self.exposure.restore(state["exposure"])
+        self.step, self.steps, self.filter_3d = int(state["step"]), state["steps"], state["filter_3d"]
+        if set(state["gathered"]) != set(self.control.NAMES):
+            raise ValueError(f"gathered has {sorted(state['gathered'])}, wanted {sorted(self.control.NAMES)}")
+        self.control.gathered = dict(state["gathered"])
+        self.control.restore(state["control"])
+        self.bounds = (float(state["bounds"][0]), float(state["bounds"][1]))
+        self.control.bounds = self.bounds
+        self.seconds, self.loss, self.psnr = (
+            float(state["seconds"]),
+            float(state["loss"]),
+            float(state["psnr"]),
+        )

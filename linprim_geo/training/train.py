@@ -1,0 +1,135 @@
+"""Training: photographs and a first guess of primitives in, a run folder with optimised primitives out.
+
+One view per step (trainer.py): render, L1 + D-SSIM, Adam, and now and then the population grows (population.py).
+training_start.py says where to start, training_loop.py what surrounds the steps.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import torch
+
+from linprim_geo.base.budget import Budget
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import is_remains, locked
+from linprim_geo.base.options import SceneOptions, TrainOptions, check_train_options
+from linprim_geo.base.progress import Progress
+from linprim_geo.geometry.camera import Similarity
+from linprim_geo.kernels import ops
+from linprim_geo.runs.run import Run, is_unused, refuse_used
+from linprim_geo.training.checkpoint import read_checkpoint
+from linprim_geo.training.effects import Choice
+from linprim_geo.training.single import train_run
+from linprim_geo.training.start import begin_run, reopen_run
+
+
+def train(
+    scene: str | os.PathLike,
+    run: str | os.PathLike,
+    scene_options: SceneOptions | None = None,
+    options: TrainOptions | None = None,
+    *,
+    time_budget: Budget | float | None = None,
+    resume: bool = False,
+    quiet: bool = False,
+    effects: Choice | None = None,
+    blocks: int | str = 1,
+    cluster: str | None = None,
+    workers: int = 0,
+) -> dict:
+    """Trains a scene into a run folder.
+
+    With `resume` the folder's own options are used (but for `threads`): learning rates and growth depend on them. A
+    capture that is no longer where it was is looked for at `scene`. Interrupted (Ctrl-C), it finishes the step, saves,
+    and raises KeyboardInterrupt.
+
+    With `time_budget`, in seconds from now for everything, a calibration of some dozen steps says what a step costs,
+    and `time_budget.plan_training` chooses `iterations` and `max_primitives` from it; one of the two that differs from
+    its default is kept. When growth has ended the steps that are left are counted anew, once, from the pace so far.
+    Both are in config.json under `time_budget`, so that a resumed run repeats them, with the seconds that the run took.
+
+    With `effects` the options that the scene calls for take the place of those that were not given (effects.py);
+    without, all are taken as they are. What was decided is in config.json, and a resumed run keeps it.
+
+    With `blocks` other than 1 the scene is trained in blocks of space by several workers, see
+    `block_training.train_blocks`.
+
+    Returns: `run`, `iterations`, `seconds` (of training steps alone), `primitives`, `psnr` (mean over held-out views),
+    `views`; with held-out views also `train_psnr`, the mean over at most 31 training views, and `advice` where these
+    are far ahead (`held_out_gap.gap_advice`), which is in config.json, too; with `--exposure gain` also `psnr_gain`,
+    each render times the gain per channel that brings it nearest to its photograph.
+
+    Raises:
+        LinprimError: the scene or an option cannot be used, or the folder exists already.
+    """
+    run_path = Path(run)
+    if blocks != 1 or (resume and "blocks" in _notes(run_path)):
+        from linprim_geo.training.blocks.driver import train_blocks
+
+        if time_budget:
+            raise LinprimError("--time-budget plans one training: wanted without --blocks")
+        trained = train_blocks(
+            scene,
+            run,
+            scene_options,
+            options,
+            blocks=blocks,
+            cluster=cluster,
+            workers=workers,
+            resume=resume,
+            quiet=quiet,
+            effects=effects,
+        )
+        if trained is not None:
+            return trained
+    check_train_options(options := options or TrainOptions())
+    scene_options = scene_options or SceneOptions()
+    progress = Progress("train", options.iterations, quiet=quiet)
+    before = torch.get_num_threads()
+    budget = Budget.of(time_budget)
+    if run_path.is_file():
+        refuse_used(run_path)
+    # Killed before anything was saved, there is nothing to go on from but the options that are given again.
+    resume = resume and not (_has_remains(run_path) and is_unused(run_path))
+    if resume:
+        Run.open(run_path)
+    if resume and budget:
+        progress.note("--resume goes on with the run's own options: --time-budget ignored")
+        budget = None
+    if budget and all(
+        getattr(options, name) != getattr(TrainOptions, name) for name in ("iterations", "max_primitives")
+    ):
+        raise LinprimError(
+            "--time-budget leaves nothing to choose beside --iterations and --max-primitives: wanted at most one "
+            "of the two"
+        )
+    try:
+        # torch only does small element-wise work here; its own threads would wait for each other longer than they
+        # compute.
+        torch.set_num_threads(1)
+        with locked(run_path, "trained into"):
+            ops.set_threads(options.threads)
+            if resume:
+                opened, loaded = reopen_run(Path(scene), run_path, scene_options, options, progress)
+                return train_run(opened, loaded, read_checkpoint(run_path), progress)
+            opened, loaded, decisions = begin_run(
+                Path(scene), run_path, scene_options, options, effects or Choice("none"), progress
+            )
+            return train_run(opened, loaded, None, progress, decisions, budget)
+    finally:
+        torch.set_num_threads(before)
+
+
+def _notes(path: Path) -> dict:
+    """What a run's config.json holds; nothing where there is none that can be read, which is told later."""
+    try:
+        return Run(path, path, SceneOptions(), TrainOptions(), Similarity()).notes
+    except LinprimError:
+        return {}
+
+
+def _has_remains(path: Path) -> bool:
+    """Whether a training that was killed has left something."""
+    return path.is_dir() and any(is_remains(entry) for entry in path.iterdir())
