@@ -1,7 +1,7 @@
 # make demo   environment, then the demo: a mesh with a score in runs/demo   (make demo DEMO="--size small")
 # make test   environment, then the tests                                    (make test PYTEST="-k mesh")
 # make env    the environment alone, in .venv                                (make env PYTHON=/path/to/python3.12)
-# make lint   the linters, the formats, the type checker
+# make lint   the linters, the formats, the type checker, the order of packages
 # make format every file in the form that make lint wants
 # make wheel  sdist and wheel in dist, checked in a fresh environment without a compiler
 # make browser-check   a report and a view in a headless Chromium (make browser-check PAGE=runs/demo/report.html)
@@ -32,6 +32,7 @@ lint: env
 	$(BIN)/ruff format --check -q .
 	$(BIN)/clang-format --dry-run --Werror $(CPP)
 	$(BIN)/mypy
+	$(BIN)/python tools/check_imports.py
 
 format: env
 	$(BIN)/ruff check --fix .

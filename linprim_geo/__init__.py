@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from linprim_geo.surface.convert import convert as convert
     from linprim_geo.surface.extract import extract_mesh as extract_mesh
     from linprim_geo.synthetic.synth import synthesize as synth
-    from linprim_geo.training.budget.dry_run import dry_run as dry_run
+    from linprim_geo.training.dry_run import dry_run as dry_run
     from linprim_geo.training.effects import Choice as Choice
     from linprim_geo.training.inspect import inspect_scene as inspect
     from linprim_geo.training.train import train as train
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 _PUBLIC = {
     "load_scene": ("capture.load", "load_scene"),
     "inspect": ("training.inspect", "inspect_scene"),
-    "dry_run": ("training.budget.dry_run", "dry_run"),
+    "dry_run": ("training.dry_run", "dry_run"),
     "train": ("training.train", "train"),
     "render": ("runs.render", "render_run"),
     "extract_mesh": ("surface.extract", "extract_mesh"),

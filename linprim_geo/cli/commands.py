@@ -34,7 +34,7 @@ def train(parsed: argparse.Namespace) -> dict:
     run = parsed.run or Path("runs") / Path(os.path.abspath(scene)).name
     scene_options, options = from_args(SceneOptions, parsed), from_args(TrainOptions, parsed)
     if parsed.dry_run:
-        from linprim_geo.training.budget.dry_run import dry_run
+        from linprim_geo.training.dry_run import dry_run
 
         if parsed.resume:
             raise LinprimError("--dry-run says what a new training would take: wanted without --resume")

@@ -53,7 +53,7 @@ def _lab_to_linear(lightness: np.ndarray, chroma: np.ndarray, hue: np.ndarray) -
 
 
 def _in_gamut(linear: np.ndarray) -> np.ndarray:
-    return ((linear >= 0.0) & (linear <= 1.0)).all(axis=-1)
+    return np.asarray(((linear >= 0.0) & (linear <= 1.0)).all(axis=-1))
 
 
 def depth_preview(depth: np.ndarray) -> np.ndarray:

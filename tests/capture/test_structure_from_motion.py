@@ -1,0 +1,395 @@
+"""Poses of photographs that come without: against cameras known exactly, kept, gone on with after a stop, and
+judged."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.captures import look_at, picture, write_transforms
+from helpers.textured_room import photograph
+from PIL import Image
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import locked
+from linprim_geo.capture import found_poses, incremental_mapping, structure_from_motion
+from linprim_geo.capture import incremental_mapping as image_pairs
+from linprim_geo.capture.found_poses import Verdict, found_model, photographs
+from linprim_geo.capture.incremental_mapping import pairs_to_match
+from linprim_geo.capture.load import load_scene
+from linprim_geo.capture.structure_from_motion import find_poses, prepare
+from linprim_geo.capture.types import PHOTOGRAPHS
+from linprim_geo.cli.main import main
+from linprim_geo.runs.run import Run
+
+SIZE, FOCAL, COUNT = (200, 150), 170.0, 9
+
+
+def cameras():
+    """Cameras that walk past a corner of the room and look at it."""
+    return [
+        look_at((-0.9 + 0.2 * i, -1.0 + 0.1 * i, 0.3 * np.sin(2.0 * i)), (1.5, 2.0, 0.2), SIZE, FOCAL)
+        for i in range(COUNT)
+    ]
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Path:
+    """A folder of photographs of the room, and nothing else."""
+    root = tmp_path_factory.mktemp("room")
+    for i, camera in enumerate(cameras()):
+        Image.fromarray(photograph(camera)).save(root / f"{i}.png")
+    return root
+
+
+@pytest.fixture(scope="module")
+def posed(room, tmp_path_factory):
+    """(cache, lines): where the poses of `room` were found, and what was said."""
+    cache, lines = tmp_path_factory.mktemp("cache"), []
+    prepare(str(room), cache=cache, threads=1, log=lines.append)
+    return cache, lines
+
+
+@pytest.fixture
+def copied(room, tmp_path) -> Path:
+    return Path(shutil.copytree(room, tmp_path / "photos"))
+
+
+def aligned(found: np.ndarray, wanted: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Scale, rotation and moved points of the similarity that brings (N, 3) `found` nearest to `wanted` (Umeyama
+    1991)."""
+    a, b = found - found.mean(0), wanted - wanted.mean(0)
+    u, singular, vt = np.linalg.svd(b.T @ a)
+    signs = np.array([1, 1, np.linalg.det(u @ vt)])
+    rotation = u * signs @ vt
+    scale = (singular * signs).sum() / (a**2).sum()
+    return scale, rotation, scale * a @ rotation.T + wanted.mean(0)
+
+
+def test_poses_and_points_are_the_true_ones_but_for_a_similarity(room, posed):
+    cache, lines = posed
+    scene = load_scene(room, cache=cache)
+    assert scene.kind == PHOTOGRAPHS and [view.name for view in scene.test] == ["0", "8"]
+    views, truth = sorted(scene.views, key=lambda view: view.name), cameras()
+    assert len(views) == COUNT
+    centers = np.array([camera.center for camera in truth])
+    scale, rotation, moved = aligned(np.array([view.camera.center for view in views]), centers)
+    spread = np.linalg.norm(centers - centers.mean(0), axis=1).max()
+    # The cameras nearly stand on a line, which leaves the turn about it to noise, so axes are compared with each other
+    # instead.
+    assert np.linalg.norm(moved - centers, axis=1).max() < 0.02 * spread
+    for first, second in zip(views, views[1:], strict=False):
+        turn = first.camera.rotation @ second.camera.rotation.T
+        wanted = truth[int(first.name)].rotation @ truth[int(second.name)].rotation.T
+        assert np.degrees(np.arccos(np.clip((np.trace(turn @ wanted.T) - 1) / 2, -1, 1))) < 0.5
+    assert abs(views[0].camera.fx / FOCAL - 1) < 0.05
+    assert len(scene.points.xyz) > 100 and np.median(scene.points.error_px) < 1
+    assert lines[0].startswith(f"finding the poses of {COUNT} photographs")
+    assert any(line.startswith(f"{COUNT} of {COUNT} photographs have poses") for line in lines)
+    assert not any(line.startswith("warning") for line in lines)
+
+
+def test_what_was_found_is_found_again_by_content(room, posed, copied, monkeypatch):
+    cache, _ = posed
+    monkeypatch.setattr(structure_from_motion, "_reconstruct", lambda *_: pytest.fail("made again"))
+    lines: list[str] = []
+    assert find_poses(copied, cache, log=lines.append) == found_model(room, cache) == found_model(copied, cache)
+    assert len(lines) == 1 and "from" in lines[0]
+    assert not list(cache.rglob("database.db*"))
+    with open(copied / "3.png", "ab") as file:
+        file.write(b"\0")
+    assert found_model(copied, cache) is None
+
+
+def test_without_being_asked_no_poses_are_looked_for(copied, tmp_path):
+    with pytest.raises(
+        LinprimError,
+        match="no camera poses found.*linprim-geo inspect and train find those of plain photographs",
+    ):
+        load_scene(copied, cache=tmp_path / "cache")
+    assert not (tmp_path / "cache").exists()
+
+
+@pytest.mark.parametrize("stage", ["_match", "_map"])
+def test_a_run_that_was_stopped_goes_on(copied, tmp_path, monkeypatch, stage):
+    import pycolmap
+
+    with monkeypatch.context() as patch:
+        patch.setattr(incremental_mapping, stage, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            find_poses(copied, tmp_path / "cache", threads=1)
+    assert found_model(copied, tmp_path / "cache") is None
+    monkeypatch.setattr(pycolmap, "extract_features", lambda *_, **__: pytest.fail("keypoints made again"))
+    if stage == "_map":
+        monkeypatch.setattr(pycolmap, "match_image_pairs", lambda *_, **__: pytest.fail("matches made again"))
+    find_poses(copied, tmp_path / "cache", threads=1)
+    assert len(load_scene(copied, cache=tmp_path / "cache").views) == COUNT
+
+
+def test_photographs_that_do_not_overlap_are_refused_and_stay_so(tmp_path, monkeypatch):
+    for i in range(4):
+        picture(i, (120, 90)).save(tmp_path / f"{i}.png")
+    with pytest.raises(
+        LinprimError, match="poses were found for 0 of 4 photographs, wanted at least 3 and half of them"
+    ):
+        prepare(tmp_path, cache=tmp_path / "cache", threads=1)
+    monkeypatch.setattr(structure_from_motion, "_reconstruct", lambda *_: pytest.fail("made again"))
+    for again in (prepare, load_scene):
+        with pytest.raises(LinprimError, match="0 of 4 photographs"):
+            again(tmp_path, cache=tmp_path / "cache")
+
+
+def test_photographs_that_show_nothing_or_break_off_are_left_out(copied, tmp_path, monkeypatch):
+    monkeypatch.setattr(image_pairs, "_MATCH_ALL", 3)
+    Image.new("RGB", SIZE, (120, 120, 120)).save(copied / "blank.png")
+    (copied / "3.png").rename(copied / "my  photo 3.png")
+    (copied / "cut.png").write_bytes((copied / "2.png").read_bytes()[:5000])
+    lines: list[str] = []
+    find_poses(copied, tmp_path / "cache", threads=1, log=lines.append)
+    assert lines[-1].startswith("warning: the poses are poor") and lines[-1].endswith(": 2 photographs are left out")
+    found = sorted(view.name for view in load_scene(copied, cache=tmp_path / "cache").views)
+    assert found == [*"01245678", "my  photo 3"]
+
+
+def test_too_few_photographs_and_broken_ones_are_named(copied, tmp_path):
+    (tmp_path / "two").mkdir()
+    for i in range(2):
+        picture(i).save(tmp_path / "two" / f"{i}.png")
+    with pytest.raises(LinprimError, match="2 photographs, wanted at least 3"):
+        prepare(tmp_path / "two", cache=tmp_path / "cache")
+    (copied / "4.png").write_bytes(b"no image")
+    with pytest.raises(LinprimError, match="4.png"):
+        prepare(copied, cache=tmp_path / "cache")
+    with pytest.raises(LinprimError, match="no such folder"):
+        prepare(tmp_path / "nowhere")
+
+
+def test_captures_with_poses_are_left_alone(tmp_path, monkeypatch):
+    write_transforms(tmp_path, 4)
+    monkeypatch.setattr(structure_from_motion, "find_poses", lambda *_, **__: pytest.fail("has poses"))
+    prepare(tmp_path)
+
+
+def test_verdicts():
+    assert (
+        Verdict(4, 2).unusable and Verdict(10, 4).unusable and not Verdict(6, 3).unusable and not Verdict(3, 3).unusable
+    )
+    assert Verdict(10, 10, 500, 0.5, 4.0).doubts == ""
+    assert Verdict(10, 8, 500, 0.5, 4.0).doubts == "2 photographs are left out"
+    poor = Verdict(10, 10, 500, 1.5, 2.5).doubts
+    assert "1.50 px" in poor and "2.5 photographs only" in poor and "left out" not in poor
+
+
+def test_poor_poses_are_warned_of_in_one_line(copied, tmp_path, monkeypatch):
+    monkeypatch.setattr(structure_from_motion, "_reconstruct", lambda *_: Verdict(9, 6, 100, 0.4, 3.5))
+    lines: list[str] = []
+    find_poses(copied, tmp_path / "cache", log=lines.append)
+    assert [line for line in lines if "warning" in line] == [
+        "warning: the poses are poor, and so may be the result: 3 photographs are left out"
+    ]
+
+
+def test_which_images_are_photographs(tmp_path):
+    for name in (
+        "a.png",
+        ".hidden.png",
+        "depth/a.png",
+        "images/cam1/b.JPG",
+        "images/cam0/b.png",
+        "images/notes.txt",
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert photographs(tmp_path) == (tmp_path / "images", ["cam0/b.png", "cam1/b.JPG"])
+    shutil.rmtree(tmp_path / "images")
+    assert photographs(tmp_path) == (tmp_path / ".", ["a.png"])
+    (tmp_path / "a.png").unlink()
+    assert photographs(tmp_path)[1] == []
+
+
+def test_photographs_that_are_alike_share_a_camera_and_exif_gives_its_focal_length(tmp_path):
+    import pycolmap
+
+    names = ["a.jpg", "b.jpg", "long.jpg", "wide.jpg", "z/a.jpg"]
+    (tmp_path / "z").mkdir()
+    for name in names:
+        image = picture(0, (48, 24) if name == "wide.jpg" else (32, 24))
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[0xA405] = 70 if name == "long.jpg" else 35  # focal length for 35 mm film
+        image.save(tmp_path / name, exif=exif)
+    sizes = [Image.open(tmp_path / name).size for name in names]
+    incremental_mapping._register(tmp_path / "d.db", tmp_path, names, sizes)
+    incremental_mapping._register(tmp_path / "d.db", tmp_path, names, sizes)  # once more changes nothing
+    with pycolmap.Database.open(tmp_path / "d.db") as database:
+        images = [database.read_image(i + 1) for i in range(5)]
+        assert [image.name for image in images] == names
+        used = [database.read_camera(image.camera_id) for image in images]
+    assert used[0].camera_id == used[1].camera_id and len({camera.camera_id for camera in used}) == 4
+    assert used[0].has_prior_focal_length and used[2].focal_length == pytest.approx(2 * used[0].focal_length, rel=1e-6)
+
+
+class _Database:
+    """Photographs in a ring, of which each shares half of its descriptors with either neighbour."""
+
+    def __init__(self, count: int):
+        rng = np.random.default_rng(0)
+        points = rng.integers(0, 256, (count, 40, 128)).astype(np.uint8)
+        self.descriptors = [np.concatenate([points[i], points[(i + 1) % count]]) for i in range(count)]
+
+    def exists_descriptors(self, image: int) -> bool:
+        return True
+
+    def num_descriptors_for_image(self, image: int) -> int:
+        return 80
+
+    def read_keypoints(self, image: int) -> np.ndarray:
+        return np.tile(np.array([[0, 0, 2, 0, 0, 2]], np.float32), (80, 1))
+
+    def read_descriptors(self, image: int):
+        return type("Descriptors", (), {"data": self.descriptors[image - 1]})
+
+
+def test_of_many_photographs_those_that_look_alike_or_follow_each_other_are_matched():
+    few, many = _Database(10), _Database(64)
+    assert len(pairs_to_match(few, 10)) == 45
+    pairs = pairs_to_match(many, 64)
+    assert len(pairs) < 64 * 63 / 2 / 3 and all(i < j for i, j in pairs)
+    assert (0, 63) in pairs and (0, 5) in pairs and (0, 6) not in pairs
+
+
+def test_two_processes_do_not_find_the_same_poses_twice(copied, posed, tmp_path, monkeypatch):
+    kept = found_poses._base(tmp_path / "cache") / found_poses._key(*photographs(copied))
+    model = found_model(copied, posed[0])
+    lines, waiting, done = [], threading.Event(), threading.Event()
+
+    def say(line: str) -> None:
+        lines.append(line)
+        waiting.set()
+
+    monkeypatch.setattr(structure_from_motion, "_reconstruct", lambda *_: pytest.fail("made twice"))
+    with locked(kept, "worked on"):
+        other = threading.Thread(target=lambda: (find_poses(copied, tmp_path / "cache", log=say), done.set()))
+        other.start()
+        assert waiting.wait(10) and lines == ["another process is finding these poses; waiting for it ..."]
+        shutil.copytree(model, kept / "model")
+        shutil.copy(model.parent / "verdict.json", kept)
+    other.join(10)
+    assert done.is_set() and len(lines) == 2
+
+
+def test_a_run_keeps_the_poses_it_was_trained_with(copied, posed, tmp_path, monkeypatch):
+    shutil.copytree(posed[0], tmp_path / "cache")
+    monkeypatch.setenv("LINPRIM_GEO_CACHE", str(tmp_path / "cache"))
+    options = [
+        "--iterations",
+        "20",
+        "--max-primitives",
+        "200",
+        "--sh-degree",
+        "0",
+        "--threads",
+        "1",
+        "--evaluate-every",
+        "0",
+    ]
+    assert main(["train", str(copied), "-o", str(tmp_path / "run"), "-r", "2", "--quiet", *options]) == 0
+    before = [view.camera.world_to_camera for view in load_scene(copied).views]
+    shutil.rmtree(tmp_path / "cache")
+    after = [view.camera.world_to_camera for view in Run.open(tmp_path / "run").scene().views]
+    np.testing.assert_array_equal(before, after)
+
+
+def test_webp_photographs_are_read_as_well(copied, posed, tmp_path):
+    for number in range(COUNT):
+        with Image.open(copied / f"{number}.png") as image:
+            image.save(copied / f"{number}.webp", lossless=True)
+        if number:  # one of another kind stays among them
+            (copied / f"{number}.png").unlink()
+        else:
+            (copied / "0.webp").unlink()
+    cache = tmp_path / "cache"
+    prepare(copied, cache=cache, threads=1)
+    scene = load_scene(copied, cache=cache)
+    assert sorted(view.image_path.name for view in scene.views) == [
+        "0.png",
+        *(f"{i}.webp" for i in range(1, COUNT)),
+    ]
+    # Of lossless photographs the model is that of the same ones in the other format, colours included.
+    same = load_scene(copied, sparse=found_model(copied, cache)).points
+    assert len(same.xyz) > 100 and same.rgb.std() > 10
+    assert sorted(path.name for path in found_model(copied, cache).parent.iterdir()) == [
+        "model",
+        "verdict.json",
+    ]
+
+
+def test_a_photograph_whose_suffix_is_wrong_is_copied_as_png(tmp_path):
+    names = ["0.png", "1.png"]
+    for index, (name, kind) in enumerate(zip(names, ("PNG", "GIF"), strict=True)):
+        picture(index).convert("L").save(tmp_path / name, format=kind)
+    folder = found_poses._readable(tmp_path, names, tmp_path / "kept")
+    for index, name in enumerate(names):
+        with Image.open(folder / name) as image:
+            assert image.format == "PNG"
+            np.testing.assert_array_equal(np.asarray(image.convert("L")), np.asarray(picture(index).convert("L")))
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        b"",
+        b"[" * 100_000,
+        b"[9, 9]",
+        b'{"photographs": 9, "registered": "9"}',
+        b'{"photographs": 9, "registered": NaN}',
+        b'{"photographs": 1' + b"0" * 400 + b', "registered": 9}',
+        b'{"photographs": 9, "registered": 9, "points": null}',
+    ],
+)
+def test_a_result_that_is_damaged_is_not_taken(copied, posed, tmp_path, damaged):
+    kept = shutil.copytree(found_model(copied, posed[0]).parent, tmp_path / "structure_from_motion" / "k").parent
+    kept = (kept / "k").rename(kept / found_model(copied, posed[0]).parent.name)
+    assert found_model(copied, tmp_path) == kept / "model"
+    (kept / "verdict.json").write_bytes(damaged)
+    assert found_model(copied, tmp_path) is None
+
+
+def test_a_result_without_its_model_is_not_taken(copied, posed, tmp_path):
+    cache = Path(shutil.copytree(posed[0], tmp_path / "cache"))
+    shutil.rmtree(found_model(copied, cache))
+    assert found_model(copied, cache) is None
+
+
+def test_png_files_can_be_saved_after_pycolmap_was_loaded():
+    # zlib is hidden until pycolmap is there, as in a Python that has its own: else it is what loads the system's first.
+    program = """
+import io, sys
+sys.modules["zlib"] = None
+from linprim_geo.geometry.load_pycolmap import pycolmap
+del sys.modules["zlib"]
+import numpy
+from PIL import Image
+for seed in range(50):
+    noise = numpy.random.default_rng(seed).integers(0, 256, (150, 200, 3), numpy.uint8)
+    Image.fromarray(noise).save(io.BytesIO(), "PNG")
+print("saved")
+"""
+    # What is aborted in the middle of freeing memory may hang in the handler that is to report it.
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0 and done.stdout == "saved\n", done.stderr[-1000:]
+
+
+def test_pycolmap_is_imported_in_one_place():
+    package = Path(structure_from_motion.__file__).parents[1]
+    found = [
+        path.name
+        for path in package.rglob("*.py")
+        if re.search(r"^\s*(import|from) pycolmap", path.read_text(), re.MULTILINE)
+    ]
+    assert found == ["load_pycolmap.py"]

@@ -1,0 +1,51 @@
+"""The instruction set that LINPRIM_GEO_ISA asks for: what this processor has is taken, anything else is refused."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+from helpers.octahedra import KERNELS
+
+# Renders one octahedron and prints the instruction set in force and what a pixel of it shows.
+PROGRAM = """
+import numpy, torch
+from linprim_geo.kernels import ops
+from linprim_geo.geometry.camera import Camera
+one = [torch.tensor([row]) for row in ([0.0, 0.0, 3.0], [1.0, 0.0, 0.0, 0.0], [1.0, 0.5, 0.7], 0.5)]
+camera = Camera(width=9, height=9, fx=9.0, fy=9.0, cx=4.5, cy=4.5, world_to_camera=numpy.eye(4))
+image = ops.rasterize(*one, torch.full((1, 1, 3), 0.5), torch.zeros(3), camera)
+print(ops.instruction_set(), float(image.opacity[4, 4]))
+"""
+
+
+def run(wanted: str | None, *words: str) -> subprocess.CompletedProcess:
+    environment = {key: value for key, value in os.environ.items() if key != "LINPRIM_GEO_ISA"}
+    if wanted is not None:
+        environment["LINPRIM_GEO_ISA"] = wanted
+    return subprocess.run([sys.executable, *words], capture_output=True, text=True, timeout=120, env=environment)
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_every_one_of_this_processor_can_be_forced(name):
+    done = run(name, "-c", PROGRAM)
+    assert done.returncode == 0, done.stderr
+    used, opacity = done.stdout.split()
+    # The middle ray crosses a length of 1.4 at a density of 0.5.
+    assert used == name and float(opacity) == pytest.approx(1 - 2.718281828 ** (-0.7), abs=2e-6)
+
+
+def test_without_a_choice_it_is_the_best():
+    done = run(None, "-c", PROGRAM)
+    assert done.returncode == 0 and done.stdout.split()[0] == KERNELS[-1], done.stderr
+
+
+@pytest.mark.parametrize("wanted", ["v9", ""])
+def test_one_that_is_not_there_is_one_sentence(wanted):
+    done = run(wanted, "-m", "linprim_geo", "train", "capture")
+    assert done.returncode == 1 and done.stdout == "" and done.stderr.count("\n") == 1
+    assert done.stderr.startswith(
+        f"linprim-geo: error: LINPRIM_GEO_ISA is {wanted!r}, which this processor or build does not have"
+    )

@@ -1,0 +1,179 @@
+"""The rasterizer's primitives, ray models, orders and screen filter against the float64 twin, value and gradient."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers.octahedra import IMAGES, KERNELS, camera, fields, kernels, octahedra, random_scene
+
+from linprim_geo.kernels import ops
+from linprim_geo.kernels.reference import rasterize as reference
+
+# What the core has: an order other than the centres' needs an entry, which a Gaussian has not.
+RUNGS = [
+    *itertools.product(("octahedron", "tetrahedron"), ("exact", "affine"), ("center", "entry", "overlap")),
+    ("gaussian", "affine", "center"),
+]
+NAMES = ["-".join(rung) for rung in RUNGS]
+
+
+def scene_of(
+    seed: int,
+    rung: tuple[str, str, str],
+    count: int = 14,
+    coefficients: int = 4,
+    size=(19, 14),
+    dtype=torch.float64,
+):
+    """Tensors that require gradients, the camera, and the keywords of the rung."""
+    primitive, ray_model, order = rung
+    parameters, view = random_scene(seed, count, coefficients, *size)
+    rng = np.random.default_rng(seed)
+    if primitive == "tetrahedron":
+        parameters[2] = torch.from_numpy(rng.uniform(0.15, 0.6, (count, 4)))
+    if primitive == "gaussian":
+        parameters[2] = parameters[2] * 0.5
+        parameters[3] = torch.from_numpy(rng.uniform(0.05, 1.0, count))
+    leaves = [p.to(dtype).requires_grad_() for p in parameters]
+    # Where a ray stops inside an overlap, the twin's gradient knows which of the boundaries it stopped at, the core's
+    # does not.
+    return (
+        leaves,
+        view,
+        dict(primitive=primitive, ray_model=ray_model, order=order, stop=0.0 if order == "overlap" else 1e-3),
+    )
+
+
+def both(leaves, view, options, geometry=True):
+    """Images and gradients (of random weights) of the core and of the twin, as two pairs."""
+    results = []
+    weights = None
+    for core in (True, False):
+        inputs = [p.detach().to(p.dtype if core else torch.float64).requires_grad_() for p in leaves]
+        if core:
+            images = fields(
+                ops.rasterize(*inputs, view, geometry=geometry, **options), IMAGES if geometry else IMAGES[:2]
+            )
+        else:
+            out = reference.rasterize(
+                *inputs,
+                world_to_camera=torch.from_numpy(view.world_to_camera),
+                fx=view.fx,
+                fy=view.fy,
+                cx=view.cx,
+                cy=view.cy,
+                width=view.width,
+                height=view.height,
+                geometry=geometry,
+                **options,
+            )
+            images = {name: out[name] for name in (IMAGES if geometry else IMAGES[:2])}
+        if weights is None:
+            generator = torch.Generator().manual_seed(3)
+            weights = {
+                name: torch.rand(image.shape, generator=generator, dtype=torch.float64) - 0.3
+                for name, image in images.items()
+            }
+        loss = sum((image.double() * weights[name]).sum() for name, image in images.items())
+        grads = torch.autograd.grad(loss, inputs, allow_unused=True)
+        results.append((images, [torch.zeros_like(p) if g is None else g for p, g in zip(inputs, grads, strict=True)]))
+    return results
+
+
+def assert_alike(leaves, view, options, geometry, value: float, gradient: float):
+    (shown, grads), (wanted, wanted_grads) = both(leaves, view, options, geometry)
+    for name, image in wanted.items():
+        scale = max(float(image.detach().abs().max()), 1e-3)
+        off = float((shown[name].detach().double() - image).abs().max())
+        assert off <= value * scale, f"{name} is off by {off / scale:.1e} of its range"
+    for index, (found, truth) in enumerate(zip(grads, wanted_grads, strict=True)):
+        off, scale = float((found.double() - truth).abs().max()), max(float(truth.abs().max()), 1e-6)
+        assert off <= gradient * scale, f"gradient {index} is off by {off / scale:.1e} of its largest"
+
+
+@pytest.mark.parametrize("rung", RUNGS, ids=NAMES)
+@pytest.mark.parametrize("geometry", [False, True], ids=["colour", "geometry"])
+@pytest.mark.parametrize("screen_filter", [0.0, 0.7], ids=["plain", "filtered"])
+def test_double_precision_equals_the_twin(rung, geometry, screen_filter):
+    for seed in range(4):
+        leaves, view, options = scene_of(100 + seed, rung)
+        assert_alike(leaves, view, options | {"screen_filter": screen_filter}, geometry, 1e-9, 1e-7)
+
+
+@pytest.mark.parametrize("rung", RUNGS, ids=NAMES)
+@pytest.mark.parametrize("isa", KERNELS)
+def test_single_precision_is_near_the_twin(rung, isa):
+    with kernels(isa):
+        for seed in range(2):
+            leaves, view, options = scene_of(200 + seed, rung, dtype=torch.float32)
+            assert_alike(leaves, view, options, False, 1e-4, 2e-3)
+
+
+def beside_the_view(primitive: str, count: int, least: float, size: float):
+    """Primitives before the camera, `least` to 3 times `least` halves of the image from its middle, of `size` times
+    their distance."""
+    rng = np.random.default_rng(1)
+    view = camera(21, 17, 12.0)
+    z = rng.uniform(0.05, 1.5, count)
+    half = np.array([view.width / 2 / view.fx, view.height / 2 / view.fy])
+    slope = rng.uniform(-1, 1, (count, 2)) * least
+    sides = np.arange(count)
+    slope[sides, sides % 2] = rng.uniform(least, 3 * least, count) * rng.choice([-1, 1], count)
+    center = np.concatenate([slope * half, np.ones((count, 1))], 1) * z[:, None]
+    extent = (
+        rng.uniform(0.3, 1.0, (count, 4 if primitive == "tetrahedron" else 3))
+        * size
+        * np.linalg.norm(center, axis=1)[:, None]
+    )
+    parameters = octahedra(
+        center.tolist(),
+        extent.tolist(),
+        (2 / extent.min(1)).tolist(),
+        rotation=rng.normal(size=(count, 4)).tolist(),
+    )
+    return [p.requires_grad_() for p in parameters], view
+
+
+@pytest.mark.parametrize("primitive", ["octahedron", "tetrahedron"])
+def test_affine_rays_keep_beside_the_view_what_is_there(primitive):
+    """The Jacobian of a centre far to the side would stretch its primitive over the whole image."""
+    leaves, view = beside_the_view(primitive, 80, 3.0, 0.3)
+    exact, affine = (
+        ops.rasterize(*[p.detach() for p in leaves], view, primitive=primitive, ray_model=model).opacity
+        for model in ("exact", "affine")
+    )
+    assert exact.mean() < 0.001
+    assert affine.mean() < 0.001
+
+
+@pytest.mark.parametrize("primitive", ["octahedron", "tetrahedron"])
+@pytest.mark.parametrize("order", ["center", "entry", "overlap"])
+@pytest.mark.parametrize("screen_filter", [0.0, 0.7], ids=["plain", "filtered"])
+def test_affine_rays_of_a_centre_outside_of_the_image_equal_the_twin(primitive, order, screen_filter):
+    leaves, view = beside_the_view(primitive, 40, 1.1, 0.8)
+    options = dict(primitive=primitive, ray_model="affine", order=order, stop=0.0, screen_filter=screen_filter)
+    assert ops.rasterize(*[p.detach() for p in leaves], view, **options).opacity.mean() > 0.2
+    assert_alike(leaves, view, options, True, 1e-9, 1e-7)
+
+
+@pytest.mark.parametrize("rung", [rung for rung in RUNGS if rung[1] == "affine"], ids="-".join)
+def test_an_image_cut_out_of_another_shows_the_same(rung):
+    """The part of an image far from the principal point: what is in view there is not drawn as if it were far
+    outside."""
+    primitive, ray_model, order = rung
+    rng = np.random.default_rng(4)
+    whole = camera(61, 13, 40.0)
+    part = replace(whole, width=15, cx=whole.cx - 46)
+    pixels, z = rng.uniform([48, 2], [59, 11], (12, 2)), rng.uniform(1, 3, 12)
+    slope = (pixels - [whole.cx, whole.cy]) / [whole.fx, whole.fy]
+    center = np.concatenate([slope, np.ones((12, 1))], 1) * z[:, None]
+    extent = rng.uniform(0.05, 0.15, (12, 4 if primitive == "tetrahedron" else 3))
+    tensors = octahedra(center.tolist(), extent.tolist(), [0.9] * 12, rotation=rng.normal(size=(12, 4)).tolist())
+    options = dict(primitive=primitive, ray_model=ray_model, order=order)
+    images = [ops.rasterize(*tensors, view, **options).rgb for view in (whole, part)]
+    assert float((images[1] - tensors[5][:, None, None]).abs().max()) > 0.05
+    assert torch.allclose(images[0][..., 46:], images[1], atol=1e-10)

@@ -1,0 +1,195 @@
+"""What the compiled rasterizer takes and refuses, and that nothing it returns is not finite."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from helpers.octahedra import (
+    KERNELS,
+    NAMES,
+    assert_identical,
+    camera,
+    cotangents,
+    everything,
+    fields,
+    gradients,
+    hard_scene,
+    kernels,
+    leaves,
+    octahedra,
+    random_scene,
+)
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.kernels import ops
+
+pytestmark = pytest.mark.usefixtures("few_threads")
+
+
+# --- nothing but finite numbers ---
+
+
+def assert_finite_everywhere(scene, view, options):
+    """All outputs and gradients are finite and the opacity is a share; returns whether anything was hit."""
+    inputs = leaves(scene)
+    screen = torch.zeros(len(inputs[0]), 3, dtype=inputs[0].dtype, requires_grad=True)
+    out = ops.rasterize(*inputs, view, geometry=True, screen=screen, **options)
+    images = fields(out)
+    total = sum(
+        (image * torch.linspace(-1, 1, image.numel(), dtype=image.dtype).view_as(image)).sum()
+        for image in images.values()
+    )
+    grads = torch.autograd.grad(total, [*inputs, screen])
+    assert all(bool(x.isfinite().all()) for x in (*images.values(), out.max_weight, *grads))
+    # 1 - T with 0 <= T <= 1, and weights T alpha with alpha <= 1 to a rounding.
+    assert (
+        0 <= out.opacity.min()
+        and out.opacity.max() <= 1
+        and out.max_weight.max() <= 1 + 4 * torch.finfo(inputs[0].dtype).eps
+    )
+    return bool((out.pixels > 0).any())
+
+
+def test_hard_scenes_give_finite_numbers_only():
+    hit = 0
+    others = [name for name in KERNELS if name != KERNELS[-1]]
+    for seed in range(1800):
+        scene, view, options = hard_scene(seed)
+        hit += assert_finite_everywhere(scene, view, options)
+        single = [p.float() for p in scene]
+        for isa in (KERNELS[-1], *([others[seed // 4 % len(others)]] if seed % 4 == 0 and others else [])):
+            ops.set_instruction_set(isa)
+            assert_finite_everywhere(single, view, options)
+    assert hit > 900
+
+
+@pytest.mark.parametrize("isa", KERNELS)
+def test_a_thickness_beyond_float_gives_finite_numbers(isa):
+    scene = [p.float() for p in octahedra([[0.01, 0.02, 3.0]], [[1.0, 1.0, 1.0]], [3e38])]
+    with kernels(isa):
+        out = ops.rasterize(*scene, camera(), geometry=True)
+    assert all(bool(image.isfinite().all()) for image in fields(out).values())
+
+
+@pytest.mark.parametrize("isa", KERNELS)
+def test_a_denormal_axis_gives_finite_gradients(isa):
+    scene = [
+        p.float()
+        for p in octahedra([[0.0, 0.0, 0.0]], [[0.0255, 0.281, 2.55e-41]], [1.0], [(-0.186, -1.351, 2.53, -0.4255)])
+    ]
+    inputs = leaves(scene)
+    with kernels(isa):
+        out = ops.rasterize(*inputs, Camera(50, 1, 3014.0, 3652.0, 25.0, 0.5, np.eye(4)), near=0.0185)
+        for extent in (1.0, 2.0):
+            ops.rasterize(*[p.float() for p in octahedra([[0, 0, 3.0]], [[extent] * 3], [1.0])], camera())
+        grads = torch.autograd.grad(out.rgb.sum(), inputs)
+    assert all(bool(g.isfinite().all()) for g in grads)
+
+
+# --- the interface ---
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("name", NAMES)
+def test_an_input_that_is_not_finite_is_named_with_its_row(name, bad):
+    scene, view = random_scene(81, 5, 4)
+    tensor = scene[NAMES.index(name)]
+    row = 2
+    tensor.view(len(tensor), -1)[row, 0] = bad
+    with pytest.raises(LinprimError, match=f"{name}: row {row} "):
+        ops.rasterize(*scene, view)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_wrong_shape_is_named(name):
+    scene, view = random_scene(82, 5, 4)
+    i = NAMES.index(name)
+    scene[i] = scene[i][..., :-1]
+    with pytest.raises(ValueError, match=name):
+        ops.rasterize(*scene, view)
+
+
+def test_two_coefficients_are_refused():
+    scene, view = random_scene(83, 5, 4)
+    scene[4] = scene[4][:, :2]
+    with pytest.raises(ValueError, match=r"sh has to have shape \(N, 1 \| 4 \| 9 \| 16, 3\)"):
+        ops.rasterize(*scene, view)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.int64])
+def test_other_dtypes_are_refused(dtype):
+    scene, view = random_scene(84, 5, 4)
+    with pytest.raises(LinprimError, match="float32 or float64"):
+        ops.rasterize(*[p.to(dtype) for p in scene], view)
+
+
+@pytest.mark.parametrize("odd", range(1, 6))
+def test_tensors_of_two_dtypes_are_refused(odd):
+    scene, view = random_scene(85, 5, 4)
+    mixed = [p.double() if i == odd else p.float() for i, p in enumerate(scene)]
+    with pytest.raises((LinprimError, ValueError, TypeError), match=NAMES[odd]):
+        ops.rasterize(*mixed, view)
+
+
+@pytest.mark.parametrize("change", [{"width": 0}, {"height": -1}, {"fx": 0.0}, {"fy": -3.0}, {"fx": float("nan")}])
+def test_impossible_cameras_are_refused(change):
+    scene, view = random_scene(86, 5, 4)
+    values = {k: getattr(view, k) for k in ("width", "height", "fx", "fy", "cx", "cy", "world_to_camera")}
+    with pytest.raises((ValueError, RuntimeError)):
+        ops.rasterize(*scene, Camera(**values | change))
+    for options, name in (
+        ({"near": 0.0}, "near"),
+        ({"near": -1.0}, "near"),
+        ({"stop": -1.0}, "stop"),
+        ({"stop": 1.0}, "stop"),
+    ):
+        with pytest.raises(ValueError, match=name):
+            ops.rasterize(*scene, view, **options)
+
+
+@pytest.mark.parametrize(
+    "change", [{"cx": float("nan")}, {"world_to_camera": np.full((4, 4), np.nan)}, {"fx": float("inf")}]
+)
+def test_cameras_that_are_not_finite_are_refused(change):
+    scene, view = random_scene(86, 5, 4)
+    values = {k: getattr(view, k) for k in ("width", "height", "fx", "fy", "cx", "cy", "world_to_camera")}
+    with pytest.raises((LinprimError, ValueError)):
+        ops.rasterize(*scene, Camera(**values | change))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_inputs_of_any_layout_give_the_same_and_stay_as_they_are(dtype):
+    scene, view = random_scene(87, 7, 9, 20, 14)
+    scene = [p.to(dtype) for p in scene]
+    wanted = everything(scene, view)
+    strided = [torch.stack([p, torch.full_like(p, 7.0)], -1)[..., 0] for p in scene]
+    transposed = [p.transpose(0, -1).contiguous().transpose(0, -1) for p in scene]
+    assert not any(p.is_contiguous() for p in strided) and not transposed[0].is_contiguous()
+    for layout in (strided, transposed):
+        before = [p.clone() for p in layout]
+        inputs = [p.detach().requires_grad_() for p in layout]
+        screen = torch.zeros(7, 3, dtype=dtype, requires_grad=True)
+        out = ops.rasterize(*inputs, view, geometry=True, screen=screen)
+        images = fields(out)
+        grads = gradients(images, [*inputs, screen], cotangents(images))
+        assert_identical([*images.values(), out.max_weight, out.pixels, *grads], wanted)
+        assert_identical(layout, before)
+
+
+def test_gradients_that_are_not_contiguous_are_read_right():
+    scene, view = random_scene(88, 7, 1, 20, 14)
+    inputs = leaves(scene)
+    out = ops.rasterize(*inputs, view)
+    weight = torch.rand(20, 14, 3, dtype=torch.float64).permute(2, 1, 0)
+    a = torch.autograd.grad(out.rgb, inputs, weight, retain_graph=True)
+    b = torch.autograd.grad(out.rgb, inputs, weight.contiguous())
+    assert_identical(a, b)
+
+
+def test_an_unknown_instruction_set_is_refused_and_the_old_one_kept():
+    before = ops.instruction_set()
+    with pytest.raises(LinprimError, match="v9"):
+        ops.set_instruction_set("v9")
+    assert ops.instruction_set() == before and "scalar" in KERNELS

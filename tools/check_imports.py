@@ -1,0 +1,33 @@
+"""Checks that packages import only those below them, and that no modules import each other in a circle.
+
+The order stands in pyproject.toml, `[tool.importlinter]`. In the repository `linprim_geo.eval` lies in `eval/`, so the
+package is put together in a temporary folder first, as in the wheel. Imports inside functions count.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from importlinter.cli import lint_imports
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def main() -> int:
+    with TemporaryDirectory() as folder:
+        package = Path(folder) / "linprim_geo"
+        shutil.copytree(ROOT / "linprim_geo", package)
+        shutil.copytree(ROOT / "eval", package / "eval")
+        # An editable install finds the package in the repository, whatever the path says.
+        sys.meta_path[:] = [finder for finder in sys.meta_path if "editable" not in type(finder).__module__]
+        sys.path.insert(0, folder)
+        os.chdir(folder)
+        return lint_imports(config_filename=str(ROOT / "pyproject.toml"), cache_dir=None)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
