@@ -6,6 +6,9 @@
 //   Vec<T, W>   W lanes of T        + - * fma min max rcp exp_neg
 //   Mask<T, W>  W booleans          & | bits all
 //   Index<T, W> W small integers    select lookup8 equal is_face
+//
+// Only operations whose result IEEE 754 fixes: rcp is a division, rounded correctly. The processors' estimates of a
+// reciprocal or of its square root differ between makers, and with them every bit that is trained.
 #pragma once
 
 #include <cmath>
@@ -224,11 +227,7 @@ inline F8 fma(F8 a, F8 b, F8 c) { return {_mm256_fmadd_ps(a.v, b.v, c.v)}; }
 inline F8 min(F8 a, F8 b) { return {_mm256_min_ps(a.v, b.v)}; }
 inline F8 max(F8 a, F8 b) { return {_mm256_max_ps(a.v, b.v)}; }
 inline F8 select(M8 m, F8 a, F8 b) { return {_mm256_blendv_ps(b.v, a.v, m.m)}; }
-// 12-bit estimate and one Newton step: relative error below 2e-7.
-inline F8 rcp(F8 a) {
-  const __m256 r = _mm256_rcp_ps(a.v);
-  return {_mm256_mul_ps(r, _mm256_fnmadd_ps(a.v, r, _mm256_set1_ps(2.0f)))};
-}
+inline F8 rcp(F8 a) { return {_mm256_div_ps(_mm256_set1_ps(1.0f), a.v)}; }
 inline F8 sqrt(F8 a) { return {_mm256_sqrt_ps(a.v)}; }
 inline float sum(F8 a) {
   const __m128 h = _mm_add_ps(_mm256_castps256_ps128(a.v), _mm256_extractf128_ps(a.v, 1));
@@ -296,11 +295,7 @@ inline F16 fma(F16 a, F16 b, F16 c) { return {_mm512_fmadd_ps(a.v, b.v, c.v)}; }
 inline F16 min(F16 a, F16 b) { return {_mm512_min_ps(a.v, b.v)}; }
 inline F16 max(F16 a, F16 b) { return {_mm512_max_ps(a.v, b.v)}; }
 inline F16 select(M16 m, F16 a, F16 b) { return {_mm512_mask_blend_ps(m.m, b.v, a.v)}; }
-// 14-bit estimate and one Newton step: relative error below 1e-7.
-inline F16 rcp(F16 a) {
-  const __m512 r = _mm512_rcp14_ps(a.v);
-  return {_mm512_mul_ps(r, _mm512_fnmadd_ps(a.v, r, _mm512_set1_ps(2.0f)))};
-}
+inline F16 rcp(F16 a) { return {_mm512_div_ps(_mm512_set1_ps(1.0f), a.v)}; }
 inline F16 sqrt(F16 a) { return {_mm512_sqrt_ps(a.v)}; }
 inline float sum(F16 a) { return _mm512_reduce_add_ps(a.v); }
 inline float max_lane(F16 a) { return _mm512_reduce_max_ps(a.v); }

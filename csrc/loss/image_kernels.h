@@ -279,7 +279,7 @@ inline void adam_part(const AdamRowsParams& P, const RowTensor& t, int64_t at, f
 #endif
   const V divisor = fma(deviation, V::set(root), V::set(P.epsilon));
   store(first, t.first), store(second, t.second);
-  // A true division: rcp knows no divisor below 1e-38, and epsilon may be 0.
+  // One rounding, where a product with rcp has two.
   store(load(t.value) - V{(V::set(step) * first).v / divisor.v}, t.value);
 }
 
