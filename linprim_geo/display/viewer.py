@@ -78,13 +78,13 @@ def view_run(
     viewer = Viewer(Path(run), port, follow=follow, reference=reference)
     address = viewer.address
     try:
+        _end_when_asked()  # before the line that tells others that it can be ended
         print(f"{address}: {viewer.status}; Ctrl-C ends it", file=sys.stderr, flush=True)
         if browser and _has_screen():
             import webbrowser
 
             webbrowser.open(address)
         parent = int(os.environ.get(PARENT, "0"))
-        _end_when_asked()
         while not parent or os.getppid() == parent:
             time.sleep(LOOK_EVERY)
             if follow and viewer.look():
