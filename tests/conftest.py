@@ -114,13 +114,7 @@ def run_copy(tiny_run, tmp_path) -> Path:
 
 def octahedron_run(folder: Path, density: float = DENSITY, views: int = 24, size: int = 64) -> Path:
     """A run that holds the one octahedron of this module, photographed from all around, without training."""
-    from linprim_geo.base.options import SceneOptions, TrainOptions
-    from linprim_geo.capture.load import load_scene
     from linprim_geo.geometry.primitives import Primitives
-    from linprim_geo.points.initial_points import scene_normalization
-    from linprim_geo.runs.run import Run
-    from linprim_geo.synthetic.synth import synthesize
-    from linprim_geo.synthetic.textured import TexturedMesh
 
     one = Primitives(
         np.array([CENTER]),
@@ -129,25 +123,40 @@ def octahedron_run(folder: Path, density: float = DENSITY, views: int = 24, size
         np.array([density]),
         np.full((1, 1, 3), 0.7),
     )
-    shape = one.triangle_mesh()
+    return exact_run(folder, one, views, size)
+
+
+def exact_run(folder: Path, primitives, views: int = 24, size: int = 64) -> Path:
+    """A run that holds the given primitives of one colour, photographed from all around, without training."""
+    from linprim_geo.points.initial_points import scene_normalization
+    from linprim_geo.base.options import SceneOptions, TrainOptions
+    from linprim_geo.geometry.primitives import Primitives
+    from linprim_geo.runs.run import Run
+    from linprim_geo.capture.load import load_scene
+    from linprim_geo.synthetic.synth import synthesize
+    from linprim_geo.synthetic.textured import TexturedMesh
+
+    shape = primitives.triangle_mesh()
 
     def albedo(points, face, bary):
-        return np.full((len(points), 3), one.base_color[0] / 255, dtype=np.float32)
+        return np.full((len(points), 3), primitives.base_color[0] / 255, dtype=np.float32)
 
-    mesh = TexturedMesh("octahedron", shape.vertices, shape.faces, np.zeros(8, np.int32), albedo, "sphere")
+    part = np.zeros(len(shape.faces), np.int32)
+    mesh = TexturedMesh("octahedra", shape.vertices, shape.faces, part, albedo, "sphere")
     scene_path = folder / "scene"
     synthesize(scene_path, mesh=mesh, views=views, test_views=2, size=size, points=300, supersample=1)
     scene = load_scene(scene_path)
     similarity = scene_normalization(scene)
     run = Run.create(folder / "run", scene, scene_path, SceneOptions(), TrainOptions(threads=1), similarity)
     scaled = Primitives(
-        similarity.apply(one.center),
-        one.rotation,
-        one.extent * similarity.scale,
-        one.density / similarity.scale,
-        one.sh,
+        similarity.apply(primitives.center),
+        primitives.rotation,
+        primitives.extent * similarity.scale,
+        primitives.density / similarity.scale,
+        primitives.sh,
     )
-    run.save(scaled, {"iteration": 1, "iterations": 1, "primitives": 1, "background": [1, 1, 1], "seconds": 0})
+    state = {"iteration": 1, "iterations": 1, "primitives": len(primitives), "background": [1, 1, 1], "seconds": 0}
+    run.save(scaled, state)
     return run.path
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import CENTER, octahedron_run
+from conftest import CENTER, DENSITY, exact_run, octahedron_run
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions
@@ -258,20 +258,31 @@ def test_a_soft_octahedron_is_cut_back(tmp_path):
     assert volumes[1] < 0.95 * volumes[0]
 
 
-def test_a_trained_part_is_closed_and_traced(tiny_run):
-    mesh, primitive, about = traced(tiny_run)
-    assert is_closed(mesh) and topology(mesh)["volume"] > 0
+def test_many_octahedra_are_closed_and_traced(tmp_path):
+    # Sixty opaque ones on a sphere, each in view, neighbours overlapping by their tips. A training would put others
+    # there with every seed and processor.
+    count, random = 60, np.random.default_rng(0)
+    height = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.pi * (1 + np.sqrt(5)) * np.arange(count)
+    ring = np.sqrt(1 - height**2)
+    given = Primitives(
+        2 * np.stack([ring * np.cos(angle), ring * np.sin(angle), height], 1),
+        random.standard_normal((count, 4)),
+        0.5 + 0.1 * random.random((count, 3)),
+        np.full(count, DENSITY),
+        np.full((count, 1, 3), 0.7),
+    )
+    mesh, primitive, about = traced(exact_run(tmp_path, given, views=16, size=48))
+    assert is_closed(mesh) and 0 < topology(mesh)["volume"] < count * 4 / 3 * 0.6**3
+    assert 1 < topology(mesh)["components"] < count
     owned = primitive != NO_PRIMITIVE
-    assert about["primitives_on_surface"] == len(np.unique(primitive[owned])) > 50
-    primitives = Run.open(tiny_run).primitives()
+    assert about["primitives_on_surface"] == len(np.unique(primitive[owned])) == count
+    primitives = Run.open(tmp_path / "run").primitives()
     middle, rows = mesh.vertices[mesh.faces[owned]].mean(1), primitive[owned]
     normals, offsets = face_planes(primitives)
     ahead = np.einsum("fki,fi->fk", normals[rows], middle - primitives.center[rows].astype(float)) - offsets[rows]
-    # On the primitive, or inside it where it was cut; a sliver that went let the surface move by the tolerance, and one
-    # after another by more: which ones do depends on the last bits of a training, so that is held to a hundredth of the
-    # area.
-    area = face_areas(mesh)[owned]
-    assert area[ahead.max(1) > 2 * about["tolerance"]].sum() < 0.01 * area.sum()
+    # On the primitive, or inside it where it was cut; to get rid of a sliver the surface may move by the tolerance.
+    assert ahead.max() < 2 * about["tolerance"]
 
 
 def test_the_file_says_which_primitive_a_face_is_a_part_of(tiny_run, tmp_path):
