@@ -128,11 +128,11 @@ def octahedron_run(folder: Path, density: float = DENSITY, views: int = 24, size
 
 def exact_run(folder: Path, primitives, views: int = 24, size: int = 64) -> Path:
     """A run that holds the given primitives of one colour, photographed from all around, without training."""
-    from linprim_geo.points.initial_points import scene_normalization
     from linprim_geo.base.options import SceneOptions, TrainOptions
-    from linprim_geo.geometry.primitives import Primitives
-    from linprim_geo.runs.run import Run
     from linprim_geo.capture.load import load_scene
+    from linprim_geo.geometry.primitives import Primitives
+    from linprim_geo.points.initial_points import scene_normalization
+    from linprim_geo.runs.run import Run
     from linprim_geo.synthetic.synth import synthesize
     from linprim_geo.synthetic.textured import TexturedMesh
 

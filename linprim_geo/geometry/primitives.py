@@ -130,7 +130,9 @@ def reference_length(extent, kind: str):
         p, q, r = distance[:j] + distance[j + 1 :]
         x, y, z = p * q, q * r, r * p
         products = products + x * r
-        area = area + (x * x + y * y + z * z + x * y + y * z + z * x) ** 0.5
+        square = x * x + y * y + z * z + x * y + y * z + z * x
+        # torch's square root has other last bits on processors of other makers (see `ops.exponential`).
+        area = area + (square**0.5 if isinstance(square, np.ndarray) else square * square.rsqrt())
     return (6 * 2 / (9 * math.sqrt(3)) / (math.sqrt(2) / 3)) * products / area
 
 

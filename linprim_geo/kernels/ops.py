@@ -24,6 +24,7 @@ if os.environ.get("LINPRIM_GEO_ISA", "auto") not in ("auto", _core.instruction_s
         f" unset, {_core.instruction_set()} is used"
     )
 
+LOG2_E = 1.4426950408889634
 # Planes in the order the core wants them; the last one is private state for the backward pass.
 _PLANES = (
     "rgb",
@@ -587,6 +588,28 @@ def set_threads(count: int) -> None:
 def threads() -> int:
     """Threads the core uses."""
     return _core.threads()
+
+
+class _Exponential(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x: Tensor) -> Tensor:
+        y = torch.exp2(x.double() * LOG2_E).to(x.dtype)
+        ctx.save_for_backward(y)
+        return y
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> Tensor:
+        (y,) = ctx.saved_tensors
+        return gradient * y
+
+
+def exponential(x: Tensor) -> Tensor:
+    """e^x of float32, with the same bits on the processors of all makers.
+
+    `torch.exp` and `torch.sqrt` go to MKL's vector library, which has other code for Intel's processors than for
+    others; `exp2` is torch's own. Taken in float64 and rounded once.
+    """
+    return _Exponential.apply(x)
 
 
 def instruction_set() -> str:

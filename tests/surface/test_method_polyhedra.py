@@ -16,7 +16,7 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Progress, Stages
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.mesh import face_areas, face_normals
+from linprim_geo.geometry.mesh import face_normals
 from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.geometry.primitives import ARRAYS, Primitives, load_primitives, save_primitives
 from linprim_geo.geometry.topology import manifold_status, topology

@@ -17,12 +17,12 @@ from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.eval.depth import eval_depth_run
 from linprim_geo.eval.images import eval_images_run
 from linprim_geo.geometry.primitives import KINDS, load_primitives
+from linprim_geo.imaging.metrics import composite
 from linprim_geo.runs.run import Run
 from linprim_geo.synthetic.synth import synthesize
 from linprim_geo.synthetic.textured import TexturedMesh
 from linprim_geo.training.step import trainer as training_step
 from linprim_geo.training.train import train
-from linprim_geo.imaging.metrics import composite
 
 # --- what a run leaves behind ----------------------------------------------------------------------------
 

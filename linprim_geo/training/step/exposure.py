@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from linprim_geo.kernels.adam import adam_rows
+from linprim_geo.kernels.ops import exponential
 
 # Adam's step in the logarithm of a gain at the start of a run, and the part of it at the end.
 RATE, RATE_END = 1e-2, 0.05
@@ -48,7 +49,7 @@ class Exposure:
     @property
     def gains(self) -> np.ndarray:
         """(V, 3) float32."""
-        return torch.exp(self.log_gain).numpy()
+        return exponential(self.log_gain).numpy()
 
     def state(self) -> dict:
         """What a resumed run needs."""
@@ -69,7 +70,7 @@ def exposed(rgb: Tensor, log_gain: Tensor, target: Tensor, behind: Tensor | None
     colour behind masks; it has no gain. Where `target` is white the rendering is cut at white: brighter is right, too.
     Gradient: to `rgb`, `log_gain` and `behind`.
     """
-    gain = torch.exp(log_gain)[:, None, None]
+    gain = exponential(log_gain)[:, None, None]
     shown = rgb * gain if behind is None else (rgb - behind) * gain + behind
     return torch.where(target >= WHITE, shown.clamp_max(1.0), shown)
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from linprim_geo.base.options import GEOMETRY_WEIGHTS, TrainOptions
 from linprim_geo.capture.types import Scene
 from linprim_geo.geometry.camera import Camera, Similarity
-from linprim_geo.kernels.ops import Rendering
+from linprim_geo.kernels.ops import Rendering, exponential
 from linprim_geo.points.initial_points import VolumePoints
 from linprim_geo.points.view_pairs import source_views, visible_pixels
 
@@ -222,14 +222,14 @@ def patch_consistency(
     own = grey[place[..., 1], place[..., 0]]
     rays = _with_one((place + 0.5 - middle) / focal)
     along = depth * (normal * ray.T).sum(0)
-    slope = torch.einsum("psc,cp->ps", rays, normal)
+    slope = (rays * normal.T[:, None]).sum(2)
     steep = slope.abs() < 0.1 * torch.linalg.vector_norm(normal, dim=0)[:, None]  # seen under less than six degrees
     reach = along[:, None] / torch.where(steep, torch.full_like(slope, -1), slope)
     usable = (depth > 0) & ~steep.any(1) & (reach > 0.5 * depth[:, None]).all(1) & (reach < 2 * depth[:, None]).all(1)
 
     pose = other.world_to_camera @ np.linalg.inv(camera.world_to_camera)
     rotation, shift = torch.from_numpy(pose[:3, :3]).to(depth), torch.from_numpy(pose[:3, 3]).to(depth)
-    there = (rays * reach[..., None]) @ rotation.T + shift
+    there = _turned(rays * reach[..., None], rotation) + shift
     usable = usable & (there[..., 2] > 1e-3).all(1)
     focal_there, middle_there = _pair(other.fx, other.fy), _pair(other.cx, other.cy)
     seen = there[..., :2] / there[..., 2:].clamp_min(1e-3) * focal_there + middle_there
@@ -241,13 +241,13 @@ def patch_consistency(
         centre = seen[:, len(offset) // 2]
         back = _bilinear(other_depth, centre, size)
         point = _with_one((centre - middle_there) / focal_there) * back[:, None]
-        point = (point - shift) @ rotation
+        point = _turned(point - shift, rotation.T)
         again = point[:, :2] / point[:, 2:].clamp_min(1e-3) * focal + middle
         miss = torch.linalg.vector_norm(again - pixels - 0.5, dim=1)
         usable = usable & (back > 0) & (miss < ROUND_TRIP_PX)
         for values in (own, theirs):
             usable = usable & (torch.linalg.vector_norm(values - values.mean(1, keepdim=True), dim=1) > PATCH * PLAIN)
-        weight = torch.where(usable, torch.exp(-miss), torch.zeros_like(miss))
+        weight = torch.where(usable, exponential(-miss), torch.zeros_like(miss))
     own, theirs = own - own.mean(1, keepdim=True), theirs - theirs.mean(1, keepdim=True)
     scale = torch.linalg.vector_norm(own, dim=1) * torch.linalg.vector_norm(theirs, dim=1)
     likeness = (own * theirs).sum(1) / torch.where(usable, scale, torch.ones_like(scale))
@@ -274,6 +274,12 @@ def _pair(a: float, b: float) -> Tensor:
 
 def _with_one(pairs: Tensor) -> Tensor:
     return torch.cat([pairs, torch.ones_like(pairs[..., :1])], -1)
+
+
+def _turned(points: Tensor, rotation: Tensor) -> Tensor:
+    """Points (..., 3) turned by a matrix; without a matrix product, whose last bits differ between makers of
+    processors."""
+    return (points[..., None, :] * rotation).sum(-1)
 
 
 def _bilinear(image: Tensor, pixels: Tensor, size: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ import torch
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.primitives import DIST_TO_SCALE, KINDS
+from linprim_geo.kernels.ops import exponential
 from linprim_geo.training.step.population import Control, Event, rotate, thinned
 
 # Shorter runs have proportionally shorter intervals.
@@ -172,7 +173,7 @@ class McmcControl(Control):
         self.scale = 1.0 if self.kind == "gaussian" else 1 / (DIST_TO_SCALE * KINDS[self.kind].size)
 
     def penalty(self, parameters):
-        size = self.scale * torch.exp(parameters["log_extent"]).mean()
+        size = self.scale * exponential(parameters["log_extent"]).mean()
         return SIZE_PENALTY * size + OPACITY_PENALTY * torch.sigmoid(parameters["raw_opacity"]).mean()
 
     def is_due(self, step):
@@ -251,8 +252,9 @@ def relocated(opacity: np.ndarray, copies: np.ndarray) -> tuple[np.ndarray, np.n
 def in_view(parameters, camera: Camera, kind: str) -> torch.Tensor:
     """(N,) bool: the primitive's bounding sphere (3 standard deviations of a Gaussian) may reach into the image."""
     pose = torch.from_numpy(camera.world_to_camera[:3].astype(np.float32))
-    local = parameters["center"].detach() @ pose[:, :3].T + pose[:, 3]
-    reach = torch.exp(parameters["log_extent"].detach().amax(1)) * (1 if KINDS[kind].solid else 3)
+    # A sum of three, no matrix product: the library for those has other code for the processors of each maker.
+    local = (parameters["center"].detach()[:, None] * pose[:, :3]).sum(2) + pose[:, 3]
+    reach = exponential(parameters["log_extent"].detach().amax(1)) * (1 if KINDS[kind].solid else 3)
     z = local[:, 2]
     depth = z.clamp_min(1e-6)
     x, y = camera.fx * local[:, 0] / depth + camera.cx, camera.fy * local[:, 1] / depth + camera.cy

@@ -123,9 +123,9 @@ def activate(
     - exp(-softplus(raw)) = sigmoid(raw), with no cap and no logarithm of 0; for Gaussians the opacity itself,
     sigmoid(raw).
     """
-    extent = torch.exp(parameters["log_extent"])
+    extent = ops.exponential(parameters["log_extent"])
     if kind == "gaussian":
-        extent = extent if filter_3d is None else torch.sqrt(extent**2 + filter_3d[:, None] ** 2)
+        extent = extent if filter_3d is None else torch.hypot(extent, filter_3d[:, None])
         density = torch.sigmoid(parameters["raw_opacity"])
     else:
         extent = extent if filter_3d is None else extent + filter_3d[:, None] / 2
@@ -311,7 +311,7 @@ class Trainer:
         photometric = parts[0] if shot.weight == 1 else shot.weight * parts[0]
         objective = photometric if penalty is None else photometric + penalty
         if passed is not None:
-            photo = target if log_gain is None else target * torch.exp(-log_gain.detach())[:, None, None]
+            photo = target if log_gain is None else target * ops.exponential(-log_gain.detach())[:, None, None]
             objective = objective + CONTRADICTION * contradiction(photo, passed.detach(), 1 - out.opacity)
         if terms is not None:
 
