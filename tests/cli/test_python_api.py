@@ -81,5 +81,5 @@ def test_every_public_name_is_there_and_no_other():
         lg.nothing  # noqa: B018
     # What type checkers see is what there is.
     source = (ROOT / "linprim_geo" / "__init__.py").read_text()
-    seen = re.findall(r"^    from \.([\w.]+) import (\w+) as (\w+)$", source, re.MULTILINE)
+    seen = re.findall(r"^    from linprim_geo\.([\w.]+) import (\w+) as (\w+)$", source, re.MULTILINE)
     assert {name: (module, inner) for module, inner, name in seen} == lg._PUBLIC

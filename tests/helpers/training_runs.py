@@ -19,13 +19,14 @@ UNSTEADY = ("seconds", "memory_gib")
 # Trains slowly enough to be hit at any moment: arguments are scene, run, milliseconds per step, options of the CLI.
 SLOW_TRAINING = """
 import sys, time
-from linprim_geo import cli, trainer
+from linprim_geo.cli.main import main
+from linprim_geo.training.step import trainer
 advance = trainer.Trainer.advance
 def slow(self):
     time.sleep(float(sys.argv[3]) / 1000)
     return advance(self)
 trainer.Trainer.advance = slow
-sys.exit(cli.main(["train", sys.argv[1], "-o", sys.argv[2], *sys.argv[4:]]))
+sys.exit(main(["train", sys.argv[1], "-o", sys.argv[2], *sys.argv[4:]]))
 """
 
 

@@ -139,7 +139,7 @@ def test_texels_between_charts_have_a_colour_of_a_chart(ball_texture):
 
 def test_the_passes_and_kept_photographs_do_not_change_the_texture(ball, ball_texture, monkeypatch):
     monkeypatch.setattr(texture_module, "TEXELS_PER_PASS", 10_000)
-    monkeypatch.setattr(texture_module, "CANDIDATES", 5_000)
+    monkeypatch.setattr(texture_raster, "CANDIDATES", 5_000)
     monkeypatch.setattr(texture_module, "KEPT_BYTES", 0)
     monkeypatch.setattr("linprim_geo.surface.visibility.POINTS_PER_TASK", 3_000)
     again = make_texture(ball[0], SIZE, ball[1])
