@@ -1,0 +1,468 @@
+// The pixels of one row of PatchMatch, several at a time; compiled once per instruction set.
+#ifndef LINPRIM_ISA
+#error "compile this file with -DLINPRIM_ISA=<name> -DLINPRIM_ISA_<NAME>=1"
+#endif
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#if defined(LINPRIM_ISA_V3) || defined(LINPRIM_ISA_V4)
+#include <immintrin.h>
+#endif
+
+#include "stereo/patch_match.h"
+
+namespace linprim {
+namespace LINPRIM_ISA {
+namespace {
+
+#if defined(LINPRIM_ISA_V4)
+constexpr int kWide = 16;
+#elif defined(LINPRIM_ISA_V3)
+constexpr int kWide = 8;
+#elif defined(LINPRIM_ISA_SCALAR)
+constexpr int kWide = 1;
+#else
+constexpr int kWide = 4;
+#endif
+typedef float F __attribute__((vector_size(4 * kWide)));
+typedef int32_t I __attribute__((vector_size(4 * kWide)));
+
+constexpr int kSamples = kWindowSide * kWindowSide;
+// Bilateral weights of a window: standard deviations in pixels and in grey values (ACMH).
+constexpr float kNearPixels = 5, kNearGrey = 10;
+// A view whose cost is below kGood exp(-iteration^2 / kGoodFalls) agrees, one above kBad does not (ACMH).
+constexpr float kGood = 0.8f, kGoodFalls = 90, kBad = 1.2f, kCostSpread = 0.3f;
+constexpr int kRegions = 8, kRefinements = 5;
+// Perturbations: of the inverse depth as a share of itself and of its range, and of the normal.
+constexpr float kDepthStep = 0.02f, kNormalStep = 0.06f;
+// Weight of a pixel of error there and back, and the error above which it counts no more.
+constexpr float kGeometryWeight = 0.1f, kGeometryMost = 4;
+// A prior plane: scale of its agreement in inverse depth, as a share of the range, and in the sine of the angle.
+constexpr float kPriorDepth = 1 / 64.f, kPriorAngle = 0.087f, kPriorCost = 0.18f;
+constexpr float kWorst = 2;
+// The cosine between a plane's normal and the ray is at least this.
+constexpr float kFlattest = 0.12f;
+
+inline F all(float x) { return x - F{}; }
+inline F low(F a, F b) { return a < b ? a : b; }
+inline F high(F a, F b) { return a > b ? a : b; }
+inline F magnitude(F a) { return a < 0.0f ? -a : a; }
+
+inline I gather(const uint32_t* base, I at) {
+#if defined(LINPRIM_ISA_V4)
+  return (I)_mm512_i32gather_epi32((__m512i)at, (const int*)base, 4);
+#elif defined(LINPRIM_ISA_V3)
+  return (I)_mm256_i32gather_epi32((const int*)base, (__m256i)at, 4);
+#else
+  I r;
+  for (int l = 0; l < kWide; ++l) r[l] = int32_t(base[at[l]]);
+  return r;
+#endif
+}
+
+inline F root(F a) {
+#if defined(LINPRIM_ISA_V4)
+  return (F)_mm512_sqrt_ps((__m512)a);
+#elif defined(LINPRIM_ISA_V3)
+  return (F)_mm256_sqrt_ps((__m256)a);
+#else
+  for (int l = 0; l < kWide; ++l) a[l] = std::sqrt(a[l]);
+  return a;
+#endif
+}
+
+// Random numbers by place and purpose.
+inline uint32_t mixed(uint32_t a) {
+  a ^= a >> 16, a *= 0x7feb352du, a ^= a >> 15, a *= 0x846ca68bu, a ^= a >> 16;
+  return a;
+}
+struct Random {
+  uint32_t state;
+  float next() {  // -1 to 1
+    state = mixed(state + 0x9e3779b9u);
+    return float(int32_t(state)) * (1 / 2147483648.f);
+  }
+};
+
+struct Planes {
+  F w, x, y;
+};
+
+// The pixels that are looked at together: their places, windows and views.
+struct Packet {
+  F column, row;
+  F weight[kSamples], centered[kSamples];  // of the reference's window: weights of sum 1; weights times (grey - mean)
+  F deviation;                             // root of the window's variance, noise included
+  F view[kMostSources];                    // weights of the views
+  int count;                               // lanes that are in the image
+  int at[kWide];                           // pixel
+};
+
+// 1 - normalised cross correlation of the windows along planes, and in `middle` where the pixel falls.
+inline F photo_cost(const PatchMatch& M, const StereoSource& S, const Packet& P, const Planes& plane) {
+  F p[3], dx[3], dy[3];
+  for (int k = 0; k < 3; ++k) {
+    p[k] = S.to[3 * k] * P.column + S.to[3 * k + 1] * P.row + S.to[3 * k + 2] + S.shift[k] * plane.w;
+    dx[k] = S.to[3 * k] + S.shift[k] * plane.x, dy[k] = S.to[3 * k + 1] + S.shift[k] * plane.y;
+  }
+  const float most_u = float(S.width) - 1.001f, most_v = float(S.height) - 1.001f;
+  // Outside of the photograph, or behind it.
+  const F u0 = p[0] / p[2], v0 = p[1] / p[2];
+  I bad = (p[2] <= 1e-6f) | (u0 < 0.0f) | (v0 < 0.0f) | (u0 > most_u) | (v0 > most_v);
+  F sum{}, square{}, product{};
+  constexpr float kFirst = -0.5f * kWindowStep * (kWindowSide - 1);
+  int k = 0;
+  for (int i = 0; i < kWindowSide; ++i) {
+    const float down = kFirst + kWindowStep * i;
+    F q[3];
+    for (int c = 0; c < 3; ++c) q[c] = p[c] + down * dy[c] + kFirst * dx[c];
+    for (int j = 0; j < kWindowSide; ++j, ++k) {
+      const F inverse = 1.0f / high(q[2], all(1e-6f));
+      const F u = low(high(q[0] * inverse, F{}), all(most_u)), v = low(high(q[1] * inverse, F{}), all(most_v));
+      const I column = __builtin_convertvector(u, I), row = __builtin_convertvector(v, I);
+      const F a = u - __builtin_convertvector(column, F), b = v - __builtin_convertvector(row, F);
+      const I quad = gather(S.quads, row * S.width + column);
+      const F g00 = __builtin_convertvector(quad & 255, F), g10 = __builtin_convertvector((quad >> 8) & 255, F);
+      const F g01 = __builtin_convertvector((quad >> 16) & 255, F),
+              g11 = __builtin_convertvector((quad >> 24) & 255, F);
+      const F top = g00 + a * (g10 - g00), bottom = g01 + a * (g11 - g01), grey = top + b * (bottom - top);
+      const F weighted = P.weight[k] * grey;
+      sum += weighted, square += weighted * grey, product += P.centered[k] * grey;
+      for (int c = 0; c < 3; ++c) q[c] += float(kWindowStep) * dx[c];
+    }
+  }
+  const F variance = high(square - sum * sum, F{}) + M.noise;
+  const F cost = 1.0f - product / (P.deviation * root(variance));
+  return bad ? all(kWorst) : low(high(cost, F{}), all(kWorst));
+}
+
+// Pixels between a pixel and where it comes back to from the surface that the source has there.
+inline F geometry_cost(const StereoSource& S, const Packet& P, const Planes& plane) {
+  F error;
+  for (int l = 0; l < kWide; ++l) {
+    float p[3];
+    for (int k = 0; k < 3; ++k)
+      p[k] = S.to[3 * k] * P.column[l] + S.to[3 * k + 1] * P.row[l] + S.to[3 * k + 2] + S.shift[k] * plane.w[l];
+    error[l] = kGeometryMost;
+    if (!(p[2] > 1e-6f)) continue;
+    const float u = p[0] / p[2], v = p[1] / p[2];
+    if (!(u > -0.5f && v > -0.5f && u < S.width - 0.5f && v < S.height - 0.5f)) continue;
+    const float w = S.inverse_depth[int(v + 0.5f) * S.width + int(u + 0.5f)];
+    if (!(w >= 0)) continue;
+    float q[3];
+    for (int k = 0; k < 3; ++k)
+      q[k] = S.back[3 * k] * u + S.back[3 * k + 1] * v + S.back[3 * k + 2] + S.back_shift[k] * w;
+    if (!(q[2] > 1e-6f)) continue;
+    const float a = q[0] / q[2] - P.column[l], b = q[1] / q[2] - P.row[l];
+    error[l] = std::min(kGeometryMost, std::sqrt(a * a + b * b));
+  }
+  return kGeometryWeight * error;
+}
+
+inline F view_cost(const PatchMatch& M, const StereoSource& S, const Packet& P, const Planes& plane) {
+  const F cost = photo_cost(M, S, P, plane);
+  return S.inverse_depth ? cost + geometry_cost(S, P, plane) : cost;
+}
+
+// Weighted mean of the views' costs.
+inline F joint_cost(const PatchMatch& M, const Packet& P, const F* cost) {
+  F sum{}, total{};
+  for (int v = 0; v < M.sources; ++v) sum += P.view[v] * cost[v], total += P.view[v];
+  return sum / high(total, all(1e-12f));
+}
+
+// Unit normals of planes, and the direction of the rays; towards the camera z is negative.
+inline void normal_of(const PatchMatch& M, float column, float row, float w, float x, float y, float normal[3]) {
+  // n is parallel to (w_x f_x, w_y f_y, w - w_x (column - c_x) - w_y (row - c_y)): n . X = 1 for w = n . ray.
+  const float n[3] = {x * M.focal_x, y * M.focal_y, w - x * (column - M.center_x) - y * (row - M.center_y)};
+  const float length = std::sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]);
+  for (int k = 0; k < 3; ++k) normal[k] = length > 0 ? n[k] / length : float(k == 2);
+}
+
+// The plane at a pixel with inverse depth w and this normal, which is turned where it is too flat to be seen.
+inline void plane_of(const PatchMatch& M, float column, float row, float w, const float normal[3], float plane[3]) {
+  const float ray[3] = {(column - M.center_x) / M.focal_x, (row - M.center_y) / M.focal_y, 1};
+  const float length = std::sqrt(ray[0] * ray[0] + ray[1] * ray[1] + 1);
+  float n[3] = {normal[0], normal[1], normal[2]};
+  float facing = (n[0] * ray[0] + n[1] * ray[1] + n[2]) / length;
+  if (facing < kFlattest) {  // n = tangential + facing ray: keep the tangential part
+    float tangential[3], size = 0;
+    for (int k = 0; k < 3; ++k) tangential[k] = n[k] - facing * ray[k] / length, size += tangential[k] * tangential[k];
+    size = std::sqrt(size);
+    const float keep = size > 0 ? std::sqrt(1 - kFlattest * kFlattest) / size : 0;
+    for (int k = 0; k < 3; ++k) n[k] = keep * tangential[k] + kFlattest * ray[k] / length;
+    facing = kFlattest;
+  }
+  const float scale = w / (facing * length);
+  plane[0] = w, plane[1] = scale * n[0] / M.focal_x, plane[2] = scale * n[1] / M.focal_y;
+}
+
+inline void random_normal(Random& random, float n[3]) {
+  float square;
+  do {
+    for (int k = 0; k < 3; ++k) n[k] = random.next();
+    square = n[0] * n[0] + n[1] * n[1] + n[2] * n[2];
+  } while (square > 1 || square < 1e-3f);
+  const float length = std::sqrt(square);
+  for (int k = 0; k < 3; ++k) n[k] /= length;
+}
+
+inline void put(Planes& planes, int lane, const float plane[3]) {
+  planes.w[lane] = plane[0], planes.x[lane] = plane[1], planes.y[lane] = plane[2];
+}
+
+// Weights of the reference's window.
+inline void look(const PatchMatch& M, Packet& P) {
+  static thread_local float falls[256];
+  static thread_local bool made = false;
+  if (!made) {
+    for (int g = 0; g < 256; ++g) falls[g] = std::exp(-0.5f * float(g * g) / (kNearGrey * kNearGrey));
+    made = true;
+  }
+  constexpr float kFirst = -0.5f * kWindowStep * (kWindowSide - 1);
+  for (int l = 0; l < kWide; ++l) {
+    const int column = int(P.column[l]), row = int(P.row[l]);
+    const int middle = M.grey[row * M.width + column];
+    float weight[kSamples], grey[kSamples], total = 0, mean = 0;
+    int k = 0;
+    for (int i = 0; i < kWindowSide; ++i)
+      for (int j = 0; j < kWindowSide; ++j, ++k) {
+        // Samples lie on corners of pixels: kFirst is odd. The one beside the corner that is nearer to the middle.
+        const float down = kFirst + kWindowStep * i, right = kFirst + kWindowStep * j;
+        const int y = std::clamp(row + int(down), 0, M.height - 1), x = std::clamp(column + int(right), 0, M.width - 1);
+        const int g = M.grey[y * M.width + x];
+        grey[k] = float(g);
+        weight[k] =
+            falls[std::abs(g - middle)] * std::exp(-0.5f * (down * down + right * right) / (kNearPixels * kNearPixels));
+        total += weight[k], mean += weight[k] * grey[k];
+      }
+    mean /= total;
+    float variance = M.noise;
+    for (k = 0; k < kSamples; ++k) {
+      const float w = weight[k] / total, difference = grey[k] - mean;
+      P.weight[k][l] = w, P.centered[k][l] = w * difference, variance += w * difference * difference;
+    }
+    P.deviation[l] = std::sqrt(variance);
+  }
+}
+
+// The least of the windows' samples is at an odd distance from the middle: kWindowSide is even and the step is 2.
+static_assert(kWindowSide % 2 == 0 && kWindowStep == 2);
+
+// Minus the logarithm of how likely a plane is by the prior, and by its cost.
+inline float unlikely(const PatchMatch& M, const float* prior, int column, int row, float cost, const float plane[3]) {
+  const float depth = (plane[0] - prior[0]) / (kPriorDepth * (M.most - M.least));
+  float a[3], b[3];
+  normal_of(M, float(column), float(row), plane[0], plane[1], plane[2], a);
+  normal_of(M, float(column), float(row), prior[0], prior[1], prior[2], b);
+  const float cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+  const float angle2 = 2 * std::max(0.f, 1 - cosine) / (kPriorAngle * kPriorAngle);
+  return cost * cost / kPriorCost - std::log(0.5f + std::exp(-0.5f * (depth * depth + angle2)));
+}
+
+// What hypotheses are compared by, lane by lane: the cost, or with a prior how unlikely they are.
+inline F ranked(const PatchMatch& M, const Packet& P, F cost, const Planes& planes) {
+  if (!M.prior) return cost;
+  for (int l = 0; l < P.count; ++l) {
+    const float* prior = M.prior + 3 * P.at[l];
+    if (!(prior[0] >= 0)) {
+      cost[l] = cost[l] * cost[l] / kPriorCost;
+      continue;
+    }
+    const float plane[3] = {planes.w[l], planes.x[l], planes.y[l]};
+    cost[l] = unlikely(M, prior, int(P.column[l]), int(P.row[l]), cost[l], plane);
+  }
+  return cost;
+}
+
+void begin(const PatchMatch& M, Packet& P) {
+  Planes planes{};
+  for (int l = 0; l < kWide; ++l) {
+    const float* known = M.plane + 3 * P.at[l];
+    float plane[3] = {known[0], known[1], known[2]};
+    if (!(plane[0] >= 0)) {
+      Random random{mixed(M.seed ^ uint32_t(P.at[l]) * 0x9e3779b9u)};
+      float n[3];
+      random_normal(random, n);
+      n[2] = std::abs(n[2]);
+      plane_of(M, P.column[l], P.row[l], M.least + (M.most - M.least) * 0.5f * (1 + random.next()), n, plane);
+    }
+    put(planes, l, plane);
+  }
+  // The mean of the better half of the views.
+  F cost[kMostSources];
+  for (int v = 0; v < M.sources; ++v) cost[v] = view_cost(M, M.source[v], P, planes);
+  for (int l = 0; l < P.count; ++l) {
+    float sorted[kMostSources];
+    for (int v = 0; v < M.sources; ++v) sorted[v] = cost[v][l];
+    const int half = (M.sources + 1) / 2;
+    std::sort(sorted, sorted + M.sources);
+    float mean = 0;
+    uint8_t chosen = 0;
+    for (int v = 0; v < half; ++v) mean += sorted[v] / float(half);
+    for (int v = 0; v < M.sources; ++v) chosen |= uint8_t(cost[v][l] <= sorted[half - 1]) << v;
+    float* plane = M.plane + 3 * P.at[l];
+    plane[0] = planes.w[l], plane[1] = planes.x[l], plane[2] = planes.y[l];
+    M.cost[P.at[l]] = mean, M.chosen[P.at[l]] = chosen;
+  }
+}
+
+// Of each region round a pixel the plane of the least cost, taken to the pixel. All places have the other colour.
+inline void candidates(const PatchMatch& M, const Packet& P, Planes* found) {
+  // Near regions: a V of 7 pixels in each direction; far ones: 11 pixels along it.
+  static constexpr int direction[4][2] = {{0, -1}, {0, 1}, {-1, 0}, {1, 0}};
+  for (int l = 0; l < kWide; ++l) {
+    const int column = int(P.column[l]), row = int(P.row[l]);
+    for (int region = 0; region < kRegions; ++region) {
+      const int dx = direction[region % 4][0], dy = direction[region % 4][1];
+      int best = -1;
+      float least = 3 * kWorst;
+      const auto offer = [&](int x, int y) {
+        if (x < 0 || y < 0 || x >= M.width || y >= M.height) return;
+        const int at = y * M.width + x;
+        if (M.cost[at] < least) least = M.cost[at], best = at;
+      };
+      if (region < 4) {
+        offer(column + dx, row + dy);
+        for (int i = 1; i <= 3; ++i)
+          for (int side = -1; side <= 1; side += 2) {
+            // Along the direction 1 + i, aside i: the sum is odd.
+            offer(column + dx * (1 + i) + dy * side * i, row + dy * (1 + i) + dx * side * i);
+          }
+      } else {
+        for (int i = 0; i < 11; ++i) offer(column + dx * (3 + 2 * i), row + dy * (3 + 2 * i));
+      }
+      if (best < 0) best = P.at[l];
+      const float* plane = M.plane + 3 * best;
+      const float right = float(column - best % M.width), down = float(row - best / M.width);
+      const float moved[3] = {std::clamp(plane[0] + plane[1] * right + plane[2] * down, M.least, M.most), plane[1],
+                              plane[2]};
+      put(found[region], l, moved);
+    }
+  }
+}
+
+// Weights of the views from what they say of the candidates.
+inline void choose_views(const PatchMatch& M, Packet& P, const F (*cost)[kMostSources], int number) {
+  const float good = kGood * std::exp(-float(number * number) / kGoodFalls);
+  for (int l = 0; l < kWide; ++l) {
+    const int column = int(P.column[l]), row = int(P.row[l]);
+    float total = 0, weight[kMostSources];
+    for (int v = 0; v < M.sources; ++v) {
+      int agree = 0, contradict = 0;
+      float sum = 0;
+      for (int region = 0; region < kRegions; ++region) {
+        const float c = cost[region][v][l];
+        if (c < good) ++agree, sum += std::exp(-c * c / (2 * kCostSpread * kCostSpread));
+        if (c > kBad) ++contradict;
+      }
+      weight[v] = agree > 2 && contradict < 3 ? sum / float(agree) : 0;
+      // Neighbours that chose it.
+      float prior = 0.1f;
+      if (column > 0) prior += 0.225f * float(M.chosen[P.at[l] - 1] >> v & 1);
+      if (column + 1 < M.width) prior += 0.225f * float(M.chosen[P.at[l] + 1] >> v & 1);
+      if (row > 0) prior += 0.225f * float(M.chosen[P.at[l] - M.width] >> v & 1);
+      if (row + 1 < M.height) prior += 0.225f * float(M.chosen[P.at[l] + M.width] >> v & 1);
+      weight[v] *= prior, total += weight[v];
+    }
+    if (!(total > 0)) {  // None agrees: the better half by their least cost.
+      float least[kMostSources], sorted[kMostSources];
+      for (int v = 0; v < M.sources; ++v) {
+        least[v] = kWorst * 2;
+        for (int region = 0; region < kRegions; ++region) least[v] = std::min(least[v], cost[region][v][l]);
+        sorted[v] = least[v];
+      }
+      const int half = (M.sources + 1) / 2;
+      std::nth_element(sorted, sorted + half - 1, sorted + M.sources);
+      for (int v = 0; v < M.sources; ++v) weight[v] = float(least[v] <= sorted[half - 1]);
+    }
+    for (int v = 0; v < M.sources; ++v) P.view[v][l] = weight[v];
+  }
+}
+
+void iterate(const PatchMatch& M, Packet& P, int number) {
+  Planes found[kRegions], current{};
+  candidates(M, P, found);
+  for (int l = 0; l < kWide; ++l) put(current, l, M.plane + 3 * P.at[l]);
+  F cost[kRegions][kMostSources], own[kMostSources];
+  for (int region = 0; region < kRegions; ++region)
+    for (int v = 0; v < M.sources; ++v) cost[region][v] = view_cost(M, M.source[v], P, found[region]);
+  for (int v = 0; v < M.sources; ++v) own[v] = view_cost(M, M.source[v], P, current);
+  choose_views(M, P, cost, number);
+  F best_cost = joint_cost(M, P, own), best = ranked(M, P, best_cost, current);
+  const auto take = [&](const Planes& planes, F planes_cost) {
+    const F rank = ranked(M, P, planes_cost, planes);
+    const I better = rank < best;
+    best = better ? rank : best, best_cost = better ? planes_cost : best_cost;
+    current.w = better ? planes.w : current.w, current.x = better ? planes.x : current.x;
+    current.y = better ? planes.y : current.y;
+  };
+  for (int region = 0; region < kRegions; ++region) take(found[region], joint_cost(M, P, cost[region]));
+  if (M.prior) {
+    Planes likely = current;
+    for (int l = 0; l < P.count; ++l)
+      if (M.prior[3 * P.at[l]] >= 0) put(likely, l, M.prior + 3 * P.at[l]);
+    for (int v = 0; v < M.sources; ++v) own[v] = view_cost(M, M.source[v], P, likely);
+    take(likely, joint_cost(M, P, own));
+  }
+  // (d', n), (d, n'), (d', n'), (random d, n), (d, random n), as they are at first.
+  const Planes old = current;
+  Planes tried[kRefinements];
+  const float smaller = 1 / float(1 + number);
+  for (int l = 0; l < kWide; ++l) {
+    Random random{mixed(M.seed ^ mixed(uint32_t(P.at[l]) * 0x9e3779b9u + uint32_t(number + 1)))};
+    const float column = P.column[l], row = P.row[l], w = old.w[l];
+    float n[3], turned[3], other[3], plane[3];
+    normal_of(M, column, row, w, old.x[l], old.y[l], n);
+    const float step = kDepthStep * smaller * std::max(w, 0.05f * M.most);
+    const float moved = std::clamp(w + step * random.next(), M.least, M.most);
+    float size = 0;
+    for (int k = 0; k < 3; ++k) turned[k] = n[k] + kNormalStep * random.next(), size += turned[k] * turned[k];
+    for (int k = 0; k < 3; ++k) turned[k] /= std::sqrt(size);
+    const float anywhere = M.least + (M.most - M.least) * 0.5f * (1 + random.next());
+    random_normal(random, other);
+    other[2] = std::abs(other[2]);
+    plane_of(M, column, row, moved, n, plane), put(tried[0], l, plane);
+    plane_of(M, column, row, w, turned, plane), put(tried[1], l, plane);
+    plane_of(M, column, row, moved, turned, plane), put(tried[2], l, plane);
+    plane_of(M, column, row, anywhere, n, plane), put(tried[3], l, plane);
+    plane_of(M, column, row, w, other, plane), put(tried[4], l, plane);
+  }
+  for (const Planes& planes : tried) {
+    for (int v = 0; v < M.sources; ++v) own[v] = view_cost(M, M.source[v], P, planes);
+    take(planes, joint_cost(M, P, own));
+  }
+  for (int l = 0; l < P.count; ++l) {
+    float* plane = M.plane + 3 * P.at[l];
+    plane[0] = current.w[l], plane[1] = current.x[l], plane[2] = current.y[l];
+    M.cost[P.at[l]] = best_cost[l];
+    uint8_t chosen = 0;
+    for (int v = 0; v < M.sources; ++v) chosen |= uint8_t(P.view[v][l] > 0) << v;
+    M.chosen[P.at[l]] = chosen;
+  }
+}
+
+void row_of(const PatchMatch& M, PatchMatchStep step, int number, int row) {
+  const int stride = step == PatchMatchStep::kBegin ? 1 : 2;
+  const int first = step == PatchMatchStep::kBegin ? 0 : (row + (step == PatchMatchStep::kOdd)) % 2;
+  Packet P;
+  for (int column = first; column < M.width; column += stride * kWide) {
+    P.count = std::min(kWide, (M.width - column + stride - 1) / stride);
+    for (int l = 0; l < kWide; ++l) {
+      const int x = column + stride * std::min(l, P.count - 1);
+      P.column[l] = float(x), P.row[l] = float(row), P.at[l] = row * M.width + x;
+    }
+    look(M, P);
+    step == PatchMatchStep::kBegin ? begin(M, P) : iterate(M, P, number);
+  }
+}
+
+}  // namespace
+}  // namespace LINPRIM_ISA
+
+#define LINPRIM_JOIN2(a, b) a##b
+#define LINPRIM_JOIN(a, b) LINPRIM_JOIN2(a, b)
+PatchMatchKernel LINPRIM_JOIN(patch_match_kernel_, LINPRIM_ISA)() { return LINPRIM_ISA::row_of; }
+
+}  // namespace linprim

@@ -1,0 +1,56 @@
+"""The cost of planes in PatchMatch stereo, in float64: what `stereo_ops.patch_match` begins with."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from linprim_geo.geometry.camera import Camera
+
+# Samples of the window: so many per side, two pixels apart; standard deviations of its weights in pixels and grey
+# values; the cost of what cannot be compared.
+SIDE, NEAR_PIXELS, NEAR_GREY, WORST = 6, 5.0, 10.0, 2.0
+
+
+def match_cost(
+    camera: Camera, grey: np.ndarray, other: Camera, other_grey: np.ndarray, plane: np.ndarray, noise: float
+) -> np.ndarray:
+    """(H, W) 1 - normalised cross correlation of windows along (H, W, 3) planes of inverse depth, 0 to 2."""
+    height, width = grey.shape
+    offset = np.arange(1 - SIDE, SIDE, 2)
+    down, right = (x.ravel() for x in np.meshgrid(offset, offset, indexing="ij"))
+    cost = np.full(grey.shape, WORST)
+    for row in range(height):
+        for column in range(width):
+            y, x = np.clip(row + down, 0, height - 1), np.clip(column + right, 0, width - 1)
+            own = grey[y, x].astype(np.float64)
+            weight = np.exp(-0.5 * (own - grey[row, column]) ** 2 / NEAR_GREY**2)
+            weight *= np.exp(-0.5 * (down**2 + right**2) / NEAR_PIXELS**2)
+            weight /= weight.sum()
+            w, slope_x, slope_y = plane[row, column].astype(np.float64)
+            middle = _pixels(camera, other, np.array([column]), np.array([row]), np.array([w]))[0]
+            if not ((middle >= 0).all() and middle[0] <= other.width - 1.001 and middle[1] <= other.height - 1.001):
+                continue
+            there = _pixels(camera, other, column + right, row + down, w + slope_x * right + slope_y * down)
+            theirs = _bilinear(other_grey.astype(np.float64), there)
+            a, b = own - weight @ own, theirs - weight @ theirs
+            variances = (weight @ a**2 + noise) * (weight @ b**2 + noise)
+            cost[row, column] = np.clip(1 - (weight * a) @ b / np.sqrt(variances), 0, WORST)
+    return cost
+
+
+def _pixels(camera: Camera, other: Camera, column: np.ndarray, row: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """(N, 2) places in another image, 0 at the middle of its first pixel, of pixels at inverse depths."""
+    rays = np.stack([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, np.ones(len(row))])
+    pose = other.world_to_camera @ np.linalg.inv(camera.world_to_camera)
+    p = pose[:3, :3] @ rays + pose[:3, 3:] * inverse
+    if (p[2] <= 0).any():
+        return np.full((len(row), 2), -1.0)
+    return np.stack([other.fx * p[0] / p[2] + other.cx - 0.5, other.fy * p[1] / p[2] + other.cy - 0.5], axis=1)
+
+
+def _bilinear(image: np.ndarray, places: np.ndarray) -> np.ndarray:
+    u, v = (np.clip(places[:, k], 0, image.shape[1 - k] - 1.001) for k in (0, 1))
+    x, y = u.astype(int), v.astype(int)
+    a, b = u - x, v - y
+    top, bottom = (image[y + k, x] * (1 - a) + image[y + k, x + 1] * a for k in (0, 1))
+    return top * (1 - b) + bottom * b

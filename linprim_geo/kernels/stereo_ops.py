@@ -1,0 +1,113 @@
+"""The core's PatchMatch stereo: a plane of inverse depth for every pixel of a photograph."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from linprim_geo import _core
+from linprim_geo.geometry.camera import Camera
+
+
+@dataclass(frozen=True)
+class StereoImage:
+    """A photograph as stereo takes it: `camera`, `grey` (H, W) uint8, and `quads` (H, W) uint32, which hold the grey
+    values of 2 by 2 pixels."""
+
+    camera: Camera
+    grey: np.ndarray
+    quads: np.ndarray
+
+    @classmethod
+    def of(cls, camera: Camera, grey: np.ndarray) -> StereoImage:
+        """Of (H, W) uint8 grey values. Pixels beyond the right and lower border are those at it."""
+        padded = np.pad(grey, ((0, 1), (0, 1)), mode="edge").astype(np.uint32)
+        quads = padded[:-1, :-1] | padded[:-1, 1:] << 8 | padded[1:, :-1] << 16 | padded[1:, 1:] << 24
+        return cls(camera, np.ascontiguousarray(grey), np.ascontiguousarray(quads))
+
+
+@dataclass
+class DepthPlanes:
+    """Planes of a photograph's pixels: `plane` (H, W, 3) float32 inverse depth and how it changes per column and row,
+    `cost` (H, W) float32 from 0 (all agree) to 2, `chosen` (H, W) uint8 with a bit for each source that agrees."""
+
+    plane: np.ndarray
+    cost: np.ndarray
+    chosen: np.ndarray
+
+    @classmethod
+    def unknown(cls, height: int, width: int) -> DepthPlanes:
+        """Planes of NaN: `patch_match` begins with random ones there."""
+        return cls(
+            np.full((height, width, 3), np.nan, np.float32),
+            np.full((height, width), 2, np.float32),
+            np.zeros((height, width), np.uint8),
+        )
+
+
+def patch_match(
+    image: StereoImage,
+    sources: list[StereoImage],
+    planes: DepthPlanes,
+    inverse_depths: tuple[float, float],
+    noise: float,
+    iterations: int,
+    *,
+    first: int = 0,
+    seed: int = 0,
+    source_depths: list[np.ndarray] | None = None,
+    prior: np.ndarray | None = None,
+) -> None:
+    """Improves the planes of an image in place: their cost is found anew, then `iterations` red-black sweeps.
+
+    The cost of a plane in a source is 1 minus the normalised cross correlation of windows of 11 by 11 pixels, with
+    bilateral weights and `noise` added to both variances, so that windows without texture agree and disagree by
+    nothing. With `source_depths` 0.1 is added for every pixel that a point misses its own by when it comes back from
+    the surface there, up to 0.4. With `prior` planes that are near to it are preferred as their likelihood says.
+
+    Args:
+        sources: 1 to 8 photographs to compare with.
+        inverse_depths: least (0: infinity) and largest.
+        noise: variance of grey values.
+        first: number of the first sweep; steps get smaller and views are chosen more strictly with it.
+        source_depths: (H, W) float32 inverse depths of each source, NaN where unknown.
+        prior: (H, W, 3) float32 planes, NaN where there is none.
+
+    Raises:
+        ValueError: shapes or dtypes that do not fit.
+
+    Results depend on the seed, not on the number of threads; the last bits also on the instruction set.
+    """
+    given = []
+    for number, source in enumerate(sources):
+        to, shift = _between(image.camera, source.camera)
+        back, back_shift = _between(source.camera, image.camera)
+        depth = None if source_depths is None else source_depths[number]
+        given.append((to, shift, back, back_shift, source.quads, depth))
+    camera = image.camera
+    lens = (camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5)
+    _core.patch_match(
+        image.grey,
+        lens,
+        inverse_depths,
+        noise,
+        seed,
+        given,
+        prior,
+        True,
+        first,
+        iterations,
+        planes.plane,
+        planes.cost,
+        planes.chosen,
+    )
+
+
+def _between(one: Camera, other: Camera) -> tuple[list[float], list[float]]:
+    """The 9 numbers A and 3 numbers b with A (x, y, 1) + b w the homogeneous pixel in `other` of the pixel (x, y) of
+    `one` at inverse depth w; the middle of the first pixel is (0, 0)."""
+    pose = other.world_to_camera @ np.linalg.inv(one.world_to_camera)
+    centered = [camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]] for camera in (one, other)]
+    to = centered[1] @ pose[:3, :3] @ np.linalg.inv(centered[0])
+    return to.reshape(-1).tolist(), (centered[1] @ pose[:3, 3]).tolist()

@@ -1,0 +1,216 @@
+"""Depth and normals of every photograph of a capture by PatchMatch stereo.
+
+Each photograph is matched with a few that show the same points under an angle: at half the size from random planes,
+then at full size, then twice more with the depths that its neighbours have found. A depth counts where neighbours see
+the same surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.progress import Progress
+from linprim_geo.capture.types import View
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, patch_match
+from linprim_geo.points.view_pairs import source_views
+
+# Sweeps at half the size, at full size, and in each of the passes in which depths of neighbours are compared.
+COARSE_SWEEPS, FINE_SWEEPS, GEOMETRIC_SWEEPS = 3, 1, (1, 1)
+# The nearest depth is that of the nearest points that a view shows, but for this share, divided by NEARER.
+NEAREST_SHARE, NEARER = 0.01, 1.5
+# A depth is confirmed by another view that comes back to within so many pixels, and so near in depth.
+CONFIRMED_PX, CONFIRMED_DEPTH = 1.0, 0.01
+# Variance of grey values that rounding them causes, at least.
+LEAST_NOISE = 1.0
+# Costs above this are those of windows that do not match.
+MOST_COST = 0.9
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """What stereo says of a photograph.
+
+    `depth` (H, W) float32 along the optical axis in the scene's unit, NaN where unknown; `normal` (H, W, 3) float32 in
+    the world, towards the camera; `cost` (H, W) float32 of the match, 0 to 2; `confirmed` (H, W) uint8, by how many
+    other views.
+    """
+
+    camera: Camera
+    depth: np.ndarray
+    normal: np.ndarray
+    cost: np.ndarray
+    confirmed: np.ndarray
+
+
+def depth_maps(views: Sequence[View], points: np.ndarray, *, seed: int = 0, quiet: bool = True) -> list[DepthMap]:
+    """Depth maps of all views, in their order.
+
+    Args:
+        views: posed photographs.
+        points: (P, 3) of the scene, by which views that see the same are found, and the range of depths.
+
+    Raises:
+        LinprimError: there are no two views that see the same points.
+    """
+    cameras = [view.camera for view in views]
+    pairs = source_views(cameras, points)
+    if not any(pairs):
+        raise LinprimError(
+            "no two photographs show the same points from directions that differ: stereo needs such pairs"
+        )
+    full = [StereoImage.of(view.camera, grey_of(view)) for view in views]
+    half = [_halved(image) for image in full]
+    noises = [noise_of(image.grey) for image in full]
+    ranges = [_range_of(camera, points) for camera in cameras]
+    progress = Progress("stereo", len(views) * (1 + len(GEOMETRIC_SWEEPS)), quiet=quiet)
+    found: list[DepthPlanes | None] = []
+    for k, sources in enumerate(pairs):
+        progress.update(k)
+        if not sources:
+            found.append(None)
+            continue
+        coarse = DepthPlanes.unknown(*half[k].grey.shape)
+        near, part = [half[j] for j in sources], seed * len(views) + k
+        patch_match(half[k], near, coarse, ranges[k], noises[k] / 4, COARSE_SWEEPS, seed=part)
+        planes = _doubled(coarse, full[k].grey.shape)
+        near = [full[j] for j in sources]
+        patch_match(full[k], near, planes, ranges[k], noises[k], FINE_SWEEPS, first=COARSE_SWEEPS, seed=part)
+        found.append(planes)
+    for turn, sweeps in enumerate(GEOMETRIC_SWEEPS):
+        # What the neighbours have found before this turn, whichever of them come first in it.
+        depths = {k: planes.plane[..., 0].copy() for k, planes in enumerate(found) if planes is not None}
+        for k, planes in enumerate(found):
+            progress.update((1 + turn) * len(views) + k)
+            sources = [j for j in pairs[k] if j in depths]
+            if planes is None or not sources:
+                continue
+            near, first, part = [full[j] for j in sources], COARSE_SWEEPS + FINE_SWEEPS + turn, seed * len(views) + k
+            theirs = [depths[j] for j in sources]
+            patch_match(
+                full[k], near, planes, ranges[k], noises[k], sweeps, first=first, seed=part, source_depths=theirs
+            )
+    return [
+        _depth_map(cameras[k], planes, [(cameras[j], found[j]) for j in pairs[k]]) for k, planes in enumerate(found)
+    ]
+
+
+def grey_of(view: View) -> np.ndarray:
+    """(H, W) uint8 luminance of a photograph."""
+    return np.rint(view.load().rgb @ np.array([0.299, 0.587, 0.114], np.float32)).astype(np.uint8)
+
+
+def noise_of(grey: np.ndarray) -> float:
+    """Variance of the noise of (H, W) grey values, LEAST_NOISE at least: by what a second difference across both
+    directions, which planes and edges along either cancel from, is in the median. Source: Immerkaer 1996, with the
+    median in place of the mean."""
+    g = grey.astype(np.float32)
+    across = g[:, :-2] - 2 * g[:, 1:-1] + g[:, 2:]
+    both = across[:-2] - 2 * across[1:-1] + across[2:]
+    return max(LEAST_NOISE, float(np.median(np.abs(both)) / 0.6745) ** 2 / 36)
+
+
+def _halved(image: StereoImage) -> StereoImage:
+    """Means of 2 by 2 pixels."""
+    grey, camera = image.grey, image.camera
+    height, width = (size // 2 for size in grey.shape)
+    mean = grey[: 2 * height, : 2 * width].reshape(height, 2, width, 2).mean((1, 3))
+    half = replace(
+        camera,
+        width=width,
+        height=height,
+        fx=camera.fx / 2,
+        fy=camera.fy / 2,
+        cx=camera.cx / 2,
+        cy=camera.cy / 2,
+    )
+    return StereoImage.of(half, np.rint(mean).astype(np.uint8))
+
+
+def _doubled(planes: DepthPlanes, shape: tuple[int, int]) -> DepthPlanes:
+    """Planes of an image of half the size as those of one of (H, W)."""
+    rows, columns = (
+        np.minimum(np.arange(size) // 2, coarse - 1) for size, coarse in zip(shape, planes.cost.shape, strict=True)
+    )
+    found = planes.plane[np.ix_(rows, columns)].copy()
+    found[..., 1:] /= 2
+    # From the middle of the coarse pixel to that of the fine one, in fine pixels.
+    right, down = (np.arange(size) - 2 * index - 0.5 for size, index in ((shape[1], columns), (shape[0], rows)))
+    found[..., 0] += found[..., 1] * right + found[..., 2] * down[:, None]
+    found[..., 0] = np.maximum(found[..., 0], 0)
+    return DepthPlanes(found, planes.cost[np.ix_(rows, columns)].copy(), planes.chosen[np.ix_(rows, columns)].copy())
+
+
+def _range_of(camera: Camera, points: np.ndarray) -> tuple[float, float]:
+    """The least and the largest inverse depth that a camera may see; the least is infinity's."""
+    pixels, depth = camera.project(points)
+    inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
+    if not inside.any():
+        inside = depth > 0
+    nearest = float(np.quantile(depth[inside], NEAREST_SHARE)) if inside.any() else 1.0
+    return 0.0, NEARER / nearest
+
+
+def _depth_map(camera: Camera, planes: DepthPlanes | None, others: list[tuple[Camera, DepthPlanes | None]]) -> DepthMap:
+    height, width = camera.height, camera.width
+    if planes is None:
+        empty = np.full((height, width), np.nan, np.float32)
+        return DepthMap(camera, empty, np.zeros((height, width, 3), np.float32), empty, np.zeros_like(empty, np.uint8))
+    inverse, slope_x, slope_y = (planes.plane[..., k].astype(np.float64) for k in range(3))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = 1 / inverse
+    column, row = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
+    # n . X = 1 for X = ray / inverse: n . ray = inverse along the image.
+    normal = np.stack(
+        [
+            slope_x * camera.fx,
+            slope_y * camera.fy,
+            inverse - slope_x * (column - camera.cx) - slope_y * (row - camera.cy),
+        ],
+        axis=-1,
+    )
+    normal = -(normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)) @ camera.rotation
+    confirmed = np.zeros((height, width), np.uint8)
+    for other, theirs in others:
+        if theirs is not None:
+            confirmed += confirmed_by(camera, depth, other, theirs.plane[..., 0])
+    known = (inverse > 0) & (planes.cost < MOST_COST)
+    return DepthMap(
+        camera,
+        np.where(known, depth, np.nan).astype(np.float32),
+        normal.astype(np.float32),
+        planes.cost,
+        np.where(known, confirmed, 0).astype(np.uint8),
+    )
+
+
+def confirmed_by(camera: Camera, depth: np.ndarray, other: Camera, inverse: np.ndarray) -> np.ndarray:
+    """(H, W) bool, where another camera's surface, of (H', W') inverse depths, is the same as that of (H, W) depths."""
+    known = np.isfinite(depth) & (depth > 0)
+    result = np.zeros(depth.shape, bool)
+    rows, columns = np.nonzero(known)
+    points = _points(camera, columns + 0.5, rows + 0.5, depth[known])
+    pixels, z = other.project(points)
+    with np.errstate(invalid="ignore"):
+        seen = (z > 0) & (pixels >= 0).all(1) & (pixels < (other.width, other.height)).all(1)
+    u, v = pixels[seen].astype(np.int64).T
+    there = inverse[v, u]
+    # On the plane through their pixel's middle, looked at along their ray.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        theirs = _points(other, pixels[seen, 0], pixels[seen, 1], 1 / there)
+    back, back_z = camera.project(theirs)
+    with np.errstate(invalid="ignore"):
+        near = np.hypot(back[:, 0] - columns[seen] - 0.5, back[:, 1] - rows[seen] - 0.5) < CONFIRMED_PX
+        near &= np.abs(back_z - depth[known][seen]) < CONFIRMED_DEPTH * depth[known][seen]
+    result[rows[seen], columns[seen]] = near & (there > 0)
+    return result
+
+
+def _points(camera: Camera, column: np.ndarray, row: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """World points at these places of the image and depths."""
+    rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones(len(column))], axis=1)
+    return (rays * depth[:, None] - camera.world_to_camera[:3, 3]) @ camera.rotation

@@ -1,0 +1,166 @@
+"""PatchMatch stereo in the core: its cost against float64, planes that it has to find, bits that must not change."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.captures import look_at
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.kernels import ops
+from linprim_geo.kernels.reference.stereo import match_cost
+from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, patch_match
+
+# A wall through the origin, seen from points around (0, 0, -3).
+NORMAL = np.array([0.35, -0.2, 1.0]) / np.linalg.norm([0.35, -0.2, 1.0])
+
+
+def camera_at(position, width: int = 60, height: int = 44, focal: float = 70.0) -> Camera:
+    shift = (0.01 * width, -0.02 * height)
+    return look_at(position, size=(width, height), focal=focal, up=(0.0, 1.0, 0.0), shift=shift)
+
+
+CAMERAS = [camera_at(p) for p in ((0, 0, -3), (0.5, 0, -2.9), (-0.5, 0.1, -3), (0.1, 0.5, -3), (0, -0.5, -2.9))]
+
+
+def texture(points: np.ndarray) -> np.ndarray:
+    """Grey values of world points: a sum of waves of 3 to 12 pixels."""
+    rng = np.random.default_rng(1)
+    value = np.zeros(points.shape[:-1])
+    for _ in range(24):
+        wave = rng.normal(size=3)
+        wave *= 2 * np.pi / (np.linalg.norm(wave) * rng.uniform(0.13, 0.5))
+        value += np.sin(points @ wave + rng.uniform(0, 2 * np.pi))
+    return np.clip(127 + 16 * value, 0, 255)
+
+
+def wall_depth(camera: Camera) -> np.ndarray:
+    """(H, W) depth of the wall."""
+    return -(camera.center @ NORMAL) / (camera.world_rays() @ NORMAL)
+
+
+def picture(camera: Camera, noise: float = 0.0, seed: int = 0) -> StereoImage:
+    points = camera.center + camera.world_rays() * wall_depth(camera)[..., None]
+    grey = texture(points) + noise * np.random.default_rng(seed).normal(size=points.shape[:2])
+    return StereoImage.of(camera, np.rint(np.clip(grey, 0, 255)).astype(np.uint8))
+
+
+@pytest.fixture(scope="module")
+def images() -> list[StereoImage]:
+    return [picture(camera, 1.0, k) for k, camera in enumerate(CAMERAS)]
+
+
+def some_planes(camera: Camera, seed: int = 0) -> DepthPlanes:
+    """Planes near the wall and far from it."""
+    rng = np.random.default_rng(seed)
+    planes = DepthPlanes.unknown(camera.height, camera.width)
+    planes.plane[..., 0] = (1 / wall_depth(camera)) * rng.uniform(0.8, 1.2, (camera.height, camera.width))
+    planes.plane[..., 1:] = rng.normal(0, 2e-3, (camera.height, camera.width, 2))
+    return planes
+
+
+def test_the_cost_agrees_with_float64(images):
+    small = [camera_at(c.center, 23, 17, 27.0) for c in CAMERAS[:2]]
+    a, b = (picture(camera) for camera in small)
+    planes = some_planes(small[0])
+    wanted = match_cost(small[0], a.grey, small[1], b.grey, planes.plane, 1.5)
+    patch_match(a, [b], planes, (0.0, 1.0), 1.5, 0)
+    assert (wanted < 1.9).mean() > 0.5 and (wanted == 2).any()
+    # Windows of grey values up to 255 in float32: a relative rounding of 6e-8 of squares of up to 255^2, 36 of them,
+    # against variances of 1.5 at least.
+    assert np.abs(planes.cost - wanted).max() < 36 * 6e-8 * 255**2 / 1.5
+
+
+def test_it_finds_a_slanted_wall(images):
+    planes = DepthPlanes.unknown(*images[0].grey.shape)
+    patch_match(images[0], images[1:], planes, (0.0, 0.8), 1.0, 5)
+    inside = np.s_[6:-6, 6:-6]  # where no window reaches beyond the photograph
+    error = np.abs(1 / planes.plane[..., 0] / wall_depth(CAMERAS[0]) - 1)[inside]
+    # A pixel of disparity is 3 / (70 * 0.5) = 9 % of the depth.
+    assert np.median(error) < 0.003 and (error < 0.01).mean() > 0.97
+
+
+def test_a_far_wall_is_told_from_a_near_one():
+    """Rays of pure rotation agree at infinity and nowhere else."""
+    near, far = CAMERAS[0], []
+    for camera in CAMERAS:
+        rays = camera.world_rays()
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        far.append(StereoImage.of(camera, np.rint(texture(6 * rays)).astype(np.uint8)))
+    planes = DepthPlanes.unknown(*far[0].grey.shape)
+    patch_match(far[0], far[1:], planes, (0.0, 0.8), 1.0, 5)
+    assert np.median(planes.plane[8:-8, 8:-8, 0]) < 0.01 / np.median(wall_depth(near))
+
+
+def test_what_has_no_texture_neither_agrees_nor_disagrees():
+    rng = np.random.default_rng(3)
+    plain = [StereoImage.of(c, (100 + (rng.random((c.height, c.width)) < 0.5)).astype(np.uint8)) for c in CAMERAS]
+    planes = some_planes(CAMERAS[0])
+    planes.plane[..., 0] = 1 / wall_depth(CAMERAS[0])
+    patch_match(plain[0], plain[1:], planes, (0.0, 0.8), 25.0, 0)
+    # Variances of a quarter beside noise of 25: correlations below a hundredth.
+    assert np.abs(planes.cost[10:-10, 10:-10] - 1).max() < 0.012
+
+
+def test_a_prior_decides_where_photographs_do_not():
+    plain = [StereoImage.of(c, np.full((c.height, c.width), 90, np.uint8)) for c in CAMERAS]
+    prior = np.zeros((CAMERAS[0].height, CAMERAS[0].width, 3), np.float32)
+    prior[..., 0] = 1 / wall_depth(CAMERAS[0])
+    prior[..., 1] = np.gradient(prior[..., 0], axis=1)
+    prior[..., 2] = np.gradient(prior[..., 0], axis=0)
+    prior[:, :20] = np.nan
+    planes = DepthPlanes.unknown(*plain[0].grey.shape)
+    patch_match(plain[0], plain[1:], planes, (0.0, 0.8), 1.0, 2, prior=prior)
+    found, wanted = planes.plane[8:-8, 26:-8, 0], prior[8:-8, 26:-8, 0]
+    assert np.abs(found / wanted - 1).max() < 0.02
+    assert np.abs(planes.plane[:, :12, 0] * wall_depth(CAMERAS[0])[:, :12] - 1).mean() > 0.1
+
+
+def test_depths_of_neighbours_that_contradict_cost_more(images):
+    planes = some_planes(CAMERAS[0])
+    planes.plane[..., 0] = 1 / wall_depth(CAMERAS[0])
+    alone, right, wrong = (DepthPlanes(planes.plane.copy(), planes.cost.copy(), planes.chosen.copy()) for _ in range(3))
+    truth = [(1 / wall_depth(camera)).astype(np.float32) for camera in CAMERAS[1:]]
+    patch_match(images[0], images[1:], alone, (0.0, 0.8), 1.0, 0)
+    patch_match(images[0], images[1:], right, (0.0, 0.8), 1.0, 0, source_depths=truth)
+    patch_match(images[0], images[1:], wrong, (0.0, 0.8), 1.0, 0, source_depths=[1.3 * w for w in truth])
+    inside = np.s_[10:-10, 10:-10]
+    # Neighbours' depths are those of the nearest pixel: it comes back to within a pixel.
+    assert np.median((right.cost - alone.cost)[inside]) < 0.1 < np.median((wrong.cost - alone.cost)[inside])
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_threads_change_no_bit(images, threads):
+    before, found = ops.threads(), []
+    try:
+        for count in (1, threads):
+            ops.set_threads(count)
+            planes = DepthPlanes.unknown(*images[0].grey.shape)
+            patch_match(images[0], images[1:], planes, (0.0, 0.8), 1.0, 2, seed=5)
+            found.append(planes)
+    finally:
+        ops.set_threads(before)
+    assert all(np.array_equal(getattr(found[0], k), getattr(found[1], k)) for k in ("plane", "cost", "chosen"))
+
+
+def test_all_instruction_sets_have_the_same_costs(images):
+    before, costs = ops.instruction_set(), []
+    try:
+        for name in ("scalar", before):
+            ops.set_instruction_set(name)
+            planes = some_planes(CAMERAS[0])
+            patch_match(images[0], images[1:], planes, (0.0, 0.8), 1.0, 0)
+            costs.append(planes.cost)
+    finally:
+        ops.set_instruction_set(before)
+    assert np.abs(costs[0] - costs[1]).max() < 36 * 6e-8 * 255**2  # as against float64, with variances of 1 at least
+
+
+def test_what_does_not_fit_is_refused(images):
+    planes = DepthPlanes.unknown(*images[0].grey.shape)
+    with pytest.raises(ValueError, match="1 to 8 sources"):
+        patch_match(images[0], [], planes, (0.0, 0.8), 1.0, 1)
+    with pytest.raises(ValueError, match="not positive"):
+        patch_match(images[0], images[1:], planes, (0.5, 0.5), 1.0, 1)
+    with pytest.raises(ValueError, match="plane"):
+        patch_match(images[0], images[1:], DepthPlanes.unknown(5, 5), (0.0, 0.8), 1.0, 1)

@@ -1,0 +1,99 @@
+"""Depth maps of several photographs: of a wall whose depth and normal are known, and the steps that lead to them."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.captures import look_at
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.capture.types import Photo
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage
+from linprim_geo.stereo.depth_maps import _doubled, _halved, confirmed_by, depth_maps, noise_of
+
+NORMAL = np.array([0.3, -0.25, 1.0]) / np.linalg.norm([0.3, -0.25, 1.0])
+CENTERS = [(0, 0, -3), (0.5, 0, -2.9), (-0.5, 0.1, -3), (0.1, 0.5, -3), (0, -0.5, -2.9)]
+
+
+def depth_of(camera: Camera) -> np.ndarray:
+    """(H, W) depth of a wall through the origin."""
+    return -(camera.center @ NORMAL) / (camera.world_rays() @ NORMAL)
+
+
+def wall_view(center) -> SimpleNamespace:
+    """A photograph of the wall, with waves of 4 to 15 pixels on it."""
+    camera = look_at(center, size=(96, 72), focal=110.0, up=(0.0, 1.0, 0.0))
+    points = camera.center + camera.world_rays() * depth_of(camera)[..., None]
+    rng = np.random.default_rng(1)
+    value = np.zeros(points.shape[:2])
+    for _ in range(24):
+        wave = rng.normal(size=3)
+        wave *= 2 * np.pi / (np.linalg.norm(wave) * rng.uniform(0.11, 0.4))
+        value += np.sin(points @ wave + rng.uniform(0, 2 * np.pi))
+    grey = np.rint(np.clip(127 + 16 * value, 0, 255)).astype(np.uint8)
+    return SimpleNamespace(camera=camera, load=lambda: Photo(np.repeat(grey[..., None], 3, 2)))
+
+
+@pytest.fixture(scope="module")
+def views() -> list[SimpleNamespace]:
+    return [wall_view(center) for center in CENTERS]
+
+
+@pytest.fixture(scope="module")
+def wall_points(views) -> np.ndarray:
+    camera = views[0].camera
+    return (camera.center + camera.world_rays() * depth_of(camera)[..., None])[::5, ::5].reshape(-1, 3)
+
+
+def test_a_wall_is_where_it_is_and_neighbours_confirm_it(views, wall_points):
+    maps = depth_maps(views, wall_points)
+    first = maps[0]
+    inside = np.s_[10:-10, 10:-10]
+    error = np.abs(first.depth / depth_of(first.camera) - 1)[inside]
+    # A pixel of disparity is 3 / (110 * 0.5) = 5 % of the depth; a tenth of one is expected of windows of 11 pixels.
+    assert np.nanmedian(error) < 0.002 and (error < 0.01).mean() > 0.97  # a few are not known
+    assert (first.confirmed[inside] >= 2).mean() > 0.95
+    # Towards the camera, and the wall's: a window's depth changes by a tenth of a pixel within 5 of them.
+    angle = np.degrees(np.arccos(np.clip(-first.normal[inside] @ NORMAL, -1, 1)))
+    assert np.median(angle) < 5
+
+
+def test_views_that_share_nothing_are_one_sentence(views):
+    behind = np.array([[0.0, 0.0, -50.0]])
+    with pytest.raises(LinprimError, match="stereo needs such pairs"):
+        depth_maps(views, behind)
+
+
+def test_noise_is_measured_past_what_the_picture_shows():
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:200, :300]
+    smooth = 60 + 0.3 * x + 0.2 * y + 20 * np.sin(x / 30)
+    for deviation in (2.0, 6.0):
+        grey = np.rint(smooth + deviation * rng.normal(size=smooth.shape)).astype(np.uint8)
+        # A median of 60,000 values has a standard error below 1 %; they are correlated over 3 by 3 pixels.
+        assert np.sqrt(noise_of(grey)) == pytest.approx(deviation, rel=0.05)
+    assert noise_of(np.rint(smooth).astype(np.uint8)) == 1.0
+
+
+def test_planes_of_half_the_size_are_those_of_the_whole(views):
+    image = StereoImage.of(views[0].camera, np.zeros((72, 96), np.uint8))
+    half = _halved(image)
+    inverse = 1 / depth_of(half.camera)
+    plane = np.stack([inverse, np.gradient(inverse, axis=1), np.gradient(inverse, axis=0)], -1).astype(np.float32)
+    coarse = DepthPlanes(plane, np.zeros(inverse.shape, np.float32), np.zeros(inverse.shape, np.uint8))
+    fine = _doubled(coarse, (72, 96)).plane
+    wanted = 1 / depth_of(views[0].camera)
+    assert np.allclose(fine[..., 0], wanted, rtol=1e-5)
+    assert np.allclose(fine[..., 1], np.gradient(wanted, axis=1), atol=1e-6)
+
+
+def test_another_surface_confirms_nothing(views):
+    one, other = views[0].camera, views[1].camera
+    depth, inverse = depth_of(one), 1 / depth_of(other)
+    assert confirmed_by(one, depth, other, inverse)[10:-10, 20:-20].all()
+    assert not confirmed_by(one, depth, other, 0.9 * inverse).any()
+    assert not confirmed_by(one, depth, other, np.full_like(inverse, np.nan)).any()
+    assert not confirmed_by(one, np.full_like(depth, np.nan), other, inverse).any()
