@@ -235,6 +235,9 @@ class ExtractOptions:
         "pixels can tell apart",
         metavar="LENGTH",
     )
+    stereo: bool = option(
+        False, "take the depths that PatchMatch stereo finds in the photographs where views confirm them (tsdf)"
+    )
     smallest_part: float = option(0.01, "drop components with less than this share of the largest one's area")
     refine: int = option(
         2,

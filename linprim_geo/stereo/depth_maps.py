@@ -45,6 +45,8 @@ class DepthMap:
     normal: np.ndarray
     cost: np.ndarray
     confirmed: np.ndarray
+    deviation: np.ndarray
+    sources: int
 
 
 def depth_maps(views: Sequence[View], points: np.ndarray, *, seed: int = 0, quiet: bool = True) -> list[DepthMap]:
@@ -159,7 +161,8 @@ def _depth_map(camera: Camera, planes: DepthPlanes | None, others: list[tuple[Ca
     height, width = camera.height, camera.width
     if planes is None:
         empty = np.full((height, width), np.nan, np.float32)
-        return DepthMap(camera, empty, np.zeros((height, width, 3), np.float32), empty, np.zeros_like(empty, np.uint8))
+        none = np.zeros((height, width), np.uint8)
+        return DepthMap(camera, empty, np.zeros((height, width, 3), np.float32), empty, none, empty, 0)
     inverse, slope_x, slope_y = (planes.plane[..., k].astype(np.float64) for k in range(3))
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = 1 / inverse
@@ -175,9 +178,12 @@ def _depth_map(camera: Camera, planes: DepthPlanes | None, others: list[tuple[Ca
     )
     normal = -(normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)) @ camera.rotation
     confirmed = np.zeros((height, width), np.uint8)
+    deviation = np.full((height, width), np.inf, np.float32)
     for other, theirs in others:
         if theirs is not None:
-            confirmed += confirmed_by(camera, depth, other, theirs.plane[..., 0])
+            miss, relative = misses(camera, depth, other, theirs.plane[..., 0])
+            confirmed += (miss < CONFIRMED_PX) & (relative < CONFIRMED_DEPTH)
+            deviation = np.fmin(deviation, relative)
     known = (inverse > 0) & (planes.cost < MOST_COST)
     return DepthMap(
         camera,
@@ -185,29 +191,29 @@ def _depth_map(camera: Camera, planes: DepthPlanes | None, others: list[tuple[Ca
         normal.astype(np.float32),
         planes.cost,
         np.where(known, confirmed, 0).astype(np.uint8),
+        deviation,
+        sum(theirs is not None for _, theirs in others),
     )
 
 
-def confirmed_by(camera: Camera, depth: np.ndarray, other: Camera, inverse: np.ndarray) -> np.ndarray:
-    """(H, W) bool, where another camera's surface, of (H', W') inverse depths, is the same as that of (H, W) depths."""
-    known = np.isfinite(depth) & (depth > 0)
-    result = np.zeros(depth.shape, bool)
-    rows, columns = np.nonzero(known)
-    points = _points(camera, columns + 0.5, rows + 0.5, depth[known])
-    pixels, z = other.project(points)
+def misses(camera: Camera, depth: np.ndarray, other: Camera, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far points of (H, W) depths come back from where they are when another camera's surface, of (H', W') inverse
+    depths, is taken in their place: (H, W) float32 pixels and share of the depth, infinite where it sees none."""
+    result = np.full((2, *depth.shape), np.inf, np.float32)
+    rows, columns = np.nonzero(np.isfinite(depth) & (depth > 0))
+    own = depth[rows, columns]
+    pixels, z = other.project(_points(camera, columns + 0.5, rows + 0.5, own))
     with np.errstate(invalid="ignore"):
         seen = (z > 0) & (pixels >= 0).all(1) & (pixels < (other.width, other.height)).all(1)
-    u, v = pixels[seen].astype(np.int64).T
+    rows, columns, own, pixels = rows[seen], columns[seen], own[seen], pixels[seen]
+    u, v = pixels.astype(np.int64).T
     there = inverse[v, u]
-    # On the plane through their pixel's middle, looked at along their ray.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        theirs = _points(other, pixels[seen, 0], pixels[seen, 1], 1 / there)
-    back, back_z = camera.project(theirs)
-    with np.errstate(invalid="ignore"):
-        near = np.hypot(back[:, 0] - columns[seen] - 0.5, back[:, 1] - rows[seen] - 0.5) < CONFIRMED_PX
-        near &= np.abs(back_z - depth[known][seen]) < CONFIRMED_DEPTH * depth[known][seen]
-    result[rows[seen], columns[seen]] = near & (there > 0)
-    return result
+    known = there > 0  # not where it is NaN
+    rows, columns, own, pixels = rows[known], columns[known], own[known], pixels[known]
+    back, back_z = camera.project(_points(other, pixels[:, 0], pixels[:, 1], 1 / there[known].astype(np.float64)))
+    result[0, rows, columns] = np.hypot(back[:, 0] - columns - 0.5, back[:, 1] - rows - 0.5)
+    result[1, rows, columns] = np.abs(back_z / own - 1)
+    return result[0], result[1]
 
 
 def _points(camera: Camera, column: np.ndarray, row: np.ndarray, depth: np.ndarray) -> np.ndarray:

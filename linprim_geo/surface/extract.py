@@ -113,6 +113,8 @@ def extract_mesh(
         raise LinprimError("--time-budget chooses the voxel size: wanted one of it and --voxel-size")
     if blocks < 1:
         raise LinprimError(f"--blocks is {blocks}, wanted a number from 1")
+    if options.stereo and (blocks > 1 or method != "tsdf"):
+        raise LinprimError("--stereo adds to the depth maps of --method tsdf: wanted it without --blocks")
     if blocks > 1 and method != "tsdf":
         raise LinprimError(
             f"--blocks fuses depth maps in parts, which --method {method} has none of: wanted --method tsdf"

@@ -14,6 +14,7 @@ from linprim_geo.base.progress import Stages
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.runs.run import Run
+from linprim_geo.surface.stereo_frames import MergedFrames
 from linprim_geo.surface.tsdf_field import DepthFrame
 from linprim_geo.surface.tsdf_fusion import auto_voxel_size, fuse_tsdf
 
@@ -44,6 +45,7 @@ def tsdf_surface(
         LinprimError: no ray crosses the level, or the grid would not fit into memory.
     """
     frames = DepthFrames(run, float(options.level), options.depth_limit) if frames is None else frames
+    about, merged = {}, None
     if not any((frame.depth > 0).any() for frame in frames):
         raise LinprimError(
             f"{run.path}: no ray of any training view crosses transmittance {options.level}, so there is no surface"
@@ -54,8 +56,16 @@ def tsdf_surface(
             f"{frames.beyond:.1%} of the depths lie beyond {frames.limit:.4g} and only clear the space before it"
         )
     voxel = options.voxel_size if options.voxel_size > 0 else auto_voxel_size(frames)
+    if options.stereo:
+        merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)
+        about = {"stereo": {"confirmed": merged.confirmed, "rendered_weight": merged.weight}}
+        stages.note(
+            f"stereo: {merged.confirmed:.0%} of the pixels have a depth that other views confirm; "
+            f"elsewhere rendered depths count {merged.weight:.2g}"
+        )
+        stages.lap("stereo")
     mesh = fuse_tsdf(
-        frames,
+        merged or frames,
         voxel_size=voxel,
         truncation_voxels=options.truncation,
         memory_limit=int(options.memory_limit * 2**30) if options.memory_limit > 0 else None,
@@ -69,6 +79,7 @@ def tsdf_surface(
         "voxel_size": voxel,
         "truncation_voxels": options.truncation,
         "depth_limit": frames.limit,
+        **about,
     }
 
 
