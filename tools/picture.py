@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""The README's picture of a run: held-out photographs beside the render, its depth and normals, and the extracted mesh.
+"""The picture of a run: held-out photographs beside the render, its depth and normals, and the extracted mesh.
 
-python tools/picture.py runs/demo/run tools/demo.png
+python tools/picture.py runs/demo/run docs/images/demo.png
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 and in extraction.
 
     linprim-geo tradeoff SCENE -o SWEEP
-    python -m linprim_geo.eval.tradeoff.figures SWEEP -o tools
+    python -m linprim_geo.eval.tradeoff.figures SWEEP -o docs/images
 
 writes tradeoff_ladder.svg and tradeoff_surface.svg, each two panels on a ground of its own, light or dark as the reader
 has it.
