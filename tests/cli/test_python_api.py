@@ -7,6 +7,7 @@ import contextlib
 import inspect
 import io
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -18,6 +19,7 @@ from linprim_geo.cli import main as cli
 
 ROOT = Path(__file__).resolve().parents[2]
 README, PYTHON = ROOT / "README.md", ROOT / "docs" / "python.md"
+DOCUMENTS = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "tests").glob("*.md")]
 
 
 def examples(page: Path) -> list[str]:
@@ -40,8 +42,8 @@ def run_examples(page: Path) -> tuple[dict, str]:
 
 def test_the_examples_of_the_readme_run(tiny_run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "runs" / "demo").mkdir(parents=True)
-    (tmp_path / "runs" / "demo" / "run").symlink_to(tiny_run, target_is_directory=True)
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "mine").symlink_to(tiny_run, target_is_directory=True)
     names, printed = run_examples(README)
     assert len(examples(README)) >= 1 and printed
     assert all(float(tensor.grad.abs().sum()) > 0 for tensor in names["tensors"][:4])
@@ -56,6 +58,53 @@ def test_the_examples_of_the_page_run(tmp_path, monkeypatch):
     assert printed.splitlines()[-1].startswith("no such folder: ")
     for name in ("half.glb", "part.ply", "primitives.ply", "part.npz"):
         assert (tmp_path / name).stat().st_size > 1000
+
+
+def anchors(page: Path) -> set[str]:
+    """What links may point to in a page: its headings as GitHub writes them."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_to_files_and_headings_that_are_there(page):
+    text = page.read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)\s]+)\)", text) + re.findall(r"^\[[^\]]+\]: (\S+)$", text, re.MULTILINE)
+    for link in links:
+        file, _, heading = link.partition("#")
+        if file.startswith("http"):
+            continue
+        target = (page.parent / file).resolve() if file else page
+        assert target.exists(), link
+        assert not heading or heading in anchors(target), link
+
+
+@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
+def test_files_and_modules_that_pages_name_are_there(page):
+    text = page.read_text(encoding="utf-8")
+    named = re.findall(r"(?<![\w./])(?:linprim_geo|eval|csrc|tools|tests|docs)/[\w./]*\w", text)
+    named += [
+        name.replace(".", "/").replace("linprim_geo/eval", "eval")
+        for name in re.findall(r"-m (linprim_geo[\w.]+)", text)
+    ]
+    for name in named:
+        assert any((ROOT / f"{name}{suffix}").exists() for suffix in ("", ".py")), name
+
+
+@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
+def test_commands_that_pages_show_are_accepted(page):
+    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+    blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+    shown = "".join(block for language, block in blocks if not language)
+    for line in re.findall(r"^linprim-geo (.*)$", shown, re.MULTILINE):
+        words = shlex.split(line, comments=True)
+        if not any(word.isupper() for word in words):
+            cli.build_parser().parse_args(words)
+
+
+def test_the_readme_is_short():
+    lines = README.read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 130 and max(map(len, lines)) <= 100
 
 
 def test_the_page_names_every_command():
