@@ -1,4 +1,4 @@
-"""Trains and scores every capture found in a folder and prints one table: what the README's figures come from.
+"""Trains and scores every capture found in a folder and prints one table: the public captures of docs/results.md.
 
     python -m linprim_geo.eval.studies.real_data --data DIR -o runs/real
 
@@ -90,7 +90,8 @@ def run_capture(capture: Path, data: Path, output: Path, options: TrainOptions, 
     row |= {"psnr": images["psnr"], "ssim": images["ssim"]}
     reference = reference_of(capture, data)
     if any(view.depth_path for view in scene.test):
-        row["abs_rel"] = eval_depth_run(folder)["abs_rel"]
+        depth = eval_depth_run(folder)
+        row |= {"abs_rel": depth["abs_rel"], "coverage": depth["coverage"]}
     stats = extract_mesh(folder, options=ExtractOptions())
     row |= {"mesh_seconds": stats["seconds"]["total"], "faces": stats["faces"], "mesh": stats["mesh"]}
     if reference is not None:
@@ -149,6 +150,7 @@ def table(rows: list[dict]) -> str:
         ("PSNR dB", "psnr", "{:.2f}"),
         ("SSIM", "ssim", "{:.4f}"),
         ("depth AbsRel", "abs_rel", "{:.4f}"),
+        ("coverage", "coverage", "{:.4f}"),
         ("Chamfer, seen part, % diag.", "visible_chamfer_percent_diagonal", "{:.3f}"),
         ("mesh s", "mesh_seconds", "{:.0f}"),
     ]

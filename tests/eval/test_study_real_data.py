@@ -53,7 +53,7 @@ def test_a_table_is_written(data, tmp_path, capsys):
         real_data.main(["--data", str(data), "-o", str(tmp_path), *options])
     (row,) = json.loads((tmp_path / "real_data.json").read_text())
     assert row["name"] == "part_small" and row["views"] == "10+2" and row["iterations"] == 40 and row["psnr"] > 10
-    assert row["visible_chamfer_percent_diagonal"] < 10 and row["abs_rel"] < 0.5
+    assert row["visible_chamfer_percent_diagonal"] < 10 and row["abs_rel"] < 0.5 and 0 < row["coverage"] <= 1
     assert [len(point) for point in row["curve"]] == [2, 2]
     text = (tmp_path / "real_data.md").read_text()
     assert (
