@@ -1,5 +1,5 @@
-"""The two plots of the README out of a sweep: what the ladder of rendering costs, and what surfaces cost in training
-and in extraction.
+"""The two plots of docs/accuracy_and_time.md out of a sweep: what the ladder of rendering costs, and what surfaces cost
+in training and in extraction.
 
     linprim-geo tradeoff SCENE -o SWEEP
     python -m linprim_geo.eval.tradeoff.figures SWEEP -o docs/images

@@ -75,9 +75,9 @@ class Effect:
 
     `measure` returns a figure in `unit`, larger the more the effect is needed, or None where the data do not say; the
     effect is on from `threshold` upwards. `cost` is the time of a training with the effect by that without: for
-    exact-rays from README's prices, for the others as eval/effects.py measures it. `on` and `off` are the settings that
-    it stands for; who gives an option of `off` decides by that. `needs` returns why a scene or the options rule it out,
-    "" if they do not. `on_request` says why evidence alone does not switch it on, "" if it does.
+    exact-rays from docs/accuracy_and_time.md, for the others as eval/studies/effects.py measures it. `on` and `off` are
+    the settings that it stands for; who gives an option of `off` decides by that. `needs` returns why a scene or the
+    options rule it out, "" if they do not. `on_request` says why evidence alone does not switch it on, "" if it does.
     """
 
     name: str

@@ -1,5 +1,5 @@
-"""The README's plots out of a sweep: what they show of known rows, that they are well-formed and light or dark, and
-what is refused."""
+"""The plots of the documents out of a sweep: what they show of known rows, that they are well-formed and light or dark,
+and what is refused."""
 
 from __future__ import annotations
 
