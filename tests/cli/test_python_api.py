@@ -102,6 +102,14 @@ def test_commands_that_pages_show_are_accepted(page):
             cli.build_parser().parse_args(words)
 
 
+def test_figures_of_the_readme_are_those_of_the_results():
+    rows = re.findall(r"^\| .* (?:dB|%) \| .*$", README.read_text(encoding="utf-8"), re.MULTILINE)
+    measured = re.findall(r"\d[\d.]*", (ROOT / "docs" / "results.md").read_text(encoding="utf-8"))
+    assert len(rows) == 5
+    for row in rows:
+        assert set(re.findall(r"(\d[\d.]*) (?:s|dB|%) ", row)) <= set(measured), row
+
+
 def test_the_readme_is_short():
     lines = README.read_text(encoding="utf-8").splitlines()
     assert len(lines) <= 130 and max(map(len, lines)) <= 100
