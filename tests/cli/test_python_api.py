@@ -10,6 +10,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -100,6 +101,14 @@ def test_commands_that_pages_show_are_accepted(page):
         words = shlex.split(line, comments=True)
         if not any(word.isupper() for word in words):
             cli.build_parser().parse_args(words)
+
+
+def test_every_package_is_listed_in_the_order_of_packages():
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    layers = settings["tool"]["importlinter"]["contracts"][0]["layers"]
+    wanted = [name for layer in layers for name in layer.split(" | ")]
+    text = (ROOT / "docs" / "developing.md").read_text(encoding="utf-8")
+    assert sorted(re.findall(r"^\| \d* ?\| `(\w+)`", text, re.MULTILINE)) == sorted(wanted)
 
 
 def test_figures_of_the_readme_are_those_of_the_results():
