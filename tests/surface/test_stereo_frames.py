@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import octahedron_run
 from helpers.captures import look_at
 
 from linprim_geo.base.errors import LinprimError
@@ -60,8 +61,9 @@ def test_fewer_neighbours_have_to_agree_where_there_are_fewer(found, monkeypatch
     assert MergedFrames(rendered(0.01), [None], 5.0).confirmed == 0
 
 
-def test_a_surface_of_a_run_takes_stereo_into_account(run_copy):
-    stats = extract_mesh(run_copy, options=ExtractOptions(stereo=True, refine=0, level=0.5, voxel_size=0.1), quiet=True)
+def test_a_surface_of_a_run_takes_stereo_into_account(tmp_path):
+    run = octahedron_run(tmp_path / "run", views=60, size=40)
+    stats = extract_mesh(run, options=ExtractOptions(stereo=True, refine=0, level=0.5), quiet=True)
     assert 0 <= stats["stereo"]["confirmed"] <= 1 and 0 < stats["stereo"]["rendered_weight"] <= 1
     with pytest.raises(LinprimError, match="wanted it without --blocks"):
-        extract_mesh(run_copy, options=ExtractOptions(stereo=True), blocks=2, quiet=True)
+        extract_mesh(run, options=ExtractOptions(stereo=True), blocks=2, quiet=True)
