@@ -21,8 +21,9 @@ import pytest
 from linprim_geo.base import progress, system
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions, SceneOptions, TrainOptions, option
-from linprim_geo.cli import commands, doctor
+from linprim_geo.cli import arguments, doctor
 from linprim_geo.cli import main as cli
+from linprim_geo.cli.options import add_options
 
 HEAVY = {
     "torch",
@@ -117,11 +118,11 @@ def test_options_become_the_dataclass_they_come_from():
         fast: bool = option(False, "hurry")
 
     parser = cli.argparse.ArgumentParser()
-    cli.add_options(parser, Options)
+    add_options(parser, Options)
     assert "100%" in parser.format_help() and "COUNT" in parser.format_help()
-    assert commands.from_args(Options, parser.parse_args([])) == Options()
+    assert arguments.from_args(Options, parser.parse_args([])) == Options()
     given = parser.parse_args("--step-size 2 --kind b --count 9 --fast".split())
-    assert commands.from_args(Options, given) == Options(2.0, "b", 9, True)
+    assert arguments.from_args(Options, given) == Options(2.0, "b", 9, True)
     for wrong in ("--kind c", "--count 1.5", "--step-size x"):
         with pytest.raises(SystemExit) as leaving:
             parser.parse_args(wrong.split())
@@ -344,7 +345,7 @@ def test_the_functions_have_the_arguments_that_the_commands_pass(line):
     module, _, name = path.rpartition(".")
     function = getattr(importlib.import_module(f"linprim_geo.{module}"), name)
     options = {field.name for field in dataclasses.fields(ExtractOptions)} if line.startswith("extract") else set()
-    passed = vars(cli.build_parser().parse_args(line.split())).keys() - {"handler", "command"} - options
+    passed = vars(cli.build_parser().parse_args(line.split())).keys() - {"run_command", "parser"} - options
     assert {renamed.get(key, key) for key in passed} <= set(inspect.signature(function).parameters)
 
 

@@ -20,7 +20,7 @@ from PIL import Image
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions, SceneOptions, TrainOptions
-from linprim_geo.cli import commands
+from linprim_geo.cli import arguments
 from linprim_geo.cli import main as cli
 from linprim_geo.display.meshes import is_inside, layers, light_mesh, up_direction
 from linprim_geo.display.report import report_run
@@ -159,11 +159,11 @@ def test_commands_repeat_the_run(made, meshed):
     parsed = {line.split()[1]: cli.build_parser().parse_args(shlex.split(line)[1:]) for line in lines}
     assert list(parsed) == ["train", "extract-mesh", "eval-mesh", "eval-images", "eval-depth", "report"]
     run = Run.open(meshed)
-    assert commands.from_args(TrainOptions, parsed["train"]) == run.train_options
-    assert commands.from_args(SceneOptions, parsed["train"]) == run.scene_options
+    assert arguments.from_args(TrainOptions, parsed["train"]) == run.train_options
+    assert arguments.from_args(SceneOptions, parsed["train"]) == run.scene_options
     assert parsed["train"].effects == "none"
     assert parsed["train"].run == parsed["report"].run == str(meshed)
-    options = commands.from_args(ExtractOptions, parsed["extract-mesh"])
+    options = arguments.from_args(ExtractOptions, parsed["extract-mesh"])
     assert options.level == 0.7 and options.smooth == 2 and options.voxel_size > 0 and options.depth_limit > 0
 
 

@@ -17,6 +17,7 @@ from linprim_geo.base.budget import Budget
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions, TrainOptions
 from linprim_geo.cli import main as cli
+from linprim_geo.cli.options import seconds
 from linprim_geo.runs.run import Run
 from linprim_geo.surface import voxel_budget
 from linprim_geo.surface.extract import extract_mesh
@@ -295,7 +296,7 @@ def test_a_budget_needs_something_to_choose(tiny_scene, tiny_run, tmp_path):
 
 
 def test_times_are_read_as_people_write_them(capsys):
-    assert [cli._seconds(text) for text in ("90", "90s", "5m", "1.5h")] == [90, 90, 300, 5400]
+    assert [seconds(text) for text in ("90", "90s", "5m", "1.5h")] == [90, 90, 300, 5400]
     for wrong in ("", "m", "0", "-5s", "5 minutes", "nan", "inf"):
         with pytest.raises(SystemExit) as leaving:
             cli.main(["train", "scene", f"--time-budget={wrong}"])

@@ -1,0 +1,53 @@
+"""What the parsed command line says: options as dataclasses, which of them were given, effects, workers, budget."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Callable
+
+from linprim_geo.base.errors import LinprimError
+
+
+def from_args(options: type, parsed: argparse.Namespace):
+    """The dataclass `options` filled from the arguments that `add_options` has added."""
+    return options(**{name: getattr(parsed, name) for name in given_options(options, parsed)})
+
+
+def given_options(options: type, parsed: argparse.Namespace) -> list[str]:
+    """Names of the fields of `options` that the command line sets."""
+    return [field.name for field in dataclasses.fields(options) if hasattr(parsed, field.name)]
+
+
+def effects_choice(parsed: argparse.Namespace):
+    """What the command line says about effects."""
+    from linprim_geo.base.options import SceneOptions, TrainOptions
+    from linprim_geo.training.effects import Choice, parse_asked
+
+    given = given_options(SceneOptions, parsed) + given_options(TrainOptions, parsed)
+    return Choice(parsed.effects, parse_asked(parsed.effect), frozenset(given))
+
+
+def blocks_and_workers(parsed: argparse.Namespace) -> dict:
+    """--blocks, --cluster and --workers as keywords."""
+    if parsed.blocks == 1 and parsed.cluster is not None and not getattr(parsed, "resume", False):
+        raise LinprimError(
+            f"--cluster is {parsed.cluster}, but there is one block, which is done here: wanted --blocks as well"
+        )
+    return {"blocks": parsed.blocks, "cluster": parsed.cluster, "workers": parsed.workers}
+
+
+def time_budget(parsed: argparse.Namespace) -> dict:
+    """`time_budget` from --time-budget as a keyword, counted from now, before large libraries are loaded; nothing
+    without it."""
+    if parsed.time_budget is None:
+        return {}
+    from linprim_geo.base.budget import Budget
+
+    return {"time_budget": Budget(parsed.time_budget)}
+
+
+def log(parsed: argparse.Namespace) -> Callable[[str], None]:
+    """What prints a line of progress, or nothing with --quiet."""
+    return (lambda text: None) if parsed.quiet else (lambda text: print(text, file=sys.stderr))

@@ -1,0 +1,34 @@
+"""The command extract-mesh: a run to a triangle mesh."""
+
+from __future__ import annotations
+
+import argparse
+
+from linprim_geo.base.options import ExtractOptions
+from linprim_geo.cli.arguments import blocks_and_workers, from_args, time_budget
+from linprim_geo.cli.options import AddCommand, add_options, add_quiet, add_run, add_workers, positive, seconds
+
+
+def add(command: AddCommand) -> None:
+    sub = command("extract-mesh", run, "extract a triangle mesh from a run")
+    add_run(sub)
+    text = (
+        "tsdf: fuse depth maps (default); polyhedra: unite the primitives, cut back to the surface, closed "
+        "and manifold; opacity-field: where light stops reaching the cameras, closed and without a grid"
+    )
+    sub.add_argument("--method", choices=("tsdf", "polyhedra", "opacity-field"), default="tsdf", help=text)
+    sub.add_argument("-o", "--output", metavar="FILE", help=".ply .obj .glb .stl (default RUN/mesh/METHOD/mesh.ply)")
+    text = "choose the voxel size so that everything takes this long, by what coarse passes take"
+    sub.add_argument("--time-budget", type=seconds, metavar="TIME", help=text)
+    add_quiet(sub)
+    text = "fuse in so many parts of one grid, each by a worker of its own, with the same result (default 1)"
+    add_workers(sub).add_argument("--blocks", type=positive, default=1, metavar="K", help=text)
+    add_options(sub.add_argument_group("extraction"), ExtractOptions)
+
+
+def run(parsed: argparse.Namespace) -> dict:
+    budget = time_budget(parsed)
+    from linprim_geo.surface.extract import extract_mesh
+
+    options, several = from_args(ExtractOptions, parsed), blocks_and_workers(parsed)
+    return extract_mesh(parsed.run, parsed.method, parsed.output, options, quiet=parsed.quiet, **several, **budget)

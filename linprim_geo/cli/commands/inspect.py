@@ -1,0 +1,25 @@
+"""The command inspect: which effects a scene calls for."""
+
+from __future__ import annotations
+
+import argparse
+
+from linprim_geo.base.options import SceneOptions, TrainOptions
+from linprim_geo.cli.arguments import effects_choice, from_args, log
+from linprim_geo.cli.options import AddCommand, add_effects, add_options, add_quiet, add_scene
+
+
+def add(command: AddCommand) -> None:
+    sub = command("inspect", run, "say which effects a scene calls for, by which evidence, and what they cost")
+    add_scene(sub)
+    add_quiet(sub)
+    add_effects(sub, "auto")
+    add_options(sub.add_argument_group("scene"), SceneOptions)
+    add_options(sub.add_argument_group("training"), TrainOptions)
+
+
+def run(parsed: argparse.Namespace) -> dict:
+    from linprim_geo.training.inspect import inspect_scene
+
+    options = from_args(SceneOptions, parsed), from_args(TrainOptions, parsed)
+    return inspect_scene(parsed.scene, *options, effects_choice(parsed), log(parsed))

@@ -1,0 +1,39 @@
+"""The commands that check, try and set up an installation: doctor, demo and completion."""
+
+from __future__ import annotations
+
+import argparse
+
+from linprim_geo.cli.options import AddCommand, add_quiet
+
+
+def add(command: AddCommand) -> None:
+    command("doctor", doctor, "check versions, libraries, cores and memory; exit 1 if something is missing")
+
+    sub = command("demo", demo, "synthesize, train, extract and score a built-in scene")
+    sub.add_argument("-o", "--output", default="runs/demo", metavar="RUN", help="folder to make (default runs/demo)")
+    sub.add_argument("--size", choices=("small", "normal"), default="normal", help="small: a quick check of it all")
+    add_quiet(sub)
+
+    sub = command("completion", completion, "print a script that completes this command line in a shell")
+    sub.add_argument("shell", choices=("bash", "zsh", "fish"))
+
+
+def doctor(parsed: argparse.Namespace) -> dict:
+    from linprim_geo.cli.doctor import describe, doctor
+
+    report = doctor()
+    return report | {"_text": describe(report), "_status": 1 if report["problems"] else 0}
+
+
+def demo(parsed: argparse.Namespace) -> dict:
+    from linprim_geo.cli.demo import run_demo
+
+    return run_demo(parsed.output, parsed.size, quiet=parsed.quiet)
+
+
+def completion(parsed: argparse.Namespace) -> dict:
+    from linprim_geo.cli.completion import completion
+
+    made = completion(parsed.parser, parsed.shell)
+    return made | {"_text": made["script"]}

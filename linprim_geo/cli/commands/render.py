@@ -1,0 +1,21 @@
+"""The command render: pictures of a run's views."""
+
+from __future__ import annotations
+
+import argparse
+
+from linprim_geo.cli.options import AddCommand, add_quiet, add_run, add_split
+
+
+def add(command: AddCommand) -> None:
+    sub = command("render", run, "render colour, depth, normals and opacity of a run's views")
+    add_run(sub)
+    add_split(sub)
+    sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/renders)")
+    add_quiet(sub)
+
+
+def run(parsed: argparse.Namespace) -> dict:
+    from linprim_geo.runs.render import render_run
+
+    return render_run(parsed.run, split=parsed.split, output=parsed.output, quiet=parsed.quiet)

@@ -1,0 +1,40 @@
+"""The commands that show a run: report and view."""
+
+from __future__ import annotations
+
+import argparse
+
+from linprim_geo.cli.options import AddCommand, add_run, whole
+
+
+def add(command: AddCommand) -> None:
+    sub = command("report", report, "write one self-contained HTML page about a run")
+    add_run(sub)
+    sub.add_argument("-o", "--output", metavar="FILE", help="page to write (default RUN/report.html)")
+    text = (
+        "mesh in the data set's frame to score depth and meshes against (default: what RUN/eval holds, and "
+        "the data set's depth)"
+    )
+    sub.add_argument("--reference", metavar="MESH", help=text)
+
+    sub = command("view", view, "show a run in a browser: primitives, meshes, cameras")
+    add_run(sub)
+    text = "wait for a run's first save, and show every save and mesh as it comes"
+    sub.add_argument("--follow", action="store_true", help=text)
+    sub.add_argument("--reference", metavar="MESH", help="mesh in the data set's frame, for the true error of meshes")
+    text = "port on this machine, which alone can reach it (default 8080; 0: any that is free)"
+    sub.add_argument("--port", type=whole, default=8080, metavar="N", help=text)
+    sub.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
+
+
+def report(parsed: argparse.Namespace) -> dict:
+    from linprim_geo.display.report import report_run
+
+    made = report_run(parsed.run, parsed.output, parsed.reference)
+    return made | {"_text": "\n".join([f"{made['report']}: {made['bytes'] / 2**20:.1f} MiB", *made["missing"]])}
+
+
+def view(parsed: argparse.Namespace) -> dict:
+    from linprim_geo.display.viewer import view_run
+
+    return view_run(parsed.run, parsed.port, browser=parsed.browser, follow=parsed.follow, reference=parsed.reference)

@@ -1,0 +1,110 @@
+"""The command train: photographs to a run of primitives."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+from pathlib import Path
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import SceneOptions, TrainOptions
+from linprim_geo.cli.arguments import blocks_and_workers, effects_choice, from_args, log, time_budget
+from linprim_geo.cli.options import (
+    AddCommand,
+    add_effects,
+    add_options,
+    add_quiet,
+    add_scene,
+    add_workers,
+    blocks,
+    seconds,
+)
+
+# 3DGS's -r -1 leaves images up to this width as they are.
+WIDEST = 1600
+
+
+def add(command: AddCommand) -> None:
+    sub = command("train", run, "train a scene: posed photographs to primitives")
+    add_scene(sub, nargs="?")
+    sub.add_argument("-s", "--source", "--source_path", dest="source", metavar="SCENE", help="the same, as in 3DGS")
+    text = "folder to make (default runs/SCENE)"
+    sub.add_argument("-o", "--output", "-m", "--model_path", dest="run", metavar="RUN", help=text)
+    sub.add_argument("--resume", action="store_true", help="go on from the latest checkpoint in RUN")
+    add_quiet(sub)
+    text = (
+        "say what would be trained, how long it takes and how much memory, by timing a few steps; nothing but "
+        "the cache is written"
+    )
+    sub.add_argument("--dry-run", action="store_true", help=text)
+    text = (
+        "choose steps and primitives so that everything takes this long, by what a step costs here; one of "
+        "the two may be given"
+    )
+    sub.add_argument("--time-budget", type=seconds, metavar="TIME", help=text)
+    text = "show the run in a browser meanwhile, as linprim-geo view RUN --follow does"
+    sub.add_argument("--view", action="store_true", help=text)
+    text = "as in 3DGS: divide the size by 1, 2, 4 or 8, or a width to go down to; -1: to 1600 if it is more"
+    sub.add_argument("-r", "--resolution", type=int, metavar="K", help=text)
+    sub.add_argument("--eval", action="store_true", help="accepted as in 3DGS: views are always held out")
+    add_effects(sub, "none")
+    text = (
+        "train in so many blocks of space, each by a worker of its own; auto: as few as a worker's memory allows "
+        "(default 1); a block's photographs lie in a temporary file, see TMPDIR"
+    )
+    add_workers(sub).add_argument("--blocks", type=blocks, default=1, metavar="auto|K", help=text)
+    add_options(sub.add_argument_group("scene"), SceneOptions)
+    add_options(sub.add_argument_group("training"), TrainOptions)
+
+
+def run(parsed: argparse.Namespace) -> dict:
+    budget = time_budget(parsed)
+    scene = parsed.scene or parsed.source
+    if scene is None or (parsed.scene and parsed.source):
+        raise LinprimError("train wants one scene: its folder, or -s and its folder")
+    scene_options, options = from_args(SceneOptions, parsed), from_args(TrainOptions, parsed)
+    if parsed.resolution is not None:
+        if scene_options.downscale != 1:
+            raise LinprimError(
+                f"-r {parsed.resolution} stands beside --downscale {scene_options.downscale}, wanted one of them"
+            )
+        parsed.downscale = _downscale_of(parsed.resolution, scene, scene_options, options.threads, log(parsed))
+        scene_options = from_args(SceneOptions, parsed)
+    folder = parsed.run or Path("runs") / Path(os.path.abspath(scene)).name
+    settings = {"quiet": parsed.quiet, "effects": effects_choice(parsed), **budget}
+    if parsed.dry_run:
+        from linprim_geo.training.dry_run import dry_run
+
+        if parsed.resume:
+            raise LinprimError("--dry-run says what a new training would take: wanted without --resume")
+        if parsed.blocks != 1:
+            raise LinprimError("--dry-run times the training of the whole scene: wanted without --blocks")
+        return dry_run(scene, folder, scene_options, options, **settings)
+    from linprim_geo.training.train import train
+
+    shown: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
+    if parsed.view:
+        from linprim_geo.display.viewer import watched
+
+        shown = watched(folder)
+    with shown:
+        several = blocks_and_workers(parsed)
+        return train(scene, folder, scene_options, options, resume=parsed.resume, **several, **settings)
+
+
+def _downscale_of(resolution: int, scene: str, options: SceneOptions, threads: int, log) -> int:
+    """3DGS's -r as --downscale. Where it names a width, the least whole divisor that does not exceed it: pixels are
+    averaged."""
+    if resolution in (1, 2, 4, 8):
+        return resolution
+    width = WIDEST if resolution == -1 else resolution
+    if width < 1:
+        raise LinprimError(f"-r is {resolution}, wanted 1, 2, 4, 8, a width in pixels, or -1")
+    from linprim_geo.capture.load import load_scene
+    from linprim_geo.capture.structure_from_motion import prepare
+
+    prepare(Path(scene), options.sparse or None, options.frames, threads=threads, log=log)
+    o = options
+    views = load_scene(scene, masks=o.masks, images=o.images, sparse=o.sparse, frames=o.frames).train
+    return -(-max(view.camera.width for view in views) // width)
