@@ -3,18 +3,89 @@ the Python functions and a run's config.json cannot disagree."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+import math
+from dataclasses import Field, dataclass, field, fields, replace
+from numbers import Integral, Real
+from typing import Any, get_args, get_type_hints
 
 from linprim_geo.base.errors import LinprimError
 
 
-def option(default, text: str, choices: tuple = (), metavar: str | None = None, number_or: str | None = None):
+def option(
+    default,
+    text: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple = (),
+    metavar: str | None = None,
+    number_or: str | None = None,
+):
     """A dataclass field that the command line turns into `--field-name` with `text` as its help.
 
-    With `number_or` it holds a number or that word.
+    Its value is at least `low` and at most `high`, or one of `choices`; `check` says so where it is not. With
+    `number_or` it holds a number or that word.
     """
-    metadata = {"help": text, "choices": choices, "metavar": metavar, "number_or": number_or}
+    metadata = {"help": text, "low": low, "high": high, "choices": choices, "metavar": metavar, "number_or": number_or}
     return field(default=default, metadata=metadata)
+
+
+def kinds(cls: type) -> dict[str, type]:
+    """bool, int, float or str for each field of an options dataclass: its annotation without None and without the word
+    of `number_or`."""
+    named = {name: get_args(hint) or (hint,) for name, hint in get_type_hints(cls).items()}
+    return {
+        entry.name: next(kind for kind in (bool, int, float, str) if kind in named[entry.name]) for entry in fields(cls)
+    }
+
+
+def flag_of(name: str) -> str:
+    """The flag of the command line for a field."""
+    return "--" + name.replace("_", "-")
+
+
+def check(options) -> None:
+    """Raises LinprimError for the first option whose value is of another type, outside its range, or not one of its
+    choices."""
+    kind_of = kinds(type(options))
+    for entry in fields(options):
+        value = getattr(options, entry.name)
+        if wanted := _wanted(value, entry, kind_of[entry.name]):
+            raise LinprimError(f"{flag_of(entry.name)} is {value!r}, wanted {wanted}")
+
+
+def _wanted(value: Any, entry: Field, kind: type) -> str:
+    """What an option's value should be; "" if it is."""
+    choices, low, high = (entry.metadata[name] for name in ("choices", "low", "high"))
+    if value is None and entry.default is None:
+        return ""
+    if choices:
+        return "" if value in choices else f"one of {', '.join(map(str, choices))}"
+    if kind not in (int, float):
+        return ""
+    word = entry.metadata["number_or"]
+    also = f"{word}, or " if word else ""
+    if word and value == word:
+        return ""
+    numbers: Any = Integral if kind is int else Real
+    if isinstance(value, bool) or not isinstance(value, numbers):
+        return also + ("a whole number" if kind is int else "a number")
+    if (-math.inf if low is None else low) <= value <= (math.inf if high is None else high) and abs(value) != math.inf:
+        return ""
+    if low is None:
+        return also + "a finite number"
+    return also + (f"at least {low}" if high is None else f"{low} to {high}")
+
+
+def with_changes(cls: type, options, changes: dict[str, Any]):
+    """The dataclass `options`, or the defaults of `cls`, with some fields changed, and checked.
+
+    Raises:
+        LinprimError: as `check`.
+    """
+    changed = replace(options or cls(), **changes)
+    check(changed)
+    return changed
 
 
 def from_saved(cls: type, values: object, where: str):
@@ -26,54 +97,39 @@ def from_saved(cls: type, values: object, where: str):
     if not isinstance(values, dict):
         raise LinprimError(f"{where}: holds {type(values).__name__} in place of options")
     taken = {}
+    kind_of = kinds(cls)
     for entry in fields(cls):
-        if entry.name not in values:
+        name, wanted = entry.name, kind_of[entry.name]
+        if name not in values:
             continue
-        value = values[entry.name]
-        wanted: type = type(entry.default)
+        value = values[name]
+        if value is entry.default is None or (isinstance(value, str) and value == entry.metadata["number_or"]):
+            taken[name] = value
+            continue
         if isinstance(value, bool) != (wanted is bool) or not isinstance(
             value, (int, float) if wanted is float else wanted
         ):
-            raise LinprimError(f"{where}: {entry.name} is {value!r:.100}, wanted {wanted.__name__}")
+            raise LinprimError(f"{where}: {name} is {value!r:.100}, wanted {wanted.__name__}")
         try:
-            taken[entry.name] = wanted(value)
+            taken[name] = wanted(value)
         except OverflowError:
-            raise LinprimError(f"{where}: {entry.name} is too large for a {wanted.__name__}") from None
+            raise LinprimError(f"{where}: {name} is too large for a {wanted.__name__}") from None
     return cls(**taken)
 
 
 def check_train_options(options: TrainOptions) -> None:
-    """Raises LinprimError for a value outside its range, or for two that exclude each other."""
-    for entry in fields(options):
-        choices = entry.metadata["choices"]
-        if choices and getattr(options, entry.name) not in choices:
-            raise LinprimError(
-                f"--{entry.name.replace('_', '-')} is {getattr(options, entry.name)!r},"
-                f" wanted one of {', '.join(map(str, choices))}"
-            )
+    """Raises LinprimError as `check`, and for two values that exclude each other."""
+    check(options)
     if options.primitive == "gaussian" and options.order != "center":
         raise LinprimError(
             f"--order is {options.order!r}, but a Gaussian has no place where a ray enters it: wanted center "
             "with --primitive gaussian"
         )
-    ranges = {
-        "iterations": (1, 10**8),
-        "max_primitives": (1, 2**30),
-        "initial_primitives": (0, options.max_primitives),
-        "seed": (0, 2**63),
-        "threads": (0, 4096),
-        "samples": (1, 8),
-        "dssim": (0, 1),
-        "stop": (0, 0.5),
-        "checkpoint_every": (1, 10**9),
-        "evaluate_every": (0, 10**9),
-        "sh_degree": (0, 3),
-        "order_from": (0, 1),
-        "geometry_from": (0, 1),
-    } | dict.fromkeys(GEOMETRY_WEIGHTS, (0, 1e6))
-    for name, (low, high) in ranges.items():
-        if not low <= getattr(options, name) <= high:
-            raise LinprimError(f"--{name.replace('_', '-')} is {getattr(options, name)}, wanted {low} to {high}")
+    if options.initial_primitives > options.max_primitives:
+        raise LinprimError(
+            f"--initial-primitives is {options.initial_primitives}, wanted at most --max-primitives, "
+            f"{options.max_primitives}"
+        )
 
 
 def initial_count(options: TrainOptions, share: float) -> int:
@@ -118,10 +174,10 @@ class SceneOptions:
     """How a capture is read."""
 
     pinhole_below: float = option(
-        0.0, "lenses that shift no ray by as many pixels count as pinholes and are not undistorted", metavar="PX"
+        0.0, "lenses that shift no ray by as many pixels count as pinholes and are not undistorted", low=0, metavar="PX"
     )
 
-    downscale: int = option(1, "average K by K pixels into one", metavar="K")
+    downscale: int = option(1, "average K by K pixels into one", low=1, metavar="K")
     masks: str = option(
         "",
         "folder of foreground masks, if they are not where data sets usually keep them; none: no masks and no alpha",
@@ -130,18 +186,18 @@ class SceneOptions:
     images: str = option(
         "", "folder of the photographs to use in place of those that the cameras name, in any size", metavar="DIR"
     )
-    frames: int = option(150, "of a video, the sharpest of each of N equal parts", metavar="N")
+    frames: int = option(150, "of a video, the sharpest of each of N equal parts", low=3, metavar="N")
     sparse: str = option(
         "", "COLMAP model to take points from, if it is not where data sets usually keep it", metavar="DIR"
     )
-    views: int = option(0, "train with N of the training views, evenly spread over them; 0 takes all")
+    views: int = option(0, "train with N of the training views, evenly spread over them; 0 takes all", low=0)
 
 
 @dataclass(frozen=True)
 class TrainOptions:
     """How a scene is trained."""
 
-    iterations: int = option(7000, "training steps, one view each")
+    iterations: int = option(7000, "training steps, one view each", low=1, high=10**8)
     primitive: str = option(
         "octahedron", "what the scene is made of", choices=("octahedron", "tetrahedron", "gaussian")
     )
@@ -166,11 +222,13 @@ class TrainOptions:
         "how their number grows: gradient splits where the image pulls, 3dgs and mcmc are those papers' rules",
         choices=("gradient", "3dgs", "mcmc"),
     )
-    max_primitives: int = option(20_000, "the population never grows past this")
-    initial_primitives: int = option(0, "primitives at the start; 0 chooses from the points and --max-primitives")
+    max_primitives: int = option(20_000, "the population never grows past this", low=1, high=2**30)
+    initial_primitives: int = option(
+        0, "primitives at the start; 0 chooses from the points and --max-primitives", low=0, high=2**30
+    )
     sh_degree: int = option(2, "degree of the view-dependent colour, 0 to 3", choices=(0, 1, 2, 3))
-    seed: int = option(0, "seed of everything random")
-    threads: int = option(0, "worker threads; 0 uses every core; the result does not depend on it")
+    seed: int = option(0, "seed of everything random", low=0, high=2**63)
+    threads: int = option(0, "worker threads; 0 uses every core; the result does not depend on it", low=0, high=4096)
     background: str = option(
         "auto",
         "auto, environment, fitted, random, black, white, or r,g,b in [0,1]; auto: an environment at infinity if "
@@ -194,24 +252,31 @@ class TrainOptions:
         choices=("dense", "sparse"),
     )
     order_from: float = option(
-        0.0, "part of the run after which --order holds; before it, training blends in the faster order of the centres"
+        0.0,
+        "part of the run after which --order holds; before it, training blends in the faster order of the centres",
+        low=0,
+        high=1,
     )
-    dssim: float = option(0.2, "weight of D-SSIM in the loss; L1 has the rest")
-    geometry_from: float = option(0.7, "part of the run after which the terms with the weights below join the loss")
-    normal_consistency: float = option(0.0, "weight: faces point as the surface that they make up")
-    distortion: float = option(0.0, "weight: what a ray sees lies together in depth")
-    binarisation: float = option(0.0, "weight: primitives are opaque or nothing")
-    point_depth: float = option(0.0, "weight: surfaces pass through the scene's points, by their errors")
-    sensor_depth: float = option(0.0, "weight: surfaces lie at the depths that the data set brings")
-    sensor_normals: float = option(0.0, "weight: faces point as the normals that the data set brings")
-    patches: float = option(0.0, "weight: small planes look alike in neighbouring views")
-    stop: float = option(1e-3, "transmittance below which a ray ends", metavar="T")
+    dssim: float = option(0.2, "weight of D-SSIM in the loss; L1 has the rest", low=0, high=1)
+    geometry_from: float = option(
+        0.7, "part of the run after which the terms with the weights below join the loss", low=0, high=1
+    )
+    normal_consistency: float = option(0.0, "weight: faces point as the surface that they make up", low=0, high=1e6)
+    distortion: float = option(0.0, "weight: what a ray sees lies together in depth", low=0, high=1e6)
+    binarisation: float = option(0.0, "weight: primitives are opaque or nothing", low=0, high=1e6)
+    point_depth: float = option(
+        0.0, "weight: surfaces pass through the scene's points, by their errors", low=0, high=1e6
+    )
+    sensor_depth: float = option(0.0, "weight: surfaces lie at the depths that the data set brings", low=0, high=1e6)
+    sensor_normals: float = option(0.0, "weight: faces point as the normals that the data set brings", low=0, high=1e6)
+    patches: float = option(0.0, "weight: small planes look alike in neighbouring views", low=0, high=1e6)
+    stop: float = option(1e-3, "transmittance below which a ray ends", low=0, high=0.5, metavar="T")
     samples: int = option(
-        1, "K by K rays per pixel: 1 is fastest, 2 resolves edges that cut through pixels", metavar="K"
+        1, "K by K rays per pixel: 1 is fastest, 2 resolves edges that cut through pixels", low=1, high=8, metavar="K"
     )
-    checkpoint_every: int = option(1000, "steps between checkpoints", metavar="STEPS")
+    checkpoint_every: int = option(1000, "steps between checkpoints", low=1, high=10**9, metavar="STEPS")
     evaluate_every: int = option(
-        1000, "steps between scores on the held-out views; 0 scores only at the end", metavar="STEPS"
+        1000, "steps between scores on the held-out views; 0 scores only at the end", low=0, high=10**9, metavar="STEPS"
     )
 
 
@@ -223,35 +288,49 @@ class ExtractOptions:
         "auto",
         "transmittance at which the surface is taken, between 0 and 1, nearer to 1 is nearer to the cameras;"
         " auto: the nearest of those at which the photographs agree about as well as at the best",
+        low=1e-6,
+        high=1 - 1e-6,
         metavar="T",
         number_or="auto",
     )
-    voxel_size: float = option(0.0, "grid spacing in the data set's unit; 0 chooses from the views", metavar="LENGTH")
-    truncation: float = option(3.0, "truncation distance in voxels")
-    memory_limit: float = option(0.0, "memory the grid may take, in GiB; 0 allows 60 % of what is free", metavar="GIB")
+    voxel_size: float = option(
+        0.0, "grid spacing in the data set's unit; 0 chooses from the views", low=0, metavar="LENGTH"
+    )
+    truncation: float = option(3.0, "truncation distance in voxels", low=1, high=100)
+    memory_limit: float = option(
+        0.0, "memory the grid may take, in GiB; 0 allows 60 % of what is free", low=0, metavar="GIB"
+    )
     depth_limit: float = option(
         0.0,
         "depths beyond this, in the data set's unit, only clear the space before them; 0: beyond what so many "
         "pixels can tell apart",
+        low=0,
         metavar="LENGTH",
     )
     stereo: bool = option(
         False, "take the depths that PatchMatch stereo finds in the photographs where views confirm them (tsdf)"
     )
-    smallest_part: float = option(0.01, "drop components with less than this share of the largest one's area")
+    smallest_part: float = option(
+        0.01, "drop components with less than this share of the largest one's area", low=0, high=1
+    )
     refine: int = option(
         2,
         "rounds in which vertices move to where the photographs agree best with each other; 0 leaves them",
+        low=0,
+        high=100,
         metavar="N",
     )
-    close_holes: int = option(0, "fill holes with at most N edges around them; 0 fills none")
-    smooth: int = option(0, "iterations of smoothing that keeps the volume; 0 leaves the surface as it is")
-    remesh: float = option(
-        0.0, "even triangles with edges of this length, in the data set's unit; 0 keeps them", metavar="LENGTH"
+    close_holes: int = option(0, "fill holes with at most N edges around them; 0 fills none", low=0, high=10**9)
+    smooth: int = option(
+        0, "iterations of smoothing that keeps the volume; 0 leaves the surface as it is", low=0, high=10_000
     )
-    target_faces: int = option(0, "simplify to N faces; 0 keeps all")
+    remesh: float = option(
+        0.0, "even triangles with edges of this length, in the data set's unit; 0 keeps them", low=0, metavar="LENGTH"
+    )
+    target_faces: int = option(0, "simplify to N faces; 0 keeps all", low=0, high=10**9)
     texture: int = option(
         0,
         "give .obj and .glb a texture of SIZE by SIZE texels out of the photographs; 0 gives vertex colours",
+        low=0,
         metavar="SIZE",
     )

@@ -16,7 +16,7 @@ import numpy as np
 from linprim_geo.base.budget import Budget
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import locked, remove_torn, write_json
-from linprim_geo.base.options import ExtractOptions
+from linprim_geo.base.options import ExtractOptions, check
 from linprim_geo.base.progress import Progress, Stages
 from linprim_geo.geometry.mesh_files import SUFFIXES
 from linprim_geo.geometry.topology import manifold_status, topology, topology_line
@@ -26,7 +26,6 @@ from linprim_geo.runs.run import Run
 from linprim_geo.surface.choose_level import USUAL_LEVEL, choose_level
 from linprim_geo.surface.postprocess import finish_surface, visible_file
 from linprim_geo.surface.single_view import without_single_views
-from linprim_geo.surface.texture import LARGEST as LARGEST_TEXTURE
 from linprim_geo.surface.texture import check_texture
 from linprim_geo.surface.voxel_budget import choose_voxel
 
@@ -40,21 +39,6 @@ METHODS = {
 
 # Folder of what workers have done, in that of the method.
 PARTS = "parts"
-
-RANGES = {
-    "level": (1e-6, 1 - 1e-6),
-    "voxel_size": (0, 1e30),
-    "truncation": (1, 100),
-    "memory_limit": (0, 1e9),
-    "depth_limit": (0, 1e30),
-    "smallest_part": (0, 1),
-    "refine": (0, 100),
-    "close_holes": (0, 10**9),
-    "smooth": (0, 10_000),
-    "remesh": (0, 1e30),
-    "target_faces": (0, 10**9),
-    "texture": (0, LARGEST_TEXTURE),
-}
 
 
 def extract_mesh(
@@ -98,13 +82,7 @@ def extract_mesh(
     options, budget = options or ExtractOptions(), Budget.of(time_budget)
     if method not in METHODS:
         raise LinprimError(f"--method is {method!r}, wanted {' or '.join(METHODS)}")
-    for name, (low, high) in RANGES.items():
-        value = getattr(options, name)
-        if name == "level" and value == "auto":
-            continue
-        if isinstance(value, str) or not low <= value <= high:
-            also = "auto, or " if name == "level" else ""
-            raise LinprimError(f"--{name.replace('_', '-')} is {value}, wanted {also}{low:g} to {high:g}")
+    check(options)
     if budget and method != "tsdf":
         raise LinprimError(
             f"--time-budget chooses a voxel size, which --method {method} has none of: wanted --method tsdf"
