@@ -89,18 +89,12 @@ def frames_of(path: Path, frames: int, cache: Path | None = None) -> Path:
     """
     if not video_frames.is_video(path):
         return path
-    folder = video_frames.frames_folder(path, _checked_count(frames), cache)
+    folder = video_frames.frames_folder(path, frames, cache)
     if not folder.is_dir():
         raise LinprimError(
             f"{path}: a video of which no {frames} frames were taken yet; linprim-geo inspect and train do"
         )
     return folder
-
-
-def _checked_count(frames: int) -> int:
-    if frames < MIN_REGISTERED:
-        raise LinprimError(f"--frames is {frames}, wanted at least {MIN_REGISTERED}")
-    return frames
 
 
 def found_model(root: Path, cache: Path | None = None) -> Path | None:

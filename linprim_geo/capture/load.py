@@ -12,9 +12,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import is_file
+from linprim_geo.base.options import SceneOptions, with_changes
 from linprim_geo.capture import found_poses
 from linprim_geo.capture.types import PHOTOGRAPHS, Frame, Listing, Scene, View, check_pose
 from linprim_geo.geometry.camera import Camera
@@ -30,14 +32,10 @@ _ALPHA_SAMPLES = 6
 
 def load_scene(
     path: str | os.PathLike,
+    options: SceneOptions | None = None,
     *,
-    downscale: int = 1,
-    masks: str | os.PathLike | None = None,
-    images: str | os.PathLike | None = None,
-    sparse: str | os.PathLike | None = None,
-    frames: int = 150,
     cache: str | os.PathLike | None = None,
-    pinhole_below: float = 0.0,
+    **changes: Any,
 ) -> Scene:
     """Reads a posed capture: `transforms*.json` (NeRF-synthetic, nerfstudio, instant-ngp), ScanNet++, a COLMAP model,
     DTU's `cameras_sphere.npz`, TUM's lists, or a trajectory (`.log`) with depth maps or of Tanks and Temples, in this
@@ -52,19 +50,12 @@ def load_scene(
 
     Args:
         path: the data set's folder, or a `.json` in it, or a video.
-        downscale: average this many pixels squared into one; cameras are scaled exactly. Where all photographs are
-            there in a folder such as `images_4` beside `images`, smaller by that factor but for rounding, these are
-            taken.
-        masks: folder of foreground masks named as the images; found by itself if it is `masks` or `mask`. With "none"
-            neither masks nor alpha channels are used.
-        images: folder of photographs that take the place of those that the cameras name; cameras are scaled to their
-            size.
-        sparse: folder of the COLMAP model, if it is not `sparse/0`, `sparse`, `colmap/sparse/0` or the folder
-            itself.
-        frames: how many were taken of a video.
+        options: how it is read. With `downscale` cameras are scaled exactly; where all photographs are there in a
+            folder such as `images_4` beside `images`, smaller by that factor but for rounding, these are taken.
+            `masks` are named as the images, and found without it in `masks` or `mask`; `images` scales the cameras to
+            the size of these images. The pixels of `pinhole_below` are those of the averaged image.
         cache: where undistorted images and poses that were found are kept, see `photos.cache_folder`.
-        pinhole_below: a lens that shifts no ray by this many pixels (of the averaged image) from where the pinhole of
-            its focal lengths and principal point has it is taken for that pinhole, and its photographs as they are.
+        changes: fields of `options` by name, such as `downscale=2`.
 
     Raises:
         LinprimError: one sentence about the first thing that is missing, damaged or does not fit together.
@@ -72,15 +63,15 @@ def load_scene(
     from linprim_geo.capture.image_folders import with_images, with_masks, with_smaller_images
     from linprim_geo.capture.readers import colmap as read_colmap
 
-    if isinstance(downscale, bool) or int(downscale) != downscale or downscale < 1:
-        raise LinprimError(f"downscale is {downscale}, wanted a whole number from 1")
+    options = with_changes(SceneOptions, options, changes)
+    downscale, pinhole_below = int(options.downscale), options.pinhole_below
     cache = Path(cache) if cache else None
-    path = found_poses.frames_of(Path(path), frames, cache)
+    path = found_poses.frames_of(Path(path), options.frames, cache)
     root, json_file = _root(path)
-    sparse_folder = _option_folder(sparse, root, "--sparse")
-    unmasked = masks == "none"
-    masks_folder = None if unmasked else _option_folder(masks, root, "--masks")
-    images_folder = _option_folder(images, root, "--images")
+    sparse_folder = _option_folder(options.sparse, root, "--sparse")
+    unmasked = options.masks == "none"
+    masks_folder = None if unmasked else _option_folder(options.masks, root, "--masks")
+    images_folder = _option_folder(options.images, root, "--images")
     read = _reader(root, json_file, sparse_folder, images_folder)
     if read is not None:
         listing = read()
@@ -98,7 +89,7 @@ def load_scene(
         posed = with_images(posed, images_folder)
     if not unmasked:
         posed = with_masks(posed, root, masks_folder)
-    smaller = with_smaller_images(posed, root, int(downscale)) if images_folder is None else None
+    smaller = with_smaller_images(posed, root, downscale) if images_folder is None else None
     if smaller is not None:
         posed, downscale = smaller, 1
     names = _names(posed)
@@ -112,9 +103,10 @@ def load_scene(
         posed = [replace(frame, lens=straight[frame.lens]) for frame in posed]
     views = []
     for frame, name in zip(posed, names, strict=True):
-        views.append(_view(frame, name, int(downscale), has_alpha, folder, pinholes))
+        views.append(_view(frame, name, downscale, has_alpha, folder, pinholes))
     train, test = _split(posed, views)
-    return Scene(root, listing.kind, train, test, listing.points, listing.unit or "unit of the data set")
+    scene = Scene(root, listing.kind, train, test, listing.points, listing.unit or "unit of the data set")
+    return scene.with_training_views(options.views)
 
 
 def has_poses(path: Path, sparse: str | os.PathLike | None = None) -> bool:

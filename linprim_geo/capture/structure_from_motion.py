@@ -14,15 +14,16 @@ from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import locked, write_json
+from linprim_geo.base.options import SceneOptions, with_changes
 from linprim_geo.capture import video_frames
 from linprim_geo.capture.found_poses import (
     _COPIES,
     Verdict,
     _base,
-    _checked_count,
     _key,
     _readable,
     _refuse,
@@ -36,27 +37,27 @@ from linprim_geo.imaging import photos
 
 def prepare(
     path: str | os.PathLike,
-    sparse: str | None = None,
-    frames: int = 150,
-    cache: Path | None = None,
+    options: SceneOptions | None = None,
     *,
+    cache: Path | None = None,
     threads: int = 0,
     log: Callable[[str], None] | None = None,
+    **changes: Any,
 ) -> None:
     """Makes a folder of photographs without poses, or a video, readable by `load_scene`, which may take minutes; leaves
     all else alone.
 
     Args:
-        path, sparse, frames, cache: as for `load_scene`.
+        path, options, cache, changes: as for `load_scene`.
         threads, log: as for `find_poses`.
 
     Raises:
         LinprimError: as `video_frames.extract_frames` and `find_poses`, or there is nothing at `path`.
     """
-    path = Path(path)
+    path, options = Path(path), with_changes(SceneOptions, options, changes)
     if video_frames.is_video(path):
-        path = video_frames.extract_frames(path, _checked_count(frames), cache, log)
-    if not has_poses(path, sparse) and photographs(path)[1]:
+        path = video_frames.extract_frames(path, options.frames, cache, log)
+    if not has_poses(path, options.sparse) and photographs(path)[1]:
         find_poses(path, cache, threads=threads, log=log)
 
 

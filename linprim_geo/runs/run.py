@@ -173,14 +173,8 @@ class Run:
         options = self.scene_options
         found = self.path / FOUND_POSES
         return load_scene(
-            self.scene_path,
-            downscale=options.downscale,
-            masks=options.masks or None,
-            images=options.images or None,
-            sparse=options.sparse or (found if found.is_dir() else None),
-            frames=options.frames,
-            pinhole_below=options.pinhole_below,
-        ).with_training_views(options.views)
+            self.scene_path, options, sparse=options.sparse or (str(found) if found.is_dir() else "")
+        )
 
     @cached_property
     def state(self) -> dict:

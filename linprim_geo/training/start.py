@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import GEOMETRY_WEIGHTS, SceneOptions, TrainOptions, check_train_options
 from linprim_geo.base.progress import Progress
 from linprim_geo.capture.load import load_scene
@@ -45,20 +44,9 @@ def decided_scene(
     """
 
     def read(how: SceneOptions) -> Scene:
-        loaded = load_scene(
-            path,
-            downscale=how.downscale,
-            masks=how.masks or None,
-            images=how.images or None,
-            sparse=how.sparse or None,
-            frames=how.frames,
-            pinhole_below=how.pinhole_below,
-        ).with_training_views(how.views)
-        return with_points(loaded, options, log)
+        return with_points(load_scene(path, how), options, log)
 
-    if scene_options.views < 0:
-        raise LinprimError(f"--views is {scene_options.views}, wanted a number of training views, or 0 for all")
-    prepare(path, scene_options.sparse or None, scene_options.frames, threads=options.threads, log=log)
+    prepare(path, scene_options, threads=options.threads, log=log)
     scene = read(scene_options)
     if choice.mode == "none" and not choice.asked:
         return [], scene, scene_options, options

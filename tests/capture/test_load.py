@@ -234,7 +234,7 @@ def test_one_image_is_refused(tmp_path):
 @pytest.mark.parametrize("value", [0, -1, 1.5, True])
 def test_downscale_must_be_a_whole_number(tmp_path, value):
     write_transforms(tmp_path, 3)
-    assert "wanted a whole number" in refusal(tmp_path, downscale=value)
+    assert f"--downscale is {value}, wanted " in refusal(tmp_path, downscale=value)
 
 
 def test_downscale_that_leaves_nothing(tmp_path):

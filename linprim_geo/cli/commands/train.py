@@ -104,7 +104,6 @@ def _downscale_of(resolution: int, scene: str, options: SceneOptions, threads: i
     from linprim_geo.capture.load import load_scene
     from linprim_geo.capture.structure_from_motion import prepare
 
-    prepare(Path(scene), options.sparse or None, options.frames, threads=threads, log=log)
-    o = options
-    views = load_scene(scene, masks=o.masks, images=o.images, sparse=o.sparse, frames=o.frames).train
+    prepare(scene, options, threads=threads, log=log)
+    views = load_scene(scene, options).train
     return -(-max(view.camera.width for view in views) // width)
