@@ -4,6 +4,7 @@ the Python functions and a run's config.json cannot disagree."""
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import Field, dataclass, field, fields, replace
 from numbers import Integral, Real
 from typing import Any, get_args, get_type_hints
@@ -20,14 +21,17 @@ def option(
     choices: tuple = (),
     metavar: str | None = None,
     number_or: str | None = None,
+    parse: Callable[[str], Any] | None = None,
 ):
     """A dataclass field that the command line turns into `--field-name` with `text` as its help.
 
     Its value is at least `low` and at most `high`, or one of `choices`; `check` says so where it is not. With
-    `number_or` it holds a number or that word.
+    `number_or` it holds a number or that word. With `parse` it holds what that makes of the flag's text, or raises
+    ValueError with a sentence; who uses it checks it. A bool is True where the flag is given, a tuple of text holds the
+    words after the flag.
     """
-    metadata = {"help": text, "low": low, "high": high, "choices": choices, "metavar": metavar, "number_or": number_or}
-    return field(default=default, metadata=metadata)
+    metadata = {"help": text, "low": low, "high": high, "choices": choices}
+    return field(default=default, metadata=metadata | {"metavar": metavar, "number_or": number_or, "parse": parse})
 
 
 def kinds(cls: type) -> dict[str, type]:
@@ -61,7 +65,7 @@ def _wanted(value: Any, entry: Field, kind: type) -> str:
         return ""
     if choices:
         return "" if value in choices else f"one of {', '.join(map(str, choices))}"
-    if kind not in (int, float):
+    if kind not in (int, float) or entry.metadata["parse"]:
         return ""
     word = entry.metadata["number_or"]
     also = f"{word}, or " if word else ""

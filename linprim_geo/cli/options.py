@@ -7,6 +7,8 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+from linprim_geo.base.options import flag_of, kinds
+
 SPLITS = ("train", "test", "all")
 
 # Adds a command by its name, the function that runs it, and one line of help; returns its parser.
@@ -14,25 +16,47 @@ AddCommand = Callable[[str, Callable[[argparse.Namespace], dict], str], argparse
 
 
 def add_options(parser: argparse._ActionsContainer, options: type) -> None:
-    """Adds one `--field-name` per field of the dataclass `options`: its type and default, its metadata's help, choices
-    and metavar. A bool becomes `--field` and `--no-field`."""
+    """Adds one `--field-name` per field of the dataclass `options`, as `base.options.option` describes it."""
+    kind_of = kinds(options)
     for field in dataclasses.fields(options):
-        flag = "--" + field.name.replace("_", "-")
-        text = field.metadata.get("help", "").replace("%", "%%")
-        shown = "" if field.default in ("", None) else f" (default {field.default})"
+        metadata, kind = field.metadata, kind_of[field.name]
         # No default here, so that given options can be told from defaults.
-        settings: dict[str, Any] = {"dest": field.name, "default": argparse.SUPPRESS, "help": text + shown}
-        if isinstance(field.default, bool):
-            settings["action"] = argparse.BooleanOptionalAction
+        settings: dict[str, Any] = {"dest": field.name, "default": argparse.SUPPRESS}
+        settings["help"] = metadata["help"].replace("%", "%%") + _shown_default(field.default)
+        if kind is bool:
+            settings["action"] = "store_true"
         else:
-            settings["type"] = str if field.default is None else type(field.default)
-            if field.metadata.get("number_or"):
-                settings["type"] = number_or(field.metadata["number_or"])
-            settings["choices"] = field.metadata.get("choices") or None
-            settings["metavar"] = field.metadata.get("metavar")
+            settings["type"] = _type_of(kind, metadata["number_or"], metadata["parse"])
+            settings["choices"] = metadata["choices"] or None
+            settings["metavar"] = metadata["metavar"]
             if settings["metavar"] is None and settings["choices"] is None:
                 settings["metavar"] = {int: "N", float: "X"}.get(settings["type"], "TEXT")
-        parser.add_argument(flag, **settings)
+            if isinstance(field.default, tuple) and not metadata["parse"]:
+                settings["nargs"] = "+"
+        parser.add_argument(flag_of(field.name), **settings)
+
+
+def _shown_default(default: object) -> str:
+    if default in ("", None, ()) or default is False:
+        return ""
+    shown = ",".join(map(str, default)) if isinstance(default, tuple) else default
+    return f" (default {shown})"
+
+
+def _type_of(kind: type, word: str | None, parse: Callable[[str], Any] | None) -> Callable[[str], Any]:
+    """What argparse makes a value by."""
+    if word:
+        return number_or(word)
+    if parse is None:
+        return kind
+
+    def parsed(text: str) -> Any:
+        try:
+            return parse(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return parsed
 
 
 def add_effects(parser: argparse.ArgumentParser, default: str) -> None:
@@ -130,23 +154,8 @@ def length(text: str) -> float:
     return value
 
 
-def pair(text: str) -> tuple[float, float]:
-    x, y = (float(part) for part in text.split(","))
-    if not (abs(x) < float("inf") and abs(y) < float("inf")):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a pair of numbers, such as 5,-3")
-    return x, y
-
-
-def size(text: str) -> tuple[int, int]:
-    width, cross, height = text.lower().partition("x")
-    height = height if cross else width
-    if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a size in pixels, such as 640x480 or 320")
-    return int(width), int(height)
-
-
 # argparse names the type in its message: "invalid count value", not "invalid positive value".
 positive.__name__ = whole.__name__ = "count"
 not_negative.__name__ = length.__name__ = "number"
 blocks.__name__ = "count, or auto:"
-size.__name__, pair.__name__, seconds.__name__ = "size", "pair X,Y", "time such as 90s, 5m or 1h"
+seconds.__name__ = "time such as 90s, 5m or 1h"

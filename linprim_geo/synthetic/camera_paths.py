@@ -9,8 +9,6 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.raycast import RayCaster
 
-PATHS = ("orbit", "hemisphere", "sphere", "arc", "inside-out")
-
 RING_ELEVATIONS_DEG = (-38.0, 6.0, 42.0)
 """The rings of `orbit`: below, level and above, so that every side of an object is seen."""
 

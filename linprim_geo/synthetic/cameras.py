@@ -10,59 +10,55 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.synthetic import camera_paths as campath
-from linprim_geo.synthetic.options import Options, number
+from linprim_geo.synthetic.options import SynthOptions
 from linprim_geo.synthetic.textured import TexturedMesh
 
 
 def place_cameras(
-    surface: TexturedMesh,
-    caster: RayCaster,
-    options: Options,
-    path: str,
-    fov: float,
-    distance: float | None,
-    principal_point_offset: tuple[float, float],
+    surface: TexturedMesh, caster: RayCaster, options: SynthOptions, path: str, fov: float
 ) -> tuple[list[Camera], list[Camera], float | None]:
     """Training cameras, held-out cameras, and their distance from the middle of the surface (None inside it).
 
     Args:
         surface: what the cameras look at, without a table.
         caster: that of `surface`; only cameras inside it need it.
-        fov: horizontal field of view in degrees.
-        distance: None for the smallest one at which the surface is within all pictures (of an arc: of a hemisphere).
-        principal_point_offset: of (cx, cy) from the middle of the image, pixels.
+        options: without a distance it is the smallest one at which the surface is within all pictures (of an arc: of
+            a hemisphere).
+        path, fov: the options', or what suits the surface.
 
     Raises:
         LinprimError: the distance or the offset has no meaning, or there is no room for cameras inside.
     """
-    width, height = options.size
+    width, height = options.width_height
     focal = 0.5 * width / np.tan(0.5 * np.deg2rad(fov))
     half = (0.5 * np.deg2rad(fov), float(np.arctan(0.5 * height / focal)))
-    dx, dy = (number("principal_point_offset", value, -float(max(width, height))) for value in principal_point_offset)
+    dx, dy = (float(value) for value in options.principal_point_offset)
+    if not -max(width, height) <= min(dx, dy) <= max(dx, dy) < np.inf:
+        raise LinprimError(f"--principal-point-offset is {dx:g},{dy:g}, wanted at least -{max(width, height)}")
     base = Camera(width, height, focal, focal, 0.5 * width + dx, 0.5 * height + dy, np.eye(4))
     if path == "inside-out":
         poses, held_out = campath.inside_out(caster, options.views, options.test_views, half, options.seed)
         distance = None
     else:
-        poses, held_out, distance = _poses_around(surface, options, path, base, distance)
+        poses, held_out, distance = _poses_around(surface, options, path, base)
     train, test = ([replace(base, world_to_camera=pose) for pose in some] for some in (poses, held_out))
     return _zoomed(train, options.zoom), _zoomed(test, options.zoom), distance
 
 
-def _poses_around(surface: TexturedMesh, options: Options, path: str, base: Camera, distance: float | None):
+def _poses_around(surface: TexturedMesh, options: SynthOptions, path: str, base: Camera):
     """Training and held-out (4, 4) world-to-camera poses around the surface, and their distance from its middle."""
     vertices = surface.used_vertices
     center = 0.5 * (vertices.min(0) + vertices.max(0))
     radius = float(np.linalg.norm(vertices - center, axis=1).max())
     on_arc = path == "arc"
+    distance = options.distance
     if distance is None:
         fitted = "hemisphere" if on_arc else path
         distance = campath.fitting_distance(fitted, vertices, center, options.views, base)
-    distance = number("distance", distance, 0.0)
     nearest = distance * (1.0 - campath.ARC_DISTANCE) if on_arc else distance
     if nearest <= radius:
         raise LinprimError(
-            f"distance is {distance:g}, but the object reaches {radius:g} from its middle"
+            f"--distance is {distance:g}, but the object reaches {radius:g} from its middle"
             f"{f' and the nearest view is at {nearest:g}' if on_arc else ''}; more is wanted"
         )
     if on_arc:

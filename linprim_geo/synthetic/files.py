@@ -11,11 +11,11 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.synthetic.options import Options
+from linprim_geo.synthetic.options import SynthOptions
 from linprim_geo.synthetic.photos import photo_name
 
 
-def shared_keys(camera: Camera, unit: float, options: Options, name_of_unit: str) -> dict:
+def shared_keys(camera: Camera, unit: float, options: SynthOptions, name_of_unit: str) -> dict:
     """What all frames of a transforms file have in common; `unit` is that of the depth in PNG files."""
     lens = {"camera_model": "OPENCV", "k1": options.distortion} if options.distortion else {"camera_model": "PINHOLE"}
     return {
@@ -34,7 +34,7 @@ def shared_keys(camera: Camera, unit: float, options: Options, name_of_unit: str
     }
 
 
-def frame_entry(split: str, number: int, camera: Camera, options: Options) -> dict:
+def frame_entry(split: str, number: int, camera: Camera, options: SynthOptions) -> dict:
     """The entry of one view in a transforms file."""
     name = f"{split}/{number:03d}"
     opengl = camera.camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])

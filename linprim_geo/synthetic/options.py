@@ -1,137 +1,148 @@
-"""The options of a synthetic capture, checked: each that has no meaning is refused with one sentence."""
+"""The options of a synthetic capture, and which of them exclude each other."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-
-import numpy as np
+from numbers import Integral
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import option
 
 Color = tuple[float, float, float]
 
+PATHS = ("orbit", "hemisphere", "sphere", "arc", "inside-out")
+
+# Pixels along a side of an image.
+SMALLEST_SIDE, LARGEST_SIDE = 8, 16384
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """640x480, or 320 for 320x320."""
+    width, cross, height = text.lower().partition("x")
+    height = height if cross else width
+    if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
+        raise ValueError(f"{text!r} is not a size in pixels, such as 640x480 or 320")
+    return int(width), int(height)
+
+
+def parse_pair(text: str) -> tuple[float, float]:
+    """Two numbers with a comma between them."""
+    try:
+        x, y = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = math.nan
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise ValueError(f"{text!r} is not a pair of numbers, such as 5,-3")
+    return x, y
+
 
 @dataclass(frozen=True)
-class Options:
-    """The options of `synth.synthesize` that do not depend on the surface, as `checked_options` gives them."""
+class SynthOptions:
+    """How a surface is photographed.
 
-    views: int
-    test_views: int
-    size: tuple[int, int]
-    supersample: int
-    points: int
-    point_noise: float
-    shading: str
-    depth_format: str
-    seed: int
-    exposure_drift: float
-    distortion: float
-    specular: float
-    zoom: float
-    table: float
-    environment: int | None
-    arc: float | None
-    noise: float
-    jpeg: int
-
-
-def checked_options(
-    *,
-    views,
-    test_views,
-    size,
-    supersample,
-    points,
-    point_noise,
-    shading,
-    depth_format,
-    seed,
-    exposure_drift,
-    distortion,
-    specular,
-    zoom,
-    table,
-    environment,
-    arc,
-    noise,
-    jpeg,
-) -> Options:
-    """The options, each within its range.
-
-    Raises:
-        LinprimError: an option has no meaning.
+    `path` is three rings, a half or a whole sphere, a walk with the camera in hand, or stations inside a room.
+    `distance` is from the middle of the bounding box (on an arc its mean); without it the object fills the frame.
+    `shading` is by two distant lamps without shadows (Lambert), to which `specular` adds highlights (Phong's, exponent
+    12). `points` lie uniform by area (with a table: as dense as the pixels that show it), each observed by at least
+    three training views; with `point_noise` their observations stay exact, and their error is the mean reprojection
+    error in pixels. A gain of `exposure_drift` is exp of a uniform number within it of 0 for all channels, and a
+    quarter of it for each; the geometric mean over the photographs is 1, and held-out ones have none. `table` is square
+    and of wood, its side so many times the object's largest horizontal extent; cameras stay above it. Half of the
+    variance of `noise` grows with the signal.
     """
-    return Options(
-        views=integer("views", views, 2),
-        test_views=integer("test_views", test_views, 0),
-        size=_size(size),
-        supersample=integer("supersample", supersample, 1, 16),
-        points=integer("points", points, 0),
-        point_noise=number("point_noise", point_noise, 0.0),
-        shading=choice("shading", shading, ("albedo", "shaded")),
-        depth_format=choice("depth_format", depth_format, ("png", "npy")),
-        seed=integer("seed", seed, 0),
-        exposure_drift=number("exposure_drift", exposure_drift, 0.0, 2.0),
-        distortion=number("distortion", distortion, -0.5, 0.5),
-        specular=number("specular", specular, 0.0, 10.0),
-        zoom=number("zoom", zoom, 0.1, 10.0),
-        table=_table(table),
-        environment=None if environment is None else integer("environment", environment, 0),
-        arc=None if arc is None else number("arc", arc, 1.0, 360.0),
-        noise=number("noise", noise, 0.0, 100.0),
-        jpeg=integer("jpeg", jpeg, 0, 100),
+
+    views: int = option(60, "training views", low=2)
+    test_views: int = option(12, "held-out views, which lie between the others", low=0)
+    size: int | tuple[int, int] = option(320, "pixels", metavar="WxH", parse=parse_size)
+    path: str | None = option(None, "of the cameras (default: what suits the scene)", choices=PATHS)
+    fov: float | None = option(None, "horizontal (default 45, inside 75)", low=1, high=170, metavar="DEGREES")
+    distance: float | None = option(None, "from the middle, in the mesh's unit", low=0, metavar="LENGTH")
+    principal_point_offset: tuple[float, float] = option(
+        (0.0, 0.0),
+        "from the middle of the image, in pixels; a negative one is written --...=-5,3",
+        metavar="X,Y",
+        parse=parse_pair,
     )
+    shading: str = option("albedo", "colours as they are, or under lamps", choices=("albedo", "shaded"))
+    background: str | Color | None = option(
+        None,
+        "transparent, black, white or r,g,b in [0,1] (default: transparent around an object, black inside)",
+        metavar="COLOR",
+    )
+    points: int = option(20_000, "points as of structure from motion, on the surface", low=0)
+    point_noise: float = option(
+        0.0, "standard deviation per axis of the points, in the mesh's unit", low=0, metavar="LENGTH"
+    )
+    supersample: int = option(3, "K*K rays a pixel", low=1, high=16, metavar="K")
+    depth_format: str = option("png", "depth maps, in whole steps or as float32", choices=("png", "npy"))
+    detail: float = option(1.0, "contrast of a built-in scene's texture", low=0, high=10)
+    exposure_drift: float = option(
+        0.0, "gains of the training photographs vary by up to exp(X) each way", low=0, high=2
+    )
+    distortion: float = option(
+        0.0,
+        "k1 of a lens with radial distortion; a negative one is written --...=-0.1",
+        low=-0.5,
+        high=0.5,
+        metavar="K1",
+    )
+    specular: float = option(0.0, "strength of highlights that move with the camera", low=0, high=10)
+    zoom: float = option(1.0, "every third camera has X times the focal length", low=0.1, high=10)
+    table: float = option(0.0, "stand it on a table X times as wide as it is; 0: none", low=0, high=100)
+    environment: int | None = option(None, "a room at infinity, drawn by seed N, in place of a background", low=0)
+    arc: float | None = option(
+        None, "of azimuth that the path arc covers (default 300)", low=1, high=360, metavar="DEGREES"
+    )
+    noise: float = option(0.0, "standard deviation of sensor noise at middle grey, in units of 1/255", low=0, high=100)
+    jpeg: int = option(0, "photographs as .jpg of this quality; 0: .png", low=0, high=100, metavar="QUALITY")
+    seed: int = option(0, "seed of everything random", low=0)
+    threads: int = option(0, "0 uses every core; the files do not depend on it", low=0)
+
+    @property
+    def width_height(self) -> tuple[int, int]:
+        """`size` as pixels along both sides.
+
+        Raises:
+            LinprimError: not one or two whole numbers from SMALLEST_SIDE to LARGEST_SIDE.
+        """
+        sides = self.size if isinstance(self.size, (tuple, list)) else (self.size, self.size)
+        if len(sides) != 2 or not all(isinstance(x, Integral) and SMALLEST_SIDE <= x <= LARGEST_SIDE for x in sides):
+            raise LinprimError(f"--size is {self.size!r}, wanted {SMALLEST_SIDE} to {LARGEST_SIDE} pixels along a side")
+        return int(sides[0]), int(sides[1])
 
 
-def check_together(options: Options, path: str, background: str | Color | None, transparent: bool) -> None:
-    """Refuses options that exclude each other; `background` is None if it was not given.
+def check_together(options: SynthOptions, path: str, transparent: bool) -> None:
+    """Refuses options that exclude each other; `path` and `transparent` are what was chosen where nothing was said.
 
     Raises:
-        LinprimError: a table seen from below, an arc that is not walked, two backgrounds, JPEG with alpha.
+        LinprimError: a table that is no table or seen from below, an arc that is not walked, two backgrounds, JPEG with
+            alpha.
     """
+    if 0 < options.table < 1:
+        raise LinprimError(f"--table is {options.table}, wanted 0, or 1 to 100")
     if options.table and path not in ("arc", "hemisphere"):
-        raise LinprimError(f"path is {path}, but of a table only what is above it is seen; arc or hemisphere is wanted")
+        raise LinprimError(f"--path is {path}, but of a table only what is above it is seen: wanted arc or hemisphere")
     if options.arc is not None and path != "arc":
-        raise LinprimError(f"arc is {options.arc:g}, but path is {path}; only the path arc has an arc")
-    if options.environment is not None and background is not None:
+        raise LinprimError(f"--arc is {options.arc:g}, but --path is {path}: only the path arc has an arc")
+    if options.environment is not None and options.background is not None:
         raise LinprimError(
-            f"environment {options.environment} and background {background!r} are both given, one of them is wanted"
+            f"--environment {options.environment} and --background {options.background!r} are both given, wanted one "
+            "of them"
         )
     if options.jpeg and transparent:
         raise LinprimError(
-            f"jpeg is {options.jpeg}, but the background is transparent, which JPEG cannot hold;"
-            " an environment or an opaque background is wanted"
+            f"--jpeg is {options.jpeg}, but the background is transparent, which JPEG cannot hold: wanted an "
+            "environment or an opaque background"
         )
 
 
-def integer(name: str, value, low: int, high: int | None = None) -> int:
-    """The whole number `value` of at least `low` and at most `high`."""
-    if not isinstance(value, (int, np.integer)) or value < low or (high is not None and value > high):
-        wanted = f"at least {low}" if high is None else f"{low} to {high}"
-        raise LinprimError(f"{name} is {value!r}, a whole number of {wanted} is wanted")
-    return int(value)
-
-
-def number(name: str, value, low: float, high: float = np.inf) -> float:
-    """The finite number `value` from `low` to `high`."""
-    try:
-        converted = float(value)
-    except (TypeError, ValueError):
-        converted = np.nan
-    if not low <= converted <= high or not np.isfinite(converted):
-        raise LinprimError(f"{name} is {value!r}, a number from {low:g} to {high:g} is wanted")
-    return converted
-
-
-def choice(name: str, value, choices: tuple[str, ...]) -> str:
-    """`value`, which is one of `choices`."""
-    if value not in choices:
-        raise LinprimError(f"{name} is {value!r}, one of {', '.join(choices)} is wanted")
-    return value
-
-
 def background_color(value: str | Color) -> Color | None:
-    """The colour of an opaque background, None for a transparent one."""
+    """The colour of an opaque background, None for a transparent one.
+
+    Raises:
+        LinprimError: neither a name nor three numbers in [0, 1].
+    """
     named = {"transparent": None, "black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
     if isinstance(value, str) and value in named:
         return named[value]
@@ -140,17 +151,5 @@ def background_color(value: str | Color) -> Color | None:
     except (TypeError, ValueError):
         color = ()
     if len(color) != 3 or not all(0.0 <= x <= 1.0 for x in color):
-        raise LinprimError(f"background is {value!r}, transparent, black, white or r,g,b in [0, 1] is wanted")
+        raise LinprimError(f"--background is {value!r}, wanted transparent, black, white or r,g,b in [0, 1]")
     return color
-
-
-def _table(value) -> float:
-    table = number("table", value, 0.0, 100.0)
-    if 0.0 < table < 1.0:
-        raise LinprimError(f"table is {value!r}, 0 or a number from 1 to 100 is wanted")
-    return table
-
-
-def _size(size) -> tuple[int, int]:
-    width, height = size if isinstance(size, (tuple, list)) else (size, size)
-    return integer("width", width, 8, 16384), integer("height", height, 8, 16384)

@@ -9,26 +9,20 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import write_json
+from linprim_geo.base.options import with_changes
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.synthetic import camera_paths as campath
 from linprim_geo.synthetic.cameras import place_cameras
 from linprim_geo.synthetic.environment import SyntheticEnvironment, synthetic_environment
 from linprim_geo.synthetic.files import frame_entry, prepare_folder, publish_folder, shared_keys
-from linprim_geo.synthetic.options import (
-    Color,
-    Options,
-    background_color,
-    check_together,
-    checked_options,
-    choice,
-    number,
-)
+from linprim_geo.synthetic.options import Color, SynthOptions, background_color, check_together
 from linprim_geo.synthetic.photos import photo_name, save_photo, save_png, sensor_noise, to_bytes
 from linprim_geo.synthetic.points import camera_rays, sample_points, write_colmap, write_points
 from linprim_geo.synthetic.shapes import SHAPES
@@ -57,35 +51,12 @@ REFINE = 0.01
 
 def synthesize(
     out: str | os.PathLike,
+    options: SynthOptions | None = None,
     *,
     shape: str | None = None,
     mesh: str | os.PathLike | TexturedMesh | None = None,
-    views: int = 60,
-    test_views: int = 12,
-    size: int | tuple[int, int] = 320,
-    path: str | None = None,
-    fov: float | None = None,
-    distance: float | None = None,
-    principal_point_offset: tuple[float, float] = (0.0, 0.0),
-    shading: str = "albedo",
-    supersample: int = 3,
-    background: str | tuple[float, float, float] | None = None,
-    points: int = 20_000,
-    point_noise: float = 0.0,
-    depth_format: str = "png",
-    detail: float = 1.0,
-    exposure_drift: float = 0.0,
-    distortion: float = 0.0,
-    specular: float = 0.0,
-    zoom: float = 1.0,
-    table: float = 0.0,
-    environment: int | None = None,
-    arc: float | None = None,
-    noise: float = 0.0,
-    jpeg: int = 0,
-    seed: int = 0,
-    threads: int = 0,
     overwrite: bool = False,
+    **changes: Any,
 ) -> dict:
     """Renders a capture of a built-in scene or of a mesh into the folder `out`, with the truth next to it.
 
@@ -105,44 +76,11 @@ def synthesize(
     Args:
         out: folder to make; it must not exist or be empty. Everything is written to a temporary folder beside
             it that is renamed at the end.
+        options: how it is photographed.
         shape: `cad`, `smooth`, `room` or `wires`. One of `shape` and `mesh`; neither is `cad`.
         mesh: a mesh file with texture or vertex colours, or a `TexturedMesh`.
-        views, test_views: how many; the test views lie between the others.
-        size: pixels, one number or (width, height).
-        path: `orbit` (three rings), `hemisphere`, `sphere`, `arc` (walked, camera in hand) or `inside-out`; default:
-            what suits the shape, and `arc` with a table.
-        fov: horizontal field of view in degrees; default 45 around an object, 75 inside.
-        distance: of the camera from the middle of the bounding box, in the mesh's unit; default: the object
-            fills the frame. On an arc it is the mean distance.
-        principal_point_offset: of (cx, cy) from the middle of the image, in pixels.
-        shading: `albedo`, or `shaded` by two distant lamps without shadows (Lambert, no view dependence).
-        supersample: rays per pixel along each axis.
-        background: `transparent` (straight alpha), `black`, `white`, `r,g,b` in [0, 1]; default transparent
-            around an object, black inside.
-        points: SfM-like points on the surface, uniform by area (with a table: as dense as the pixels that show it),
-            each observed by at least three training views (two if there are no more).
-        point_noise: standard deviation per axis in the mesh's unit; the observations stay exact, and the
-            points' error is their mean reprojection error in pixels.
-        depth_format: `png` or `npy`.
-        detail: contrast of the built-in texture's bands, blotches and grain.
-        exposure_drift: every training photograph is multiplied by a gain per channel, exp of a uniform number within
-            this of 0, the same for the channels, and a quarter of it for each; the geometric mean over the photographs
-            is 1 per channel, as the gain of the held-out ones is. What exceeds white is cut, as in a camera. The gains
-            are in `synth.json`.
-        distortion: k1 of OpenCV's radial distortion; images, depth, normals and masks are those of that lens.
-        specular: strength of highlights of the two lamps (Phong's, exponent 12), added to either shading.
-        zoom: every third camera has a focal length so many times as long.
-        table: the object stands on a square table of wood whose side is so many times its largest horizontal extent; 0
-            is none. Everything that is written contains the table. Cameras look at the object, and stay above the
-            table.
-        environment: seed of a room at infinity that stands behind everything, in place of `background`; None is none.
-        arc: degrees of azimuth that the path `arc` covers; default 300.
-        noise: standard deviation of the sensor noise at middle grey, in units of 1/255; half of its variance grows with
-            the signal.
-        jpeg: quality (1 to 100) of the photographs as .jpg; 0 writes .png. Not with a transparent background.
-        seed: of the points, the noise, the gains, the wood, and the paths inside-out and arc.
-        threads: 0 uses every core; the files do not depend on it.
         overwrite: replace `out` if it was made by `synth` before.
+        changes: fields of `options` by name, such as `views=16`.
 
     Returns:
         What was made: folder, counts, size, seconds.
@@ -153,36 +91,16 @@ def synthesize(
     """
     start = time.perf_counter()
     out = Path(out)
-    options = checked_options(
-        views=views,
-        test_views=test_views,
-        size=size,
-        supersample=supersample,
-        points=points,
-        point_noise=point_noise,
-        shading=shading,
-        depth_format=depth_format,
-        seed=seed,
-        exposure_drift=exposure_drift,
-        distortion=distortion,
-        specular=specular,
-        zoom=zoom,
-        table=table,
-        environment=environment,
-        arc=arc,
-        noise=noise,
-        jpeg=jpeg,
-    )
-    subject = _surface(shape, mesh, detail)
-    path = choice("path", path or ("arc" if options.table else subject.path), campath.PATHS)
-    inside = path == "inside-out"
-    backdrop = _backdrop(options, background, inside)
-    check_together(options, path, background, transparent=backdrop is None)
+    options = with_changes(SynthOptions, options, changes)
+    subject = _surface(shape, mesh, options.detail)
+    path = options.path or ("arc" if options.table else subject.path)
+    backdrop = _backdrop(options, inside=path == "inside-out")
+    check_together(options, path, transparent=backdrop is None)
     surface = on_table(subject, options.table, options.seed) if options.table else subject
-    workers = threads or os.cpu_count() or 1
+    workers = options.threads or os.cpu_count() or 1
     caster = RayCaster(surface.vertices, surface.faces, threads=workers)
-    field = number("fov", fov if fov is not None else (75.0 if inside else 45.0), 1.0, 170.0)
-    train, test, distance = place_cameras(subject, caster, options, path, field, distance, principal_point_offset)
+    field = options.fov or (75.0 if path == "inside-out" else 45.0)
+    train, test, distance = place_cameras(subject, caster, options, path, field)
     gains = _gains(options)
 
     temporary = prepare_folder(out, overwrite)
@@ -213,12 +131,9 @@ def synthesize(
             "output": str(out),
             "shape": surface.name,
             "unit": surface.unit,
-            "path": path,
+            **_described(options, path, backdrop, gains),
             "fov_degrees": field,
             "distance": distance,
-            "principal_point_offset": list(principal_point_offset),
-            "detail": detail,
-            **_described(options, path, backdrop, gains),
             "points": len(cloud.xyz),
             "mean_track_length": float(np.mean(cloud.track_length)) if len(cloud.xyz) else 0.0,
             "depth_unit_scale_factor": unit,
@@ -241,33 +156,35 @@ def synthesize(
 
 
 def _surface(shape, mesh, detail) -> TexturedMesh:
-    detail = number("detail", detail, 0.0, 10.0)
     if shape is not None and mesh is not None:
-        raise LinprimError(f"shape {shape!r} and mesh {str(mesh)!r} are both given, one of them is wanted")
+        raise LinprimError(f"--scene {shape!r} and --mesh {str(mesh)!r} are both given, wanted one of them")
     if isinstance(mesh, TexturedMesh):
         return mesh
     if mesh is not None:
         return load_textured(mesh, detail=detail)
-    return SHAPES[choice("shape", shape or "cad", tuple(SHAPES))](detail=detail)
+    if (shape or "cad") not in SHAPES:
+        raise LinprimError(f"--scene is {shape!r}, wanted one of {', '.join(SHAPES)}")
+    return SHAPES[shape or "cad"](detail=detail)
 
 
-def _backdrop(options: Options, background: str | Color | None, inside: bool) -> Backdrop:
+def _backdrop(options: SynthOptions, inside: bool) -> Backdrop:
     """What stands behind the surface: an environment, a colour, or nothing (None, transparent)."""
     if options.environment is not None:
         return synthetic_environment(options.environment)
-    if background is None:
-        background = "black" if inside else "transparent"
-    return background_color(background)
+    if options.background is None:
+        return background_color("black" if inside else "transparent")
+    return background_color(options.background)
 
 
-def _described(options: Options, path: str, backdrop: Backdrop, gains: np.ndarray) -> dict:
+def _described(options: SynthOptions, path: str, backdrop: Backdrop, gains: np.ndarray) -> dict:
     """The options as `synth.json` records them, with what was chosen where nothing was said."""
-    settings = asdict(options)
-    width, height = settings.pop("size")
+    settings = {name: value for name, value in asdict(options).items() if name not in ("size", "fov", "threads")}
+    width, height = options.width_height
     color = list(backdrop) if isinstance(backdrop, tuple) else ("transparent" if backdrop is None else "environment")
     arc = campath.ARC_DEG if options.arc is None else options.arc
     return {
         **settings,
+        "path": path,
         "width": width,
         "height": height,
         "background": color,
@@ -276,7 +193,7 @@ def _described(options: Options, path: str, backdrop: Backdrop, gains: np.ndarra
     }
 
 
-def _gains(options: Options) -> np.ndarray:
+def _gains(options: SynthOptions) -> np.ndarray:
     """(views, 3) gains of the training photographs, of geometric mean 1 per channel."""
     rng = np.random.default_rng([options.seed, 5])
     log = rng.uniform(-1.0, 1.0, (options.views, 1)) + 0.25 * rng.uniform(-1.0, 1.0, (options.views, 3))

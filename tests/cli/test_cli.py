@@ -24,6 +24,7 @@ from linprim_geo.base.options import ExtractOptions, SceneOptions, TrainOptions,
 from linprim_geo.cli import arguments, doctor
 from linprim_geo.cli import main as cli
 from linprim_geo.cli.options import add_options
+from linprim_geo.synthetic.options import SynthOptions
 
 HEAVY = {
     "torch",
@@ -203,7 +204,7 @@ def test_train_wants_exactly_one_scene(arguments, capsys):
         "train a --primitive cube",
         "train a --filter 2d",
         "synth out --size 3x",
-        "synth out --views 0",
+        "synth out --shading dark",
         "synth out --scene cad --mesh x.ply",
         "convert a",
         "render run --split x",
@@ -306,21 +307,23 @@ def test_python_m_runs_the_same_program():
 
 def test_synth_leaves_what_is_not_said_to_the_library(monkeypatch, capsys):
     calls = []
-    stand_in = types.SimpleNamespace(synthesize=lambda out, **settings: calls.append((out, settings)) or {})
+    stand_in = types.SimpleNamespace(
+        synthesize=lambda out, options, **surface: calls.append((out, options, surface)) or {}
+    )
     monkeypatch.setitem(sys.modules, "linprim_geo.synthetic.synth", stand_in)
     room = "synth out --scene room --size 64x48 --fov 60 --background 0,0.5,1 --overwrite"
     for line in ("synth out", room, "synth out --mesh x.glb --size 64 --point-noise 0.01"):
         assert cli.main(line.split()) == 0
-    (_, plain), (_, room), (_, mesh) = calls
-    assert (plain["principal_point_offset"], plain["detail"]) == ((0.0, 0.0), 1.0)
-    assert not plain.keys() & {"shape", "mesh", "path", "fov", "distance", "background"}
-    assert (room["shape"], room["size"], room["fov"], room["overwrite"]) == ("room", (64, 48), 60.0, True)
-    assert room["background"] == "0,0.5,1" and "mesh" not in room
-    assert (mesh["mesh"], mesh["size"], mesh["point_noise"]) == (
-        "x.glb",
-        (64, 64),
-        0.01,
-    ) and "shape" not in mesh
+    nothing = {"shape": None, "mesh": None, "overwrite": False}
+    assert calls == [
+        ("out", SynthOptions(), nothing),
+        (
+            "out",
+            SynthOptions(size=(64, 48), fov=60.0, background="0,0.5,1"),
+            {"shape": "room", "mesh": None, "overwrite": True},
+        ),
+        ("out", SynthOptions(size=(64, 64), point_noise=0.01), nothing | {"mesh": "x.glb"}),
+    ]
 
 
 # The function behind each command whose arguments are passed on by name, and the names that differ.
@@ -351,12 +354,12 @@ def test_the_functions_have_the_arguments_that_the_commands_pass(line):
 
 def test_principal_point_and_detail_reach_synth(monkeypatch):
     calls = []
-    stand_in = types.SimpleNamespace(synthesize=lambda out, **settings: calls.append(settings) or {})
+    stand_in = types.SimpleNamespace(synthesize=lambda out, options, **_: calls.append(options) or {})
     monkeypatch.setitem(sys.modules, "linprim_geo.synthetic.synth", stand_in)
     assert cli.main("synth out --principal-point-offset=-5,3.5 --detail 0.5 --distance 4".split()) == 0
     assert cli.main("synth out --principal-point-offset 5,-3".split()) == 0
-    assert [call["principal_point_offset"] for call in calls] == [(-5.0, 3.5), (5.0, -3.0)]
-    assert (calls[0]["detail"], calls[0]["distance"]) == (0.5, 4.0)
+    assert [call.principal_point_offset for call in calls] == [(-5.0, 3.5), (5.0, -3.0)]
+    assert (calls[0].detail, calls[0].distance) == (0.5, 4.0)
     for wrong in ("1", "1,2,3", "a,b", "inf,0", "nan,1", ","):
         with pytest.raises(SystemExit) as leaving:
             cli.main(["synth", "out", "--principal-point-offset", wrong])
@@ -488,6 +491,7 @@ def command_help(command: str) -> str:
         "train gone -o here --resume",
         "synth x --mesh gone.glb",
         "synth x --size 4",
+        "synth x --views 0",
         "synth x --background pink",
         "extract-mesh . --level 2",
         "demo -o .",
