@@ -8,17 +8,18 @@ and the same surface.) The protocols of published tables are in `protocols`.
 
 from __future__ import annotations
 
-import math
 import os
 import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import check
 from linprim_geo.eval import open_run, write_results
+from linprim_geo.eval.options import ScoreOptions, check_score_options
 from linprim_geo.eval.surface_samples import Comparison, SurfaceDistance, reduce_scores, sample_surface, with_percent
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh, clean_mesh, face_normals
@@ -30,18 +31,6 @@ DEFAULT_TAU_SHARE = 0.01  # of the reference's diagonal
 # counts as seen: sixteen times the single-precision error of Embree in a centred scene.
 OCCLUSION_TOLERANCE = 1e-5
 HAUSDORFF_WARNING = "largest sampled distance: a lower bound of the Hausdorff distance, and one stray face decides it"
-# The options that only some protocols take.
-TAKEN_BY = {
-    "samples": ("headline", "linprim"),
-    "cameras": ("headline", "scannetpp"),
-    "mask": ("dtu",),
-    "box": ("dtu",),
-    "plane": ("dtu",),
-    "scene": ("tnt",),
-    "crop": ("tnt",),
-    "transform": ("tnt",),
-    "meters_per_unit": ("dtu", "tnt", "scannetpp"),
-}
 
 
 def score_mesh(
@@ -89,7 +78,7 @@ def score_mesh(
     Accuracy: distances are float64 around the centre of the mesh they are taken to: about 1e-15 of the
     extent of both meshes.
     """
-    check_options(samples, tau, seed)
+    check(ScoreOptions(samples=samples, tau=tau, seed=seed))
     clean = clean_mesh(prediction, "prediction"), clean_mesh(reference, "reference")
     results, _, _ = _score_headline(
         clean[0][0], clean[1][0], samples=samples, tau=tau, seed=seed, cameras=cameras, unit=unit
@@ -135,19 +124,10 @@ def eval_mesh_files(
     prediction_path: str | os.PathLike,
     reference_path: str | os.PathLike,
     output: str | os.PathLike | None = None,
-    samples: int | None = None,
-    tau: float | None = None,
-    seed: int = 0,
+    options: ScoreOptions | None = None,
+    *,
     run=None,
-    protocol: str = "headline",
-    cameras: str | os.PathLike | None = None,
-    mask: str | os.PathLike | None = None,
-    box: str | None = None,
-    plane: str | os.PathLike | None = None,
-    scene: str | None = None,
-    crop: str | os.PathLike | None = None,
-    transform: str | os.PathLike | None = None,
-    meters_per_unit: float | None = None,
+    **changes: Any,
 ) -> dict:
     """Scores one mesh file against another and writes the scores, two error-coloured surfaces and two plots.
 
@@ -159,17 +139,11 @@ def eval_mesh_files(
     plots show the distances that the protocol scores.
 
     Args:
-        samples: points per surface (headline 200,000, linprim 5,000).
-        tau: threshold of the rates in the meshes' unit; None takes the protocol's, else 1 % of the diagonal.
+        options: how it is scored. `mask`, `box` and `plane` are read by `protocols.files`; `cameras` takes the place of
+            the run's; `transform` takes the prediction into the reference's frame.
         run: a run folder, or an open run: its training cameras give the headline's `visible` and `rays` and
             the culling of scannetpp, its scene the unit.
-        protocol: "headline" or one of `protocols.PROTOCOLS`.
-        cameras: folder of a capture, whose training cameras are taken in place of the run's.
-        mask, box, plane: dtu: see `protocol_files.read_observed_volume` and `read_plane`.
-        scene, crop, transform: tnt: the scene's name, its crop volume, and a 4x4 matrix that takes the
-            prediction into the reference's frame.
-        meters_per_unit: metres that one unit of the meshes is long, for the protocols that have lengths of
-            their own; None takes the benchmark's unit (dtu 0.001, else 1).
+        changes: fields of `options` by name, such as `samples=5000`.
 
     Returns:
         what `score_mesh` or `protocols.score_by_protocol` returns, with `dropped`, `prediction`, `reference`
@@ -179,13 +153,12 @@ def eval_mesh_files(
         LinprimError: a file cannot be read or written, an option does not belong to the protocol, or the
             protocol refuses a mesh or an option.
     """
-    check_options(2 if samples is None else samples, tau, seed)
-    given = {"samples": samples, "cameras": cameras, "mask": mask, "box": box, "plane": plane}
-    given |= {"scene": scene, "crop": crop, "transform": transform, "meters_per_unit": meters_per_unit}
-    settings = _settings(protocol, given, tau, seed)
+    options = replace(options or ScoreOptions(), **changes)
+    check_score_options(options)
+    protocol, settings = options.protocol, _settings(options)
     prediction = load_mesh(Path(prediction_path))
-    if transform is not None:
-        prediction = _transformed(prediction, transform)
+    if options.transform is not None:
+        prediction = _transformed(prediction, options.transform)
     prediction, dropped_prediction = clean_mesh(prediction, os.fspath(prediction_path))
     from linprim_geo.eval.protocols.files import read_reference
     from linprim_geo.eval.protocols.score import TAKES_POINTS, score_by_protocol
@@ -198,15 +171,13 @@ def eval_mesh_files(
         seen_by, unit = [view.camera for view in data_set.train], data_set.unit
         folder = Path(run.path) / "eval" / "mesh"
         output = (folder if protocol == "headline" else folder / protocol) if output is None else output
-    if cameras is not None:
+    if options.cameras is not None:
         from linprim_geo.eval.culling import training_cameras
 
-        seen_by = training_cameras(cameras)
+        seen_by = training_cameras(options.cameras)
     if protocol == "headline":
-        count = DEFAULT_SAMPLES if samples is None else samples
-        results, forward, backward = _score_headline(
-            prediction, reference, samples=count, tau=tau, seed=seed, cameras=seen_by, unit=unit
-        )
+        drawn = {"samples": options.samples or DEFAULT_SAMPLES, "tau": options.tau, "seed": options.seed}
+        results, forward, backward = _score_headline(prediction, reference, **drawn, cameras=seen_by, unit=unit)
     else:
         settings = replace(settings, cameras=seen_by)
         scored = score_by_protocol(protocol, prediction, reference, settings, unit)
@@ -219,42 +190,22 @@ def eval_mesh_files(
     return results
 
 
-def check_options(samples: int, tau: float | None, seed: int) -> None:
-    """Raises LinprimError unless `samples` is at least 2, `tau` a positive length or None, and `seed` from 0."""
-    if samples != int(samples) or samples < 2:
-        raise LinprimError(f"--samples is {samples}, expected a whole number of at least 2")
-    if tau is not None and not (math.isfinite(tau) and tau > 0):
-        raise LinprimError(f"--tau is {tau}, expected a positive length")
-    if seed != int(seed) or seed < 0:
-        raise LinprimError(f"--seed is {seed}, expected a whole number that is not negative")
-
-
-def _settings(protocol: str, given: dict, tau: float | None, seed: int):
+def _settings(options: ScoreOptions):
     """The `Settings` of a published protocol, with the small files read; None for the headline."""
     from linprim_geo.eval.protocols.files import read_crop, read_observed_volume, read_plane
-    from linprim_geo.eval.protocols.score import METERS_PER_UNIT, PROTOCOLS, Settings
+    from linprim_geo.eval.protocols.score import METERS_PER_UNIT, Settings
 
-    if protocol != "headline" and protocol not in PROTOCOLS:
-        names = ", ".join(("headline", *PROTOCOLS))
-        raise LinprimError(f"--protocol is {protocol}, expected one of {names}")
-    for name, protocols in TAKEN_BY.items():
-        if given[name] is not None and protocol not in protocols:
-            option = "--" + name.replace("_", "-")
-            raise LinprimError(f"{option} does not belong to --protocol {protocol}, only to {' and '.join(protocols)}")
-    if protocol == "headline":
+    if options.protocol == "headline":
         return None
-    scale = given["meters_per_unit"] or METERS_PER_UNIT.get(protocol, 1.0)
-    if not (math.isfinite(scale) and scale > 0):
-        raise LinprimError(f"--meters-per-unit is {scale}, expected a positive length")
     return Settings(
-        metre=1.0 / scale,
-        tau=tau,
-        samples=given["samples"],
-        seed=seed,
-        observed=read_observed_volume(given["mask"], given["box"]),
-        plane=None if given["plane"] is None else read_plane(given["plane"]),
-        scene=given["scene"],
-        crop=None if given["crop"] is None else read_crop(given["crop"]),
+        metre=1.0 / (options.meters_per_unit or METERS_PER_UNIT.get(options.protocol, 1.0)),
+        tau=options.tau,
+        samples=options.samples,
+        seed=options.seed,
+        observed=read_observed_volume(options.mask, options.box),
+        plane=None if options.plane is None else read_plane(options.plane),
+        scene=options.scene,
+        crop=None if options.crop is None else read_crop(options.crop),
     )
 
 

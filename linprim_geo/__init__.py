@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from linprim_geo.eval.images import eval_images_run as eval_images
     from linprim_geo.eval.mesh import eval_mesh_files as eval_mesh
     from linprim_geo.eval.mesh import score_mesh as score_mesh
+    from linprim_geo.eval.options import ScoreOptions as ScoreOptions
+    from linprim_geo.eval.options import TradeoffOptions as TradeoffOptions
     from linprim_geo.eval.tradeoff.sweep import tradeoff as tradeoff
     from linprim_geo.geometry.camera import Camera as Camera
     from linprim_geo.geometry.mesh import Mesh as Mesh
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
     from linprim_geo.runs.run import Run as Run
     from linprim_geo.surface.convert import convert as convert
     from linprim_geo.surface.extract import extract_mesh as extract_mesh
+    from linprim_geo.synthetic.options import SynthOptions as SynthOptions
     from linprim_geo.synthetic.synth import synthesize as synth
     from linprim_geo.training.dry_run import dry_run as dry_run
     from linprim_geo.training.effects import Choice as Choice
@@ -79,6 +82,9 @@ _PUBLIC = {
     "Run": ("runs.run", "Run"),
     "Scene": ("capture.types", "Scene"),
     "SceneOptions": ("base.options", "SceneOptions"),
+    "ScoreOptions": ("eval.options", "ScoreOptions"),
+    "SynthOptions": ("synthetic.options", "SynthOptions"),
+    "TradeoffOptions": ("eval.options", "TradeoffOptions"),
     "TrainOptions": ("base.options", "TrainOptions"),
 }
 

@@ -17,13 +17,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import write_json
-from linprim_geo.base.options import SceneOptions, TrainOptions
+from linprim_geo.base.options import SceneOptions, TrainOptions, with_changes
 from linprim_geo.base.progress import Progress
+from linprim_geo.eval.options import TradeoffOptions
 from linprim_geo.eval.tradeoff.knobs import (
     KNOBS,
     RENDER_DEFAULTS,
@@ -58,50 +60,34 @@ POINTS = 30_000
 def tradeoff(
     scene: str | os.PathLike,
     output: str | os.PathLike,
+    options: TradeoffOptions | None = None,
     *,
-    knobs: Sequence[str] = (),
-    run: str | os.PathLike | None = None,
-    reference: str | os.PathLike | None = None,
-    quick: bool = False,
-    rounds: int | None = None,
-    iterations: int | None = None,
-    max_primitives: int | None = None,
-    threads: int = 0,
     cluster: str | None = None,
     workers: int | None = None,
     quiet: bool = False,
+    **changes: Any,
 ) -> dict:
     """Sweeps the knobs on a scene and writes the tables and the page into the folder `output`.
 
     Args:
-        knobs: names out of `KNOBS`; none means all.
-        run: a run of this scene that render, extraction and evaluation knobs are measured on, which is not changed;
-            without it one is trained with the defaults at the size `MODEST`, which is also what training knobs are
-            swept around.
-        reference: mesh in the data set's frame for Chamfer distances and depth; default: `reference.ply` in the scene,
-            if there.
-        quick: the size `QUICK`, to see that all of it runs.
-        rounds: how often everything is timed (default 3, quick 2).
-        iterations, max_primitives: in place of those of `MODEST` or `QUICK`.
+        options: what is measured. `run` is not changed; without it one is trained with the defaults at the size
+            `MODEST`, or with `quick` at `QUICK`, which is also what training knobs are swept around. `reference` is for
+            Chamfer distances and depth.
         cluster, workers: where and how many trainings at once, see `executor.open_executor`; they share the cores of a
             machine, and are timed so. Neither: here, one after another. Everything else is measured here in any case.
+        changes: fields of `options` by name, such as `quick=True`.
 
     Returns: what tradeoff.json holds: `rows` (one per rung of each knob), `sentences`, `rule`, `about`.
 
     Raises:
         LinprimError: a knob has another name, the scene or the run cannot be used, or the folder holds another sweep.
     """
+    options = with_changes(TradeoffOptions, options, changes)
+    knobs, threads = options.knobs, options.threads
     unknown = [name for name in knobs if name not in KNOBS]
     if unknown:
         raise LinprimError(f"--knobs {unknown[0]} is unknown, wanted some of {', '.join(KNOBS)}")
-    if rounds is not None and rounds < 1:
-        raise LinprimError(f"--rounds is {rounds}, wanted at least 1")
-    size = {"iterations": iterations, "max_primitives": max_primitives}
-    for name, value in size.items():
-        if value is not None and value < 1:
-            raise LinprimError(f"--{name.replace('_', '-')} is {value}, wanted at least 1")
-    size = (QUICK if quick else MODEST) | {name: value for name, value in size.items() if value is not None}
-    sweep = Sweep(Path(scene), Path(output), run, reference, quick, rounds, size, threads, quiet)
+    sweep = Sweep(Path(scene), Path(output), options, quiet)
     chosen = [KNOBS[name] for name in KNOBS if not knobs or name in knobs]
     if cluster is None and workers is None:
         return sweep.measure(chosen)
@@ -122,18 +108,16 @@ class Sweep:
     executor: Executor | None = None
     cores = slot = 1
 
-    def __init__(self, scene, folder, run, reference, quick, rounds, size, threads, quiet):
+    def __init__(self, scene: Path, folder: Path, options: TradeoffOptions, quiet: bool):
         from linprim_geo.capture.load import load_scene
         from linprim_geo.capture.structure_from_motion import prepare
 
-        self.scene_path, self.folder, self.given, self.quick, self.threads = (
-            Path(os.path.realpath(scene)),
-            folder,
-            run,
-            quick,
-            threads,
-        )
-        self.rounds = rounds or (QUICK_ROUNDS if quick else ROUNDS)
+        run, reference, quick, threads = options.run, options.reference, options.quick, options.threads
+        self.scene_path, self.folder, self.given = Path(os.path.realpath(scene)), folder, run
+        self.quick, self.threads = quick, threads
+        given = {"iterations": options.iterations, "max_primitives": options.max_primitives}
+        size = (QUICK if quick else MODEST) | {name: value for name, value in given.items() if value is not None}
+        self.rounds = options.rounds or (QUICK_ROUNDS if quick else ROUNDS)
         self.progress = Progress("tradeoff", 1, quiet=quiet)
         self.warm = self.warm_score = self.warm_train = (
             False  # the first time of all loads libraries, and is not counted

@@ -18,6 +18,7 @@ def option(
     *,
     low: float | None = None,
     high: float | None = None,
+    positive: bool = False,
     choices: tuple = (),
     metavar: str | None = None,
     number_or: str | None = None,
@@ -25,12 +26,12 @@ def option(
 ):
     """A dataclass field that the command line turns into `--field-name` with `text` as its help.
 
-    Its value is at least `low` and at most `high`, or one of `choices`; `check` says so where it is not. With
-    `number_or` it holds a number or that word. With `parse` it holds what that makes of the flag's text, or raises
+    Its value is at least `low` and at most `high`, or `positive`, or one of `choices`; `check` says so where it is not.
+    With `number_or` it holds a number or that word. With `parse` it holds what that makes of the flag's text, or raises
     ValueError with a sentence; who uses it checks it. A bool is True where the flag is given, a tuple of text holds the
     words after the flag.
     """
-    metadata = {"help": text, "low": low, "high": high, "choices": choices}
+    metadata = {"help": text, "low": low, "high": high, "positive": positive, "choices": choices}
     return field(default=default, metadata=metadata | {"metavar": metavar, "number_or": number_or, "parse": parse})
 
 
@@ -74,6 +75,8 @@ def _wanted(value: Any, entry: Field, kind: type) -> str:
     numbers: Any = Integral if kind is int else Real
     if isinstance(value, bool) or not isinstance(value, numbers):
         return also + ("a whole number" if kind is int else "a number")
+    if entry.metadata["positive"]:
+        return "" if 0 < value < math.inf else also + "a positive number"
     if (-math.inf if low is None else low) <= value <= (math.inf if high is None else high) and abs(value) != math.inf:
         return ""
     if low is None:

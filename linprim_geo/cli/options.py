@@ -131,13 +131,6 @@ def whole(text: str) -> int:
     return value
 
 
-def not_negative(text: str) -> float:
-    value = float(text)
-    if not 0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not a number from 0 on")
-    return value
-
-
 def seconds(text: str) -> float:
     """90, 90s, 5m or 1.5h as seconds."""
     units = {"s": 1, "m": 60, "h": 3600}
@@ -147,15 +140,7 @@ def seconds(text: str) -> float:
     return value
 
 
-def length(text: str) -> float:
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not a positive length")
-    return value
-
-
 # argparse names the type in its message: "invalid count value", not "invalid positive value".
 positive.__name__ = whole.__name__ = "count"
-not_negative.__name__ = length.__name__ = "number"
 blocks.__name__ = "count, or auto:"
 seconds.__name__ = "time such as 90s, 5m or 1h"

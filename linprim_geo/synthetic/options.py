@@ -57,7 +57,7 @@ class SynthOptions:
     size: int | tuple[int, int] = option(320, "pixels", metavar="WxH", parse=parse_size)
     path: str | None = option(None, "of the cameras (default: what suits the scene)", choices=PATHS)
     fov: float | None = option(None, "horizontal (default 45, inside 75)", low=1, high=170, metavar="DEGREES")
-    distance: float | None = option(None, "from the middle, in the mesh's unit", low=0, metavar="LENGTH")
+    distance: float | None = option(None, "from the middle, in the mesh's unit", positive=True, metavar="LENGTH")
     principal_point_offset: tuple[float, float] = option(
         (0.0, 0.0),
         "from the middle of the image, in pixels; a negative one is written --...=-5,3",

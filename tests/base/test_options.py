@@ -28,6 +28,7 @@ class Options:
     shift: float = option(0.0, "whereto")
     level: float | str = option("auto", "where", low=0.1, high=0.9, number_or="auto")
     size: float | None = option(None, "how large", low=1)
+    step: float = option(1.0, "how far", positive=True)
     kind: str = option("a", "which", choices=("a", "b"))
 
 
@@ -43,6 +44,7 @@ class Options:
         ({"share": "half"}, "--share is 'half', wanted a number"),
         ({"shift": float("inf")}, "--shift is inf, wanted a finite number"),
         ({"size": 0.5}, "--size is 0.5, wanted at least 1"),
+        ({"step": 0.0}, "--step is 0.0, wanted a positive number"),
         ({"level": 1.0}, "--level is 1.0, wanted auto, or 0.1 to 0.9"),
         ({"level": "best"}, "--level is 'best', wanted auto, or a number"),
         ({"kind": "c"}, "--kind is 'c', wanted one of a, b"),

@@ -1,5 +1,6 @@
 """The protocols of published tables against closed forms, their own floors, and direct implementations."""
 
+import dataclasses
 import json
 import math
 from dataclasses import replace
@@ -13,6 +14,7 @@ from scipy.io import savemat
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.cli import main as cli
+from linprim_geo.eval import options
 from linprim_geo.eval.culling import count_views
 from linprim_geo.eval.mesh import eval_mesh_files
 from linprim_geo.eval.protocols.files import CropVolume, ObservedVolume, read_observed_volume, read_plane
@@ -273,6 +275,11 @@ def test_faces_that_are_degenerate_repeated_or_nan_change_nothing(protocol, tmp_
     # The files round coordinates to seven and nine digits.
     assert b["chamfer"] == pytest.approx(a["chamfer"], rel=1e-3)
     assert b["dropped"]["prediction"] == {"not_finite": 2, "degenerate": 2, "duplicate": 2, "unreferenced": 3}
+
+
+def test_every_protocol_is_a_choice():
+    assert options.PROTOCOLS == ("headline", *PROTOCOLS)
+    assert options.TAKEN_BY.keys() < {field.name for field in dataclasses.fields(options.ScoreOptions)}
 
 
 # --- files and the command ----------------------------------------------------------------------------------

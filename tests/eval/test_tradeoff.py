@@ -14,6 +14,7 @@ import pytest
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import SceneOptions, TrainOptions, check_train_options
+from linprim_geo.eval.options import TradeoffOptions
 from linprim_geo.eval.tradeoff import knobs
 from linprim_geo.eval.tradeoff import page as tradeoff_page
 from linprim_geo.eval.tradeoff import sweep as sweeping
@@ -378,7 +379,7 @@ def test_a_sweep_by_workers_goes_on_and_tells_what_fails(monkeypatch, tiny_scene
 
 
 def test_a_trained_run_is_scored_by_image_depth_and_surface(swept, tiny_scene, tiny_run, tmp_path):
-    sweep = sweeping.Sweep(tiny_scene, tmp_path / "x", tiny_run, None, True, None, sweeping.QUICK, 1, True)
+    sweep = sweeping.Sweep(tiny_scene, tmp_path / "x", TradeoffOptions(run=tiny_run, quick=True, threads=1), True)
     found = sweep._train_errors(swept[0] / "runs" / "given")
     assert 22 < found["psnr"] < 40 and found["photo_percent"] == pytest.approx(100 * 10 ** (-found["psnr"] / 20))
     assert 0 < found["depth_percent"] < 10 and 0 < found["chamfer_percent"] < 5
