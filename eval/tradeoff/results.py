@@ -37,7 +37,7 @@ COLUMNS = (
 def write_report(
     folder: Path, about: dict, knobs: Sequence[Knob], measured: Mapping[str, Sequence[tuple[Rung, dict]]]
 ) -> dict:
-    """Writes the three files into `folder` and returns what the JSON holds.
+    """Writes the three files into `folder` and returns what the JSON holds, and the `files`.
 
     Args:
         about: what was swept, and how.
@@ -68,7 +68,12 @@ def write_report(
             )
     with atomic_write(folder / "tradeoff.html") as temporary:
         temporary.write_text(page(results, {knob.name: knob for knob in knobs}), encoding="utf-8")
-    return results
+    return results | {"files": [str(folder / f"tradeoff.{suffix}") for suffix in ("html", "csv", "json")]}
+
+
+def describe(results: dict) -> str:
+    """What `write_report` returns as lines for a person: a sentence per knob, the rule, and the files."""
+    return "\n".join([*results["sentences"].values(), "", results["rule"], "", *results["files"]])
 
 
 def _row(knob: Knob, rung: Rung, entry: dict) -> dict:

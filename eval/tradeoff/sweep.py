@@ -77,7 +77,8 @@ def tradeoff(
             machine, and are timed so. Neither: here, one after another. Everything else is measured here in any case.
         changes: fields of `options` by name, such as `quick=True`.
 
-    Returns: what tradeoff.json holds: `rows` (one per rung of each knob), `sentences`, `rule`, `about`.
+    Returns: what tradeoff.json holds: `rows` (one per rung of each knob), `sentences`, `rule`, `about`; and
+        `files`.
 
     Raises:
         LinprimError: a knob has another name, the scene or the run cannot be used, or the folder holds another sweep.

@@ -16,12 +16,12 @@ SIZES = {"small": (40, 160, 1500, 2000), "normal": (60, 320, 7000, 5000)}
 
 def run_demo(output: str = "runs/demo", size: str = "normal", *, quiet: bool = False) -> dict:
     """Makes OUTPUT/scene (images, depth, reference mesh), OUTPUT/run (trained, meshed, scored) and OUTPUT/report.html,
-    prints the scores.
+    says on stderr what it does.
 
     Replaces what an earlier demo left in `output`; any other folder there is refused.
 
-    Returns: `psnr`, `ssim`, `chamfer_percent_diagonal`, `f1`, `abs_rel`, `normal_mean_deg`, `seconds`, `primitives`,
-    and the paths.
+    Returns: `psnr`, `ssim`, `views` (held out), `chamfer_percent_diagonal`, `f1`, `abs_rel`, `normal_mean_deg`,
+    `seconds`, `primitives`, and the paths.
     """
     from linprim_geo.display.report import report_run
     from linprim_geo.eval.depth import eval_depth_run
@@ -69,6 +69,7 @@ def run_demo(output: str = "runs/demo", size: str = "normal", *, quiet: bool = F
     result = {
         "psnr": images["psnr"],
         "ssim": images["ssim"],
+        "views": images["views"],
         "chamfer_percent_diagonal": mesh["chamfer_percent_diagonal"],
         "f1": mesh["f1"],
         "abs_rel": depth["abs_rel"],
@@ -82,12 +83,17 @@ def run_demo(output: str = "runs/demo", size: str = "normal", *, quiet: bool = F
         "report": report["report"],
     }
     write_json(marker, {"size": size, **result})
-    result["_text"] = (
-        f"\nPSNR {images['psnr']:.2f} dB, SSIM {images['ssim']:.4f} on {images['views']} held-out views; "
-        f"depth AbsRel {depth['abs_rel']:.4f}, normals {depth['normal_mean_deg']:.1f} degrees off\n"
-        f"mesh: Chamfer {mesh['chamfer_percent_diagonal']:.3f} % of the diagonal, F1 {mesh['f1']:.3f} at 1 %; "
-        f"{trained['primitives']} primitives, {trained['seconds']:.0f} s of training\n\n"
-        f"all of it on one page: {report['report']}\n"
-        f"open {stats['mesh']} and {reference} in MeshLab; pictures are in {run / 'renders'}, figures in {run / 'eval'}"
-    )
     return result
+
+
+def describe(result: dict) -> str:
+    """The result of `run_demo` as text for a person."""
+    return (
+        f"\nPSNR {result['psnr']:.2f} dB, SSIM {result['ssim']:.4f} on {result['views']} held-out views; "
+        f"depth AbsRel {result['abs_rel']:.4f}, normals {result['normal_mean_deg']:.1f} degrees off\n"
+        f"mesh: Chamfer {result['chamfer_percent_diagonal']:.3f} % of the diagonal, F1 {result['f1']:.3f} at 1 %; "
+        f"{result['primitives']} primitives, {result['seconds']:.0f} s of training\n\n"
+        f"all of it on one page: {result['report']}\n"
+        f"open {result['mesh']} and {result['reference']} in MeshLab; pictures are in {result['renders']}, "
+        f"figures in {Path(result['run']) / 'eval'}"
+    )

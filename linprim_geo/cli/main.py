@@ -10,16 +10,15 @@ from __future__ import annotations
 import argparse
 import contextlib
 import errno
-import json
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import Any
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.version import __version__
+from linprim_geo.cli.output import Output, printing
 
 EXIT_UNUSABLE, EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_PIPE = 1, 70, 130, 141
 
@@ -36,10 +35,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parsed = build_parser().parse_args(arguments)
     parsed.json, parsed.debug = getattr(parsed, "json", False), getattr(parsed, "debug", False)
     try:
-        with _stdout_for_result(parsed.json) as print_result:
-            result = parsed.run_command(parsed)
-            print_result(result)
-        return int(result.pop("_status", 0)) if isinstance(result, dict) else 0
+        with printing(parsed.json) as print_output:
+            output = parsed.run_command(parsed)
+            print_output(output)
+        return output.status
     except BrokenPipeError:
         # Nothing more can be printed; without this the interpreter would complain while it closes stdout.
         with contextlib.suppress(OSError, ValueError):
@@ -79,56 +78,6 @@ def explain(error: BaseException) -> tuple[str, int]:
     return f"internal error: {text}; run again with --debug", EXIT_INTERNAL
 
 
-@contextlib.contextmanager
-def _stdout_for_result(as_json: bool) -> Iterator[Callable[[Any], None]]:
-    """Yields a function that prints the result; with `as_json` whatever else goes to stdout goes to stderr.
-
-    Libraries print from C as well, so the file descriptor is redirected, not only Python's stream.
-    """
-    if not as_json:
-        yield _print_for_people
-        sys.stdout.flush()
-        return
-    results: list[Any] = []
-    stdout = sys.stdout
-    stdout.flush()
-    descriptor: int | None = None
-    saved = -1
-    try:
-        saved = os.dup(stdout.fileno())
-        descriptor = stdout.fileno()
-    except (OSError, ValueError):
-        pass
-    try:
-        if descriptor is not None:
-            os.dup2(sys.stderr.fileno(), descriptor)
-        with contextlib.redirect_stdout(sys.stderr):
-            yield results.append
-    finally:
-        if descriptor is not None:
-            os.dup2(saved, descriptor)
-            os.close(saved)
-    from linprim_geo.base.files import json_ready
-
-    shown = {key: value for key, value in (results[0] or {}).items() if not key.startswith("_")}
-    stdout.write(json.dumps(json_ready(shown), allow_nan=False) + "\n")
-    stdout.flush()
-
-
-def _print_for_people(result: dict | None) -> None:
-    """One `name: value` line per plain value; a command that has words of its own puts them under `_text`."""
-    if result is None:
-        return
-    if "_text" in result:
-        print(result["_text"])
-        return
-    for key, value in result.items():
-        if isinstance(value, bool | int | str) and not key.startswith("_"):
-            print(f"{key}: {value}")
-        elif isinstance(value, float):
-            print(f"{key}: {value:.6g}")
-
-
 def build_parser() -> argparse.ArgumentParser:
     """The whole command line."""
     common = argparse.ArgumentParser(add_help=False)
@@ -147,7 +96,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"linprim-geo {__version__}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
-    def command(name: str, run: Callable[[argparse.Namespace], dict], text: str) -> argparse.ArgumentParser:
+    def command(name: str, run: Callable[[argparse.Namespace], Output], text: str) -> argparse.ArgumentParser:
         description = text[0].upper() + text[1:] + "."
         sub = subparsers.add_parser(name, parents=[common], help=text, description=description, allow_abbrev=False)
         # `parser` for completion.

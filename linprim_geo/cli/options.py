@@ -8,11 +8,12 @@ from collections.abc import Callable
 from typing import Any
 
 from linprim_geo.base.options import flag_of, kinds
+from linprim_geo.cli.output import Output
 
 SPLITS = ("train", "test", "all")
 
 # Adds a command by its name, the function that runs it, and one line of help; returns its parser.
-AddCommand = Callable[[str, Callable[[argparse.Namespace], dict], str], argparse.ArgumentParser]
+AddCommand = Callable[[str, Callable[[argparse.Namespace], Output], str], argparse.ArgumentParser]
 
 
 def add_options(parser: argparse._ActionsContainer, options: type) -> None:

@@ -48,3 +48,8 @@ def report_run(
         "missing": text.missing,
         "seconds": time.perf_counter() - start,
     }
+
+
+def describe(made: dict) -> str:
+    """What `report_run` returns as lines for a person: the page, and what is missing on it."""
+    return "\n".join([f"{made['report']}: {made['bytes'] / 2**20:.1f} MiB", *made["missing"]])

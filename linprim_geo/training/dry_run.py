@@ -42,8 +42,9 @@ def dry_run(
     undistorted photographs.
 
     Returns: `images` and `held_out`, `width` and `height` of the largest image, `photo_gib` that all would take,
-        `photos_in_memory` (how many stay there), `iterations`, `max_primitives`, `minutes`, `memory_gib` (at its peak),
-        `available_gib`, `fits`, and `advice`, what to change where it does not fit, else "".
+        `photo_limit_gib` that they may, `photos_in_memory` (how many stay there), `iterations`, `max_primitives`,
+        `minutes`, `memory_gib` (at its peak), `available_gib`, `fits`, and `advice`, what to change where it does not
+        fit, else "".
 
     Accuracy: memory within a quarter of what a training takes, or 0.3 GiB; minutes are those of this machine as busy as
     it is now.
@@ -116,6 +117,7 @@ def dry_run(
         "width": size.width,
         "height": size.height,
         "photo_gib": photos / 2**30,
+        "photo_limit_gib": limit / 2**30,
         "photos_in_memory": held,
         "iterations": options.iterations,
         "max_primitives": options.max_primitives,
@@ -125,16 +127,16 @@ def dry_run(
         "fits": needed <= available,
         "advice": "" if needed <= available else _advice(used, available, per_primitive, options),
     }
-    return report | {"_text": describe(report, limit / 2**30)}
+    return report
 
 
-def describe(report: dict, limit_gib: float) -> str:
-    """The report as lines for a person; `limit_gib` is what photographs may take."""
+def describe(report: dict) -> str:
+    """The report of `dry_run` as lines for a person."""
     kept = "all in memory"
     if report["photos_in_memory"] < report["images"]:
         kept = (
-            f"{report['photos_in_memory']} in memory, which is {limit_gib:.1f} GiB, and the others read when "
-            "they are due"
+            f"{report['photos_in_memory']} in memory, which is {report['photo_limit_gib']:.1f} GiB, and the others "
+            "read when they are due"
         )
     lines = [
         f"images: {report['images']} for training of {report['width']}x{report['height']}, "

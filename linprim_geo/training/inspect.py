@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import asdict
 
 from linprim_geo.base.options import SceneOptions, TrainOptions
@@ -16,8 +15,7 @@ def inspect_scene(
     choice: Choice = Choice(),  # noqa: B008
     log=None,
 ) -> dict:
-    """Reads a scene and decides: `effects`, a list of decisions as tables, `options` that follow from them, and a
-    `_text` for people.
+    """Reads a scene and decides: `effects`, a list of decisions as tables, and `options` that follow from them.
 
     Raises:
         LinprimError: the scene or an option cannot be used.
@@ -28,7 +26,7 @@ def inspect_scene(
         path, scene_options, options, choice, log or (lambda text: None)
     )
     chosen = chosen_options(decisions)
-    result = {
+    return {
         "scene": str(path),
         "views": len(scene.train),
         "held_out_views": len(scene.test),
@@ -36,13 +34,12 @@ def inspect_scene(
         "effects": [asdict(decision) for decision in decisions],
         "options": chosen,
     }
-    return result | {"_text": describe(decisions)}
 
 
-def describe(decisions: Iterable[Decision]) -> str:
-    """A block per effect: on or off and why, what it costs, and the evidence."""
+def describe(result: dict) -> str:
+    """A block per effect of what `inspect_scene` returns: on or off and why, what it costs, and the evidence."""
     lines = []
-    for d in decisions:
+    for d in (Decision(**each) for each in result["effects"]):
         cost = "no time" if d.cost < FREE else f"about {d.cost:.2f} times the time"
         why = f"{REASONS[d.reason]}{': ' + d.note if d.note else ''}"
         lines.append(f"{d.name:<15} {'on ' if d.on else 'off'}  {why}. Costs {cost}: {d.what}")

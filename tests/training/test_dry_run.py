@@ -174,7 +174,7 @@ def test_what_does_not_fit_comes_with_what_to_change(available, primitives, advi
     assert not report["fits"] and report["memory_gib"] > report["available_gib"]
     import re
 
-    assert re.search(advice, report["advice"]) and report["advice"] in report["_text"]
+    assert re.search(advice, report["advice"]) and report["advice"] in dry_run.describe(report)
     if available:
         most = int(re.search(r"--max-primitives (\d+)", report["advice"])[1])
         assert dry_run.dry_run(tiny_scene, tmp_path / "run", options=replace(options, max_primitives=most), quiet=True)[
@@ -185,7 +185,7 @@ def test_what_does_not_fit_comes_with_what_to_change(available, primitives, advi
 def test_photographs_that_are_read_when_they_are_due_are_said(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(shots, "available_memory", lambda: 0)
     report = dry_run.dry_run(tiny_scene, tmp_path / "run", options=OPTIONS, quiet=True)
-    assert report["photos_in_memory"] == 0 and "read when they are due" in report["_text"]
+    assert report["photos_in_memory"] == 0 and "read when they are due" in dry_run.describe(report)
 
 
 def test_a_budget_is_planned_with(tiny_scene, tmp_path):

@@ -18,7 +18,7 @@ from linprim_geo.points.photo_evidence import Observations
 from linprim_geo.runs.run import Run
 from linprim_geo.synthetic.synth import synthesize
 from linprim_geo.training.effects import EFFECTS, Choice, Data, decide, parse_asked, settle
-from linprim_geo.training.inspect import inspect_scene
+from linprim_geo.training.inspect import describe, inspect_scene
 from linprim_geo.training.train import train
 
 SMALL = {
@@ -291,8 +291,8 @@ def test_inspect_prints_and_gives_json(scenes, capsys):
     assert report["options"]["exposure"] == "gain" and report["views"] == 30
     result = inspect_scene(scenes("exposure"), SceneOptions(), OPTIONS, Choice())
     for effect in EFFECTS.values():
-        assert effect.name in result["_text"] and effect.evidence in result["_text"]
-    assert "exposure        on   the data say so" in result["_text"]
+        assert effect.name in describe(result) and effect.evidence in describe(result)
+    assert "exposure        on   the data say so" in describe(result)
 
 
 @pytest.mark.parametrize(

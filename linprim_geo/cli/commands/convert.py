@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from linprim_geo.cli.options import AddCommand
+from linprim_geo.cli.output import Output
 
 
 def add(command: AddCommand) -> None:
@@ -20,8 +21,8 @@ def add(command: AddCommand) -> None:
     sub.add_argument("--as", dest="write_as", choices=choices, default="auto", help=text)
 
 
-def run(parsed: argparse.Namespace) -> dict:
+def run(parsed: argparse.Namespace) -> Output:
     from linprim_geo.surface.convert import convert, describe
 
     report = convert(parsed.source, parsed.target, parsed.write_as)
-    return report | {"_text": describe(report)}
+    return Output(report, describe(report))

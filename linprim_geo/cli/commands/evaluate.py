@@ -7,6 +7,7 @@ import sys
 
 from linprim_geo.cli.arguments import from_args
 from linprim_geo.cli.options import AddCommand, add_options, add_run, add_split
+from linprim_geo.cli.output import Output
 from linprim_geo.eval.options import ScoreOptions
 
 
@@ -42,20 +43,22 @@ def add(command: AddCommand) -> None:
     add_options(sub.add_argument_group("scores"), ScoreOptions)
 
 
-def eval_depth(parsed: argparse.Namespace) -> dict:
+def eval_depth(parsed: argparse.Namespace) -> Output:
     from linprim_geo.eval.depth import eval_depth_run
 
     depth = f"depth_{parsed.depth}"
-    return eval_depth_run(parsed.run, parsed.reference, split=parsed.split, depth=depth, output=parsed.output)
+    how = {"split": parsed.split, "depth": depth, "output": parsed.output}
+    return Output(eval_depth_run(parsed.run, parsed.reference, **how))
 
 
-def eval_images(parsed: argparse.Namespace) -> dict:
+def eval_images(parsed: argparse.Namespace) -> Output:
     from linprim_geo.eval.images import eval_images_run
 
-    return eval_images_run(parsed.run, split=parsed.split, output=parsed.output, lpips_weights=parsed.lpips_weights)
+    how = {"split": parsed.split, "output": parsed.output, "lpips_weights": parsed.lpips_weights}
+    return Output(eval_images_run(parsed.run, **how))
 
 
-def eval_mesh(parsed: argparse.Namespace) -> dict:
+def eval_mesh(parsed: argparse.Namespace) -> Output:
     from linprim_geo.eval.mesh import eval_mesh_files
 
     options = from_args(ScoreOptions, parsed)
@@ -64,4 +67,4 @@ def eval_mesh(parsed: argparse.Namespace) -> dict:
         broken = results["dropped"][which].get("not_finite", 0)
         if broken:
             print(f"linprim-geo: {file}: faces left out because a coordinate is not finite: {broken}", file=sys.stderr)
-    return results
+    return Output(results)

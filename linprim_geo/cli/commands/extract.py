@@ -7,6 +7,7 @@ import argparse
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.cli.arguments import blocks_and_workers, from_args, time_budget
 from linprim_geo.cli.options import AddCommand, add_options, add_quiet, add_run, add_workers, positive, seconds
+from linprim_geo.cli.output import Output
 
 
 def add(command: AddCommand) -> None:
@@ -26,9 +27,10 @@ def add(command: AddCommand) -> None:
     add_options(sub.add_argument_group("extraction"), ExtractOptions)
 
 
-def run(parsed: argparse.Namespace) -> dict:
+def run(parsed: argparse.Namespace) -> Output:
     budget = time_budget(parsed)
     from linprim_geo.surface.extract import extract_mesh
 
     options, several = from_args(ExtractOptions, parsed), blocks_and_workers(parsed)
-    return extract_mesh(parsed.run, parsed.method, parsed.output, options, quiet=parsed.quiet, **several, **budget)
+    settings = {"quiet": parsed.quiet, **several, **budget}
+    return Output(extract_mesh(parsed.run, parsed.method, parsed.output, options, **settings))

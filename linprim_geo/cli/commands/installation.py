@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from linprim_geo.cli.options import AddCommand, add_quiet
+from linprim_geo.cli.output import Output
 
 
 def add(command: AddCommand) -> None:
@@ -19,21 +20,22 @@ def add(command: AddCommand) -> None:
     sub.add_argument("shell", choices=("bash", "zsh", "fish"))
 
 
-def doctor(parsed: argparse.Namespace) -> dict:
+def doctor(parsed: argparse.Namespace) -> Output:
     from linprim_geo.cli.doctor import describe, doctor
 
     report = doctor()
-    return report | {"_text": describe(report), "_status": 1 if report["problems"] else 0}
+    return Output(report, describe(report), status=1 if report["problems"] else 0)
 
 
-def demo(parsed: argparse.Namespace) -> dict:
-    from linprim_geo.cli.demo import run_demo
+def demo(parsed: argparse.Namespace) -> Output:
+    from linprim_geo.cli.demo import describe, run_demo
 
-    return run_demo(parsed.output, parsed.size, quiet=parsed.quiet)
+    result = run_demo(parsed.output, parsed.size, quiet=parsed.quiet)
+    return Output(result, describe(result))
 
 
-def completion(parsed: argparse.Namespace) -> dict:
+def completion(parsed: argparse.Namespace) -> Output:
     from linprim_geo.cli.completion import completion
 
     made = completion(parsed.parser, parsed.shell)
-    return made | {"_text": made["script"]}
+    return Output(made, made["script"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from linprim_geo.cli.options import AddCommand, add_quiet, add_run, add_split
+from linprim_geo.cli.output import Output
 
 
 def add(command: AddCommand) -> None:
@@ -15,7 +16,7 @@ def add(command: AddCommand) -> None:
     add_quiet(sub)
 
 
-def run(parsed: argparse.Namespace) -> dict:
+def run(parsed: argparse.Namespace) -> Output:
     from linprim_geo.runs.render import render_run
 
-    return render_run(parsed.run, split=parsed.split, output=parsed.output, quiet=parsed.quiet)
+    return Output(render_run(parsed.run, split=parsed.split, output=parsed.output, quiet=parsed.quiet))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from linprim_geo.cli.options import AddCommand, add_run, whole
+from linprim_geo.cli.output import Output
 
 
 def add(command: AddCommand) -> None:
@@ -27,14 +28,15 @@ def add(command: AddCommand) -> None:
     sub.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
 
 
-def report(parsed: argparse.Namespace) -> dict:
-    from linprim_geo.display.report import report_run
+def report(parsed: argparse.Namespace) -> Output:
+    from linprim_geo.display.report import describe, report_run
 
     made = report_run(parsed.run, parsed.output, parsed.reference)
-    return made | {"_text": "\n".join([f"{made['report']}: {made['bytes'] / 2**20:.1f} MiB", *made["missing"]])}
+    return Output(made, describe(made))
 
 
-def view(parsed: argparse.Namespace) -> dict:
+def view(parsed: argparse.Namespace) -> Output:
     from linprim_geo.display.viewer import view_run
 
-    return view_run(parsed.run, parsed.port, browser=parsed.browser, follow=parsed.follow, reference=parsed.reference)
+    how = {"browser": parsed.browser, "follow": parsed.follow, "reference": parsed.reference}
+    return Output(view_run(parsed.run, parsed.port, **how))

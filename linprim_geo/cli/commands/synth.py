@@ -6,6 +6,7 @@ import argparse
 
 from linprim_geo.cli.arguments import from_args
 from linprim_geo.cli.options import AddCommand, add_options
+from linprim_geo.cli.output import Output
 from linprim_geo.synthetic.options import SynthOptions
 
 
@@ -19,8 +20,9 @@ def add(command: AddCommand) -> None:
     add_options(sub.add_argument_group("capture"), SynthOptions)
 
 
-def run(parsed: argparse.Namespace) -> dict:
+def run(parsed: argparse.Namespace) -> Output:
     from linprim_geo.synthetic.synth import synthesize
 
     options = from_args(SynthOptions, parsed)
-    return synthesize(parsed.output, options, shape=parsed.scene, mesh=parsed.mesh, overwrite=parsed.overwrite)
+    made = synthesize(parsed.output, options, shape=parsed.scene, mesh=parsed.mesh, overwrite=parsed.overwrite)
+    return Output(made)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from linprim_geo.cli.arguments import from_args
 from linprim_geo.cli.options import AddCommand, add_options, add_quiet, add_scene, add_workers
+from linprim_geo.cli.output import Output
 from linprim_geo.eval.options import TradeoffOptions
 
 
@@ -22,12 +23,11 @@ def add(command: AddCommand) -> None:
     add_quiet(sub)
 
 
-def run(parsed: argparse.Namespace) -> dict:
+def run(parsed: argparse.Namespace) -> Output:
+    from linprim_geo.eval.tradeoff.results import describe
     from linprim_geo.eval.tradeoff.sweep import tradeoff
 
     output = Path(parsed.output or Path("runs") / f"{Path(os.path.abspath(parsed.scene)).name}_tradeoff")
     where = {"cluster": parsed.cluster, "workers": parsed.workers}
     results = tradeoff(parsed.scene, output, from_args(TradeoffOptions, parsed), quiet=parsed.quiet, **where)
-    files = [str(output / f"tradeoff.{suffix}") for suffix in ("html", "csv", "json")]
-    text = "\n".join([*results["sentences"].values(), "", results["rule"], "", *files])
-    return results | {"files": files, "_text": text}
+    return Output(results, describe(results))

@@ -20,6 +20,7 @@ from linprim_geo.cli.options import (
     blocks,
     seconds,
 )
+from linprim_geo.cli.output import Output
 
 # 3DGS's -r -1 leaves images up to this width as they are.
 WIDEST = 1600
@@ -58,7 +59,7 @@ def add(command: AddCommand) -> None:
     add_options(sub.add_argument_group("training"), TrainOptions)
 
 
-def run(parsed: argparse.Namespace) -> dict:
+def run(parsed: argparse.Namespace) -> Output:
     budget = time_budget(parsed)
     scene = parsed.scene or parsed.source
     if scene is None or (parsed.scene and parsed.source):
@@ -74,13 +75,14 @@ def run(parsed: argparse.Namespace) -> dict:
     folder = parsed.run or Path("runs") / Path(os.path.abspath(scene)).name
     settings = {"quiet": parsed.quiet, "effects": effects_choice(parsed), **budget}
     if parsed.dry_run:
-        from linprim_geo.training.dry_run import dry_run
+        from linprim_geo.training.dry_run import describe, dry_run
 
         if parsed.resume:
             raise LinprimError("--dry-run says what a new training would take: wanted without --resume")
         if parsed.blocks != 1:
             raise LinprimError("--dry-run times the training of the whole scene: wanted without --blocks")
-        return dry_run(scene, folder, scene_options, options, **settings)
+        report = dry_run(scene, folder, scene_options, options, **settings)
+        return Output(report, describe(report))
     from linprim_geo.training.train import train
 
     shown: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
@@ -90,7 +92,7 @@ def run(parsed: argparse.Namespace) -> dict:
         shown = watched(folder)
     with shown:
         several = blocks_and_workers(parsed)
-        return train(scene, folder, scene_options, options, resume=parsed.resume, **several, **settings)
+        return Output(train(scene, folder, scene_options, options, resume=parsed.resume, **several, **settings))
 
 
 def _downscale_of(resolution: int, scene: str, options: SceneOptions, threads: int, log) -> int:

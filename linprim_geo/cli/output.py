@@ -1,0 +1,65 @@
+"""What a command gives back, and how it is printed."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Output:
+    """The result, which --json prints; the text for people, else a line for each plain value; the exit status."""
+
+    result: dict
+    text: str | None = None
+    status: int = 0
+
+
+@contextlib.contextmanager
+def printing(as_json: bool) -> Iterator[Callable[[Output], None]]:
+    """Yields a function that prints the output; with `as_json` whatever else goes to stdout goes to stderr.
+
+    Libraries print from C as well, so the file descriptor is redirected, not only Python's stream.
+    """
+    if not as_json:
+        yield _print_for_people
+        sys.stdout.flush()
+        return
+    outputs: list[Output] = []
+    stdout = sys.stdout
+    stdout.flush()
+    descriptor: int | None = None
+    saved = -1
+    try:
+        saved = os.dup(stdout.fileno())
+        descriptor = stdout.fileno()
+    except (OSError, ValueError):
+        pass
+    try:
+        if descriptor is not None:
+            os.dup2(sys.stderr.fileno(), descriptor)
+        with contextlib.redirect_stdout(sys.stderr):
+            yield outputs.append
+    finally:
+        if descriptor is not None:
+            os.dup2(saved, descriptor)
+            os.close(saved)
+    from linprim_geo.base.files import json_ready
+
+    stdout.write(json.dumps(json_ready(outputs[0].result), allow_nan=False) + "\n")
+    stdout.flush()
+
+
+def _print_for_people(output: Output) -> None:
+    if output.text is not None:
+        print(output.text)
+        return
+    for key, value in output.result.items():
+        if isinstance(value, bool | int | str):
+            print(f"{key}: {value}")
+        elif isinstance(value, float):
+            print(f"{key}: {value:.6g}")
