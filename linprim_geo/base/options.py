@@ -49,6 +49,23 @@ def flag_of(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
+def changed_options(options) -> list[Field]:
+    """The fields of an options dataclass whose values differ from their defaults."""
+    return [entry for entry in fields(options) if getattr(options, entry.name) != entry.default]
+
+
+def flags(options) -> list[str]:
+    """The words of a command line that set text, numbers and bools that differ from their defaults."""
+    words = []
+    for entry in changed_options(options):
+        flag, value = flag_of(entry.name), getattr(options, entry.name)
+        if isinstance(value, bool):
+            words.append(flag)
+        else:
+            words += [f"{flag}={value}"] if str(value).startswith("-") else [flag, str(value)]
+    return words
+
+
 def check(options) -> None:
     """Raises LinprimError for the first option whose value is of another type, outside its range, or not one of its
     choices."""

@@ -9,13 +9,13 @@ import json
 import os
 import shlex
 import tempfile
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.options import ExtractOptions, SceneOptions, TrainOptions
+from linprim_geo.base.options import ExtractOptions, flags, from_saved
 from linprim_geo.capture.types import Scene, View
 from linprim_geo.display.report_mesh import HEADLINE, ShownMesh, find_meshes, read_json
 from linprim_geo.runs.run import Run
@@ -251,12 +251,14 @@ def _png(pixels: np.ndarray) -> tuple[str, int, int]:
 def commands(run: Run, report: Report, reference: str | os.PathLike | None) -> list[str]:
     """The command lines that make this run, its meshes and its scores again."""
     words = ["linprim-geo", "train", str(run.scene_path), "-o", str(run.path)]
-    for options in (run.scene_options, run.train_options):
-        words += _given(options)
+    words += flags(run.scene_options) + flags(run.train_options)
     # What the data called for is among the options: nothing is to be decided again.
     lines = [shlex.join([*words, "--effects", "none"])]
     for shown in report.meshes:
-        lines.append(shlex.join(_extraction(run, shown)))
+        try:
+            lines.append(shlex.join(_extraction(run, shown)))
+        except LinprimError as error:
+            report.missing.append(f"{error}, so the command that extracts it again is not known")
         for scores in shown.scores:
             words = [
                 "linprim-geo",
@@ -283,50 +285,14 @@ def commands(run: Run, report: Report, reference: str | os.PathLike | None) -> l
 
 
 def _extraction(run: Run, shown: ShownMesh) -> list[str]:
-    """The words that extract a mesh again, as far as its stats.json tells: what was chosen automatically is spelled
-    out."""
-    stats = shown.stats
-    words = [
-        "linprim-geo",
-        "extract-mesh",
-        str(run.path),
-        "--method",
-        shown.method,
-        "--level",
-        f"{stats['level']:.12g}",
-    ]
-    for name, flag, usual in (
-        ("voxel_size", "--voxel-size", 0.0),
-        ("truncation_voxels", "--truncation", ExtractOptions.truncation),
-        ("depth_limit", "--depth-limit", ExtractOptions.depth_limit),
-        ("refine", "--refine", ExtractOptions.refine),
-    ):
-        if stats.get(name, usual) != usual:
-            words += [flag, f"{stats[name]:.12g}"]
-    flags = {
-        "max_edges": "--close-holes",
-        "iterations": "--smooth",
-        "edge_length": "--remesh",
-        "target_faces": "--target-faces",
-    }
-    for step in stats.get("processing") or []:
-        words += [word for key, flag in flags.items() if key in step for word in (flag, f"{step[key]:.12g}")]
-    if stats.get("texture"):
-        words += ["--texture", str(stats["texture"]["size"])]
+    """The words that extract a mesh again; what was chosen automatically is spelled out.
+
+    Raises:
+        LinprimError: its stats.json holds no options.
+    """
+    where = f"stats.json of {shown.method}: options"
+    options = from_saved(ExtractOptions, shown.stats.get("options"), where)
+    words = ["linprim-geo", "extract-mesh", str(run.path), "--method", shown.method, *flags(options)]
     usual = run.path / "mesh" / shown.method / "mesh.ply"
-    return words + ([] if Path(stats["mesh"]).parts[-3:] == usual.parts[-3:] else ["-o", str(stats["mesh"])])
-
-
-def _given(options: SceneOptions | TrainOptions) -> list[str]:
-    """The words of a command line that set what differs from its default."""
-    words = []
-    for entry in fields(options):
-        value, flag = getattr(options, entry.name), "--" + entry.name.replace("_", "-")
-        if value == entry.default:
-            continue
-        if isinstance(value, bool):
-            words.append(flag if value else flag.replace("--", "--no-", 1))
-        else:
-            words.append(f"{flag}={value}" if str(value).startswith("-") else flag)
-            words += [] if str(value).startswith("-") else [str(value)]
-    return words
+    made = shown.stats["mesh"]
+    return words + ([] if Path(made).parts[-3:] == usual.parts[-3:] else ["-o", made])

@@ -7,11 +7,11 @@ import math
 import platform
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 
-from linprim_geo.base.options import SceneOptions, TrainOptions
+from linprim_geo.base.options import changed_options, flag_of
 from linprim_geo.base.progress import duration
 from linprim_geo.base.version import __version__
 from linprim_geo.display.report_data import Report
@@ -189,18 +189,10 @@ def _input(report: Report) -> str:
 
 def _decisions(report: Report) -> str:
     rows = []
-    for options, kind in ((report.run.scene_options, SceneOptions), (report.run.train_options, TrainOptions)):
-        for entry in fields(kind):
-            value = getattr(options, entry.name)
-            if value != entry.default:
-                rows.append(
-                    (
-                        f"--{entry.name.replace('_', '-')}",
-                        str(value),
-                        str(entry.default),
-                        entry.metadata["help"],
-                    )
-                )
+    for options in (report.run.scene_options, report.run.train_options):
+        for entry in changed_options(options):
+            value = str(getattr(options, entry.name))
+            rows.append((flag_of(entry.name), value, str(entry.default), entry.metadata["help"]))
     text = (
         _words(rows, ("option", "value", "default", "what it is")) if rows else "<p>Every option has its default.</p>"
     )

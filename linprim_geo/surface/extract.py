@@ -7,7 +7,7 @@ import os
 import shutil
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import asdict, replace
 from importlib import import_module
 from pathlib import Path
 
@@ -36,6 +36,9 @@ METHODS = {
     "polyhedra": "method_polyhedra.polyhedra_surface",
     "opacity-field": "method_opacity_field.opacity_surface",
 }
+
+# Options that a method chooses where they are 0; what it took is in its statistics.
+CHOSEN = ("voxel_size", "depth_limit")
 
 # Folder of what workers have done, in that of the method.
 PARTS = "parts"
@@ -69,11 +72,10 @@ def extract_mesh(
     With `blocks` other than 1 the depth maps are fused in so many parts of one lattice by several workers, with the
     same result to the last bit; `cluster` and `workers` say where, see `executor.open_executor`.
 
-    Returns: what stats.json holds: topology of both meshes, options, before an environment
-        `seen_by_one_view` (`single_view.without_single_views`), `processing` step by step, `texture`, what manifold3d
-        says of
-    a watertight mesh (`manifold_status`), `predicted_error` (median and 90 % quantile) of the vertices that cameras
-    see, seconds and peak memory per stage, and the paths.
+    Returns: what stats.json holds: topology of both meshes, `options` with what was chosen in them, before an
+        environment `seen_by_one_view` (`single_view.without_single_views`), `processing` step by step, `texture`, what
+        manifold3d says of a watertight mesh (`manifold_status`), `predicted_error` (median and 90 % quantile) of the
+        vertices that cameras see, seconds and peak memory per stage, and the paths.
 
     Raises:
         LinprimError: nothing was trained, no ray crosses the level, the grid would not fit into memory, or the time is
@@ -167,12 +169,14 @@ def _extract(
         if left_out["pieces"]:
             stages.note(f"left out: {left_out['pieces']} parts that one camera alone sees before the open background")
         stages.lap("support")
+    options = replace(options, **{name: about[name] for name in CHOSEN if name in about})
     done = finish_surface(mesh, opened, options, target, stages)
     shape = topology(done.mesh)
     stats = {
         "mesh": str(target),
         "mesh_visible": str(visible_target),
         "method": method,
+        "options": asdict(options),
         **about,
         "level_differences": agreement,
         "unit": opened.unit,

@@ -4,13 +4,20 @@ checkpoint."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from linprim_geo.base.options import GEOMETRY_WEIGHTS, SceneOptions, TrainOptions, check_train_options
+from linprim_geo.base.options import (
+    GEOMETRY_WEIGHTS,
+    SceneOptions,
+    TrainOptions,
+    changed_options,
+    check_train_options,
+    flag_of,
+)
 from linprim_geo.base.progress import Progress
 from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.structure_from_motion import prepare
@@ -96,10 +103,10 @@ def reopen_run(
     if scene.resolve() != opened.scene_path:
         opened = opened.with_scene_at(scene)
     ignored = [
-        "--" + field.name.replace("_", "-")
+        flag_of(entry.name)
         for given, own in ((scene_options, opened.scene_options), (options, opened.train_options))
-        for field in fields(given)
-        if field.name != "threads" and getattr(given, field.name) not in (field.default, getattr(own, field.name))
+        for entry in changed_options(given)
+        if entry.name != "threads" and getattr(given, entry.name) != getattr(own, entry.name)
     ]
     if ignored:
         progress.note(f"--resume goes on with the run's own options: {', '.join(ignored)} ignored")

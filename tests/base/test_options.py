@@ -12,8 +12,10 @@ from linprim_geo.base.options import (
     ExtractOptions,
     SceneOptions,
     TrainOptions,
+    changed_options,
     check,
     check_train_options,
+    flags,
     from_saved,
     option,
     with_changes,
@@ -75,6 +77,23 @@ def test_every_default_is_allowed_and_every_number_has_a_range(cls):
     for entry in fields(cls):
         if not isinstance(entry.default, str | bool) and not entry.metadata["choices"]:
             assert entry.metadata["low"] is not None, entry.name
+
+
+def test_flags_set_what_differs_from_its_default():
+    from argparse import ArgumentParser
+
+    from linprim_geo.cli.arguments import from_args
+    from linprim_geo.cli.options import add_options
+
+    parser = ArgumentParser()
+    add_options(parser, Options)
+    options = Options(count=4, shift=-0.5, level=0.25, size=2.0, kind="b")
+    assert flags(options) == "--count 4 --shift=-0.5 --level 0.25 --size 2.0 --kind b".split()
+    assert from_args(Options, parser.parse_args(flags(options))) == options
+    assert (
+        flags(Options()) == []
+        and [entry.name for entry in changed_options(options)] == "count shift level size kind".split()
+    )
 
 
 def test_values_that_exclude_each_other_are_refused():

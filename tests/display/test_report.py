@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import html
 import io
 import json
@@ -165,6 +166,18 @@ def test_commands_repeat_the_run(made, meshed):
     assert parsed["train"].run == parsed["report"].run == str(meshed)
     options = arguments.from_args(ExtractOptions, parsed["extract-mesh"])
     assert options.level == 0.7 and options.smooth == 2 and options.voxel_size > 0 and options.depth_limit > 0
+    stats = json.loads((meshed / "mesh" / "tsdf" / "stats.json").read_text())
+    assert dataclasses.asdict(options) == stats["options"]
+
+
+def test_a_mesh_without_options_has_no_command(run_copy):
+    stats = extract_mesh(run_copy, options=ExtractOptions(level=0.7), quiet=True)
+    file = run_copy / "mesh" / "tsdf" / "stats.json"
+    for wrong in (None, {"smooth": "much"}):
+        file.write_text(json.dumps(stats | {"options": wrong}))
+        made = report_run(run_copy)
+        assert any("stats.json of tsdf: options" in sentence for sentence in made["missing"])
+        assert "extract-mesh" not in Path(made["report"]).read_text()
 
 
 def test_a_run_without_mesh_scores_and_capture_says_so(run_copy, tiny_scene, tmp_path):
