@@ -9,8 +9,8 @@ import json
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -122,11 +122,8 @@ def train_model(
     variant: Variant,
     options: TrainOptions,
     folder: Path,
-    changed: Callable[[], AbstractContextManager] = nullcontext,
 ) -> dict:
     """Trains and scores one model in `folder`, or takes what is there; what `model.json` in it holds.
-
-    What no option says is changed while `changed` is entered, and the folder's name has to tell it.
 
     Raises:
         LinprimError: `folder` holds a model of other options, or something else.
@@ -145,7 +142,7 @@ def train_model(
             raise LinprimError(f"{folder}: exists and is not an earlier run; give another folder with -o")
         shutil.rmtree(folder)  # stopped before it was done
     _warm_up(capture, scene_options)
-    with changed(), _watched(record := {}):
+    with _watched(record := {}):
         trained = train(capture, folder, scene_options, options, quiet=True)
     scores = eval_images_run(folder, lpips_weights="none")
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]

@@ -76,23 +76,6 @@ PUBLISHED = (
         ),
     )
     + _rows(
-        "5",
-        QUALITY,
-        {
-            ("39f36da05b", method): text
-            for method, text in {
-                "3DGS, as given": ".859 27.70 .211",
-                "3DGS, noisy points": ".858 27.61 .217",
-                "3DGS, half the points": ".859 27.69 .214",
-                "3DGS, half the size": ".849 27.25 .235",
-                "LinPrim, as given": ".857 27.56 .225",
-                "LinPrim, noisy points": ".855 27.54 .228",
-                "LinPrim, half the points": ".854 27.51 .232",
-                "LinPrim, half the size": ".856 27.44 .227",
-            }.items()
-        },
-    )
-    + _rows(
         "7",
         QUALITY,
         _over_scenes(

@@ -1,5 +1,5 @@
-"""LinPrim's tables of single changes: degree of the colour, zooming out, worse starts, fixed counts, tetrahedra; and
-the two ablations that its authors promised, exact rays against affine ones and density against opacity.
+"""LinPrim's tables of single changes: degree of the colour, zooming out, fixed counts, tetrahedra; and exact rays
+against affine ones, an ablation that its authors promised.
 
 Every function takes a `Case` and returns the rows of its table for that scene: `scene`, `method`, `source` and the
 figures.
@@ -8,15 +8,13 @@ figures.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.eval.images import eval_images_run
 from linprim_geo.eval.paper.models import Model, Variant, measure, train_model
-from linprim_geo.eval.paper.starts import NOISE, STARTS, by_density, camera_spread, started
 from linprim_geo.runs.run import Run
 
 SCALES = (1, 2, 4, 8)
@@ -40,15 +38,8 @@ class Case:
     reference: Path | None = None
     labels: Path | None = None
 
-    def trained(
-        self,
-        variant: Variant,
-        name: str = "",
-        changed: Callable[[], AbstractContextManager] = nullcontext,
-        **options,
-    ) -> Path:
-        """Folder of the run of a variant with other options, trained unless it is there; `name` tells what `changed`
-        does."""
+    def trained(self, variant: Variant, **options) -> Path:
+        """Folder of the run of a variant with other options, trained unless it is there."""
         given = replace(self.options, primitive=variant.kind, population=variant.population)
         wanted = replace(given, **options)
         parts = [variant.name.replace(":", "_"), str(wanted.max_primitives)]
@@ -57,10 +48,10 @@ class Case:
             for key, value in options.items()
             if key != "max_primitives" and value != getattr(given, key)
         ]
-        folder = self.folder / "_".join([*parts, *([name.replace(" ", "-")] if name else [])])
+        folder = self.folder / "_".join(parts)
         if not (folder / "model.json").exists():
             print(f"{self.scene}: training {folder.name}", flush=True)
-        train_model(self.scene, self.capture, self.scene_options, variant, wanted, folder, changed)
+        train_model(self.scene, self.capture, self.scene_options, variant, wanted, folder)
         return folder
 
     def row(self, method: str, **figures) -> dict:
@@ -111,23 +102,6 @@ def zooming_out(case: Case) -> list[dict]:
     return rows
 
 
-def worse_starts(case: Case) -> list[dict]:
-    """Table 5: from noisy points, half the points, and primitives of half the size."""
-    deviation = NOISE * camera_spread(case.capture, case.scene_options)
-    rows = []
-    for kind in ("gaussian", "octahedron"):
-        variant = case.kinds[kind]
-        for start in STARTS:
-            usual = start == STARTS[0]
-            folder = (
-                case.trained(variant)
-                if usual
-                else case.trained(variant, start, lambda start=start: started(start, deviation))
-            )
-            rows.append(case.quality(f"{variant.name}, {start}", folder))
-    return rows
-
-
 def fixed_counts(case: Case) -> list[dict]:
     """Tables 7 and 11: MCMC with at most so many primitives, beside 3DGS's rules with the largest number allowed."""
     rows = []
@@ -151,12 +125,6 @@ def rays(case: Case) -> list[dict]:
         case,
         {f"{model} rays": case.trained(case.kinds["octahedron"], ray_model=model) for model in ("exact", "affine")},
     )
-
-
-def density(case: Case) -> list[dict]:
-    """Opacity along a reference length as what is optimised, against the logarithm of the density."""
-    variant = case.kinds["octahedron"]
-    return _costed(case, {"opacity": case.trained(variant), "density": case.trained(variant, "by density", by_density)})
 
 
 def _costed(case: Case, folders: dict[str, Path]) -> list[dict]:

@@ -1,14 +1,13 @@
 """LinPrim's tables on a CPU, with the authors' figures beside ours.
 
-    python -m linprim_geo.eval.paper.tables -o runs/paper [--tables 2 5 9 ...] [--data CAPTURE ...] [--quick]
+    python -m linprim_geo.eval.paper.tables -o runs/paper [--tables 2 4 9 ...] [--data CAPTURE ...] [--quick]
 
     1 6 8    octahedra, tetrahedra and Gaussians at every one of --caps: counts and cost, work, stages; frame time at
              equal PSNR, PSNR at equal time
     2        degree of the view-dependent colour             7 11     fixed counts, MCMC
     3        quality by class, given --labels                9        depth: L1, L2, coverage
     4        zooming out with and without filters            10       Chamfer distance of a TSDF at 5 cm, 5,000 samples
-    5        worse initialisation                            12       octahedra against tetrahedra
-    rays     exact against affine rays                       density  density against opacity as what is optimised
+    12       octahedra against tetrahedra                    rays     exact against affine rays
 
 Models are trained by the function behind `linprim-geo train`, and what is trained already is taken from the output
 folder. All but 1, 6, 8, 7 and 11 use the largest of --caps alone. Written are table_N.txt and table_N.json, and for 1,
@@ -129,13 +128,6 @@ TABLES = {
         paper_studies.zooming_out,
         "Photographs averaged down; rendered with one ray per pixel (--samples) of the smaller image.",
     ),
-    "5": Table(
-        "Table 5: worse initialisation",
-        paper_studies.worse_starts,
-        "Noise: standard deviation per axis of 5 % of the largest distance of a training camera from their mean. "
-        "All is done to what a "
-        "run starts from, points that it adds by itself included.",
-    ),
     "7": Table(
         "Tables 7 and 11: fixed counts, MCMC",
         paper_studies.fixed_counts,
@@ -165,11 +157,6 @@ TABLES = {
         "Ablation: exact against affine rays",
         paper_studies.rays,
         "Trained and rendered by the same rays; frames on one thread.",
-    ),
-    "density": Table(
-        "Ablation: density against opacity",
-        paper_studies.density,
-        "The logarithm of the density with the rate of learning of the opacity; growth as usual.",
     ),
 }
 SAME = {"11": "7"}

@@ -12,166 +12,19 @@ import pytest
 from PIL import Image
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.capture.load import load_scene
-from linprim_geo.capture.types import PointCloud
 from linprim_geo.eval.paper import tables as paper_tables
 from linprim_geo.eval.paper.classes import class_errors, read_labels, stand_in_labels
 from linprim_geo.eval.paper.published import PUBLISHED, published
-from linprim_geo.eval.paper.starts import (
-    STARTS,
-    by_density,
-    camera_spread,
-    halved,
-    log_density,
-    noisy,
-    raw_opacity,
-    started,
-)
 from linprim_geo.eval.paper.text_tables import number
-from linprim_geo.geometry.primitives import reference_length
 from linprim_geo.imaging.metrics import composite, psnr, to_8bit
-from linprim_geo.points import start_points
 from linprim_geo.runs.run import Run
-from linprim_geo.training import start as training_start
-from linprim_geo.training.step import trainer as trainer_module
-from linprim_geo.training.train import train
-
-USUAL = (
-    training_start.Trainer,
-    start_points.initial_cloud,
-    training_start.initial_parameters,
-    trainer_module.activate,
-)
-
-
-def usual():
-    return (
-        training_start.Trainer,
-        start_points.initial_cloud,
-        training_start.initial_parameters,
-        trainer_module.activate,
-    )
 
 
 @pytest.fixture(autouse=True)
 def points_as_they_are(monkeypatch):
     """Looking for more points takes seconds for every training."""
     monkeypatch.setattr("linprim_geo.points.start_points.fill_points", lambda scene, *_: scene.points)
-
-
-# --- starts ----------------------------------------------------------------------------------------------
-
-
-def test_the_spread_of_cameras_is_their_largest_distance_from_their_mean(tiny_scene):
-    centers = np.stack([view.camera.center for view in load_scene(tiny_scene).train])
-    spread = camera_spread(tiny_scene, SceneOptions())
-    assert spread == max(float(np.linalg.norm(c - centers.mean(0))) for c in centers) > 0
-
-
-def test_points_are_moved_by_noise_and_halved():
-    rng = np.random.default_rng(0)
-    cloud = PointCloud(rng.normal(size=(20_001, 3)), rng.integers(0, 255, (20_001, 3), dtype=np.uint8))
-    moved = noisy(cloud, 0.3, seed=5)
-    off = moved.xyz - cloud.xyz
-    assert np.std(off, axis=0) == pytest.approx([0.3] * 3, rel=0.02) and np.abs(off.mean(0)).max() < 0.01
-    assert np.array_equal(moved.rgb, cloud.rgb) and np.array_equal(noisy(cloud, 0.3, seed=5).xyz, moved.xyz)
-    half = halved(cloud, seed=5)
-    assert len(half.xyz) == 10_000
-    found = {tuple(p) for p in cloud.xyz}
-    assert all(tuple(p) in found for p in half.xyz) and len({tuple(p) for p in half.xyz}) == 10_000
-    assert len(halved(PointCloud(np.zeros((1, 3)), np.zeros((1, 3), np.uint8)), 0).xyz) == 1
-
-
-@pytest.mark.parametrize("start", STARTS)
-def test_a_training_starts_from_what_was_asked_for(start, tiny_scene, tmp_path):
-    """One step is taken, and what it begins with is compared with what it usually does."""
-    begun = {}
-
-    def begin(name, context):
-        class Looking(training_start.Trainer):
-            def __init__(self, *args, **named):
-                super().__init__(*args, **named)
-                begun[name] = {key: value.detach().numpy().copy() for key, value in self.parameters.items()}
-                begun[name]["bounds"] = self.bounds
-
-        options = TrainOptions(iterations=1, max_primitives=200, initial_primitives=150, sh_degree=0, threads=1)
-        with context, pytest.MonkeyPatch.context() as patch:
-            patch.setattr(training_start, "Trainer", Looking)
-            train(tiny_scene, tmp_path / name, SceneOptions(), options, quiet=True)
-
-    begin("before", started("as given", 0.2))
-    begin("after", started(start, 0.2))
-    assert usual() == USUAL
-    before, after = begun["before"], begun["after"]
-    center = before["center"]
-    if start == "as given":
-        assert all(np.array_equal(before[name], after[name]) for name in before)
-    elif start == "noisy points":
-        scale = Run.open(tmp_path / "after").similarity.scale
-        assert np.std(after["center"] - center) == pytest.approx(0.2 * scale, rel=0.15)
-    elif start == "half the points":
-        assert len(after["center"]) == len(center) // 2 == 75
-        assert {tuple(p) for p in after["center"].tolist()} <= {tuple(p) for p in center.tolist()}
-    else:
-        assert np.array_equal(after["center"], center)
-        free = before["log_extent"][:, :2] > math.log(2.1 * before["bounds"][0])  # those are laid flat across the third
-        assert free.sum() > 100
-        assert (before["log_extent"] - after["log_extent"])[:, :2][free] == pytest.approx(math.log(2), abs=1e-5)
-
-
-# --- density against opacity -----------------------------------------------------------------------------
-
-
-def test_the_logarithm_of_the_density_and_the_opacity_are_each_others_inverse():
-    raw, length = np.linspace(-15, 40, 200), np.geomspace(1e-4, 3, 200)
-    logarithm = log_density(raw, length)
-    assert np.exp(logarithm) * length == pytest.approx(np.log1p(np.exp(raw)), rel=1e-9)
-    assert raw_opacity(logarithm, length) == pytest.approx(raw, rel=1e-9, abs=1e-9)
-
-
-def test_by_density_the_extent_leaves_the_density_alone(tiny_scene, tmp_path):
-    """The same start, no step that differs before the first; then the gradient by the extent is that at constant
-    density."""
-    import torch
-
-    seen = {}
-
-    class Looking(training_start.Trainer):
-        def advance(self):
-            active = trainer_module.activate(self.parameters, 0, self.kind, self.filter_3d)
-            seen.setdefault("first", [t.detach().numpy().copy() for t in active])
-            if self.step == 0:
-                leaf = self.parameters["log_extent"].clone().requires_grad_()
-                density = trainer_module.activate(self.parameters | {"log_extent": leaf}, 0, self.kind, None)[3]
-                seen["gradient"] = torch.autograd.grad(density.sum() + 0 * leaf.sum(), leaf)[0].abs().sum().item()
-            super().advance()
-
-        def _grow(self):
-            seen["counts"] = [*seen.get("counts", []), len(self)]
-            super()._grow()
-
-    options = TrainOptions(iterations=150, max_primitives=220, initial_primitives=150, sh_degree=0, threads=1)
-    found = {}
-    for name in ("opacity", "density"):
-        seen.clear()
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(training_start, "Trainer", Looking)
-            if name == "opacity":
-                trained = train(tiny_scene, tmp_path / name, SceneOptions(), options, quiet=True)
-            else:
-                with by_density():
-                    trained = train(tiny_scene, tmp_path / name, SceneOptions(), options, quiet=True)
-        found[name] = {**seen, "trained": trained, "saved": Run.open(tmp_path / name).training_primitives()}
-    assert usual() == USUAL
-    for a, b in zip(found["opacity"]["first"], found["density"]["first"], strict=True):
-        assert b == pytest.approx(a, rel=1e-5, abs=1e-6)
-    assert found["density"]["gradient"] == 0 < found["opacity"]["gradient"]
-    saved, counts = found["density"]["saved"], found["density"]["counts"]
-    assert len(saved.center) > 150 and len(counts) > 1 and found["density"]["trained"]["psnr"] > 14
-    opacity = 1 - np.exp(-saved.density * reference_length(saved.extent, "octahedron"))
-    assert np.isfinite(opacity).all() and 0.3 < np.median(opacity) < 1
-    assert found["density"]["trained"]["psnr"] != found["opacity"]["trained"]["psnr"]
 
 
 # --- classes ---------------------------------------------------------------------------------------------
@@ -247,7 +100,7 @@ def test_the_labels_of_a_built_in_scene_are_its_parts(tiny_scene, tmp_path):
 
 def test_published_figures_are_those_of_the_authors_and_marked_as_such():
     assert all(row["source"] == "published" for row in PUBLISHED)
-    assert {row["table"] for row in PUBLISHED} == {"1", "2", "3", "4", "5", "6", "7", "8", "9", "10", "12"}
+    assert {row["table"] for row in PUBLISHED} == {"1", "2", "3", "4", "6", "7", "8", "9", "10", "12"}
     for row in published("3"):  # three of their numbers say one thing
         if "gaussians" in row:
             assert row["octahedra"] - row["gaussians"] == pytest.approx(row["change"])
@@ -255,7 +108,7 @@ def test_published_figures_are_those_of_the_authors_and_marked_as_such():
         assert sum(row[f"scale_{k}"] for k in (1, 2, 4, 8)) / 4 == pytest.approx(row["mean"], abs=0.0101)
     (octahedra,) = [r for r in published("12") if (r["scene"], r["method"]) == ("room", "octahedra")]
     assert (octahedra["ssim"], octahedra["psnr"], octahedra["lpips"]) == (0.913, 29.88, 0.216)
-    assert published("rays") == published("density") == []
+    assert published("rays") == []
 
 
 def test_numbers_of_a_table():
@@ -286,13 +139,11 @@ MADE = {
     "2": (("psnr_3", "change_2", "change_1", "change_0"), 2),
     "3": (("share", "gaussians", "octahedra", "change"), 8),
     "4": (("scale_1", "scale_2", "scale_4", "scale_8", "mean"), 2),
-    "5": (("ssim", "psnr", "count"), 8),
     "7": (("ssim", "psnr", "count"), 4),
     "9": (("l1", "l1_std", "l2", "l2_std", "coverage"), 2),
     "10": (("voxel", "chamfer", "standard_error"), 2),
     "12": (("ssim", "psnr", "count"), 2),
     "rays": (("psnr", "train_cpu_seconds", "frame_cpu_ms"), 2),
-    "density": (("psnr", "train_cpu_seconds", "frame_cpu_ms"), 2),
 }
 
 
@@ -306,7 +157,7 @@ def test_a_quick_run_makes_the_table(name, quick):
     for row in ours:
         assert row["scene"] == "cad" and all(math.isfinite(row[column]) for column in columns)
         assert row["method"] in text
-    assert ("published" in text) == (name not in ("rays", "density")) and paper_tables.TABLES[name].title in text
+    assert ("published" in text) == (name != "rays") and paper_tables.TABLES[name].title in text
     assert len([row for row in table["rows"] if row["source"] == "published"]) == len(published(name))
     # What a study changes makes a difference.
     assert len({tuple(row[column] for column in columns[:2]) for row in ours}) > 1
@@ -318,11 +169,9 @@ def test_tables_share_models_and_a_second_run_trains_nothing(quick, capsys):
     assert {
         "octahedron_60",
         "gaussian_60",
-        "octahedron_60_noisy-points",
-        "octahedron_60_by-density",
         "octahedron_mcmc_60",
     } <= names
-    assert len(names) == 22
+    assert len(names) == 15
     before = {name: (models / name / "model.json").stat().st_mtime_ns for name in names}
     command = ["--quick", "-o", str(quick), "--iterations", "25", "--caps", "60"]
     paper_tables.main([*command, "--tables", "11"])  # the same as 7
