@@ -28,7 +28,6 @@ from linprim_geo.capture.load import load_scene
 from linprim_geo.eval.depth import eval_depth_run
 from linprim_geo.points import start_points
 from linprim_geo.synthetic.synth import synthesize
-from linprim_geo.training import start as training_start
 from linprim_geo.training.effects import EFFECTS, Choice, Decision, decide
 from linprim_geo.training.train import train
 
@@ -301,8 +300,6 @@ def main() -> None:
     parser.add_argument("--primitives", type=int, default=2000, metavar="N")
     parser.add_argument("--seeds", type=int, default=2, metavar="N", help="trainings of everything that is compared")
     parser.add_argument("--only", nargs="*", choices=tuple(PAIRS), default=tuple(PAIRS), metavar="EFFECT")
-    text = "start from the scenes' points alone: looking for more takes longer than a small training"
-    parser.add_argument("--own-points", action="store_true", help=text)
     parser.add_argument(
         "--scenes",
         nargs="*",
@@ -319,8 +316,6 @@ def main() -> None:
         Size(parsed.size, parsed.iterations, parsed.primitives),
         parsed.seeds,
     )
-    if parsed.own_points:
-        training_start.fill_points = lambda scene, *_: scene.points
     rows, comparisons = [], []
     try:
         for name in parsed.only:
