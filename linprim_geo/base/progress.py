@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 
-from linprim_geo.base.memory import memory_gib
+from linprim_geo.base.memory import forget_peak, peak_gib
 
 
 def duration(seconds: float) -> str:
@@ -70,7 +70,7 @@ class Stages:
         self.seconds: dict[str, float] = {}
         self.peak_gib: dict[str, float] = {}
         self._begin = time.perf_counter()
-        _forget_peak()
+        forget_peak()
 
     def note(self, text: str) -> None:
         """Prints a line that stays, indented under its job."""
@@ -81,9 +81,9 @@ class Stages:
         unknown)."""
         now = time.perf_counter()
         self.seconds[name] = round(self.seconds.get(name, 0.0) + now - self._begin, 3)
-        self.peak_gib[name] = round(max(self.peak_gib.get(name, 0.0), memory_gib("VmHWM")), 3)
+        self.peak_gib[name] = round(max(self.peak_gib.get(name, 0.0), peak_gib()), 3)
         self._begin = now
-        _forget_peak()
+        forget_peak()
 
     def line(self) -> str:
         """One printed line of what `report` returns."""
@@ -98,13 +98,3 @@ class Stages:
             "seconds": self.seconds | {"total": round(sum(self.seconds.values()), 3)},
             "peak_gib": self.peak_gib | {"total": max(self.peak_gib.values(), default=0.0)},
         }
-
-
-def _forget_peak() -> None:
-    """Sets the peak that the system keeps to what is resident now; where that cannot be done the peaks are those since
-    the start."""
-    try:
-        with open("/proc/self/clear_refs", "w") as file:
-            file.write("5")
-    except OSError:
-        pass

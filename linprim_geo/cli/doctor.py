@@ -6,13 +6,13 @@ from __future__ import annotations
 import contextlib
 import importlib
 import importlib.metadata
-import math
 import os
 import platform
 import shutil
 import sys
 from pathlib import Path
 
+from linprim_geo.base.cores import usable_cores
 from linprim_geo.base.system import compiler_problem, find_compiler, install_command, missing_libraries, python_problem
 from linprim_geo.base.version import __version__
 
@@ -22,6 +22,7 @@ LIBRARIES = (
     ("numpy", ("numpy",)),
     ("scipy", ("scipy",)),
     ("PIL", ("pillow",)),
+    ("psutil", ("psutil",)),
     ("open3d", ("open3d-cpu", "open3d")),
     ("pymeshlab", ("pymeshlab",)),
     ("trimesh", ("trimesh",)),
@@ -63,7 +64,7 @@ def doctor() -> dict:
     instruction_set, problem = _instruction_set()
     if problem:
         problems += [each for each in (problem, compiler_problem()) if each]
-    memory, available = memory_bytes()
+    memory, available = _memory()
     disk = shutil.disk_usage(Path.cwd()).free
     if available is not None and available < LITTLE_MEMORY:
         free = _gigabytes(available)
@@ -111,26 +112,14 @@ def describe(report: dict) -> str:
     return "\n".join(lines)
 
 
-def usable_cores() -> int:
-    """Cores that this process may use: the affinity mask, and a container's quota rounded up."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    with contextlib.suppress(OSError, ValueError):
-        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
-        if quota != "max":
-            cores = min(cores, max(1, math.ceil(int(quota) / int(period))))
-    return cores
+def _memory() -> tuple[int | None, int | None]:
+    """(total, available) memory in bytes; None where psutil is missing."""
+    from linprim_geo.base.memory import available_memory, total_memory
 
-
-def memory_bytes() -> tuple[int | None, int | None]:
-    """(total, available) main memory in bytes; None where the system does not say."""
-    total = available = None
-    with contextlib.suppress(OSError, ValueError, AttributeError):
-        total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                available = int(line.split()[1]) * 1024
-    return total, available
+    try:
+        return total_memory(), available_memory()
+    except ImportError:
+        return None, None
 
 
 def _library(module: str, distributions: tuple[str, ...]) -> tuple[str | None, str | None]:

@@ -119,10 +119,10 @@ def _run_task(task: dict) -> dict:
         begin = time.monotonic()
         module, function = task["function"].split(":")
         result = getattr(import_module(module), function)(folder, **task["arguments"])
-        from linprim_geo.base.memory import memory_gib
+        from linprim_geo.base.memory import peak_gib
 
         # What the system counts as the peak of children begins with that of the process that they are copies of.
-        result |= {"task_seconds": time.monotonic() - begin, "task_peak_gib": memory_gib("VmHWM")}
+        result |= {"task_seconds": time.monotonic() - begin, "task_peak_gib": peak_gib()}
         write_json(folder / DONE, {"task": key_of(task), "name": task["name"], "result": result})
         return result_of_folder(folder)
 

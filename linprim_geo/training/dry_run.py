@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from linprim_geo.base.budget import Budget
-from linprim_geo.base.memory import available_memory, memory_gib
+from linprim_geo.base.memory import available_memory, memory_gib, peak_gib
 from linprim_geo.base.options import SceneOptions, TrainOptions, check_train_options
 from linprim_geo.base.progress import Progress, duration
 from linprim_geo.kernels import ops
@@ -105,7 +105,7 @@ def dry_run(
     finally:
         torch.set_num_threads(before)
     per_primitive = bytes_per_primitive(options)
-    used = (memory_gib("VmHWM") or memory_gib()) - per_primitive * counts[0] / 2**30  # without those that were timed
+    used = peak_gib() - per_primitive * counts[0] / 2**30  # without those that were timed
     available = available_memory() / 2**30 + memory_gib()
     needed = used + per_primitive * options.max_primitives / 2**30
     held = sum(not isinstance(shot, StoredShot) for shot in shots)

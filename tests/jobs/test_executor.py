@@ -15,8 +15,9 @@ from pathlib import Path
 import pytest
 from helpers.executor_tasks import is_alive
 
+from linprim_geo.base.cores import usable_cores
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.memory import memory_gib
+from linprim_geo.base.memory import peak_gib
 from linprim_geo.base.progress import Progress
 from linprim_geo.jobs import worker
 from linprim_geo.jobs.executor import ATTEMPTS, Executor, Outcome, Task
@@ -77,7 +78,7 @@ def task(shared: Path, function: str, name: str = "t", **arguments) -> Task:
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a child's peak begins with its parent's")
 def test_the_peak_of_a_worker_is_its_own(tmp_path):
     large = bytearray(b"1") * 2**30
-    assert memory_gib("VmHWM") > 1
+    assert peak_gib() > 1
     [done] = run([task(tmp_path, "chain", start="a", steps=1)], tmp_path)
     del large
     assert 0 < done["task_peak_gib"] < 0.9
@@ -323,6 +324,6 @@ def test_a_marker_is_no_task(tmp_path):
 
 def test_processes_have_as_many_workers_as_cores(tmp_path):
     with Processes(tmp_path) as executor:
-        assert executor.workers == os.cpu_count()
+        assert executor.workers == usable_cores()
     with pytest.raises(LinprimError, match="--workers is -1"):
         open_executor(None, tmp_path, -1)

@@ -168,7 +168,8 @@ def test_people_read_lines(tiny_scene, tmp_path, capsys):
 def test_what_does_not_fit_comes_with_what_to_change(available, primitives, advice, tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(dry_run, "available_memory", lambda: int(available * 2**30))
     if available == 0:  # what is taken already is all there is
-        monkeypatch.setattr(dry_run, "memory_gib", lambda entry="": 1.0)
+        monkeypatch.setattr(dry_run, "memory_gib", lambda: 1.0)
+        monkeypatch.setattr(dry_run, "peak_gib", lambda: 1.0)
     options = replace(OPTIONS, max_primitives=primitives)
     report = dry_run.dry_run(tiny_scene, tmp_path / "run", options=options, quiet=True)
     assert not report["fits"] and report["memory_gib"] > report["available_gib"]

@@ -1,0 +1,48 @@
+"""The control groups of this process on Linux, by which containers and services limit memory and cores."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+MACHINE = Path("/")
+
+
+def group_folders(controller: str, root: Path = MACHINE) -> list[Path]:
+    """Folders with the limits of a controller ("memory", "cpu") on this process: its own group first, then the groups
+    above it, up to the root of the hierarchy. Empty where there are no control groups.
+
+    Version 1 mounts a hierarchy per controller, version 2 one for all. A container that sees only its own part of the
+    hierarchy finds its group at the root, while the name in /proc may be that of the host: names without a folder are
+    passed over.
+    """
+    mounts = root / "sys/fs/cgroup"
+    try:
+        rows = [line.split(":", 2) for line in (root / "proc/self/cgroup").read_text().splitlines()]
+    except OSError:
+        return []
+    found = []
+    for row in rows:
+        if len(row) != 3:
+            continue
+        _, controllers, name = row
+        if controllers and controller not in controllers.split(","):
+            continue
+        mount = mounts / controller if controllers else mounts
+        parts = [part for part in name.split("/") if part not in ("", "..")]
+        folders = [mount.joinpath(*parts[:count]) for count in range(len(parts), -1, -1)]
+        found += [folder for folder in folders if folder.is_dir()]
+    return found
+
+
+def read_number(file: Path, entry: str = "") -> int | None:
+    """The number in a file of a control group, or in its line `entry`; None if the file or line is missing, or says
+    "max"."""
+    with contextlib.suppress(OSError, ValueError):
+        for line in file.read_text().splitlines():
+            if not entry:
+                return int(line)
+            name, _, value = line.partition(" ")
+            if name == entry:
+                return int(value)
+    return None

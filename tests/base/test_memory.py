@@ -1,0 +1,113 @@
+"""Memory and cores: the machine's, and the limits of control groups of both versions, read from made-up files."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import psutil
+import pytest
+
+from linprim_geo.base.control_groups import group_folders
+from linprim_geo.base.cores import usable_cores
+from linprim_geo.base.memory import available_memory, forget_peak, memory_gib, peak_gib, total_memory
+
+MIB = 2**20
+FREE, TOTAL = 10_000 * MIB, 16_000 * MIB
+NO_LIMIT = 9223372036854771712  # what version 1 says
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """A machine with 16,000 MiB of memory, 10,000 of them available, and 8 cores."""
+    memory = psutil.virtual_memory()._replace(available=FREE, total=TOTAL)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(8)), raising=False)
+
+
+def write(root, files):
+    for name, text in files.items():
+        file = root / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(f"{text}\n")
+
+
+def stat(inactive, active, prefix=""):
+    """A memory.stat: cache holds shared memory too, which cannot be given up."""
+    text = f"cache {5000 * MIB}\nshmem {4000 * MIB}\ninactive_anon {9 * MIB}\n"
+    return text + f"{prefix}inactive_file {inactive * MIB}\n{prefix}active_file {active * MIB}"
+
+
+def test_without_control_groups_the_machine_counts(machine, tmp_path):
+    assert (available_memory(tmp_path), total_memory(tmp_path), usable_cores(tmp_path)) == (FREE, TOTAL, 8)
+
+
+def test_a_container_of_version_2_limits_memory_and_cores(machine, tmp_path):
+    """A container sees its own group as the root of the hierarchy."""
+    write(tmp_path, {"proc/self/cgroup": "0::/"})
+    group = "sys/fs/cgroup"
+    write(tmp_path, {f"{group}/memory.max": 3000 * MIB, f"{group}/memory.current": 2900 * MIB})
+    write(tmp_path, {f"{group}/cpu.max": "250000 100000"})
+    assert (available_memory(tmp_path), total_memory(tmp_path), usable_cores(tmp_path)) == (100 * MIB, 3000 * MIB, 3)
+    write(tmp_path, {f"{group}/memory.stat": stat(inactive=700, active=200)})
+    assert available_memory(tmp_path) == 1000 * MIB
+    write(tmp_path, {f"{group}/memory.max": "max", f"{group}/cpu.max": "max 100000"})
+    assert (available_memory(tmp_path), total_memory(tmp_path), usable_cores(tmp_path)) == (FREE, TOTAL, 8)
+
+
+def test_the_tightest_group_above_counts(machine, tmp_path):
+    """A service in a slice: the slice has the limit of memory, the service that of cores."""
+    write(tmp_path, {"proc/self/cgroup": "0::/work.slice/job.service"})
+    slices, job = "sys/fs/cgroup/work.slice", "sys/fs/cgroup/work.slice/job.service"
+    write(tmp_path, {f"{slices}/memory.max": 4000 * MIB, f"{slices}/memory.current": 1500 * MIB})
+    write(tmp_path, {f"{slices}/memory.stat": stat(inactive=500, active=0), f"{slices}/cpu.max": "600000 100000"})
+    write(tmp_path, {f"{job}/memory.max": "max", f"{job}/memory.current": 900 * MIB, f"{job}/cpu.max": "50000 100000"})
+    root = tmp_path / "sys/fs/cgroup"
+    assert group_folders("memory", tmp_path) == [root / "work.slice/job.service", root / "work.slice", root]
+    assert (available_memory(tmp_path), total_memory(tmp_path), usable_cores(tmp_path)) == (3000 * MIB, 4000 * MIB, 1)
+    write(tmp_path, {f"{job}/memory.max": 1000 * MIB})
+    assert (available_memory(tmp_path), total_memory(tmp_path)) == (100 * MIB, 1000 * MIB)
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_version_1_has_a_hierarchy_per_controller(inside, machine, tmp_path):
+    """Inside a container the names in /proc are those of the host, and the group is at the root of what is mounted."""
+    write(tmp_path, {"proc/self/cgroup": "4:memory:/docker/abc\n3:cpu,cpuacct:/docker/abc\n1:name=systemd:/x\n0::/"})
+    name = "" if inside else "/docker/abc"
+    memory, cores = f"sys/fs/cgroup/memory{name}", f"sys/fs/cgroup/cpu{name}"
+    write(tmp_path, {f"{memory}/memory.limit_in_bytes": 2000 * MIB, f"{memory}/memory.usage_in_bytes": 1950 * MIB})
+    write(tmp_path, {f"{memory}/memory.stat": f"inactive_file {MIB}\n{stat(600, 50, prefix='total_')}"})
+    write(tmp_path, {f"{cores}/cpu.cfs_quota_us": 150000, f"{cores}/cpu.cfs_period_us": 100000})
+    assert (available_memory(tmp_path), total_memory(tmp_path), usable_cores(tmp_path)) == (700 * MIB, 2000 * MIB, 2)
+    write(tmp_path, {f"{memory}/memory.limit_in_bytes": NO_LIMIT, f"{cores}/cpu.cfs_quota_us": -1})
+    assert (available_memory(tmp_path), total_memory(tmp_path), usable_cores(tmp_path)) == (FREE, TOTAL, 8)
+
+
+def test_more_in_use_than_the_limit_leaves_nothing(machine, tmp_path):
+    group = "sys/fs/cgroup"
+    write(tmp_path, {"proc/self/cgroup": "0::/", f"{group}/memory.max": 10 * MIB})
+    write(tmp_path, {f"{group}/memory.current": 12 * MIB})
+    assert available_memory(tmp_path) == 0
+
+
+@pytest.mark.parametrize("text", ["", "nonsense", "0:", "0::/../../other"])
+def test_files_that_say_nothing_limit_nothing(text, machine, tmp_path):
+    group = "sys/fs/cgroup"
+    write(tmp_path, {"proc/self/cgroup": text, f"{group}/memory.max": "?", f"{group}/memory.current": ""})
+    write(tmp_path, {f"{group}/cpu.max": "many"})
+    assert (available_memory(tmp_path), total_memory(tmp_path), usable_cores(tmp_path)) == (FREE, TOTAL, 8)
+
+
+def test_this_machine_has_memory_and_cores():
+    assert 0 < available_memory() <= total_memory() and 1 <= usable_cores() <= os.cpu_count()
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/clear_refs"), reason="the peak can be forgotten on Linux alone")
+def test_the_peak_is_of_what_came_after_the_last_one():
+    held = np.ones(2**26)  # half a GiB
+    with_array = peak_gib()
+    assert with_array >= memory_gib() > held.nbytes / 2**30
+    del held
+    assert peak_gib() == pytest.approx(with_array, abs=0.1)
+    forget_peak()
+    assert peak_gib() < with_array - 0.3
