@@ -18,6 +18,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from linprim_geo.base.cores import usable_cores
+
 ROOT = Path(__file__).resolve().parent.parent
 
 TESTS = (
@@ -110,9 +112,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--keep", type=Path, metavar="FOLDER", help="build here and leave it (default: a temporary folder)"
     )
-    parser.add_argument(
-        "--jobs", type=int, default=os.cpu_count() or 1, help="compilers at once (default: %(default)s)"
-    )
+    parser.add_argument("--jobs", type=int, default=usable_cores(), help="compilers at once (default: %(default)s)")
     parser.add_argument("pytest", nargs="*", help="arguments of pytest in place of the core's test files, after --")
     options = parser.parse_args(arguments)
     if not sys.platform.startswith("linux"):

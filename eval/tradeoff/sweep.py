@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from linprim_geo.base.cores import usable_cores
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import write_json
 from linprim_geo.base.options import SceneOptions, TrainOptions, with_changes
@@ -92,7 +93,7 @@ def tradeoff(
     chosen = [KNOBS[name] for name in KNOBS if not knobs or name in knobs]
     if cluster is None and workers is None:
         return sweep.measure(chosen)
-    cores, own_machines = os.cpu_count() or 1, cluster not in (None, "local")
+    cores, own_machines = usable_cores(), cluster not in (None, "local")
     with open_executor(cluster, sweep.folder / "runs", workers or 0) as executor:
         sweep.executor, sweep.cores = (
             executor,
@@ -587,7 +588,7 @@ class Sweep:
         for knob in knobs:
             entries = [(rung, self.store.get(_key(knob.group, self._setting(knob, rung)))) for rung in knob.rungs]
             measured[knob.name] = [(rung, entry) for rung, entry in entries if entry and entry["times"]]
-        about = self.about | {"rounds": self.rounds, "load": os.getloadavg()[0], "cores": os.cpu_count()}
+        about = self.about | {"rounds": self.rounds, "load": os.getloadavg()[0], "cores": usable_cores()}
         return write_report(self.folder, about, knobs, measured)
 
 

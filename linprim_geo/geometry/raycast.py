@@ -8,13 +8,13 @@ and re-cast.
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
+from linprim_geo.base.cores import usable_cores
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
 
@@ -77,7 +77,7 @@ class RayCaster:
 
         vertices, faces = _checked(vertices, faces)
         self.vertices, self.faces = vertices, faces
-        self.threads = threads or os.cpu_count() or 1
+        self.threads = threads or usable_cores()
         self.recast = 0
 
         corner = np.zeros(len(vertices), dtype=bool)

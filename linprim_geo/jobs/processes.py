@@ -12,6 +12,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+from linprim_geo.base.cores import usable_cores
 from linprim_geo.base.memory import available_memory
 from linprim_geo.jobs.executor import PATIENCE, Executor, Outcome, outcome_of
 from linprim_geo.jobs.worker import ONE_THREAD
@@ -25,7 +26,7 @@ class Processes(Executor):
     def __init__(self, shared: Path, workers: int = 0):
         """`workers` at once at most; 0: one per core."""
         super().__init__(shared)
-        self.workers = workers or os.cpu_count() or 1
+        self.workers = workers or usable_cores()
         self.memory_gib = available_memory() / 2**30
         self.processes: dict[subprocess.Popen, int] = {}
 

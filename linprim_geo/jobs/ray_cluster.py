@@ -9,6 +9,7 @@ import socket
 from contextlib import suppress
 from pathlib import Path
 
+from linprim_geo.base.cores import usable_cores
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.jobs.executor import Executor, Outcome, outcome_of
 from linprim_geo.jobs.worker import ONE_THREAD
@@ -40,7 +41,7 @@ class RayCluster(Executor):
         if ray.is_initialized():
             raise LinprimError("--cluster: this process has joined a Ray cluster already, wanted one that has not")
         if address == "local":
-            how |= {"num_cpus": workers or os.cpu_count() or 1, "include_dashboard": False}
+            how |= {"num_cpus": workers or usable_cores(), "include_dashboard": False}
             # No other machine is to reach it, and it wants no name service.
             how["_node_ip_address"] = "127.0.0.1"
         ending = signal.getsignal(signal.SIGTERM)

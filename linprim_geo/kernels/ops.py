@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from linprim_geo import _core
+from linprim_geo.base.cores import usable_cores
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
 
@@ -580,9 +581,9 @@ def photometric_loss(image: Tensor, target: Tensor, dssim: float = 0.2, weight: 
 
 
 def set_threads(count: int) -> None:
-    """Threads of the core, 0 for one per core. No result depends on it. Not to be called while another thread
-    renders."""
-    _core.set_threads(count)
+    """Threads of the core, 0 for one per core that this process may use. No result depends on it. Not to be called
+    while another thread renders."""
+    _core.set_threads(count or usable_cores())
 
 
 def threads() -> int:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from linprim_geo.base.cores import usable_cores
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import write_json
 from linprim_geo.base.options import with_changes
@@ -97,7 +98,7 @@ def synthesize(
     backdrop = _backdrop(options, inside=path == "inside-out")
     check_together(options, path, transparent=backdrop is None)
     surface = on_table(subject, options.table, options.seed) if options.table else subject
-    workers = options.threads or os.cpu_count() or 1
+    workers = options.threads or usable_cores()
     caster = RayCaster(surface.vertices, surface.faces, threads=workers)
     field = options.fov or (75.0 if path == "inside-out" else 45.0)
     train, test, distance = place_cameras(subject, caster, options, path, field)

@@ -19,6 +19,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 
+from linprim_geo.base.cores import usable_cores
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write, locked
 from linprim_geo.base.options import GEOMETRY_WEIGHTS, SceneOptions, TrainOptions, check_train_options
@@ -186,7 +187,7 @@ def block_memory(primitives: int, coarse: int, largest: int, options: TrainOptio
 def _all(run: Run, scene: Scene, count: int, executor: Executor, progress: Progress) -> dict:
     """What `train_blocks` does when there are several."""
     options, folder = run.train_options, run.path / FOLDER
-    cores = options.threads or os.cpu_count() or 1
+    cores = options.threads or usable_cores()
     progress.note(
         f"{scene.root}: {scene.kind}, {len(scene.train)} training and {len(scene.test)} held-out views in "
         f"{count} blocks on {executor.what}"

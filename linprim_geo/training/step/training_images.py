@@ -3,7 +3,6 @@ they are due."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from functools import partial
 import numpy as np
 import torch
 
+from linprim_geo.base.cores import usable_cores
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.memory import available_memory
 from linprim_geo.capture.types import View
@@ -136,7 +136,7 @@ def load_shots(views: tuple[View, ...], similarity: Similarity, limit: int | Non
         camera = view.camera.transformed(similarity)
         read = partial(_decode, view, camera)
         shots.append(read if left >= 0 else partial(StoredShot, view.name, camera, read, view.has_alpha, recent))
-    with ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
+    with ThreadPoolExecutor(max(1, min(4, usable_cores()))) as pool:
         return list(pool.map(lambda make: make(), shots))
 
 
