@@ -8,11 +8,11 @@ import glob
 import json
 import os
 import shutil
-import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 from linprim_geo.base.errors import LinprimError
 
@@ -31,6 +31,8 @@ _UMASK = _read_umask()
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LOCK = ".lock"
 _SECONDS_BETWEEN_TRIES = 0.2
+# What a file system says that knows no locks.
+_NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
 
 
 @contextlib.contextmanager
@@ -111,72 +113,37 @@ def locked(folder: Path, what: str, file: str = "", wait: Callable[[], object] |
             raise LinprimError(f"{above}: is a file, wanted a folder")
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     path = folder / (f".{file}{_LOCK}" if file else _LOCK)
+    # Without flock filelock would take the mere existence of the file for a lock, which a kill leaves behind.
+    lock, told = FileLock(path, fallback_to_soft=False), False
     with writing(folder / file):
-        held, told = None, False
-        while held is None:
+        while not lock.is_locked:
             folder.mkdir(parents=True, exist_ok=True)
             try:
-                handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-            except FileNotFoundError:  # who held it before has just removed the folder, which was empty
-                continue
-            if not _lock(handle):
-                os.close(handle)
+                lock.acquire(timeout=_SECONDS_BETWEEN_TRIES)
+            except Timeout:
                 if wait is None:
                     raise LinprimError(
                         f"{folder / file}: is being {what} by another process, wanted another place, or to wait "
                         "for its end"
-                    )
+                    ) from None
                 if not told:
                     wait()
                     told = True
-                time.sleep(_SECONDS_BETWEEN_TRIES)
+            except FileNotFoundError:  # the process that held it has just removed the folder, which was empty
                 continue
-            # Who held it before may have removed the file while this process opened it; Windows lets nobody remove an
-            # open one.
-            if os.name == "nt" or _is_at(handle, path):
-                held = handle
-            else:
-                os.close(handle)
+            except OSError as error:
+                if error.errno in _NO_LOCKS:
+                    break
+                raise
     try:
         yield
     finally:
-        if os.name == "nt":  # a file that is open cannot be removed there
-            os.close(held)
-            held = None
         with contextlib.suppress(OSError):
-            path.unlink()
-        if held is not None:
-            os.close(held)
+            path.unlink()  # before the release: afterwards another process may hold it
+        lock.release()
         for parent in made:
             with contextlib.suppress(OSError):
                 parent.rmdir()  # only if nothing was written
-
-
-def _lock(handle: int) -> bool:
-    """Locks an open file without waiting; False where another process has it."""
-    if sys.platform == "win32":
-        import msvcrt
-
-        try:
-            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
-        except OSError:
-            return False
-        return True
-    import fcntl
-
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        return error.errno not in (errno.EWOULDBLOCK, errno.EACCES)
-    return True
-
-
-def _is_at(handle: int, path: Path) -> bool:
-    """Whether the open file is the one that `path` names now."""
-    try:
-        return os.path.samestat(os.fstat(handle), os.stat(path))
-    except OSError:
-        return False
 
 
 def _sync_folder(folder: Path) -> None:

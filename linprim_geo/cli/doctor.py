@@ -23,6 +23,7 @@ LIBRARIES = (
     ("scipy", ("scipy",)),
     ("PIL", ("pillow",)),
     ("psutil", ("psutil",)),
+    ("filelock", ("filelock",)),
     ("open3d", ("open3d-cpu", "open3d")),
     ("pymeshlab", ("pymeshlab",)),
     ("trimesh", ("trimesh",)),
