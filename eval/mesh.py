@@ -135,7 +135,7 @@ def eval_mesh_files(
     `output`; without it to the run's `eval/mesh` (the headline) or `eval/mesh/PROTOCOL`, and without a run
     nothing is written. The surfaces are the cleaned inputs, refined so that colours show what lies between far
     corners; the `quality` of a vertex is its exact distance to the other surface, its colour that distance
-    from dark blue (0) to yellow (`color_max`, the larger 95 % quantile of the two directions, or beyond). The
+    from dark violet (0) to yellow (`color_max`, the larger 95 % quantile of the two directions, or beyond). The
     plots show the distances that the protocol scores.
 
     Args:

@@ -22,6 +22,7 @@ LIBRARIES = (
     ("numpy", ("numpy",)),
     ("scipy", ("scipy",)),
     ("PIL", ("pillow",)),
+    ("matplotlib", ("matplotlib",)),
     ("psutil", ("psutil",)),
     ("filelock", ("filelock",)),
     ("open3d", ("open3d-cpu", "open3d")),

@@ -329,7 +329,7 @@ class Viewer:
         layer = next((each for each in chosen.layers if each.name == self._layer.value), chosen.layers[0])
         if layer.top is not None and self.seen.run is not None:
             top = f"{layer.top:.3g} {self.seen.run.unit}"
-            self._legend.content = as_text(f"{layer.name}: dark blue 0, light yellow {top} and more")
+            self._legend.content = as_text(f"{layer.name}: dark violet 0, light yellow {top} and more")
         mesh = Mesh(chosen.mesh.vertices, chosen.mesh.faces, colors=layer.colors)
         keep = self._kept(mesh.vertices[mesh.faces].mean(1))
         return (mesh if keep.all() else select_faces(mesh, keep)), chosen.inside

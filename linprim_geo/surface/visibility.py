@@ -250,9 +250,7 @@ def render_preview(
     """A picture of a mesh by rays, without a graphics library: Lambert shading with the light at the camera.
 
     Args:
-        colors: (V, 3) uint8 vertex colours; the mesh's own by default, light grey if it has none. For an
-        error per
-            vertex give `color_scale(error)`.
+        colors: (V, 3) uint8 vertex colours; the mesh's own by default, light grey if it has none.
         smooth: interpolate vertex normals; else each face is flat, which shows the triangulation. Faces seen
         from
             behind are drawn bluish, so holes and inverted parts can be told.

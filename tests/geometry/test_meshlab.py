@@ -166,7 +166,7 @@ def test_error_colours(extracted, solid, tmp_path):
         assert mesh.has_vertex_scalar() and mesh.has_vertex_color()
         np.testing.assert_allclose(quality, load_mesh(tmp_path / f"{name}.ply").quality, rtol=1e-6)
         assert np.isclose(np.median(quality), scores["accuracy" if name == "error_pred" else "completeness"], rtol=0.5)
-        # From dark blue to yellow: where the error is larger, there is more green.
+        # From dark violet to yellow: where the error is larger, there is more green.
         order = np.argsort(quality)
         tenth = len(order) // 10
         assert shown[order[-tenth:], 1].mean() > shown[order[:tenth], 1].mean() + 40
