@@ -13,26 +13,15 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write, read_json
 from linprim_geo.eval.tradeoff.frontier import frontier
 from linprim_geo.eval.tradeoff.knobs import KNOBS
-from linprim_geo.eval.tradeoff.page import plot
-from linprim_geo.imaging import plots as svg
+from linprim_geo.eval.tradeoff.page import panel
+from linprim_geo.imaging import plots
 
-TOP, GAP = 26, 8
-LIGHT = {
-    "ground": "#ffffff",
-    "ink": "#1b1f24",
-    "plot": "#fafbfc",
-    "edge": "#c8ced6",
-    "line": "#e3e7ec",
-    "blue": "#1f63b2",
-    "dim": "#707a86",
-}
 DARK = {
     "ground": "#0d1117",
     "ink": "#d9dfe6",
@@ -42,6 +31,7 @@ DARK = {
     "blue": "#6cb0ff",
     "dim": "#8f99a5",
 }
+STYLE = f"@media (prefers-color-scheme: dark) {{ svg {{ {' '.join(f'--{k}: {v};' for k, v in DARK.items())} }} }}"
 # What a rung is called where several knobs are in one plot; knobs that are not here keep the names of their rungs.
 NAMES = {
     "rays": "{} rays",
@@ -72,26 +62,6 @@ def rungs(rows: Sequence[dict], knobs: Sequence[str], error: str) -> list[dict]:
     return [row | {"frontier": index in on} for index, row in enumerate(found)]
 
 
-def figure(panels: Sequence[tuple[str, Sequence[dict], str]], name: str) -> str:
-    """An SVG file of panels (title, rows, error) beside each other; `name` says what it is to who cannot see it."""
-    width, height = len(panels) * svg.WIDTH + (len(panels) - 1) * GAP, svg.HEIGHT + TOP - 16
-    parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" '
-        f'height="{height}" role="img" '
-        f'aria-label="{escape(name)}">',
-        f"<style>svg {{ {_colors(LIGHT)} }} @media (prefers-color-scheme: dark) {{ svg {{ {_colors(DARK)} }} "
-        f"}}{svg.STYLE}"
-        "svg text { font-size: 12.5px; } svg .ground { fill: var(--ground); } svg .title { font-weight: 600; "
-        "font-size: 14px; }</style>",
-        f'<rect class="ground" width="{width}" height="{height}" rx="6"/>',
-    ]
-    for index, (title, rows, error) in enumerate(panels):
-        left = index * (svg.WIDTH + GAP)
-        parts.append(f'<text class="title" x="{left + svg.LEFT}" y="{TOP - 4}">{escape(title)}</text>')
-        parts.append(f'<g transform="translate({left} {TOP - 16})">{plot(rows, error)}</g>')
-    return "\n".join([*parts, "</svg>\n"])
-
-
 def figures(sweep: Path, output: Path) -> list[Path]:
     """Writes both files from the `tradeoff.json` in the folder `sweep` into `output`; returns their paths.
 
@@ -105,7 +75,7 @@ def figures(sweep: Path, output: Path) -> list[Path]:
     except (KeyError, TypeError):
         raise LinprimError(f"{file}: has no rows of knobs, wanted what linprim-geo tradeoff has written") from None
     ladder, training = ("rays", "order", "scalar"), ("iterations", "primitives", "scale", "views")
-    plots = {
+    wanted = {
         "tradeoff_ladder.svg": (
             "Image and depth error of the rungs of rendering over the seconds of a frame",
             (
@@ -122,7 +92,7 @@ def figures(sweep: Path, output: Path) -> list[Path]:
         ),
     }
     drawn = {}
-    for target, (name, panels) in plots.items():
+    for target, (name, panels) in wanted.items():
         shown = []
         for title, knobs, error in panels:
             of_panel = rungs(rows, knobs, error)
@@ -131,16 +101,12 @@ def figures(sweep: Path, output: Path) -> list[Path]:
                     f"{file}: has no {error} of {', '.join(knobs)}, wanted a sweep of all knobs on a scene with "
                     "a reference mesh"
                 )
-            shown.append((title, of_panel, error))
-        drawn[output / target] = figure(shown, name)
+            shown.append(panel(of_panel, error, title))
+        drawn[output / target] = plots.frontiers(shown, name, STYLE)
     for path, text in drawn.items():
         with atomic_write(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
     return list(drawn)
-
-
-def _colors(colors: dict[str, str]) -> str:
-    return " ".join(f"--{name}: {color};" for name, color in colors.items())
 
 
 def main(arguments: list[str] | None = None) -> None:

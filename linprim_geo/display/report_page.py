@@ -18,7 +18,7 @@ from linprim_geo.display.report_data import Report
 from linprim_geo.display.report_mesh import ShownMesh
 from linprim_geo.geometry.primitives import KINDS
 from linprim_geo.geometry.topology import topology_line
-from linprim_geo.imaging import plots as svg
+from linprim_geo.imaging import plots
 from linprim_geo.training.effects import REASONS
 
 # The browser itself refuses whatever is not in the page.
@@ -93,7 +93,7 @@ def page(report: Report) -> Page:
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>',
         f'<meta http-equiv="Content-Security-Policy" content="{escape(POLICY)}"/>',
         '<meta name="viewport" content="width=device-width, initial-scale=1"/>',
-        f"<title>{escape(name)} – linprim-geo</title><style>{asset['style.css']}{svg.STYLE}</style></head><body>",
+        f"<title>{escape(name)} – linprim-geo</title><style>{asset['style.css']}</style></head><body>",
         f"<header><h1>{escape(name)}</h1>{_summary(report)}</header>",
         "<nav>" + " ".join(f'<a href="#{anchor}">{title}</a>' for anchor, title in SECTIONS) + "</nav><main>",
     ]
@@ -225,7 +225,7 @@ def _decisions(report: Report) -> str:
 
 
 def _training(report: Report) -> str:
-    plots = []
+    shown = []
     for title, unit, log, names in (
         ("loss", "", True, {"loss": "training"}),
         ("PSNR", "dB", False, {"train_psnr": "training view", "psnr": "held-out views"}),
@@ -242,8 +242,8 @@ def _training(report: Report) -> str:
             if entries:
                 series.append((name, [entry["step"] for entry in entries], [entry[key] for entry in entries]))
         if series:
-            plots.append(f"<div>{svg.curves(series, 'step', title + (f', {unit}' if unit else ''), log=log)}</div>")
-    return f'<div class="plots">{"".join(plots)}</div>' if plots else "<p>metrics.jsonl holds nothing to draw.</p>"
+            shown.append(f"<div>{plots.curves(series, 'step', title + (f', {unit}' if unit else ''), log=log)}</div>")
+    return f'<div class="plots">{"".join(shown)}</div>' if shown else "<p>metrics.jsonl holds nothing to draw.</p>"
 
 
 def _views(report: Report) -> str:

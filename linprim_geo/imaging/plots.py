@@ -1,135 +1,383 @@
-"""Plots as inline SVG: an axis with round ticks, a frame with a grid, and curves over one axis; well-formed XML, no
-script.
+"""Plots by matplotlib: curves and frontiers as SVG for pages and files, rates and histograms as PNG.
 
-Colours are the classes `frame`, `grid`, `series0`, `series1`, `on`, `off` of `STYLE`, so that a page can be light or
-dark.
+SVG takes its colours from CSS variables of the names in `COLORS`, so a page can be light or dark; where it defines
+none, the colours here are used. The same numbers give the same bytes.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from html import escape
+import contextlib
+import io
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree
 
+import numpy as np
+
+from linprim_geo.base.files import atomic_write
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLORS = {
+    "ground": "#ffffff",
+    "ink": "#1b1f24",
+    "plot": "#fafbfc",
+    "edge": "#c8ced6",
+    "line": "#e3e7ec",
+    "blue": "#1f63b2",
+    "orange": "#c25e0c",
+    "dim": "#707a86",
+}
+# Pixels of one plot, and of what is round its frame: left, right, top, bottom.
 WIDTH, HEIGHT = 560, 340
-LEFT, RIGHT, TOP, BOTTOM = 74, 24, 30, 52
-STYLE = """
-svg text { font: 11px system-ui, sans-serif; fill: var(--ink, #1b1f24); }
-svg .frame { fill: var(--plot, #fafbfc); stroke: var(--edge, #c8ced6); } svg .grid { stroke: var(--line, #e3e7ec); }
-svg .series0 { stroke: var(--blue, #1f63b2); } svg .series1 { stroke: var(--orange, #c25e0c); }
-svg .on { stroke: var(--blue, #1f63b2); } svg .off { stroke: var(--dim, #8a939e); }
-svg .on.dot { fill: var(--blue, #1f63b2); } svg .off.dot { fill: var(--dim, #8a939e); } svg .dot { stroke: none; }
-svg .curve { fill: none; stroke-width: 1.6; stroke-linejoin: round; }
-svg .point { stroke-width: 5; stroke-linecap: round; }
-"""
-# A linear axis has round steps, about so many.
-_STEPS = 5
+MARGINS = (74, 24, 40, 52)
+PNG_WIDTH, PNG_HEIGHT = 900, 590
+PNG_MARGINS = (78, 26, 98, 62)
+TICKS = 7
+# A logarithmic axis over less than this ratio has too few of 1, 2 and 5 and takes evenly spaced ticks.
+SHORT = 10
+HISTOGRAM_BINS = 80
 
 
-class Axis:
-    """An axis over `values`, logarithmic (then they are positive) or linear, from pixel `start` to pixel `end`."""
+@dataclass(frozen=True)
+class Point:
+    """A measured setting: cost `x` with its quartiles, error `y`; whether it is on the frontier, and the default."""
 
-    def __init__(self, values: Sequence[float], start: float, end: float, *, log: bool = True, room: float = 0.15):
-        """`room` is the share of the range that is added on either side."""
-        self.log, self.start, self.end = log, start, end
-        low, high = self._scaled(min(values)), self._scaled(max(values))
-        least = 0.06 if log else 0.5 * abs(low) or 0.5
-        more = max(room * (high - low), least if log or high == low else 0.0)
-        self.low, self.high = low - more, high + more
-
-    def _scaled(self, value: float) -> float:
-        return math.log10(value) if self.log else float(value)
-
-    def at(self, value: float) -> float:
-        """The pixel of a value."""
-        return self.start + (self.end - self.start) * (self._scaled(value) - self.low) / (self.high - self.low)
-
-    def ticks(self) -> list[float]:
-        """Three to seven round values, or fewer of a short axis."""
-        if not self.log:
-            return self._linear_ticks()
-        decades = range(math.floor(self.low), math.ceil(self.high) + 1)
-        for steps in (
-            (1,),
-            (1, 3),
-            (1, 2, 5),
-            (1, 1.5, 2, 3, 4, 5, 6, 8),
-            tuple(1 + k / 10 for k in range(90)),
-        ):
-            found = [step * 10.0**decade for decade in decades for step in steps]
-            found = [value for value in found if self.low <= math.log10(value) <= self.high]
-            if len(found) >= 3:
-                break
-        return found[:: -(-len(found) // 7) or 1]
-
-    def _linear_ticks(self) -> list[float]:
-        rough = (self.high - self.low) / _STEPS
-        power = 10.0 ** math.floor(math.log10(rough))
-        step = next(m * power for m in (1, 2, 5, 10) if m * power >= rough * (1 - 1e-9))
-        first, last = math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
-        return [k * step for k in range(first, last + 1)]
+    name: str
+    x: float
+    low: float
+    high: float
+    y: float
+    on_frontier: bool
+    default: bool
 
 
-def tick(value: float) -> str:
-    """A short text of a value beside an axis."""
-    return (
-        f"{value:.6g}"
-        if value == 0 or 1e-3 <= abs(value) < 1e5
-        else f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e")
-    )
+@dataclass(frozen=True)
+class Panel:
+    """Points in one frame, both axes logarithmic."""
 
-
-def frame(x_axis: Axis, y_axis: Axis, x_label: str, y_label: str, name: str) -> list[str]:
-    """The opening tag, which says `name` to who cannot see it, the grid with its ticks, and both labels; the caller
-    closes it."""
-    out = [
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" height="{HEIGHT}" role="img" '
-        f'aria-label="{escape(name)}">',
-        f'<rect class="frame" x="{LEFT}" y="{TOP}" width="{WIDTH - LEFT - RIGHT}" height="{HEIGHT - TOP - BOTTOM}"/>',
-    ]
-    for value in x_axis.ticks():
-        x = x_axis.at(value)
-        out.append(f'<line class="grid" x1="{x:.1f}" x2="{x:.1f}" y1="{TOP}" y2="{HEIGHT - BOTTOM}"/>')
-        out.append(f'<text x="{x:.1f}" y="{HEIGHT - BOTTOM + 16}" text-anchor="middle">{tick(value)}</text>')
-    for value in y_axis.ticks():
-        y = y_axis.at(value)
-        out.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
-        out.append(f'<text x="{LEFT - 7}" y="{y + 4:.1f}" text-anchor="end">{tick(value)}</text>')
-    out.append(
-        f'<text x="{(LEFT + WIDTH - RIGHT) / 2}" y="{HEIGHT - 12}" text-anchor="middle">{escape(x_label)}</text>'
-    )
-    middle = (TOP + HEIGHT - BOTTOM) / 2
-    out.append(
-        f'<text x="15" y="{middle}" text-anchor="middle" transform="rotate(-90 15 {middle})">{escape(y_label)}</text>'
-    )
-    return out
+    title: str
+    points: Sequence[Point]
+    x_label: str
+    y_label: str
 
 
 def curves(
-    series: Sequence[tuple[str, Sequence[float], Sequence[float]]],
-    x_label: str,
-    y_label: str,
-    *,
-    log: bool = False,
+    series: Sequence[tuple[str, Sequence[float], Sequence[float]]], x_label: str, y_label: str, *, log: bool = False
 ) -> str:
-    """An SVG of up to two curves (name, x, y) over a linear x; y linear, or logarithmic for positive values.
+    """An SVG element of up to two curves (name, x, y); x linear, y linear, or logarithmic for positive values.
 
     Each is named above the frame with its last value. A curve of one point is drawn as a point.
     """
-    x_axis = Axis([x for _, xs, _ in series for x in xs], LEFT, WIDTH - RIGHT, log=False, room=0.0)
-    y_axis = Axis([y for _, _, ys in series for y in ys], HEIGHT - BOTTOM, TOP, log=log, room=0.06)
-    named = [f"{name}: {_said(ys[-1])}" for name, _, ys in series]
-    out = frame(x_axis, y_axis, x_label, y_label, f"{y_label} over {x_label}; at the end {', '.join(named)}")
-    left: float = LEFT
-    for index, ((_, xs, ys), label) in enumerate(zip(series, named, strict=True)):
-        places = [f"{x_axis.at(x):.1f} {y_axis.at(y):.1f}" for x, y in zip(xs, ys, strict=True)]
-        kind = "curve" if len(places) > 1 else "curve point"
-        out.append(f'<path class="{kind} series{index}" d="M{"L".join(places)}{"h0" if len(places) == 1 else ""}"/>')
-        out.append(f'<path class="curve series{index}" d="M{left} {TOP - 12}h18"/>')
-        out.append(f'<text x="{left + 24}" y="{TOP - 8}">{escape(label)}</text>')
-        left += 40 + 6.4 * len(label)
-    return "".join(out) + "</svg>"
+    with _style():
+        figure, (axes,) = _figure(1, WIDTH, HEIGHT, MARGINS)
+        for (name, x, y), color in zip(series, ("blue", "orange"), strict=False):
+            label = f"{name}: {_number(y[-1])}"
+            axes.plot(x, y, color=COLORS[color], label=label, marker="o" if len(x) == 1 else "")
+        axes.margins(x=0.0, y=0.06)
+        if log:
+            axes.set_yscale("log")
+        _label(axes, x_label, y_label)
+        _legend(axes)
+        at_the_end = ", ".join(f"{name}: {_number(y[-1])}" for name, _, y in series)
+        return _element(figure, f"{y_label} over {x_label}; at the end {at_the_end}")
 
 
-def _said(value: float) -> str:
+def frontiers(panels: Sequence[Panel], label: str, style: str | None = None) -> str:
+    """An SVG element of panels beside each other; `label` says what it is to people who cannot see it.
+
+    Every point is named, with the quartiles of its cost as a bar and a ring round the default; the frontier is a line
+    in steps. An error of 0 is drawn a decade below the least that is not. With a `style` sheet the text of a file, on a
+    ground of its own.
+    """
+    with _style():
+        figure, frames = _figure(len(panels), WIDTH, HEIGHT, MARGINS)
+        for axes, panel in zip(frames, panels, strict=True):
+            _draw_panel(figure, axes, panel)
+        if style is None:
+            return _element(figure, label)
+        figure.patch.set(visible=True, facecolor=COLORS["ground"])
+        return _element(figure, label, style)
+
+
+def rates(
+    path: Path,
+    thresholds: np.ndarray,
+    shares: Mapping[str, np.ndarray],
+    tau: float,
+    title: str,
+    unit: str,
+) -> None:
+    """Writes a PNG of shares (name: one per threshold) over thresholds on a logarithmic axis, with their values at
+    `tau`.
+
+    Raises:
+        LinprimError: the file cannot be written.
+    """
+    with _style():
+        figure, (axes,) = _figure(1, PNG_WIDTH, PNG_HEIGHT, PNG_MARGINS)
+        axes.set_xscale("log")
+        # Thinner and thinner, so that curves that coincide can all be seen.
+        for (name, share), color, width in zip(
+            shares.items(), ("blue", "orange", "ink"), (6.0, 3.5, 1.5), strict=False
+        ):
+            at_tau = float(np.interp(np.log10(tau), np.log10(thresholds), share))
+            named = f"{name}, {100 * at_tau:.1f} % at tau"
+            axes.plot(thresholds, share, color=COLORS[color], linewidth=width, label=named)
+        axes.set(xlim=(thresholds[0], thresholds[-1]), ylim=(0.0, 1.0))
+        _save_with_threshold(path, figure, axes, tau, title, f"threshold ({unit})", "share within the threshold")
+
+
+def histogram(path: Path, distances: Mapping[str, np.ndarray], end: float, tau: float, title: str, unit: str) -> None:
+    """Writes a PNG with histograms of distances (name: values) from 0 to `end`.
+
+    Raises:
+        LinprimError: the file cannot be written.
+    """
+    with _style():
+        figure, (axes,) = _figure(1, PNG_WIDTH, PNG_HEIGHT, PNG_MARGINS)
+        bins = np.linspace(0.0, end, HISTOGRAM_BINS + 1)
+        for (name, values), color in zip(distances.items(), ("blue", "orange"), strict=False):
+            count = max(len(values), 1)
+            beyond, average = 100.0 * (values > end).sum() / count, float(values.mean()) if len(values) else np.nan
+            named = f"{name}: mean {average:.3g}, {beyond:.1f} % further"
+            shares = np.histogram(values, bins)[0] / count
+            axes.stairs(shares, bins, color=COLORS[color], label=named, linewidth=2.0)
+            axes.stairs(shares, bins, color=COLORS[color], fill=True, alpha=0.24)
+        axes.set_xlim(0.0, end)
+        axes.set_ylim(bottom=0.0)
+        _save_with_threshold(path, figure, axes, tau, title, f"distance ({unit})", "share of the points")
+
+
+# --- frames ----------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _style() -> Iterator[None]:
+    """Settings of matplotlib for every plot here; lengths are pixels."""
+    import matplotlib
+
+    # It warns that it makes a cache of fonts, or that the home folder cannot be written.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    with matplotlib.rc_context(
+        {
+            "figure.dpi": 72,
+            "savefig.dpi": 72,
+            "svg.fonttype": "none",  # text stays text
+            "font.sans-serif": ["DejaVu Sans"],
+            "font.size": 11,
+            "axes.facecolor": COLORS["plot"],
+            "axes.edgecolor": COLORS["edge"],
+            "axes.labelcolor": COLORS["ink"],
+            "axes.linewidth": 1.0,
+            "axes.grid": True,
+            "axes.axisbelow": True,
+            "axes.titlelocation": "left",
+            "axes.titleweight": "bold",
+            "grid.color": COLORS["line"],
+            "grid.linewidth": 1.0,
+            "text.color": COLORS["ink"],
+            "xtick.bottom": False,
+            "ytick.left": False,
+            "xtick.labelcolor": COLORS["ink"],
+            "ytick.labelcolor": COLORS["ink"],
+            "lines.linewidth": 1.6,
+            "lines.markersize": 5,
+            "legend.frameon": False,
+        }
+    ):
+        yield
+
+
+def _figure(panels: int, width: int, height: int, margins: tuple[int, int, int, int]) -> tuple[Figure, list[Axes]]:
+    """A figure of panels beside each other, each so many pixels large."""
+    from matplotlib.figure import Figure
+
+    whole = panels * width
+    figure = Figure(figsize=(whole / 72, height / 72), dpi=72)
+    figure.patch.set_visible(False)
+    left, right, top, bottom = margins
+    inside = (width - left - right) / whole, (height - top - bottom) / height
+    frames = [figure.add_axes(((k * width + left) / whole, bottom / height, *inside)) for k in range(panels)]
+    return figure, frames
+
+
+def _label(axes: Axes, x_label: str, y_label: str) -> None:
+    """Names the axes, and puts a few round numbers beside them."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+
+    axes.set(xlabel=x_label, ylabel=y_label)
+    for axis in (axes.xaxis, axes.yaxis):
+        low, high = axis.get_view_interval()
+        if axis.get_scale() == "log":
+            axis.set_minor_locator(NullLocator())
+        if axis.get_scale() == "log" and high > SHORT * low:
+            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=TICKS))
+        else:
+            axis.set_major_locator(MaxNLocator(TICKS - 1, steps=(1, 2, 5, 10)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.6g}"))
+
+
+def _legend(axes: Axes) -> None:
+    """One row above the frame, where it hides nothing."""
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.2, handlelength=1.6)
+
+
+def _save_with_threshold(
+    path: Path, figure: Figure, axes: Axes, tau: float, title: str, x_label: str, y_label: str
+) -> None:
+    from matplotlib.ticker import FuncFormatter
+
+    _label(axes, x_label, y_label)
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:.3g} %"))
+    if tau <= axes.get_xlim()[1]:
+        axes.axvline(tau, color=COLORS["dim"], linestyle="dashed", linewidth=1.0)
+        axes.annotate(
+            f"tau = {tau:.3g}", (tau, 1.0), (4, -4), ("data", "axes fraction"), "offset points", va="top", ha="left"
+        )
+    _legend(axes)
+    axes.set_title(title, pad=34)
+    figure.patch.set(visible=True, facecolor="white")
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, format="png", metadata={"Software": None})
+
+
+def _number(value: float) -> str:
     return f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
+
+
+# --- panels ----------------------------------------------------------------------------------------------
+
+
+def _draw_panel(figure: Figure, axes: Axes, panel: Panel) -> None:
+    points = panel.points
+    floor = min((point.y for point in points if point.y > 0), default=1.0) / 10
+    heights = [max(point.y, floor) for point in points]
+    axes.set(xscale="log", yscale="log")
+    axes.set_xlim(*_range([point.low for point in points] + [point.high for point in points]))
+    axes.set_ylim(*_range(heights))
+    _label(axes, panel.x_label, panel.y_label)
+    axes.set_title(panel.title)
+    on = sorted((point.x, y) for point, y in zip(points, heights, strict=True) if point.on_frontier)
+    if on:
+        # What one can have: the error of the best that takes no longer, so the line goes in steps.
+        x = [on[0][0], *(x for x, _ in on), axes.get_xlim()[1]]
+        y = [axes.get_ylim()[1], *(y for _, y in on), on[-1][1]]
+        axes.step(x, y, where="post", color=COLORS["blue"], linewidth=1.5, alpha=0.6)
+    for point, y in zip(points, heights, strict=True):
+        color = COLORS["blue" if point.on_frontier else "dim"]
+        axes.hlines(y, point.low, point.high, color=color, linewidth=2.0, alpha=0.5)
+        axes.plot(point.x, y, "o", color=color, markersize=8, markeredgewidth=0)
+        if point.default:
+            axes.plot(point.x, y, "o", color=color, markersize=15, fillstyle="none")
+    _name_points(figure, axes, points, heights, on)
+
+
+def _range(values: Sequence[float]) -> tuple[float, float]:
+    """Limits of a logarithmic axis round positive values, with room for names."""
+    low, high = np.log10(min(values)), np.log10(max(values))
+    room = max(0.15 * (high - low), 0.06)
+    return float(10 ** (low - room)), float(10 ** (high + room))
+
+
+Box = tuple[float, float, float, float]
+
+
+def _name_points(
+    figure: Figure, axes: Axes, points: Sequence[Point], heights: Sequence[float], on: Sequence[tuple[float, float]]
+) -> None:
+    """Writes every point's name near it, where it covers the least of what is drawn; matplotlib itself would write
+    names over each other."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    inside = axes.get_window_extent(renderer)
+    frame = (inside.x0, inside.y0, inside.x1, inside.y1)
+
+    def pixels(x: float, y: float) -> tuple[float, float]:
+        return tuple(axes.transData.transform((x, y)))
+
+    places = [pixels(point.x, y) for point, y in zip(points, heights, strict=True)]
+    boxes: list[Box] = [(x - 6, y - 6, x + 6, y + 6) for x, y in places]
+    for point, (_, y) in zip(points, places, strict=True):
+        boxes.append((pixels(point.low, 1.0)[0], y - 3, pixels(point.high, 1.0)[0], y + 3))
+    corners = [pixels(x, y) for x, y in on]
+    for (x0, y0), (x1, y1) in zip(corners, [*corners[1:], (frame[2], corners[-1][1])] if on else [], strict=True):
+        boxes += [(x0, y0 - 3, x1, y0 + 3), (x1 - 3, min(y0, y1), x1 + 3, max(y0, y1))]
+    for point, (x, y) in zip(points, places, strict=True):
+        text = axes.annotate(point.name, (0, 0), xycoords="figure pixels", va="bottom", ha="left")
+        extent = text.get_window_extent(renderer)
+        left, bottom = _free_place(x, y, extent.width, extent.height, frame, boxes)
+        text.set_position((left, bottom))
+        boxes.append((left, bottom, left + extent.width, bottom + extent.height))
+
+
+def _free_place(
+    x: float, y: float, width: float, height: float, frame: Box, boxes: Sequence[Box]
+) -> tuple[float, float]:
+    """Left and bottom of a name near a point, where it covers the least of `boxes`, and stays inside the frame."""
+    places = [(x + 10, y - height / 2), (x - 10 - width, y - height / 2)]
+    for away in (1.0, 1.8, 2.6):
+        for left in (x + 6, x - 6 - width):
+            places += [(left, y + 4 + (away - 1) * height), (left, y - 4 - away * height)]
+    places = [
+        (
+            min(max(left, frame[0] + 3), frame[2] - width - 2),
+            min(max(bottom, frame[1] + 2), frame[3] - height - 2),
+        )
+        for left, bottom in places
+    ]
+
+    def covered(place: tuple[float, float]) -> float:
+        left, bottom = place
+        return sum(
+            max(0.0, min(left + width, b[2]) - max(left, b[0]))
+            * max(0.0, min(bottom + height, b[3]) - max(bottom, b[1]))
+            for b in boxes
+        )
+
+    return min(places, key=covered)
+
+
+# --- SVG -------------------------------------------------------------------------------------------------
+
+
+def _element(figure: Figure, label: str, style: str | None = None) -> str:
+    """The figure as an SVG element for a page: no namespaces, no style sheet that would reach the page, no ids that
+    nothing refers to. With a `style` the text of a file."""
+    from matplotlib import rc_context
+
+    for artist in figure.findobj():
+        artist.set_clip_on(False)  # nothing lies outside, and what clips is found by an address
+    written = io.BytesIO()
+    with rc_context({"svg.hashsalt": label}):  # ids are the same every time, and others in another plot of a page
+        figure.savefig(written, format="svg", metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
+    root = ElementTree.fromstring(written.getvalue())
+    for element in root.iter():
+        element.tag = element.tag.rpartition("}")[2]
+        element.attrib = {name.rpartition("}")[2]: value for name, value in element.attrib.items()}
+        if "style" in element.attrib:
+            for name, color in COLORS.items():
+                element.attrib["style"] = element.attrib["style"].replace(color, f"var(--{name}, {color})")
+    used = {element.get("href", "").removeprefix("#") for element in root.iter()}
+    for parent in reversed(list(root.iter())):
+        if parent.get("id") not in used:
+            parent.attrib.pop("id", None)
+        for child in list(parent):
+            if child.tag == "style" or (child.tag in ("g", "defs", "metadata") and not len(child)):
+                parent.remove(child)
+    size = root.get("viewBox", "").split()[2:]
+    root.attrib = {"viewBox": root.get("viewBox", ""), "width": size[0], "height": size[1]}
+    root.attrib |= {"role": "img", "aria-label": label, "stroke-linejoin": "round"}
+    if style is None:
+        return ElementTree.tostring(root, encoding="unicode")
+    root.set("xmlns", "http://www.w3.org/2000/svg")
+    sheet = ElementTree.Element("style")
+    sheet.text = style
+    root.insert(0, sheet)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"

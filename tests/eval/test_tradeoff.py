@@ -21,6 +21,7 @@ from linprim_geo.eval.tradeoff import sweep as sweeping
 from linprim_geo.eval.tradeoff.frontier import frontier, pays, verdict
 from linprim_geo.eval.tradeoff.knobs import ERRORS, GROUPS, KNOBS, Knob, Rung, settings, training_options
 from linprim_geo.eval.tradeoff.sweep import tradeoff
+from linprim_geo.imaging.plots import frontiers
 
 # What the design lists: every knob that trades time for accuracy.
 LISTED = {
@@ -388,23 +389,11 @@ def test_a_trained_run_is_scored_by_image_depth_and_surface(swept, tiny_scene, t
 # --- drawing ---------------------------------------------------------------------------------------------
 
 
-def test_names_of_near_points_do_not_cover_each_other():
-    rows = [row(f"rung number {k}", 1.0 + 0.02 * k, 1.0 - 0.005 * k) | {"frontier": True} for k in range(5)]
-    tree = ElementTree.fromstring(tradeoff_page.plot(rows, "depth_percent"))
-    labels = [
-        (float(t.get("x")), float(t.get("y")), t.text) for t in tree.iter("text") if (t.text or "").startswith("rung")
-    ]
-    assert len(labels) == 5
-    for i, (x, y, text) in enumerate(labels):
-        width = len(text) * tradeoff_page.LETTER
-        assert tradeoff_page.LEFT <= x and x + width <= tradeoff_page.WIDTH - tradeoff_page.RIGHT
-        for u, v, _ in labels[:i]:
-            assert abs(x - u) >= width - 1 or abs(y - v) >= tradeoff_page.LINE - 1
-
-
 def test_an_error_of_zero_and_a_single_point_can_be_drawn():
     for rows in ([row("a", 1.0, 0.0)], [row("a", 1.0, 0.0), row("b", 1e-6, 3.0)]):
-        ElementTree.fromstring(tradeoff_page.plot([each | {"frontier": True} for each in rows], "depth_percent"))
+        panel = tradeoff_page.panel([each | {"frontier": True} for each in rows], "depth_percent")
+        assert [point.name for point in panel.points] == [each["rung"] for each in rows]
+        assert panel.y_label == "depth error, %" and ElementTree.fromstring(frontiers([panel], "errors")) is not None
 
 
 # --- errors ----------------------------------------------------------------------------------------------
