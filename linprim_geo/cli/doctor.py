@@ -23,6 +23,7 @@ LIBRARIES = (
     ("scipy", ("scipy",)),
     ("PIL", ("pillow",)),
     ("matplotlib", ("matplotlib",)),
+    ("jinja2", ("jinja2",)),
     ("psutil", ("psutil",)),
     ("filelock", ("filelock",)),
     ("open3d", ("open3d-cpu", "open3d")),
