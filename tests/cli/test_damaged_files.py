@@ -301,14 +301,29 @@ def test_a_mesh_of_two_coordinates_is_one_sentence(tmp_path):
     assert "three numbers" in refused(load_mesh, tmp_path / "flat.obj")
 
 
-def test_a_matlab_array_of_a_type_that_does_not_exist_is_one_sentence(tmp_path):
-    """scipy's reader ends the process on it."""
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {176: 0x01000200},  # the numbers are of a type that does not exist
+        {140: 0, 164: 15, 176: 15},  # the flags are empty, and name and numbers compressed
+    ],
+)
+def test_a_matlab_file_that_crashes_its_reader_is_one_sentence(changes, tmp_path):
+    """scipy's reader would end the process on both."""
     savemat(tmp_path / "plane.mat", {"P": np.array([0, 0, 1.0, 2])})
     data = bytearray((tmp_path / "plane.mat").read_bytes())
-    place = bytes(data).index((9).to_bytes(4, "little") + (32).to_bytes(4, "little"))
-    data[place : place + 4] = (0x01000200).to_bytes(4, "little")
+    assert data[176:184] == (9).to_bytes(4, "little") + (32).to_bytes(4, "little")  # doubles, four of them
+    for place, value in changes.items():
+        data[place : place + 4] = value.to_bytes(4, "little")
     (tmp_path / "plane.mat").write_bytes(data)
-    assert "plane.mat" in refused(read_plane, tmp_path / "plane.mat")
+    said = refused(read_plane, tmp_path / "plane.mat")
+    assert "plane.mat: is not a MATLAB file up to version 7" in said
+
+
+@pytest.mark.parametrize("value", ["text", np.array([1 + 2j]), {"a": 1.0}, np.array([1.0, "x"], object)])
+def test_a_matlab_array_that_is_not_of_real_numbers_is_one_sentence(value, tmp_path):
+    savemat(tmp_path / "plane.mat", {"P": value})
+    assert "expected real numbers" in refused(read_plane, tmp_path / "plane.mat")
 
 
 def test_a_sentence_stays_one_line_of_bounded_length():
