@@ -11,6 +11,7 @@ from linprim_geo.base.files import atomic_write
 from linprim_geo.eval.surface_samples import Comparison, PointDistance, SurfaceDistance, refine
 from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.geometry.mesh_files import save_mesh
+from linprim_geo.geometry.ply import color_columns, write_ply, xyz_columns
 from linprim_geo.imaging import plots
 from linprim_geo.imaging.colors import error_colors
 
@@ -55,15 +56,9 @@ def _error_of(points: np.ndarray, other, color_max: float) -> tuple[np.ndarray, 
 
 def _write_points(path: Path, points: np.ndarray, quality: np.ndarray, colors: np.ndarray) -> None:
     """A binary PLY of points, coordinates in double precision."""
-    layout = [("xyz", "<f8", 3), ("rgb", "u1", 3), ("quality", "<f4")]
-    rows = np.empty(len(points), dtype=layout)
-    rows["xyz"], rows["rgb"], rows["quality"] = points, colors, quality
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    header += [f"property double {name}" for name in "xyz"]
-    header += [f"property uchar {name}" for name in ("red", "green", "blue")]
-    header += ["property float quality", "end_header", ""]
+    columns = xyz_columns(points.astype(np.float64)) | color_columns(colors) | {"quality": quality}
     with atomic_write(path) as temporary:
-        temporary.write_bytes("\n".join(header).encode("ascii") + rows.tobytes())
+        write_ply(temporary, columns)
 
 
 # --- plots -----------------------------------------------------------------------------------------------

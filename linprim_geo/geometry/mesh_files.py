@@ -12,6 +12,7 @@ import numpy as np
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write
 from linprim_geo.geometry.mesh import FLOAT32_SHARE, Mesh, _check_indices, _unit, merge_vertices
+from linprim_geo.geometry.ply import color_columns, write_ply, xyz_columns
 
 SUFFIXES = (".ply", ".obj", ".glb", ".stl")
 
@@ -138,38 +139,15 @@ def needs_double(mesh: Mesh) -> bool:
 
 
 def _write_ply(path: Path, mesh: Mesh) -> None:
-    real = "<f8" if needs_double(mesh) else "<f4"
-    fields = [(name, real) for name in "xyz"]
-    columns = [*mesh.vertices.T]
+    columns = xyz_columns(mesh.vertices.astype(np.float64 if needs_double(mesh) else np.float32))
     if mesh.normals is not None:
-        fields += [(name, "<f4") for name in ("nx", "ny", "nz")]
-        columns += [*mesh.normals.T]
+        columns |= xyz_columns(mesh.normals.astype(np.float32), "nx ny nz")
     if mesh.colors is not None:
-        fields += [(name, "u1") for name in ("red", "green", "blue")]
-        columns += [*mesh.colors.T]
+        columns |= color_columns(mesh.colors)
     if mesh.quality is not None:
-        fields.append(("quality", "<f4"))
-        columns.append(mesh.quality)
-    rows = np.empty(len(mesh.vertices), dtype=fields)
-    for (name, _), column in zip(fields, columns, strict=True):
-        rows[name] = column
-    traced = mesh.primitive is not None
-    triangles = np.empty(
-        len(mesh.faces), dtype=[("count", "u1"), ("index", "<i4", (3,)), *([("primitive", "<i4")] if traced else [])]
-    )
-    triangles["count"] = 3
-    triangles["index"] = mesh.faces
-    if traced:
-        triangles["primitive"] = mesh.primitive
-    names = {"<f8": "double", "<f4": "float", "u1": "uchar"}
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    header += [f"property {names[kind]} {name}" for name, kind in fields]
-    header += [f"element face {len(triangles)}", "property list uchar int vertex_indices"]
-    header += [*(["property int primitive"] if traced else []), "end_header", ""]
-    with open(path, "wb") as file:
-        file.write("\n".join(header).encode("ascii"))
-        file.write(rows.tobytes())
-        file.write(triangles.tobytes())
+        columns["quality"] = mesh.quality.astype(np.float32)
+    traced = {} if mesh.primitive is None else {"primitive": mesh.primitive.astype(np.int32)}
+    write_ply(path, columns, mesh.faces, traced)
 
 
 def _write_obj(path: Path, mesh: Mesh) -> None:

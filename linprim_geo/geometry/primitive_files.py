@@ -23,6 +23,7 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write
+from linprim_geo.geometry.ply import write_ply
 from linprim_geo.geometry.primitives import KINDS, SH_COEFFICIENTS, Primitives, reference_length, unit_quaternions
 
 # LinPrim's formula never reads more than this share of the opacity, so that the logarithm stays finite ...
@@ -257,18 +258,15 @@ def write_primitive_ply(path: str | os.PathLike, primitives: Primitives) -> dict
     padded[:, : primitives.sh.shape[1]] = primitives.sh
     names = _names(primitives.kind)
     end = 55 + lengths.shape[1]
-    table = np.zeros((count, len(names)), dtype="<f4")
+    table = np.zeros((count, len(names)), dtype=np.float32)
     table[:, 0:3] = primitives.center
     table[:, 6:9] = padded[:, 0]
     table[:, 9:54] = padded[:, 1:].transpose(0, 2, 1).reshape(count, 45)
     table[:, 54] = logit
     table[:, 55:end] = lengths
     table[:, end : end + 4] = primitives.rotation
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    header += [f"property float {name}" for name in names] + ["end_header", ""]
-    with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        file.write("\n".join(header).encode("ascii"))
-        file.write(table.data)
+    with atomic_write(path) as temporary:
+        write_ply(temporary, dict(zip(names, table.T, strict=True)))
     return {"rows": count, "clamped": clamped}
 
 

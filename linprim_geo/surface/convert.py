@@ -10,6 +10,7 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write
+from linprim_geo.geometry.ply import color_columns, write_ply, xyz_columns
 from linprim_geo.geometry.primitive_files import read_ply_header, read_primitive_ply, write_primitive_ply
 from linprim_geo.geometry.primitives import KINDS, Primitives, load_primitives, save_primitives
 
@@ -184,27 +185,15 @@ def save_primitive_mesh(path: str | os.PathLike, primitives: Primitives) -> int:
     alpha = np.repeat(np.rint(primitives.alpha * 255.0).astype(np.uint8), len(mesh.vertices) // len(primitives))
     suffix = path.suffix.lower()
     if suffix == ".ply":
-        _save_ply(path, mesh, alpha)
+        assert mesh.colors is not None
+        colors = np.column_stack([mesh.colors, alpha])
+        with atomic_write(path) as temporary:
+            write_ply(temporary, xyz_columns(mesh.vertices.astype(np.float32)) | color_columns(colors), mesh.faces)
     elif suffix == ".glb":
         _save_glb(path, mesh, alpha)
     else:
         save_mesh(path, mesh)
     return len(mesh.faces)
-
-
-def _save_ply(path: Path, mesh: Mesh, alpha: np.ndarray) -> None:
-    vertices = np.empty(len(mesh.vertices), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3), ("alpha", "u1")])
-    vertices["xyz"], vertices["rgb"], vertices["alpha"] = mesh.vertices, mesh.colors, alpha
-    faces = np.empty(len(mesh.faces), dtype=[("corners", "u1"), ("vertices", "<i4", 3)])
-    faces["corners"], faces["vertices"] = 3, mesh.faces
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    header += [f"property float {name}" for name in "xyz"]
-    header += [f"property uchar {name}" for name in ("red", "green", "blue", "alpha")]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
-    with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        file.write("\n".join(header).encode("ascii"))
-        file.write(vertices.data)
-        file.write(faces.data)
 
 
 def _save_glb(path: Path, mesh: Mesh, alpha: np.ndarray) -> None:

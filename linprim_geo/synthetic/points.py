@@ -12,6 +12,7 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.ply import color_columns, write_ply, xyz_columns
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.synthetic.camera_paths import surface_samples
 from linprim_geo.synthetic.photos import photo_name
@@ -227,13 +228,4 @@ def write_colmap(folder: Path, cameras: list[Camera], cloud: Cloud, distortion: 
 
 def write_points(path: Path, cloud: Cloud) -> None:
     """A binary PLY of x y z (double, so that nothing is lost far from the origin) and red green blue."""
-    fields = [(axis, "<f8") for axis in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
-    table = np.empty(len(cloud.xyz), dtype=fields)
-    for i, axis in enumerate("xyz"):
-        table[axis] = cloud.xyz[:, i]
-    for i, name in enumerate(("red", "green", "blue")):
-        table[name] = cloud.rgb[:, i]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
-    lines += [f"property double {axis}" for axis in "xyz"]
-    lines += [f"property uchar {name}" for name in ("red", "green", "blue")]
-    path.write_bytes(("\n".join([*lines, "end_header"]) + "\n").encode() + table.tobytes())
+    write_ply(path, xyz_columns(cloud.xyz.astype(np.float64)) | color_columns(cloud.rgb))
