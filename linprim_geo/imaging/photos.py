@@ -12,7 +12,7 @@ import numpy as np
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write
 from linprim_geo.geometry.lens import Intrinsics, Lens, source_pixels
-from linprim_geo.imaging.sampling import sample_bilinear, sample_nearest
+from linprim_geo.geometry.sampling import sample_bilinear, sample_nearest
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _MODES_WITH_ALPHA = ("RGBA", "LA", "PA", "La", "RGBa")

@@ -14,7 +14,7 @@ import numpy as np
 
 from linprim_geo.capture.types import Scene
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.imaging.sampling import sample_bilinear
+from linprim_geo.geometry.sampling import sample_bilinear
 from linprim_geo.points.initial_points import Look, VolumePoints, in_image, local_planes, spread_looks
 
 # So many points and views say enough; more only take time.

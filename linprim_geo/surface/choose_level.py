@@ -14,7 +14,7 @@ import numpy as np
 
 from linprim_geo.capture.types import Photo
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.imaging.sampling import bilinear
+from linprim_geo.geometry.sampling import bilinear
 from linprim_geo.points.view_pairs import source_views
 from linprim_geo.runs.run import Run
 

@@ -12,7 +12,7 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.capture.types import View
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.lens import Lens, check_lens, model_parameter_counts, undistorted
-from linprim_geo.imaging.sampling import sample_bilinear
+from linprim_geo.geometry.sampling import sample_bilinear
 
 SIZE = (160, 120)
 F, X, Y = 130.0, 83.0, 57.5  # a principal point off the middle shows an exchange of x and y, or of sizes
