@@ -15,6 +15,7 @@ import numpy as np
 
 from linprim_geo.capture.types import PointCloud, Scene
 from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.sampling import sample_bilinear
 from linprim_geo.points.far_colors import FarColors
 from linprim_geo.points.initial_points import Look, in_image, spread_looks
 
@@ -328,17 +329,8 @@ def _differences(view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray, inve
 def _sampled(image: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """((..., 3) bilinear samples at (..., 2) positions, (...) whether they lie within the outermost pixel centres)."""
     height, width = image.shape[:2]
-    at = places - 0.5
-    inside = np.asarray(((at >= 0) & (at <= [width - 1, height - 1])).all(-1))
-    at = np.where(inside[..., None], at, 0.0)
-    low = np.minimum(at.astype(np.int64), [max(width - 2, 0), max(height - 2, 0)])
-    x, y = np.moveaxis((at - low).astype(np.float32)[..., None], -2, 0)
-    flat = image.reshape(-1, 3)
-    start = low[..., 1] * width + low[..., 0]
-    right, down = int(width > 1), width * int(height > 1)
-    upper = flat[start] * (1 - x) + flat[start + right] * x
-    lower = flat[start + down] * (1 - x) + flat[start + down + right] * x
-    return upper * (1 - y) + lower * y, inside
+    inside = np.asarray(((places >= 0.5) & (places <= [width - 0.5, height - 0.5])).all(-1))
+    return sample_bilinear(image, np.where(inside[..., None], places, 0.5)), inside
 
 
 def _not_in_free_space(points: np.ndarray, views: Sequence[_Gaps], own: int) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 
 from linprim_geo.capture.types import Photo
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.sampling import bilinear
+from linprim_geo.geometry.sampling import sample_bilinear
 from linprim_geo.points.view_pairs import source_views
 from linprim_geo.runs.run import Run
 
@@ -106,9 +106,9 @@ def color_differences(
         if (
             other_photo.alpha is not None
         ):  # colours are mixed with the background unless all four pixels around are opaque
-            usable &= ~same | (bilinear(other_photo.alpha[..., None], pixels.T)[:, 0] > 254.5)
+            usable &= ~same | (sample_bilinear(other_photo.alpha[..., None], pixels)[:, 0] > 254.5)
         seen |= same
-        difference = np.minimum(np.abs(bilinear(other_photo.rgb, pixels.T) - own).mean(1), LARGEST_DIFFERENCE)
+        difference = np.minimum(np.abs(sample_bilinear(other_photo.rgb, pixels) - own).mean(1), LARGEST_DIFFERENCE)
         found.append(np.where(same, difference, np.float32(LARGEST_DIFFERENCE)))
     return np.stack(found)[:, usable & seen]
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.mesh import barycentric
+from linprim_geo.geometry.sampling import sample_bilinear
 
 Albedo = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """(points (N, 3) relative to the mesh's `albedo_origin`, face (N,), bary (N, 2)) -> (N, 3) float32 colours in
@@ -304,13 +305,7 @@ class FileAlbedo:
 def _bilinear(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
     """Samples (H, W, 3) at uv with v up from the lower edge, texel centres at half-integers, repeating."""
     height, width = image.shape[:2]
-    x, y = uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5
-    x0, y0 = np.floor(x), np.floor(y)
-    fx, fy = (x - x0).astype(np.float32)[:, None], (y - y0).astype(np.float32)[:, None]
-    x0, y0 = x0.astype(np.int64) % width, y0.astype(np.int64) % height
-    x1, y1 = (x0 + 1) % width, (y0 + 1) % height
-    top = image[y0, x0] * (1 - fx) + image[y0, x1] * fx
-    return top * (1 - fy) + (image[y1, x0] * (1 - fx) + image[y1, x1] * fx) * fy
+    return sample_bilinear(image, np.stack([uv[:, 0] * width, (1.0 - uv[:, 1]) * height], axis=-1), repeat=True)
 
 
 def load_textured(path: str | Path, *, detail: float = 1.0) -> TexturedMesh:

@@ -12,7 +12,6 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.capture.types import View
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.lens import Lens, check_lens, model_parameter_counts, undistorted
-from linprim_geo.geometry.sampling import sample_bilinear
 
 SIZE = (160, 120)
 F, X, Y = 130.0, 83.0, 57.5  # a principal point off the middle shows an exchange of x and y, or of sizes
@@ -87,13 +86,6 @@ def test_a_lens_without_distortion_is_used_as_it_is():
         target = undistorted(Lens(model, *SIZE, tuple(map(float, params))))
         assert (target.width, target.height, target.cx, target.cy) == (*SIZE, X, Y)
     assert not Lens("FISHEYE", *SIZE, (F, F, X, Y)).is_pinhole
-
-
-def test_bilinear_sampling_reproduces_a_linear_image():
-    x, y = np.meshgrid(np.arange(9) + 0.5, np.arange(7) + 0.5)
-    image = (2 * x + 3 * y)[..., None].astype(np.float32)
-    at = np.random.default_rng(0).uniform([0.5, 0.5], [8.5, 6.5], (4, 5, 2)).astype(np.float32)
-    np.testing.assert_allclose(sample_bilinear(image, at)[..., 0], 2 * at[..., 0] + 3 * at[..., 1], rtol=1e-5)
 
 
 @pytest.mark.parametrize(
