@@ -9,7 +9,6 @@ import platform
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 from importlib.resources import files
 
 from linprim_geo.base.options import changed_options, flag_of
