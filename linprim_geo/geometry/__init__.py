@@ -1,1 +1,1 @@
-"""Cameras, lenses, meshes, primitives, ray casting, and their files."""
+"""Cameras, lenses, samples of images, meshes, primitives, ray casting, and their files."""

@@ -1,1 +1,1 @@
-"""Photographs from files, sampling, image metrics, colours, plots."""
+"""Photographs from files, image metrics, colours, plots."""
