@@ -37,7 +37,7 @@ COLUMNS = (
 def write_report(
     folder: Path, about: dict, knobs: Sequence[Knob], measured: Mapping[str, Sequence[tuple[Rung, dict]]]
 ) -> dict:
-    """Writes the three files into `folder` and returns what the JSON holds, and the `files`.
+    """Writes the three files into `folder` and returns what the JSON holds.
 
     Args:
         about: what was swept, and how.
@@ -56,6 +56,7 @@ def write_report(
         "sentences": {name: found["sentence"] for name, found in verdicts.items()},
         "verdicts": verdicts,
         "rows": rows,
+        "files": [str(folder / f"tradeoff.{suffix}") for suffix in ("html", "csv", "json")],
     }
     results = json.loads(json.dumps(_without_nan(results)))
     write_json(folder / "tradeoff.json", results)
@@ -68,7 +69,7 @@ def write_report(
             )
     with atomic_write(folder / "tradeoff.html") as temporary:
         temporary.write_text(page(results, {knob.name: knob for knob in knobs}), encoding="utf-8")
-    return results | {"files": [str(folder / f"tradeoff.{suffix}") for suffix in ("html", "csv", "json")]}
+    return results
 
 
 def describe(results: dict) -> str:

@@ -78,7 +78,7 @@ def tradeoff(
             machine, and are timed so. Neither: here, one after another. Everything else is measured here in any case.
         changes: fields of `options` by name, such as `quick=True`.
 
-    Returns: what tradeoff.json holds: `rows` (one per rung of each knob), `sentences`, `rule`, `about`; and
+    Returns: what tradeoff.json holds: `rows` (one per rung of each knob), `sentences`, `rule`, `about`,
         `files`.
 
     Raises:
