@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import atomic_write, write_json
 
 SPLITS = ("test", "train", "all")
 
@@ -25,6 +24,9 @@ def write_results(folder: str | os.PathLike, results: Mapping, rows: Sequence[Ma
     Raises:
         LinprimError: the folder cannot be written.
     """
+    # Here, so that the command line can read the options of this package without other libraries.
+    from linprim_geo.base.files import atomic_write, write_json
+
     folder = Path(folder)
     if rows:
         with atomic_write(folder / "per_view.csv") as temporary:

@@ -39,6 +39,10 @@ HEAVY = {
     "PIL",
     "numpy",
     "viser",
+    "filelock",
+    "psutil",
+    "jinja2",
+    "matplotlib",
 }
 COMMANDS = (
     "train inspect render extract-mesh eval-depth eval-images eval-mesh report view tradeoff synth "
@@ -84,7 +88,7 @@ def recorded_train(monkeypatch):
     return calls
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["train", "--help"], ["--version"]])
+@pytest.mark.parametrize("arguments", [["--help"], ["train", "--help"], ["eval-mesh", "--help"], ["--version"]])
 def test_help_imports_no_library(arguments):
     done = run_python(f"from linprim_geo.cli.main import main; main({arguments!r})", "-X", "importtime")
     assert done.returncode == 0 and done.stdout
