@@ -331,18 +331,23 @@ class ExtractOptions:
         low=0,
         metavar="LENGTH",
     )
-    stereo: bool = option(
-        False, "take the depths that PatchMatch stereo finds in the photographs where views confirm them (tsdf)"
+    stereo: str = option(
+        "auto",
+        "fuse the depths that PatchMatch stereo finds in the photographs where views confirm them: on, off, or auto: "
+        "where an environment was trained, with --method tsdf, without --blocks and --time-budget",
+        choices=("auto", "on", "off"),
     )
     smallest_part: float = option(
         0.01, "drop components with less than this share of the largest one's area", low=0, high=1
     )
-    refine: int = option(
-        2,
-        "rounds in which vertices move to where the photographs agree best with each other; 0 leaves them",
+    refine: int | str = option(
+        "auto",
+        "rounds in which vertices move to where the photographs agree best with each other; 0 leaves them; auto: 2, "
+        "and 0 after stereo, which is more accurate than they can be moved",
         low=0,
         high=100,
         metavar="N",
+        number_or="auto",
     )
     close_holes: int = option(0, "fill holes with at most N edges around them; 0 fills none", low=0, high=10**9)
     smooth: int = option(

@@ -40,6 +40,8 @@ METHODS = {
 # Options that a method chooses where they are 0; what it took is in its statistics.
 CHOSEN = ("voxel_size", "depth_limit")
 
+# Rounds of refinement with `refine` auto, where stereo has no part in the surface.
+REFINE_ROUNDS = 2
 # Folder of what workers have done, in that of the method.
 PARTS = "parts"
 
@@ -93,13 +95,17 @@ def extract_mesh(
         raise LinprimError("--time-budget chooses the voxel size: wanted one of it and --voxel-size")
     if blocks < 1:
         raise LinprimError(f"--blocks is {blocks}, wanted a number from 1")
-    if options.stereo and (blocks > 1 or method != "tsdf"):
-        raise LinprimError("--stereo adds to the depth maps of --method tsdf: wanted it without --blocks")
     if blocks > 1 and method != "tsdf":
         raise LinprimError(
             f"--blocks fuses depth maps in parts, which --method {method} has none of: wanted --method tsdf"
         )
     opened = Run.open(run)
+    if blocks > 1 or budget or method != "tsdf":
+        if options.stereo == "on":
+            raise LinprimError("--stereo on is for --method tsdf, without --blocks and --time-budget")
+        options = replace(options, stereo="off")
+    elif options.stereo == "auto" and opened.environment is None:
+        options = replace(options, stereo="off")
     folder = opened.path / "mesh" / method
     target = Path(output) if output else folder / "mesh.ply"
     if target.suffix.lower() not in SUFFIXES:
@@ -136,6 +142,8 @@ def _extract(
     for file in written:
         remove_torn(file)
     stages = Stages(progress)
+    if options.refine == "auto" and options.stereo == "off":
+        options = replace(options, refine=REFINE_ROUNDS)
 
     agreement = None
     if options.level == "auto":
@@ -170,6 +178,8 @@ def _extract(
             stages.note(f"left out: {left_out['pieces']} parts that one camera alone sees before the open background")
         stages.lap("support")
     options = replace(options, **{name: about[name] for name in CHOSEN if name in about})
+    if options.refine == "auto":
+        options = replace(options, refine=0 if "stereo" in about else REFINE_ROUNDS)
     done = finish_surface(mesh, opened, options, target, stages)
     shape = topology(done.mesh)
     stats = {

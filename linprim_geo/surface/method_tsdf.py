@@ -23,6 +23,9 @@ SEEN_THROUGH = 0.5
 # Depth, background and whether it is clamped, of a pixel; frames of more than this in all are not kept.
 BYTES_PER_PIXEL, KEPT_BYTES = 6, 2**30
 
+LEAST_CONFIRMED = 0.01
+"""Stereo that confirms less than this share of the pixels has nothing to say of a scene."""
+
 SMALLEST_DISPARITY = 0.25
 """Depths are trusted as far as this many pixels between the two cameras that are furthest apart move a point by a
 truncation."""
@@ -56,14 +59,10 @@ def tsdf_surface(
             f"{frames.beyond:.1%} of the depths lie beyond {frames.limit:.4g} and only clear the space before it"
         )
     voxel = options.voxel_size if options.voxel_size > 0 else auto_voxel_size(frames)
-    if options.stereo:
-        merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)
+    if options.stereo != "off":
+        merged = _with_stereo(frames, options.stereo == "on", stages)
+    if merged:
         about = {"stereo": {"confirmed": merged.confirmed, "rendered_weight": merged.weight}}
-        stages.note(
-            f"stereo: {merged.confirmed:.0%} of the pixels have a depth that other views confirm; "
-            f"elsewhere rendered depths count {merged.weight:.2g}"
-        )
-        stages.lap("stereo")
     mesh = fuse_tsdf(
         merged or frames,
         voxel_size=voxel,
@@ -81,6 +80,27 @@ def tsdf_surface(
         "depth_limit": frames.limit,
         **about,
     }
+
+
+def _with_stereo(frames: DepthFrames, wanted: bool, stages: Stages) -> MergedFrames | None:
+    """The frames with the depths of stereo; None, unless it is `wanted`, where there are hardly any.
+
+    Raises:
+        LinprimError: it is wanted, and no two views show the same points.
+    """
+    try:
+        merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)
+    except LinprimError as error:
+        if wanted:
+            raise
+        stages.note(f"no stereo: {error}")
+        return None
+    stages.lap("stereo")
+    stages.note(
+        f"stereo: {merged.confirmed:.0%} of the pixels have a depth that other views confirm; "
+        f"elsewhere rendered depths count {merged.weight:.2g}"
+    )
+    return merged if wanted or merged.confirmed > LEAST_CONFIRMED else None
 
 
 class DepthFrames(Sequence):

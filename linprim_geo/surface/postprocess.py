@@ -42,7 +42,7 @@ def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, 
     caster = RayCaster(mesh.vertices, mesh.faces)
     gains = photo_gains(mesh, cameras, (view.load() for view in views), caster)
     if options.refine:
-        mesh = refine_surface(mesh, views, options.refine, gains, caster)
+        mesh = refine_surface(mesh, views, int(options.refine), gains, caster)
         stages.lap("refine")
     mesh, processing = process_mesh(mesh, options, stages.note)
     if processing:

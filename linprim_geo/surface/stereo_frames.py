@@ -47,11 +47,14 @@ class MergedFrames(Sequence):
 
     def _merged(self, frame: DepthFrame, depth: np.ndarray) -> DepthFrame:
         known = depth <= self.limit  # not where it is NaN
+        if frame.background is not None:
+            # Beside an outline the windows of stereo take the background for a part of what is in front of it.
+            known &= ~frame.background
         clamped = None if frame.clamped is None else frame.clamped & ~known
         return DepthFrame(
             frame.camera,
             np.where(known, depth, frame.depth).astype(np.float32),
-            background=None if frame.background is None else frame.background & ~known,
+            background=frame.background,
             confidence=np.where(known, np.float32(1), np.float32(self.weight)),
             clamped=clamped,
         )

@@ -53,6 +53,17 @@ def test_depths_beyond_the_limit_are_left_to_the_rendering(found):
     assert np.allclose(merged[0].depth, 3.03)
 
 
+def test_what_primitives_let_through_is_no_surface(found):
+    (frame,) = rendered(0.01)
+    frame.background[:, :5] = True
+    merged = MergedFrames([frame], [None], 5.0)[0]
+    assert (
+        np.allclose(merged.depth[:, :5], 3.03)
+        and merged.background[:, :5].all()
+        and (merged.depth[1:, 5:20] == 3).all()
+    )
+
+
 def test_fewer_neighbours_have_to_agree_where_there_are_fewer(found, monkeypatch):
     maps = stereo_frames.depth_maps()
     maps[0].confirmed[1:, :20], maps[0].sources = 2, 3
@@ -63,7 +74,7 @@ def test_fewer_neighbours_have_to_agree_where_there_are_fewer(found, monkeypatch
 
 def test_a_surface_of_a_run_takes_stereo_into_account(tmp_path):
     run = octahedron_run(tmp_path / "run", views=60, size=40)
-    stats = extract_mesh(run, options=ExtractOptions(stereo=True, refine=0, level=0.5), quiet=True)
+    stats = extract_mesh(run, options=ExtractOptions(stereo="on", level=0.5), quiet=True)
     assert 0 <= stats["stereo"]["confirmed"] <= 1 and 0 < stats["stereo"]["rendered_weight"] <= 1
-    with pytest.raises(LinprimError, match="wanted it without --blocks"):
-        extract_mesh(run, options=ExtractOptions(stereo=True), blocks=2, quiet=True)
+    with pytest.raises(LinprimError, match="without --blocks"):
+        extract_mesh(run, options=ExtractOptions(stereo="on"), blocks=2, quiet=True)
