@@ -13,11 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.memory import available_memory
 from linprim_geo.base.progress import Progress
 from linprim_geo.capture.types import View
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, patch_match
-from linprim_geo.points.view_pairs import source_views
+from linprim_geo.points.view_pairs import source_views, visible_pixels
 
 # Sweeps at half the size, at full size, and in each of the passes in which depths of neighbours are compared.
 COARSE_SWEEPS, FINE_SWEEPS, GEOMETRIC_SWEEPS = 3, 1, (1, 1)
@@ -27,6 +28,12 @@ NEAREST_SHARE, NEARER = 0.01, 1.5
 CONFIRMED_PX, CONFIRMED_DEPTH = 1.0, 0.01
 # Variance of grey values that rounding them causes, at least.
 LEAST_NOISE = 1.0
+# Bytes per pixel of all views that are in memory at once: planes 17, images 7, depths of the last turn 4, maps 25.
+PIXEL_BYTES = 53
+# Of the memory that is free, no more than this share is taken.
+MEMORY_SHARE = 0.5
+# Both sides of a photograph have at least this many pixels: half of them hold a window.
+SMALLEST = 24
 # Costs above this are those of windows that do not match.
 MOST_COST = 0.9
 
@@ -36,8 +43,9 @@ class DepthMap:
     """What stereo says of a photograph.
 
     `depth` (H, W) float32 along the optical axis in the scene's unit, NaN where unknown; `normal` (H, W, 3) float32 in
-    the world, towards the camera; `cost` (H, W) float32 of the match, 0 to 2; `confirmed` (H, W) uint8, by how many
-    other views.
+    the world, towards the camera; `cost` (H, W) float32 of the match, 0 to 2; `confirmed` (H, W) uint8, by how many of
+    `sources` other views, and `deviation` (H, W) float32 the least share of the depth by which one of these differs,
+    infinite where none sees the point.
     """
 
     camera: Camera
@@ -57,9 +65,18 @@ def depth_maps(views: Sequence[View], points: np.ndarray, *, seed: int = 0, quie
         points: (P, 3) of the scene, by which views that see the same are found, and the range of depths.
 
     Raises:
-        LinprimError: there are no two views that see the same points.
+        LinprimError: there are no two views that see the same points; photographs are too small for a window, or all
+            of them too large for the memory that is free.
     """
     cameras = [view.camera for view in views]
+    if any(min(camera.width, camera.height) < SMALLEST for camera in cameras):
+        raise LinprimError(f"stereo needs photographs of {SMALLEST} pixels a side at least")
+    wanted, free = PIXEL_BYTES * sum(camera.width * camera.height for camera in cameras), available_memory()
+    if wanted > MEMORY_SHARE * free:
+        raise LinprimError(
+            f"stereo of {len(views)} photographs takes {wanted / 2**30:.1f} GiB of the {free / 2**30:.1f} that are "
+            "free, wanted smaller photographs (--downscale) or fewer"
+        )
     pairs = source_views(cameras, points)
     if not any(pairs):
         raise LinprimError(
@@ -149,20 +166,17 @@ def _doubled(planes: DepthPlanes, shape: tuple[int, int]) -> DepthPlanes:
 
 def _range_of(camera: Camera, points: np.ndarray) -> tuple[float, float]:
     """The least and the largest inverse depth that a camera may see; the least is infinity's."""
-    pixels, depth = camera.project(points)
-    inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
-    if not inside.any():
-        inside = depth > 0
-    nearest = float(np.quantile(depth[inside], NEAREST_SHARE)) if inside.any() else 1.0
-    return 0.0, NEARER / nearest
+    depth = visible_pixels(camera, points)[2]
+    # A camera that sees none of the points has no pair either: its range is not used.
+    return 0.0, NEARER / float(np.quantile(depth, NEAREST_SHARE)) if len(depth) else 1.0
 
 
 def _depth_map(camera: Camera, planes: DepthPlanes | None, others: list[tuple[Camera, DepthPlanes | None]]) -> DepthMap:
     height, width = camera.height, camera.width
     if planes is None:
         empty = np.full((height, width), np.nan, np.float32)
-        none = np.zeros((height, width), np.uint8)
-        return DepthMap(camera, empty, np.zeros((height, width, 3), np.float32), empty, none, empty, 0)
+        none, infinite = np.zeros((height, width), np.uint8), np.full((height, width), np.inf, np.float32)
+        return DepthMap(camera, empty, np.zeros((height, width, 3), np.float32), empty, none, infinite, 0)
     inverse, slope_x, slope_y = (planes.plane[..., k].astype(np.float64) for k in range(3))
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = 1 / inverse

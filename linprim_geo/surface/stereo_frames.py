@@ -29,9 +29,8 @@ class MergedFrames(Sequence):
 
     def __init__(self, rendered: Sequence[DepthFrame], views: Sequence[View], limit: float, *, quiet: bool = True):
         self.rendered, self.limit = rendered, limit
-        surface = [frame.surface()[0] for frame in rendered]
-        points = np.concatenate(surface)
-        maps = depth_maps(views, points[:: max(1, len(points) // POINTS)], quiet=quiet)
+        points = np.concatenate([_some(frame.surface()[0], POINTS // len(views)) for frame in rendered])
+        maps = depth_maps(views, points, quiet=quiet)
         self.depths = [_confirmed_depth(found) for found in maps]
         self.confirmed = float(np.mean([np.isfinite(depth).mean() for depth in self.depths]))
         self.weight = _rendered_weight(maps, self.depths, rendered)
@@ -58,6 +57,11 @@ class MergedFrames(Sequence):
             confidence=np.where(known, np.float32(1), np.float32(self.weight)),
             clamped=clamped,
         )
+
+
+def _some(points: np.ndarray, count: int) -> np.ndarray:
+    """About `count` of (P, 3) points, evenly over their order."""
+    return points[:: max(1, len(points) // max(1, count))]
 
 
 def _confirmed_depth(found: DepthMap) -> np.ndarray:

@@ -67,6 +67,18 @@ def test_views_that_share_nothing_are_one_sentence(views):
         depth_maps(views, behind)
 
 
+def test_what_does_not_fit_into_memory_is_one_sentence(views, wall_points, monkeypatch):
+    monkeypatch.setattr("linprim_geo.stereo.depth_maps.available_memory", lambda: 2**20)
+    with pytest.raises(LinprimError, match="5 photographs takes 0.0 GiB of the 0.0 that are free"):
+        depth_maps(views, wall_points)
+
+
+def test_photographs_smaller_than_a_window_are_one_sentence():
+    small = [SimpleNamespace(camera=look_at(center, size=(40, 20), up=(0.0, 1.0, 0.0))) for center in CENTERS]
+    with pytest.raises(LinprimError, match="24 pixels a side"):
+        depth_maps(small, np.zeros((9, 3)))
+
+
 def test_noise_is_measured_past_what_the_picture_shows():
     rng = np.random.default_rng(0)
     y, x = np.mgrid[:200, :300]
