@@ -74,7 +74,7 @@ def tradeoff(
         options: what is measured. `run` is not changed; without it one is trained with the defaults at the size
             `MODEST`, or with `quick` at `QUICK`, which is also what training knobs are swept around. `reference` is for
             Chamfer distances and depth.
-        cluster, workers: where and how many trainings at once, see `executor.open_executor`; they share the cores of a
+        cluster, workers: where and how many trainings at once, see `jobs.open.open_executor`; they share the cores of a
             machine, and are timed so. Neither: here, one after another. Everything else is measured here in any case.
         changes: fields of `options` by name, such as `quick=True`.
 

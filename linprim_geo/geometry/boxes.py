@@ -88,7 +88,7 @@ def margin_of(blocks: Sequence[Block], xyz: np.ndarray) -> float:
 
 
 def smaller(camera: Camera, factor: int) -> Camera:
-    """The same view with `factor` by `factor` pixels averaged into one, as `scene.load_scene` does."""
+    """The same view with `factor` by `factor` pixels averaged into one, as `capture.load.load_scene` does."""
     k = factor
     width, height = camera.width // k, camera.height // k
     return replace(

@@ -62,17 +62,17 @@ def extract_mesh(
 
     RUN/mesh/METHOD holds mesh.ply, mesh_visible.ply and stats.json; with `output` the two meshes go to OUTPUT and its
     sibling *_visible, in the format of the suffix (.ply, .obj, .glb, .stl). Vertices have normals, colours and, as
-    `quality`, the predicted error (`photo_sweep.predicted_error`); everything is in the data set's frame and unit. The
-    photographs move the vertices to where they agree best (`photo_sweep.refine_surface`), then holes are closed, the
-    surface smoothed, remeshed and simplified as the options ask (`mesh_process`); with `texture` .obj and .glb have a
-    texture out of the photographs in place of vertex colours.
+    `quality`, the predicted error (`photo_consistency.predicted_error`); everything is in the data set's frame and
+    unit. The photographs move the vertices to where they agree best (`photo_consistency.refine_surface`), then holes
+    are closed, the surface smoothed, remeshed and simplified as the options ask (`mesh_process`); with `texture` .obj
+    and .glb have a texture out of the photographs in place of vertex colours.
 
     With `time_budget`, in seconds, the voxel size is the smallest with which everything takes that time at most, by
-    what coarse passes take (`time_budget.choose_voxel`); stats.json has `time_budget`: what was chosen and why, and the
-    seconds that it took.
+    what coarse passes take (`voxel_budget.choose_voxel`); stats.json has `time_budget`: what was chosen and why, and
+    the seconds that it took.
 
     With `blocks` other than 1 the depth maps are fused in so many parts of one lattice by several workers, with the
-    same result to the last bit; `cluster` and `workers` say where, see `executor.open_executor`.
+    same result to the last bit; `cluster` and `workers` say where, see `jobs.open.open_executor`.
 
     Returns: what stats.json holds: topology of both meshes, `options` with what was chosen in them, before an
         environment `seen_by_one_view` (`single_view.without_single_views`), `processing` step by step, `texture`, what

@@ -104,7 +104,7 @@ def _with_stereo(frames: DepthFrames, wanted: bool, stages: Stages) -> MergedFra
 
 
 class DepthFrames(Sequence):
-    """`tsdf.DepthFrame`s of the training views: depth at transmittance `level`, free background.
+    """`tsdf_field.DepthFrame`s of the training views: depth at transmittance `level`, free background.
 
     Depths beyond `limit` are clamped to it; 0 chooses one by `depth_limit`. `beyond` is their share. Frames are kept in
     memory if they are at most KEPT_BYTES in all, else, and without `keep`, rendered whenever they are asked for.

@@ -18,8 +18,8 @@ BEHIND = 0.02
 
 
 def seen_alone(vertices: np.ndarray, depths: Iterable[tuple[Camera, np.ndarray]]) -> np.ndarray:
-    """(V,) bool, whether one camera alone sees a vertex (`support.Support`), by the (H, W) z-depths of the cameras'
-    surface."""
+    """(V,) bool, whether one camera alone sees a vertex (`view_support.Support`), by the (H, W) z-depths of the
+    cameras' surface."""
     support = Support(torch.from_numpy(vertices))
     for camera, depth in depths:
         inside, row, column = in_image(camera, vertices)

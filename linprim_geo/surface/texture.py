@@ -69,9 +69,9 @@ def make_texture(mesh: Mesh, size: int, views: Sequence[View], note: Callable[[s
 
     Args:
         size: texels along an edge of the image.
-        views: `scene.View`s, or anything with a `camera` and a `load()` that gives `rgb` (H, W, 3) uint8 and `alpha`
-            (H, W) uint8 or None. They are decoded once if they take at most KEPT_BYTES in all, else again for every
-            TEXELS_PER_PASS texels.
+        views: `capture.types.View`s, or anything with a `camera` and a `load()` that gives `rgb` (H, W, 3) uint8 and
+            `alpha` (H, W) uint8 or None. They are decoded once if they take at most KEPT_BYTES in all, else again for
+            every TEXELS_PER_PASS texels.
         note: called with lines for the user.
     Raises:
         LinprimError: an empty mesh or one that is not finite, or so many charts that they do not fit.

@@ -53,7 +53,7 @@ def fuse_tsdf(
         memory_limit: bytes the field may take; default 60 % of what is available.
         block_resolution: voxels along the edge of a block.
         min_component: pieces with less than this share of the largest piece's area are dropped; 0 keeps all.
-        behind_voxels: see `tsdf.BEHIND_VOXELS`; 1.5 makes a sheet without thickness a closed shell, at the
+        behind_voxels: see `tsdf_field.BEHIND_VOXELS`; 1.5 makes a sheet without thickness a closed shell, at the
             price of swollen thin parts.
         occluded_vote: weight of a vote "inside" from every view in which a voxel lies further behind the
             surface than the truncation; 0.01 to 0.02 closes tunnels that too deep pixels dig into solids.
@@ -98,7 +98,7 @@ def fuse_tsdf(
 @dataclass(frozen=True)
 class Lattice:
     """Where a field is kept: `blocks` (B, 3) of `resolution`^3 voxels of edge `voxel`; block (0, 0, 0) starts at
-    `origin` (3,). `truncation` is in voxels, `rules` are `tsdf.vote_rules`."""
+    `origin` (3,). `truncation` is in voxels, `rules` are `tsdf_field.vote_rules`."""
 
     blocks: np.ndarray
     origin: np.ndarray

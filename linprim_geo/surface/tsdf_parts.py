@@ -33,7 +33,7 @@ REMEDY = "more --blocks, a larger --voxel-size, fewer --workers, or more memory"
 
 
 class PartFusion:
-    """Fuses a lattice in `count` parts, for `fuse.fuse_tsdf`. What is done is in `folder` until all is."""
+    """Fuses a lattice in `count` parts, for `tsdf_fusion.fuse_tsdf`. What is done is in `folder` until all is."""
 
     def __init__(self, run: Run, level: float, count: int, executor: Executor, folder: Path, quiet: bool = False):
         self.run, self.level, self.count = run, level, count

@@ -106,7 +106,7 @@ def sample_points(
 def pixel_samples(
     caster: RayCaster, cameras: list[Camera], count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What rays through random positions in random pictures meet, as `campath.surface_samples`; no more than
+    """What rays through random positions in random pictures meet, as `camera_paths.surface_samples`; no more than
     `count`."""
     chosen = rng.integers(len(cameras), size=count)
     place = rng.uniform(size=(count, 2))

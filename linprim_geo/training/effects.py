@@ -39,7 +39,7 @@ class Data:
     """A scene as the detectors see it: what they share is measured once."""
 
     def __init__(self, scene: Scene, options: TrainOptions):
-        """`scene` with points to start from, as `training_start.with_points` gives."""
+        """`scene` with points to start from, as `start_points.with_points` gives."""
         self.scene, self.options = scene, options
 
     @cached_property

@@ -1,7 +1,7 @@
 """Training: photographs and a first guess of primitives in, a run folder with optimised primitives out.
 
 One view per step (trainer.py): render, L1 + D-SSIM, Adam, and now and then the population grows (population.py).
-training_start.py says where to start, training_loop.py what surrounds the steps.
+start.py says where to start, loop.py what surrounds the steps.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def train(
     and raises KeyboardInterrupt.
 
     With `time_budget`, in seconds from now for everything, a calibration of some dozen steps says what a step costs,
-    and `time_budget.plan_training` chooses `iterations` and `max_primitives` from it; one of the two that differs from
+    and `budget.plan.plan_training` chooses `iterations` and `max_primitives` from it; one of the two that differs from
     its default is kept. When growth has ended the steps that are left are counted anew, once, from the pace so far.
     Both are in config.json under `time_budget`, so that a resumed run repeats them, with the seconds that the run took.
 
@@ -54,7 +54,7 @@ def train(
     without, all are taken as they are. What was decided is in config.json, and a resumed run keeps it.
 
     With `blocks` other than 1 the scene is trained in blocks of space by several workers, see
-    `block_training.train_blocks`.
+    `blocks.driver.train_blocks`.
 
     Returns: `run`, `iterations`, `seconds` (of training steps alone), `primitives`, `psnr` (mean over held-out views),
     `views`; with held-out views also `train_psnr`, the mean over at most 31 training views, and `advice` where these

@@ -76,7 +76,7 @@ def train_blocks(
 
     Args:
         blocks: how many; "auto": as few as a worker's memory allows.
-        cluster, workers: where and how many at once, see `executor.open_executor`.
+        cluster, workers: where and how many at once, see `jobs.open.open_executor`.
 
     Returns: as `train`, and `blocks`, `block_peak_gib` (the most memory that a worker took), `coarse_seconds` and
     `worker_seconds`.
