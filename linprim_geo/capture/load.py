@@ -1,5 +1,4 @@
-"""A capture as the rest of the package sees it: posed views, their photographs, and the points that come with
-them.
+"""Loads a capture: posed views, their photographs, and the points that come with them.
 
 `load_scene` finds out how a folder is laid out and checks everything that can be checked without decoding
 pixels; `View.load` decodes, undistorts and averages down.

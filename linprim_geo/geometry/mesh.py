@@ -1,4 +1,4 @@
-"""Triangle meshes: the `Mesh` every stage passes on, its files, its topology, and the checks before a library
+"""Triangle meshes: the `Mesh` that every stage passes on, its areas, normals and parts, and the checks before a library
 sees it.
 
 Some mesh libraries crash or answer nonsense on empty meshes, foreign indices, NaN and degenerate faces, so

@@ -1,8 +1,8 @@
-"""The environment of a scene: a cube map of what stands at infinity behind everything.
+"""What photographs show at infinity: the colour that most of them agree on in each direction, and how much of what they
+show it explains.
 
-`FarColors` is what photographs say of it before anything is trained: the colour that most of them show in a direction,
-and how well that explains them. From it follow whether a scene is open, which points lie in front, and where the
-training of the map begins. `ops.environment_light` says how the six faces lie.
+From it follow whether a scene is open, which points lie in front of the background, and where the training of the
+environment begins. `ops.environment_light` says how the six faces of its cube map lie.
 """
 
 from __future__ import annotations

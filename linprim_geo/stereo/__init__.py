@@ -1,1 +1,1 @@
-"""Dense depth from photographs alone: PatchMatch stereo, its consistency between views, and fused points."""
+"""Dense depth from photographs alone: PatchMatch stereo, and its consistency between views."""

@@ -1,4 +1,4 @@
-"""Textures that a mesh file brings along."""
+"""Textured meshes from and to files: OBJ with its material and picture, GLB."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The steps of a training and what surrounds them: scores on held-out views, the table of metrics, checkpoints,
-interruption."""
+"""The training loop: scores of held-out views, metrics.jsonl, checkpoints, Ctrl-C."""
 
 from __future__ import annotations
 

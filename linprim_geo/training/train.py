@@ -1,7 +1,7 @@
-"""Training: photographs and a first guess of primitives in, a run folder with optimised primitives out.
+"""Training a scene: photographs in, a run folder with optimised primitives out, whole or in blocks.
 
-One view per step (trainer.py): render, L1 + D-SSIM, Adam, and now and then the population grows (population.py).
-start.py says where to start, loop.py what surrounds the steps.
+`single.train_run` is one training; its step is `step.trainer.Trainer.advance`: render a view, L1 + D-SSIM, Adam, and
+now and then density control. start.py makes the first primitives, loop.py runs the steps.
 """
 
 from __future__ import annotations

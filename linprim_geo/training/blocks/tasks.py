@@ -1,5 +1,5 @@
-"""What workers do when a scene is trained in blocks: the coarse scene, the plan, a block by itself, and it beside what
-others have become.
+"""What workers do in a training in blocks: train the coarse scene, train one block alone, then again with its
+neighbours' current primitives frozen around it.
 
 Every task reads what those before it left in RUN/blocks, and goes on from its own last checkpoint.
 """

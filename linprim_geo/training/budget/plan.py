@@ -1,5 +1,4 @@
-"""How much to do in a given time: the cost of a training step and of a voxel size, measured first, and what is chosen
-from it."""
+"""How many steps and primitives fit into a given time, by the measured cost of a training step."""
 
 from __future__ import annotations
 
