@@ -121,7 +121,7 @@ def stand_in_labels(folder: Path, shape: str, views: tuple[View, ...]) -> Path:
     from PIL import Image
 
     from linprim_geo.geometry.raycast import RayCaster
-    from linprim_geo.synthetic.shapes import SHAPES
+    from linprim_geo.synthetic.built_in import SHAPES
 
     if (folder / NAMES).is_file():
         return folder

@@ -44,7 +44,7 @@ from linprim_geo.eval.paper.text_tables import number, plain
 from linprim_geo.geometry.primitives import KINDS
 from linprim_geo.jobs.executor import Task
 from linprim_geo.jobs.open import open_executor
-from linprim_geo.synthetic.shapes import SHAPES
+from linprim_geo.synthetic.built_in import SHAPES
 
 VIEWS, TEST_VIEWS = 60, 12
 CAPS = (1250, 2500, 5000, 10_000, 20_000)

@@ -77,6 +77,9 @@ class SynthOptions:
     supersample: int = option(3, "K*K rays a pixel", low=1, high=16, metavar="K")
     depth_format: str = option("png", "depth maps, in whole steps or as float32", choices=("png", "npy"))
     detail: float = option(1.0, "contrast of a built-in scene's texture", low=0, high=10)
+    texture: str = option(
+        "strong", "of a built-in scene: weak has a tenth of the contrast", choices=("strong", "weak", "plain")
+    )
     exposure_drift: float = option(
         0.0, "gains of the training photographs vary by up to exp(X) each way", low=0, high=2
     )

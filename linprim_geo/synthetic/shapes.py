@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from linprim_geo.synthetic.textured import TexturedMesh, procedural_albedo
@@ -279,15 +277,6 @@ def wire_and_sheet(detail: float = 1.0) -> TexturedMesh:
     faces = np.concatenate([faces, cells + len(vertices)])
     part = np.concatenate([part, np.full(len(cells), 4, np.int32)])
     return _finish("wire_and_sheet", np.concatenate([vertices, sheet]), faces, part, detail=detail, seed=4)
-
-
-SHAPES: dict[str, Callable[..., TexturedMesh]] = {
-    "cad": cad_part,
-    "smooth": smooth_body,
-    "room": furnished_room,
-    "wires": wire_and_sheet,
-}
-"""The built-in scenes by name; each takes `detail`, the contrast of its fine texture."""
 
 
 class Tags:

@@ -26,7 +26,7 @@ from linprim_geo.synthetic.files import frame_entry, prepare_folder, publish_fol
 from linprim_geo.synthetic.options import Color, SynthOptions, background_color, check_together
 from linprim_geo.synthetic.photos import photo_name, save_photo, save_png, sensor_noise, to_bytes
 from linprim_geo.synthetic.points import camera_rays, sample_points, write_colmap, write_points
-from linprim_geo.synthetic.shapes import SHAPES
+from linprim_geo.synthetic.built_in import SHAPES, TEXTURES
 from linprim_geo.synthetic.tabletop import on_table
 from linprim_geo.synthetic.textured import TexturedMesh, load_textured
 
@@ -78,7 +78,7 @@ def synthesize(
         out: folder to make; it must not exist or be empty. Everything is written to a temporary folder beside
             it that is renamed at the end.
         options: how it is photographed.
-        shape: `cad`, `smooth`, `room` or `wires`. One of `shape` and `mesh`; neither is `cad`.
+        shape: `cad`, `smooth`, `room`, `wires` or `hall`. One of `shape` and `mesh`; neither is `cad`.
         mesh: a mesh file with texture or vertex colours, or a `TexturedMesh`.
         overwrite: replace `out` if it was made by `synth` before.
         changes: fields of `options` by name, such as `views=16`.
@@ -93,7 +93,7 @@ def synthesize(
     start = time.perf_counter()
     out = Path(out)
     options = with_changes(SynthOptions, options, changes)
-    subject = _surface(shape, mesh, options.detail)
+    subject = _surface(shape, mesh, options.detail * TEXTURES[options.texture])
     path = options.path or ("arc" if options.table else subject.path)
     backdrop = _backdrop(options, inside=path == "inside-out")
     check_together(options, path, transparent=backdrop is None)

@@ -81,7 +81,7 @@ def test_labels_that_do_not_fit_are_refused_in_a_sentence(tiny_scene, tmp_path):
 
 
 def test_the_labels_of_a_built_in_scene_are_its_parts(tiny_scene, tmp_path):
-    from linprim_geo.synthetic.shapes import SHAPES
+    from linprim_geo.synthetic.built_in import SHAPES
 
     views = load_scene(tiny_scene).test
     folder = stand_in_labels(tmp_path / "labels", "cad", views)

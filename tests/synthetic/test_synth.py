@@ -11,7 +11,8 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import barycentric
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.synthetic import camera_paths as campath
-from linprim_geo.synthetic import shapes, synth
+from linprim_geo.synthetic import hall, shapes, synth
+from linprim_geo.synthetic.built_in import SHAPES
 from linprim_geo.synthetic.points import MAX_TRACK, sees
 from linprim_geo.synthetic.synth import synthesize
 from linprim_geo.synthetic.textured import TexturedMesh, load_textured, procedural_albedo, subdivide
@@ -21,7 +22,7 @@ SMALL = {"views": 8, "test_views": 3, "size": (72, 64), "supersample": 2, "point
 
 @pytest.fixture(scope="module")
 def built():
-    return {name: make() for name, make in shapes.SHAPES.items()}
+    return {name: make() for name, make in SHAPES.items()}
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +87,22 @@ def test_objects_are_centred_with_diagonal_two_and_coloured_in_pieces(built):
     assert built["room"].path == "inside-out" and built["room"].unit == "metre"
 
 
+def test_the_hall_is_a_closed_surface_with_a_checker_of_the_strength_asked_for(built):
+    shape = built["hall"]
+    assert shape.path == "inside-out" and (edge_uses(shape.faces) == 2).all()
+    box = np.ptp(shape.vertices, axis=0)
+    assert np.allclose(box, hall.SIZE)
+    # The floor, one point in each square.
+    x, y = np.meshgrid(np.arange(2.0, 4.0, 0.4), np.arange(0.4, 2.0, 0.4))
+    points = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
+    floor = np.full(len(points), np.nonzero(shape.part == 0)[0][0])
+    spread = {}
+    for detail in (1.0, 0.1, 0.0):
+        colors = hall.hall(detail).colors(points, floor, np.zeros((len(points), 2)))
+        spread[detail] = colors.std(0).max()
+    assert spread[1.0] > 0.1 and spread[0.1] == pytest.approx(0.1 * spread[1.0], rel=0.1) and spread[0.0] < 1e-6
+
+
 def test_wires_are_closed_and_the_sheet_is_open(built):
     shape = built["wires"]
     sheet = shape.part == 4
@@ -131,7 +148,7 @@ def test_the_smooth_body_lies_on_its_field_and_its_facets_within_two_hundredths_
 
 def test_shapes_and_their_colours_are_the_same_every_time(built):
     for name, first in built.items():
-        again = shapes.SHAPES[name]()
+        again = SHAPES[name]()
         assert np.array_equal(first.vertices, again.vertices) and np.array_equal(first.faces, again.faces)
         rng = np.random.default_rng(0)
         points, face = rng.uniform(-1, 1, (3000, 3)), rng.integers(0, len(first.faces), 3000)

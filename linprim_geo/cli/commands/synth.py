@@ -14,7 +14,7 @@ def add(command: AddCommand) -> None:
     sub = command("synth", run, "render posed images, depth, normals and points of a mesh or a built-in scene")
     sub.add_argument("output", metavar="OUT", help="folder to make")
     shape = sub.add_mutually_exclusive_group()
-    shape.add_argument("--scene", choices=("cad", "smooth", "room", "wires"), help="built-in (default cad)")
+    shape.add_argument("--scene", choices=("cad", "smooth", "room", "wires", "hall"), help="built-in (default cad)")
     shape.add_argument("--mesh", metavar="FILE", help="any mesh with a texture or vertex colours")
     sub.add_argument("--overwrite", action="store_true", help="replace OUT if synth has made it")
     add_options(sub.add_argument_group("capture"), SynthOptions)
