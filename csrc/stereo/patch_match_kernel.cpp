@@ -29,8 +29,14 @@ typedef float F __attribute__((vector_size(4 * kWide)));
 typedef int32_t I __attribute__((vector_size(4 * kWide)));
 
 constexpr int kSamples = kWindowSide * kWindowSide;
-// Bilateral weights of a window: standard deviations in pixels and in grey values (ACMH).
-constexpr float kNearPixels = 5, kNearGrey = 10;
+// Bilateral weights of a window: standard deviations in pixels and in grey values. A sample farther in grey than
+// kFarGrey of these does not count. The next wider one is taken where samples like the pixel are less than kOwnShare of
+// the window or tell nothing.
+constexpr float kNearPixels = 5, kFarGrey = 2.5f, kOwnShare = 0.5f;
+constexpr int kGreys = 3;
+constexpr float kNearGrey[kGreys] = {10, 25, 60};
+// A window tells something if its variance is so many times the noise's: a right match then costs 0.2 at most.
+constexpr float kInformed = 4;
 // A view whose cost is below kGood exp(-iteration^2 / kGoodFalls) agrees, one above kBad does not (ACMH).
 constexpr float kGood = 0.8f, kGoodFalls = 90, kBad = 1.2f, kCostSpread = 0.3f;
 constexpr int kRegions = 8, kRefinements = 5;
@@ -212,38 +218,69 @@ inline void put(Planes& planes, int lane, const float plane[3]) {
   planes.w[lane] = plane[0], planes.x[lane] = plane[1], planes.y[lane] = plane[2];
 }
 
-// Weights of the reference's window.
+// Variance of the grey values of 3 by 3 pixels.
+inline float local_variance(const PatchMatch& M, int column, int row) {
+  float sum = 0, square = 0, n = 0;
+  for (int y = std::max(row - 1, 0); y <= std::min(row + 1, M.height - 1); ++y)
+    for (int x = std::max(column - 1, 0); x <= std::min(column + 1, M.width - 1); ++x) {
+      const float g = M.grey[y * M.width + x];
+      sum += g, square += g * g, ++n;
+    }
+  return square / n - sum / n * (sum / n);
+}
+
+// Weights of the reference's window: samples of the pixel's own grey, and others where these do not suffice and an edge
+// runs through the pixel itself. Beside an edge a plain pixel keeps to itself: it may lie on what is behind.
 inline void look(const PatchMatch& M, Packet& P) {
-  static thread_local float falls[256];
+  static thread_local float falls[kGreys][256];
   static thread_local bool made = false;
   if (!made) {
-    for (int g = 0; g < 256; ++g) falls[g] = std::exp(-0.5f * float(g * g) / (kNearGrey * kNearGrey));
+    for (int s = 0; s < kGreys; ++s)
+      for (int g = 0; g < 256; ++g) {
+        const float away = float(g) / kNearGrey[s];
+        falls[s][g] = away > kFarGrey ? 0 : std::exp(-0.5f * away * away);
+      }
     made = true;
   }
   constexpr float kFirst = -0.5f * kWindowStep * (kWindowSide - 1);
   for (int l = 0; l < kWide; ++l) {
     const int column = int(P.column[l]), row = int(P.row[l]);
     const int middle = M.grey[row * M.width + column];
-    float weight[kSamples], grey[kSamples], total = 0, mean = 0;
+    float near[kSamples], all_near = 0;
+    int grey[kSamples];
     int k = 0;
     for (int i = 0; i < kWindowSide; ++i)
       for (int j = 0; j < kWindowSide; ++j, ++k) {
         // Samples lie on corners of pixels: kFirst is odd. The one beside the corner that is nearer to the middle.
         const float down = kFirst + kWindowStep * i, right = kFirst + kWindowStep * j;
         const int y = std::clamp(row + int(down), 0, M.height - 1), x = std::clamp(column + int(right), 0, M.width - 1);
-        const int g = M.grey[y * M.width + x];
-        grey[k] = float(g);
-        weight[k] =
-            falls[std::abs(g - middle)] * std::exp(-0.5f * (down * down + right * right) / (kNearPixels * kNearPixels));
-        total += weight[k], mean += weight[k] * grey[k];
+        grey[k] = M.grey[y * M.width + x];
+        near[k] = std::exp(-0.5f * (down * down + right * right) / (kNearPixels * kNearPixels));
+        all_near += near[k];
       }
-    mean /= total;
-    float variance = M.noise;
-    for (k = 0; k < kSamples; ++k) {
-      const float w = weight[k] / total, difference = grey[k] - mean;
-      P.weight[k][l] = w, P.centered[k][l] = w * difference, variance += w * difference * difference;
+    float weight[kSamples], total, mean, variance;
+    for (int s = 0; s < kGreys; ++s) {
+      total = mean = variance = 0;
+      for (k = 0; k < kSamples; ++k) {
+        weight[k] = falls[s][std::abs(grey[k] - middle)] * near[k];
+        total += weight[k], mean += weight[k] * float(grey[k]);
+      }
+      // No sample has the pixel's own grey.
+      if (!(total > 0)) continue;
+      mean /= total;
+      for (k = 0; k < kSamples; ++k) {
+        const float difference = float(grey[k]) - mean;
+        variance += weight[k] * difference * difference;
+      }
+      variance /= total;
+      if (variance > kInformed * M.noise && total > kOwnShare * all_near) break;
+      if (local_variance(M, column, row) < kInformed * M.noise) break;
     }
-    P.deviation[l] = std::sqrt(variance);
+    for (k = 0; k < kSamples; ++k) {
+      const float w = total > 0 ? weight[k] / total : 0;
+      P.weight[k][l] = w, P.centered[k][l] = w * (float(grey[k]) - mean);
+    }
+    P.deviation[l] = std::sqrt(variance + M.noise);
   }
 }
 

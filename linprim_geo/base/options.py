@@ -334,7 +334,8 @@ class ExtractOptions:
     stereo: str = option(
         "auto",
         "fuse the depths that PatchMatch stereo finds in the photographs where views confirm them: on, off, or auto: "
-        "where an environment was trained, with --method tsdf, without --blocks and --time-budget",
+        "where these are without masks, and agree with each other at more of the surface with it than without, "
+        "with --method tsdf, without --blocks and --time-budget",
         choices=("auto", "on", "off"),
     )
     smallest_part: float = option(

@@ -34,8 +34,8 @@ PIXEL_BYTES = 53
 MEMORY_SHARE = 0.5
 # Both sides of a photograph have at least this many pixels: half of them hold a window.
 SMALLEST = 24
-# Costs above this are those of windows that do not match.
-MOST_COST = 0.9
+# Costs above this are those of windows that do not match: less than half of their variance is common.
+MOST_COST = 0.5
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,8 @@ def extract_mesh(
         if options.stereo == "on":
             raise LinprimError("--stereo on is for --method tsdf, without --blocks and --time-budget")
         options = replace(options, stereo="off")
-    elif options.stereo == "auto" and opened.environment is None:
+    elif options.stereo == "auto" and opened.scene().has_alpha:
+        # Masks say where an object ends better than windows do, and no wall is in the way.
         options = replace(options, stereo="off")
     folder = opened.path / "mesh" / method
     target = Path(output) if output else folder / "mesh.ply"
@@ -179,7 +180,7 @@ def _extract(
         stages.lap("support")
     options = replace(options, **{name: about[name] for name in CHOSEN if name in about})
     if options.refine == "auto":
-        options = replace(options, refine=0 if "stereo" in about else REFINE_ROUNDS)
+        options = replace(options, refine=0 if about.get("stereo", {}).get("taken") else REFINE_ROUNDS)
     done = finish_surface(mesh, opened, options, target, stages)
     shape = topology(done.mesh)
     stats = {

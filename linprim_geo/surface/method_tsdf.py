@@ -11,9 +11,11 @@ import numpy as np
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Stages
+from linprim_geo.capture.types import View
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.runs.run import Run
+from linprim_geo.surface.photo_consistency import best_agreement, photo_gains
 from linprim_geo.surface.stereo_frames import MergedFrames
 from linprim_geo.surface.tsdf_field import DepthFrame
 from linprim_geo.surface.tsdf_fusion import auto_voxel_size, fuse_tsdf
@@ -48,7 +50,7 @@ def tsdf_surface(
         LinprimError: no ray crosses the level, or the grid would not fit into memory.
     """
     frames = DepthFrames(run, float(options.level), options.depth_limit) if frames is None else frames
-    about, merged = {}, None
+    about: dict = {}
     if not any((frame.depth > 0).any() for frame in frames):
         raise LinprimError(
             f"{run.path}: no ray of any training view crosses transmittance {options.level}, so there is no surface"
@@ -59,20 +61,36 @@ def tsdf_surface(
             f"{frames.beyond:.1%} of the depths lie beyond {frames.limit:.4g} and only clear the space before it"
         )
     voxel = options.voxel_size if options.voxel_size > 0 else auto_voxel_size(frames)
-    if options.stereo != "off":
-        merged = _with_stereo(frames, options.stereo == "on", stages)
-    if merged:
-        about = {"stereo": {"confirmed": merged.confirmed, "rendered_weight": merged.weight}}
-    mesh = fuse_tsdf(
-        merged or frames,
-        voxel_size=voxel,
-        truncation_voxels=options.truncation,
-        memory_limit=int(options.memory_limit * 2**30) if options.memory_limit > 0 else None,
-        min_component=options.smallest_part,
-        log=stages.note,
-        fuse=fuse,
-    )
-    stages.lap("fuse")
+    memory = int(options.memory_limit * 2**30) if options.memory_limit > 0 else None
+
+    def fused(source: Sequence[DepthFrame]) -> Mesh:
+        return fuse_tsdf(
+            source,
+            voxel_size=voxel,
+            truncation_voxels=options.truncation,
+            memory_limit=memory,
+            min_component=options.smallest_part,
+            log=stages.note,
+            fuse=fuse,
+        )
+
+    if options.stereo == "on":
+        merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)
+        stages.lap("stereo")
+        mesh, about = fused(merged), merged.about() | {"taken": True}
+        stages.lap("fuse")
+    else:
+        mesh = fused(frames)
+        stages.lap("fuse")
+        if options.stereo == "auto":
+            mesh, about = _better_by_stereo(mesh, fused, frames, stages)
+    if about:
+        stages.note(
+            f"stereo: {about['confirmed']:.0%} of the pixels have a depth that other views confirm, "
+            f"{about['plain']:.0%} lie on one of {about['planes']} planes without texture; elsewhere rendered depths "
+            f"count {about['rendered_weight']:.2g}"
+        )
+        about = {"stereo": about}
     return mesh, {
         "level": options.level,
         "voxel_size": voxel,
@@ -82,25 +100,39 @@ def tsdf_surface(
     }
 
 
-def _with_stereo(frames: DepthFrames, wanted: bool, stages: Stages) -> MergedFrames | None:
-    """The frames with the depths of stereo; None, unless it is `wanted`, where there are hardly any.
-
-    Raises:
-        LinprimError: it is wanted, and no two views show the same points.
-    """
+def _better_by_stereo(
+    rendered: Mesh, fused: Callable[[Sequence[DepthFrame]], Mesh], frames: DepthFrames, stages: Stages
+) -> tuple[Mesh, dict]:
+    """The surface of stereo, or the `rendered` one where photographs agree at more of its vertices or there is hardly
+    any stereo; with what there is to say of it."""
     try:
         merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)
     except LinprimError as error:
-        if wanted:
-            raise
         stages.note(f"no stereo: {error}")
-        return None
+        return rendered, {}
     stages.lap("stereo")
+    if merged.confirmed < LEAST_CONFIRMED:
+        return rendered, merged.about() | {"taken": False}
+    mesh = fused(merged)
+    stages.lap("fuse")
+    without, with_stereo = (_agreeing(surface, frames.views) for surface in (rendered, mesh))
+    stages.lap("compare")
+    taken = with_stereo >= without
     stages.note(
-        f"stereo: {merged.confirmed:.0%} of the pixels have a depth that other views confirm; "
-        f"elsewhere rendered depths count {merged.weight:.2g}"
+        f"photographs agree at {without:.1%} of the vertices without stereo and at {with_stereo:.1%} with it: "
+        f"{'it is' if taken else 'it is not'} taken"
     )
-    return merged if wanted or merged.confirmed > LEAST_CONFIRMED else None
+    about = merged.about() | {"taken": taken, "agreeing": with_stereo, "agreeing_without": without}
+    return mesh if taken else rendered, about
+
+
+def _agreeing(mesh: Mesh, views: Sequence[View]) -> float:
+    """Share of the vertices that two photographs see at which these agree best within reach of the surface: where
+    something is missing or stands too far out, they do so beyond it."""
+    cameras = [view.camera for view in views]
+    gains = photo_gains(mesh, cameras, (view.load() for view in views))
+    found = best_agreement(mesh, cameras, (view.load() for view in views), gains)
+    return float(found.inside[found.known].mean()) if found.known.any() else 0.0
 
 
 class DepthFrames(Sequence):

@@ -56,8 +56,10 @@ def hall(detail: float = 1.0) -> TexturedMesh:
 
 @dataclass(frozen=True)
 class CheckerAlbedo:
-    """Squares of SQUARE metres, light and dark in turn, each of a shade of its own: a solid texture. `part` (F,) piece of
-    each face, `base` (P, 3) its colour, `shade` (PERIOD, PERIOD, PERIOD, 3) what a square adds."""
+    """Squares of SQUARE metres, light and dark in turn, each of a shade of its own: a solid texture.
+
+    `part` (F,) piece of each face, `base` (P, 3) its colour, `shade` (PERIOD, PERIOD, PERIOD, 3) what a square adds.
+    """
 
     part: np.ndarray
     base: np.ndarray

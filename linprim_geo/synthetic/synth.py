@@ -20,13 +20,13 @@ from linprim_geo.base.options import with_changes
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.synthetic import camera_paths as campath
+from linprim_geo.synthetic.built_in import SHAPES, TEXTURES
 from linprim_geo.synthetic.cameras import place_cameras
 from linprim_geo.synthetic.environment import SyntheticEnvironment, synthetic_environment
 from linprim_geo.synthetic.files import frame_entry, prepare_folder, publish_folder, shared_keys
 from linprim_geo.synthetic.options import Color, SynthOptions, background_color, check_together
 from linprim_geo.synthetic.photos import photo_name, save_photo, save_png, sensor_noise, to_bytes
 from linprim_geo.synthetic.points import camera_rays, sample_points, write_colmap, write_points
-from linprim_geo.synthetic.built_in import SHAPES, TEXTURES
 from linprim_geo.synthetic.tabletop import on_table
 from linprim_geo.synthetic.textured import TexturedMesh, load_textured
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +12,11 @@ from helpers.captures import look_at
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions
-from linprim_geo.surface import stereo_frames
+from linprim_geo.capture.load import load_scene
+from linprim_geo.capture.types import Scene
+from linprim_geo.geometry.mesh import vertex_normals
+from linprim_geo.geometry.mesh_files import load_mesh
+from linprim_geo.surface import method_tsdf, stereo_frames
 from linprim_geo.surface.extract import extract_mesh
 from linprim_geo.surface.stereo_frames import MergedFrames
 from linprim_geo.surface.tsdf_field import DepthFrame
@@ -29,6 +34,9 @@ def found(monkeypatch):
     deviation = np.full((30, 40), 0.001, np.float32)
     maps = [SimpleNamespace(depth=depth, confirmed=confirmed, deviation=deviation, sources=4)]
     monkeypatch.setattr(stereo_frames, "depth_maps", lambda *_, **__: maps)
+    monkeypatch.setattr(
+        stereo_frames, "_planes", lambda *_: (np.zeros((0, 4)), [np.full((30, 40), np.nan, np.float32)])
+    )
 
 
 def rendered(error: float) -> list[DepthFrame]:
@@ -42,6 +50,16 @@ def test_confirmed_depths_take_the_place_of_rendered_ones(found):
     # (0.001 / sqrt 2 / 0.01)^2
     assert merged.weight == pytest.approx(0.005, rel=1e-4)
     assert (frame.confidence[1:, :20] == 1).all() and np.allclose(frame.confidence[:, 20:], merged.weight)
+
+
+def test_planes_stand_where_nothing_is_confirmed(found, monkeypatch):
+    on_plane = np.full((30, 40), np.nan, np.float32)
+    on_plane[:, 10:30] = 3.5
+    monkeypatch.setattr(stereo_frames, "_planes", lambda *_: (np.zeros((1, 4)), [on_plane]))
+    merged = MergedFrames(rendered(0.01), [None], 5.0)
+    frame = merged[0]
+    assert (frame.depth[1:, :20] == 3).all() and (frame.depth[:, 20:30] == 3.5).all() and merged.plain == 0.5
+    assert (frame.confidence[:, 20:30] == 1).all() and np.allclose(frame.confidence[:, 30:], merged.weight)
 
 
 def test_rendered_depths_that_are_as_good_count_as_much(found):
@@ -72,9 +90,32 @@ def test_fewer_neighbours_have_to_agree_where_there_are_fewer(found, monkeypatch
     assert MergedFrames(rendered(0.01), [None], 5.0).confirmed == 0
 
 
-def test_a_surface_of_a_run_takes_stereo_into_account(tmp_path):
-    run = octahedron_run(tmp_path / "run", views=60, size=40)
-    stats = extract_mesh(run, options=ExtractOptions(stereo="on", level=0.5), quiet=True)
+@pytest.fixture(scope="module")
+def many_views(tmp_path_factory):
+    """A run of one octahedron whose views are so near to each other that stereo finds pairs."""
+    return octahedron_run(tmp_path_factory.mktemp("many"), views=60, size=40)
+
+
+@pytest.mark.parametrize("shares, taken", [((0.8, 0.9), True), ((0.9, 0.8), False), ((0.9, 0.9), True)])
+def test_the_surface_is_the_one_at_which_photographs_agree_more_often(many_views, monkeypatch, shares, taken):
+    told = iter(shares)
+    monkeypatch.setattr(Scene, "has_alpha", False)
+    monkeypatch.setattr(method_tsdf, "LEAST_CONFIRMED", 0.0)
+    monkeypatch.setattr(method_tsdf, "_agreeing", lambda *_: next(told))
+    stats = extract_mesh(many_views, options=ExtractOptions(level=0.5), quiet=True)
+    assert stats["stereo"]["taken"] is taken and stats["refine"] == (0 if taken else 2)
+
+
+def test_a_surface_takes_stereo_into_account_where_it_is_asked_to(many_views):
+    stats = extract_mesh(many_views, options=ExtractOptions(stereo="on", level=0.5), quiet=True)
     assert 0 <= stats["stereo"]["confirmed"] <= 1 and 0 < stats["stereo"]["rendered_weight"] <= 1
     with pytest.raises(LinprimError, match="without --blocks"):
-        extract_mesh(run, options=ExtractOptions(stereo="on"), blocks=2, quiet=True)
+        extract_mesh(many_views, options=ExtractOptions(stereo="on"), blocks=2, quiet=True)
+
+
+def test_photographs_agree_within_reach_of_the_true_surface_alone(tiny_scene):
+    views = load_scene(tiny_scene).train
+    true = load_mesh(tiny_scene / "reference.ply")
+    # 48 pixels a side: three of them are 0.15.
+    for wrong in (true.vertices + 0.2 * vertex_normals(true), 1.3 * true.vertices):
+        assert method_tsdf._agreeing(true, views) > method_tsdf._agreeing(replace(true, vertices=wrong), views) + 0.05

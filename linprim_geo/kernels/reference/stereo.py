@@ -6,9 +6,12 @@ import numpy as np
 
 from linprim_geo.geometry.camera import Camera
 
-# Samples of the window: so many per side, two pixels apart; standard deviations of its weights in pixels and grey
-# values; the cost of what cannot be compared.
-SIDE, NEAR_PIXELS, NEAR_GREY, WORST = 6, 5.0, 10.0, 2.0
+# Samples of the window: so many per side, two pixels apart; standard deviations of its weights in pixels; the cost of
+# what cannot be compared.
+SIDE, NEAR_PIXELS, WORST = 6, 5.0, 2.0
+# Standard deviations in grey values, from the narrowest, and how many of them a sample may be off; the share of the
+# window that has to be like the pixel, and the variance that it needs, in that of the noise.
+NEAR_GREYS, FAR_GREY, OWN_SHARE, INFORMED = (10.0, 25.0, 60.0), 2.5, 0.5, 4.0
 
 
 def match_cost(
@@ -23,9 +26,9 @@ def match_cost(
         for column in range(width):
             y, x = np.clip(row + down, 0, height - 1), np.clip(column + right, 0, width - 1)
             own = grey[y, x].astype(np.float64)
-            weight = np.exp(-0.5 * (own - grey[row, column]) ** 2 / NEAR_GREY**2)
-            weight *= np.exp(-0.5 * (down**2 + right**2) / NEAR_PIXELS**2)
-            weight /= weight.sum()
+            near = np.exp(-0.5 * (down**2 + right**2) / NEAR_PIXELS**2)
+            plain = grey[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2].var() < INFORMED * noise
+            weight = _window(own, float(grey[row, column]), near, noise, plain)
             w, slope_x, slope_y = plane[row, column].astype(np.float64)
             middle = _pixels(camera, other, np.array([column]), np.array([row]), np.array([w]))[0]
             if not ((middle >= 0).all() and middle[0] <= other.width - 1.001 and middle[1] <= other.height - 1.001):
@@ -36,6 +39,21 @@ def match_cost(
             variances = (weight @ a**2 + noise) * (weight @ b**2 + noise)
             cost[row, column] = np.clip(1 - (weight * a) @ b / np.sqrt(variances), 0, WORST)
     return cost
+
+
+def _window(own: np.ndarray, middle: float, near: np.ndarray, noise: float, plain: bool) -> np.ndarray:
+    """Weights of a window's grey values, of sum 1. `plain`: no edge runs through its middle."""
+    for spread in NEAR_GREYS:
+        away = np.abs(own - middle) / spread
+        weight = np.where(away > FAR_GREY, 0, np.exp(-0.5 * away**2)) * near
+        total = weight.sum()
+        if not total:
+            continue
+        weight /= total
+        variance = weight @ (own - weight @ own) ** 2
+        if (variance > INFORMED * noise and total > OWN_SHARE * near.sum()) or plain:
+            break
+    return weight
 
 
 def _pixels(camera: Camera, other: Camera, column: np.ndarray, row: np.ndarray, inverse: np.ndarray) -> np.ndarray:

@@ -1,0 +1,306 @@
+"""Planes for regions without texture, such as painted walls.
+
+Stereo sees the edges of a plain region and not what is inside. Planes are fitted to the confirmed depths along its
+edges, of which those of occluders lie before it and none behind it. Planes that several views find from directions that
+differ are offered to every region; rendered depths, rough as they are, decide which of them it gets, or that it gets
+none. A silhouette of something round gives another plane to each view, and so none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import binary_dilation, find_objects, label, uniform_filter
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.stereo.depth_maps import CONFIRMED_DEPTH
+
+# An edge runs through 3 by 3 pixels whose variance is so many times that of the noise; fewer edge pixels than SPECK
+# together are noise.
+EDGE_VARIANCE, SPECK = 4.0, 9
+# Regions have at least so many pixels (two windows of stereo) and so many confirmed depths within RING pixels.
+LEAST_PIXELS, LEAST_POINTS, RING = 200, 30, 4
+# Depths are on a plane up to this share of them, and behind it from BEHIND times as much.
+TOLERANCE, BEHIND = CONFIRMED_DEPTH, 3.0
+# At least and at most such shares of a region's confirmed depths are on its plane, and behind it.
+ON_SHARE, BEHIND_SHARE = 0.1, 0.1
+# Triples of points that are tried for a plane, planes that are looked for, and fits of each to what is on it.
+TRIPLES, PLANES_PER_REGION, FITS = 300, 4, 3
+# Points along an edge have common errors: they count as so many independent ones at most.
+INDEPENDENT_POINTS = 20
+# A plane is one that so many views find, of which two see it from directions that differ by SPREAD.
+LEAST_VIEWS, SPREAD = 3, np.radians(10)
+# Planes are the same if their normals differ by no more, and their distance by no more than TOLERANCE of the depth.
+SAME_ANGLE = np.radians(3)
+# Rounds in which planes are chosen by regions and fitted to all points on them.
+ROUNDS = 3
+# Rendered depths that are off by MOST_OFF, a share of depth, say nothing; a plane is refused from REFUSED_OFF in the
+# mean over a window of one in WINDOW_PART of the larger side.
+MOST_OFF, REFUSED_OFF, WINDOW_PART = 0.1, 0.06, 10
+# One more plane in a region has to bring its rendered depths nearer by this share of MOST_OFF in the mean.
+LEAST_GAIN = 0.05
+# Planes that are compared with the rendered depths of a region: those with the most points on them.
+COMPARED = 8
+
+
+@dataclass(frozen=True)
+class PlainRegion:
+    """A region of view `view` without texture: `mask` of a window whose first pixel is (`top`, `left`); along its edges
+    `rays` (N, 3) of depth 1 and `inverse` (N,) depths; `corners` (5, 3) rays to its ends and its middle."""
+
+    view: int
+    top: int
+    left: int
+    mask: np.ndarray
+    rays: np.ndarray
+    inverse: np.ndarray
+    corners: np.ndarray
+
+    def off(self, planes: np.ndarray) -> np.ndarray:
+        """(N, K) by what share of their inverse depth (K, 3) planes are before the edges' points."""
+        return (self.rays @ planes.T) / self.inverse[:, None] - 1
+
+
+def edges_of(grey: np.ndarray, noise: float) -> np.ndarray:
+    """(H, W) bool: where an edge runs through a pixel or beside it."""
+    values = grey.astype(np.float64)
+    mean = uniform_filter(values, 3, mode="nearest")
+    edge = uniform_filter(values * values, 3, mode="nearest") - mean * mean > EDGE_VARIANCE * noise
+    parts, _ = label(edge, np.ones((3, 3)))
+    return edge & (np.bincount(parts.ravel())[parts] >= SPECK)
+
+
+def plain_regions(view: int, camera: Camera, edge: np.ndarray, depth: np.ndarray) -> list[PlainRegion]:
+    """Regions between edges; `depth` (H, W) is NaN where it is not confirmed."""
+    labels, _ = label(~edge)
+    points, regions = np.isfinite(depth) & edge, []
+    for number, (rows, columns) in enumerate(find_objects(labels), start=1):
+        top, left = max(rows.start - RING, 0), max(columns.start - RING, 0)
+        window = np.s_[top : rows.stop + RING, left : columns.stop + RING]
+        mask = labels[window] == number
+        if np.count_nonzero(mask) < LEAST_PIXELS:
+            continue
+        row, column = np.nonzero(binary_dilation(mask, iterations=RING) & points[window])
+        if len(row) < LEAST_POINTS:
+            continue
+        inside = np.nonzero(mask)
+        low, middle, high = (np.quantile(inside, share, axis=1) for share in (0.05, 0.5, 0.95))
+        ends = np.array([(low[0], low[1]), (low[0], high[1]), (high[0], low[1]), (high[0], high[1]), tuple(middle)])
+        inverse = 1 / depth[window][row, column].astype(np.float64)
+        rays, corners = _rays(camera, row + top, column + left), _rays(camera, ends[:, 0] + top, ends[:, 1] + left)
+        regions.append(PlainRegion(view, top, left, mask, rays, inverse, corners))
+    return regions
+
+
+def _rays(camera: Camera, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """(..., 3) points of depth 1 in the camera's frame."""
+    x, y = np.broadcast_arrays((column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy)
+    return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+
+def planes_of_region(region: PlainRegion, rng: np.random.Generator) -> list[tuple[int, np.ndarray]]:
+    """Planes (3,) with ray . plane = inverse depth, and how many points are on them, by random triples of points."""
+    found, left = [], np.ones(len(region.inverse), bool)
+    for _ in range(PLANES_PER_REGION):
+        rest = np.nonzero(left)[0]
+        if len(rest) < LEAST_POINTS:
+            break
+        triples = rest[rng.integers(0, len(rest), (TRIPLES, 3))]
+        corners = region.rays[triples]
+        proper = np.abs(np.linalg.det(corners)) > 1e-4
+        if not proper.any():
+            break
+        tried = np.linalg.solve(corners[proper], region.inverse[triples[proper]][..., None])[..., 0]
+        off = region.off(tried)
+        on, behind = np.abs(off) < TOLERANCE, off > BEHIND * TOLERANCE
+        on = on[:, np.argmax((on & left[:, None]).sum(0) - 2 * behind.sum(0))]
+        left &= ~on
+        plane, on = _fitted(region, on)
+        count = int(np.count_nonzero(on))
+        if count >= max(LEAST_POINTS, ON_SHARE * len(on)) and _certain(region, plane, on):
+            found.append((count, plane))
+    return found
+
+
+def _fitted(region: PlainRegion, on: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A plane by least squares of relative inverse depth, and the (N,) points on it."""
+    plane = np.zeros(3)
+    for _ in range(FITS):
+        if np.count_nonzero(on) < LEAST_POINTS:
+            break
+        scaled = region.rays[on] / region.inverse[on, None]
+        plane = np.linalg.lstsq(scaled, np.ones(len(scaled)), rcond=None)[0]
+        on = np.abs(region.off(plane[None])[:, 0]) < TOLERANCE
+    return plane, on
+
+
+def _certain(region: PlainRegion, plane: np.ndarray, on: np.ndarray) -> bool:
+    """Whether nothing is behind a plane, and the points on it say where it is all over the region."""
+    if np.count_nonzero(region.off(plane[None]) > BEHIND * TOLERANCE) > BEHIND_SHARE * len(on):
+        return False
+    scaled = region.rays[on] / region.inverse[on, None]
+    # A point is within TOLERANCE: a standard deviation of half of it.
+    information = scaled.T @ scaled / len(scaled) * min(len(scaled), INDEPENDENT_POINTS) / (TOLERANCE / 2) ** 2
+    covariance = np.linalg.inv(information + 1e-9 * np.trace(information) * np.eye(3))
+    inverse = region.corners @ plane
+    deviation = np.sqrt(np.einsum("ki,ij,kj->k", region.corners, covariance, region.corners))
+    return bool((inverse > 0).all() and (deviation < 2 * TOLERANCE * inverse).all())
+
+
+def common_planes(cameras: Sequence[Camera], regions: Sequence[PlainRegion], seed: int = 0) -> np.ndarray:
+    """(K, 4) planes (n, d) of the world, n . x = d, that several views find."""
+    rng, found = np.random.default_rng(seed), []
+    for region in regions:
+        camera = cameras[region.view]
+        for count, plane in planes_of_region(region, rng):
+            depth = 1 / (region.corners[4] @ plane)
+            middle = _to_world(camera, region.corners[4][None] * depth)[0]
+            found.append((count, region.view, depth, middle, _in_world(camera, plane)))
+    found.sort(key=lambda one: -one[0])
+    if not found:
+        return np.zeros((0, 4))
+    weight, view, depth, middle, plane = (np.array(column) for column in zip(*found, strict=True))
+    free, planes = np.ones(len(found), bool), []
+    for first in range(len(found)):
+        if not free[first]:
+            continue
+        mean = plane[first]
+        same = _same(mean, plane[:, :3], middle, depth) & free
+        same[first] = True
+        normal = weight[same] @ plane[same, :3]
+        normal /= np.linalg.norm(normal)
+        mean = np.append(normal, np.average(middle[same] @ normal, weights=weight[same]))
+        same = (_same(mean, plane[:, :3], middle, depth) | same) & free
+        free &= ~same
+        if _seen_enough(cameras, view[same], np.average(middle[same], axis=0, weights=weight[same])):
+            planes.append(mean)
+    planes = np.array(planes).reshape(-1, 4)
+    for _ in range(ROUNDS):
+        planes = _refitted(cameras, regions, planes)
+    return planes
+
+
+def _same(plane: np.ndarray, normals: np.ndarray, points: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """(N,) whether planes through points, seen at such depths, are this one."""
+    near = np.abs(points @ plane[:3] - plane[3]) < TOLERANCE * depth
+    return near & (normals @ plane[:3] > np.cos(SAME_ANGLE))
+
+
+def _seen_enough(cameras: Sequence[Camera], views: np.ndarray, point: np.ndarray) -> bool:
+    views = np.unique(views)
+    if len(views) < LEAST_VIEWS:
+        return False
+    towards = np.array([cameras[view].center - point for view in views])
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    return bool((towards @ towards.T).min() < np.cos(SPREAD))
+
+
+def _accepted(region: PlainRegion, off: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of (N, K) `PlainRegion.off`: (N, K) points on planes, and (K,) whether a plane may be the region's."""
+    on, count = np.abs(off) < TOLERANCE, len(region.inverse)
+    behind = (off > BEHIND * TOLERANCE).sum(0)
+    return on, (on.sum(0) >= max(LEAST_POINTS, ON_SHARE * count)) & (behind <= BEHIND_SHARE * count)
+
+
+def _refitted(cameras: Sequence[Camera], regions: Sequence[PlainRegion], planes: np.ndarray) -> np.ndarray:
+    """Planes fitted to all points on them in regions that they explain; those that are uncertain or double go."""
+    points: list[list] = [[] for _ in planes]
+    for region in regions if len(planes) else ():
+        camera = cameras[region.view]
+        on, fits = _accepted(region, region.off(_in_camera(camera, planes)))
+        left = np.ones(len(on), bool)
+        while True:  # the one with the most points first, then by those that are left
+            counts = (on & left[:, None]).sum(0) * fits
+            best = int(np.argmax(counts))
+            if counts[best] < max(LEAST_POINTS, ON_SHARE * len(left)):
+                break
+            own = on[:, best]
+            depth = 1 / region.inverse[own]
+            points[best].append((_to_world(camera, region.rays[own] * depth[:, None]), depth, region.view))
+            left &= ~own
+    fitted = []
+    for plane, parts in zip(planes, points, strict=True):
+        if not parts:
+            continue
+        place, depth = (np.concatenate(x) for x in list(zip(*parts, strict=True))[:2])
+        views = np.array([view for *_, view in parts])
+        middle = np.average(place, axis=0, weights=depth**-2)
+        spread = place - middle
+        variance, axes = np.linalg.eigh(spread.T @ (spread / depth[:, None] ** 2) / (depth**-2).sum())
+        # The normal's angle is as certain as the points are wide across the narrower side.
+        wide = np.sqrt(max(variance[1], 0)) * np.tan(SAME_ANGLE) * np.sqrt(len(np.unique(views)))
+        if wide < TOLERANCE * np.median(depth) or not _seen_enough(cameras, views, middle):
+            continue
+        normal = axes[:, 0] * (1 if axes[:, 0] @ plane[:3] > 0 else -1)
+        fitted.append((len(place), np.append(normal, normal @ middle), middle, float(np.median(depth))))
+    kept: list[np.ndarray] = []
+    for _, plane, middle, depth in sorted(fitted, key=lambda one: -one[0]):
+        if not any(_same(other, plane[None, :3], middle[None], np.array([depth]))[0] for other in kept):
+            kept.append(plane)
+    return np.array(kept).reshape(-1, 4)
+
+
+def _to_world(camera: Camera, points: np.ndarray) -> np.ndarray:
+    return (points - camera.world_to_camera[:3, 3]) @ camera.rotation
+
+
+def _in_world(camera: Camera, plane: np.ndarray) -> np.ndarray:
+    """(n, d) of the world of a plane p . x = 1 of a camera."""
+    length = np.linalg.norm(plane)
+    return np.append(camera.rotation.T @ plane, 1 - plane @ camera.world_to_camera[:3, 3]) / length
+
+
+def _in_camera(camera: Camera, planes: np.ndarray) -> np.ndarray:
+    """(K, 3) planes p . x = 1 of a camera of (K, 4) planes of the world; 0 for those through its centre."""
+    normals = planes[:, :3] @ camera.rotation.T
+    distance = planes[:, 3] + normals @ camera.world_to_camera[:3, 3]
+    through = np.abs(distance) < 1e-9
+    return np.where(through[:, None], 0, normals / np.where(through, 1, distance)[:, None])
+
+
+def plane_depths(
+    camera: Camera, regions: Sequence[PlainRegion], planes: np.ndarray, rendered: np.ndarray
+) -> np.ndarray:
+    """(H, W) float32 depth of plain regions of a view by the planes that fit them, NaN elsewhere.
+
+    `regions` are the view's own; `planes` (K, 4) of the world; `rendered` (H, W) depth, 0 where there is none.
+    """
+    depth = np.full(rendered.shape, np.nan, np.float32)
+    if not len(planes):
+        return depth
+    in_camera = _in_camera(camera, planes)
+    size = 2 * (max(rendered.shape) // (2 * WINDOW_PART)) + 1
+    for region in regions:
+        on, fits = _accepted(region, region.off(in_camera))
+        order = np.argsort(-on.sum(0), kind="stable")
+        window = np.s_[region.top : region.top + region.mask.shape[0], region.left : region.left + region.mask.shape[1]]
+        inverse = _chosen(camera, region, in_camera[[k for k in order if fits[k]][:COMPARED]], rendered[window], size)
+        known = inverse > 0
+        depth[window][known] = 1 / inverse[known]
+    return depth
+
+
+def _chosen(camera: Camera, region: PlainRegion, planes: np.ndarray, rendered: np.ndarray, size: int) -> np.ndarray:
+    """Inverse depth within the mask of a region by the planes nearest to the rendered depths, 0 where none is."""
+    mask = region.mask
+    inverse, least = np.zeros(mask.shape), np.full(mask.shape, MOST_OFF, np.float32)
+    known = mask & (rendered > 0)
+    if not len(planes) or np.count_nonzero(known) < 0.5 * np.count_nonzero(mask):
+        return inverse
+    rays = _rays(camera, np.arange(mask.shape[0])[:, None] + region.top, np.arange(mask.shape[1]) + region.left)
+    share = np.maximum(uniform_filter(known.astype(np.float32), size, mode="constant"), 1e-6)
+    planes = rays @ planes.T
+    off = np.where(known[..., None], np.minimum(np.abs(rendered[..., None] * planes - 1), MOST_OFF), 0)
+    off = uniform_filter(off.astype(np.float32), (size, size, 0), mode="constant") / share[..., None]
+    off[planes <= 0] = MOST_OFF
+    while True:
+        gain = np.maximum(least[..., None] - off, 0)[mask].mean(0)
+        best = int(np.argmax(gain))
+        if gain[best] < LEAST_GAIN * MOST_OFF:
+            break
+        nearer = off[..., best] < least
+        least = np.where(nearer, off[..., best], least)
+        inverse = np.where(nearer, planes[..., best], inverse)
+    return np.where(mask & (least < REFUSED_OFF), inverse, 0)

@@ -1,0 +1,127 @@
+"""Planes of regions without texture: of a box with plain walls, whose confirmed depths are exact along its edges; and
+things that must not become planes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.captures import look_at
+
+from linprim_geo.stereo.plain_regions import common_planes, edges_of, plain_regions, plane_depths
+
+# A corner of a room: floor z = 0 and two walls x = 0 and y = 0, from the air where all are positive.
+WALLS = np.eye(3)
+CENTERS = [(4.0, 3.0, 2.0), (3.0, 4.0, 2.2), (3.6, 3.6, 1.5), (4.4, 2.6, 1.8), (2.8, 4.4, 1.6)]
+GREYS = np.array([80, 120, 160])
+
+
+def camera_at(center):
+    return look_at(center, target=(0.8, 0.8, 0.8), size=(160, 120), focal=110.0)
+
+
+def corner_depth(camera) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W) depth of the corner, and which wall it is."""
+    rays = camera.world_rays()
+    with np.errstate(divide="ignore"):
+        along = np.stack([-(camera.center @ n) / (rays @ n) for n in WALLS], axis=-1)
+    along[along <= 0] = np.inf
+    return along.min(-1), along.argmin(-1)
+
+
+def seen(camera, depth: np.ndarray, grey: np.ndarray, number: int):
+    """The regions of a view whose edges have exact depths, and nothing else has one."""
+    edge = edges_of(grey, 1.0)
+    return plain_regions(number, camera, edge, np.where(edge, depth, np.nan).astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def corner():
+    cameras = [camera_at(center) for center in CENTERS]
+    depths, regions = [], []
+    for number, camera in enumerate(cameras):
+        depth, wall = corner_depth(camera)
+        grey = GREYS[wall]
+        # Marks on the walls, as pictures and sockets are, in the planes of these.
+        rng = np.random.default_rng(0)
+        for row, column in zip(rng.integers(5, 110, 60), rng.integers(5, 150, 60), strict=True):
+            grey[row : row + 3, column : column + 3] += 60
+        depths.append(depth)
+        regions.append(seen(camera, depth, grey.astype(np.uint8), number))
+    return cameras, depths, regions
+
+
+def test_the_walls_of_a_corner_are_found_from_their_edges(corner):
+    cameras, _, regions = corner
+    planes = common_planes(cameras, [region for own in regions for region in own])
+    assert len(planes) >= 3
+    for wall in WALLS:
+        # Exact depths: what is left is the mixture of two walls within a pixel of their edge.
+        near = np.abs(planes[:, :3] @ wall) > np.cos(np.radians(1))
+        assert near.any() and np.abs(planes[near, 3]).min() < 0.02
+
+
+def test_rendered_depths_that_are_rough_choose_the_right_plane(corner):
+    cameras, depths, regions = corner
+    planes = common_planes(cameras, [region for own in regions for region in own])
+    rng = np.random.default_rng(1)
+    for camera, depth, own in zip(cameras, depths, regions, strict=True):
+        rough = (depth * rng.normal(1, 0.03, depth.shape)).astype(np.float32)
+        found = plane_depths(camera, own, planes, rough)
+        known = np.isfinite(found)
+        assert known.mean() > 0.4
+        error = np.abs(found[known] / depth[known] - 1)
+        # A hundredth is the tolerance of points on a plane.
+        assert np.median(error) < 0.005 and (error < 0.02).mean() > 0.95
+
+
+def test_rendered_depths_that_contradict_refuse_it(corner):
+    cameras, depths, regions = corner
+    planes = common_planes(cameras, [region for own in regions for region in own])
+    # Nearer than all of the walls.
+    elsewhere = (0.8 * depths[0]).astype(np.float32)
+    assert not np.isfinite(plane_depths(cameras[0], regions[0], planes, elsewhere)).any()
+
+
+def round_depth(camera, center: np.ndarray, radius: float, axis: np.ndarray) -> np.ndarray:
+    """(H, W) depth of the nearest point of a cylinder, infinite beside it; a ball without an axis."""
+    rays = camera.world_rays()
+    start = camera.center - center
+    across, begin = rays - (rays @ axis)[..., None] * axis, start - (start @ axis) * axis
+    a, b, c = (across**2).sum(-1), across @ begin, begin @ begin - radius**2
+    root = b * b - a * c
+    return np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, np.inf)
+
+
+@pytest.mark.parametrize("axis", [(0, 0, 0), (0, 0, 1)], ids=["ball", "column"])
+def test_what_is_round_becomes_no_plane(axis):
+    center, cameras = np.array([0.8, 0.8, 0.8]), [camera_at(c) for c in CENTERS]
+    regions = []
+    for number, camera in enumerate(cameras):
+        depth = round_depth(camera, center, 0.9, np.array(axis, float))
+        regions += seen(
+            camera, np.where(np.isfinite(depth), depth, np.nan), np.where(np.isfinite(depth), 150, 60), number
+        )
+    assert regions and not len(common_planes(cameras, regions))
+
+
+def test_a_wall_that_is_slightly_bent_becomes_no_plane():
+    """A plain cylinder of radius 12, seen from inside, between an edge at the floor and one at a height of 1.6."""
+    center, axis = np.array([-9.0, -9.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    cameras, regions, depths = [camera_at(c) for c in CENTERS], [], []
+    for number, camera in enumerate(cameras):
+        rays = camera.world_rays()
+        start = camera.center - center
+        across, begin = rays - (rays @ axis)[..., None] * axis, start - (start @ axis) * axis
+        a, b, c = (across**2).sum(-1), across @ begin, begin @ begin - 12.0**2
+        depth = (-b - np.sqrt(np.maximum(b * b - a * c, 0))) / a
+        depth = np.where((b * b > a * c) & (depth > 0), depth, np.nan)
+        height = camera.center[2] + rays[..., 2] * depth
+        band = (height > 0) & (height < 1.6)
+        regions.append(seen(camera, depth, np.where(band, 150, 60), number))
+        depths.append(depth)
+    planes = common_planes(cameras, [region for own in regions for region in own])
+    for camera, depth, own in zip(cameras, depths, regions, strict=True):
+        found = plane_depths(camera, own, planes, np.nan_to_num(depth).astype(np.float32))
+        known = np.isfinite(found) & np.isfinite(depth)
+        # Where a plane is taken all the same it is one that fits.
+        assert (np.abs(found[known] / depth[known] - 1) < 0.03).all()
