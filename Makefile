@@ -16,6 +16,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3
+# As many processes as there are cores, and no more than memory allows on a large machine.
+WORKERS := from linprim_geo.base.cores import usable_cores; print(min(8, usable_cores()))
 CPP := $(wildcard csrc/*.h csrc/*/*.h csrc/*/*.cpp)
 CORE := CMakeLists.txt csrc $(wildcard csrc/*.h csrc/*/*)
 
@@ -25,7 +27,7 @@ demo: env
 	$(BIN)/python -m linprim_geo demo $(DEMO)
 
 test: env
-	$(BIN)/python -m pytest -q $(PYTEST)
+	$(BIN)/python -m pytest -q -n $$($(BIN)/python -c "$(WORKERS)") --dist worksteal $(PYTEST)
 
 lint: env
 	$(BIN)/ruff check .
