@@ -404,8 +404,8 @@ NB_MODULE(_core, m) {
   using Source = std::tuple<std::array<float, 9>, std::array<float, 3>, std::array<float, 9>, std::array<float, 3>,
                             In<uint32_t>, std::optional<In<float>>>;
   m.def("patch_match", [](In<uint8_t> grey, std::array<float, 4> lens, std::array<float, 2> range, float noise,
-                          uint32_t seed, const std::vector<Source>& sources, std::optional<In<float>> prior, bool begin,
-                          int first, int count, Out<float> plane, Out<float> cost, Out<uint8_t> chosen) {
+                          uint32_t seed, const std::vector<Source>& sources, int first, int count, Out<float> plane,
+                          Out<float> cost, Out<uint8_t> chosen) {
     if (grey.ndim() != 2 || grey.size() == 0) throw std::invalid_argument("grey has to have shape (H, W)");
     if (sources.empty() || sources.size() > linprim::kMostSources) throw std::invalid_argument("wanted 1 to 8 sources");
     const int64_t height = int64_t(grey.shape(0)), width = int64_t(grey.shape(1));
@@ -426,11 +426,10 @@ NB_MODULE(_core, m) {
       source.height = int(quads.shape(0)), source.width = int(quads.shape(1)), source.quads = quads.data();
       if (inverse_depth) source.inverse_depth = checked(*inverse_depth, {source.height, source.width}, "inverse_depth");
     }
-    if (prior) match.prior = checked(*prior, {height, width, 3}, "prior");
     match.plane = checked(plane, {height, width, 3}, "plane"), match.cost = checked(cost, {height, width}, "cost");
     match.chosen = checked(chosen, {height, width}, "chosen");
     nb::gil_scoped_release release;
-    if (begin) linprim::patch_match_begin(match);
+    linprim::patch_match_begin(match);
     for (int number = first; number < first + count; ++number) linprim::patch_match_iterate(match, number);
   });
   m.def("add_votes", [](Pose project, int width, int height, In<float> surfels, std::array<float, 8> rules,

@@ -1,7 +1,7 @@
 // PatchMatch stereo: a plane for every pixel of a photograph, by how well other photographs agree along it.
 //
 // Source: Bleyer et al. 2011 (planes as hypotheses), Galliani et al. 2015 (red-black propagation), Xu and Tao 2019
-// (ACMH: regions of candidates, views chosen jointly) and 2020 (ACMP: a prior of planes).
+// (ACMH: regions of candidates, views chosen jointly).
 #pragma once
 
 #include <cstdint>
@@ -33,10 +33,9 @@ struct PatchMatch {
   float least, most;  // inverse depth
   float noise;        // variance of the noise of grey values, added to the variances of windows
   uint32_t seed;
-  const float* prior;  // (height, width, 3) planes that are likely, NaN where there is none; or null
-  float* plane;        // (height, width, 3)
-  float* cost;         // (height, width), 0 to 2
-  uint8_t* chosen;     // (height, width) bit v: source v was chosen
+  float* plane;     // (height, width, 3)
+  float* cost;      // (height, width), 0 to 2
+  uint8_t* chosen;  // (height, width) bit v: source v was chosen
 };
 
 // Writes random planes where plane[0] is NaN, then the cost of all of them.

@@ -44,8 +44,6 @@ constexpr int kRegions = 8, kRefinements = 5;
 constexpr float kDepthStep = 0.02f, kNormalStep = 0.06f;
 // Weight of a pixel of error there and back, and the error above which it counts no more.
 constexpr float kGeometryWeight = 0.1f, kGeometryMost = 4;
-// A prior plane: scale of its agreement in inverse depth, as a share of the range, and in the sine of the angle.
-constexpr float kPriorDepth = 1 / 64.f, kPriorAngle = 0.087f, kPriorCost = 0.18f;
 constexpr float kWorst = 2;
 // The cosine between a plane's normal and the ray is at least this.
 constexpr float kFlattest = 0.12f;
@@ -284,35 +282,6 @@ inline void look(const PatchMatch& M, Packet& P) {
   }
 }
 
-// The least of the windows' samples is at an odd distance from the middle: kWindowSide is even and the step is 2.
-static_assert(kWindowSide % 2 == 0 && kWindowStep == 2);
-
-// Minus the logarithm of how likely a plane is by the prior, and by its cost.
-inline float unlikely(const PatchMatch& M, const float* prior, int column, int row, float cost, const float plane[3]) {
-  const float depth = (plane[0] - prior[0]) / (kPriorDepth * (M.most - M.least));
-  float a[3], b[3];
-  normal_of(M, float(column), float(row), plane[0], plane[1], plane[2], a);
-  normal_of(M, float(column), float(row), prior[0], prior[1], prior[2], b);
-  const float cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-  const float angle2 = 2 * std::max(0.f, 1 - cosine) / (kPriorAngle * kPriorAngle);
-  return cost * cost / kPriorCost - std::log(0.5f + std::exp(-0.5f * (depth * depth + angle2)));
-}
-
-// What hypotheses are compared by, lane by lane: the cost, or with a prior how unlikely they are.
-inline F ranked(const PatchMatch& M, const Packet& P, F cost, const Planes& planes) {
-  if (!M.prior) return cost;
-  for (int l = 0; l < P.count; ++l) {
-    const float* prior = M.prior + 3 * P.at[l];
-    if (!(prior[0] >= 0)) {
-      cost[l] = cost[l] * cost[l] / kPriorCost;
-      continue;
-    }
-    const float plane[3] = {planes.w[l], planes.x[l], planes.y[l]};
-    cost[l] = unlikely(M, prior, int(P.column[l]), int(P.row[l]), cost[l], plane);
-  }
-  return cost;
-}
-
 void begin(const PatchMatch& M, Packet& P) {
   Planes planes{};
   for (int l = 0; l < kWide; ++l) {
@@ -427,22 +396,13 @@ void iterate(const PatchMatch& M, Packet& P, int number) {
     for (int v = 0; v < M.sources; ++v) cost[region][v] = view_cost(M, M.source[v], P, found[region]);
   for (int v = 0; v < M.sources; ++v) own[v] = view_cost(M, M.source[v], P, current);
   choose_views(M, P, cost, number);
-  F best_cost = joint_cost(M, P, own), best = ranked(M, P, best_cost, current);
+  F best = joint_cost(M, P, own);
   const auto take = [&](const Planes& planes, F planes_cost) {
-    const F rank = ranked(M, P, planes_cost, planes);
-    const I better = rank < best;
-    best = better ? rank : best, best_cost = better ? planes_cost : best_cost;
-    current.w = better ? planes.w : current.w, current.x = better ? planes.x : current.x;
-    current.y = better ? planes.y : current.y;
+    const I better = planes_cost < best;
+    best = better ? planes_cost : best, current.w = better ? planes.w : current.w;
+    current.x = better ? planes.x : current.x, current.y = better ? planes.y : current.y;
   };
   for (int region = 0; region < kRegions; ++region) take(found[region], joint_cost(M, P, cost[region]));
-  if (M.prior) {
-    Planes likely = current;
-    for (int l = 0; l < P.count; ++l)
-      if (M.prior[3 * P.at[l]] >= 0) put(likely, l, M.prior + 3 * P.at[l]);
-    for (int v = 0; v < M.sources; ++v) own[v] = view_cost(M, M.source[v], P, likely);
-    take(likely, joint_cost(M, P, own));
-  }
   // (d', n), (d, n'), (d', n'), (random d, n), (d, random n), as they are at first.
   const Planes old = current;
   Planes tried[kRefinements];
@@ -473,7 +433,7 @@ void iterate(const PatchMatch& M, Packet& P, int number) {
   for (int l = 0; l < P.count; ++l) {
     float* plane = M.plane + 3 * P.at[l];
     plane[0] = current.w[l], plane[1] = current.x[l], plane[2] = current.y[l];
-    M.cost[P.at[l]] = best_cost[l];
+    M.cost[P.at[l]] = best[l];
     uint8_t chosen = 0;
     for (int v = 0; v < M.sources; ++v) chosen |= uint8_t(P.view[v][l] > 0) << v;
     M.chosen[P.at[l]] = chosen;

@@ -57,14 +57,13 @@ def patch_match(
     first: int = 0,
     seed: int = 0,
     source_depths: list[np.ndarray] | None = None,
-    prior: np.ndarray | None = None,
 ) -> None:
     """Improves the planes of an image in place: their cost is found anew, then `iterations` red-black sweeps.
 
     The cost of a plane in a source is 1 minus the normalised cross correlation of windows of 11 by 11 pixels, with
     bilateral weights and `noise` added to both variances, so that windows without texture agree and disagree by
     nothing. With `source_depths` 0.1 is added for every pixel that a point misses its own by when it comes back from
-    the surface there, up to 0.4. With `prior` planes that are near to it are preferred as their likelihood says.
+    the surface there, up to 0.4.
 
     Args:
         sources: 1 to 8 photographs to compare with.
@@ -72,7 +71,6 @@ def patch_match(
         noise: variance of grey values.
         first: number of the first sweep; steps get smaller and views are chosen more strictly with it.
         source_depths: (H, W) float32 inverse depths of each source, NaN where unknown.
-        prior: (H, W, 3) float32 planes, NaN where there is none.
 
     Raises:
         ValueError: shapes or dtypes that do not fit.
@@ -94,8 +92,6 @@ def patch_match(
         noise,
         seed,
         given,
-        prior,
-        True,
         first,
         iterations,
         planes.plane,

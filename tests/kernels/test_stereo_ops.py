@@ -102,20 +102,6 @@ def test_what_has_no_texture_neither_agrees_nor_disagrees():
     assert np.abs(planes.cost[10:-10, 10:-10] - 1).max() < 0.012
 
 
-def test_a_prior_decides_where_photographs_do_not():
-    plain = [StereoImage.of(c, np.full((c.height, c.width), 90, np.uint8)) for c in CAMERAS]
-    prior = np.zeros((CAMERAS[0].height, CAMERAS[0].width, 3), np.float32)
-    prior[..., 0] = 1 / wall_depth(CAMERAS[0])
-    prior[..., 1] = np.gradient(prior[..., 0], axis=1)
-    prior[..., 2] = np.gradient(prior[..., 0], axis=0)
-    prior[:, :20] = np.nan
-    planes = DepthPlanes.unknown(*plain[0].grey.shape)
-    patch_match(plain[0], plain[1:], planes, (0.0, 0.8), 1.0, 2, prior=prior)
-    found, wanted = planes.plane[8:-8, 26:-8, 0], prior[8:-8, 26:-8, 0]
-    assert np.abs(found / wanted - 1).max() < 0.02
-    assert np.abs(planes.plane[:, :12, 0] * wall_depth(CAMERAS[0])[:, :12] - 1).mean() > 0.1
-
-
 def test_depths_of_neighbours_that_contradict_cost_more(images):
     planes = some_planes(CAMERAS[0])
     planes.plane[..., 0] = 1 / wall_depth(CAMERAS[0])
