@@ -227,54 +227,59 @@ inline float local_variance(const PatchMatch& M, int column, int row) {
   return square / n - sum / n * (sum / n);
 }
 
-// Weights of the reference's window: samples of the pixel's own grey, and others where these do not suffice and an edge
-// runs through the pixel itself. Beside an edge a plain pixel keeps to itself: it may lie on what is behind.
-inline void look(const PatchMatch& M, Packet& P) {
-  static thread_local float falls[kGreys][256];
-  static thread_local bool made = false;
-  if (!made) {
+// The samples of a window: their places, odd numbers of pixels from the middle, their weights by distance with the sum
+// of these, and by difference of grey values.
+struct WindowTables {
+  int down[kSamples], right[kSamples];
+  float near[kSamples], all_near = 0, falls[kGreys][256];
+  WindowTables() {
+    static_assert(kWindowStep * (kWindowSide - 1) % 2 == 0);
+    constexpr int kFirst = -kWindowStep * (kWindowSide - 1) / 2;
+    for (int k = 0; k < kSamples; ++k) {
+      const int y = kFirst + kWindowStep * (k / kWindowSide), x = kFirst + kWindowStep * (k % kWindowSide);
+      down[k] = y, right[k] = x;
+      near[k] = std::exp(-0.5f * float(y * y + x * x) / (kNearPixels * kNearPixels)), all_near += near[k];
+    }
     for (int s = 0; s < kGreys; ++s)
       for (int g = 0; g < 256; ++g) {
         const float away = float(g) / kNearGrey[s];
         falls[s][g] = away > kFarGrey ? 0 : std::exp(-0.5f * away * away);
       }
-    made = true;
   }
-  constexpr float kFirst = -0.5f * kWindowStep * (kWindowSide - 1);
+};
+
+// Weights of the reference's window: samples of the pixel's own grey, and others where these do not suffice and an edge
+// runs through the pixel itself. Beside an edge a plain pixel keeps to itself: it may lie on what is behind.
+inline void look(const PatchMatch& M, Packet& P) {
+  static const WindowTables tables;
   for (int l = 0; l < kWide; ++l) {
     const int column = int(P.column[l]), row = int(P.row[l]);
     const int middle = M.grey[row * M.width + column];
-    float near[kSamples], all_near = 0;
     int grey[kSamples];
-    int k = 0;
-    for (int i = 0; i < kWindowSide; ++i)
-      for (int j = 0; j < kWindowSide; ++j, ++k) {
-        // Samples lie on corners of pixels: kFirst is odd. The one beside the corner that is nearer to the middle.
-        const float down = kFirst + kWindowStep * i, right = kFirst + kWindowStep * j;
-        const int y = std::clamp(row + int(down), 0, M.height - 1), x = std::clamp(column + int(right), 0, M.width - 1);
-        grey[k] = M.grey[y * M.width + x];
-        near[k] = std::exp(-0.5f * (down * down + right * right) / (kNearPixels * kNearPixels));
-        all_near += near[k];
-      }
+    for (int k = 0; k < kSamples; ++k) {
+      const int y = std::clamp(row + tables.down[k], 0, M.height - 1);
+      const int x = std::clamp(column + tables.right[k], 0, M.width - 1);
+      grey[k] = M.grey[y * M.width + x];
+    }
+    const float informed = kInformed * M.noise;
+    const bool plain = local_variance(M, column, row) < informed;
     float weight[kSamples], total, mean, variance;
     for (int s = 0; s < kGreys; ++s) {
       total = mean = variance = 0;
-      for (k = 0; k < kSamples; ++k) {
-        weight[k] = falls[s][std::abs(grey[k] - middle)] * near[k];
+      for (int k = 0; k < kSamples; ++k) {
+        weight[k] = tables.falls[s][std::abs(grey[k] - middle)] * tables.near[k];
         total += weight[k], mean += weight[k] * float(grey[k]);
       }
-      // No sample has the pixel's own grey.
-      if (!(total > 0)) continue;
+      if (!(total > 0)) continue;  // no sample is like the pixel
       mean /= total;
-      for (k = 0; k < kSamples; ++k) {
+      for (int k = 0; k < kSamples; ++k) {
         const float difference = float(grey[k]) - mean;
         variance += weight[k] * difference * difference;
       }
       variance /= total;
-      if (variance > kInformed * M.noise && total > kOwnShare * all_near) break;
-      if (local_variance(M, column, row) < kInformed * M.noise) break;
+      if (plain || (variance > informed && total > kOwnShare * tables.all_near)) break;
     }
-    for (k = 0; k < kSamples; ++k) {
+    for (int k = 0; k < kSamples; ++k) {
       const float w = total > 0 ? weight[k] / total : 0;
       P.weight[k][l] = w, P.centered[k][l] = w * (float(grey[k]) - mean);
     }
