@@ -45,7 +45,7 @@ class DepthMap:
     `depth` (H, W) float32 along the optical axis in the scene's unit, NaN where unknown; `normal` (H, W, 3) float32 in
     the world, towards the camera; `cost` (H, W) float32 of the match, 0 to 2; `confirmed` (H, W) uint8, by how many of
     `sources` other views, and `deviation` (H, W) float32 the least share of the depth by which one of these differs,
-    infinite where none sees the point.
+    infinite where none sees the point. `grey` (H, W) uint8 is what was matched, `noise` the variance of its noise.
     """
 
     camera: Camera
@@ -55,6 +55,8 @@ class DepthMap:
     confirmed: np.ndarray
     deviation: np.ndarray
     sources: int
+    grey: np.ndarray
+    noise: float
 
 
 def depth_maps(views: Sequence[View], points: np.ndarray, *, seed: int = 0, quiet: bool = True) -> list[DepthMap]:
@@ -82,7 +84,7 @@ def depth_maps(views: Sequence[View], points: np.ndarray, *, seed: int = 0, quie
         raise LinprimError(
             "no two photographs show the same points from directions that differ: stereo needs such pairs"
         )
-    full = [StereoImage.of(view.camera, grey_of(view)) for view in views]
+    full = [StereoImage.of(view.camera, _grey_of(view)) for view in views]
     half = [_halved(image) for image in full]
     noises = [noise_of(image.grey) for image in full]
     ranges = [_range_of(camera, points) for camera in cameras]
@@ -114,11 +116,12 @@ def depth_maps(views: Sequence[View], points: np.ndarray, *, seed: int = 0, quie
                 full[k], near, planes, ranges[k], noises[k], sweeps, first=first, seed=part, source_depths=theirs
             )
     return [
-        _depth_map(cameras[k], planes, [(cameras[j], found[j]) for j in pairs[k]]) for k, planes in enumerate(found)
+        _depth_map(full[k], noises[k], planes, [(cameras[j], found[j]) for j in pairs[k]])
+        for k, planes in enumerate(found)
     ]
 
 
-def grey_of(view: View) -> np.ndarray:
+def _grey_of(view: View) -> np.ndarray:
     """(H, W) uint8 luminance of a photograph."""
     return np.rint(view.load().rgb @ np.array([0.299, 0.587, 0.114], np.float32)).astype(np.uint8)
 
@@ -171,12 +174,15 @@ def _range_of(camera: Camera, points: np.ndarray) -> tuple[float, float]:
     return 0.0, NEARER / float(np.quantile(depth, NEAREST_SHARE)) if len(depth) else 1.0
 
 
-def _depth_map(camera: Camera, planes: DepthPlanes | None, others: list[tuple[Camera, DepthPlanes | None]]) -> DepthMap:
-    height, width = camera.height, camera.width
+def _depth_map(
+    image: StereoImage, noise: float, planes: DepthPlanes | None, others: list[tuple[Camera, DepthPlanes | None]]
+) -> DepthMap:
+    camera, (height, width) = image.camera, image.grey.shape
     if planes is None:
         empty = np.full((height, width), np.nan, np.float32)
         none, infinite = np.zeros((height, width), np.uint8), np.full((height, width), np.inf, np.float32)
-        return DepthMap(camera, empty, np.zeros((height, width, 3), np.float32), empty, none, infinite, 0)
+        normal = np.zeros((height, width, 3), np.float32)
+        return DepthMap(camera, empty, normal, empty, none, infinite, 0, image.grey, noise)
     inverse, slope_x, slope_y = (planes.plane[..., k].astype(np.float64) for k in range(3))
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = 1 / inverse
@@ -207,6 +213,8 @@ def _depth_map(camera: Camera, planes: DepthPlanes | None, others: list[tuple[Ca
         np.where(known, confirmed, 0).astype(np.uint8),
         deviation,
         sum(theirs is not None for _, theirs in others),
+        image.grey,
+        noise,
     )
 
 

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from linprim_geo.capture.types import View
-from linprim_geo.stereo.depth_maps import DepthMap, depth_maps, grey_of, noise_of
-from linprim_geo.stereo.plain_regions import common_planes, edges_of, plain_regions, plane_depths
+from linprim_geo.stereo.depth_maps import DepthMap, depth_maps
+from linprim_geo.stereo.plain_regions import PlainRegion, common_planes, edges_of, plain_regions, plane_depths
 from linprim_geo.surface.tsdf_field import DepthFrame
 
 # A depth counts as confirmed if so many neighbours confirm it, or all but one of fewer.
@@ -33,8 +33,13 @@ class MergedFrames(Sequence):
         maps = depth_maps(views, points, quiet=quiet)
         self.depths = [_confirmed_depth(found) for found in maps]
         self.confirmed = float(np.mean([np.isfinite(depth).mean() for depth in self.depths]))
-        self.weight = _rendered_weight(maps, self.depths, rendered)
-        self.planes, self.on_planes = _planes(views, self.depths, rendered)
+        regions = _plain_regions(maps, self.depths)
+        self.planes = common_planes([found.camera for found in maps], [region for own in regions for region in own])
+        deviations, self.on_planes = Deviations(), []
+        for found, depth, own, frame in zip(maps, self.depths, regions, rendered, strict=True):
+            deviations.add(found, depth, frame)
+            self.on_planes.append(plane_depths(frame.camera, own, self.planes, frame.depth))
+        self.weight = deviations.weight()
         self.plain = float(np.mean([np.isfinite(depth).mean() for depth in self.on_planes]))
 
     def about(self) -> dict:
@@ -86,30 +91,32 @@ def _confirmed_depth(found: DepthMap) -> np.ndarray:
     return np.where(found.confirmed >= wanted, found.depth, np.float32(np.nan))
 
 
-def _planes(
-    views: Sequence[View], depths: Sequence[np.ndarray], rendered: Sequence[DepthFrame]
-) -> tuple[np.ndarray, list[np.ndarray]]:
-    """The (K, 4) planes of regions without texture, and for each view (H, W) depths on them, NaN elsewhere."""
-    regions = []
-    for number, (view, depth) in enumerate(zip(views, depths, strict=True)):
-        grey = grey_of(view)
-        regions.append(plain_regions(number, view.camera, edges_of(grey, noise_of(grey)), depth))
-    cameras = [view.camera for view in views]
-    planes = common_planes(cameras, [region for own in regions for region in own])
-    frames = zip(cameras, regions, rendered, strict=True)
-    return planes, [plane_depths(camera, own, planes, frame.depth) for camera, own, frame in frames]
+def _plain_regions(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> list[list[PlainRegion]]:
+    """Those of each view."""
+    return [
+        plain_regions(number, found.camera, edges_of(found.grey, found.noise), depth)
+        for number, (found, depth) in enumerate(zip(maps, depths, strict=True))
+    ]
 
 
-def _rendered_weight(maps: Sequence[DepthMap], depths: Sequence[np.ndarray], rendered: Sequence[DepthFrame]) -> float:
-    """See `MergedFrames`."""
-    stereo, other = [np.zeros(0)], [np.zeros(0)]
-    for found, depth, frame in zip(maps, depths, rendered, strict=True):
+class Deviations:
+    """How far confirmed depths are from those of their neighbours, and rendered ones from confirmed ones, as shares of
+    the depth."""
+
+    def __init__(self) -> None:
+        self.stereo, self.rendered = [np.zeros(0, np.float32)], [np.zeros(0, np.float32)]
+
+    def add(self, found: DepthMap, depth: np.ndarray, frame: DepthFrame) -> None:
+        """Those of a view, whose confirmed `depth` is NaN elsewhere."""
         both = np.isfinite(depth) & (frame.depth > 0)
-        stereo.append(found.deviation[both])
-        other.append(np.abs(frame.depth[both] / depth[both] - 1))
-    own, theirs = np.concatenate(stereo), np.concatenate(other)
-    if not len(own):
-        return 1.0
-    # A difference of two depths of the same accuracy is larger than the error of one by sqrt(2).
-    ratio = np.median(own) / np.sqrt(2) / max(float(np.median(theirs)), 1e-15)
-    return float(min(1.0, ratio**2))
+        self.stereo.append(found.deviation[both])
+        self.rendered.append(np.abs(frame.depth[both] / depth[both] - 1))
+
+    def weight(self) -> float:
+        """See `MergedFrames`."""
+        stereo, rendered = np.concatenate(self.stereo), np.concatenate(self.rendered)
+        if not len(stereo):
+            return 1.0
+        # A difference of two depths of the same accuracy is larger than the error of one by sqrt(2).
+        ratio = np.median(stereo) / np.sqrt(2) / max(float(np.median(rendered)), 1e-15)
+        return float(min(1.0, ratio**2))

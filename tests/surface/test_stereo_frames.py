@@ -32,11 +32,10 @@ def found(monkeypatch):
     confirmed = np.full((30, 40), 3, np.uint8)
     confirmed[0], confirmed[:, 20:] = 1, 0
     deviation = np.full((30, 40), 0.001, np.float32)
-    maps = [SimpleNamespace(depth=depth, confirmed=confirmed, deviation=deviation, sources=4)]
+    grey = np.zeros((30, 40), np.uint8)
+    maps = [SimpleNamespace(camera=CAMERA, depth=depth, confirmed=confirmed, deviation=deviation, sources=4)]
+    maps[0].grey, maps[0].noise = grey, 1.0
     monkeypatch.setattr(stereo_frames, "depth_maps", lambda *_, **__: maps)
-    monkeypatch.setattr(
-        stereo_frames, "_planes", lambda *_: (np.zeros((0, 4)), [np.full((30, 40), np.nan, np.float32)])
-    )
 
 
 def rendered(error: float) -> list[DepthFrame]:
@@ -55,7 +54,7 @@ def test_confirmed_depths_take_the_place_of_rendered_ones(found):
 def test_planes_stand_where_nothing_is_confirmed(found, monkeypatch):
     on_plane = np.full((30, 40), np.nan, np.float32)
     on_plane[:, 10:30] = 3.5
-    monkeypatch.setattr(stereo_frames, "_planes", lambda *_: (np.zeros((1, 4)), [on_plane]))
+    monkeypatch.setattr(stereo_frames, "plane_depths", lambda *_: on_plane)
     merged = MergedFrames(rendered(0.01), [None], 5.0)
     frame = merged[0]
     assert (frame.depth[1:, :20] == 3).all() and (frame.depth[:, 20:30] == 3.5).all() and merged.plain == 0.5
