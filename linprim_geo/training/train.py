@@ -13,7 +13,7 @@ import torch
 
 from linprim_geo.base.budget import Budget
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import is_remains, locked
+from linprim_geo.base.files import locked
 from linprim_geo.base.options import SceneOptions, TrainOptions, check_train_options
 from linprim_geo.base.progress import Progress
 from linprim_geo.geometry.camera import Similarity
@@ -92,7 +92,7 @@ def train(
     if run_path.is_file():
         refuse_used(run_path)
     # Killed before anything was saved, there is nothing to go on from but the options that are given again.
-    resume = resume and not (_has_remains(run_path) and is_unused(run_path))
+    resume = resume and not (run_path.is_dir() and is_unused(run_path))
     if resume:
         Run.open(run_path)
     if resume and budget:
@@ -128,8 +128,3 @@ def _notes(path: Path) -> dict:
         return Run(path, path, SceneOptions(), TrainOptions(), Similarity()).notes
     except LinprimError:
         return {}
-
-
-def _has_remains(path: Path) -> bool:
-    """Whether a training that was killed has left something."""
-    return path.is_dir() and any(is_remains(entry) for entry in path.iterdir())

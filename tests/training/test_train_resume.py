@@ -81,6 +81,13 @@ def test_a_kill_at_the_worst_moment_loses_nothing(torn, tiny_scene, tiny_run, ru
     assert_same_run(tiny_run, run_copy)
 
 
+def test_an_empty_folder_is_begun_anew(tiny_scene, tmp_path):
+    # What a kill between making the folder and its lock leaves.
+    (tmp_path / "run").mkdir()
+    train(tiny_scene, tmp_path / "run", options=QUICK, resume=True, quiet=True)
+    assert checkpoint(tmp_path / "run")["step"] == QUICK.iterations
+
+
 def test_resuming_a_finished_run_changes_nothing(tiny_scene, tiny_run, run_copy):
     result = train(tiny_scene, run_copy, resume=True, quiet=True)
     assert result["iterations"] == 400 and result["psnr"] == pytest.approx(metrics(tiny_run)[-1]["psnr"], abs=1e-3)
