@@ -16,7 +16,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3
-# As many processes as there are cores, and no more than memory allows on a large machine.
+# One process per core, 8 at most: each of them holds torch.
 WORKERS := from linprim_geo.base.cores import usable_cores; print(min(8, usable_cores()))
 CPP := $(wildcard csrc/*.h csrc/*/*.h csrc/*/*.cpp)
 CORE := CMakeLists.txt csrc $(wildcard csrc/*.h csrc/*/*)

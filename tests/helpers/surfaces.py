@@ -70,3 +70,9 @@ def camera_above(height, focal=100.0, target=(0.0, 0.0)):
     pose[:3, :3] = np.diag([1.0, -1.0, -1.0])
     pose[:3, 3] = -pose[:3, :3] @ np.array([*target, height])
     return Camera(200, 200, focal, focal, 100.0, 100.0, pose)
+
+
+def edge_uses(faces: np.ndarray) -> np.ndarray:
+    """Of each edge of (M, 3) faces, how many of them use it."""
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    return np.unique(edges[:, 0] * (faces.max() + 1) + edges[:, 1], return_counts=True)[1]

@@ -107,7 +107,7 @@ def test_what_is_round_becomes_no_plane(axis):
 def test_a_wall_that_is_slightly_bent_becomes_no_plane():
     """A plain cylinder of radius 12, seen from inside, between an edge at the floor and one at a height of 1.6."""
     center, axis = np.array([-9.0, -9.0, 0.0]), np.array([0.0, 0.0, 1.0])
-    cameras, regions, depths = [camera_at(c) for c in CENTERS], [], []
+    cameras, regions = [camera_at(c) for c in CENTERS], []
     for number, camera in enumerate(cameras):
         rays = camera.world_rays()
         start = camera.center - center
@@ -118,10 +118,4 @@ def test_a_wall_that_is_slightly_bent_becomes_no_plane():
         height = camera.center[2] + rays[..., 2] * depth
         band = (height > 0) & (height < 1.6)
         regions.append(seen(camera, depth, np.where(band, 150, 60), number))
-        depths.append(depth)
-    planes = common_planes(cameras, [region for own in regions for region in own])
-    for camera, depth, own in zip(cameras, depths, regions, strict=True):
-        found = plane_depths(camera, own, planes, np.nan_to_num(depth).astype(np.float32))
-        known = np.isfinite(found) & np.isfinite(depth)
-        # Where a plane is taken all the same it is one that fits.
-        assert (np.abs(found[known] / depth[known] - 1) < 0.03).all()
+    assert all(regions) and not len(common_planes(cameras, [region for own in regions for region in own]))

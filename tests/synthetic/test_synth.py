@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from helpers.surfaces import edge_uses
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.capture.load import load_scene
@@ -11,7 +12,7 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import barycentric
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.synthetic import camera_paths as campath
-from linprim_geo.synthetic import hall, shapes, synth
+from linprim_geo.synthetic import shapes, synth
 from linprim_geo.synthetic.built_in import SHAPES
 from linprim_geo.synthetic.points import MAX_TRACK, sees
 from linprim_geo.synthetic.synth import synthesize
@@ -48,11 +49,6 @@ def cameras_of(out, split):
     return listing, cameras
 
 
-def edge_uses(faces):
-    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    return np.unique(edges[:, 0] * (faces.max() + 1) + edges[:, 1], return_counts=True)[1]
-
-
 def areas(vertices, faces):
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -85,22 +81,6 @@ def test_objects_are_centred_with_diagonal_two_and_coloured_in_pieces(built):
         assert len(shape.part) == len(shape.faces) and (areas(shape.vertices, shape.faces) > 0).mean() > 0.999
     assert set(np.unique(built["cad"].part)) == set(range(8))
     assert built["room"].path == "inside-out" and built["room"].unit == "metre"
-
-
-def test_the_hall_is_a_closed_surface_with_a_checker_of_the_strength_asked_for(built):
-    shape = built["hall"]
-    assert shape.path == "inside-out" and (edge_uses(shape.faces) == 2).all()
-    box = np.ptp(shape.vertices, axis=0)
-    assert np.allclose(box, hall.SIZE)
-    # The floor, one point in each square.
-    x, y = np.meshgrid(np.arange(2.0, 4.0, 0.4), np.arange(0.4, 2.0, 0.4))
-    points = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
-    floor = np.full(len(points), np.nonzero(shape.part == 0)[0][0])
-    spread = {}
-    for detail in (1.0, 0.1, 0.0):
-        colors = hall.hall(detail).colors(points, floor, np.zeros((len(points), 2)))
-        spread[detail] = colors.std(0).max()
-    assert spread[1.0] > 0.1 and spread[0.1] == pytest.approx(0.1 * spread[1.0], rel=0.1) and spread[0.0] < 1e-6
 
 
 def test_wires_are_closed_and_the_sheet_is_open(built):
