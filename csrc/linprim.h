@@ -2,7 +2,7 @@
 // step.
 //
 // Plain functions over plain arrays; no Python, no torch, no exceptions of its own (std::bad_alloc passes through).
-// Preconditions are the caller's (bind.cpp checks them). All functions use every thread of the pool (parallel.h) and
+// Preconditions are the caller's (bind/ checks them). All functions use every thread of the pool (parallel.h) and
 // give bitwise the same result for any number of threads.
 #pragma once
 

@@ -1,0 +1,35 @@
+// Arrays of Python as the core takes them, with their shapes checked.
+#pragma once
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+
+#include <cstdint>
+#include <initializer_list>
+#include <stdexcept>
+#include <string>
+
+namespace nb = nanobind;
+
+template <class T>
+using In = nb::ndarray<const T, nb::c_contig, nb::device::cpu>;
+template <class T>
+using Out = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
+using Pose = nb::ndarray<const double, nb::shape<3, 4>, nb::c_contig, nb::device::cpu>;
+
+template <class Array>
+auto checked(const Array& array, std::initializer_list<int64_t> shape, const char* name) {
+  bool same = array.ndim() == shape.size();
+  size_t axis = 0;
+  for (int64_t size : shape) {
+    if (same && int64_t(array.shape(axis)) != size) same = false;
+    ++axis;
+  }
+  if (!same) {
+    std::string wanted, found;
+    for (int64_t size : shape) wanted += (wanted.empty() ? "" : ", ") + std::to_string(size);
+    for (size_t a = 0; a < array.ndim(); ++a) found += (a ? ", " : "") + std::to_string(array.shape(a));
+    throw std::invalid_argument(std::string(name) + " has shape (" + found + "), wanted (" + wanted + ")");
+  }
+  return array.data();
+}

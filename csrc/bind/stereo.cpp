@@ -1,0 +1,51 @@
+// PatchMatch stereo.
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include <algorithm>
+#include <array>
+#include <optional>
+#include <stdexcept>
+#include <tuple>
+#include <vector>
+
+#include "bind/arrays.h"
+#include "bind/parts.h"
+#include "stereo/patch_match.h"
+
+void bind_stereo(nb::module_& m) {
+  // `sources`: (to, shift, back, back_shift, quads, inverse depth or None) of each.
+  using Source = std::tuple<std::array<float, 9>, std::array<float, 3>, std::array<float, 9>, std::array<float, 3>,
+                            In<uint32_t>, std::optional<In<float>>>;
+  m.def("patch_match", [](In<uint8_t> grey, std::array<float, 4> lens, std::array<float, 2> range, float noise,
+                          uint32_t seed, const std::vector<Source>& sources, int first, int count, Out<float> plane,
+                          Out<float> cost, Out<uint8_t> chosen) {
+    if (grey.ndim() != 2 || grey.size() == 0) throw std::invalid_argument("grey has to have shape (H, W)");
+    if (sources.empty() || sources.size() > linprim::kMostSources) throw std::invalid_argument("wanted 1 to 8 sources");
+    const int64_t height = int64_t(grey.shape(0)), width = int64_t(grey.shape(1));
+    linprim::PatchMatch match{};
+    match.width = int(width), match.height = int(height), match.sources = int(sources.size());
+    match.grey = grey.data(), match.noise = noise, match.seed = seed;
+    match.focal_x = lens[0], match.focal_y = lens[1], match.center_x = lens[2], match.center_y = lens[3];
+    match.least = range[0], match.most = range[1];
+    if (!(lens[0] > 0 && lens[1] > 0 && range[0] >= 0 && range[1] > range[0] && noise > 0))
+      throw std::invalid_argument("focal lengths, the range of inverse depths or the noise are not positive");
+    for (size_t v = 0; v < sources.size(); ++v) {
+      const auto& [to, shift, back, back_shift, quads, inverse_depth] = sources[v];
+      linprim::StereoSource& source = match.source[v];
+      std::copy_n(to.data(), 9, source.to), std::copy_n(shift.data(), 3, source.shift);
+      std::copy_n(back.data(), 9, source.back), std::copy_n(back_shift.data(), 3, source.back_shift);
+      if (quads.ndim() != 2 || quads.shape(0) < 2 || quads.shape(1) < 2)
+        throw std::invalid_argument("quads have to have shape (H, W) of 2 at least");
+      source.height = int(quads.shape(0)), source.width = int(quads.shape(1)), source.quads = quads.data();
+      if (inverse_depth) source.inverse_depth = checked(*inverse_depth, {source.height, source.width}, "inverse_depth");
+    }
+    match.plane = checked(plane, {height, width, 3}, "plane"), match.cost = checked(cost, {height, width}, "cost");
+    match.chosen = checked(chosen, {height, width}, "chosen");
+    nb::gil_scoped_release release;
+    linprim::patch_match_begin(match);
+    for (int number = first; number < first + count; ++number) linprim::patch_match_iterate(match, number);
+  });
+}

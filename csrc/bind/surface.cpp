@@ -1,0 +1,185 @@
+// Points and voxels of surfaces: optical depth, photographs, votes.
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+
+#include <algorithm>
+#include <array>
+#include <optional>
+#include <stdexcept>
+#include <tuple>
+#include <utility>
+#include <vector>
+
+#include "bind/arrays.h"
+#include "bind/parts.h"
+#include "linprim.h"
+#include "surface/face_samples.h"
+#include "surface/fuse.h"
+#include "surface/photo_sweep.h"
+#include "surface/point_colors.h"
+#include "surface/points_within.h"
+#include "surface/segment_depth.h"
+
+namespace {
+
+// A numpy array that has the values.
+nb::ndarray<nb::numpy, int64_t, nb::ndim<1>> owned(std::vector<int64_t>&& values) {
+  auto* kept = new std::vector<int64_t>(std::move(values));
+  return {kept->data(), {kept->size()}, nb::capsule(kept, [](void* p) noexcept {
+            delete static_cast<std::vector<int64_t>*>(p);
+          })};
+}
+
+linprim::PhotoView photo_view(const Pose& pose, const std::array<double, 4>& lens, int width, int height,
+                              const float* image, int channels, const float* depth) {
+  linprim::PhotoView view{{}, lens[0], lens[1], lens[2], lens[3], width, height, image, channels, depth};
+  std::copy_n(pose.data(), 12, view.pose);
+  return view;
+}
+
+template <class Real>
+void bind_tree(nb::class_<linprim::SolidTree>& tree) {
+  tree.def("__init__", [](linprim::SolidTree* self, int kind, In<Real> center, In<Real> rotation, In<Real> extent,
+                          In<Real> density) {
+    const int64_t n = center.ndim() ? int64_t(center.shape(0)) : 0;
+    if (n >= (int64_t(1) << 31)) throw std::invalid_argument("more than 2^31 primitives");
+    if (kind != int(linprim::PrimitiveKind::kOctahedron) && kind != int(linprim::PrimitiveKind::kTetrahedron))
+      throw std::invalid_argument("segments have an optical depth in octahedra and tetrahedra only");
+    const auto solid = linprim::PrimitiveKind(kind);
+    const int64_t extents = solid == linprim::PrimitiveKind::kTetrahedron ? 4 : 3;
+    const Real *c = checked(center, {n, 3}, "center"), *r = checked(rotation, {n, 4}, "rotation");
+    const Real *e = checked(extent, {n, extents}, "extent"), *d = checked(density, {n}, "density");
+    nb::gil_scoped_release release;
+    new (self) linprim::SolidTree(solid, n, c, r, e, d);
+  });
+}
+
+}  // namespace
+
+void bind_surface(nb::module_& m) {
+  auto tree = nb::class_<linprim::SolidTree>(m, "SolidTree");
+  bind_tree<float>(tree), bind_tree<double>(tree);
+  tree.def("__len__", &linprim::SolidTree::size);
+  tree.def("optical_depth", [](const linprim::SolidTree& self, In<double> origin, In<double> ends,
+                               std::optional<In<double>> begin, double most, Out<double> depth) {
+    const int64_t count = int64_t(depth.size());
+    const double *from = checked(origin, {3}, "origin"), *to = checked(ends, {count, 3}, "ends");
+    const double* start = begin ? checked(*begin, {count}, "begin") : nullptr;
+    double* sums = checked(depth, {count}, "depth");
+    if (!(most > 0)) throw std::invalid_argument("most has to be positive");
+    nb::gil_scoped_release release;
+    self.optical_depth(from, to, start, count, most, sums);
+  });
+  m.def("add_photo", [](Pose pose, std::array<double, 4> lens, In<float> image, In<float> depth, In<float> jump,
+                        std::array<double, 2> rules, In<double> offset, In<double> point, In<double> normal,
+                        In<double> footprint, Out<int32_t> views, Out<float> weight, Out<float> value,
+                        Out<float> square) {
+    if (image.ndim() != 2 || image.size() == 0) throw std::invalid_argument("image has to have shape (H, W)");
+    const int64_t height = int64_t(image.shape(0)), width = int64_t(image.shape(1));
+    const int64_t count = int64_t(views.size()), offsets = int64_t(offset.size());
+    const linprim::PhotoView view =
+        photo_view(pose, lens, int(width), int(height), image.data(), 1, checked(depth, {height, width}, "depth"));
+    const float* jumps = checked(jump, {height, width}, "jump");
+    const linprim::PhotoSums sums{count,
+                                  checked(point, {count, 3}, "point"),
+                                  checked(normal, {count, 3}, "normal"),
+                                  checked(footprint, {count}, "footprint"),
+                                  checked(views, {count}, "views"),
+                                  checked(weight, {count}, "weight"),
+                                  checked(value, {count, offsets}, "value"),
+                                  checked(square, {count, offsets}, "square")};
+    const double* along = checked(offset, {offsets}, "offset");
+    nb::gil_scoped_release release;
+    linprim::add_photo(view, jumps, {rules[0], rules[1]}, along, int(offsets), sums);
+  });
+  m.def("add_colors", [](Pose pose, std::array<double, 4> lens, In<float> image, In<float> depth, In<float> near,
+                         In<float> far, std::array<double, 4> rules, In<double> point, In<double> normal,
+                         Out<float> best, Out<float> shade, Out<uint8_t> good) {
+    if (image.ndim() != 3 || image.size() == 0 || (image.shape(2) != 3 && image.shape(2) != 4))
+      throw std::invalid_argument("image has to have shape (H, W, 3) or (H, W, 4)");
+    const int64_t height = int64_t(image.shape(0)), width = int64_t(image.shape(1)), count = int64_t(good.size());
+    const linprim::PhotoView view = photo_view(pose, lens, int(width), int(height), image.data(), int(image.shape(2)),
+                                               checked(depth, {height, width}, "depth"));
+    const float *nearest = checked(near, {height, width}, "near"), *farthest = checked(far, {height, width}, "far");
+    const int64_t kept = linprim::kKeptSamples;
+    const linprim::ColorSamples samples{count,
+                                        checked(point, {count, 3}, "point"),
+                                        checked(normal, {count, 3}, "normal"),
+                                        checked(best, {count, kept}, "best"),
+                                        checked(shade, {count, kept, 3}, "shade"),
+                                        checked(good, {count}, "good")};
+    nb::gil_scoped_release release;
+    linprim::add_colors(view, nearest, farthest, {rules[0], rules[1], rules[2], rules[3]}, samples);
+  });
+  m.def("least_footprints", [](Pose pose, std::array<double, 4> lens, int width, int height, double least_cosine,
+                               In<double> point, In<double> normal, Out<double> least) {
+    const int64_t count = int64_t(least.size());
+    const linprim::PhotoView view = photo_view(pose, lens, width, height, nullptr, 0, nullptr);
+    const double *at = checked(point, {count, 3}, "point"), *along = checked(normal, {count, 3}, "normal");
+    double* out = checked(least, {count}, "least");
+    nb::gil_scoped_release release;
+    linprim::least_footprints(view, least_cosine, at, along, count, out);
+  });
+  m.def("face_samples", [](Pose pose, std::array<double, 4> lens, In<float> depth, In<double> vertex,
+                           In<int64_t> corner, In<double> bary, double behind, double slack, In<uint8_t> skip,
+                           Out<uint8_t> found) {
+    if (depth.ndim() != 2) throw std::invalid_argument("depth has to have shape (H, W)");
+    const int64_t samples = int64_t(bary.shape(0)), count = int64_t(found.size()), vertices = int64_t(vertex.shape(0));
+    if (samples > linprim::kMostFaceSamples) throw std::invalid_argument("too many samples");
+    const linprim::PhotoView view =
+        photo_view(pose, lens, int(depth.shape(1)), int(depth.shape(0)), nullptr, 0, depth.data());
+    const linprim::Faces faces{count, checked(vertex, {vertices, 3}, "vertex"), checked(corner, {count, 3}, "corner"),
+                               checked(skip, {count}, "skip")};
+    if (std::any_of(faces.corner, faces.corner + 3 * count, [&](int64_t row) { return row < 0 || row >= vertices; }))
+      throw std::invalid_argument("corners are outside of the vertices");
+    const double* weights = checked(bary, {samples, 3}, "bary");
+    uint8_t* out = checked(found, {count}, "found");
+    nb::gil_scoped_release release;
+    linprim::face_samples(view, faces, weights, int(samples), behind, slack, out);
+  });
+  // (N,) how many points each body has, and the rows of them all, body by body.
+  m.def("points_within", [](In<double> center, In<double> normal, In<double> offset, In<double> point, double enlarged,
+                            int64_t least) {
+    if (normal.ndim() != 3) throw std::invalid_argument("normal has to have shape (N, F, 3)");
+    const int64_t count = int64_t(normal.shape(0)), faces = int64_t(normal.shape(1)), points = int64_t(point.shape(0));
+    const linprim::ConvexBodies bodies{count, int(faces), checked(center, {count, 3}, "center"),
+                                       checked(normal, {count, faces, 3}, "normal"),
+                                       checked(offset, {count, faces}, "offset")};
+    const double* at = checked(point, {points, 3}, "point");
+    std::vector<std::vector<int64_t>> found;
+    {
+      nb::gil_scoped_release release;
+      found = linprim::points_within(bodies, at, points, enlarged, least);
+    }
+    size_t total = 0;
+    for (const auto& rows : found) total += rows.size();
+    std::vector<int64_t> sizes, all;
+    sizes.reserve(found.size()), all.reserve(total);
+    for (const auto& rows : found)
+      sizes.push_back(int64_t(rows.size())), all.insert(all.end(), rows.begin(), rows.end());
+    return std::tuple(owned(std::move(sizes)), owned(std::move(all)));
+  });
+  m.def("add_votes", [](Pose project, int width, int height, In<float> surfels, std::array<float, 8> rules,
+                        In<int64_t> rows, In<double> corner, double voxel, int resolution, Out<float> total,
+                        Out<float> weight, Out<float> free) {
+    const int64_t blocks = int64_t(corner.shape(0)), count = int64_t(rows.size()),
+                  voxels = int64_t(resolution) * resolution * resolution;
+    const float* table = checked(surfels, {int64_t(height) * width, linprim::kSurfelColumns}, "surfels");
+    linprim::SurfelView view{{}, width, height, reinterpret_cast<const linprim::Surfel*>(table)};
+    std::copy_n(project.data(), 12, view.project);
+    const auto [near, far_front, behind, behind_weight, grazed, grazed_reach, grazed_weight, occluded] = rules;
+    const linprim::VoteRules how{near, far_front, behind, behind_weight, grazed, grazed_reach, grazed_weight, occluded};
+    const linprim::VoxelSums sums{checked(corner, {blocks, 3}, "corner"),
+                                  voxel,
+                                  resolution,
+                                  checked(total, {blocks, voxels}, "total"),
+                                  checked(weight, {blocks, voxels}, "weight"),
+                                  checked(free, {blocks, voxels}, "free")};
+    const int64_t* chosen = checked(rows, {count}, "rows");
+    if (std::any_of(chosen, chosen + count, [&](int64_t row) { return row < 0 || row >= blocks; }))
+      throw std::invalid_argument("rows are outside of the blocks");
+    nb::gil_scoped_release release;
+    linprim::add_votes(view, how, chosen, count, sums);
+  });
+}
