@@ -47,7 +47,7 @@ def _shown_default(default: object) -> str:
 def _type_of(kind: type, word: str | None, parse: Callable[[str], Any] | None) -> Callable[[str], Any]:
     """What argparse makes a value by."""
     if word:
-        return number_or(word)
+        return number_or(word, kind)
     if parse is None:
         return kind
 
@@ -110,11 +110,12 @@ def blocks(text: str) -> int | str:
     return text if text == "auto" else positive(text)
 
 
-def number_or(word: str) -> Callable[[str], float | str]:
+def number_or(word: str, kind: type = float) -> Callable[[str], float | str]:
     def parse(text: str) -> float | str:
-        return word if text == word else float(text)
+        return word if text == word else kind(text)
 
-    parse.__name__ = f"number, or {word}:"  # as argparse puts it into its message
+    name = "whole number" if kind is int else "number"
+    parse.__name__ = f"{name}, or {word}:"  # as argparse puts it into its message
     return parse
 
 
