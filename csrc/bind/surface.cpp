@@ -15,6 +15,7 @@
 #include "bind/parts.h"
 #include "linprim.h"
 #include "surface/face_samples.h"
+#include "surface/filter_normals.h"
 #include "surface/fuse.h"
 #include "surface/photo_sweep.h"
 #include "surface/point_colors.h"
@@ -181,5 +182,17 @@ void bind_surface(nb::module_& m) {
       throw std::invalid_argument("rows are outside of the blocks");
     nb::gil_scoped_release release;
     linprim::add_votes(view, how, chosen, count, sums);
+  });
+  m.def("filter_normals", [](In<int64_t> corner, In<double> bound, double contrast, int normal_rounds,
+                             int vertex_rounds, Out<double> vertex) {
+    const int64_t vertices = int64_t(bound.size()), faces = int64_t(corner.shape(0));
+    const int64_t* corners = checked(corner, {faces, 3}, "corner");
+    const double* most = checked(bound, {vertices}, "bound");
+    double* moved = checked(vertex, {vertices, 3}, "vertex");
+    if (!(contrast > 0)) throw std::invalid_argument("contrast has to be positive");
+    if (std::any_of(corners, corners + 3 * faces, [&](int64_t row) { return row < 0 || row >= vertices; }))
+      throw std::invalid_argument("corners are outside of the vertices");
+    nb::gil_scoped_release release;
+    linprim::filter_normals({contrast, normal_rounds, vertex_rounds}, vertices, faces, corners, most, moved);
   });
 }

@@ -51,7 +51,7 @@ def chamfers(case: Case) -> list[dict]:
         folder = case.trained(case.kinds[kind])
         run = Run.open(folder)
         voxel = VOXEL_M if run.unit in METRES else VOXEL_SHARE * load_mesh(case.reference).diagonal
-        options = ExtractOptions(level=0.5, voxel_size=voxel, refine=0, smallest_part=0.0)
+        options = ExtractOptions(level=0.5, voxel_size=voxel, refine=0, denoise="off", smallest_part=0.0)
         mesh = extract_mesh(folder, "tsdf", folder / "mesh" / "table_10.ply", options, quiet=True)["mesh"]
         scores = eval_mesh_files(mesh, case.reference, protocol="linprim", seed=case.options.seed)
         figures = {name: scores[name] for name in ("chamfer", "accuracy", "completeness")}

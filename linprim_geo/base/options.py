@@ -350,6 +350,12 @@ class ExtractOptions:
         metavar="N",
         number_or="auto",
     )
+    denoise: str = option(
+        "on",
+        "on: smooth the surface but for edges, where vertices need not move farther than their predicted error and "
+        "photographs agree no less afterwards; off: leave it",
+        choices=("on", "off"),
+    )
     close_holes: int = option(0, "fill holes with at most N edges around them; 0 fills none", low=0, high=10**9)
     smooth: int = option(
         0, "iterations of smoothing that keeps the volume; 0 leaves the surface as it is", low=0, high=10_000

@@ -84,3 +84,19 @@ def add_votes(
         total, weight, free: (B, resolution^3) float32 sums.
     """
     _core.add_votes(project, width, height, surfels, rules, rows, corner, voxel, resolution, total, weight, free)
+
+
+def filter_normals(corner, bound, contrast: float, normal_rounds: int, vertex_rounds: int, vertex) -> None:
+    """Moves the vertices of a mesh so that the normals of its faces become those of their neighbours, but for edges.
+
+    Each of `normal_rounds` averages the normals of faces that share a vertex, by area and Tukey's weight of their
+    difference; each of `vertex_rounds` moves vertices towards the planes of their faces. Source: Zheng et al. 2011,
+    Sun et al. 2007.
+
+    Args:
+        corner: (M, 3) int64 faces.
+        bound: (V,) float64, no vertex moves farther.
+        contrast: length of the difference of two unit normals from which on they have nothing to do with each other.
+        vertex: (V, 3) float64, changed in place.
+    """
+    _core.filter_normals(corner, bound, contrast, normal_rounds, vertex_rounds, vertex)

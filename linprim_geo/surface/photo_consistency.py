@@ -199,10 +199,7 @@ def refine_surface(
     Moves are averaged over neighbours and fade out where the photographs say nothing. Colours and quality are kept as
     they are. `caster`: of the mesh as it is given, if there is one already.
     """
-    from scipy.sparse import diags
-
-    cameras, graph = [view.camera for view in views], _neighbours(mesh)
-    average = diags(1 / np.asarray(graph.sum(1)).ravel()) @ graph
+    cameras, average = [view.camera for view in views], _average(mesh)
     for _ in range(rounds):
         agreement = best_agreement(mesh, cameras, (view.load() for view in views), gains, caster)
         caster = None
@@ -213,6 +210,14 @@ def refine_surface(
         move /= weight + LEAST_SHARPNESS
         mesh = replace(mesh, vertices=mesh.vertices + move[:, None] * agreement.normals)
     return replace(mesh, normals=vertex_normals(mesh))
+
+
+def mean_over_neighbours(mesh: Mesh, values: np.ndarray, rings: int) -> np.ndarray:
+    """(V,) means of what vertices and their neighbours have, `rings` times in turn."""
+    average = _average(mesh)
+    for _ in range(rings):
+        values = average @ values
+    return values
 
 
 def _compared(
@@ -282,6 +287,14 @@ def _neighbours(mesh: Mesh) -> csr_matrix:
     graph = coo_matrix((np.ones(len(ends[0])), ends), shape=(count, count)).tocsr() + identity(count, format="csr")
     graph.data[:] = 1  # an edge of two faces counts once
     return graph
+
+
+def _average(mesh: Mesh) -> csr_matrix:
+    """(V, V) that takes the mean over a vertex and its neighbours."""
+    from scipy.sparse import diags
+
+    graph = _neighbours(mesh)
+    return diags(1 / np.asarray(graph.sum(1)).ravel()) @ graph
 
 
 def _points(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:

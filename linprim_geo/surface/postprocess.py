@@ -1,5 +1,5 @@
-"""What follows the extraction of any surface: refinement, holes and simplification, quality, colours, what cameras see,
-texture, files."""
+"""What follows the extraction of any surface: refinement, denoising, holes and simplification, quality, colours, what
+cameras see, texture, files."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from linprim_geo.geometry.mesh_files import save_mesh
 from linprim_geo.geometry.mesh_process import process_mesh
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.runs.run import Run
+from linprim_geo.surface.denoise import denoised
 from linprim_geo.surface.photo_consistency import photo_gains, predicted_error, refine_surface
 from linprim_geo.surface.texture import make_texture
 from linprim_geo.surface.texture_files import save_textured
@@ -44,13 +45,17 @@ def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, 
     if options.refine:
         mesh = refine_surface(mesh, views, int(options.refine), gains, caster)
         stages.lap("refine")
+    if options.denoise == "on":
+        mesh = denoised(mesh, views, gains)
+        stages.lap("denoise")
     mesh, processing = process_mesh(mesh, options, stages.note)
     if processing:
         stages.lap("process")
-    if options.refine or processing:
+    if options.refine or options.denoise == "on" or processing:
         caster = RayCaster(mesh.vertices, mesh.faces)
-    mesh = replace(mesh, quality=predicted_error(mesh, cameras, (view.load() for view in views), gains, caster))
-    stages.lap("quality")
+    if processing or options.denoise == "off":
+        mesh = replace(mesh, quality=predicted_error(mesh, cameras, (view.load() for view in views), gains, caster))
+        stages.lap("quality")
     mesh = replace(mesh, colors=color_vertices(mesh, cameras, (view.load().rgb for view in views), caster))
     stages.lap("colours")
     seen = visible_faces(mesh, cameras, caster)

@@ -69,7 +69,7 @@ def test_what_is_written(extracted, solid):
         "render",
         "fuse",
         "refine",
-        "quality",
+        "denoise",
         "colours",
         "visibility",
         "write",

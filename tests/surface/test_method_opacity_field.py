@@ -210,7 +210,7 @@ def test_what_is_written(extracted):
     assert sorted(path.name for path in folder.iterdir()) == ["mesh.ply", "mesh_visible.ply", "stats.json"]
     assert json.loads((folder / "stats.json").read_text()) == json.loads(json.dumps(stats))
     assert stats["method"] == METHOD and stats["level"] == 0.75 and stats["spacing"] > 0
-    steps = ("first round", "second round", "typical cameras", "refine", "quality", "colours", "visibility", "write")
+    steps = ("first round", "second round", "typical cameras", "refine", "denoise", "colours", "visibility", "write")
     assert stats["seconds"].keys() == {"level", *steps, "total"}
     assert 0.97 * stats["faces"] <= stats["visible"]["faces"] <= stats["faces"]
 

@@ -290,7 +290,7 @@ def test_the_file_says_which_primitive_a_face_is_a_part_of(tiny_run, tmp_path):
     import trimesh
 
     target = tmp_path / "traced.ply"
-    extract_mesh(tiny_run, "polyhedra", target, ExtractOptions(level=0.75, refine=0), quiet=True)
+    extract_mesh(tiny_run, "polyhedra", target, ExtractOptions(level=0.75, refine=0, denoise="off"), quiet=True)
     mesh, owner, _ = traced(tiny_run)
     for file in (target, target.with_name("traced_visible.ply")):
         read = trimesh.load(file, process=False)
@@ -304,7 +304,9 @@ def test_the_file_says_which_primitive_a_face_is_a_part_of(tiny_run, tmp_path):
         meshes = pymeshlab.MeshSet()
         meshes.load_new_mesh(str(file))
         assert meshes.current_mesh().face_number() == len(found)
-    extract_mesh(tiny_run, "polyhedra", target, ExtractOptions(level=0.75, refine=0, target_faces=200), quiet=True)
+    extract_mesh(
+        tiny_run, "polyhedra", target, ExtractOptions(level=0.75, refine=0, denoise="off", target_faces=200), quiet=True
+    )
     assert b"primitive" not in target.read_bytes()[:600]
 
 
