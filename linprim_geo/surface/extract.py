@@ -65,7 +65,8 @@ def extract_mesh(
     `quality`, the predicted error (`photo_consistency.predicted_error`); everything is in the data set's frame and
     unit. The photographs move the vertices to where they agree best (`photo_consistency.refine_surface`), noise
     is smoothed away (`denoise.denoised`), then holes are closed, the surface smoothed, remeshed and simplified as the
-    options ask (`mesh_process`); with `texture` .obj and .glb have a texture out of the photographs in place of vertex colours.
+    options ask (`mesh_process`); with `texture` .obj and .glb have a texture out of the photographs in place of vertex
+    colours.
 
     With `time_budget`, in seconds, the voxel size is the smallest with which everything takes that time at most, by
     what coarse passes take (`voxel_budget.choose_voxel`); stats.json has `time_budget`: what was chosen and why, and

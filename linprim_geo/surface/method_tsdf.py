@@ -115,7 +115,9 @@ def _better_by_stereo(
         return rendered, merged.about() | {"taken": False}
     mesh = fused(merged)
     stages.lap("fuse")
-    without, with_stereo = (_agreeing(surface, frames.views) for surface in (rendered, mesh))
+    cameras = [view.camera for view in frames.views]
+    gains = photo_gains(rendered, cameras, (view.load() for view in frames.views))
+    without, with_stereo = (_agreeing(surface, frames.views, gains) for surface in (rendered, mesh))
     stages.lap("compare")
     taken = with_stereo >= without
     stages.note(
@@ -126,12 +128,10 @@ def _better_by_stereo(
     return mesh if taken else rendered, about
 
 
-def _agreeing(mesh: Mesh, views: Sequence[View]) -> float:
+def _agreeing(mesh: Mesh, views: Sequence[View], gains: np.ndarray) -> float:
     """Share of the vertices that two photographs see at which these agree best within reach of the surface: where
-    something is missing or stands too far out, they do so beyond it."""
-    cameras = [view.camera for view in views]
-    gains = photo_gains(mesh, cameras, (view.load() for view in views))
-    found = best_agreement(mesh, cameras, (view.load() for view in views), gains)
+    something is missing or stands too far out, they do so beyond it. `gains`: see `best_agreement`."""
+    found = best_agreement(mesh, [view.camera for view in views], (view.load() for view in views), gains)
     return float(found.inside[found.known].mean()) if found.known.any() else 0.0
 
 

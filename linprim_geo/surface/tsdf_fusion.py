@@ -19,6 +19,11 @@ measured on a room of 53,000 blocks that gave 3.6 million faces."""
 FINEST_PART = 8
 """A voxel smaller than this part of a pixel's footprint holds nothing that a pixel has seen."""
 
+MOST_FACES, CELLS_PER_AREA, AREA_CELLS = 1e6, 1.5, 64
+"""Without a voxel size given a mesh has about so many faces at most. A plane crosses so many cubes per area of a side
+of one, in the mean over its directions, and marching cubes makes two faces in each. The area is measured with so many
+cubes along the diagonal."""
+
 KEY_BITS = 21
 """Bits per axis of the key of a block or voxel: three fit into an int64."""
 
@@ -128,12 +133,12 @@ def estimate_memory(blocks: int, block_resolution: int = 8, frame_pixels: int = 
     return blocks * block_resolution**3 * BYTES_PER_VOXEL + frame_pixels * 300
 
 
-def auto_voxel_size(frames: Iterable[DepthFrame], bounds: np.ndarray | None = None) -> float:
-    """A voxel size that the views can support: their median pixel footprint, kept in 1/400 to 1/100 of the
-    diagonal.
+def auto_voxel_size(frames: Iterable[DepthFrame]) -> float:
+    """A voxel size that the views can support: their median pixel footprint; larger where the surface would have more
+    than MOST_FACES faces, at most 1/100 of the diagonal.
 
-    The diagonal is that of `bounds`, or of the box between the 1 and 99 % quantiles of the depth samples,
-    widened by the share that quantiles cut off a uniform distribution. Rounded to two digits.
+    The diagonal is that of the box between the 1 and 99 % quantiles of the depth samples, widened by the share that
+    quantiles cut off a uniform distribution. Rounded to two digits.
 
     Raises:
         LinprimError: no frame has a depth.
@@ -141,9 +146,6 @@ def auto_voxel_size(frames: Iterable[DepthFrame], bounds: np.ndarray | None = No
     footprints, samples = [], []
     for frame in frames:
         points, depth = frame.surface()
-        if bounds is not None:
-            inside = ((points >= bounds[0]) & (points <= bounds[1])).all(1)
-            points, depth = points[inside], depth[inside]
         if len(depth) == 0:
             continue
         camera = frame.camera
@@ -151,13 +153,18 @@ def auto_voxel_size(frames: Iterable[DepthFrame], bounds: np.ndarray | None = No
         samples.append(points[:: max(1, len(points) // 4096)])
     if not samples:
         raise LinprimError("no depth map holds a surface, so no voxel size can be chosen")
-    if bounds is None:
-        low, high = np.quantile(np.concatenate(samples), [0.01, 0.99], axis=0)
-        diagonal = float(np.linalg.norm(high - low)) / 0.98
-    else:
-        diagonal = float(np.linalg.norm(np.asarray(bounds[1]) - np.asarray(bounds[0])))
-    size = float(np.clip(np.median(footprints), diagonal / 400, diagonal / 100))
+    points = np.concatenate(samples)
+    low, high = np.quantile(points, [0.01, 0.99], axis=0)
+    diagonal = float(np.linalg.norm(high - low)) / 0.98
+    finest = np.sqrt(2 * CELLS_PER_AREA * _area(points, diagonal / AREA_CELLS) / MOST_FACES)
+    size = float(min(max(np.median(footprints), finest), diagonal / 100))
     return float(f"{size:.2g}")
+
+
+def _area(points: np.ndarray, cell: float) -> float:
+    """Area of a surface that (P, 3) points lie densely on, by how many cubes they are in."""
+    cells = np.unique(np.floor(points / cell).astype(np.int64), axis=0)
+    return len(cells) * cell * cell / CELLS_PER_AREA
 
 
 def _trimmed(mesh: Mesh, bounds: np.ndarray | None, min_component: float) -> Mesh:

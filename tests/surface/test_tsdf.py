@@ -348,12 +348,19 @@ def test_a_surface_that_every_other_view_denies_is_no_surface():
         fuse_tsdf(blind, voxel_size=0.05)
 
 
-def test_auto_voxel_size_follows_the_pixels():
-    # Footprint: depth of about 2.2 over a focal length of 154 pixels; the diagonal is 2 sqrt(3).
+def test_auto_voxel_size_follows_the_pixels(monkeypatch):
+    # Footprint: depth of about 2.2 over a focal length of 154 pixels.
     coarse = fuse.auto_voxel_size(sphere_frames(around(12)))
     assert 0.012 < coarse < 0.018
-    fine = fuse.auto_voxel_size(sphere_frames(around(12, size=512)))
-    assert fine == pytest.approx(2 * np.sqrt(3) / 400, rel=0.1)  # held back by the diagonal
+    fine_frames = sphere_frames(around(12, size=256))
+    # Rounded to two digits.
+    assert fuse.auto_voxel_size(fine_frames) == pytest.approx(coarse / 2, rel=0.03)
+    # Held back by the number of faces: those of a sphere of radius 1.
+    monkeypatch.setattr(fuse, "MOST_FACES", 1e5)
+    held = fuse.auto_voxel_size(fine_frames)
+    assert held == pytest.approx(np.sqrt(3 * 4 * np.pi / 1e5), rel=0.1)
+    faces = len(fuse.fuse_tsdf(sphere_frames(around(12)), voxel_size=held).faces)
+    assert 0.8e5 < faces < 1.2e5
 
 
 # --- what cameras see ------------------------------------------------------------------------------------
