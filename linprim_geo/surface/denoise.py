@@ -15,7 +15,7 @@ import numpy as np
 from linprim_geo.capture.types import View
 from linprim_geo.geometry.mesh import Mesh, vertex_normals
 from linprim_geo.kernels import surface_ops
-from linprim_geo.surface.photo_consistency import mean_over_neighbours, predicted_error
+from linprim_geo.surface.photo_consistency import neighbour_average, predicted_error
 
 # Length of the difference of two unit normals: faces with 41 degrees or more between them are on two sides of an edge,
 # so that 45 degree chamfers stay.
@@ -46,9 +46,13 @@ def denoised(mesh: Mesh, views: Sequence[View], gains: np.ndarray | None = None)
         return replace(mesh, quality=error)
     smooth = replace(mesh, vertices=filtered(mesh, error))
     error_then = error_of(smooth)
-    taken = mean_over_neighbours(mesh, error_then, RINGS) <= mean_over_neighbours(mesh, error, RINGS)
-    # Without steps between what is taken and what is not.
-    share = mean_over_neighbours(mesh, taken.astype(float), RINGS)
+    average = neighbour_average(mesh)
+    means, means_then = error, error_then
+    for _ in range(RINGS):
+        means, means_then = average @ means, average @ means_then
+    share = (means_then <= means).astype(float)
+    for _ in range(RINGS):  # no steps between what is taken and what is not
+        share = average @ share
     mesh = replace(
         mesh,
         vertices=mesh.vertices + share[:, None] * (smooth.vertices - mesh.vertices),

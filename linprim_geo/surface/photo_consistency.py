@@ -199,7 +199,7 @@ def refine_surface(
     Moves are averaged over neighbours and fade out where the photographs say nothing. Colours and quality are kept as
     they are. `caster`: of the mesh as it is given, if there is one already.
     """
-    cameras, average = [view.camera for view in views], _average(mesh)
+    cameras, average = [view.camera for view in views], neighbour_average(mesh)
     for _ in range(rounds):
         agreement = best_agreement(mesh, cameras, (view.load() for view in views), gains, caster)
         caster = None
@@ -210,14 +210,6 @@ def refine_surface(
         move /= weight + LEAST_SHARPNESS
         mesh = replace(mesh, vertices=mesh.vertices + move[:, None] * agreement.normals)
     return replace(mesh, normals=vertex_normals(mesh))
-
-
-def mean_over_neighbours(mesh: Mesh, values: np.ndarray, rings: int) -> np.ndarray:
-    """(V,) means of what vertices and their neighbours have, `rings` times in turn."""
-    average = _average(mesh)
-    for _ in range(rings):
-        values = average @ values
-    return values
 
 
 def _compared(
@@ -289,7 +281,7 @@ def _neighbours(mesh: Mesh) -> csr_matrix:
     return graph
 
 
-def _average(mesh: Mesh) -> csr_matrix:
+def neighbour_average(mesh: Mesh) -> csr_matrix:
     """(V, V) that takes the mean over a vertex and its neighbours."""
     from scipy.sparse import diags
 
