@@ -23,12 +23,12 @@
 namespace {
 
 // Ray model, order, screen filter.
-using Rung = std::tuple<int, int, double>;
+using RasterModel = std::tuple<int, int, double>;
 
 linprim::View make_view(const Pose& pose, const std::tuple<double, double, double, double>& intrinsics, int width,
-                        int height, double near, double stop, double level, const Rung& rung) {
+                        int height, double near, double stop, double level, const RasterModel& model) {
   linprim::View view{};
-  const auto [rays, order, screen_filter] = rung;
+  const auto [rays, order, screen_filter] = model;
   if (rays < 0 || rays >= linprim::kRayModels || order < 0 || order >= linprim::kOrders)
     throw std::invalid_argument("unknown ray model or order");
   if (!(screen_filter >= 0) || !std::isfinite(screen_filter))
@@ -126,9 +126,9 @@ void bind_real(nb::module_& m, const char* suffix) {
   m.def((std::string("rasterize_") + suffix).c_str(),
         [](int kind, Array center, Array rotation, Array extent, Array density, Array sh, Array background, Pose pose,
            std::tuple<double, double, double, double> intrinsics, int width, int height, double near, double stop,
-           double level, Rung rung, bool geometry, std::vector<std::optional<Out<Real>>> planes, Out<Real> color,
-           Out<Real> max_weight, Out<int32_t> pixels) {
-          const linprim::View view = make_view(pose, intrinsics, width, height, near, stop, level, rung);
+           double level, RasterModel model, bool geometry, std::vector<std::optional<Out<Real>>> planes,
+           Out<Real> color, Out<Real> max_weight, Out<int32_t> pixels) {
+          const linprim::View view = make_view(pose, intrinsics, width, height, near, stop, level, model);
           const auto primitives = make_primitives<Real>(kind, center, rotation, extent, density, sh);
           require_kernels<Real>(view, primitives);
           const auto out = make_planes<Real, Out<Real>>(planes, height, width);
@@ -145,10 +145,10 @@ void bind_real(nb::module_& m, const char* suffix) {
       (std::string("rasterize_grad_") + suffix).c_str(),
       [](int kind, Array center, Array rotation, Array extent, Array density, Array sh, Array background, Pose pose,
          std::tuple<double, double, double, double> intrinsics, int width, int height, double near, double stop,
-         double level, Rung rung, bool geometry, std::vector<std::optional<Array>> planes, Array color,
+         double level, RasterModel model, bool geometry, std::vector<std::optional<Array>> planes, Array color,
          std::vector<std::optional<Array>> grads, Out<Real> center_grad, Out<Real> rotation_grad, Out<Real> extent_grad,
          Out<Real> density_grad, Out<Real> sh_grad, Out<Real> background_grad, Out<Real> screen_grad) {
-        const linprim::View view = make_view(pose, intrinsics, width, height, near, stop, level, rung);
+        const linprim::View view = make_view(pose, intrinsics, width, height, near, stop, level, model);
         const auto primitives = make_primitives<Real>(kind, center, rotation, extent, density, sh);
         require_kernels<Real>(view, primitives);
         const auto out = make_planes<Real, Array>(planes, height, width);
@@ -170,8 +170,8 @@ void bind_real(nb::module_& m, const char* suffix) {
   m.def((std::string("level_depth_") + suffix).c_str(),
         [](int kind, Array center, Array rotation, Array extent, Array density, Array sh, Pose pose,
            std::tuple<double, double, double, double> intrinsics, int width, int height, double near, double level,
-           Rung rung, Out<Real> depth, Out<Real> opacity) {
-          const linprim::View view = make_view(pose, intrinsics, width, height, near, 0, level, rung);
+           RasterModel model, Out<Real> depth, Out<Real> opacity) {
+          const linprim::View view = make_view(pose, intrinsics, width, height, near, 0, level, model);
           const auto primitives = make_primitives<Real>(kind, center, rotation, extent, density, sh);
           if (primitives.kind == linprim::PrimitiveKind::kGaussian)
             throw std::invalid_argument("a Gaussian has no entry and no exit");

@@ -51,7 +51,7 @@ struct Gaussian {
 
   // With g the gradient to the exponent: the sums of g dx dx, g dx dy, g dy dy, g dx, g dy at 0-4; d_tau is the
   // gradient to -ln(1 - alpha).
-  template <class Solid, bool kDistance>
+  template <class Kind, bool kDistance>
   static void add_gradient(const Record&, const Meeting& m, M hit, V, V through, V d_tau, V d_in, V d_out, V, V, V,
                            V* sums) {
     const M free = hit & (m.alpha < V::set(Real(kLargestAlpha)));

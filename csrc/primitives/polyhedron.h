@@ -1,7 +1,7 @@
 // What the polyhedra have in common in a tile kernel: from the planes of entry and exit to depths and optical
 // thickness, and back.
 //
-// A tile kernel asks of a primitive kind ("Solid"):
+// A tile kernel asks of a primitive kind ("Kind"):
 //   Record, Meeting, kVolume (absorbs along an interval), kColorSums and kGeometrySums per gradient slot
 //   meet          which lanes hit, and what the functions below need to know of them
 //   thickness     what is absorbed, as `attenuate` wants it (0 in lanes without a hit)
@@ -65,10 +65,10 @@ struct Polyhedron {
     }
   }
   // From the gradients to optical thickness, z-depth of entry and of exit (0 in lanes without a hit), and what the
-  // density has beside its share of the thickness, to the sums of Solid's record. The unnamed argument is the
+  // density has beside its share of the thickness, to the sums of Kind's record. The unnamed argument is the
   // transmittance; kDistance: there is a sum for the centre's distance.
-  template <class Solid, bool kDistance>
-  static void add_gradient(const typename Solid::Record& r, const Meeting& m, M hit, V length, V, V d_tau, V d_in,
+  template <class Kind, bool kDistance>
+  static void add_gradient(const typename Kind::Record& r, const Meeting& m, M hit, V length, V, V d_tau, V d_in,
                            V d_out, V d_density, V px, V py, V* sums) {
     const V zero = V::set(0), d_chord = d_tau * V::set(r.density);
     sums[Sum::density] = fma(d_tau, m.chord, sums[Sum::density] + d_density);
@@ -86,7 +86,7 @@ struct Polyhedron {
       g_out = select(hit, zero - fma(d_out, inverse, d_chord), zero);
       if constexpr (kDistance) sums[Sum::distance] = fma(d_in + d_out, inverse, sums[Sum::distance]);
     }
-    Solid::add_planes(r, m, hit, g_in, g_out, px, py, sums);
+    Kind::add_planes(r, m, hit, g_in, g_out, px, py, sums);
   }
 };
 

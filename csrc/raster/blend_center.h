@@ -27,25 +27,22 @@ enum GeometryState {
 };
 
 // Adds one primitive to the geometric outputs of a part of a block.
-template <class Solid>
-inline void blend_geometry(const typename Solid::Record& record, const typename Solid::Real (*normals)[3],
-                           Vec<typename Solid::Real, Solid::kWidth> v_length,
-                           Mask<typename Solid::Real, Solid::kWidth> hit,
-                           Index<typename Solid::Real, Solid::kWidth> in_face,
-                           Vec<typename Solid::Real, Solid::kWidth> t, Vec<typename Solid::Real, Solid::kWidth> after,
-                           Vec<typename Solid::Real, Solid::kWidth> tau, Vec<typename Solid::Real, Solid::kWidth> alpha,
-                           Vec<typename Solid::Real, Solid::kWidth> e_tau,
-                           Vec<typename Solid::Real, Solid::kWidth> weight,
-                           Vec<typename Solid::Real, Solid::kWidth> t_in,
-                           Vec<typename Solid::Real, Solid::kWidth> t_out, typename Solid::Real level,
-                           typename Solid::Real (*geo)[kTilePixels], int at) {
-  using Real = typename Solid::Real;
-  using V = Vec<Real, Solid::kWidth>;
-  using M = Mask<Real, Solid::kWidth>;
+template <class Kind>
+inline void blend_geometry(const typename Kind::Record& record, const typename Kind::Real (*normals)[3],
+                           Vec<typename Kind::Real, Kind::kWidth> v_length, Mask<typename Kind::Real, Kind::kWidth> hit,
+                           Index<typename Kind::Real, Kind::kWidth> in_face, Vec<typename Kind::Real, Kind::kWidth> t,
+                           Vec<typename Kind::Real, Kind::kWidth> after, Vec<typename Kind::Real, Kind::kWidth> tau,
+                           Vec<typename Kind::Real, Kind::kWidth> alpha, Vec<typename Kind::Real, Kind::kWidth> e_tau,
+                           Vec<typename Kind::Real, Kind::kWidth> weight, Vec<typename Kind::Real, Kind::kWidth> t_in,
+                           Vec<typename Kind::Real, Kind::kWidth> t_out, typename Kind::Real level,
+                           typename Kind::Real (*geo)[kTilePixels], int at) {
+  using Real = typename Kind::Real;
+  using V = Vec<Real, Kind::kWidth>;
+  using M = Mask<Real, Kind::kWidth>;
   const V zero = V::set(0), v_level = V::set(level);
   auto state = [&](int s) { return V::load(geo[s] + at); };
   V z = t_in;
-  if constexpr (Solid::kVolume) {
+  if constexpr (Kind::kVolume) {
     V mean, slope;
     mean_in_slice(tau, alpha, e_tau, mean, slope);
     z = fma(t_out - t_in, mean, t_in);
@@ -67,7 +64,7 @@ inline void blend_geometry(const typename Solid::Record& record, const typename 
   for (int k = 0; k < 3; ++k) fma(weight, normal[k], state(kNormal + k)).store(geo[kNormal + k] + at);
   if (crossing.bits()) {
     V median = t_in;
-    if constexpr (Solid::kVolume) {
+    if constexpr (Kind::kVolume) {
       const V slowness = rcp(V::set(record.density) * v_length);
       const V inside = log(select(crossing, t * V::set(1 / level), V::set(1))) * slowness;
       median = min(t_in + inside, t_out);
@@ -112,10 +109,10 @@ inline void store_pixels(const RasterParams<Real>& P, int tile_x, int tile_y, Re
   }
 }
 
-template <class Solid, bool kGeometry>
-Counts forward_center(const RasterParams<typename Solid::Real>& P, int tile, void*) {
-  using Real = typename Solid::Real;
-  constexpr int W = Solid::kWidth;
+template <class Kind, bool kGeometry>
+Counts forward_center(const RasterParams<typename Kind::Real>& P, int tile, void*) {
+  using Real = typename Kind::Real;
+  constexpr int W = Kind::kWidth;
   using T = Tile<Real, W>;
   using V = typename T::V;
   using M = typename T::M;
@@ -124,7 +121,7 @@ Counts forward_center(const RasterParams<typename Solid::Real>& P, int tile, voi
   const int tile_x = tile % P.tiles_x * kTile, tile_y = tile / P.tiles_x * kTile;
   const Lanes<Real, W> lanes;
   const V zero = V::set(0), v_stop = V::set(Real(view.stop));
-  const auto* records = static_cast<const typename Solid::Record*>(P.records);
+  const auto* records = static_cast<const typename Kind::Record*>(P.records);
   uint64_t visited = 0, hit_lanes = 0;
 
   alignas(64) Real length[kTilePixels], through[kTilePixels], red[kTilePixels], green[kTilePixels], blue[kTilePixels];
@@ -140,7 +137,7 @@ Counts forward_center(const RasterParams<typename Solid::Real>& P, int tile, voi
     const int count = int(std::min<uint32_t>(kChunk, end - begin));
     uint32_t* blocks = P.lists.blocks + begin;
     uint32_t touched[kChunk] = {};
-    const typename Solid::Record* record[kChunk];
+    const typename Kind::Record* record[kChunk];
     if (alive)
       for (int i = 0; i < count; ++i) {
         record[i] = &records[P.lists.primitive[begin + i]];
@@ -169,11 +166,11 @@ Counts forward_center(const RasterParams<typename Solid::Real>& P, int tile, voi
           for (int k = 0; k < kGroup && todo; ++k, todo &= todo - 1) {
             const int i = std::countr_zero(todo);
             const auto& R = *record[i];
-            typename Solid::Meeting m;
+            typename Kind::Meeting m;
             const M hit =
-                Solid::template meet<kGeometry>(R, view, x - V::set(R.ref_x), y - V::set(R.ref_y), v_length, m);
-            taus[kept] = Solid::thickness(R, v_length, hit, m);
-            if constexpr (kGeometry) Solid::depths(R, v_length, m, t_in[kept], t_out[kept]), in_face[kept] = m.in_face;
+                Kind::template meet<kGeometry>(R, view, x - V::set(R.ref_x), y - V::set(R.ref_y), v_length, m);
+            taus[kept] = Kind::thickness(R, v_length, hit, m);
+            if constexpr (kGeometry) Kind::depths(R, v_length, m, t_in[kept], t_out[kept]), in_face[kept] = m.in_face;
             hits[kept] = hit, entry[kept] = i;
             kept += hit.bits() != 0;
             visited += W;
@@ -182,7 +179,7 @@ Counts forward_center(const RasterParams<typename Solid::Real>& P, int tile, voi
             const auto& R = *record[entry[k]];
             const M hit = hits[k] & (t >= v_stop);
             V alpha, e_tau;
-            Solid::attenuate(R, taus[k], alpha, e_tau);
+            Kind::attenuate(R, taus[k], alpha, e_tau);
             const V weight = select(hit, t * alpha, zero), after = t * e_tau;
             r = fma(weight, V::set(R.rgb[0]), r), g = fma(weight, V::set(R.rgb[1]), g),
             b = fma(weight, V::set(R.rgb[2]), b);
@@ -193,8 +190,8 @@ Counts forward_center(const RasterParams<typename Solid::Real>& P, int tile, voi
               const uint32_t slot = P.lists.slot[begin + entry[k]];
               P.pair_weight[slot] = std::max(P.pair_weight[slot], max_lane(weight)),
               P.pair_pixels[slot] += unsigned(std::popcount(bits));
-              blend_geometry<Solid>(R, P.normals[P.lists.primitive[begin + entry[k]]], v_length, hit, in_face[k], t,
-                                    after, taus[k], alpha, e_tau, weight, t_in[k], t_out[k], Real(view.level), geo, at);
+              blend_geometry<Kind>(R, P.normals[P.lists.primitive[begin + entry[k]]], v_length, hit, in_face[k], t,
+                                   after, taus[k], alpha, e_tau, weight, t_in[k], t_out[k], Real(view.level), geo, at);
             }
             t = select(hit, after, t);
           }
@@ -280,21 +277,21 @@ struct Incoming {
 };
 
 // The adjoint of blending one primitive into a part of a block: adds to its sums, and takes it from what is in front.
-template <class Solid, bool kGeometry>
-inline void blend_backward(const typename Solid::Record& record, const typename Solid::Real (*normals)[3],
-                           const View& view, Incoming<typename Solid::Real, Solid::kWidth, kGeometry>& state,
-                           const typename Solid::Meeting& m, Mask<typename Solid::Real, Solid::kWidth> met,
-                           Vec<typename Solid::Real, Solid::kWidth> tau, int at,
-                           Vec<typename Solid::Real, Solid::kWidth> px, Vec<typename Solid::Real, Solid::kWidth> py,
-                           Vec<typename Solid::Real, Solid::kWidth>* sums) {
-  using Real = typename Solid::Real;
-  using V = Vec<Real, Solid::kWidth>;
-  using M = Mask<Real, Solid::kWidth>;
-  using S = Incoming<Real, Solid::kWidth, kGeometry>;
+template <class Kind, bool kGeometry>
+inline void blend_backward(const typename Kind::Record& record, const typename Kind::Real (*normals)[3],
+                           const View& view, Incoming<typename Kind::Real, Kind::kWidth, kGeometry>& state,
+                           const typename Kind::Meeting& m, Mask<typename Kind::Real, Kind::kWidth> met,
+                           Vec<typename Kind::Real, Kind::kWidth> tau, int at,
+                           Vec<typename Kind::Real, Kind::kWidth> px, Vec<typename Kind::Real, Kind::kWidth> py,
+                           Vec<typename Kind::Real, Kind::kWidth>* sums) {
+  using Real = typename Kind::Real;
+  using V = Vec<Real, Kind::kWidth>;
+  using M = Mask<Real, Kind::kWidth>;
+  using S = Incoming<Real, Kind::kWidth, kGeometry>;
   const V zero = V::set(0), t = V::load(state.through + at);
   const M hit = met & (t >= V::set(Real(view.stop)));
   V alpha, e_tau;
-  Solid::attenuate(record, tau, alpha, e_tau);
+  Kind::attenuate(record, tau, alpha, e_tau);
   const V after = t * e_tau, weight = select(hit, t * alpha, zero);
   const V gr = V::load(state.red + at), gg = V::load(state.green + at), gb = V::load(state.blue + at);
   V value = fma(V::set(record.rgb[0]), gr,
@@ -304,9 +301,9 @@ inline void blend_backward(const typename Solid::Record& record, const typename 
   if constexpr (kGeometry) {
     auto from = [&](int plane) { return V::load(state.geo[plane] + at); };
     V t_in, t_out;
-    Solid::depths(record, v_length, m, t_in, t_out);
+    Kind::depths(record, v_length, m, t_in, t_out);
     V z = t_in, mean = zero, slope = zero;
-    if constexpr (Solid::kVolume) {
+    if constexpr (Kind::kVolume) {
       mean_in_slice(tau, alpha, e_tau, mean, slope);
       z = fma(t_out - t_in, mean, t_in);
     }
@@ -322,7 +319,7 @@ inline void blend_backward(const typename Solid::Record& record, const typename 
     const V v_level = V::set(Real(view.level)), g_median = from(S::kMedian);
     const M crossing = hit & (v_level < t) & (v_level >= after);
     d_in = d_in + select(crossing, g_median, zero);
-    if constexpr (Solid::kVolume) {
+    if constexpr (Kind::kVolume) {
       const V slowness = from(S::kSlowness);
       d_tau_direct = d_tau_direct - select(hit & (v_level < after), g_median * slowness, zero);
       if (crossing.bits()) {
@@ -348,8 +345,8 @@ inline void blend_backward(const typename Solid::Record& record, const typename 
   sums[Sum::rgb] = fma(weight, gr, sums[Sum::rgb]);
   sums[Sum::rgb + 1] = fma(weight, gg, sums[Sum::rgb + 1]);
   sums[Sum::rgb + 2] = fma(weight, gb, sums[Sum::rgb + 2]);
-  Solid::template add_gradient<Solid, kGeometry>(record, m, hit, v_length, e_tau, d_tau, d_in, d_out, d_density_direct,
-                                                 px, py, sums);
+  Kind::template add_gradient<Kind, kGeometry>(record, m, hit, v_length, e_tau, d_tau, d_in, d_out, d_density_direct,
+                                               px, py, sums);
   rest.store(state.remaining + at);
   select(hit, after, t).store(state.through + at);
 }
@@ -370,20 +367,20 @@ inline const T& opaque(const T& object) {
   return *p;
 }
 
-template <class Solid, bool kGeometry>
-void backward_center(const RasterParams<typename Solid::Real>& P, int tile, void*) {
-  using Real = typename Solid::Real;
-  constexpr int W = Solid::kWidth;
+template <class Kind, bool kGeometry>
+void backward_center(const RasterParams<typename Kind::Real>& P, int tile, void*) {
+  using Real = typename Kind::Real;
+  constexpr int W = Kind::kWidth;
   using T = Tile<Real, W>;
   using V = typename T::V;
   using M = typename T::M;
-  constexpr int kSums = kGeometry ? Solid::kGeometrySums : Solid::kColorSums;
+  constexpr int kSums = kGeometry ? Kind::kGeometrySums : Kind::kColorSums;
   constexpr int kReady = 4;  // entries that are intersected before they are worked on
   constexpr int kAhead = 6;  // pairs whose records are fetched before their turn
   const View& view = P.view;
   const int tile_x = tile % P.tiles_x * kTile, tile_y = tile / P.tiles_x * kTile;
   const Lanes<Real, W> lanes;
-  const auto* records = static_cast<const typename Solid::Record*>(P.records);
+  const auto* records = static_cast<const typename Kind::Record*>(P.records);
   Incoming<Real, W, kGeometry> state;
   state.load(P, tile, tile_x, tile_y);
 
@@ -397,7 +394,7 @@ void backward_center(const RasterParams<typename Solid::Real>& P, int tile, void
     }
     if (e + kAhead < end) {
       const char* next = reinterpret_cast<const char*>(&records[P.lists.primitive[e + kAhead]]);
-      for (size_t line = 0; line < sizeof(typename Solid::Record); line += 64) __builtin_prefetch(next + line);
+      for (size_t line = 0; line < sizeof(typename Kind::Record); line += 64) __builtin_prefetch(next + line);
     }
     const auto& record_of_pair = records[P.lists.primitive[e]];
     const Real origin_x = origin_in_tile(record_of_pair.ref_x, tile_x),
@@ -408,7 +405,7 @@ void backward_center(const RasterParams<typename Solid::Real>& P, int tile, void
     for (V& s : sums) s = V::set(0);
     int part = 0;
     while (todo) {
-      typename Solid::Meeting ready[kReady];
+      typename Kind::Meeting ready[kReady];
       V taus[kReady];
       M met[kReady];
       int places[kReady], count = 0;
@@ -419,8 +416,8 @@ void backward_center(const RasterParams<typename Solid::Real>& P, int tile, void
         const V py = lanes.y + V::set(Real(4 * (block >> 2) + T::part_y(part)) - origin_y);
         const int at = block * 16 + part * W;
         const V v_length = V::load(state.length + at);
-        met[count] = Solid::template meet<true>(record, view, px + from_x, py + from_y, v_length, ready[count]);
-        taus[count] = Solid::thickness(record, v_length, met[count], ready[count]);
+        met[count] = Kind::template meet<true>(record, view, px + from_x, py + from_y, v_length, ready[count]);
+        taus[count] = Kind::thickness(record, v_length, met[count], ready[count]);
         places[count] = at;
         count += T::kParts == 1 || met[count].bits() != 0;
         if (++part == T::kParts) part = 0, todo &= todo - 1;
@@ -430,12 +427,12 @@ void backward_center(const RasterParams<typename Solid::Real>& P, int tile, void
         const int at = places[k], block = at / 16, place = at % 16 / W;
         const V px = lanes.x + V::set(Real(4 * (block & 3) + T::part_x(place)) - origin_x);
         const V py = lanes.y + V::set(Real(4 * (block >> 2) + T::part_y(place)) - origin_y);
-        blend_backward<Solid, kGeometry>(record, kGeometry ? P.normals[P.lists.primitive[e]] : nullptr, view, state,
-                                         ready[k], met[k], taus[k], at, px, py, sums);
+        blend_backward<Kind, kGeometry>(record, kGeometry ? P.normals[P.lists.primitive[e]] : nullptr, view, state,
+                                        ready[k], met[k], taus[k], at, px, py, sums);
       }
     }
     reduce(sums, kSums, slot);
-    Solid::recenter(record_of_pair, Real(tile_x) + origin_x, Real(tile_y) + origin_y, slot);
+    Kind::recenter(record_of_pair, Real(tile_x) + origin_x, Real(tile_y) + origin_y, slot);
   }
 }
 

@@ -42,13 +42,13 @@ inline void slice_moments(Vec<Real, W> tau, Vec<Real, W> alpha, Vec<Real, W> thr
   }
 }
 
-template <class Solid, bool kBackward, bool kGeometry>
+template <class Kind, bool kBackward, bool kGeometry>
 struct OverlapCandidate {
-  using Real = typename Solid::Real;
-  using V = Vec<Real, Solid::kWidth>;
-  const typename Solid::Record* record;
+  using Real = typename Kind::Real;
+  using V = Vec<Real, Kind::kWidth>;
+  const typename Kind::Record* record;
   uint32_t entry, pixels;
-  typename Solid::Meeting meeting;
+  typename Kind::Meeting meeting;
   V t_in, t_out;                               // both before every event where the ray misses
   V rate;                                      // density per z-depth
   V weight;                                    // integral of T density over its interval so far
@@ -59,14 +59,14 @@ struct OverlapCandidate {
 // Walks the rays of a part from event to event while open() says that a ray is: begin(candidate, rays that meet it),
 // then, from each event to the next, segment(now, next, rays that have a next event), and finish(candidate) when no ray
 // meets it any more.
-template <class Solid, bool kTrack, class Candidate, class Begin, class Open, class Segment, class Finish>
-inline void sweep_overlaps(Window<Solid, Candidate>& window, const View& view,
-                           const Part<typename Solid::Real, Solid::kWidth>& part,
-                           Vec<typename Solid::Real, Solid::kWidth> v_length, Begin begin, Open open, Segment segment,
+template <class Kind, bool kTrack, class Candidate, class Begin, class Open, class Segment, class Finish>
+inline void sweep_overlaps(Window<Kind, Candidate>& window, const View& view,
+                           const Part<typename Kind::Real, Kind::kWidth>& part,
+                           Vec<typename Kind::Real, Kind::kWidth> v_length, Begin begin, Open open, Segment segment,
                            Finish finish) {
-  using Real = typename Solid::Real;
-  using V = Vec<Real, Solid::kWidth>;
-  using M = Mask<Real, Solid::kWidth>;
+  using Real = typename Kind::Real;
+  using V = Vec<Real, Kind::kWidth>;
+  using M = Mask<Real, Kind::kWidth>;
   const V never = V::set(kNever<Real>), before = V::set(-kNever<Real>);
   V now = before;
   for (M going = open(); going.bits(); going = open()) {
@@ -79,11 +79,11 @@ inline void sweep_overlaps(Window<Solid, Candidate>& window, const View& view,
     auto latest = [&] { return max_lane(select(next < never, next, before)); };
     while (window.more() && (window.bound() <= latest() || !(next < never).bits())) {
       Candidate& c = window.take();
-      const M hit = going & Solid::template meet<kTrack>(*c.record, view, part.x - V::set(c.record->ref_x),
-                                                         part.y - V::set(c.record->ref_y), v_length, c.meeting);
-      Solid::thickness(*c.record, v_length, hit, c.meeting);
+      const M hit = going & Kind::template meet<kTrack>(*c.record, view, part.x - V::set(c.record->ref_x),
+                                                        part.y - V::set(c.record->ref_y), v_length, c.meeting);
+      Kind::thickness(*c.record, v_length, hit, c.meeting);
       V t_in, t_out;
-      Solid::depths(*c.record, v_length, c.meeting, t_in, t_out);
+      Kind::depths(*c.record, v_length, c.meeting, t_in, t_out);
       // An interval that rounds to nothing is not met; a ray does not go back.
       const M met = hit & (t_in < t_out) & (now < t_out);
       if (!met.bits()) {
@@ -109,14 +109,14 @@ inline void sweep_overlaps(Window<Solid, Candidate>& window, const View& view,
   window.remove([&](Candidate& c) { return finish(c), true; });
 }
 
-template <class Solid, bool kGeometry>
-Counts forward_overlap(const RasterParams<typename Solid::Real>& P, int tile, void* scratch) {
-  using Real = typename Solid::Real;
-  constexpr int W = Solid::kWidth;
+template <class Kind, bool kGeometry>
+Counts forward_overlap(const RasterParams<typename Kind::Real>& P, int tile, void* scratch) {
+  using Real = typename Kind::Real;
+  constexpr int W = Kind::kWidth;
   using T = Tile<Real, W>;
   using V = typename T::V;
   using M = typename T::M;
-  using Candidate = OverlapCandidate<Solid, false, kGeometry>;
+  using Candidate = OverlapCandidate<Kind, false, kGeometry>;
   const View& view = P.view;
   const int tile_x = tile % P.tiles_x * kTile, tile_y = tile / P.tiles_x * kTile;
   const Lanes<Real, W> lanes;
@@ -132,7 +132,7 @@ Counts forward_overlap(const RasterParams<typename Solid::Real>& P, int tile, vo
   const uint32_t first = P.lists.tile_begin[tile], end = P.lists.tile_begin[tile + 1];
   if constexpr (kGeometry)
     for (uint32_t e = first; e < end; ++e) P.pair_weight[P.lists.slot[e]] = 0, P.pair_pixels[P.lists.slot[e]] = 0;
-  Window<Solid, Candidate> window(P, tile, scratch, end - first);
+  Window<Kind, Candidate> window(P, tile, scratch, end - first);
 
   for (int block = 0; block < kBlocks; ++block)
     for (int p = 0; p < T::kParts; ++p) {
@@ -143,7 +143,7 @@ Counts forward_overlap(const RasterParams<typename Solid::Real>& P, int tile, vo
       V seen = zero, origin = zero, first_depth = zero, m1 = zero, m2 = zero, median = zero, slowness = zero;
       V normal[3] = {zero, zero, zero}, median_normal[3] = {zero, zero, zero};
       window.start(block);
-      sweep_overlaps<Solid, kGeometry>(
+      sweep_overlaps<Kind, kGeometry>(
           window, view, part, v_length,
           [&](Candidate& c, M met) {
             visited += W, hit_lanes += unsigned(std::popcount(met.bits()));
@@ -220,20 +220,19 @@ Counts forward_overlap(const RasterParams<typename Solid::Real>& P, int tile, vo
 }
 
 // Under affine rays depths follow the distance of the centre, which has its sum among the geometric ones.
-template <class Solid, bool kGeometry>
-constexpr int kOverlapSums =
-    kGeometry || Solid::kRayModel == RayModel::kAffine ? Solid::kGeometrySums : Solid::kColorSums;
+template <class Kind, bool kGeometry>
+constexpr int kOverlapSums = kGeometry || Kind::kRayModel == RayModel::kAffine ? Kind::kGeometrySums : Kind::kColorSums;
 
-template <class Solid, bool kGeometry>
-void backward_overlap(const RasterParams<typename Solid::Real>& P, int tile, void* scratch) {
-  using Real = typename Solid::Real;
-  constexpr int W = Solid::kWidth;
+template <class Kind, bool kGeometry>
+void backward_overlap(const RasterParams<typename Kind::Real>& P, int tile, void* scratch) {
+  using Real = typename Kind::Real;
+  constexpr int W = Kind::kWidth;
   using T = Tile<Real, W>;
   using V = typename T::V;
   using M = typename T::M;
-  using Candidate = OverlapCandidate<Solid, true, kGeometry>;
+  using Candidate = OverlapCandidate<Kind, true, kGeometry>;
   using S = Incoming<Real, W, kGeometry>;
-  constexpr int kSums = kOverlapSums<Solid, kGeometry>;
+  constexpr int kSums = kOverlapSums<Kind, kGeometry>;
   constexpr int kMoments = kGeometry ? 4 : 2;
   const View& view = P.view;
   const int tile_x = tile % P.tiles_x * kTile, tile_y = tile / P.tiles_x * kTile;
@@ -244,7 +243,7 @@ void backward_overlap(const RasterParams<typename Solid::Real>& P, int tile, voi
   const uint32_t first = P.lists.tile_begin[tile], end = P.lists.tile_begin[tile + 1];
   auto slot_of = [&](uint32_t entry) { return P.sums + int64_t(P.lists.slot[entry]) * kSums; };
   for (uint32_t e = first; e < end; ++e) std::fill(slot_of(e), slot_of(e) + kSums, Real(0));
-  Window<Solid, Candidate> window(P, tile, scratch, end - first);
+  Window<Kind, Candidate> window(P, tile, scratch, end - first);
 
   for (int block = 0; block < kBlocks; ++block)
     for (int p = 0; p < T::kParts; ++p) {
@@ -264,7 +263,7 @@ void backward_overlap(const RasterParams<typename Solid::Real>& P, int tile, voi
       // h(t) = g1 (t - origin) + g2 (t - origin)^2.
       auto along = [&](V depth) { return (depth - origin) * fma(depth - origin, g2, g1); };
       window.start(block);
-      sweep_overlaps<Solid, true>(
+      sweep_overlaps<Kind, true>(
           window, view, part, v_length,
           [&](Candidate& c, M) {
             c.weight = c.d_density = c.d_in = c.d_out = zero;
@@ -380,11 +379,11 @@ void backward_overlap(const RasterParams<typename Solid::Real>& P, int tile, voi
                   sums[Sum::normal + 3 * f + k] =
                       fma(select(equal(c.meeting.in_face, f), c.weight, zero), incoming(S::kNormal + k),
                           c.d_median[f] * incoming(S::kMedianNormal + k));
-            Solid::template add_gradient<Solid, kSums == Solid::kGeometrySums>(
+            Kind::template add_gradient<Kind, kSums == Kind::kGeometrySums>(
                 *c.record, c.meeting, met, v_length, zero, zero, select(met, c.d_in, zero), select(met, c.d_out, zero),
                 select(met, c.d_density * v_length, zero), part.px - V::set(origin_in_tile(c.record->ref_x, tile_x)),
                 part.py - V::set(origin_in_tile(c.record->ref_y, tile_y)), sums);
-            add_to_slot<Solid, kSums>(*c.record, sums, tile_x, tile_y, slot_of(c.entry));
+            add_to_slot<Kind, kSums>(*c.record, sums, tile_x, tile_y, slot_of(c.entry));
           });
     }
 }

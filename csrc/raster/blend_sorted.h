@@ -14,10 +14,10 @@
 namespace linprim::LINPRIM_ISA {
 
 // The primitives of one tile list that a part of a block has in hand. Candidate needs members `record`, `entry`.
-template <class Solid, class Candidate>
+template <class Kind, class Candidate>
 class Window {
  public:
-  using Real = typename Solid::Real;
+  using Real = typename Kind::Real;
   static int64_t bytes(int64_t longest_list) {
     return (longest_list + 1) * int64_t(sizeof(Candidate) + 2 * sizeof(int32_t));
   }
@@ -41,7 +41,7 @@ class Window {
     const int id = free_count_ ? free_[--free_count_] : used_++;
     members_[count_++] = id;
     Candidate& c = candidates_[id];
-    c.entry = at_, c.record = &static_cast<const typename Solid::Record*>(P_.records)[P_.lists.primitive[at_]];
+    c.entry = at_, c.record = &static_cast<const typename Kind::Record*>(P_.records)[P_.lists.primitive[at_]];
     ++at_;
     skip();
     return c;
@@ -97,28 +97,28 @@ struct Part {
 // ---- By entry depth
 // -----------------------------------------------------------------------------------------------------
 
-template <class Solid, bool kBackward, bool kGeometry>
+template <class Kind, bool kBackward, bool kGeometry>
 struct EntryCandidate {
-  using Real = typename Solid::Real;
-  using V = Vec<Real, Solid::kWidth>;
-  const typename Solid::Record* record;
+  using Real = typename Kind::Real;
+  using V = Vec<Real, Kind::kWidth>;
+  const typename Kind::Record* record;
   uint32_t entry;
-  typename Solid::Meeting meeting;
-  Mask<Real, Solid::kWidth> waiting;  // hit, and not blended yet
+  typename Kind::Meeting meeting;
+  Mask<Real, Kind::kWidth> waiting;  // hit, and not blended yet
   V tau, t_in, t_out;
-  V sums[kBackward ? (kGeometry ? Solid::kGeometrySums : Solid::kColorSums) : 1];
+  V sums[kBackward ? (kGeometry ? Kind::kGeometrySums : Kind::kColorSums) : 1];
 };
 
 // Calls blend(candidate, mask) for the rays of a part, each in the order of its entries, while go_on() says that a ray
 // is open; finish(candidate) when a candidate leaves.
-template <class Solid, bool kTrack, class Candidate, class Begin, class Open, class Blend, class Finish>
-inline void sweep_entries(Window<Solid, Candidate>& window, const View& view,
-                          const Part<typename Solid::Real, Solid::kWidth>& part,
-                          Vec<typename Solid::Real, Solid::kWidth> v_length, Begin begin, Open open, Blend blend,
+template <class Kind, bool kTrack, class Candidate, class Begin, class Open, class Blend, class Finish>
+inline void sweep_entries(Window<Kind, Candidate>& window, const View& view,
+                          const Part<typename Kind::Real, Kind::kWidth>& part,
+                          Vec<typename Kind::Real, Kind::kWidth> v_length, Begin begin, Open open, Blend blend,
                           Finish finish) {
-  using Real = typename Solid::Real;
-  using V = Vec<Real, Solid::kWidth>;
-  using M = Mask<Real, Solid::kWidth>;
+  using Real = typename Kind::Real;
+  using V = Vec<Real, Kind::kWidth>;
+  using M = Mask<Real, Kind::kWidth>;
   const V never = V::set(kNever<Real>);
   V last = V::set(-kNever<Real>);  // no ray goes back
   for (M going = open(); going.bits(); going = open()) {
@@ -128,14 +128,14 @@ inline void sweep_entries(Window<Solid, Candidate>& window, const View& view,
     auto latest = [&] { return max_lane(select(going & (next < never), next, V::set(-kNever<Real>))); };
     while (window.more() && (window.bound() <= latest() || !(going & (next < never)).bits())) {
       Candidate& c = window.take();
-      c.waiting = Solid::template meet<kTrack>(*c.record, view, part.x - V::set(c.record->ref_x),
-                                               part.y - V::set(c.record->ref_y), v_length, c.meeting);
+      c.waiting = Kind::template meet<kTrack>(*c.record, view, part.x - V::set(c.record->ref_x),
+                                              part.y - V::set(c.record->ref_y), v_length, c.meeting);
       if (!(c.waiting & going).bits()) {
         window.drop_last();
         continue;
       }
-      c.tau = Solid::thickness(*c.record, v_length, c.waiting, c.meeting);
-      Solid::depths(*c.record, v_length, c.meeting, c.t_in, c.t_out);
+      c.tau = Kind::thickness(*c.record, v_length, c.waiting, c.meeting);
+      Kind::depths(*c.record, v_length, c.meeting, c.t_in, c.t_out);
       c.t_in = max(c.t_in, last);
       begin(c);
       next = min(next, select(c.waiting & going, c.t_in, never));
@@ -158,14 +158,14 @@ inline void sweep_entries(Window<Solid, Candidate>& window, const View& view,
   window.remove([&](Candidate& c) { return finish(c), true; });
 }
 
-template <class Solid, bool kGeometry>
-Counts forward_entry(const RasterParams<typename Solid::Real>& P, int tile, void* scratch) {
-  using Real = typename Solid::Real;
-  constexpr int W = Solid::kWidth;
+template <class Kind, bool kGeometry>
+Counts forward_entry(const RasterParams<typename Kind::Real>& P, int tile, void* scratch) {
+  using Real = typename Kind::Real;
+  constexpr int W = Kind::kWidth;
   using T = Tile<Real, W>;
   using V = typename T::V;
   using M = typename T::M;
-  using Candidate = EntryCandidate<Solid, false, kGeometry>;
+  using Candidate = EntryCandidate<Kind, false, kGeometry>;
   const View& view = P.view;
   const int tile_x = tile % P.tiles_x * kTile, tile_y = tile / P.tiles_x * kTile;
   const Lanes<Real, W> lanes;
@@ -181,7 +181,7 @@ Counts forward_entry(const RasterParams<typename Solid::Real>& P, int tile, void
   const uint32_t first = P.lists.tile_begin[tile], end = P.lists.tile_begin[tile + 1];
   if constexpr (kGeometry)
     for (uint32_t e = first; e < end; ++e) P.pair_weight[P.lists.slot[e]] = 0, P.pair_pixels[P.lists.slot[e]] = 0;
-  Window<Solid, Candidate> window(P, tile, scratch, end - first);
+  Window<Kind, Candidate> window(P, tile, scratch, end - first);
 
   for (int block = 0; block < kBlocks; ++block)
     for (int p = 0; p < T::kParts; ++p) {
@@ -190,13 +190,13 @@ Counts forward_entry(const RasterParams<typename Solid::Real>& P, int tile, void
       const V v_length = V::load(length + at);
       V t = V::load(through + at), r = zero, g = zero, b = zero;
       window.start(block);
-      sweep_entries<Solid, kGeometry>(
+      sweep_entries<Kind, kGeometry>(
           window, view, part, v_length, [&](Candidate&) { visited += W; }, [&] { return t >= v_stop; },
           [&](Candidate& c, M now) {
             const auto& R = *c.record;
             const M hit = now & (t >= v_stop);
             V alpha, e_tau;
-            Solid::attenuate(R, c.tau, alpha, e_tau);
+            Kind::attenuate(R, c.tau, alpha, e_tau);
             const V weight = select(hit, t * alpha, zero), after = t * e_tau;
             r = fma(weight, V::set(R.rgb[0]), r), g = fma(weight, V::set(R.rgb[1]), g),
             b = fma(weight, V::set(R.rgb[2]), b);
@@ -205,8 +205,8 @@ Counts forward_entry(const RasterParams<typename Solid::Real>& P, int tile, void
             if constexpr (kGeometry) {
               const uint32_t slot = P.lists.slot[c.entry];
               P.pair_weight[slot] = std::max(P.pair_weight[slot], max_lane(weight)), P.pair_pixels[slot] += count;
-              blend_geometry<Solid>(R, P.normals[P.lists.primitive[c.entry]], v_length, hit, c.meeting.in_face, t,
-                                    after, c.tau, alpha, e_tau, weight, c.t_in, c.t_out, Real(view.level), geo, at);
+              blend_geometry<Kind>(R, P.normals[P.lists.primitive[c.entry]], v_length, hit, c.meeting.in_face, t, after,
+                                   c.tau, alpha, e_tau, weight, c.t_in, c.t_out, Real(view.level), geo, at);
             }
             t = select(hit, after, t);
           },
@@ -218,26 +218,26 @@ Counts forward_entry(const RasterParams<typename Solid::Real>& P, int tile, void
 }
 
 // Adds a finished candidate's sums to its slot.
-template <class Solid, int kSums>
-inline void add_to_slot(const typename Solid::Record& record, const Vec<typename Solid::Real, Solid::kWidth>* sums,
-                        int tile_x, int tile_y, typename Solid::Real* slot) {
-  alignas(64) typename Solid::Real own[kSums];
+template <class Kind, int kSums>
+inline void add_to_slot(const typename Kind::Record& record, const Vec<typename Kind::Real, Kind::kWidth>* sums,
+                        int tile_x, int tile_y, typename Kind::Real* slot) {
+  alignas(64) typename Kind::Real own[kSums];
   reduce(sums, kSums, own);
-  using Real = typename Solid::Real;
-  Solid::recenter(record, Real(tile_x) + origin_in_tile(record.ref_x, tile_x),
-                  Real(tile_y) + origin_in_tile(record.ref_y, tile_y), own);
+  using Real = typename Kind::Real;
+  Kind::recenter(record, Real(tile_x) + origin_in_tile(record.ref_x, tile_x),
+                 Real(tile_y) + origin_in_tile(record.ref_y, tile_y), own);
   for (int i = 0; i < kSums; ++i) slot[i] += own[i];
 }
 
-template <class Solid, bool kGeometry>
-void backward_entry(const RasterParams<typename Solid::Real>& P, int tile, void* scratch) {
-  using Real = typename Solid::Real;
-  constexpr int W = Solid::kWidth;
+template <class Kind, bool kGeometry>
+void backward_entry(const RasterParams<typename Kind::Real>& P, int tile, void* scratch) {
+  using Real = typename Kind::Real;
+  constexpr int W = Kind::kWidth;
   using T = Tile<Real, W>;
   using V = typename T::V;
   using M = typename T::M;
-  using Candidate = EntryCandidate<Solid, true, kGeometry>;
-  constexpr int kSums = kGeometry ? Solid::kGeometrySums : Solid::kColorSums;
+  using Candidate = EntryCandidate<Kind, true, kGeometry>;
+  constexpr int kSums = kGeometry ? Kind::kGeometrySums : Kind::kColorSums;
   const View& view = P.view;
   const int tile_x = tile % P.tiles_x * kTile, tile_y = tile / P.tiles_x * kTile;
   const Lanes<Real, W> lanes;
@@ -246,23 +246,23 @@ void backward_entry(const RasterParams<typename Solid::Real>& P, int tile, void*
   const uint32_t first = P.lists.tile_begin[tile], end = P.lists.tile_begin[tile + 1];
   auto slot_of = [&](uint32_t entry) { return P.sums + int64_t(P.lists.slot[entry]) * kSums; };
   for (uint32_t e = first; e < end; ++e) std::fill(slot_of(e), slot_of(e) + kSums, Real(0));
-  Window<Solid, Candidate> window(P, tile, scratch, end - first);
+  Window<Kind, Candidate> window(P, tile, scratch, end - first);
 
   for (int block = 0; block < kBlocks; ++block)
     for (int p = 0; p < T::kParts; ++p) {
       const Part<Real, W> part(lanes, tile_x, tile_y, block, p);
       window.start(block);
-      sweep_entries<Solid, true>(
+      sweep_entries<Kind, true>(
           window, view, part, V::load(state.length + part.at),
           [](Candidate& c) { std::fill(c.sums, c.sums + kSums, V::set(0)); },
           [&] { return V::load(state.through + part.at) >= V::set(Real(view.stop)); },
           [&](Candidate& c, M now) {
-            blend_backward<Solid, kGeometry>(*c.record, kGeometry ? P.normals[P.lists.primitive[c.entry]] : nullptr,
-                                             view, state, c.meeting, now, c.tau, part.at,
-                                             part.px - V::set(origin_in_tile(c.record->ref_x, tile_x)),
-                                             part.py - V::set(origin_in_tile(c.record->ref_y, tile_y)), c.sums);
+            blend_backward<Kind, kGeometry>(*c.record, kGeometry ? P.normals[P.lists.primitive[c.entry]] : nullptr,
+                                            view, state, c.meeting, now, c.tau, part.at,
+                                            part.px - V::set(origin_in_tile(c.record->ref_x, tile_x)),
+                                            part.py - V::set(origin_in_tile(c.record->ref_y, tile_y)), c.sums);
           },
-          [&](Candidate& c) { add_to_slot<Solid, kSums>(*c.record, c.sums, tile_x, tile_y, slot_of(c.entry)); });
+          [&](Candidate& c) { add_to_slot<Kind, kSums>(*c.record, c.sums, tile_x, tile_y, slot_of(c.entry)); });
     }
 }
 

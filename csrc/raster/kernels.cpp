@@ -34,36 +34,36 @@ constexpr int kWidth = 4;
 #endif
 
 // Enough for the larger of the two passes.
-template <class Solid>
+template <class Kind>
 int64_t scratch_bytes(Order order, bool geometry, int64_t longest_list) {
   if (order == Order::kEntry)
-    return geometry ? Window<Solid, EntryCandidate<Solid, true, true>>::bytes(longest_list)
-                    : Window<Solid, EntryCandidate<Solid, true, false>>::bytes(longest_list);
+    return geometry ? Window<Kind, EntryCandidate<Kind, true, true>>::bytes(longest_list)
+                    : Window<Kind, EntryCandidate<Kind, true, false>>::bytes(longest_list);
   if (order == Order::kOverlap)
-    return geometry ? Window<Solid, OverlapCandidate<Solid, true, true>>::bytes(longest_list)
-                    : Window<Solid, OverlapCandidate<Solid, true, false>>::bytes(longest_list);
+    return geometry ? Window<Kind, OverlapCandidate<Kind, true, true>>::bytes(longest_list)
+                    : Window<Kind, OverlapCandidate<Kind, true, false>>::bytes(longest_list);
   return 0;
 }
 
-template <class Solid>
-constexpr SolidKernels<typename Solid::Real> solid_kernels(void (*project)(const ProjectParams<typename Solid::Real>&,
-                                                                           int64_t, int64_t),
-                                                           void (*chain)(const ChainParams<typename Solid::Real>&,
-                                                                         int64_t, int64_t)) {
-  SolidKernels<typename Solid::Real> k{};
-  k.record_bytes = sizeof(typename Solid::Record);
+template <class Kind>
+constexpr SolidKernels<typename Kind::Real> solid_kernels(void (*project)(const ProjectParams<typename Kind::Real>&,
+                                                                          int64_t, int64_t),
+                                                          void (*chain)(const ChainParams<typename Kind::Real>&,
+                                                                        int64_t, int64_t)) {
+  SolidKernels<typename Kind::Real> k{};
+  k.record_bytes = sizeof(typename Kind::Record);
   k.project = project, k.chain = chain;
-  k.forward[0][0] = forward_center<Solid, false>, k.forward[0][1] = forward_center<Solid, true>;
-  k.backward[0][0] = backward_center<Solid, false>, k.backward[0][1] = backward_center<Solid, true>;
-  k.scratch_bytes = scratch_bytes<Solid>;
-  for (auto& sums : k.sums_per_slot) sums[0] = Solid::kColorSums, sums[1] = Solid::kGeometrySums;
-  if constexpr (Solid::kVolume) {
-    k.level_depth = level_depth_tile<Solid>;
-    k.sums_per_slot[2][0] = kOverlapSums<Solid, false>;
-    k.forward[1][0] = forward_entry<Solid, false>, k.forward[1][1] = forward_entry<Solid, true>;
-    k.backward[1][0] = backward_entry<Solid, false>, k.backward[1][1] = backward_entry<Solid, true>;
-    k.forward[2][0] = forward_overlap<Solid, false>, k.forward[2][1] = forward_overlap<Solid, true>;
-    k.backward[2][0] = backward_overlap<Solid, false>, k.backward[2][1] = backward_overlap<Solid, true>;
+  k.forward[0][0] = forward_center<Kind, false>, k.forward[0][1] = forward_center<Kind, true>;
+  k.backward[0][0] = backward_center<Kind, false>, k.backward[0][1] = backward_center<Kind, true>;
+  k.scratch_bytes = scratch_bytes<Kind>;
+  for (auto& sums : k.sums_per_slot) sums[0] = Kind::kColorSums, sums[1] = Kind::kGeometrySums;
+  if constexpr (Kind::kVolume) {
+    k.level_depth = level_depth_tile<Kind>;
+    k.sums_per_slot[2][0] = kOverlapSums<Kind, false>;
+    k.forward[1][0] = forward_entry<Kind, false>, k.forward[1][1] = forward_entry<Kind, true>;
+    k.backward[1][0] = backward_entry<Kind, false>, k.backward[1][1] = backward_entry<Kind, true>;
+    k.forward[2][0] = forward_overlap<Kind, false>, k.forward[2][1] = forward_overlap<Kind, true>;
+    k.backward[2][0] = backward_overlap<Kind, false>, k.backward[2][1] = backward_overlap<Kind, true>;
   }
   return k;
 }

@@ -11,10 +11,10 @@ namespace linprim::LINPRIM_ISA {
 // included: sum_i density_i |v| clamp(t - t_in_i, 0, t_out_i - t_in_i) = ln(1 / level). The sum does not depend on any
 // order and grows with t, so it is bisected. `scratch` holds 3 * 16 values per pair of the longest tile list. Writes
 // out.depth_median, 0 where never, and out.opacity, which does not depend on the order either.
-template <class Solid>
-void level_depth_tile(const RasterParams<typename Solid::Real>& P, int tile, typename Solid::Real* scratch) {
-  using Real = typename Solid::Real;
-  constexpr int W = Solid::kWidth;
+template <class Kind>
+void level_depth_tile(const RasterParams<typename Kind::Real>& P, int tile, typename Kind::Real* scratch) {
+  using Real = typename Kind::Real;
+  constexpr int W = Kind::kWidth;
   using T = Tile<Real, W>;
   using V = typename T::V;
   using M = typename T::M;
@@ -36,15 +36,15 @@ void level_depth_tile(const RasterParams<typename Solid::Real>& P, int tile, typ
       V low = V::set(Real(1e30)), high = zero;
       for (uint32_t e = P.lists.tile_begin[tile]; e < P.lists.tile_begin[tile + 1]; ++e) {
         if (!(P.lists.blocks[e] >> block & 1)) continue;
-        const auto& record = static_cast<const typename Solid::Record*>(P.records)[P.lists.primitive[e]];
-        typename Solid::Meeting meeting;
+        const auto& record = static_cast<const typename Kind::Record*>(P.records)[P.lists.primitive[e]];
+        typename Kind::Meeting meeting;
         const V v_length = V::load(length + at);
-        const M hit = Solid::template meet<false>(record, view, x - V::set(record.ref_x), y - V::set(record.ref_y),
-                                                  v_length, meeting);
+        const M hit = Kind::template meet<false>(record, view, x - V::set(record.ref_x), y - V::set(record.ref_y),
+                                                 v_length, meeting);
         if (!hit.bits()) continue;
-        Solid::thickness(record, v_length, hit, meeting);
+        Kind::thickness(record, v_length, hit, meeting);
         V t_in, t_out;
-        Solid::depths(record, v_length, meeting, t_in, t_out);
+        Kind::depths(record, v_length, meeting, t_in, t_out);
         t_in = select(hit, t_in, zero);
         const V thick = meeting.chord * rcp(v_length), rate = V::set(record.density) * v_length;
         low = min(low, select(hit, t_in, low)), high = max(high, t_in + thick);

@@ -26,7 +26,7 @@ inline double shortest_ns(int repeats, Work work) {
 template <int W>
 Limits measure_limits() {
   using V = Vec<float, W>;
-  using Solid = Octahedron<float, W, RayModel::kExact>;
+  using Kind = Octahedron<float, W, RayModel::kExact>;
   using T = Tile<float, W>;
   constexpr int kRepeats = 15;
   Limits limits{};
@@ -98,14 +98,14 @@ Limits measure_limits() {
         V taus[kGroup];
         for (int i = 0; i < kGroup; ++i) {
           const auto& R = records[first + i];
-          typename Solid::Meeting m;
-          const auto hit = Solid::template meet<false>(R, view, x - V::set(R.ref_x), y - V::set(R.ref_y), v_length, m);
-          taus[i] = Solid::thickness(R, v_length, hit, m);
+          typename Kind::Meeting m;
+          const auto hit = Kind::template meet<false>(R, view, x - V::set(R.ref_x), y - V::set(R.ref_y), v_length, m);
+          taus[i] = Kind::thickness(R, v_length, hit, m);
         }
         for (int i = 0; i < kGroup; ++i) {
           const auto& R = records[first + i];
           V alpha, e_tau;
-          Solid::attenuate(R, taus[i], alpha, e_tau);
+          Kind::attenuate(R, taus[i], alpha, e_tau);
           const V weight = t * alpha;
           r = fma(weight, V::set(R.rgb[0]), r), g = fma(weight, V::set(R.rgb[1]), g),
           b = fma(weight, V::set(R.rgb[2]), b);
@@ -121,23 +121,23 @@ Limits measure_limits() {
   Incoming<float, W, false> state;
   std::copy(length, length + kTilePixels, state.length);
   for (float* plane : {state.red, state.green, state.blue, state.one}) std::fill(plane, plane + kTilePixels, 0.1f);
-  float slots[kPairs][Solid::kColorSums];
+  float slots[kPairs][Kind::kColorSums];
   const double backward = shortest_ns(kRepeats, [&] {
     std::fill(state.through, state.through + kTilePixels, 1.0f);
     std::fill(state.remaining, state.remaining + kTilePixels, 0.2f);
     for (int i = 0; i < kPairs; ++i) {
       const auto& record_of_pair = records[i];
-      V sums[Solid::kColorSums];
+      V sums[Kind::kColorSums];
       for (V& s : sums) s = V::set(0);
       each_part([&](int at, V x, V y) {
         const auto& R = opaque(record_of_pair);
-        typename Solid::Meeting m;
+        typename Kind::Meeting m;
         const V v_length = V::load(state.length + at);
-        const auto hit = Solid::template meet<true>(R, view, x - V::set(R.ref_x), y - V::set(R.ref_y), v_length, m);
-        const V tau = Solid::thickness(R, v_length, hit, m);
-        blend_backward<Solid, false>(R, nullptr, view, state, m, hit, tau, at, x, y, sums);
+        const auto hit = Kind::template meet<true>(R, view, x - V::set(R.ref_x), y - V::set(R.ref_y), v_length, m);
+        const V tau = Kind::thickness(R, v_length, hit, m);
+        blend_backward<Kind, false>(R, nullptr, view, state, m, hit, tau, at, x, y, sums);
       });
-      reduce(sums, Solid::kColorSums, slots[i]);
+      reduce(sums, Kind::kColorSums, slots[i]);
     }
     asm volatile("" : : "m"(slots));
   });
