@@ -205,7 +205,7 @@ def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitiv
 
     from linprim_geo.capture.load import load_scene
     from linprim_geo.kernels import ops
-    from linprim_geo.points.densify import fill_points
+    from linprim_geo.points.densify import densify
     from linprim_geo.points.initial_points import scene_normalization
     from linprim_geo.runs.run import Run
     from linprim_geo.training.blocks.windows import Windows
@@ -218,16 +218,16 @@ def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitiv
     how = TrainOptions(max_primitives=primitives, initial_primitives=primitives, threads=1)
     similarity = scene_normalization(loaded)
     before = time.process_time()
-    cloud = fill_points(loaded, how.seed)
+    cloud = densify(loaded, how.seed)
     filling = time.process_time() - before
-    windows, shots = Windows(), []
+    windows, images = Windows(), []
     for view in loaded.train:
         rgb = view.load().rgb
-        shots.append(
-            windows.shot(view.name, view.camera.transformed(similarity), rgb, np.full(rgb.shape[:2], 255, np.uint8))
+        images.append(
+            windows.image(view.name, view.camera.transformed(similarity), rgb, np.full(rgb.shape[:2], 255, np.uint8))
         )
     run = Run(folder / "run", Path(scene), SceneOptions(), how, similarity)
-    trainer = start_trainer(loaded, run, shots, how, None, cloud)
+    trainer = start_trainer(loaded, run, images, how, None, cloud)
     setup = time.process_time() - begin - filling
     for _ in range(WARM_UP):
         trainer.advance()
@@ -236,9 +236,9 @@ def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitiv
     for _ in range(steps):
         trainer.advance()
     step = (time.process_time() - begin) / steps
-    camera = shots[0].camera
+    camera = images[0].camera
     return {
-        "photos": len(shots),
+        "photos": len(images),
         "pixels": camera.width * camera.height,
         "primitives": len(trainer),
         "setup_seconds": setup,

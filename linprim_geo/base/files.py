@@ -41,7 +41,8 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
 
     The data is on disk before the rename and the rename before this returns, so a crash at any moment leaves either the
     old file or the new one, and files that are written one after the other are never lost the other way round. On an
-    error, or Ctrl-C, the temporary file is removed and the old file stays; `remove_torn` removes what a kill has left.
+    error, or Ctrl-C, the temporary file is removed and the old file stays; `remove_temporary` removes what a kill
+    has left.
 
     Raises:
         LinprimError: the folder cannot be written, or the disk is full.
@@ -49,7 +50,7 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
     path = Path(path)
     temporary = None
     try:
-        with writing(path):
+        with readable_write_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=f".tmp{path.suffix}", dir=path.parent)
             os.close(handle)
@@ -68,7 +69,7 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
+def readable_write_errors(path: Path) -> Iterator[None]:
     """Turns the errors of a disk that is full, fails or may not be written into one sentence about `path`."""
     try:
         yield
@@ -85,14 +86,14 @@ def writing(path: Path) -> Iterator[None]:
         raise found or _full(path) from error
 
 
-def remove_torn(path: Path) -> None:
+def remove_temporary(path: Path) -> None:
     """Removes what writing `path` left behind when it was killed; only for who holds the lock of its folder."""
     for torn in path.parent.glob(f".{glob.escape(path.stem)}.*.tmp{glob.escape(path.suffix)}"):
         with contextlib.suppress(OSError):
             torn.unlink()
 
 
-def is_remains(entry: Path) -> bool:
+def is_leftover(entry: Path) -> bool:
     """Whether a directory entry is nothing but what `locked` or a killed `atomic_write` leaves."""
     return entry.name.startswith(".") and (entry.name.endswith(_LOCK) or ".tmp" in entry.name) and entry.is_file()
 
@@ -115,7 +116,7 @@ def locked(folder: Path, what: str, file: str = "", wait: Callable[[], object] |
     path = folder / (f".{file}{_LOCK}" if file else _LOCK)
     # Without flock filelock would take the mere existence of the file for a lock, which a kill leaves behind.
     lock, told = FileLock(path, fallback_to_soft=False), False
-    with writing(folder / file):
+    with readable_write_errors(folder / file):
         while not lock.is_locked:
             folder.mkdir(parents=True, exist_ok=True)
             try:

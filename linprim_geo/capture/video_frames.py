@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import locked, writing
+from linprim_geo.base.files import locked, readable_write_errors
 from linprim_geo.imaging import photos
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
@@ -144,6 +144,6 @@ def _save(folder: Path, frame: tuple[float, int, np.ndarray]) -> int:
     from PIL import Image
 
     path = folder / f"{frame[1]:06d}.jpg"
-    with writing(path):
+    with readable_write_errors(path):
         Image.fromarray(frame[2]).save(path, quality=_JPEG_QUALITY, subsampling=0)
     return 1

@@ -23,7 +23,7 @@ from importlib import import_module, metadata
 from pathlib import Path
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import locked, read_json, remove_torn, write_json
+from linprim_geo.base.files import locked, read_json, remove_temporary, write_json
 from linprim_geo.base.version import __version__
 
 # The marker of a task that is done, in its folder, and the token by which workers know the driver's folder.
@@ -115,7 +115,7 @@ def _run_task(task: dict) -> dict:
         done = result_of(task)
         if done is not None:
             return done
-        remove_torn(folder / DONE)
+        remove_temporary(folder / DONE)
         begin = time.monotonic()
         module, function = task["function"].split(":")
         result = getattr(import_module(module), function)(folder, **task["arguments"])

@@ -17,7 +17,7 @@ from linprim_geo.capture.types import PointCloud, Scene
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.sampling import sample_bilinear
 from linprim_geo.points.far_colors import FarColors
-from linprim_geo.points.initial_points import Look, in_image, spread_looks
+from linprim_geo.points.initial_points import SmallView, evenly_spread_views, in_image
 
 # A cell of the image, as a share of its longer side, is to hold a point: about 1,400 cells of 4:3, fewer than the
 # primitives that a view ends up with, so that what is found by features is hardly ever doubled. Depths from colours are
@@ -59,9 +59,7 @@ _AT_ONCE = 64
 _BACKDROP = 25.5
 
 
-def fill_points(
-    scene: Scene, seed: int, backdrop: np.ndarray | None = None, far: FarColors | None = None
-) -> PointCloud:
+def densify(scene: Scene, seed: int, backdrop: np.ndarray | None = None, far: FarColors | None = None) -> PointCloud:
     """The scene's points and, after them, new ones in the image cells of training views that hold none.
 
     View by view, those with most points first, every cell that neither a given nor a new point falls into gets a
@@ -83,7 +81,7 @@ def fill_points(
     """
     cloud = scene.points
     assert cloud is not None, "of a scene without points there is nothing to fill"
-    views = [_Gaps(look, cloud.xyz) for look in spread_looks(scene.train, MOST_VIEWS)]
+    views = [_Gaps(look, cloud.xyz) for look in evenly_spread_views(scene.train, MOST_VIEWS)]
     at_infinity = [None if far is None else far.difference(view.look) for view in views]
     rng = np.random.default_rng([seed, 8])
     found = [np.empty((0, 3))]
@@ -118,7 +116,7 @@ def fill_points(
 class _Gaps:
     """A view, the points it sees, and the triangles between them: `pixels` (P, 2) and `inverse` (P,) depths."""
 
-    def __init__(self, look: Look, xyz: np.ndarray):
+    def __init__(self, look: SmallView, xyz: np.ndarray):
         self.look, self.camera = look, look.camera
         inside = in_image(self.camera, xyz)[0]
         self.pixels, depth = self.camera.project(xyz[inside])

@@ -18,7 +18,7 @@ from linprim_geo.capture.types import Scene
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.environment_map import filled, nearest_texel, texel_directions, texels_for
 from linprim_geo.kernels import ops
-from linprim_geo.points.initial_points import Look, VolumePoints, in_image, spread_looks
+from linprim_geo.points.initial_points import SmallView, VolumePoints, evenly_spread_views, in_image
 
 # The photographs' own colours at infinity are gathered with fewer, from views spread over the capture.
 SURVEY_TEXELS, SURVEY_VIEWS = 128, 60
@@ -46,7 +46,7 @@ class FarColors:
     before it differs from view to view.
     """
 
-    def __init__(self, looks: Sequence[Look]):
+    def __init__(self, looks: Sequence[SmallView]):
         self.looks = looks
         self.size = texels_for([look.camera for look in looks], most=SURVEY_TEXELS)
         focal = float(np.median([look.camera.fx for look in looks]))
@@ -56,7 +56,7 @@ class FarColors:
         faces = [self._face(each, images) for each in directions]
         self.texels, self.views = (np.concatenate(parts) for parts in zip(*faces, strict=True))
 
-    def _image(self, look: Look) -> np.ndarray:
+    def _image(self, look: SmallView) -> np.ndarray:
         """(H, W, 3) float32, averaged as a texel averages."""
         from scipy.ndimage import uniform_filter
 
@@ -76,7 +76,7 @@ class FarColors:
     def _all_compared(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         return [self.compared(look) for look in self.looks]
 
-    def compared(self, look: Look) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def compared(self, look: SmallView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of a look, on the lattice of STRIDE pixels: (h, w) mean difference of a patch from the environment, (h, w)
         variation of its colours, both of 255, and (h, w) how many views show the direction."""
         from scipy.ndimage import uniform_filter
@@ -95,7 +95,7 @@ class FarColors:
         variation = np.sqrt(np.maximum(variance.max(-1), 0))
         return uniform_filter(difference, PATCH, mode="nearest"), variation, self.views[texel]
 
-    def difference(self, look: Look) -> Callable[[np.ndarray], np.ndarray]:
+    def difference(self, look: SmallView) -> Callable[[np.ndarray], np.ndarray]:
         """A function of (Q, 2) positions in a look: (Q,) how much the patches there differ from the environment, of
         255; NaN where too few views tell."""
         difference, _, views = self.compared(look)
@@ -143,7 +143,7 @@ class FarColors:
 
 def far_colors(scene: Scene) -> FarColors:
     """What the photographs of a scene show at infinity."""
-    return FarColors(spread_looks(scene.train, SURVEY_VIEWS))
+    return FarColors(evenly_spread_views(scene.train, SURVEY_VIEWS))
 
 
 def far_share(far: FarColors, scene: Scene) -> float:

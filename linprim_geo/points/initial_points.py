@@ -163,7 +163,7 @@ def visual_hull_points(scene: Scene, count: int, seed: int) -> VolumePoints:
     if not scene.has_alpha:
         raise LinprimError(f"{scene.root}: the images have no alpha channel and no masks, wanted one for a visual hull")
     rng = np.random.default_rng(seed)
-    looks = spread_looks(scene.train, _MAX_LOOKS)
+    looks = evenly_spread_views(scene.train, _MAX_LOOKS)
     box = _hull_box(scene, looks, rng)
     kept, total, batches = [], 0, 0
     while total < count and batches < _HULL_MAX_BATCHES:
@@ -210,10 +210,10 @@ def frusta_points(scene: Scene, count: int, seed: int) -> VolumePoints:
         if sum(len(points) for points in found[-1]) >= count:
             break
     xyz = np.concatenate([np.concatenate(points) for points in reversed(found)])[:count]
-    return VolumePoints(xyz, _colors(xyz, spread_looks(scene.train, _COLOR_VIEWS)))
+    return VolumePoints(xyz, _colors(xyz, evenly_spread_views(scene.train, _COLOR_VIEWS)))
 
 
-class Look:
+class SmallView:
     """A training view's camera and photograph, averaged down to what choosing points needs.
 
     `rgb` (h, w, 3) uint8; `foreground` (h, w) bool, None without alpha; `open` says whether the object goes on outside
@@ -236,17 +236,17 @@ class Look:
             self.open = bool(edges)
 
 
-def spread_looks(views: Sequence[View], limit: int) -> list[Look]:
+def evenly_spread_views(views: Sequence[View], limit: int) -> list[SmallView]:
     """Looks at no more than `limit` of the views, evenly spread over their order.
 
     Raises:
         LinprimError: a photograph cannot be read.
     """
     chosen = np.unique(np.linspace(0, len(views) - 1, min(limit, len(views))).round().astype(int))
-    return [Look(views[i]) for i in chosen]
+    return [SmallView(views[i]) for i in chosen]
 
 
-def _hull_box(scene: Scene, looks: Sequence[Look], rng: np.random.Generator) -> np.ndarray:
+def _hull_box(scene: Scene, looks: Sequence[SmallView], rng: np.random.Generator) -> np.ndarray:
     """(2, 3) corners of a box round the visual hull, from coarse to fine."""
     cameras = [look.camera for look in looks]
     center, distance = looked_at(scene)
@@ -267,7 +267,7 @@ def _hull_box(scene: Scene, looks: Sequence[Look], rng: np.random.Generator) -> 
     return box
 
 
-def _inside_hull(points: np.ndarray, looks: Sequence[Look], grow: int | Sequence[int]) -> np.ndarray:
+def _inside_hull(points: np.ndarray, looks: Sequence[SmallView], grow: int | Sequence[int]) -> np.ndarray:
     """(P,) whether enough views see the points and hardly any sees background there."""
     allowed = int(_MASK_ERRORS * len(looks))
     needed = max(2, int(np.ceil(_HULL_MIN_SEEN * len(looks))))
@@ -323,7 +323,7 @@ def _along_pixels(cameras: Sequence[Camera], count: int, low: float, high: float
     return points
 
 
-def _colors(points: np.ndarray, looks: Sequence[Look]) -> np.ndarray:
+def _colors(points: np.ndarray, looks: Sequence[SmallView]) -> np.ndarray:
     """(P, 3) uint8 mean of the foreground pixels that the points fall on; the images' mean where there is
     none."""
     total, weight = np.zeros((len(points), 3)), np.zeros(len(points))

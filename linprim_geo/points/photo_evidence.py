@@ -15,7 +15,7 @@ import numpy as np
 from linprim_geo.capture.types import Scene
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.sampling import sample_bilinear
-from linprim_geo.points.initial_points import Look, VolumePoints, in_image, local_planes, spread_looks
+from linprim_geo.points.initial_points import SmallView, VolumePoints, evenly_spread_views, in_image, local_planes
 
 # So many points and views say enough; more only take time.
 POINTS, VIEWS = 2500, 60
@@ -150,7 +150,7 @@ def observe(scene: Scene, seed: int = 0, views: int = VIEWS) -> Observations | N
     cloud = scene.points
     if cloud is None or isinstance(cloud, VolumePoints) or len(cloud.xyz) < _LEAST_POINTS:
         return None
-    looks = spread_looks(scene.train, views)
+    looks = evenly_spread_views(scene.train, views)
     rng = np.random.default_rng([seed, 11])
     normal, flat = _normals(cloud.xyz, seed)
     good = np.flatnonzero(flat < _FLAT)
@@ -181,13 +181,13 @@ def observe(scene: Scene, seed: int = 0, views: int = VIEWS) -> Observations | N
     return Observations(xyz, seen, plain & seen, color, footprint)
 
 
-def _same_views(scene: Scene, looks: Sequence[Look]) -> list[Camera]:
+def _same_views(scene: Scene, looks: Sequence[SmallView]) -> list[Camera]:
     chosen = np.unique(np.linspace(0, len(scene.train) - 1, len(looks)).round().astype(int))
     return [scene.train[i].camera for i in chosen]
 
 
 def _colors_in(
-    look: Look, xyz: np.ndarray, rows: np.ndarray, facing: np.ndarray
+    look: SmallView, xyz: np.ndarray, rows: np.ndarray, facing: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Of the points `rows` of (N, 3) `xyz` in a view, whose planes have the normals (P, 3) `facing` it: (P,) whether it
     sees them, (P,) whether also in plain surroundings, (P, 3) colours in [0, 1], (P,) z-depths."""

@@ -10,7 +10,7 @@ import numpy as np
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import TrainOptions, initial_count
 from linprim_geo.capture.types import PointCloud, Scene
-from linprim_geo.points.densify import fill_points
+from linprim_geo.points.densify import densify
 from linprim_geo.points.far_colors import FarColors
 from linprim_geo.points.initial_points import (
     VolumePoints,
@@ -58,6 +58,6 @@ def initial_cloud(cloud: PointCloud, options: TrainOptions) -> PointCloud:
 
 
 def filled_points(scene: Scene, seed: int, backdrop: np.ndarray | None, far: FarColors | None = None) -> PointCloud:
-    """The scene's points, filled up (`fill_points`) unless they are random ones, which lie on no surface."""
+    """The scene's points, filled up (`densify`) unless they are random ones, which lie on no surface."""
     assert scene.points is not None
-    return scene.points if isinstance(scene.points, VolumePoints) else fill_points(scene, seed, backdrop, far)
+    return scene.points if isinstance(scene.points, VolumePoints) else densify(scene, seed, backdrop, far)

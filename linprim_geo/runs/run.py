@@ -30,7 +30,7 @@ import numpy as np
 from linprim_geo.base.version import __version__
 from linprim_geo.geometry.camera import Similarity
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import is_remains, write_json, writing
+from linprim_geo.base.files import is_leftover, readable_write_errors, write_json
 from linprim_geo.base.options import SceneOptions, TrainOptions, check_train_options, from_saved, raster_options
 from linprim_geo.geometry.primitives import KINDS, Primitives, load_primitives, save_primitives
 from linprim_geo.capture.types import PHOTOGRAPHS, Scene, View
@@ -100,7 +100,7 @@ class Run:
             config["blocks"] = blocks
         # The cache may be emptied, and poses that are found anew would lie in another frame.
         if scene.kind == PHOTOGRAPHS and (model := found_model(scene.root)) is not None:
-            with writing(path / FOUND_POSES):
+            with readable_write_errors(path / FOUND_POSES):
                 shutil.copytree(model, path / FOUND_POSES, dirs_exist_ok=True)
         write_json(
             path / "transform.json",
@@ -326,7 +326,7 @@ def is_unused(path: Path) -> bool:
     if not path.exists():
         return True
     return path.is_dir() and all(
-        is_remains(entry) or entry.name in ("transform.json", FOUND_POSES) for entry in path.iterdir()
+        is_leftover(entry) or entry.name in ("transform.json", FOUND_POSES) for entry in path.iterdir()
     )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from linprim_geo.base.budget import Budget
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import locked, remove_torn, write_json
+from linprim_geo.base.files import locked, remove_temporary, write_json
 from linprim_geo.base.options import ExtractOptions, check
 from linprim_geo.base.progress import Progress, Stages
 from linprim_geo.geometry.mesh_files import SUFFIXES
@@ -142,7 +142,7 @@ def _extract(
     if options.texture:
         written += [file.with_suffix(suffix) for file in (target, visible_target) for suffix in (".png", ".mtl")]
     for file in written:
-        remove_torn(file)
+        remove_temporary(file)
     stages = Stages(progress)
     if options.refine == "auto" and options.stereo == "off":
         options = replace(options, refine=REFINE_ROUNDS)

@@ -78,7 +78,7 @@ class PartFusion:
             )
         self.executor.run(tasks, Progress("parts", 1, quiet=self.quiet))
         mesh = placed(
-            together([load_part(place / f"{part:03d}" / "part.npz") for part in range(count)]), lattice.origin
+            merge_parts([load_part(place / f"{part:03d}" / "part.npz") for part in range(count)]), lattice.origin
         )
         shutil.rmtree(place)
         return mesh
@@ -125,7 +125,7 @@ def part_task(folder: Path, run: str, level: float, limit: float, part: int) -> 
     return {"faces": len(surface.faces), "views": used, "blocks": int(own.sum())}
 
 
-def together(parts: Iterable[Mesh]) -> Mesh:
+def merge_parts(parts: Iterable[Mesh]) -> Mesh:
     """All parts as one mesh; vertices on seams are there more than once."""
     vertices, faces, first = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
     for part in parts:

@@ -10,7 +10,7 @@ import torch
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.capture.types import Scene
 from linprim_geo.points.far_colors import OPEN_SHARE, FarColors, far_colors, far_share
-from linprim_geo.training.step.training_images import Shot
+from linprim_geo.training.step.training_images import TrainingImage
 
 # A backdrop is plain where this share of all border pixels lies this near to their median colour, per channel.
 BACKDROP_SHARE, BACKDROP_TOLERANCE = 0.8, 0.1
@@ -28,7 +28,7 @@ class Background:
     far: FarColors | None = None
 
 
-def chosen_background(text: str, scene: Scene, shots: list[Shot], begun: bool | None = None) -> Background:
+def chosen_background(text: str, scene: Scene, images: list[TrainingImage], begun: bool | None = None) -> Background:
     """What the option's text stands for. Of a training that goes on, `begun` says whether it has an environment: that
     has its colours.
 
@@ -40,26 +40,26 @@ def chosen_background(text: str, scene: Scene, shots: list[Shot], begun: bool | 
         LinprimError: the text is no name and not three numbers in [0, 1].
     """
     named = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-    has_alpha = shots[0].alpha is not None
+    has_alpha = images[0].alpha is not None
     far = None
     if text == "auto":
         text = "random"
         if begun:
             text = "environment"
-        elif not has_alpha and plain_border(shots) > BACKDROP_SHARE:
+        elif not has_alpha and plain_border(images) > BACKDROP_SHARE:
             text = "fitted"
         elif not has_alpha and begun is None:
             far = far_colors(scene)
             text = "environment" if far_share(far, scene) >= OPEN_SHARE else "random"
     if text == "random":
-        return Background(torch.ones(3) if has_alpha else torch.from_numpy(_mean_color(shots)), random=True)
+        return Background(torch.ones(3) if has_alpha else torch.from_numpy(_mean_color(images)), random=True)
     if text == "environment":
         if has_alpha:
             raise LinprimError("--background environment: masks or alpha say already what is background")
         far = far_colors(scene) if far is None and begun is None else far
-        return Background(torch.from_numpy(_mean_color(shots)), environment=True, far=far)
+        return Background(torch.from_numpy(_mean_color(images)), environment=True, far=far)
     if text == "fitted":
-        return Background(torch.from_numpy(np.median(_border_colors(shots), 0).astype(np.float32)), fitted=True)
+        return Background(torch.from_numpy(np.median(_border_colors(images), 0).astype(np.float32)), fitted=True)
     try:
         color = named[text] if text in named else tuple(float(x) for x in text.split(","))
     except ValueError:
@@ -72,19 +72,19 @@ def chosen_background(text: str, scene: Scene, shots: list[Shot], begun: bool | 
     return Background(torch.tensor(color, dtype=torch.float32))
 
 
-def _border_colors(shots: list[Shot]) -> np.ndarray:
+def _border_colors(images: list[TrainingImage]) -> np.ndarray:
     """(P, 3) colours in [0, 1] of the outermost pixels of all views."""
     edges = []
-    for rgb in (shot.rgb.numpy() for shot in shots):
+    for rgb in (image.rgb.numpy() for image in images):
         edges.append(np.concatenate([edge.T for edge in (rgb[:, 0], rgb[:, -1], rgb[:, :, 0], rgb[:, :, -1])]))
     return np.concatenate(edges).astype(np.float64) / 255
 
 
-def plain_border(shots: list[Shot]) -> float:
+def plain_border(images: list[TrainingImage]) -> float:
     """Share of the outermost pixels of all views that lie near their median colour."""
-    colors = _border_colors(shots)
+    colors = _border_colors(images)
     return float(np.mean(np.abs(colors - np.median(colors, 0)).max(1) < BACKDROP_TOLERANCE))
 
 
-def _mean_color(shots: list[Shot]) -> np.ndarray:
-    return np.mean([s.rgb.numpy().mean((1, 2)) for s in shots], 0).astype(np.float32) / np.float32(255)
+def _mean_color(images: list[TrainingImage]) -> np.ndarray:
+    return np.mean([s.rgb.numpy().mean((1, 2)) for s in images], 0).astype(np.float32) / np.float32(255)

@@ -22,7 +22,7 @@ from linprim_geo.training.effects import Choice
 from linprim_geo.training.loop import QUICK_VIEWS, evaluate
 from linprim_geo.training.start import begin_run, late_terms, start_trainer
 from linprim_geo.training.step.trainer import Trainer
-from linprim_geo.training.step.training_images import StoredShot, load_shots, photo_bytes, photo_limit
+from linprim_geo.training.step.training_images import LazyTrainingImage, load_training_images, photo_bytes, photo_limit
 
 # Timing takes at most CALIBRATION_SHARE of so many seconds.
 TIMING = 125.0
@@ -63,13 +63,13 @@ def dry_run(
         planned, loaded, _ = begin_run(Path(scene), Path(run), scene_options, options, effects, progress)
         # What is there now is what would be there for all of it.
         limit = photo_limit()
-        shots, held_out = (load_shots(views, planned.similarity) for views in (loaded.train, loaded.test))
-        terms = late_terms(planned, loaded, shots, progress)
+        images, held_out = (load_training_images(views, planned.similarity) for views in (loaded.train, loaded.test))
+        terms = late_terms(planned, loaded, images, progress)
 
         counts = []
 
         def start(options: TrainOptions) -> Trainer:
-            trainer = start_trainer(loaded, planned, shots, options, None)
+            trainer = start_trainer(loaded, planned, images, options, None)
             counts.append(len(trainer))
             return trainer
 
@@ -77,7 +77,7 @@ def dry_run(
             quick = len(held_out[:: max(1, len(held_out) // QUICK_VIEWS)])
             timed, pace = plan_run(
                 planned,
-                shots,
+                images,
                 held_out,
                 terms,
                 budget,
@@ -91,7 +91,7 @@ def dry_run(
         else:
             options = planned.train_options
             setup = time.monotonic() - began
-            cost, begun, starting, per_view = calibrate(options, shots, terms, Budget(TIMING), start, evaluate)
+            cost, begun, starting, per_view = calibrate(options, images, terms, Budget(TIMING), start, evaluate)
             rounds = options.iterations // options.evaluate_every if options.evaluate_every else 0
             scored = len(held_out) + rounds * min(len(held_out), QUICK_VIEWS)
             steps = options.iterations * cost.seconds(options.max_primitives * mean_population(begun))
@@ -108,11 +108,11 @@ def dry_run(
     used = peak_gib() - per_primitive * counts[0] / 2**30  # without those that were timed
     available = available_memory() / 2**30 + memory_gib()
     needed = used + per_primitive * options.max_primitives / 2**30
-    held = sum(not isinstance(shot, StoredShot) for shot in shots)
+    held = sum(not isinstance(image, LazyTrainingImage) for image in images)
     size = max((view.camera for view in loaded.train), key=lambda camera: camera.width * camera.height)
     photos = photo_bytes(loaded.train)
     report = {
-        "images": len(shots),
+        "images": len(images),
         "held_out": len(held_out),
         "width": size.width,
         "height": size.height,

@@ -24,7 +24,7 @@ from linprim_geo.points.far_colors import OPEN_SHARE, far_colors, far_share
 from linprim_geo.points.initial_points import CAMERA_DISTANCE, VolumePoints, scene_normalization
 from linprim_geo.points.photo_evidence import Observations, observe
 from linprim_geo.training.step.trainer import SMALLEST_PX
-from linprim_geo.training.step.training_images import load_shots
+from linprim_geo.training.step.training_images import load_training_images
 
 MODES = ("auto", "none", "all")
 # An effect that makes a step of training dearer by less than this costs nothing worth saving.
@@ -309,7 +309,7 @@ def _plain_border(data: Data) -> float:
     from linprim_geo.training.background import plain_border
 
     views = data.scene.train[:: max(1, len(data.scene.train) // 60)]
-    return 100 * plain_border(load_shots(views, data.similarity))
+    return 100 * plain_border(load_training_images(views, data.similarity))
 
 
 def _far(data: Data) -> float:

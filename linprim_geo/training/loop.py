@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import atomic_write, writing
+from linprim_geo.base.files import atomic_write, readable_write_errors
 from linprim_geo.base.memory import memory_gib
 from linprim_geo.base.progress import Progress, duration
 from linprim_geo.runs.run import Run
@@ -21,7 +21,7 @@ from linprim_geo.training.budget.pacing import Pace
 from linprim_geo.training.checkpoint import write_checkpoint
 from linprim_geo.training.step.exposure import Exposure, with_best_gain
 from linprim_geo.training.step.trainer import Trainer
-from linprim_geo.training.step.training_images import Shot, UnreadablePhoto
+from linprim_geo.training.step.training_images import TrainingImage, UnreadablePhoto
 
 # Held-out views scored during training; all of them are at the end.
 QUICK_VIEWS = 16
@@ -30,7 +30,7 @@ QUICK_VIEWS = 16
 def run_steps(
     trainer: Trainer,
     run: Run,
-    held_out: list[Shot],
+    held_out: list[TrainingImage],
     progress: Progress,
     pace: Pace | None = None,
     until: int | None = None,
@@ -51,7 +51,7 @@ def run_steps(
     cut_metrics(table, trainer.step)
     score = score_gain = None
     saved = -1
-    with writing(table), open(table, "a") as log, _interrupt_flag() as interrupted:
+    with readable_write_errors(table), open(table, "a") as log, _interrupt_flag() as interrupted:
         while trainer.step < (until or trainer.iterations) and not interrupted:
             if pace:
                 pace.watch(trainer, run, progress, save=lambda: save_training(trainer, run))
@@ -125,7 +125,7 @@ def cut_metrics(path: Path, step: int) -> None:
         temporary.write_text("".join(kept))
 
 
-def evaluate(trainer: Trainer, shots: list[Shot], gains: bool = False) -> float | None:
+def evaluate(trainer: Trainer, images: list[TrainingImage], gains: bool = False) -> float | None:
     """Mean PSNR over views, renders clamped and rounded to 8 bits as saved images are; None without views.
 
     With `gains` each render is first multiplied by the gain per channel that brings it nearest to its photograph: what
@@ -135,10 +135,10 @@ def evaluate(trainer: Trainer, shots: list[Shot], gains: bool = False) -> float 
 
     background = trainer.shown_background()
     scores = []
-    for shot in shots:
-        render, photo = trainer.render(shot.camera, background).numpy(), shot.over(background).numpy()
+    for image in images:
+        render, photo = trainer.render(image.camera, background).numpy(), image.over(background).numpy()
         if gains:
-            alpha = None if shot.alpha is None else shot.alpha.numpy() / 255
+            alpha = None if image.alpha is None else image.alpha.numpy() / 255
             render = with_best_gain(render.transpose(1, 2, 0), photo.transpose(1, 2, 0), alpha).transpose(2, 0, 1)
         scores.append(psnr(to_8bit(render), to_8bit(photo)))
     return float(np.mean(scores)) if scores else None
@@ -188,11 +188,11 @@ def save_training(trainer: Trainer, run: Run) -> None:
             "background": [float(x) for x in trainer.shown_background()],
             "seconds": trainer.seconds,
         }
-        | ({} if trainer.exposure is None else {"gains": _gains(trainer.shots, trainer.exposure)}),
+        | ({} if trainer.exposure is None else {"gains": _gains(trainer.images, trainer.exposure)}),
         trainer.environment,
     )
 
 
-def _gains(shots: Sequence[Shot], exposure: Exposure) -> dict[str, list[float]]:
+def _gains(images: Sequence[TrainingImage], exposure: Exposure) -> dict[str, list[float]]:
     """{name of a training view: its gain per channel}."""
-    return {shot.name: gain.tolist() for shot, gain in zip(shots, exposure.gains, strict=True)}
+    return {image.name: gain.tolist() for image, gain in zip(images, exposure.gains, strict=True)}

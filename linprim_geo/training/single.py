@@ -19,7 +19,7 @@ from linprim_geo.training.effects import Decision
 from linprim_geo.training.held_out_gap import gap_advice
 from linprim_geo.training.loop import QUICK_VIEWS, evaluate, run_steps
 from linprim_geo.training.start import late_terms, start_trainer
-from linprim_geo.training.step.training_images import Shot, load_shots
+from linprim_geo.training.step.training_images import TrainingImage, load_training_images
 
 
 def train_run(
@@ -42,22 +42,22 @@ def train_run(
     wanted = [name for name in GEOMETRY_WEIGHTS if getattr(options, name) > 0]
     if state is None or wanted:
         scene = with_points(scene, options, progress.note)
-    shots = load_shots(scene.train, run.similarity)
-    if all(shot.alpha is not None and int(shot.alpha.max()) == 0 for shot in shots):
+    images = load_training_images(scene.train, run.similarity)
+    if all(image.alpha is not None and int(image.alpha.max()) == 0 for image in images):
         raise LinprimError(f"{scene.root}: the masks leave no pixel of any training image")
-    held_out: list[Shot] | None = None
+    held_out: list[TrainingImage] | None = None
     pace = None
     if budget:
-        held_out = load_shots(scene.test, run.similarity)
+        held_out = load_training_images(scene.test, run.similarity)
         volume = isinstance(scene.points, VolumePoints)
         run, pace = plan_run(
             run,
-            shots,
+            images,
             held_out,
-            late_terms(run, scene, shots, progress),
+            late_terms(run, scene, images, progress),
             budget,
             progress,
-            start=lambda options: start_trainer(scene, run, shots, options, None),
+            start=lambda options: start_trainer(scene, run, images, options, None),
             score=evaluate,
             # The smaller limit that is chosen leaves too many points, not too few, and volumes are filled anew.
             start_share=0.0 if volume else SFM_START,
@@ -66,8 +66,8 @@ def train_run(
         options, progress.total = run.train_options, run.train_options.iterations
         if volume:  # as many as the population begins with
             scene = with_points(replace(scene, points=None), options, progress.note)
-    trainer = start_trainer(scene, run, shots, options, state)
-    trainer.terms = late_terms(run, scene, shots, progress)
+    trainer = start_trainer(scene, run, images, options, state)
+    trainer.terms = late_terms(run, scene, images, progress)
     if not (run.path / "config.json").exists():
         Run.create(
             run.path,
@@ -87,10 +87,10 @@ def train_run(
     progress.start = trainer.step
     progress.note(
         f"{scene.root}: {scene.kind}, {len(scene.train)} training and {len(scene.test)} held-out views of "
-        f"{shots[0].camera.width}x{shots[0].camera.height}; {len(trainer)} primitives, {ops.instruction_set()}, "
+        f"{images[0].camera.width}x{images[0].camera.height}; {len(trainer)} primitives, {ops.instruction_set()}, "
         f"{ops.threads()} threads"
     )
-    held_out = load_shots(scene.test, run.similarity) if held_out is None else held_out
+    held_out = load_training_images(scene.test, run.similarity) if held_out is None else held_out
     seconds, score, score_gain = run_steps(trainer, run, held_out, progress, pace)
     result = {
         "run": str(run.path),
@@ -108,11 +108,11 @@ def train_run(
         + (f", {score_gain:.2f} dB with the best gain of each" if held_out and score_gain is not None else "")
     )
     if score is not None:
-        train_score = evaluate(trainer, shots[:: max(1, len(shots) // QUICK_VIEWS)])
+        train_score = evaluate(trainer, images[:: max(1, len(images) // QUICK_VIEWS)])
         assert train_score is not None
         result["train_psnr"] = train_score
         effects = run.notes.get("effects")
-        if advice := gap_advice(train_score, score, len(shots), options, effects if isinstance(effects, list) else []):
+        if advice := gap_advice(train_score, score, len(images), options, effects if isinstance(effects, list) else []):
             progress.note(advice)
             result["advice"] = advice
             run.note("advice", advice)

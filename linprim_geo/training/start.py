@@ -39,7 +39,7 @@ from linprim_geo.training.checkpoint import restore
 from linprim_geo.training.effects import Choice, Decision, decide, settle, summary
 from linprim_geo.training.step.geometry_terms import GeometryTerms, gather_evidence
 from linprim_geo.training.step.trainer import LARGEST_PART, SMALLEST_PX, Trainer, initial_parameters
-from linprim_geo.training.step.training_images import Shot
+from linprim_geo.training.step.training_images import TrainingImage
 
 
 def decided_scene(
@@ -119,14 +119,14 @@ def reopen_run(
     return replace(opened, train_options=replace(opened.train_options, threads=options.threads)), opened.scene()
 
 
-def late_terms(run: Run, scene: Scene, shots: list[Shot], progress: Progress) -> GeometryTerms | None:
+def late_terms(run: Run, scene: Scene, images: list[TrainingImage], progress: Progress) -> GeometryTerms | None:
     """The late terms for geometry that have a weight, of a scene with points; None if none has."""
     options = run.train_options
     if not any(getattr(options, name) > 0 for name in GEOMETRY_WEIGHTS):
         return None
     assert scene.points is not None
     evidence = gather_evidence(scene, options, run.similarity, progress.note)
-    terms = GeometryTerms(options, shots, evidence, run.similarity.apply(scene.points.xyz))
+    terms = GeometryTerms(options, images, evidence, run.similarity.apply(scene.points.xyz))
     if terms.sources is not None and not any(terms.sources):
         progress.note("--patches: no two views see the same places from angles that suit it, so it does nothing")
     return terms
@@ -135,7 +135,7 @@ def late_terms(run: Run, scene: Scene, shots: list[Shot], progress: Progress) ->
 def start_trainer(
     scene: Scene,
     run: Run,
-    shots: list[Shot],
+    images: list[TrainingImage],
     options: TrainOptions,
     state: dict | None,
     cloud: PointCloud | None = None,
@@ -145,17 +145,17 @@ def start_trainer(
 
     Args:
         scene: with points to start from; those of a checkpoint need none.
-        shots: its training views in the training frame.
+        images: its training views in the training frame.
         cloud: the points to start from; default: `filled_points` of the scene.
         largest: extent that a primitive may have, in the training frame; default: by what the points reach.
 
     Raises:
         LinprimError: the background is none, or the checkpoint does not fit the options.
     """
-    focal = float(np.median([max(s.camera.fx, s.camera.fy) for s in shots]))
-    centers = np.stack([s.camera.center for s in shots])
+    focal = float(np.median([max(s.camera.fx, s.camera.fy) for s in images]))
+    centers = np.stack([s.camera.center for s in images])
     begun = None if state is None else "environment" in state.get("parameters", {})
-    behind = chosen_background(options.background, scene, shots, begun)
+    behind = chosen_background(options.background, scene, images, begun)
     surface = state is None and not isinstance(scene.points, VolumePoints)
     if state is not None:
         xyz, rgb, radius = np.zeros((4, 3)), np.zeros((4, 3)), 1.0  # replaced below
@@ -176,16 +176,16 @@ def start_trainer(
         _lay_down(parameters, xyz, options.seed, bounds[0])
     log_gain = None
     if options.exposure == "gain" and state is None:
-        seen = observe(scene, options.seed, views=len(shots))
+        seen = observe(scene, options.seed, views=len(images))
         log_gain = None if seen is None else seen.log_gains[0]
     environment = None
     if behind.environment:
-        size = texels_for([shot.camera for shot in shots])
+        size = texels_for([image.camera for image in images])
         environment = (
             torch.zeros(6, size, size, 3) if behind.far is None else behind.far.start(size)
         )  # zeros: replaced below
     trainer = Trainer(
-        shots,
+        images,
         parameters,
         options,
         bounds,

@@ -12,7 +12,7 @@ import sys
 import pytest
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import atomic_write, locked, remove_torn, write_json
+from linprim_geo.base.files import atomic_write, locked, remove_temporary, write_json
 
 
 @pytest.fixture
@@ -132,7 +132,7 @@ def test_the_data_is_on_disk_before_the_name_and_the_name_before_the_end(old, mo
 def test_what_a_kill_left_is_removed_and_nothing_else(tmp_path):
     for name in (".mesh.abc.tmp.ply", ".mesh_visible.abc.tmp.ply", ".mesh.abc.tmp.obj", "mesh.ply", "mesh.tmp.ply"):
         (tmp_path / name).touch()
-    remove_torn(tmp_path / "mesh.ply")
+    remove_temporary(tmp_path / "mesh.ply")
     left = [".mesh.abc.tmp.obj", ".mesh_visible.abc.tmp.ply", "mesh.ply", "mesh.tmp.ply"]
     assert sorted(path.name for path in tmp_path.iterdir()) == left
 

@@ -288,7 +288,7 @@ def test_what_was_measured_is_taken_from_the_folder(swept, tiny_scene, tiny_run,
 def test_training_knobs_run_on_every_rung(tiny_scene, tmp_path, monkeypatch):
     """A few steps each; how runs are scored is tested by the ones that score."""
     monkeypatch.setattr(
-        "linprim_geo.points.start_points.fill_points", lambda scene, *_: scene.points
+        "linprim_geo.points.start_points.densify", lambda scene, *_: scene.points
     )  # seconds for every rung
     scored = []
 

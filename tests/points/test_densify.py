@@ -13,8 +13,8 @@ from PIL import Image
 from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.types import PointCloud, Scene
 from linprim_geo.points import densify as filling
-from linprim_geo.points.densify import _differences, _Gaps, _not_in_free_space, _sources, fill_points
-from linprim_geo.points.initial_points import local_planes, spread_looks
+from linprim_geo.points.densify import _differences, _Gaps, _not_in_free_space, _sources, densify
+from linprim_geo.points.initial_points import evenly_spread_views, local_planes
 
 # A room of 4 x 4 x 3: the far wall at y = 2, the floor at z = -1.5, a box in front of the wall.
 BOX_LOW, BOX_HIGH = np.array([-0.5, 0.6, -1.5]), np.array([0.5, 1.4, -0.3])
@@ -97,7 +97,7 @@ def on_box(xyz):
 
 def test_gaps_between_points_are_filled_on_the_surface(room):
     given = len(room.points.xyz)
-    cloud = fill_points(room, seed=0)
+    cloud = densify(room, seed=0)
     np.testing.assert_array_equal(cloud.xyz[:given], room.points.xyz)
     new = cloud.xyz[given:]
     assert len(new) > given / 2 and cloud.rgb.shape == cloud.xyz.shape and cloud.rgb.dtype == np.uint8
@@ -112,7 +112,7 @@ def test_gaps_between_points_are_filled_on_the_surface(room):
 def test_an_object_without_features_is_found_by_its_colours(room):
     assert on_box(room.points.xyz).sum() <= 60  # floor points at its foot
     given = len(room.points.xyz)
-    new = fill_points(room, seed=0)
+    new = densify(room, seed=0)
     box = on_box(new.xyz[given:]) & (new.xyz[given:, 2] > -1.2)
     assert box.sum() >= 8
     green = new.rgb[given:].astype(int)[box]
@@ -120,7 +120,7 @@ def test_an_object_without_features_is_found_by_its_colours(room):
 
 
 def test_two_calls_give_the_same_points_and_another_seed_others(room):
-    first, again, other = (fill_points(room, seed=seed).xyz for seed in (3, 3, 4))
+    first, again, other = (densify(room, seed=seed).xyz for seed in (3, 3, 4))
     assert first.tobytes() == again.tobytes()
     assert first.shape != other.shape or (first != other).any()
 
@@ -136,7 +136,7 @@ def full_cloud(room):
 
 def test_where_cells_are_full_nothing_is_added(room):
     full = full_cloud(room)
-    assert len(fill_points(full, seed=0).xyz) <= 1.01 * len(full.points.xyz)
+    assert len(densify(full, seed=0).xyz) <= 1.01 * len(full.points.xyz)
 
 
 def test_masked_background_gets_no_points(room, tmp_path):
@@ -151,7 +151,7 @@ def test_masked_background_gets_no_points(room, tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps(transforms(cameras(), paths)))
     scene = with_cloud(load_scene(tmp_path), room.points.xyz)
     assert scene.has_alpha
-    cloud = fill_points(scene, seed=0)
+    cloud = densify(scene, seed=0)
     new = cloud.rgb[len(scene.points.xyz) :]
     assert len(new) > 100
     np.testing.assert_allclose(new, np.broadcast_to(COLORS["wall"], new.shape), atol=1)
@@ -160,15 +160,15 @@ def test_masked_background_gets_no_points(room, tmp_path):
 def test_a_plain_backdrop_gets_no_points(room):
     given = len(room.points.xyz)
     backdrop = np.array(COLORS["wall"]) / 255
-    with_it = fill_points(room, seed=0).rgb[given:].astype(int)
-    without = fill_points(room, seed=0, backdrop=backdrop).rgb[given:].astype(int)
+    with_it = densify(room, seed=0).rgb[given:].astype(int)
+    without = densify(room, seed=0, backdrop=backdrop).rgb[given:].astype(int)
     like = [np.abs(rgb - COLORS["wall"]).max(1) <= 20 for rgb in (with_it, without)]
     assert like[0].sum() > 100 and like[1].sum() == 0 and len(without) > 100
 
 
 def test_points_that_other_views_see_through_are_dropped(room):
     full = full_cloud(room)
-    views = [_Gaps(look, full.points.xyz) for look in spread_looks(room.train, 100)]
+    views = [_Gaps(look, full.points.xyz) for look in evenly_spread_views(room.train, 100)]
     wall = np.array([[0.2, 2.0, 0.4], [-0.7, 2.0, 0.2], [0.9, 2.0, 0.3]])
     floating = wall - [0, 0.5, 0]
     np.testing.assert_array_equal(_not_in_free_space(wall, views, 0), True)
@@ -176,7 +176,7 @@ def test_points_that_other_views_see_through_are_dropped(room):
 
 
 def test_patches_agree_at_the_true_depth(room):
-    views = [_Gaps(look, room.points.xyz) for look in spread_looks(room.train, 100)]
+    views = [_Gaps(look, room.points.xyz) for look in evenly_spread_views(room.train, 100)]
     index = 4
     view, depth = views[index], cast(cameras()[index])[0]
     face = np.array([[64.0, 60.0], [58.0, 64.0], [70.0, 58.0]])  # the box's front
@@ -201,7 +201,7 @@ def test_patches_agree_at_the_true_depth(room):
     ids=["few", "line", "one place", "behind"],
 )
 def test_clouds_that_span_nothing_are_left_alone_or_filled_finitely(room, xyz):
-    cloud = fill_points(with_cloud(room, xyz), seed=0)
+    cloud = densify(with_cloud(room, xyz), seed=0)
     np.testing.assert_array_equal(cloud.xyz[: len(xyz)], xyz)
     assert np.isfinite(cloud.xyz).all() and len(cloud.rgb) == len(cloud.xyz)
 

@@ -16,10 +16,10 @@ from linprim_geo.capture.types import PointCloud, Scene, View
 from linprim_geo.points.initial_points import (
     CAMERA_DISTANCE,
     _colors,
+    evenly_spread_views,
     focus_point,
     frusta_points,
     scene_normalization,
-    spread_looks,
     visual_hull_points,
 )
 
@@ -142,7 +142,7 @@ def test_colors_come_from_the_foreground_alone(tmp_path):
     # The pixels beside the ball hide blue: a point there has no colour of its own and gets the ball's.
     scene = silhouettes(tmp_path, sphere_ring(8))
     beside = PLACE + np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0], [0.1, 0.1, 0.1]])
-    colors = _colors(beside, spread_looks(scene.train, 8))
+    colors = _colors(beside, evenly_spread_views(scene.train, 8))
     np.testing.assert_allclose(colors, np.broadcast_to([200, 60, 20], (4, 3)), atol=1)
 
 

@@ -17,7 +17,7 @@ from linprim_geo.surface.extract import extract_mesh
 from linprim_geo.surface.method_tsdf import DepthFrames
 from linprim_geo.surface.tsdf_field import placed, vote_rules
 from linprim_geo.surface.tsdf_fusion import Lattice, _find_blocks, fuse_lattice
-from linprim_geo.surface.tsdf_parts import halo, load_lattice, load_part, owners, part_task, save_lattice, together
+from linprim_geo.surface.tsdf_parts import halo, load_lattice, load_part, merge_parts, owners, part_task, save_lattice
 
 LEVEL = 0.5
 
@@ -49,7 +49,7 @@ def test_parts_are_together_the_whole_to_the_last_bit(kind, tiny_run, lattice, t
     else:  # nearly every block is a seam
         owner = np.random.default_rng(0).integers(0, 3, len(made.blocks))
     parts = parts_of(tiny_run, made, owner, tmp_path)
-    mesh = placed(together(parts), made.origin)
+    mesh = placed(merge_parts(parts), made.origin)
     assert len(whole.faces) > 1000 and all(len(part.faces) for part in parts)
     assert np.array_equal(mesh.vertices, whole.vertices) and np.array_equal(mesh.faces, whole.faces)
     assert sum(len(part.faces) for part in parts) == len(whole.faces)  # nothing twice

@@ -35,11 +35,11 @@ from linprim_geo.training.blocks import driver as block_training
 from linprim_geo.training.blocks import plan
 from linprim_geo.training.blocks import tasks as block_tasks
 from linprim_geo.training.blocks.driver import blocks_that_fit, train_blocks
-from linprim_geo.training.blocks.plan import EXCHANGES, apportioned, block_of, known_of
-from linprim_geo.training.blocks.tasks import beyond, block_folder, join_task, tensors
-from linprim_geo.training.blocks.windows import Windows, block_shots
+from linprim_geo.training.blocks.plan import EXCHANGES, apportioned, block_of, exact_radius_of
+from linprim_geo.training.blocks.tasks import block_folder, join_task, outside, tensors
+from linprim_geo.training.blocks.windows import Windows, block_images
 from linprim_geo.training.step.trainer import Trainer, initial_parameters
-from linprim_geo.training.step.training_images import RECENT, Shot, StoredShot
+from linprim_geo.training.step.training_images import RECENT, LazyTrainingImage, TrainingImage
 from linprim_geo.training.train import train
 
 OPTIONS = TrainOptions(
@@ -110,10 +110,10 @@ def test_a_block_that_has_lost_all_it_owned_adds_nothing(lost, whole, tmp_path, 
 
 def test_the_nearest_that_memory_allows_stand_in_full(monkeypatch):
     distances = np.concatenate([np.zeros(100), np.linspace(0.01, 9.0, 900)])
-    assert known_of(distances, 0.5, 100_000) == np.inf  # 90,000 lie outside
+    assert exact_radius_of(distances, 0.5, 100_000) == np.inf  # 90,000 lie outside
     monkeypatch.setattr(plan, "MOST_BESIDE", 10_000)
-    assert known_of(distances, 0.5, 100_000) == pytest.approx(1.01)
-    assert known_of(distances, 2.0, 100_000) == 2.0
+    assert exact_radius_of(distances, 0.5, 100_000) == pytest.approx(1.01)
+    assert exact_radius_of(distances, 2.0, 100_000) == 2.0
 
 
 def test_others_stand_in_full_as_far_as_they_are_known(whole, tmp_path, monkeypatch):
@@ -132,7 +132,7 @@ def test_others_stand_in_full_as_far_as_they_are_known(whole, tmp_path, monkeypa
 
     monkeypatch.setattr(block_tasks, "_trained", trained)
     assert join_task(tmp_path, str(run), 0, 1)["owned"] > 0
-    coarse = beyond(Run.open(run / "blocks" / "coarse" / "run").training_primitives(), own, known)["center"]
+    coarse = outside(Run.open(run / "blocks" / "coarse" / "run").training_primitives(), own, known)["center"]
     beside = theirs[~own.holds(theirs, margin) & own.holds(theirs, known)]
     assert known > margin and 0 < len(beside) < len(theirs) and 0 < len(coarse) and taken["known"] == known
     assert np.array_equal(taken["frozen"]["center"], np.concatenate([coarse, beside]))
@@ -243,27 +243,30 @@ def test_a_block_sees_its_own_pixels_and_the_frozen_scene_elsewhere(whole):
     scene, coarse = run.scene(), Run.open(whole[0] / "blocks" / "coarse" / "run")
     everything = Block((-np.inf,) * 3, (np.inf,) * 3)
     factor = coarse.scene_options.downscale
-    frozen = beyond(coarse.training_primitives(), everything, 0.1)
+    frozen = outside(coarse.training_primitives(), everything, 0.1)
     assert len(frozen["center"]) == 0
-    shots = block_shots(coarse, scene.train[:2], everything, 0.1, 0.1, factor, run.similarity, OPTIONS, tensors(frozen))
+    images = block_images(
+        coarse, scene.train[:2], everything, 0.1, 0.1, factor, run.similarity, OPTIONS, tensors(frozen)
+    )
     photo = scene.train[0].load()
-    camera = shots[0].camera
+    camera = images[0].camera
     left, top = (
         round(a - b) for a, b in ((scene.train[0].camera.cx, camera.cx), (scene.train[0].camera.cy, camera.cy))
     )
     part = photo.rgb[top : top + camera.height, left : left + camera.width]
-    alpha = shots[0].alpha.numpy() > 0
-    assert np.array_equal(shots[0].rgb.numpy().transpose(1, 2, 0)[alpha], part[alpha])
+    alpha = images[0].alpha.numpy() > 0
+    assert np.array_equal(images[0].rgb.numpy().transpose(1, 2, 0)[alpha], part[alpha])
     own = block_of(worker.result_of_folder(run.path / "blocks" / "plan"), 0)
-    frozen = beyond(coarse.training_primitives(), own, 0.05)
+    frozen = outside(coarse.training_primitives(), own, 0.05)
     assert len(frozen["center"]) > 0 and not own.holds(frozen["center"], 0.05).any()
-    shots = block_shots(coarse, scene.train, own, 0.05, 0.05, factor, run.similarity, OPTIONS, tensors(frozen))
-    assert all(shot.weight == shot.camera.width * shot.camera.height / 48**2 for shot in shots)
+    images = block_images(coarse, scene.train, own, 0.05, 0.05, factor, run.similarity, OPTIONS, tensors(frozen))
+    assert all(image.weight == image.camera.width * image.camera.height / 48**2 for image in images)
     assert all(
-        shot.camera.width <= 48 and shot.rgb.shape[1:] == (shot.camera.height, shot.camera.width) for shot in shots
+        image.camera.width <= 48 and image.rgb.shape[1:] == (image.camera.height, image.camera.width)
+        for image in images
     )
-    assert sum(shot.camera.width * shot.camera.height for shot in shots) < 0.9 * len(scene.train) * 48 * 48
-    assert all(shot.size == (48, 48) for shot in shots)
+    assert sum(image.camera.width * image.camera.height for image in images) < 0.9 * len(scene.train) * 48 * 48
+    assert all(image.size == (48, 48) for image in images)
 
 
 def test_windows_are_in_no_memory_and_leave_no_file(whole, tmp_path, monkeypatch):
@@ -271,23 +274,23 @@ def test_windows_are_in_no_memory_and_leave_no_file(whole, tmp_path, monkeypatch
     run = Run.open(whole[0])
     scene, coarse = run.scene(), Run.open(whole[0] / "blocks" / "coarse" / "run")
     everything, factor = Block((-np.inf,) * 3, (np.inf,) * 3), coarse.scene_options.downscale
-    nothing = tensors(beyond(coarse.training_primitives(), everything, 0.1))
-    shots = block_shots(coarse, scene.train, everything, 0.1, 0.1, factor, run.similarity, OPTIONS, nothing)
+    nothing = tensors(outside(coarse.training_primitives(), everything, 0.1))
+    images = block_images(coarse, scene.train, everything, 0.1, 0.1, factor, run.similarity, OPTIONS, nothing)
     assert not list(tmp_path.iterdir())
-    assert all(type(shot) is StoredShot for shot in shots) and len(shots) > RECENT
-    first = [(shot.rgb.clone(), shot.alpha.clone()) for shot in shots]
+    assert all(type(image) is LazyTrainingImage for image in images) and len(images) > RECENT
+    first = [(image.rgb.clone(), image.alpha.clone()) for image in images]
     assert all(
-        torch.equal(shot.rgb, rgb) and torch.equal(shot.alpha, alpha)
-        for shot, (rgb, alpha) in zip(shots, first, strict=True)
+        torch.equal(image.rgb, rgb) and torch.equal(image.alpha, alpha)
+        for image, (rgb, alpha) in zip(images, first, strict=True)
     )
-    assert len({rgb.numpy().tobytes() for rgb, _ in first}) == len(shots)
+    assert len({rgb.numpy().tobytes() for rgb, _ in first}) == len(images)
     monkeypatch.setattr(tempfile, "tempdir", "/dev/null/nowhere")
     with pytest.raises(LinprimError, match="/dev/null/nowhere"):
         Windows()
     with pytest.raises(LinprimError, match="no space left on the device"):
         windows = Windows.__new__(Windows)
         windows._what, windows._file, windows._recent = tmp_path / "windows", open("/dev/full", "wb"), {}
-        windows.shot("a", shots[0].camera, np.zeros((999, 999, 3), np.uint8), np.zeros((999, 999), np.uint8))
+        windows.image("a", images[0].camera, np.zeros((999, 999, 3), np.uint8), np.zeros((999, 999), np.uint8))
 
 
 @pytest.mark.parametrize("population", ["gradient", "3dgs"])
@@ -300,14 +303,14 @@ def test_a_window_pulls_as_its_photograph_does(population):
     camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, pose)
     rgb = torch.zeros(3, 48, 64, dtype=torch.uint8)
     rgb[:, 16:32, 16:48] = torch.from_numpy(rng.integers(0, 255, (3, 16, 32), dtype=np.uint8))
-    whole_photo = Shot("whole", camera, rgb, None)
-    window = Shot("window", cropped(camera, 16, 16, 32, 16), rgb[:, 16:32, 16:48].contiguous(), None, (64, 48))
+    whole_photo = TrainingImage("whole", camera, rgb, None)
+    window = TrainingImage("window", cropped(camera, 16, 16, 32, 16), rgb[:, 16:32, 16:48].contiguous(), None, (64, 48))
     assert window.weight == 1 / 6 and whole_photo.weight == 1 and window.size == whole_photo.size
     name = {"gradient": "pull", "3dgs": "gradient"}[population]
     pulls = []
-    for shot in (whole_photo, window):
+    for image in (whole_photo, window):
         options, copy = replace(OPTIONS, dssim=0.0, population=population), {k: v.clone() for k, v in start.items()}
-        trainer = Trainer([shot], copy, options, (0.01, 0.1), torch.zeros(3), False, False)
+        trainer = Trainer([image], copy, options, (0.01, 0.1), torch.zeros(3), False, False)
         trainer.advance()
         pulls.append(trainer.control.gathered[name])
     assert pulls[0].max() > 0 and torch.allclose(pulls[0], pulls[1], rtol=1e-3, atol=1e-6 * float(pulls[0].max()))
@@ -317,17 +320,17 @@ def test_frozen_primitives_are_drawn_and_stay(whole):
     run = Run.open(whole[0])
     scene, coarse = run.scene(), Run.open(whole[0] / "blocks" / "coarse" / "run")
     own = block_of(worker.result_of_folder(run.path / "blocks" / "plan"), 0)
-    frozen = tensors(beyond(coarse.training_primitives(), own, 0.05))
-    shots = block_shots(
+    frozen = tensors(outside(coarse.training_primitives(), own, 0.05))
+    images = block_images(
         coarse, scene.train, own, 0.05, 0.05, coarse.scene_options.downscale, run.similarity, OPTIONS, frozen
     )
     rng = np.random.default_rng(0)
     start = initial_parameters(rng.normal(size=(40, 3)), rng.integers(0, 255, (40, 3)), 1, 0, (0.01, 1.0))
-    trainer = Trainer(shots, start, replace(OPTIONS, iterations=20), (0.01, 1.0), torch.ones(3), False, True)
-    alone = trainer.render(shots[0].camera, torch.ones(3))
+    trainer = Trainer(images, start, replace(OPTIONS, iterations=20), (0.01, 1.0), torch.ones(3), False, True)
+    alone = trainer.render(images[0].camera, torch.ones(3))
     trainer.frozen = frozen
     before = [tensor.clone() for tensor in frozen]
-    assert not torch.equal(alone, trainer.render(shots[0].camera, torch.ones(3)))
+    assert not torch.equal(alone, trainer.render(images[0].camera, torch.ones(3)))
     for _ in range(20):
         trainer.advance()
     assert all(torch.equal(a, b) for a, b in zip(before, frozen, strict=True))
@@ -336,7 +339,7 @@ def test_frozen_primitives_are_drawn_and_stay(whole):
     )
     empty = tuple(tensor[:0] for tensor in frozen)
     twins = [
-        Trainer(shots, {k: v.clone() for k, v in start.items()}, OPTIONS, (0.01, 1.0), torch.ones(3), False, True)
+        Trainer(images, {k: v.clone() for k, v in start.items()}, OPTIONS, (0.01, 1.0), torch.ones(3), False, True)
         for _ in range(2)
     ]
     twins[1].frozen = empty

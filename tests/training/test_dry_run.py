@@ -17,9 +17,14 @@ from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.capture.load import load_scene
 from linprim_geo.cli import main as cli
 from linprim_geo.training import dry_run, single
-from linprim_geo.training.step import training_images as shots
+from linprim_geo.training.step import training_images as images
 from linprim_geo.training.step.trainer import Trainer
-from linprim_geo.training.step.training_images import Shot, StoredShot, load_shots, photo_bytes
+from linprim_geo.training.step.training_images import (
+    LazyTrainingImage,
+    TrainingImage,
+    load_training_images,
+    photo_bytes,
+)
 from linprim_geo.training.train import train
 
 OPTIONS = TrainOptions(
@@ -39,17 +44,17 @@ def test_photographs_on_disk_train_to_the_same_bits(kept, tiny_scene, tmp_path, 
     options = replace(OPTIONS, exposure="gain", patches=0.1, geometry_from=0.5)
     train(tiny_scene, tmp_path / "memory", options=options, quiet=True)
     one = photo_bytes(load_scene(tiny_scene).train[:1])
-    monkeypatch.setattr(shots, "available_memory", lambda: int(one * (kept + 0.5) / shots.MEMORY_SHARE))
+    monkeypatch.setattr(images, "available_memory", lambda: int(one * (kept + 0.5) / images.MEMORY_SHARE))
     seen = []
-    original = single.load_shots
+    original = single.load_training_images
 
     def loading(views, similarity):
         seen.append(original(views, similarity))
         return seen[-1]
 
-    monkeypatch.setattr(single, "load_shots", loading)
+    monkeypatch.setattr(single, "load_training_images", loading)
     train(tiny_scene, tmp_path / "disk", options=options, quiet=True)
-    assert [type(shot) is Shot for shot in seen[0]] == [True] * kept + [False] * (12 - kept)
+    assert [type(image) is TrainingImage for image in seen[0]] == [True] * kept + [False] * (12 - kept)
     for name in ("training_frame.npz", "scene.npz", "scene.ply"):
         assert (tmp_path / "memory" / name).read_bytes() == (tmp_path / "disk" / name).read_bytes(), name
     scores = [
@@ -64,27 +69,27 @@ def test_a_photograph_on_disk_is_the_one_in_memory_and_few_are_kept(tiny_scene):
     from linprim_geo.points.initial_points import scene_normalization
 
     similarity = scene_normalization(scene)
-    memory, disk = (load_shots(scene.train, similarity, limit) for limit in (10**9, 0))
+    memory, disk = (load_training_images(scene.train, similarity, limit) for limit in (10**9, 0))
     for one, other in zip(memory, disk, strict=True):
-        assert type(one) is Shot and type(other) is StoredShot and one.name == other.name
+        assert type(one) is TrainingImage and type(other) is LazyTrainingImage and one.name == other.name
         assert torch.equal(one.rgb, other.rgb) and torch.equal(one.alpha, other.alpha)
         assert np.array_equal(one.camera.world_to_camera, other.camera.world_to_camera)
         assert torch.equal(one.over(torch.ones(3)), other.over(torch.ones(3)))
-        assert len(other._recent) <= shots.RECENT
+        assert len(other._recent) <= images.RECENT
 
 
 def test_photographs_take_a_share_of_the_memory_but_not_all_of_a_large_one(monkeypatch):
-    monkeypatch.setattr(shots, "available_memory", lambda: 2**30)
-    assert shots.photo_limit() == 2**28
-    monkeypatch.setattr(shots, "available_memory", lambda: 2**40)
-    assert shots.photo_limit() == shots.MOST_KEPT
+    monkeypatch.setattr(images, "available_memory", lambda: 2**30)
+    assert images.photo_limit() == 2**28
+    monkeypatch.setattr(images, "available_memory", lambda: 2**40)
+    assert images.photo_limit() == images.MOST_KEPT
 
 
 def test_a_step_reads_its_photograph_once(tiny_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(shots, "available_memory", lambda: 0)
+    monkeypatch.setattr(images, "available_memory", lambda: 0)
     reads, before = [], []
-    decode, advance = shots._decode, Trainer.advance
-    monkeypatch.setattr(shots, "_decode", lambda view, camera: (reads.append(view.name), decode(view, camera))[1])
+    decode, advance = images._decode, Trainer.advance
+    monkeypatch.setattr(images, "_decode", lambda view, camera: (reads.append(view.name), decode(view, camera))[1])
 
     def counted(self):
         before.append(len(reads))
@@ -97,7 +102,7 @@ def test_a_step_reads_its_photograph_once(tiny_scene, tmp_path, monkeypatch):
 
 def test_a_photograph_that_is_gone_is_named(tiny_scene, tmp_path, monkeypatch):
     scene = shutil.copytree(tiny_scene, tmp_path / "scene")
-    monkeypatch.setattr(shots, "available_memory", lambda: 0)
+    monkeypatch.setattr(images, "available_memory", lambda: 0)
     advance = Trainer.advance
 
     def removing(self):
@@ -184,7 +189,7 @@ def test_what_does_not_fit_comes_with_what_to_change(available, primitives, advi
 
 
 def test_photographs_that_are_read_when_they_are_due_are_said(tiny_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(shots, "available_memory", lambda: 0)
+    monkeypatch.setattr(images, "available_memory", lambda: 0)
     report = dry_run.dry_run(tiny_scene, tmp_path / "run", options=OPTIONS, quiet=True)
     assert report["photos_in_memory"] == 0 and "read when they are due" in dry_run.describe(report)
 

@@ -266,12 +266,12 @@ def test_an_event_copies_rows_and_moments():
     control = GradientControl(options, 50, [], (1e-3, 1.0))
     table = parameters(50)
     control.gathered["pull"] += 1
-    event = control.change(table, 5)
+    event = control.grow(table, 5)
     new = np.arange(50, len(event.source))
     assert 0 < len(new) <= 10 and (event.source[:50] == np.arange(50)).all()
     rows, values = event.values["center"]
     assert set(new) < set(rows) and set(event.source[new]) < set(rows) and len(values) == len(rows)
-    assert (np.sort(event.calm) == np.sort(rows)).all() and event.fresh is None
+    assert (np.sort(event.reset_momentum) == np.sort(rows)).all() and event.reset_state is None
     again = GradientControl(options, 7, [], (1e-3, 1.0))
     again.restore(control.state())
     assert again.growth == control.growth

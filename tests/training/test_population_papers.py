@@ -98,7 +98,7 @@ def test_a_gradient_is_averaged_over_the_views_that_see():
     screen = torch.tensor([[3e-6, 4e-6, 9.0], [0, 0, 0], [1, 1, 1]])
     assert list(in_view(parameters, CAMERAS[0], "octahedron")) == [True, True, False]
     for _ in range(2):
-        control.gather(parameters, CAMERAS[0], (CAMERAS[0].width, CAMERAS[0].height), screen)
+        control.accumulate(parameters, CAMERAS[0], (CAMERAS[0].width, CAMERAS[0].height), screen)
     # From -1 to 1 over 100 pixels: 50 times as much per unit, 5e-6 * 50 = 2.5e-4 per view.
     assert torch.allclose(control.gathered["gradient"], torch.tensor([5e-4, 0, 0]), rtol=1e-5)
     assert list(control.gathered["seen"]) == [2, 2, 0]
@@ -113,8 +113,8 @@ def test_small_ones_are_cloned_and_large_ones_split():
     parameters["raw_opacity"] = torch.full((4,), 2.0)
     control.gathered["gradient"] = torch.tensor([2e-4, 2e-4, 1e-4, 1e-4]) * 3
     control.gathered["seen"] = torch.full((4,), 3.0)
-    event = control.change(parameters, 750)
-    assert list(event.source) == [0, 2, 3, 0, 1, 1] and list(event.fresh) == [3, 4, 5]
+    event = control.grow(parameters, 750)
+    assert list(event.source) == [0, 2, 3, 0, 1, 1] and list(event.reset_state) == [3, 4, 5]
     extent = np.exp(after(event, parameters, "log_extent"))
     assert np.allclose(extent, np.array([[5, 5, 6, 5, 5, 5]]).T * 1e-3)
     center = after(event, parameters, "center")
@@ -130,7 +130,7 @@ def test_gaussians_are_copied_as_they_are():
     control, parameters = classic(2, "gaussian"), table(2, "gaussian")
     parameters["log_extent"][:] = math.log(0.005)
     control.gathered = {"gradient": torch.tensor([3e-4, 3e-4]), "seen": torch.ones(2)}
-    event = control.change(parameters, 600)
+    event = control.grow(parameters, 600)
     assert list(event.source) == [0, 1, 0, 1] and "raw_opacity" not in event.values
 
 
@@ -143,7 +143,7 @@ def test_halves_are_spread_like_the_parent(kind):
     size = torch.tensor([0.3, 0.2, 0.1]) if kind != "tetrahedron" else torch.full((4,), 0.2)
     parameters["log_extent"] = torch.log(size).repeat(count, 1)
     control.gathered = {"gradient": torch.ones(count), "seen": torch.ones(count)}
-    event = control.change(parameters, 1000)
+    event = control.grow(parameters, 1000)
     assert len(event.source) == 2 * count
     # A quarter turn about x takes y to z. Standard deviations of 8000 draws are good to 1 / sqrt(16000) = 0.8 %.
     spread = after(event, parameters, "center").std(0) / constants.spread
@@ -162,15 +162,15 @@ def test_faint_and_oversized_ones_are_pruned(kind):
     limit = constants.largest * RADIUS * (1 if kind == "gaussian" else KINDS[kind].size / 2)
     parameters["log_extent"][2, 0] = math.log(limit * 1.01)
     parameters["log_extent"][3, 0] = math.log(limit * 0.99)
-    assert list(control.change(parameters, 1000).source) == [0, 2, 3, 4]
+    assert list(control.grow(parameters, 1000).source) == [0, 2, 3, 4]
     # Only once opacities have been reset.
-    assert list(control.change(parameters, 3500).source) == [0, 3, 4]
+    assert list(control.grow(parameters, 3500).source) == [0, 3, 4]
 
 
 def test_something_is_left():
     control, parameters = classic(3), table(3)
     parameters["raw_opacity"] = torch.tensor([-9.0, -8.0, -10.0])
-    assert list(control.change(parameters, 1000).source) == [1]
+    assert list(control.grow(parameters, 1000).source) == [1]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -178,22 +178,22 @@ def test_a_reset_leaves_nothing_below_the_prune_level(kind):
     constants = GAUSSIANS if kind == "gaussian" else POLYHEDRA
     control, parameters = classic(20, kind), table(20, kind)
     parameters["raw_opacity"][:10] = -3.6
-    event = control.change(parameters, 3000)
+    event = control.grow(parameters, 3000)
     opacity = opacity_of(after(event, parameters, "raw_opacity"))
-    assert event.calm_opacity and opacity.max() == pytest.approx(2 * constants.faintest, rel=1e-5)
+    assert event.reset_opacity and opacity.max() == pytest.approx(2 * constants.faintest, rel=1e-5)
     assert opacity.min() >= constants.faintest
-    assert not control.change(parameters, 3250).calm_opacity
+    assert not control.grow(parameters, 3250).reset_opacity
 
 
 def test_the_limit_on_the_population_takes_what_pulls_hardest():
     control, parameters = classic(10, max_primitives=12), table(10)
     parameters["raw_opacity"][:] = 1.0
     control.gathered = {"gradient": torch.arange(10.0), "seen": torch.ones(10)}
-    event = control.change(parameters, 1000)
-    assert len(event.source) == 12 and set(event.source[event.fresh]) == {8, 9}
+    event = control.grow(parameters, 1000)
+    assert len(event.source) == 12 and set(event.source[event.reset_state]) == {8, 9}
     full = classic(10, max_primitives=10)
     full.gathered = control.gathered
-    assert list(full.change(parameters, 1000).source) == list(range(10))
+    assert list(full.grow(parameters, 1000).source) == list(range(10))
 
 
 # --- MCMC -------------------------------------------------------------------------------------------------
@@ -230,7 +230,7 @@ def test_fifty_copies_lose_no_digits():
 def test_dead_ones_move_onto_living_ones_and_five_percent_join(kind):
     control, parameters = mcmc(200, kind), table(200, kind)
     parameters["raw_opacity"][:40] = -6.0
-    event = control.change(parameters, 600)
+    event = control.grow(parameters, 600)
     assert len(event.source) == 210
     assert (event.source[:40] >= 40).all() and (event.source[40:200] == np.arange(40, 200)).all()
     opacity, raw = opacity_of(after(event, parameters, "raw_opacity")), parameters["raw_opacity"].numpy()
@@ -239,9 +239,9 @@ def test_dead_ones_move_onto_living_ones_and_five_percent_join(kind):
     for row in range(40, 200):
         family = np.flatnonzero(event.source == row)
         assert np.prod(1 - opacity[family]) == pytest.approx(1 - opacity_of(raw[row]), rel=1e-4)
-        assert (len(family) == 1) == (row not in event.fresh)
-    assert {*range(40), *range(200, 210)} <= set(event.fresh)
-    assert event.values["log_extent"][1].shape == (len(event.fresh), KINDS[kind].extents)
+        assert (len(family) == 1) == (row not in event.reset_state)
+    assert {*range(40), *range(200, 210)} <= set(event.reset_state)
+    assert event.values["log_extent"][1].shape == (len(event.reset_state), KINDS[kind].extents)
 
 
 def test_parents_are_drawn_in_proportion_to_their_opacity():
@@ -253,7 +253,7 @@ def test_parents_are_drawn_in_proportion_to_their_opacity():
         name: torch.cat([value, value.new_full((1, *value.shape[1:]), -9.0)]) for name, value in parameters.items()
     }
     for step in range(600, 2600):
-        counts[control.change(parameters, step).source[3]] += 1
+        counts[control.grow(parameters, step).source[3]] += 1
     # 2000 draws: three standard deviations are 0.034.
     assert np.abs(counts / 2000 - [0.1, 0.3, 0.6]).max() < 0.034
 
@@ -262,15 +262,15 @@ def test_a_relocated_one_that_should_vanish_ends_at_the_lower_bound():
     control, parameters = mcmc(40), table(40)
     parameters["log_extent"][:] = math.log(BOUNDS[0])
     parameters["raw_opacity"][:30] = -6.0
-    event = control.change(parameters, 600)
+    event = control.grow(parameters, 600)
     assert np.exp(event.values["log_extent"][1]).min() >= BOUNDS[0] * (1 - 1e-6)
 
 
 def test_the_population_stays_below_its_limit_and_at_least_one_lives():
     control, parameters = mcmc(100, max_primitives=102), table(100)
-    assert len(control.change(parameters, 600).source) == 102
+    assert len(control.grow(parameters, 600).source) == 102
     parameters["raw_opacity"][:] = -9.0
-    assert len(control.change(parameters, 600).source) == 102
+    assert len(control.grow(parameters, 600).source) == 102
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -285,7 +285,7 @@ def test_noise_moves_transparent_ones_along_their_axes(kind):
     parameters["raw_opacity"][:] = math.log(0.001)
     parameters["raw_opacity"][: count // 2] = 2.0
     before = {name: value.clone() for name, value in parameters.items()}
-    control.disturb(parameters, 1)
+    control.add_noise(parameters, 1)
     moved = parameters["center"].numpy()
     assert (moved[: count // 2] == 0).all()
     # Covariance times normal noise, times 5e5 * 1.6e-4 * radius * S(1 - opacity), S = 1 / (1 + exp(-100 * 0.004)) here.
@@ -294,9 +294,9 @@ def test_noise_moves_transparent_ones_along_their_axes(kind):
     # 2000 draws: three standard deviations of a standard deviation are 5 %.
     assert np.allclose(moved[count // 2 :].std(0), expected, rtol=0.06)
     again = {name: value.clone() for name, value in before.items()}
-    control.disturb(again, 1)
+    control.add_noise(again, 1)
     assert torch.equal(again["center"], parameters["center"])
-    control.disturb(again, 2)
+    control.add_noise(again, 2)
     assert not torch.equal(again["center"], parameters["center"])
     assert all(torch.equal(before[name], parameters[name]) for name in before if name != "center")
 
@@ -323,7 +323,7 @@ def test_an_event_depends_on_the_seed_and_the_step_alone(make, kind):
         control = make(50, kind, seed=seed)
         for name in control.NAMES:
             control.gathered[name] += 1
-        return control.change(parameters, step)
+        return control.grow(parameters, step)
 
     first, again, later, other = event(1000), event(1000), event(2000), event(1000, 1)
     assert (first.source == again.source).all()

@@ -36,7 +36,7 @@ from linprim_geo.training.budget.plan import (
 )
 from linprim_geo.training.start import start_trainer
 from linprim_geo.training.step.trainer import Trainer
-from linprim_geo.training.step.training_images import load_shots
+from linprim_geo.training.step.training_images import load_training_images
 from linprim_geo.training.train import train
 
 MANY = 10**9
@@ -122,8 +122,8 @@ def test_the_voxel_fills_the_time():
 @pytest.fixture
 def trainer(tiny_scene, tiny_run):
     run = Run.open(tiny_run)
-    shots = load_shots(run.scene().train, run.similarity)
-    return start_trainer(run.scene(), run, shots, run.train_options, None)
+    images = load_training_images(run.scene().train, run.similarity)
+    return start_trainer(run.scene(), run, images, run.train_options, None)
 
 
 def test_a_correction_stretches_what_is_left_of_the_schedule(trainer):

@@ -12,7 +12,7 @@ from linprim_geo.geometry.primitives import KINDS, Primitives
 from linprim_geo.kernels import ops
 from linprim_geo.training.step import trainer as training_step
 from linprim_geo.training.step.trainer import Trainer
-from linprim_geo.training.step.training_images import load_shots
+from linprim_geo.training.step.training_images import load_training_images
 
 
 def test_activation_gives_the_opacity_of_the_raw_value():
@@ -38,15 +38,15 @@ def trainer(tiny_scene):
 
     scene = load_scene(tiny_scene)
     similarity = scene_normalization(scene)
-    shots = load_shots(scene.train, similarity)
+    images = load_training_images(scene.train, similarity)
     xyz = similarity.apply(scene.points.xyz[:40])
     parameters = training_step.initial_parameters(xyz, scene.points.rgb[:40], 1, 0, (1e-3, 1.0))
     options = TrainOptions(iterations=100, max_primitives=50, sh_degree=1, threads=1)
-    return Trainer(shots, parameters, options, (1e-3, 1.0), torch.ones(3), False, True)
+    return Trainer(images, parameters, options, (1e-3, 1.0), torch.ones(3), False, True)
 
 
 def test_every_view_is_seen_once_per_round(trainer):
-    count = len(trainer.shots)
+    count = len(trainer.images)
     rounds = [[trainer.view_of(step) for step in range(r * count, (r + 1) * count)] for r in range(4)]
     assert all(sorted(order) == list(range(count)) for order in rounds)
     assert len({tuple(order) for order in rounds}) > 1
@@ -148,7 +148,7 @@ def test_the_3d_filter_widens_what_is_rendered(kind):
 
 
 def test_the_length_of_the_3d_filter_is_that_of_the_nearest_view_that_sees(trainer):
-    cameras = [shot.camera for shot in trainer.shots]
+    cameras = [image.camera for image in trainer.images]
     rng = np.random.default_rng(0)
     center = rng.normal(size=(300, 3)) * 4
     found = training_step.filter_lengths(torch.from_numpy(center.astype(np.float32)), cameras).numpy()

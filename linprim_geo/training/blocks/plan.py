@@ -146,8 +146,8 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
         steps = math.ceil(options.iterations * len(seen_by[k]) / len(scene.train))
         parts.append(
             {
-                "low": [_plain(x) for x in block.low],
-                "high": [_plain(x) for x in block.high],
+                "low": [_json_number(x) for x in block.low],
+                "high": [_json_number(x) for x in block.high],
                 "views": seen_by[k],
                 "pixels": pixels[k],
                 "work": float(work[block.holds(points)].sum() / work.sum()),
@@ -155,7 +155,7 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
                 "max_primitives": most,
                 "own_primitives": own[k],
                 "initial_primitives": min(most, math.ceil(share * options.initial_primitives)),
-                "known": _plain(known_of(block.distance(grown), margin, options.max_primitives)),
+                "known": _json_number(exact_radius_of(block.distance(grown), margin, options.max_primitives)),
             }
         )
     background = worker.result_of_folder(opened.path / FOLDER / "coarse")
@@ -183,7 +183,7 @@ def apportioned(shares: Sequence[float] | np.ndarray, total: int) -> list[int]:
     return parts.tolist()
 
 
-def known_of(distances: np.ndarray, margin: float, primitives: int) -> float:
+def exact_radius_of(distances: np.ndarray, margin: float, primitives: int) -> float:
     """How far from a block the nearest MOST_BESIDE primitives outside of it reach, its margin at least; infinite if
     there are fewer.
 
@@ -196,7 +196,7 @@ def known_of(distances: np.ndarray, margin: float, primitives: int) -> float:
     return max(margin, float(outside[most])) if most < len(outside) else math.inf
 
 
-def _plain(x: float) -> float | None:
+def _json_number(x: float) -> float | None:
     return float(x) if math.isfinite(x) else None
 
 

@@ -28,13 +28,13 @@ from linprim_geo.points.start_points import filled_points, initial_cloud
 from linprim_geo.runs.run import Run
 from linprim_geo.training.background import chosen_background
 from linprim_geo.training.blocks.plan import EXCHANGES, FOLDER, _opened, _prepared, block_of, coarse_of
-from linprim_geo.training.blocks.windows import block_shots
+from linprim_geo.training.blocks.windows import block_images
 from linprim_geo.training.checkpoint import read_checkpoint
 from linprim_geo.training.loop import run_steps
 from linprim_geo.training.single import train_run
 from linprim_geo.training.start import start_trainer
 from linprim_geo.training.step.trainer import CONTROLS
-from linprim_geo.training.step.training_images import load_shots
+from linprim_geo.training.step.training_images import load_training_images
 
 # Arrays of primitives by name, of any number: the frozen ones may be none.
 Arrays = dict[str, np.ndarray]
@@ -48,7 +48,9 @@ def coarse_task(folder: Path, run: str) -> dict:
     coarse = coarse_of(opened, scene)
     small = replace(coarse.scene(), points=scene.points)
     with locked(coarse.path, "trained into"):
-        behind = chosen_background(coarse.train_options.background, small, load_shots(small.train, coarse.similarity))
+        behind = chosen_background(
+            coarse.train_options.background, small, load_training_images(small.train, coarse.similarity)
+        )
         state = read_checkpoint(coarse.path) if (coarse.path / "config.json").exists() else None
         done = train_run(coarse, small, state, Progress("coarse scene", 1, quiet=True))
     shown_color = [float(x) for x in (Run.open(coarse.path).background if behind.fitted else behind.color)]
@@ -65,7 +67,7 @@ def block_task(folder: Path, run: str, block: int) -> dict:
     own, margin = block_of(plan, block), plan["margin"]
     coarse = Run.open(opened.path / FOLDER / "coarse" / "run").training_primitives()
     return _trained(
-        folder, opened, scene, plan, block, beyond(coarse, own, margin), margin, until(opened.train_options, 0), None
+        folder, opened, scene, plan, block, outside(coarse, own, margin), margin, until(opened.train_options, 0), None
     )
 
 
@@ -84,7 +86,7 @@ def join_task(folder: Path, run: str, block: int, exchange: int) -> dict:
     known = math.inf if plan["blocks"][block]["known"] is None else plan["blocks"][block]["known"]
     state = _state_of(opened.path, block, exchange - 1)
     begin = [_rows(state, is_owned(opened.path, plan, block, exchange - 1, state))]
-    frozen = [beyond(Run.open(opened.path / FOLDER / "coarse" / "run").training_primitives(), own, known)]
+    frozen = [outside(Run.open(opened.path / FOLDER / "coarse" / "run").training_primitives(), own, known)]
     for other in range(len(plan["blocks"])):
         if other != block and not own.is_apart(block_of(plan, other), known):
             theirs = _state_of(opened.path, other, exchange - 1)
@@ -95,7 +97,7 @@ def join_task(folder: Path, run: str, block: int, exchange: int) -> dict:
             frozen.append(select(still, rows & ~inside & own.holds(center, known)))
     count = len(_centers(begin[0]))
     if sum(len(_centers(each)) for each in begin):
-        state |= _together(begin)
+        state |= _concatenate_rows(begin)
     end = until(opened.train_options, exchange)
     trained = _trained(folder, opened, scene, plan, block, concatenated(frozen), known, end, state)
     return trained | {"owned": count}
@@ -122,7 +124,7 @@ def _rows(state: dict, keep: np.ndarray) -> dict:
     return tables | {name: None if state[name] is None else state[name][rows] for name in _TENSORS}
 
 
-def _together(parts: Sequence[dict]) -> dict:
+def _concatenate_rows(parts: Sequence[dict]) -> dict:
     """That of all of them."""
     tables = {name: {key: torch.cat([part[name][key] for part in parts]) for key in parts[0][name]} for name in _TABLES}
     return tables | {
@@ -169,9 +171,9 @@ def _trained(
         cloud = _points_of(seen, opened, plan, block, options) if state is None else None
         coarse = Run.open(opened.path / FOLDER / "coarse" / "run")
         margin, factor, still = plan["margin"], plan["factor"], tensors(frozen)
-        shots = block_shots(coarse, seen.train, own, margin, known, factor, opened.similarity, options, still)
+        images = block_images(coarse, seen.train, own, margin, known, factor, opened.similarity, options, still)
         here = replace(opened, path=path, train_options=options)
-        trainer = start_trainer(seen, here, shots, options, state, cloud, plan["extent"])
+        trainer = start_trainer(seen, here, images, options, state, cloud, plan["extent"])
         trainer.frozen = still
         trainer.control.limit_only(own.holds, part["own_primitives"], trainer.parameters, trainer.step)
         if not begun:
@@ -218,7 +220,7 @@ def is_owned(run: Path, plan: dict, block: int, exchange: int, state: dict) -> n
     return np.arange(len(_centers(state))) < worker.result_of_folder(block_folder(run, block, exchange))["owned"]
 
 
-def beyond(primitives: Primitives, block: Block, margin: float) -> Arrays:
+def outside(primitives: Primitives, block: Block, margin: float) -> Arrays:
     """Those outside of a block and its margin, but for those that reach into the block."""
     reach = primitives.extent.max(1)[:, None]
     low, high = np.asarray(block.low), np.asarray(block.high)

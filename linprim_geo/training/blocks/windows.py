@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import writing
+from linprim_geo.base.files import readable_write_errors
 from linprim_geo.base.options import TrainOptions, raster_options
 from linprim_geo.capture.types import View
 from linprim_geo.geometry.boxes import Block, cropped, enlarged, smaller, surface_points, window
@@ -23,7 +23,7 @@ from linprim_geo.geometry.camera import Camera, Similarity
 from linprim_geo.geometry.primitives import Tensors
 from linprim_geo.kernels import ops
 from linprim_geo.runs.run import Run
-from linprim_geo.training.step.training_images import Shot, StoredShot
+from linprim_geo.training.step.training_images import LazyTrainingImage, TrainingImage
 
 # Transmittance at which the coarse surface is taken.
 LEVEL = 0.5
@@ -54,34 +54,34 @@ class Windows:
                 f"no folder for temporary files can be written ({error}): wanted TMPDIR to name one"
             ) from None
         self._what = folder / "windows of photographs (TMPDIR)"
-        with writing(self._what):
+        with readable_write_errors(self._what):
             self._file = tempfile.TemporaryFile()
-        self._recent: dict[str, Shot] = {}
+        self._recent: dict[str, TrainingImage] = {}
 
-    def shot(
+    def image(
         self, name: str, camera: Camera, rgb: np.ndarray, alpha: np.ndarray, photo: tuple[int, int] | None = None
-    ) -> StoredShot:
-        """Takes up (H, W, 3) and (H, W) uint8; `photo` as of a `Shot`.
+    ) -> LazyTrainingImage:
+        """Takes up (H, W, 3) and (H, W) uint8; `photo` as of a `TrainingImage`.
 
         Raises:
             LinprimError: the disk is full.
         """
-        with writing(self._what):
+        with readable_write_errors(self._what):
             begin = self._file.seek(0, os.SEEK_END)
             self._file.write(rgb.transpose(2, 0, 1).tobytes() + alpha.tobytes())
-        return StoredShot(name, camera, partial(self._read, begin, name, camera), True, self._recent, photo)
+        return LazyTrainingImage(name, camera, partial(self._read, begin, name, camera), True, self._recent, photo)
 
-    def _read(self, begin: int, name: str, camera: Camera) -> Shot:
-        with writing(self._what):
+    def _read(self, begin: int, name: str, camera: Camera) -> TrainingImage:
+        with readable_write_errors(self._what):
             self._file.seek(begin)
             planes = bytearray(self._file.read(4 * camera.height * camera.width))
         if len(planes) != 4 * camera.height * camera.width:
             raise LinprimError(f"{self._what}: what was written of {name} cannot be read again")
         rgba = torch.frombuffer(planes, dtype=torch.uint8).reshape(4, camera.height, camera.width)
-        return Shot(name, camera, rgba[:3], rgba[3])
+        return TrainingImage(name, camera, rgba[:3], rgba[3])
 
 
-def block_shots(
+def block_images(
     coarse: Run,
     views: Sequence[View],
     block: Block,
@@ -91,7 +91,7 @@ def block_shots(
     similarity: Similarity,
     options: TrainOptions,
     frozen: Tensors,
-) -> list[Shot]:
+) -> list[TrainingImage]:
     """What a block is trained on.
 
     A photograph is cut to the window that shows the block and its margin, and counts by that window's share of its
@@ -103,7 +103,7 @@ def block_shots(
         LinprimError: a photograph cannot be read, or the disk is full.
     """
     how = raster_options(options) | {"stop": options.stop}
-    shots: list[Shot] = []
+    images: list[TrainingImage] = []
     windows = Windows()
     for view, (camera, depth) in zip(views, small_depths(coarse, views, factor), strict=True):
         surface = surface_points(camera, depth)
@@ -122,8 +122,8 @@ def block_shots(
         if not mask.all():
             instead, opacity = _rendered(frozen, small, how)
             rgb, alpha = np.where(mask[..., None], rgb, instead), np.where(mask, alpha, opacity)
-        shots.append(windows.shot(view.name, small, rgb, alpha, (view.camera.width, view.camera.height)))
-    return shots
+        images.append(windows.image(view.name, small, rgb, alpha, (view.camera.width, view.camera.height)))
+    return images
 
 
 def _rendered(frozen: Tensors, camera: Camera, how: dict) -> tuple[np.ndarray, np.ndarray]:

@@ -27,7 +27,7 @@ from linprim_geo.training.budget.plan import (
 )
 from linprim_geo.training.step.geometry_terms import GeometryTerms
 from linprim_geo.training.step.trainer import SHARED, Trainer
-from linprim_geo.training.step.training_images import Shot
+from linprim_geo.training.step.training_images import TrainingImage
 
 # A calibration: steps of each of two populations, the smaller one this part of the larger, in turn after the
 # warm-up, and the share of the budget after which no further ones are timed.
@@ -113,14 +113,14 @@ class Pace:
 
 def plan_run(
     run: Run,
-    shots: list[Shot],
-    held_out: list[Shot],
+    images: list[TrainingImage],
+    held_out: list[TrainingImage],
     terms: GeometryTerms | None,
     budget: Budget,
     progress: Progress,
     *,
     start: Callable[[TrainOptions], Trainer],
-    score: Callable[[Trainer, list[Shot]], object],
+    score: Callable[[Trainer, list[TrainingImage]], object],
     start_share: float,
     quick_views: int,
 ) -> tuple[Run, Pace]:
@@ -141,14 +141,14 @@ def plan_run(
         if value != getattr(TrainOptions, name)
     }
     begin = time.monotonic()
-    cost, begun, starting, view_seconds = calibrate(run.train_options, shots, terms, budget, start, score)
+    cost, begun, starting, view_seconds = calibrate(run.train_options, images, terms, budget, start, score)
     calibrating = time.monotonic() - begin
     # What goes on beside the steps: scores and checkpoints on the way, and both at the end.
     beside = SAVE_SECONDS / options.checkpoint_every
     beside += view_seconds * quick_views / options.evaluate_every if options.evaluate_every else 0.0
     cost = replace(cost, base=cost.base + beside)
     finish = SAVE_SECONDS + view_seconds * len(held_out)
-    pixels = sum(shot.camera.width * shot.camera.height for shot in shots)
+    pixels = sum(image.camera.width * image.camera.height for image in images)
     left = budget.left() - starting - SAVE_SECONDS - finish
     plan = plan_training(left, cost, max(begun, start_share), max(1, pixels // PIXELS_PER_PRIMITIVE), **given)
     if plan is None:
@@ -180,11 +180,11 @@ def plan_run(
 
 def calibrate(
     options: TrainOptions,
-    shots: list[Shot],
+    images: list[TrainingImage],
     terms: GeometryTerms | None,
     budget: Budget,
     start: Callable[[TrainOptions], Trainer],
-    score: Callable[[Trainer, list[Shot]], object],
+    score: Callable[[Trainer, list[TrainingImage]], object],
 ) -> tuple[StepCost, float, float, float]:
     """(cost of a step, population at the start as a share of its limit, seconds to make the first population, seconds
     to score a view).
@@ -203,7 +203,7 @@ def calibrate(
     fewer["log_extent"].clamp_(*(float(np.log(bound)) for bound in large.bounds))
     environment = None if large.environment is None else large.environment.clone()
     small = Trainer(
-        shots,
+        images,
         fewer,
         options,
         large.bounds,
@@ -233,8 +233,8 @@ def calibrate(
                 times[name].append(trainer.seconds)
     mean = {name: float(np.mean(values)) for name, values in times.items() if values}
     begin = time.monotonic()
-    score(large, shots[:2])
-    view_seconds = (time.monotonic() - begin) / len(shots[:2])
+    score(large, images[:2])
+    view_seconds = (time.monotonic() - begin) / len(images[:2])
     late = mean.get("late", mean["large"]) / mean["large"]
     cost = StepCost.fit(
         (part, mean["small"]), (len(large), mean["large"]), late, 1 - late_from if late_from < 1 else 0.0

@@ -50,21 +50,21 @@ class Evidence:
 class GeometryTerms:
     """The weighted sum of the terms for a view at a step. `needs_geometry` says whether one looks at the renderer's."""
 
-    def __init__(self, options: TrainOptions, shots: list, evidence: list[Evidence], points: np.ndarray):
-        """`shots` as the trainer has them, an `evidence` each; `points` (P, 3) of the scene in the training frame."""
-        self.options, self.shots, self.evidence = options, shots, evidence
-        self.sources = source_views([shot.camera for shot in shots], points) if options.patches > 0 else None
+    def __init__(self, options: TrainOptions, images: list, evidence: list[Evidence], points: np.ndarray):
+        """`images` as the trainer has them, an `evidence` each; `points` (P, 3) of the scene in the training frame."""
+        self.options, self.images, self.evidence = options, images, evidence
+        self.sources = source_views([image.camera for image in images], points) if options.patches > 0 else None
         self.needs_geometry = any(getattr(options, name) > 0 for name in GEOMETRY_WEIGHTS if name != "binarisation")
 
     def loss(self, out: Rendering, index: int, step: int, raw_opacity: Tensor, render_depth) -> Tensor:
         """Scalar. `out` is the rendering of view `index`, with its geometry where that is needed;
         `render_depth(camera)` gives the (H, W) depth of another view."""
-        o, shot, evidence = self.options, self.shots[index], self.evidence[index]
+        o, image, evidence = self.options, self.images[index], self.evidence[index]
         total = raw_opacity.new_zeros(())
         if o.binarisation > 0:
             total = total + o.binarisation * binarisation(raw_opacity)
         if o.normal_consistency > 0:
-            total = total + o.normal_consistency * normal_consistency(out, shot.camera)
+            total = total + o.normal_consistency * normal_consistency(out, image.camera)
         if o.distortion > 0:
             assert out.distortion is not None
             total = total + o.distortion * out.distortion.mean()
@@ -79,12 +79,12 @@ class GeometryTerms:
             total = total + o.point_depth * depth_error(found, evidence.point_depth, evidence.point_weight)
         if self.sources is not None and self.sources[index]:
             rng = np.random.default_rng([o.seed, 9, step])
-            other = self.shots[self.sources[index][rng.integers(len(self.sources[index]))]]
+            other = self.images[self.sources[index][rng.integers(len(self.sources[index]))]]
             opaque = out.opacity.detach() > 0.5
-            if shot.alpha is not None:
-                opaque = opaque & (shot.alpha > 127)
+            if image.alpha is not None:
+                opaque = opaque & (image.alpha > 127)
             pixels = patch_pixels(opaque, rng)
-            views = (shot.camera, grey(shot), other.camera, grey(other), render_depth(other.camera))
+            views = (image.camera, grey(image), other.camera, grey(other), render_depth(other.camera))
             total = total + o.patches * patch_consistency(out, *views, pixels)
         return total
 
@@ -126,9 +126,9 @@ def gather_evidence(
     return gathered
 
 
-def grey(shot) -> Tensor:
+def grey(image) -> Tensor:
     """(H, W) float32 mean of a photograph's channels, in [0, 1]."""
-    return shot.rgb.to(torch.float32).mean(0) / 255
+    return image.rgb.to(torch.float32).mean(0) / 255
 
 
 def depth_normals(depth: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:

@@ -2,7 +2,7 @@
 
 Parents are drawn in proportion to the screen-space gradient gathered since the last event. Primitives that have become
 transparent or have shrunk to nothing are not deleted but become the second half of another parent. The rules of the
-papers that this is compared with are in population_papers.py; what they all have in common is `Control`.
+papers that this is compared with are in population_papers.py; what they all have in common is `DensityControl`.
 """
 
 from __future__ import annotations
@@ -70,18 +70,18 @@ class Event:
     """One change of the population, N primitives before it and M after it.
 
     Row i of the new tables, Adam's moments included, is row `source[i]` of the old ones; then `values[name]`, pairs of
-    rows of the new table and what they receive, is written. First moments become 0 in the rows `calm`, both in the rows
-    `fresh`, and both of the opacity everywhere with `calm_opacity`.
+    rows of the new table and what they receive, is written. First moments become 0 in the rows `reset_momentum`, both
+    in the rows `reset_state`, and both of the opacity everywhere with `reset_opacity`.
     """
 
     source: np.ndarray
     values: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
-    calm: np.ndarray | None = None
-    fresh: np.ndarray | None = None
-    calm_opacity: bool = False
+    reset_momentum: np.ndarray | None = None
+    reset_state: np.ndarray | None = None
+    reset_opacity: bool = False
 
 
-class Control:
+class DensityControl:
     """A rule of growth. Whatever it draws comes from (seed, purpose, step), so that a resumed run repeats itself.
 
     `gathered` holds a value per primitive for each name in `NAMES`; the trainer saves it and sets it to 0 after each
@@ -110,18 +110,20 @@ class Control:
         """What is added to the loss, differentiable in the raw parameters."""
         return None
 
-    def gather(self, parameters: Parameters, camera: Camera, size: tuple[int, int], screen_grad: torch.Tensor) -> None:
+    def accumulate(
+        self, parameters: Parameters, camera: Camera, size: tuple[int, int], screen_grad: torch.Tensor
+    ) -> None:
         """Notes one view's gradient to the projected centres (N, 3), see `ops.rasterize`'s `screen`; `size`, (width,
         height), is that of the photograph, of which the camera may see a part."""
 
-    def disturb(self, parameters: Parameters, step: int) -> None:
+    def add_noise(self, parameters: Parameters, step: int) -> None:
         """Changes parameters in place after the optimiser's step, `step` counted from 1."""
 
     def is_due(self, step: int) -> bool:
         """Whether the population changes after this step."""
         raise NotImplementedError
 
-    def change(self, parameters: Parameters, step: int) -> Event:
+    def grow(self, parameters: Parameters, step: int) -> Event:
         """The change after this step."""
         raise NotImplementedError
 
@@ -142,7 +144,7 @@ class Control:
         """Takes back what `state` returned."""
 
 
-class GradientControl(Control):
+class GradientControl(DensityControl):
     """This file's rule: `grow` at the steps of a plan."""
 
     NAMES = ("pull",)
@@ -160,14 +162,14 @@ class GradientControl(Control):
                 self.options.iterations, int(counts(parameters["center"].detach().numpy()).sum()), most
             )
 
-    def gather(self, parameters, camera, size, screen_grad):
+    def accumulate(self, parameters, camera, size, screen_grad):
         # In units of the image's size, so that views of different resolution pull alike.
         self.gathered["pull"] += screen_grad[:, 2] * max(size)
 
     def is_due(self, step):
         return self.growth.is_due(step)
 
-    def change(self, parameters, step):
+    def grow(self, parameters, step):
         parents, children, halves = grow(
             parameters,
             self.gathered["pull"],
@@ -183,7 +185,7 @@ class GradientControl(Control):
         rows = np.concatenate([parents, children])
         # A child is its parent, moments and all, but for what a half has of its own.
         values = {name: (rows, np.concatenate([both[0], both[1]])) for name, both in halves.items()}
-        return Event(source, values, calm=rows)
+        return Event(source, values, reset_momentum=rows)
 
     def state(self):
         return [self.growth.first, self.growth.last, self.growth.every, self.growth.rate, self.growth.cap]

@@ -17,7 +17,7 @@ import torch
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.primitives import DIST_TO_SCALE, KINDS
 from linprim_geo.kernels.ops import exponential
-from linprim_geo.training.step.population import Control, Event, rotate, thinned
+from linprim_geo.training.step.population import DensityControl, Event, rotate, thinned
 
 # Shorter runs have proportionally shorter intervals.
 FULL_ITERATIONS = 7000
@@ -57,7 +57,7 @@ GAUSSIANS = ClassicConstants(100, 2e-4, 0.01, 0.1, 0.005, 1.6, 1.0)
 RESET_EVERY = 3000
 
 
-class ClassicControl(Control):
+class ClassicControl(DensityControl):
     """3DGS's rule. Where LinPrim's code errs, this does what was meant:
 
     * Opacities are reset to twice the prune level, 3DGS's own ratio. LinPrim's 0.01 lies below its prune level of
@@ -79,7 +79,7 @@ class ClassicControl(Control):
         self.every, self.reset_every = _steps(self.constants.every, total), _steps(RESET_EVERY, total)
         self.first, self.last = _steps(FIRST, total), round(self.GROWS_UNTIL * total)
 
-    def gather(self, parameters, camera, size, screen_grad):
+    def accumulate(self, parameters, camera, size, screen_grad):
         half = torch.tensor([size[0] / 2, size[1] / 2])
         seen = in_view(parameters, camera, self.kind)
         pull = torch.linalg.vector_norm(screen_grad[:, :2] * half, dim=1)
@@ -90,7 +90,7 @@ class ClassicControl(Control):
         grows = step > self.first and step % self.every == 0
         return step < self.last and (grows or step % self.reset_every == 0)
 
-    def change(self, parameters, step):
+    def grow(self, parameters, step):
         constants, rng = self.constants, self.rng(7, step)
         raw = parameters["raw_opacity"].detach().numpy().astype(np.float64)
         log_extent = parameters["log_extent"].detach().numpy().astype(np.float64)
@@ -141,7 +141,7 @@ class ClassicControl(Control):
             raw, changed = np.minimum(raw, _logit(2 * constants.faintest)), True
         if changed:
             values["raw_opacity"] = np.arange(len(source)), raw
-        return Event(source, values, fresh=fresh, calm_opacity=reset)
+        return Event(source, values, reset_state=fresh, reset_opacity=reset)
 
 
 MCMC_EVERY, MCMC_RATE = 100, 0.05
@@ -150,7 +150,7 @@ NOISE_RATE, NOISE_CENTER = 5e5, (1.6e-4, 1.6e-6)
 SIZE_PENALTY = OPACITY_PENALTY = 0.01
 
 
-class McmcControl(Control):
+class McmcControl(DensityControl):
     """MCMC's rule: dead primitives move onto opaque ones, five percent more by the same draw, noise on the centres of
     the transparent ones, and penalties on size and opacity. A polyhedron counts as a Gaussian of standard deviations
     extent / 2.6, as in LinPrim; relocation therefore changes its image.
@@ -179,7 +179,7 @@ class McmcControl(Control):
     def is_due(self, step):
         return self.first < step < self.last and step % self.every == 0
 
-    def disturb(self, parameters, step):
+    def add_noise(self, parameters, step):
         """center += covariance noise 5e5 rate S(1 - opacity), S(x) = 1 / (1 + exp(-100 (x - 0.995))), rate the papers'
         for centres."""
         opacity = torch.sigmoid(parameters["raw_opacity"]).numpy().astype(np.float64)
@@ -200,7 +200,7 @@ class McmcControl(Control):
         moved = parameters["center"].numpy()[rows] + strength[:, None] * rotate(q, local)
         parameters["center"][torch.from_numpy(rows)] = torch.from_numpy(moved.astype(np.float32))
 
-    def change(self, parameters, step):
+    def grow(self, parameters, step):
         rng = self.rng(8, step)
         raw = parameters["raw_opacity"].detach().numpy().astype(np.float64)
         opacity = 1 / (1 + np.exp(-raw))
@@ -229,7 +229,7 @@ class McmcControl(Control):
         fresh = np.flatnonzero(changed)
         log_extent = np.clip(log_extent[fresh], *np.log(self.bounds))
         values = {"raw_opacity": (fresh, _logit(opacity[fresh])), "log_extent": (fresh, log_extent)}
-        return Event(source, values, fresh=fresh)
+        return Event(source, values, reset_state=fresh)
 
 
 def relocated(opacity: np.ndarray, copies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -27,11 +27,11 @@ from linprim_geo.points.far_colors import SURVEY_VIEWS
 from linprim_geo.training.step.environment import contradiction, seen_through
 from linprim_geo.training.step.exposure import Exposure, exposed
 from linprim_geo.training.step.geometry_terms import GeometryTerms
-from linprim_geo.training.step.population import Control, GradientControl
+from linprim_geo.training.step.population import DensityControl, GradientControl
 from linprim_geo.training.step.population_papers import ClassicControl, McmcControl
-from linprim_geo.training.step.training_images import Shot
+from linprim_geo.training.step.training_images import TrainingImage
 
-CONTROLS: dict[str, type[Control]] = {
+CONTROLS: dict[str, type[DensityControl]] = {
     "gradient": GradientControl,
     "3dgs": ClassicControl,
     "mcmc": McmcControl,
@@ -178,7 +178,7 @@ class Trainer:
 
     def __init__(
         self,
-        shots: list[Shot],
+        images: list[TrainingImage],
         parameters: dict[str, torch.Tensor],
         options: TrainOptions,
         bounds: tuple[float, float],
@@ -191,7 +191,7 @@ class Trainer:
     ):
         """`log_gain` (V, 3): where the gains of the photographs begin, with `--exposure gain`. `environment` (6, S, S,
         3): texels of what stands behind everything, in place of a background, to begin with."""
-        self.shots, self.options, self.bounds, self.terms = shots, options, bounds, terms
+        self.images, self.options, self.bounds, self.terms = images, options, bounds, terms
         self.parameters = dict(parameters)
         self.fitted, self.random_background = fitted, random_background
         self.background = background
@@ -200,13 +200,13 @@ class Trainer:
         self.looks_around = {round(share * options.iterations) for share in LOOKS_AROUND}
         # Gradient of the loss to a texel through which a pixel's light passes to this part: below it Adam's steps get
         # small.
-        camera = shots[0].camera
+        camera = images[0].camera
         self.faint = FAINT / (3 * camera.width * camera.height)
         if environment is not None:
             self.parameters["environment"] = environment
         self.first = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
         self.second = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
-        self.exposure = Exposure(len(shots), log_gain) if options.exposure == "gain" else None
+        self.exposure = Exposure(len(images), log_gain) if options.exposure == "gain" else None
         self.step = 0
         # (step, iterations): from this step on the run is to end after so many, what is left of its schedules stretched
         # to fit.
@@ -214,8 +214,8 @@ class Trainer:
         self.steps = torch.zeros(len(self), dtype=torch.int32)  # sparse Adam: updates of each primitive
         self.seconds = 0.0
         self.loss = self.psnr = math.nan  # running means
-        self.kind, self.how = options.primitive, raster_options(options)
-        self.control = CONTROLS[options.population](options, len(self), [shot.camera for shot in shots], bounds)
+        self.kind, self.raster_options = options.primitive, raster_options(options)
+        self.control = CONTROLS[options.population](options, len(self), [image.camera for image in images], bounds)
         self.filter_3d: torch.Tensor | None = None
         # Primitives that stay as they are, as the rasterizer takes them: they stand for what others train.
         self.frozen: Tensors | None = None
@@ -256,14 +256,18 @@ class Trainer:
         """Degree of the view-dependent colour at this step."""
         return min(self.options.sh_degree, int(self.step / (DEGREE_EVERY * self.options.iterations)))
 
-    def how_now(self) -> dict:
+    def raster_options_now(self) -> dict:
         """The keywords of `ops.rasterize` at this step: until --order-from blending takes the order of the centres."""
-        return self.how if self.has_reached(self.options.order_from) else self.how | {"order": "center"}
+        return (
+            self.raster_options
+            if self.has_reached(self.options.order_from)
+            else self.raster_options | {"order": "center"}
+        )
 
     def view_of(self, step: int) -> int:
         """Index of the view of a step: every view once per round, in an order drawn per round."""
-        turn, place = divmod(step, len(self.shots))
-        return int(np.random.default_rng([self.options.seed, 3, turn]).permutation(len(self.shots))[place])
+        turn, place = divmod(step, len(self.images))
+        return int(np.random.default_rng([self.options.seed, 3, turn]).permutation(len(self.images))[place])
 
     def advance(self) -> None:
         """One training step.
@@ -273,7 +277,7 @@ class Trainer:
         """
         begin = time.perf_counter()
         index = self.view_of(self.step)
-        shot = self.shots[index]
+        image = self.images[index]
         background = self.background
         if self.fitted:
             background = self.parameters["background"]
@@ -281,7 +285,7 @@ class Trainer:
             background = torch.from_numpy(
                 np.random.default_rng([self.options.seed, 4, self.step]).random(3, dtype=np.float32)
             )
-        target = shot.over(background.detach())
+        target = image.over(background.detach())
         leaves = {k: v.requires_grad_() for k, v in self.parameters.items()}
         active = self._cast(*self._with_frozen(activate(leaves, self.degree, self.kind, self.filter_3d)))
         screen = torch.zeros(len(active[0]), 3, dtype=active[0].dtype, requires_grad=True)
@@ -290,25 +294,25 @@ class Trainer:
         # Geometry has no average over the rays of a pixel: with several of them it is rendered by itself.
         needed = terms is not None and terms.needs_geometry
         shared = needed and self.options.samples == 1
-        how = {"stop": self.options.stop, **self.how_now()}
+        how = {"stop": self.options.stop, **self.raster_options_now()}
         samples = self.options.samples
         out = _single(
-            ops.rasterize(*active, behind, shot.camera, samples=samples, geometry=shared, screen=screen, **how)
+            ops.rasterize(*active, behind, image.camera, samples=samples, geometry=shared, screen=screen, **how)
         )
         passed = None
         if self.environment is not None:
-            passed = ops.environment_light(out.opacity, leaves["environment"], shot.camera, self.options.stop)
+            passed = ops.environment_light(out.opacity, leaves["environment"], image.camera, self.options.stop)
             out = replace(out, rgb=out.rgb + passed)
         shown, log_gain = out.rgb, None
         if self.exposure is not None:
             log_gain = self.exposure.row(index)
             # A colour that was drawn, or that stands for what a mask left out, is not in the photograph.
-            drawn = self.random_background or shot.alpha is not None
+            drawn = self.random_background or image.alpha is not None
             rest = background[:, None, None] * (1 - out.opacity) if drawn else None
             shown = exposed(out.rgb, log_gain, target, rest)
         parts = ops.photometric_loss(shown, target, self.options.dssim)
         penalty = self.control.penalty(leaves)
-        photometric = parts[0] if shot.weight == 1 else shot.weight * parts[0]
+        photometric = parts[0] if image.weight == 1 else image.weight * parts[0]
         objective = photometric if penalty is None else photometric + penalty
         if passed is not None:
             photo = target if log_gain is None else target * ops.exponential(-log_gain.detach())[:, None, None]
@@ -324,7 +328,7 @@ class Trainer:
                 assert depth is not None
                 return depth
 
-            geometry = surface(shot.camera, active) if needed and not shared else out
+            geometry = surface(image.camera, active) if needed and not shared else out
             objective = objective + terms.loss(geometry, index, self.step, leaves["raw_opacity"], depth_of)
         wanted = [*leaves.values(), screen] + ([] if log_gain is None else [log_gain])
         grads = torch.autograd.grad(objective, wanted, allow_unused=True)
@@ -336,8 +340,8 @@ class Trainer:
             # A penalty or a term on opacities reaches every primitive, whether the view touched it or not.
             touched = screen_grad[:, 2] > 0 if penalty is None and terms is None else None
             self._update(dict(zip(leaves, grads, strict=True)), touched)
-            self.control.disturb(self.parameters, self.step + 1)
-            self.control.gather(self.parameters, shot.camera, shot.size, screen_grad)
+            self.control.add_noise(self.parameters, self.step + 1)
+            self.control.accumulate(self.parameters, image.camera, image.size, screen_grad)
         self.step += 1
         if self.step in self.looks_around:
             self._look_around()
@@ -389,7 +393,7 @@ class Trainer:
             self.parameters[name].clamp_(0, 1)
 
     def _grow(self) -> None:
-        event = self.control.change(self.parameters, self.step)
+        event = self.control.grow(self.parameters, self.step)
         source = torch.from_numpy(event.source)
         for name in self.parameters:
             if name in SHARED:
@@ -400,15 +404,19 @@ class Trainer:
                 rows, values = event.values[name]
                 self.parameters[name][torch.from_numpy(rows)] = torch.from_numpy(values.astype(np.float32))
             moments: list[tuple[dict[str, Tensor], np.ndarray | slice | None]]
-            moments = [(self.first, event.calm), (self.first, event.fresh), (self.second, event.fresh)]
-            if name == "raw_opacity" and event.calm_opacity:
+            moments = [
+                (self.first, event.reset_momentum),
+                (self.first, event.reset_state),
+                (self.second, event.reset_state),
+            ]
+            if name == "raw_opacity" and event.reset_opacity:
                 moments += [(self.first, slice(None)), (self.second, slice(None))]
             for table, calmed in moments:
                 if calmed is not None:
                     table[name][calmed] = 0
         self.steps = self.steps[source]
-        if event.fresh is not None:
-            self.steps[event.fresh] = 0
+        if event.reset_state is not None:
+            self.steps[event.reset_state] = 0
         self.control.reset(len(self))
         self._refilter()
 
@@ -423,13 +431,15 @@ class Trainer:
         black = torch.zeros(3, dtype=active[0].dtype)
 
         def opacities() -> Iterator[tuple[Camera, Tensor]]:
-            for shot in self.shots[:: max(1, len(self.shots) // SURVEY_VIEWS)]:
+            for image in self.images[:: max(1, len(self.images) // SURVEY_VIEWS)]:
                 out = _single(
-                    ops.rasterize(*active, black, shot.camera, stop=self.options.stop, geometry=True, **self.how_now())
+                    ops.rasterize(
+                        *active, black, image.camera, stop=self.options.stop, geometry=True, **self.raster_options_now()
+                    )
                 )
                 assert out.max_weight is not None
-                support.add(shot.camera, out.max_weight[: len(self)])
-                yield shot.camera, out.opacity
+                support.add(image.camera, out.max_weight[: len(self)])
+                yield image.camera, out.opacity
 
         seen = seen_through(len(self.environment[0]), opacities())
         self.parameters["environment"] = filled(self.environment, seen)
@@ -438,7 +448,7 @@ class Trainer:
     def _refilter(self) -> None:
         """Makes the 3D filter for where the primitives are now."""
         if self.options.filter != "none":
-            cameras = [shot.camera for shot in self.shots]
+            cameras = [image.camera for image in self.images]
             self.filter_3d = filter_lengths(self.parameters["center"], cameras)
 
     @torch.no_grad()
@@ -452,7 +462,7 @@ class Trainer:
                 camera,
                 stop=self.options.stop,
                 samples=self.options.samples,
-                **self.how,
+                **self.raster_options,
             )
         )
         if self.environment is None:

@@ -23,7 +23,7 @@ MEMORY_SHARE, MOST_KEPT, RECENT = 0.25, 3 * 2**29, 2
 
 
 @dataclass(frozen=True)
-class Shot:
+class TrainingImage:
     """A view in memory: `rgb` (3, H, W) uint8, `alpha` (H, W) uint8 or None, its camera in the training frame.
 
     `photo` is (width, height) of the photograph that it is cut out of, None where it is the whole.
@@ -58,23 +58,23 @@ class UnreadablePhoto(LinprimError):
     """A photograph that could be read when training began no longer can."""
 
 
-class StoredShot(Shot):
+class LazyTrainingImage(TrainingImage):
     """The same, read whenever it is used.
 
     `read` gives it, and `recent` holds what was read last, for all that share it.
     """
 
-    _read_it: Callable[[], Shot]
-    _recent: dict[str, Shot]
+    _read_it: Callable[[], TrainingImage]
+    _recent: dict[str, TrainingImage]
     _has_alpha: bool
 
     def __init__(
         self,
         name: str,
         camera: Camera,
-        read: Callable[[], Shot],
+        read: Callable[[], TrainingImage],
         has_alpha: bool,
-        recent: dict[str, Shot],
+        recent: dict[str, TrainingImage],
         photo: tuple[int, int] | None = None,
     ):
         given = {
@@ -88,17 +88,17 @@ class StoredShot(Shot):
         for key, value in given.items():
             object.__setattr__(self, key, value)
 
-    def _read(self) -> Shot:
-        shot = self._recent.pop(self.name, None)
-        if shot is None:
+    def _read(self) -> TrainingImage:
+        image = self._recent.pop(self.name, None)
+        if image is None:
             try:
-                shot = self._read_it()
+                image = self._read_it()
             except LinprimError as error:
                 raise UnreadablePhoto(str(error)) from error
             while len(self._recent) >= RECENT:
                 del self._recent[next(iter(self._recent))]
-        self._recent[self.name] = shot
-        return shot
+        self._recent[self.name] = image
+        return image
 
     @property
     def rgb(self) -> torch.Tensor:
@@ -121,7 +121,9 @@ def photo_limit() -> int:
     return min(int(MEMORY_SHARE * available_memory()), MOST_KEPT)
 
 
-def load_shots(views: tuple[View, ...], similarity: Similarity, limit: int | None = None) -> list[Shot]:
+def load_training_images(
+    views: tuple[View, ...], similarity: Similarity, limit: int | None = None
+) -> list[TrainingImage]:
     """The views in their order. The first of them that take up to `limit` bytes are decoded into memory, the others
     when they are used: the results of training are the same.
 
@@ -129,18 +131,20 @@ def load_shots(views: tuple[View, ...], similarity: Similarity, limit: int | Non
         limit: bytes; default `photo_limit()`.
     """
     left = photo_limit() if limit is None else limit
-    recent: dict[str, Shot] = {}
-    shots: list[Callable[[], Shot]] = []
+    recent: dict[str, TrainingImage] = {}
+    images: list[Callable[[], TrainingImage]] = []
     for view in views:
         left -= photo_bytes((view,))
         camera = view.camera.transformed(similarity)
         read = partial(_decode, view, camera)
-        shots.append(read if left >= 0 else partial(StoredShot, view.name, camera, read, view.has_alpha, recent))
+        images.append(
+            read if left >= 0 else partial(LazyTrainingImage, view.name, camera, read, view.has_alpha, recent)
+        )
     with ThreadPoolExecutor(max(1, min(4, usable_cores()))) as pool:
-        return list(pool.map(lambda make: make(), shots))
+        return list(pool.map(lambda make: make(), images))
 
 
-def _decode(view: View, camera: Camera) -> Shot:
+def _decode(view: View, camera: Camera) -> TrainingImage:
     photo = view.load()
     alpha = None if photo.alpha is None else torch.from_numpy(np.ascontiguousarray(photo.alpha))
-    return Shot(view.name, camera, torch.from_numpy(np.ascontiguousarray(photo.rgb.transpose(2, 0, 1))), alpha)
+    return TrainingImage(view.name, camera, torch.from_numpy(np.ascontiguousarray(photo.rgb.transpose(2, 0, 1))), alpha)
