@@ -113,7 +113,10 @@ inline F photo_cost(const PatchMatch& M, const StereoSource& S, const Packet& P,
   const float most_u = float(S.width) - 1.001f, most_v = float(S.height) - 1.001f;
   // Outside of the photograph, or behind it.
   const F u0 = p[0] / p[2], v0 = p[1] / p[2];
-  I bad = (p[2] <= 1e-6f) | (u0 < 0.0f) | (v0 < 0.0f) | (u0 > most_u) | (v0 > most_v);
+  const I bad = (p[2] <= 1e-6f) | (u0 < 0.0f) | (v0 < 0.0f) | (u0 > most_u) | (v0 > most_v);
+  bool none = true;
+  for (int l = 0; l < kWide; ++l) none &= bad[l] != 0;
+  if (none) return all(kWorst);
   F sum{}, square{}, product{};
   constexpr float kFirst = -0.5f * kWindowStep * (kWindowSide - 1);
   int k = 0;
@@ -287,6 +290,13 @@ inline void look(const PatchMatch& M, Packet& P) {
   }
 }
 
+// Sorts the costs of views and says how many are the better half of those that show the point, 1 at least.
+inline int better_half(float* cost, int views) {
+  std::sort(cost, cost + views);
+  const int seen = int(std::lower_bound(cost, cost + views, kWorst) - cost);
+  return std::max(1, (seen + 1) / 2);
+}
+
 void begin(const PatchMatch& M, Packet& P) {
   Planes planes{};
   for (int l = 0; l < kWide; ++l) {
@@ -305,11 +315,9 @@ void begin(const PatchMatch& M, Packet& P) {
   F cost[kMostSources];
   for (int v = 0; v < M.sources; ++v) cost[v] = view_cost(M, M.source[v], P, planes);
   for (int l = 0; l < P.count; ++l) {
-    float sorted[kMostSources];
+    float sorted[kMostSources], mean = 0;
     for (int v = 0; v < M.sources; ++v) sorted[v] = cost[v][l];
-    const int half = (M.sources + 1) / 2;
-    std::sort(sorted, sorted + M.sources);
-    float mean = 0;
+    const int half = better_half(sorted, M.sources);
     uint8_t chosen = 0;
     for (int v = 0; v < half; ++v) mean += sorted[v] / float(half);
     for (int v = 0; v < M.sources; ++v) chosen |= uint8_t(cost[v][l] <= sorted[half - 1]) << v;
@@ -384,8 +392,7 @@ inline void choose_views(const PatchMatch& M, Packet& P, const F (*cost)[kMostSo
         for (int region = 0; region < kRegions; ++region) least[v] = std::min(least[v], cost[region][v][l]);
         sorted[v] = least[v];
       }
-      const int half = (M.sources + 1) / 2;
-      std::nth_element(sorted, sorted + half - 1, sorted + M.sources);
+      const int half = better_half(sorted, M.sources);
       for (int v = 0; v < M.sources; ++v) weight[v] = float(least[v] <= sorted[half - 1]);
     }
     for (int v = 0; v < M.sources; ++v) P.view[v][l] = weight[v];

@@ -71,6 +71,17 @@ def test_the_cost_agrees_with_float64(images):
     assert np.abs(planes.cost - wanted).max() < 36 * 6e-8 * 255**2 / 1.5
 
 
+def test_photographs_that_do_not_show_a_point_have_no_say(images):
+    away = StereoImage.of(look_at((0, 0, -3), (0, 0, -6), size=(60, 44), focal=70.0, up=(0, 1, 0)), images[0].grey)
+    costs = []
+    for sources in (images[1:3], [images[1], away, images[2], away, away]):
+        planes = some_planes(CAMERAS[0])
+        patch_match(images[0], sources, planes, (0.0, 1.0), 1.0, 0)
+        costs.append(planes.cost)
+    both = costs[0] < 1.9
+    assert both.mean() > 0.5 and np.array_equal(costs[0][both], costs[1][both])
+
+
 def test_it_finds_a_slanted_wall(images):
     planes = DepthPlanes.unknown(*images[0].grey.shape)
     patch_match(images[0], images[1:], planes, (0.0, 0.8), 1.0, 5)
