@@ -20,6 +20,8 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, patch_match
 from linprim_geo.points.view_pairs import source_views, visible_pixels
 
+# Photographs that one is matched with, at most: as many as the core takes.
+MOST_SOURCES = 8
 # Sweeps at half the size, at full size, and in each of the passes in which depths of neighbours are compared.
 COARSE_SWEEPS, FINE_SWEEPS, GEOMETRIC_SWEEPS = 3, 1, (1, 1)
 # The nearest depth is that of the nearest points that a view shows, but for this share, divided by NEARER.
@@ -79,7 +81,7 @@ def depth_maps(views: Sequence[View], points: np.ndarray, *, seed: int = 0, quie
             f"stereo of {len(views)} photographs takes {wanted / 2**30:.1f} GiB of the {free / 2**30:.1f} that are "
             "free, wanted smaller photographs (--downscale) or fewer"
         )
-    pairs = source_views(cameras, points)
+    pairs = source_views(cameras, points, MOST_SOURCES)
     if not any(pairs):
         raise LinprimError(
             "no two photographs show the same points from directions that differ: stereo needs such pairs"

@@ -1,0 +1,34 @@
+"""Which views are matched with which."""
+
+from __future__ import annotations
+
+import numpy as np
+from helpers.captures import look_at
+
+from linprim_geo.points import view_pairs
+
+
+def test_every_point_gets_its_views_where_more_may_be_taken():
+    """Two walls, a few cameras before each of them, and one in the middle that sees half of both."""
+    rng = np.random.default_rng(0)
+    left, right = (rng.uniform([x - 1, 3.9, -1], [x + 1, 4.1, 1], (400, 3)) for x in (-1.2, 1.2))
+    cameras = [look_at((0.0, 0.0, 0.0), (0.0, 4.0, 0.0), size=(60, 40))]
+    for x in (-1.2, 1.2):
+        for k in range(5):
+            place = (x + 0.3 * (k - 2), 0.5, 0.0)
+            cameras.append(look_at(place, (place[0], 4.0, 0.0), size=(30, 40)))
+    points = np.concatenate([left, right])
+    few, many = (view_pairs.source_views(cameras, points, most)[0] for most in (view_pairs.SOURCES, 8))
+    assert len(few) == view_pairs.SOURCES and many[: len(few)] == few and len(many) == 8
+    seen = np.stack([view_pairs.visible_pixels(camera, points)[0] for camera in cameras])
+    own = seen[0]
+    assert own[:400].sum() > 100 and own[400:].sum() > 100
+    times = seen[many][:, own].sum(0)
+    assert (times >= 3).mean() > 0.9 > (seen[few][:, own].sum(0) >= 3).mean()
+
+
+def test_no_more_views_than_show_something():
+    points = np.random.default_rng(0).uniform([-0.3, 1.9, -0.3], [0.3, 2.1, 0.3], (300, 3))
+    cameras = [look_at((x, 0.0, 0.0), (x, 2.0, 0.0), size=(40, 30)) for x in (0.0, 0.3, -0.3)]
+    cameras.append(look_at((0.0, 0.0, 0.0), (0.0, -2.0, 0.0), size=(40, 30)))
+    assert sorted(view_pairs.source_views(cameras, points, 8)[0]) == [1, 2]
