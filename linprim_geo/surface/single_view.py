@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.mesh import Mesh, face_areas, face_components, remove_small_components, select_faces
+from linprim_geo.geometry.mesh import Mesh, face_areas, face_components, select_faces
 from linprim_geo.geometry.view_support import Support
 from linprim_geo.points.initial_points import in_image
 
@@ -34,7 +34,8 @@ def without_single_views(mesh: Mesh, depths: Iterable[tuple[Camera, np.ndarray]]
     """The mesh without what one camera alone sees, and for the statistics `pieces` and their `area`.
 
     Of an open surface every connected patch of such faces is left out that has at least the share `smallest` of the
-    area; of a closed one whole components, if most of their area is so: it stays closed.
+    area; of a closed one whole components, if most of their area is so: it stays closed. What this cuts off from the
+    rest goes too if it is smaller than the share `smallest` of the largest component.
     """
     alone = seen_alone(mesh.vertices, depths)[mesh.faces].all(1)
     area = face_areas(mesh)
@@ -51,7 +52,12 @@ def without_single_views(mesh: Mesh, depths: Iterable[tuple[Camera, np.ndarray]]
     about = {"pieces": pieces, "area": float(area[drop].sum())}
     if not pieces or drop.all():
         return mesh, {"pieces": 0, "area": 0.0} if drop.all() else about
-    return remove_small_components(select_faces(mesh, ~drop), smallest), about
+    whole = face_components(mesh)[1]
+    cut = np.isin(whole, whole[drop])[~drop]
+    left = select_faces(mesh, ~drop)
+    count, label = face_components(left)
+    size = np.bincount(label, weights=area[~drop], minlength=count)
+    return select_faces(left, ~cut | (size >= smallest * size.max())[label]), about
 
 
 def mesh_is_closed(mesh: Mesh) -> bool:

@@ -70,6 +70,24 @@ def test_a_piece_that_floats_before_one_camera_is_left_out():
     assert again is kept and nothing == {"pieces": 0, "area": 0.0}
 
 
+def test_small_pieces_that_several_cameras_see_stay():
+    """Beside the subject; it is what was cut off from a dropped piece that goes."""
+    parts = [square(0.0, 0.0, 0.4, 9), square(0.0, 0.6, 0.01, 4), square(2.0, 4.0, 0.1, 4)]
+    first = np.cumsum([0] + [len(vertices) for vertices, _ in parts])
+    mesh = Mesh(
+        np.concatenate([vertices for vertices, _ in parts]),
+        np.concatenate([faces + begin for (_, faces), begin in zip(parts, first, strict=False)]),
+    )
+    cameras = [camera_at(x, y) for x, y in ((-1, 0), (1, 0), (0, 1), (0, -1))]
+    depths = [(camera, np.full((60, 80), 1e3)) for camera in cameras]
+    kept, about = without_single_views(mesh, depths, 0.01)
+    # No camera of these sees the last piece; one does not need to be seen to stay.
+    assert about["pieces"] == 0 and len(kept.faces) == len(mesh.faces)
+    aside = Camera(80, 60, 60.0, 60.0, 40.0, 30.0, look_at(np.array([6.0, 0.0, 4.0]), np.zeros(3)))
+    kept, about = without_single_views(mesh, [*depths, (aside, np.full((60, 80), 1e3))], 0.01)
+    assert about["pieces"] == 1 and len(kept.vertices) == first[2]
+
+
 def test_a_closed_mesh_stays_closed():
     import trimesh
 
