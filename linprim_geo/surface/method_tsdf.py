@@ -64,15 +64,19 @@ def tsdf_surface(
     memory = int(options.memory_limit * 2**30) if options.memory_limit > 0 else None
 
     def fused(source: Sequence[DepthFrame]) -> Mesh:
-        return fuse_tsdf(
+        merged = source if isinstance(source, MergedFrames) else None
+        mesh = fuse_tsdf(
             source,
             voxel_size=voxel,
             truncation_voxels=options.truncation,
             memory_limit=memory,
-            min_component=options.smallest_part,
+            min_component=0 if merged else options.smallest_part,
             log=stages.note,
             fuse=fuse,
         )
+        # A piece is no wider than the band in which depths vote: nothing can be said of it.
+        band = (2 * options.truncation * voxel) ** 2
+        return merged.supported_parts(mesh, options.smallest_part, band) if merged else mesh
 
     if options.stereo == "on":
         merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)

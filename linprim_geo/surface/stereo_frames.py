@@ -1,5 +1,7 @@
 """Depth maps for fusing out of three sources: what stereo finds and its neighbours confirm, planes of regions without
-texture, and what the primitives render everywhere else, with the weight that its deviation from the first deserves."""
+texture, and what the primitives render everywhere else, with the weight that its deviation from the first deserves.
+
+Of the surface that is fused from them, small pieces stay that the first two of several views support."""
 
 from __future__ import annotations
 
@@ -8,12 +10,18 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from linprim_geo.capture.types import View
-from linprim_geo.stereo.depth_maps import DepthMap, depth_maps
+from linprim_geo.geometry.mesh import Mesh, face_areas, face_components, select_faces
+from linprim_geo.points.initial_points import in_image
+from linprim_geo.stereo.depth_maps import CONFIRMED_DEPTH, DepthMap, depth_maps
 from linprim_geo.stereo.plain_regions import PlainRegion, common_planes, edges_of, plain_regions, plane_depths
 from linprim_geo.surface.tsdf_field import DepthFrame
 
-# A depth counts as confirmed if so many neighbours confirm it, or all but one of fewer.
-NEIGHBOURS = 3
+# A depth counts as confirmed if so many neighbours confirm it; one that a single neighbour confirms is wrong two to
+# four times as often and counts so much.
+NEIGHBOURS, LONE_WEIGHT = 2, 0.1
+# A piece of surface is supported if so many views have depths on this share of it. What is true has 0.3 to 0.9 of it
+# so, what is not 0.1 at most.
+SUPPORTING_VIEWS, SUPPORTED_SHARE = 2, 0.25
 # Points of the rendered surface by which stereo finds pairs of views.
 POINTS = 20_000
 
@@ -24,15 +32,17 @@ class MergedFrames(Sequence):
 
     `weight` is what rendered depths count elsewhere: the squared deviation of confirmed depths from those of their
     neighbours over that of rendered ones from confirmed ones, 1 at most. `confirmed` is the share of pixels with
-    confirmed depths, `plain` that of pixels on one of the `planes` (K, 4).
+    confirmed depths, `lone` that of those which one neighbour alone confirms, `plain` that of pixels on one of the
+    `planes` (K, 4).
     """
 
     def __init__(self, rendered: Sequence[DepthFrame], views: Sequence[View], limit: float, *, quiet: bool = True):
         self.rendered, self.limit = rendered, limit
         points = np.concatenate([_some(frame.surface()[0], POINTS // len(views)) for frame in rendered])
         maps = depth_maps(views, points, quiet=quiet)
-        self.depths = [_confirmed_depth(found) for found in maps]
-        self.confirmed = float(np.mean([np.isfinite(depth).mean() for depth in self.depths]))
+        self.depths = [_depth_where(found, found.confirmed >= NEIGHBOURS) for found in maps]
+        self.lone_depths = [_depth_where(found, found.confirmed == 1) for found in maps]
+        self.confirmed, self.lone = _share_known(self.depths), _share_known(self.lone_depths)
         regions = _plain_regions(maps, self.depths)
         self.planes = common_planes([found.camera for found in maps], [region for own in regions for region in own])
         deviations, self.on_planes = Deviations(), []
@@ -40,12 +50,13 @@ class MergedFrames(Sequence):
             deviations.add(found, depth, frame)
             self.on_planes.append(plane_depths(frame.camera, own, self.planes, frame.depth))
         self.weight = deviations.weight()
-        self.plain = float(np.mean([np.isfinite(depth).mean() for depth in self.on_planes]))
+        self.plain = _share_known(self.on_planes)
 
     def about(self) -> dict:
         """For the statistics."""
         return {
             "confirmed": self.confirmed,
+            "lone": self.lone,
             "rendered_weight": self.weight,
             "plain": self.plain,
             "planes": len(self.planes),
@@ -55,20 +66,20 @@ class MergedFrames(Sequence):
         return len(self.rendered)
 
     def __getitem__(self, index):
-        return self._merged(self.rendered[index], self.depths[index], self.on_planes[index])
+        return self._merged(self.rendered[index], self.lone_depths[index], self.on_planes[index], self.depths[index])
 
     def __iter__(self) -> Iterator[DepthFrame]:
-        return map(self._merged, self.rendered, self.depths, self.on_planes)
+        return map(self._merged, self.rendered, self.lone_depths, self.on_planes, self.depths)
 
-    def _merged(self, frame: DepthFrame, confirmed: np.ndarray, on_plane: np.ndarray) -> DepthFrame:
+    def _merged(self, frame: DepthFrame, lone: np.ndarray, on_plane: np.ndarray, confirmed: np.ndarray) -> DepthFrame:
         depth, weight = frame.depth, np.full(frame.depth.shape, self.weight, np.float32)
         known = np.zeros(depth.shape, bool)
-        for source in (on_plane, confirmed):
+        for source, own_weight in ((lone, LONE_WEIGHT), (on_plane, 1), (confirmed, 1)):
             better = source <= self.limit  # not where it is NaN
             if frame.background is not None:
                 # Beside an outline the windows of stereo take the background for a part of what is in front of it.
                 better &= ~frame.background
-            depth, weight = np.where(better, source, depth), np.where(better, np.float32(1), weight)
+            depth, weight = np.where(better, source, depth), np.where(better, np.float32(own_weight), weight)
             known |= better
         clamped = None if frame.clamped is None else frame.clamped & ~known
         return DepthFrame(
@@ -79,16 +90,42 @@ class MergedFrames(Sequence):
             clamped=clamped,
         )
 
+    def supporting(self, points: np.ndarray) -> np.ndarray:
+        """(P,) how many views have a confirmed depth, or one on a plane, at these points of the world."""
+        views = np.zeros(len(points), int)
+        for frame, confirmed, on_plane in zip(self.rendered, self.depths, self.on_planes, strict=True):
+            inside, row, column = in_image(frame.camera, points)
+            along = frame.camera.project(points)[1]
+            for source in (confirmed, on_plane):
+                views += inside & (np.abs(source[row, column] / along - 1) < CONFIRMED_DEPTH)
+        return views
+
+    def supported_parts(self, mesh: Mesh, share: float, least_area: float) -> Mesh:
+        """The mesh without its small and unsupported pieces: those of less than `share` of the largest piece's area of
+        which less than SUPPORTED_SHARE lies where SUPPORTING_VIEWS have depths, or less than `least_area` in all."""
+        count, label = face_components(mesh)
+        area = face_areas(mesh)
+        of_piece = np.bincount(label, weights=area, minlength=count)
+        keep = of_piece >= share * of_piece.max(initial=0)
+        rows = np.flatnonzero((~keep & (of_piece >= least_area))[label])
+        corners, faces = np.unique(mesh.faces[rows], return_inverse=True)
+        supported = (self.supporting(mesh.vertices[corners]) >= SUPPORTING_VIEWS)[faces.reshape(-1, 3)].mean(1)
+        of_supported = np.bincount(label[rows], weights=area[rows] * supported, minlength=count)
+        return select_faces(mesh, (keep | (of_supported > SUPPORTED_SHARE * of_piece))[label])
+
 
 def _some(points: np.ndarray, count: int) -> np.ndarray:
     """About `count` of (P, 3) points, evenly over their order."""
     return points[:: max(1, len(points) // max(1, count))]
 
 
-def _confirmed_depth(found: DepthMap) -> np.ndarray:
-    """(H, W) depth, NaN where too few neighbours confirm it."""
-    wanted = min(NEIGHBOURS, max(2, found.sources - 1))
-    return np.where(found.confirmed >= wanted, found.depth, np.float32(np.nan))
+def _depth_where(found: DepthMap, taken: np.ndarray) -> np.ndarray:
+    """(H, W) depth, NaN elsewhere."""
+    return np.where(taken, found.depth, np.float32(np.nan))
+
+
+def _share_known(depths: Sequence[np.ndarray]) -> float:
+    return float(np.mean([np.isfinite(depth).mean() for depth in depths]))
 
 
 def _plain_regions(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> list[list[PlainRegion]]:

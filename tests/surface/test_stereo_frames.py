@@ -1,4 +1,4 @@
-"""Depth maps of two sources as one: confirmed depths of stereo, and rendered ones elsewhere by what they deserve."""
+"""Depth maps of three sources as one, each by what it deserves, and what is supported of the surface made of them."""
 
 from __future__ import annotations
 
@@ -14,23 +14,24 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.types import Scene
-from linprim_geo.geometry.mesh import vertex_normals
+from linprim_geo.geometry.mesh import Mesh, vertex_normals
 from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.surface import method_tsdf, stereo_frames
 from linprim_geo.surface.extract import extract_mesh
 from linprim_geo.surface.stereo_frames import MergedFrames
 from linprim_geo.surface.tsdf_field import DepthFrame
+from linprim_geo.surface.tsdf_parts import merge_parts
 
 CAMERA = look_at((0.0, -3.0, 0.0), size=(40, 30))
 
 
 @pytest.fixture
 def found(monkeypatch):
-    """Stereo that finds depth 3 in the left half, confirmed by three views but for the first row, with a deviation of
-    0.001."""
+    """Stereo that finds depth 3 in the left half, confirmed by two views but for the first two rows, by one in the
+    second, with a deviation of 0.001."""
     depth = np.full((30, 40), 3.0, np.float32)
-    confirmed = np.full((30, 40), 3, np.uint8)
-    confirmed[0], confirmed[:, 20:] = 1, 0
+    confirmed = np.full((30, 40), 2, np.uint8)
+    confirmed[0], confirmed[1], confirmed[:, 20:] = 0, 1, 0
     deviation = np.full((30, 40), 0.001, np.float32)
     grey = np.zeros((30, 40), np.uint8)
     maps = [SimpleNamespace(camera=CAMERA, depth=depth, confirmed=confirmed, deviation=deviation, sources=4)]
@@ -45,10 +46,12 @@ def rendered(error: float) -> list[DepthFrame]:
 def test_confirmed_depths_take_the_place_of_rendered_ones(found):
     merged = MergedFrames(rendered(0.01), [None], 5.0)
     frame = merged[0]
-    assert (frame.depth[1:, :20] == 3).all() and np.allclose(frame.depth[0], 3.03) and merged.confirmed == 29 / 60
+    assert (frame.depth[1:, :20] == 3).all() and np.allclose(frame.depth[0], 3.03)
+    assert merged.confirmed == pytest.approx(28 / 60) and merged.lone == pytest.approx(1 / 60)
     # (0.001 / sqrt 2 / 0.01)^2
     assert merged.weight == pytest.approx(0.005, rel=1e-4)
-    assert (frame.confidence[1:, :20] == 1).all() and np.allclose(frame.confidence[:, 20:], merged.weight)
+    assert (frame.confidence[2:, :20] == 1).all() and np.allclose(frame.confidence[:, 20:], merged.weight)
+    assert np.allclose(frame.confidence[1, :20], stereo_frames.LONE_WEIGHT)
 
 
 def test_planes_stand_where_nothing_is_confirmed(found, monkeypatch):
@@ -57,7 +60,8 @@ def test_planes_stand_where_nothing_is_confirmed(found, monkeypatch):
     monkeypatch.setattr(stereo_frames, "plane_depths", lambda *_: on_plane)
     merged = MergedFrames(rendered(0.01), [None], 5.0)
     frame = merged[0]
-    assert (frame.depth[1:, :20] == 3).all() and (frame.depth[:, 20:30] == 3.5).all() and merged.plain == 0.5
+    assert (frame.depth[2:, :20] == 3).all() and (frame.depth[:, 20:30] == 3.5).all() and merged.plain == 0.5
+    assert (frame.depth[:2, 10:20] == 3.5).all()
     assert (frame.confidence[:, 20:30] == 1).all() and np.allclose(frame.confidence[:, 30:], merged.weight)
 
 
@@ -81,12 +85,30 @@ def test_what_primitives_let_through_is_no_surface(found):
     )
 
 
-def test_fewer_neighbours_have_to_agree_where_there_are_fewer(found, monkeypatch):
-    maps = stereo_frames.depth_maps()
-    maps[0].confirmed[1:, :20], maps[0].sources = 2, 3
-    assert MergedFrames(rendered(0.01), [None], 5.0).confirmed == 29 / 60
-    maps[0].sources = 4
-    assert MergedFrames(rendered(0.01), [None], 5.0).confirmed == 0
+def sheet(low, high, y: float) -> Mesh:
+    """Two triangles across the view, between these x and z."""
+    (x0, z0), (x1, z1) = low, high
+    corners = np.array([[x0, y, z0], [x1, y, z0], [x1, y, z1], [x0, y, z1]])
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def test_small_pieces_stay_where_views_support_them(found, monkeypatch):
+    maps, frames = 2 * stereo_frames.depth_maps(), 2 * rendered(0.0)
+    monkeypatch.setattr(stereo_frames, "depth_maps", lambda *_, **__: maps[: len(_[0])])
+    merged = MergedFrames(frames, [None, None], 5.0)
+    # Confirmed is depth 3, so y = 0, where the picture's left half looks: x < 0.
+    true, floating, unseen, large = (
+        sheet((-0.5, -0.3), (-0.3, -0.1), 0.0),
+        sheet((-0.5, -0.3), (-0.3, -0.1), -0.5),
+        sheet((0.3, -0.3), (0.5, -0.1), 0.0),
+        sheet((-20, -20), (20, 20), 9.0),
+    )
+    kept = merged.supported_parts(merge_parts([true, floating, unseen, large]), 0.01, 0.01)
+    assert np.array_equal(kept.vertices, np.concatenate([true.vertices, large.vertices]))
+    # What is smaller than can be told from noise goes, and so does what one view alone supports.
+    assert len(merged.supported_parts(merge_parts([true, large]), 0.01, 0.1).faces) == 2
+    alone = MergedFrames(frames[:1], [None], 5.0)
+    assert len(alone.supported_parts(merge_parts([true, large]), 0.01, 0.01).faces) == 2
 
 
 @pytest.fixture(scope="module")
