@@ -154,6 +154,7 @@ def table(rows: list[dict], columns: dict[str, str]) -> str:
     lines = ["| " + " | ".join(columns.values()) + " |", "|---" * len(columns) + "|"]
     for each in rows:
         cells = [f"{each[key]:.3f}" if isinstance(each[key], float) else str(each[key]) for key in columns]
+        cells = ["–" if cell == "nan" else cell for cell in cells]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
