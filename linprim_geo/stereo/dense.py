@@ -163,7 +163,7 @@ def _photographs(
         "scene": str(path.resolve()),
         "scene_options": asdict(scene_options),
         "options": asdict(options),
-        "time_budget": None if budget is None else {"seconds": budget.seconds, **asdict(plan)},
+        "time_budget": None if budget is None else asdict(plan) | {"seconds": budget.seconds, "planned": plan.seconds},
         "downscale": downscale,
         "names": [view.name for view in views],
     }

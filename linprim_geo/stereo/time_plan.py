@@ -20,7 +20,7 @@ TIMED, TIMED_SHARE, TIMED_PIXELS = 3, 0.05, 200_000
 # cores, and the page comes after it.
 WHOLE = 3.0
 # Photographs are not made smaller than so many pixels along the longer side.
-SMALLEST_SIDE = 320
+SMALLEST_SIDE = 240
 LEAST_VIEWS = 3
 
 
