@@ -11,6 +11,7 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write, remove_temporary
+from linprim_geo.base.memory import available_memory
 from linprim_geo.base.progress import Progress
 from linprim_geo.capture.types import View
 from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage
@@ -30,6 +31,8 @@ from linprim_geo.stereo.depth_maps import (
 STAGES = 1 + len(GEOMETRIC_SWEEPS)
 # Photographs in memory: one, those that it is compared with, and as many again for the next one.
 KEPT = 2 * (1 + SOURCES)
+# Bytes per pixel of the largest photograph at the peak, when points are fused: 720 on `banana`.
+PIXEL_BYTES = 750
 
 
 class Photographs:
@@ -39,12 +42,20 @@ class Photographs:
         """`points` (P, 3) of the scene, by which views that see the same are found, and the range of depths.
 
         Raises:
-            LinprimError: a photograph is too small for a window, or no two see the same points.
+            LinprimError: a photograph is too small for a window or too large for the memory that is free, or no two
+                see the same points.
         """
         self.views, self.points = views, points
         self.cameras = [view.camera for view in views]
         if any(min(camera.width, camera.height) < SMALLEST for camera in self.cameras):
             raise LinprimError(f"stereo needs photographs of {SMALLEST} pixels a side at least")
+        largest = max(self.cameras, key=lambda camera: camera.width * camera.height)
+        wanted, free = PIXEL_BYTES * largest.width * largest.height, available_memory()
+        if wanted > free:
+            raise LinprimError(
+                f"stereo of photographs of {largest.width}x{largest.height} takes {wanted / 2**30:.1f} GiB of the "
+                f"{free / 2**30:.1f} that are free, wanted smaller ones (--downscale)"
+            )
         self.pairs = source_views(self.cameras, points)
         if not any(self.pairs):
             raise LinprimError(

@@ -223,6 +223,12 @@ def test_what_cannot_be_used_is_one_sentence(capture, made, tmp_path):
     refused("2 photographs with poses, wanted at least 3", scene=two)
 
 
+def test_photographs_that_do_not_fit_into_memory_are_one_sentence(capture, tmp_path, monkeypatch):
+    monkeypatch.setattr("linprim_geo.stereo.planes_on_disk.available_memory", lambda: 2**20)
+    with pytest.raises(LinprimError, match="photographs of 96x72 takes 0.0 GiB of the 0.0 that are free"):
+        dense.run_stereo(capture, tmp_path / "dense", None, None, None, quiet=True)
+
+
 def test_depths_beside_a_mask_are_unknown(capture, tmp_path):
     masked = tmp_path / "masked"
     shutil.copytree(capture, masked)
