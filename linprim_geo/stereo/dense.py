@@ -83,6 +83,7 @@ def run_stereo(
         stages.lap("stereo")
         clock = Progress("points", len(photographs.views), quiet=quiet)
         count, model = PointFusion(workspace, photographs.pairs, options.least_confidence).write(output / POINTS, clock)
+        clock.clear()
         workspace.write_model(model)
         workspace.write_configurations(photographs.pairs)
         stages.lap("points")
@@ -117,8 +118,9 @@ def _notes(output: Path, resume: bool) -> dict:
         how = ", or go on with --resume" if begun else ""
         raise LinprimError(f"{output}: exists already; give another folder with -o{how}")
     notes = read_json(output / NOTES, "the notes of linprim-geo stereo")
-    if not isinstance(notes, dict) or not isinstance(notes.get("names"), list):
-        raise LinprimError(f"{output / NOTES}: does not say which photographs were taken, wanted them under names")
+    known = isinstance(notes, dict) and isinstance(notes.get("names"), list) and isinstance(notes.get("scene"), str)
+    if not known or not isinstance(notes.get("downscale"), int):
+        raise LinprimError(f"{output / NOTES}: does not say which photographs were taken, wanted names and downscale")
     return notes
 
 
@@ -195,10 +197,12 @@ def _match(photographs: Photographs, workspace: Workspace, seed: int, quiet: boo
     planes = PlanesOnDisk(photographs, workspace.root / WORK, seed)
     progress = Progress("stereo", STAGES * len(views), quiet=quiet)
     planes.compute(progress)
+    progress.clear()
     progress = Progress("maps", len(left), quiet=quiet)
     for number, k in enumerate(left):
         progress.update(number, photographs.views[k].name)
         workspace.write_maps(k, maps_of(photographs, planes, k))
+    progress.clear()
 
 
 def _coverage(workspace: Workspace, k: int) -> dict:

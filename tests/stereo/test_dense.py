@@ -25,8 +25,8 @@ from linprim_geo.stereo.time_plan import planned
 
 SIZE = (96, 72)
 CENTERS = [(x, y, 0.0) for y in (-0.35, 0.0) for x in (-0.7, -0.35, 0.0)]
-# Calibration errors of captures that the law was not fitted to are up to 0.08 (docs/stereo.md).
-CALIBRATION = 0.08
+# Calibration errors of captures that the law was not fitted to are up to 0.16 (docs/stereo.md).
+CALIBRATION = 0.16
 
 
 def cameras() -> list:
@@ -221,6 +221,30 @@ def test_what_cannot_be_used_is_one_sentence(capture, made, tmp_path):
     (two / "sparse" / "0").mkdir(parents=True)
     reconstruction(cameras()[:2], ["0.png", "1.png"], np.ones((4, 3))).write_binary(str(two / "sparse" / "0"))
     refused("2 photographs with poses, wanted at least 3", scene=two)
+
+
+def test_photographs_through_a_lens_are_written_as_a_pinhole_sees_them(tmp_path):
+    from linprim_geo.synthetic.synth import synthesize
+
+    settings = {"views": 8, "test_views": 0, "size": 64, "points": 500, "supersample": 1, "distortion": -0.1}
+    synthesize(tmp_path / "bent", shape="room", **settings)
+    found = dense.run_stereo(tmp_path / "bent", tmp_path / "dense", None, None, None, quiet=True)
+    model = pycolmap.Reconstruction(str(found.workspace.root / "sparse"))
+    for k, view in enumerate(found.workspace.views):
+        assert view.lens is not None and found.workspace.image(k).suffix == ".png"
+        assert np.array_equal(found.workspace.colors(k), view.load().rgb)
+    # The middle of the first pixel is 0.5, as in COLMAP.
+    camera, taken = found.workspace.views[0].camera, model.camera(1)
+    assert taken.model_name == "PINHOLE" and np.allclose(taken.params, [camera.fx, camera.fy, camera.cx, camera.cy])
+
+
+def test_notes_that_are_damaged_are_one_sentence(capture, made, tmp_path):
+    for text in ("[", "[]", "{}", '{"names": [], "downscale": null, "scene": ""}'):
+        target = tmp_path / "dense"
+        target.mkdir(exist_ok=True)
+        (target / dense.NOTES).write_text(text)
+        with pytest.raises(LinprimError, match="stereo.json"):
+            dense.run_stereo(capture, target, None, None, None, resume=True, quiet=True)
 
 
 def test_photographs_that_do_not_fit_into_memory_are_one_sentence(capture, tmp_path, monkeypatch):
