@@ -118,9 +118,12 @@ def _notes(output: Path, resume: bool) -> dict:
         how = ", or go on with --resume" if begun else ""
         raise LinprimError(f"{output}: exists already; give another folder with -o{how}")
     notes = read_json(output / NOTES, "the notes of linprim-geo stereo")
-    known = isinstance(notes, dict) and isinstance(notes.get("names"), list) and isinstance(notes.get("scene"), str)
-    if not known or not isinstance(notes.get("downscale"), int):
+    wanted = {"names": list, "scene": str, "downscale": int}
+    if not isinstance(notes, dict) or any(not isinstance(notes.get(key), kind) for key, kind in wanted.items()):
         raise LinprimError(f"{output / NOTES}: does not say which photographs were taken, wanted names and downscale")
+    for torn in output.rglob(".*.tmp*"):  # what a kill has left of files that were being written
+        if is_leftover(torn):
+            torn.unlink()
     return notes
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import atomic_write, remove_temporary
+from linprim_geo.base.files import atomic_write
 from linprim_geo.base.memory import available_memory
 from linprim_geo.base.progress import Progress
 from linprim_geo.capture.types import View
@@ -128,9 +128,7 @@ class PlanesOnDisk:
 
     def _write(self, k: int, stage: int, planes: DepthPlanes) -> None:
         layers = [*np.moveaxis(planes.plane, 2, 0), planes.cost, planes.chosen.astype(np.float32)]
-        path = self._file(k, stage)
-        remove_temporary(path)
-        with atomic_write(path) as temporary:
+        with atomic_write(self._file(k, stage)) as temporary:
             np.save(temporary, np.stack(layers))
 
     def _file(self, k: int, stage: int) -> Path:

@@ -157,6 +157,7 @@ def test_a_stopped_run_goes_on_to_the_same_files(capture, made, tmp_path, monkey
         dense.run_stereo(capture, target, None, None, None, quiet=True)
     with pytest.raises(LinprimError, match="go on with --resume"):
         dense.run_stereo(capture, target, None, None, None, quiet=True)
+    (target / "images" / ".0.abc.tmp.png").write_bytes(b"what a kill has left")
     dense.run_stereo(capture, target, None, None, None, resume=True, quiet=True)
     assert len(calls) == 4 + len(CENTERS) - 3  # three were done
     assert contents(target) == contents(made.workspace.root)
