@@ -16,12 +16,14 @@ if TYPE_CHECKING:
     from linprim_geo.base.errors import LinprimError as LinprimError
     from linprim_geo.base.options import ExtractOptions as ExtractOptions
     from linprim_geo.base.options import SceneOptions as SceneOptions
+    from linprim_geo.base.options import StereoOptions as StereoOptions
     from linprim_geo.base.options import TrainOptions as TrainOptions
     from linprim_geo.capture.load import load_scene as load_scene
     from linprim_geo.capture.types import Scene as Scene
     from linprim_geo.cli.demo import run_demo as demo
     from linprim_geo.cli.doctor import doctor as doctor
     from linprim_geo.display.report import report_run as report
+    from linprim_geo.display.stereo_report import dense_stereo as dense_stereo
     from linprim_geo.display.viewer import view_run as view
     from linprim_geo.eval.depth import eval_depth_run as eval_depth
     from linprim_geo.eval.images import eval_images_run as eval_images
@@ -57,6 +59,7 @@ _PUBLIC = {
     "train": ("training.train", "train"),
     "render": ("runs.render", "render_run"),
     "extract_mesh": ("surface.extract", "extract_mesh"),
+    "dense_stereo": ("display.stereo_report", "dense_stereo"),
     "eval_depth": ("eval.depth", "eval_depth_run"),
     "eval_images": ("eval.images", "eval_images_run"),
     "eval_mesh": ("eval.mesh", "eval_mesh_files"),
@@ -83,6 +86,7 @@ _PUBLIC = {
     "Scene": ("capture.types", "Scene"),
     "SceneOptions": ("base.options", "SceneOptions"),
     "ScoreOptions": ("eval.options", "ScoreOptions"),
+    "StereoOptions": ("base.options", "StereoOptions"),
     "SynthOptions": ("synthetic.options", "SynthOptions"),
     "TradeoffOptions": ("eval.options", "TradeoffOptions"),
     "TrainOptions": ("base.options", "TrainOptions"),

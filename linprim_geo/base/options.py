@@ -370,3 +370,18 @@ class ExtractOptions:
         low=0,
         metavar="SIZE",
     )
+
+
+@dataclass(frozen=True)
+class StereoOptions:
+    """How dense stereo is done."""
+
+    least_confidence: float = option(
+        0.5,
+        "depths become points where they are right within 1 % with at least this probability",
+        low=0,
+        high=1,
+        metavar="P",
+    )
+    seed: int = option(0, "seed of everything random", low=0, high=2**31)
+    threads: int = option(0, "worker threads; 0 uses every core; the result does not depend on it", low=0, high=4096)

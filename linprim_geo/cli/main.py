@@ -23,7 +23,7 @@ from linprim_geo.cli.output import Output, printing
 EXIT_UNUSABLE, EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_PIPE = 1, 70, 130, 141
 
 # Files in linprim_geo/cli/commands, in the order of the help.
-COMMANDS = "train inspect render extract evaluate show tradeoff synth convert installation".split()
+COMMANDS = "train inspect render extract stereo evaluate show tradeoff synth convert installation".split()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

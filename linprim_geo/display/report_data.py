@@ -230,12 +230,12 @@ def _pictures(report: Report, views: list[View]) -> list[ShownView]:
         if mesh is not None and mesh.light is not None:
             grey = np.full(mesh.light.vertices.shape, 205, np.uint8)
             pictures.append((f"mesh of {mesh.method} from there", render_preview(mesh.light, view.camera, colors=grey)))
-        encoded = [(title, *_png(pixels)) for title, pixels in pictures]
+        encoded = [(title, *embedded_png(pixels)) for title, pixels in pictures]
         shown.append(ShownView(view.name, psnr(render, photo), ssim(render, photo), encoded))
     return shown
 
 
-def _png(pixels: np.ndarray) -> tuple[str, int, int]:
+def embedded_png(pixels: np.ndarray) -> tuple[str, int, int]:
     """(data URI, width, height) of an image, averaged down to at most PIXELS along its longer side."""
     from PIL import Image
 

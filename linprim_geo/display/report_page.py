@@ -84,28 +84,16 @@ class Table:
 
 def page(report: Report) -> Page:
     """The page of a report."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
 
     name = "/".join(report.run.path.resolve().parts[-2:])
-    # Style and script are part of the page as they are: nothing in them comes from a run.
-    style, script = (
-        Markup((files(__package__) / "page" / file).read_text(encoding="utf-8")) for file in ("style.css", "viewer.js")
-    )
+    # The script is part of the page as it is: nothing in it comes from a run.
+    script = Markup((files(__package__) / "page" / "viewer.js").read_text(encoding="utf-8"))
     shown = [each for each in report.meshes if each.packed]
     scores, mesh_sources = _scores(report)
-    environment = Environment(
-        loader=PackageLoader("linprim_geo.display", "page"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    html = environment.get_template("report.html").render(
+    html = rendered(
+        "report.html",
         name=name,
-        policy=POLICY,
-        style=style,
         script=script,
         sections=SECTIONS,
         titles=dict(SECTIONS),
@@ -133,6 +121,23 @@ def page(report: Report) -> Page:
         missing=report.missing,
     )
     return Page(html, len(report.views), [each.method for each in shown], report.missing)
+
+
+def rendered(template: str, **values: object) -> str:
+    """The HTML of a template in the folder page, with the style sheet and the policy of every page."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markupsafe import Markup
+
+    environment = Environment(
+        loader=PackageLoader("linprim_geo.display", "page"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    style = Markup((files(__package__) / "page" / "style.css").read_text(encoding="utf-8"))
+    return environment.get_template(template).render(policy=POLICY, style=style, **values)
 
 
 def _cards(report: Report) -> list[tuple[str, str]]:

@@ -86,10 +86,10 @@ def depth_maps(views: Sequence[View], points: np.ndarray, *, seed: int = 0, quie
         raise LinprimError(
             "no two photographs show the same points from directions that differ: stereo needs such pairs"
         )
-    full = [StereoImage.of(view.camera, _grey_of(view)) for view in views]
-    half = [_halved(image) for image in full]
+    full = [StereoImage.of(view.camera, grey_of(view)) for view in views]
+    half = [halved(image) for image in full]
     noises = [noise_of(image.grey) for image in full]
-    ranges = [_range_of(camera, points) for camera in cameras]
+    ranges = [inverse_range(camera, points) for camera in cameras]
     progress = Progress("stereo", len(views) * (1 + len(GEOMETRIC_SWEEPS)), quiet=quiet)
     found: list[DepthPlanes | None] = []
     for k, sources in enumerate(pairs):
@@ -97,14 +97,10 @@ def depth_maps(views: Sequence[View], points: np.ndarray, *, seed: int = 0, quie
         if not sources:
             found.append(None)
             continue
-        coarse = DepthPlanes.unknown(*half[k].grey.shape)
-        near, part = [half[j] for j in sources], seed * len(views) + k
-        patch_match(half[k], near, coarse, ranges[k], noises[k] / 4, COARSE_SWEEPS, seed=part)
-        planes = _doubled(coarse, full[k].grey.shape)
-        near = [full[j] for j in sources]
-        patch_match(full[k], near, planes, ranges[k], noises[k], FINE_SWEEPS, first=COARSE_SWEEPS, seed=part)
+        images, halves = ([each[j] for j in (k, *sources)] for each in (full, half))
+        planes = photometric_planes(images, halves, ranges[k], noises[k], seed * len(views) + k)
         found.append(planes)
-    for turn, sweeps in enumerate(GEOMETRIC_SWEEPS):
+    for turn in range(len(GEOMETRIC_SWEEPS)):
         # What the neighbours have found before this turn, whichever of them come first in it.
         depths = {k: planes.plane[..., 0].copy() for k, planes in enumerate(found) if planes is not None}
         for k, planes in enumerate(found):
@@ -112,18 +108,56 @@ def depth_maps(views: Sequence[View], points: np.ndarray, *, seed: int = 0, quie
             sources = [j for j in pairs[k] if j in depths]
             if planes is None or not sources:
                 continue
-            near, first, part = [full[j] for j in sources], COARSE_SWEEPS + FINE_SWEEPS + turn, seed * len(views) + k
-            theirs = [depths[j] for j in sources]
-            patch_match(
-                full[k], near, planes, ranges[k], noises[k], sweeps, first=first, seed=part, source_depths=theirs
-            )
+            images, theirs = [full[j] for j in (k, *sources)], [depths[j] for j in sources]
+            geometric_planes(images, planes, theirs, ranges[k], noises[k], turn, seed * len(views) + k)
     return [
         _depth_map(full[k], noises[k], planes, [(cameras[j], found[j]) for j in pairs[k]])
         for k, planes in enumerate(found)
     ]
 
 
-def _grey_of(view: View) -> np.ndarray:
+def photometric_planes(
+    images: Sequence[StereoImage],
+    halves: Sequence[StereoImage],
+    inverse_depths: tuple[float, float],
+    noise: float,
+    seed: int,
+) -> DepthPlanes:
+    """Planes of the first of `images` by how well the others agree along them; `halves` are the same of half the
+    size."""
+    coarse = DepthPlanes.unknown(*halves[0].grey.shape)
+    patch_match(halves[0], list(halves[1:]), coarse, inverse_depths, noise / 4, COARSE_SWEEPS, seed=seed)
+    planes = _doubled(coarse, images[0].grey.shape)
+    others = list(images[1:])
+    patch_match(images[0], others, planes, inverse_depths, noise, FINE_SWEEPS, first=COARSE_SWEEPS, seed=seed)
+    return planes
+
+
+def geometric_planes(
+    images: Sequence[StereoImage],
+    planes: DepthPlanes,
+    source_depths: list[np.ndarray],
+    inverse_depths: tuple[float, float],
+    noise: float,
+    turn: int,
+    seed: int,
+) -> None:
+    """Improves planes of the first of `images` in place, by the inverse depths of the others as well; `turn` counts
+    GEOMETRIC_SWEEPS."""
+    patch_match(
+        images[0],
+        list(images[1:]),
+        planes,
+        inverse_depths,
+        noise,
+        GEOMETRIC_SWEEPS[turn],
+        first=COARSE_SWEEPS + FINE_SWEEPS + turn,
+        seed=seed,
+        source_depths=source_depths,
+    )
+
+
+def grey_of(view: View) -> np.ndarray:
     """(H, W) uint8 luminance of a photograph."""
     return np.rint(view.load().rgb @ np.array([0.299, 0.587, 0.114], np.float32)).astype(np.uint8)
 
@@ -138,7 +172,7 @@ def noise_of(grey: np.ndarray) -> float:
     return max(LEAST_NOISE, float(np.median(np.abs(both)) / 0.6745) ** 2 / 36)
 
 
-def _halved(image: StereoImage) -> StereoImage:
+def halved(image: StereoImage) -> StereoImage:
     """Means of 2 by 2 pixels."""
     grey, camera = image.grey, image.camera
     height, width = (size // 2 for size in grey.shape)
@@ -169,11 +203,30 @@ def _doubled(planes: DepthPlanes, shape: tuple[int, int]) -> DepthPlanes:
     return DepthPlanes(found, planes.cost[np.ix_(rows, columns)].copy(), planes.chosen[np.ix_(rows, columns)].copy())
 
 
-def _range_of(camera: Camera, points: np.ndarray) -> tuple[float, float]:
+def inverse_range(camera: Camera, points: np.ndarray) -> tuple[float, float]:
     """The least and the largest inverse depth that a camera may see; the least is infinity's."""
     depth = visible_pixels(camera, points)[2]
     # A camera that sees none of the points has no pair either: its range is not used.
     return 0.0, NEARER / float(np.quantile(depth, NEAREST_SHARE)) if len(depth) else 1.0
+
+
+def depth_and_normal(camera: Camera, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W) float64 depth, infinite where the inverse depth is 0, and (H, W, 3) unit normals in the world towards the
+    camera, of (H, W, 3) `DepthPlanes.plane`."""
+    inverse, slope_x, slope_y = (plane[..., k].astype(np.float64) for k in range(3))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = 1 / inverse
+    column, row = np.arange(camera.width) + 0.5, np.arange(camera.height)[:, None] + 0.5
+    # n . X = 1 for X = ray / inverse: n . ray = inverse along the image.
+    normal = np.stack(
+        [
+            slope_x * camera.fx,
+            slope_y * camera.fy,
+            inverse - slope_x * (column - camera.cx) - slope_y * (row - camera.cy),
+        ],
+        axis=-1,
+    )
+    return depth, -(normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)) @ camera.rotation
 
 
 def _depth_map(
@@ -185,20 +238,7 @@ def _depth_map(
         none, infinite = np.zeros((height, width), np.uint8), np.full((height, width), np.inf, np.float32)
         normal = np.zeros((height, width, 3), np.float32)
         return DepthMap(camera, empty, normal, empty, none, infinite, 0, image.grey, noise)
-    inverse, slope_x, slope_y = (planes.plane[..., k].astype(np.float64) for k in range(3))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = 1 / inverse
-    column, row = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
-    # n . X = 1 for X = ray / inverse: n . ray = inverse along the image.
-    normal = np.stack(
-        [
-            slope_x * camera.fx,
-            slope_y * camera.fy,
-            inverse - slope_x * (column - camera.cx) - slope_y * (row - camera.cy),
-        ],
-        axis=-1,
-    )
-    normal = -(normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)) @ camera.rotation
+    depth, normal = depth_and_normal(camera, planes.plane)
     confirmed = np.zeros((height, width), np.uint8)
     deviation = np.full((height, width), np.inf, np.float32)
     for other, theirs in others:
@@ -206,7 +246,7 @@ def _depth_map(
             miss, relative = misses(camera, depth, other, theirs.plane[..., 0])
             confirmed += (miss < CONFIRMED_PX) & (relative < CONFIRMED_DEPTH)
             deviation = np.fmin(deviation, relative)
-    known = (inverse > 0) & (planes.cost < MOST_COST)
+    known = (planes.plane[..., 0] > 0) & (planes.cost < MOST_COST)
     return DepthMap(
         camera,
         np.where(known, depth, np.nan).astype(np.float32),

@@ -45,7 +45,7 @@ HEAVY = {
     "matplotlib",
 }
 COMMANDS = (
-    "train inspect render extract-mesh eval-depth eval-images eval-mesh report view tradeoff synth "
+    "train inspect render extract-mesh stereo eval-depth eval-images eval-mesh report view tradeoff synth "
     "convert doctor demo completion"
 ).split()
 
@@ -434,6 +434,7 @@ REPORTING = {
     "inspect SCENE": "effects",
     "render RUN -o renders": "files",
     "extract-mesh RUN -o m.ply --voxel-size 0.1 --level 0.75": "faces",
+    "stereo SCENE -o d --threads 1": "coverage",
     "tradeoff SCENE -o t --run RUN --knobs rays --quick --rounds 1 --threads 1": "sentences",
 }
 
@@ -466,7 +467,7 @@ def test_what_is_not_quiet_says_something(tiny_run, tmp_path, talkative, capfd):
 
 
 def test_quiet_is_an_option_where_something_is_reported():
-    takes = {"train", "inspect", "render", "extract-mesh", "tradeoff", "demo"}
+    takes = {"train", "inspect", "render", "extract-mesh", "stereo", "tradeoff", "demo"}
     assert {line.split()[0] for line in REPORTING} == takes - {"demo"}
     for command in COMMANDS:
         assert ("--quiet" in command_help(command)) == (command in takes), command
@@ -487,6 +488,9 @@ def command_help(command: str) -> str:
         "train . -o x",
         "render gone",
         "extract-mesh gone",
+        "stereo gone -o x",
+        "stereo . -o x",
+        "stereo . -o here",
         "eval-images gone",
         "eval-depth gone",
         "eval-mesh gone.ply gone.ply",

@@ -12,7 +12,7 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.capture.types import Photo
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage
-from linprim_geo.stereo.depth_maps import _doubled, _halved, depth_maps, misses, noise_of
+from linprim_geo.stereo.depth_maps import _doubled, depth_maps, halved, misses, noise_of
 
 NORMAL = np.array([0.3, -0.25, 1.0]) / np.linalg.norm([0.3, -0.25, 1.0])
 CENTERS = [(0, 0, -3), (0.5, 0, -2.9), (-0.5, 0.1, -3), (0.1, 0.5, -3), (0, -0.5, -2.9)]
@@ -92,7 +92,7 @@ def test_noise_is_measured_past_what_the_picture_shows():
 
 def test_planes_of_half_the_size_are_those_of_the_whole(views):
     image = StereoImage.of(views[0].camera, np.zeros((72, 96), np.uint8))
-    half = _halved(image)
+    half = halved(image)
     inverse = 1 / depth_of(half.camera)
     plane = np.stack([inverse, np.gradient(inverse, axis=1), np.gradient(inverse, axis=0)], -1).astype(np.float32)
     coarse = DepthPlanes(plane, np.zeros(inverse.shape, np.float32), np.zeros(inverse.shape, np.uint8))

@@ -1,0 +1,84 @@
+"""What the maps of a photograph and of those that it was compared with say about each of its depths."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.stereo.depth_maps import CONFIRMED_DEPTH, CONFIRMED_PX
+
+# Pixels from a pixel to those that are to continue its plane, half a window of PatchMatch, and by what share of their
+# inverse depth they may differ from it, half of what counts as right.
+REACH, CONTINUED = 5, 0.005
+
+
+@dataclass(frozen=True)
+class Glance:
+    """How another photograph sees the depths of one: (H, W) float32 each.
+
+    `pixel` int32 is where in the other, counted along its rows, -1 outside of it; `miss` in pixels, by how far a point
+    comes back from where it is when the surface that the other has found is taken in its place, infinite where it has
+    none; `relative` the difference of both depths as a share; `parallax` by how many pixels of the other a point moves
+    if its depth changes by all of itself.
+    """
+
+    pixel: np.ndarray
+    miss: np.ndarray
+    relative: np.ndarray
+    parallax: np.ndarray
+
+    @property
+    def confirms(self) -> np.ndarray:
+        """(H, W) bool."""
+        return (self.miss < CONFIRMED_PX) & (np.abs(self.relative) < CONFIRMED_DEPTH)
+
+
+def glance(camera: Camera, depth: np.ndarray, other: Camera, plane: np.ndarray) -> Glance:
+    """How `other`, whose `plane` (3, H', W') are inverse depths and their slopes, sees (H, W) depths of `camera`."""
+    pixel = np.full(depth.shape, -1, np.int32)
+    miss, relative, parallax = (np.full(depth.shape, value, np.float32) for value in (np.inf, np.inf, 0))
+    rows, columns = np.nonzero(np.isfinite(depth) & (depth > 0))
+    own = depth[rows, columns].astype(np.float64)
+    pose = other.world_to_camera @ camera.camera_to_world
+    rays = np.stack([(columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy, np.ones(len(own))])
+    turned = pose[:3, :3] @ (rays * own)
+    x, y, z = turned + pose[:3, 3:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = other.fx * x / z + other.cx, other.fy * y / z + other.cy
+        seen = (z > 0) & (u >= 0) & (v >= 0) & (u < other.width) & (v < other.height)
+    rows, columns, own, u, v, x, y, z = (each[seen] for each in (rows, columns, own, u, v, x, y, z))
+    # d(x / z) / d ln(depth), and the same of y.
+    grows = turned[:, seen]
+    parallax[rows, columns] = np.hypot(
+        other.fx * (grows[0] - x / z * grows[2]) / z, other.fy * (grows[1] - y / z * grows[2]) / z
+    )
+    column, row = u.astype(np.int64), v.astype(np.int64)
+    pixel[rows, columns] = row * other.width + column
+    w, w_x, w_y = plane[:, row, column]
+    inverse = w + w_x * (u - column - 0.5) + w_y * (v - row - 0.5)
+    known = inverse > 0  # not where it is NaN
+    rows, columns, own, u, v, inverse = (each[known] for each in (rows, columns, own, u, v, inverse))
+    points = np.stack([(u - other.cx) / other.fx, (v - other.cy) / other.fy, np.ones(len(u))]) / inverse
+    x, y, z = pose[:3, :3].T @ (points - pose[:3, 3:])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        back = np.hypot(camera.fx * x / z + camera.cx - columns - 0.5, camera.fy * y / z + camera.cy - rows - 0.5)
+    miss[rows, columns] = np.where(z > 0, back, np.inf)
+    relative[rows, columns] = z / own - 1
+    return Glance(pixel, miss, relative, parallax)
+
+
+def support(plane: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """(H, W) float32 share of 8 pixels around each, REACH columns or rows away, whose depth continues its plane up to
+    CONTINUED; `plane` (3, H, W) are inverse depths and their slopes, `known` (H, W) where they count."""
+    height, width = known.shape
+    total = np.zeros((height, width), np.float32)
+    for down, right in np.ndindex(3, 3):
+        rows = np.clip(np.arange(height) + REACH * (down - 1), 0, height - 1)
+        columns = np.clip(np.arange(width) + REACH * (right - 1), 0, width - 1)
+        at = np.ix_(rows, columns)
+        moved = plane[1] * (columns - np.arange(width)) + plane[2] * (rows - np.arange(height))[:, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            total += known[at] & (np.abs(plane[0][at] / (plane[0] + moved) - 1) < CONTINUED)
+    return (total - known) / 8  # the pixel itself is one of the 9

@@ -1,0 +1,135 @@
+"""PatchMatch stereo of captures that do not fit into memory: the planes of each photograph lie in a file of their own
+after each stage, so that a run that was stopped goes on there."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import atomic_write
+from linprim_geo.base.memory import available_memory
+from linprim_geo.base.progress import Progress
+from linprim_geo.capture.types import View
+from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage
+from linprim_geo.points.view_pairs import SOURCES, source_views
+from linprim_geo.stereo.depth_maps import (
+    GEOMETRIC_SWEEPS,
+    SMALLEST,
+    geometric_planes,
+    grey_of,
+    halved,
+    inverse_range,
+    noise_of,
+    photometric_planes,
+)
+
+# By photographs alone, then in turns with the depths of neighbours.
+STAGES = 1 + len(GEOMETRIC_SWEEPS)
+# Photographs in memory: one, those that it is compared with, and as many again for the next one.
+KEPT = 2 * (1 + SOURCES)
+# Bytes per pixel of the largest photograph at the peak, when points are fused: 720 on `banana`.
+PIXEL_BYTES = 750
+
+
+class Photographs:
+    """Views as stereo takes them, read when they are needed; the last KEPT are in memory."""
+
+    def __init__(self, views: Sequence[View], points: np.ndarray):
+        """`points` (P, 3) of the scene, by which views that see the same are found, and the range of depths.
+
+        Raises:
+            LinprimError: a photograph is too small for a window or too large for the memory that is free, or no two
+                see the same points.
+        """
+        self.views, self.points = views, points
+        self.cameras = [view.camera for view in views]
+        if any(min(camera.width, camera.height) < SMALLEST for camera in self.cameras):
+            raise LinprimError(f"stereo needs photographs of {SMALLEST} pixels a side at least")
+        largest = max(self.cameras, key=lambda camera: camera.width * camera.height)
+        wanted, free = PIXEL_BYTES * largest.width * largest.height, available_memory()
+        if wanted > free:
+            raise LinprimError(
+                f"stereo of photographs of {largest.width}x{largest.height} takes {wanted / 2**30:.1f} GiB of the "
+                f"{free / 2**30:.1f} that are free, wanted smaller ones (--downscale)"
+            )
+        self.pairs = source_views(self.cameras, points)
+        if not any(self.pairs):
+            raise LinprimError(
+                "no two photographs show the same points from directions that differ: stereo needs such pairs"
+            )
+        self._kept: OrderedDict[int, tuple[StereoImage, StereoImage, float]] = OrderedDict()
+
+    def image(self, k: int) -> StereoImage:
+        """View k at full size."""
+        return self._read(k)[0]
+
+    def half(self, k: int) -> StereoImage:
+        """View k at half the size."""
+        return self._read(k)[1]
+
+    def noise(self, k: int) -> float:
+        """Variance of the noise of view k's grey values."""
+        return self._read(k)[2]
+
+    def _read(self, k: int) -> tuple[StereoImage, StereoImage, float]:
+        if k in self._kept:
+            self._kept.move_to_end(k)
+        else:
+            image = StereoImage.of(self.cameras[k], grey_of(self.views[k]))
+            self._kept[k] = image, halved(image), noise_of(image.grey)
+            if len(self._kept) > KEPT:
+                self._kept.popitem(last=False)
+        return self._kept[k]
+
+
+class PlanesOnDisk:
+    """The planes of photographs after the last stage, in files of `folder`."""
+
+    def __init__(self, photographs: Photographs, folder: Path, seed: int):
+        self.photographs, self.folder, self.seed = photographs, folder, seed
+
+    def compute(self, progress: Progress) -> None:
+        """Does what is left of all stages; `progress` counts photographs in stages."""
+        names = range(len(self.photographs.views))
+        done = [stage for stage in range(STAGES) if all(self._file(k, stage).is_file() for k in names)]
+        for stage in range(done[-1] + 1 if done else 0, STAGES):
+            for k in names:
+                progress.update(stage * len(names) + k, self.photographs.views[k].name)
+                if not self._file(k, stage).is_file():
+                    self._write(k, stage, self._planes(k, stage))
+            for k in names if stage else ():
+                self._file(k, stage - 1).unlink(missing_ok=True)
+
+    def read(self, k: int) -> np.ndarray:
+        """(5, H, W) float32 of view k, mapped from its file: `DepthPlanes.plane`, its cost, and what was chosen."""
+        return np.load(self._file(k, STAGES - 1), mmap_mode="r")
+
+    def _planes(self, k: int, stage: int) -> DepthPlanes:
+        photographs = self.photographs
+        seed = self.seed * len(photographs.views) + k
+        near = [k, *(j for j in photographs.pairs[k] if stage == 0 or photographs.pairs[j])]
+        images = [photographs.image(j) for j in near]
+        depths, noise = inverse_range(photographs.cameras[k], photographs.points), photographs.noise(k)
+        if stage == 0:
+            if len(near) == 1:
+                return DepthPlanes.unknown(*images[0].grey.shape)
+            return photometric_planes(images, [photographs.half(j) for j in near], depths, noise, seed)
+        before = [np.load(self._file(j, stage - 1), mmap_mode="r") for j in near]
+        plane, cost, chosen = np.moveaxis(before[0][:3], 0, 2), before[0][3], before[0][4]
+        planes = DepthPlanes(np.array(plane, order="C"), np.array(cost), chosen.astype(np.uint8))
+        if len(near) > 1:
+            theirs = [np.array(each[0]) for each in before[1:]]
+            geometric_planes(images, planes, theirs, depths, noise, stage - 1, seed)
+        return planes
+
+    def _write(self, k: int, stage: int, planes: DepthPlanes) -> None:
+        layers = [*np.moveaxis(planes.plane, 2, 0), planes.cost, planes.chosen.astype(np.float32)]
+        with atomic_write(self._file(k, stage)) as temporary:
+            np.save(temporary, np.stack(layers))
+
+    def _file(self, k: int, stage: int) -> Path:
+        return self.folder / f"{self.photographs.views[k].name}.{stage}.npy"

@@ -1,0 +1,87 @@
+"""What photographs say of each other's depths, on walls whose depth is known."""
+
+from __future__ import annotations
+
+import numpy as np
+from helpers.captures import look_at
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.stereo.confidence import MOST_PIXELS, RIGHT, evidence
+from linprim_geo.stereo.evidence import CONTINUED, REACH, glance, support
+
+NORMAL = np.array([0.3, -0.25, 1.0]) / np.linalg.norm([0.3, -0.25, 1.0])
+
+
+def camera_at(center) -> Camera:
+    return look_at(center, size=(96, 72), focal=110.0, up=(0.0, 1.0, 0.0))
+
+
+def plane_of(camera: Camera) -> np.ndarray:
+    """(3, H, W) inverse depth of a wall through the origin, and its slopes."""
+    inverse = -(camera.world_rays() @ NORMAL) / (camera.center @ NORMAL)
+    return np.stack([inverse, np.gradient(inverse, axis=1), np.gradient(inverse, axis=0)])
+
+
+ONE, OTHER = camera_at((0, 0, -3)), camera_at((0.5, 0, -2.9))
+
+
+def test_another_view_of_the_same_wall_confirms_it():
+    seen = glance(ONE, 1 / plane_of(ONE)[0], OTHER, plane_of(OTHER))
+    inside = np.s_[10:-10, 20:-20]
+    # Float32 pixels of up to 96, and slopes by differences, which are exact on planes.
+    assert seen.miss[inside].max() < 1e-3 and np.abs(seen.relative[inside]).max() < 1e-5
+    assert seen.confirms[inside].all()
+    # Where a point is in the other, to its pixel.
+    points = ONE.center + ONE.world_rays() / plane_of(ONE)[0][..., None]
+    pixels = OTHER.project(points[inside].reshape(-1, 3))[0].astype(int)
+    assert np.array_equal(seen.pixel[inside].ravel(), pixels[:, 1] * OTHER.width + pixels[:, 0])
+
+
+def test_parallax_is_how_far_a_point_moves_with_its_depth():
+    depth, step = 1 / plane_of(ONE)[0], 1e-4
+    near, far = (
+        OTHER.project((ONE.center + ONE.world_rays() * (depth * (1 + sign * step))[..., None]).reshape(-1, 3))[0]
+        for sign in (-1, 1)
+    )
+    moved = np.linalg.norm(far - near, axis=1).reshape(depth.shape) / (2 * step)
+    parallax = glance(ONE, depth, OTHER, plane_of(OTHER)).parallax
+    seen = parallax > 0
+    # Differences over 2e-4 of the depth leave out its square: 1e-8.
+    assert seen.mean() > 0.7 and np.allclose(parallax[seen], moved[seen], rtol=1e-4)
+
+
+def test_another_depth_is_not_confirmed_and_unknown_ones_are_not_seen():
+    seen = glance(ONE, 1.05 / plane_of(ONE)[0], OTHER, plane_of(OTHER))
+    assert not seen.confirms.any()
+    # The other's wall is 5 % of the larger depth before it, along a ray that is about the same.
+    known = np.isfinite(seen.miss)
+    assert np.allclose(seen.relative[known], 1 / 1.05 - 1, atol=0.03)
+    nothing = glance(ONE, np.full((72, 96), np.nan), OTHER, plane_of(OTHER))
+    assert np.isinf(nothing.miss).all() and (nothing.pixel == -1).all()
+    nothing = glance(ONE, 1 / plane_of(ONE)[0], OTHER, np.full((3, 72, 96), np.nan))
+    assert np.isinf(nothing.miss).all() and not nothing.confirms.any()
+
+
+def test_support_is_whole_on_a_plane_and_lost_beside_a_step():
+    plane, known = plane_of(ONE), np.ones((72, 96), bool)
+    inside = np.s_[REACH:-REACH, REACH:-REACH]
+    assert (support(plane, known)[inside] == 1).all()
+    stepped = plane.copy()
+    stepped[0, :, 48:] *= 1 + 3 * CONTINUED
+    found = support(stepped, known)[REACH:-REACH]
+    # Of the 8 pixels around, 3 lie beyond the step.
+    assert (found[:, 48 - REACH : 48 + REACH] == 5 / 8).all()
+    assert (found[:, REACH : 48 - REACH] == 1).all() and (found[:, 48 + REACH : -REACH] == 1).all()
+    assert not support(plane, ~known).any()
+
+
+def test_evidence_counts_those_that_see_a_depth():
+    plane, known = plane_of(ONE), np.ones((72, 96), bool)
+    same, other = (glance(ONE, scale / plane[0], OTHER, plane_of(OTHER)) for scale in (1.0, 1.05))
+    unseen = glance(ONE, 1 / plane[0], OTHER, np.full((3, 72, 96), np.nan))
+    cost = np.full((72, 96), 0.1, np.float32)
+    at = (36, 48)
+    found = evidence(plane, cost, known, [same, other, unseen])[at]
+    pixels = min(np.log2(RIGHT * same.parallax[at]), MOST_PIXELS)
+    assert np.allclose(found, [1, 1, 1 / 2, 0.1, pixels, 1], atol=1e-6)
+    assert np.allclose(evidence(plane, cost, known, [unseen])[at][1:3], 0)
