@@ -1,8 +1,7 @@
 """The rasterizer and the loss of the compiled core as torch operators.
 
-`rasterize` and `photometric_loss` are differentiable custom operators (`torch.ops.linprim_geo.*`) with fake
-implementations for tracing; the thread pool and the choice of instruction set are plain functions.
-Arrays cross as `tensor.detach().numpy()`: no copy where a tensor is contiguous.
+`rasterize` and `photometric_loss` are differentiable operators (`torch.ops.linprim_geo.*`) with fake implementations
+for tracing; the thread pool and the choice of instruction set are plain functions.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ from linprim_geo import _core
 from linprim_geo.base.cores import usable_cores
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
+from linprim_geo.kernels.operators import as_array, check_dtypes, check_finite, define, scalar_suffix
 
 # The core takes the environment's choice by itself where it can; a choice it cannot take should not pass unseen.
 if os.environ.get("LINPRIM_GEO_ISA", "auto") not in ("auto", _core.instruction_set()):
@@ -41,36 +41,9 @@ _PLANES = (
 _CHANNELS = (3, 0, 0, 0, 0, 0, 3, 3, 4)
 
 
-def as_array(tensor: Tensor):
-    return tensor.detach().contiguous().resolve_neg().numpy()
-
-
-def scalar_suffix(dtype: torch.dtype) -> str:
-    if dtype == torch.float32:
-        return "f32"
-    if dtype == torch.float64:
-        return "f64"
-    raise LinprimError(f"rasterize takes float32 or float64 tensors, found {dtype}")
-
-
 def _planes(like: Tensor, width: int, height: int, geometry: bool) -> list[Tensor]:
     shapes = [((c,) if c else ()) + (height, width) for c in _CHANNELS]
     return [like.new_empty(shape if i < 2 or geometry else (0,)) for i, shape in enumerate(shapes)]
-
-
-def check_dtypes(wanted: torch.dtype, **tensors: Tensor) -> None:
-    for name, tensor in tensors.items():
-        if tensor.dtype != wanted:
-            raise ValueError(f"{name} is {tensor.dtype}, wanted {wanted}")
-
-
-def check_finite(suffix: str, **tensors: Tensor) -> None:
-    check = getattr(_core, f"first_non_finite_{suffix}")
-    for name, tensor in tensors.items():
-        at = check(as_array(tensor))
-        if at >= 0:
-            row = at // max(1, tensor[0].numel()) if tensor.dim() else 0
-            raise LinprimError(f"{name}: row {row} holds {tensor.reshape(-1)[at].item()}, finite numbers were wanted")
 
 
 # What the two operators take beside tensors. `numbers`: fx, fy, cx, cy, near, stop, level, screen_filter; `choices`:
@@ -98,7 +71,6 @@ def _core_arguments(tensors: list[Tensor], pose: Tensor, numbers: list[float], c
     ]
 
 
-@torch.library.custom_op("linprim_geo::rasterize", mutates_args=())
 def _rasterize(
     center: Tensor,
     rotation: Tensor,
@@ -140,13 +112,11 @@ def _outputs(center: Tensor, choices: list[int]) -> tuple[list[Tensor], Tensor, 
     )
 
 
-@_rasterize.register_fake
-def _(center, rotation, extent, density, sh, background, screen, world_to_camera, numbers, choices):
+def _rasterize_fake(center, rotation, extent, density, sh, background, screen, world_to_camera, numbers, choices):
     planes, *others = _outputs(center, choices)
     return (*planes, *others)
 
 
-@torch.library.custom_op("linprim_geo::rasterize_grad", mutates_args=())
 def _rasterize_grad(
     center: Tensor,
     rotation: Tensor,
@@ -178,9 +148,13 @@ def _gradients(inputs: list[Tensor]) -> list[Tensor]:
     return [*out, inputs[0].new_empty((inputs[0].shape[0], 3))]
 
 
-@_rasterize_grad.register_fake
-def _(center, rotation, extent, density, sh, background, world_to_camera, numbers, choices, color, planes, grads):
+def _rasterize_grad_fake(
+    center, rotation, extent, density, sh, background, world_to_camera, numbers, choices, color, planes, grads
+):
     return tuple(_gradients([center, rotation, extent, density, sh, background]))
+
+
+define("rasterize_grad", _rasterize_grad, _rasterize_grad_fake)
 
 
 def _rasterize_setup(ctx, inputs, output):
@@ -201,7 +175,7 @@ def _rasterize_backward(ctx, *grads):
     return (*parameters, screen if ctx.has_screen else None, None, None, None)
 
 
-_rasterize.register_autograd(_rasterize_backward, setup_context=_rasterize_setup)
+define("rasterize", _rasterize, _rasterize_fake, _rasterize_backward, _rasterize_setup)
 
 
 @dataclass(frozen=True)
@@ -357,7 +331,6 @@ def has_kernels(primitive: str, ray_model: str, order: str) -> bool:
     return _core.has_kernels_f32(KINDS.index(primitive), RAY_MODELS.index(ray_model), ORDERS.index(order))
 
 
-@torch.library.custom_op("linprim_geo::average_pixels", mutates_args=())
 def _average(image: Tensor, factor: int) -> Tensor:
     height, width = image.shape[-2] // factor, image.shape[-1] // factor
     coarse = image.new_empty((*image.shape[:-2], height, width))
@@ -367,12 +340,10 @@ def _average(image: Tensor, factor: int) -> Tensor:
     return coarse
 
 
-@_average.register_fake
-def _(image, factor):
+def _average_fake(image, factor):
     return image.new_empty((*image.shape[:-2], image.shape[-2] // factor, image.shape[-1] // factor))
 
 
-@torch.library.custom_op("linprim_geo::average_pixels_grad", mutates_args=())
 def _average_grad(grad: Tensor, factor: int) -> Tensor:
     height, width = grad.shape[-2:]
     fine = grad.new_empty((*grad.shape[:-2], height * factor, width * factor))
@@ -382,22 +353,24 @@ def _average_grad(grad: Tensor, factor: int) -> Tensor:
     return fine
 
 
-@_average_grad.register_fake
-def _(grad, factor):
+def _average_grad_fake(grad, factor):
     return grad.new_empty((*grad.shape[:-2], grad.shape[-2] * factor, grad.shape[-1] * factor))
+
+
+define("average_pixels_grad", _average_grad, _average_grad_fake)
 
 
 def _average_setup(ctx, inputs, output):
     ctx.factor = inputs[1]
 
 
-_average.register_autograd(
-    lambda ctx, grad: (torch.ops.linprim_geo.average_pixels_grad(grad, ctx.factor), None),
-    setup_context=_average_setup,
-)
+def _average_backward(ctx, grad):
+    return torch.ops.linprim_geo.average_pixels_grad(grad, ctx.factor), None
 
 
-@torch.library.custom_op("linprim_geo::environment_light", mutates_args=())
+define("average_pixels", _average, _average_fake, _average_backward, _average_setup)
+
+
 def _environment(opacity: Tensor, texels: Tensor, rotation: list[float], lens: list[float], least: float) -> Tensor:
     check_dtypes(texels.dtype, opacity=opacity)
     light = opacity.new_empty(3, *opacity.shape)
@@ -407,12 +380,10 @@ def _environment(opacity: Tensor, texels: Tensor, rotation: list[float], lens: l
     return light
 
 
-@_environment.register_fake
-def _(opacity, texels, rotation, lens, least):
+def _environment_fake(opacity, texels, rotation, lens, least):
     return opacity.new_empty(3, *opacity.shape)
 
 
-@torch.library.custom_op("linprim_geo::environment_light_grad", mutates_args=())
 def _environment_grad(
     grad: Tensor, opacity: Tensor, size: int, rotation: list[float], lens: list[float], least: float
 ) -> Tensor:
@@ -423,9 +394,11 @@ def _environment_grad(
     return out
 
 
-@_environment_grad.register_fake
-def _(grad, opacity, size, rotation, lens, least):
+def _environment_grad_fake(grad, opacity, size, rotation, lens, least):
     return grad.new_empty(6, size, size, 3)
+
+
+define("environment_light_grad", _environment_grad, _environment_grad_fake)
 
 
 def _environment_setup(ctx, inputs, output):
@@ -442,7 +415,7 @@ def _environment_backward(ctx, grad):
     return to_opacity, torch.ops.linprim_geo.environment_light_grad(grad, opacity, ctx.size, *ctx.how), None, None, None
 
 
-_environment.register_autograd(_environment_backward, setup_context=_environment_setup)
+define("environment_light", _environment, _environment_fake, _environment_backward, _environment_setup)
 
 
 def environment_light(opacity: Tensor, texels: Tensor, camera: Camera, least: float = 0.0) -> Tensor:
@@ -536,7 +509,6 @@ def level_depth(
     return depth, opacity
 
 
-@torch.library.custom_op("linprim_geo::photometric_loss", mutates_args=())
 def _photometric(image: Tensor, target: Tensor, dssim: float, weight: Tensor | None) -> tuple[Tensor, Tensor]:
     check_dtypes(torch.float32, image=image, target=target, **({} if weight is None else {"weight": weight}))
     gradient = torch.empty_like(image, memory_format=torch.contiguous_format)
@@ -546,8 +518,7 @@ def _photometric(image: Tensor, target: Tensor, dssim: float, weight: Tensor | N
     return torch.tensor(parts, dtype=torch.float64), gradient
 
 
-@_photometric.register_fake
-def _(image, target, dssim, weight):
+def _photometric_fake(image, target, dssim, weight):
     return image.new_empty(4, dtype=torch.float64), torch.empty_like(image, memory_format=torch.contiguous_format)
 
 
@@ -562,7 +533,7 @@ def _photometric_backward(ctx, grad_parts, _):
     return (None if grad_parts is None else gradient * grad_parts[0].to(gradient.dtype)), None, None, None
 
 
-_photometric.register_autograd(_photometric_backward, setup_context=_photometric_setup)
+define("photometric_loss", _photometric, _photometric_fake, _photometric_backward, _photometric_setup)
 
 
 def photometric_loss(image: Tensor, target: Tensor, dssim: float = 0.2, weight: Tensor | None = None) -> Tensor:

@@ -99,7 +99,6 @@ def _serve() -> None:
     # None of these starts a thread, which would not survive being copied.
     import open3d  # noqa: F401
     import pycolmap  # noqa: F401
-    import torch._dynamo  # noqa: F401
     import trimesh  # noqa: F401
 
     import linprim_geo.points.triangulate
