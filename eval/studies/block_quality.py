@@ -47,11 +47,10 @@ def border_distance(blocks, xyz: np.ndarray) -> np.ndarray:
 
 def borders(run: Path) -> tuple[list, float]:
     """The blocks of a run and their margin, in the training frame."""
-    from linprim_geo.jobs.worker import result_of_folder
-    from linprim_geo.training.blocks.plan import FOLDER, block_of
+    from linprim_geo.training.blocks.plan import read_plan
 
-    plan = result_of_folder(run / FOLDER / "plan")
-    return [block_of(plan, k) for k in range(len(plan["blocks"]))], plan["margin"]
+    plan = read_plan(run)
+    return [part.block for part in plan.blocks], plan.margin
 
 
 def score(run: Path, reference: Path, blocks, margin: float) -> dict:

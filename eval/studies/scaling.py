@@ -189,14 +189,13 @@ def predict(found: Fit, photos: float, capture: Capture) -> dict:
 
 def shown_in_blocks(run: Path) -> tuple[float, float]:
     """(blocks that a photograph is used in, part of its pixels that is used in one) of a run in blocks."""
-    from linprim_geo.jobs.worker import result_of_folder
     from linprim_geo.runs.run import Run
-    from linprim_geo.training.blocks.plan import FOLDER
+    from linprim_geo.training.blocks.plan import read_plan
 
-    plan, count = result_of_folder(run / FOLDER / "plan"), len(Run.open(run).scene().train)
-    uses = sum(len(part["views"]) for part in plan["blocks"])
-    pixels = sum(part["pixels"] for part in plan["blocks"])
-    return uses / count, pixels / (uses * plan["all_pixels"] / count)
+    plan, count = read_plan(run), len(Run.open(run).scene().train)
+    uses = sum(len(part.views) for part in plan.blocks)
+    pixels = sum(part.pixels for part in plan.blocks)
+    return uses / count, pixels / (uses * plan.all_pixels / count)
 
 
 def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitives: int, steps: int) -> dict:
