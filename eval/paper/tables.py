@@ -39,6 +39,7 @@ from linprim_geo.eval.paper.layout import OF_KINDS, SAME, TABLES, Table, table_t
 from linprim_geo.eval.paper.models import Model, Variant, measure, train_model
 from linprim_geo.eval.paper.published import published
 from linprim_geo.eval.paper.studies import Case
+from linprim_geo.eval.study_tables import write_table
 from linprim_geo.geometry.primitives import KINDS
 from linprim_geo.jobs.executor import Task
 from linprim_geo.jobs.open import open_executor
@@ -288,9 +289,7 @@ def _study(name: str, args: argparse.Namespace, captures: dict[str, Capture]) ->
 
 
 def _finish(file: Path, text: str) -> None:
-    with atomic_write(file) as temporary:
-        temporary.write_text(text + "\n")
-    print("\n" + text, flush=True)
+    print("\n" + write_table(file, text), flush=True)
 
 
 def _parsed(arguments: Sequence[str] | None) -> tuple[argparse.Namespace, list[str]]:

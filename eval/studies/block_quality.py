@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import atomic_write, read_json, write_json
+from linprim_geo.base.files import read_json, write_json
 from linprim_geo.base.options import ExtractOptions, TrainOptions
+from linprim_geo.eval.study_tables import write_table
 
 LEVEL, SAMPLES = 0.75, 50_000
 COLUMNS = {
@@ -138,8 +139,7 @@ def run(given: argparse.Namespace) -> list[dict]:
             output / "block_quality.json",
             {"given": {k: v for k, v in vars(given).items() if k != "output"}, "rows": rows},
         )
-        with atomic_write(output / "block_quality.md") as temporary:
-            temporary.write_text(table(rows))
+        write_table(output / "block_quality.md", table(rows))
     return rows
 
 

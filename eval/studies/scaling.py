@@ -24,8 +24,9 @@ from pathlib import Path
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import atomic_write, write_json
+from linprim_geo.base.files import write_json
 from linprim_geo.base.options import SceneOptions, TrainOptions
+from linprim_geo.eval.study_tables import write_table
 
 # (photographs, downscale, primitives) of a capture of 1024x1024; the last is what the fit is checked on.
 SIZES = (
@@ -335,8 +336,7 @@ def run(given: argparse.Namespace) -> dict:
         "predictions": predictions,
     }
     write_json(output / "scaling.json", result)
-    with atomic_write(output / "scaling.md") as temporary:
-        temporary.write_text(table(fitted, checked, predictions, capture))
+    write_table(output / "scaling.md", table(fitted, checked, predictions, capture))
     return result
 
 

@@ -9,6 +9,7 @@ import pytest
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.eval.studies import real_data
+from linprim_geo.eval.study_tables import processor
 from linprim_geo.synthetic.synth import synthesize
 
 
@@ -68,6 +69,7 @@ def test_a_table_is_written(data, written, tmp_path, capsys):
     assert row["visible_chamfer_percent_diagonal"] < 10 and row["abs_rel"] < 0.5 and 0 < row["coverage"] <= 1
     assert [len(point) for point in row["curve"]] == [2, 2]
     text = (out / "real_data.md").read_text()
+    assert text.startswith("Made by `python ") and f"on {processor()}, " in text.splitlines()[0]
     assert (
         text.strip() in capsys.readouterr().out and "| part_small | 10+2 | 40x40 |" in text and "* part_small: " in text
     )
