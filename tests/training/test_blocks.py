@@ -40,7 +40,8 @@ from linprim_geo.training.blocks.driver import blocks_that_fit, train_blocks
 from linprim_geo.training.blocks.plan import EXCHANGES, apportioned, exact_radius_of, read_plan
 from linprim_geo.training.blocks.tasks import block_folder, join_task, outside, tensors
 from linprim_geo.training.blocks.windows import Windows, block_images
-from linprim_geo.training.step.trainer import Trainer, initial_parameters
+from linprim_geo.training.step.parameters import initial_parameters
+from linprim_geo.training.step.trainer import Trainer
 from linprim_geo.training.step.training_images import RECENT, LazyTrainingImage, TrainingImage
 from linprim_geo.training.train import train
 
