@@ -29,7 +29,8 @@ from linprim_geo.eval.depth import eval_depth_run
 from linprim_geo.eval.study_tables import write_table
 from linprim_geo.points import start_points
 from linprim_geo.synthetic.synth import synthesize
-from linprim_geo.training.effects import EFFECTS, Choice, Decision, decide
+from linprim_geo.training.effect_registry import EFFECTS
+from linprim_geo.training.effects import Choice, Decision, decide
 from linprim_geo.training.train import train
 
 VIEWS, TEST_VIEWS, POINTS = 32, 8, 3000
