@@ -111,14 +111,23 @@ def train_run(
         + (f", {score_gain:.2f} dB with the best gain of each" if held_out and score_gain is not None else "")
     )
     if score is not None:
-        train_score = evaluate(trainer, images[:: max(1, len(images) // QUICK_VIEWS)])
-        assert train_score is not None
-        result["train_psnr"] = train_score
-        effects = run.notes.get("effects")
-        if advice := gap_advice(train_score, score, len(images), options, effects if isinstance(effects, list) else []):
-            progress.note(advice)
-            result["advice"] = advice
-            run.note("advice", advice)
+        result |= _beside_training_views(trainer, run, images, score, progress)
     if pace:
         result["time_budget"] = pace.close(run, progress)
     return result
+
+
+def _beside_training_views(
+    trainer: Trainer, run: Run, images: Sequence[TrainingImage], score: float, progress: Progress
+) -> dict:
+    """The mean PSNR of some training views, and advice where the held-out `score` is far behind."""
+    train_score = evaluate(trainer, list(images[:: max(1, len(images) // QUICK_VIEWS)]))
+    assert train_score is not None
+    found: dict = {"train_psnr": train_score}
+    effects = run.notes.get("effects")
+    decided = effects if isinstance(effects, list) else []
+    if advice := gap_advice(train_score, score, len(images), trainer.options, decided):
+        progress.note(advice)
+        found["advice"] = advice
+        run.note("advice", advice)
+    return found
