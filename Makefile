@@ -82,4 +82,5 @@ $(VENV)/.installed: pyproject.toml constraints.txt $(VENV)/.checked
 $(VENV)/.core: $(CORE) $(VENV)/.installed
 	@echo "building the core"
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(PIP) install -qq --no-build-isolation --no-deps -e .
+	@$(BIN)/python -m nanobind.stubgen -q -m linprim_geo._core -o linprim_geo/_core.pyi
 	@touch $@

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import locked
 
 # Half-axes and rotation (w, x, y, z) of the one octahedron of `solid`, whose middle is at CENTER.
 EXTENT, ROTATION, CENTER = (0.9, 0.6, 0.7), (0.8, 0.2, -0.4, 0.4), (3.0, -2.0, 1.0)
@@ -70,14 +71,27 @@ def few_threads(one_thread):
     ops.set_instruction_set(before[1])
 
 
+def made_once(tmp_path_factory, name: str, make) -> Path:
+    """The folder `name` that `make(folder)` makes, once for all processes of the tests."""
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    with locked(base, "made", name, wait=lambda: None):
+        if not (base / name).exists():
+            make(base / f"{name}.part")
+            (base / f"{name}.part").rename(base / name)
+    return base / name
+
+
 @pytest.fixture(scope="session")
 def tiny_scene(tmp_path_factory) -> Path:
-    """The built-in part with transparent background: 12 + 3 views of 48x48, 400 points, depth, reference.ply."""
+    """The built-in part with transparent background: 12 + 3 views of 48x48, 400 points, depth, reference.ply. For all
+    processes of the tests: not to be changed."""
     from linprim_geo.synthetic.synth import synthesize
 
-    out = tmp_path_factory.mktemp("tiny") / "scene"
-    synthesize(out, shape="cad", views=12, test_views=3, size=48, points=400, supersample=2)
-    return out
+    def make(out):
+        synthesize(out, shape="cad", views=12, test_views=3, size=48, points=400, supersample=2)
+
+    return made_once(tmp_path_factory, "tiny_scene", make)
 
 
 @pytest.fixture(scope="session")
@@ -98,12 +112,13 @@ def tiny_options():
 
 @pytest.fixture(scope="session")
 def tiny_run(tiny_scene, tiny_options, tmp_path_factory) -> Path:
-    """A run trained on `tiny_scene`. Tests that change it copy it."""
+    """A run trained on `tiny_scene`, for the tests of this process. Tests that change it copy it."""
     from linprim_geo.training.train import train
 
-    out = tmp_path_factory.mktemp("tiny_run") / "run"
-    train(tiny_scene, out, options=tiny_options, quiet=True)
-    return out
+    trained = made_once(
+        tmp_path_factory, "tiny_run", lambda out: train(tiny_scene, out, options=tiny_options, quiet=True)
+    )
+    return Path(shutil.copytree(trained, tmp_path_factory.mktemp("tiny_run_copy") / "run"))
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 # The checkout's folders that become packages, and where.
 PACKAGES = {"linprim_geo": "linprim_geo", "eval": "linprim_geo/eval"}
-NOT_PACKED = (".pyc", ".so")
+NOT_PACKED = (".pyc", ".so", ".pyi")
 
 SMOKE = (
     "doctor",

@@ -310,7 +310,8 @@ def _trainer(options):
     import torch
 
     from linprim_geo.geometry.camera import Camera
-    from linprim_geo.training.step.trainer import Trainer, initial_parameters
+    from linprim_geo.training.step.parameters import initial_parameters
+    from linprim_geo.training.step.trainer import Trainer
     from linprim_geo.training.step.training_images import Shot
 
     rng = np.random.default_rng(7)

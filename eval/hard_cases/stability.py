@@ -8,7 +8,7 @@ the exit status is 1:
 
     finite      no NaN or infinity in any image or gradient, of geometry too
     share       0 <= opacity <= 1
-    forward     every ray within the rounding that `many_scenes.rounding` derives for it, times BOUND
+    forward     every ray within the rounding that `rounding_bounds.rounding` derives for it, times BOUND
     gradient    of resolved scenes within 1e-3 of the reference, and never off by more than its own magnitude; of
                 polyhedra on 99.9 % of the cases, as a ray within rounding of an edge has the gradient of either face
 
@@ -17,9 +17,9 @@ pixel wide has no gradient in single precision, nor has a face seen edge-on to 1
 
 A gradient is the difference of what a ray's entry and its exit contribute, and is small behind opaque things: no scalar
 resolves one that cancels to less than some eps of these contributions without absorption. There, "relative" means to
-that many eps / 1e-3 of them: the roundings of the sums, and the condition of the gradient as
-`many_scenes.gradient_condition` derives it for polyhedra, `many_scenes.gaussian_gradient_rounding` for Gaussians. No
-limit comes from what a processor gave.
+that many eps / 1e-3 of them: the roundings of the sums, and the condition of the gradient as rounding_bounds.py derives
+it, `gradient_condition` for polyhedra, `gaussian_gradient_rounding` for Gaussians. No limit comes from what a processor
+gave.
 """
 
 from __future__ import annotations
@@ -38,12 +38,13 @@ import torch
 from torch import Tensor
 
 from linprim_geo.eval.hard_cases import classes as hard_cases
-from linprim_geo.eval.hard_cases import many_scenes
+from linprim_geo.eval.hard_cases import many_scenes, rounding_bounds
+from linprim_geo.eval.hard_cases.class_scenes import WINDOW
 from linprim_geo.eval.hard_cases.many_scenes import PARAMETERS, Scenes
 from linprim_geo.kernels import ops
 
 SCALARS = {"float32": torch.float32, "float64": torch.float64}
-BOUND = 1.0  # times the rounding of `many_scenes.rounding`
+BOUND = 1.0  # times the rounding of `rounding_bounds.rounding`
 CLOSE, SHARE_CLOSE = 1e-3, 0.999
 # Roundings, in eps, of a gradient's sum over 16 pixels and of the colour and exponential in it; each primitive adds one
 # to the light that is left, the light behind it, their product and the exponential.
@@ -262,14 +263,14 @@ def gradient_errors(scenes: Scenes, got: list[Tensor], wanted: list[Tensor], kno
 def gradient_rounding(
     scenes: Scenes, found: many_scenes.Chords, off: Tensor, weights: Tensor, contributions: list[Tensor], eps: float
 ) -> list[Tensor]:
-    """(B,) for each of PARAMETERS: by how much the gradients may be off; `off` as `many_scenes.rounding` gives it."""
+    """(B,) for each of PARAMETERS: by how much the gradients may be off; `off` as `rounding` gives it."""
     part = (RESOLUTION + RESOLUTION_EACH * scenes.center.shape[1]) * eps
     if scenes.primitive != "gaussian":
-        part = part + many_scenes.gradient_condition(scenes, found, eps)
+        part = part + rounding_bounds.gradient_condition(scenes, found, eps)
         return [part * c for c in contributions]
     color = torch.relu(many_scenes.C0 * scenes.sh[:, :, 0] + 0.5)
     pull = weights[:, :3].abs().mT @ color.mT + weights[:, 3, :, None].abs()
-    bounds = many_scenes.gaussian_gradient_rounding(scenes, found, off, pull, eps)
+    bounds = rounding_bounds.gaussian_gradient_rounding(scenes, found, off, pull, eps)
     return [
         torch.maximum(a, part * c) for a, c in zip([*bounds, torch.zeros_like(bounds[0])], contributions, strict=True)
     ]
@@ -289,7 +290,7 @@ def judge(name: str, rung: Rung, scenes: Scenes, truth: Truth, weights: Tensor, 
     opacity_off = (opacity - truth.opacity).abs() * clear
     overlap = rung.order == "overlap"
     off = torch.cat(
-        [many_scenes.rounding(scenes.rows(p), _rows(truth.found, p), rung.eps, overlap) for p in _chunks(scenes)]
+        [rounding_bounds.rounding(scenes.rows(p), _rows(truth.found, p), rung.eps, overlap) for p in _chunks(scenes)]
     )
     brightest = torch.relu(many_scenes.C0 * scenes.sh + 0.5).flatten(1).amax(1)[:, None]
     alpha = -torch.expm1(-truth.found.tau).sum(-1)
@@ -342,7 +343,7 @@ def measure(
         for (primitive, ray_model), group in groups:
             if primitive not in what.primitives:
                 continue
-            count = max(1, gradients, math.ceil(cases / hard_cases.WINDOW**2))
+            count = max(1, gradients, math.ceil(cases / WINDOW**2))
             scenes = hard_cases.generate(name, primitive, ray_model, count, seed)
             weights = torch.from_numpy(
                 np.random.default_rng(seed).normal(size=(count, 4, scenes.width * scenes.height))

@@ -10,7 +10,6 @@ import shutil
 import tempfile
 import time
 from collections.abc import Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -25,7 +24,7 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.primitives import ARRAYS, KINDS, Primitives
 from linprim_geo.kernels import ops
 from linprim_geo.runs.run import is_unused
-from linprim_geo.training import start as training_start
+from linprim_geo.training.step.trainer import Trainer
 from linprim_geo.training.train import train
 
 STAGES = {
@@ -65,33 +64,28 @@ class Variant:
 # --- training ----------------------------------------------------------------------------------------------
 
 
-@contextmanager
-def _watched(record: dict):
-    """Makes `train` count CPU seconds of this process, so that other work on the machine does not count, and notes its
-    start.
+class _Measured:
+    """Steps for `train` that count CPU seconds of this process, so that other work on the machine does not count.
 
     `record` gets `start_count`, `start_thinness` (`thinness` before the first step) and `train_wall_seconds` of all
     steps.
     """
 
-    class Watched(training_start.Trainer):
-        def __init__(self, *args, **named):
-            super().__init__(*args, **named)
-            record.update(start_count=len(self), train_wall_seconds=0.0)
-            record["start_thinness"] = thinness(torch.exp(self.parameters["log_extent"]).detach().numpy(), self.kind)
+    def __init__(self):
+        self.record: dict = {}
 
-        def advance(self) -> None:
-            before, wall, cpu = self.seconds, time.perf_counter(), time.process_time()
-            super().advance()
-            self.seconds = before + time.process_time() - cpu
-            record["train_wall_seconds"] += time.perf_counter() - wall
-
-    usual = training_start.Trainer
-    training_start.Trainer = Watched
-    try:
-        yield
-    finally:
-        training_start.Trainer = usual
+    def advance(self, trainer: Trainer) -> None:
+        if not self.record:
+            extent = torch.exp(trainer.parameters["log_extent"]).detach().numpy()
+            self.record = {
+                "start_count": len(trainer),
+                "train_wall_seconds": 0.0,
+                "start_thinness": thinness(extent, trainer.kind),
+            }
+        before, wall, cpu = trainer.seconds, time.perf_counter(), time.process_time()
+        trainer.advance()
+        trainer.seconds = before + time.process_time() - cpu
+        self.record["train_wall_seconds"] += time.perf_counter() - wall
 
 
 @functools.cache
@@ -142,8 +136,8 @@ def train_model(
             raise LinprimError(f"{folder}: exists and is not an earlier run; give another folder with -o")
         shutil.rmtree(folder)  # stopped before it was done
     _warm_up(capture, scene_options)
-    with _watched(record := {}):
-        trained = train(capture, folder, scene_options, options, quiet=True)
+    measured = _Measured()
+    trained = train(capture, folder, scene_options, options, quiet=True, advance=measured.advance)
     scores = eval_images_run(folder, lpips_weights="none")
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     row = {
@@ -156,7 +150,7 @@ def train_model(
     row |= {"psnr": scores["psnr"], "ssim": scores["ssim"], "held_out_views": scores["views"]}
     row |= {
         "train_cpu_seconds": trained["seconds"],
-        **record,
+        **measured.record,
         "file_mb": (folder / "scene.ply").stat().st_size / 1e6,
     }
     row |= {"curve": [[line["seconds"], line["psnr"]] for line in lines if "psnr" in line]}

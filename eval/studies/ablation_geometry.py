@@ -25,8 +25,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import atomic_write, write_json
+from linprim_geo.base.files import write_json
 from linprim_geo.base.options import SceneOptions, TrainOptions
+from linprim_geo.eval.study_tables import write_table
 
 # Options that a variant changes; `all` of a kind of scene are those that are recommended for it.
 VARIANTS: dict[str, dict] = {
@@ -247,8 +248,7 @@ def run(given: argparse.Namespace) -> None:
         "medians of the ratios to plain (PSNR: difference in dB)", {v: summary[v] for v in given.variants}
     )
     write_json(given.output / "ablation.json", {"options": asdict(options), "scenes": rows, "medians": summary})
-    with atomic_write(given.output / "ablation.txt") as temporary:
-        temporary.write_text(text)
+    write_table(given.output / "ablation.txt", text)
     print(text)
 
 

@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import atomic_write, read_json, write_json
+from linprim_geo.base.files import read_json, write_json
 from linprim_geo.base.options import ExtractOptions, TrainOptions
+from linprim_geo.eval.study_tables import write_table
 
 LEVEL, SAMPLES = 0.75, 50_000
 COLUMNS = {
@@ -47,11 +48,10 @@ def border_distance(blocks, xyz: np.ndarray) -> np.ndarray:
 
 def borders(run: Path) -> tuple[list, float]:
     """The blocks of a run and their margin, in the training frame."""
-    from linprim_geo.jobs.worker import result_of_folder
-    from linprim_geo.training.blocks.plan import FOLDER, block_of
+    from linprim_geo.training.blocks.plan import read_plan
 
-    plan = result_of_folder(run / FOLDER / "plan")
-    return [block_of(plan, k) for k in range(len(plan["blocks"]))], plan["margin"]
+    plan = read_plan(run)
+    return [part.block for part in plan.blocks], plan.margin
 
 
 def score(run: Path, reference: Path, blocks, margin: float) -> dict:
@@ -139,8 +139,7 @@ def run(given: argparse.Namespace) -> list[dict]:
             output / "block_quality.json",
             {"given": {k: v for k, v in vars(given).items() if k != "output"}, "rows": rows},
         )
-        with atomic_write(output / "block_quality.md") as temporary:
-            temporary.write_text(table(rows))
+        write_table(output / "block_quality.md", table(rows))
     return rows
 
 

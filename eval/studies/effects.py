@@ -26,9 +26,11 @@ from linprim_geo.base.files import write_json
 from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.capture.load import load_scene
 from linprim_geo.eval.depth import eval_depth_run
+from linprim_geo.eval.study_tables import write_table
 from linprim_geo.points import start_points
 from linprim_geo.synthetic.synth import synthesize
-from linprim_geo.training.effects import EFFECTS, Choice, Decision, decide
+from linprim_geo.training.effect_registry import EFFECTS
+from linprim_geo.training.effects import Choice, Decision, decide
 from linprim_geo.training.train import train
 
 VIEWS, TEST_VIEWS, POINTS = 32, 8, 3000
@@ -331,7 +333,7 @@ def main() -> None:
         raise SystemExit(str(error)) from None
     text = table(rows, comparisons, seeds)
     write_json(folder / "effects.json", {"size": vars(size), "seeds": seeds, "effects": rows, "modes": comparisons})
-    (folder / "effects.md").write_text(text + "\n")
+    write_table(folder / "effects.md", text)
     print(text)
 
 

@@ -18,9 +18,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import atomic_write, write_json
+from linprim_geo.base.files import write_json
 from linprim_geo.base.options import ExtractOptions, SceneOptions, TrainOptions
 from linprim_geo.base.progress import Progress
+from linprim_geo.eval.study_tables import write_table
 from linprim_geo.jobs.executor import Task
 from linprim_geo.jobs.open import open_executor
 
@@ -204,11 +205,10 @@ def main(arguments: list[str] | None = None) -> None:
             else:
                 rows.append(result)
             write_json(args.output / "real_data.json", rows)
-            with atomic_write(args.output / "real_data.md") as temporary:
-                temporary.write_text(table(rows) + "\n\n" + curves(rows) + "\n")
+            text = write_table(args.output / "real_data.md", table(rows) + "\n\n" + curves(rows))
     except LinprimError as error:
         raise SystemExit(f"real_data: error: {error}") from None
-    print(table(rows) + "\n\n" + curves(rows))
+    print(text)
     if failed:
         raise SystemExit("real_data: error: " + "; ".join(failed))
 

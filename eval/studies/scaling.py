@@ -24,8 +24,9 @@ from pathlib import Path
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import atomic_write, write_json
+from linprim_geo.base.files import write_json
 from linprim_geo.base.options import SceneOptions, TrainOptions
+from linprim_geo.eval.study_tables import write_table
 
 # (photographs, downscale, primitives) of a capture of 1024x1024; the last is what the fit is checked on.
 SIZES = (
@@ -189,14 +190,13 @@ def predict(found: Fit, photos: float, capture: Capture) -> dict:
 
 def shown_in_blocks(run: Path) -> tuple[float, float]:
     """(blocks that a photograph is used in, part of its pixels that is used in one) of a run in blocks."""
-    from linprim_geo.jobs.worker import result_of_folder
     from linprim_geo.runs.run import Run
-    from linprim_geo.training.blocks.plan import FOLDER
+    from linprim_geo.training.blocks.plan import read_plan
 
-    plan, count = result_of_folder(run / FOLDER / "plan"), len(Run.open(run).scene().train)
-    uses = sum(len(part["views"]) for part in plan["blocks"])
-    pixels = sum(part["pixels"] for part in plan["blocks"])
-    return uses / count, pixels / (uses * plan["all_pixels"] / count)
+    plan, count = read_plan(run), len(Run.open(run).scene().train)
+    uses = sum(len(part.views) for part in plan.blocks)
+    pixels = sum(part.pixels for part in plan.blocks)
+    return uses / count, pixels / (uses * plan.all_pixels / count)
 
 
 def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitives: int, steps: int) -> dict:
@@ -336,8 +336,7 @@ def run(given: argparse.Namespace) -> dict:
         "predictions": predictions,
     }
     write_json(output / "scaling.json", result)
-    with atomic_write(output / "scaling.md") as temporary:
-        temporary.write_text(table(fitted, checked, predictions, capture))
+    write_table(output / "scaling.md", table(fitted, checked, predictions, capture))
     return result
 
 

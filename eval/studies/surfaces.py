@@ -23,8 +23,9 @@ from pathlib import Path
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import atomic_write, write_json
+from linprim_geo.base.files import write_json
 from linprim_geo.base.options import ExtractOptions, SceneOptions, TrainOptions
+from linprim_geo.eval.study_tables import write_table
 
 BUILT_IN = ("cad", "smooth", "room", "wires")
 METHODS = {"octahedron": ("tsdf", "polyhedra", "opacity-field"), "gaussian": ("tsdf",)}
@@ -170,8 +171,7 @@ def run(given: argparse.Namespace) -> None:
                 rows.append({"scene": name, "primitive": primitive, **json.loads(saved.read_text())})
                 print(json.dumps(rows[-1]), flush=True)
     write_json(given.output / "surfaces.json", {"train_options": asdict(options), "refine": given.refine, "rows": rows})
-    with atomic_write(given.output / "surfaces.md") as temporary:
-        temporary.write_text(table(rows))
+    write_table(given.output / "surfaces.md", table(rows))
     print(table(rows))
 
 

@@ -12,7 +12,6 @@ import json
 import math
 import os
 import shutil
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property
@@ -29,13 +28,12 @@ from linprim_geo.base.progress import Progress
 from linprim_geo.eval.options import TradeoffOptions
 from linprim_geo.eval.tradeoff.knobs import (
     KNOBS,
-    RENDER_DEFAULTS,
-    RENDER_REFERENCE,
     Knob,
     Rung,
     settings,
     training_options,
 )
+from linprim_geo.eval.tradeoff.rendering import RenderedRun
 from linprim_geo.eval.tradeoff.results import write_report
 from linprim_geo.jobs.executor import Executor, Task
 from linprim_geo.jobs.open import open_executor
@@ -50,10 +48,6 @@ WIDEST, QUICK_WIDEST = 400, 128
 ROUNDS, QUICK_ROUNDS = 3, 2
 # Held-out views that render knobs are measured on.
 RENDERED_VIEWS, QUICK_VIEWS = 8, 2
-# A view is drawn so many times in a round, and the shortest counts.
-REPEATS = 3
-# A view is rotated by this many pixels at its middle to see what pops.
-POP_PX = 0.5
 # Points of a score that is not the knob itself.
 POINTS = 30_000
 
@@ -192,7 +186,7 @@ class Sweep:
 
         rungs = knob.rungs
         if knob.name == "degree":
-            degree = self.render_defaults["degree"]
+            degree = self.rendered.defaults["degree"]
             return replace(knob, rungs=tuple(r for r in rungs if r.changes["degree"] <= degree), default=str(degree))
         if knob.group == "extract":
             return replace(knob, rungs=tuple(r for r in rungs if r.changes["method"] in METHODS))
@@ -203,7 +197,7 @@ class Sweep:
         return (
             found
             if knob.group != "render"
-            else found | {"degree": rung.changes.get("degree", self.render_defaults["degree"])}
+            else found | {"degree": rung.changes.get("degree", self.rendered.defaults["degree"])}
         )
 
     def _in_turn(self, group: str, knobs: Sequence[Knob], measure: Callable[[str, dict, set, int], None]) -> None:
@@ -277,106 +271,24 @@ class Sweep:
         return Run.open(self.base)
 
     @cached_property
-    def render_defaults(self) -> dict:
-        """The defaults with the degree of the run's colour."""
-        count = self.run.training_primitives().sh.shape[1]
-        return RENDER_DEFAULTS | {"degree": math.isqrt(count) - 1}
-
-    @cached_property
-    def cameras(self) -> list:
-        """Cameras, in the training frame, that render knobs are measured on."""
-        scene = self.run.scene()
-        views, most = scene.test or scene.train, QUICK_VIEWS if self.quick else RENDERED_VIEWS
-        return [view.camera.transformed(self.run.similarity) for view in views[:: -(-len(views) // most)]]
+    def rendered(self) -> RenderedRun:
+        return RenderedRun(self.run, QUICK_VIEWS if self.quick else RENDERED_VIEWS)
 
     # --- render -----------------------------------------------------------------------------------------
 
-    def draw(self, setting: dict, camera, geometry: bool = False, gradients: bool = False):
-        """The run seen by a camera under a setting; with `gradients` the tensors' as well, of the mean of the
-        colour."""
-        import torch
-
-        from linprim_geo.base.options import raster_options
-        from linprim_geo.kernels import ops
-
-        primitives = self.run.training_primitives() if "primitives" not in self.__dict__ else self.primitives
-        self.primitives = primitives
-        dtype = torch.float64 if setting["scalar"] == "float64" else torch.float32
-        arrays = [primitives.center, primitives.rotation, primitives.extent, primitives.density]
-        arrays.append(primitives.sh[:, : (setting["degree"] + 1) ** 2])
-        tensors = [torch.from_numpy(np.ascontiguousarray(a)).to(dtype).requires_grad_(gradients) for a in arrays]
-        how = raster_options(self.run.train_options) | {"primitive": primitives.kind}
-        how |= {"ray_model": setting["ray_model"], "order": setting["order"], "stop": setting["stop"]}
-        if not ops.has_kernels(primitives.kind, how["ray_model"], how["order"]):
-            raise LinprimError(
-                f"a {primitives.kind} is not drawn in the order {how['order']} with {how['ray_model']} rays"
-            )
-        background = self.run.raster_arguments()[1].to(dtype)
-        begin = time.perf_counter()
-        out = ops.rasterize(*tensors, background, camera, geometry=geometry, **how)
-        if gradients:
-            torch.autograd.grad(out.rgb.mean(), tensors)
-        return out, time.perf_counter() - begin
-
-    @cached_property
-    def truth(self) -> list:
-        """Per camera the integral itself: (colour, depth, colour after the small rotation)."""
-        import torch
-
-        exact = RENDER_REFERENCE | {"degree": self.render_defaults["degree"]}
-        if self.run.training_primitives().kind == "gaussian":
-            exact |= {"order": "center"}
-        found = []
-        with torch.no_grad():
-            for camera in self.cameras:
-                out, _ = self.draw(exact, camera, geometry=True)
-                turned, _ = self.draw(exact, rotated(camera))
-                found.append((out.rgb.numpy(), out.depth_median.numpy(), turned.rgb.numpy()))
-        return found
-
     def _render(self, key: str, setting: dict, errors: set, turn: int) -> None:
-        import torch
-
         from linprim_geo.base.progress import Stages
 
         entry = self.store[key]
         if not errors <= entry["errors"].keys():
-            truth = self.truth
-            with torch.no_grad():
-                found = [
-                    self._render_errors(setting, camera, *t, errors)
-                    for camera, t in zip(self.cameras, truth, strict=True)
-                ]
-            entry["errors"] |= {name: float(np.mean([view[name] for view in found])) for name in found[0]}
+            entry["errors"] |= self.rendered.errors(setting, errors)
         if len(entry["times"]) > turn:
             return
         stages = Stages(self.progress)
-        with torch.no_grad():
-            frame = [min(self.draw(setting, camera)[1] for _ in range(REPEATS)) for camera in self.cameras]
-        with_gradient = [
-            min(self.draw(setting, camera, gradients=True)[1] for _ in range(REPEATS)) for camera in self.cameras
-        ]
+        frame, with_gradient = self.rendered.seconds(setting)
         stages.lap("draw")
-        self._note(key, float(np.mean(frame)), stages.peak_gib["draw"])
-        entry.setdefault("gradient_times", []).append(float(np.mean(with_gradient)))
-
-    def _render_errors(self, setting, camera, rgb, depth, rgb_turned, errors: set) -> dict:
-        out, _ = self.draw(setting, camera, geometry=True)
-        image, surface = out.rgb.double().numpy(), out.depth_median.double().numpy()
-        found = {"image_percent": 100 * math.sqrt(np.mean((image - rgb) ** 2))}
-        both = (surface > 0) & (depth > 0)
-        found["depth_percent"] = (
-            100 * float(np.mean(np.abs(surface - depth)[both] / depth[both])) if both.any() else math.nan
-        )
-        if "alone_percent" in errors:
-            exact = setting | {name: RENDER_REFERENCE[name] for name in ("scalar", "stop")}
-            alone = self.draw(exact, camera)[0].rgb.double().numpy()
-            found["alone_percent"] = 100 * math.sqrt(np.mean((image - alone) ** 2))
-        if "popping_percent" in errors:
-            turned = self.draw(setting, rotated(camera))[0].rgb.double().numpy()
-            beyond = np.abs(turned - image) - np.abs(rgb_turned - rgb)
-            found["popping_percent"] = 100 * float(np.mean(np.maximum(beyond, 0)))
-        return found
+        self._note(key, frame, stages.peak_gib["draw"])
+        entry.setdefault("gradient_times", []).append(with_gradient)
 
     # --- train ------------------------------------------------------------------------------------------
 
@@ -606,15 +518,6 @@ def train_task(folder: Path, scene: str, scene_options: dict, options: dict) -> 
         return {"failed": str(error)}
     shutil.rmtree(folder / "warm_up")
     return {"seconds": trained["seconds"], "primitives": trained["primitives"]}
-
-
-def rotated(camera):
-    """The camera turned about its own upright axis by POP_PX pixels at the middle of its image."""
-    angle = POP_PX / camera.fx
-    turn = np.eye(4)
-    turn[0, 0] = turn[2, 2] = math.cos(angle)
-    turn[0, 2], turn[2, 0] = math.sin(angle), -math.sin(angle)
-    return replace(camera, world_to_camera=turn @ camera.world_to_camera)
 
 
 def _key(group: str, setting: dict) -> str:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from linprim_geo import _core
-from linprim_geo.kernels.ops import as_array, check_dtypes
+from linprim_geo.kernels.operators import as_array, check_dtypes
 
 
 def adam_step(

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from linprim_geo import _core
-from linprim_geo.kernels.ops import KINDS, as_array, check_dtypes, check_finite, scalar_suffix
+from linprim_geo.kernels.operators import as_array, check_dtypes, check_finite, scalar_suffix
+from linprim_geo.kernels.ops import KINDS
 
 
 class SolidTree:

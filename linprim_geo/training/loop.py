@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -34,9 +34,10 @@ def run_steps(
     progress: Progress,
     pace: Pace | None = None,
     until: int | None = None,
+    advance: Callable[[Trainer], None] = Trainer.advance,
 ) -> tuple[float, float | None, float | None]:
     """Steps until the end, or to step `until` of all, with lines in metrics.jsonl, checkpoints, and scores on
-    `held_out` now and then.
+    `held_out` now and then. `advance` makes one step.
 
     Returns: seconds spent in steps, and the final mean held-out PSNR in dB, as rendered and, where exposures are
         fitted, with gains; None without views.
@@ -56,7 +57,7 @@ def run_steps(
             if pace:
                 pace.watch(trainer, run, progress, save=lambda: save_training(trainer, run))
             try:
-                trainer.advance()
+                advance(trainer)
             except UnreadablePhoto:
                 raise
             except LinprimError as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 
 from linprim_geo.base.budget import Budget
@@ -19,6 +19,7 @@ from linprim_geo.training.effects import Decision
 from linprim_geo.training.held_out_gap import gap_advice
 from linprim_geo.training.loop import QUICK_VIEWS, evaluate, run_steps
 from linprim_geo.training.start import late_terms, start_trainer
+from linprim_geo.training.step.trainer import Trainer
 from linprim_geo.training.step.training_images import TrainingImage, load_training_images
 
 
@@ -29,12 +30,14 @@ def train_run(
     progress: Progress,
     decisions: Sequence[Decision] = (),
     budget: Budget | None = None,
+    advance: Callable[[Trainer], None] = Trainer.advance,
 ) -> dict:
     """Trains from a checkpoint's `state`, or from the start: what is random does not depend on when a run was stopped.
 
     Args:
         run: a new run has no folder yet.
         decisions, budget: of a new run, for its config.json.
+        advance: see `train`.
 
     Returns, raises: as `train`.
     """
@@ -91,7 +94,7 @@ def train_run(
         f"{ops.threads()} threads"
     )
     held_out = load_training_images(scene.test, run.similarity) if held_out is None else held_out
-    seconds, score, score_gain = run_steps(trainer, run, held_out, progress, pace)
+    seconds, score, score_gain = run_steps(trainer, run, held_out, progress, pace, advance=advance)
     result = {
         "run": str(run.path),
         "iterations": trainer.step,
@@ -108,14 +111,23 @@ def train_run(
         + (f", {score_gain:.2f} dB with the best gain of each" if held_out and score_gain is not None else "")
     )
     if score is not None:
-        train_score = evaluate(trainer, images[:: max(1, len(images) // QUICK_VIEWS)])
-        assert train_score is not None
-        result["train_psnr"] = train_score
-        effects = run.notes.get("effects")
-        if advice := gap_advice(train_score, score, len(images), options, effects if isinstance(effects, list) else []):
-            progress.note(advice)
-            result["advice"] = advice
-            run.note("advice", advice)
+        result |= _beside_training_views(trainer, run, images, score, progress)
     if pace:
         result["time_budget"] = pace.close(run, progress)
     return result
+
+
+def _beside_training_views(
+    trainer: Trainer, run: Run, images: Sequence[TrainingImage], score: float, progress: Progress
+) -> dict:
+    """The mean PSNR of some training views, and advice where the held-out `score` is far behind."""
+    train_score = evaluate(trainer, list(images[:: max(1, len(images) // QUICK_VIEWS)]))
+    assert train_score is not None
+    found: dict = {"train_psnr": train_score}
+    effects = run.notes.get("effects")
+    decided = effects if isinstance(effects, list) else []
+    if advice := gap_advice(train_score, score, len(images), trainer.options, decided):
+        progress.note(advice)
+        found["advice"] = advice
+        run.note("advice", advice)
+    return found

@@ -38,7 +38,8 @@ from linprim_geo.training.background import chosen_background
 from linprim_geo.training.checkpoint import restore
 from linprim_geo.training.effects import Choice, Decision, decide, settle, summary
 from linprim_geo.training.step.geometry_terms import GeometryTerms, gather_evidence
-from linprim_geo.training.step.trainer import LARGEST_PART, SMALLEST_PX, Trainer, initial_parameters
+from linprim_geo.training.step.parameters import initial_parameters
+from linprim_geo.training.step.trainer import LARGEST_PART, SMALLEST_PX, Trainer
 from linprim_geo.training.step.training_images import TrainingImage
 
 

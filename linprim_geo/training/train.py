@@ -7,6 +7,7 @@ now and then density control. start.py makes the first primitives, loop.py runs 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -23,6 +24,7 @@ from linprim_geo.training.checkpoint import read_checkpoint
 from linprim_geo.training.effects import Choice
 from linprim_geo.training.single import train_run
 from linprim_geo.training.start import begin_run, reopen_run
+from linprim_geo.training.step.trainer import Trainer
 
 
 def train(
@@ -38,6 +40,7 @@ def train(
     blocks: int | str = 1,
     cluster: str | None = None,
     workers: int = 0,
+    advance: Callable[[Trainer], None] = Trainer.advance,
 ) -> dict:
     """Trains a scene into a run folder.
 
@@ -55,6 +58,9 @@ def train(
 
     With `blocks` other than 1 the scene is trained in blocks of space by several workers, see
     `blocks.driver.train_blocks`.
+
+    `advance` makes one step, from step 0 of a new run on: who measures steps gives a function that calls
+    `Trainer.advance` in it. Blocks are trained without it.
 
     Returns: `run`, `iterations`, `seconds` (of training steps alone), `primitives`, `psnr` (mean over held-out views),
     `views`; with held-out views also `train_psnr`, the mean over at most 31 training views, and `advice` where these
@@ -113,11 +119,11 @@ def train(
             ops.set_threads(options.threads)
             if resume:
                 opened, loaded = reopen_run(Path(scene), run_path, scene_options, options, progress)
-                return train_run(opened, loaded, read_checkpoint(run_path), progress)
+                return train_run(opened, loaded, read_checkpoint(run_path), progress, advance=advance)
             opened, loaded, decisions = begin_run(
                 Path(scene), run_path, scene_options, options, effects or Choice("none"), progress
             )
-            return train_run(opened, loaded, None, progress, decisions, budget)
+            return train_run(opened, loaded, None, progress, decisions, budget, advance)
     finally:
         torch.set_num_threads(before)
 

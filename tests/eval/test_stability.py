@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.eval.hard_cases import many_scenes, stability
+from linprim_geo.eval.hard_cases import many_scenes, rounding_bounds, stability
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels import ops
 from linprim_geo.kernels.reference import rasterize as reference
@@ -105,7 +105,7 @@ def test_the_reference_of_many_scenes_is_the_twin(name, ray_model):
                 )
                 # The twin loses the digits of distance over thickness, and those that the kernel's own double set-up
                 # may lose.
-                off = many_scenes.rounding(scenes, many_scenes.chords(scenes), 2.0**-52, True)[i].sum()
+                off = rounding_bounds.rounding(scenes, many_scenes.chords(scenes), 2.0**-52, True)[i].sum()
                 bound = 1e-11 + 100 * float(off)
                 if primitive == "tetrahedron":  # nor are its normals, from differences of vertices
                     bound += 1e-11 * float(parameters[2].max() / parameters[2].min().clamp(min=1e-12))

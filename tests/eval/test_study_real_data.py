@@ -1,12 +1,15 @@
 """The script that trains and scores a folder of captures: what it finds, and that it deletes nothing of the user's."""
 
 import json
+import shutil
+from pathlib import Path
 
 import pytest
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.eval.studies import real_data
+from linprim_geo.eval.study_tables import processor
 from linprim_geo.synthetic.synth import synthesize
 
 
@@ -47,25 +50,34 @@ def test_photographs_are_never_deleted(data):
     assert sorted(p.name for p in (data / "part_small").rglob("*")) == before
 
 
-def test_a_table_is_written(data, tmp_path, capsys):
-    options = ["--iterations", "40", "--max-primitives", "150", "--sh-degree", "0", "--evaluate-every", "20"]
-    for _ in range(2):  # an earlier run is replaced
-        real_data.main(["--data", str(data), "-o", str(tmp_path), *options])
-    (row,) = json.loads((tmp_path / "real_data.json").read_text())
+OPTIONS = ["--iterations", "40", "--max-primitives", "150", "--sh-degree", "0", "--evaluate-every", "20"]
+
+
+@pytest.fixture(scope="module")
+def written(data, tmp_path_factory):
+    """The folder of a study of `data` by this process."""
+    out = tmp_path_factory.mktemp("written")
+    real_data.main(["--data", str(data), "-o", str(out), *OPTIONS])
+    return out
+
+
+def test_a_table_is_written(data, written, tmp_path, capsys):
+    out = Path(shutil.copytree(written, tmp_path / "again"))
+    real_data.main(["--data", str(data), "-o", str(out), *OPTIONS])  # an earlier run is replaced
+    (row,) = json.loads((out / "real_data.json").read_text())
     assert row["name"] == "part_small" and row["views"] == "10+2" and row["iterations"] == 40 and row["psnr"] > 10
     assert row["visible_chamfer_percent_diagonal"] < 10 and row["abs_rel"] < 0.5 and 0 < row["coverage"] <= 1
     assert [len(point) for point in row["curve"]] == [2, 2]
-    text = (tmp_path / "real_data.md").read_text()
+    text = (out / "real_data.md").read_text()
+    assert text.startswith("Made by `python ") and f"on {processor()}, " in text.splitlines()[0]
     assert (
         text.strip() in capsys.readouterr().out and "| part_small | 10+2 | 40x40 |" in text and "* part_small: " in text
     )
 
 
-def test_workers_give_the_same_scores(data, tmp_path, capsys):
-    options = ["--iterations", "40", "--max-primitives", "150", "--sh-degree", "0", "--evaluate-every", "20"]
-    for name, workers in (("here", "1"), ("workers", "2")):
-        real_data.main(["--data", str(data), "-o", str(tmp_path / name), "--workers", workers, *options])
-    here, workers = (json.loads((tmp_path / name / "real_data.json").read_text())[0] for name in ("here", "workers"))
+def test_workers_give_the_same_scores(data, written, tmp_path):
+    real_data.main(["--data", str(data), "-o", str(tmp_path), "--workers", "2", *OPTIONS])
+    here, workers = (json.loads((folder / "real_data.json").read_text())[0] for folder in (written, tmp_path))
     for key in ("psnr", "ssim", "abs_rel", "primitives", "faces", "chamfer_percent_diagonal"):
         assert here[key] == workers[key], key
-    assert not list((tmp_path / "workers").glob("tasks_*"))
+    assert not list(tmp_path.glob("tasks_*"))

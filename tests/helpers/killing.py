@@ -86,7 +86,9 @@ def extract(run: str, output: str) -> None:
     from linprim_geo.base.options import ExtractOptions
     from linprim_geo.surface.extract import extract_mesh
 
-    extract_mesh(run, output=output, options=ExtractOptions(level=0.5), quiet=True)
+    # What is only computed in memory is left out: it would be most of the time.
+    options = ExtractOptions(level=0.5, stereo="off", refine=0, denoise="off")
+    extract_mesh(run, output=output, options=options, quiet=True)
 
 
 def convert(source: str, target: str) -> None:
@@ -99,7 +101,6 @@ def _serve() -> None:
     # None of these starts a thread, which would not survive being copied.
     import open3d  # noqa: F401
     import pycolmap  # noqa: F401
-    import torch._dynamo  # noqa: F401
     import trimesh  # noqa: F401
 
     import linprim_geo.points.triangulate

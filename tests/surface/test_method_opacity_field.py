@@ -23,6 +23,7 @@ from linprim_geo.geometry.topology import manifold_status, topology
 from linprim_geo.kernels import ops
 from linprim_geo.surface import method_opacity_field as opacity
 from linprim_geo.surface.extract import extract_mesh
+from linprim_geo.surface.march_tetrahedra import march_tetrahedra
 
 METHOD = "opacity-field"
 
@@ -155,7 +156,7 @@ def tetrahedra_of_a_ball(count=1500, seed=3):
 def test_marching_gives_a_closed_ball_that_is_outward():
     points, cells, _ = tetrahedra_of_a_ball()
     radius = np.linalg.norm(points, axis=1)
-    edges, faces = opacity.march_tetrahedra(points, cells, radius < 1.2)
+    edges, faces = march_tetrahedra(points, cells, radius < 1.2)
     assert (radius[edges[:, 0]] < 1.2).all() and (radius[edges[:, 1]] >= 1.2).all()
     a, b = points[edges[:, 0]], points[edges[:, 1]]
     share = (1.2 - radius[edges[:, 0]]) / (radius[edges[:, 1]] - radius[edges[:, 0]])
@@ -172,7 +173,7 @@ def test_marching_is_a_manifold_for_any_labels(seed):
     inside[np.unique(hull)] = False
     mirrored = cells.copy()
     mirrored[::2] = mirrored[::2][:, [1, 0, 2, 3]]
-    edges, faces = opacity.march_tetrahedra(points, mirrored, inside)
+    edges, faces = march_tetrahedra(points, mirrored, inside)
     mesh = Mesh(points[edges].mean(1), faces)
     assert topology(mesh)["watertight"] and topology(mesh)["volume"] > 0
     assert manifold_status(mesh) == "NoError"
@@ -181,7 +182,7 @@ def test_marching_is_a_manifold_for_any_labels(seed):
 def test_marching_without_a_surface():
     points, cells, _ = tetrahedra_of_a_ball(20)
     for inside in (np.zeros(20, bool), np.ones(20, bool)):
-        edges, faces = opacity.march_tetrahedra(points, cells, inside)
+        edges, faces = march_tetrahedra(points, cells, inside)
         assert edges.shape == (0, 2) and faces.shape == (0, 3)
 
 

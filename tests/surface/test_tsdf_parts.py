@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.here import Here
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions
@@ -105,15 +106,16 @@ def test_the_command_gives_the_same_files_in_parts(run_copy, tmp_path):
 def test_parts_that_are_done_are_not_done_again_and_those_of_other_options_go(run_copy, monkeypatch, tmp_path):
     options = ExtractOptions(level=LEVEL, refine=0)
     folder = run_copy / "mesh" / "tsdf" / "parts"
-    monkeypatch.setattr(shutil, "rmtree", lambda path: None)  # what a kill before the end leaves
-    extract_mesh(run_copy, options=options, quiet=True, blocks=2, workers=2)
-    (place,) = [path for path in folder.iterdir() if path.is_dir()]
-    before = {path: path.stat().st_mtime_ns for path in place.glob(f"*/{worker.DONE}")}
-    assert len(before) == 2
-    extract_mesh(run_copy, options=options, quiet=True, blocks=2, workers=2)
-    assert before == {path: path.stat().st_mtime_ns for path in place.glob(f"*/{worker.DONE}")}
-    monkeypatch.undo()
-    extract_mesh(run_copy, options=replace(options, voxel_size=0.03), quiet=True, blocks=2, workers=2)
+    monkeypatch.setattr("linprim_geo.surface.extract.open_executor", Here)
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", lambda path: None)  # what a kill before the end leaves
+        extract_mesh(run_copy, options=options, quiet=True, blocks=2)
+        (place,) = [path for path in folder.iterdir() if path.is_dir()]
+        before = {path: path.stat().st_mtime_ns for path in place.glob(f"*/{worker.DONE}")}
+        assert len(before) == 2
+        extract_mesh(run_copy, options=options, quiet=True, blocks=2)
+        assert before == {path: path.stat().st_mtime_ns for path in place.glob(f"*/{worker.DONE}")}
+    extract_mesh(run_copy, options=replace(options, voxel_size=0.03), quiet=True, blocks=2)
     assert not folder.exists()
 
 

@@ -4,6 +4,7 @@ path."""
 from __future__ import annotations
 
 import json
+import math
 import os
 import random
 import signal
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.executor_tasks import is_alive
+from helpers.here import Here
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions, TrainOptions
@@ -35,10 +37,11 @@ from linprim_geo.training.blocks import driver as block_training
 from linprim_geo.training.blocks import plan
 from linprim_geo.training.blocks import tasks as block_tasks
 from linprim_geo.training.blocks.driver import blocks_that_fit, train_blocks
-from linprim_geo.training.blocks.plan import EXCHANGES, apportioned, block_of, exact_radius_of
+from linprim_geo.training.blocks.plan import EXCHANGES, apportioned, exact_radius_of, read_plan
 from linprim_geo.training.blocks.tasks import block_folder, join_task, outside, tensors
 from linprim_geo.training.blocks.windows import Windows, block_images
-from linprim_geo.training.step.trainer import Trainer, initial_parameters
+from linprim_geo.training.step.parameters import initial_parameters
+from linprim_geo.training.step.trainer import Trainer
 from linprim_geo.training.step.training_images import RECENT, LazyTrainingImage, TrainingImage
 from linprim_geo.training.train import train
 
@@ -79,23 +82,23 @@ def test_the_run_renders_extracts_and_scores_as_any_other(whole, tmp_path):
 
 def test_every_block_keeps_what_it_owns(whole):
     run, done = whole
-    plan = worker.result_of_folder(run / "blocks" / "plan")
+    plan = read_plan(run)
     kept = []
     for k in range(COUNT):
         begun, ended = (
             load_primitives(block_folder(run, k, at) / "run" / "training_frame.npz") for at in (0, len(EXCHANGES))
         )
-        own = block_of(plan, k).holds(begun.center)
+        own = plan.blocks[k].block.holds(begun.center)
         assert 0 < own.sum() < len(begun)  # the margin is trained and dropped
         neighbour = load_primitives(block_folder(run, 1 - k) / "run" / "training_frame.npz").center
-        beside = block_of(plan, 1 - k).holds(neighbour) & block_of(plan, k).holds(neighbour, plan["margin"])
+        beside = plan.blocks[1 - k].block.holds(neighbour) & plan.blocks[k].block.holds(neighbour, plan.margin)
         after = load_primitives(block_folder(run, k, 1) / "run" / "training_frame.npz").center
         assert len(after) == own.sum() + beside.sum()
         assert 0 < np.abs(after - np.concatenate([begun.center[own], neighbour[beside]])).max() < 0.2
         kept.append(ended.center[: own.sum()])
     assert np.array_equal(Run.open(run).training_primitives().center, np.concatenate(kept))
-    assert sum(part["work"] for part in plan["blocks"]) == pytest.approx(1)
-    assert all(0.4 < part["work"] < 0.6 for part in plan["blocks"])
+    assert sum(part.work for part in plan.blocks) == pytest.approx(1)
+    assert all(0.4 < part.work < 0.6 for part in plan.blocks)
 
 
 @pytest.mark.parametrize("lost", [(0,), (0, 1)])
@@ -108,6 +111,14 @@ def test_a_block_that_has_lost_all_it_owned_adds_nothing(lost, whole, tmp_path, 
     assert result["owned"] == 0 < result["primitives"]
 
 
+def test_a_plan_comes_back_from_its_file(whole):
+    saved = worker.result_of_folder(whole[0] / "blocks" / "plan")
+    found = plan.Plan.from_json(saved, whole[0])
+    assert json.loads(json.dumps(found.to_json(), allow_nan=False)).items() <= saved.items()
+    ends = [end for part in found.blocks for end in (*part.block.low, *part.block.high)]
+    assert math.inf in ends and -math.inf in ends and plan.Plan.from_json(found.to_json(), whole[0]) == found
+
+
 def test_the_nearest_that_memory_allows_stand_in_full(monkeypatch):
     distances = np.concatenate([np.zeros(100), np.linspace(0.01, 9.0, 900)])
     assert exact_radius_of(distances, 0.5, 100_000) == np.inf  # 90,000 lie outside
@@ -117,14 +128,14 @@ def test_the_nearest_that_memory_allows_stand_in_full(monkeypatch):
 
 
 def test_others_stand_in_full_as_far_as_they_are_known(whole, tmp_path, monkeypatch):
-    run, read, taken = whole[0], worker.result_of_folder, {}
-    plan = read(run / "blocks" / "plan")
-    own, other, margin = block_of(plan, 0), block_of(plan, 1), plan["margin"]
+    run, taken = whole[0], {}
+    plan = read_plan(run)
+    own, other, margin = plan.blocks[0].block, plan.blocks[1].block, plan.margin
     theirs = load_primitives(block_folder(run, 1) / "run" / "training_frame.npz").center
     theirs = theirs[other.holds(theirs)]
     known = float(np.median(own.distance(theirs)))
-    limited = plan | {"blocks": [part | {"known": known} for part in plan["blocks"]]}
-    monkeypatch.setattr(worker, "result_of_folder", lambda folder: limited if folder.name == "plan" else read(folder))
+    limited = replace(plan, blocks=tuple(replace(part, known=known) for part in plan.blocks))
+    monkeypatch.setattr(block_tasks, "read_plan", lambda _: limited)
 
     def trained(folder, run, scene, plan, block, frozen, known, end, begin):
         taken.update(frozen=frozen, known=known)
@@ -139,7 +150,7 @@ def test_others_stand_in_full_as_far_as_they_are_known(whole, tmp_path, monkeypa
 
 
 def test_a_run_begun_by_another_version_is_one_sentence(whole, tiny_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(block_training, "FORMAT", 1)
+    monkeypatch.setattr(plan, "FORMAT", 1)
     with pytest.raises(
         LinprimError, match="was begun in blocks by another version of linprim-geo, wanted a new folder"
     ):
@@ -148,14 +159,15 @@ def test_a_run_begun_by_another_version_is_one_sentence(whole, tiny_scene, tmp_p
 
 def test_own_primitives_are_limited_to_what_is_asked_for(whole):
     run, done = whole
-    plan = worker.result_of_folder(run / "blocks" / "plan")
-    assert sum(part["own_primitives"] for part in plan["blocks"]) == OPTIONS.max_primitives
+    plan = read_plan(run)
+    assert sum(part.own_primitives for part in plan.blocks) == OPTIONS.max_primitives
     assert 0.97 * OPTIONS.max_primitives <= done["primitives"] <= 1.01 * OPTIONS.max_primitives
-    assert sum(part["max_primitives"] for part in plan["blocks"]) > 1.05 * OPTIONS.max_primitives
+    assert sum(part.max_primitives for part in plan.blocks) > 1.05 * OPTIONS.max_primitives
     assert apportioned([1, 1, 1], 10) == [4, 3, 3] and apportioned([0, 5, 2], 70) == [0, 50, 20]
 
 
-def test_so_few_steps_that_none_are_left_after_an_exchange(tiny_scene, tmp_path):
+def test_so_few_steps_that_none_are_left_after_an_exchange(tiny_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(block_training, "open_executor", Here)
     done = train_blocks(tiny_scene, tmp_path / "run", options=replace(OPTIONS, iterations=5), blocks=COUNT, quiet=True)
     assert done["iterations"] == 5 and done["primitives"] > 20 and done["psnr"] > 5
 
@@ -256,7 +268,7 @@ def test_a_block_sees_its_own_pixels_and_the_frozen_scene_elsewhere(whole):
     part = photo.rgb[top : top + camera.height, left : left + camera.width]
     alpha = images[0].alpha.numpy() > 0
     assert np.array_equal(images[0].rgb.numpy().transpose(1, 2, 0)[alpha], part[alpha])
-    own = block_of(worker.result_of_folder(run.path / "blocks" / "plan"), 0)
+    own = read_plan(run.path).blocks[0].block
     frozen = outside(coarse.training_primitives(), own, 0.05)
     assert len(frozen["center"]) > 0 and not own.holds(frozen["center"], 0.05).any()
     images = block_images(coarse, scene.train, own, 0.05, 0.05, factor, run.similarity, OPTIONS, tensors(frozen))
@@ -319,7 +331,7 @@ def test_a_window_pulls_as_its_photograph_does(population):
 def test_frozen_primitives_are_drawn_and_stay(whole):
     run = Run.open(whole[0])
     scene, coarse = run.scene(), Run.open(whole[0] / "blocks" / "coarse" / "run")
-    own = block_of(worker.result_of_folder(run.path / "blocks" / "plan"), 0)
+    own = read_plan(run.path).blocks[0].block
     frozen = tensors(outside(coarse.training_primitives(), own, 0.05))
     images = block_images(
         coarse, scene.train, own, 0.05, 0.05, coarse.scene_options.downscale, run.similarity, OPTIONS, frozen

@@ -17,7 +17,8 @@ from linprim_geo.geometry.lens import Lens, largest_displacement, straightened
 from linprim_geo.points.photo_evidence import Observations
 from linprim_geo.runs.run import Run
 from linprim_geo.synthetic.synth import synthesize
-from linprim_geo.training.effects import EFFECTS, Choice, Data, decide, parse_asked, settle
+from linprim_geo.training.effect_registry import EFFECTS, Data
+from linprim_geo.training.effects import Choice, decide, parse_asked, settle
 from linprim_geo.training.inspect import describe, inspect_scene
 from linprim_geo.training.train import train
 

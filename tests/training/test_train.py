@@ -21,7 +21,7 @@ from linprim_geo.imaging.metrics import composite
 from linprim_geo.runs.run import Run
 from linprim_geo.synthetic.synth import synthesize
 from linprim_geo.synthetic.textured import TexturedMesh
-from linprim_geo.training.step import trainer as training_step
+from linprim_geo.training.step.parameters import activate
 from linprim_geo.training.train import train
 
 # Pictures of the best single colour score at most 14.4 dB on the held-out views of these scenes: this is half of that
@@ -64,7 +64,7 @@ def test_only_the_last_checkpoints_are_kept_and_they_hold_tensors_alone(tiny_run
 
 def test_the_checkpoint_and_the_exported_primitives_agree(tiny_run):
     with torch.no_grad():
-        tensors = training_step.activate(checkpoint(tiny_run)["parameters"], 1)
+        tensors = activate(checkpoint(tiny_run)["parameters"], 1)
     saved = load_primitives(tiny_run / "training_frame.npz")
     for name, tensor in zip(("center", "rotation", "extent", "density", "sh"), tensors, strict=True):
         assert np.array_equal(getattr(saved, name), tensor.numpy()), name
@@ -317,7 +317,7 @@ def test_every_kind_learns_under_every_rule_and_goes_on_bit_for_bit(kind, popula
     state, saved = checkpoint(whole), load_primitives(whole / "training_frame.npz")
     assert saved.kind == kind and len(saved) == len(state["filter_3d"])
     with torch.no_grad():
-        active = training_step.activate(state["parameters"], 1, kind, state["filter_3d"])
+        active = activate(state["parameters"], 1, kind, state["filter_3d"])
     for name, tensor in zip(("center", "rotation", "extent", "density", "sh"), active, strict=True):
         assert np.array_equal(getattr(saved, name), tensor.numpy()), name
     assert (saved.extent > np.exp(state["parameters"]["log_extent"].numpy())).all()

@@ -8,9 +8,9 @@ import torch
 
 from linprim_geo.base.options import TrainOptions
 from linprim_geo.capture.load import load_scene
-from linprim_geo.geometry.primitives import KINDS, Primitives
+from linprim_geo.geometry.primitives import KINDS, SH_Y0, Primitives
 from linprim_geo.kernels import ops
-from linprim_geo.training.step import trainer as training_step
+from linprim_geo.training.step.parameters import activate, filter_lengths, initial_parameters
 from linprim_geo.training.step.trainer import Trainer
 from linprim_geo.training.step.training_images import load_training_images
 
@@ -25,7 +25,7 @@ def test_activation_gives_the_opacity_of_the_raw_value():
         "sh_dc": torch.zeros(5, 1, 3),
         "sh_rest": torch.zeros(5, 8, 3),
     }
-    _, _, extent, density, sh = training_step.activate(parameters, 1)
+    _, _, extent, density, sh = activate(parameters, 1)
     # Along the shortest diagonal, 2 * 0.05 long, the light that is left is exp(-density * 0.1).
     expected = torch.sigmoid(raw.double())
     assert torch.allclose(-torch.expm1(-0.1 * density.double()), expected, rtol=1e-5, atol=0)
@@ -40,7 +40,7 @@ def trainer(tiny_scene):
     similarity = scene_normalization(scene)
     images = load_training_images(scene.train, similarity)
     xyz = similarity.apply(scene.points.xyz[:40])
-    parameters = training_step.initial_parameters(xyz, scene.points.rgb[:40], 1, 0, (1e-3, 1.0))
+    parameters = initial_parameters(xyz, scene.points.rgb[:40], 1, 0, (1e-3, 1.0))
     options = TrainOptions(iterations=100, max_primitives=50, sh_degree=1, threads=1)
     return Trainer(images, parameters, options, (1e-3, 1.0), torch.ones(3), False, True)
 
@@ -93,33 +93,31 @@ def test_a_child_has_its_parents_state_but_no_momentum(trainer):
 def test_the_start_follows_the_points():
     xyz = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 1.5]])
     rgb = np.array([[255, 0, 128]] * 5, dtype=np.uint8)
-    start = training_step.initial_parameters(xyz, rgb, 2, 0, (1e-3, 0.9))
+    start = initial_parameters(xyz, rgb, 2, 0, (1e-3, 0.9))
     assert torch.equal(start["center"], torch.from_numpy(xyz.astype(np.float32)))
     # The mean distance to the three nearest: 1 for the first, which the largest half-axis cuts to 0.9.
     nearest = (0.5 + np.sqrt(2) * 2) / 3
     assert torch.allclose(torch.exp(start["log_extent"][0]), torch.tensor(0.9))
     assert nearest > 0.9 and start["log_extent"].max() <= np.log(0.9) + 1e-6
-    small = training_step.initial_parameters(xyz * 0.1, rgb, 2, 0, (1e-3, 0.9))
+    small = initial_parameters(xyz * 0.1, rgb, 2, 0, (1e-3, 0.9))
     assert torch.allclose(torch.exp(small["log_extent"][0]), torch.tensor(0.1))
-    _, _, _, _, sh = training_step.activate(start, 2)
-    assert torch.allclose(
-        0.5 + training_step.SH_Y0 * sh[:, 0], torch.tensor([1.0, 0.0, 128 / 255]).repeat(5, 1), atol=1e-6
-    )
+    _, _, _, _, sh = activate(start, 2)
+    assert torch.allclose(0.5 + SH_Y0 * sh[:, 0], torch.tensor([1.0, 0.0, 128 / 255]).repeat(5, 1), atol=1e-6)
     assert sh.shape == (5, 9, 3) and sh[:, 1:].abs().max() == 0
-    one = training_step.initial_parameters(xyz[:1], rgb[:1], 0, 0, (1e-3, 0.9))
+    one = initial_parameters(xyz[:1], rgb[:1], 0, 0, (1e-3, 0.9))
     assert torch.allclose(torch.exp(one["log_extent"]), torch.tensor(0.9)) and one["sh_rest"].shape == (
         1,
         0,
         3,
     )
-    twins = training_step.initial_parameters(np.zeros((5, 3)), rgb, 0, 0, (1e-3, 0.9))
+    twins = initial_parameters(np.zeros((5, 3)), rgb, 0, 0, (1e-3, 0.9))
     assert torch.allclose(torch.exp(twins["log_extent"]), torch.tensor(1e-3))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_start_of_every_kind(kind):
     xyz = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 1.5]])
-    start = training_step.initial_parameters(xyz, np.zeros((5, 3), np.uint8), 0, 0, (1e-3, 9.0), kind)
+    start = initial_parameters(xyz, np.zeros((5, 3), np.uint8), 0, 0, (1e-3, 9.0), kind)
     extent = np.exp(start["log_extent"].numpy())
     assert extent.shape == (5, KINDS[kind].extents) and np.ptp(extent, axis=1).max() == 0
     # The mean distance to the three nearest is 1.
@@ -139,11 +137,11 @@ def test_the_3d_filter_widens_what_is_rendered(kind):
         "sh_rest": torch.zeros(3, 0, 3),
     }
     length = torch.tensor([0.0, 0.1, 0.3])
-    _, _, extent, density, _ = training_step.activate(parameters, 0, kind, length)
+    _, _, extent, density, _ = activate(parameters, 0, kind, length)
     wider = torch.sqrt(0.04 + length**2) if kind == "gaussian" else 0.2 + length / 2
     assert torch.allclose(extent, wider[:, None].repeat(1, columns))
     # Opacity refers to what is rendered.
-    saved = Primitives(*(x.numpy() for x in training_step.activate(parameters, 0, kind, length)), kind)
+    saved = Primitives(*(x.numpy() for x in activate(parameters, 0, kind, length)), kind)
     assert np.allclose(saved.alpha, torch.sigmoid(raw), rtol=1e-5)
 
 
@@ -151,7 +149,7 @@ def test_the_length_of_the_3d_filter_is_that_of_the_nearest_view_that_sees(train
     cameras = [image.camera for image in trainer.images]
     rng = np.random.default_rng(0)
     center = rng.normal(size=(300, 3)) * 4
-    found = training_step.filter_lengths(torch.from_numpy(center.astype(np.float32)), cameras).numpy()
+    found = filter_lengths(torch.from_numpy(center.astype(np.float32)), cameras).numpy()
     focal = max(max(c.fx, c.fy) for c in cameras)
     seen = 0
     for point, length in zip(center, found, strict=True):

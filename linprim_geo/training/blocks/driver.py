@@ -35,10 +35,10 @@ from linprim_geo.runs.run import Run, is_unused
 from linprim_geo.training.blocks.plan import (
     EXCHANGES,
     FOLDER,
-    FORMAT,
     MOST_BESIDE,
     MOST_COARSE_PRIMITIVES,
     MOST_COARSE_VIEWS,
+    Plan,
     coarse_of,
     save_points,
 )
@@ -214,16 +214,14 @@ def _all(run: Run, scene: Scene, count: int, executor: Executor, progress: Progr
         cores,
         REMEDY,
     )
-    (plan,) = executor.run([planning], Progress("plan", 1, quiet=progress.quiet))
-    if plan.get("format") != FORMAT:
-        raise LinprimError(f"{run.path}: was begun in blocks by another version of linprim-geo, wanted a new folder")
+    (planned,) = executor.run([planning], Progress("plan", 1, quiet=progress.quiet))
+    plan = Plan.from_json(planned, run.path)
     rounds, memory = [], []
-    for k, part in enumerate(plan["blocks"]):
-        memory.append(block_memory(part["max_primitives"], plan["frozen"], plan["largest"], options))
+    for k, part in enumerate(plan.blocks):
+        memory.append(block_memory(part.max_primitives, plan.frozen, plan.largest, options))
         progress.note(
-            f"  block {k}: {len(part['views'])} views, {part['pixels'] / max(1, plan['all_pixels']):.0%} of the "
-            "pixels, "
-            f"{part['iterations']} steps, {part['max_primitives']} primitives, {memory[k]:.1f} GiB"
+            f"  block {k}: {len(part.views)} views, {part.pixels / max(1, plan.all_pixels):.0%} of the pixels, "
+            f"{part.iterations} steps, {part.max_primitives} primitives, {memory[k]:.1f} GiB"
         )
     for exchange in range(len(EXCHANGES) + 1):
         title = f"exchange {exchange} of {len(EXCHANGES)}" if exchange else "blocks"
@@ -251,7 +249,7 @@ def _step(task: Task) -> str:
         return "begun"
 
 
-def _merged(run: Run, scene: Scene, coarse: dict, plan: dict, rounds: Sequence[list[dict]], progress: Progress) -> dict:
+def _merged(run: Run, scene: Scene, coarse: dict, plan: Plan, rounds: Sequence[list[dict]], progress: Progress) -> dict:
     """Writes the primitives that the blocks own as those of the run, and scores them; `rounds` are what the tasks
     said."""
     from linprim_geo.imaging.metrics import psnr, to_8bit
@@ -271,7 +269,7 @@ def _merged(run: Run, scene: Scene, coarse: dict, plan: dict, rounds: Sequence[l
         "iteration": steps,
         "iterations": steps,
         "primitives": len(merged),
-        "background": plan["shown"],
+        "background": list(plan.shown),
         "seconds": seconds,
     }
     run.save(merged, state, Run.open(run.path / FOLDER / "coarse" / "run").environment)
@@ -281,14 +279,14 @@ def _merged(run: Run, scene: Scene, coarse: dict, plan: dict, rounds: Sequence[l
         rgb = photo.rgb.astype(np.float32).transpose(2, 0, 1) / 255
         if photo.alpha is not None:
             alpha = photo.alpha.astype(np.float32) / 255
-            rgb = rgb * alpha + np.asarray(plan["shown"], np.float32)[:, None, None] * (1 - alpha)
+            rgb = rgb * alpha + np.asarray(plan.shown, np.float32)[:, None, None] * (1 - alpha)
         scores.append(psnr(to_8bit(images["rgb"]), to_8bit(rgb)))
     score = float(np.mean(scores)) if scores else None
     peak = max(result["task_peak_gib"] for result in results)
     line = {"step": steps, "seconds": round(seconds, 3), "primitives": len(merged), "memory_gib": round(peak, 3)}
     for name in ("loss", "train_psnr"):
         line[name] = round(
-            float(np.average([result[name] for result in ended], weights=[part["pixels"] for part in plan["blocks"]])),
+            float(np.average([result[name] for result in ended], weights=[part.pixels for part in plan.blocks])),
             6,
         )
     if score is not None:

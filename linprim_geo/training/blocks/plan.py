@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +39,78 @@ LEAST_STEPS = 300
 # stand in full, the nearest first, up to about so many primitives with those that are trained in the margin; beyond
 # these the coarse scene does.
 EXCHANGES, MOST_BESIDE = (0.125, 0.5, 0.8125), 100_000
+
+
+@dataclass(frozen=True)
+class Part:
+    """A block and its share. Steps, primitives and photographs are those that it and its margin are trained with."""
+
+    block: Block
+    views: tuple[int, ...]  # training views of the scene that show it
+    pixels: int  # of the windows of these views
+    work: float  # its part of the whole's, 0 to 1
+    iterations: int
+    max_primitives: int
+    own_primitives: int  # at most in it without its margin
+    initial_primitives: int
+    known: float  # so far from it others stand in full; may be infinite
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What `plan_task` has decided. Lengths are the training frame's."""
+
+    margin: float
+    factor: int  # pixels of the whole per pixel of the coarse scene
+    background: str  # as --background says it
+    shown: tuple[float, ...]  # (3,) the colour behind everything
+    fitted: bool
+    environment: bool
+    frozen: int  # primitives of the coarse scene
+    extent: float  # the largest that a primitive may have
+    largest: int  # pixels of the largest photograph
+    all_pixels: int  # of all training photographs
+    blocks: tuple[Part, ...]
+
+    def to_json(self) -> dict:
+        """The table that the plan's task leaves; infinite numbers are null."""
+        parts = []
+        for part in self.blocks:
+            plain = {entry.name: getattr(part, entry.name) for entry in fields(part) if entry.name != "block"}
+            ends = {name: [_json_number(x) for x in getattr(part.block, name)] for name in ("low", "high")}
+            parts.append(ends | plain | {"views": list(part.views), "known": _json_number(part.known)})
+        plain = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        return {"format": FORMAT} | plain | {"shown": list(self.shown), "blocks": parts}
+
+    @staticmethod
+    def from_json(saved: dict, run: Path) -> Plan:
+        """Reads what `to_json` made.
+
+        Raises:
+            LinprimError: it is of another format.
+        """
+        if saved.get("format") != FORMAT:
+            raise LinprimError(f"{run}: was begun in blocks by another version of linprim-geo, wanted a new folder")
+        parts = []
+        for part in saved["blocks"]:
+            low, high = (
+                tuple(end if x is None else x for x in part[name])
+                for name, end in (("low", -math.inf), ("high", math.inf))
+            )
+            plain = {entry.name: part[entry.name] for entry in fields(Part) if entry.name != "block"}
+            known = math.inf if part["known"] is None else part["known"]
+            parts.append(Part(Block(low, high), **plain | {"views": tuple(part["views"]), "known": known}))
+        plain = {entry.name: saved[entry.name] for entry in fields(Plan)}
+        return Plan(**plain | {"shown": tuple(saved["shown"]), "blocks": tuple(parts)})
+
+
+def read_plan(run: Path) -> Plan:
+    """The plan of a run in blocks.
+
+    Raises:
+        LinprimError: there is none, or it is of another version.
+    """
+    return Plan.from_json(worker.result_of_folder(run / FOLDER / "plan"), run)
 
 
 def save_points(path: Path, cloud: PointCloud) -> None:
@@ -88,7 +160,7 @@ def _prepared(options: TrainOptions) -> None:
 
 
 def plan_task(folder: Path, run: str, count: int) -> dict:
-    """Splits space, and finds the views that show each block. Returns the plan that `block_task` reads."""
+    """Splits space, and finds the views that show each block. Returns what `read_plan` reads."""
     opened, scene = _opened(run)
     _prepared(opened.train_options)
     coarse = Run.open(opened.path / FOLDER / "coarse" / "run")
@@ -145,34 +217,32 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
         most = max(1, math.ceil(share * options.max_primitives))
         steps = math.ceil(options.iterations * len(seen_by[k]) / len(scene.train))
         parts.append(
-            {
-                "low": [_json_number(x) for x in block.low],
-                "high": [_json_number(x) for x in block.high],
-                "views": seen_by[k],
-                "pixels": pixels[k],
-                "work": float(work[block.holds(points)].sum() / work.sum()),
-                "iterations": max(min(LEAST_STEPS, options.iterations), steps),
-                "max_primitives": most,
-                "own_primitives": own[k],
-                "initial_primitives": min(most, math.ceil(share * options.initial_primitives)),
-                "known": _json_number(exact_radius_of(block.distance(grown), margin, options.max_primitives)),
-            }
+            Part(
+                block=block,
+                views=tuple(seen_by[k]),
+                pixels=pixels[k],
+                work=float(work[block.holds(points)].sum() / work.sum()),
+                iterations=max(min(LEAST_STEPS, options.iterations), steps),
+                max_primitives=most,
+                own_primitives=own[k],
+                initial_primitives=min(most, math.ceil(share * options.initial_primitives)),
+                known=exact_radius_of(block.distance(grown), margin, options.max_primitives),
+            )
         )
-    background = worker.result_of_folder(opened.path / FOLDER / "coarse")
-    return {
-        "format": FORMAT,
-        "margin": margin,
-        "factor": factor,
-        "background": background["background"],
-        "shown": background["shown"],
-        "fitted": background["fitted"],
-        "environment": background["environment"],
-        "frozen": len(grown),
-        "extent": float(state["bounds"][1]),
-        "largest": max(view.camera.width * view.camera.height for view in scene.train),
-        "all_pixels": sum(view.camera.width * view.camera.height for view in scene.train),
-        "blocks": parts,
-    }
+    behind = worker.result_of_folder(opened.path / FOLDER / "coarse")
+    return Plan(
+        margin=margin,
+        factor=factor,
+        background=behind["background"],
+        shown=tuple(behind["shown"]),
+        fitted=behind["fitted"],
+        environment=behind["environment"],
+        frozen=len(grown),
+        extent=float(state["bounds"][1]),
+        largest=max(view.camera.width * view.camera.height for view in scene.train),
+        all_pixels=sum(view.camera.width * view.camera.height for view in scene.train),
+        blocks=tuple(parts),
+    ).to_json()
 
 
 def apportioned(shares: Sequence[float] | np.ndarray, total: int) -> list[int]:
@@ -198,12 +268,3 @@ def exact_radius_of(distances: np.ndarray, margin: float, primitives: int) -> fl
 
 def _json_number(x: float) -> float | None:
     return float(x) if math.isfinite(x) else None
-
-
-def block_of(plan: dict, k: int) -> Block:
-    """A block of the plan."""
-    part = plan["blocks"][k]
-    low, high = (
-        [x if x is not None else end for x in part[name]] for name, end in (("low", -np.inf), ("high", np.inf))
-    )
-    return Block(tuple(low), tuple(high))

@@ -27,7 +27,7 @@ from linprim_geo.points.far_colors import far_colors
 from linprim_geo.points.start_points import filled_points, initial_cloud
 from linprim_geo.runs.run import Run
 from linprim_geo.training.background import chosen_background
-from linprim_geo.training.blocks.plan import EXCHANGES, FOLDER, _opened, _prepared, block_of, coarse_of
+from linprim_geo.training.blocks.plan import EXCHANGES, FOLDER, Plan, _opened, _prepared, coarse_of, read_plan
 from linprim_geo.training.blocks.windows import block_images
 from linprim_geo.training.checkpoint import read_checkpoint
 from linprim_geo.training.loop import run_steps
@@ -63,8 +63,8 @@ def coarse_task(folder: Path, run: str) -> dict:
 def block_task(folder: Path, run: str, block: int) -> dict:
     """Trains a block of the plan and its margin before the coarse scene, up to the first exchange."""
     opened, scene = _opened(run)
-    plan = worker.result_of_folder(opened.path / FOLDER / "plan")
-    own, margin = block_of(plan, block), plan["margin"]
+    plan = read_plan(opened.path)
+    own, margin = plan.blocks[block].block, plan.margin
     coarse = Run.open(opened.path / FOLDER / "coarse" / "run").training_primitives()
     return _trained(
         folder, opened, scene, plan, block, outside(coarse, own, margin), margin, until(opened.train_options, 0), None
@@ -81,14 +81,13 @@ def join_task(folder: Path, run: str, block: int, exchange: int) -> dict:
     first ones, are the block's.
     """
     opened, scene = _opened(run)
-    plan = worker.result_of_folder(opened.path / FOLDER / "plan")
-    own, margin = block_of(plan, block), plan["margin"]
-    known = math.inf if plan["blocks"][block]["known"] is None else plan["blocks"][block]["known"]
+    plan = read_plan(opened.path)
+    own, known, margin = plan.blocks[block].block, plan.blocks[block].known, plan.margin
     state = _state_of(opened.path, block, exchange - 1)
     begin = [_rows(state, is_owned(opened.path, plan, block, exchange - 1, state))]
     frozen = [outside(Run.open(opened.path / FOLDER / "coarse" / "run").training_primitives(), own, known)]
-    for other in range(len(plan["blocks"])):
-        if other != block and not own.is_apart(block_of(plan, other), known):
+    for other, part in enumerate(plan.blocks):
+        if other != block and not own.is_apart(part.block, known):
             theirs = _state_of(opened.path, other, exchange - 1)
             center, rows = _centers(theirs), is_owned(opened.path, plan, other, exchange - 1, theirs)
             inside = own.holds(center, margin)
@@ -143,7 +142,7 @@ def _trained(
     folder: Path,
     opened: Run,
     scene: Scene,
-    plan: dict,
+    plan: Plan,
     block: int,
     frozen: Arrays,
     known: float,
@@ -154,28 +153,29 @@ def _trained(
     `begin`, else from the points in it and its margin. Up to `known` from the block the frozen primitives are those
     that the scene will have."""
     _prepared(opened.train_options)
-    part, own = plan["blocks"][block], block_of(plan, block)
-    names = ("iterations", "max_primitives", "initial_primitives")
+    part, own = plan.blocks[block], plan.blocks[block].block
     options = replace(
         opened.train_options,
-        **{name: part[name] for name in names},
-        background=plan["background"],
+        iterations=part.iterations,
+        max_primitives=part.max_primitives,
+        initial_primitives=part.initial_primitives,
+        background=plan.background,
         evaluate_every=0,
         threads=worker.cores,
     )
     path = folder / "run"
-    seen = replace(scene, train=tuple(scene.train[k] for k in part["views"]), test=())
+    seen = replace(scene, train=tuple(scene.train[k] for k in part.views), test=())
     with locked(path, "trained into"):
         begun = (path / "config.json").exists()
         state = (read_checkpoint(path) if begun else None) or begin
         cloud = _points_of(seen, opened, plan, block, options) if state is None else None
         coarse = Run.open(opened.path / FOLDER / "coarse" / "run")
-        margin, factor, still = plan["margin"], plan["factor"], tensors(frozen)
+        margin, factor, still = plan.margin, plan.factor, tensors(frozen)
         images = block_images(coarse, seen.train, own, margin, known, factor, opened.similarity, options, still)
         here = replace(opened, path=path, train_options=options)
-        trainer = start_trainer(seen, here, images, options, state, cloud, plan["extent"])
+        trainer = start_trainer(seen, here, images, options, state, cloud, plan.extent)
         trainer.frozen = still
-        trainer.control.limit_only(own.holds, part["own_primitives"], trainer.parameters, trainer.step)
+        trainer.control.limit_only(own.holds, part.own_primitives, trainer.parameters, trainer.step)
         if not begun:
             about = opened.scene_path, opened.scene_options, options, opened.similarity, ops.instruction_set()
             Run.create(path, seen, *about)
@@ -186,17 +186,14 @@ def _trained(
     return {"seconds": seconds, "primitives": len(trainer), "loss": trainer.loss, "train_psnr": trainer.psnr}
 
 
-def _points_of(scene: Scene, run: Run, plan: dict, number: int, options: TrainOptions) -> PointCloud:
+def _points_of(scene: Scene, run: Run, plan: Plan, number: int, options: TrainOptions) -> PointCloud:
     """The scene's points in a block and its margin, filled up: at most as many in either as a training begins with that
     has the block's own primitives in the one and the others of its `options` in the other."""
-    far = far_colors(scene) if plan["environment"] else None
-    cloud = filled_points(scene, options.seed, np.asarray(plan["shown"]) if plan["fitted"] else None, far)
-    where, block, own = (
-        run.similarity.apply(cloud.xyz),
-        block_of(plan, number),
-        max(1, plan["blocks"][number]["own_primitives"]),
-    )
-    inside, beside = block.holds(where), block.holds(where, plan["margin"])
+    far = far_colors(scene) if plan.environment else None
+    cloud = filled_points(scene, options.seed, np.asarray(plan.shown) if plan.fitted else None, far)
+    where, block = run.similarity.apply(cloud.xyz), plan.blocks[number].block
+    own = max(1, plan.blocks[number].own_primitives)
+    inside, beside = block.holds(where), block.holds(where, plan.margin)
     if not beside.any():
         raise LinprimError(f"block {number} holds no point to start from: wanted fewer blocks")
     chosen = []
@@ -212,11 +209,11 @@ def block_folder(run: Path, block: int, exchange: int = 0) -> Path:
     return run / FOLDER / (f"{block:03d}joined{exchange}" if exchange else f"{block:03d}")
 
 
-def is_owned(run: Path, plan: dict, block: int, exchange: int, state: dict) -> np.ndarray:
+def is_owned(run: Path, plan: Plan, block: int, exchange: int, state: dict) -> np.ndarray:
     """(N,) which primitives of a block's state after an exchange are its own. That is decided at the first; later they
     may leave it."""
     if exchange == 0:
-        return block_of(plan, block).holds(_centers(state))
+        return plan.blocks[block].block.holds(_centers(state))
     return np.arange(len(_centers(state))) < worker.result_of_folder(block_folder(run, block, exchange))["owned"]
 
 

@@ -1,0 +1,55 @@
+"""The doctor: libraries, compiler, system libraries and the cache."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+from linprim_geo.base import system
+from linprim_geo.cli import doctor
+from linprim_geo.cli import main as cli
+
+
+def test_doctor_shows_the_cache(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(doctor, "LIBRARIES", (("numpy", ("numpy",)),))
+    (tmp_path / "cache").mkdir()
+    (tmp_path / "cache" / "kept.npz").write_bytes(b"x" * 1000)
+    monkeypatch.setenv("LINPRIM_GEO_CACHE", str(tmp_path / "cache"))
+    cli.main(["doctor", "--json"])
+    report = json.loads(capsys.readouterr().out)
+    assert (report["cache"], report["cache_bytes"]) == (str(tmp_path / "cache"), 1000)
+    cli.main(["doctor"])
+    assert f"cache: {tmp_path / 'cache'}" in capsys.readouterr().out
+    monkeypatch.setenv("LINPRIM_GEO_CACHE", str(tmp_path / "cache" / "kept.npz" / "inside"))
+    cli.main(["doctor", "--json"])
+    problems = json.loads(capsys.readouterr().out)["problems"]
+    assert any("LINPRIM_GEO_CACHE" in problem for problem in problems)
+
+
+def test_doctor_names_what_is_missing(monkeypatch, capsys):
+    monkeypatch.setattr(doctor, "LIBRARIES", (("numpy", ("numpy",)), ("no_such_module", ("no-such-package",))))
+    assert cli.main(["doctor", "--json"]) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert report["libraries"]["numpy"] and report["libraries"]["no_such_module"] is None
+    assert any("no_such_module is not installed" in problem for problem in report["problems"])
+    assert report["cores"] >= 1 and report["memory_bytes"] > 0
+    cli.main(["doctor"])
+    assert "no_such_module MISSING" in capsys.readouterr().out
+
+
+def test_missing_system_libraries_come_with_the_line_that_installs_them(monkeypatch):
+    absent = system.SystemLibrary("libnosuch.so.9", "libnosuch9", "nosuch", "nothing")
+    monkeypatch.setattr(system, "LINUX_LIBRARIES", (absent,))
+    monkeypatch.setattr(sys, "platform", "linux")
+    assert system.missing_libraries() == [absent]
+    monkeypatch.setattr(system.shutil, "which", lambda name: name if name == "apt-get" else None)
+    assert system.install_command([absent])[-1] == "libnosuch9"
+    monkeypatch.setattr(system.shutil, "which", lambda name: name if name == "dnf" else None)
+    assert system.install_command([absent])[-1] == "nosuch"
+    monkeypatch.setattr(system.shutil, "which", lambda name: None)
+    assert system.install_command([absent]) is None
+
+
+def test_a_compiler_that_cannot_do_cxx20_is_named(monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    assert "no-such-compiler does not compile C++20" in system.compiler_problem()

@@ -1,0 +1,29 @@
+"""Tasks done by this process, where what a worker process is does not matter: each of those loads all libraries."""
+
+from __future__ import annotations
+
+from linprim_geo.jobs.executor import Executor, outcome_of
+from linprim_geo.jobs.worker import run_task
+
+
+class Here(Executor):
+    """One task after the other. Takes the place of `open_executor`."""
+
+    what = "this process"
+
+    def __init__(self, cluster, shared, workers=0):
+        super().__init__(shared)
+        self.answers: list[dict] = []
+
+    def capacity(self):
+        return 1, 64.0
+
+    def start(self, spec, task):
+        self.answers.append(run_task(spec))
+        return len(self.answers) - 1
+
+    def ended(self, handles, seconds):
+        return [(handle, outcome_of(self.answers[handle])) for handle in handles]
+
+    def stop(self):
+        pass
