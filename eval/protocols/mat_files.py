@@ -42,7 +42,8 @@ def read_arrays(path: str | os.PathLike, names: tuple[str, ...]) -> dict[str, np
             pass
     except OSError as error:
         raise LinprimError(f"{path}: cannot be read ({error.strerror or error})") from error
-    done = subprocess.run([sys.executable, "-c", _READER, os.fspath(path), *names], capture_output=True)
+    # -P: no module comes from the folder this was called in.
+    done = subprocess.run([sys.executable, "-P", "-c", _READER, os.fspath(path), *names], capture_output=True)
     if done.returncode:
         said = done.stderr.decode(errors="replace").strip() if done.returncode == 1 else "its reader crashes on it"
         raise LinprimError(f"{path}: is not a MATLAB file up to version 7 ({said})")

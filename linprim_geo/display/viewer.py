@@ -106,7 +106,8 @@ def watched(run: str | os.PathLike) -> Iterator[None]:
     """
     check_installed()
     port = DEFAULT_PORT if _is_free(DEFAULT_PORT) else 0
-    words = [sys.executable, "-m", "linprim_geo", "view", os.fspath(run), "--follow", "--port", str(port)]
+    # -P: no module comes from the folder this was called in, which may be a downloaded capture.
+    words = [sys.executable, "-P", "-m", "linprim_geo", "view", os.fspath(run), "--follow", "--port", str(port)]
     environment = os.environ | {PARENT: str(os.getpid())}
     child = subprocess.Popen(words, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     try:

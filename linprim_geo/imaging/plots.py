@@ -164,8 +164,10 @@ def _style() -> Iterator[None]:
 
     # It warns that it makes a cache of fonts, or that the home folder cannot be written.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    # matplotlib reads a file of settings from the folder that this is called in: its defaults first.
     with matplotlib.rc_context(
-        {
+        matplotlib.rcParamsDefault
+        | {
             "figure.dpi": 72,
             "savefig.dpi": 72,
             "svg.fonttype": "none",  # text stays text

@@ -36,8 +36,9 @@ class Processes(Executor):
     def start(self, spec, task):
         kills = _oom_kills()
         # In a session of its own: Ctrl-C is for the driver, which then ends its workers.
+        # -P: no module comes from the folder this was called in, which may be a downloaded capture.
         process = subprocess.Popen(
-            [sys.executable, "-m", "linprim_geo.jobs.worker"],
+            [sys.executable, "-P", "-m", "linprim_geo.jobs.worker"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=os.environ | ONE_THREAD,

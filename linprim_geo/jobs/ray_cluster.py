@@ -45,11 +45,15 @@ class RayCluster(Executor):
             # No other machine is to reach it, and it wants no name service.
             how["_node_ip_address"] = "127.0.0.1"
         ending = signal.getsignal(signal.SIGTERM)
+        here = Path.cwd()
         try:
+            # Ray's workers import from the folder that this process joins in, which may be a downloaded capture.
+            os.chdir(here.anchor)
             self._join(address, how)
         except Exception as error:  # noqa: BLE001 - Ray raises a plain Exception where its start takes too long
             raise _no_answer(address, error) from None
         finally:
+            os.chdir(here)
             with suppress(ValueError):  # Ray sets one of its own
                 signal.signal(signal.SIGTERM, ending)
         self.workers = workers or 10**9

@@ -13,8 +13,10 @@ import signal
 import subprocess
 import sys
 import types
+from pathlib import Path
 
 import pytest
+from helpers.planted import plant_modules
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions, SceneOptions, TrainOptions, option
@@ -304,6 +306,15 @@ def test_python_m_runs_the_same_program():
         [sys.executable, "-m", "linprim_geo", "--version"], capture_output=True, text=True, timeout=60
     )
     assert re.fullmatch(r"linprim-geo \d+\.\d+\.\d+\n", done.stdout)
+
+
+@pytest.mark.parametrize("words", [["linprim-geo"], ["python", "-m", "linprim_geo"]])
+def test_commands_import_nothing_from_the_folder_they_are_called_in(words, tmp_path):
+    plant_modules(tmp_path)
+    words = [str(Path(sys.executable).with_name(words[0])), *words[1:]]
+    done = subprocess.run([*words, "inspect", "."], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1 and ".: " in done.stderr, done.stderr
+    assert not (tmp_path / "imported").exists()
 
 
 def test_synth_leaves_what_is_not_said_to_the_library(monkeypatch, capsys):

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import MESHES
+from helpers.planted import plant_modules
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions
@@ -272,6 +273,18 @@ def test_ctrl_c_and_a_request_to_end_are_no_errors(meshed, number):
     process.send_signal(number)
     out, error = process.communicate(timeout=30)
     assert process.returncode == 0 and error == "" and f'"address": "{address}"' in out and out.count("\n") == 1
+
+
+def test_a_view_of_training_imports_nothing_from_the_folder_it_is_started_in(meshed, tmp_path):
+    plant_modules(tmp_path)
+    program = "import sys\nfrom linprim_geo.display.viewer import watched\n"
+    words = ["-P", "-c", f"{program}with watched(sys.argv[1]):\n    sys.stdin.readline()\n", str(meshed)]
+    settings = os.environ | {"DISPLAY": "", "WAYLAND_DISPLAY": ""}
+    pipes = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, *words], env=settings, cwd=tmp_path, **pipes) as process:
+        line = process.stderr.readline()
+        process.communicate("\n", timeout=30)
+    assert line.startswith("http://localhost") and not (tmp_path / "imported").exists()
 
 
 def test_a_view_of_training_ends_with_it(meshed):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from xml.etree import ElementTree
 
 import numpy as np
@@ -29,6 +31,20 @@ def drawn(tree, color):
 
 def texts(tree):
     return [(float(each.get("x")), float(each.get("y")), each.text) for each in tree.iter("text")]
+
+
+def test_settings_in_the_folder_it_is_called_in_change_nothing(tmp_path):
+    program = "import sys; from linprim_geo.imaging.plots import Panel, Point, frontiers; "
+    program += "print(frontiers([Panel('a', [Point('b', 1.0, 1.0, 1.0, 1.0, True, True)], 'x', 'y')], 'label'))"
+    plain, planted = tmp_path / "plain", tmp_path / "planted"
+    for folder in (plain, planted):
+        folder.mkdir()
+    (planted / "matplotlibrc").write_text("axes.labelsize: 40\nlines.markerfacecolor: red\nytick.labelsize: 3\n")
+    results = [
+        subprocess.run([sys.executable, "-P", "-c", program], cwd=folder, capture_output=True, text=True, check=True)
+        for folder in (plain, planted)
+    ]
+    assert results[0].stdout == results[1].stdout and "<svg" in results[0].stdout
 
 
 def panel(count=5, **changed):

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 from helpers.executor_tasks import is_alive
+from helpers.planted import plant_modules
 
 from linprim_geo.base.cores import usable_cores
 from linprim_geo.base.errors import LinprimError
@@ -93,6 +94,21 @@ def test_tasks_are_done_once_with_one_thread_each(executor, tmp_path):
         assert all(result["task_peak_gib"] > 0 for result in results)
     for k in range(4):
         assert len((tmp_path / str(k) / "attempts").read_text().splitlines()) == 1
+
+
+def test_workers_import_nothing_from_the_folder_they_are_started_in(tmp_path, monkeypatch):
+    plant_modules(tmp_path / "capture")
+    monkeypatch.chdir(tmp_path / "capture")
+    [done] = run([task(tmp_path, "chain", start="a", steps=1)], tmp_path)
+    assert done["value"] == chained("a", 1) and not (tmp_path / "capture" / "imported").exists()
+
+
+@pytest.mark.slow
+def test_workers_of_ray_import_nothing_from_the_folder_they_are_started_in(tmp_path):
+    plant_modules(tmp_path / "capture")
+    words = [sys.executable, "-P", str(HERE / "executor_tasks.py"), str(tmp_path), "local", "2", "0.1", "2"]
+    done = subprocess.run(words, cwd=tmp_path / "capture", capture_output=True, text=True)
+    assert done.returncode == 0 and not (tmp_path / "capture" / "imported").exists(), done.stderr
 
 
 def test_a_worker_that_dies_is_begun_again_and_goes_on(executor, tmp_path):
