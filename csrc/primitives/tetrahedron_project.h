@@ -218,8 +218,9 @@ void chain_tetrahedra(const ChainParams<Real>& P, int64_t begin, int64_t end) {
       for (int i = 0; i < 3; ++i)
         out.axis[k][i] = kDirection[0][k] * e_grad[0][i] + kDirection[1][k] * e_grad[1][i] +
                          kDirection[2][k] * e_grad[2][i] + kDirection[3][k] * e_grad[3][i];
-    // Movement on the screen, whole and tile by tile, as that of the centre at its depth.
-    const D z = rays.crosses_near ? splat(0.0) : f.pose.center[2];
+    // Movement on the screen, whole and tile by tile, as that of the centre at its depth, or at the middle of the
+    // depths beyond the near plane.
+    const D z = rays.crosses_near ? (view.near + f.pose.center[2] + f.high_z) * 0.5 : f.pose.center[2];
     out.screen_x = out.center[0] * z * (1.0 / view.fx), out.screen_y = out.center[1] * z * (1.0 / view.fy);
     double pull[kLanes] = {};
     for (int l = 0; l < lanes; ++l) {

@@ -67,8 +67,7 @@ def adam_rows(
         rates: learning rate of each tensor.
         steps: (N,) int32, 0 for a row without a history. To forget a row's history, set it and both moments to 0.
         touched: (N,) bool; None: the rows where any of the tensors has a gradient that is not 0, which costs reading
-            the gradients of the others as well. After `rasterize`, `screen_grad[:, 2] > 0` is a row's being seen, as
-            long as only the image gives gradients.
+            the gradients of the others as well.
 
     Raises:
         ValueError: shapes, dtypes or layouts that do not fit.

@@ -240,7 +240,7 @@ def rasterize(
             need it. The geometry has no meaningful average, so it goes with 1 only.
         screen: (N, 3) zeros. The gradient of the first two is that of the loss to the projected centres, per pixel; the
             third is no gradient but the sum over 16x16 tiles of the length of each tile's part of it: how hard the
-            image pulls, without cancelling.
+            image pulls, without cancelling. What crosses the near plane moves as at the middle of its depths beyond.
 
     Raises:
         LinprimError: a non-finite input (naming tensor and row; in sh, of primitives that are in view) or a dtype other

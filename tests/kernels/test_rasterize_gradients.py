@@ -3,6 +3,7 @@ forward."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from helpers.octahedra import (
@@ -22,6 +23,7 @@ from helpers.octahedra import (
 )
 
 from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.primitives import KINDS
 from linprim_geo.kernels import ops
 
 pytestmark = pytest.mark.usefixtures("few_threads")
@@ -201,3 +203,30 @@ def test_a_list_is_taken_again_only_for_the_very_same_content():
         ops.rasterize(*changed, Camera(**values | numbers), geometry=True, **options)
         ops.rasterize(*changed, Camera(**values | numbers), geometry=False, **options)
         assert_identical(gradients(images, inputs, cotangents(images)), wanted)
+
+
+@pytest.mark.parametrize("primitive", ["octahedron", "tetrahedron"])
+def test_screen_gradient_of_what_crosses_the_near_plane_is_not_zero(primitive):
+    """It is that of a movement at the middle of the depths beyond the near plane."""
+    camera = Camera(20, 16, 15.0, 16.0, 10.0, 8.0, np.eye(4))
+    near, reach, arms = 0.2, 0.8, 3 if primitive == "octahedron" else 4
+    center = torch.tensor([[0.05, -0.1, 0.3], [0.1, 0.05, -0.1], [0.1, 0.1, 3.0]], dtype=torch.float64)
+    center.requires_grad_()
+    rotation = torch.tensor([[1.0, 0, 0, 0]] * 3, dtype=torch.float64)
+    extent = torch.full((3, arms), reach, dtype=torch.float64)
+    sh = torch.tensor([0.3, -0.5, 0.9], dtype=torch.float64).reshape(3, 1, 1).repeat(1, 1, 3)
+    screen = torch.zeros(3, 3, dtype=torch.float64, requires_grad=True)
+    rest = torch.full((3,), 0.7, dtype=torch.float64), sh, torch.zeros(3, dtype=torch.float64)
+    out = ops.rasterize(center, rotation, extent, *rest, camera, primitive=primitive, near=near, screen=screen)
+    weight = torch.rand(3, 16, 20, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    moved, pulled = torch.autograd.grad((out.rgb * weight).sum(), [center, screen])
+    if primitive == "octahedron":
+        high = reach
+    else:
+        high = reach * float(KINDS[primitive].directions[:, 2].max())
+    z = center.detach()[:, 2]
+    depth = torch.where(z - reach < near, (near + z + high) / 2, z)
+    expected = moved[:, :2] * depth[:, None] / torch.tensor([camera.fx, camera.fy], dtype=torch.float64)
+    torch.testing.assert_close(pulled[:, :2], expected, rtol=1e-9, atol=1e-12)
+    assert (moved[:, :2].norm(dim=1) > 1e-3).all()
+    assert (pulled[:, 2] >= pulled[:, :2].norm(dim=1) * (1 - 1e-12)).all()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -43,6 +45,24 @@ def trainer(tiny_scene):
     parameters = initial_parameters(xyz, scene.points.rgb[:40], 1, 0, (1e-3, 1.0))
     options = TrainOptions(iterations=100, max_primitives=50, sh_degree=1, threads=1)
     return Trainer(images, parameters, options, (1e-3, 1.0), torch.ones(3), False, True)
+
+
+@pytest.mark.parametrize("adam", ["dense", "sparse"])
+def test_what_crosses_the_near_plane_is_trained_and_pulls(trainer, adam):
+    trainer.options = replace(trainer.options, adam=adam)
+    camera = trainer.images[trainer.view_of(0)].camera
+    row, names = 7, ("center", "log_extent", "sh_dc", "raw_opacity")
+    extent = 0.2
+    trainer.parameters["center"][row] = torch.from_numpy(camera.center + 0.3 * extent * camera.rotation[2])
+    trainer.parameters["log_extent"][row] = np.log(extent)
+    trainer.parameters["raw_opacity"][row] = 0.0
+    trainer.parameters["center"][8] = torch.from_numpy(camera.center - camera.rotation[2])  # behind the camera
+    before = {name: trainer.parameters[name][row].clone() for name in names}
+    trainer.advance()
+    assert all(not torch.equal(trainer.parameters[name][row], before[name]) for name in names)
+    assert trainer.control.gathered["pull"][row] > 0
+    if adam == "sparse":
+        assert trainer.steps[row] == 1 and trainer.steps[8] == 0
 
 
 def test_every_view_is_seen_once_per_round(trainer):

@@ -245,9 +245,7 @@ class Trainer:
             if self.exposure is not None:
                 self.exposure.update(index, grads[-1], self.part())
             grads = grads[: len(leaves)]
-            # A penalty or a term on opacities reaches every primitive, whether the view touched it or not.
-            touched = screen_grad[:, 2] > 0 if penalty is None and terms is None else None
-            self._update(dict(zip(leaves, grads, strict=True)), touched)
+            self._update(dict(zip(leaves, grads, strict=True)))
             self.control.add_noise(self.parameters, self.step + 1)
             self.control.accumulate(self.parameters, image.camera, image.size, screen_grad)
         self.step += 1
@@ -265,7 +263,7 @@ class Trainer:
         if not math.isfinite(loss):
             raise LinprimError(f"the loss is {loss}")
 
-    def _update(self, grads: dict[str, torch.Tensor | None], touched: torch.Tensor | None) -> None:
+    def _update(self, grads: dict[str, torch.Tensor | None]) -> None:
         part = self.part()
         rates = {name: rate * final**part for name, (rate, final) in RATES.items()}
         wanted = {name: grad for name in self.parameters if (grad := grads[name]) is not None}
@@ -281,7 +279,6 @@ class Trainer:
                 [self.second[name] for name in rows],
                 [rates[name] for name in rows],
                 self.steps,
-                touched,
             )
             names = [name for name in names if name in SHARED]
         for name in names:
