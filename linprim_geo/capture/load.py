@@ -15,7 +15,7 @@ from typing import Any
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import is_file
-from linprim_geo.base.options import SceneOptions, with_changes
+from linprim_geo.base.options import SceneOptions, flag_of, with_changes
 from linprim_geo.capture import found_poses
 from linprim_geo.capture.types import PHOTOGRAPHS, Frame, Listing, Scene, View, check_pose
 from linprim_geo.geometry.camera import Camera
@@ -25,6 +25,8 @@ from linprim_geo.imaging import photos
 # Of the images sorted by name, those whose index is a multiple of this are held out if the data set does
 # not say.
 HOLD_OUT_EVERY = 8
+# Options that name a folder.
+_FOLDERS = ("masks", "images", "sparse")
 # Images decoded at load time to see whether an alpha channel holds anything but 255.
 _ALPHA_SAMPLES = 6
 
@@ -164,6 +166,36 @@ def _option_folder(value: str | os.PathLike | None, root: Path, option: str) -> 
         if folder.is_dir():
             return folder
     raise LinprimError(f"{option} {value}: no such folder, neither here nor in {root}")
+
+
+def settled_folders(options: SceneOptions, root: Path) -> SceneOptions:
+    """`options` as a run keeps them, for commands that are called elsewhere: folders in the capture relative to it,
+    others absolute.
+
+    Raises:
+        LinprimError: there is no such folder.
+    """
+    settled, root = {}, root.resolve()
+    for name in _FOLDERS:
+        folder = None if options.masks == "none" == getattr(options, name) else getattr(options, name)
+        if found := _option_folder(folder, root, flag_of(name)):
+            found = found.resolve()
+            settled[name] = str(found.relative_to(root) if found.is_relative_to(root) else found)
+    return replace(options, **settled)
+
+
+def in_capture(options: SceneOptions, path: Path) -> SceneOptions:
+    """A run's `options` for `load_scene`: folders that are in its capture stay those, whatever else has their names
+    where this is called."""
+    root = path if path.is_dir() else path.parent
+    return replace(
+        options,
+        **{
+            name: str(root / getattr(options, name))
+            for name in _FOLDERS
+            if getattr(options, name) not in ("", "none") and (root / getattr(options, name)).is_dir()
+        },
+    )
 
 
 def _contents(root: Path) -> str:

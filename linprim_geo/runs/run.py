@@ -34,7 +34,7 @@ from linprim_geo.base.files import is_leftover, readable_write_errors, write_jso
 from linprim_geo.base.options import SceneOptions, TrainOptions, check_train_options, from_saved, raster_options
 from linprim_geo.geometry.primitives import KINDS, Primitives, load_primitives, save_primitives
 from linprim_geo.capture.types import PHOTOGRAPHS, Scene, View
-from linprim_geo.capture.load import load_scene
+from linprim_geo.capture.load import in_capture, load_scene
 from linprim_geo.capture.found_poses import found_model
 
 if TYPE_CHECKING:
@@ -170,7 +170,7 @@ class Run:
 
     @cached_property
     def _scene(self) -> Scene:
-        options = self.scene_options
+        options = in_capture(self.scene_options, self.scene_path)
         found = self.path / FOUND_POSES
         return load_scene(
             self.scene_path, options, sparse=options.sparse or (str(found) if found.is_dir() else "")

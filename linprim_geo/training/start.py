@@ -3,8 +3,8 @@ checkpoint."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from linprim_geo.base.options import (
     flag_of,
 )
 from linprim_geo.base.progress import Progress
-from linprim_geo.capture.load import load_scene
+from linprim_geo.capture.load import load_scene, settled_folders
 from linprim_geo.capture.structure_from_motion import prepare
 from linprim_geo.capture.types import PointCloud, Scene
 from linprim_geo.geometry.environment_map import texels_for
@@ -87,15 +87,22 @@ def begin_run(
     decisions, loaded, scene_options, options = decided_scene(scene, scene_options, options, effects, progress.note)
     if decisions:
         progress.note(summary(decisions))
+    scene_options = settled_folders(scene_options, loaded.root)
     run = Run(run_path, scene, scene_options, options, scene_normalization(loaded), loaded.unit)
     return run, loaded, decisions
 
 
 def reopen_run(
-    scene: Path, run_path: Path, scene_options: SceneOptions, options: TrainOptions, progress: Progress
+    scene: Path,
+    run_path: Path,
+    scene_options: SceneOptions,
+    options: TrainOptions,
+    progress: Progress,
+    effects: Choice | None = None,
+    ignored: Sequence[str] = (),
 ) -> tuple[Run, Scene]:
-    """An existing run and its scene; options that were given and differ from the run's, but for `threads`, are named as
-    ignored.
+    """An existing run and its scene; `ignored`, the choice of effects, and options that were given and differ from the
+    run's, but for `threads`, are named as ignored.
 
     Raises:
         LinprimError: not a run folder, a file in it is damaged, or its scene is neither where it was nor at `scene`.
@@ -103,10 +110,14 @@ def reopen_run(
     opened = Run.open(run_path)
     if scene.resolve() != opened.scene_path:
         opened = opened.with_scene_at(scene)
-    ignored = [
+    loaded, effects = opened.scene(), effects or Choice("none")
+    kept = [settled_folders(each, loaded.root) for each in (scene_options, opened.scene_options)]
+    ignored = [*ignored, *["--effects"] * (effects.mode != "none"), *["--effect"] * bool(effects.asked)]
+    ignored += [
         flag_of(entry.name)
-        for given, own in ((scene_options, opened.scene_options), (options, opened.train_options))
-        for entry in changed_options(given)
+        for given, own in (kept, (options, opened.train_options))
+        for entry in fields(given)
+        if entry in changed_options(given) or entry.name in effects.given
         if entry.name != "threads" and getattr(given, entry.name) != getattr(own, entry.name)
     ]
     if ignored:
@@ -117,7 +128,7 @@ def reopen_run(
             "bits will differ"
         )
     progress.total = opened.train_options.iterations
-    return replace(opened, train_options=replace(opened.train_options, threads=options.threads)), opened.scene()
+    return replace(opened, train_options=replace(opened.train_options, threads=options.threads)), loaded
 
 
 def late_terms(run: Run, scene: Scene, images: list[TrainingImage], progress: Progress) -> GeometryTerms | None:

@@ -101,11 +101,10 @@ def train(
     resume = resume and not (run_path.is_dir() and is_unused(run_path))
     if resume:
         Run.open(run_path)
-    if resume and budget:
-        progress.note("--resume goes on with the run's own options: --time-budget ignored")
-        budget = None
-    if budget and all(
-        getattr(options, name) != getattr(TrainOptions, name) for name in ("iterations", "max_primitives")
+    if (
+        budget
+        and not resume
+        and all(getattr(options, name) != getattr(TrainOptions, name) for name in ("iterations", "max_primitives"))
     ):
         raise LinprimError(
             "--time-budget leaves nothing to choose beside --iterations and --max-primitives: wanted at most one "
@@ -118,7 +117,8 @@ def train(
         with locked(run_path, "trained into"):
             ops.set_threads(options.threads)
             if resume:
-                opened, loaded = reopen_run(Path(scene), run_path, scene_options, options, progress)
+                ignored = [flag for flag, given in (("--time-budget", budget), ("--cluster", cluster)) if given]
+                opened, loaded = reopen_run(Path(scene), run_path, scene_options, options, progress, effects, ignored)
                 return train_run(opened, loaded, read_checkpoint(run_path), progress, advance=advance)
             opened, loaded, decisions = begin_run(
                 Path(scene), run_path, scene_options, options, effects or Choice("none"), progress

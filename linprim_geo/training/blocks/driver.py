@@ -97,8 +97,10 @@ def train_blocks(
         with locked(run_path, "trained into"):
             ops.set_threads(options.threads)
             if resume:
-                opened, loaded = reopen_run(where, run_path, scene_options, options, progress)
-                count: int | None = opened.notes.get("blocks")
+                begun = Run.open(run_path).notes.get("blocks")
+                ignored = ["--blocks"] if blocks not in (1, begun) else []
+                opened, loaded = reopen_run(where, run_path, scene_options, options, progress, effects, ignored)
+                count: int | None = begun
                 if type(count) is not int or count < 2:
                     raise LinprimError(f"{run_path}: was not begun in blocks, wanted --resume without --blocks")
                 loaded = with_points(loaded, opened.train_options, progress.note)
