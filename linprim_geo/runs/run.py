@@ -284,7 +284,7 @@ class Run:
         from linprim_geo.kernels import ops
 
         tensors, background, how = self.raster_arguments()
-        kind = {"primitive": how["primitive"], "ray_model": how["ray_model"]}
+        kind = {name: how[name] for name in ("primitive", "ray_model", "near")}
         for view in views:
             camera = view.camera.transformed(self.similarity)
             with torch.no_grad():

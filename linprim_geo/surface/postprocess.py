@@ -17,7 +17,7 @@ from linprim_geo.surface.denoise import denoised
 from linprim_geo.surface.photo_consistency import photo_gains, predicted_error, refine_surface
 from linprim_geo.surface.texture import make_texture
 from linprim_geo.surface.texture_files import save_textured
-from linprim_geo.surface.visibility import color_vertices, visible_faces
+from linprim_geo.surface.visibility import color_vertices, pixels_of, visible_faces
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, 
     if processing or options.denoise == "off":
         mesh = replace(mesh, quality=predicted_error(mesh, cameras, (view.load() for view in views), gains, caster))
         stages.lap("quality")
-    mesh = replace(mesh, colors=color_vertices(mesh, cameras, (view.load().rgb for view in views), caster))
+    mesh = replace(mesh, colors=color_vertices(mesh, cameras, (pixels_of(view.load()) for view in views), caster))
     stages.lap("colours")
     seen = visible_faces(mesh, cameras, caster)
     visible = select_faces(mesh, seen)

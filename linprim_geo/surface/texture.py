@@ -15,7 +15,7 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.mesh import Mesh, face_areas, face_normals
-from linprim_geo.surface.visibility import POOR_RINGS, color_vertices, photographed
+from linprim_geo.surface.visibility import POOR_RINGS, color_vertices, photographed, pixels_of
 
 if TYPE_CHECKING:
     from linprim_geo.capture.types import View
@@ -114,8 +114,7 @@ class _Photographs:
 
     def _load(self):
         for view in self.views:
-            photo = view.load()
-            yield photo.rgb if photo.alpha is None else np.dstack([photo.rgb, photo.alpha])
+            yield pixels_of(view.load())
 
 
 def _texel_size(mesh: Mesh, corners: np.ndarray) -> float:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.capture.types import Photo
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh, vertex_normals
 from linprim_geo.kernels import surface_ops
@@ -110,6 +111,11 @@ def faces_of_pixels(caster: RayCaster, cameras: Sequence[Camera]) -> np.ndarray:
         believed = (face >= 0) & (depth <= maximum_filter(depth, footprint=AROUND, mode="nearest") * (1 + BEHIND_SHARE))
         seen[face[believed]] = True
     return seen
+
+
+def pixels_of(photo: Photo) -> np.ndarray:
+    """(H, W, 3) uint8 of a photograph, or with alpha (H, W, 4): an image as `photographed` takes it."""
+    return photo.rgb if photo.alpha is None else np.dstack([photo.rgb, photo.alpha])
 
 
 def color_vertices(

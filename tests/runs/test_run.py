@@ -160,3 +160,21 @@ def test_a_folder_that_is_no_run_is_one_sentence(tmp_path):
     for path, sentence in ((tmp_path, "config.json is missing"), (tmp_path / "missing", "missing: no such folder")):
         with pytest.raises(LinprimError, match=sentence):
             Run.open(path)
+
+
+@pytest.mark.parametrize("kind", ["octahedron", "gaussian"])
+def test_surfaces_begin_at_the_near_plane_of_training(tiny_scene, tmp_path, kind):
+    """One primitive lies before the near plane of Gaussians, the other at three times the distance behind it."""
+    scene, options = load_scene(tiny_scene), TrainOptions(primitive=kind)
+    run = Run.create(tmp_path / "run", scene, tiny_scene, SceneOptions(), options, Similarity())
+    camera = scene.train[0].camera
+    center = camera.center + np.array([[0.1], [0.6]]) * camera.rotation[2]
+    opacity = [0.99, 0.99] if kind == "gaussian" else [1e4, 1e4]
+    rotation, sh = np.tile([1.0, 0, 0, 0], (2, 1)), np.zeros((2, 1, 3))
+    primitives = Primitives(center, rotation, np.full((2, 3), 0.02), np.array(opacity), sh, kind)
+    run.save(primitives, {"iteration": 1, "primitives": 2, "background": [0, 0, 0], "seconds": 1.0})
+    ((_, depth, _),) = run.surface_depths(scene.train[:1], 0.5)
+    ((_, images),) = run.render_views(scene.train[:1])
+    nearest = 0.6 if kind == "gaussian" else 0.1
+    assert depth[depth > 0].min() == pytest.approx(nearest, abs=0.03)
+    assert images["depth_median"][images["depth_median"] > 0].min() == pytest.approx(nearest, abs=0.03)
