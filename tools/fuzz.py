@@ -5,7 +5,7 @@ memory.
     python tools/fuzz.py --only "mesh glb" --seed 0 --at 123      one input again, with its traceback; its file is kept
 
 An input is a whole file that was damaged by mutations drawn from (seed, reader, number). Readers run in a process of
-their own that may take 1 GiB more than it has, and that is started again after a crash; every input is on disk before
+their own that may take 192 MiB more than it has, and that is started again after a crash; every input is on disk before
 it is tried. Exit status 1 if there is a finding.
 """
 
@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 
 # Seconds after which reading one small file counts as a hang, bytes it may take, the longest that a sentence may be.
-HANG, MEMORY, LONGEST = 5.0, 2**30, 2000
+HANG, MEMORY, LONGEST = 5.0, 192 * 2**20, 2000
 # Seconds without any progress after which a process is ended that does not even answer its alarm.
 STUCK = 30.0
 
@@ -73,6 +73,8 @@ def attempt(case: Case, path: Path) -> tuple[str, str]:
         return "read", ""
     except LinprimError as error:
         text = str(error)
+        if isinstance(error.__cause__ or error.__context__, MemoryError):
+            return "memory", f"{text[:200]!r} {_place(error.__traceback__)}"
         if "\n" in text or not text.strip() or len(text) > LONGEST:
             return "no sentence", f"{text[:300]!r} ({len(text)} characters)"
         return "refused", text
@@ -103,14 +105,13 @@ def work(names: list[str], counts: list[int], seed: int, start: int, folder: Pat
 
     _prepare(folder)
     current = os.open(folder / "current", os.O_WRONLY | os.O_CREAT)
-    limited = False
     with open(folder / "results.jsonl", "a", buffering=1) as results:
         for name, count in zip(names, counts, strict=True):
+            resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
             case = _case(name, folder)
-            if not limited:
-                size = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-                resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, size + MEMORY))
-                limited = True
+            # Again for every reader: what those before it have left behind is not its own.
+            size = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+            resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, resource.RLIM_INFINITY))
             seen = {"read": 0, "refused": 0}
             for number in range(start, count):
                 path = case.damage(seed, number)

@@ -284,7 +284,7 @@ def _zip(rng: np.random.Generator, data: bytes) -> bytes:
         return data
     place, what = int(rng.integers(len(members))), rng.random()
     name, content = members[place]
-    method = zipfile.ZIP_STORED
+    method, enormous = zipfile.ZIP_STORED, -1
     if what < 0.1:
         del members[place]
     elif what < 0.15:
@@ -296,6 +296,9 @@ def _zip(rng: np.random.Generator, data: bytes) -> bytes:
     elif what < 0.35:
         members[place] = (name, content + bytes(int(2 ** rng.uniform(0, 24))))
         method = zipfile.ZIP_DEFLATED
+    elif what < 0.36 and content.startswith(b"\x93NUMPY"):
+        members[place] = (name, _enormous_header(rng))
+        method, enormous = zipfile.ZIP_DEFLATED, place
     elif what < 0.75 and content.startswith(b"\x93NUMPY"):
         members[place] = (name, _npy(rng, content))
     else:
@@ -303,9 +306,19 @@ def _zip(rng: np.random.Generator, data: bytes) -> bytes:
     out = io.BytesIO()
     with warnings.catch_warnings(), zipfile.ZipFile(out, "w", method) as archive:
         warnings.simplefilter("ignore")
-        for name, content in members:
-            archive.writestr(name, content)
+        for number, (name, content) in enumerate(members):
+            with archive.open(name, "w") as file:
+                file.write(content)
+                for _ in range(256 if number == enormous else 0):
+                    file.write(bytes(2**20))
     return out.getvalue()
+
+
+def _enormous_header(rng: np.random.Generator) -> bytes:
+    """The start of a .npy file of 256 MiB."""
+    shape = _pick(rng, ((2**26,), (2**24, 4), (2**13, 2**13), (2**24, 4, 1)))
+    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}".encode().ljust(117) + b"\n"
+    return b"\x93NUMPY\x01\x00\x76\x00" + header
 
 
 def _npy(rng: np.random.Generator, content: bytes) -> bytes:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
@@ -15,6 +17,8 @@ from linprim_geo.geometry.mesh import FLOAT32_SHARE, Mesh, _check_indices, _unit
 from linprim_geo.geometry.ply import color_columns, write_ply, xyz_columns
 
 SUFFIXES = (".ply", ".obj", ".glb", ".stl")
+# Bytes before the first part of a .glb, and before the content of each.
+_GLB_HEADER, _GLB_CHUNK_HEADER = 12, 8
 
 
 # --- files -----------------------------------------------------------------------------------------------
@@ -51,10 +55,31 @@ def load_with_visual(path: str | os.PathLike, seams: bool = False) -> tuple[Mesh
         raise LinprimError(f"{path}: cannot be read as a mesh ({error or type(error).__name__})") from error
 
 
+def _check_glb(path: Path) -> None:
+    """Raises LinprimError if parts or arrays of a .glb claim to be larger than the file: trimesh makes room for them
+    first."""
+    size, start = path.stat().st_size, _GLB_HEADER
+    with open(path, "rb") as file:
+        while start + _GLB_CHUNK_HEADER <= size:
+            file.seek(start)
+            length, kind = struct.unpack("<I4s", file.read(_GLB_CHUNK_HEADER))
+            start += _GLB_CHUNK_HEADER + length
+            if start > size:
+                raise LinprimError(f"{path}: a part of it claims {length} bytes, more than the file has")
+            if kind == b"JSON":
+                for accessor in json.loads(file.read(length)).get("accessors", []):
+                    if accessor.get("count", 0) > size:
+                        raise LinprimError(
+                            f"{path}: claims an array of {accessor['count']} rows, more than the file has"
+                        )
+
+
 def _load_mesh(path: Path, seams: bool) -> tuple[Mesh, Any]:
     """`load_with_visual` with whatever errors trimesh and numpy raise for damaged files."""
     import trimesh
 
+    if path.suffix.lower() == ".glb":
+        _check_glb(path)
     loaded = trimesh.load(path, process=False, maintain_order=not seams)
     pose = np.eye(4)
     if isinstance(loaded, trimesh.Scene):

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from linprim_geo.base.arrays import read_member
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write
 
@@ -32,8 +33,8 @@ SH_COEFFICIENTS = (1, 4, 9, 16)
 
 # Files before there were other kinds than octahedra have the first format and no array `kind`.
 FORMAT_OF_OCTAHEDRA, FORMAT = "linprim-geo octahedra 1", "linprim-geo primitives 2"
-# No zip packs more bytes than this into one.
-_DENSEST = 1032
+# Primitives are never packed into fewer bytes than a part of so many; those of a file of a few bytes may be.
+_DENSEST, _SMALL = 32, 2**20
 ARRAYS = ("center", "rotation", "extent", "density", "sh")
 
 # An octahedron of half-axes d stands for a Gaussian of standard deviations d / 2.6: LinPrim's constant, chosen by eye
@@ -373,15 +374,11 @@ def _read_member(path: Path, archive: zipfile.ZipFile, members: dict, name: str)
     if info is None:
         raise LinprimError(f"{path}: the array {name} is missing")
     packed = 1 if info.compress_type == zipfile.ZIP_STORED else _DENSEST
-    if info.file_size > packed * path.stat().st_size:
+    if info.file_size > max(_SMALL, packed * path.stat().st_size):
         raise LinprimError(f"{path}: {name} claims {info.file_size} bytes, more than the file has")
-    with archive.open(info) as file:
-        version = np.lib.format.read_magic(file)
-        if version != (1, 0):
-            raise LinprimError(f"{path}: {name} has the array format {version}, wanted (1, 0)")
-        shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-        claimed = math.prod(shape) * dtype.itemsize + file.tell()
-        if claimed != info.file_size or dtype.hasobject:
+
+    def check(shape: tuple[int, ...], dtype: np.dtype) -> None:
+        if not 0 <= math.prod(shape) * dtype.itemsize <= info.file_size:
             raise LinprimError(f"{path}: {name} claims {shape} {dtype}, but has {info.file_size} bytes")
-    with archive.open(info) as file:
-        return np.lib.format.read_array(file, allow_pickle=False)
+
+    return read_member(archive, info, check)

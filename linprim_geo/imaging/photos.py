@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from linprim_geo.base.arrays import read_array
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write
 from linprim_geo.geometry.lens import Intrinsics, Lens, source_pixels
@@ -130,11 +131,10 @@ def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
     Raises:
         LinprimError: unreadable, or not of `size` (width, height).
     """
+    width, height, _ = image_header(path)
+    if (width, height) != size:  # before it is unpacked
+        raise LinprimError(f"{path}: the mask is {width}x{height}, wanted {size[0]}x{size[1]} as its image")
     rgb, alpha = read_photo(path, None)
-    if rgb.shape[1::-1] != size:
-        raise LinprimError(
-            f"{path}: the mask is {rgb.shape[1]}x{rgb.shape[0]}, wanted {size[0]}x{size[1]} as its image"
-        )
     grey = rgb.max(axis=2)
     if alpha is not None and alpha.min() < 255:
         grey = alpha
@@ -151,31 +151,30 @@ def read_depth(path: Path, scale: float, size: tuple[int, int]) -> np.ndarray:
     """
     if not path.is_file():
         raise LinprimError(f"{path}: no such file, wanted a depth map")
+
+    def check(shape: tuple[int, ...], dtype: np.dtype) -> None:
+        held = tuple(length for length in shape if length != 1)
+        if len(held) != 2 or dtype.kind not in "uif":
+            raise LinprimError(f"{path}: the depth map has shape {shape} of {dtype}, wanted one number per pixel")
+        if held != size[::-1]:
+            raise LinprimError(f"{path}: the depth map is {held[1]}x{held[0]}, wanted {size[0]}x{size[1]} as its image")
+
     if path.suffix in (".npy", ".npz"):
         try:
-            values = np.load(path, allow_pickle=False)
-            if hasattr(values, "files"):
-                values = values[values.files[0]]
-        except Exception as error:  # numpy raises half a dozen kinds for damaged files
+            values = np.squeeze(read_array(path, check))
+        except LinprimError:
+            raise
+        except Exception as error:  # numpy and zipfile raise a dozen kinds for damaged files
             raise LinprimError(
                 f"{path}: cannot be read as a depth map ({error}), wanted a complete .npy or .npz"
             ) from error
     else:
         with _opened(path) as image:
+            check(image.size[::-1], np.dtype(np.float32))  # before it is unpacked
             values = np.asarray(image)
-            if values.dtype == np.uint8:
-                raise LinprimError(
-                    f"{path}: the depth map has {image.mode} pixels of 8 bits, wanted 16-bit grey or float"
-                )
-    values = np.squeeze(values)
-    if values.ndim != 2 or values.dtype.kind not in "uif":
-        raise LinprimError(
-            f"{path}: the depth map has shape {values.shape} of {values.dtype}, wanted one number per pixel"
-        )
-    if values.shape != size[::-1]:
-        raise LinprimError(
-            f"{path}: the depth map is {values.shape[1]}x{values.shape[0]}, wanted {size[0]}x{size[1]} as its image"
-        )
+        if values.dtype == np.uint8:
+            raise LinprimError(f"{path}: the depth map has {image.mode} pixels of 8 bits, wanted 16-bit grey or float")
+        check(values.shape, values.dtype)
     with np.errstate(over="ignore", invalid="ignore"):
         depth = (values.astype(np.float64) * scale).astype(np.float32)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
@@ -210,21 +209,27 @@ def read_normals(path: Path, size: tuple[int, int]) -> np.ndarray:
     """
     if not path.is_file():
         raise LinprimError(f"{path}: no such file, wanted normals")
+
+    def check(shape: tuple[int, ...], dtype: np.dtype) -> None:
+        if dtype.kind not in "uif":
+            raise LinprimError(f"{path}: the normals are of the type {dtype}, wanted three numbers per pixel")
+        if shape != (size[1], size[0], 3):
+            raise LinprimError(f"{path}: the normals have shape {shape}, wanted {(size[1], size[0], 3)}")
+
     if path.suffix == ".npy":
         try:
-            values = np.load(path, allow_pickle=False)
+            values = read_array(path, check)
+        except LinprimError:
+            raise
         except Exception as error:  # numpy raises half a dozen kinds for damaged files
             raise LinprimError(f"{path}: cannot be read as normals ({error}), wanted a complete .npy") from error
-        if values.dtype.kind not in "uif":
-            raise LinprimError(f"{path}: the normals are of the type {values.dtype}, wanted three numbers per pixel")
         with np.errstate(over="ignore"):
             normals = values.astype(np.float32)
     else:
         with _opened(path) as image:
+            check((image.height, image.width, 3), np.dtype(np.uint8))  # before it is unpacked
             values = np.asarray(image.convert("RGB"))
         normals = np.where(values.any(-1, keepdims=True), values.astype(np.float32) * (2 / 255) - 1, np.float32(0))
-    if normals.shape != (size[1], size[0], 3):
-        raise LinprimError(f"{path}: the normals have shape {values.shape}, wanted {(size[1], size[0], 3)}")
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
     usable = np.isfinite(length) & (length > 0.5)
     return np.divide(normals, length, out=np.zeros_like(normals, np.float32), where=usable)

@@ -7,6 +7,7 @@ import io
 import json
 import os
 import pickle
+import struct
 import subprocess
 import sys
 import time
@@ -217,6 +218,29 @@ def test_an_npz_that_unpacks_to_more_than_it_can_takes_no_memory(tmp_path):
             as_npy(np.zeros(9, np.float32), f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}}}"),
         )
     assert "center claims" in refused(load_primitives, tmp_path / "bomb.npz")
+
+
+def test_primitives_that_unpack_to_hundreds_of_megabytes_are_one_sentence(tmp_path):
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("format.npy", as_npy(np.array("linprim-geo primitives 2")))
+        archive.writestr("kind.npy", as_npy(np.array("octahedron")))
+        archive.writestr("center.npy", as_npy(np.zeros((5_000_000, 3), np.float32)))
+    assert "center claims" in refused(load_primitives, tmp_path / "bomb.npz")
+
+
+@pytest.mark.parametrize("claim", ["a part", "an array"])
+def test_a_glb_that_claims_more_than_it_holds_takes_no_memory(claim, tmp_path):
+    content = {"asset": {"version": "2.0"}, "accessors": [{"componentType": 5126, "type": "VEC3", "count": 10**8}]}
+    primitive = {"attributes": {"POSITION": 0}}
+    content |= {"meshes": [{"primitives": [primitive]}], "nodes": [{"mesh": 0}], "scenes": [{"nodes": [0]}], "scene": 0}
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    parts = struct.pack("<I4s", len(text), b"JSON") + text
+    if claim == "a part":
+        parts += struct.pack("<I4s", 2**31, b"BIN\0")
+    (tmp_path / "x.glb").write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(parts)) + parts)
+    said = refused(load_mesh, tmp_path / "x.glb")
+    assert "x.glb: " in said and "more than the file has" in said
 
 
 def test_depths_beyond_float32_are_none(tmp_path):

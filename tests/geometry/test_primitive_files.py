@@ -215,7 +215,7 @@ def enormous_npz():
         (npz_bytes(**good_arrays() | {"extent": np.zeros((4, 3))}), "extent of row 0"),
         (npz_bytes(**good_arrays() | {"rotation": np.zeros((4, 4))}), "rotation of row 0"),
         (npz_bytes(**good_arrays() | {"sh": np.zeros((4, 5, 3))}), "sh has the shape"),
-        (npz_bytes(**good_arrays() | {"center": np.array([[None] * 3] * 4)}), "center claims"),
+        (npz_bytes(**good_arrays() | {"center": np.array([[None] * 3] * 4)}), "Python objects"),
         (npz_bytes(**good_arrays() | {"center": np.array([["a"] * 3] * 4)}), "center has the type"),
         (enormous_npz(), r"center claims \(1099511627776, 3\)"),
     ],

@@ -3,12 +3,18 @@ alpha."""
 
 from __future__ import annotations
 
+import io
+import sys
+import zipfile
+from functools import partial
+
 import numpy as np
 import pytest
 from helpers.captures import look_at
 from PIL import Image
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.memory import forget_peak, memory_gib, peak_gib
 from linprim_geo.capture.types import View
 from linprim_geo.geometry.lens import Lens, undistorted
 from linprim_geo.imaging import photos
@@ -84,6 +90,45 @@ def test_eight_bit_depth_is_refused(tmp_path):
     (tmp_path / "d.npy").write_bytes(b"\x93NUMPY")
     with pytest.raises(LinprimError, match="d.npy: cannot be read as a depth map"):
         photos.read_depth(tmp_path / "d.npy", 1.0, (6, 4))
+
+
+def enormous(shape, descr) -> bytes:
+    """The start of a .npy file that claims an array of 400 MB or more, and 400 MB of zeros."""
+    header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}".encode().ljust(117) + b"\n"
+    return b"\x93NUMPY\x01\x00\x76\x00" + header + bytes(400_000_000)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the peak cannot be set back")
+@pytest.mark.parametrize("suffix", ["npz", "npy", "png", "tif"])
+@pytest.mark.parametrize("what", ["depth", "normals", "mask"])
+def test_a_file_that_unpacks_to_another_size_takes_no_memory(tmp_path, suffix, what):
+    path = tmp_path / f"a.{suffix}"
+    if suffix in ("npz", "npy") and (what == "mask" or (what, suffix) == ("normals", "npz")):
+        pytest.skip("no such files")
+    if suffix in ("npz", "npy"):
+        shape, descr = ((10_000, 10_000), "<f4") if what == "depth" else ((8_000, 8_000, 3), "<f2")
+        if suffix == "npz":
+            with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+                archive.writestr("depth.npy", enormous(shape, descr))
+        else:
+            path.write_bytes(enormous(shape, descr))
+    else:
+        Image.fromarray(np.zeros((6000, 6000), np.uint16)).save(path, compression="tiff_deflate")
+    read = {"depth": partial(photos.read_depth, scale=1.0), "normals": photos.read_normals, "mask": photos.read_mask}
+    forget_peak()
+    before = memory_gib()
+    with pytest.raises(LinprimError, match="wanted .*6"):
+        read[what](path, size=(6, 4))
+    assert peak_gib() < before + 0.02
+
+
+def test_a_depth_file_packed_by_a_method_that_numpy_does_not_write_is_refused(tmp_path):
+    content = io.BytesIO()
+    np.save(content, np.ones((4, 6), np.float32))
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr("depth.npy", content.getvalue())
+    with pytest.raises(LinprimError, match="packed by the method 14"):
+        photos.read_depth(tmp_path / "a.npz", 1.0, (6, 4))
 
 
 BARREL = Lens("OPENCV", 60, 44, (50.0, 51.0, 31.0, 21.5, -0.2, 0.05, 0.001, -0.002))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from linprim_geo.base.arrays import read_member
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.capture.types import Frame, Listing, check_pose
 from linprim_geo.geometry.lens import Lens
@@ -86,19 +88,26 @@ def decomposed(projection: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarr
 
 
 def _projections(path: Path) -> list[np.ndarray]:
+    held: dict[str, np.ndarray] = {}
+
+    def check(shape: tuple[int, ...], dtype: np.dtype) -> None:
+        if shape not in ((3, 4), (4, 4)) or dtype.kind not in "uif":
+            raise LinprimError(f"{path}: {name} is of shape {shape} of {dtype}, wanted a 4x4 matrix")
+
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            held = {
-                name: np.asarray(arrays[name], np.float64)
-                for name in arrays.files
-                if name.startswith(("world_mat_", "scale_mat_"))
-            }
+        with zipfile.ZipFile(path) as archive:
+            for member in archive.infolist():
+                name = member.filename.removesuffix(".npy")
+                if name.startswith(("world_mat_", "scale_mat_")) and not name.startswith("world_mat_inv"):
+                    held[name] = read_member(archive, member, check).astype(np.float64)
+    except LinprimError:
+        raise
     except Exception as error:  # numpy and zipfile raise half a dozen kinds for damaged files
         reason = (str(error).splitlines() or ["damaged"])[0]
         raise LinprimError(
             f"{path}: cannot be read as cameras ({reason}), wanted a complete .npz without pickled objects"
         ) from error
-    count = sum(name.startswith("world_mat_") and not name.startswith("world_mat_inv") for name in held)
+    count = sum(name.startswith("world_mat_") for name in held)
     if not count:
         raise LinprimError(f"{path}: no world_mat_0, wanted world_mat_i and scale_mat_i of every image")
     matrices = []
@@ -106,9 +115,8 @@ def _projections(path: Path) -> list[np.ndarray]:
         pair = []
         for name in ("world", "scale"):
             matrix = held.get(f"{name}_mat_{index}")
-            if matrix is None or matrix.shape not in ((3, 4), (4, 4)):
-                found = "missing" if matrix is None else f"of shape {matrix.shape}"
-                raise LinprimError(f"{path}: {name}_mat_{index} is {found}, wanted a 4x4 matrix")
+            if matrix is None:
+                raise LinprimError(f"{path}: {name}_mat_{index} is missing, wanted a 4x4 matrix")
             pair.append(matrix)
         matrices.append((pair[0][:3] @ np.vstack([pair[1][:3], [0, 0, 0, 1]]))[:3])
     return matrices
