@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from pathlib import Path
 
 MACHINE = Path("/")
@@ -28,11 +29,26 @@ def group_folders(controller: str, root: Path = MACHINE) -> list[Path]:
         _, controllers, name = row
         if controllers and controller not in controllers.split(","):
             continue
-        mount = mounts / controller if controllers else mounts
+        # Controllers that share a hierarchy are mounted under both names; a link by one name may be missing.
+        mount = mounts / controllers
+        if controllers and (mounts / controller).is_dir():
+            mount = mounts / controller
         parts = [part for part in name.split("/") if part not in ("", "..")]
         folders = [mount.joinpath(*parts[:count]) for count in range(len(parts), -1, -1)]
         found += [folder for folder in folders if folder.is_dir()]
     return found
+
+
+def container(root: Path = MACHINE) -> str | None:
+    """The kind of container that this process is in, as it says itself; None in none, or one that does not say."""
+    for name, file in (("docker", ".dockerenv"), ("podman", "run/.containerenv")):
+        if (root / file).exists():
+            return name
+    if "KUBERNETES_SERVICE_HOST" in os.environ:
+        return "kubernetes"
+    with contextlib.suppress(OSError):
+        return (root / "run/systemd/container").read_text().strip()[:40] or None
+    return None
 
 
 def read_number(file: Path, entry: str = "") -> int | None:

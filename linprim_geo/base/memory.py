@@ -10,10 +10,12 @@ from linprim_geo.base.control_groups import MACHINE, group_folders, read_number
 
 # What a process takes in any case, libraries above all, and each pixel of the image that is at work.
 PROCESS_GIB, PIXEL_BYTES = 0.45, 300
-# Files of a control group by version: limit, use, and the lines of memory.stat that count cached pages of files. In
-# version 1 those that begin with total_ include the groups below, as the use does.
+# Files of a control group: limit, use, and the lines of memory.stat that count cached pages of files. Version 2 has two
+# limits; above the second a process is slowed down until it hardly moves. In version 1 the lines that begin with total_
+# include the groups below, as the use does.
 _FILES = (
     ("memory.max", "memory.current", ("inactive_file", "active_file")),
+    ("memory.high", "memory.current", ("inactive_file", "active_file")),
     ("memory.limit_in_bytes", "memory.usage_in_bytes", ("total_inactive_file", "total_active_file")),
 )
 

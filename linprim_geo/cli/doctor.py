@@ -12,7 +12,8 @@ import shutil
 import sys
 from pathlib import Path
 
-from linprim_geo.base.cores import usable_cores
+from linprim_geo.base.control_groups import container
+from linprim_geo.base.cores import core_quota, usable_cores
 from linprim_geo.base.system import compiler_problem, find_compiler, install_command, missing_libraries, python_problem
 from linprim_geo.base.version import __version__
 
@@ -44,9 +45,11 @@ def doctor() -> dict:
     """Imports every library and looks at the machine.
 
     Returns:
-        `version`, `python`, `platform`, `cores` (that this process may use), `memory_bytes`,
-        `memory_available_bytes`, `disk_free_bytes`, `cache` (folder of undistorted images and triangulated
-        points; None without numpy), `cache_bytes` (what it holds), `compiler`, `instruction_set` (None
+        `version`, `python`, `platform`, `container` (its kind, None in none that can be told), `cores` (that this
+        process may use), `machine_cores`, `core_quota` (cores' worth of time that its control groups allow, None
+        without such a limit), `memory_bytes` (that it may take), `machine_memory_bytes`, `memory_available_bytes`,
+        `disk_free_bytes`, `cache` (folder of undistorted images and triangulated points; None without numpy),
+        `cache_bytes` (what it holds), `compiler`, `instruction_set` (None
         without the core), `libraries` ({module: version, or None if it cannot be imported}),
         `missing_system_libraries`, and `problems`: one sentence each that says what to do; empty if
         everything works.
@@ -67,7 +70,7 @@ def doctor() -> dict:
     instruction_set, problem = _instruction_set()
     if problem:
         problems += [each for each in (problem, compiler_problem()) if each]
-    memory, available = _memory()
+    memory, available, machine_memory = _memory()
     disk = shutil.disk_usage(Path.cwd()).free
     if available is not None and available < LITTLE_MEMORY:
         free = _gigabytes(available)
@@ -81,8 +84,12 @@ def doctor() -> dict:
         "version": __version__,
         "python": platform.python_version(),
         "platform": platform.platform(),
+        "container": container(),
         "cores": usable_cores(),
+        "machine_cores": os.cpu_count() or 1,
+        "core_quota": core_quota(),
         "memory_bytes": memory,
+        "machine_memory_bytes": machine_memory,
         "memory_available_bytes": available,
         "disk_free_bytes": disk,
         "cache": None if cache is None else str(cache),
@@ -103,6 +110,7 @@ def describe(report: dict) -> str:
         f"linprim-geo {report['version']}, Python {report['python']}, {report['platform']}",
         f"{report['cores']} cores, {_gigabytes(report['memory_bytes'])} of memory ({free} free), "
         f"{_gigabytes(report['disk_free_bytes'])} free on this disk",
+        *_limits(report),
         f"instruction set: {report['instruction_set'] or 'unknown, the core is not built'}",
         f"C++20 compiler: {report['compiler'] or 'none'}",
         f"cache: {report['cache'] or '?'}, {_gigabytes(report['cache_bytes'])} (may be deleted at any time)",
@@ -115,14 +123,29 @@ def describe(report: dict) -> str:
     return "\n".join(lines)
 
 
-def _memory() -> tuple[int | None, int | None]:
-    """(total, available) memory in bytes; None where psutil is missing."""
+def _limits(report: dict) -> list[str]:
+    """What the machine has of which this process may use a part, and why."""
+    lines = [] if report["container"] is None else [f"container: {report['container']}"]
+    if report["core_quota"] is not None:
+        lines.append(f"quota: {report['core_quota']:g} of the machine's {report['machine_cores']} cores")
+    elif report["cores"] < report["machine_cores"]:
+        lines.append(f"affinity: {report['cores']} of the machine's {report['machine_cores']} cores")
+    memory, machine = report["memory_bytes"], report["machine_memory_bytes"]
+    if memory is not None and memory < machine:
+        lines.append(f"limit: {_gigabytes(memory)} of the machine's {_gigabytes(machine)} of memory")
+    return lines
+
+
+def _memory() -> tuple[int | None, int | None, int | None]:
+    """Memory that may be taken, that is available, and that the machine has, in bytes; None where psutil is missing."""
     from linprim_geo.base.memory import available_memory, total_memory
 
     try:
-        return total_memory(), available_memory()
+        import psutil
+
+        return total_memory(), available_memory(), psutil.virtual_memory().total
     except ImportError:
-        return None, None
+        return None, None, None
 
 
 def _library(module: str, distributions: tuple[str, ...]) -> tuple[str | None, str | None]:

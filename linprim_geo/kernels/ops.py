@@ -46,6 +46,9 @@ def threads() -> int:
     return _core.threads()
 
 
+set_threads(0)  # the core by itself takes every core of the machine, whatever the quota of its container
+
+
 class _Exponential(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x: Tensor) -> Tensor:

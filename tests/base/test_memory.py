@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 
 import numpy as np
 import psutil
 import pytest
 
-from linprim_geo.base.control_groups import group_folders
-from linprim_geo.base.cores import usable_cores
+from linprim_geo.base.control_groups import container, group_folders
+from linprim_geo.base.cores import core_quota, usable_cores
 from linprim_geo.base.memory import available_memory, forget_peak, memory_gib, peak_gib, total_memory
 
 MIB = 2**20
@@ -81,6 +83,38 @@ def test_version_1_has_a_hierarchy_per_controller(inside, machine, tmp_path):
     assert (available_memory(tmp_path), total_memory(tmp_path), usable_cores(tmp_path)) == (700 * MIB, 2000 * MIB, 2)
     write(tmp_path, {f"{memory}/memory.limit_in_bytes": NO_LIMIT, f"{cores}/cpu.cfs_quota_us": -1})
     assert (available_memory(tmp_path), total_memory(tmp_path), usable_cores(tmp_path)) == (FREE, TOTAL, 8)
+
+
+def test_controllers_that_share_a_hierarchy_are_found_by_either_name(machine, tmp_path):
+    write(tmp_path, {"proc/self/cgroup": "3:cpu,cpuacct:/job"})
+    cores = "sys/fs/cgroup/cpu,cpuacct/job"
+    write(tmp_path, {f"{cores}/cpu.cfs_quota_us": 150000, f"{cores}/cpu.cfs_period_us": 100000})
+    assert usable_cores(tmp_path) == 2 and core_quota(tmp_path) == 1.5
+
+
+def test_what_slows_a_process_down_limits_its_memory(machine, tmp_path):
+    group = "sys/fs/cgroup"
+    write(tmp_path, {"proc/self/cgroup": "0::/", f"{group}/memory.max": "max", f"{group}/memory.high": 2000 * MIB})
+    write(tmp_path, {f"{group}/memory.current": 500 * MIB})
+    assert (available_memory(tmp_path), total_memory(tmp_path)) == (1500 * MIB, 2000 * MIB)
+
+
+def test_containers_say_what_they_are(monkeypatch, tmp_path):
+    monkeypatch.delenv("KUBERNETES_SERVICE_HOST", raising=False)
+    assert container(tmp_path) is None
+    write(tmp_path, {"run/systemd/container": "lxc"})
+    assert container(tmp_path) == "lxc"
+    monkeypatch.setenv("KUBERNETES_SERVICE_HOST", "10.0.0.1")
+    assert container(tmp_path) == "kubernetes"
+    write(tmp_path, {".dockerenv": ""})
+    assert container(tmp_path) == "docker"
+
+
+def test_the_core_begins_with_the_cores_that_may_be_used():
+    program = "import os; os.cpu_count = lambda: 9; os.sched_getaffinity = lambda pid: set(range(3))\n"
+    program += "from linprim_geo.kernels import ops; print(ops.threads())"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "3\n" or usable_cores() < 3
 
 
 def test_more_in_use_than_the_limit_leaves_nothing(machine, tmp_path):
