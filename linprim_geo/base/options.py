@@ -214,6 +214,15 @@ class SceneOptions:
     sparse: str = option(
         "", "COLMAP model to take points from, if it is not where data sets usually keep it", metavar="DIR"
     )
+    test_every: int | str = option(
+        "auto",
+        "hold out every Nth photograph by name; 0: none, all are trained on and count for the mesh; auto: those that "
+        "the data set names, else every 8th",
+        low=0,
+        high=10**6,
+        metavar="N",
+        number_or="auto",
+    )
     views: int = option(0, "train with N of the training views, evenly spread over them; 0 takes all", low=0)
 
 

@@ -45,7 +45,8 @@ def load_scene(
     Photographs without poses, and videos, are read once `structure_from_motion.prepare` has found their poses.
 
     Held out are the frames that the data set names so (`transforms_test.json`, else `_val`;
-    `test_filenames`; ScanNet++'s lists), else every 8th of the images sorted by name. Points come with the transforms
+    `test_filenames`; ScanNet++'s lists), else every 8th of the images sorted by name; or those that `test_every` says.
+    Points come with the transforms
     (`ply_file_path`) or from a COLMAP model in the folder whose poses agree with them. Image headers are
     read, pixels are not (but for a few with alpha).
 
@@ -105,7 +106,7 @@ def load_scene(
     views = []
     for frame, name in zip(posed, names, strict=True):
         views.append(_view(frame, name, downscale, has_alpha, folder, pinholes))
-    train, test = _split(posed, views)
+    train, test = _split(posed, views, options.test_every)
     scene = Scene(root, listing.kind, train, test, listing.points, listing.unit or "unit of the data set")
     return scene.with_training_views(options.views)
 
@@ -175,7 +176,8 @@ def settled_folders(options: SceneOptions, root: Path) -> SceneOptions:
     Raises:
         LinprimError: there is no such folder.
     """
-    settled, root = {}, root.resolve()
+    settled: dict[str, Any] = {}
+    root = root.resolve()
     for name in _FOLDERS:
         folder = None if options.masks == "none" == getattr(options, name) else getattr(options, name)
         if found := _option_folder(folder, root, flag_of(name)):
@@ -188,14 +190,10 @@ def in_capture(options: SceneOptions, path: Path) -> SceneOptions:
     """A run's `options` for `load_scene`: folders that are in its capture stay those, whatever else has their names
     where this is called."""
     root = path if path.is_dir() else path.parent
-    return replace(
-        options,
-        **{
-            name: str(root / getattr(options, name))
-            for name in _FOLDERS
-            if getattr(options, name) not in ("", "none") and (root / getattr(options, name)).is_dir()
-        },
-    )
+    named: dict[str, Any] = {name: getattr(options, name) for name in _FOLDERS}
+    held = {name: str(root / value) for name, value in named.items() if value not in ("", "none")}
+    there: dict[str, Any] = {name: folder for name, folder in held.items() if Path(folder).is_dir()}
+    return replace(options, **there)
 
 
 def _contents(root: Path) -> str:
@@ -297,9 +295,12 @@ def _view(frame: Frame, name: str, factor: int, has_alpha: bool, cache: Path, pi
     )
 
 
-def _split(frames: Sequence[Frame], views: Sequence[View]) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """By what the frames say, else every 8th by name; never fewer than two training views."""
-    if any(frame.split is not None for frame in frames):
+def _split(
+    frames: Sequence[Frame], views: Sequence[View], every: int | str
+) -> tuple[tuple[View, ...], tuple[View, ...]]:
+    """By what the frames say, else every 8th by name, unless `every` is a number; never fewer than two training
+    views."""
+    if every == "auto" and any(frame.split is not None for frame in frames):
         train = tuple(view for frame, view in zip(frames, views, strict=True) if frame.split != "test")
         test = tuple(view for frame, view in zip(frames, views, strict=True) if frame.split == "test")
         if len(train) < 2:
@@ -308,6 +309,13 @@ def _split(frames: Sequence[Frame], views: Sequence[View]) -> tuple[tuple[View, 
             )
         return train, test
     order = sorted(range(len(views)), key=lambda i: frames[i].relative)
-    held_out = order[::HOLD_OUT_EVERY] if len(views) > 2 else []
+    if every == "auto":
+        every = HOLD_OUT_EVERY if len(views) > 2 else 0
+    held_out = order[:: int(every)] if every else []
+    if len(order) - len(held_out) < 2:
+        raise LinprimError(
+            f"--test-every {every} leaves {len(order) - len(held_out)} of {len(views)} photographs to train on, wanted "
+            "at least two"
+        )
     chosen = set(held_out)
     return tuple(views[i] for i in order if i not in chosen), tuple(views[i] for i in held_out)

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
+import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
+from linprim_geo.base import cores
 from linprim_geo.base.errors import LinprimError
+
+# By which libraries are told how many threads to have.
+_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "IGL_NUM_THREADS")
 
 
 def from_args(options: type, parsed: argparse.Namespace):
@@ -46,6 +52,31 @@ def time_budget(parsed: argparse.Namespace) -> dict:
     from linprim_geo.base.budget import Budget
 
     return {"time_budget": Budget(parsed.time_budget)}
+
+
+@contextlib.contextmanager
+def limited_threads(count: int) -> Iterator[None]:
+    """In the block everything has so many threads: what asks for `usable_cores`, and libraries that are yet to be
+    loaded. 0 leaves all as it is."""
+    if not count:
+        yield
+        return
+    before = {name: os.environ.get(name) for name in _THREADS}
+    cores.limit = count
+    os.environ.update(dict.fromkeys(_THREADS, str(count)))
+    # Loaded already where Python calls this, not where a shell does.
+    ops, torch = (sys.modules.get(name) for name in ("linprim_geo.kernels.ops", "torch"))
+    loaded = (ops.threads(), torch.get_num_threads()) if ops and torch else None
+    if ops and torch:
+        ops.set_threads(count), torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        cores.limit = 0
+        for name, value in before.items():
+            os.environ.pop(name, None) if value is None else os.environ.update({name: value})
+        if ops and torch and loaded:
+            ops.set_threads(loaded[0]), torch.set_num_threads(loaded[1])
 
 
 def log(parsed: argparse.Namespace) -> Callable[[str], None]:

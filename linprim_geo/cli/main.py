@@ -18,6 +18,7 @@ from importlib import import_module
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.version import __version__
+from linprim_geo.cli.arguments import limited_threads
 from linprim_geo.cli.output import Output, printing
 
 EXIT_UNUSABLE, EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_PIPE = 1, 70, 130, 141
@@ -35,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parsed = build_parser().parse_args(arguments)
     parsed.json, parsed.debug = getattr(parsed, "json", False), getattr(parsed, "debug", False)
     try:
-        with printing(parsed.json) as print_output:
+        with printing(parsed.json) as print_output, limited_threads(getattr(parsed, "most_threads", 0)):
             output = parsed.run_command(parsed)
             print_output(output)
         return output.status

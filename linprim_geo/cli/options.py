@@ -10,6 +10,7 @@ from typing import Any
 from linprim_geo.base.options import flag_of, kinds
 from linprim_geo.cli.output import Output
 
+MOST_THREADS = 4096
 SPLITS = ("train", "test", "all")
 
 # Adds a command by its name, the function that runs it, and one line of help; returns its parser.
@@ -90,6 +91,12 @@ def add_quiet(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress")
 
 
+def add_threads(parser: argparse.ArgumentParser) -> None:
+    """Adds --threads to a command that has no options with it; `cli.main` heeds it."""
+    text = "worker threads; 0 uses every core; the result does not depend on it (default 0)"
+    parser.add_argument("--threads", dest="most_threads", type=threads, default=0, metavar="N", help=text)
+
+
 def add_run(parser: argparse.ArgumentParser) -> None:
     """Adds the folder of a run."""
     parser.add_argument("run", metavar="RUN", help="folder that train has made")
@@ -126,6 +133,13 @@ def positive(text: str) -> int:
     return value
 
 
+def threads(text: str) -> int:
+    value = int(text)
+    if not 0 <= value <= MOST_THREADS:
+        raise argparse.ArgumentTypeError(f"{text} is not 0 to {MOST_THREADS}")
+    return value
+
+
 def whole(text: str) -> int:
     value = int(text)
     if value < 0:
@@ -143,6 +157,6 @@ def seconds(text: str) -> float:
 
 
 # argparse names the type in its message: "invalid count value", not "invalid positive value".
-positive.__name__ = whole.__name__ = "count"
+positive.__name__ = whole.__name__ = threads.__name__ = "count"
 blocks.__name__ = "count, or auto:"
 seconds.__name__ = "time such as 90s, 5m or 1h"

@@ -33,6 +33,24 @@ def test_every_eighth_by_name_is_held_out(tmp_path):
         np.testing.assert_allclose(view.camera.world_to_camera, cameras[int(view.name)].world_to_camera, atol=1e-12)
 
 
+@pytest.mark.parametrize(("every", "held_out"), [(0, []), (3, ["00", "03", "06", "09"]), (100, ["00"])])
+@pytest.mark.parametrize("named", [False, True])
+def test_a_number_holds_out_every_so_many_whatever_the_data_set_names(every, held_out, named, tmp_path):
+    write_transforms(tmp_path, 10)
+    if named:
+        edit(tmp_path / "transforms.json", lambda content: content.update(test_filenames=["images/05.png"]))
+    scene = load_scene(tmp_path, test_every=every)
+    assert [view.name for view in scene.test] == held_out and len(scene.train) == 10 - len(held_out)
+
+
+def test_a_number_that_leaves_nothing_to_train_on_is_one_sentence(tmp_path):
+    write_transforms(tmp_path, 10)
+    with pytest.raises(LinprimError, match="--test-every 1 leaves 0 of 10 photographs to train on"):
+        load_scene(tmp_path, test_every=1)
+    with pytest.raises(LinprimError, match="--test-every is -1, wanted auto, or 0 to 1000000"):
+        load_scene(tmp_path, test_every=-1)
+
+
 def test_the_split_does_not_depend_on_the_order_of_frames(tmp_path):
     write_transforms(tmp_path, 10)
     edit(tmp_path / "transforms.json", lambda content: content["frames"].reverse())

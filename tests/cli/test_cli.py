@@ -360,7 +360,9 @@ def test_the_functions_have_the_arguments_that_the_commands_pass(line):
     module, _, name = path.rpartition(".")
     function = getattr(importlib.import_module(f"linprim_geo.{module}"), name)
     options = {field.name for field in dataclasses.fields(ExtractOptions)} if line.startswith("extract") else set()
-    passed = vars(cli.build_parser().parse_args(line.split())).keys() - {"run_command", "parser"} - options
+    passed = (
+        vars(cli.build_parser().parse_args(line.split())).keys() - {"run_command", "parser", "most_threads"} - options
+    )
     assert {renamed.get(key, key) for key in passed} <= set(inspect.signature(function).parameters)
 
 
@@ -419,6 +421,41 @@ def test_input_that_cannot_be_used_is_one_sentence_and_leaves_nothing(line, tmp_
     shown = capfd.readouterr()
     assert shown.out == "" and shown.err.startswith("linprim-geo: error: ") and shown.err.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["here"]
+
+
+WITH_THREADS = {
+    "render r": "linprim_geo.runs.render.render_run",
+    "extract-mesh r": "linprim_geo.surface.extract.extract_mesh",
+    "eval-depth r": "linprim_geo.eval.depth.eval_depth_run",
+    "eval-images r": "linprim_geo.eval.images.eval_images_run",
+    "eval-mesh a b": "linprim_geo.eval.mesh.eval_mesh_files",
+    "report r": "linprim_geo.display.report.report_run",
+    "view r": "linprim_geo.display.viewer.view_run",
+    "demo": "linprim_geo.cli.demo.run_demo",
+}
+
+
+@pytest.mark.parametrize(("line", "function"), WITH_THREADS.items())
+def test_threads_limit_what_a_command_takes(line, function, monkeypatch):
+    from linprim_geo.base.cores import usable_cores
+    from linprim_geo.kernels import ops
+
+    found = []
+
+    def stand_in(*_, **__):
+        found.append((usable_cores(), ops.threads(), os.environ["OMP_NUM_THREADS"]))
+        raise LinprimError("enough")
+
+    before = usable_cores(), ops.threads(), os.environ.get("OMP_NUM_THREADS")
+    monkeypatch.setattr(function, stand_in)
+    assert cli.main([*line.split(), "--threads", "1"]) == 1 and found == [(1, 1, "1")]
+    assert (usable_cores(), ops.threads(), os.environ.get("OMP_NUM_THREADS")) == before
+
+
+def test_threads_have_a_range(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["render", "r", "--threads", "5000"])
+    assert "5000 is not 0 to 4096" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="makes a symbolic link")

@@ -53,3 +53,25 @@ def test_missing_system_libraries_come_with_the_line_that_installs_them(monkeypa
 def test_a_compiler_that_cannot_do_cxx20_is_named(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     assert "no-such-compiler does not compile C++20" in system.compiler_problem()
+
+
+def test_doctor_tells_limits_from_the_machine(monkeypatch, capsys):
+    monkeypatch.setattr(doctor, "LIBRARIES", (("numpy", ("numpy",)),))
+    monkeypatch.setattr(doctor, "container", lambda: "podman")
+    monkeypatch.setattr(doctor, "usable_cores", lambda: 2)
+    monkeypatch.setattr(doctor.os, "cpu_count", lambda: 16)
+    monkeypatch.setattr(doctor, "core_quota", lambda: 1.5)
+    monkeypatch.setattr(doctor, "_memory", lambda: (8 * 2**30, 6 * 2**30, 64 * 2**30))
+    cli.main(["doctor"])
+    shown = capsys.readouterr().out
+    for line in (
+        "2 cores, 8.0 GiB of memory (6.0 GiB free)",
+        "container: podman",
+        "quota: 1.5 of the machine's 16 cores",
+        "limit: 8.0 GiB of the machine's 64.0 GiB of memory",
+        "instruction set: ",
+    ):
+        assert line in shown
+    monkeypatch.setattr(doctor, "core_quota", lambda: None)
+    cli.main(["doctor"])
+    assert "affinity: 2 of the machine's 16 cores" in capsys.readouterr().out

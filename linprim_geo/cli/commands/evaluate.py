@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from linprim_geo.cli.arguments import from_args
-from linprim_geo.cli.options import AddCommand, add_options, add_run, add_split
+from linprim_geo.cli.options import AddCommand, add_options, add_run, add_split, add_threads
 from linprim_geo.cli.output import Output
 from linprim_geo.eval.options import ScoreOptions
 
@@ -22,6 +22,7 @@ def add(command: AddCommand) -> None:
     )
     sub.add_argument("--depth", choices=("overlap", "median", "expected", "first"), default="overlap", help=text)
     sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/eval/depth)")
+    add_threads(sub)
 
     sub = command("eval-images", eval_images, "score a run's colours: PSNR, SSIM and LPIPS on held-out views")
     add_run(sub)
@@ -32,6 +33,7 @@ def add(command: AddCommand) -> None:
         "leaves it out)"
     )
     sub.add_argument("--lpips-weights", metavar="PATH", help=text)
+    add_threads(sub)
 
     sub = command("eval-mesh", eval_mesh, "score a mesh against a reference mesh: Chamfer distance and the rest")
     sub.add_argument("mesh", metavar="MESH", help="mesh to score")
@@ -40,6 +42,7 @@ def add(command: AddCommand) -> None:
     sub.add_argument("--run", metavar="RUN", help="cull to what the training cameras of this run see")
     text = "folder for results.json, error-coloured PLYs and plots (default RUN/eval/mesh)"
     sub.add_argument("-o", "--output", metavar="DIR", help=text)
+    add_threads(sub)
     add_options(sub.add_argument_group("scores"), ScoreOptions)
 
 

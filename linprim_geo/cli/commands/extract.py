@@ -6,7 +6,16 @@ import argparse
 
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.cli.arguments import blocks_and_workers, from_args, time_budget
-from linprim_geo.cli.options import AddCommand, add_options, add_quiet, add_run, add_workers, positive, seconds
+from linprim_geo.cli.options import (
+    AddCommand,
+    add_options,
+    add_quiet,
+    add_run,
+    add_threads,
+    add_workers,
+    positive,
+    seconds,
+)
 from linprim_geo.cli.output import Output
 
 
@@ -21,6 +30,7 @@ def add(command: AddCommand) -> None:
     sub.add_argument("-o", "--output", metavar="FILE", help=".ply .obj .glb .stl (default RUN/mesh/METHOD/mesh.ply)")
     text = "choose the voxel size so that everything takes this long, by what coarse passes take"
     sub.add_argument("--time-budget", type=seconds, metavar="TIME", help=text)
+    add_threads(sub)
     add_quiet(sub)
     text = "fuse in so many parts of one grid, each by a worker of its own, with the same result (default 1)"
     add_workers(sub).add_argument("--blocks", type=positive, default=1, metavar="K", help=text)

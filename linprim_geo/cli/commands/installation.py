@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from linprim_geo.cli.options import AddCommand, add_quiet
+from linprim_geo.cli.options import AddCommand, add_quiet, add_threads
 from linprim_geo.cli.output import Output
 
 
@@ -14,6 +14,7 @@ def add(command: AddCommand) -> None:
     sub = command("demo", demo, "synthesize, train, extract and score a built-in scene")
     sub.add_argument("-o", "--output", default="runs/demo", metavar="RUN", help="folder to make (default runs/demo)")
     sub.add_argument("--size", choices=("small", "normal"), default="normal", help="small: a quick check of it all")
+    add_threads(sub)
     add_quiet(sub)
 
     sub = command("completion", completion, "print a script that completes this command line in a shell")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from linprim_geo.cli.options import AddCommand, add_quiet, add_run, add_split
+from linprim_geo.cli.options import AddCommand, add_quiet, add_run, add_split, add_threads
 from linprim_geo.cli.output import Output
 
 
@@ -13,6 +13,7 @@ def add(command: AddCommand) -> None:
     add_run(sub)
     add_split(sub)
     sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/renders)")
+    add_threads(sub)
     add_quiet(sub)
 
 

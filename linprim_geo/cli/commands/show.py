@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from linprim_geo.cli.options import AddCommand, add_run, whole
+from linprim_geo.cli.options import AddCommand, add_run, add_threads, whole
 from linprim_geo.cli.output import Output
 
 
@@ -17,6 +17,7 @@ def add(command: AddCommand) -> None:
         "the data set's depth)"
     )
     sub.add_argument("--reference", metavar="MESH", help=text)
+    add_threads(sub)
 
     sub = command("view", view, "show a run in a browser: primitives, meshes, cameras")
     add_run(sub)
@@ -26,6 +27,7 @@ def add(command: AddCommand) -> None:
     text = "port on this machine, which alone can reach it (default 8080; 0: any that is free)"
     sub.add_argument("--port", type=whole, default=8080, metavar="N", help=text)
     sub.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
+    add_threads(sub)
 
 
 def report(parsed: argparse.Namespace) -> Output:
