@@ -331,7 +331,11 @@ class ExtractOptions:
     )
     truncation: float = option(3.0, "truncation distance in voxels", low=1, high=100)
     memory_limit: float = option(
-        0.0, "memory the grid may take, in GiB; 0 allows 60 % of what is free", low=0, metavar="GIB"
+        0.0,
+        "memory the grid may take, and the depth maps that the level is chosen by, in GiB; 0 allows 60 % of what is "
+        "free",
+        low=0,
+        metavar="GIB",
     )
     depth_limit: float = option(
         0.0,

@@ -25,6 +25,9 @@ USUAL_LEVEL = 0.75
 # Views that are looked at, each in so many others, and pixels of each pair; fewer pixels in all than the least decide
 # nothing.
 VIEWS, SOURCES, PIXELS, LEAST_PIXELS = 10, 3, 20_000, 2000
+# Bytes that the photographs and depth maps may take which are kept until other views need them again, and those of a
+# pixel: colour, alpha, and a depth at each level.
+KEPT_BYTES, PIXEL_BYTES = 2**30, 4 + 4 * len(LEVELS)
 # Colours that differ by more than this, of 255, count as much as this, and so do depths that contradict each other.
 LARGEST_DIFFERENCE = 40.0
 # Two views contradict each other where the depth of the other differs from what it should be by more than this share.
@@ -36,34 +39,42 @@ EQUALLY_GOOD = 0.05
 LEAST_CONTRAST = 0.02
 
 
-def choose_level(run: Run) -> tuple[float, dict[float, float]]:
+def choose_level(run: Run, memory_limit: int = 0) -> tuple[float, dict[float, float]]:
     """Returns the level, between the first and the last of LEVELS, and the mean colour difference (of 255) at each
     level.
 
     The differences are those of the same pixels at every level, so that none is favoured by what it leaves out. The
     level is the one nearest to the cameras that is as good as the best (EQUALLY_GOOD); without enough to compare,
     USUAL_LEVEL and no differences.
+
+    Memory: photographs and depth maps of as many views as fit into KEPT_BYTES and `memory_limit` bytes (0: no limit of
+    its own), at least of one view and its SOURCES.
     """
     views = run.scene().train
     cameras = [view.camera for view in views]
     sources = source_views(cameras, run.primitives().center)
     chosen = [k for k in range(0, len(views), -(-len(views) // VIEWS)) if sources[k]]
-    pairs = [(k, other) for k in chosen for other in sources[k][:SOURCES]]
-    wanted = sorted({k for pair in pairs for k in pair})
-    photos = {k: views[k].load() for k in wanted}
-    depths = {
-        level: {
-            k: depth
-            for k, (_, depth, _) in zip(wanted, run.surface_depths([views[k] for k in wanted], level), strict=True)
-        }
-        for level in LEVELS
-    }
-    differences = [
-        color_differences(
-            cameras[k], photos[k], cameras[o], photos[o], [(depths[level][k], depths[level][o]) for level in LEVELS]
-        )
-        for k, o in pairs
-    ]
+    largest = max((camera.width * camera.height for camera in cameras), default=1)
+    room = min(memory_limit or KEPT_BYTES, KEPT_BYTES) // (largest * PIXEL_BYTES)
+    kept: dict[int, tuple[Photo, list[np.ndarray]]] = {}
+    differences = []
+    for k in chosen:
+        needed = [k, *sources[k][:SOURCES]]
+        missing = [other for other in needed if other not in kept]
+        others = [other for other in kept if other not in needed]
+        for other in others[: max(0, len(kept) + len(missing) - room)]:
+            del kept[other]
+        rendered = [
+            [depth for _, depth, _ in run.surface_depths([views[other] for other in missing], level)]
+            for level in LEVELS
+        ]
+        kept |= {other: (views[other].load(), list(depths)) for other, *depths in zip(missing, *rendered, strict=True)}
+        differences += [
+            color_differences(
+                cameras[k], kept[k][0], cameras[o], kept[o][0], list(zip(kept[k][1], kept[o][1], strict=True))
+            )
+            for o in needed[1:]
+        ]
     count = sum(part.shape[1] for part in differences)
     if count < LEAST_PIXELS:
         return USUAL_LEVEL, {}

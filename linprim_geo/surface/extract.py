@@ -149,7 +149,7 @@ def _extract(
 
     agreement = None
     if options.level == "auto":
-        level, agreement = choose_level(opened)
+        level, agreement = choose_level(opened, int(options.memory_limit * 2**30))
         options = replace(options, level=level)
         said = "the photographs do not tell" if level == USUAL_LEVEL else "the nearest at which the photographs agree"
         stages.note(f"level {level:g}: {said}")

@@ -3,6 +3,7 @@ say."""
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,7 +11,15 @@ import numpy as np
 import pytest
 
 from linprim_geo.capture.load import load_scene
-from linprim_geo.surface.choose_level import LEVELS, USUAL_LEVEL, choose_level, color_differences, nearest_good
+from linprim_geo.surface.choose_level import (
+    LEVELS,
+    PIXEL_BYTES,
+    SOURCES,
+    USUAL_LEVEL,
+    choose_level,
+    color_differences,
+    nearest_good,
+)
 from linprim_geo.synthetic.synth import synthesize
 
 
@@ -38,6 +47,29 @@ def test_the_true_surface_is_found(scene, true_level):
     level, differences = choose_level(run_of(scene, true_level))
     assert level == pytest.approx(true_level, abs=0.06)
     assert tuple(differences) == LEVELS and choose_level(run_of(scene, true_level)) == (level, differences)
+
+
+def test_only_the_depth_maps_of_some_views_are_held_at_once(scene, monkeypatch):
+    run, held = run_of(scene, 0.6), [0, 0]
+    plain = run.surface_depths
+
+    def gone():
+        held[0] -= 1
+
+    def counted(views, level):
+        for view, depth, rest in plain(views, level):
+            held[0] += 1
+            held[1] = max(held)
+            weakref.finalize(depth, gone)
+            yield view, depth, rest
+
+    run.surface_depths = counted
+    whole = choose_level(run)
+    assert held[1] > 6 * len(LEVELS)
+    for limit, most in ((1, 1 + SOURCES), (6 * 96 * 96 * PIXEL_BYTES, 6)):
+        held[:] = [0, 0]
+        assert choose_level(run, limit) == whole
+        assert held[1] <= most * len(LEVELS)
 
 
 def test_beyond_the_levels_the_nearest_is_taken(scene):
