@@ -277,8 +277,8 @@ def test_ctrl_c_and_a_request_to_end_are_no_errors(meshed, number):
 
 def test_a_view_of_training_imports_nothing_from_the_folder_it_is_started_in(meshed, tmp_path):
     plant_modules(tmp_path)
-    program = "import sys\nfrom linprim_geo.display.viewer import watched\n"
-    words = ["-P", "-c", f"{program}with watched(sys.argv[1]):\n    sys.stdin.readline()\n", str(meshed)]
+    program = "import sys\nfrom linprim_geo.display import viewer\nviewer._is_free = lambda port: False\n"
+    words = ["-P", "-c", f"{program}with viewer.watched(sys.argv[1]):\n    sys.stdin.readline()\n", str(meshed)]
     settings = os.environ | {"DISPLAY": "", "WAYLAND_DISPLAY": ""}
     pipes = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, *words], env=settings, cwd=tmp_path, **pipes) as process:
