@@ -312,15 +312,15 @@ def _trainer(options):
     from linprim_geo.geometry.camera import Camera
     from linprim_geo.training.step.parameters import initial_parameters
     from linprim_geo.training.step.trainer import Trainer
-    from linprim_geo.training.step.training_images import Shot
+    from linprim_geo.training.step.training_images import TrainingImage
 
     rng = np.random.default_rng(7)
-    shots = []
+    images = []
     for number, pose in enumerate(_poses(3)):
         rgb = torch.from_numpy(rng.integers(0, 256, (3, 9, 12), np.uint8))
-        shots.append(Shot(str(number), Camera(*SIZE, 10.0, 11.0, 6.0, 4.5, np.linalg.inv(pose)), rgb, None))
+        images.append(TrainingImage(str(number), Camera(*SIZE, 10.0, 11.0, 6.0, 4.5, np.linalg.inv(pose)), rgb, None))
     parameters = initial_parameters(rng.normal(size=(7, 3)), rng.integers(0, 256, (7, 3)), 1, 0, (1e-3, 1.0))
-    return Trainer(shots, parameters, options, (1e-3, 1.0), torch.ones(3), False, True)
+    return Trainer(images, parameters, options, (1e-3, 1.0), torch.ones(3), False, True)
 
 
 def read_run_file(file: Path) -> None:
