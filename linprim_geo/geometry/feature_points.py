@@ -195,9 +195,7 @@ def verify_matches(cameras: Sequence[Camera], database_path: Path, pairs: list) 
             if not database.exists_matches(first, second):
                 continue
             matches = database.read_matches(first, second)
-            error = sampson_px(
-                cameras[i], cameras[j], keypoints[i][matches[:, 0]], keypoints[j][matches[:, 1]]
-            )
+            error = sampson_px(cameras[i], cameras[j], keypoints[i][matches[:, 0]], keypoints[j][matches[:, 1]])
             inliers = matches[error <= _MAX_EPIPOLAR_PX]
             if database.exists_two_view_geometry(first, second):
                 database.delete_two_view_geometry(first, second)

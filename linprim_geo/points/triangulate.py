@@ -65,7 +65,8 @@ def triangulate_points(
         )
     cloud = PointCloud(found.xyz, found.rgb, found.error_px)
     _store(stored, cloud)
-    say(f"triangulated points: {len(cloud.xyz)}, median error {np.median(found.error_px):.2f} px, {time.monotonic() - start:.1f} s")
+    error, seconds = np.median(found.error_px), time.monotonic() - start
+    say(f"triangulated points: {len(cloud.xyz)}, median error {error:.2f} px, {seconds:.1f} s")
     return cloud
 
 

@@ -112,6 +112,7 @@ def test_unreliable_points_are_dropped(room):
     xyz = np.concatenate([wall, np.full((4, 3), [0.0, 2.0, 0.0]), [[0.0, 20.0, 0.0]]])
     error = np.array([0.1] * 200 + [value for value, _ in odd.values()] + [0.1])
     tracks = [[0, 2, 5]] * 200 + [track for _, track in odd.values()] + [[0, 5]]
+
     def points(xyz):
         point = np.repeat(np.arange(len(xyz)), [len(track) for track in tracks])
         colors, pixels = np.zeros((len(xyz), 3), np.uint8), np.zeros((len(point), 2))
