@@ -8,6 +8,7 @@ tone curve. Rounding to 8 bits and JPEG come after that (`photos`).
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ WALK_VIEWS = 12.0
 BLUR_STEPS_PER_PX = 4
 """Positions of the image that are averaged for a pixel of motion."""
 
-PHONE = {
+PHONE: dict[str, Any] = {
     "full_well": 6000.0,
     "read_noise": 6.0,
     "jpeg": 90,
@@ -87,7 +88,7 @@ class CameraEffects:
         if self.options.motion_blur:
             light = motion_blurred(light, self.options.motion_blur, rng)
         if self.options.vignetting:
-            light = light * vignette(*light.shape[:2], self.options.vignetting)[..., None]
+            light = light * vignette(light.shape[0], light.shape[1], self.options.vignetting)[..., None]
         if split == "train":
             light = light * 2.0 ** self.stops[number]
         light = exposed(light, self.options.full_well, self.options.read_noise, rng)

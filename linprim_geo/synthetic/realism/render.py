@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from linprim_geo.base.cores import usable_cores
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
+from linprim_geo.synthetic.camera_effects import to_linear
 from linprim_geo.synthetic.realism.parts import Material, Part
 
 MAX_DEPTH = 5
@@ -25,7 +27,8 @@ FIREFLY = 3.0
 """A pixel of one pass may be this many times the mean of the others, plus FIREFLY_FLOOR of the mean of the image."""
 FIREFLY_FLOOR = 0.3
 
-VARIANTS = ("llvm_ad_rgb", "scalar_rgb")
+VARIANTS = {"scalar": "scalar_rgb", "llvm": "llvm_ad_rgb"}
+"""Mitsuba's names of the tracers."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +53,14 @@ class Stage:
 
 
 class PathTracer:
-    """A stage ready to be rendered."""
+    """A stage ready to be rendered by one of the tracers of VARIANTS on so many threads, 0 for all cores.
 
-    def __init__(self, stage: Stage, variant: str | None = None):
-        self.mi = load_mitsuba(variant)
+    Raises:
+        LinprimError: Mitsuba is not installed.
+    """
+
+    def __init__(self, stage: Stage, tracer: str = "scalar", threads: int = 0):
+        self.mi = load_mitsuba(tracer, threads or usable_cores())
         with tempfile.TemporaryDirectory(prefix="linprim-realism-") as name:
             description = self._describe(stage, Path(name))
             self.scene = self.mi.load_dict(description)
@@ -88,8 +95,9 @@ class PathTracer:
             "fov_axis": "x",
             "near_clip": 1e-3,
             "far_clip": 1e4,
-            "principal_point_offset_x": camera.cx / width - 0.5,
-            "principal_point_offset_y": camera.cy / height - 0.5,
+            # How far the middle of the image is from the principal point, not the other way round.
+            "principal_point_offset_x": 0.5 - camera.cx / width,
+            "principal_point_offset_y": 0.5 - camera.cy / height,
             "to_world": self.mi.ScalarTransform4f(pose),
             "film": {
                 "type": "hdrfilm",
@@ -161,28 +169,24 @@ class PathTracer:
         return {"type": "twosided", "bsdf": bsdf}
 
 
-def load_mitsuba(variant: str | None = None) -> Any:
-    """The module with a variant set: `variant`, or scalar_rgb.
+def load_mitsuba(tracer: str, threads: int) -> Any:
+    """Mitsuba with its variant and its number of threads set.
 
     Raises:
         LinprimError: the extra is not installed.
     """
     try:
+        import drjit
         import mitsuba
     except ImportError:
         raise LinprimError(
             "path-traced scenes want Mitsuba 3, which is not installed: pip install linprim-geo[realism]"
         ) from None
-    wanted = variant or "scalar_rgb"
-    if mitsuba.variant() != wanted:
-        mitsuba.set_variant(wanted)
+    if mitsuba.variant() != VARIANTS[tracer]:
+        mitsuba.set_variant(VARIANTS[tracer])
+    drjit.set_thread_count(threads)
+    mitsuba.set_log_level(mitsuba.LogLevel.Error)  # the sampler warns when it rounds the number of paths up
     return mitsuba
-
-
-def to_linear(value: np.ndarray) -> np.ndarray:
-    """sRGB in [0, 1] as linear intensity (IEC 61966-2-1)."""
-    value = np.asarray(value, dtype=np.float64)
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
 def write_part(path: Path, part: Part) -> None:

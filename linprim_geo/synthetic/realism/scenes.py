@@ -103,7 +103,7 @@ class TracedScene:
         Raises:
             LinprimError: Mitsuba is not installed.
         """
-        self.tracer = PathTracer(self.stage, f"{self.options.tracer}_{'ad_' * (self.options.tracer == 'llvm')}rgb")
+        self.tracer = PathTracer(self.stage, self.options.tracer, self.options.threads)
         chosen = np.linspace(0, len(self.train) - 1, min(METER_VIEWS, len(self.train))).astype(int)
         lights = [self.tracer.render(self.train[i], METER_SAMPLES, self._seed(2, i))[0] for i in chosen]
         self.exposure = METER_LEVEL / float(
