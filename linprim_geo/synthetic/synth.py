@@ -30,7 +30,8 @@ from linprim_geo.synthetic.points import Cloud, sample_points, write_colmap, wri
 from linprim_geo.synthetic.points_from_photos import photographed_colors, photographed_points
 from linprim_geo.synthetic.pose_errors import SEED as POSE_SEED
 from linprim_geo.synthetic.pose_errors import reported
-from linprim_geo.synthetic.realism.scenes import TracedScene, seen_faces
+from linprim_geo.synthetic.realism.render import load_mitsuba
+from linprim_geo.synthetic.realism.scenes import TracedScene, refuse_own, seen_faces
 from linprim_geo.synthetic.rendering import Backdrop, Renderer, depth_unit, render_views, without_threads
 from linprim_geo.synthetic.tabletop import on_table
 from linprim_geo.synthetic.textured import TexturedMesh, load_textured
@@ -118,9 +119,11 @@ def _plan(shape, mesh, options: SynthOptions) -> _Plan:
     workers = options.threads or usable_cores()
     gains = _gains(options)
     if options.realism:
+        refuse_own(options.realism, options)
         figure = None if mesh is None else _surface(None, mesh, 1.0)
         if shape is not None:
             raise LinprimError(f"--scene {shape!r} and --realism {options.realism} are both given, wanted one of them")
+        load_mitsuba(options.tracer, workers)
         traced = TracedScene(options.realism, figure, options)
         check_together(options, traced.path, transparent=False)
         caster = RayCaster(traced.surface.vertices, traced.surface.faces, threads=workers)

@@ -219,8 +219,8 @@ def street_poses(views: int, test_views: int, seed: int) -> tuple[list[np.ndarra
     The held-out views lie between training views and jitter independently.
     """
     rng = np.random.default_rng([seed, 22])
-    between = (np.arange(test_views) + 0.5) / max(test_views, 1)
-    return tuple([_on_street(way, rng) for way in ways] for ways in ((np.arange(views) + 0.5) / views, between))
+    train = [_on_street((i + 0.5) / views, rng) for i in range(views)]
+    return train, [_on_street((i + 0.5) / test_views, rng) for i in range(test_views)]
 
 
 def _on_street(way: float, rng: np.random.Generator) -> np.ndarray:

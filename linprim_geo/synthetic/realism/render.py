@@ -177,11 +177,12 @@ def load_mitsuba(tracer: str, threads: int) -> Any:
     """
     try:
         import drjit
-        import mitsuba
+        import mitsuba as module
     except ImportError:
         raise LinprimError(
             "path-traced scenes want Mitsuba 3, which is not installed: pip install linprim-geo[realism]"
         ) from None
+    mitsuba: Any = module
     if mitsuba.variant() != VARIANTS[tracer]:
         mitsuba.set_variant(VARIANTS[tracer])
     drjit.set_thread_count(threads)

@@ -80,7 +80,6 @@ class TracedScene:
     """A scene as `synth` wants it: `surface`, `train` and `test` cameras, and `picture`, after `prepare`."""
 
     def __init__(self, name: str, figure: TexturedMesh | None, options: SynthOptions):
-        refuse_own(name, options)
         scene = SCENES[name]
         self.name, self.path, self.options = name, scene.path, options
         self.stage = scene.build(figure or smooth_body(), options.seed)

@@ -17,10 +17,10 @@ def pictures(seed: int) -> list[Part]:
     """Two framed pictures on every wall."""
     width, depth, _ = ROOM
     parts = []
-    places = [((x, -0.03, 1.1), (0.9, 0, 0)) for x in (1.2, 4.6)]
-    places += [((0.03, y, 1.1), (0, 0.9, 0)) for y in (-5.6, -2.2)]
-    places += [((x + 0.9, 0.03 - depth, 1.1), (-0.9, 0, 0)) for x in (1.5, 4.4)]
-    places += [((width - 0.03, -y, 1.1), (0, -0.9, 0)) for y in (0.3, 5.3)]
+    places = [((x, -0.03, 1.1), (0.9, 0.0, 0.0)) for x in (1.2, 4.6)]
+    places += [((0.03, y, 1.1), (0.0, 0.9, 0.0)) for y in (-5.6, -2.2)]
+    places += [((x + 0.9, 0.03 - depth, 1.1), (-0.9, 0.0, 0.0)) for x in (1.5, 4.4)]
+    places += [((width - 0.03, -y, 1.1), (0.0, -0.9, 0.0)) for y in (0.3, 5.3)]
     for number, (corner, along) in enumerate(places):
         shade = ((0.18, 0.30, 0.40), (0.45, 0.30, 0.20), (0.25, 0.35, 0.25))[number % 3]
         paint = Material(color=textures.cover((512, 400), seed + number, color=shade))

@@ -40,8 +40,12 @@ def wood(shape: tuple[int, int], planks: int, seed: int, color=(0.56, 0.38, 0.24
     light = 0.10 * rings + 0.07 * fibre + 0.04 * fine + rng.uniform(-0.12, 0.12, planks)[plank]
     for _ in range(3 * planks):
         x, y, radius = rng.uniform(), rng.uniform(), rng.uniform(0.006, 0.014)
-        distance = np.hypot((u - x) * 0.5 * width / height, v - y) / radius
-        light -= 0.45 * np.exp(-(distance**2)) - 0.10 * np.cos(6.0 * distance) * np.exp(-distance / 2.0)
+        # Beyond 12 radii nothing is left of a knot.
+        rows = slice(max(0, int((y - 12 * radius) * height)), int((y + 12 * radius) * height) + 1)
+        reach = 24.0 * radius * height / width
+        part = rows, slice(max(0, int((x - reach) * width)), int((x + reach) * width) + 1)
+        distance = np.hypot((u[part] - x) * 0.5 * width / height, v[part] - y) / radius
+        light[part] -= 0.45 * np.exp(-(distance**2)) - 0.10 * np.cos(6.0 * distance) * np.exp(-distance / 2.0)
     seam = np.abs(v * planks - np.rint(v * planks)) * height / planks
     light -= 0.45 * np.exp(-((seam / 1.5) ** 2))
     tint = np.array([0.9, 1.0, 1.15])
