@@ -132,7 +132,7 @@ class SynthOptions:
         "a scene with light and materials, by path tracing (extra realism); --mesh is its figure",
         choices=("desk", "facade", "shelf", "statue"),
     )
-    samples: int = option(64, "light paths a pixel of --realism", low=4, high=65536)
+    samples: int = option(128, "light paths a pixel of --realism", low=4, high=65536)
     tracer: str = option(
         "scalar", "of --realism; llvm takes half the time and wants a libLLVM that fits", choices=("scalar", "llvm")
     )
