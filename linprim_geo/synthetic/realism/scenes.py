@@ -15,6 +15,7 @@ from linprim_geo.synthetic.camera_effects import to_srgb
 from linprim_geo.synthetic.options import SynthOptions
 from linprim_geo.synthetic.realism.desk import desk_scene
 from linprim_geo.synthetic.realism.facade import facade_scene, street_poses
+from linprim_geo.synthetic.realism.parts import Material, quad
 from linprim_geo.synthetic.realism.render import PathTracer, Stage
 from linprim_geo.synthetic.realism.shelf import shelf_scene
 from linprim_geo.synthetic.realism.statue import statue_scene
@@ -129,10 +130,12 @@ def refuse_own(name: str, options: SynthOptions) -> None:
 
 
 def surface_of(stage: Stage, name: str) -> TexturedMesh:
-    """All parts as one surface with their colours, without light."""
+    """All parts and, in white, the rectangles of light as one surface with their colours, without shading."""
+    white = Material(color=(1.0, 1.0, 1.0))
+    lamps = [quad("light", light.corner, light.edge_u, light.edge_v, white) for light in stage.lights]
     vertices, faces, part, materials = [], [], [], []
     first = offset = 0
-    for number, piece in enumerate(stage.parts):
+    for number, piece in enumerate([*stage.parts, *lamps]):
         vertices.append(piece.vertices)
         faces.append(piece.faces + offset)
         part.append(np.full(len(piece.faces), number, dtype=np.int32))
