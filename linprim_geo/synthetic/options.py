@@ -50,6 +50,11 @@ class SynthOptions:
     quarter of it for each; the geometric mean over the photographs is 1, and held-out ones have none. `table` is square
     and of wood, its side so many times the object's largest horizontal extent; cameras stay above it. Half of the
     variance of `noise` grows with the signal.
+
+    From `camera` to `tone` is what light goes through in a camera (`camera_effects` has the formulas); `pose_error` and
+    `focal_error` change the cameras that are written, of training and held-out views, not the photographs
+    (`pose_errors`). Depth, normals and the reference stay exact. With `points_from` photographs the points are
+    triangulated from the training photographs with the cameras as written, as many as there are.
     """
 
     views: int = option(60, "training views", low=2)
@@ -99,6 +104,38 @@ class SynthOptions:
     )
     noise: float = option(0.0, "standard deviation of sensor noise at middle grey, in units of 1/255", low=0, high=100)
     jpeg: int = option(0, "photographs as .jpg of this quality; 0: .png", low=0, high=100, metavar="QUALITY")
+    camera: str = option("ideal", "phone: all effects of a camera below at once", choices=("ideal", "phone"))
+    full_well: float = option(
+        0.0, "electrons of a pixel at white, whose random arrival is shot noise; 0: none", low=0, metavar="ELECTRONS"
+    )
+    read_noise: float = option(0.0, "standard deviation of the electronics", low=0, metavar="ELECTRONS")
+    exposure_walk: float = option(
+        0.0, "exposure drifts smoothly along the training views by up to X stops", low=0, high=4
+    )
+    white_balance: float = option(
+        0.0, "red and blue drift smoothly by up to this share, opposite ways", low=0, high=0.5
+    )
+    vignetting: float = option(0.0, "share of the light that is lost in the corners", low=0, high=1)
+    tone: float = option(0.0, "share of an S-shaped tone curve", low=0, high=1)
+    motion_blur: float = option(0.0, "mean length of the motion during the exposure", low=0, high=100, metavar="PIXELS")
+    pose_error: float = option(
+        0.0, "points move by this much in the image, as poses err (root mean square)", low=0, high=100, metavar="PIXELS"
+    )
+    focal_error: float = option(
+        0.0, "focal lengths are reported too long by this share; negative: --...=-0.005", low=-0.5, high=0.5
+    )
+    points_from: str = option(
+        "surface", "points of the surface, or triangulated from the photographs", choices=("surface", "photographs")
+    )
+    realism: str | None = option(
+        None,
+        "a scene with light and materials, by path tracing (extra realism); --mesh is its figure",
+        choices=("desk", "facade", "shelf", "statue"),
+    )
+    samples: int = option(128, "light paths a pixel of --realism", low=4, high=65536)
+    tracer: str = option(
+        "scalar", "of --realism; llvm takes half the time and wants a libLLVM that fits", choices=("scalar", "llvm")
+    )
     seed: int = option(0, "seed of everything random", low=0)
     threads: int = option(0, "0 uses every core; the files do not depend on it", low=0)
 
@@ -119,8 +156,8 @@ def check_together(options: SynthOptions, path: str, transparent: bool) -> None:
     """Refuses options that exclude each other; `path` and `transparent` are what was chosen where nothing was said.
 
     Raises:
-        LinprimError: a table that is no table or seen from below, an arc that is not walked, two backgrounds, JPEG with
-            alpha.
+        LinprimError: a table that is no table or seen from below, an arc that is not walked, two backgrounds, JPEG or
+            motion blur with alpha, read noise of a sensor without electrons, points from distorted photographs.
     """
     if 0 < options.table < 1:
         raise LinprimError(f"--table is {options.table}, wanted 0, or 1 to 100")
@@ -132,6 +169,20 @@ def check_together(options: SynthOptions, path: str, transparent: bool) -> None:
         raise LinprimError(
             f"--environment {options.environment} and --background {options.background!r} are both given, wanted one "
             "of them"
+        )
+    if options.read_noise and not options.full_well:
+        raise LinprimError(
+            f"--read-noise is {options.read_noise:g} electrons, but --full-well is 0, wanted the electrons at white"
+        )
+    if options.motion_blur and transparent:
+        raise LinprimError(
+            f"--motion-blur is {options.motion_blur:g}, but the background is transparent: wanted an environment or an "
+            "opaque background"
+        )
+    if options.points_from == "photographs" and options.distortion:
+        raise LinprimError(
+            f"--points-from is photographs, but --distortion is {options.distortion:g}: points are triangulated from "
+            "photographs without distortion only"
         )
     if options.jpeg and transparent:
         raise LinprimError(

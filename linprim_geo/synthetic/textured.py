@@ -274,7 +274,7 @@ def refine(vertices: np.ndarray, faces: np.ndarray, max_edge: float) -> tuple[np
 
 
 @dataclass(frozen=True)
-class _Material:
+class PieceColors:
     """Colour of one piece of a file: an image (H, W, 3) float32 with (F, 3, 2) uv, or (F, 3, 3) corner
     colours."""
 
@@ -289,7 +289,7 @@ class FileAlbedo:
     linearly."""
 
     part: np.ndarray
-    materials: tuple[_Material, ...]
+    materials: tuple[PieceColors, ...]
 
     def __call__(self, points: np.ndarray, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
         color = np.empty((len(face), 3), dtype=np.float32)
@@ -353,7 +353,7 @@ def load_textured(path: str | Path, *, detail: float = 1.0) -> TexturedMesh:
     return TexturedMesh(path.stem, vertices, faces, part, albedo)
 
 
-def _material(mesh, first: int) -> tuple[_Material, bool]:
+def _material(mesh, first: int) -> tuple[PieceColors, bool]:
     """The colours of a trimesh mesh whose faces start at number `first`, and whether the file had any."""
     visual = mesh.visual
     uv = getattr(visual, "uv", None)
@@ -364,14 +364,14 @@ def _material(mesh, first: int) -> tuple[_Material, bool]:
         factor = getattr(material, "baseColorFactor", None)
         if factor is not None:
             pixels = pixels * (np.asarray(factor[:3], dtype=np.float32) / 255.0)
-        return _Material(first, pixels, np.asarray(uv, dtype=np.float32)[mesh.faces]), True
+        return PieceColors(first, pixels, np.asarray(uv, dtype=np.float32)[mesh.faces]), True
     if visual.kind in ("vertex", "face"):
         if visual.kind == "vertex":
             corners = np.asarray(visual.vertex_colors)[mesh.faces][:, :, :3]
         else:
             corners = np.repeat(np.asarray(visual.face_colors)[:, None, :3], 3, axis=1)
-        return _Material(first, None, corners.astype(np.float32) / 255.0), True
+        return PieceColors(first, None, corners.astype(np.float32) / 255.0), True
     color = getattr(material, "main_color", None)
     flat = np.full(3, 150.0) if color is None else np.asarray(color[:3], dtype=np.float64)
     corners = np.broadcast_to(flat.astype(np.float32) / 255.0, (len(mesh.faces), 3, 3))
-    return _Material(first, None, corners), uv is not None and color is not None
+    return PieceColors(first, None, corners), uv is not None and color is not None

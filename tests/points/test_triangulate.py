@@ -12,15 +12,16 @@ from PIL import Image
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.capture.load import load_scene
-from linprim_geo.points.triangulate import (
-    _posed,
-    _reliable,
-    _sampson_px,
-    _verify,
+from linprim_geo.geometry.feature_points import (
+    FeaturePoints,
     matching_pairs,
     not_isolated,
-    triangulate_points,
+    posed_model,
+    reliable_points,
+    sampson_px,
+    verify_matches,
 )
+from linprim_geo.points.triangulate import triangulate_points
 
 SIZE, FOCAL = (200, 150), 170.0
 
@@ -78,19 +79,12 @@ def test_images_without_texture_give_no_points(tmp_path):
 
 
 def test_pairs_are_neighbours_that_look_the_same_way(room):
-    views = load_scene(room).train
-    pairs = matching_pairs(views, partners=2)
+    cameras = [view.camera for view in load_scene(room).train]
+    pairs = matching_pairs(cameras, partners=2)
     assert all(i < j for i, j in pairs) and len(set(pairs)) == len(pairs)
-    assert (0, 1) in pairs and (0, len(views) - 1) not in pairs
-    away = [
-        type(view)(
-            view.name,
-            look_at(view.camera.center, view.camera.center - view.camera.rotation[2]),
-            view.image_path,
-        )
-        for view in views
-    ]
-    assert matching_pairs([views[0], away[0]]) == []
+    assert (0, 1) in pairs and (0, len(cameras) - 1) not in pairs
+    away = look_at(cameras[0].center, cameras[0].center - cameras[0].rotation[2])
+    assert matching_pairs([cameras[0], away]) == []
 
 
 def test_points_without_company_are_dropped():
@@ -106,7 +100,7 @@ def test_points_without_company_are_dropped():
 
 
 def test_unreliable_points_are_dropped(room):
-    views = load_scene(room).train
+    cameras = [view.camera for view in load_scene(room).train]
     rng = np.random.default_rng(0)
     wall = np.concatenate([rng.uniform(-1, 1, (200, 1)), np.full((200, 1), 2.0), rng.uniform(-1, 1, (200, 1))], axis=1)
     odd = {
@@ -118,27 +112,33 @@ def test_unreliable_points_are_dropped(room):
     xyz = np.concatenate([wall, np.full((4, 3), [0.0, 2.0, 0.0]), [[0.0, 20.0, 0.0]]])
     error = np.array([0.1] * 200 + [value for value, _ in odd.values()] + [0.1])
     tracks = [[0, 2, 5]] * 200 + [track for _, track in odd.values()] + [[0, 5]]
-    keep = _reliable(views, xyz, error, tracks)
+
+    def points(xyz):
+        point = np.repeat(np.arange(len(xyz)), [len(track) for track in tracks])
+        colors, pixels = np.zeros((len(xyz), 3), np.uint8), np.zeros((len(point), 2))
+        return FeaturePoints(xyz, colors, error, point, np.concatenate(tracks), pixels)
+
+    keep = reliable_points(cameras, points(xyz))
     assert keep[:200].mean() > 0.98
     assert keep[200:].tolist() == [False, False, False, True, False]
     near_wall = xyz.copy()
     near_wall[-1] = [0.0, 2.0, 0.1]  # the last one was dropped for its place alone
-    assert _reliable(views, near_wall, error, tracks)[-1]
+    assert reliable_points(cameras, points(near_wall))[-1]
 
 
 def test_distance_from_epipolar_geometry_is_in_pixels(room):
     first, second = (load_scene(room).train[i].camera for i in (0, 4))
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3)) + [1.5, 2.0, 0.2]
     one, two = first.project(points)[0], second.project(points)[0]
-    assert _sampson_px(first, second, one, two).max() < 1e-9
+    assert sampson_px(first, second, one, two).max() < 1e-9
     # The epipolar line in the second image, from two depths on the same ray; the step across it is 5 px.
     farther = second.project(first.center + 1.01 * (points - first.center))[0]
     along = (farther - two) / np.linalg.norm(farther - two, axis=1, keepdims=True)
     across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    assert _sampson_px(first, second, one, two + 5 * along).max() < 1e-6
+    assert sampson_px(first, second, one, two + 5 * along).max() < 1e-6
     # Sampson's distance shares the step between both images: 5 / sqrt(2) if both see the scene at the same
     # size; these two differ by a fifth or so.
-    np.testing.assert_allclose(_sampson_px(first, second, one, two + 5 * across), 5 / np.sqrt(2), rtol=0.25)
+    np.testing.assert_allclose(sampson_px(first, second, one, two + 5 * across), 5 / np.sqrt(2), rtol=0.25)
 
 
 def test_matches_that_the_poses_forbid_are_dropped(room, tmp_path):
@@ -148,13 +148,13 @@ def test_matches_that_the_poses_forbid_are_dropped(room, tmp_path):
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (6, 3)) + [1.5, 2.0, 0.2]
     one, two = (views[i].camera.project(points)[0] for i in (0, 4))
     two[4:] += 20 * np.array([0.5, np.sqrt(0.75)])  # far off any epipolar line of these cameras, which run sideways
-    _posed(views, tmp_path / "db")
+    posed_model([view.camera for view in views], tmp_path / "db")
     with pycolmap.Database.open(tmp_path / "db") as database:
         for i in range(len(views)):
             keypoints = {0: one, 4: two}.get(i, np.zeros((1, 2)))
             database.write_keypoints(i + 1, keypoints.astype(np.float32))
         database.write_matches(1, 5, np.repeat(np.arange(6, dtype=np.uint32)[:, None], 2, axis=1))
-    _verify(views, tmp_path / "db", [(0, 4), (1, 2)])
+    verify_matches([view.camera for view in views], tmp_path / "db", [(0, 4), (1, 2)])
     with pycolmap.Database.open(tmp_path / "db") as database:
         kept = database.read_two_view_geometry(1, 5).inlier_matches
         assert not database.exists_two_view_geometry(2, 3)

@@ -12,7 +12,7 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import barycentric
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.synthetic import camera_paths as campath
-from linprim_geo.synthetic import shapes, synth
+from linprim_geo.synthetic import rendering, shapes, synth
 from linprim_geo.synthetic.built_in import SHAPES
 from linprim_geo.synthetic.points import MAX_TRACK, sees
 from linprim_geo.synthetic.synth import synthesize
@@ -405,7 +405,7 @@ def test_shading_follows_the_lamps_and_float_depth_is_exact(tmp_path):
         depth_format="npy",
         **{**SMALL, "points": 0},
     )
-    strength = synth.AMBIENT + sum(power * max(d[2], 0) / np.linalg.norm(d) for d, power in synth.LIGHTS)
+    strength = rendering.AMBIENT + sum(power * max(d[2], 0) / np.linalg.norm(d) for d, power in rendering.LIGHTS)
     image = png(tmp_path / "a/train/000.png")
     inside = image[..., 3] == 255
     assert np.abs(image[inside][:, :3] / 255.0 - 0.5 * strength).max() < 0.75 / 255

@@ -1,0 +1,50 @@
+"""Points that come from the photographs of a synthetic capture, as in a real one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.feature_points import file_name, reliable_points, triangulate_features
+from linprim_geo.synthetic.points import Cloud
+
+
+def photographed_points(cameras: list[Camera], photos: list[Path], seed: int, threads: int) -> Cloud:
+    """What several photographs agree on: keypoints, matched and triangulated with the given cameras."""
+
+    def copies(folder: Path) -> None:
+        for number, path in enumerate(photos):
+            save_opaque(path, folder / file_name(number))
+
+    found = triangulate_features(cameras, copies, seed, threads)
+    found = found.chosen(reliable_points(cameras, found))
+    return Cloud(found.xyz, found.rgb, found.error_px, found.point, found.image, found.pixel)
+
+
+def save_opaque(source: Path, target: Path) -> None:
+    """A copy of a photograph as PNG without alpha; what is transparent becomes black."""
+    from PIL import Image
+
+    with Image.open(source) as photo:
+        if photo.mode == "RGBA":
+            photo = Image.alpha_composite(Image.new("RGBA", photo.size, (0, 0, 0, 255)), photo)
+        photo.convert("RGB").save(target, compress_level=0)
+
+
+def photographed_colors(cloud: Cloud, photos: list[Path]) -> Cloud:
+    """The cloud with the colours of the pixels at the first observation of each point."""
+    from PIL import Image
+
+    rgb = cloud.rgb.copy()
+    first = np.searchsorted(cloud.point, np.arange(len(cloud.xyz)))
+    for number, path in enumerate(photos):
+        rows = np.flatnonzero(cloud.image[first] == number) if len(first) else first
+        if len(rows):
+            with Image.open(path) as photo:
+                pixels = np.asarray(photo.convert("RGB"))
+            column, row = cloud.pixel[first[rows]].astype(int).T
+            rgb[rows] = pixels[row, column]
+    return replace(cloud, rgb=rgb)

@@ -1,0 +1,208 @@
+"""Path tracing by Mitsuba 3: parts and light become its scene, a camera an image of linear colour."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from linprim_geo.base.cores import usable_cores
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.synthetic.camera_effects import to_linear
+from linprim_geo.synthetic.realism.parts import Material, Part
+
+MAX_DEPTH = 5
+"""Longest path in segments; what is missing of a white room's light is below 1 %."""
+
+PASSES = 2
+"""Renderings of a view that are averaged, after what is far brighter in one than in the others was cut. More of them
+would cut more, but the samples of each are stratified: one pass of 64 has the noise of four of 27."""
+
+FIREFLY = 3.0
+"""A pixel of one pass may be this many times the mean of the others, plus FIREFLY_FLOOR of the mean of the image."""
+FIREFLY_FLOOR = 0.3
+
+VARIANTS = {"scalar": "scalar_rgb", "llvm": "llvm_ad_rgb"}
+"""Mitsuba's names of the tracers."""
+
+
+@dataclass(frozen=True)
+class Light:
+    """A rectangle that shines to the side of edge_u x edge_v; `radiance` (3,) linear."""
+
+    corner: tuple[float, float, float]
+    edge_u: tuple[float, float, float]
+    edge_v: tuple[float, float, float]
+    radiance: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What is rendered: parts, rectangles of light, and `sky`, a latitude-longitude image (H, W, 3) of linear
+    radiance or None: row i + 0.5 of H is at i / H of the way from straight up to straight down, column j is along
+    azimuth 2 pi j / W from +y towards +x."""
+
+    parts: Sequence[Part]
+    lights: Sequence[Light] = field(default_factory=tuple)
+    sky: np.ndarray | None = None
+
+
+class PathTracer:
+    """A stage ready to be rendered by one of the tracers of VARIANTS on so many threads, 0 for all cores.
+
+    Raises:
+        LinprimError: Mitsuba is not installed.
+    """
+
+    def __init__(self, stage: Stage, tracer: str = "scalar", threads: int = 0):
+        self.mi = load_mitsuba(tracer, threads or usable_cores())
+        with tempfile.TemporaryDirectory(prefix="linprim-realism-") as name:
+            description = self._describe(stage, Path(name))
+            self.scene = self.mi.load_dict(description)
+
+    def render(self, camera: Camera, samples: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """Linear radiance (H, W, 3) float32 and the standard error of each value, from `samples` paths a pixel.
+
+        Pixels are box-filtered and independent of each other. The same seed gives the same image.
+        """
+        mi = self.mi
+        sensor = mi.load_dict(self._sensor(camera))
+        each = max(1, samples // PASSES)
+        images = np.stack(
+            [
+                np.array(mi.render(self.scene, sensor=sensor, spp=each, seed=PASSES * seed + i))[..., :3]
+                for i in range(PASSES)
+            ]
+        ).astype(np.float32)
+        others = (images.sum(0) - images) / (PASSES - 1)
+        images = np.minimum(images, FIREFLY * others + FIREFLY_FLOOR * images.mean())
+        return images.mean(0), images.std(0, ddof=1) / np.float32(np.sqrt(PASSES))
+
+    def _sensor(self, camera: Camera) -> dict[str, Any]:
+        """Mitsuba's perspective camera looks along +z with x to the left and y up."""
+        pose = camera.camera_to_world @ np.diag([-1.0, -1.0, 1.0, 1.0])
+        width, height = camera.width, camera.height
+        if abs(camera.fx - camera.fy) > 1e-9 * camera.fx:
+            raise LinprimError(f"focal lengths are {camera.fx:g} and {camera.fy:g}, the path tracer wants equal ones")
+        return {
+            "type": "perspective",
+            "fov": float(np.rad2deg(2.0 * np.arctan(0.5 * width / camera.fx))),
+            "fov_axis": "x",
+            "near_clip": 1e-3,
+            "far_clip": 1e4,
+            # How far the middle of the image is from the principal point, not the other way round.
+            "principal_point_offset_x": 0.5 - camera.cx / width,
+            "principal_point_offset_y": 0.5 - camera.cy / height,
+            "to_world": self.mi.ScalarTransform4f(pose),
+            "film": {
+                "type": "hdrfilm",
+                "width": width,
+                "height": height,
+                "pixel_format": "rgb",
+                "component_format": "float32",
+                "rfilter": {"type": "box"},
+            },
+            "sampler": {"type": "multijitter"},
+        }
+
+    def _describe(self, stage: Stage, folder: Path) -> dict[str, Any]:
+        mi = self.mi
+        scene: dict[str, Any] = {"type": "scene", "integrator": {"type": "path", "max_depth": MAX_DEPTH, "rr_depth": 3}}
+        for number, part in enumerate(stage.parts):
+            path = folder / f"{number}.ply"
+            write_part(path, part)
+            scene[f"part{number}"] = {
+                "type": "ply",
+                "filename": str(path),
+                "face_normals": not part.smooth,
+                "bsdf": self._bsdf(part.material, part.colors is not None),
+            }
+        for number, light in enumerate(stage.lights):
+            corner, u, v = (np.array(value, dtype=np.float64) for value in (light.corner, light.edge_u, light.edge_v))
+            frame = np.eye(4)
+            frame[:3] = np.stack(
+                [0.5 * u, 0.5 * v, np.cross(u, v) / np.linalg.norm(np.cross(u, v)), corner + 0.5 * (u + v)], axis=1
+            )
+            scene[f"light{number}"] = {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f(frame),
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [float(c) for c in light.radiance]}},
+            }
+        if stage.sky is not None:
+            # Mitsuba has y up and -z at the first column.
+            turn = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
+            scene["sky"] = {
+                "type": "envmap",
+                "bitmap": mi.Bitmap(np.array(stage.sky, dtype=np.float32, order="C")),
+                "to_world": mi.ScalarTransform4f(turn),
+            }
+        return scene
+
+    def _bsdf(self, material: Material, own_colors: bool) -> dict[str, Any]:
+        if own_colors:
+            color: dict[str, Any] = {"type": "mesh_attribute", "name": "vertex_color"}
+        elif isinstance(material.color, np.ndarray):
+            color = {"type": "bitmap", "bitmap": self.mi.Bitmap(np.array(material.color, order="C"))}
+        else:
+            color = {"type": "rgb", "value": [float(c) for c in to_linear(np.array(material.color))]}
+        if material.kind == "metal":
+            bsdf = {"type": "roughconductor", "material": "Cr", "alpha": material.roughness, "distribution": "ggx"}
+        elif material.kind == "plastic" and own_colors:
+            # Mitsuba's roughplastic wants the mean of its colour, which colours at vertices do not have.
+            roughness = float(np.sqrt(material.roughness))
+            bsdf = {"type": "principled", "base_color": color, "roughness": roughness, "specular": 0.5}
+        elif material.kind == "plastic":
+            bsdf = {
+                "type": "roughplastic",
+                "diffuse_reflectance": color,
+                "alpha": material.roughness,
+                "distribution": "ggx",
+                "nonlinear": True,
+            }
+        else:
+            bsdf = {"type": "diffuse", "reflectance": color}
+        return {"type": "twosided", "bsdf": bsdf}
+
+
+def load_mitsuba(tracer: str, threads: int) -> Any:
+    """Mitsuba with its variant and its number of threads set.
+
+    Raises:
+        LinprimError: the extra is not installed.
+    """
+    try:
+        import drjit
+        import mitsuba as module
+    except ImportError:
+        raise LinprimError(
+            "path-traced scenes want Mitsuba 3, which is not installed: pip install linprim-geo[realism]"
+        ) from None
+    mitsuba: Any = module
+    if mitsuba.variant() != VARIANTS[tracer]:
+        mitsuba.set_variant(VARIANTS[tracer])
+    drjit.set_thread_count(threads)
+    mitsuba.set_log_level(mitsuba.LogLevel.Error)  # the sampler warns when it rounds the number of paths up
+    return mitsuba
+
+
+def write_part(path: Path, part: Part) -> None:
+    """A binary PLY as Mitsuba reads it: float32 positions, s and t with t down, linear colours."""
+    columns = {name: part.vertices[:, i] for i, name in enumerate("xyz")}
+    if part.uv is not None:
+        columns |= {"u": part.uv[:, 0], "v": 1.0 - part.uv[:, 1]}
+    if part.colors is not None:
+        columns |= {name: to_linear(part.colors[:, i]) for i, name in enumerate("rgb")}
+    vertices = np.empty(len(part.vertices), dtype=[(name, "<f4") for name in columns])
+    for name, values in columns.items():
+        vertices[name] = values
+    faces = np.empty(len(part.faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
+    faces["count"], faces["index"] = 3, part.faces
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    header += [f"property float {name}" for name in columns]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    path.write_bytes("\n".join(header).encode() + vertices.tobytes() + faces.tobytes())
