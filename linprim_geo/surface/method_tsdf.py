@@ -28,6 +28,10 @@ BYTES_PER_PIXEL, KEPT_BYTES = 6, 2**30
 LEAST_CONFIRMED = 0.01
 """Stereo that confirms less than this share of the pixels has nothing to say of a scene."""
 
+CLEARLY_LESS = 0.01
+"""Where photographs agree at a share of the vertices that is smaller by this, they speak against stereo. Where they
+agree anywhere, as on plain walls, the shares are the same but for chance."""
+
 SMALLEST_DISPARITY = 0.25
 """Depths are trusted as far as this many pixels between the two cameras that are furthest apart move a point by a
 truncation."""
@@ -107,8 +111,8 @@ def tsdf_surface(
 def _better_by_stereo(
     rendered: Mesh, fused: Callable[[Sequence[DepthFrame]], Mesh], frames: DepthFrames, stages: Stages
 ) -> tuple[Mesh, dict]:
-    """The surface of stereo, or the `rendered` one where photographs agree at more of its vertices or there is hardly
-    any stereo; with what there is to say of it."""
+    """The surface of stereo, or the `rendered` one where photographs agree at clearly more of its vertices or there is
+    hardly any stereo; with what there is to say of it."""
     try:
         merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)
     except LinprimError as error:
@@ -123,7 +127,7 @@ def _better_by_stereo(
     gains = photo_gains(rendered, cameras, (view.load() for view in frames.views))
     without, with_stereo = (_agreeing(surface, frames.views, gains) for surface in (rendered, mesh))
     stages.lap("compare")
-    taken = with_stereo >= without
+    taken = with_stereo > without - CLEARLY_LESS
     stages.note(
         f"photographs agree at {without:.1%} of the vertices without stereo and at {with_stereo:.1%} with it: "
         f"{'it is' if taken else 'it is not'} taken"

@@ -117,8 +117,8 @@ def many_views(tmp_path_factory):
     return octahedron_run(tmp_path_factory.mktemp("many"), views=60, size=40)
 
 
-@pytest.mark.parametrize("shares, taken", [((0.8, 0.9), True), ((0.9, 0.8), False), ((0.9, 0.9), True)])
-def test_the_surface_is_the_one_at_which_photographs_agree_more_often(many_views, monkeypatch, shares, taken):
+@pytest.mark.parametrize("shares, taken", [((0.8, 0.9), True), ((0.9, 0.88), False), ((0.9, 0.895), True)])
+def test_photographs_that_agree_clearly_less_often_speak_against_stereo(many_views, monkeypatch, shares, taken):
     told = iter(shares)
     monkeypatch.setattr(Scene, "has_alpha", False)
     monkeypatch.setattr(method_tsdf, "LEAST_CONFIRMED", 0.0)
