@@ -21,7 +21,7 @@ FEWEST_PIXELS, MOST_PIXELS = -4.0, 0.0
 # Of masks, pixels below this alpha are background, whose depth is not asked for.
 FOREGROUND = 128
 # The logit of the probability: a constant, and weights of the evidence in the order of `evidence`.
-WEIGHTS = np.array([-0.726, 0.594, 1.993, -2.388, 0.429, 3.258])
+WEIGHTS = np.array([-0.854, 0.839, 1.958, -2.295, 0.527, 3.223])
 
 
 def evidence(plane: np.ndarray, cost: np.ndarray, known: np.ndarray, glances: list[Glance]) -> np.ndarray:

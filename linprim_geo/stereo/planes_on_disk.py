@@ -15,9 +15,10 @@ from linprim_geo.base.memory import available_memory
 from linprim_geo.base.progress import Progress
 from linprim_geo.capture.types import View
 from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage
-from linprim_geo.points.view_pairs import SOURCES, source_views
+from linprim_geo.points.view_pairs import source_views
 from linprim_geo.stereo.depth_maps import (
     GEOMETRIC_SWEEPS,
+    MOST_SOURCES,
     SMALLEST,
     geometric_planes,
     grey_of,
@@ -30,9 +31,10 @@ from linprim_geo.stereo.depth_maps import (
 # By photographs alone, then in turns with the depths of neighbours.
 STAGES = 1 + len(GEOMETRIC_SWEEPS)
 # Photographs in memory: one, those that it is compared with, and as many again for the next one.
-KEPT = 2 * (1 + SOURCES)
-# Bytes per pixel of the largest photograph at the peak, when points are fused: 720 on `banana`.
-PIXEL_BYTES = 750
+KEPT = 2 * (1 + MOST_SOURCES)
+# Bytes per pixel of the largest photograph at the peak, when points are fused: 980 on `banana`, whose photographs are
+# compared with four others at most, and 20 for each further one.
+PIXEL_BYTES = 1100
 
 
 class Photographs:
@@ -56,7 +58,7 @@ class Photographs:
                 f"stereo of photographs of {largest.width}x{largest.height} takes {wanted / 2**30:.1f} GiB of the "
                 f"{free / 2**30:.1f} that are free, wanted smaller ones (--downscale)"
             )
-        self.pairs = source_views(self.cameras, points)
+        self.pairs = source_views(self.cameras, points, MOST_SOURCES)
         if not any(self.pairs):
             raise LinprimError(
                 "no two photographs show the same points from directions that differ: stereo needs such pairs"

@@ -12,8 +12,8 @@ from linprim_geo.stereo.evidence import CONTINUED, REACH, glance, support
 NORMAL = np.array([0.3, -0.25, 1.0]) / np.linalg.norm([0.3, -0.25, 1.0])
 
 
-def camera_at(center) -> Camera:
-    return look_at(center, size=(96, 72), focal=110.0, up=(0.0, 1.0, 0.0))
+def camera_at(center, target=(0.0, 0.0, 0.0)) -> Camera:
+    return look_at(center, target, size=(96, 72), focal=110.0, up=(0.0, 1.0, 0.0))
 
 
 def plane_of(camera: Camera) -> np.ndarray:
@@ -75,13 +75,17 @@ def test_support_is_whole_on_a_plane_and_lost_beside_a_step():
     assert not support(plane, ~known).any()
 
 
-def test_evidence_counts_those_that_see_a_depth():
+def test_evidence_counts_those_in_which_a_point_falls_inside_and_that_see_a_depth():
     plane, known = plane_of(ONE), np.ones((72, 96), bool)
     same, other = (glance(ONE, scale / plane[0], OTHER, plane_of(OTHER)) for scale in (1.0, 1.05))
     unseen = glance(ONE, 1 / plane[0], OTHER, np.full((3, 72, 96), np.nan))
+    # It has a surface everywhere, but looks past the point.
+    beside = camera_at((0.5, 0, -2.9), (1.5, 0, 0))
+    outside = glance(ONE, 1 / plane[0], beside, np.broadcast_to([[[0.3]], [[0.0]], [[0.0]]], (3, 72, 96)))
     cost = np.full((72, 96), 0.1, np.float32)
     at = (36, 48)
-    found = evidence(plane, cost, known, [same, other, unseen])[at]
+    assert outside.pixel[at] == -1 and (outside.pixel >= 0).any()
+    found = evidence(plane, cost, known, [same, other, unseen, outside])[at]
     pixels = min(np.log2(RIGHT * same.parallax[at]), MOST_PIXELS)
     assert np.allclose(found, [1, 1, 1 / 2, 0.1, pixels, 1], atol=1e-6)
     assert np.allclose(evidence(plane, cost, known, [unseen])[at][1:3], 0)
