@@ -45,18 +45,19 @@ class DepthMap:
     """What stereo says of a photograph.
 
     `depth` (H, W) float32 along the optical axis in the scene's unit, NaN where unknown; `normal` (H, W, 3) float32 in
-    the world, towards the camera; `cost` (H, W) float32 of the match, 0 to 2; `confirmed` (H, W) uint8, by how many of
-    `sources` other views, and `deviation` (H, W) float32 the least share of the depth by which one of these differs,
-    infinite where none sees the point. `grey` (H, W) uint8 is what was matched, `noise` the variance of its noise.
+    the world, towards the camera; `cost` (H, W) float32 of the match, 0 to 2; `seen` (H, W) uint8 how many other views
+    have a surface where the point falls, `confirmed` (H, W) uint8 how many of them the same, and `deviation` (H, W)
+    float32 the least share of the depth by which one of these differs, infinite where none has. `grey` (H, W) uint8 is
+    what was matched, `noise` the variance of its noise.
     """
 
     camera: Camera
     depth: np.ndarray
     normal: np.ndarray
     cost: np.ndarray
+    seen: np.ndarray
     confirmed: np.ndarray
     deviation: np.ndarray
-    sources: int
     grey: np.ndarray
     noise: float
 
@@ -237,13 +238,14 @@ def _depth_map(
         empty = np.full((height, width), np.nan, np.float32)
         none, infinite = np.zeros((height, width), np.uint8), np.full((height, width), np.inf, np.float32)
         normal = np.zeros((height, width, 3), np.float32)
-        return DepthMap(camera, empty, normal, empty, none, infinite, 0, image.grey, noise)
+        return DepthMap(camera, empty, normal, empty, none, none, infinite, image.grey, noise)
     depth, normal = depth_and_normal(camera, planes.plane)
-    confirmed = np.zeros((height, width), np.uint8)
+    seen, confirmed = (np.zeros((height, width), np.uint8) for _ in range(2))
     deviation = np.full((height, width), np.inf, np.float32)
     for other, theirs in others:
         if theirs is not None:
             miss, relative = misses(camera, depth, other, theirs.plane[..., 0])
+            seen += np.isfinite(miss)
             confirmed += (miss < CONFIRMED_PX) & (relative < CONFIRMED_DEPTH)
             deviation = np.fmin(deviation, relative)
     known = (planes.plane[..., 0] > 0) & (planes.cost < MOST_COST)
@@ -252,9 +254,9 @@ def _depth_map(
         np.where(known, depth, np.nan).astype(np.float32),
         normal.astype(np.float32),
         planes.cost,
+        seen,
         np.where(known, confirmed, 0).astype(np.uint8),
         deviation,
-        sum(theirs is not None for _, theirs in others),
         image.grey,
         noise,
     )

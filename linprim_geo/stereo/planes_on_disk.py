@@ -108,7 +108,7 @@ class PlanesOnDisk:
 
     def read(self, k: int) -> np.ndarray:
         """(5, H, W) float32 of view k, mapped from its file: `DepthPlanes.plane`, its cost, and what was chosen."""
-        return np.load(self._file(k, STAGES - 1), mmap_mode="r")
+        return np.load(self._file(k, STAGES - 1), mmap_mode="r", allow_pickle=False)
 
     def _planes(self, k: int, stage: int) -> DepthPlanes:
         photographs = self.photographs
@@ -120,7 +120,7 @@ class PlanesOnDisk:
             if len(near) == 1:
                 return DepthPlanes.unknown(*images[0].grey.shape)
             return photometric_planes(images, [photographs.half(j) for j in near], depths, noise, seed)
-        before = [np.load(self._file(j, stage - 1), mmap_mode="r") for j in near]
+        before = [np.load(self._file(j, stage - 1), mmap_mode="r", allow_pickle=False) for j in near]
         plane, cost, chosen = np.moveaxis(before[0][:3], 0, 2), before[0][3], before[0][4]
         planes = DepthPlanes(np.array(plane, order="C"), np.array(cost), chosen.astype(np.uint8))
         if len(near) > 1:

@@ -16,9 +16,9 @@ from linprim_geo.stereo.depth_maps import CONFIRMED_DEPTH, DepthMap, depth_maps
 from linprim_geo.stereo.plain_regions import PlainRegion, common_planes, edges_of, plain_regions, plane_depths
 from linprim_geo.surface.tsdf_field import DepthFrame
 
-# A depth counts as confirmed if so many neighbours confirm it; one that a single neighbour confirms is wrong two to
-# four times as often and counts so much.
-NEIGHBOURS, LONE_WEIGHT = 2, 0.1
+# A depth counts as confirmed if so many other views confirm it, or two and all but one of fewer that show the point.
+# One that fewer confirm is wrong two to four times as often and counts so much.
+CONFIRMING, DOUBTFUL_WEIGHT = 3, 0.1
 # A piece of surface is supported if so many views have depths on this share of it. What is true has 0.3 to 0.9 of it
 # so, what is not 0.1 at most.
 SUPPORTING_VIEWS, SUPPORTED_SHARE = 2, 0.25
@@ -32,7 +32,7 @@ class MergedFrames(Sequence):
 
     `weight` is what rendered depths count elsewhere: the squared deviation of confirmed depths from those of their
     neighbours over that of rendered ones from confirmed ones, 1 at most. `confirmed` is the share of pixels with
-    confirmed depths, `lone` that of those which one neighbour alone confirms, `plain` that of pixels on one of the
+    confirmed depths, `doubtful` that of those which too few views confirm, `plain` that of pixels on one of the
     `planes` (K, 4).
     """
 
@@ -40,9 +40,12 @@ class MergedFrames(Sequence):
         self.rendered, self.limit = rendered, limit
         points = np.concatenate([_some(frame.surface()[0], POINTS // len(views)) for frame in rendered])
         maps = depth_maps(views, points, quiet=quiet)
-        self.depths = [_depth_where(found, found.confirmed >= NEIGHBOURS) for found in maps]
-        self.lone_depths = [_depth_where(found, found.confirmed == 1) for found in maps]
-        self.confirmed, self.lone = _share_known(self.depths), _share_known(self.lone_depths)
+        sure = [_is_confirmed(found) for found in maps]
+        self.depths = [_depth_where(found, own) for found, own in zip(maps, sure, strict=True)]
+        self.doubtful_depths = [
+            _depth_where(found, ~own & (found.confirmed > 0)) for found, own in zip(maps, sure, strict=True)
+        ]
+        self.confirmed, self.doubtful = _share_known(self.depths), _share_known(self.doubtful_depths)
         regions = _plain_regions(maps, self.depths)
         self.planes = common_planes([found.camera for found in maps], [region for own in regions for region in own])
         deviations, self.on_planes = Deviations(), []
@@ -56,7 +59,7 @@ class MergedFrames(Sequence):
         """For the statistics."""
         return {
             "confirmed": self.confirmed,
-            "lone": self.lone,
+            "doubtful": self.doubtful,
             "rendered_weight": self.weight,
             "plain": self.plain,
             "planes": len(self.planes),
@@ -66,15 +69,19 @@ class MergedFrames(Sequence):
         return len(self.rendered)
 
     def __getitem__(self, index):
-        return self._merged(self.rendered[index], self.lone_depths[index], self.on_planes[index], self.depths[index])
+        return self._merged(
+            self.rendered[index], self.doubtful_depths[index], self.on_planes[index], self.depths[index]
+        )
 
     def __iter__(self) -> Iterator[DepthFrame]:
-        return map(self._merged, self.rendered, self.lone_depths, self.on_planes, self.depths)
+        return map(self._merged, self.rendered, self.doubtful_depths, self.on_planes, self.depths)
 
-    def _merged(self, frame: DepthFrame, lone: np.ndarray, on_plane: np.ndarray, confirmed: np.ndarray) -> DepthFrame:
+    def _merged(
+        self, frame: DepthFrame, doubtful: np.ndarray, on_plane: np.ndarray, confirmed: np.ndarray
+    ) -> DepthFrame:
         depth, weight = frame.depth, np.full(frame.depth.shape, self.weight, np.float32)
         known = np.zeros(depth.shape, bool)
-        for source, own_weight in ((lone, LONE_WEIGHT), (on_plane, 1), (confirmed, 1)):
+        for source, own_weight in ((doubtful, DOUBTFUL_WEIGHT), (on_plane, 1), (confirmed, 1)):
             better = source <= self.limit  # not where it is NaN
             if frame.background is not None:
                 # Beside an outline the windows of stereo take the background for a part of what is in front of it.
@@ -117,6 +124,11 @@ class MergedFrames(Sequence):
 def _some(points: np.ndarray, count: int) -> np.ndarray:
     """About `count` of (P, 3) points, evenly over their order."""
     return points[:: max(1, len(points) // max(1, count))]
+
+
+def _is_confirmed(found: DepthMap) -> np.ndarray:
+    """(H, W) bool."""
+    return found.confirmed >= np.minimum(CONFIRMING, np.maximum(2, found.seen.astype(np.int8) - 1))
 
 
 def _depth_where(found: DepthMap, taken: np.ndarray) -> np.ndarray:

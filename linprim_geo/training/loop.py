@@ -34,10 +34,10 @@ def run_steps(
     progress: Progress,
     pace: Pace | None = None,
     until: int | None = None,
-    advance: Callable[[Trainer], None] = Trainer.advance,
+    advance: Callable[[Trainer], None] | None = None,
 ) -> tuple[float, float | None, float | None]:
     """Steps until the end, or to step `until` of all, with lines in metrics.jsonl, checkpoints, and scores on
-    `held_out` now and then. `advance` makes one step.
+    `held_out` now and then. `advance` makes one step in place of `Trainer.advance`.
 
     Returns: seconds spent in steps, and the final mean held-out PSNR in dB, as rendered and, where exposures are
         fitted, with gains; None without views.
@@ -57,7 +57,7 @@ def run_steps(
             if pace:
                 pace.watch(trainer, run, progress, save=lambda: save_training(trainer, run))
             try:
-                advance(trainer)
+                advance(trainer) if advance else trainer.advance()
             except UnreadablePhoto:
                 raise
             except LinprimError as error:

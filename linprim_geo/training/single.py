@@ -30,7 +30,7 @@ def train_run(
     progress: Progress,
     decisions: Sequence[Decision] = (),
     budget: Budget | None = None,
-    advance: Callable[[Trainer], None] = Trainer.advance,
+    advance: Callable[[Trainer], None] | None = None,
 ) -> dict:
     """Trains from a checkpoint's `state`, or from the start: what is random does not depend on when a run was stopped.
 

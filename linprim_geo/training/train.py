@@ -40,7 +40,7 @@ def train(
     blocks: int | str = 1,
     cluster: str | None = None,
     workers: int = 0,
-    advance: Callable[[Trainer], None] = Trainer.advance,
+    advance: Callable[[Trainer], None] | None = None,
 ) -> dict:
     """Trains a scene into a run folder.
 
@@ -59,8 +59,8 @@ def train(
     With `blocks` other than 1 the scene is trained in blocks of space by several workers, see
     `blocks.driver.train_blocks`.
 
-    `advance` makes one step, from step 0 of a new run on: who measures steps gives a function that calls
-    `Trainer.advance` in it. Blocks are trained without it.
+    `advance` makes one step in place of `Trainer.advance`, from step 0 of a new run on: who measures steps
+    gives a function that calls that in it. Blocks are trained without it.
 
     Returns: `run`, `iterations`, `seconds` (of training steps alone), `primitives`, `psnr` (mean over held-out views),
     `views`; with held-out views also `train_psnr`, the mean over at most 31 training views, and `advice` where these

@@ -27,14 +27,15 @@ CAMERA = look_at((0.0, -3.0, 0.0), size=(40, 30))
 
 @pytest.fixture
 def found(monkeypatch):
-    """Stereo that finds depth 3 in the left half, confirmed by two views but for the first two rows, by one in the
-    second, with a deviation of 0.001."""
+    """Stereo that finds depth 3 in the left half, confirmed by two of three views but for the first two rows, by one
+    in the second, with a deviation of 0.001."""
     depth = np.full((30, 40), 3.0, np.float32)
     confirmed = np.full((30, 40), 2, np.uint8)
     confirmed[0], confirmed[1], confirmed[:, 20:] = 0, 1, 0
     deviation = np.full((30, 40), 0.001, np.float32)
     grey = np.zeros((30, 40), np.uint8)
-    maps = [SimpleNamespace(camera=CAMERA, depth=depth, confirmed=confirmed, deviation=deviation, sources=4)]
+    seen = np.full((30, 40), 3, np.uint8)
+    maps = [SimpleNamespace(camera=CAMERA, depth=depth, seen=seen, confirmed=confirmed, deviation=deviation)]
     maps[0].grey, maps[0].noise = grey, 1.0
     monkeypatch.setattr(stereo_frames, "depth_maps", lambda *_, **__: maps)
 
@@ -47,11 +48,11 @@ def test_confirmed_depths_take_the_place_of_rendered_ones(found):
     merged = MergedFrames(rendered(0.01), [None], 5.0)
     frame = merged[0]
     assert (frame.depth[1:, :20] == 3).all() and np.allclose(frame.depth[0], 3.03)
-    assert merged.confirmed == pytest.approx(28 / 60) and merged.lone == pytest.approx(1 / 60)
+    assert merged.confirmed == pytest.approx(28 / 60) and merged.doubtful == pytest.approx(1 / 60)
     # (0.001 / sqrt 2 / 0.01)^2
     assert merged.weight == pytest.approx(0.005, rel=1e-4)
     assert (frame.confidence[2:, :20] == 1).all() and np.allclose(frame.confidence[:, 20:], merged.weight)
-    assert np.allclose(frame.confidence[1, :20], stereo_frames.LONE_WEIGHT)
+    assert np.allclose(frame.confidence[1, :20], stereo_frames.DOUBTFUL_WEIGHT)
 
 
 def test_planes_stand_where_nothing_is_confirmed(found, monkeypatch):
@@ -83,6 +84,16 @@ def test_what_primitives_let_through_is_no_surface(found):
         and merged.background[:, :5].all()
         and (merged.depth[1:, 5:20] == 3).all()
     )
+
+
+def test_of_more_views_that_show_a_point_more_have_to_confirm_it(found):
+    maps = stereo_frames.depth_maps()
+    for seen, wanted in ((2, 2), (3, 2), (4, 3), (8, 3)):
+        maps[0].seen[:] = seen
+        for confirming in (wanted - 1, wanted):
+            maps[0].confirmed[2:, :20] = confirming
+            merged = MergedFrames(rendered(0.01), [None], 5.0)
+            assert (merged[0].confidence[2:, :20] == (1 if confirming == wanted else np.float32(0.1))).all()
 
 
 def sheet(low, high, y: float) -> Mesh:
