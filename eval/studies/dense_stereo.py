@@ -205,7 +205,7 @@ def run(given: argparse.Namespace) -> None:
             measured = measure(capture, reference, given.output / capture.name, given.photographs, given.threads)
             with atomic_write(saved) as temporary:
                 np.savez(temporary, **measured)
-        captures[capture.name] = dict(np.load(saved))
+        captures[capture.name] = dict(np.load(saved, allow_pickle=False))
         print(json.dumps(row(capture.name, captures[capture.name])), flush=True)
     if given.fit:
         print("weights:", np.round(fit([captures[name] for name in given.fitted]), 3).tolist())
