@@ -347,12 +347,15 @@ class ExtractOptions:
     stereo: str = option(
         "auto",
         "fuse the depths that PatchMatch stereo finds in the photographs where views confirm them: on, off, or auto: "
-        "where these are without masks, and agree with each other at more of the surface with it than without, "
+        "where these are without masks, and do not agree with each other at clearly less of the surface, "
         "with --method tsdf, without --blocks and --time-budget",
         choices=("auto", "on", "off"),
     )
     smallest_part: float = option(
-        0.01, "drop components with less than this share of the largest one's area", low=0, high=1
+        0.01,
+        "drop components with less than this share of the largest one's area, if stereo does not support them",
+        low=0,
+        high=1,
     )
     refine: int | str = option(
         "auto",
