@@ -19,6 +19,7 @@ from linprim_geo.capture.types import View
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, patch_match
 from linprim_geo.points.view_pairs import source_views, visible_pixels
+from linprim_geo.stereo.evidence import glance
 
 # Photographs that one is matched with, at most: as many as the core takes.
 MOST_SOURCES = 8
@@ -26,12 +27,10 @@ MOST_SOURCES = 8
 COARSE_SWEEPS, FINE_SWEEPS, GEOMETRIC_SWEEPS = 3, 1, (1, 1)
 # The nearest depth is that of the nearest points that a view shows, but for this share, divided by NEARER.
 NEAREST_SHARE, NEARER = 0.01, 1.5
-# A depth is confirmed by another view that comes back to within so many pixels, and so near in depth.
-CONFIRMED_PX, CONFIRMED_DEPTH = 1.0, 0.01
 # Variance of grey values that rounding them causes, at least.
 LEAST_NOISE = 1.0
-# Bytes per pixel of all views that are in memory at once: planes 17, images 7, depths of the last turn 4, maps 25.
-PIXEL_BYTES = 53
+# Bytes per pixel of all views that are in memory at once: planes 17, images 7, depths of the last turn 4, maps 26.
+PIXEL_BYTES = 54
 # Of the memory that is free, no more than this share is taken.
 MEMORY_SHARE = 0.5
 # Both sides of a photograph have at least this many pixels: half of them hold a window.
@@ -244,10 +243,10 @@ def _depth_map(
     deviation = np.full((height, width), np.inf, np.float32)
     for other, theirs in others:
         if theirs is not None:
-            miss, relative = misses(camera, depth, other, theirs.plane[..., 0])
-            seen += np.isfinite(miss)
-            confirmed += (miss < CONFIRMED_PX) & (relative < CONFIRMED_DEPTH)
-            deviation = np.fmin(deviation, relative)
+            found = glance(camera, depth, other, np.moveaxis(theirs.plane, 2, 0))
+            seen += np.isfinite(found.miss)
+            confirmed += found.confirms
+            deviation = np.fmin(deviation, np.abs(found.relative))
     known = (planes.plane[..., 0] > 0) & (planes.cost < MOST_COST)
     return DepthMap(
         camera,
@@ -260,29 +259,3 @@ def _depth_map(
         image.grey,
         noise,
     )
-
-
-def misses(camera: Camera, depth: np.ndarray, other: Camera, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far points of (H, W) depths come back from where they are when another camera's surface, of (H', W') inverse
-    depths, is taken in their place: (H, W) float32 pixels and share of the depth, infinite where it sees none."""
-    result = np.full((2, *depth.shape), np.inf, np.float32)
-    rows, columns = np.nonzero(np.isfinite(depth) & (depth > 0))
-    own = depth[rows, columns]
-    pixels, z = other.project(_points(camera, columns + 0.5, rows + 0.5, own))
-    with np.errstate(invalid="ignore"):
-        seen = (z > 0) & (pixels >= 0).all(1) & (pixels < (other.width, other.height)).all(1)
-    rows, columns, own, pixels = rows[seen], columns[seen], own[seen], pixels[seen]
-    u, v = pixels.astype(np.int64).T
-    there = inverse[v, u]
-    known = there > 0  # not where it is NaN
-    rows, columns, own, pixels = rows[known], columns[known], own[known], pixels[known]
-    back, back_z = camera.project(_points(other, pixels[:, 0], pixels[:, 1], 1 / there[known].astype(np.float64)))
-    result[0, rows, columns] = np.hypot(back[:, 0] - columns - 0.5, back[:, 1] - rows - 0.5)
-    result[1, rows, columns] = np.abs(back_z / own - 1)
-    return result[0], result[1]
-
-
-def _points(camera: Camera, column: np.ndarray, row: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """World points at these places of the image and depths."""
-    rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones(len(column))], axis=1)
-    return (rays * depth[:, None] - camera.world_to_camera[:3, 3]) @ camera.rotation

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.stereo.depth_maps import CONFIRMED_DEPTH, CONFIRMED_PX
 
+# A depth is confirmed by another view that comes back to within so many pixels, and so near in depth.
+CONFIRMED_PX, CONFIRMED_DEPTH = 1.0, 0.01
 # Pixels from a pixel to those that are to continue its plane, half a window of PatchMatch, and by what share of their
 # inverse depth they may differ from it, half of what counts as right.
 REACH, CONTINUED = 5, 0.005

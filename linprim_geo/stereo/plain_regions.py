@@ -15,7 +15,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, find_objects, label, uniform_filter
 
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.stereo.depth_maps import CONFIRMED_DEPTH
+from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 
 # An edge runs through 3 by 3 pixels whose variance is so many times that of the noise; fewer edge pixels than SPECK
 # together are noise.

@@ -67,31 +67,32 @@ def tsdf_surface(
     voxel = options.voxel_size if options.voxel_size > 0 else auto_voxel_size(frames)
     memory = int(options.memory_limit * 2**30) if options.memory_limit > 0 else None
 
-    def fused(source: Sequence[DepthFrame]) -> Mesh:
-        merged = source if isinstance(source, MergedFrames) else None
-        mesh = fuse_tsdf(
+    def fused(source: Sequence[DepthFrame], smallest_part: float) -> Mesh:
+        return fuse_tsdf(
             source,
             voxel_size=voxel,
             truncation_voxels=options.truncation,
             memory_limit=memory,
-            min_component=0 if merged else options.smallest_part,
+            min_component=smallest_part,
             log=stages.note,
             fuse=fuse,
         )
-        # A piece is no wider than the band in which depths vote: nothing can be said of it.
-        band = (2 * options.truncation * voxel) ** 2
-        return merged.supported_parts(mesh, options.smallest_part, band) if merged else mesh
+
+    def fused_with_stereo(merged: MergedFrames) -> Mesh:
+        # Noise of depths makes pieces as wide as the band in which a depth votes.
+        band = 2 * options.truncation * voxel
+        return merged.supported_parts(fused(merged, 0), options.smallest_part, band**2)
 
     if options.stereo == "on":
         merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)
         stages.lap("stereo")
-        mesh, about = fused(merged), merged.about() | {"taken": True}
+        mesh, about = fused_with_stereo(merged), merged.about() | {"taken": True}
         stages.lap("fuse")
     else:
-        mesh = fused(frames)
+        mesh = fused(frames, options.smallest_part)
         stages.lap("fuse")
         if options.stereo == "auto":
-            mesh, about = _better_by_stereo(mesh, fused, frames, stages)
+            mesh, about = _better_by_stereo(mesh, fused_with_stereo, frames, stages)
     if about:
         stages.note(
             f"stereo: {about['confirmed']:.0%} of the pixels have a depth that other views confirm, "
@@ -109,7 +110,7 @@ def tsdf_surface(
 
 
 def _better_by_stereo(
-    rendered: Mesh, fused: Callable[[Sequence[DepthFrame]], Mesh], frames: DepthFrames, stages: Stages
+    rendered: Mesh, fused: Callable[[MergedFrames], Mesh], frames: DepthFrames, stages: Stages
 ) -> tuple[Mesh, dict]:
     """The surface of stereo, or the `rendered` one where photographs agree at clearly more of its vertices or there is
     hardly any stereo; with what there is to say of it."""

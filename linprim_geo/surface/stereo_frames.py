@@ -1,7 +1,7 @@
 """Depth maps for fusing out of three sources: what stereo finds and its neighbours confirm, planes of regions without
 texture, and what the primitives render everywhere else, with the weight that its deviation from the first deserves.
 
-Of the surface that is fused from them, small pieces stay that the first two of several views support."""
+Of the surface that is fused from them, small pieces stay only if stereo and planes of several views support them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import numpy as np
 from linprim_geo.capture.types import View
 from linprim_geo.geometry.mesh import Mesh, face_areas, face_components, select_faces
 from linprim_geo.points.initial_points import in_image
-from linprim_geo.stereo.depth_maps import CONFIRMED_DEPTH, DepthMap, depth_maps
+from linprim_geo.stereo.depth_maps import DepthMap, depth_maps
+from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.plain_regions import PlainRegion, common_planes, edges_of, plain_regions, plane_depths
 from linprim_geo.surface.tsdf_field import DepthFrame
 
@@ -82,10 +83,7 @@ class MergedFrames(Sequence):
         depth, weight = frame.depth, np.full(frame.depth.shape, self.weight, np.float32)
         known = np.zeros(depth.shape, bool)
         for source, own_weight in ((doubtful, DOUBTFUL_WEIGHT), (on_plane, 1), (confirmed, 1)):
-            better = source <= self.limit  # not where it is NaN
-            if frame.background is not None:
-                # Beside an outline the windows of stereo take the background for a part of what is in front of it.
-                better &= ~frame.background
+            better = self._fused(frame, source)
             depth, weight = np.where(better, source, depth), np.where(better, np.float32(own_weight), weight)
             known |= better
         clamped = None if frame.clamped is None else frame.clamped & ~known
@@ -97,14 +95,21 @@ class MergedFrames(Sequence):
             clamped=clamped,
         )
 
+    def _fused(self, frame: DepthFrame, source: np.ndarray) -> np.ndarray:
+        """(H, W) bool, where depths of a source are fused."""
+        known = source <= self.limit  # not where it is NaN
+        # Beside an outline the windows of stereo take the background for a part of what is in front of it.
+        return known if frame.background is None else known & ~frame.background
+
     def supporting(self, points: np.ndarray) -> np.ndarray:
-        """(P,) how many views have a confirmed depth, or one on a plane, at these points of the world."""
+        """(P,) how many views fuse a confirmed depth, or one on a plane, at these points of the world."""
         views = np.zeros(len(points), int)
         for frame, confirmed, on_plane in zip(self.rendered, self.depths, self.on_planes, strict=True):
+            depth = np.where(np.isfinite(confirmed), confirmed, on_plane)
+            depth = np.where(self._fused(frame, depth), depth, np.nan)
             inside, row, column = in_image(frame.camera, points)
             along = frame.camera.project(points)[1]
-            for source in (confirmed, on_plane):
-                views += inside & (np.abs(source[row, column] / along - 1) < CONFIRMED_DEPTH)
+            views += inside & (np.abs(depth[row, column] / along - 1) < CONFIRMED_DEPTH)
         return views
 
     def supported_parts(self, mesh: Mesh, share: float, least_area: float) -> Mesh:

@@ -12,7 +12,7 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.capture.types import Photo
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage
-from linprim_geo.stereo.depth_maps import _doubled, depth_maps, halved, misses, noise_of
+from linprim_geo.stereo.depth_maps import _doubled, depth_maps, halved, noise_of
 
 NORMAL = np.array([0.3, -0.25, 1.0]) / np.linalg.norm([0.3, -0.25, 1.0])
 CENTERS = [(0, 0, -3), (0.5, 0, -2.9), (-0.5, 0.1, -3), (0.1, 0.5, -3), (0, -0.5, -2.9)]
@@ -100,15 +100,3 @@ def test_planes_of_half_the_size_are_those_of_the_whole(views):
     wanted = 1 / depth_of(views[0].camera)
     assert np.allclose(fine[..., 0], wanted, rtol=1e-5)
     assert np.allclose(fine[..., 1], np.gradient(wanted, axis=1), atol=1e-6)
-
-
-def test_another_surface_is_missed(views):
-    one, other = views[0].camera, views[1].camera
-    depth, inverse = depth_of(one), 1 / depth_of(other)
-    pixels, share = misses(one, depth, other, inverse)
-    # The other's depth is that of the nearest pixel's middle: half a pixel of a slope of 0.4.
-    assert pixels[10:-10, 20:-20].max() < 0.5 and share[10:-10, 20:-20].max() < 0.01
-    pixels, share = misses(one, depth, other, 0.9 * inverse)
-    assert share[np.isfinite(share)].min() > 0.05
-    assert np.isinf(misses(one, depth, other, np.full_like(inverse, np.nan))).all()
-    assert np.isinf(misses(one, np.full_like(depth, np.nan), other, inverse)).all()

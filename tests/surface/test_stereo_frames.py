@@ -122,6 +122,17 @@ def test_small_pieces_stay_where_views_support_them(found, monkeypatch):
     assert len(alone.supported_parts(merge_parts([true, large]), 0.01, 0.01).faces) == 2
 
 
+def test_a_view_supports_a_point_once_and_only_by_what_is_fused(found, monkeypatch):
+    on_plane = np.full((30, 40), 3.0, np.float32)
+    monkeypatch.setattr(stereo_frames, "plane_depths", lambda *_: on_plane)
+    point = np.array([[-0.4, 0.0, -0.2]])
+    (frame,) = rendered(0.0)
+    assert MergedFrames([frame], [None], 5.0).supporting(point) == [1]
+    assert MergedFrames([frame], [None], 2.5).supporting(point) == [0]  # beyond the limit
+    frame.background[:] = True
+    assert MergedFrames([frame], [None], 5.0).supporting(point) == [0]
+
+
 @pytest.fixture(scope="module")
 def many_views(tmp_path_factory):
     """A run of one octahedron whose views are so near to each other that stereo finds pairs."""
