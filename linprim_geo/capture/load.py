@@ -46,9 +46,8 @@ def load_scene(
 
     Held out are the frames that the data set names so (`transforms_test.json`, else `_val`;
     `test_filenames`; ScanNet++'s lists), else every 8th of the images sorted by name; or those that `test_every` says.
-    Points come with the transforms
-    (`ply_file_path`) or from a COLMAP model in the folder whose poses agree with them. Image headers are
-    read, pixels are not (but for a few with alpha).
+    Points come with the transforms (`ply_file_path`) or from a COLMAP model in the folder whose poses agree with them.
+    Image headers are read, pixels are not (but for a few with alpha).
 
     Args:
         path: the data set's folder, or a `.json` in it, or a video.

@@ -24,6 +24,7 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.display.viewer_scene import Seen, load_seen, photo, primitive_mesh, select, stamps
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh, select_faces
+from linprim_geo.imaging.colors import to_linear
 from linprim_geo.runs.run import Run
 
 HOST = "127.0.0.1"
@@ -359,8 +360,7 @@ def _glb(mesh: Mesh, double_sided: bool) -> bytes:
     from trimesh.visual.material import PBRMaterial
 
     assert mesh.colors is not None
-    shares = mesh.colors / 255.0
-    linear = np.where(shares <= 0.04045, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
+    linear = to_linear(mesh.colors / 255.0)
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     material = PBRMaterial(doubleSided=double_sided, metallicFactor=0.0, roughnessFactor=1.0)
     body.visual = trimesh.visual.TextureVisuals(material=material)

@@ -34,9 +34,9 @@ _ISOLATION_ROUNDS = 3
 
 
 @dataclass(frozen=True)
-class FeaturePoints:
-    """Triangulated points: `xyz` (P, 3), `rgb` (P, 3) uint8, mean `error_px` (P,), and their observations: rows of
-    point, photograph and pixel position, ordered by point."""
+class ObservedPoints:
+    """Points and where photographs see them: `xyz` (P, 3), `rgb` (P, 3) uint8, mean `error_px` (P,), and observations,
+    ordered by point: `point` (N,), `image` (N,) and `pixel` (N, 2)."""
 
     xyz: np.ndarray
     rgb: np.ndarray
@@ -45,22 +45,27 @@ class FeaturePoints:
     image: np.ndarray
     pixel: np.ndarray
 
+    @property
+    def track_length(self) -> np.ndarray:
+        """(P,) how many observations each point has."""
+        return np.bincount(self.point, minlength=len(self.xyz))
+
     def tracks(self) -> list[list[int]]:
         """The photographs that see each point, in ascending order."""
         bounds = np.searchsorted(self.point, np.arange(len(self.xyz) + 1))
         return [np.unique(self.image[a:b]).tolist() for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
 
-    def chosen(self, keep: np.ndarray) -> FeaturePoints:
+    def chosen(self, keep: np.ndarray) -> ObservedPoints:
         """Those points (P,) that are True."""
         number = np.cumsum(keep) - 1
         rows = keep[self.point]
         kept = self.xyz[keep], self.rgb[keep], self.error_px[keep]
-        return FeaturePoints(*kept, number[self.point[rows]], self.image[rows], self.pixel[rows])
+        return ObservedPoints(*kept, number[self.point[rows]], self.image[rows], self.pixel[rows])
 
 
 def triangulate_features(
     cameras: Sequence[Camera], write_images: Callable[[Path], None], seed: int = 0, threads: int = -1
-) -> FeaturePoints:
+) -> ObservedPoints:
     """Keypoints (SIFT on the CPU), matched between views that look alike, verified and triangulated with the cameras
     kept fixed; all points, reliable or not (`reliable_points`).
 
@@ -114,11 +119,11 @@ def _match(database_path: Path, images: Path, pairs: list, threads: int) -> None
     )
 
 
-def _collected(points: list, model=None) -> FeaturePoints:
+def _collected(points: list, model=None) -> ObservedPoints:
     """The points of a pycolmap reconstruction with their observations."""
     elements = [(row, element) for row, point in enumerate(points) for element in point.track.elements]
     pixel = [model.image(element.image_id).points2D[element.point2D_idx].xy for _, element in elements]
-    return FeaturePoints(
+    return ObservedPoints(
         xyz=np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
         rgb=np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
         error_px=np.array([point.error for point in points], dtype=np.float32),
@@ -226,7 +231,7 @@ def file_name(index: int) -> str:
     return f"{index:06d}.png"
 
 
-def reliable_points(cameras: Sequence[Camera], points: FeaturePoints) -> np.ndarray:
+def reliable_points(cameras: Sequence[Camera], points: ObservedPoints) -> np.ndarray:
     """(P,) whether a point's error, angle and company are good enough."""
     xyz, tracks = points.xyz, points.tracks()
     if not len(xyz):

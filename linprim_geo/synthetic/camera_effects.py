@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from linprim_geo.imaging.colors import to_linear, to_srgb
 from linprim_geo.synthetic.options import SynthOptions
 
 SEED = 9
@@ -45,18 +46,6 @@ def with_camera(options: SynthOptions) -> SynthOptions:
         return options
     default = {entry.name: entry.default for entry in fields(SynthOptions)}
     return replace(options, **{name: value for name, value in PHONE.items() if getattr(options, name) == default[name]})
-
-
-def to_linear(value: np.ndarray) -> np.ndarray:
-    """sRGB as linear intensity (IEC 61966-2-1), below 0 and above 1 by the same formulas."""
-    value = np.asarray(value)
-    return np.where(value <= 0.04045, value / 12.92, ((np.maximum(value, 0.04045) + 0.055) / 1.055) ** 2.4)
-
-
-def to_srgb(value: np.ndarray) -> np.ndarray:
-    """Linear intensity as sRGB, the inverse of `to_linear`."""
-    value = np.asarray(value)
-    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * np.maximum(value, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
 class CameraEffects:

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.feature_points import ObservedPoints
 from linprim_geo.geometry.ply import color_columns, write_ply, xyz_columns
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.synthetic.camera_paths import surface_samples
@@ -25,23 +25,6 @@ MIN_FACING = 0.15
 """Points are observed at angles of more than 9 degrees from the surface, as feature matching needs."""
 
 
-@dataclass(frozen=True)
-class Cloud:
-    """Points (P, 3) as given out, colours (P, 3) uint8, error (P,) px, and observations: rows of point and
-    image number with the pixel position."""
-
-    xyz: np.ndarray
-    rgb: np.ndarray
-    error_px: np.ndarray
-    point: np.ndarray
-    image: np.ndarray
-    pixel: np.ndarray
-
-    @property
-    def track_length(self) -> np.ndarray:
-        return np.bincount(self.point, minlength=len(self.xyz))
-
-
 def sample_points(
     surface: TexturedMesh,
     caster: RayCaster,
@@ -53,7 +36,7 @@ def sample_points(
     seed: int,
     distortion: float = 0.0,
     by_pixels: bool = False,
-) -> Cloud:
+) -> ObservedPoints:
     """Surface points, each seen by at least three of the cameras (two if there are no more).
 
     They are uniform by area or, `by_pixels`, as dense as the pixels that show the surface, as are the keypoints
@@ -80,7 +63,7 @@ def sample_points(
     if wanted == 0 or found == 0:
         empty = np.zeros((0, 3))
         none = np.zeros(0, dtype=np.int64)
-        return Cloud(empty, empty.astype(np.uint8), none.astype(np.float32), none, none, np.zeros((0, 2)))
+        return ObservedPoints(empty, empty.astype(np.uint8), none.astype(np.float32), none, none, np.zeros((0, 2)))
     xyz, _, face, bary, seen = (np.concatenate(items)[:wanted] for items in zip(*batches, strict=True))
 
     # Of the views that see a point, a random MAX_TRACK are kept.
@@ -100,7 +83,7 @@ def sample_points(
         error[rows] = np.linalg.norm(project(camera, given[point[rows]], distortion)[0] - pixel[rows], axis=1)
     total = np.bincount(point, weights=error, minlength=len(xyz))
     mean = (total / np.bincount(point, minlength=len(xyz))).astype(np.float32)
-    return Cloud(given, (np.clip(color, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8), mean, point, image, pixel)
+    return ObservedPoints(given, (np.clip(color, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8), mean, point, image, pixel)
 
 
 def pixel_samples(
@@ -175,7 +158,9 @@ def sees(caster: RayCaster, camera: Camera, xyz: np.ndarray, normal: np.ndarray,
     return seen
 
 
-def write_colmap(folder: Path, cameras: list[Camera], cloud: Cloud, distortion: float = 0.0, jpeg: int = 0) -> None:
+def write_colmap(
+    folder: Path, cameras: list[Camera], cloud: ObservedPoints, distortion: float = 0.0, jpeg: int = 0
+) -> None:
     """A COLMAP model (binary) of the training views, with the points and their observations."""
     from linprim_geo.geometry.load_pycolmap import pycolmap
 
@@ -226,6 +211,6 @@ def write_colmap(folder: Path, cameras: list[Camera], cloud: Cloud, distortion: 
             raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def write_points(path: Path, cloud: Cloud) -> None:
+def write_points(path: Path, cloud: ObservedPoints) -> None:
     """A binary PLY of x y z (double, so that nothing is lost far from the origin) and red green blue."""
     write_ply(path, xyz_columns(cloud.xyz.astype(np.float64)) | color_columns(cloud.rgb))

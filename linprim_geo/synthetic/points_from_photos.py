@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.feature_points import file_name, reliable_points, triangulate_features
-from linprim_geo.synthetic.points import Cloud
+from linprim_geo.geometry.feature_points import ObservedPoints, file_name, reliable_points, triangulate_features
 
 
-def photographed_points(cameras: list[Camera], photos: list[Path], seed: int, threads: int) -> Cloud:
+def photographed_points(cameras: list[Camera], photos: list[Path], seed: int, threads: int) -> ObservedPoints:
     """What several photographs agree on: keypoints, matched and triangulated with the given cameras."""
 
     def copies(folder: Path) -> None:
@@ -20,8 +19,7 @@ def photographed_points(cameras: list[Camera], photos: list[Path], seed: int, th
             save_opaque(path, folder / file_name(number))
 
     found = triangulate_features(cameras, copies, seed, threads)
-    found = found.chosen(reliable_points(cameras, found))
-    return Cloud(found.xyz, found.rgb, found.error_px, found.point, found.image, found.pixel)
+    return found.chosen(reliable_points(cameras, found))
 
 
 def save_opaque(source: Path, target: Path) -> None:
@@ -34,7 +32,7 @@ def save_opaque(source: Path, target: Path) -> None:
         photo.convert("RGB").save(target, compress_level=0)
 
 
-def photographed_colors(cloud: Cloud, photos: list[Path]) -> Cloud:
+def photographed_colors(cloud: ObservedPoints, photos: list[Path]) -> ObservedPoints:
     """The cloud with the colours of the pixels at the first observation of each point."""
     from PIL import Image
 

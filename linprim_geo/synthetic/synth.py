@@ -17,6 +17,7 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import write_json
 from linprim_geo.base.options import with_changes
 from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.feature_points import ObservedPoints
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.synthetic import camera_paths as campath
 from linprim_geo.synthetic.built_in import SHAPES, TEXTURES
@@ -26,7 +27,7 @@ from linprim_geo.synthetic.environment import synthetic_environment
 from linprim_geo.synthetic.files import frame_entry, prepare_folder, publish_folder, shared_keys
 from linprim_geo.synthetic.options import SynthOptions, background_color, check_together
 from linprim_geo.synthetic.photos import photo_name
-from linprim_geo.synthetic.points import Cloud, sample_points, write_colmap, write_points
+from linprim_geo.synthetic.points import sample_points, write_colmap, write_points
 from linprim_geo.synthetic.points_from_photos import photographed_colors, photographed_points
 from linprim_geo.synthetic.pose_errors import SEED as POSE_SEED
 from linprim_geo.synthetic.pose_errors import reported
@@ -190,7 +191,7 @@ def _told(plan: _Plan, options: SynthOptions) -> dict[str, list[Camera]]:
     }
 
 
-def _cloud(plan: _Plan, options: SynthOptions, renderer: Renderer, told: list[Camera], folder: Path) -> Cloud:
+def _cloud(plan: _Plan, options: SynthOptions, renderer: Renderer, told: list[Camera], folder: Path) -> ObservedPoints:
     """The points that go with the photographs in `folder`."""
     photos = [folder / photo_name("train", number, options.jpeg) for number in range(len(told))]
     if options.points_from == "photographs":

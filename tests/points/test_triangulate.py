@@ -13,7 +13,7 @@ from PIL import Image
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.capture.load import load_scene
 from linprim_geo.geometry.feature_points import (
-    FeaturePoints,
+    ObservedPoints,
     matching_pairs,
     not_isolated,
     posed_model,
@@ -116,7 +116,7 @@ def test_unreliable_points_are_dropped(room):
     def points(xyz):
         point = np.repeat(np.arange(len(xyz)), [len(track) for track in tracks])
         colors, pixels = np.zeros((len(xyz), 3), np.uint8), np.zeros((len(point), 2))
-        return FeaturePoints(xyz, colors, error, point, np.concatenate(tracks), pixels)
+        return ObservedPoints(xyz, colors, error, point, np.concatenate(tracks), pixels)
 
     keep = reliable_points(cameras, points(xyz))
     assert keep[:200].mean() > 0.98

@@ -8,6 +8,7 @@ import pytest
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
+from linprim_geo.imaging.colors import to_linear, to_srgb
 from linprim_geo.synthetic import camera_effects as effects
 from linprim_geo.synthetic.camera_paths import look_at
 from linprim_geo.synthetic.options import SynthOptions
@@ -24,7 +25,7 @@ def photographed(values, **options):
 
 def test_linear_and_srgb_are_inverse():
     values = np.linspace(0.0, 1.0, 1001)
-    np.testing.assert_allclose(effects.to_srgb(effects.to_linear(values)), values, atol=1e-9)
+    np.testing.assert_allclose(to_srgb(to_linear(values)), values, atol=1e-9)
 
 
 def test_without_effects_the_picture_is_the_same_object():
@@ -43,8 +44,8 @@ def test_noise_has_the_variance_of_photons_and_electronics(light):
 
 
 def test_corners_lose_the_share_that_vignetting_says():
-    seen = effects.to_linear(photographed(np.full((101, 201, 3), 0.7), vignetting=0.4))
-    middle = float(effects.to_linear(0.7))
+    seen = to_linear(photographed(np.full((101, 201, 3), 0.7), vignetting=0.4))
+    middle = float(to_linear(0.7))
     # The middle of the corner pixel is half a pixel inside the corner.
     inside = ((100.5 - 0.5) ** 2 + (50.5 - 0.5) ** 2) / (100.5**2 + 50.5**2)
     assert seen[50, 100] == pytest.approx(middle, rel=1e-5)
@@ -74,8 +75,8 @@ def test_exposure_and_white_balance_walk_smoothly_within_their_limits():
     assert np.abs(np.diff(drawn.stops)).max() < 0.25
     grey = np.full((3, 3, 3), 0.5, np.float32)
     brightest = int(np.argmax(np.abs(drawn.stops)))
-    seen = effects.to_linear(drawn.apply(grey, "train", brightest)[0, 0])
-    light = effects.to_linear(0.5) * 2.0 ** drawn.stops[brightest]
+    seen = to_linear(drawn.apply(grey, "train", brightest)[0, 0])
+    light = to_linear(0.5) * 2.0 ** drawn.stops[brightest]
     balance = drawn.balance[brightest]
     np.testing.assert_allclose(seen, np.minimum(light * np.array([1 + balance, 1, 1 - balance]), 1.0), rtol=1e-5)
     # Held-out photographs have neither.
