@@ -21,7 +21,7 @@ FEWEST_PIXELS, MOST_PIXELS = -4.0, 0.0
 # Of masks, pixels below this alpha are background, whose depth is not asked for.
 FOREGROUND = 128
 # The logit of the probability: a constant, and weights of the evidence in the order of `evidence`.
-WEIGHTS = np.array([-0.854, 0.839, 1.958, -2.295, 0.527, 3.223])
+WEIGHTS = np.array([-1.324, 1.014, 2.011, -1.71, 0.425, 3.265])
 
 
 def evidence(plane: np.ndarray, cost: np.ndarray, known: np.ndarray, glances: list[Glance]) -> np.ndarray:

@@ -35,8 +35,9 @@ PIXEL_BYTES = 54
 MEMORY_SHARE = 0.5
 # Both sides of a photograph have at least this many pixels: half of them hold a window.
 SMALLEST = 24
-# Costs above this are those of windows that do not match: less than half of their variance is common.
-MOST_COST = 0.5
+# Windows that cost more may match by chance: less than a tenth of their variance is common, as 1 / 12 is of 36 samples
+# of noise. Weak textures under noise cost nearly as much when they are right, which other views tell.
+MOST_COST = 0.9
 
 
 @dataclass(frozen=True)

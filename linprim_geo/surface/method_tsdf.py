@@ -78,15 +78,15 @@ def tsdf_surface(
             fuse=fuse,
         )
 
-    def fused_with_stereo(merged: MergedFrames) -> Mesh:
-        # Noise of depths makes pieces as wide as the band in which a depth votes.
-        band = 2 * options.truncation * voxel
-        return merged.supported_parts(fused(merged, 0), options.smallest_part, band**2)
+    def fused_with_stereo(merged: MergedFrames) -> tuple[Mesh, dict]:
+        mesh, left_out = merged.supported(fused(merged, 0), options.smallest_part, 2 * options.truncation * voxel)
+        return mesh, merged.about() | {"unsupported": left_out}
 
     if options.stereo == "on":
         merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)
         stages.lap("stereo")
-        mesh, about = fused_with_stereo(merged), merged.about() | {"taken": True}
+        mesh, about = fused_with_stereo(merged)
+        about |= {"taken": True}
         stages.lap("fuse")
     else:
         mesh = fused(frames, options.smallest_part)
@@ -110,7 +110,7 @@ def tsdf_surface(
 
 
 def _better_by_stereo(
-    rendered: Mesh, fused: Callable[[MergedFrames], Mesh], frames: DepthFrames, stages: Stages
+    rendered: Mesh, fused: Callable[[MergedFrames], tuple[Mesh, dict]], frames: DepthFrames, stages: Stages
 ) -> tuple[Mesh, dict]:
     """The surface of stereo, or the `rendered` one where photographs agree at clearly more of its vertices or there is
     hardly any stereo; with what there is to say of it."""
@@ -122,7 +122,7 @@ def _better_by_stereo(
     stages.lap("stereo")
     if merged.confirmed < LEAST_CONFIRMED:
         return rendered, merged.about() | {"taken": False}
-    mesh = fused(merged)
+    mesh, about = fused(merged)
     stages.lap("fuse")
     cameras = [view.camera for view in frames.views]
     gains = photo_gains(rendered, cameras, (view.load() for view in frames.views))
@@ -133,7 +133,7 @@ def _better_by_stereo(
         f"photographs agree at {without:.1%} of the vertices without stereo and at {with_stereo:.1%} with it: "
         f"{'it is' if taken else 'it is not'} taken"
     )
-    about = merged.about() | {"taken": taken, "agreeing": with_stereo, "agreeing_without": without}
+    about |= {"taken": taken, "agreeing": with_stereo, "agreeing_without": without}
     return mesh if taken else rendered, about
 
 

@@ -62,5 +62,5 @@ def without_single_views(mesh: Mesh, depths: Iterable[tuple[Camera, np.ndarray]]
 
 def mesh_is_closed(mesh: Mesh) -> bool:
     """Whether every edge has two faces."""
-    edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    return bool((np.unique(edges, axis=0, return_counts=True)[1] == 2).all())
+    edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).astype(np.int64)
+    return bool((np.unique(edges[:, 0] * len(mesh.vertices) + edges[:, 1], return_counts=True)[1] == 2).all())

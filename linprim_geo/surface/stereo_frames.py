@@ -1,7 +1,7 @@
 """Depth maps for fusing out of three sources: what stereo finds and its neighbours confirm, planes of regions without
 texture, and what the primitives render everywhere else, with the weight that its deviation from the first deserves.
 
-Of the surface that is fused from them, small pieces stay only if stereo and planes of several views support them."""
+Of the surface that is fused from them, what stereo and planes of several views do not support is left out."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.depth_maps import DepthMap, depth_maps
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.plain_regions import PlainRegion, common_planes, edges_of, plain_regions, plane_depths
+from linprim_geo.surface.single_view import mesh_is_closed
 from linprim_geo.surface.tsdf_field import DepthFrame
 
 # A depth counts as confirmed if so many other views confirm it, or two and all but one of fewer that show the point.
@@ -112,9 +113,21 @@ class MergedFrames(Sequence):
             views += inside & (np.abs(depth[row, column] / along - 1) < CONFIRMED_DEPTH)
         return views
 
-    def supported_parts(self, mesh: Mesh, share: float, least_area: float) -> Mesh:
-        """The mesh without its small and unsupported pieces: those of less than `share` of the largest piece's area of
-        which less than SUPPORTED_SHARE lies where SUPPORTING_VIEWS have depths, or less than `least_area` in all."""
+    def supported(self, mesh: Mesh, share: float, band: float) -> tuple[Mesh, float]:
+        """The mesh without what views do not support, and what share of its area is left out.
+
+        SUPPORTING_VIEWS have depths within half a `band`, in which depths vote, of what stays: elsewhere rendered
+        depths alone say where a surface is, and without texture they do not know. Of small pieces, with less than
+        `share` of the largest one's area, those stay of which SUPPORTED_SHARE is supported and which are larger than
+        the square of a `band`: noise of depths makes pieces as wide. A closed surface loses pieces alone.
+        """
+        area = face_areas(mesh).sum()
+        views = self.supporting(mesh.vertices)
+        left = mesh if mesh_is_closed(mesh) else _near(mesh, views >= SUPPORTING_VIEWS, band / 2)
+        left = self._supported_pieces(left, share, band**2)
+        return left, float(1 - face_areas(left).sum() / area) if area else 0.0
+
+    def _supported_pieces(self, mesh: Mesh, share: float, least_area: float) -> Mesh:
         count, label = face_components(mesh)
         area = face_areas(mesh)
         of_piece = np.bincount(label, weights=area, minlength=count)
@@ -124,6 +137,18 @@ class MergedFrames(Sequence):
         supported = (self.supporting(mesh.vertices[corners]) >= SUPPORTING_VIEWS)[faces.reshape(-1, 3)].mean(1)
         of_supported = np.bincount(label[rows], weights=area[rows] * supported, minlength=count)
         return select_faces(mesh, (keep | (of_supported > SUPPORTED_SHARE * of_piece))[label])
+
+
+def _near(mesh: Mesh, supported: np.ndarray, reach: float) -> Mesh:
+    """Faces with a vertex that is no farther than `reach` from one of those (V,) that are `supported`."""
+    from scipy.spatial import cKDTree
+
+    if not supported.any():
+        return select_faces(mesh, np.zeros(len(mesh.faces), bool))
+    distance = cKDTree(mesh.vertices[supported]).query(mesh.vertices[~supported], distance_upper_bound=reach)[0]
+    near = supported.copy()
+    near[~supported] = np.isfinite(distance)
+    return select_faces(mesh, near[mesh.faces].any(1))
 
 
 def _some(points: np.ndarray, count: int) -> np.ndarray:

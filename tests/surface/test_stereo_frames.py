@@ -103,23 +103,47 @@ def sheet(low, high, y: float) -> Mesh:
     return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
+def merged_of(views: int, monkeypatch) -> MergedFrames:
+    """Views that see depth 3, so y = 0, in the picture's left half, where x < 0."""
+    maps = views * stereo_frames.depth_maps()[:1]
+    monkeypatch.setattr(stereo_frames, "depth_maps", lambda *_, **__: maps)
+    return MergedFrames(views * rendered(0.0), views * [None], 5.0)
+
+
 def test_small_pieces_stay_where_views_support_them(found, monkeypatch):
-    maps, frames = 2 * stereo_frames.depth_maps(), 2 * rendered(0.0)
-    monkeypatch.setattr(stereo_frames, "depth_maps", lambda *_, **__: maps[: len(_[0])])
-    merged = MergedFrames(frames, [None, None], 5.0)
-    # Confirmed is depth 3, so y = 0, where the picture's left half looks: x < 0.
-    true, floating, unseen, large = (
+    merged = merged_of(2, monkeypatch)
+    true, floating, large = (
         sheet((-0.5, -0.3), (-0.3, -0.1), 0.0),
         sheet((-0.5, -0.3), (-0.3, -0.1), -0.5),
-        sheet((0.3, -0.3), (0.5, -0.1), 0.0),
-        sheet((-20, -20), (20, 20), 9.0),
+        sheet((-1.9, 0.2), (-0.2, 1.3), 0.0),
     )
-    kept = merged.supported_parts(merge_parts([true, floating, unseen, large]), 0.01, 0.01)
+    kept, left_out = merged.supported(merge_parts([true, floating, large]), 0.1, 0.1)
     assert np.array_equal(kept.vertices, np.concatenate([true.vertices, large.vertices]))
-    # What is smaller than can be told from noise goes, and so does what one view alone supports.
-    assert len(merged.supported_parts(merge_parts([true, large]), 0.01, 0.1).faces) == 2
-    alone = MergedFrames(frames[:1], [None], 5.0)
-    assert len(alone.supported_parts(merge_parts([true, large]), 0.01, 0.01).faces) == 2
+    assert left_out == pytest.approx(0.04 / (0.08 + 1.7 * 1.1))
+    # What is smaller than can be told from noise goes.
+    assert len(merged.supported(merge_parts([true, large]), 0.1, 0.3)[0].faces) == 2
+
+
+def test_surface_beyond_the_reach_of_what_two_views_support_is_left_out(found, monkeypatch):
+    x, z = np.meshgrid(np.linspace(-0.5, 0.5, 101), [-0.1, 0.1])
+    corners = np.stack([x.ravel(), np.zeros(202), z.ravel()], 1)
+    first = np.arange(100)
+    faces = np.concatenate(
+        [np.stack([first, first + 1, first + 102], 1), np.stack([first, first + 102, first + 101], 1)]
+    )
+    strip = Mesh(corners, faces)
+    kept, left_out = merged_of(2, monkeypatch).supported(strip, 0.01, 0.4)
+    # Views look at x < 0; half a band farther, and a face, there is surface.
+    assert kept.vertices[:, 0].min() == -0.5 and kept.vertices[:, 0].max() == pytest.approx(0.2, abs=0.021)
+    assert left_out == pytest.approx(0.3, abs=0.021)
+    assert len(merged_of(1, monkeypatch).supported(strip, 0.01, 0.4)[0].faces) == 0
+
+
+def test_a_closed_surface_stays_closed(found, monkeypatch):
+    corners = np.array([[-0.3, 0, -0.3], [0.9, 0, -0.3], [-0.3, 0, 0.9], [0.3, 0.9, 0.3]])
+    closed = Mesh(corners, np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]]))
+    kept, left_out = merged_of(2, monkeypatch).supported(closed, 0.01, 0.1)
+    assert np.array_equal(kept.faces, closed.faces) and left_out == pytest.approx(0, abs=1e-12)
 
 
 def test_a_view_supports_a_point_once_and_only_by_what_is_fused(found, monkeypatch):
