@@ -102,11 +102,14 @@ class MergedFrames(Sequence):
         # Beside an outline the windows of stereo take the background for a part of what is in front of it.
         return known if frame.background is None else known & ~frame.background
 
-    def supporting(self, points: np.ndarray) -> np.ndarray:
-        """(P,) how many views fuse a confirmed depth, or one on a plane, at these points of the world."""
+    def supporting(self, points: np.ndarray, *, doubtful: bool = False) -> np.ndarray:
+        """(P,) how many views fuse a confirmed depth, or one on a plane, at these points of the world; or a `doubtful`
+        one, too."""
         views = np.zeros(len(points), int)
-        for frame, confirmed, on_plane in zip(self.rendered, self.depths, self.on_planes, strict=True):
-            depth = np.where(np.isfinite(confirmed), confirmed, on_plane)
+        for frame, *sources in zip(self.rendered, self.depths, self.on_planes, self.doubtful_depths, strict=True):
+            depth = np.full(frame.depth.shape, np.nan, np.float32)
+            for source in sources if doubtful else sources[:2]:
+                depth = np.where(np.isfinite(depth), depth, source)
             depth = np.where(self._fused(frame, depth), depth, np.nan)
             inside, row, column = in_image(frame.camera, points)
             along = frame.camera.project(points)[1]
@@ -116,13 +119,14 @@ class MergedFrames(Sequence):
     def supported(self, mesh: Mesh, share: float, band: float) -> tuple[Mesh, float]:
         """The mesh without what views do not support, and what share of its area is left out.
 
-        SUPPORTING_VIEWS have depths within half a `band`, in which depths vote, of what stays: elsewhere rendered
-        depths alone say where a surface is, and without texture they do not know. Of small pieces, with less than
-        `share` of the largest one's area, those stay of which SUPPORTED_SHARE is supported and which are larger than
-        the square of a `band`: noise of depths makes pieces as wide. A closed surface loses pieces alone.
+        Within half a `band`, in which depths vote, of what stays SUPPORTING_VIEWS have depths, if doubtful ones:
+        elsewhere rendered depths alone say where a surface is, and without texture they do not know. Of small pieces,
+        with less than `share` of the largest one's area, those stay of which SUPPORTED_SHARE is supported by depths
+        without doubt and which are larger than the square of a `band`: noise of depths makes pieces as wide. A closed
+        surface loses pieces alone.
         """
         area = face_areas(mesh).sum()
-        views = self.supporting(mesh.vertices)
+        views = self.supporting(mesh.vertices, doubtful=True)
         left = mesh if mesh_is_closed(mesh) else _near(mesh, views >= SUPPORTING_VIEWS, band / 2)
         left = self._supported_pieces(left, share, band**2)
         return left, float(1 - face_areas(left).sum() / area) if area else 0.0

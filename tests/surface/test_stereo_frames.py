@@ -157,6 +157,14 @@ def test_a_view_supports_a_point_once_and_only_by_what_is_fused(found, monkeypat
     assert MergedFrames([frame], [None], 5.0).supporting(point) == [0]
 
 
+def test_doubtful_depths_support_only_where_they_are_asked_for(found):
+    merged = MergedFrames(rendered(0.0), [None], 5.0)
+    # Row 1 of the picture, 30 pixels a unit of depth: z = 13.5 / 30 * 3.
+    doubtful, unknown = [-0.4, 0.0, 1.35], [-0.4, 0.0, 1.45]
+    assert merged.supporting(np.array([doubtful, unknown])).tolist() == [0, 0]
+    assert merged.supporting(np.array([doubtful, unknown]), doubtful=True).tolist() == [1, 0]
+
+
 @pytest.fixture(scope="module")
 def many_views(tmp_path_factory):
     """A run of one octahedron whose views are so near to each other that stereo finds pairs."""
