@@ -23,8 +23,8 @@ def depth_of(camera: Camera) -> np.ndarray:
     return -(camera.center @ NORMAL) / (camera.world_rays() @ NORMAL)
 
 
-def wall_view(center) -> SimpleNamespace:
-    """A photograph of the wall, with waves of 4 to 15 pixels on it."""
+def wall_view(center, contrast: float = 55.0, noise: float = 0.0) -> SimpleNamespace:
+    """A photograph of the wall, with waves of 4 to 15 pixels on it; `contrast` and `noise` are standard deviations."""
     camera = look_at(center, size=(96, 72), focal=110.0, up=(0.0, 1.0, 0.0))
     points = camera.center + camera.world_rays() * depth_of(camera)[..., None]
     rng = np.random.default_rng(1)
@@ -33,7 +33,12 @@ def wall_view(center) -> SimpleNamespace:
         wave = rng.normal(size=3)
         wave *= 2 * np.pi / (np.linalg.norm(wave) * rng.uniform(0.11, 0.4))
         value += np.sin(points @ wave + rng.uniform(0, 2 * np.pi))
-    grey = np.rint(np.clip(127 + 16 * value, 0, 255)).astype(np.uint8)
+    value = (
+        127
+        + contrast / np.sqrt(12) * value
+        + noise * np.random.default_rng(int(100 * sum(abs(x) for x in center))).normal(size=value.shape)
+    )
+    grey = np.rint(np.clip(value, 0, 255)).astype(np.uint8)
     return SimpleNamespace(camera=camera, load=lambda: Photo(np.repeat(grey[..., None], 3, 2)))
 
 
@@ -59,6 +64,18 @@ def test_a_wall_is_where_it_is_and_neighbours_confirm_it(views, wall_points):
     # Towards the camera, and the wall's: a window's depth changes by a tenth of a pixel within 5 of them.
     angle = np.degrees(np.arccos(np.clip(-first.normal[inside] @ NORMAL, -1, 1)))
     assert np.median(angle) < 5
+
+
+def test_texture_as_weak_as_the_noise_is_known_and_confirmed(wall_points):
+    maps = depth_maps([wall_view(center, contrast=4.0, noise=4.0) for center in CENTERS], wall_points)
+    first = maps[0]
+    inside = np.s_[10:-10, 10:-10]
+    sure = (first.confirmed >= 3)[inside]
+    error = np.abs(first.depth / depth_of(first.camera) - 1)[inside][sure]
+    # Half of a window's variance is noise in each photograph: the right match costs 2 / 3.
+    assert np.median(first.cost[inside][sure]) == pytest.approx(2 / 3, abs=0.1)
+    # A pixel of disparity is 5 % of the depth.
+    assert sure.mean() > 0.4 and np.median(error) < 0.01 and (error < 0.05).mean() > 0.9
 
 
 def test_views_that_share_nothing_are_one_sentence(views):
