@@ -346,9 +346,9 @@ class ExtractOptions:
     )
     stereo: str = option(
         "auto",
-        "fuse the depths that PatchMatch stereo finds in the photographs where views confirm them: on, off, or auto: "
-        "where these are without masks, and do not agree with each other at clearly less of the surface, "
-        "with --method tsdf, without --blocks and --time-budget",
+        "fuse the depths that PatchMatch stereo finds in the photographs where views confirm them, and leave out what "
+        "no two photographs support: on, off, or auto: where these are without masks, and do not agree with each other "
+        "at clearly less of the surface, with --method tsdf, without --blocks and --time-budget",
         choices=("auto", "on", "off"),
     )
     smallest_part: float = option(
