@@ -27,10 +27,11 @@ from pathlib import Path
 
 import numpy as np
 
-# Seconds after which reading one small file counts as a hang, bytes it may take, the longest that a sentence may be.
+# Seconds of processor time, as machines are busy, after which reading one small file counts as a hang; bytes that it
+# may take; the longest that a sentence may be.
 HANG, MEMORY, LONGEST = 5.0, 192 * 2**20, 2000
-# Seconds without any progress after which a process is ended that does not even answer its alarm.
-STUCK = 30.0
+# Seconds without any progress after which a process is ended that does not answer its alarm, or waits for ever.
+STUCK = 120.0
 
 
 class Hang(BaseException):
@@ -67,7 +68,7 @@ def attempt(case: Case, path: Path) -> tuple[str, str]:
     """(read, refused or a finding's name, what was said)."""
     from linprim_geo.base.errors import LinprimError
 
-    signal.setitimer(signal.ITIMER_REAL, HANG)
+    signal.setitimer(signal.ITIMER_PROF, HANG)
     try:
         case.reader.read(path)
         return "read", ""
@@ -83,7 +84,7 @@ def attempt(case: Case, path: Path) -> tuple[str, str]:
     except (Exception, SystemExit) as error:
         return type(error).__name__, f"{error!s:.200} {_place(error.__traceback__)}"
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
 
 
 def _place(trace) -> str:
@@ -145,7 +146,7 @@ def _prepare(folder: Path) -> None:
 
     torch.set_num_threads(1)
     ops.set_threads(1)
-    signal.signal(signal.SIGALRM, _alarm)
+    signal.signal(signal.SIGPROF, _alarm)
 
 
 def _case(name: str, folder: Path) -> Case:
@@ -234,7 +235,7 @@ def again(name: str, seed: int, number: int) -> int:
     case = _case(name, folder)
     path = case.damage(seed, number)
     print(f"{path}: {path.stat().st_size} bytes")
-    signal.setitimer(signal.ITIMER_REAL, HANG)
+    signal.setitimer(signal.ITIMER_PROF, HANG)
     case.reader.read(path)
     print("read")
     return 0
