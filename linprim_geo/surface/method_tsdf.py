@@ -99,7 +99,7 @@ def tsdf_surface(
             f"{about['plain']:.0%} lie on one of {about['planes']} planes without texture; elsewhere rendered depths "
             f"count {about['rendered_weight']:.2g}"
         )
-        if about.get("unsupported"):
+        if about["taken"] and about["unsupported"]:
             stages.note(f"left out: {about['unsupported']:.1%} of the surface, which no two photographs support")
         about = {"stereo": about}
     return mesh, {
