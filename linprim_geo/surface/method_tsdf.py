@@ -86,6 +86,8 @@ def tsdf_surface(
         merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)
         stages.lap("stereo")
         mesh, about = fused_with_stereo(merged)
+        if not len(mesh.faces):
+            raise LinprimError(f"{run.path}: no two photographs support any surface; use --stereo auto or off")
         about |= {"taken": True}
         stages.lap("fuse")
     else:
@@ -126,6 +128,8 @@ def _better_by_stereo(
         return rendered, merged.about() | {"taken": False}
     mesh, about = fused(merged)
     stages.lap("fuse")
+    if not len(mesh.faces):
+        return rendered, about | {"taken": False}
     cameras = [view.camera for view in frames.views]
     gains = photo_gains(rendered, cameras, (view.load() for view in frames.views))
     without, with_stereo = (_agreeing(surface, frames.views, gains) for surface in (rendered, mesh))

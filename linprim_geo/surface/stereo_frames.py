@@ -119,11 +119,11 @@ class MergedFrames(Sequence):
     def supported(self, mesh: Mesh, share: float, band: float) -> tuple[Mesh, float]:
         """The mesh without what views do not support, and what share of its area is left out.
 
-        Within half a `band`, in which depths vote, of what stays SUPPORTING_VIEWS have depths, if doubtful ones:
-        elsewhere rendered depths alone say where a surface is, and without texture they do not know. Of small pieces,
-        with less than `share` of the largest one's area, those stay of which SUPPORTED_SHARE is supported by depths
-        without doubt and which are larger than the square of a `band`: noise of depths makes pieces as wide. A closed
-        surface loses pieces alone.
+        What stays has depths of SUPPORTING_VIEWS, even doubtful ones, within half the `band` in which depths vote:
+        elsewhere rendered depths alone say where a surface is, and without texture they do not know. A piece with less
+        than `share` of the largest one's area stays if SUPPORTED_SHARE of it has depths without doubt, and if it is
+        larger than the square of the `band`: noise of depths makes pieces as wide. A closed surface loses whole pieces
+        alone.
         """
         area = face_areas(mesh).sum()
         views = self.supporting(mesh.vertices, doubtful=True)

@@ -188,6 +188,17 @@ def test_a_surface_takes_stereo_into_account_where_it_is_asked_to(many_views):
         extract_mesh(many_views, options=ExtractOptions(stereo="on"), blocks=2, quiet=True)
 
 
+def test_where_nothing_is_supported_the_rendered_surface_stays(many_views, monkeypatch):
+    nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), int))
+    monkeypatch.setattr(Scene, "has_alpha", False)
+    monkeypatch.setattr(method_tsdf, "LEAST_CONFIRMED", 0.0)
+    monkeypatch.setattr(MergedFrames, "supported", lambda *_: (nothing, 1.0))
+    stats = extract_mesh(many_views, options=ExtractOptions(level=0.5), quiet=True)
+    assert not stats["stereo"]["taken"] and stats["stereo"]["unsupported"] == 1 and stats["faces"] > 0
+    with pytest.raises(LinprimError, match="no two photographs support any surface"):
+        extract_mesh(many_views, options=ExtractOptions(stereo="on", level=0.5), quiet=True)
+
+
 def test_photographs_agree_within_reach_of_the_true_surface_alone(tiny_scene):
     views = load_scene(tiny_scene).train
     true = load_mesh(tiny_scene / "reference.ply")
