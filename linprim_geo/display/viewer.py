@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.srgb import to_linear
 from linprim_geo.display.viewer_scene import Seen, load_seen, photo, primitive_mesh, select, stamps
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh, select_faces
-from linprim_geo.imaging.colors import to_linear
 from linprim_geo.runs.run import Run
 
 HOST = "127.0.0.1"

@@ -1,4 +1,4 @@
-"""Numbers as colours by one colour map (errors, depths, scales), and sRGB against linear intensity."""
+"""Numbers as colours, by one colour map: errors, depths, scales."""
 
 from __future__ import annotations
 
@@ -26,15 +26,3 @@ def depth_preview(depth: np.ndarray) -> np.ndarray:
     low, high = np.percentile(inverse[valid], [1, 99])
     colors = error_colors((inverse - low) / max(high - low, 1e-12))
     return np.where(valid[..., None], colors, 0).astype(np.uint8)
-
-
-def to_linear(value: np.ndarray) -> np.ndarray:
-    """sRGB as linear intensity (IEC 61966-2-1), below 0 and above 1 by the same formulas."""
-    value = np.asarray(value)
-    return np.where(value <= 0.04045, value / 12.92, ((np.maximum(value, 0.04045) + 0.055) / 1.055) ** 2.4)
-
-
-def to_srgb(value: np.ndarray) -> np.ndarray:
-    """Linear intensity as sRGB, the inverse of `to_linear`."""
-    value = np.asarray(value)
-    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * np.maximum(value, 0.0031308) ** (1 / 2.4) - 0.055)

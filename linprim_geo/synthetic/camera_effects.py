@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from linprim_geo.imaging.colors import to_linear, to_srgb
+from linprim_geo.base.srgb import to_linear, to_srgb
 from linprim_geo.synthetic.options import SynthOptions
 
 SEED = 9

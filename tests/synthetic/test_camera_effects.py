@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.srgb import to_linear, to_srgb
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.imaging.colors import to_linear, to_srgb
 from linprim_geo.synthetic import camera_effects as effects
 from linprim_geo.synthetic.camera_paths import look_at
 from linprim_geo.synthetic.options import SynthOptions

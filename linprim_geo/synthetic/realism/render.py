@@ -12,8 +12,8 @@ import numpy as np
 
 from linprim_geo.base.cores import usable_cores
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.srgb import to_linear
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.imaging.colors import to_linear
 from linprim_geo.synthetic.realism.parts import Material, Part
 
 MAX_DEPTH = 5

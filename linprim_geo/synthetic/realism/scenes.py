@@ -8,9 +8,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.srgb import to_srgb
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.raycast import RayCaster
-from linprim_geo.imaging.colors import to_srgb
 from linprim_geo.synthetic import camera_paths
 from linprim_geo.synthetic.options import SynthOptions
 from linprim_geo.synthetic.realism.desk import desk_scene
