@@ -27,11 +27,11 @@ from pathlib import Path
 
 import numpy as np
 
-# Seconds of processor time, as machines are busy, after which reading one small file counts as a hang; bytes that it
-# may take; the longest that a sentence may be.
+# Seconds on an idle machine after which reading one small file counts as a hang, bytes it may take, the longest that a
+# sentence may be.
 HANG, MEMORY, LONGEST = 5.0, 192 * 2**20, 2000
-# Seconds without any progress after which a process is ended that does not answer its alarm, or waits for ever.
-STUCK = 120.0
+# Seconds without any progress after which a process is ended that does not even answer its alarm.
+STUCK = 30.0
 
 
 class Hang(BaseException):
@@ -68,7 +68,7 @@ def attempt(case: Case, path: Path) -> tuple[str, str]:
     """(read, refused or a finding's name, what was said)."""
     from linprim_geo.base.errors import LinprimError
 
-    signal.setitimer(signal.ITIMER_PROF, HANG)
+    signal.setitimer(signal.ITIMER_REAL, _on_this_machine(HANG))
     try:
         case.reader.read(path)
         return "read", ""
@@ -84,7 +84,7 @@ def attempt(case: Case, path: Path) -> tuple[str, str]:
     except (Exception, SystemExit) as error:
         return type(error).__name__, f"{error!s:.200} {_place(error.__traceback__)}"
     finally:
-        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.setitimer(signal.ITIMER_REAL, 0)
 
 
 def _place(trace) -> str:
@@ -93,6 +93,13 @@ def _place(trace) -> str:
         frame for frame in traceback.extract_tb(trace) if "linprim_geo" in frame.filename or "fuzz_" in frame.filename
     ]
     return f"[{Path(frames[-1].filename).name}:{frames[-1].lineno}]" if frames else ""
+
+
+def _on_this_machine(seconds: float) -> float:
+    """Seconds of an idle machine on one whose cores have several processes each to run."""
+    from linprim_geo.base.cores import usable_cores
+
+    return seconds * max(1.0, os.getloadavg()[0] / usable_cores())
 
 
 def _alarm(*_):
@@ -146,7 +153,7 @@ def _prepare(folder: Path) -> None:
 
     torch.set_num_threads(1)
     ops.set_threads(1)
-    signal.signal(signal.SIGPROF, _alarm)
+    signal.signal(signal.SIGALRM, _alarm)
 
 
 def _case(name: str, folder: Path) -> Case:
@@ -204,7 +211,7 @@ def _watch(process: subprocess.Popen, current: Path) -> int:
             return process.wait(timeout=1.0)
         except subprocess.TimeoutExpired:
             begun = current.stat().st_size > 0
-            if begun and time.time() - current.stat().st_mtime > STUCK:
+            if begun and time.time() - current.stat().st_mtime > _on_this_machine(STUCK):
                 process.kill()
 
 
@@ -235,7 +242,7 @@ def again(name: str, seed: int, number: int) -> int:
     case = _case(name, folder)
     path = case.damage(seed, number)
     print(f"{path}: {path.stat().st_size} bytes")
-    signal.setitimer(signal.ITIMER_PROF, HANG)
+    signal.setitimer(signal.ITIMER_REAL, _on_this_machine(HANG))
     case.reader.read(path)
     print("read")
     return 0
