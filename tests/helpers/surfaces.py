@@ -76,3 +76,9 @@ def edge_uses(faces: np.ndarray) -> np.ndarray:
     """Of each edge of (M, 3) faces, how many of them use it."""
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     return np.unique(edges[:, 0] * (faces.max() + 1) + edges[:, 1], return_counts=True)[1]
+
+
+def areas(vertices, faces):
+    """(F,) areas of triangles."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
