@@ -156,8 +156,8 @@ def common_planes(cameras: Sequence[Camera], regions: Sequence[PlainRegion], see
         camera = cameras[region.view]
         for count, plane in planes_of_region(region, rng):
             depth = 1 / (region.corners[4] @ plane)
-            middle = _to_world(camera, region.corners[4][None] * depth)[0]
-            found.append((count, region.view, depth, middle, _in_world(camera, plane)))
+            middle = to_world(camera, region.corners[4][None] * depth)[0]
+            found.append((count, region.view, depth, middle, in_world(camera, plane)))
     found.sort(key=lambda one: -one[0])
     if not found:
         return np.zeros((0, 4))
@@ -174,7 +174,7 @@ def common_planes(cameras: Sequence[Camera], regions: Sequence[PlainRegion], see
         mean = np.append(normal, np.average(middle[same] @ normal, weights=weight[same]))
         same = (_same(mean, plane[:, :3], middle, depth) | same) & free
         free &= ~same
-        if _seen_enough(cameras, view[same], np.average(middle[same], axis=0, weights=weight[same])):
+        if seen_enough(cameras, view[same], np.average(middle[same], axis=0, weights=weight[same])):
             planes.append(mean)
     planes = np.array(planes).reshape(-1, 4)
     for _ in range(ROUNDS):
@@ -188,7 +188,7 @@ def _same(plane: np.ndarray, normals: np.ndarray, points: np.ndarray, depth: np.
     return near & (normals @ plane[:3] > np.cos(SAME_ANGLE))
 
 
-def _seen_enough(cameras: Sequence[Camera], views: np.ndarray, point: np.ndarray) -> bool:
+def seen_enough(cameras: Sequence[Camera], views: np.ndarray, point: np.ndarray) -> bool:
     views = np.unique(views)
     if len(views) < LEAST_VIEWS:
         return False
@@ -209,7 +209,7 @@ def _refitted(cameras: Sequence[Camera], regions: Sequence[PlainRegion], planes:
     points: list[list] = [[] for _ in planes]
     for region in regions if len(planes) else ():
         camera = cameras[region.view]
-        on, fits = _accepted(region, region.off(_in_camera(camera, planes)))
+        on, fits = _accepted(region, region.off(in_camera(camera, planes)))
         left = np.ones(len(on), bool)
         while True:  # the one with the most points first, then by those that are left
             counts = (on & left[:, None]).sum(0) * fits
@@ -218,7 +218,7 @@ def _refitted(cameras: Sequence[Camera], regions: Sequence[PlainRegion], planes:
                 break
             own = on[:, best]
             depth = 1 / region.inverse[own]
-            points[best].append((_to_world(camera, region.rays[own] * depth[:, None]), depth, region.view))
+            points[best].append((to_world(camera, region.rays[own] * depth[:, None]), depth, region.view))
             left &= ~own
     fitted = []
     for plane, parts in zip(planes, points, strict=True):
@@ -231,7 +231,7 @@ def _refitted(cameras: Sequence[Camera], regions: Sequence[PlainRegion], planes:
         variance, axes = np.linalg.eigh(spread.T @ (spread / depth[:, None] ** 2) / (depth**-2).sum())
         # The normal's angle is as certain as the points are wide across the narrower side.
         wide = np.sqrt(max(variance[1], 0)) * np.tan(SAME_ANGLE) * np.sqrt(len(np.unique(views)))
-        if wide < TOLERANCE * np.median(depth) or not _seen_enough(cameras, views, middle):
+        if wide < TOLERANCE * np.median(depth) or not seen_enough(cameras, views, middle):
             continue
         normal = axes[:, 0] * (1 if axes[:, 0] @ plane[:3] > 0 else -1)
         fitted.append((len(place), np.append(normal, normal @ middle), middle, float(np.median(depth))))
@@ -242,17 +242,17 @@ def _refitted(cameras: Sequence[Camera], regions: Sequence[PlainRegion], planes:
     return np.array(kept).reshape(-1, 4)
 
 
-def _to_world(camera: Camera, points: np.ndarray) -> np.ndarray:
+def to_world(camera: Camera, points: np.ndarray) -> np.ndarray:
     return (points - camera.world_to_camera[:3, 3]) @ camera.rotation
 
 
-def _in_world(camera: Camera, plane: np.ndarray) -> np.ndarray:
+def in_world(camera: Camera, plane: np.ndarray) -> np.ndarray:
     """(n, d) of the world of a plane p . x = 1 of a camera."""
     length = np.linalg.norm(plane)
     return np.append(camera.rotation.T @ plane, 1 - plane @ camera.world_to_camera[:3, 3]) / length
 
 
-def _in_camera(camera: Camera, planes: np.ndarray) -> np.ndarray:
+def in_camera(camera: Camera, planes: np.ndarray) -> np.ndarray:
     """(K, 3) planes p . x = 1 of a camera of (K, 4) planes of the world; 0 for those through its centre."""
     normals = planes[:, :3] @ camera.rotation.T
     distance = planes[:, 3] + normals @ camera.world_to_camera[:3, 3]
@@ -270,13 +270,13 @@ def plane_depths(
     depth = np.full(rendered.shape, np.nan, np.float32)
     if not len(planes):
         return depth
-    in_camera = _in_camera(camera, planes)
+    local = in_camera(camera, planes)
     size = 2 * (max(rendered.shape) // (2 * WINDOW_PART)) + 1
     for region in regions:
-        on, fits = _accepted(region, region.off(in_camera))
+        on, fits = _accepted(region, region.off(local))
         order = np.argsort(-on.sum(0), kind="stable")
         window = np.s_[region.top : region.top + region.mask.shape[0], region.left : region.left + region.mask.shape[1]]
-        inverse = _chosen(camera, region, in_camera[[k for k in order if fits[k]][:COMPARED]], rendered[window], size)
+        inverse = _chosen(camera, region, local[[k for k in order if fits[k]][:COMPARED]], rendered[window], size)
         known = inverse > 0
         depth[window][known] = 1 / inverse[known]
     return depth
