@@ -1,0 +1,283 @@
+"""Planes of painted walls by their shading.
+
+A plane is fitted to every plain region of every photograph that stereo says little about (`shading.py`). Where regions
+of several photographs agree their plane is fitted to all of them together. Every region then gets the planes that carry
+its shading as well as its own does. Walls without any shading, and whatever is not flat, get none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import binary_dilation, label
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.points.initial_points import in_image
+from linprim_geo.stereo.depth_maps import DepthMap
+from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
+from linprim_geo.stereo.plain_regions import SAME_ANGLE, in_camera, in_world, seen_enough, to_world
+from linprim_geo.stereo.shading import (
+    BOX,
+    LEAST_BOXES,
+    SHOWN_SHARE,
+    STRIDE,
+    Fit,
+    ShadedRegion,
+    Shading,
+    depth_deviation,
+    evaluate,
+    fit_plane,
+    shaded_regions,
+    unexplained,
+)
+
+# Views that a region is compared with, at most and at least.
+MOST_VIEWS, LEAST_VIEWS = 8, 3
+# Boxes of a region that are compared: in the first steps from every start, and then.
+FIRST_BOXES, MOST_BOXES, FIRST_STEPS = 200, 800, 6
+# A plane carries a region's shading if no more than this share of its deviation is left, and one of other regions if
+# no more than OTHERS_SHARE and hardly more than the region's own plane leaves: paint that shines makes up as much.
+LEFT_SHARE, OTHERS_SHARE, HARDLY_MORE = 0.2, 0.25, 1.1
+# Noise leaves one deviation: where this is left, smoothed, another surface is. Nearly all of a flat region is below.
+MOST_LEFT, FLAT_SHARE = 1.3, 0.9
+# A region's own plane is known to this share of its depth, or better; several regions know theirs better together.
+CERTAIN = 2 * CONFIRMED_DEPTH
+# Planes of regions are taken together if they differ by no more than these: what the plane of one alone is off by.
+ALIKE_ANGLE, ALIKE_DEPTH = 4 * SAME_ANGLE, 5 * CONFIRMED_DEPTH
+# Stereo confirms up to SURE_SHARE of a plain region by chance; of more depths, AGREEING are on the plane.
+SURE_DEPTHS, SURE_SHARE, AGREEING = 30, 0.1, 0.7
+# A background is so many times as far as a region's other depths.
+FAR = 1e4
+# A plane carries a region if it does so around half of its boxes.
+CARRIED_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class FittedRegion:
+    """A region, what share of its deviation a plane that carries it may leave, and the fit of its own plane if that one
+    carries it and is certain."""
+
+    region: ShadedRegion
+    most_left: float
+    fit: Fit | None
+
+
+class ShadedPlanes:
+    """`planes` (K, 4) of the world that carry the shading of plain regions in several views: the `known` ones first.
+
+    Args:
+        maps: of all views.
+        depths: (H, W) confirmed depth of each view, NaN elsewhere.
+        rendered: (H, W) rendered depth of each view, 0 where there is none.
+        known: (K, 4) planes that points along edges have given; they are more exact.
+    """
+
+    def __init__(
+        self,
+        maps: Sequence[DepthMap],
+        depths: Sequence[np.ndarray],
+        rendered: Sequence[np.ndarray],
+        known: np.ndarray,
+    ):
+        self.shadings = [Shading.of(found) for found in maps]
+        self.depths, self.known = depths, known
+        self.regions: list[list[FittedRegion]] = []
+        for view, (shading, depth) in enumerate(zip(self.shadings, depths, strict=True)):
+            own = shaded_regions(view, shading, np.isfinite(depth))
+            fitted = [self._fitted(region, rendered[view]) for region in own]
+            self.regions.append([one for one in fitted if one is not None])
+        self.planes = self._common([one for own in self.regions for one in own if one.fit is not None])
+
+    def _camera(self, region: ShadedRegion) -> Camera:
+        return self.shadings[region.view].camera
+
+    def _fitted(self, region: ShadedRegion, rendered: np.ndarray) -> FittedRegion | None:
+        """None for a region whose shading is lost in the noise, or that too few views show."""
+        shading = self.shadings[region.view]
+        # What noise leaves is too large a share of less.
+        if np.var(region.value) < 2 * shading.noise / OTHERS_SHARE**2:
+            return None
+        starts = _starts(region, self.depths[region.view], rendered)
+        if not starts:
+            return None
+        depth = 1 / np.median(region.rays @ starts[0])
+        region = replace(region, depth=abs(float(depth)))
+        region = replace(region, others=self._others(region))
+        if len(region.others) < LEAST_VIEWS:
+            return None
+        few = [region.some(FIRST_BOXES)]
+        tried = [fit_plane(in_world(shading.camera, start), few, self.shadings, FIRST_STEPS) for start in starts]
+        found = [fit for fit in tried if fit is not None and fit.views >= LEAST_VIEWS]
+        if not found:
+            return None
+        fit = fit_plane(min(found, key=lambda fit: fit.left_share).plane, [region.some(MOST_BOXES)], self.shadings)
+        if fit is None or fit.views < LEAST_VIEWS or self._is_far(region, fit):
+            return None
+        left = unexplained(region, in_camera(shading.camera, fit.plane[None])[0], self.shadings)
+        flat = np.count_nonzero(left <= MOST_LEFT) >= FLAT_SHARE * np.isfinite(left).sum()
+        most = min(HARDLY_MORE * fit.left_share, OTHERS_SHARE) if flat else OTHERS_SHARE
+        return FittedRegion(region, most, fit if flat and self._certain(region, fit) else None)
+
+    def _is_far(self, region: ShadedRegion, fit: Fit) -> bool:
+        """Whether a plane without parallax carries a region's shading as well as a fit does: a sky."""
+        camera = self._camera(region)
+        plane = in_world(camera, np.array([0, 0, 1 / (FAR * region.depth)]))
+        far = evaluate(plane, [region.some(MOST_BOXES)], self.shadings)
+        return far is not None and far.views >= LEAST_VIEWS and far.left < HARDLY_MORE * fit.left
+
+    def _certain(self, region: ShadedRegion, fit: Fit) -> bool:
+        """Whether a fit to a region carries its shading, is certain, and is not contradicted."""
+        camera = self._camera(region)
+        if fit.left_share > LEFT_SHARE or depth_deviation(fit, region, camera) > CERTAIN:
+            return False
+        inverse = region.rays @ in_camera(camera, fit.plane[None])[0]
+        return bool((inverse > 0).all()) and not self._contradicted(region, inverse)
+
+    def _others(self, region: ShadedRegion) -> tuple[int, ...]:
+        """Views that show a region, from near and far places."""
+        camera = self._camera(region)
+        points, shown = to_world(camera, region.some(LEAST_BOXES).rays * region.depth), []
+        for view, shading in enumerate(self.shadings):
+            if view != region.view and in_image(shading.camera, points)[0].mean() > SHOWN_SHARE:
+                shown.append(view)
+        shown.sort(key=lambda view: float(np.linalg.norm(self.shadings[view].camera.center - camera.center)))
+        picked = np.linspace(0, len(shown) - 1, min(len(shown), MOST_VIEWS)).round().astype(int)
+        return tuple(shown[k] for k in picked)
+
+    def _contradicted(self, region: ShadedRegion, inverse: np.ndarray) -> bool:
+        """Whether stereo is sure of other depths within a region than the (N,) `inverse` ones, NaN where unknown."""
+        sure = self.depths[region.view][region.row, region.column]
+        known = np.isfinite(sure) & np.isfinite(inverse)
+        agree = np.abs(inverse[known] * sure[known] - 1) < 3 * CONFIRMED_DEPTH
+        return len(agree) >= max(SURE_DEPTHS, SURE_SHARE * len(sure)) and agree.mean() < AGREEING
+
+    def _common(self, fitted: list[FittedRegion]) -> np.ndarray:
+        """The known planes, and those of regions in several views that none of these carries."""
+        planes = list(self.known)
+        fitted = [one for one in fitted if not any(self._carries(plane, one) for plane in planes)]
+        boxes = np.array([len(one.region.row) for one in fitted])
+        alike, left = self._alike(fitted), np.ones(len(fitted), bool)
+        while left.any():
+            group = alike[np.argmax((alike & left) @ boxes * left)] & left
+            plane, carried = _plane(fitted[np.argmax(boxes * group)]), group
+            for _ in range(2):
+                together = [fitted[k].region.some(MOST_BOXES) for k in np.flatnonzero(carried)]
+                fit = fit_plane(plane, together, self.shadings) if together else None
+                plane = plane if fit is None else fit.plane
+                carried = left & [self._carries(plane, one) for one in fitted]
+            if self._of_several_views(plane, [fitted[k].region for k in np.flatnonzero(carried)]):
+                planes.append(plane)
+            left &= ~(carried | group)
+        return np.array(planes).reshape(-1, 4)
+
+    def _alike(self, fitted: list[FittedRegion]) -> np.ndarray:
+        """(N, N) bool whose planes are alike: every one with itself."""
+        planes = np.array([_plane(one) for one in fitted]).reshape(-1, 4)
+        alike = np.abs(planes[:, :3] @ planes[:, :3].T) > np.cos(ALIKE_ANGLE)
+        for k, one in enumerate(fitted):
+            inverse = one.region.some(LEAST_BOXES).rays @ in_camera(self._camera(one.region), planes).T
+            alike[k] &= np.median(np.abs(inverse / inverse[:, [k]] - 1), axis=0) < ALIKE_DEPTH
+        return alike
+
+    def _of_several_views(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> bool:
+        finding = {region.view for region in regions}
+        if len(finding) < LEAST_VIEWS:
+            return False
+        middles = []
+        for region in regions:
+            camera, ray = self._camera(region), np.median(region.rays, axis=0)
+            middles.append(to_world(camera, ray / (ray @ in_camera(camera, plane[None])[0])))
+        views = np.array(sorted(finding.union(*(region.others for region in regions))))
+        return seen_enough([shading.camera for shading in self.shadings], views, np.mean(middles, axis=0))
+
+    def _carries(self, plane: np.ndarray, one: FittedRegion) -> bool:
+        """Whether a plane leaves hardly more of a region's shading than the region's own, of as many boxes."""
+        if (one.region.rays @ in_camera(self._camera(one.region), plane[None])[0] <= 0).any():
+            return False
+        few = [one.region.some(FIRST_BOXES)]
+        found, own = evaluate(plane, few, self.shadings), evaluate(_plane(one), few, self.shadings)
+        if found is None or own is None:
+            return False
+        return found.boxes > 0.7 * own.boxes and found.left < HARDLY_MORE * own.left
+
+    def _carriers(self, one: FittedRegion) -> dict[int, np.ndarray]:
+        """The planes that carry a region's shading, and (N,) bool around which of its boxes."""
+        region, carriers = one.region, {}
+        for k, plane in enumerate(in_camera(self._camera(region), self.planes)):
+            inverse = region.rays @ plane
+            if (inverse <= 0).any() or self._contradicted(region, inverse):
+                continue
+            fit = evaluate(self.planes[k], [region.some(MOST_BOXES)], self.shadings)
+            if fit is None or fit.views < LEAST_VIEWS or fit.left_share > one.most_left:
+                continue
+            carried = unexplained(region, plane, self.shadings) <= MOST_LEFT
+            if carried.mean() >= CARRIED_SHARE:
+                carriers[k] = carried
+        return carriers
+
+    def depth_maps(self) -> list[np.ndarray]:
+        """(H, W) float32 depth of every view's regions, each by one plane where that carries its shading, else NaN.
+
+        Of planes that do so as well, such as those of one wall, the one is taken that carries most in all views.
+        """
+        carriers = [[self._carriers(one) for one in own] for own in self.regions]
+        carried = np.zeros(len(self.planes))
+        for own in carriers:
+            for of_region in own:
+                for k, boxes in of_region.items():
+                    carried[k] += np.count_nonzero(boxes)
+        carried[: len(self.known)] *= HARDLY_MORE
+        result = []
+        for shading, own, of_view in zip(self.shadings, self.regions, carriers, strict=True):
+            depth, labels = np.full(shading.value.shape, np.nan, np.float32), label(shading.plain)[0]
+            for one, of_region in zip(own, of_view, strict=True):
+                most = max((np.count_nonzero(boxes) for boxes in of_region.values()), default=0)
+                as_well = [k for k, boxes in of_region.items() if HARDLY_MORE * np.count_nonzero(boxes) >= most]
+                if as_well:
+                    best = max(as_well, key=lambda k: carried[k])
+                    inside = labels == labels[one.region.row[0], one.region.column[0]]
+                    _fill(depth, inside, one.region, of_region[best], in_camera(shading.camera, self.planes)[best])
+            result.append(depth)
+        return result
+
+
+def _fill(depth: np.ndarray, inside: np.ndarray, region: ShadedRegion, carried: np.ndarray, plane: np.ndarray) -> None:
+    """Sets the depth of a plane around the boxes of a region that it carries; `inside` (H, W) has their middles."""
+    height, width = depth.shape
+    grid = np.zeros((-(-height // STRIDE), -(-width // STRIDE)), bool)
+    grid[region.row[carried] // STRIDE, region.column[carried] // STRIDE] = True
+    wide = binary_dilation(grid, np.ones((3, 3))).repeat(STRIDE, 0).repeat(STRIDE, 1)[:height, :width]
+    # A ray of a region is affine in row and column, and so is its inverse depth.
+    affine = np.linalg.lstsq(
+        np.stack([region.row, region.column, np.ones(len(region.row))], 1), region.rays @ plane, rcond=None
+    )[0]
+    row, column = np.nonzero(binary_dilation(inside, iterations=BOX // 2) & wide)
+    inverse = affine[0] * row + affine[1] * column + affine[2]
+    depth[row, column] = np.where(inverse > 0, 1 / np.where(inverse > 0, inverse, 1), np.nan)
+
+
+def _plane(one: FittedRegion) -> np.ndarray:
+    assert one.fit is not None
+    return one.fit.plane
+
+
+def _starts(region: ShadedRegion, depth: np.ndarray, rendered: np.ndarray) -> list[np.ndarray]:
+    """Planes (3,) to start from: through rendered depths, and parallel to the image at confirmed depths around."""
+    starts, inside = [], rendered[region.row, region.column]
+    known = inside > 0
+    if np.count_nonzero(known) >= LEAST_BOXES:
+        rays, inverse = region.rays[known], 1 / inside[known].astype(np.float64)
+        weight = np.ones(len(inverse))
+        for _ in range(5):  # towards the least sum of absolute differences
+            plane = np.linalg.lstsq(rays * weight[:, None], inverse * weight, rcond=None)[0]
+            weight = np.maximum(np.abs(rays @ plane / inverse - 1), 2 * CONFIRMED_DEPTH) ** -0.5
+        starts.append(plane)
+    grid = np.zeros(depth[::STRIDE, ::STRIDE].shape, bool)
+    grid[region.row // STRIDE, region.column // STRIDE] = True
+    around = depth[::STRIDE, ::STRIDE][binary_dilation(grid, iterations=BOX // STRIDE + 2)]
+    around = around[np.isfinite(around)]
+    if len(around) >= SURE_DEPTHS:
+        starts += [np.array([0, 0, 1 / np.quantile(around, share)]) for share in (0.5, 0.9)]
+    return starts

@@ -1,0 +1,290 @@
+"""How a plane carries the shading of a wall from one photograph to others.
+
+A plain wall has no texture to match, but light falls off along it. Averaged over boxes of pixels that is far above the
+noise, and only the right plane makes it agree in all photographs. Gauss-Newton steps on the differences of box means
+find the plane; each pair of photographs has a gain, an offset and a noise of its own, as paint shines from aside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, label, median_filter, uniform_filter
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.stereo.depth_maps import DepthMap
+from linprim_geo.stereo.plain_regions import edges_of, in_camera
+
+# Sides of the boxes that are averaged, pixels from one to the next, and the smoothing of slopes in pixels.
+BOX, STRIDE, SLOPE_SIGMA = 9, 4, 8.0
+# Besides where `edges_of` finds one, an edge is where the slope, smoothed by EDGE_SIGMA pixels, differs by so many
+# deviations of its noise from the median of MEDIAN boxes a side around.
+EDGE_SIGMA, EDGE_SLOPE, MEDIAN = 2.0, 6.0, 9
+# A region has so many boxes, and stereo confirms no more than this share of them.
+LEAST_BOXES, KNOWN_SHARE = 60, 0.5
+# Another view shows at least this share of a region's boxes.
+SHOWN_SHARE = 0.3
+# Steps of a fit at most, the first one's size at most and the last one's, in radians and in depths.
+STEPS, FIRST_STEP, LAST_STEP = 20, 0.3, 5e-4
+# The range of gains, and rounds in which differences beyond two deviations lose weight.
+GAINS, ROUNDS = (0.7, 1.4), 3
+# Variance that JPEG adds to differences of box means: it rounds means of its blocks to thirds of a grey level.
+ROUNDING = 0.1
+# Differences are smoothed over so many boxes a side before they are compared with the noise.
+SMOOTH = 5
+
+
+@dataclass(frozen=True)
+class Shading:
+    """Box means of a photograph.
+
+    `value` (H, W) float32; `plain` (H, W) bool where the box has no edge; `along_x` and `along_y` (H, W) float32 slopes
+    per pixel, of plain pixels around; `noise` the variance of a mean.
+    """
+
+    camera: Camera
+    value: np.ndarray
+    plain: np.ndarray
+    along_x: np.ndarray
+    along_y: np.ndarray
+    noise: float
+
+    @classmethod
+    def of(cls, found: DepthMap) -> Shading:
+        grey = found.grey.astype(np.float32)
+        slope = np.hypot(*(_beyond_shading(one) for one in np.gradient(gaussian_filter(grey, EDGE_SIGMA))))
+        # The variance of the derivative of white noise behind a Gaussian is that of the noise over 8 pi sigma^4.
+        edge = edges_of(found.grey, found.noise)
+        edge |= slope > EDGE_SLOPE * np.sqrt(found.noise / (8 * np.pi * EDGE_SIGMA**4))
+        plain = uniform_filter((~edge).astype(np.float32), BOX, mode="constant") > 1 - 0.5 / BOX**2
+        value = uniform_filter(grey, BOX, mode="nearest")
+        # The mean of plain pixels around, as noise of slopes makes steps of a fit too small.
+        share = gaussian_filter(plain.astype(np.float32), SLOPE_SIGMA)
+        smooth = gaussian_filter(np.where(plain, value, 0), SLOPE_SIGMA) / np.maximum(share, 1e-6)
+        along_y, along_x = np.gradient(smooth)
+        return cls(found.camera, value, plain, along_x, along_y, found.noise / BOX**2)
+
+
+def _beyond_shading(slope: np.ndarray) -> np.ndarray:
+    """Slopes along an axis less the median of those around, which shading has and edges do not change."""
+    usual = median_filter(slope[::STRIDE, ::STRIDE], MEDIAN, mode="nearest")
+    return slope - usual.repeat(STRIDE, 0).repeat(STRIDE, 1)[: slope.shape[0], : slope.shape[1]]
+
+
+@dataclass(frozen=True)
+class ShadedRegion:
+    """Boxes of view `view` between edges: `row`, `column` (N,), `rays` (N, 3) of depth 1 and `value` (N,); about their
+    `depth`, and the views `others` that they are compared with."""
+
+    view: int
+    row: np.ndarray
+    column: np.ndarray
+    rays: np.ndarray
+    value: np.ndarray
+    depth: float = 1.0
+    others: tuple[int, ...] = ()
+
+    def some(self, count: int) -> ShadedRegion:
+        step = -(-len(self.row) // count)
+        parts = {name: getattr(self, name)[::step] for name in ("row", "column", "rays", "value")}
+        return replace(self, **parts)
+
+
+def shaded_regions(view: int, shading: Shading, confirmed: np.ndarray) -> list[ShadedRegion]:
+    """Those of a view whose `confirmed` (H, W) bool says where stereo is sure."""
+    labels, count = label(shading.plain)
+    grid = labels[::STRIDE, ::STRIDE]
+    row, column = (x * STRIDE for x in np.nonzero(grid))
+    grid = grid[grid > 0]
+    boxes = np.bincount(grid, minlength=count + 1)
+    known = np.bincount(grid, weights=confirmed[row, column], minlength=count + 1)
+    camera, regions = shading.camera, []
+    for k in np.flatnonzero((boxes >= LEAST_BOXES) & (known <= KNOWN_SHARE * boxes)):
+        y, x = row[grid == k], column[grid == k]
+        rays = np.stack([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, np.ones(len(x))], 1)
+        regions.append(ShadedRegion(view, y, x, rays, shading.value[y, x].astype(np.float64)))
+    return regions
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Boxes of a region in another view by a plane: `shown` (N,) bool which are plain there; of these (M,) their
+    `value` there, the differences `left` after gain and offset, their `weight`, and `slope` by inverse depth."""
+
+    shown: np.ndarray
+    value: np.ndarray
+    left: np.ndarray
+    weight: np.ndarray
+    slope: np.ndarray
+
+
+def compare(region: ShadedRegion, plane: np.ndarray, own: Shading, other: Shading) -> Comparison | None:
+    """None where the other view shows too little. `plane` (3,) with ray . plane = inverse depth."""
+    camera = other.camera
+    turn = camera.rotation @ own.camera.rotation.T
+    shift = camera.world_to_camera[:3, 3] - turn @ own.camera.world_to_camera[:3, 3]
+    inverse = region.rays @ plane
+    point = region.rays @ turn.T + inverse[:, None] * shift
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = point[:, 0] / point[:, 2] * camera.fx + camera.cx - 0.5
+        y = point[:, 1] / point[:, 2] * camera.fy + camera.cy - 0.5
+    height, width = other.value.shape
+    shown = (inverse > 0) & (point[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < width - 1) & (y < height - 1)
+    shown[shown] = other.plain[np.rint(y[shown]).astype(int), np.rint(x[shown]).astype(int)]
+    if np.count_nonzero(shown) < max(LEAST_BOXES, SHOWN_SHARE * len(shown)):
+        return None
+    x, y, point = x[shown], y[shown], point[shown]
+    value, along_x, along_y = _interpolated((other.value, other.along_x, other.along_y), x, y)
+    gain, left, weight = _matched(region.value[shown], value)
+    by_x = (shift[0] - point[:, 0] / point[:, 2] * shift[2]) / point[:, 2] * camera.fx
+    by_y = (shift[1] - point[:, 1] / point[:, 2] * shift[2]) / point[:, 2] * camera.fy
+    return Comparison(shown, value, left, weight, gain * (along_x * by_x + along_y * by_y))
+
+
+def _interpolated(images: Sequence[np.ndarray], x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
+    """(M,) of each image between its pixels."""
+    column, row = x.astype(int), y.astype(int)
+    right, down, width = x - column, y - row, images[0].shape[1]
+    first = row * width + column
+    upper, lower = (1 - down), down
+    found = []
+    for image in images:
+        flat = image.ravel()
+        above = flat[first] * (1 - right) + flat[first + 1] * right
+        below = flat[first + width] * (1 - right) + flat[first + width + 1] * right
+        found.append(above * upper + below * lower)
+    return found
+
+
+def _matched(ours: np.ndarray, theirs: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """The gain of theirs, what is left of ours after it and an offset, and Huber's weights."""
+    weight = np.ones_like(ours)
+    for _ in range(ROUNDS):
+        a, b = (x - np.average(x, weights=weight) for x in (ours, theirs))
+        gain = float(np.clip((weight * a * b).sum() / max((weight * b * b).sum(), 1e-6), *GAINS))
+        left = a - gain * b
+        deviation = 1.4826 * np.median(np.abs(left)) + 0.05
+        weight = 1 / np.maximum(1, np.abs(left) / (2 * deviation))
+    return gain, left, weight
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A plane (4,) of the world, n . x = d, and how it carries shading: `left` and `deviation` of the box means in grey
+    levels, geometric means over pairs of views; the (3, 3) `information` and (3,) `downhill` by turning about two axes
+    and shifting in depths; how many `boxes` were compared, and with how many views each region."""
+
+    plane: np.ndarray
+    left: float
+    deviation: float
+    information: np.ndarray
+    downhill: np.ndarray
+    boxes: int
+    views: float
+
+    @property
+    def left_share(self) -> float:
+        return self.left / self.deviation
+
+
+def evaluate(plane: np.ndarray, regions: Sequence[ShadedRegion], shadings: Sequence[Shading]) -> Fit | None:
+    """How a plane carries the shading of regions; None where no view shows them."""
+    information, downhill = np.zeros((3, 3)), np.zeros(3)
+    left, deviation, boxes, views = 0.0, 0.0, 0, 0
+    scale = _scale(regions)
+    for region in regions:
+        local, moves = _with_moves(shadings[region.view].camera, plane, scale)
+        for other in region.others:
+            found = compare(region, local, shadings[region.view], shadings[other])
+            if found is None:
+                continue
+            root = np.sqrt(found.weight)
+            slope = (found.slope * root)[:, None] * (region.rays[found.shown] @ moves)
+            taken = np.linalg.qr(np.stack([found.value - found.value.mean(), np.ones_like(root)], 1) * root[:, None])[0]
+            slope -= taken @ (taken.T @ slope)
+            variance = float((found.weight * found.left**2).mean()) + 1e-4
+            information += slope.T @ slope / variance
+            downhill += slope.T @ (found.left * root) / variance
+            left += len(root) * np.log(variance) / 2
+            deviation += len(root) * np.log(np.var(region.value[found.shown]) + 1e-4) / 2
+            boxes, views = boxes + len(root), views + 1
+    if not boxes:
+        return None
+    left, deviation = float(np.exp(left / boxes)), float(np.exp(deviation / boxes))
+    return Fit(plane, left, deviation, information, downhill, boxes, views / len(regions))
+
+
+def fit_plane(
+    plane: np.ndarray, regions: Sequence[ShadedRegion], shadings: Sequence[Shading], steps: int = STEPS
+) -> Fit | None:
+    """The best plane near one, by Levenberg's and Marquardt's steps; None where no view shows the regions."""
+    best, damping, scale = evaluate(plane, regions, shadings), 1e-3, _scale(regions)
+    if best is None:
+        return None
+    for _ in range(steps):
+        diagonal = np.diag(best.information)
+        damped = best.information + np.diag(damping * diagonal + 1e-9 * diagonal.sum() + 1e-12)
+        step = np.linalg.solve(damped, best.downhill)
+        step *= min(1, FIRST_STEP / max(np.abs(step).max(), 1e-12))
+        moved = best.plane + step @ _moves(best.plane, scale)
+        tried = evaluate(moved / np.linalg.norm(moved[:3]), regions, shadings)
+        # What is left varies a little as boxes come and go; far fewer boxes, of which less is left, are no better.
+        if tried is not None and tried.left < 1.001 * best.left and tried.boxes > 0.7 * best.boxes:
+            best, damping = tried, max(damping / 5, 1e-6)
+            if np.abs(step).max() < LAST_STEP:
+                break
+        elif (damping := 10 * damping) > 1e3:
+            break
+    return best
+
+
+def _scale(regions: Sequence[ShadedRegion]) -> float:
+    return float(np.median([region.depth for region in regions]))
+
+
+def _moves(plane: np.ndarray, scale: float) -> np.ndarray:
+    """(3, 4) directions in which a plane turns and shifts."""
+    first = np.cross(plane[:3], np.eye(3)[np.argmin(np.abs(plane[:3]))])
+    first /= np.linalg.norm(first)
+    return np.array([[*first, 0], [*np.cross(plane[:3], first), 0], [0, 0, 0, scale]])
+
+
+def _with_moves(camera: Camera, plane: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """A plane in a camera's frame (3,), and (3, 3) how it changes by `_moves`."""
+    step = 1e-5
+    planes = in_camera(camera, np.vstack([plane, plane + step * _moves(plane, scale)]))
+    return planes[0], ((planes[1:] - planes[0]) / step).T
+
+
+def depth_deviation(fit: Fit, region: ShadedRegion, camera: Camera) -> float:
+    """Of a region's depth by a fit to it alone, as a share, by noise alone."""
+    local, moves = _with_moves(camera, fit.plane, _scale([region]))
+    # Boxes overlap: so many of them are independent.
+    covariance = np.linalg.pinv(fit.information * (STRIDE / BOX) ** 2, hermitian=True)
+    variance = np.einsum("ni,ij,nj->n", region.rays, moves @ covariance @ moves.T, region.rays)
+    return float(np.median(np.sqrt(np.maximum(variance, 0)) / np.abs(region.rays @ local)))
+
+
+def unexplained(region: ShadedRegion, plane: np.ndarray, shadings: Sequence[Shading]) -> np.ndarray:
+    """(N,) what a plane (3,) of the view leaves around the boxes of a region, in deviations of the noise; NaN where no
+    view shows them."""
+    row, column = ((x - x.min()) // STRIDE for x in (region.row, region.column))
+    shape = (row.max() + 1, column.max() + 1)
+    square, count = np.zeros(len(row)), np.zeros(len(row))
+    # The boxes of a square of SMOOTH a side cover this one.
+    side = (SMOOTH - 1) * STRIDE + BOX
+    for other in region.others:
+        found = compare(region, plane, shadings[region.view], shadings[other])
+        if found is None:
+            continue
+        left, share = np.zeros(shape), np.zeros(shape)
+        left[row[found.shown], column[found.shown]] = found.left
+        share[row[found.shown], column[found.shown]] = 1
+        left, share = (uniform_filter(x, SMOOTH, mode="constant")[row, column] for x in (left, share))
+        left, share = left[found.shown], share[found.shown]
+        noise = (shadings[region.view].noise + shadings[other].noise) * BOX**2 / (side**2 * share)
+        square[found.shown] += (left / share) ** 2 / (noise + ROUNDING)
+        count += found.shown
+    return np.sqrt(square / np.where(count > 0, count, np.nan))

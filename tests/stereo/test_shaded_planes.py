@@ -1,0 +1,158 @@
+"""Planes of walls without texture, by how light falls off along them: of analytic photographs with noise, and things
+that must not become planes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.captures import look_at
+
+from linprim_geo.stereo.depth_maps import DepthMap
+from linprim_geo.stereo.plain_regions import in_camera
+from linprim_geo.stereo.shaded_planes import ShadedPlanes
+from linprim_geo.stereo.shading import Shading, evaluate, fit_plane, shaded_regions
+
+# A wall y = 0, seen from an arc before it; a lamp near its left upper corner.
+WALL, LAMP, NOISE = np.array([0.0, 1.0, 0.0, 0.0]), np.array([-0.9, 0.7, 0.8]), 2.0
+CENTERS = [(2 * np.sin(angle), 2 * np.cos(angle), 0.2) for angle in np.radians(np.linspace(-35, 35, 9))]
+NO_PLANES = np.zeros((0, 4))
+
+
+def camera_at(center):
+    return look_at(center, target=(0.0, 0.0, 0.0), size=(240, 180), focal=200.0)
+
+
+def wall_depth(camera, bulge: float = 0.0) -> np.ndarray:
+    """(H, W) depth of the wall, or of one that comes forward by `bulge` in the middle, as a parabola."""
+    rays = camera.world_rays()
+    depth = -camera.center[1] / rays[..., 1]
+    for _ in range(20 if bulge else 0):
+        x = camera.center[0] + depth * rays[..., 0]
+        depth = (bulge * np.maximum(1 - x**2, 0) - camera.center[1]) / rays[..., 1]
+    return depth
+
+
+def light(points: np.ndarray) -> np.ndarray:
+    """Grey values of a white wall by the lamp's light, as displays show it."""
+    towards = LAMP - points
+    square = (towards**2).sum(-1)
+    return 255 * np.clip(0.55 * towards[..., 1] / square**1.5, 0, 1) ** (1 / 2.2)
+
+
+def map_of(camera, grey: np.ndarray, seed: int, depth: np.ndarray | None = None) -> DepthMap:
+    noisy = grey + np.random.default_rng(seed).normal(0, NOISE, grey.shape)
+    nothing = np.full(grey.shape, np.nan, np.float32)
+    none = np.zeros(grey.shape, np.uint8)
+    return DepthMap(
+        camera=camera,
+        depth=nothing if depth is None else depth,
+        normal=np.full((*grey.shape, 3), np.nan, np.float32),
+        cost=nothing,
+        seen=none,
+        confirmed=none,
+        deviation=nothing,
+        grey=np.clip(np.rint(noisy), 0, 255).astype(np.uint8),
+        noise=NOISE**2 + 1 / 12,
+    )
+
+
+def photographs(value, bulge: float = 0.0, seed: int = 0):
+    """Maps of all cameras with the grey values `value`(points, view), and the true depths."""
+    maps, depths = [], []
+    for view, center in enumerate(CENTERS):
+        camera = camera_at(center)
+        depth = wall_depth(camera, bulge)
+        points = camera.center + camera.world_rays() * depth[..., None]
+        maps.append(map_of(camera, value(points, view), seed + view))
+        depths.append(depth)
+    return maps, depths
+
+
+def planes_of(maps, depths, known=NO_PLANES, confirmed=None):
+    """From rendered depths that are a tenth too near and tilted, as those of plain walls are."""
+    width = depths[0].shape[1]
+    rendered = [(depth * np.linspace(0.86, 0.94, width)).astype(np.float32) for depth in depths]
+    confirmed = confirmed or [np.full(depth.shape, np.nan, np.float32) for depth in depths]
+    return ShadedPlanes(maps, confirmed, rendered, known)
+
+
+def errors(found: ShadedPlanes, depths) -> tuple[float, np.ndarray]:
+    """The share of pixels that have depths, and how far these are off."""
+    own = found.depth_maps()
+    off = np.concatenate([np.abs(one / depth - 1)[np.isfinite(one)] for one, depth in zip(own, depths, strict=True)])
+    return float(np.mean([np.isfinite(one).mean() for one in own])), off
+
+
+@pytest.mark.parametrize("seed", [0, 100, 200])
+def test_a_lit_wall_without_texture_is_where_it_is(seed):
+    maps, depths = photographs(lambda points, view: light(points), seed=seed)
+    found = planes_of(maps, depths)
+    assert len(found.planes) == 1
+    share, off = errors(found, depths)
+    assert share > 0.7
+    # Rendered depths are off by 6 to 14 %; noise alone allows 0.2 % (`depth_deviation`).
+    assert np.quantile(off, 0.95) < 0.01
+
+
+def test_exposures_that_differ_change_nothing():
+    rng = np.random.default_rng(5)
+    gains, offsets = rng.uniform(0.85, 1.15, len(CENTERS)), rng.uniform(-8, 8, len(CENTERS))
+    maps, depths = photographs(lambda points, view: gains[view] * light(points) + offsets[view])
+    share, off = errors(planes_of(maps, depths), depths)
+    assert share > 0.7 and np.quantile(off, 0.95) < 0.01
+
+
+def test_a_bent_wall_gets_no_plane():
+    # It comes forward by 4 % of its depth; by 1 % it is within the tolerance of a plane.
+    maps, depths = photographs(lambda points, view: light(points), bulge=0.08)
+    assert errors(planes_of(maps, depths), depths)[0] < 0.05
+    maps, depths = photographs(lambda points, view: light(points), bulge=0.02)
+    assert np.quantile(errors(planes_of(maps, depths), depths)[1], 0.95) < 0.02
+
+
+def test_a_wall_in_even_light_gets_no_plane():
+    maps, depths = photographs(lambda points, view: np.full(points.shape[:-1], 140.0))
+    assert errors(planes_of(maps, depths), depths)[0] == 0
+
+
+def test_a_sky_gets_no_plane():
+    """Its colours depend on the direction alone."""
+    maps, depths = [], []
+    for view, center in enumerate(CENTERS):
+        camera = camera_at(center)
+        rays = camera.world_rays()
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        maps.append(map_of(camera, 120 + 60 * rays[..., 0] ** 2 + 50 * rays[..., 2], view))
+        depths.append(wall_depth(camera))
+    found = planes_of(maps, depths)
+    own = np.concatenate([one.ravel() for one in found.depth_maps()])
+    assert np.isnan(own).mean() > 0.95
+
+
+def test_stereo_that_is_sure_of_something_else_refuses_a_plane():
+    maps, depths = photographs(lambda points, view: light(points))
+    confirmed = [np.full(depth.shape, np.nan, np.float32) for depth in depths]
+    for own, depth in zip(confirmed, depths, strict=True):
+        own[60:140:2, 60:200:2] = 0.8 * depth[60:140:2, 60:200:2]
+    assert errors(planes_of(maps, depths, confirmed=confirmed), depths)[0] == 0
+
+
+def test_a_known_plane_is_taken_where_it_carries_the_shading_as_well():
+    maps, depths = photographs(lambda points, view: light(points))
+    found = planes_of(maps, depths, known=np.array([WALL, [0.0, 1.0, 0.0, 0.2]]))
+    assert len(found.planes) == 2
+    share, off = errors(found, depths)
+    assert share > 0.7 and off.max() < 1e-5
+
+
+def test_the_fit_goes_downhill_and_ends_at_the_truth_without_noise():
+    maps, depths = photographs(lambda points, view: light(points))
+    shadings = [Shading.of(one) for one in maps]
+    region = max(shaded_regions(4, shadings[4], np.zeros(depths[4].shape, bool)), key=lambda one: len(one.row))
+    region = type(region)(**{**vars(region), "depth": 2.0, "others": (1, 2, 6, 7)})
+    start = np.array([0.08, 1.0, -0.05, 0.15])
+    start /= np.linalg.norm(start[:3])
+    first, last = evaluate(start, [region], shadings), fit_plane(start, [region], shadings)
+    assert first is not None and last is not None and last.left < 0.2 * first.left
+    inverse = region.rays @ in_camera(shadings[4].camera, last.plane[None])[0]
+    assert np.abs(inverse * depths[4][region.row, region.column] - 1).max() < 0.02
