@@ -15,6 +15,7 @@ from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.depth_maps import DepthMap, depth_maps
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.plain_regions import PlainRegion, common_planes, edges_of, plain_regions, plane_depths
+from linprim_geo.stereo.shaded_planes import ShadedPlanes
 from linprim_geo.surface.single_view import mesh_is_closed
 from linprim_geo.surface.tsdf_field import DepthFrame
 
@@ -54,6 +55,10 @@ class MergedFrames(Sequence):
         for found, depth, own, frame in zip(maps, self.depths, regions, rendered, strict=True):
             deviations.add(found, depth, frame)
             self.on_planes.append(plane_depths(frame.camera, own, self.planes, frame.depth))
+        shaded = ShadedPlanes(maps, self.depths, [frame.depth for frame in rendered], self.planes)
+        self.planes = shaded.planes
+        for view, depth in enumerate(shaded.depth_maps()):
+            self.on_planes[view] = np.where(np.isfinite(depth), depth, self.on_planes[view])
         self.weight = deviations.weight()
         self.plain = _share_known(self.on_planes)
 
