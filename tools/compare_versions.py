@@ -1,0 +1,142 @@
+#!/usr/bin/env python3
+"""Compares two installed versions over scenes and seeds: is anything worse than the scatter of its seeds?
+
+    python tools/compare_versions.py --before OLD/.venv/bin/linprim-geo --after .venv/bin/linprim-geo \\
+        --scene office=DIR:REFERENCE --scene banana=DIR -o runs/compare --iterations 2000
+
+Each version trains each scene with each seed and, where a reference mesh is named, extracts the mesh; one ruler, the
+later version's `eval-mesh --run`, scores both. What the output folder holds is not done again, so a comparison can be
+interrupted. `compare.md` and `compare.json` hold means over the seeds with standard deviations: PSNR of held-out
+photographs in dB, and Chamfer distance and normal consistency of the seen part, in % of the diagonal and as a cosine.
+A figure counts as worse if it is by more than twice the deviation of the difference of both means.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import write_json
+from linprim_geo.eval.study_tables import write_table
+
+# name: (heading, decimals, whether larger is better)
+FIGURES = {
+    "psnr": ("held out, dB", 2, True),
+    "chamfer": ("Chamfer, %", 3, False),
+    "normals": ("normals", 3, True),
+}
+
+
+@dataclass(frozen=True)
+class SceneToCompare:
+    name: str
+    folder: Path
+    reference: Path | None
+
+    @classmethod
+    def parse(cls, text: str) -> SceneToCompare:
+        name, _, places = text.partition("=")
+        folder, _, reference = places.partition(":")
+        if not name or not folder:
+            raise LinprimError(f"--scene {text}: is not NAME=FOLDER or NAME=FOLDER:REFERENCE")
+        return cls(name, Path(folder), Path(reference) if reference else None)
+
+
+def run_json(command: list, log: Path) -> dict:
+    """The JSON object that a command prints; its messages go to `log`."""
+    with log.open("a", encoding="utf-8") as messages:
+        done = subprocess.run([str(part) for part in command], stdout=subprocess.PIPE, stderr=messages, text=True)
+    if done.returncode:
+        raise LinprimError(f"{command[0]} {command[1]} ended with {done.returncode}: see {log}")
+    return json.loads(done.stdout)
+
+
+def measure(program: Path, ruler: Path, scene: SceneToCompare, seed: int, iterations: int, folder: Path) -> dict:
+    """The figures of one version, scene and seed; from `folder`/figures.json where they are there."""
+    kept = folder / "figures.json"
+    if kept.exists():
+        return json.loads(kept.read_text(encoding="utf-8"))
+    shutil.rmtree(folder, ignore_errors=True)  # what was interrupted
+    folder.mkdir(parents=True)
+    run, log = folder / "run", folder / "log.txt"
+    one_thread = ["--threads", "1", "--json"]
+    trained = run_json(
+        [program, "train", scene.folder, "-o", run, "--seed", seed, "--iterations", iterations, *one_thread], log
+    )
+    figures = {"psnr": trained["psnr"]}
+    if scene.reference:
+        mesh = folder / "mesh.ply"
+        run_json([program, "extract-mesh", run, "-o", mesh, "--json"], log)
+        score = run_json([ruler, "eval-mesh", mesh, scene.reference, "--run", run, "-o", folder, *one_thread], log)
+        seen = score["visible"]
+        figures |= {"chamfer": seen["chamfer_percent_diagonal"], "normals": seen["normal_consistency"]}
+    write_json(kept, figures)
+    return figures
+
+
+def row(scene: str, name: str, before: list[float], after: list[float]) -> dict:
+    """Means and deviations of one figure, and whether it is worse than their scatter."""
+    means = np.mean(before), np.mean(after)
+    deviations = [float(np.std(values, ddof=1)) if len(values) > 1 else float("nan") for values in (before, after)]
+    loss = (means[0] - means[1]) * (1 if FIGURES[name][2] else -1)
+    scatter = float(np.hypot(*deviations)) / np.sqrt(len(before))
+    return {
+        "scene": scene,
+        "figure": name,
+        "before": float(means[0]),
+        "before_deviation": deviations[0],
+        "after": float(means[1]),
+        "after_deviation": deviations[1],
+        "worse": bool(loss > 2 * scatter),
+    }
+
+
+def table(rows: list[dict]) -> str:
+    lines = ["| scene | figure | before | after | |", "|---|---|---|---|---|"]
+    for one in rows:
+        heading, decimals, _ = FIGURES[one["figure"]]
+        cells = [f"{one[k]:.{decimals}f} ± {one[k + '_deviation']:.{decimals}f}" for k in ("before", "after")]
+        lines.append(f"| {one['scene']} | {heading} | {cells[0]} | {cells[1]} | {'worse' if one['worse'] else ''} |")
+    return "\n".join(lines)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--before", type=Path, required=True, metavar="PROGRAM", help="the earlier linprim-geo")
+    parser.add_argument("--after", type=Path, required=True, metavar="PROGRAM", help="the later one, also the ruler")
+    parser.add_argument("--scene", action="append", required=True, metavar="NAME=FOLDER[:REFERENCE]")
+    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="seeds 0 to N - 1 (default 3)")
+    parser.add_argument("--iterations", type=int, default=7000, metavar="N", help="steps of training (default 7000)")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+    chosen = parser.parse_args()
+    try:
+        rows = []
+        for scene in map(SceneToCompare.parse, chosen.scene):
+            both: dict[str, list[dict]] = {"before": [], "after": []}
+            for seed in range(chosen.seeds):
+                for version, found in both.items():
+                    folder = chosen.output / scene.name / f"{version}_{seed}"
+                    program = getattr(chosen, version)
+                    found.append(measure(program, chosen.after, scene, seed, chosen.iterations, folder))
+                    print(scene.name, seed, version, found[-1], file=sys.stderr, flush=True)
+            for name in both["after"][0]:
+                rows.append(row(scene.name, name, *([one[name] for one in found] for found in both.values())))
+            write_json(chosen.output / "compare.json", rows)
+            text = write_table(chosen.output / "compare.md", table(rows))
+        print(text)
+    except LinprimError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
