@@ -89,12 +89,12 @@ def plain_regions(view: int, camera: Camera, edge: np.ndarray, depth: np.ndarray
         low, middle, high = (np.quantile(inside, share, axis=1) for share in (0.05, 0.5, 0.95))
         ends = np.array([(low[0], low[1]), (low[0], high[1]), (high[0], low[1]), (high[0], high[1]), tuple(middle)])
         inverse = 1 / depth[window][row, column].astype(np.float64)
-        rays, corners = _rays(camera, row + top, column + left), _rays(camera, ends[:, 0] + top, ends[:, 1] + left)
+        rays, corners = rays_of(camera, row + top, column + left), rays_of(camera, ends[:, 0] + top, ends[:, 1] + left)
         regions.append(PlainRegion(view, top, left, mask, rays, inverse, corners))
     return regions
 
 
-def _rays(camera: Camera, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+def rays_of(camera: Camera, row: np.ndarray, column: np.ndarray) -> np.ndarray:
     """(..., 3) points of depth 1 in the camera's frame."""
     x, y = np.broadcast_arrays((column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy)
     return np.stack([x, y, np.ones_like(x)], axis=-1)
@@ -289,7 +289,7 @@ def _chosen(camera: Camera, region: PlainRegion, planes: np.ndarray, rendered: n
     known = mask & (rendered > 0)
     if not len(planes) or np.count_nonzero(known) < 0.5 * np.count_nonzero(mask):
         return inverse
-    rays = _rays(camera, np.arange(mask.shape[0])[:, None] + region.top, np.arange(mask.shape[1]) + region.left)
+    rays = rays_of(camera, np.arange(mask.shape[0])[:, None] + region.top, np.arange(mask.shape[1]) + region.left)
     share = np.maximum(uniform_filter(known.astype(np.float32), size, mode="constant"), 1e-6)
     planes = rays @ planes.T
     off = np.where(known[..., None], np.minimum(np.abs(rendered[..., None] * planes - 1), MOST_OFF), 0)

@@ -17,7 +17,7 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
-from linprim_geo.stereo.plain_regions import SAME_ANGLE, in_camera, in_world, seen_enough, to_world
+from linprim_geo.stereo.plain_regions import SAME_ANGLE, in_camera, in_world, rays_of, seen_enough, to_world
 from linprim_geo.stereo.shading import (
     BOX,
     LEAST_BOXES,
@@ -238,24 +238,23 @@ class ShadedPlanes:
                 if as_well:
                     best = max(as_well, key=lambda k: carried[k])
                     inside = labels == labels[one.region.row[0], one.region.column[0]]
-                    _fill(depth, inside, one.region, of_region[best], in_camera(shading.camera, self.planes)[best])
+                    plane = in_camera(shading.camera, self.planes)[best]
+                    _fill(depth, shading.camera, inside, one.region, of_region[best], plane)
             result.append(depth)
         return result
 
 
-def _fill(depth: np.ndarray, inside: np.ndarray, region: ShadedRegion, carried: np.ndarray, plane: np.ndarray) -> None:
+def _fill(
+    depth: np.ndarray, camera: Camera, inside: np.ndarray, region: ShadedRegion, carried: np.ndarray, plane: np.ndarray
+) -> None:
     """Sets the depth of a plane around the boxes of a region that it carries; `inside` (H, W) has their middles."""
     height, width = depth.shape
     grid = np.zeros((-(-height // STRIDE), -(-width // STRIDE)), bool)
     grid[region.row[carried] // STRIDE, region.column[carried] // STRIDE] = True
     wide = binary_dilation(grid, np.ones((3, 3))).repeat(STRIDE, 0).repeat(STRIDE, 1)[:height, :width]
-    # A ray of a region is affine in row and column, and so is its inverse depth.
-    affine = np.linalg.lstsq(
-        np.stack([region.row, region.column, np.ones(len(region.row))], 1), region.rays @ plane, rcond=None
-    )[0]
     row, column = np.nonzero(binary_dilation(inside, iterations=BOX // 2) & wide)
-    inverse = affine[0] * row + affine[1] * column + affine[2]
-    depth[row, column] = np.where(inverse > 0, 1 / np.where(inverse > 0, inverse, 1), np.nan)
+    inverse = rays_of(camera, row, column) @ plane
+    depth[row, column] = 1 / np.where(inverse > 0, inverse, np.nan)
 
 
 def _plane(one: FittedRegion) -> np.ndarray:

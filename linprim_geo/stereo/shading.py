@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter, label, median_filter, uniform_filter
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.stereo.depth_maps import DepthMap
-from linprim_geo.stereo.plain_regions import edges_of, in_camera
+from linprim_geo.stereo.plain_regions import edges_of, in_camera, rays_of
 
 # Sides of the boxes that are averaged, pixels from one to the next, and the smoothing of slopes in pixels.
 BOX, STRIDE, SLOPE_SIGMA = 9, 4, 8.0
@@ -103,8 +103,7 @@ def shaded_regions(view: int, shading: Shading, confirmed: np.ndarray) -> list[S
     camera, regions = shading.camera, []
     for k in np.flatnonzero((boxes >= LEAST_BOXES) & (known <= KNOWN_SHARE * boxes)):
         y, x = row[grid == k], column[grid == k]
-        rays = np.stack([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, np.ones(len(x))], 1)
-        regions.append(ShadedRegion(view, y, x, rays, shading.value[y, x].astype(np.float64)))
+        regions.append(ShadedRegion(view, y, x, rays_of(camera, y, x), shading.value[y, x].astype(np.float64)))
     return regions
 
 
