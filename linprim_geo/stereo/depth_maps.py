@@ -8,7 +8,7 @@ the same surface.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -175,19 +175,13 @@ def noise_of(grey: np.ndarray) -> float:
 
 def halved(image: StereoImage) -> StereoImage:
     """Means of 2 by 2 pixels."""
-    grey, camera = image.grey, image.camera
+    return StereoImage.of(image.camera.halved(), np.rint(means_of_four(image.grey)).astype(np.uint8))
+
+
+def means_of_four(grey: np.ndarray) -> np.ndarray:
+    """(H // 2, W // 2) means of 2 by 2 of (H, W) values."""
     height, width = (size // 2 for size in grey.shape)
-    mean = grey[: 2 * height, : 2 * width].reshape(height, 2, width, 2).mean((1, 3))
-    half = replace(
-        camera,
-        width=width,
-        height=height,
-        fx=camera.fx / 2,
-        fy=camera.fy / 2,
-        cx=camera.cx / 2,
-        cy=camera.cy / 2,
-    )
-    return StereoImage.of(half, np.rint(mean).astype(np.uint8))
+    return grey[: 2 * height, : 2 * width].reshape(height, 2, width, 2).mean((1, 3))
 
 
 def _doubled(planes: DepthPlanes, shape: tuple[int, int]) -> DepthPlanes:
