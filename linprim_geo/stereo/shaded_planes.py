@@ -82,11 +82,13 @@ class ShadedPlanes:
         known: np.ndarray,
     ):
         self.shadings = [Shading.of(found) for found in maps]
-        self.depths, self.known = depths, known
+        self.cameras, self.known = [found.camera for found in maps], known
+        self.depths = [shading.small(depth) for shading, depth in zip(self.shadings, depths, strict=True)]
         self.regions: list[list[FittedRegion]] = []
-        for view, (shading, depth) in enumerate(zip(self.shadings, depths, strict=True)):
-            own = shaded_regions(view, shading, np.isfinite(depth))
-            fitted = [self._fitted(region, rendered[view]) for region in own]
+        for view, shading in enumerate(self.shadings):
+            small = shading.small(rendered[view])
+            own = shaded_regions(view, shading, np.isfinite(self.depths[view]))
+            fitted = [self._fitted(region, small) for region in own]
             self.regions.append([one for one in fitted if one is not None])
         self.planes = self._common([one for own in self.regions for one in own if one.fit is not None])
 
@@ -230,31 +232,38 @@ class ShadedPlanes:
                     carried[k] += np.count_nonzero(boxes)
         carried[: len(self.known)] *= HARDLY_MORE
         result = []
-        for shading, own, of_view in zip(self.shadings, self.regions, carriers, strict=True):
-            depth, labels = np.full(shading.value.shape, np.nan, np.float32), label(shading.plain)[0]
+        for view, (own, of_view) in enumerate(zip(self.regions, carriers, strict=True)):
+            number = np.full(self.shadings[view].value.shape, -1)
+            labels = label(self.shadings[view].plain)[0]
             for one, of_region in zip(own, of_view, strict=True):
                 most = max((np.count_nonzero(boxes) for boxes in of_region.values()), default=0)
                 as_well = [k for k, boxes in of_region.items() if HARDLY_MORE * np.count_nonzero(boxes) >= most]
                 if as_well:
                     best = max(as_well, key=lambda k: carried[k])
                     inside = labels == labels[one.region.row[0], one.region.column[0]]
-                    plane = in_camera(shading.camera, self.planes)[best]
-                    _fill(depth, shading.camera, inside, one.region, of_region[best], plane)
-            result.append(depth)
+                    number[_around(inside, one.region, of_region[best])] = best
+            result.append(self._depth(view, number))
         return result
 
+    def _depth(self, view: int, number: np.ndarray) -> np.ndarray:
+        """(H, W) float32 depth of the planes that `number` names at pixels of the small photograph, NaN for -1."""
+        camera, factor = self.cameras[view], self.shadings[view].factor
+        depth = np.full((camera.height, camera.width), np.nan, np.float32)
+        number = number.repeat(factor, 0).repeat(factor, 1)
+        row, column = np.nonzero(number >= 0)
+        planes = in_camera(camera, self.planes)[number[row, column]]
+        inverse = np.einsum("nc,nc->n", rays_of(camera, row, column), planes)
+        depth[row, column] = 1 / np.where(inverse > 0, inverse, np.nan)
+        return depth
 
-def _fill(
-    depth: np.ndarray, camera: Camera, inside: np.ndarray, region: ShadedRegion, carried: np.ndarray, plane: np.ndarray
-) -> None:
-    """Sets the depth of a plane around the boxes of a region that it carries; `inside` (H, W) has their middles."""
-    height, width = depth.shape
+
+def _around(inside: np.ndarray, region: ShadedRegion, carried: np.ndarray) -> np.ndarray:
+    """(H, W) bool around those boxes of a region that are carried; `inside` (H, W) has the middles of all."""
+    height, width = inside.shape
     grid = np.zeros((-(-height // STRIDE), -(-width // STRIDE)), bool)
     grid[region.row[carried] // STRIDE, region.column[carried] // STRIDE] = True
     wide = binary_dilation(grid, np.ones((3, 3))).repeat(STRIDE, 0).repeat(STRIDE, 1)[:height, :width]
-    row, column = np.nonzero(binary_dilation(inside, iterations=BOX // 2) & wide)
-    inverse = rays_of(camera, row, column) @ plane
-    depth[row, column] = 1 / np.where(inverse > 0, inverse, np.nan)
+    return binary_dilation(inside, iterations=BOX // 2) & wide
 
 
 def _plane(one: FittedRegion) -> np.ndarray:

@@ -14,9 +14,11 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, label, median_filter, uniform_filter
 
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.stereo.depth_maps import DepthMap
+from linprim_geo.stereo.depth_maps import DepthMap, means_of_four
 from linprim_geo.stereo.plain_regions import edges_of, in_camera, rays_of
 
+# Larger photographs are halved.
+MOST_SIDE = 800
 # Sides of the boxes that are averaged, pixels from one to the next, and the smoothing of slopes in pixels.
 BOX, STRIDE, SLOPE_SIGMA = 9, 4, 8.0
 # Besides where `edges_of` finds one, an edge is where the slope, smoothed by EDGE_SIGMA pixels, differs by so many
@@ -38,7 +40,8 @@ SMOOTH = 5
 
 @dataclass(frozen=True)
 class Shading:
-    """Box means of a photograph.
+    """Box means of a photograph, which is halved until no side is longer than MOST_SIDE: `factor` says how often, as a
+    power of two, and all else is of the small photograph.
 
     `value` (H, W) float32; `plain` (H, W) bool where the box has no edge; `along_x` and `along_y` (H, W) float32 slopes
     per pixel, of plain pixels around; `noise` the variance of a mean.
@@ -50,21 +53,29 @@ class Shading:
     along_x: np.ndarray
     along_y: np.ndarray
     noise: float
+    factor: int
 
     @classmethod
     def of(cls, found: DepthMap) -> Shading:
-        grey = found.grey.astype(np.float32)
+        grey, camera, noise, factor = found.grey.astype(np.float32), found.camera, found.noise, 1
+        while max(grey.shape) > MOST_SIDE:
+            grey, camera, noise, factor = means_of_four(grey), camera.halved(), noise / 4, 2 * factor
         slope = np.hypot(*(_beyond_shading(one) for one in np.gradient(gaussian_filter(grey, EDGE_SIGMA))))
         # The variance of the derivative of white noise behind a Gaussian is that of the noise over 8 pi sigma^4.
-        edge = edges_of(found.grey, found.noise)
-        edge |= slope > EDGE_SLOPE * np.sqrt(found.noise / (8 * np.pi * EDGE_SIGMA**4))
+        edge = edges_of(grey, noise)
+        edge |= slope > EDGE_SLOPE * np.sqrt(noise / (8 * np.pi * EDGE_SIGMA**4))
         plain = uniform_filter((~edge).astype(np.float32), BOX, mode="constant") > 1 - 0.5 / BOX**2
         value = uniform_filter(grey, BOX, mode="nearest")
         # The mean of plain pixels around, as noise of slopes makes steps of a fit too small.
         share = gaussian_filter(plain.astype(np.float32), SLOPE_SIGMA)
         smooth = gaussian_filter(np.where(plain, value, 0), SLOPE_SIGMA) / np.maximum(share, 1e-6)
         along_y, along_x = np.gradient(smooth)
-        return cls(found.camera, value, plain, along_x, along_y, found.noise / BOX**2)
+        return cls(camera, value, plain, along_x, along_y, noise / BOX**2, factor)
+
+    def small(self, image: np.ndarray) -> np.ndarray:
+        """Every `factor`-th pixel of an image of the photograph's size."""
+        height, width = self.value.shape
+        return image[self.factor // 2 :: self.factor, self.factor // 2 :: self.factor][:height, :width]
 
 
 def _beyond_shading(slope: np.ndarray) -> np.ndarray:

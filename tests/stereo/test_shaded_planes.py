@@ -102,6 +102,15 @@ def test_exposures_that_differ_change_nothing():
     assert share > 0.7 and np.quantile(off, 0.95) < 0.01
 
 
+def test_larger_photographs_are_halved(monkeypatch):
+    monkeypatch.setattr("linprim_geo.stereo.shading.MOST_SIDE", 120)
+    maps, depths = photographs(lambda points, view: light(points))
+    found = planes_of(maps, depths)
+    assert {shading.factor for shading in found.shadings} == {2}
+    share, off = errors(found, depths)
+    assert share > 0.5 and np.quantile(off, 0.95) < 0.01
+
+
 def test_a_bent_wall_gets_no_plane():
     # It comes forward by 4 % of its depth; by 1 % it is within the tolerance of a plane.
     maps, depths = photographs(lambda points, view: light(points), bulge=0.08)
