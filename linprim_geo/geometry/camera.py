@@ -71,18 +71,6 @@ class Camera:
         pixels = np.stack([local[:, 0] * scale * self.fx + self.cx, local[:, 1] * scale * self.fy + self.cy], 1)
         return pixels, depth
 
-    def halved(self) -> Camera:
-        """Of means of 2 by 2 pixels."""
-        return replace(
-            self,
-            width=self.width // 2,
-            height=self.height // 2,
-            fx=self.fx / 2,
-            fy=self.fy / 2,
-            cx=self.cx / 2,
-            cy=self.cy / 2,
-        )
-
     def pinhole(self) -> tuple[np.ndarray, tuple[float, float, float, float]]:
         """(3, 4) world to camera, and focal lengths and principal point, as the core takes them."""
         return np.ascontiguousarray(self.world_to_camera[:3], np.float64), (self.fx, self.fy, self.cx, self.cy)

@@ -16,6 +16,7 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.memory import available_memory
 from linprim_geo.base.progress import Progress
 from linprim_geo.capture.types import View
+from linprim_geo.geometry.boxes import smaller
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, patch_match
 from linprim_geo.points.view_pairs import source_views, visible_pixels
@@ -175,13 +176,13 @@ def noise_of(grey: np.ndarray) -> float:
 
 def halved(image: StereoImage) -> StereoImage:
     """Means of 2 by 2 pixels."""
-    return StereoImage.of(image.camera.halved(), np.rint(means_of_four(image.grey)).astype(np.uint8))
+    return StereoImage.of(smaller(image.camera, 2), np.rint(block_means(image.grey, 2)).astype(np.uint8))
 
 
-def means_of_four(grey: np.ndarray) -> np.ndarray:
-    """(H // 2, W // 2) means of 2 by 2 of (H, W) values."""
-    height, width = (size // 2 for size in grey.shape)
-    return grey[: 2 * height, : 2 * width].reshape(height, 2, width, 2).mean((1, 3))
+def block_means(grey: np.ndarray, factor: int) -> np.ndarray:
+    """(H // factor, W // factor) means of `factor` by `factor` of (H, W) values."""
+    height, width = (size // factor for size in grey.shape)
+    return grey[: factor * height, : factor * width].reshape(height, factor, width, factor).mean((1, 3))
 
 
 def _doubled(planes: DepthPlanes, shape: tuple[int, int]) -> DepthPlanes:

@@ -189,6 +189,7 @@ def _same(plane: np.ndarray, normals: np.ndarray, points: np.ndarray, depth: np.
 
 
 def seen_enough(cameras: Sequence[Camera], views: np.ndarray, point: np.ndarray) -> bool:
+    """Whether LEAST_VIEWS of `views`, numbers of cameras, differ, and two see a point from directions that do."""
     views = np.unique(views)
     if len(views) < LEAST_VIEWS:
         return False
@@ -243,6 +244,7 @@ def _refitted(cameras: Sequence[Camera], regions: Sequence[PlainRegion], planes:
 
 
 def to_world(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """(..., 3) points of the camera's frame in the world's."""
     return (points - camera.world_to_camera[:3, 3]) @ camera.rotation
 
 

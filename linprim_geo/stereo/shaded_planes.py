@@ -1,8 +1,8 @@
-"""Planes of painted walls by their shading.
+"""Depth of painted walls: planes that are photo-consistent on shading alone.
 
 A plane is fitted to every plain region of every photograph that stereo says little about (`shading.py`). Where regions
-of several photographs agree their plane is fitted to all of them together. Every region then gets the planes that carry
-its shading as well as its own does. Walls without any shading, and whatever is not flat, get none.
+of several photographs agree their plane is fitted to all of them together. Every region then gets one plane of those
+that explain ("carry") its shading as well as its own does. Walls without shading, and whatever is not flat, get none.
 """
 
 from __future__ import annotations
@@ -168,7 +168,8 @@ class ShadedPlanes:
                 together = [fitted[k].region.some(MOST_BOXES) for k in np.flatnonzero(carried)]
                 fit = fit_plane(plane, together, self.shadings) if together else None
                 plane = plane if fit is None else fit.plane
-                carried = left & [self._carries(plane, one) for one in fitted]
+                carried = np.zeros_like(left)
+                carried[[k for k in np.flatnonzero(left) if self._carries(plane, fitted[k])]] = True
             if self._of_several_views(plane, [fitted[k].region for k in np.flatnonzero(carried)]):
                 planes.append(plane)
             left &= ~(carried | group)
@@ -184,6 +185,7 @@ class ShadedPlanes:
         return alike
 
     def _of_several_views(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> bool:
+        """Whether regions of enough views lie on a plane, and views from directions that differ were compared."""
         finding = {region.view for region in regions}
         if len(finding) < LEAST_VIEWS:
             return False
@@ -198,8 +200,7 @@ class ShadedPlanes:
         """Whether a plane leaves hardly more of a region's shading than the region's own, of as many boxes."""
         if (one.region.rays @ in_camera(self._camera(one.region), plane[None])[0] <= 0).any():
             return False
-        few = [one.region.some(FIRST_BOXES)]
-        found, own = evaluate(plane, few, self.shadings), evaluate(_plane(one), few, self.shadings)
+        found, own = evaluate(plane, [one.region.some(MOST_BOXES)], self.shadings), one.fit
         if found is None or own is None:
             return False
         return found.boxes > 0.7 * own.boxes and found.left < HARDLY_MORE * own.left
@@ -233,7 +234,7 @@ class ShadedPlanes:
         carried[: len(self.known)] *= HARDLY_MORE
         result = []
         for view, (own, of_view) in enumerate(zip(self.regions, carriers, strict=True)):
-            number = np.full(self.shadings[view].value.shape, -1)
+            number = np.full(self.shadings[view].plain.shape, -1)
             labels = label(self.shadings[view].plain)[0]
             for one, of_region in zip(own, of_view, strict=True):
                 most = max((np.count_nonzero(boxes) for boxes in of_region.values()), default=0)

@@ -1,4 +1,4 @@
-"""How a plane carries the shading of a wall from one photograph to others.
+"""Photo-consistency of planes on shading alone: how well a plane explains a plain wall in several photographs.
 
 A plain wall has no texture to match, but light falls off along it. Averaged over boxes of pixels that is far above the
 noise, and only the right plane makes it agree in all photographs. Gauss-Newton steps on the differences of box means
@@ -13,13 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import gaussian_filter, label, median_filter, uniform_filter
 
+from linprim_geo.geometry.boxes import smaller
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.stereo.depth_maps import DepthMap, means_of_four
+from linprim_geo.geometry.sampling import sample_bilinear
+from linprim_geo.stereo.depth_maps import DepthMap, block_means
 from linprim_geo.stereo.plain_regions import edges_of, in_camera, rays_of
 
-# Larger photographs are halved.
+# Larger photographs are averaged down.
 MOST_SIDE = 800
-# Sides of the boxes that are averaged, pixels from one to the next, and the smoothing of slopes in pixels.
+# The side of a box, the way from one to the next, and the smoothing of slopes, in pixels.
 BOX, STRIDE, SLOPE_SIGMA = 9, 4, 8.0
 # Besides where `edges_of` finds one, an edge is where the slope, smoothed by EDGE_SIGMA pixels, differs by so many
 # deviations of its noise from the median of MEDIAN boxes a side around.
@@ -40,41 +42,40 @@ SMOOTH = 5
 
 @dataclass(frozen=True)
 class Shading:
-    """Box means of a photograph, which is halved until no side is longer than MOST_SIDE: `factor` says how often, as a
-    power of two, and all else is of the small photograph.
+    """Box means of a photograph, of which `factor` by `factor` pixels are averaged first if a side is longer than
+    MOST_SIDE; all else is of the small photograph.
 
-    `value` (H, W) float32; `plain` (H, W) bool where the box has no edge; `along_x` and `along_y` (H, W) float32 slopes
-    per pixel, of plain pixels around; `noise` the variance of a mean.
+    `means` (H, W, 3) float32 has the mean and its slopes per column and per row, of plain pixels around; `plain` (H, W)
+    says where the box has no edge; `noise` is the variance of a mean.
     """
 
     camera: Camera
-    value: np.ndarray
+    means: np.ndarray
     plain: np.ndarray
-    along_x: np.ndarray
-    along_y: np.ndarray
     noise: float
     factor: int
 
     @classmethod
     def of(cls, found: DepthMap) -> Shading:
-        grey, camera, noise, factor = found.grey.astype(np.float32), found.camera, found.noise, 1
-        while max(grey.shape) > MOST_SIDE:
-            grey, camera, noise, factor = means_of_four(grey), camera.halved(), noise / 4, 2 * factor
+        factor = -(-max(found.grey.shape) // MOST_SIDE)
+        grey = block_means(found.grey.astype(np.float32), factor)
+        noise = found.noise / factor**2
         slope = np.hypot(*(_beyond_shading(one) for one in np.gradient(gaussian_filter(grey, EDGE_SIGMA))))
         # The variance of the derivative of white noise behind a Gaussian is that of the noise over 8 pi sigma^4.
         edge = edges_of(grey, noise)
         edge |= slope > EDGE_SLOPE * np.sqrt(noise / (8 * np.pi * EDGE_SIGMA**4))
         plain = uniform_filter((~edge).astype(np.float32), BOX, mode="constant") > 1 - 0.5 / BOX**2
-        value = uniform_filter(grey, BOX, mode="nearest")
-        # The mean of plain pixels around, as noise of slopes makes steps of a fit too small.
+        mean = uniform_filter(grey, BOX, mode="nearest")
+        # Of plain pixels far around: noise of the slopes would make the steps of a fit too small.
         share = gaussian_filter(plain.astype(np.float32), SLOPE_SIGMA)
-        smooth = gaussian_filter(np.where(plain, value, 0), SLOPE_SIGMA) / np.maximum(share, 1e-6)
-        along_y, along_x = np.gradient(smooth)
-        return cls(camera, value, plain, along_x, along_y, noise / BOX**2, factor)
+        smooth = gaussian_filter(np.where(plain, mean, 0), SLOPE_SIGMA) / np.maximum(share, 1e-6)
+        by_row, by_column = np.gradient(smooth)
+        means = np.stack([mean, by_column, by_row], -1)
+        return cls(smaller(found.camera, factor), means, plain, noise / BOX**2, factor)
 
     def small(self, image: np.ndarray) -> np.ndarray:
         """Every `factor`-th pixel of an image of the photograph's size."""
-        height, width = self.value.shape
+        height, width = self.plain.shape
         return image[self.factor // 2 :: self.factor, self.factor // 2 :: self.factor][:height, :width]
 
 
@@ -114,7 +115,7 @@ def shaded_regions(view: int, shading: Shading, confirmed: np.ndarray) -> list[S
     camera, regions = shading.camera, []
     for k in np.flatnonzero((boxes >= LEAST_BOXES) & (known <= KNOWN_SHARE * boxes)):
         y, x = row[grid == k], column[grid == k]
-        regions.append(ShadedRegion(view, y, x, rays_of(camera, y, x), shading.value[y, x].astype(np.float64)))
+        regions.append(ShadedRegion(view, y, x, rays_of(camera, y, x), shading.means[y, x, 0].astype(np.float64)))
     return regions
 
 
@@ -140,32 +141,17 @@ def compare(region: ShadedRegion, plane: np.ndarray, own: Shading, other: Shadin
     with np.errstate(divide="ignore", invalid="ignore"):
         x = point[:, 0] / point[:, 2] * camera.fx + camera.cx - 0.5
         y = point[:, 1] / point[:, 2] * camera.fy + camera.cy - 0.5
-    height, width = other.value.shape
+    height, width = other.plain.shape
     shown = (inverse > 0) & (point[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < width - 1) & (y < height - 1)
     shown[shown] = other.plain[np.rint(y[shown]).astype(int), np.rint(x[shown]).astype(int)]
     if np.count_nonzero(shown) < max(LEAST_BOXES, SHOWN_SHARE * len(shown)):
         return None
     x, y, point = x[shown], y[shown], point[shown]
-    value, along_x, along_y = _interpolated((other.value, other.along_x, other.along_y), x, y)
+    value, by_column, by_row = sample_bilinear(other.means, np.stack([x, y], 1) + 0.5).T
     gain, left, weight = _matched(region.value[shown], value)
     by_x = (shift[0] - point[:, 0] / point[:, 2] * shift[2]) / point[:, 2] * camera.fx
     by_y = (shift[1] - point[:, 1] / point[:, 2] * shift[2]) / point[:, 2] * camera.fy
-    return Comparison(shown, value, left, weight, gain * (along_x * by_x + along_y * by_y))
-
-
-def _interpolated(images: Sequence[np.ndarray], x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
-    """(M,) of each image between its pixels."""
-    column, row = x.astype(int), y.astype(int)
-    right, down, width = x - column, y - row, images[0].shape[1]
-    first = row * width + column
-    upper, lower = (1 - down), down
-    found = []
-    for image in images:
-        flat = image.ravel()
-        above = flat[first] * (1 - right) + flat[first + 1] * right
-        below = flat[first + width] * (1 - right) + flat[first + width + 1] * right
-        found.append(above * upper + below * lower)
-    return found
+    return Comparison(shown, value, left, weight, gain * (by_column * by_x + by_row * by_y))
 
 
 def _matched(ours: np.ndarray, theirs: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:

@@ -3,6 +3,8 @@ that must not become planes."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.captures import look_at
@@ -39,31 +41,31 @@ def light(points: np.ndarray) -> np.ndarray:
     return 255 * np.clip(0.55 * towards[..., 1] / square**1.5, 0, 1) ** (1 / 2.2)
 
 
-def map_of(camera, grey: np.ndarray, seed: int, depth: np.ndarray | None = None) -> DepthMap:
-    noisy = grey + np.random.default_rng(seed).normal(0, NOISE, grey.shape)
+def map_of(camera, grey: np.ndarray, seed: int, noise: float = NOISE) -> DepthMap:
+    noisy = grey + np.random.default_rng(seed).normal(0, noise, grey.shape)
     nothing = np.full(grey.shape, np.nan, np.float32)
     none = np.zeros(grey.shape, np.uint8)
     return DepthMap(
         camera=camera,
-        depth=nothing if depth is None else depth,
+        depth=nothing,
         normal=np.full((*grey.shape, 3), np.nan, np.float32),
         cost=nothing,
         seen=none,
         confirmed=none,
         deviation=nothing,
         grey=np.clip(np.rint(noisy), 0, 255).astype(np.uint8),
-        noise=NOISE**2 + 1 / 12,
+        noise=noise**2 + 1 / 12,
     )
 
 
-def photographs(value, bulge: float = 0.0, seed: int = 0):
+def photographs(value, bulge: float = 0.0, seed: int = 0, noise: float = NOISE):
     """Maps of all cameras with the grey values `value`(points, view), and the true depths."""
     maps, depths = [], []
     for view, center in enumerate(CENTERS):
         camera = camera_at(center)
         depth = wall_depth(camera, bulge)
         points = camera.center + camera.world_rays() * depth[..., None]
-        maps.append(map_of(camera, value(points, view), seed + view))
+        maps.append(map_of(camera, value(points, view), seed + view, noise))
         depths.append(depth)
     return maps, depths
 
@@ -90,8 +92,9 @@ def test_a_lit_wall_without_texture_is_where_it_is(seed):
     assert len(found.planes) == 1
     share, off = errors(found, depths)
     assert share > 0.7
-    # Rendered depths are off by 6 to 14 %; noise alone allows 0.2 % (`depth_deviation`).
-    assert np.quantile(off, 0.95) < 0.01
+    # Rendered depths are off by 6 to 14 %. By noise alone one region knows its depth to 0.06 to 0.09 %
+    # (`depth_deviation`).
+    assert np.quantile(off, 0.95) < 0.005
 
 
 def test_exposures_that_differ_change_nothing():
@@ -99,7 +102,7 @@ def test_exposures_that_differ_change_nothing():
     gains, offsets = rng.uniform(0.85, 1.15, len(CENTERS)), rng.uniform(-8, 8, len(CENTERS))
     maps, depths = photographs(lambda points, view: gains[view] * light(points) + offsets[view])
     share, off = errors(planes_of(maps, depths), depths)
-    assert share > 0.7 and np.quantile(off, 0.95) < 0.01
+    assert share > 0.7 and np.quantile(off, 0.95) < 0.005
 
 
 def test_larger_photographs_are_halved(monkeypatch):
@@ -155,13 +158,13 @@ def test_a_known_plane_is_taken_where_it_carries_the_shading_as_well():
 
 
 def test_the_fit_goes_downhill_and_ends_at_the_truth_without_noise():
-    maps, depths = photographs(lambda points, view: light(points))
+    maps, depths = photographs(lambda points, view: light(points), noise=0.0)
     shadings = [Shading.of(one) for one in maps]
     region = max(shaded_regions(4, shadings[4], np.zeros(depths[4].shape, bool)), key=lambda one: len(one.row))
-    region = type(region)(**{**vars(region), "depth": 2.0, "others": (1, 2, 6, 7)})
+    region = replace(region, depth=2.0, others=(1, 2, 6, 7))
     start = np.array([0.08, 1.0, -0.05, 0.15])
     start /= np.linalg.norm(start[:3])
     first, last = evaluate(start, [region], shadings), fit_plane(start, [region], shadings)
     assert first is not None and last is not None and last.left < 0.2 * first.left
     inverse = region.rays @ in_camera(shadings[4].camera, last.plane[None])[0]
-    assert np.abs(inverse * depths[4][region.row, region.column] - 1).max() < 0.02
+    assert np.abs(inverse * depths[4][region.row, region.column] - 1).max() < 0.005
