@@ -5,10 +5,11 @@
         --scene office=DIR:REFERENCE --scene banana=DIR -o runs/compare --iterations 2000
 
 Each version trains each scene with each seed and, where a reference mesh is named, extracts the mesh; one ruler, the
-later version's `eval-mesh --run`, scores both. What the output folder holds is not done again, so a comparison can be
-interrupted. `compare.md` and `compare.json` hold means over the seeds with standard deviations: PSNR of held-out
-photographs in dB, and Chamfer distance and normal consistency of the seen part, in % of the diagonal and as a cosine.
-A figure counts as worse if it is by more than twice the deviation of the difference of both means.
+later version's `eval-mesh --run`, scores both. What the output folder holds of as many steps is not done again, so a
+comparison can be interrupted; another pair of versions needs another folder. `compare.md` and `compare.json` hold
+means over the seeds with standard deviations: PSNR of held-out photographs in dB, and Chamfer distance and normal
+consistency of the seen part, in % of the diagonal and as a cosine. A figure counts as worse if it is by more than twice
+the deviation of the difference of both means.
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ FIGURES = {
 
 @dataclass(frozen=True)
 class SceneToCompare:
+    """A capture, and the mesh that it is scored against, if there is one."""
+
     name: str
     folder: Path
     reference: Path | None
@@ -64,9 +67,9 @@ def measure(program: Path, ruler: Path, scene: SceneToCompare, seed: int, iterat
     kept = folder / "figures.json"
     if kept.exists():
         return json.loads(kept.read_text(encoding="utf-8"))
-    shutil.rmtree(folder, ignore_errors=True)  # what was interrupted
-    folder.mkdir(parents=True)
     run, log = folder / "run", folder / "log.txt"
+    shutil.rmtree(run, ignore_errors=True)  # what was interrupted
+    folder.mkdir(parents=True, exist_ok=True)
     one_thread = ["--threads", "1", "--json"]
     trained = run_json(
         [program, "train", scene.folder, "-o", run, "--seed", seed, "--iterations", iterations, *one_thread], log
@@ -85,7 +88,7 @@ def measure(program: Path, ruler: Path, scene: SceneToCompare, seed: int, iterat
 def row(scene: str, name: str, before: list[float], after: list[float]) -> dict:
     """Means and deviations of one figure, and whether it is worse than their scatter."""
     means = np.mean(before), np.mean(after)
-    deviations = [float(np.std(values, ddof=1)) if len(values) > 1 else float("nan") for values in (before, after)]
+    deviations = [float(np.std(values, ddof=1)) for values in (before, after)]
     loss = (means[0] - means[1]) * (1 if FIGURES[name][2] else -1)
     scatter = float(np.hypot(*deviations)) / np.sqrt(len(before))
     return {
@@ -118,12 +121,17 @@ def main() -> int:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
     chosen = parser.parse_args()
     try:
+        for program in (chosen.before, chosen.after):
+            if not program.is_file():
+                raise LinprimError(f"{program}: no such program")
+        if chosen.seeds < 2:
+            raise LinprimError(f"--seeds {chosen.seeds}: wanted at least 2, one seed has no scatter")
         rows = []
         for scene in map(SceneToCompare.parse, chosen.scene):
             both: dict[str, list[dict]] = {"before": [], "after": []}
             for seed in range(chosen.seeds):
                 for version, found in both.items():
-                    folder = chosen.output / scene.name / f"{version}_{seed}"
+                    folder = chosen.output / scene.name / f"{version}_{chosen.iterations}_{seed}"
                     program = getattr(chosen, version)
                     found.append(measure(program, chosen.after, scene, seed, chosen.iterations, folder))
                     print(scene.name, seed, version, found[-1], file=sys.stderr, flush=True)
