@@ -9,6 +9,7 @@ of a score.
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field, replace
 
 from linprim_geo.base.options import SceneOptions, TrainOptions
@@ -229,3 +230,18 @@ def training_options(
         elif name != "equal_time":
             at_once[name] = value
     return replace(options, **at_once), scene
+
+
+def setting_key(group: str, setting: dict) -> str:
+    """Under which a setting is kept in measured.json."""
+    return f"{group} {json.dumps(setting, sort_keys=True)}"
+
+
+def setting_shown(setting: dict) -> str:
+    """For people."""
+    return ", ".join(f"{name} {value}" for name, value in setting.items()) or "defaults"
+
+
+def setting_name(setting: dict) -> str:
+    """Of a file or folder."""
+    return "_".join(f"{name}-{value}" for name, value in setting.items()) or "base"

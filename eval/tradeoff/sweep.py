@@ -30,13 +30,18 @@ from linprim_geo.eval.tradeoff.knobs import (
     KNOBS,
     Knob,
     Rung,
+    setting_key,
+    setting_name,
+    setting_shown,
     settings,
     training_options,
 )
 from linprim_geo.eval.tradeoff.rendering import RenderedRun
 from linprim_geo.eval.tradeoff.results import write_report
+from linprim_geo.eval.tradeoff.training import SurfaceScores, training_errors
 from linprim_geo.jobs.executor import Executor, Task
 from linprim_geo.jobs.open import open_executor
+from linprim_geo.runs.run import Run
 from linprim_geo.training.budget.memory import memory_estimate
 from linprim_geo.training.step.training_images import photo_bytes
 
@@ -48,8 +53,6 @@ WIDEST, QUICK_WIDEST = 400, 128
 ROUNDS, QUICK_ROUNDS = 3, 2
 # Held-out views that render knobs are measured on.
 RENDERED_VIEWS, QUICK_VIEWS = 8, 2
-# Points of a score that is not the knob itself.
-POINTS = 30_000
 
 
 def tradeoff(
@@ -206,7 +209,7 @@ class Sweep:
         for knob in knobs:
             for rung in knob.rungs:
                 setting = self._setting(knob, rung)
-                wanted.setdefault(_key(group, setting), (setting, set()))[1].update(knob.errors)
+                wanted.setdefault(setting_key(group, setting), (setting, set()))[1].update(knob.errors)
         for turn in range(self.rounds):
             if group == "train" and self.executor:
                 each = [setting for setting, _ in wanted.values()]
@@ -218,7 +221,7 @@ class Sweep:
                     len(entry["times"]) > turn and errors <= entry["errors"].keys() | {"photo_percent"}
                 ):
                     continue
-                self.progress.note(f"{group}, round {turn + 1} of {self.rounds}: {_shown(setting)}")
+                self.progress.note(f"{group}, round {turn + 1} of {self.rounds}: {setting_shown(setting)}")
                 try:
                     measure(key, setting, errors, turn)
                 except LinprimError as error:
@@ -242,7 +245,7 @@ class Sweep:
         """Folder of the run that render, extraction and evaluation knobs are measured on: a copy of the given one, or
         the trained base."""
         if self.given is None:
-            key = _key("train", {})
+            key = setting_key("train", {})
             if not (self.store.get(key, {}).get("errors")):
                 self.store.setdefault(key, {"setting": {}, "times": [], "peak_gib": 0.0, "errors": {}})
                 self.progress.note("training with the defaults")
@@ -250,9 +253,7 @@ class Sweep:
                 if self.executor:
                     self.store[key]["times"].clear()  # it was alone; the others share the cores
                 self._save()
-            return self.folder / "runs" / _name({})
-        from linprim_geo.runs.run import Run
-
+            return self.folder / "runs" / setting_name({})
         Run.open(self.given)
         copy = self.folder / "runs" / "given"
         copy.mkdir(parents=True, exist_ok=True)
@@ -266,8 +267,6 @@ class Sweep:
 
     @cached_property
     def run(self):
-        from linprim_geo.runs.run import Run
-
         return Run.open(self.base)
 
     @cached_property
@@ -310,7 +309,7 @@ class Sweep:
         folder = self.folder / "runs" / f"round_{turn}_{self.cores}"
         largest = max(view.camera.width * view.camera.height for view in self.scene.train)
         for setting in settings:
-            key = _key("train", setting)
+            key = setting_key("train", setting)
             entry = self.store.setdefault(key, {"setting": setting, "times": [], "peak_gib": 0.0, "errors": {}})
             if "failed" in entry or len(entry["times"]) > turn:
                 continue
@@ -318,10 +317,10 @@ class Sweep:
             square = scene_options.downscale**2
             arguments = {"scene": str(self.scene_path), "scene_options": asdict(scene_options)}
             tasks[key] = Task(
-                _shown(setting),
-                "linprim_geo.eval.tradeoff.sweep:train_task",
+                setting_shown(setting),
+                "linprim_geo.eval.tradeoff.training:train_task",
                 arguments | {"options": asdict(replace(options, threads=self.cores))},
-                folder / _name(setting),
+                folder / setting_name(setting),
                 memory_estimate((), options, photo_bytes(self.scene.train) // square, largest // square),
                 self.slot,
                 "fewer --workers, or more memory",
@@ -334,7 +333,7 @@ class Sweep:
                 self.progress.note(f"  {found['failed']}")
                 self._save()
                 continue
-            trained, kept = tasks[key].folder / "run", self.folder / "runs" / _name(self.store[key]["setting"])
+            trained, kept = tasks[key].folder / "run", self.folder / "runs" / setting_name(self.store[key]["setting"])
             if not self.store[key]["errors"] and trained.exists():
                 shutil.rmtree(kept, ignore_errors=True)
                 trained.rename(kept)
@@ -349,7 +348,7 @@ class Sweep:
         entry = self.store[key]
         options, scene_options = self._options(key, setting)
         if len(entry["times"]) <= turn:
-            folder = self.folder / "runs" / (_name(setting) if not entry["errors"] else "again")
+            folder = self.folder / "runs" / (setting_name(setting) if not entry["errors"] else "again")
             shutil.rmtree(folder, ignore_errors=True)
             if not self.warm_train:
                 self.warm_train = True
@@ -370,12 +369,12 @@ class Sweep:
             if folder.name == "again":
                 shutil.rmtree(folder)
         if not entry["errors"]:
-            entry["errors"] = self._train_errors(self.folder / "runs" / _name(setting))
+            entry["errors"] = self._train_errors(self.folder / "runs" / setting_name(setting))
 
     def _equal_time(self, setting: dict, iterations: int) -> int:
         """Steps that take as long as the base's, by the timings of both at equal count."""
         count = {name: value for name, value in setting.items() if name != "equal_time"}
-        both = [_key("train", {}), _key("train", count)]
+        both = [setting_key("train", {}), setting_key("train", count)]
         for key, of in zip(both, ({}, count), strict=True):
             if not self.store.get(key, {}).get("times"):
                 self.store.setdefault(key, {"setting": of, "times": [], "peak_gib": 0.0, "errors": {}})
@@ -384,43 +383,13 @@ class Sweep:
         return max(1, round(iterations * base / other))
 
     def _train_errors(self, folder: Path) -> dict:
-        """Held-out images and depth at the base's scale, and the surface, of a trained run."""
-        from linprim_geo.eval.depth import eval_depth_run
-        from linprim_geo.eval.images import eval_images_run
-        from linprim_geo.geometry.mesh_files import load_mesh
-        from linprim_geo.runs.run import Run
-        from linprim_geo.surface.extract import extract_mesh
-
         run = Run.open(folder)
         run = replace(run, scene_options=replace(run.scene_options, downscale=self.scene_options.downscale))
-        found = {}
-        if run.scene().test:
-            found["psnr"] = eval_images_run(run, lpips_weights="none")["psnr"]
-            found["photo_percent"] = 100 * 10 ** (-found["psnr"] / 20)
-            if self.reference or any(view.depth_path for view in run.scene().test):
-                found["depth_percent"] = 100 * eval_depth_run(run, self.reference)["abs_rel"]
-        if self.reference:
-            try:
-                mesh = load_mesh(extract_mesh(folder, quiet=True)["mesh"])
-            except LinprimError as error:
-                self.progress.note(f"  {error}")
-                found["chamfer_percent"] = math.nan
-            else:
-                found["chamfer_percent"] = self._score(mesh)["chamfer_percent_diagonal"]
-        return found
+        return training_errors(run, self.scores, self.progress.note)
 
     @cached_property
-    def reference_mesh(self):
-        from linprim_geo.geometry.mesh_files import load_mesh
-
-        return load_mesh(self.reference)
-
-    def _score(self, mesh) -> dict:
-        """Scores of the parts of both surfaces that the scene's training cameras see."""
-        from linprim_geo.eval.mesh import score_mesh
-
-        cameras = [view.camera for view in self.scene.train]
-        return score_mesh(mesh, self.reference_mesh, samples=POINTS, cameras=cameras)["visible"]
+    def scores(self) -> SurfaceScores:
+        return SurfaceScores(self.scene.train, self.reference)
 
     # --- extract and evaluate ---------------------------------------------------------------------------
 
@@ -448,7 +417,7 @@ class Sweep:
             if setting["method"] == "tsdf"
             else ExtractOptions()
         )
-        target = self.folder / "meshes" / f"{_name(setting)}.ply"
+        target = self.folder / "meshes" / f"{setting_name(setting)}.ply"
         stats = extract_mesh(self.base, setting["method"], target, options, quiet=True)
         if len(entry["times"]) <= turn:
             self._note(
@@ -463,7 +432,7 @@ class Sweep:
                 ("chamfer_percent", "normal_percent"), math.nan
             )
             if self.reference:
-                scores = self._score(load_mesh(target))
+                scores = self.scores.of(load_mesh(target))
                 found["chamfer_percent"] = scores["chamfer_percent_diagonal"]
                 found["normal_percent"] = 100 * (1 - scores["normal_consistency"])
             entry["errors"] = found
@@ -483,7 +452,7 @@ class Sweep:
         from linprim_geo.base.progress import Stages
         from linprim_geo.eval.mesh import score_mesh
 
-        prediction, reference = self.scored_mesh, self.reference_mesh
+        prediction, reference = self.scored_mesh, self.scores.truth
         if not self.warm_score:
             self.warm_score = True
             score_mesh(prediction, reference, samples=1000)
@@ -498,35 +467,9 @@ class Sweep:
     def _report(self, knobs: Sequence[Knob]) -> dict:
         measured: dict[str, list[tuple[Rung, dict]]] = {}
         for knob in knobs:
-            entries = [(rung, self.store.get(_key(knob.group, self._setting(knob, rung)))) for rung in knob.rungs]
+            entries = [
+                (rung, self.store.get(setting_key(knob.group, self._setting(knob, rung)))) for rung in knob.rungs
+            ]
             measured[knob.name] = [(rung, entry) for rung, entry in entries if entry and entry["times"]]
         about = self.about | {"rounds": self.rounds, "load": os.getloadavg()[0], "cores": usable_cores()}
         return write_report(self.folder, about, knobs, measured)
-
-
-def train_task(folder: Path, scene: str, scene_options: dict, options: dict) -> dict:
-    """A training into folder/run, after a few steps that load the libraries. Returns its seconds and primitives, or why
-    it `failed`."""
-    from linprim_geo.training.train import train
-
-    chosen = SceneOptions(**scene_options), TrainOptions(**options)
-    try:
-        for name, iterations in (("warm_up", min(20, chosen[1].iterations)), ("run", chosen[1].iterations)):
-            shutil.rmtree(folder / name, ignore_errors=True)
-            trained = train(scene, folder / name, chosen[0], replace(chosen[1], iterations=iterations), quiet=True)
-    except LinprimError as error:
-        return {"failed": str(error)}
-    shutil.rmtree(folder / "warm_up")
-    return {"seconds": trained["seconds"], "primitives": trained["primitives"]}
-
-
-def _key(group: str, setting: dict) -> str:
-    return f"{group} {json.dumps(setting, sort_keys=True)}"
-
-
-def _shown(setting: dict) -> str:
-    return ", ".join(f"{name} {value}" for name, value in setting.items()) or "defaults"
-
-
-def _name(setting: dict) -> str:
-    return "_".join(f"{name}-{value}" for name, value in setting.items()) or "base"

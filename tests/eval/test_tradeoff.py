@@ -20,6 +20,7 @@ from linprim_geo.eval.options import TradeoffOptions
 from linprim_geo.eval.tradeoff import knobs
 from linprim_geo.eval.tradeoff import page as tradeoff_page
 from linprim_geo.eval.tradeoff import sweep as sweeping
+from linprim_geo.eval.tradeoff import training
 from linprim_geo.eval.tradeoff.frontier import frontier, pays, verdict
 from linprim_geo.eval.tradeoff.knobs import ERRORS, GROUPS, KNOBS, Knob, Rung, settings, training_options
 from linprim_geo.eval.tradeoff.sweep import tradeoff
@@ -193,7 +194,7 @@ def swept(tiny_scene, tiny_run, tmp_path_factory):
     out = tmp_path_factory.mktemp("tradeoff") / "sweep"
     before = {path: path.stat().st_mtime_ns for path in tiny_run.rglob("*")}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweeping, "POINTS", 3000)
+        patch.setattr(training, "POINTS", 3000)
         tradeoff(tiny_scene, out, knobs=RENDERED, run=tiny_run, quick=True, threads=1, quiet=True)
         results = tradeoff(tiny_scene, out, knobs=MEASURED, run=tiny_run, quick=True, rounds=1, threads=1, quiet=True)
     assert before == {path: path.stat().st_mtime_ns for path in tiny_run.rglob("*")}, "the given run was changed"
@@ -395,7 +396,7 @@ def test_a_sweep_by_workers_goes_on_and_tells_what_fails(monkeypatch, photograph
     assert tasks == [] and len(results["rows"]) == len(KNOBS["iterations"].rungs)
     (tmp_path / "x").mkdir()
     options = {"threads": 1, "iterations": 5, "max_primitives": 10, "background": "no colour"}
-    told = sweeping.train_task(tmp_path / "x", str(photographs), {}, options)
+    told = training.train_task(tmp_path / "x", str(photographs), {}, options)
     assert "--background is 'no colour'" in told["failed"]
 
 
