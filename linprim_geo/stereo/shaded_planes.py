@@ -1,8 +1,9 @@
 """Depth of painted walls: planes that are photo-consistent on shading alone.
 
 A plane is fitted to every plain region of every photograph that stereo says little about (`shading.py`). Where regions
-of several photographs agree their plane is fitted to all of them together. Every region then gets one plane of those
-that explain ("carry") its shading as well as its own does. Walls without shading, and whatever is not flat, get none.
+of several photographs agree their plane is fitted to all of them together, and to what stereo knows along their edges.
+Every region then gets one plane of those that explain ("carry") its shading as well as its own does. Walls without
+shading, and whatever is not flat, get none.
 """
 
 from __future__ import annotations
@@ -17,7 +18,16 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
-from linprim_geo.stereo.plain_regions import SAME_ANGLE, in_camera, in_world, rays_of, seen_enough, to_world
+from linprim_geo.stereo.plain_regions import (
+    RING,
+    SAME_ANGLE,
+    TOLERANCE,
+    in_camera,
+    in_world,
+    rays_of,
+    seen_enough,
+    to_world,
+)
 from linprim_geo.stereo.shading import (
     BOX,
     LEAST_BOXES,
@@ -29,6 +39,7 @@ from linprim_geo.stereo.shading import (
     depth_deviation,
     evaluate,
     fit_plane,
+    plane_moves,
     shaded_regions,
     unexplained,
 )
@@ -48,6 +59,9 @@ CERTAIN = 2 * CONFIRMED_DEPTH
 ALIKE_ANGLE, ALIKE_DEPTH = 4 * SAME_ANGLE, 5 * CONFIRMED_DEPTH
 # Stereo confirms up to SURE_SHARE of a plain region by chance; of more depths, AGREEING are on the plane.
 SURE_DEPTHS, SURE_SHARE, AGREEING = 30, 0.1, 0.7
+# Confirmed depths along the edges of regions hold a plane if they are as near as NEAR, and after some steps as
+# TOLERANCE. Half of TOLERANCE is their deviation; as their errors have common causes, they count as so many at most.
+NEAR, NARROWER, HOLDING_STEPS, INDEPENDENT = 2 * TOLERANCE, 0.8, 6, 200
 # A background is so many times as far as a region's other depths.
 FAR = 1e4
 # A plane carries a region if it does so around half of its boxes.
@@ -65,13 +79,14 @@ class FittedRegion:
 
 
 class ShadedPlanes:
-    """`planes` (K, 4) of the world that carry the shading of plain regions in several views: the `known` ones first.
+    """`planes` (K, 4) of the world that carry the shading of plain regions in several views, the known ones first.
 
     Args:
         maps: of all views.
         depths: (H, W) confirmed depth of each view, NaN elsewhere.
         rendered: (H, W) rendered depth of each view, 0 where there is none.
-        known: (K, 4) planes that points along edges have given; they are more exact.
+        by_points: (K, 4) planes with confirmed points all over; they stay as they are.
+        by_edges: (K, 4) planes that points along edges have given; shading makes them more exact.
     """
 
     def __init__(
@@ -79,10 +94,12 @@ class ShadedPlanes:
         maps: Sequence[DepthMap],
         depths: Sequence[np.ndarray],
         rendered: Sequence[np.ndarray],
-        known: np.ndarray,
+        by_points: np.ndarray,
+        by_edges: np.ndarray,
     ):
         self.shadings = [Shading.of(found) for found in maps]
-        self.cameras, self.known = [found.camera for found in maps], known
+        self.cameras = [found.camera for found in maps]
+        self.known, self.exact = np.concatenate([by_points, by_edges]), len(by_points)
         self.depths = [shading.small(depth) for shading, depth in zip(self.shadings, depths, strict=True)]
         self.regions: list[list[FittedRegion]] = []
         for view, shading in enumerate(self.shadings):
@@ -91,6 +108,7 @@ class ShadedPlanes:
             fitted = [self._fitted(region, small) for region in own]
             self.regions.append([one for one in fitted if one is not None])
         self.planes = self._common([one for own in self.regions for one in own if one.fit is not None])
+        self.planes = self._held(self._all_carriers())
 
     def _camera(self, region: ShadedRegion) -> Camera:
         return self.shadings[region.view].camera
@@ -220,12 +238,69 @@ class ShadedPlanes:
                 carriers[k] = carried
         return carriers
 
+    def _all_carriers(self) -> list[list[dict[int, np.ndarray]]]:
+        """`_carriers` of the regions of each view."""
+        return [[self._carriers(one) for one in own] for own in self.regions]
+
+    def _held(self, carriers: Sequence[Sequence[dict[int, np.ndarray]]]) -> np.ndarray:
+        """The planes, each held by the confirmed depths along the edges of those regions whose shading it carries."""
+        carried: list[list[ShadedRegion]] = [[] for _ in self.planes]
+        for own, of_view in zip(self.regions, carriers, strict=True):
+            for one, of_region in zip(own, of_view, strict=True):
+                for k in of_region:
+                    carried[k].append(one.region)
+        held = [self._held_plane(plane, carried[k]) for k, plane in enumerate(self.planes) if k >= self.exact]
+        return np.concatenate([self.planes[: self.exact], np.reshape(held, (-1, 4))])
+
+    def _held_plane(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> np.ndarray:
+        """A plane fitted to the shading of regions and to the confirmed depths along their edges that are near it: a
+        wall meets others there, and a floor. The plane as it was where the two contradict each other."""
+        few = [region.some(MOST_BOXES) for region in regions]
+        first = evaluate(plane, few, self.shadings) if few else None
+        if first is None:
+            return plane
+        fit = first
+        points, centers = self._points_along(regions)
+        for k in range(HOLDING_STEPS):
+            normal, moves = fit.plane[:3], plane_moves(fit.plane, few)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                along = (points - centers) @ normal
+                off = (points @ normal - fit.plane[3]) / along
+            near: np.ndarray = np.abs(off) < max(NEAR * NARROWER**k, TOLERANCE)
+            slope = (points[near] @ moves[:, :3].T - moves[:, 3]) / along[near, None]
+            weight = INDEPENDENT / max(INDEPENDENT, int(near.sum())) / (TOLERANCE / 2) ** 2
+            information = fit.information + weight * slope.T @ slope
+            step = np.linalg.pinv(information, hermitian=True) @ (fit.downhill - weight * slope.T @ off[near])
+            moved = fit.plane + step @ moves
+            tried = evaluate(moved / np.linalg.norm(moved[:3]), few, self.shadings)
+            if tried is None or tried.left > HARDLY_MORE * first.left or tried.boxes < 0.7 * first.boxes:
+                return plane
+            fit = tried
+        return fit.plane
+
+    def _points_along(self, regions: Sequence[ShadedRegion]) -> tuple[np.ndarray, np.ndarray]:
+        """(P, 3) points of the world at the confirmed depths along the edges of regions, and (P, 3) the centres of the
+        cameras that see them."""
+        points, centers = [np.zeros((0, 3))], [np.zeros((0, 3))]
+        for region in regions:
+            camera, depth = self._camera(region), self.depths[region.view]
+            around = binary_dilation(self._inside(region), iterations=BOX // 2 + RING)
+            row, column = np.nonzero(around & np.isfinite(depth))
+            points.append(to_world(camera, rays_of(camera, row, column) * depth[row, column, None]))
+            centers.append(np.broadcast_to(camera.center, points[-1].shape))
+        return np.concatenate(points), np.concatenate(centers)
+
+    def _inside(self, region: ShadedRegion) -> np.ndarray:
+        """(H, W) bool where the boxes of a region have their middles."""
+        labels = label(self.shadings[region.view].plain)[0]
+        return labels == labels[region.row[0], region.column[0]]
+
     def depth_maps(self) -> list[np.ndarray]:
         """(H, W) float32 depth of every view's regions, each by one plane where that carries its shading, else NaN.
 
         Of planes that do so as well, such as those of one wall, the one is taken that carries most in all views.
         """
-        carriers = [[self._carriers(one) for one in own] for own in self.regions]
+        carriers = self._all_carriers()
         carried = np.zeros(len(self.planes))
         for own in carriers:
             for of_region in own:
@@ -235,14 +310,12 @@ class ShadedPlanes:
         result = []
         for view, (own, of_view) in enumerate(zip(self.regions, carriers, strict=True)):
             number = np.full(self.shadings[view].plain.shape, -1)
-            labels = label(self.shadings[view].plain)[0]
             for one, of_region in zip(own, of_view, strict=True):
                 most = max((np.count_nonzero(boxes) for boxes in of_region.values()), default=0)
                 as_well = [k for k, boxes in of_region.items() if HARDLY_MORE * np.count_nonzero(boxes) >= most]
                 if as_well:
                     best = max(as_well, key=lambda k: carried[k])
-                    inside = labels == labels[one.region.row[0], one.region.column[0]]
-                    number[_around(inside, one.region, of_region[best])] = best
+                    number[_around(self._inside(one.region), one.region, of_region[best])] = best
             result.append(self._depth(view, number))
         return result
 

@@ -216,7 +216,7 @@ def fit_plane(
     plane: np.ndarray, regions: Sequence[ShadedRegion], shadings: Sequence[Shading], steps: int = STEPS
 ) -> Fit | None:
     """The best plane near one, by Levenberg's and Marquardt's steps; None where no view shows the regions."""
-    best, damping, scale = evaluate(plane, regions, shadings), 1e-3, _scale(regions)
+    best, damping = evaluate(plane, regions, shadings), 1e-3
     if best is None:
         return None
     for _ in range(steps):
@@ -224,7 +224,7 @@ def fit_plane(
         damped = best.information + np.diag(damping * diagonal + 1e-9 * diagonal.sum() + 1e-12)
         step = np.linalg.solve(damped, best.downhill)
         step *= min(1, FIRST_STEP / max(np.abs(step).max(), 1e-12))
-        moved = best.plane + step @ _moves(best.plane, scale)
+        moved = best.plane + step @ plane_moves(best.plane, regions)
         tried = evaluate(moved / np.linalg.norm(moved[:3]), regions, shadings)
         # What is left varies a little as boxes come and go; far fewer boxes, of which less is left, are no better.
         if tried is not None and tried.left < 1.001 * best.left and tried.boxes > 0.7 * best.boxes:
@@ -240,8 +240,12 @@ def _scale(regions: Sequence[ShadedRegion]) -> float:
     return float(np.median([region.depth for region in regions]))
 
 
+def plane_moves(plane: np.ndarray, regions: Sequence[ShadedRegion]) -> np.ndarray:
+    """(3, 4) how a plane of regions changes, turned about two axes and shifted in depths."""
+    return _moves(plane, _scale(regions))
+
+
 def _moves(plane: np.ndarray, scale: float) -> np.ndarray:
-    """(3, 4) directions in which a plane turns and shifts."""
     first = np.cross(plane[:3], np.eye(3)[np.argmin(np.abs(plane[:3]))])
     first /= np.linalg.norm(first)
     return np.array([[*first, 0], [*np.cross(plane[:3], first), 0], [0, 0, 0, scale]])

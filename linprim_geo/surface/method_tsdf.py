@@ -98,7 +98,7 @@ def tsdf_surface(
     if about:
         stages.note(
             f"stereo: {about['confirmed']:.0%} of the pixels have a depth that other views confirm, "
-            f"{about['plain']:.0%} lie on one of {about['planes']} planes without texture; elsewhere rendered depths "
+            f"{about['flat']:.0%} lie on one of {about['planes']} planes; elsewhere rendered depths "
             f"count {about['rendered_weight']:.2g}"
         )
         if about["taken"] and about["unsupported"]:

@@ -15,6 +15,7 @@ from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.depth_maps import DepthMap, depth_maps
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.plain_regions import PlainRegion, common_planes, edges_of, plain_regions, plane_depths
+from linprim_geo.stereo.point_planes import planes_of_points, point_plane_depth
 from linprim_geo.stereo.shaded_planes import ShadedPlanes
 from linprim_geo.surface.single_view import mesh_is_closed
 from linprim_geo.surface.tsdf_field import DepthFrame
@@ -35,7 +36,7 @@ class MergedFrames(Sequence):
 
     `weight` is what rendered depths count elsewhere: the squared deviation of confirmed depths from those of their
     neighbours over that of rendered ones from confirmed ones, 1 at most. `confirmed` is the share of pixels with
-    confirmed depths, `doubtful` that of those which too few views confirm, `plain` that of pixels on one of the
+    confirmed depths, `doubtful` that of those which too few views confirm, `flat` that of pixels on one of the
     `planes` (K, 4).
     """
 
@@ -49,18 +50,28 @@ class MergedFrames(Sequence):
             _depth_where(found, ~own & (found.confirmed > 0)) for found, own in zip(maps, sure, strict=True)
         ]
         self.confirmed, self.doubtful = _share_known(self.depths), _share_known(self.doubtful_depths)
-        regions = _plain_regions(maps, self.depths)
-        self.planes = common_planes([found.camera for found in maps], [region for own in regions for region in own])
-        deviations, self.on_planes = Deviations(), []
-        for found, depth, own, frame in zip(maps, self.depths, regions, rendered, strict=True):
+        deviations = Deviations()
+        for found, depth, frame in zip(maps, self.depths, rendered, strict=True):
             deviations.add(found, depth, frame)
-            self.on_planes.append(plane_depths(frame.camera, own, self.planes, frame.depth))
-        shaded = ShadedPlanes(maps, self.depths, [frame.depth for frame in rendered], self.planes)
-        self.planes = shaded.planes
-        for view, depth in enumerate(shaded.depth_maps()):
-            self.on_planes[view] = np.where(np.isfinite(depth), depth, self.on_planes[view])
         self.weight = deviations.weight()
-        self.plain = _share_known(self.on_planes)
+        self._take_planes(maps)
+
+    def _take_planes(self, maps: Sequence[DepthMap]) -> None:
+        """Finds planes by points, by edges and by shading, and what lies on them; moves confirmed depths to them."""
+        regions = _plain_regions(maps, self.depths)
+        by_points = planes_of_points(maps, self.depths)
+        by_edges = common_planes([found.camera for found in maps], [region for own in regions for region in own])
+        shaded = ShadedPlanes(maps, self.depths, [frame.depth for frame in self.rendered], by_points, by_edges)
+        self.planes, self.on_planes = shaded.planes, []
+        # Planes with points all over have them in their plain regions, too.
+        for_regions = self.planes[len(by_points) :]
+        for view, by_shading in enumerate(shaded.depth_maps()):
+            frame, depth = self.rendered[view], self.depths[view]
+            on_plane = point_plane_depth(maps[view], depth, by_points)
+            self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(on_plane), on_plane, depth)
+            along_edges = plane_depths(frame.camera, regions[view], for_regions, frame.depth)
+            self.on_planes.append(_first_known((on_plane, by_shading, along_edges)))
+        self.flat = _share_known(self.on_planes)
 
     def about(self) -> dict:
         """For the statistics."""
@@ -68,7 +79,7 @@ class MergedFrames(Sequence):
             "confirmed": self.confirmed,
             "doubtful": self.doubtful,
             "rendered_weight": self.weight,
-            "plain": self.plain,
+            "flat": self.flat,
             "planes": len(self.planes),
         }
 
@@ -112,9 +123,7 @@ class MergedFrames(Sequence):
         one, too."""
         views = np.zeros(len(points), int)
         for frame, *sources in zip(self.rendered, self.depths, self.on_planes, self.doubtful_depths, strict=True):
-            depth = np.full(frame.depth.shape, np.nan, np.float32)
-            for source in sources if doubtful else sources[:2]:
-                depth = np.where(np.isfinite(depth), depth, source)
+            depth = _first_known(sources if doubtful else sources[:2])
             depth = np.where(self._fused(frame, depth), depth, np.nan)
             inside, row, column = in_image(frame.camera, points)
             along = frame.camera.project(points)[1]
@@ -173,6 +182,14 @@ def _is_confirmed(found: DepthMap) -> np.ndarray:
 def _depth_where(found: DepthMap, taken: np.ndarray) -> np.ndarray:
     """(H, W) depth, NaN elsewhere."""
     return np.where(taken, found.depth, np.float32(np.nan))
+
+
+def _first_known(depths: Sequence[np.ndarray]) -> np.ndarray:
+    """(H, W) the first of several depths that is not NaN."""
+    result = depths[0]
+    for depth in depths[1:]:
+        result = np.where(np.isfinite(result), result, depth)
+    return result
 
 
 def _share_known(depths: Sequence[np.ndarray]) -> float:

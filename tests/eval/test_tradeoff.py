@@ -17,10 +17,9 @@ from helpers.here import Here
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import SceneOptions, TrainOptions, check_train_options
 from linprim_geo.eval.options import TradeoffOptions
-from linprim_geo.eval.tradeoff import knobs
+from linprim_geo.eval.tradeoff import knobs, training
 from linprim_geo.eval.tradeoff import page as tradeoff_page
 from linprim_geo.eval.tradeoff import sweep as sweeping
-from linprim_geo.eval.tradeoff import training
 from linprim_geo.eval.tradeoff.frontier import frontier, pays, verdict
 from linprim_geo.eval.tradeoff.knobs import ERRORS, GROUPS, KNOBS, Knob, Rung, settings, training_options
 from linprim_geo.eval.tradeoff.sweep import tradeoff

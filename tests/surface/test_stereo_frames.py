@@ -36,7 +36,7 @@ def found(monkeypatch):
     grey = np.zeros((30, 40), np.uint8)
     seen = np.full((30, 40), 3, np.uint8)
     maps = [SimpleNamespace(camera=CAMERA, depth=depth, seen=seen, confirmed=confirmed, deviation=deviation)]
-    maps[0].grey, maps[0].noise = grey, 1.0
+    maps[0].grey, maps[0].noise, maps[0].normal = grey, 1.0, np.zeros((30, 40, 3), np.float32)
     monkeypatch.setattr(stereo_frames, "depth_maps", lambda *_, **__: maps)
 
 
@@ -61,9 +61,18 @@ def test_planes_stand_where_nothing_is_confirmed(found, monkeypatch):
     monkeypatch.setattr(stereo_frames, "plane_depths", lambda *_: on_plane)
     merged = MergedFrames(rendered(0.01), [None], 5.0)
     frame = merged[0]
-    assert (frame.depth[2:, :20] == 3).all() and (frame.depth[:, 20:30] == 3.5).all() and merged.plain == 0.5
+    assert (frame.depth[2:, :20] == 3).all() and (frame.depth[:, 20:30] == 3.5).all() and merged.flat == 0.5
     assert (frame.depth[:2, 10:20] == 3.5).all()
     assert (frame.confidence[:, 20:30] == 1).all() and np.allclose(frame.confidence[:, 30:], merged.weight)
+
+
+def test_confirmed_depths_that_stereo_cannot_tell_from_a_plane_are_on_it(found, monkeypatch):
+    on_plane = np.full((30, 40), np.nan, np.float32)
+    on_plane[5:, 10:30] = 3.001
+    monkeypatch.setattr(stereo_frames, "point_plane_depth", lambda *_: on_plane)
+    frame = MergedFrames(rendered(0.01), [None], 5.0)[0]
+    assert np.allclose(frame.depth[5:, 10:30], 3.001) and (frame.confidence[5:, 10:30] == 1).all()
+    assert (frame.depth[2:, :10] == 3).all() and (frame.depth[2:5, 10:20] == 3).all()
 
 
 def test_rendered_depths_that_are_as_good_count_as_much(found):

@@ -1,0 +1,142 @@
+"""Planes of large flat surfaces, by the points that stereo confirms on them.
+
+A floor or a wall with weak texture is confirmed here and there, and bumpy. Planes that many confirmed points of several
+views lie on, with their normals, are found one after the other. The depth of such a plane is taken where stereo cannot
+tell it from confirmed depths, and where depths that nothing confirms lie on it as noise and mistakes would not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from linprim_geo.stereo.depth_maps import DepthMap
+from linprim_geo.stereo.plain_regions import FITS, LEAST_VIEWS, TOLERANCE, in_camera, rays_of, to_world
+
+# Confirmed points of all views that planes are looked for in, of these that seeds are tried on, and seeds.
+POINTS, TRIED_ON, SEEDS = 40_000, 4_000, 300
+# Planes at most, and the least share of the points that one has.
+MOST_PLANES, LEAST_SHARE = 30, 0.01
+# Normals of points on a plane are within 30 degrees of its own.
+SAME_NORMAL = float(np.cos(np.radians(30)))
+# Of points within TOLERANCE of a plane so many are within half of it. Across a curved surface it is one half.
+CENTRAL_SHARE = 0.7
+# Depths are taken from a plane where this share of the WINDOW by WINDOW pixels around has depths on it.
+WINDOW, ON_SHARE = 15, 0.5
+# The least share of confirmed depths around that are on a plane where stereo cannot tell it from them, and how much of
+# their deviation they are off in the mean: what noise leaves in the mean of a few windows of stereo.
+NEARLY_ALL, UNTOLD = 0.8, 0.5
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points (P, 3) of the world, their normals, the centres of the cameras that see them, and the views (P,)."""
+
+    position: np.ndarray
+    normal: np.ndarray
+    center: np.ndarray
+    view: np.ndarray
+
+    @classmethod
+    def of(cls, maps: Sequence[DepthMap], depths: Sequence[np.ndarray], rng: np.random.Generator) -> SurfacePoints:
+        """About POINTS at the (H, W) confirmed `depths` of views, NaN elsewhere."""
+        parts = []
+        for view, (found, depth) in enumerate(zip(maps, depths, strict=True)):
+            row, column = np.nonzero(np.isfinite(depth))
+            some = rng.permutation(len(row))[: -(-POINTS // len(maps))]
+            row, column = row[some], column[some]
+            points = to_world(found.camera, rays_of(found.camera, row, column) * depth[row, column, None])
+            center = np.broadcast_to(found.camera.center, points.shape)
+            parts.append((points, found.normal[row, column].astype(np.float64), center, np.full(len(row), view)))
+        return cls(*map(np.concatenate, zip(*parts, strict=True)))
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+    def __getitem__(self, rows: np.ndarray) -> SurfacePoints:
+        return SurfacePoints(self.position[rows], self.normal[rows], self.center[rows], self.view[rows])
+
+    def on(self, planes: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
+        """(P, K) bool which are on (K, 4) planes up to a share of their distance, with normals alike."""
+        normal = planes[:, :3].T
+        off = np.abs(self.position @ normal - planes[:, 3])
+        near = off < tolerance * np.abs((self.position - self.center) @ normal)
+        return near & (np.abs(self.normal @ normal) > SAME_NORMAL)
+
+
+def planes_of_points(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> np.ndarray:
+    """(K, 4) planes n . x = d of the world with the most of the confirmed `depths` (H, W) of views, NaN elsewhere."""
+    rng = np.random.default_rng(0)
+    points = SurfacePoints.of(maps, depths, rng)
+    least, planes, left = LEAST_SHARE * len(points), [], np.arange(len(points))
+    for _ in range(MOST_PLANES):
+        rest = points[left]
+        if len(rest) < max(least, 3):
+            break
+        seeds = rest[rng.integers(0, len(rest), SEEDS)]
+        tried = np.column_stack([seeds.normal, (seeds.normal * seeds.position).sum(1)])
+        some = rest[rng.permutation(len(rest))[:TRIED_ON]]
+        plane = tried[np.argmax(some.on(tried).sum(0))]
+        on = rest.on(plane[None])[:, 0]
+        for _ in range(FITS):
+            if np.count_nonzero(on) < max(least, 3):
+                break
+            plane = _fitted(rest[on])
+            on = rest.on(plane[None])[:, 0]
+        count = np.count_nonzero(on)
+        if count < max(least, 3):
+            break
+        central = np.count_nonzero(rest.on(plane[None], TOLERANCE / 2))
+        if central >= CENTRAL_SHARE * count and len(np.unique(rest.view[on])) >= LEAST_VIEWS:
+            planes.append(plane)
+        left = left[~on]
+    return np.array(planes).reshape(-1, 4)
+
+
+def _fitted(points: SurfacePoints) -> np.ndarray:
+    """The plane (4,) nearest to points, of which the far ones are less exact."""
+    weight = 1 / np.maximum(np.linalg.norm(points.position - points.center, axis=1), 1e-12)
+    middle = np.average(points.position, axis=0, weights=weight**2)
+    scaled = (points.position - middle) * weight[:, None]
+    normal = np.linalg.eigh(scaled.T @ scaled)[1][:, 0]
+    return np.append(normal, normal @ middle)
+
+
+def point_plane_depth(found: DepthMap, confirmed: np.ndarray, planes: np.ndarray) -> np.ndarray:
+    """(H, W) float32 depth of the planes that most depths around lie on, NaN elsewhere.
+
+    Pixels with a confirmed depth are on a plane if stereo cannot tell it from that depth: nearly all confirmed depths
+    around are on it, and are off by less, in the mean, than they deviate from those of neighbours. Relief stays.
+
+    Args:
+        confirmed: (H, W) confirmed depth of the view, NaN elsewhere.
+        planes: (K, 4) of the world.
+    """
+    height, width = found.grey.shape
+    rays = found.camera.ray_grid()
+    known = np.isfinite(found.depth)
+    own = np.where(known, found.depth, 1)
+    inverse, most, off = np.zeros((height, width)), np.zeros((height, width)), np.ones((height, width))
+    for plane, local in zip(planes, in_camera(found.camera, planes), strict=True):
+        by_plane = rays @ local
+        off_plane = np.where(known & (by_plane > 0), by_plane * own - 1, 1)
+        on = (np.abs(off_plane) < TOLERANCE) & (np.abs(found.normal @ plane[:3]) > SAME_NORMAL)
+        if on.any():
+            share = _mean_around(on)
+            better = share > most
+            most[better], inverse[better], off[better] = share[better], by_plane[better], off_plane[better]
+    sure, on = np.isfinite(confirmed), np.abs(off) < TOLERANCE
+    on_sure = on & sure
+    nearly_all = _mean_around(on_sure) >= NEARLY_ALL * _mean_around(sure)
+    error, deviation = (_mean_around(np.where(on_sure, image, 0)) for image in (off, found.deviation))
+    alike = np.abs(error) <= UNTOLD * deviation
+    taken = np.where(sure, on & nearly_all & alike, most > ON_SHARE)
+    with np.errstate(divide="ignore"):
+        return np.where(taken, 1 / inverse, np.nan).astype(np.float32)
+
+
+def _mean_around(image: np.ndarray) -> np.ndarray:
+    return uniform_filter(image.astype(np.float64), WINDOW, mode="constant")
