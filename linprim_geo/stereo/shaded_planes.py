@@ -101,11 +101,14 @@ class ShadedPlanes:
         self.cameras = [found.camera for found in maps]
         self.known, self.exact = np.concatenate([by_points, by_edges]), len(by_points)
         self.depths = [shading.small(depth) for shading, depth in zip(self.shadings, depths, strict=True)]
+        self.shown: list[list[ShadedRegion]] = []
         self.regions: list[list[FittedRegion]] = []
         for view, shading in enumerate(self.shadings):
             small = shading.small(rendered[view])
             own = shaded_regions(view, shading, np.isfinite(self.depths[view]))
-            fitted = [self._fitted(region, small) for region in own]
+            started = [found for region in own if (found := self._started(region, small)) is not None]
+            fitted = [self._fitted(region, starts) for region, starts in started]
+            self.shown.append([region for region, _ in started])
             self.regions.append([one for one in fitted if one is not None])
         self.planes = self._common([one for own in self.regions for one in own if one.fit is not None])
         self.planes = self._held(self._all_carriers())
@@ -113,11 +116,11 @@ class ShadedPlanes:
     def _camera(self, region: ShadedRegion) -> Camera:
         return self.shadings[region.view].camera
 
-    def _fitted(self, region: ShadedRegion, rendered: np.ndarray) -> FittedRegion | None:
-        """None for a region whose shading is lost in the noise, or that too few views show."""
-        shading = self.shadings[region.view]
+    def _started(self, region: ShadedRegion, rendered: np.ndarray) -> tuple[ShadedRegion, list[np.ndarray]] | None:
+        """A region with its depth and the views that show it, and planes to start from; None for one whose shading is
+        lost in the noise, or that too few views show."""
         # What noise leaves is too large a share of less.
-        if np.var(region.value) < 2 * shading.noise / OTHERS_SHARE**2:
+        if np.var(region.value) < 2 * self.shadings[region.view].noise / OTHERS_SHARE**2:
             return None
         starts = _starts(region, self.depths[region.view], rendered)
         if not starts:
@@ -125,27 +128,51 @@ class ShadedPlanes:
         depth = 1 / np.median(region.rays @ starts[0])
         region = replace(region, depth=abs(float(depth)))
         region = replace(region, others=self._others(region))
-        if len(region.others) < LEAST_VIEWS:
-            return None
+        return (region, starts) if len(region.others) >= LEAST_VIEWS else None
+
+    def _fitted(self, region: ShadedRegion, starts: Sequence[np.ndarray]) -> FittedRegion | None:
+        """None for a region that too few views show by any plane, and for a background."""
+        camera = self._camera(region)
         few = [region.some(FIRST_BOXES)]
-        tried = [fit_plane(in_world(shading.camera, start), few, self.shadings, FIRST_STEPS) for start in starts]
+        tried = [fit_plane(in_world(camera, start), few, self.shadings, FIRST_STEPS) for start in starts]
         found = [fit for fit in tried if fit is not None and fit.views >= LEAST_VIEWS]
         if not found:
             return None
         fit = fit_plane(min(found, key=lambda fit: fit.left_share).plane, [region.some(MOST_BOXES)], self.shadings)
         if fit is None or fit.views < LEAST_VIEWS or self._is_far(region, fit):
             return None
-        left = unexplained(region, in_camera(shading.camera, fit.plane[None])[0], self.shadings)
+        left = unexplained(region, in_camera(camera, fit.plane[None])[0], self.shadings)
         flat = np.count_nonzero(left <= MOST_LEFT) >= FLAT_SHARE * np.isfinite(left).sum()
         most = min(HARDLY_MORE * fit.left_share, OTHERS_SHARE) if flat else OTHERS_SHARE
         return FittedRegion(region, most, fit if flat and self._certain(region, fit) else None)
 
     def _is_far(self, region: ShadedRegion, fit: Fit) -> bool:
         """Whether a plane without parallax carries a region's shading as well as a fit does: a sky."""
-        camera = self._camera(region)
-        plane = in_world(camera, np.array([0, 0, 1 / (FAR * region.depth)]))
-        far = evaluate(plane, [region.some(MOST_BOXES)], self.shadings)
-        return far is not None and far.views >= LEAST_VIEWS and far.left < HARDLY_MORE * fit.left
+        far = self._far(region.some(MOST_BOXES))
+        return far is not None and far.left < HARDLY_MORE * fit.left
+
+    def _far(self, region: ShadedRegion) -> Fit | None:
+        """How a background carries the shading of a region; None if too few views show it."""
+        plane = in_world(self._camera(region), np.array([0, 0, 1 / (FAR * region.depth)]))
+        far = evaluate(plane, [region], self.shadings)
+        return far if far is not None and far.views >= LEAST_VIEWS else None
+
+    def is_background(self, view: int) -> np.ndarray:
+        """(H, W) bool: regions of a view whose shading a background carries better than any plane that may move."""
+        camera, shading = self.cameras[view], self.shadings[view]
+        background = np.zeros((camera.height, camera.width), bool)
+        for region in self.shown[view]:
+            few = region.some(FIRST_BOXES)
+            # All other views: those that show it at its depth may not show it far away.
+            far = self._far(replace(few, others=tuple(k for k in range(len(self.shadings)) if k != view)))
+            if far is None:
+                continue
+            fits = [evaluate(plane, [few], self.shadings) for plane in self.planes[self.exact :]]
+            if all(fit is None or fit.left_share > HARDLY_MORE * far.left_share for fit in fits):
+                around = binary_dilation(self._inside(region), iterations=BOX)
+                row, column = np.nonzero(around.repeat(shading.factor, 0).repeat(shading.factor, 1))
+                background[row, column] = True
+        return background
 
     def _certain(self, region: ShadedRegion, fit: Fit) -> bool:
         """Whether a fit to a region carries its shading, is certain, and is not contradicted."""

@@ -70,6 +70,8 @@ class MergedFrames(Sequence):
             on_plane = point_plane_depth(maps[view], depth, by_points)
             self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(on_plane), on_plane, depth)
             along_edges = plane_depths(frame.camera, regions[view], for_regions, frame.depth)
+            if np.isfinite(along_edges).any():
+                along_edges[shaded.is_background(view)] = np.nan
             self.on_planes.append(_first_known((on_plane, by_shading, along_edges)))
         self.flat = _share_known(self.on_planes)
 

@@ -127,8 +127,8 @@ def test_a_wall_in_even_light_gets_no_plane():
     assert errors(planes_of(maps, depths), depths)[0] == 0
 
 
-def test_a_sky_gets_no_plane():
-    """Its colours depend on the direction alone."""
+def sky():
+    """Maps and depths that are no depths: colours depend on the direction alone."""
     maps, depths = [], []
     for view, center in enumerate(CENTERS):
         camera = camera_at(center)
@@ -136,6 +136,20 @@ def test_a_sky_gets_no_plane():
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         maps.append(map_of(camera, 120 + 60 * rays[..., 0] ** 2 + 50 * rays[..., 2], view))
         depths.append(wall_depth(camera))
+    return maps, depths
+
+
+def test_a_plane_of_edges_does_not_reach_into_the_sky():
+    maps, depths = sky()
+    found = planes_of(maps, depths, by_edges=WALL[None])
+    assert np.mean([found.is_background(view).mean() for view in range(len(maps))]) > 0.8
+    maps, depths = photographs(lambda points, view: light(points))
+    found = planes_of(maps, depths, by_edges=WALL[None])
+    assert not any(found.is_background(view).any() for view in range(len(maps)))
+
+
+def test_a_sky_gets_no_plane():
+    maps, depths = sky()
     found = planes_of(maps, depths)
     own = np.concatenate([one.ravel() for one in found.depth_maps()])
     assert np.isnan(own).mean() > 0.95
