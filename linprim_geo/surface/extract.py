@@ -18,13 +18,14 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import locked, remove_temporary, write_json
 from linprim_geo.base.options import ExtractOptions, check
 from linprim_geo.base.progress import Progress, Stages
+from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.geometry.mesh_files import SUFFIXES
 from linprim_geo.geometry.topology import manifold_status, topology, topology_line
 from linprim_geo.jobs.executor import Executor
 from linprim_geo.jobs.open import open_executor
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.choose_level import USUAL_LEVEL, choose_level
-from linprim_geo.surface.postprocess import finish_surface, visible_file
+from linprim_geo.surface.postprocess import Finished, finish_surface, visible_file
 from linprim_geo.surface.single_view import without_single_views
 from linprim_geo.surface.texture import check_texture
 from linprim_geo.surface.voxel_budget import choose_voxel
@@ -171,19 +172,12 @@ def _extract(
     else:
         mesh, about = surface(opened, options, stages, *kept)
     if opened.environment is not None:
-        views = opened.surface_depths(opened.scene().train, float(options.level))
-        mesh, left_out = without_single_views(
-            mesh, ((view.camera, depth) for view, depth, _ in views), options.smallest_part
-        )
+        mesh, left_out = _seen_by_several(mesh, opened, options, stages)
         about = about | {"seen_by_one_view": left_out}
-        if left_out["pieces"]:
-            stages.note(f"left out: {left_out['pieces']} parts that one camera alone sees before the open background")
-        stages.lap("support")
     options = replace(options, **{name: about[name] for name in CHOSEN if name in about})
     if options.refine == "auto":
         options = replace(options, refine=0 if about.get("stereo", {}).get("taken") else REFINE_ROUNDS)
     done = finish_surface(mesh, opened, options, target, stages)
-    shape = topology(done.mesh)
     stats = {
         "mesh": str(target),
         "mesh_visible": str(visible_target),
@@ -191,16 +185,8 @@ def _extract(
         "options": asdict(options),
         **about,
         "level_differences": agreement,
-        "unit": opened.unit,
-        "views": len(opened.scene().train),
-        "primitives": opened.state.get("primitives"),
-        **shape,
-        "manifold_status": manifold_status(done.mesh) if shape["watertight"] else None,
+        **_statistics(done, opened),
         "refine": options.refine,
-        "processing": done.processing,
-        "texture": done.texture,
-        "visible": topology(done.visible),
-        "predicted_error": error_summary(done.visible.quality),
         **stages.report(),
     }
     if budget:
@@ -215,6 +201,34 @@ def _extract(
         )
     stages.note(stages.line())
     return stats
+
+
+def _seen_by_several(mesh: Mesh, opened: Run, options: ExtractOptions, stages: Stages) -> tuple[Mesh, dict]:
+    """See `without_single_views`."""
+    views = opened.surface_depths(opened.scene().train, float(options.level))
+    mesh, left_out = without_single_views(
+        mesh, ((view.camera, depth) for view, depth, _ in views), options.smallest_part
+    )
+    if left_out["pieces"]:
+        stages.note(f"left out: {left_out['pieces']} parts that one camera alone sees before the open background")
+    stages.lap("support")
+    return mesh, left_out
+
+
+def _statistics(done: Finished, opened: Run) -> dict:
+    """What stats.json says of a mesh and its run."""
+    shape = topology(done.mesh)
+    return {
+        "unit": opened.unit,
+        "views": len(opened.scene().train),
+        "primitives": opened.state.get("primitives"),
+        **shape,
+        "manifold_status": manifold_status(done.mesh) if shape["watertight"] else None,
+        "processing": done.processing,
+        "texture": done.texture,
+        "visible": topology(done.visible),
+        "predicted_error": error_summary(done.visible.quality),
+    }
 
 
 def error_summary(quality: np.ndarray | None) -> dict[str, float] | None:

@@ -104,30 +104,34 @@ def dry_run(
             )
     finally:
         torch.set_num_threads(before)
-    per_primitive = bytes_per_primitive(options)
-    used = peak_gib() - per_primitive * counts[0] / 2**30  # without those that were timed
-    available = available_memory() / 2**30 + memory_gib()
-    needed = used + per_primitive * options.max_primitives / 2**30
-    held = sum(not isinstance(image, LazyTrainingImage) for image in images)
     size = max((view.camera for view in loaded.train), key=lambda camera: camera.width * camera.height)
-    photos = photo_bytes(loaded.train)
-    report = {
+    return {
         "images": len(images),
         "held_out": len(held_out),
         "width": size.width,
         "height": size.height,
-        "photo_gib": photos / 2**30,
+        "photo_gib": photo_bytes(loaded.train) / 2**30,
         "photo_limit_gib": limit / 2**30,
-        "photos_in_memory": held,
+        "photos_in_memory": sum(not isinstance(image, LazyTrainingImage) for image in images),
         "iterations": options.iterations,
         "max_primitives": options.max_primitives,
         "minutes": seconds / 60,
+        **_memory(options, counts[0]),
+    }
+
+
+def _memory(options: TrainOptions, timed: int) -> dict:
+    """What is needed and available, after `timed` primitives were trained for a moment."""
+    per_primitive = bytes_per_primitive(options)
+    used = peak_gib() - per_primitive * timed / 2**30  # without those that were timed
+    available = available_memory() / 2**30 + memory_gib()
+    needed = used + per_primitive * options.max_primitives / 2**30
+    return {
         "memory_gib": needed,
         "available_gib": available,
         "fits": needed <= available,
         "advice": "" if needed <= available else _advice(used, available, per_primitive, options),
     }
-    return report
 
 
 def describe(report: dict) -> str:

@@ -52,23 +52,8 @@ def train_run(
     pace = None
     if budget:
         held_out = load_training_images(scene.test, run.similarity)
-        volume = isinstance(scene.points, VolumePoints)
-        run, pace = plan_run(
-            run,
-            images,
-            held_out,
-            late_terms(run, scene, images, progress),
-            budget,
-            progress,
-            start=lambda options: start_trainer(scene, run, images, options, None),
-            score=evaluate,
-            # The smaller limit that is chosen leaves too many points, not too few, and volumes are filled anew.
-            start_share=0.0 if volume else SFM_START,
-            quick_views=len(held_out[:: max(1, len(held_out) // QUICK_VIEWS)]),
-        )
+        run, scene, pace = _planned(run, scene, images, held_out, budget, progress)
         options, progress.total = run.train_options, run.train_options.iterations
-        if volume:  # as many as the population begins with
-            scene = with_points(replace(scene, points=None), options, progress.note)
     trainer = start_trainer(scene, run, images, options, state)
     trainer.terms = late_terms(run, scene, images, progress)
     if not (run.path / "config.json").exists():
@@ -115,6 +100,34 @@ def train_run(
     if pace:
         result["time_budget"] = pace.close(run, progress)
     return result
+
+
+def _planned(
+    run: Run,
+    scene: Scene,
+    images: list[TrainingImage],
+    held_out: list[TrainingImage],
+    budget: Budget,
+    progress: Progress,
+) -> tuple[Run, Scene, Pace]:
+    """The run with options that fit into a time budget, and the scene with points for as many primitives."""
+    volume = isinstance(scene.points, VolumePoints)
+    planned, pace = plan_run(
+        run,
+        images,
+        held_out,
+        late_terms(run, scene, images, progress),
+        budget,
+        progress,
+        start=lambda options: start_trainer(scene, run, images, options, None),
+        score=evaluate,
+        # The smaller limit that is chosen leaves too many points, not too few, and volumes are filled anew.
+        start_share=0.0 if volume else SFM_START,
+        quick_views=len(held_out[:: max(1, len(held_out) // QUICK_VIEWS)]),
+    )
+    if volume:  # as many as the population begins with
+        scene = with_points(replace(scene, points=None), planned.train_options, progress.note)
+    return planned, scene, pace
 
 
 def _beside_training_views(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -181,28 +181,7 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
         raise LinprimError(f"{scene.root}: no camera sees a point of the scene, so no block can be made")
     blocks = split_space(points[used], work[used], count)
     margin = margin_of(blocks, points[used])
-    seen_by: list[list[int]] = [[] for _ in blocks]
-    # Of windows, and of the coarse scene: in a block, and in it and its margin.
-    pixels, within = [0] * count, np.zeros((2, count))
-    for number, (view, camera, depth) in enumerate(looks()):
-        if not (depth > 0).any():
-            continue
-        surface = surface_points(camera, depth)
-        reach = Block(tuple(np.nanmin(surface, (0, 1))), tuple(np.nanmax(surface, (0, 1))))
-        for k, block in enumerate(blocks):
-            if reach.is_apart(block, margin):
-                continue
-            mask = block.holds(surface, margin)
-            within[:, k] += block.holds(surface).sum(), mask.sum()
-            found = window(mask, view.camera, factor)
-            if found is not None:
-                seen_by[k].append(number)
-                pixels[k] += found[2] * found[3]
-    for k, views in enumerate(seen_by):
-        if len(views) < 2:
-            raise LinprimError(
-                f"block {k} of {count} is seen by {len(views)} cameras, wanted two at least: fewer blocks"
-            )
+    seen_by, pixels, within = _shown(blocks, looks(), margin, factor)
     options = opened.train_options
     # Where the coarse scene has grown primitives the whole would, too, and none larger.
     grown = coarse.training_primitives().center
@@ -243,6 +222,35 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
         all_pixels=sum(view.camera.width * view.camera.height for view in scene.train),
         blocks=tuple(parts),
     ).to_json()
+
+
+def _shown(
+    blocks: Sequence[Block], looks: Iterable[tuple[View, Camera, np.ndarray]], margin: float, factor: int
+) -> tuple[list[list[int]], list[int], np.ndarray]:
+    """The views that show each block, the pixels of its windows in them, and (2, B) how much of the coarse scene they
+    show in it, and in it and its margin."""
+    seen_by: list[list[int]] = [[] for _ in blocks]
+    pixels, within = [0] * len(blocks), np.zeros((2, len(blocks)))
+    for number, (view, camera, depth) in enumerate(looks):
+        if not (depth > 0).any():
+            continue
+        surface = surface_points(camera, depth)
+        reach = Block(tuple(np.nanmin(surface, (0, 1))), tuple(np.nanmax(surface, (0, 1))))
+        for k, block in enumerate(blocks):
+            if reach.is_apart(block, margin):
+                continue
+            mask = block.holds(surface, margin)
+            within[:, k] += block.holds(surface).sum(), mask.sum()
+            found = window(mask, view.camera, factor)
+            if found is not None:
+                seen_by[k].append(number)
+                pixels[k] += found[2] * found[3]
+    for k, views in enumerate(seen_by):
+        if len(views) < 2:
+            raise LinprimError(
+                f"block {k} of {len(blocks)} is seen by {len(views)} cameras, wanted two at least: fewer blocks"
+            )
+    return seen_by, pixels, within
 
 
 def apportioned(shares: Sequence[float] | np.ndarray, total: int) -> list[int]:
