@@ -158,11 +158,15 @@ def _matched(ours: np.ndarray, theirs: np.ndarray) -> tuple[float, np.ndarray, n
     """The gain of theirs, what is left of ours after it and an offset, and Huber's weights."""
     weight = np.ones_like(ours)
     for _ in range(ROUNDS):
-        a, b = (x - np.average(x, weights=weight) for x in (ours, theirs))
-        gain = float(np.clip((weight * a * b).sum() / max((weight * b * b).sum(), 1e-6), *GAINS))
+        total = weight.sum()
+        a, b = (x - weight @ x / total for x in (ours, theirs))
+        weighted = weight * b
+        gain = min(max(float(weighted @ a / max(weighted @ b, 1e-6)), GAINS[0]), GAINS[1])
         left = a - gain * b
-        deviation = 1.4826 * np.median(np.abs(left)) + 0.05
-        weight = 1 / np.maximum(1, np.abs(left) / (2 * deviation))
+        size = np.abs(left)
+        # The middle one: np.median takes as long as all the rest.
+        deviation = 1.4826 * np.partition(size, len(size) // 2)[len(size) // 2] + 0.05
+        weight = 1 / np.maximum(1, size / (2 * deviation))
     return gain, left, weight
 
 
@@ -198,8 +202,12 @@ def evaluate(plane: np.ndarray, regions: Sequence[ShadedRegion], shadings: Seque
                 continue
             root = np.sqrt(found.weight)
             slope = (found.slope * root)[:, None] * (region.rays[found.shown] @ moves)
-            taken = np.linalg.qr(np.stack([found.value - found.value.mean(), np.ones_like(root)], 1) * root[:, None])[0]
-            slope -= taken @ (taken.T @ slope)
+            # Less what gain and offset take.
+            offset = root / np.linalg.norm(root)
+            gained = found.value * root
+            gained -= (offset @ gained) * offset
+            gained /= max(float(np.linalg.norm(gained)), 1e-12)
+            slope -= np.outer(offset, offset @ slope) + np.outer(gained, gained @ slope)
             variance = float((found.weight * found.left**2).mean()) + 1e-4
             information += slope.T @ slope / variance
             downhill += slope.T @ (found.left * root) / variance
