@@ -79,6 +79,8 @@ def load_scene(
     elif (model := found_poses.found_model(root, cache)) is not None:
         listing = replace(read_colmap.read_colmap(root, model), kind=PHOTOGRAPHS)
     else:
+        if not _images_in(root):
+            raise LinprimError(f"{root}: no camera poses found, and no photographs ({_contents(root)})")
         raise LinprimError(
             f"{root}: no camera poses found ({_contents(root)}), wanted transforms.json, transforms_train.json,"
             " a COLMAP model in sparse/0 or the like; linprim-geo inspect and train find those of plain photographs"
@@ -195,9 +197,12 @@ def in_capture(options: SceneOptions, path: Path) -> SceneOptions:
     return replace(options, **there)
 
 
+def _images_in(root: Path) -> int:
+    return sum(1 for entry in root.rglob("*") if entry.suffix.lower() in photos.IMAGE_SUFFIXES)
+
+
 def _contents(root: Path) -> str:
-    entries = sorted(entry.name for entry in root.iterdir())
-    images = sum(1 for entry in root.rglob("*") if entry.suffix.lower() in photos.IMAGE_SUFFIXES)
+    entries, images = sorted(entry.name for entry in root.iterdir()), _images_in(root)
     if not entries:
         return "the folder is empty"
     shown = ", ".join(entries[:6]) + (", ..." if len(entries) > 6 else "")

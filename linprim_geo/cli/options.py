@@ -150,7 +150,10 @@ def whole(text: str) -> int:
 def seconds(text: str) -> float:
     """90, 90s, 5m or 1.5h as seconds."""
     units = {"s": 1, "m": 60, "h": 3600}
-    value = float(text[:-1]) * units[text[-1]] if text[-1:] in units else float(text)
+    try:
+        value = float(text[:-1]) * units[text[-1]] if text[-1:] in units else float(text)
+    except ValueError:
+        value = 0.0
     if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is not a time such as 90s, 5m or 1h")
     return value
@@ -159,4 +162,3 @@ def seconds(text: str) -> float:
 # argparse names the type in its message: "invalid count value", not "invalid positive value".
 positive.__name__ = whole.__name__ = threads.__name__ = "count"
 blocks.__name__ = "count, or auto:"
-seconds.__name__ = "time such as 90s, 5m or 1h"

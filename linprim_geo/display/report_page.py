@@ -248,10 +248,12 @@ def _scores(report: Report) -> tuple[list[tuple[str, Table]], list[str]]:
     if report.images:
         images = report.images
         shown = [*IMAGE_SCORES[:2], *(score for score in IMAGE_SCORES[2:] if score[0] in images)]
-        cells = [
-            f"{_number(images.get(name), digits)} ± {_number(images.get(f'{name}_standard_error'), digits)}"
-            for name, _, digits in shown
-        ]
+        cells = []
+        for name, _, digits in shown:
+            cells.append(_number(images.get(name), digits))
+            error = images.get(f"{name}_standard_error")
+            if error is not None and math.isfinite(error):  # one view has none
+                cells[-1] += f" ± {_number(error, digits)}"
         head = (*(title for _, title, _ in shown), "views")
         caption = f"Protocol: {images.get('protocol')}."
         tables.append(("Colours", Table(head, [[*cells, str(images.get("views"))]], caption, "figures")))

@@ -159,7 +159,8 @@ class Viewer:
         """One line about what is shown."""
         if self.seen.run is None:
             return f"waiting for {self.path} to save"
-        return f"{self.path}, step {self.seen.step}, {self.seen.count} primitives, {len(self.seen.meshes)} meshes"
+        meshes = f"{len(self.seen.meshes)} mesh" + ("es" if len(self.seen.meshes) != 1 else "")
+        return f"{self.path}, step {self.seen.step}, {self.seen.count} primitives, {meshes}"
 
     def look(self) -> bool:
         """Reads the run if it has saved since; whether it did. A run that is not there yet, or is being written, is

@@ -208,7 +208,7 @@ def test_equal_stems_get_names_of_their_own(tmp_path):
 
 def test_folders_that_are_no_capture(tmp_path):
     assert "no such folder" in refusal(tmp_path / "nothing")
-    assert "the folder is empty" in refusal(tmp_path)
+    assert "no photographs (the folder is empty)" in refusal(tmp_path)
     (tmp_path / "photos").mkdir()
     picture(0).save(tmp_path / "photos" / "a.png")
     message = refusal(tmp_path)

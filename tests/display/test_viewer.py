@@ -77,7 +77,7 @@ def test_it_serves_a_page_to_this_machine_alone(viewer):
     text = page(viewer.address)
     assert "<html" in text and "<script" in text
     assert viewer.server.get_host() == "127.0.0.1"
-    assert "step 400" in viewer._text.content and "1 meshes" in viewer._text.content
+    assert "step 400" in viewer._text.content and "1 mesh" in viewer._text.content
 
 
 def test_primitives_are_polyhedra_from_an_opacity_on(viewer, meshed):
