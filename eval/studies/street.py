@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from linprim_geo.synthetic.shapes import SEGMENTS, Tags, operation
+from linprim_geo.synthetic.shapes import SEGMENTS, Tags, box, operation
 from linprim_geo.synthetic.textured import TexturedMesh, procedural_albedo
 
 # Width and height of the street, in metres, and the length of one house.
@@ -34,9 +34,6 @@ def street(houses: int, seed: int = 11) -> TexturedMesh:
     air = Manifold.cube((length, WIDTH, HEIGHT))
     air = tags.tag(air, 0)
     recesses, things = [], []
-
-    def box(low, high):
-        return Manifold.cube(np.subtract(high, low)).translate(low)
 
     for house in range(houses):
         for side in (0, 1):
@@ -82,13 +79,6 @@ def street(houses: int, seed: int = 11) -> TexturedMesh:
                     )
     air = Manifold.batch_boolean([air, *recesses], operation("Add"))
     air = Manifold.batch_boolean([air, *things], operation("Subtract"))
-    vertices, faces, part = tags.triangles(air)
-    faces = faces[:, ::-1]
-    corner = vertices[faces]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    level = np.abs(normal[:, 2]) > 0.99 * np.linalg.norm(normal, axis=1)
-    shell = part == 0
-    part[shell & level & (normal[:, 2] > 0)] = 1
-    part[shell & level & (normal[:, 2] < 0)] = 2
+    vertices, faces, part = tags.from_inside(air)
     albedo = procedural_albedo(part, scale=1.6, detail=1.0, drift=0.05, seed=seed, palette=PALETTE)
     return TexturedMesh("street", vertices, faces, part, albedo, path="inside-out", unit="metre")

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import binary_dilation, label
+from scipy.ndimage import binary_dilation
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.points.initial_points import in_image
@@ -167,7 +167,7 @@ class ShadedPlanes:
             far = self._far(replace(few, others=tuple(k for k in range(len(self.shadings)) if k != view)))
             if far is None:
                 continue
-            fits = [evaluate(plane, [few], self.shadings) for plane in self.planes[self.exact :]]
+            fits = (evaluate(plane, [few], self.shadings) for plane in self.planes[self.exact :])
             if all(fit is None or fit.left_share > HARDLY_MORE * far.left_share for fit in fits):
                 around = binary_dilation(self._inside(region), iterations=BOX)
                 row, column = np.nonzero(around.repeat(shading.factor, 0).repeat(shading.factor, 1))
@@ -319,7 +319,7 @@ class ShadedPlanes:
 
     def _inside(self, region: ShadedRegion) -> np.ndarray:
         """(H, W) bool where the boxes of a region have their middles."""
-        labels = label(self.shadings[region.view].plain)[0]
+        labels = self.shadings[region.view].labels
         return labels == labels[region.row[0], region.column[0]]
 
     def depth_maps(self) -> list[np.ndarray]:

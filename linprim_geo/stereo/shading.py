@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, label, median_filter, uniform_filter
@@ -73,6 +74,11 @@ class Shading:
         means = np.stack([mean, by_column, by_row], -1)
         return cls(smaller(found.camera, factor), means, plain, noise / BOX**2, factor)
 
+    @cached_property
+    def labels(self) -> np.ndarray:
+        """(H, W) the number of the plain area that a pixel is in, from 1, else 0."""
+        return label(self.plain)[0]
+
     def small(self, image: np.ndarray) -> np.ndarray:
         """Every `factor`-th pixel of an image of the photograph's size."""
         height, width = self.plain.shape
@@ -106,12 +112,11 @@ class ShadedRegion:
 
 def shaded_regions(view: int, shading: Shading, confirmed: np.ndarray) -> list[ShadedRegion]:
     """Those of a view whose `confirmed` (H, W) bool says where stereo is sure."""
-    labels, count = label(shading.plain)
-    grid = labels[::STRIDE, ::STRIDE]
+    grid = shading.labels[::STRIDE, ::STRIDE]
     row, column = (x * STRIDE for x in np.nonzero(grid))
     grid = grid[grid > 0]
-    boxes = np.bincount(grid, minlength=count + 1)
-    known = np.bincount(grid, weights=confirmed[row, column], minlength=count + 1)
+    boxes = np.bincount(grid)
+    known = np.bincount(grid, weights=confirmed[row, column])
     camera, regions = shading.camera, []
     for k in np.flatnonzero((boxes >= LEAST_BOXES) & (known <= KNOWN_SHARE * boxes)):
         y, x = row[grid == k], column[grid == k]

@@ -34,7 +34,8 @@ ROOM_PALETTE = (
 )
 
 
-def _box(low, high):
+def box(low, high):
+    """A solid box between two corners."""
     from manifold3d import Manifold
 
     return Manifold.cube(np.subtract(high, low)).translate(low)
@@ -64,7 +65,7 @@ def cad_part(detail: float = 1.0) -> TexturedMesh:
     upper = [(x * 0.9625, y * 0.945, 0.12) for x, y in outline]
     plate = tags.tag(Manifold.hull_points(np.array(lower + upper)), 0)
 
-    foot = _box((-0.21, -0.23, 0.1), (0.51, 0.23, 0.14))
+    foot = box((-0.21, -0.23, 0.1), (0.51, 0.23, 0.14))
     block = tags.tag(Manifold.batch_hull([foot, across(0.3, -0.23, 0.23, 0.15, 0.55)]), 1)
     ribs = []
     for y in (-0.165, 0.0, 0.165):
@@ -73,9 +74,9 @@ def cad_part(detail: float = 1.0) -> TexturedMesh:
         ribs.append(tags.tag(rib, 2))
     buttress = Manifold.extrude(CrossSection([[(0.3, 0.1), (0.62, 0.1), (0.3, 0.62)]]), 0.05)
     ribs.append(tags.tag(buttress.rotate((90, 0, 0)).translate((0, 0.025, 0)), 2))
-    fence = _box((-0.5, 0.44, 0.1), (0.6, 0.47, 0.42))
+    fence = box((-0.5, 0.44, 0.1), (0.6, 0.47, 0.42))
     for x in (-0.42, -0.14, 0.14, 0.42):
-        fence -= _box((x - 0.07, 0.4, 0.18), (x + 0.07, 0.5, 0.34))
+        fence -= box((x - 0.07, 0.4, 0.18), (x + 0.07, 0.5, 0.34))
     stud = _drum(0.09, 0.3, (-0.42, -0.36, 0.1)) + _drum(0.09, 0.04, (-0.42, -0.36, 0.4), top=0.06)
     solid = Manifold.batch_boolean([plate, block, *ribs, tags.tag(fence, 3), tags.tag(stud, 4)], operation("Add"))
 
@@ -89,7 +90,7 @@ def cad_part(detail: float = 1.0) -> TexturedMesh:
     socket = Manifold.cylinder(0.2, 0.05, -1.0, 6).translate((-0.42, -0.36, 0.3))
     cuts += [tags.tag(slot, 6), tags.tag(socket, 6)]
     for x in (-0.3, 0.3):
-        cuts.append(tags.tag(_box((x - 0.22, -0.3, -0.1), (x + 0.22, 0.3, 0.05)), 7))
+        cuts.append(tags.tag(box((x - 0.22, -0.3, -0.1), (x + 0.22, 0.3, 0.05)), 7))
     solid = Manifold.batch_boolean([solid, *cuts], operation("Subtract"))
     return _finish("cad_part", *tags.triangles(solid), detail=detail, seed=1)
 
@@ -170,45 +171,38 @@ def furnished_room(detail: float = 1.0, seed: int = 5) -> TexturedMesh:
     _add_sofa(add)
     _add_other_things(add)
 
-    air = tags.tag(_box((0, 0, 0), (6, 5, 2.7)), 0)
-    recesses = [_box((1.4, 4.9, 0.9), (3.2, 5.22, 2.1)), _box((-0.14, 3.3, 0.0), (0.1, 4.2, 2.05))]
-    mullion = _box((2.27, 5.12, 0.8), (2.33, 5.3, 2.2))
+    air = tags.tag(box((0, 0, 0), (6, 5, 2.7)), 0)
+    recesses = [box((1.4, 4.9, 0.9), (3.2, 5.22, 2.1)), box((-0.14, 3.3, 0.0), (0.1, 4.2, 2.05))]
+    mullion = box((2.27, 5.12, 0.8), (2.33, 5.3, 2.2))
     air = Manifold.batch_boolean([air, *(tags.tag(item, 16) for item in recesses)], operation("Add"))
     air = Manifold.batch_boolean([air, tags.tag(mullion, 7), *things], operation("Subtract"))
-    vertices, faces, part = tags.triangles(air)
-    faces = faces[:, ::-1]
-    corner = vertices[faces]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    level = np.abs(normal[:, 2]) > 0.99 * np.linalg.norm(normal, axis=1)
-    shell = part == 0
-    part[shell & level & (normal[:, 2] > 0)] = 1
-    part[shell & level & (normal[:, 2] < 0)] = 2
+    vertices, faces, part = tags.from_inside(air)
     albedo = procedural_albedo(part, scale=2.2, detail=detail, drift=0.04, seed=3, palette=ROOM_PALETTE)
     return TexturedMesh("furnished_room", vertices, faces, part, albedo, path="inside-out", unit="metre")
 
 
 def _add_table_and_chairs(add) -> None:
-    add(_box((1.8, 1.65, 0.71), (3.4, 2.55, 0.75)), 3)
+    add(box((1.8, 1.65, 0.71), (3.4, 2.55, 0.75)), 3)
     for x in (1.85, 3.29):
         for y in (1.7, 2.44):
-            add(_box((x, y, -0.1), (x + 0.06, y + 0.06, 0.72)), 3)
+            add(box((x, y, -0.1), (x + 0.06, y + 0.06, 0.72)), 3)
     for x, y, sign in ((2.15, 2.75, 1), (2.6, 1.05, -1)):
-        add(_box((x, y, 0.43), (x + 0.44, y + 0.42, 0.47)), 4)
+        add(box((x, y, 0.43), (x + 0.44, y + 0.42, 0.47)), 4)
         back = y + 0.38 if sign > 0 else y
-        add(_box((x, back, 0.6), (x + 0.44, back + 0.035, 0.95)), 4)
+        add(box((x, back, 0.6), (x + 0.44, back + 0.035, 0.95)), 4)
         for dx in (0.0, 0.405):
             for dy in (0.0, 0.385):
                 tall = 0.95 if abs(y + dy - back) < 0.05 else 0.44
-                add(_box((x + dx, y + dy, -0.1), (x + dx + 0.035, y + dy + 0.035, tall)), 4)
+                add(box((x + dx, y + dy, -0.1), (x + dx + 0.035, y + dy + 0.035, tall)), 4)
 
 
 def _add_shelf(add, things: list, rng: np.random.Generator) -> None:
     """With books whose colours follow the number of `things` before them."""
     for y in (0.9, 2.92):
-        add(_box((5.66, y, -0.1), (6.1, y + 0.03, 1.95)), 5)
+        add(box((5.66, y, -0.1), (6.1, y + 0.03, 1.95)), 5)
     heights = (0.08, 0.46, 0.84, 1.22, 1.6, 1.92)
     for z in heights:
-        add(_box((5.66, 0.9, z), (6.1, 2.95, z + 0.03)), 5)
+        add(box((5.66, 0.9, z), (6.1, 2.95, z + 0.03)), 5)
     for number, z in enumerate(heights[:-1]):
         y = 0.96
         while y < 2.75:
@@ -216,7 +210,7 @@ def _add_shelf(add, things: list, rng: np.random.Generator) -> None:
             if rng.uniform() < 0.72:
                 depth = rng.uniform(0.0, 0.06)
                 add(
-                    _box((5.74 + depth, y, z + 0.02), (6.1, y + width, z + 0.03 + tall)),
+                    box((5.74 + depth, y, z + 0.02), (6.1, y + width, z + 0.03 + tall)),
                     6 + (number + len(things)) % 4,
                 )
             y += width + (0.0 if rng.uniform() < 0.7 else rng.uniform(0.05, 0.2))
@@ -230,10 +224,10 @@ def _add_sofa(add) -> None:
         corners = [np.where(pick, high, low) for pick in np.ndindex(2, 2, 2)]
         return Manifold.batch_hull([Manifold.sphere(radius, 32).translate(corner) for corner in corners])
 
-    add(_box((3.6, -0.1, 0.12), (5.3, 0.8, 0.3)), 10)
+    add(box((3.6, -0.1, 0.12), (5.3, 0.8, 0.3)), 10)
     for x in (3.66, 5.16):
-        add(_box((x, 0.05, -0.1), (x + 0.08, 0.13, 0.14)), 3)
-        add(_box((x, 0.65, -0.1), (x + 0.08, 0.73, 0.14)), 3)
+        add(box((x, 0.05, -0.1), (x + 0.08, 0.13, 0.14)), 3)
+        add(box((x, 0.65, -0.1), (x + 0.08, 0.73, 0.14)), 3)
     add(cushion((3.6, -0.02, 0.2), (3.82, 0.82, 0.62)), 10)
     add(cushion((5.08, -0.02, 0.2), (5.3, 0.82, 0.62)), 10)
     add(cushion((3.75, -0.02, 0.25), (5.15, 0.26, 0.85)), 10)
@@ -245,9 +239,9 @@ def _add_other_things(add) -> None:
     """Wardrobe, lamps, balls, dishes, pictures, a rug and a beam."""
     from manifold3d import CrossSection, Manifold
 
-    add(_box((-0.1, -0.1, -0.1), (0.62, 1.25, 2.1)), 12)
+    add(box((-0.1, -0.1, -0.1), (0.62, 1.25, 2.1)), 12)
     for y in (0.52, 0.68):
-        add(_box((0.6, y, 0.95), (0.65, y + 0.025, 1.2)), 7)
+        add(box((0.6, y, 0.95), (0.65, y + 0.025, 1.2)), 7)
     add(_drum(1.35, 0.115, (2.6, 2.1, -0.1)).scale((1.0, 0.85, 1.0)), 13)
     add(_drum(0.16, 0.13, (5.5, 3.6, -0.1)) + _drum(0.015, 1.5, (5.5, 3.6, 0.0)), 7)
     add(_drum(0.23, 0.3, (5.5, 3.6, 1.4), top=0.13), 14)
@@ -258,11 +252,11 @@ def _add_other_things(add) -> None:
     vase = CrossSection([[(0, 0), (0.07, 0), (0.11, 0.1), (0.09, 0.2), (0.04, 0.27), (0.06, 0.34), (0, 0.34)]])
     add(Manifold.revolve(vase, SEGMENTS).translate((3.05, 2.25, 0.745)), 15)
     add(_drum(0.045, 0.11, (2.7, 1.9, 0.745)) - _drum(0.037, 0.11, (2.7, 1.9, 0.765)), 6)
-    add(_box((2.3, 2.2, 0.74), (2.62, 2.42, 0.79)), 8)
-    add(_box((4.0, 4.97, 1.1), (5.1, 5.1, 1.85)), 11)
-    add(_box((-0.1, 1.9, 1.2), (0.035, 2.9, 1.9)), 9)
-    add(_box((3.9, 4.6, -0.1), (4.7, 5.1, 0.55)), 12)
-    add(_box((-0.1, 2.35, 2.55), (6.1, 2.5, 2.8)), 3)
+    add(box((2.3, 2.2, 0.74), (2.62, 2.42, 0.79)), 8)
+    add(box((4.0, 4.97, 1.1), (5.1, 5.1, 1.85)), 11)
+    add(box((-0.1, 1.9, 1.2), (0.035, 2.9, 1.9)), 9)
+    add(box((3.9, 4.6, -0.1), (4.7, 5.1, 0.55)), 12)
+    add(box((-0.1, 2.35, 2.55), (6.1, 2.5, 2.8)), 3)
 
 
 def wire_and_sheet(detail: float = 1.0) -> TexturedMesh:
@@ -328,6 +322,18 @@ class Tags:
         for run, original in enumerate(mesh.run_original_id):
             part[bounds[run] : bounds[run + 1]] = self.part_of_id[int(original)]
         return np.array(mesh.vert_properties[:, :3], dtype=np.float64), faces, part
+
+    def from_inside(self, air) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As `triangles`, of a solid of air whose faces look into it; of piece 0 floors become 1 and ceilings 2."""
+        vertices, faces, part = self.triangles(air)
+        faces = faces[:, ::-1]
+        corner = vertices[faces]
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        level = np.abs(normal[:, 2]) > 0.99 * np.linalg.norm(normal, axis=1)
+        shell = part == 0
+        part[shell & level & (normal[:, 2] > 0)] = 1
+        part[shell & level & (normal[:, 2] < 0)] = 2
+        return vertices, faces, part
 
 
 def operation(name: str):

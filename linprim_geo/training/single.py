@@ -76,7 +76,7 @@ def train_run(
     progress.note(
         f"{scene.root}: {scene.kind}, {len(scene.train)} training and {len(scene.test)} held-out views of "
         f"{images[0].camera.width}x{images[0].camera.height}; {len(trainer)} primitives, {ops.instruction_set()}, "
-        f"{ops.threads()} threads; behind it: {background_in_words(trainer)}"
+        f"{ops.threads()} threads; background: {_background_in_words(trainer)}"
     )
     held_out = load_training_images(scene.test, run.similarity) if held_out is None else held_out
     seconds, score, score_gain = run_steps(trainer, run, held_out, progress, pace, advance=advance)
@@ -102,7 +102,7 @@ def train_run(
     return result
 
 
-def background_in_words(trainer: Trainer) -> str:
+def _background_in_words(trainer: Trainer) -> str:
     if "environment" in trainer.parameters:
         return "an environment at infinity"
     if trainer.fitted:

@@ -239,7 +239,9 @@ def test_scores_from_before_the_last_save_are_not_taken(run_copy):
     wrong = json.loads(file.read_text()) | {"psnr": 99.0}
     file.write_text(json.dumps(wrong))
     text = Path(report_run(run_copy)["report"]).read_text()
-    assert "99.00 dB" in text and "LPIPS" not in text
+    assert "99.00 dB" in text and "LPIPS" not in text and "99.00 ±" in text
+    file.write_text(json.dumps(wrong | {"psnr_standard_error": float("nan")}))  # of one view
+    assert "99.00 ±" not in Path(report_run(run_copy)["report"]).read_text()
     file.write_text(json.dumps(wrong | {"lpips_vgg": 0.12362, "lpips_vgg_standard_error": 0.01}))
     text = Path(report_run(run_copy)["report"]).read_text()
     assert "LPIPS, VGG16" in text and "0.1236" in text and "AlexNet" not in text

@@ -57,8 +57,9 @@ def test_a_wall_and_a_floor_are_found(seed):
 
 
 def test_one_or_two_views_are_not_enough():
-    maps, _ = corner(CENTERS[:2])
-    assert len(planes_of_points(maps, [found.depth for found in maps])) == 0
+    for views in (1, 2):
+        maps, _ = corner(CENTERS[:views])
+        assert len(planes_of_points(maps, [found.depth for found in maps])) == 0
     nothing = [np.full(found.depth.shape, np.nan, np.float32) for found in maps]
     assert planes_of_points(maps, nothing).shape == (0, 4)
 

@@ -14,6 +14,7 @@ from PIL import Image
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import SceneOptions, TrainOptions
+from linprim_geo.cli.main import main
 from linprim_geo.eval.depth import eval_depth_run
 from linprim_geo.eval.images import eval_images_run
 from linprim_geo.geometry.primitives import KINDS, load_primitives
@@ -413,3 +414,12 @@ def test_the_frame_of_the_data_set_comes_back(tmp_path):
     low, high = body.vertices.min(0) * scale + offset, body.vertices.max(0) * scale + offset
     inside = ((far.center > low - 20) & (far.center < high + 20)).all(1)
     assert inside.mean() > 0.95
+
+
+@pytest.mark.parametrize(
+    ("background", "words"), [("random", "random colours"), ("fitted", "plain backdrop"), ("white", "one colour")]
+)
+def test_a_run_says_what_it_puts_behind_everything(tiny_scene, tmp_path, capsys, background, words):
+    options = ["--iterations", "2", "--max-primitives", "50", "--threads", "1", "--background", background]
+    assert main(["train", str(tiny_scene), "-o", str(tmp_path / "run"), *options]) == 0
+    assert words in capsys.readouterr().err

@@ -10,7 +10,6 @@ import torch
 
 from linprim_geo.base.options import TrainOptions
 from linprim_geo.capture.load import load_scene
-from linprim_geo.cli.main import main
 from linprim_geo.geometry.primitives import KINDS, SH_Y0, Primitives
 from linprim_geo.kernels import ops
 from linprim_geo.training.step.parameters import activate, filter_lengths, initial_parameters
@@ -196,12 +195,3 @@ def test_the_exponential_is_rounded_once_and_is_its_own_gradient():
     assert (np.abs(found - exact) <= (0.5 + 400 * 2.0**-29) * np.spacing(found)).all()
     (gradient,) = torch.autograd.grad(y.sum(), x)
     assert torch.equal(gradient, y.detach())
-
-
-@pytest.mark.parametrize(
-    ("background", "words"), [("random", "random colours"), ("fitted", "plain backdrop"), ("white", "one colour")]
-)
-def test_a_run_says_what_it_puts_behind_everything(tiny_scene, tmp_path, capsys, background, words):
-    options = ["--iterations", "2", "--max-primitives", "50", "--threads", "1", "--background", background]
-    assert main(["train", str(tiny_scene), "-o", str(tmp_path / "run"), *options]) == 0
-    assert words in capsys.readouterr().err
