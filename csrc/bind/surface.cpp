@@ -17,7 +17,7 @@
 #include "surface/face_samples.h"
 #include "surface/filter_normals.h"
 #include "surface/fuse.h"
-#include "surface/photo_sweep.h"
+#include "surface/photo_consistency.h"
 #include "surface/point_colors.h"
 #include "surface/points_within.h"
 #include "surface/segment_depth.h"

@@ -6,27 +6,12 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
-#if defined(LINPRIM_ISA_V3) || defined(LINPRIM_ISA_V4)
-#include <immintrin.h>
-#endif
-
 #include "stereo/patch_match.h"
+#include "stereo/wide.h"
 
 namespace linprim {
 namespace LINPRIM_ISA {
 namespace {
-
-#if defined(LINPRIM_ISA_V4)
-constexpr int kWide = 16;
-#elif defined(LINPRIM_ISA_V3)
-constexpr int kWide = 8;
-#elif defined(LINPRIM_ISA_SCALAR)
-constexpr int kWide = 1;
-#else
-constexpr int kWide = 4;
-#endif
-typedef float F __attribute__((vector_size(4 * kWide)));
-typedef int32_t I __attribute__((vector_size(4 * kWide)));
 
 constexpr int kSamples = kWindowSide * kWindowSide;
 // Bilateral weights of a window: standard deviations in pixels and in grey values. A sample farther in grey than
@@ -47,34 +32,6 @@ constexpr float kGeometryWeight = 0.1f, kGeometryMost = 4;
 constexpr float kWorst = 2;
 // The cosine between a plane's normal and the ray is at least this.
 constexpr float kFlattest = 0.12f;
-
-inline F all(float x) { return x - F{}; }
-inline F low(F a, F b) { return a < b ? a : b; }
-inline F high(F a, F b) { return a > b ? a : b; }
-inline F magnitude(F a) { return a < 0.0f ? -a : a; }
-
-inline I gather(const uint32_t* base, I at) {
-#if defined(LINPRIM_ISA_V4)
-  return (I)_mm512_i32gather_epi32((__m512i)at, (const int*)base, 4);
-#elif defined(LINPRIM_ISA_V3)
-  return (I)_mm256_i32gather_epi32((const int*)base, (__m256i)at, 4);
-#else
-  I r;
-  for (int l = 0; l < kWide; ++l) r[l] = int32_t(base[at[l]]);
-  return r;
-#endif
-}
-
-inline F root(F a) {
-#if defined(LINPRIM_ISA_V4)
-  return (F)_mm512_sqrt_ps((__m512)a);
-#elif defined(LINPRIM_ISA_V3)
-  return (F)_mm256_sqrt_ps((__m256)a);
-#else
-  for (int l = 0; l < kWide; ++l) a[l] = std::sqrt(a[l]);
-  return a;
-#endif
-}
 
 // Random numbers by place and purpose.
 inline uint32_t mixed(uint32_t a) {

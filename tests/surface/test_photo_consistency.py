@@ -21,7 +21,7 @@ from helpers.textured_plane import (
 
 from linprim_geo.geometry.mesh import Mesh, vertex_normals
 from linprim_geo.kernels import ops
-from linprim_geo.surface import photo_consistency as photo_sweep
+from linprim_geo.surface import photo_consistency
 from linprim_geo.surface.photo_consistency import best_agreement, photo_gains, predicted_error, refine_surface
 
 
@@ -85,9 +85,9 @@ def test_plain_surfaces_are_less_certain():
         before = told
     # Where photographs say nothing, only what is expected before they are asked is left.
     plain = [Shown(view, lambda x, y: np.full_like(x, 0.5)) for view in ring()]
-    footprint = photo_sweep._footprints(*photo_sweep._points(mesh), [s.camera for s in plain])[middle]
-    scale, place = photo_sweep.PRIOR_SCALE, np.linspace(0, 3, 10_001)
-    for _ in range(photo_sweep.PRIOR_ROUNDS):
+    footprint = photo_consistency._footprints(*photo_consistency._points(mesh), [s.camera for s in plain])[middle]
+    scale, place = photo_consistency.PRIOR_SCALE, np.linspace(0, 3, 10_001)
+    for _ in range(photo_consistency.PRIOR_ROUNDS):
         scale = np.average(place, weights=np.exp(-place / scale))
     assert predicted(mesh, plain)[middle] == pytest.approx(scale * footprint, rel=0.05)
 
@@ -98,7 +98,9 @@ def test_slivers_are_swept_along_the_surface_normal():
     jitter = random.normal(size=mesh.vertices.shape) * [0.3, 0.3, 0.1] * (mesh.vertices[1, 1] - mesh.vertices[0, 1])
     rough = replace(mesh, vertices=mesh.vertices + jitter)
     middle = inner(mesh)
-    tilt, own = (np.median(np.hypot(*n[middle, :2].T)) for n in (photo_sweep._points(rough)[1], vertex_normals(rough)))
+    tilt, own = (
+        np.median(np.hypot(*n[middle, :2].T)) for n in (photo_consistency._points(rough)[1], vertex_normals(rough))
+    )
     assert tilt < 0.5 * own
 
 
@@ -138,7 +140,9 @@ def test_vertices_that_fewer_than_two_photographs_see_take_that_of_the_nearest(s
     known = np.flatnonzero(found.known)
     for row in hidden[:3]:
         nearest = known[
-            np.argsort(np.linalg.norm(below.vertices[known] - below.vertices[row], axis=1))[: photo_sweep.NEIGHBOURS]
+            np.argsort(np.linalg.norm(below.vertices[known] - below.vertices[row], axis=1))[
+                : photo_consistency.NEIGHBOURS
+            ]
         ]
         assert told[row] == pytest.approx(told[nearest].mean(), rel=0.05)  # others are as near
     assert np.isnan(predicted(mesh, shown[:1])).all()
@@ -155,17 +159,17 @@ def test_a_transparent_photograph_counts_as_grey(shown):
 def test_the_core_adds_what_the_formulas_say(shown):
     """Float64 numpy, from the definition."""
     mesh = sheet(lambda x, y: 0.3 * FOOTPRINT * np.sin(9 * y), steps=9)
-    footprint, normals = np.full(len(mesh.vertices), FOOTPRINT), photo_sweep._points(mesh)[1]
+    footprint, normals = np.full(len(mesh.vertices), FOOTPRINT), photo_consistency._points(mesh)[1]
     found = agreement(mesh, shown)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(photo_sweep, "_footprints", lambda points, normals, cameras: footprint)
+        patch.setattr(photo_consistency, "_footprints", lambda points, normals, cameras: footprint)
         same = agreement(mesh, shown)
-    sums = np.zeros((3, len(mesh.vertices), len(photo_sweep.OFFSETS)))
+    sums = np.zeros((3, len(mesh.vertices), len(photo_consistency.OFFSETS)))
     for s in shown:
         c, image = s.camera, s.photo.rgb[..., 0] / 255.0
         toward = c.center - mesh.vertices
         cosine = np.einsum("vd,vd->v", normals, toward) / np.linalg.norm(toward, axis=1)
-        for k, offset in enumerate(photo_sweep.OFFSETS):
+        for k, offset in enumerate(photo_consistency.OFFSETS):
             pixel, _ = c.project(mesh.vertices + offset * FOOTPRINT * normals)
             x, y = pixel.T - 0.5
             j, i = np.floor(x).astype(int), np.floor(y).astype(int)
@@ -177,8 +181,8 @@ def test_the_core_adds_what_the_formulas_say(shown):
     mean = sums[1] / sums[0]
     spread = np.sqrt(np.maximum(sums[2] / sums[0] - mean**2, 0))
     middle = inner(mesh, 0.45)  # all views see these
-    best = photo_sweep.OFFSETS[spread.argmin(1)]
-    rows, k = np.arange(len(spread)), np.clip(spread.argmin(1), 2, len(photo_sweep.OFFSETS) - 3)
+    best = photo_consistency.OFFSETS[spread.argmin(1)]
+    rows, k = np.arange(len(spread)), np.clip(spread.argmin(1), 2, len(photo_consistency.OFFSETS) - 3)
     rise = np.minimum(spread[rows, k - 2], spread[rows, k + 2]) - spread[rows, k]
     middle &= np.abs(best) < 2
     assert same.sharpness[middle] == pytest.approx(rise[middle], abs=2e-3)

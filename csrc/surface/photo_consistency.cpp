@@ -1,4 +1,4 @@
-#include "surface/photo_sweep.h"
+#include "surface/photo_consistency.h"
 
 namespace linprim {
 namespace {
