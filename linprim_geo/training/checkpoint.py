@@ -95,7 +95,7 @@ def _check_state(trainer: Trainer, state: dict) -> None:
         raise ValueError("a second moment is negative")
     _check_tensor("steps", state["steps"], torch.int32, (count,))
     for name in trainer.control.NAMES:
-        _check_tensor(f"gathered {name}", state["gathered"][name], torch.float32, (count,))
+        _check_tensor(f"accumulated {name}", state["accumulated"][name], torch.float32, (count,))
     if (state["filter_3d"] is None) != (trainer.filter_3d is None):
         raise ValueError("filter_3d belongs to a run with another --filter")
     if state["filter_3d"] is not None:

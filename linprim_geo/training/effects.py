@@ -15,7 +15,7 @@ from linprim_geo.capture.types import Scene
 from linprim_geo.training.effect_registry import EFFECTS, Data, Effect
 
 MODES = ("auto", "none", "all")
-# An effect that makes a step of training dearer by less than this costs nothing worth saving.
+# An effect that makes a step of training more expensive by less than this costs nothing worth saving.
 FREE = 1.05
 
 

@@ -170,7 +170,7 @@ BAD_STATES = {
     "no control": lambda s: s.update(control=[]),
     "control of NaN": lambda s: s.update(control=[float("nan")] * 5),
     "a loss that is a word": lambda s: s.update(loss="x"),
-    "gathered of another length": lambda s: s["gathered"].update(pull=torch.zeros(3)),
+    "accumulated of another length": lambda s: s["accumulated"].update(screen_gradient=torch.zeros(3)),
     "steps of another type": lambda s: s.update(steps=s["steps"].float()),
 }
 

@@ -318,14 +318,16 @@ def test_a_window_pulls_as_its_photograph_does(population):
     whole_photo = TrainingImage("whole", camera, rgb, None)
     window = TrainingImage("window", cropped(camera, 16, 16, 32, 16), rgb[:, 16:32, 16:48].contiguous(), None, (64, 48))
     assert window.weight == 1 / 6 and whole_photo.weight == 1 and window.size == whole_photo.size
-    name = {"gradient": "pull", "3dgs": "gradient"}[population]
-    pulls = []
+    name = {"gradient": "screen_gradient", "3dgs": "gradient"}[population]
+    gradients = []
     for image in (whole_photo, window):
         options, copy = replace(OPTIONS, dssim=0.0, population=population), {k: v.clone() for k, v in start.items()}
         trainer = Trainer([image], copy, options, (0.01, 0.1), torch.zeros(3), False, False)
         trainer.advance()
-        pulls.append(trainer.control.gathered[name])
-    assert pulls[0].max() > 0 and torch.allclose(pulls[0], pulls[1], rtol=1e-3, atol=1e-6 * float(pulls[0].max()))
+        gradients.append(trainer.control.accumulated[name])
+    assert gradients[0].max() > 0 and torch.allclose(
+        gradients[0], gradients[1], rtol=1e-3, atol=1e-6 * float(gradients[0].max())
+    )
 
 
 def test_frozen_primitives_are_drawn_and_stay(whole):

@@ -28,8 +28,8 @@ def parameters(count: int, seed: int = 0, kind: str = "octahedron") -> dict[str,
     return {name: torch.from_numpy(value.astype(np.float32)) for name, value in values.items()}
 
 
-def event(table, pull, cap=10_000, rate=0.05, seed=0, kind="octahedron"):
-    return grow(table, pull, Growth(0, 100, 1, rate, cap), SMALLEST, np.random.default_rng(seed), kind)
+def event(table, screen_gradient, cap=10_000, rate=0.05, seed=0, kind="octahedron"):
+    return grow(table, screen_gradient, Growth(0, 100, 1, rate, cap), SMALLEST, np.random.default_rng(seed), kind)
 
 
 def shapes(table, kind, rows=slice(None), **changed) -> Primitives:
@@ -75,8 +75,8 @@ def test_a_plan_exists_for_every_run(iterations, start, cap):
 
 def test_halves_stay_inside_the_box_of_the_parent_and_along_the_axis_that_is_cut():
     table = parameters(200)
-    pull = torch.ones(200)
-    parents, children, halves = event(table, pull, rate=0.25)
+    screen_gradient = torch.ones(200)
+    parents, children, halves = event(table, screen_gradient, rate=0.25)
     assert len(parents) == 50 and list(children) == list(range(200, 250))
     parent = np.exp(table["log_extent"].numpy().astype(np.float64))[parents]
     whole = Primitives(
@@ -115,12 +115,12 @@ def test_long_axes_are_cut_in_proportion_to_their_square():
 
 def test_parents_are_drawn_in_proportion_to_the_pull():
     table = parameters(400)
-    pull = torch.zeros(400)
-    pull[100:300] = 1
-    pull[200:300] = 3
+    screen_gradient = torch.zeros(400)
+    screen_gradient[100:300] = 1
+    screen_gradient[200:300] = 3
     counts = np.zeros(400)
     for seed in range(300):
-        parents, *_ = event(table, pull, rate=0.01, seed=seed)
+        parents, *_ = event(table, screen_gradient, rate=0.01, seed=seed)
         assert len(set(parents)) == len(parents) == 4
         counts[parents] += 1
     assert counts[:100].sum() == counts[300:].sum() == 0
@@ -154,9 +154,9 @@ def test_the_cap_holds_at_every_event():
 
 
 def test_draws_depend_on_the_generator_alone():
-    table, pull = parameters(300), torch.rand(300, generator=torch.Generator().manual_seed(1))
+    table, screen_gradient = parameters(300), torch.rand(300, generator=torch.Generator().manual_seed(1))
     before = {name: value.clone() for name, value in table.items()}
-    first, again, other = (event(table, pull, rate=0.1, seed=seed) for seed in (7, 7, 8))
+    first, again, other = (event(table, screen_gradient, rate=0.1, seed=seed) for seed in (7, 7, 8))
     assert (first[0] == again[0]).all() and (first[1] == again[1]).all()
     assert all((first[2][name] == again[2][name]).all() for name in ("center", "log_extent"))
     assert len(first[0]) != len(other[0]) or (first[0] != other[0]).any()
@@ -172,9 +172,9 @@ def test_a_population_of_one_can_be_cut():
 def test_nothing_is_cut_where_nothing_pulls():
     assert len(event(parameters(50), torch.zeros(50))[0]) == 0
     # No more parents than are pulled at, however large the rate.
-    pull = torch.zeros(50)
-    pull[3] = 1
-    assert list(event(parameters(50), pull, rate=1.0)[0]) == [3]
+    screen_gradient = torch.zeros(50)
+    screen_gradient[3] = 1
+    assert list(event(parameters(50), screen_gradient, rate=1.0)[0]) == [3]
 
 
 def test_all_dead_leaves_all_as_they_are():
@@ -265,7 +265,7 @@ def test_an_event_copies_rows_and_moments():
     options = TrainOptions(iterations=100, max_primitives=60)
     control = GradientControl(options, 50, [], (1e-3, 1.0))
     table = parameters(50)
-    control.gathered["pull"] += 1
+    control.accumulated["screen_gradient"] += 1
     event = control.grow(table, 5)
     new = np.arange(50, len(event.source))
     assert 0 < len(new) <= 10 and (event.source[:50] == np.arange(50)).all()

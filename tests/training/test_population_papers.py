@@ -100,8 +100,8 @@ def test_a_gradient_is_averaged_over_the_views_that_see():
     for _ in range(2):
         control.accumulate(parameters, CAMERAS[0], (CAMERAS[0].width, CAMERAS[0].height), screen)
     # From -1 to 1 over 100 pixels: 50 times as much per unit, 5e-6 * 50 = 2.5e-4 per view.
-    assert torch.allclose(control.gathered["gradient"], torch.tensor([5e-4, 0, 0]), rtol=1e-5)
-    assert list(control.gathered["seen"]) == [2, 2, 0]
+    assert torch.allclose(control.accumulated["gradient"], torch.tensor([5e-4, 0, 0]), rtol=1e-5)
+    assert list(control.accumulated["seen"]) == [2, 2, 0]
     parameters["center"][0, 2] = -4.0  # behind the camera
     assert not in_view(parameters, CAMERAS[0], "octahedron")[0]
 
@@ -111,8 +111,8 @@ def test_small_ones_are_cloned_and_large_ones_split():
     # Diameters 0.01 and 0.012 around 0.01 * 1.1.
     parameters["log_extent"] = torch.log(torch.tensor([0.005, 0.006, 0.005, 0.006])).repeat(3, 1).T.clone()
     parameters["raw_opacity"] = torch.full((4,), 2.0)
-    control.gathered["gradient"] = torch.tensor([2e-4, 2e-4, 1e-4, 1e-4]) * 3
-    control.gathered["seen"] = torch.full((4,), 3.0)
+    control.accumulated["gradient"] = torch.tensor([2e-4, 2e-4, 1e-4, 1e-4]) * 3
+    control.accumulated["seen"] = torch.full((4,), 3.0)
     event = control.grow(parameters, 750)
     assert list(event.source) == [0, 2, 3, 0, 1, 1] and list(event.reset_state) == [3, 4, 5]
     extent = np.exp(after(event, parameters, "log_extent"))
@@ -129,7 +129,7 @@ def test_small_ones_are_cloned_and_large_ones_split():
 def test_gaussians_are_copied_as_they_are():
     control, parameters = classic(2, "gaussian"), table(2, "gaussian")
     parameters["log_extent"][:] = math.log(0.005)
-    control.gathered = {"gradient": torch.tensor([3e-4, 3e-4]), "seen": torch.ones(2)}
+    control.accumulated = {"gradient": torch.tensor([3e-4, 3e-4]), "seen": torch.ones(2)}
     event = control.grow(parameters, 600)
     assert list(event.source) == [0, 1, 0, 1] and "raw_opacity" not in event.values
 
@@ -142,7 +142,7 @@ def test_halves_are_spread_like_the_parent(kind):
     parameters["rotation"][:] = torch.tensor([math.sqrt(0.5), math.sqrt(0.5), 0, 0])
     size = torch.tensor([0.3, 0.2, 0.1]) if kind != "tetrahedron" else torch.full((4,), 0.2)
     parameters["log_extent"] = torch.log(size).repeat(count, 1)
-    control.gathered = {"gradient": torch.ones(count), "seen": torch.ones(count)}
+    control.accumulated = {"gradient": torch.ones(count), "seen": torch.ones(count)}
     event = control.grow(parameters, 1000)
     assert len(event.source) == 2 * count
     # A quarter turn about x takes y to z. Standard deviations of 8000 draws are good to 1 / sqrt(16000) = 0.8 %.
@@ -188,11 +188,11 @@ def test_a_reset_leaves_nothing_below_the_prune_level(kind):
 def test_the_limit_on_the_population_takes_what_pulls_hardest():
     control, parameters = classic(10, max_primitives=12), table(10)
     parameters["raw_opacity"][:] = 1.0
-    control.gathered = {"gradient": torch.arange(10.0), "seen": torch.ones(10)}
+    control.accumulated = {"gradient": torch.arange(10.0), "seen": torch.ones(10)}
     event = control.grow(parameters, 1000)
     assert len(event.source) == 12 and set(event.source[event.reset_state]) == {8, 9}
     full = classic(10, max_primitives=10)
-    full.gathered = control.gathered
+    full.accumulated = control.accumulated
     assert list(full.grow(parameters, 1000).source) == list(range(10))
 
 
@@ -322,7 +322,7 @@ def test_an_event_depends_on_the_seed_and_the_step_alone(make, kind):
     def event(step, seed=0):
         control = make(50, kind, seed=seed)
         for name in control.NAMES:
-            control.gathered[name] += 1
+            control.accumulated[name] += 1
         return control.grow(parameters, step)
 
     first, again, later, other = event(1000), event(1000), event(2000), event(1000, 1)

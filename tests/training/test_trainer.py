@@ -60,7 +60,7 @@ def test_what_crosses_the_near_plane_is_trained_and_pulls(trainer, adam):
     before = {name: trainer.parameters[name][row].clone() for name in names}
     trainer.advance()
     assert all(not torch.equal(trainer.parameters[name][row], before[name]) for name in names)
-    assert trainer.control.gathered["pull"][row] > 0
+    assert trainer.control.accumulated["screen_gradient"][row] > 0
     if adam == "sparse":
         assert trainer.steps[row] == 1 and trainer.steps[8] == 0
 
@@ -104,8 +104,8 @@ def test_a_child_has_its_parents_state_but_no_momentum(trainer):
     for row in range(40, len(trainer)):
         assert (dc == trainer.parameters["sh_dc"][row]).all((1, 2)).any()
         assert (trainer.first["center"][row] == 0).all()
-    pull = trainer.control.gathered["pull"]
-    assert len(pull) == len(trainer) and pull.max() == 0
+    screen_gradient = trainer.control.accumulated["screen_gradient"]
+    assert len(screen_gradient) == len(trainer) and screen_gradient.max() == 0
     for table in (trainer.parameters, trainer.first, trainer.second):
         assert all(len(value) == len(trainer) for value in table.values())
 

@@ -181,7 +181,7 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
         raise LinprimError(f"{scene.root}: no camera sees a point of the scene, so no block can be made")
     blocks = split_space(points[used], work[used], count)
     margin = margin_of(blocks, points[used])
-    seen_by, pixels, within = _shown(blocks, looks(), margin, factor)
+    seen_by, pixels, within = _visible_points(blocks, looks(), margin, factor)
     options = opened.train_options
     # Where the coarse scene has grown primitives the whole would, too, and none larger.
     grown = coarse.training_primitives().center
@@ -224,7 +224,7 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
     ).to_json()
 
 
-def _shown(
+def _visible_points(
     blocks: Sequence[Block], looks: Iterable[tuple[View, Camera, np.ndarray]], margin: float, factor: int
 ) -> tuple[list[list[int]], list[int], np.ndarray]:
     """The views that show each block, the pixels of its windows in them, and (2, B) how much of the coarse scene they

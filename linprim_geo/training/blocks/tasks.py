@@ -113,7 +113,7 @@ def _centers(state: dict) -> np.ndarray:
 
 
 # What a checkpoint holds for every primitive, in tables by name and as tensors.
-_TABLES, _TENSORS = ("parameters", "first", "second", "gathered"), ("steps", "filter_3d")
+_TABLES, _TENSORS = ("parameters", "first", "second", "accumulated"), ("steps", "filter_3d")
 
 
 def _rows(state: dict, keep: np.ndarray) -> dict:

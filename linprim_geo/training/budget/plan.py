@@ -24,7 +24,7 @@ SAVE_SECONDS = 0.3
 @dataclass(frozen=True)
 class StepCost:
     """Seconds of one training step: `base` + `per_primitive` times the number of primitives; `late` times that in the
-    share `late_share` of the run that has more terms or a dearer order."""
+    share `late_share` of the run that has more terms or a more expensive order."""
 
     base: float
     per_primitive: float

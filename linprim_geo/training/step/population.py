@@ -1,8 +1,8 @@
-"""How the number of primitives grows: where the image pulls hardest on a primitive, it is cut in two.
+"""How the number of primitives grows: the primitives with the largest screen-space gradient are cut in two.
 
-Parents are drawn in proportion to the screen-space gradient gathered since the last event. Primitives that have become
-transparent or have shrunk to nothing are not deleted but become the second half of another parent. The rules of the
-papers that this is compared with are in population_papers.py; what they all have in common is `DensityControl`.
+Parents are drawn in proportion to the screen-space gradient accumulated since the last event. Primitives that have
+become transparent or have shrunk to nothing are not deleted but become the second half of another parent. The rules of
+the papers that this is compared with are in population_papers.py; what they all have in common is `DensityControl`.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Event:
 class DensityControl:
     """A rule of growth. Whatever it draws comes from (seed, purpose, step), so that a resumed run repeats itself.
 
-    `gathered` holds a value per primitive for each name in `NAMES`; the trainer saves it and sets it to 0 after each
+    `accumulated` holds a value per primitive for each name in `NAMES`; the trainer saves it and sets it to 0 after each
     event.
     """
 
@@ -99,8 +99,8 @@ class DensityControl:
         self.reset(count)
 
     def reset(self, count: int) -> None:
-        """Forgets what was gathered; there are `count` primitives now."""
-        self.gathered = {name: torch.zeros(count) for name in self.NAMES}
+        """Forgets what was accumulated; there are `count` primitives now."""
+        self.accumulated = {name: torch.zeros(count) for name in self.NAMES}
 
     def rng(self, purpose: int, step: int) -> np.random.Generator:
         """The generator of this purpose at this step."""
@@ -147,7 +147,7 @@ class DensityControl:
 class GradientControl(DensityControl):
     """This file's rule: `grow` at the steps of a plan."""
 
-    NAMES = ("pull",)
+    NAMES = ("screen_gradient",)
     GROWS_UNTIL = GROWS_UNTIL
 
     def __init__(self, options, count, cameras, bounds):
@@ -163,8 +163,8 @@ class GradientControl(DensityControl):
             )
 
     def accumulate(self, parameters, camera, size, screen_grad):
-        # In units of the image's size, so that views of different resolution pull alike.
-        self.gathered["pull"] += screen_grad[:, 2] * max(size)
+        # In units of the image's size, so that views of different resolution count alike.
+        self.accumulated["screen_gradient"] += screen_grad[:, 2] * max(size)
 
     def is_due(self, step):
         return self.growth.is_due(step)
@@ -172,14 +172,14 @@ class GradientControl(DensityControl):
     def grow(self, parameters, step):
         parents, children, halves = grow(
             parameters,
-            self.gathered["pull"],
+            self.accumulated["screen_gradient"],
             self.growth,
             math.log(self.bounds[0]),
             self.rng(5, step),
             self.kind,
             None if self.counts is None else int(self.counts(parameters["center"].detach().numpy()).sum()),
         )
-        count = len(self.gathered["pull"])
+        count = len(self.accumulated["screen_gradient"])
         source = np.arange(max(count, int(children.max(initial=-1)) + 1))
         source[children] = parents
         rows = np.concatenate([parents, children])
@@ -197,7 +197,7 @@ class GradientControl(DensityControl):
 
 def grow(
     parameters: Parameters,
-    pull: torch.Tensor,
+    screen_gradient: torch.Tensor,
     growth: Growth,
     smallest_log_extent: float,
     rng: np.random.Generator,
@@ -209,7 +209,7 @@ def grow(
     Args:
         parameters: raw trainable tensors, `center` (N, 3), `rotation` (N, 4), `log_extent` (N, 3 or 4), `raw_opacity`
             (N,), ...
-        pull: (N,) screen-space gradient gathered since the last event, >= 0.
+        screen_gradient: (N,) screen-space gradient accumulated since the last event, >= 0.
         smallest_log_extent: a primitive with an extent at this floor counts as dead.
         counted: primitives that count towards the cap; default: all.
 
@@ -220,7 +220,7 @@ def grow(
     log_extent = parameters["log_extent"].detach().numpy().astype(np.float64)
     opacity = 1 - np.exp(-np.logaddexp(0.0, parameters["raw_opacity"].detach().numpy().astype(np.float64)))
     count = len(opacity)
-    weight = pull.detach().numpy().astype(np.float64).copy()
+    weight = screen_gradient.detach().numpy().astype(np.float64).copy()
     dead = (opacity < DEAD_OPACITY) | (log_extent.min(1) <= smallest_log_extent + 1e-6)
     weight[dead] = 0
     candidates = int((weight > 0).sum())

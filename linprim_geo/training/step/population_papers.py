@@ -82,9 +82,9 @@ class ClassicControl(DensityControl):
     def accumulate(self, parameters, camera, size, screen_grad):
         half = torch.tensor([size[0] / 2, size[1] / 2])
         seen = in_view(parameters, camera, self.kind)
-        pull = torch.linalg.vector_norm(screen_grad[:, :2] * half, dim=1)
-        self.gathered["gradient"] += torch.where(seen, pull, 0.0)
-        self.gathered["seen"] += seen
+        screen_gradient = torch.linalg.vector_norm(screen_grad[:, :2] * half, dim=1)
+        self.accumulated["gradient"] += torch.where(seen, screen_gradient, 0.0)
+        self.accumulated["seen"] += seen
 
     def is_due(self, step):
         grows = step > self.first and step % self.every == 0
@@ -105,12 +105,12 @@ class ClassicControl(DensityControl):
                 alive &= size <= constants.largest * self.radius
             if not alive.any():
                 alive[np.argmax(opacity)] = True
-            pull, seen = (self.gathered[name].numpy().astype(np.float64) for name in self.NAMES)
-            pull = np.where(alive, pull / np.maximum(seen, 1), 0)
-            hot = np.flatnonzero(pull >= constants.threshold)
-            # The limit on the population is ours: what pulls hardest goes first.
+            screen_gradient, seen = (self.accumulated[name].numpy().astype(np.float64) for name in self.NAMES)
+            screen_gradient = np.where(alive, screen_gradient / np.maximum(seen, 1), 0)
+            hot = np.flatnonzero(screen_gradient >= constants.threshold)
+            # The limit on the population is ours: the largest gradients go first.
             room = max(0, self.options.max_primitives - int(alive.sum()))
-            hot = np.sort(hot[np.argsort(-pull[hot], kind="stable")[:room]])
+            hot = np.sort(hot[np.argsort(-screen_gradient[hot], kind="stable")[:room]])
             is_small = size[hot] <= constants.small * self.radius
             clone, split = hot[is_small], hot[~is_small]
             alive[split] = False

@@ -1,4 +1,5 @@
-"""One training step and the state it changes: raw parameters, Adam's moments, the 3D filter, what growth has gathered.
+"""One training step and the state it changes: raw parameters, Adam's moments, the 3D filter, what density control has
+accumulated.
 
 Whatever is random is drawn from a generator seeded by (seed, purpose, step), so the state needs no generator and a
 resumed run repeats the interrupted one bit for bit.
@@ -411,7 +412,7 @@ class Trainer:
             "parameters": self.parameters,
             "first": self.first,
             "second": self.second,
-            "gathered": self.control.gathered,
+            "accumulated": self.control.accumulated,
             "filter_3d": self.filter_3d,
             "steps": self.steps,
             "step": self.step,
@@ -431,9 +432,9 @@ class Trainer:
         if self.exposure is not None:
             self.exposure.restore(state["exposure"])
         self.step, self.steps, self.filter_3d = int(state["step"]), state["steps"], state["filter_3d"]
-        if set(state["gathered"]) != set(self.control.NAMES):
-            raise ValueError(f"gathered has {sorted(state['gathered'])}, wanted {sorted(self.control.NAMES)}")
-        self.control.gathered = dict(state["gathered"])
+        if set(state["accumulated"]) != set(self.control.NAMES):
+            raise ValueError(f"accumulated has {sorted(state['accumulated'])}, wanted {sorted(self.control.NAMES)}")
+        self.control.accumulated = dict(state["accumulated"])
         self.control.restore(state["control"])
         self.bounds = (float(state["bounds"][0]), float(state["bounds"][1]))
         self.control.bounds = self.bounds
