@@ -73,11 +73,10 @@ def check_score_options(options: ScoreOptions) -> None:
 class TradeoffOptions:
     """What a sweep measures, and at which size."""
 
-    knobs: tuple[str, ...] = option((), "knobs to sweep; a wrong name lists them (default all)", metavar="NAME")
+    parameters: tuple[str, ...] = option((), "what to sweep; a wrong name lists all (default all)", metavar="NAME")
     run: str | os.PathLike | None = option(
         None,
-        "run of this scene that knobs of rendering, extraction and evaluation are measured on (default: trains one of "
-        "modest size)",
+        "run of this scene to measure rendering, extraction and evaluation on (default: trains one of modest size)",
         metavar="RUN",
     )
     reference: str | os.PathLike | None = option(

@@ -104,11 +104,11 @@ def median_spread(values: list[float]) -> dict[str, float]:
 
 
 def measure(
-    count: int, threads: int, runs: int, geometry: bool, rung: dict[str, str], width: int = 800, height: int = 600
+    count: int, threads: int, runs: int, geometry: bool, variant: dict[str, str], width: int = 800, height: int = 600
 ) -> dict:
     """Alternates forward, backward, loss, optimiser and the machine's limits `runs` times after two warm-ups.
 
-    `rung` holds the keywords primitive, ray_model and order of `ops.rasterize`.
+    `variant` holds the keywords primitive, ray_model and order of `ops.rasterize`.
     """
     import torch
 
@@ -118,7 +118,7 @@ def measure(
 
     torch.set_num_threads(threads)
     ops.set_threads(threads)
-    parameters = [torch.from_numpy(v).requires_grad_() for v in as_kind(room(count), rung["primitive"]).values()]
+    parameters = [torch.from_numpy(v).requires_grad_() for v in as_kind(room(count), variant["primitive"]).values()]
     background = torch.zeros(3, requires_grad=True)
     moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in parameters]
     camera = Camera(width, height, 0.75 * width, 0.75 * width, width / 2, height / 2, np.eye(4))
@@ -132,7 +132,7 @@ def measure(
     stats = {}
     for run in range(runs + 2):
         marks = [time.perf_counter()]
-        out = ops.rasterize(*parameters, background, camera, geometry=geometry, **rung)
+        out = ops.rasterize(*parameters, background, camera, geometry=geometry, **variant)
         marks.append(time.perf_counter())
         loss = ops.photometric_loss(out.rgb, target)[0]
         marks.append(time.perf_counter())
@@ -160,7 +160,7 @@ def measure(
     hits = stats["hit_lanes"]
     limit = {name: median_spread(values) for name, values in limits.items()}
     return {
-        **rung,
+        **variant,
         "primitives": count,
         "threads": threads,
         "instruction_set": ops.instruction_set(),
@@ -202,8 +202,8 @@ def main() -> None:
     from linprim_geo.kernels import ops
 
     ops.set_instruction_set(args.instruction_set)
-    rung = {"primitive": args.primitive, "ray_model": args.ray_model, "order": args.order}
-    results = [measure(n, args.threads, args.runs, args.geometry, rung) for n in args.primitives]
+    variant = {"primitive": args.primitive, "ray_model": args.ray_model, "order": args.order}
+    results = [measure(n, args.threads, args.runs, args.geometry, variant) for n in args.primitives]
     if args.json:
         print(json.dumps(results[0] if len(results) == 1 else results, indent=2))
         return

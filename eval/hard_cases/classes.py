@@ -2,7 +2,7 @@
 
 A scene is a camera with a window of a few pixels and one or a few primitives; one of its rays is aimed at a point
 inside the first primitive, and the densities are chosen so that this ray neither misses nor is opaque, unless that is
-the point of the class. Everything is rounded to float32 values, held in float64, so that every rung of the accuracy
+the point of the class. Everything is rounded to float32 values, held in float64, so that every variant of the accuracy
 ladder and the reference (`linprim_geo.eval.hard_cases.many_scenes`) see the same numbers.
 """
 

@@ -1,4 +1,4 @@
-"""A float64 reference for thousands of tiny scenes at once, with the rounding that a rung may add to each ray.
+"""A float64 reference for thousands of tiny scenes at once, with the rounding that a variant may add to each ray.
 
 The same model as `linprim_geo.kernels.reference.rasterize`, which takes one scene at a time: there, frames at the
 primitive and a walk over primitives; here, planes in camera space, tables over (scene, ray, primitive, face), and

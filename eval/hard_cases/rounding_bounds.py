@@ -1,4 +1,4 @@
-"""How far the arithmetic of a rung may be off, for the scenes of `many_scenes`: images, depths and gradients."""
+"""How far the arithmetic of a variant may be off, for the scenes of `many_scenes`: images, depths and gradients."""
 
 from __future__ import annotations
 

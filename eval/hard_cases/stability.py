@@ -1,7 +1,7 @@
 """How far the compiled rasterizer is from float64 truth on hard cases: `python -m linprim_geo.eval.hard_cases.stability
 [--json]`.
 
-Every class of `linprim_geo.eval.hard_cases.classes` is rendered and differentiated on every rung (primitive, ray model,
+Every class of `classes.py` is rendered and differentiated on every variant of the kernels (primitive, ray model,
 order, scalar) that the core has and compared with `linprim_geo.eval.hard_cases.many_scenes`. A forward case is one ray
 of one scene; a gradient case is one scene's gradient of a random weighting of its rgb and opacity. What must hold, else
 the exit status is 1:
@@ -40,57 +40,27 @@ from torch import Tensor
 from linprim_geo.eval.hard_cases import classes as hard_cases
 from linprim_geo.eval.hard_cases import many_scenes, rounding_bounds
 from linprim_geo.eval.hard_cases.class_scenes import WINDOW
+from linprim_geo.eval.hard_cases.compiled import SCALARS, Variant, run_core, variants
 from linprim_geo.eval.hard_cases.many_scenes import PARAMETERS, Scenes
 from linprim_geo.kernels import ops
 
-SCALARS = {"float32": torch.float32, "float64": torch.float64}
 BOUND = 1.0  # times the rounding of `rounding_bounds.rounding`
 CLOSE, SHARE_CLOSE = 1e-3, 0.999
 # Roundings, in eps, of a gradient's sum over 16 pixels and of the colour and exponential in it; each primitive adds one
 # to the light that is left, the light behind it, their product and the exponential.
 RESOLUTION, RESOLUTION_EACH = 16, 4
 FACES_TIED = 4  # faces that meet in a vertex of an octahedron
-GEOMETRY_EVERY = 4  # scenes of which the gradients of all geometric images are looked through for NaN, one in so many
 TABLE = 2_000_000  # (scene, ray, primitive, face) that the reference holds at once
-
-
-@dataclass(frozen=True)
-class Rung:
-    """One rung of the accuracy ladder."""
-
-    primitive: str
-    ray_model: str
-    order: str
-    scalar: str
-
-    @property
-    def name(self) -> str:
-        """ray model-order-scalar."""
-        return f"{self.ray_model}-{self.order}-{self.scalar}"
-
-    @property
-    def eps(self) -> float:
-        """Distance from 1 to the next number."""
-        return torch.finfo(SCALARS[self.scalar]).eps
-
-
-def rungs(scalars: Sequence[str] = tuple(SCALARS)) -> list[Rung]:
-    """What the core can do; a Gaussian's two ray models are one."""
-    return [
-        Rung(*rung)
-        for rung in itertools.product(ops.KINDS, ops.RAY_MODELS, ops.ORDERS, scalars)
-        if ops.has_kernels(*rung[:3]) and rung[:2] != ("gaussian", "exact")
-    ]
 
 
 @dataclass
 class Figures:
-    """What one class gave on one rung. `forward` is |rgb - reference| over the scene's largest reference value, or of
-    opacity."""
+    """What one class gave on one variant. `forward` is |rgb - reference| over the scene's largest reference value, or
+    of opacity."""
 
     name: str
     primitive: str
-    rung: str
+    variant: str
     cases: int = 0
     gradient_cases: int = 0
     nonfinite: int = 0
@@ -121,56 +91,6 @@ class Figures:
         if not self.gradient <= 1.0:
             found.append(f"a gradient off by {self.gradient:.3g} of its magnitude (scene {self.worst_gradient_scene})")
         return found
-
-
-def _finite(tensors: Sequence[Tensor]) -> bool:
-    return bool(np.isfinite(np.concatenate([t.numpy().ravel() for t in tensors])).all())
-
-
-def run_core(
-    scenes: Scenes, rung: Rung, weights: Tensor, gradients: int
-) -> tuple[Tensor, Tensor, list[Tensor], Tensor]:
-    """Renders every scene by itself and differentiates the first `gradients`.
-
-    Returns:
-        rgb (B, 3, R), opacity (B, R), gradients to PARAMETERS (each `gradients` rows), all float64, and (B,) bool:
-        everything finite.
-    """
-    dtype = SCALARS[rung.scalar]
-    tensors = [getattr(scenes, name).to(dtype) for name in PARAMETERS]
-    background = torch.zeros(3, dtype=dtype)
-    cotangent = weights.to(dtype).reshape(len(scenes), 4, scenes.height, scenes.width)
-    focal, middle, near = scenes.focal.tolist(), scenes.middle.tolist(), scenes.near.tolist()
-    kinds = [
-        ops.KINDS.index(rung.primitive),
-        ops.RAY_MODELS.index(rung.ray_model),
-        ops.ORDERS.index(rung.order),
-    ]
-    rgb, opacity, grads, finite = [], [], [], []
-    with torch.no_grad():
-        for i in range(len(scenes)):
-            inputs, geometry = [*(t[i] for t in tensors), background], int(i % 2 == 0)
-            numbers, choices = (
-                [*focal[i], *middle[i], near[i], 0.0, 0.5, 0.0],
-                [scenes.width, scenes.height, *kinds, geometry],
-            )
-            out = torch.ops.linprim_geo.rasterize(*inputs, None, scenes.pose[i], numbers, choices)
-            *planes, color, _, _ = out
-            good = _finite(planes)
-            rgb.append(planes[0].flatten(1).clone()), opacity.append(planes[1].flatten().clone())
-            if i < gradients:
-                given = [cotangent[i, :3], cotangent[i, 3], *[None] * 6]
-                adjoint = torch.ops.linprim_geo.rasterize_grad
-                got = adjoint(*inputs, scenes.pose[i], numbers, choices, color, planes, given)
-                good &= _finite(got)
-                grads.append([g.double() for g in got[:5]])
-                if i % GEOMETRY_EVERY == 0:
-                    given = [torch.linspace(-1, 1, p.numel(), dtype=dtype).view_as(p) for p in planes[:8]]
-                    got = adjoint(*inputs, scenes.pose[i], numbers, choices, color, planes, given)
-                    good &= _finite(got)
-            finite.append(good)
-    columns = [torch.stack(c) for c in zip(*grads, strict=True)] if grads else []
-    return torch.stack(rgb).double(), torch.stack(opacity).double(), columns, torch.tensor(finite)
 
 
 @dataclass(frozen=True)
@@ -276,11 +196,11 @@ def gradient_rounding(
     ]
 
 
-def judge(name: str, rung: Rung, scenes: Scenes, truth: Truth, weights: Tensor, gradients: int) -> Figures:
+def judge(name: str, variant: Variant, scenes: Scenes, truth: Truth, weights: Tensor, gradients: int) -> Figures:
     """Runs the core on the scenes and compares."""
     what = hard_cases.CLASSES[name]
-    rgb, opacity, grads, finite = run_core(scenes, rung, weights, gradients)
-    figures = Figures(name, rung.primitive, rung.name, cases=opacity.numel(), gradient_cases=gradients)
+    rgb, opacity, grads, finite = run_core(scenes, variant, weights, gradients)
+    figures = Figures(name, variant.primitive, variant.name, cases=opacity.numel(), gradient_cases=gradients)
     figures.nonfinite = int((~finite).sum())
     figures.outside = int(((opacity < 0) | (opacity > 1)).any(1).sum())
     if not what.value:
@@ -288,24 +208,24 @@ def judge(name: str, rung: Rung, scenes: Scenes, truth: Truth, weights: Tensor, 
     clear = ~truth.doubtful
     color_off = (rgb - truth.rgb).abs().amax(1) * clear
     opacity_off = (opacity - truth.opacity).abs() * clear
-    overlap = rung.order == "overlap"
+    overlap = variant.order == "overlap"
     off = torch.cat(
-        [rounding_bounds.rounding(scenes.rows(p), _rows(truth.found, p), rung.eps, overlap) for p in _chunks(scenes)]
+        [rounding_bounds.rounding(scenes.rows(p), _rows(truth.found, p), variant.eps, overlap) for p in _chunks(scenes)]
     )
     brightest = torch.relu(many_scenes.C0 * scenes.sh + 0.5).flatten(1).amax(1)[:, None]
     alpha = -torch.expm1(-truth.found.tau).sum(-1)
     # Each of M factors exp(-tau) is good to 3e-7 = 2.5 eps in single precision.
-    allowed = off.sum(-1) + 4 * rung.eps * off.shape[2] * alpha
+    allowed = off.sum(-1) + 4 * variant.eps * off.shape[2] * alpha
     if overlap and off.shape[2] > 1:
         # An end that is off by d also lets each primitive absorb over d more of the others' light.
         found = truth.found
         length = torch.where(found.hit, found.t_out - found.t_in, torch.ones_like(found.tau))
-        ends = 4 * rung.eps * (found.t_in.abs() + found.t_out.abs()).sum(-1, keepdim=True)
+        ends = 4 * variant.eps * (found.t_in.abs() + found.t_out.abs()).sum(-1, keepdim=True)
         allowed = allowed - torch.expm1(-found.tau / length.clamp(min=1e-30) * ends).sum(-1)
     # A colour is a sum of two terms, each rounded; a dark one is their difference.
     terms = (many_scenes.C0 * scenes.sh.abs() + 0.5).flatten(1).amax(1)[:, None]
-    color_bound = brightest * (2 * allowed + 16 * rung.eps * alpha) + 2 * rung.eps * terms * alpha + 1e-30
-    opacity_bound = allowed + 4 * rung.eps * off.shape[2]
+    color_bound = brightest * (2 * allowed + 16 * variant.eps * alpha) + 2 * variant.eps * terms * alpha + 1e-30
+    opacity_bound = allowed + 4 * variant.eps * off.shape[2]
     ratio = torch.maximum(color_off / color_bound, opacity_off / opacity_bound).nan_to_num(math.inf).amax(1)
     # Where a scene is nothing but rounding, relative to that.
     largest = torch.maximum(truth.rgb.flatten(1).amax(1), color_bound.amax(1))
@@ -315,7 +235,7 @@ def judge(name: str, rung: Rung, scenes: Scenes, truth: Truth, weights: Tensor, 
     if gradients:
         some = scenes.rows(slice(0, gradients))
         found = _rows(truth.found, slice(0, gradients))
-        known = gradient_rounding(some, found, off[:gradients], weights[:gradients], truth.contributions, rung.eps)
+        known = gradient_rounding(some, found, off[:gradients], weights[:gradients], truth.contributions, variant.eps)
         errors = [gradient_errors(scenes, grads, choice, known) for choice in truth.gradients]
         errors = torch.stack(errors).amin(0)
         errors = errors.nan_to_num(math.inf, math.inf)
@@ -333,10 +253,10 @@ def _rows(found: many_scenes.Chords, part: slice) -> many_scenes.Chords:
 
 
 def measure(
-    names: Sequence[str], chosen: Sequence[Rung], cases: int = 10_000, gradients: int = 200, seed: int = 0
+    names: Sequence[str], chosen: Sequence[Variant], cases: int = 10_000, gradients: int = 200, seed: int = 0
 ) -> Iterator[Figures]:
-    """Figures of every class on every rung: at least `cases` rays and `gradients` scenes with a gradient on each;
-    `chosen` as `rungs` orders them."""
+    """Figures of every class on every variant: at least `cases` rays and `gradients` scenes with a gradient on each;
+    `chosen` as `variants` orders them."""
     for name in names:
         what = hard_cases.CLASSES[name]
         groups = itertools.groupby(chosen, key=lambda r: (r.primitive, r.ray_model))
@@ -357,19 +277,19 @@ def measure(
             weights = weights * ~doubtful[:, None]
             for order, same in itertools.groupby(group, key=lambda r: r.order):
                 truth = reference(scenes, order, weights, what.ties, gradients if what.value else 0)
-                for rung in same:
-                    yield judge(name, rung, scenes, truth, weights, gradients)
+                for variant in same:
+                    yield judge(name, variant, scenes, truth, weights, gradients)
 
 
 def table(rows: Sequence[Figures]) -> str:
     """The figures as text."""
     lines = [
-        f"{'class':26} {'primitive':12} {'rung':24} {'cases':>7} {'worst':>9} {'of bound':>9}"
+        f"{'class':26} {'primitive':12} {'variant':24} {'cases':>7} {'worst':>9} {'of bound':>9}"
         f" {'gradients':>9} {'resolved':>9} {'<= 1e-3':>9} {'worst':>9} {'NaN':>4}"
     ]
     for r in rows:
         lines.append(
-            f"{r.name:26} {r.primitive:12} {r.rung:24} {r.cases:7} {r.forward:9.1e} {r.over_bound:9.2g}"
+            f"{r.name:26} {r.primitive:12} {r.variant:24} {r.cases:7} {r.forward:9.1e} {r.over_bound:9.2g}"
             f" {r.gradient_cases:9} {100 * r.resolved:8.2f}% {100 * r.close:8.2f}% {r.gradient:9.1e} {r.nonfinite:4}"
         )
     return "\n".join(lines)
@@ -381,7 +301,7 @@ def report(rows: Sequence[Figures], seed: int) -> dict:
         {
             "name": r.name,
             "primitive": r.primitive,
-            "rung": r.rung,
+            "variant": r.variant,
             "cases": r.cases,
             "worst_relative_error": r.forward,
             "nonfinite": r.nonfinite,
@@ -410,14 +330,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         type=int,
         default=10_000,
         metavar="N",
-        help="rays of each class on each rung (default: %(default)s)",
+        help="rays of each class on each variant (default: %(default)s)",
     )
     parser.add_argument(
         "--gradients",
         type=int,
         default=2_000,
         metavar="N",
-        help="scenes of each class and primitive whose gradient is taken, shared by its rungs (default: %(default)s)",
+        help="scenes of each class and primitive whose gradient is taken, for all variants (default: %(default)s)",
     )
     parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
     parser.add_argument(
@@ -437,7 +357,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     if options.cases < 1 or options.gradients < 1:
         parser.error("--cases and --gradients have to be at least 1")
-    chosen = [r for r in rungs(options.scalars) if r.primitive in options.primitives]
+    chosen = [r for r in variants(options.scalars) if r.primitive in options.primitives]
     before, rows, begin = (torch.get_num_threads(), ops.threads()), [], time.monotonic()
     torch.set_num_threads(1), ops.set_threads(1)  # the scenes are tiny
     try:
@@ -461,7 +381,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"{time.monotonic() - begin:.0f} s"
         )
         for row, problem in failed:
-            print(f"FAILED: {row.name}, {row.primitive}, {row.rung}: {problem}")
+            print(f"FAILED: {row.name}, {row.primitive}, {row.variant}: {problem}")
     return int(bool(failed))
 
 

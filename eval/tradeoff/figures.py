@@ -18,8 +18,8 @@ from pathlib import Path
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write, read_json
 from linprim_geo.eval.tradeoff.frontier import frontier
-from linprim_geo.eval.tradeoff.knobs import KNOBS
 from linprim_geo.eval.tradeoff.page import panel
+from linprim_geo.eval.tradeoff.parameters import PARAMETERS
 from linprim_geo.imaging import plots
 
 DARK = {
@@ -32,7 +32,8 @@ DARK = {
     "dim": "#8f99a5",
 }
 STYLE = f"@media (prefers-color-scheme: dark) {{ svg {{ {' '.join(f'--{k}: {v};' for k, v in DARK.items())} }} }}"
-# What a rung is called where several knobs are in one plot; knobs that are not here keep the names of their rungs.
+# What a value is called where several parameters are in one plot; parameters that are not here keep the names of their
+# values.
 NAMES = {
     "rays": "{} rays",
     "order": "{} order",
@@ -45,18 +46,18 @@ NAMES = {
 TWICE = re.compile(r"^2 of the ")
 
 
-def rungs(rows: Sequence[dict], knobs: Sequence[str], error: str) -> list[dict]:
-    """The measured rungs of some knobs for one plot: named, the shared default once, and the frontier of all of them
-    anew."""
+def plotted_values(rows: Sequence[dict], parameters: Sequence[str], error: str) -> list[dict]:
+    """The measured values of some parameters for one plot: named, the shared default once, and the frontier of all of
+    them anew."""
     found, default = [], None
     for row in rows:
-        if row["knob"] not in knobs or row.get(error) is None or row["seconds"] <= 0:
+        if row["parameter"] not in parameters or row.get(error) is None or row["seconds"] <= 0:
             continue
-        if row["default"] and len(knobs) > 1:
-            default = default or row | {"rung": "default"}
+        if row["default"] and len(parameters) > 1:
+            default = default or row | {"value": "default"}
             continue
-        name = NAMES.get(row["knob"], "{}").format(row["rung"]) if len(knobs) > 1 else row["rung"]
-        found.append(row | {"rung": TWICE.sub("twice the ", name)})
+        name = NAMES.get(row["parameter"], "{}").format(row["value"]) if len(parameters) > 1 else row["value"]
+        found.append(row | {"value": TWICE.sub("twice the ", name)})
     found += [default] if default else []
     on = set(frontier([(row["seconds"], row[error]) for row in found]))
     return [row | {"frontier": index in on} for index, row in enumerate(found)]
@@ -66,18 +67,18 @@ def figures(sweep: Path, output: Path) -> list[Path]:
     """Writes both files from the `tradeoff.json` in the folder `sweep` into `output`; returns their paths.
 
     Raises:
-        LinprimError: it cannot be read, or lacks a knob or an error of a panel, as without a reference mesh.
+        LinprimError: it cannot be read, or lacks a parameter or an error of a panel, as without a reference mesh.
     """
     file = sweep / "tradeoff.json"
     results = read_json(file, "what linprim-geo tradeoff has written")
     try:
-        rows = [row for row in results["rows"] if row["knob"] in KNOBS]
+        rows = [row for row in results["rows"] if row["parameter"] in PARAMETERS]
     except (KeyError, TypeError):
-        raise LinprimError(f"{file}: has no rows of knobs, wanted what linprim-geo tradeoff has written") from None
+        raise LinprimError(f"{file}: has no rows of parameters, wanted what linprim-geo tradeoff has written") from None
     ladder, training = ("rays", "order", "scalar"), ("iterations", "primitives", "scale", "views")
     wanted = {
         "tradeoff_ladder.svg": (
-            "Image and depth error of the rungs of rendering over the seconds of a frame",
+            "Image and depth error of the settings of rendering over the seconds of a frame",
             (
                 ("Image error of a frame", ladder, "image_percent"),
                 ("Depth error of a frame", ladder, "depth_percent"),
@@ -94,11 +95,11 @@ def figures(sweep: Path, output: Path) -> list[Path]:
     drawn = {}
     for target, (name, panels) in wanted.items():
         shown = []
-        for title, knobs, error in panels:
-            of_panel = rungs(rows, knobs, error)
+        for title, parameters, error in panels:
+            of_panel = plotted_values(rows, parameters, error)
             if len(of_panel) < 2:
                 raise LinprimError(
-                    f"{file}: has no {error} of {', '.join(knobs)}, wanted a sweep of all knobs on a scene with "
+                    f"{file}: has no {error} of {', '.join(parameters)}, wanted a sweep of all of them on a scene with "
                     "a reference mesh"
                 )
             shown.append(panel(of_panel, error, title))

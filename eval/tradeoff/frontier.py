@@ -1,22 +1,21 @@
-"""What a sweep of a knob says: the settings that no other beats in both time and error, and whether the dearer ones are
-worth it."""
+"""What a sweep of a parameter says: the settings that no other beats in both time and error, and whether the more
+expensive ones are worth it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
-from linprim_geo.eval.tradeoff.knobs import ERRORS, Knob
+from linprim_geo.eval.tradeoff.parameters import ERRORS, Parameter
 
-# The rule of the verdict. A dearer rung is worth its time if error ~ time^-r with r at least this: what averaging
-# independent samples gives, which is always there as another way to spend time. Less error than this share is none.
+# The rule of the verdict. A more expensive value is worth its time if error ~ time^-r with r at least this: what
+# averaging independent samples gives, which is always there as another way to spend time. Less error than this share is
+# none.
 RETURN, LEAST_GAIN = 0.5, 0.01
 RULE = (
-    "A dearer rung is worth it if it divides the error by at least the root of what it multiplies the time by, "
-    "as averaging "
-    "independent samples would, and removes at least 1 % of it. Rungs are looked at from the fastest on, along "
-    "the frontier. Where "
-    "the middle halves of two timings overlap, they count as equal."
+    "A more expensive value is worth it if it divides the error by at least the root of what it multiplies the time "
+    "by, as averaging independent samples would, and removes at least 1 % of it. Values are looked at from the fastest "
+    "on, along the frontier. Where the middle halves of two timings overlap, they count as equal."
 )
 
 
@@ -31,12 +30,12 @@ def frontier(points: Sequence[tuple[float, float]]) -> list[int]:
     return kept
 
 
-def pays(cheap: dict, dear: dict, error: str) -> bool:
-    """Whether the step from one row to a dearer one follows RULE."""
-    a, b = cheap[error], dear[error]
+def pays(cheap: dict, expensive: dict, error: str) -> bool:
+    """Whether the step from one row to a more expensive one follows RULE."""
+    a, b = cheap[error], expensive[error]
     if not b < (1 - LEAST_GAIN) * a:
         return False
-    ratio = 1.0 if same_time(cheap, dear) else dear["seconds"] / cheap["seconds"]
+    ratio = 1.0 if same_time(cheap, expensive) else expensive["seconds"] / cheap["seconds"]
     return b <= 0 or ratio <= 1 or math.log(a / b) >= RETURN * math.log(ratio)
 
 
@@ -47,15 +46,16 @@ def same_time(one: dict, other: dict) -> bool:
     return one["low"] <= other["high"] and other["low"] <= one["high"]
 
 
-def verdict(knob: Knob, rows: Sequence[dict]) -> dict:
-    """The sentence about a knob from its rows, and `error`, `cheapest`, `taken`, `most_accurate` (names of rungs).
+def verdict(parameter: Parameter, rows: Sequence[dict]) -> dict:
+    """The sentence about a parameter from its rows, and `error`, `cheapest`, `taken`, `most_accurate` (names of
+    values).
 
-    A row has `rung`, `seconds`, `low`, `high`, `rounds`, and the errors; the first of the knob's errors that all rows
-    have decides.
+    A row has `value`, `seconds`, `low`, `high`, `rounds`, and the errors; the first of the parameter's errors that all
+    rows have decides.
     """
     rows = [row for row in rows if math.isfinite(row.get("seconds", math.nan))]
-    known = [name for name in knob.errors if rows and all(math.isfinite(row.get(name, math.nan)) for row in rows)]
-    title = knob.title[0].upper() + knob.title[1:]
+    known = [name for name in parameter.errors if rows and all(math.isfinite(row.get(name, math.nan)) for row in rows)]
+    title = parameter.title[0].upper() + parameter.title[1:]
     if not known or len(rows) < 2:
         return {"sentence": f"{title}: nothing here to judge it by.", "error": None}
     error = known[0]
@@ -74,28 +74,28 @@ def verdict(knob: Knob, rows: Sequence[dict]) -> dict:
         text = f"{title}: {_step(cheapest, best, error)}: not worth it"
     else:
         others = [row for row in rows if row is not cheapest]
-        dearest = max(others, key=lambda row: row["seconds"])
+        most_expensive = max(others, key=lambda row: row["seconds"])
         text = (
-            f"{title}: {cheapest['rung']} is the fastest, and no other removes any of the {what} "
-            f"({dearest['rung']} costs {_times(cheapest, dearest)}): others are not worth it"
+            f"{title}: {cheapest['value']} is the fastest, and no other removes any of the {what} "
+            f"({most_expensive['value']} costs {_times(cheapest, most_expensive)}): others are not worth it"
         )
-    names = {"cheapest": cheapest["rung"], "taken": taken["rung"], "most_accurate": best["rung"]}
+    names = {"cheapest": cheapest["value"], "taken": taken["value"], "most_accurate": best["value"]}
     return {"sentence": text + ".", "error": error, **names}
 
 
-def _step(cheap: dict, dear: dict, error: str, more: bool = False) -> str:
-    a, b = cheap[error], dear[error]
+def _step(cheap: dict, expensive: dict, error: str, more: bool = False) -> str:
+    a, b = cheap[error], expensive[error]
     unit = f" {ERRORS[error].unit}" if ERRORS[error].unit else ""
     less = 100 * (1 - b / a) if a > 0 else 0.0
     share = "over 99" if less > 99 else f"{less:.0f}" if less >= 9.5 else f"{less:.1g}"
     verb = "would cost" if more else "costs"
     return (
-        f"{dear['rung']} {verb} {_times(cheap, dear)} the time of {cheap['rung']} and "
+        f"{expensive['value']} {verb} {_times(cheap, expensive)} the time of {cheap['value']} and "
         f"remove{'' if more else 's'} {share} % of the "
         f"{ERRORS[error].title} ({a:.3g} to {b:.3g}{unit})"
     )
 
 
-def _times(cheap: dict, dear: dict) -> str:
-    text = f"{dear['seconds'] / cheap['seconds']:.2f}x"
-    return text + (" (within the spread of the timings)" if same_time(cheap, dear) else "")
+def _times(cheap: dict, expensive: dict) -> str:
+    text = f"{expensive['seconds'] / cheap['seconds']:.2f}x"
+    return text + (" (within the spread of the timings)" if same_time(cheap, expensive) else "")

@@ -1,4 +1,4 @@
-"""The page of a sweep: one HTML file with a plot and a table per knob; well-formed XML, no script, nothing from
+"""The page of a sweep: one HTML file with a plot and a table per parameter; well-formed XML, no script, nothing from
 elsewhere."""
 
 from __future__ import annotations
@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
-from linprim_geo.eval.tradeoff.knobs import ERRORS, Knob
+from linprim_geo.eval.tradeoff.parameters import ERRORS, Parameter
 from linprim_geo.imaging.plots import Panel, Point, frontiers
 
 STYLE = """
@@ -21,7 +21,7 @@ p.verdict { font-weight: 600; } .small { color: #59636e; font-size: 0.86em; }
 """
 
 
-def page(results: dict, knobs: dict[str, Knob]) -> str:
+def page(results: dict, parameters: dict[str, Parameter]) -> str:
     """The HTML of what tradeoff.json holds."""
     about = results["about"]
     parts = [
@@ -29,21 +29,21 @@ def page(results: dict, knobs: dict[str, Knob]) -> str:
         f"<style>{STYLE}</style></head><body><h1>What accuracy costs in time</h1>",
         f'<p class="small">Scene {escape(about["scene"])}, {about["options"]["iterations"]} steps and '
         f"{about['options']['max_primitives']} "
-        f"primitives where a knob does not say otherwise; {about['rounds']} rounds, load {about['load']:.1f} on "
+        f"primitives where a parameter does not say otherwise; {about['rounds']} rounds, load {about['load']:.1f} on "
         f"{about['cores']} cores. "
         "Times are medians with their quartiles; blue points lie on the frontier, which no other setting beats "
         "in both time and error; a "
         "ring marks the default.</p>",
     ]
-    for name, knob in knobs.items():
-        rows = [row for row in results["rows"] if row["knob"] == name]
-        parts.append(f"<h2>{escape(knob.title[0].upper() + knob.title[1:])}</h2>")
+    for name, parameter in parameters.items():
+        rows = [row for row in results["rows"] if row["parameter"] == name]
+        parts.append(f"<h2>{escape(parameter.title[0].upper() + parameter.title[1:])}</h2>")
         error = results["verdicts"][name]["error"]
         parts.append('<div class="pair">')
         if error:
             drawn = panel(rows, error)
             parts.append(frontiers([drawn], f"{drawn.y_label} over seconds"))
-        parts.append(table(rows, knob) + "</div>")
+        parts.append(table(rows, parameter) + "</div>")
         parts.append(f'<p class="verdict">{escape(results["sentences"][name])}</p>')
     parts.append("<h2>In short</h2><ul>")
     parts += [f"<li>{escape(sentence)}</li>" for sentence in results["sentences"].values()]
@@ -51,17 +51,17 @@ def page(results: dict, knobs: dict[str, Knob]) -> str:
     return "\n".join(parts)
 
 
-def table(rows: Sequence[dict], knob: Knob) -> str:
-    """The rows of one knob."""
-    errors = [name for name in knob.errors if any(row.get(name) is not None for row in rows)]
+def table(rows: Sequence[dict], parameter: Parameter) -> str:
+    """The rows of one parameter."""
+    errors = [name for name in parameter.errors if any(row.get(name) is not None for row in rows)]
     gradient = any(row.get("gradient_seconds") is not None for row in rows)
-    head = ["rung", "seconds", "quartiles", *(["with gradient"] if gradient else []), "peak GiB"]
+    head = ["value", "seconds", "quartiles", *(["with gradient"] if gradient else []), "peak GiB"]
     head += [ERRORS[name].title + (f", {ERRORS[name].unit}" if ERRORS[name].unit else "") for name in errors]
     if any(row.get("psnr") is not None for row in rows):
         head.append("PSNR, dB")
     lines = []
     for row in rows:
-        cells = [row["rung"] + (" (default)" if row["default"] else ""), _short(row["seconds"])]
+        cells = [row["value"] + (" (default)" if row["default"] else ""), _short(row["seconds"])]
         cells.append(f"{_short(row['low'])} – {_short(row['high'])}")
         cells += [_short(row.get("gradient_seconds"))] if gradient else []
         cells += [f"{row['peak_gib']:.2f}", *(_short(row.get(name)) for name in errors)]
@@ -75,7 +75,7 @@ def panel(rows: Sequence[dict], error: str, title: str = "") -> Panel:
     """The measured settings of `rows` as points of error over seconds."""
     what = ERRORS[error]
     points = [
-        Point(row["rung"], row["seconds"], row["low"], row["high"], row[error], row["frontier"], row["default"])
+        Point(row["value"], row["seconds"], row["low"], row["high"], row[error], row["frontier"], row["default"])
         for row in rows
         if row.get(error) is not None and row["seconds"] > 0
     ]

@@ -1,5 +1,5 @@
-"""A run drawn under the settings of the knobs of rendering: how long that takes, and how far it is from the integral
-itself."""
+"""A run drawn under the settings of the parameters of rendering: how long that takes, and how far it is from the
+integral itself."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.eval.tradeoff.knobs import RENDER_DEFAULTS, RENDER_REFERENCE
+from linprim_geo.eval.tradeoff.parameters import RENDER_DEFAULTS, RENDER_REFERENCE
 from linprim_geo.runs.run import Run
 
 # A view is drawn so many times in a round, and the shortest counts.
@@ -85,7 +85,7 @@ class RenderedRun:
         return float(np.mean(frame)), float(np.mean(with_gradient))
 
     def errors(self, setting: dict, wanted: set) -> dict[str, float]:
-        """Means over cameras of the errors of knobs.ERRORS that are wanted, image and depth in any case."""
+        """Means over cameras of the errors of parameters.ERRORS that are wanted, image and depth in any case."""
         import torch
 
         truth = self.truth

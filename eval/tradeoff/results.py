@@ -1,4 +1,4 @@
-"""What a sweep has measured as rows, with a verdict for each knob: `tradeoff.csv`, `tradeoff.json` and
+"""What a sweep has measured as rows, with a verdict for each parameter: `tradeoff.csv`, `tradeoff.json` and
 `tradeoff.html`."""
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy as np
 
 from linprim_geo.base.files import atomic_write, write_json
 from linprim_geo.eval.tradeoff.frontier import RULE, frontier, verdict
-from linprim_geo.eval.tradeoff.knobs import ERRORS, Knob, Rung
 from linprim_geo.eval.tradeoff.page import page
+from linprim_geo.eval.tradeoff.parameters import ERRORS, Parameter, Value
 
 COLUMNS = (
-    "knob",
-    "rung",
+    "parameter",
+    "value",
     "default",
     "frontier",
     "seconds",
@@ -35,21 +35,21 @@ COLUMNS = (
 
 
 def write_report(
-    folder: Path, about: dict, knobs: Sequence[Knob], measured: Mapping[str, Sequence[tuple[Rung, dict]]]
+    folder: Path, about: dict, parameters: Sequence[Parameter], measured: Mapping[str, Sequence[tuple[Value, dict]]]
 ) -> dict:
     """Writes the three files into `folder` and returns what the JSON holds.
 
     Args:
         about: what was swept, and how.
-        measured: by the knob's name its rungs and what `tradeoff.Sweep` has stored of each.
+        measured: by the parameter's name its values and what `tradeoff.Sweep` has stored of each.
     """
     rows, verdicts = [], {}
-    for knob in knobs:
-        mine = [_row(knob, rung, entry) for rung, entry in measured[knob.name]]
-        verdicts[knob.name] = verdict(knob, mine)
-        error = verdicts[knob.name]["error"]
-        on = {mine[k]["rung"] for k in frontier([(row["seconds"], row[error]) for row in mine])} if error else set()
-        rows += [row | {"frontier": row["rung"] in on} for row in mine]
+    for parameter in parameters:
+        mine = [_row(parameter, value, entry) for value, entry in measured[parameter.name]]
+        verdicts[parameter.name] = verdict(parameter, mine)
+        error = verdicts[parameter.name]["error"]
+        on = {mine[k]["value"] for k in frontier([(row["seconds"], row[error]) for row in mine])} if error else set()
+        rows += [row | {"frontier": row["value"] in on} for row in mine]
     results = {
         "about": about,
         "rule": RULE,
@@ -68,21 +68,21 @@ def write_report(
                 {name: "" if value is None else value for name, value in row.items()} for row in results["rows"]
             )
     with atomic_write(folder / "tradeoff.html") as temporary:
-        temporary.write_text(page(results, {knob.name: knob for knob in knobs}), encoding="utf-8")
+        temporary.write_text(page(results, {parameter.name: parameter for parameter in parameters}), encoding="utf-8")
     return results
 
 
 def describe(results: dict) -> str:
-    """What `write_report` returns as lines for a person: a sentence per knob, the rule, and the files."""
+    """What `write_report` returns as lines for a person: a sentence per parameter, the rule, and the files."""
     return "\n".join([*results["sentences"].values(), "", results["rule"], "", *results["files"]])
 
 
-def _row(knob: Knob, rung: Rung, entry: dict) -> dict:
+def _row(parameter: Parameter, value: Value, entry: dict) -> dict:
     low, middle, high = np.percentile(entry["times"], [25, 50, 75])
     row = {
-        "knob": knob.name,
-        "rung": rung.name,
-        "default": rung.name == knob.default,
+        "parameter": parameter.name,
+        "value": value.name,
+        "default": value.name == parameter.default,
         "seconds": float(middle),
         "low": float(low),
         "high": float(high),
@@ -91,10 +91,12 @@ def _row(knob: Knob, rung: Rung, entry: dict) -> dict:
     }
     if entry.get("gradient_times"):
         row["gradient_seconds"] = float(np.median(entry["gradient_times"]))
-    found = {name: entry["errors"][name] for name in (*knob.errors, "psnr") if entry["errors"].get(name) is not None}
+    found = {
+        name: entry["errors"][name] for name in (*parameter.errors, "psnr") if entry["errors"].get(name) is not None
+    }
     return (
         row
-        | {name: math.nan for name in knob.errors}
+        | {name: math.nan for name in parameter.errors}
         | found
         | {n: entry[n] for n in ("primitives", "faces") if n in entry}
     )

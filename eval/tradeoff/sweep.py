@@ -1,4 +1,5 @@
-"""What accuracy costs in time on a scene: every knob of `eval/knobs.py` swept one at a time around the defaults.
+"""What accuracy costs in time on a scene: every parameter of `eval/parameters.py` swept one at a time around the
+defaults.
 
 Writes `tradeoff.csv`, `tradeoff.json` and `tradeoff.html`. All settings of a group are timed in turn, round after
 round, so that a noisy machine hurts all alike; a timing is the median of the rounds with its quartiles. What was
@@ -26,13 +27,13 @@ from linprim_geo.base.files import write_json
 from linprim_geo.base.options import SceneOptions, TrainOptions, with_changes
 from linprim_geo.base.progress import Progress
 from linprim_geo.eval.options import TradeoffOptions
-from linprim_geo.eval.tradeoff.knobs import (
-    KNOBS,
-    Knob,
-    Rung,
+from linprim_geo.eval.tradeoff.parameters import (
+    PARAMETERS,
+    Parameter,
+    Value,
+    describe_setting,
     setting_key,
     setting_name,
-    setting_shown,
     settings,
     training_options,
 )
@@ -45,13 +46,13 @@ from linprim_geo.runs.run import Run
 from linprim_geo.training.budget.memory import memory_estimate
 from linprim_geo.training.step.training_images import photo_bytes
 
-# The training that knobs are swept around: a modest size of the defaults, images averaged down to at most so many
+# The training that parameters are swept around: a modest size of the defaults, images averaged down to at most so many
 # pixels across.
 MODEST = {"iterations": 2000, "max_primitives": 2000}
 QUICK = {"iterations": 200, "max_primitives": 200}
 WIDEST, QUICK_WIDEST = 400, 128
 ROUNDS, QUICK_ROUNDS = 3, 2
-# Held-out views that render knobs are measured on.
+# Held-out views that render parameters are measured on.
 RENDERED_VIEWS, QUICK_VIEWS = 8, 2
 
 
@@ -65,29 +66,30 @@ def tradeoff(
     quiet: bool = False,
     **changes: Any,
 ) -> dict:
-    """Sweeps the knobs on a scene and writes the tables and the page into the folder `output`.
+    """Sweeps the parameters on a scene and writes the tables and the page into the folder `output`.
 
     Args:
         options: what is measured. `run` is not changed; without it one is trained with the defaults at the size
-            `MODEST`, or with `quick` at `QUICK`, which is also what training knobs are swept around. `reference` is for
-            Chamfer distances and depth.
+            `MODEST`, or with `quick` at `QUICK`, which is also what training parameters are swept around. `reference`
+            is for Chamfer distances and depth.
         cluster, workers: where and how many trainings at once, see `jobs.open.open_executor`; they share the cores of a
             machine, and are timed so. Neither: here, one after another. Everything else is measured here in any case.
         changes: fields of `options` by name, such as `quick=True`.
 
-    Returns: what tradeoff.json holds: `rows` (one per rung of each knob), `sentences`, `rule`, `about`,
+    Returns: what tradeoff.json holds: `rows` (one per value of each parameter), `sentences`, `rule`, `about`,
         `files`.
 
     Raises:
-        LinprimError: a knob has another name, the scene or the run cannot be used, or the folder holds another sweep.
+        LinprimError: a parameter has another name, the scene or the run cannot be used, or the folder holds another
+        sweep.
     """
     options = with_changes(TradeoffOptions, options, changes)
-    knobs, threads = options.knobs, options.threads
-    unknown = [name for name in knobs if name not in KNOBS]
+    parameters, threads = options.parameters, options.threads
+    unknown = [name for name in parameters if name not in PARAMETERS]
     if unknown:
-        raise LinprimError(f"--knobs {unknown[0]} is unknown, wanted some of {', '.join(KNOBS)}")
+        raise LinprimError(f"--parameters {unknown[0]} is unknown, wanted some of {', '.join(PARAMETERS)}")
     sweep = Sweep(Path(scene), Path(output), options, quiet)
-    chosen = [KNOBS[name] for name in KNOBS if not knobs or name in knobs]
+    chosen = [PARAMETERS[name] for name in PARAMETERS if not parameters or name in parameters]
     if cluster is None and workers is None:
         return sweep.measure(chosen)
     cores, own_machines = usable_cores(), cluster not in (None, "local")
@@ -154,7 +156,7 @@ class Sweep:
 
     # --- what is measured -------------------------------------------------------------------------------
 
-    def measure(self, knobs: Sequence[Knob]) -> dict:
+    def measure(self, parameters: Sequence[Parameter]) -> dict:
         """Measures what is missing, and writes the results."""
         import torch
 
@@ -164,14 +166,14 @@ class Sweep:
         torch.set_num_threads(1)
         ops.set_threads(self.threads)
         try:
-            knobs = [self._fitting(knob) for knob in knobs]
+            parameters = [self._fitting(parameter) for parameter in parameters]
             for group, measure in (
                 ("train", self._train),
                 ("render", self._render),
                 ("extract", self._extract),
                 ("evaluate", self._evaluate),
             ):
-                mine = [knob for knob in knobs if knob.group == group]
+                mine = [parameter for parameter in parameters if parameter.group == group]
                 if group in ("extract", "evaluate") and self.reference is None and mine:
                     self.progress.note(
                         f"no reference mesh, so {', '.join(k.name for k in mine)}: time alone, or nothing"
@@ -181,35 +183,41 @@ class Sweep:
                 self._in_turn(group, mine, measure)
         finally:
             torch.set_num_threads(before)
-        return self._report(knobs)
+        return self._report(parameters)
 
-    def _fitting(self, knob: Knob) -> Knob:
-        """The knob without the rungs that the run, or this installation, does not have."""
+    def _fitting(self, parameter: Parameter) -> Parameter:
+        """The parameter without the values that the run, or this installation, does not have."""
         from linprim_geo.surface.extract import METHODS
 
-        rungs = knob.rungs
-        if knob.name == "degree":
+        values = parameter.values
+        if parameter.name == "degree":
             degree = self.rendered.defaults["degree"]
-            return replace(knob, rungs=tuple(r for r in rungs if r.changes["degree"] <= degree), default=str(degree))
-        if knob.group == "extract":
-            return replace(knob, rungs=tuple(r for r in rungs if r.changes["method"] in METHODS))
-        return knob
+            return replace(
+                parameter,
+                values=tuple(value for value in values if value.changes["degree"] <= degree),
+                default=str(degree),
+            )
+        if parameter.group == "extract":
+            return replace(parameter, values=tuple(value for value in values if value.changes["method"] in METHODS))
+        return parameter
 
-    def _setting(self, knob: Knob, rung: Rung) -> dict:
-        found = settings(knob, rung)
+    def _setting(self, parameter: Parameter, value: Value) -> dict:
+        found = settings(parameter, value)
         return (
             found
-            if knob.group != "render"
-            else found | {"degree": rung.changes.get("degree", self.rendered.defaults["degree"])}
+            if parameter.group != "render"
+            else found | {"degree": value.changes.get("degree", self.rendered.defaults["degree"])}
         )
 
-    def _in_turn(self, group: str, knobs: Sequence[Knob], measure: Callable[[str, dict, set, int], None]) -> None:
+    def _in_turn(
+        self, group: str, parameters: Sequence[Parameter], measure: Callable[[str, dict, set, int], None]
+    ) -> None:
         """Every setting of a group once per round, unless it was measured in that round before."""
         wanted: dict[str, tuple[dict, set]] = {}
-        for knob in knobs:
-            for rung in knob.rungs:
-                setting = self._setting(knob, rung)
-                wanted.setdefault(setting_key(group, setting), (setting, set()))[1].update(knob.errors)
+        for parameter in parameters:
+            for value in parameter.values:
+                setting = self._setting(parameter, value)
+                wanted.setdefault(setting_key(group, setting), (setting, set()))[1].update(parameter.errors)
         for turn in range(self.rounds):
             if group == "train" and self.executor:
                 each = [setting for setting, _ in wanted.values()]
@@ -221,7 +229,7 @@ class Sweep:
                     len(entry["times"]) > turn and errors <= entry["errors"].keys() | {"photo_percent"}
                 ):
                     continue
-                self.progress.note(f"{group}, round {turn + 1} of {self.rounds}: {setting_shown(setting)}")
+                self.progress.note(f"{group}, round {turn + 1} of {self.rounds}: {describe_setting(setting)}")
                 try:
                     measure(key, setting, errors, turn)
                 except LinprimError as error:
@@ -242,14 +250,14 @@ class Sweep:
 
     @cached_property
     def base(self) -> Path:
-        """Folder of the run that render, extraction and evaluation knobs are measured on: a copy of the given one, or
-        the trained base."""
+        """Folder of the run that render, extraction and evaluation parameters are measured on: a copy of the given one,
+        or the trained base."""
         if self.given is None:
             key = setting_key("train", {})
             if not (self.store.get(key, {}).get("errors")):
                 self.store.setdefault(key, {"setting": {}, "times": [], "peak_gib": 0.0, "errors": {}})
                 self.progress.note("training with the defaults")
-                self._train(key, {}, set(KNOBS["primitive"].errors), 0)
+                self._train(key, {}, set(PARAMETERS["primitive"].errors), 0)
                 if self.executor:
                     self.store[key]["times"].clear()  # it was alone; the others share the cores
                 self._save()
@@ -317,7 +325,7 @@ class Sweep:
             square = scene_options.downscale**2
             arguments = {"scene": str(self.scene_path), "scene_options": asdict(scene_options)}
             tasks[key] = Task(
-                setting_shown(setting),
+                describe_setting(setting),
                 "linprim_geo.eval.tradeoff.training:train_task",
                 arguments | {"options": asdict(replace(options, threads=self.cores))},
                 folder / setting_name(setting),
@@ -464,12 +472,13 @@ class Sweep:
 
     # --- results ----------------------------------------------------------------------------------------
 
-    def _report(self, knobs: Sequence[Knob]) -> dict:
-        measured: dict[str, list[tuple[Rung, dict]]] = {}
-        for knob in knobs:
+    def _report(self, parameters: Sequence[Parameter]) -> dict:
+        measured: dict[str, list[tuple[Value, dict]]] = {}
+        for parameter in parameters:
             entries = [
-                (rung, self.store.get(setting_key(knob.group, self._setting(knob, rung)))) for rung in knob.rungs
+                (value, self.store.get(setting_key(parameter.group, self._setting(parameter, value))))
+                for value in parameter.values
             ]
-            measured[knob.name] = [(rung, entry) for rung, entry in entries if entry and entry["times"]]
+            measured[parameter.name] = [(value, entry) for value, entry in entries if entry and entry["times"]]
         about = self.about | {"rounds": self.rounds, "load": os.getloadavg()[0], "cores": usable_cores()}
-        return write_report(self.folder, about, knobs, measured)
+        return write_report(self.folder, about, parameters, measured)

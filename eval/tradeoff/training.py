@@ -14,7 +14,7 @@ from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.capture.types import View
 from linprim_geo.runs.run import Run
 
-# Points of a score that is not the knob itself.
+# Points of a score that is not the parameter itself.
 POINTS = 30_000
 
 

@@ -29,7 +29,7 @@ class VoxelCost:
     @staticmethod
     def fit(passes: Sequence[tuple[float, float]]) -> VoxelCost:
         """Through one or two (voxel size, seconds), from coarse to fine. One alone counts as area in full, which is the
-        dearer guess; so do two of which the finer was not slower."""
+        more expensive guess; so do two of which the finer was not slower."""
         v, t = passes[-1]
         if len(passes) > 1:
             (u, s), (v, t) = passes[-2:]

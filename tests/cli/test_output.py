@@ -78,7 +78,7 @@ REPORTING = {
     "render RUN -o renders": "files",
     "extract-mesh RUN -o m.ply --voxel-size 0.1 --level 0.75": "faces",
     "stereo SCENE -o d --threads 1": "coverage",
-    "tradeoff SCENE -o t --run RUN --knobs rays --quick --rounds 1 --threads 1": "sentences",
+    "tradeoff SCENE -o t --run RUN --parameters rays --quick --rounds 1 --threads 1": "sentences",
 }
 
 

@@ -1,4 +1,4 @@
-"""The hard cases on every rung of the ladder, properties that random scenes must have, and the table's own
+"""The hard cases on every variant of the ladder, properties that random scenes must have, and the table's own
 reference."""
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.eval.hard_cases import many_scenes, rounding_bounds, stability
+from linprim_geo.eval.hard_cases import compiled, many_scenes, rounding_bounds, stability
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels import ops
 from linprim_geo.kernels.reference import rasterize as reference
@@ -26,7 +26,7 @@ LADDER = [
     *itertools.product(("octahedron", "tetrahedron"), ("exact", "affine"), ("center", "entry", "overlap")),
     ("gaussian", "affine", "center"),
 ]
-SOLID = [rung for rung in LADDER if rung[0] != "gaussian"]
+SOLID = [variant for variant in LADDER if variant[0] != "gaussian"]
 DTYPES = [torch.float32, torch.float64]
 
 
@@ -39,25 +39,25 @@ def one_thread():
     ops.set_instruction_set(before[2])
 
 
-def ladder(rungs, dtypes=None):
-    """Parametrises a test over rungs and scalars."""
+def ladder(variants, dtypes=None):
+    """Parametrises a test over variants and scalars."""
     if dtypes is None:
-        return pytest.mark.parametrize("rung", rungs, ids=["-".join(r) for r in rungs])
-    cases = list(itertools.product(rungs, dtypes))
-    return pytest.mark.parametrize("rung,dtype", cases, ids=["-".join((*r, str(d)[6:])) for r, d in cases])
+        return pytest.mark.parametrize("variant", variants, ids=["-".join(r) for r in variants])
+    cases = list(itertools.product(variants, dtypes))
+    return pytest.mark.parametrize("variant,dtype", cases, ids=["-".join((*r, str(d)[6:])) for r, d in cases])
 
 
-def options_of(rung) -> dict:
-    return dict(zip(("primitive", "ray_model", "order"), rung, strict=True))
+def options_of(variant) -> dict:
+    return dict(zip(("primitive", "ray_model", "order"), variant, strict=True))
 
 
-def scene_of(rung, seed, count=8, coefficients=1, **camera):
-    """An ordinary scene of a rung's primitive in float64, and its camera."""
+def scene_of(variant, seed, count=8, coefficients=1, **camera):
+    """An ordinary scene of a variant's primitive in float64, and its camera."""
     parameters, view = random_scene(seed, count, coefficients, **camera)
     rng = np.random.default_rng(seed)
-    if rung[0] == "tetrahedron":
+    if variant[0] == "tetrahedron":
         parameters[2] = torch.from_numpy(rng.uniform(0.2, 1.2, (count, 4)))
-    if rung[0] == "gaussian":
+    if variant[0] == "gaussian":
         parameters[2], parameters[3] = parameters[2] * 0.5, torch.from_numpy(rng.uniform(0.05, 1.0, count))
     return parameters, view
 
@@ -68,11 +68,11 @@ def scene_of(rung, seed, count=8, coefficients=1, **camera):
 @pytest.mark.parametrize("primitive,name", [(p, n) for n, c in CLASSES.items() for p in c.primitives])
 def test_hard_classes_hold(primitive, name):
     # A few of the many cases of `python -m linprim_geo.eval.hard_cases.stability`; each of those is as good.
-    chosen = [r for r in stability.rungs() if r.primitive == primitive]
+    chosen = [r for r in compiled.variants() if r.primitive == primitive]
     count = {"coincident": 4, "denormal axes": 40, "overflowing axes": 40}.get(name, 20)
     rows = list(stability.measure([name], chosen, cases=16 * count, gradients=count // 2, seed=1))
     assert len(rows) == len(chosen) > 0
-    problems = [(row.rung, problem) for row in rows for problem in row.problems()]
+    problems = [(row.variant, problem) for row in rows for problem in row.problems()]
     assert not problems, problems
 
 
@@ -179,7 +179,7 @@ def test_the_command_prints_its_table_as_json(capsys):
     assert status == 0 and {row["name"] for row in document["classes"]} == {"ordinary", "needles"}
     for row in document["classes"]:
         assert row["cases"] >= 32 and row["nonfinite"] == 0 and row["worst_relative_error"] < 0.1
-        assert set(row) >= {"name", "primitive", "rung", "cases", "worst_relative_error", "nonfinite"}
+        assert set(row) >= {"name", "primitive", "variant", "cases", "worst_relative_error", "nonfinite"}
 
 
 def test_the_command_fails_where_a_figure_does(capsys, monkeypatch):
@@ -203,7 +203,7 @@ def test_the_command_fails_where_a_figure_does(capsys, monkeypatch):
     ],
 )
 def test_figures_name_what_does_not_hold(change, word):
-    good = dict(name="ordinary", primitive="octahedron", rung="exact-center-float32", cases=100, gradient_cases=100)
+    good = dict(name="ordinary", primitive="octahedron", variant="exact-center-float32", cases=100, gradient_cases=100)
     assert not stability.Figures(**good).problems()
     (problem,) = stability.Figures(**good, **change).problems()
     assert word in problem
@@ -213,10 +213,10 @@ def test_figures_name_what_does_not_hold(change, word):
 
 
 @ladder(LADDER, DTYPES)
-def test_what_is_not_finite_is_refused_with_its_tensor_and_row(rung, dtype):
-    options = options_of(rung)
+def test_what_is_not_finite_is_refused_with_its_tensor_and_row(variant, dtype):
+    options = options_of(variant)
     for name, bad in itertools.product(NAMES, (math.nan, math.inf, -math.inf)):
-        parameters, view = scene_of(rung, 81, 5, 4)
+        parameters, view = scene_of(variant, 81, 5, 4)
         parameters = [p.to(dtype) for p in parameters]
         tensor = parameters[NAMES.index(name)]
         tensor.view(len(tensor), -1)[2, -1] = bad
@@ -236,11 +236,11 @@ def assert_finite(parameters, view, options) -> bool:
 
 
 @ladder(LADDER, DTYPES)
-def test_no_primitive_and_one_in_images_of_any_shape(rung, dtype):
-    options = options_of(rung)
+def test_no_primitive_and_one_in_images_of_any_shape(variant, dtype):
+    options = options_of(variant)
     for (width, height), count in itertools.product(((1, 1), (1, 5000), (5000, 1)), (0, 1)):
         focal = max(4.0, 0.8 * max(width, height))
-        parameters, view = scene_of(rung, 5, 1, width=width, height=height, depth=2.0, spread=0.05, focal=focal)
+        parameters, view = scene_of(variant, 5, 1, width=width, height=height, depth=2.0, spread=0.05, focal=focal)
         parameters = [p[:count] if i < 5 else p for i, p in enumerate(parameters)]
         assert assert_finite([p.to(dtype) for p in parameters], view, options) == (count == 1)
         if width == height == count == 1:
@@ -261,9 +261,9 @@ def test_no_primitive_and_one_in_images_of_any_shape(rung, dtype):
 
 
 @ladder(LADDER, DTYPES)
-def test_nothing_in_view_leaves_the_background_and_no_gradient(rung, dtype):
-    options = options_of(rung)
-    parameters, view = scene_of(rung, 6, 4)
+def test_nothing_in_view_leaves_the_background_and_no_gradient(variant, dtype):
+    options = options_of(variant)
+    parameters, view = scene_of(variant, 6, 4)
     pose = view.world_to_camera.copy()
     pose[2, 3] -= 100.0  # everything is behind the camera now
     inputs = leaves(parameters, dtype)
@@ -294,7 +294,7 @@ def quaternion_product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return torch.cat([aw * bw - (bv @ av)[:, None], aw * bv + bw * av + torch.linalg.cross(av.expand_as(bv), bv)], 1)
 
 
-def assert_near(rung, got, wanted, units, eps: float, names=IMAGES):
+def assert_near(variant, got, wanted, units, eps: float, names=IMAGES):
     """Images that agree to 400 roundings of their range, but for a ray in a thousand that meets an edge or a tie of
     depths."""
     for name, unit in zip(names, units, strict=True):
@@ -306,9 +306,9 @@ def assert_near(rung, got, wanted, units, eps: float, names=IMAGES):
 @given(seeds, st.floats(-3, 3))
 @PROPERTY
 @ladder(LADDER)
-def test_a_rigid_motion_of_scene_and_camera_changes_nothing(rung, seed, distance):
-    options = options_of(rung)
-    parameters, view = scene_of(rung, seed)
+def test_a_rigid_motion_of_scene_and_camera_changes_nothing(variant, seed, distance):
+    options = options_of(variant)
+    parameters, view = scene_of(variant, seed)
     rng = np.random.default_rng(seed)
     turn, shift = torch.from_numpy(rng.normal(size=4)), 10**distance * rng.normal(size=3)
     turn /= turn.norm()
@@ -321,20 +321,20 @@ def test_a_rigid_motion_of_scene_and_camera_changes_nothing(rung, seed, distance
     pose[:3, 3] -= pose[:3, :3] @ shift
     other = Camera(view.width, view.height, view.fx, view.fy, view.cx, view.cy, pose)
     images = [ops.rasterize(*p, v, geometry=True, stop=0.0, **options) for p, v in ((moved, other), (parameters, view))]
-    assert_near(rung, *images, [1.0] * len(IMAGES), 1e3 * 2.3e-16 * (1 + 10**distance))
+    assert_near(variant, *images, [1.0] * len(IMAGES), 1e3 * 2.3e-16 * (1 + 10**distance))
 
 
 @given(seeds, st.floats(-6, 6))
 @PROPERTY
 @ladder(LADDER, DTYPES)
-def test_a_change_of_unit_changes_nothing(rung, dtype, seed, exponent):
-    options = options_of(rung)
-    parameters, view = scene_of(rung, seed)
+def test_a_change_of_unit_changes_nothing(variant, dtype, seed, exponent):
+    options = options_of(variant)
+    parameters, view = scene_of(variant, seed)
     k = 2.0 ** round(exponent / math.log10(2))  # exact in both scalars
     scaled = [p.clone() for p in parameters]
     scaled[0] *= k
     scaled[2] *= k
-    if rung[0] != "gaussian":
+    if variant[0] != "gaussian":
         scaled[3] /= k
     pose = view.world_to_camera.copy()
     pose[:3, 3] *= k
@@ -343,15 +343,15 @@ def test_a_change_of_unit_changes_nothing(rung, dtype, seed, exponent):
     images = [
         ops.rasterize(*[x.to(dtype) for x in p], v, geometry=True, stop=0.0, near=n, **options) for p, v, n in cases
     ]
-    assert_near(rung, *images, (1, 1, k, k, k, k * k, 1, 1), torch.finfo(dtype).eps)
+    assert_near(variant, *images, (1, 1, k, k, k, k * k, 1, 1), torch.finfo(dtype).eps)
 
 
 @given(seeds)
 @PROPERTY
 @ladder(LADDER, DTYPES)
-def test_the_order_of_the_input_is_irrelevant(rung, dtype, seed):
-    options = options_of(rung)
-    parameters, view = scene_of(rung, seed, 12)
+def test_the_order_of_the_input_is_irrelevant(variant, dtype, seed):
+    options = options_of(variant)
+    parameters, view = scene_of(variant, seed, 12)
     parameters = [p.to(dtype) for p in parameters]
     mixed = torch.from_numpy(np.random.default_rng(seed).permutation(12))
     got, wanted = (
@@ -364,26 +364,26 @@ def test_the_order_of_the_input_is_irrelevant(rung, dtype, seed):
         )
         for index in (mixed, torch.arange(12))
     )
-    if rung[2] == "center":  # no two depths are the same: the same arithmetic
+    if variant[2] == "center":  # no two depths are the same: the same arithmetic
         assert_identical(list(fields(got).values()), list(fields(wanted).values()))
     else:
-        assert_near(rung, got, wanted, [1.0] * len(IMAGES), torch.finfo(dtype).eps)
+        assert_near(variant, got, wanted, [1.0] * len(IMAGES), torch.finfo(dtype).eps)
     torch.testing.assert_close(got.max_weight, wanted.max_weight[mixed], rtol=0, atol=400 * torch.finfo(dtype).eps)
 
 
 @given(seeds)
 @PROPERTY
 @ladder(SOLID, DTYPES)
-def test_coincident_primitives_may_be_swapped_under_overlap(rung, dtype, seed):
-    options = options_of(rung)
-    parameters, view = scene_of(rung, seed, 6)
+def test_coincident_primitives_may_be_swapped_under_overlap(variant, dtype, seed):
+    options = options_of(variant)
+    parameters, view = scene_of(variant, seed, 6)
     for i in (0, 1, 2):
         parameters[i][1:4] = parameters[i][0]
     parameters = [p.to(dtype) for p in parameters]
     swapped = [p[[3, 1, 0, 2, 4, 5]] if i < 5 else p for i, p in enumerate(parameters)]
     images = [ops.rasterize(*p, view, stop=0.0, **options) for p in (parameters, swapped)]
-    if rung[2] == "overlap":
-        assert_near(rung, *images, [1.0] * 2, torch.finfo(dtype).eps, COLOR)
+    if variant[2] == "overlap":
+        assert_near(variant, *images, [1.0] * 2, torch.finfo(dtype).eps, COLOR)
     # The light behind them is the same in any order.
     torch.testing.assert_close(images[0].opacity, images[1].opacity, rtol=0, atol=400 * torch.finfo(dtype).eps)
 
@@ -391,10 +391,10 @@ def test_coincident_primitives_may_be_swapped_under_overlap(rung, dtype, seed):
 @given(seeds, st.integers(2, 200))
 @PROPERTY
 @ladder(SOLID, DTYPES)
-def test_copies_of_a_share_of_the_density_are_the_whole(rung, dtype, seed, copies):
+def test_copies_of_a_share_of_the_density_are_the_whole(variant, dtype, seed, copies):
     # Thicknesses of one chord add, so a primitive of one colour may be cut into copies in every order.
-    options = options_of(rung)
-    parameters, view = scene_of(rung, seed, 1, width=9, height=7, depth=4.0, spread=0.2)
+    options = options_of(variant)
+    parameters, view = scene_of(variant, seed, 1, width=9, height=7, depth=4.0, spread=0.2)
     parameters = [p.to(dtype) for p in parameters]
     split = [p.repeat_interleave(copies, 0) if i < 5 else p for i, p in enumerate(parameters)]
     split[3] = split[3] / copies
@@ -409,14 +409,14 @@ def test_copies_of_a_share_of_the_density_are_the_whole(rung, dtype, seed, copie
 @given(seeds, st.floats(-6, 6), st.sampled_from([0.0, 1e-3, 0.3]))
 @PROPERTY
 @ladder(LADDER, DTYPES)
-def test_opacity_is_a_share_and_grows_with_density(rung, dtype, seed, exponent, stop):
-    options = options_of(rung)
-    parameters, view = scene_of(rung, seed)
+def test_opacity_is_a_share_and_grows_with_density(variant, dtype, seed, exponent, stop):
+    options = options_of(variant)
+    parameters, view = scene_of(variant, seed)
     parameters = [p.to(dtype) for p in parameters]
     thick = 10**exponent
-    parameters[3] = parameters[3] * thick if rung[0] != "gaussian" else parameters[3]
+    parameters[3] = parameters[3] * thick if variant[0] != "gaussian" else parameters[3]
     more = list(parameters)
-    more[3] = (parameters[3] * 1.5).clamp(max=1.0) if rung[0] == "gaussian" else parameters[3] * 1.5
+    more[3] = (parameters[3] * 1.5).clamp(max=1.0) if variant[0] == "gaussian" else parameters[3] * 1.5
     eps = torch.finfo(dtype).eps
     opacity = [ops.rasterize(*p, view, stop=stop, **options).opacity for p in (parameters, more)]
     assert all(0 <= float(image.min()) and float(image.max()) <= 1 for image in opacity)
@@ -427,9 +427,9 @@ def test_opacity_is_a_share_and_grows_with_density(rung, dtype, seed, exponent, 
 @given(seeds, st.sampled_from([2, 3, 5]))
 @settings(PROPERTY, max_examples=3)
 @ladder(LADDER, DTYPES)
-def test_the_number_of_threads_changes_no_bit(rung, dtype, seed, threads):
-    options = options_of(rung)
-    parameters, view = scene_of(rung, seed, 40, width=40, height=35)
+def test_the_number_of_threads_changes_no_bit(variant, dtype, seed, threads):
+    options = options_of(variant)
+    parameters, view = scene_of(variant, seed, 40, width=40, height=35)
     parameters = [p.to(dtype) for p in parameters]
     results = []
     for count in (1, threads):

@@ -1,5 +1,5 @@
-"""The sweep of knobs: every rung sets something that runs, the frontier and the sentences follow their rules, the files
-agree."""
+"""The sweep of parameters: every value sets something that runs, the frontier and the sentences follow their rules, the
+files agree."""
 
 from __future__ import annotations
 
@@ -17,16 +17,24 @@ from helpers.here import Here
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import SceneOptions, TrainOptions, check_train_options
 from linprim_geo.eval.options import TradeoffOptions
-from linprim_geo.eval.tradeoff import knobs, training
 from linprim_geo.eval.tradeoff import page as tradeoff_page
+from linprim_geo.eval.tradeoff import parameters, training
 from linprim_geo.eval.tradeoff import sweep as sweeping
 from linprim_geo.eval.tradeoff.frontier import frontier, pays, verdict
-from linprim_geo.eval.tradeoff.knobs import ERRORS, GROUPS, KNOBS, Knob, Rung, settings, training_options
+from linprim_geo.eval.tradeoff.parameters import (
+    ERRORS,
+    GROUPS,
+    PARAMETERS,
+    Parameter,
+    Value,
+    settings,
+    training_options,
+)
 from linprim_geo.eval.tradeoff.sweep import tradeoff
 from linprim_geo.imaging.plots import frontiers
 from linprim_geo.synthetic.synth import synthesize
 
-# What the design lists: every knob that trades time for accuracy.
+# What the design lists: every parameter that trades time for accuracy.
 LISTED = {
     "rays",
     "order",
@@ -44,35 +52,44 @@ LISTED = {
 }
 
 
-def row(rung, seconds, error, name="depth_percent", spread=0.0, rounds=3):
+def row(value, seconds, error, name="depth_percent", spread=0.0, rounds=3):
     low, high = seconds * (1 - spread), seconds * (1 + spread)
-    return {"rung": rung, "seconds": seconds, "low": low, "high": high, "rounds": rounds, "default": False, name: error}
+    return {
+        "value": value,
+        "seconds": seconds,
+        "low": low,
+        "high": high,
+        "rounds": rounds,
+        "default": False,
+        name: error,
+    }
 
 
-def knob(*names, error="depth_percent"):
-    return Knob("rays", "ray model", "render", tuple(Rung(name) for name in names), names[0], (error,))
+def parameter(*names, error="depth_percent"):
+    return Parameter("rays", "ray model", "render", tuple(Value(name) for name in names), names[0], (error,))
 
 
 # --- the registry ----------------------------------------------------------------------------------------
 
 
 def test_the_registry_is_complete():
-    assert set(KNOBS) == LISTED
-    for name, each in KNOBS.items():
+    assert set(PARAMETERS) == LISTED
+    for name, each in PARAMETERS.items():
         assert each.name == name and each.group in GROUPS and set(each.errors) <= set(ERRORS) and each.errors
-        names = [r.name for r in each.rungs]
+        names = [r.name for r in each.values]
         assert len(set(names)) == len(names) >= 2 and each.default in names
     shown = [
         json.dumps(settings(each, r), sort_keys=True)
-        for each in KNOBS.values()
-        for r in each.rungs
+        for each in PARAMETERS.values()
+        for r in each.values
         if r.name != each.default
     ]
-    assert len(set(shown)) == len(shown), "two rungs that are not the default set the same"
+    assert len(set(shown)) == len(shown), "two values that are not the default set the same"
 
 
 def test_defaults_of_the_registry_are_those_of_the_options():
-    assert settings(KNOBS["rays"], knobs.rung(KNOBS["rays"], "exact")) == knobs.RENDER_DEFAULTS
+    rays = PARAMETERS["rays"]
+    assert settings(rays, parameters.value_named(rays, "exact")) == parameters.RENDER_DEFAULTS
     options = TrainOptions()
     for name, value in (
         ("ray_model", options.ray_model),
@@ -80,25 +97,27 @@ def test_defaults_of_the_registry_are_those_of_the_options():
         ("stop", options.stop),
         ("degree", options.sh_degree),
     ):
-        assert knobs.RENDER_DEFAULTS[name] == value
+        assert parameters.RENDER_DEFAULTS[name] == value
     assert (
-        settings(KNOBS["primitive"], knobs.rung(KNOBS["primitive"], "octahedron")) == {}
+        settings(PARAMETERS["primitive"], parameters.value_named(PARAMETERS["primitive"], "octahedron")) == {}
         and options.primitive == "octahedron"
     )
-    assert KNOBS["trained-degree"].default == str(options.sh_degree)
+    assert PARAMETERS["trained-degree"].default == str(options.sh_degree)
     for name in ("order", "stop", "scalar", "degree", "extraction", "samples"):
-        each = KNOBS[name]
-        base = knobs.RENDER_DEFAULTS | knobs.EXTRACT_DEFAULTS | knobs.EVALUATE_DEFAULTS
-        assert knobs.rung(each, each.default).changes.items() <= base.items(), name
+        each = PARAMETERS[name]
+        base = parameters.RENDER_DEFAULTS | parameters.EXTRACT_DEFAULTS | parameters.EVALUATE_DEFAULTS
+        assert parameters.value_named(each, each.default).changes.items() <= base.items(), name
 
 
 def test_every_training_rung_changes_an_option_that_is_allowed():
     options, scene = TrainOptions(iterations=100, max_primitives=80), SceneOptions(downscale=2)
-    for each in KNOBS.values():
+    for each in PARAMETERS.values():
         if each.group != "train":
             continue
         found = [
-            training_options(options, scene, 24, settings(each, r)) for r in each.rungs if "equal_time" not in r.changes
+            training_options(options, scene, 24, settings(each, value))
+            for value in each.values
+            if "equal_time" not in value.changes
         ]
         assert len({(str(a), str(b)) for a, b in found}) == len(found), each.name
         for changed, _ in found:
@@ -153,29 +172,29 @@ def test_a_step_pays_if_the_error_falls_with_the_root_of_the_time():
 
 
 def test_the_sentences_follow_the_rule():
-    said = verdict(knob("affine", "exact"), [row("affine", 1.0, 1.0), row("exact", 1.18, 0.8)])
+    said = verdict(parameter("affine", "exact"), [row("affine", 1.0, 1.0), row("exact", 1.18, 0.8)])
     assert said["sentence"] == (
         "Ray model: exact costs 1.18x the time of affine and removes 20 % of the depth error (1 to 0.8 %): worth it."
     )
     assert (said["cheapest"], said["taken"], said["most_accurate"]) == ("affine", "exact", "exact")
-    said = verdict(knob("a", "b"), [row("a", 1.0, 1.0), row("b", 4.0, 0.9)])
+    said = verdict(parameter("a", "b"), [row("a", 1.0, 1.0), row("b", 4.0, 0.9)])
     assert said["sentence"].endswith(
         "b costs 4.00x the time of a and removes 10 % of the depth error (1 to 0.9 %): not worth it."
     )
-    said = verdict(knob("a", "b", "c"), [row("a", 1.0, 1.0), row("b", 1.5, 0.5), row("c", 9.0, 0.45)])
+    said = verdict(parameter("a", "b", "c"), [row("a", 1.0, 1.0), row("b", 1.5, 0.5), row("c", 9.0, 0.45)])
     assert "worth it; c would cost 6.00x the time of b and remove 10 %" in said["sentence"] and said["taken"] == "b"
-    said = verdict(knob("a", "b", "c"), [row("a", 1.0, 1.0), row("b", 2.0, 0.9), row("c", 3.0, 0.1)])
+    said = verdict(parameter("a", "b", "c"), [row("a", 1.0, 1.0), row("b", 2.0, 0.9), row("c", 3.0, 0.1)])
     assert said["taken"] == "c"  # a step that does not pay is no obstacle to the next one
-    said = verdict(knob("a", "b"), [row("a", 1.0, 0.5), row("b", 4.0, 0.9)])
+    said = verdict(parameter("a", "b"), [row("a", 1.0, 0.5), row("b", 4.0, 0.9)])
     assert "a is the fastest, and no other removes any of the depth error (b costs 4.00x)" in said["sentence"]
-    said = verdict(knob("a", "b"), [row("a", 1.0, 1.0, spread=0.3), row("b", 1.2, 0.9, spread=0.3)])
+    said = verdict(parameter("a", "b"), [row("a", 1.0, 1.0, spread=0.3), row("b", 1.2, 0.9, spread=0.3)])
     assert "1.20x (within the spread of the timings)" in said["sentence"] and said["taken"] == "b"
-    assert verdict(knob("a", "b"), [row("a", 1.0, math.nan), row("b", 2.0, math.nan)])["error"] is None
-    assert verdict(knob("a", "b"), [])["error"] is None
+    assert verdict(parameter("a", "b"), [row("a", 1.0, math.nan), row("b", 2.0, math.nan)])["error"] is None
+    assert verdict(parameter("a", "b"), [])["error"] is None
 
 
 def test_what_only_some_rows_have_does_not_decide():
-    each = Knob("x", "x", "train", (Rung("a"), Rung("b")), "a", ("chamfer_percent", "photo_percent"))
+    each = Parameter("x", "x", "train", (Value("a"), Value("b")), "a", ("chamfer_percent", "photo_percent"))
     rows = [row("a", 1.0, math.nan, "chamfer_percent"), row("b", 2.0, 1.0, "chamfer_percent")]
     rows[0]["photo_percent"], rows[1]["photo_percent"] = 2.0, 1.0
     assert verdict(each, rows)["error"] == "photo_percent"
@@ -194,8 +213,9 @@ def swept(tiny_scene, tiny_run, tmp_path_factory):
     before = {path: path.stat().st_mtime_ns for path in tiny_run.rglob("*")}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "POINTS", 3000)
-        tradeoff(tiny_scene, out, knobs=RENDERED, run=tiny_run, quick=True, threads=1, quiet=True)
-        results = tradeoff(tiny_scene, out, knobs=MEASURED, run=tiny_run, quick=True, rounds=1, threads=1, quiet=True)
+        how = {"run": tiny_run, "quick": True, "threads": 1, "quiet": True}
+        tradeoff(tiny_scene, out, parameters=RENDERED, **how)
+        results = tradeoff(tiny_scene, out, parameters=MEASURED, rounds=1, **how)
     assert before == {path: path.stat().st_mtime_ns for path in tiny_run.rglob("*")}, "the given run was changed"
     return out, results
 
@@ -204,19 +224,19 @@ def test_every_rung_was_timed_and_judged(swept):
     out, results = swept
     assert "failed" not in (out / "measured.json").read_text()
     for name in MEASURED:
-        rows = [row for row in results["rows"] if row["knob"] == name]
+        rows = [row for row in results["rows"] if row["parameter"] == name]
         degree = 1  # of the run
-        wanted = [r.name for r in KNOBS[name].rungs if name != "degree" or int(r.name) <= degree]
-        assert [row["rung"] for row in rows] == wanted and sum(row["default"] for row in rows) == 1
+        wanted = [r.name for r in PARAMETERS[name].values if name != "degree" or int(r.name) <= degree]
+        assert [row["value"] for row in rows] == wanted and sum(row["default"] for row in rows) == 1
         assert any(row["frontier"] for row in rows) and results["sentences"][name].endswith("worth it.")
         for row in rows:
             assert row["rounds"] == (2 if name in RENDERED else 1) and row["peak_gib"] > 0
             assert 0 < row["low"] <= row["seconds"] <= row["high"]
-            assert all(row[error] is not None and row[error] >= 0 for error in KNOBS[name].errors), row
+            assert all(row[error] is not None and row[error] >= 0 for error in PARAMETERS[name].errors), row
 
 
 def test_the_errors_are_those_of_the_knob(swept):
-    rows = {(row["knob"], row["rung"]): row for row in swept[1]["rows"]}
+    rows = {(row["parameter"], row["value"]): row for row in swept[1]["rows"]}
     # The integral itself differs from the reference by rounding and the early stop alone, the order of centres by more.
     assert rows["order", "overlap"]["image_percent"] < 0.2 * rows["order", "center"]["image_percent"]
     assert rows["stop", "0"]["alone_percent"] < 0.1 * rows["stop", "1e-2"]["alone_percent"]
@@ -272,8 +292,8 @@ def test_the_page_is_well_formed_and_stands_alone(swept):
     assert "http" not in text and "url(" not in text and "@import" not in text
     tree = ElementTree.fromstring(text.removeprefix("<!DOCTYPE html>\n"))
     shown = [" ".join(element.itertext()) for element in tree.iter("svg")]
-    for name, svg in zip([each for each in KNOBS if each in MEASURED], shown, strict=True):
-        assert all(row["rung"] in svg for row in results["rows"] if row["knob"] == name), name
+    for name, svg in zip([each for each in PARAMETERS if each in MEASURED], shown, strict=True):
+        assert all(row["value"] in svg for row in results["rows"] if row["parameter"] == name), name
     words = " ".join(tree.itertext())
     assert all(sentence in words for sentence in results["sentences"].values()) and results["rule"] in words
 
@@ -283,9 +303,9 @@ def test_what_was_measured_is_taken_from_the_folder(swept, tiny_scene, tiny_run,
     for name in ("_render", "_extract", "_evaluate", "_train"):
         monkeypatch.setattr(sweeping.Sweep, name, lambda *_: pytest.fail("measured again"))
     again = tradeoff(
-        tiny_scene, out, knobs=("rays", "samples"), run=tiny_run, quick=True, rounds=1, threads=1, quiet=True
+        tiny_scene, out, parameters=("rays", "samples"), run=tiny_run, quick=True, rounds=1, threads=1, quiet=True
     )
-    assert again["rows"] == [row for row in results["rows"] if row["knob"] in ("rays", "samples")]
+    assert again["rows"] == [row for row in results["rows"] if row["parameter"] in ("rays", "samples")]
 
 
 @pytest.fixture(scope="module")
@@ -298,17 +318,17 @@ def photographs(tmp_path_factory):
     return out
 
 
-def shortened(monkeypatch, name, *rungs):
-    """Leaves a knob those of its rungs alone."""
-    each = KNOBS[name]
-    monkeypatch.setitem(KNOBS, name, replace(each, rungs=tuple(r for r in each.rungs if r.name in rungs)))
+def shortened(monkeypatch, name, *values):
+    """Leaves a parameter those of its values alone."""
+    each = PARAMETERS[name]
+    monkeypatch.setitem(PARAMETERS, name, replace(each, values=tuple(r for r in each.values if r.name in values)))
 
 
 def test_training_knobs_run_on_every_rung(tiny_scene, tmp_path, monkeypatch):
     """A few steps each; how runs are scored is tested by the ones that score."""
     monkeypatch.setattr(
         "linprim_geo.points.start_points.densify", lambda scene, *_: scene.points
-    )  # seconds for every rung
+    )  # seconds for every value
     scored = []
 
     def score(self, folder):
@@ -319,13 +339,13 @@ def test_training_knobs_run_on_every_rung(tiny_scene, tmp_path, monkeypatch):
         return {"photo_percent": 1.0 / run.state["iteration"], "psnr": 20.0}
 
     monkeypatch.setattr(sweeping.Sweep, "_train_errors", score)
-    chosen = [name for name, each in KNOBS.items() if each.group == "train"]
+    chosen = [name for name, each in PARAMETERS.items() if each.group == "train"]
     size = {"iterations": 8, "max_primitives": 60}
     results = tradeoff(
-        tiny_scene, tmp_path / "sweep", knobs=chosen, quick=True, rounds=1, **size, threads=1, quiet=True
+        tiny_scene, tmp_path / "sweep", parameters=chosen, quick=True, rounds=1, **size, threads=1, quiet=True
     )
     assert results["about"]["options"].items() >= size.items()
-    assert len(results["rows"]) == sum(len(KNOBS[name].rungs) for name in chosen)
+    assert len(results["rows"]) == sum(len(PARAMETERS[name].values) for name in chosen)
     assert {run.train_options.primitive for run in scored} == {"octahedron", "tetrahedron", "gaussian"}
     assert {run.train_options.sh_degree for run in scored} == {0, 1, 2, 3}
     assert {run.train_options.iterations for run in scored} >= {2, 4, 8, 16}
@@ -340,7 +360,7 @@ def test_training_knobs_run_on_every_rung(tiny_scene, tmp_path, monkeypatch):
 def test_trainings_by_workers_are_those_of_this_process(monkeypatch, photographs, tmp_path):
     shortened(monkeypatch, "primitive", "octahedron", "gaussian", "gaussian, equal time")
     how = {
-        "knobs": ["primitive"],
+        "parameters": ["primitive"],
         "quick": True,
         "iterations": 12,
         "max_primitives": 60,
@@ -352,8 +372,8 @@ def test_trainings_by_workers_are_those_of_this_process(monkeypatch, photographs
     assert len(there["rows"]) == len(here["rows"]) == 3
     for one, other in zip(there["rows"], here["rows"], strict=True):
         assert one["rounds"] == 2 and one["seconds"] > 0 and 0.1 < one["peak_gib"] < 4
-        if "equal" not in one["rung"]:
-            assert (one["rung"], one["psnr"], one["primitives"]) == (other["rung"], other["psnr"], other["primitives"])
+        if "equal" not in one["value"]:
+            assert all(one[name] == other[name] for name in ("value", "psnr", "primitives"))
     names = {path.name for path in (tmp_path / "there" / "runs").iterdir()}
     assert "base" in names and not [name for name in names if name.startswith("round_") or name == "again"]
 
@@ -362,7 +382,7 @@ def test_a_sweep_by_workers_goes_on_and_tells_what_fails(monkeypatch, photograph
     shortened(monkeypatch, "iterations", "1/4", "1/2", "1")
     monkeypatch.setattr(sweeping, "open_executor", Here)
     how = {
-        "knobs": ["iterations"],
+        "parameters": ["iterations"],
         "quick": True,
         "iterations": 12,
         "max_primitives": 60,
@@ -392,7 +412,7 @@ def test_a_sweep_by_workers_goes_on_and_tells_what_fails(monkeypatch, photograph
 
     monkeypatch.setattr(sweeping.Executor, "run", counted)
     results = tradeoff(photographs, tmp_path / "sweep", **how)
-    assert tasks == [] and len(results["rows"]) == len(KNOBS["iterations"].rungs)
+    assert tasks == [] and len(results["rows"]) == len(PARAMETERS["iterations"].values)
     (tmp_path / "x").mkdir()
     options = {"threads": 1, "iterations": 5, "max_primitives": 10, "background": "no colour"}
     told = training.train_task(tmp_path / "x", str(photographs), {}, options)
@@ -412,7 +432,7 @@ def test_a_trained_run_is_scored_by_image_depth_and_surface(swept, tiny_scene, t
 def test_an_error_of_zero_and_a_single_point_can_be_drawn():
     for rows in ([row("a", 1.0, 0.0)], [row("a", 1.0, 0.0), row("b", 1e-6, 3.0)]):
         panel = tradeoff_page.panel([each | {"frontier": True} for each in rows], "depth_percent")
-        assert [point.name for point in panel.points] == [each["rung"] for each in rows]
+        assert [point.name for point in panel.points] == [each["value"] for each in rows]
         assert panel.y_label == "depth error, %" and ElementTree.fromstring(frontiers([panel], "errors")) is not None
 
 
@@ -421,8 +441,8 @@ def test_an_error_of_zero_and_a_single_point_can_be_drawn():
 
 def test_what_cannot_be_swept_is_one_sentence(swept, tiny_scene, tiny_run, tmp_path):
     out, _ = swept
-    with pytest.raises(LinprimError, match="--knobs nonsense is unknown, wanted some of rays, order"):
-        tradeoff(tiny_scene, tmp_path / "x", knobs=("nonsense",), quiet=True)
+    with pytest.raises(LinprimError, match="--parameters nonsense is unknown, wanted some of rays, order"):
+        tradeoff(tiny_scene, tmp_path / "x", parameters=("nonsense",), quiet=True)
     with pytest.raises(LinprimError, match="holds a sweep of another run"):
         tradeoff(tiny_scene, out, quick=True, threads=1, quiet=True)
     with pytest.raises(LinprimError, match="--rounds is 0"):
@@ -432,7 +452,7 @@ def test_what_cannot_be_swept_is_one_sentence(swept, tiny_scene, tiny_run, tmp_p
     with pytest.raises(LinprimError, match="no such file, wanted a reference mesh"):
         tradeoff(tiny_scene, tmp_path / "x", reference=tmp_path / "none.ply", quiet=True)
     with pytest.raises(LinprimError, match="none: no such folder, wanted that of a run"):
-        tradeoff(tiny_scene, tmp_path / "y", knobs=("rays",), run=tmp_path / "none", quick=True, quiet=True)
+        tradeoff(tiny_scene, tmp_path / "y", parameters=("rays",), run=tmp_path / "none", quick=True, quiet=True)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").write_text("mine")
     with pytest.raises(LinprimError, match="holds no sweep"):

@@ -10,24 +10,24 @@ import xml.etree.ElementTree as ElementTree
 import pytest
 
 from linprim_geo.eval.tradeoff import figures as tradeoff_figures
-from linprim_geo.eval.tradeoff.figures import rungs
-from linprim_geo.eval.tradeoff.knobs import KNOBS
+from linprim_geo.eval.tradeoff.figures import plotted_values
+from linprim_geo.eval.tradeoff.parameters import PARAMETERS
 
 SVG = "{http://www.w3.org/2000/svg}"
 
 
 def sweep(folder, leave_out=(), chamfer=True):
-    """A tradeoff.json whose every rung takes longer and errs less than the one before it."""
+    """A tradeoff.json whose every value takes longer and errs less than the one before it."""
     rows = []
-    for knob in KNOBS.values():
-        if knob.name in leave_out:
+    for parameter in PARAMETERS.values():
+        if parameter.name in leave_out:
             continue
-        for k, rung in enumerate(knob.rungs):
+        for k, value in enumerate(parameter.values):
             seconds = 1e-3 * 2**k
             row = {
-                "knob": knob.name,
-                "rung": rung.name,
-                "default": rung.name == knob.default,
+                "parameter": parameter.name,
+                "value": value.name,
+                "default": value.name == parameter.default,
                 "seconds": seconds,
                 "frontier": True,
             }
@@ -71,10 +71,10 @@ def test_both_files_show_every_rung_in_both_panels(tmp_path, capsys):
 
 
 def test_the_shared_default_is_one_point_and_the_frontier_is_that_of_all_of_them():
-    def row(knob, rung, seconds, error, default=False):
+    def row(parameter, value, seconds, error, default=False):
         return {
-            "knob": knob,
-            "rung": rung,
+            "parameter": parameter,
+            "value": value,
             "seconds": seconds,
             "default": default,
             "depth_percent": error,
@@ -88,16 +88,16 @@ def test_the_shared_default_is_one_point_and_the_frontier_is_that_of_all_of_them
     ]
     rows += [row("order", "overlap", 4.0, 1.0), row("order", "entry", 4.5, 1.5), row("stop", "0", 0.5, 0.1)]
     rows += [row("scalar", "float64", 0.0, 0.1), row("scalar", "float32", 3.0, None)]
-    found = rungs(rows, ("rays", "order", "scalar"), "depth_percent")
-    assert {r["rung"]: r["frontier"] for r in found} == {
+    found = plotted_values(rows, ("rays", "order", "scalar"), "depth_percent")
+    assert {r["value"]: r["frontier"] for r in found} == {
         "affine rays": False,
         "default": True,
         "overlap order": True,
         "entry order": False,
     }
     rows = [row("extraction", "tsdf x1", 1.0, 2.0, True), row("extraction", "polyhedra", 2.0, 3.0)]
-    alone = rungs(rows, ("extraction",), "depth_percent")
-    assert [r["rung"] for r in alone] == ["tsdf x1", "polyhedra"]
+    alone = plotted_values(rows, ("extraction",), "depth_percent")
+    assert [r["value"] for r in alone] == ["tsdf x1", "polyhedra"]
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,7 @@ def test_the_shared_default_is_one_point_and_the_frontier_is_that_of_all_of_them
         (lambda folder: folder, "tradeoff.json: cannot be read"),
         (
             lambda folder: folder.mkdir() or (folder / "tradeoff.json").write_text("[]"),
-            "has no rows of knobs",
+            "has no rows of parameters",
         ),
         (
             lambda folder: sweep(folder, leave_out=("rays", "order", "scalar")),

@@ -1,4 +1,4 @@
-"""Scenes of every primitive for the torch twin, and the rungs of its ladder: primitive, ray model and order."""
+"""Scenes of every primitive for the torch twin, and the variants of its ladder: primitive, ray model and order."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from helpers.reference_scenes import random_scene
 
 POLYHEDRA, MODELS, ORDERS = ("octahedron", "tetrahedron"), ("exact", "affine"), ("center", "entry", "overlap")
-RUNGS = list(itertools.product(POLYHEDRA, MODELS, ORDERS))
+VARIANTS = list(itertools.product(POLYHEDRA, MODELS, ORDERS))
 FINITE_DIFFERENCES = dict(eps=1e-6, rtol=1e-5, check_undefined_grad=False)
 BASIS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
 

@@ -14,23 +14,23 @@ from linprim_geo.kernels import ops
 from linprim_geo.kernels.reference import rasterize as reference
 
 # What the core has: an order other than the centres' needs an entry, which a Gaussian has not.
-RUNGS = [
+VARIANTS = [
     *itertools.product(("octahedron", "tetrahedron"), ("exact", "affine"), ("center", "entry", "overlap")),
     ("gaussian", "affine", "center"),
 ]
-NAMES = ["-".join(rung) for rung in RUNGS]
+NAMES = ["-".join(variant) for variant in VARIANTS]
 
 
 def scene_of(
     seed: int,
-    rung: tuple[str, str, str],
+    variant: tuple[str, str, str],
     count: int = 14,
     coefficients: int = 4,
     size=(19, 14),
     dtype=torch.float64,
 ):
-    """Tensors that require gradients, the camera, and the keywords of the rung."""
-    primitive, ray_model, order = rung
+    """Tensors that require gradients, the camera, and the keywords of the variant."""
+    primitive, ray_model, order = variant
     parameters, view = random_scene(seed, count, coefficients, *size)
     rng = np.random.default_rng(seed)
     if primitive == "tetrahedron":
@@ -95,21 +95,21 @@ def assert_alike(leaves, view, options, geometry, value: float, gradient: float)
         assert off <= gradient * scale, f"gradient {index} is off by {off / scale:.1e} of its largest"
 
 
-@pytest.mark.parametrize("rung", RUNGS, ids=NAMES)
+@pytest.mark.parametrize("variant", VARIANTS, ids=NAMES)
 @pytest.mark.parametrize("geometry", [False, True], ids=["colour", "geometry"])
 @pytest.mark.parametrize("screen_filter", [0.0, 0.7], ids=["plain", "filtered"])
-def test_double_precision_equals_the_twin(rung, geometry, screen_filter):
+def test_double_precision_equals_the_twin(variant, geometry, screen_filter):
     for seed in range(4):
-        leaves, view, options = scene_of(100 + seed, rung)
+        leaves, view, options = scene_of(100 + seed, variant)
         assert_alike(leaves, view, options | {"screen_filter": screen_filter}, geometry, 1e-9, 1e-7)
 
 
-@pytest.mark.parametrize("rung", RUNGS, ids=NAMES)
+@pytest.mark.parametrize("variant", VARIANTS, ids=NAMES)
 @pytest.mark.parametrize("isa", KERNELS)
-def test_single_precision_is_near_the_twin(rung, isa):
+def test_single_precision_is_near_the_twin(variant, isa):
     with kernels(isa):
         for seed in range(2):
-            leaves, view, options = scene_of(200 + seed, rung, dtype=torch.float32)
+            leaves, view, options = scene_of(200 + seed, variant, dtype=torch.float32)
             assert_alike(leaves, view, options, False, 1e-4, 2e-3)
 
 
@@ -160,11 +160,11 @@ def test_affine_rays_of_a_centre_outside_of_the_image_equal_the_twin(primitive, 
     assert_alike(leaves, view, options, True, 1e-9, 1e-7)
 
 
-@pytest.mark.parametrize("rung", [rung for rung in RUNGS if rung[1] == "affine"], ids="-".join)
-def test_an_image_cut_out_of_another_shows_the_same(rung):
+@pytest.mark.parametrize("variant", [variant for variant in VARIANTS if variant[1] == "affine"], ids="-".join)
+def test_an_image_cut_out_of_another_shows_the_same(variant):
     """The part of an image far from the principal point: what is in view there is not drawn as if it were far
     outside."""
-    primitive, ray_model, order = rung
+    primitive, ray_model, order = variant
     rng = np.random.default_rng(4)
     whole = camera(61, 13, 40.0)
     part = replace(whole, width=15, cx=whole.cx - 46)

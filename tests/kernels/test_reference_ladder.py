@@ -1,4 +1,4 @@
-"""The torch twin on every rung: an independent program, tetrahedra, gradients, precision, arguments."""
+"""The torch twin on every variant: an independent program, tetrahedra, gradients, precision, arguments."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers.reference_ladder import BASIS, FINITE_DIFFERENCES, MODELS, ORDERS, POLYHEDRA, RUNGS, pixel_of, scene
+from helpers.reference_ladder import BASIS, FINITE_DIFFERENCES, MODELS, ORDERS, POLYHEDRA, VARIANTS, pixel_of, scene
 from helpers.reference_scenes import IMAGES, assert_same, axis_camera, gray, octahedra, tensor
 from scipy.optimize import brentq
 
@@ -203,9 +203,9 @@ def literal_render(parameters, camera, primitive, model, order, k=0.0, near=0.01
     ids=("far", "near", "stop"),
 )
 @pytest.mark.parametrize("k", [0.0, 0.7])
-@pytest.mark.parametrize("primitive,model,order", RUNGS)
+@pytest.mark.parametrize("primitive,model,order", VARIANTS)
 def test_equals_a_program_that_only_asks_whether_points_are_inside(primitive, model, order, k, more):
-    seed = 40 + RUNGS.index((primitive, model, order))
+    seed = 40 + VARIANTS.index((primitive, model, order))
     parameters, camera = scene(primitive, seed, 9, width=7, height=6, **more)
     definition = {name: camera[name] for name in ("near", "stop", "level") if name in camera}
     result = rasterize(*parameters, **camera, primitive=primitive, ray_model=model, order=order, screen_filter=k)
@@ -356,7 +356,7 @@ def test_primitive_without_size_is_not_drawn():
 
 
 @pytest.mark.parametrize("k", [0.0, 0.6])
-@pytest.mark.parametrize("primitive,model,order", [*RUNGS, ("gaussian", "affine", "center")])
+@pytest.mark.parametrize("primitive,model,order", [*VARIANTS, ("gaussian", "affine", "center")])
 def test_gradients_along_random_directions(primitive, model, order, k):
     seed = 80 + len(model) + len(order)
     for more in ({}, {"stop": 0.35, "level": 0.6, "depth": 1.2}):
@@ -389,7 +389,7 @@ def test_every_gradient_of_overlap_with_a_filter(primitive):
 @pytest.mark.parametrize("center,near", [((0, 0, 2), 0.01), ((1, 0, 2), 0.01), ((0, 0, 2), 1), ((0.5, 0, 0.5), 0.01)])
 def test_gradients_are_finite_everywhere(center, near, dtype):
     # Through vertices and edges, parallel faces, coincident copies, no density, and an opaque one.
-    for (primitive, model, order), k in itertools.product([*RUNGS, ("gaussian", "exact", "center")], (0.0, 0.5)):
+    for (primitive, model, order), k in itertools.product([*VARIANTS, ("gaussian", "exact", "center")], (0.0, 0.5)):
         parameters = octahedra([center, center, (0, 0, 4), (0, 0, 5)], [[1, 1, 1]] * 4, [1.0, 1.0, 0.0, 1e6])
         if primitive == "tetrahedron":
             parameters[2] = torch.full((4, 4), math.sqrt(3), dtype=torch.float64)
@@ -405,7 +405,7 @@ def test_gradients_are_finite_everywhere(center, near, dtype):
         assert all(g.isfinite().all() for g in grads), options
 
 
-@pytest.mark.parametrize("primitive,model,order", [*RUNGS, ("gaussian", "affine", "center")])
+@pytest.mark.parametrize("primitive,model,order", [*VARIANTS, ("gaussian", "affine", "center")])
 def test_float32_follows_float64(primitive, model, order):
     parameters, camera = scene(primitive, 95, 30, width=16, height=12)
     options = dict(primitive=primitive, ray_model=model, order=order, screen_filter=0.3, stop=0.0)

@@ -13,7 +13,7 @@ from linprim_geo.eval.options import TradeoffOptions
 
 
 def add(command: AddCommand) -> None:
-    text = "sweep every knob that trades time for accuracy: tables, plots, and a sentence for each"
+    text = "sweep every parameter that trades time for accuracy: tables, plots, and a sentence for each"
     sub = command("tradeoff", run, text)
     add_scene(sub)
     text = "folder to make, or to go on with (default runs/SCENE_tradeoff)"

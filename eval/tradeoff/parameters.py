@@ -1,7 +1,7 @@
-"""Every knob that trades time for accuracy: its rungs from cheap to dear, how a rung is set, and the error that it is
-judged by.
+"""Every parameter that trades time for accuracy: its values from cheap to expensive, how a value is set, and the error
+that it is judged by.
 
-What a rung sets is a table of changes to the defaults; `eval/tradeoff.py` sweeps one knob at a time. Of the four
+What a value sets is a table of changes to the defaults; `sweep.py` sweeps one parameter at a time. Of the four
 groups, `render` changes keywords of `ops.rasterize` (and the scalar and the degree of its tensors) on a trained run,
 `train` changes options or the photographs of a training, `extract` the method and the voxel size, `evaluate` the points
 of a score.
@@ -18,8 +18,8 @@ GROUPS = ("render", "train", "extract", "evaluate")
 
 
 @dataclass(frozen=True)
-class Rung:
-    """One setting of a knob: its `name` as shown, and what it changes of the defaults (nothing for the default
+class Value:
+    """One setting of a parameter: its `name` as shown, and what it changes of the defaults (nothing for the default
     itself)."""
 
     name: str
@@ -27,15 +27,15 @@ class Rung:
 
 
 @dataclass(frozen=True)
-class Knob:
-    """A knob. `errors` are keys of `ERRORS`: the first that a scene allows decides, the others are reported beside
+class Parameter:
+    """A parameter. `errors` are keys of `ERRORS`: the first that a scene allows decides, the others are reported beside
     it."""
 
     name: str
     title: str
     group: str
-    rungs: tuple[Rung, ...]
-    default: str  # name of a rung
+    values: tuple[Value, ...]
+    default: str  # name of a value
     errors: tuple[str, ...]
 
 
@@ -50,7 +50,7 @@ class Error:
 ERRORS = {
     "depth_percent": Error("depth error", "%"),
     "image_percent": Error("image error", "% of the range"),
-    "alone_percent": Error("image error of this knob alone", "% of the range"),
+    "alone_percent": Error("image error of this parameter alone", "% of the range"),
     "popping_percent": Error("popping", "% of the range"),
     "photo_percent": Error("held-out image error", "% of the range"),
     "chamfer_percent": Error("Chamfer distance", "% of the diagonal"),
@@ -58,7 +58,7 @@ ERRORS = {
     "boundary_edges": Error("boundary edges"),
     "standard_error_percent": Error("standard error of the score", "% of the diagonal"),
 }
-# What rendering is without any changes: `train`'s defaults; a run of a lower degree has no rungs above it. The
+# What rendering is without any changes: `train`'s defaults; a run of a lower degree has no values above it. The
 # reference is the integral itself, in double precision, of all degrees that the run has.
 RENDER_DEFAULTS = {"ray_model": "exact", "order": "center", "scalar": "float32", "stop": 1e-3, "degree": 2}
 RENDER_REFERENCE = {"ray_model": "exact", "order": "overlap", "scalar": "float64", "stop": 0.0, "degree": 3}
@@ -70,122 +70,122 @@ RENDER_ERRORS = ("depth_percent", "image_percent")
 TRAIN_ERRORS = ("chamfer_percent", "depth_percent", "photo_percent")
 
 
-def _rungs(key: str, values: dict) -> tuple[Rung, ...]:
-    """A rung for each name, that sets `key` to its value."""
-    return tuple(Rung(name, {key: value}) for name, value in values.items())
+def _values(key: str, values: dict) -> tuple[Value, ...]:
+    """A value for each name, that sets `key` to its value."""
+    return tuple(Value(name, {key: value}) for name, value in values.items())
 
 
-KNOBS = {
-    knob.name: knob
-    for knob in (
-        Knob(
+PARAMETERS = {
+    parameter.name: parameter
+    for parameter in (
+        Parameter(
             "rays",
             "ray model",
             "render",
-            _rungs("ray_model", {"affine": "affine", "exact": "exact"}),
+            _values("ray_model", {"affine": "affine", "exact": "exact"}),
             "exact",
             RENDER_ERRORS,
         ),
-        Knob(
+        Parameter(
             "order",
             "order of blending",
             "render",
-            _rungs("order", {x: x for x in ("center", "entry", "overlap")}),
+            _values("order", {x: x for x in ("center", "entry", "overlap")}),
             "center",
             (*RENDER_ERRORS, "popping_percent"),
         ),
-        Knob(
+        Parameter(
             "scalar",
             "scalar",
             "render",
-            _rungs("scalar", {x: x for x in ("float32", "float64")}),
+            _values("scalar", {x: x for x in ("float32", "float64")}),
             "float32",
             ("image_percent", "depth_percent", "alone_percent"),
         ),
-        Knob(
+        Parameter(
             "stop",
             "transmittance at which rays end",
             "render",
-            _rungs("stop", {"1e-2": 1e-2, "1e-3": 1e-3, "1e-4": 1e-4, "0": 0.0}),
+            _values("stop", {"1e-2": 1e-2, "1e-3": 1e-3, "1e-4": 1e-4, "0": 0.0}),
             "1e-3",
             ("image_percent", "depth_percent", "alone_percent"),
         ),
-        Knob(
+        Parameter(
             "degree",
             "degree of the colour that is drawn",
             "render",
-            _rungs("degree", {str(d): d for d in range(4)}),
+            _values("degree", {str(d): d for d in range(4)}),
             "2",
             ("image_percent",),
         ),
-        Knob(
+        Parameter(
             "trained-degree",
             "degree of the colour that is trained",
             "train",
-            _rungs("sh_degree", {str(d): d for d in range(4)}),
+            _values("sh_degree", {str(d): d for d in range(4)}),
             "2",
             ("photo_percent",),
         ),
-        Knob(
+        Parameter(
             "primitive",
             "primitive",
             "train",
             (
-                *_rungs("primitive", {x: x for x in ("octahedron", "tetrahedron", "gaussian")}),
-                Rung("tetrahedron, equal time", {"primitive": "tetrahedron", "equal_time": True}),
-                Rung("gaussian, equal time", {"primitive": "gaussian", "equal_time": True}),
+                *_values("primitive", {x: x for x in ("octahedron", "tetrahedron", "gaussian")}),
+                Value("tetrahedron, equal time", {"primitive": "tetrahedron", "equal_time": True}),
+                Value("gaussian, equal time", {"primitive": "gaussian", "equal_time": True}),
             ),
             "octahedron",
             TRAIN_ERRORS,
         ),
-        Knob(
+        Parameter(
             "primitives",
             "most primitives",
             "train",
-            _rungs("max_primitives_times", {"1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0}),
+            _values("max_primitives_times", {"1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0}),
             "1",
             TRAIN_ERRORS,
         ),
-        Knob(
+        Parameter(
             "iterations",
             "training steps",
             "train",
-            _rungs("iterations_times", {"1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0}),
+            _values("iterations_times", {"1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0}),
             "1",
             TRAIN_ERRORS,
         ),
-        Knob(
+        Parameter(
             "scale",
             "image scale",
             "train",
-            _rungs("downscale_times", {"1/4": 4, "1/2": 2, "1": 1}),
+            _values("downscale_times", {"1/4": 4, "1/2": 2, "1": 1}),
             "1",
             TRAIN_ERRORS,
         ),
-        Knob(
+        Parameter(
             "views",
             "training views",
             "train",
-            _rungs("views", {"1/4": 0.25, "1/2": 0.5, "all": 1.0}),
+            _values("views", {"1/4": 0.25, "1/2": 0.5, "all": 1.0}),
             "all",
             TRAIN_ERRORS,
         ),
-        Knob(
+        Parameter(
             "extraction",
             "extraction, method and voxel",
             "extract",
             (
-                *(Rung(f"tsdf x{v:g}", {"method": "tsdf", "voxel": v}) for v in (4.0, 2.0, 1.0, 0.5)),
-                Rung("polyhedra", {"method": "polyhedra"}),
+                *(Value(f"tsdf x{v:g}", {"method": "tsdf", "voxel": v}) for v in (4.0, 2.0, 1.0, 0.5)),
+                Value("polyhedra", {"method": "polyhedra"}),
             ),
             "tsdf x1",
             ("chamfer_percent", "normal_percent", "boundary_edges"),
         ),
-        Knob(
+        Parameter(
             "samples",
             "points of an evaluation",
             "evaluate",
-            _rungs("samples", {f"{n:,}": n for n in (1_000, 5_000, 30_000, 200_000)}),
+            _values("samples", {f"{n:,}": n for n in (1_000, 5_000, 30_000, 200_000)}),
             "200,000",
             ("standard_error_percent",),
         ),
@@ -193,27 +193,27 @@ KNOBS = {
 }
 
 
-def rung(knob: Knob, name: str) -> Rung:
-    """The rung of that name."""
-    return next(r for r in knob.rungs if r.name == name)
+def value_named(parameter: Parameter, name: str) -> Value:
+    """The value of that name."""
+    return next(value for value in parameter.values if value.name == name)
 
 
-def settings(knob: Knob, rung: Rung) -> dict:
-    """What is measured for a rung: the defaults of the knob's group with its changes, so that a setting that several
-    knobs have in common is measured once. Of training only what differs from the base, and nothing for a rung that is
-    the base."""
+def settings(parameter: Parameter, value: Value) -> dict:
+    """What is measured for a value: the defaults of the parameter's group with its changes, so that a setting that
+    several parameters have in common is measured once. Of training only what differs from the base, and nothing for a
+    value that is the base."""
     base = {"render": RENDER_DEFAULTS, "extract": EXTRACT_DEFAULTS, "evaluate": EVALUATE_DEFAULTS, "train": {}}[
-        knob.group
+        parameter.group
     ]
-    if knob.group == "train" and rung.name == knob.default:
+    if parameter.group == "train" and value.name == parameter.default:
         return {}
-    return base | rung.changes
+    return base | value.changes
 
 
 def training_options(
     options: TrainOptions, scene: SceneOptions, views: int, changes: dict
 ) -> tuple[TrainOptions, SceneOptions]:
-    """The base's options with the changes of a rung of the group `train`; `views` is the number of training views of
+    """The base's options with the changes of a value of the group `train`; `views` is the number of training views of
     the scene.
 
     `*_times` multiply the base's value, `views` is a share, `equal_time` is the sweep's business; everything else is an
@@ -237,7 +237,7 @@ def setting_key(group: str, setting: dict) -> str:
     return f"{group} {json.dumps(setting, sort_keys=True)}"
 
 
-def setting_shown(setting: dict) -> str:
+def describe_setting(setting: dict) -> str:
     """For people."""
     return ", ".join(f"{name} {value}" for name, value in setting.items()) or "defaults"
 
