@@ -234,6 +234,34 @@ def gradient_condition(s: Scenes, found: Chords, eps: float) -> Tensor:
     return torch.where(there, of_divisor + of_corner, torch.zeros_like(width)).amax(-1).nan_to_num(math.inf, math.inf)
 
 
+def _gaussian_rounding(
+    s: Scenes, there: Tensor, center: Tensor, axes: Tensor, moved: Tensor, alpha: Tensor, eps: float
+) -> Tensor:
+    """`rounding` of Gaussians: `there` (B, M) the drawn ones, `moved` (B, M) by how many units of double precision the
+    camera's position may move a centre."""
+    rays, center = rays_of(s), torch.where(there[..., None], center, torch.ones_like(center))
+    size, size_off, flat = _exponent_rounding(s, center, axes, rays, moved, eps)
+    # Alpha is monotone in the exponent, but for two jumps: nothing below the floor, nothing of a flat ellipse.
+    off = torch.expm1((4 * eps + 64 * 2.0**-53) * size + size_off + 8 * eps).clamp(max=1e300)
+    density = s.density.clamp(0, 1)[:, None]
+    smooth = density * torch.exp(-_exponent(s, center, axes, rays))
+    largest = (smooth * (1 + off)).clamp(max=GAUSSIAN_CAP).minimum(density)
+    jumps = (smooth * (1 + off) >= GAUSSIAN_FLOOR) & (smooth / (1 + off) < GAUSSIAN_FLOOR) | flat[:, None]
+    jump = torch.where(largest >= GAUSSIAN_FLOOR, largest, torch.zeros_like(largest))
+    off = torch.where(jumps, jump, (alpha * off).clamp(max=1.0))
+    return torch.where(there[:, None], off.nan_to_num(1.0, 1.0), alpha)
+
+
+def _pixel_at(s: Scenes, at: Tensor, usable: Tensor) -> Tensor:
+    """(B, M, 3) direction, of depth 1, of the centre of the pixel that is nearest to `at`, where planes are evaluated
+    from; the middle of the image where a primitive has no place in it."""
+    reference = torch.round(at * s.focal[:, None] + s.middle[:, None] - 0.5)
+    middle = torch.floor(s.middle)[:, None].expand_as(reference)
+    reference = torch.where(usable[..., None], reference, middle).clamp(-4e6, 4e6)
+    base = (reference + 0.5 - s.middle[:, None]) / s.focal[:, None]
+    return torch.cat([base, torch.ones_like(base[..., :1])], -1)
+
+
 def rounding(s: Scenes, found: Chords, eps: float, depths: bool = False) -> Tensor:
     """(B, R, M) by how much the alpha of each ray and primitive may be off where planes are evaluated with unit
     roundoff `eps` / 2.
@@ -256,17 +284,7 @@ def rounding(s: Scenes, found: Chords, eps: float, depths: bool = False) -> Tens
     moved = s.center.abs().sum(-1) + s.pose[:, None, :3, 3].abs().sum(-1)
     alpha = -torch.expm1(-found.tau)
     if s.primitive == "gaussian":
-        center = torch.where(there[..., None], center, torch.ones_like(center))
-        size, size_off, flat = _exponent_rounding(s, center, axes, rays, moved, eps)
-        # Alpha is monotone in the exponent, but for two jumps: nothing below the floor, nothing of a flat ellipse.
-        off = torch.expm1((4 * eps + 64 * tiny) * size + size_off + 8 * eps).clamp(max=1e300)
-        density = s.density.clamp(0, 1)[:, None]
-        smooth = density * torch.exp(-_exponent(s, center, axes, rays))
-        largest = (smooth * (1 + off)).clamp(max=GAUSSIAN_CAP).minimum(density)
-        jumps = (smooth * (1 + off) >= GAUSSIAN_FLOOR) & (smooth / (1 + off) < GAUSSIAN_FLOOR) | flat[:, None]
-        jump = torch.where(largest >= GAUSSIAN_FLOOR, largest, torch.zeros_like(largest))
-        off = torch.where(jumps, jump, (alpha * off).clamp(max=1.0))
-        return torch.where(there[:, None], off.nan_to_num(1.0, 1.0), alpha)
+        return _gaussian_rounding(s, there, center, axes, moved, alpha, eps)
     exact = s.ray_model == "exact"
     extent = torch.where((s.extent > 0).all(-1, keepdim=True), s.extent, torch.ones_like(s.extent))
     s = replace(s, extent=extent)
@@ -275,12 +293,7 @@ def rounding(s: Scenes, found: Chords, eps: float, depths: bool = False) -> Tens
     usable = there & (~crosses if exact else there)
     safe = torch.where(usable[..., None], center, torch.ones_like(center))
     at = safe[..., :2] / safe[..., 2:]
-    reference = torch.round(at * s.focal[:, None] + s.middle[:, None] - 0.5)
-    reference = torch.where(usable[..., None], reference, torch.floor(s.middle)[:, None].expand_as(reference)).clamp(
-        -4e6, 4e6
-    )
-    base = (reference + 0.5 - s.middle[:, None]) / s.focal[:, None]
-    base = torch.cat([base, torch.ones_like(base[..., :1])], -1)
+    base = _pixel_at(s, at, usable)
     n = faces(s, axes)  # (B, M, F, 3)
     h, h_size, h_off = _divisors(s, n, center, safe)
     step = rays[:, :, None, :2] - base[:, None, :, :2]  # (B, R, M, 2)

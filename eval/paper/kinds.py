@@ -42,6 +42,20 @@ def compare(rows: Sequence[dict]) -> dict:
     return result
 
 
+def _equal_psnr(pairs: Sequence[dict]) -> tuple[list[list[str]], list[str]]:
+    """The table's lines, and a note for each pair of models that have no PSNR in common."""
+    lines, notes = [], []
+    for pair in pairs:
+        name = " / ".join(pair["pair"])
+        for p in pair["points"]:
+            times = (*p["ms"], p["ms_ratio"], *p["core_ms"], p["core_ratio"])
+            lines.append([name, f"{p['psnr']:.2f}", *map(short, p["count"]), *(f"{x:.2f}" for x in times)])
+        if not pair["points"]:
+            ranges = " against ".join(f"{low:.2f} to {high:.2f} dB" for low, high in pair["ranges"])
+            notes.append(f"  {name}: no overlap, {ranges}")
+    return lines, notes
+
+
 def scene_text(scene: str, rows: Sequence[dict], comparison: dict) -> str:
     """All tables of one scene as plain text."""
     names, first = list(dict.fromkeys(r["model"] for r in rows)), rows[0]
@@ -98,15 +112,7 @@ def scene_text(scene: str, rows: Sequence[dict], comparison: dict) -> str:
             for r in rows
         ],
     )
-    lines, notes = [], []
-    for pair in comparison["equal_psnr"]:
-        name = " / ".join(pair["pair"])
-        for p in pair["points"]:
-            times = (*p["ms"], p["ms_ratio"], *p["core_ms"], p["core_ratio"])
-            lines.append([name, f"{p['psnr']:.2f}", *map(short, p["count"]), *(f"{x:.2f}" for x in times)])
-        if not pair["points"]:
-            ranges = " against ".join(f"{low:.2f} to {high:.2f} dB" for low, high in pair["ranges"])
-            notes.append(f"  {name}: no overlap, {ranges}")
+    lines, notes = _equal_psnr(comparison["equal_psnr"])
     table(
         "Equal PSNR: A / B",
         ["A / B", "PSNR dB", "count A", "B", "CPU ms A", "B", "A/B", "core ms A", "B", "A/B"],

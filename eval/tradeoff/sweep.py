@@ -9,7 +9,6 @@ measured is kept in `measured.json` of the folder, and taken from there.
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import os
 import shutil
@@ -23,7 +22,6 @@ import numpy as np
 
 from linprim_geo.base.cores import usable_cores
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import write_json
 from linprim_geo.base.options import SceneOptions, TrainOptions, with_changes
 from linprim_geo.base.progress import Progress
 from linprim_geo.eval.options import TradeoffOptions
@@ -39,7 +37,8 @@ from linprim_geo.eval.tradeoff.parameters import (
 )
 from linprim_geo.eval.tradeoff.rendering import RenderedRun
 from linprim_geo.eval.tradeoff.results import write_report
-from linprim_geo.eval.tradeoff.training import SurfaceScores, training_errors
+from linprim_geo.eval.tradeoff.store import Store
+from linprim_geo.eval.tradeoff.training import SurfaceScores, copy_run, training_errors
 from linprim_geo.jobs.executor import Executor, Task
 from linprim_geo.jobs.open import open_executor
 from linprim_geo.runs.run import Run
@@ -94,17 +93,15 @@ def tradeoff(
         return sweep.measure(chosen)
     cores, own_machines = usable_cores(), cluster not in (None, "local")
     with open_executor(cluster, sweep.folder / "runs", workers or 0) as executor:
-        sweep.executor, sweep.cores = (
-            executor,
-            threads or (cores if own_machines else max(1, cores // (workers or cores))),
-        )
+        sweep.executor = executor
+        sweep.cores = threads or (cores if own_machines else max(1, cores // (workers or cores)))
         sweep.slot = sweep.cores if own_machines else 1
         return sweep.measure(chosen)
 
 
 class Sweep:
-    """One folder of measurements. `store[key]` of a setting holds `times`, `peak_gib`, and what was found of it once.
-    With an `executor` trainings are its tasks, on so many `cores` each, and count as `slot` of its own."""
+    """One folder of measurements. With an `executor` trainings are its tasks, on so many `cores` each, and count as
+    `slot` of its own."""
 
     executor: Executor | None = None
     cores = slot = 1
@@ -120,9 +117,8 @@ class Sweep:
         size = (QUICK if quick else MODEST) | {name: value for name, value in given.items() if value is not None}
         self.rounds = options.rounds or (QUICK_ROUNDS if quick else ROUNDS)
         self.progress = Progress("tradeoff", 1, quiet=quiet)
-        self.warm = self.warm_score = self.warm_train = (
-            False  # the first time of all loads libraries, and is not counted
-        )
+        # The first time of all loads libraries, and is not counted.
+        self.warm = self.warm_score = self.warm_train = False
         prepare(scene, threads=threads, log=self.progress.note)
         self.scene = load_scene(scene)
         widest = max(view.camera.width for view in self.scene.train)
@@ -139,20 +135,7 @@ class Sweep:
             "options": asdict(self.options) | {"threads": threads},
             "scene_options": asdict(self.scene_options),
         }
-        self.about = json.loads(json.dumps(about))
-        self.store: dict[str, dict] = {}
-        saved = folder / "measured.json"
-        if saved.exists():
-            try:
-                held = json.loads(saved.read_text())
-                before, self.store = held["about"], held["measured"]
-            except (OSError, ValueError, KeyError, TypeError):
-                raise LinprimError(f"{saved}: is damaged, wanted what an earlier sweep has written") from None
-            if before != self.about:
-                what = next(name for name in self.about if before.get(name) != self.about[name])
-                raise LinprimError(f"{folder}: holds a sweep of another {what}; give another folder with -o")
-        elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise LinprimError(f"{folder}: exists already and holds no sweep; give another folder with -o")
+        self.store = Store(folder, about)
 
     # --- what is measured -------------------------------------------------------------------------------
 
@@ -224,7 +207,7 @@ class Sweep:
                 self._train_at_once([setting for setting in each if "equal_time" not in setting], turn)
                 self._train_at_once([setting for setting in each if "equal_time" in setting], turn)
             for key, (setting, errors) in wanted.items():
-                entry = self.store.setdefault(key, {"setting": setting, "times": [], "peak_gib": 0.0, "errors": {}})
+                entry = self.store.entry(key, setting)
                 if "failed" in entry or (
                     len(entry["times"]) > turn and errors <= entry["errors"].keys() | {"photo_percent"}
                 ):
@@ -235,16 +218,7 @@ class Sweep:
                 except LinprimError as error:
                     entry["failed"] = str(error)
                     self.progress.note(f"  {error}")
-                self._save()
-
-    def _save(self) -> None:
-        write_json(self.folder / "measured.json", {"about": self.about, "measured": self.store})
-
-    def _note(self, key: str, seconds: float, peak_gib: float = 0.0, **more) -> None:
-        entry = self.store[key]
-        entry["times"].append(seconds)
-        entry["peak_gib"] = max(entry["peak_gib"], peak_gib)
-        entry.update(more)
+                self.store.save()
 
     # --- the run that is looked at ----------------------------------------------------------------------
 
@@ -254,24 +228,15 @@ class Sweep:
         or the trained base."""
         if self.given is None:
             key = setting_key("train", {})
-            if not (self.store.get(key, {}).get("errors")):
-                self.store.setdefault(key, {"setting": {}, "times": [], "peak_gib": 0.0, "errors": {}})
+            if not self.store.get(key).get("errors"):
+                self.store.entry(key, {})
                 self.progress.note("training with the defaults")
                 self._train(key, {}, set(PARAMETERS["primitive"].errors), 0)
                 if self.executor:
                     self.store[key]["times"].clear()  # it was alone; the others share the cores
-                self._save()
+                self.store.save()
             return self.folder / "runs" / setting_name({})
-        Run.open(self.given)
-        copy = self.folder / "runs" / "given"
-        copy.mkdir(parents=True, exist_ok=True)
-        for name in ("config.json", "transform.json", "run.json", "training_frame.npz"):
-            if not (Path(self.given) / name).exists():
-                raise LinprimError(
-                    f"{self.given}: {name} is missing, so this is not the folder of a run that has saved something"
-                )
-            shutil.copy(Path(self.given) / name, copy / name)
-        return copy
+        return copy_run(Path(self.given), self.folder / "runs" / "given")
 
     @cached_property
     def run(self):
@@ -294,7 +259,7 @@ class Sweep:
         stages = Stages(self.progress)
         frame, with_gradient = self.rendered.seconds(setting)
         stages.lap("draw")
-        self._note(key, frame, stages.peak_gib["draw"])
+        self.store.note(key, frame, stages.peak_gib["draw"])
         entry.setdefault("gradient_times", []).append(with_gradient)
 
     # --- train ------------------------------------------------------------------------------------------
@@ -318,7 +283,7 @@ class Sweep:
         largest = max(view.camera.width * view.camera.height for view in self.scene.train)
         for setting in settings:
             key = setting_key("train", setting)
-            entry = self.store.setdefault(key, {"setting": setting, "times": [], "peak_gib": 0.0, "errors": {}})
+            entry = self.store.entry(key, setting)
             if "failed" in entry or len(entry["times"]) > turn:
                 continue
             options, scene_options = self._options(key, setting)
@@ -333,20 +298,20 @@ class Sweep:
                 self.slot,
                 "fewer --workers, or more memory",
             )
-        self._save()
+        self.store.save()
         progress = Progress(f"train, round {turn + 1} of {self.rounds}", 1, quiet=self.progress.quiet)
         for key, found in zip(tasks, self.executor.run(list(tasks.values()), progress), strict=True):
             if "failed" in found:
                 self.store[key]["failed"] = found["failed"]
                 self.progress.note(f"  {found['failed']}")
-                self._save()
+                self.store.save()
                 continue
             trained, kept = tasks[key].folder / "run", self.folder / "runs" / setting_name(self.store[key]["setting"])
             if not self.store[key]["errors"] and trained.exists():
                 shutil.rmtree(kept, ignore_errors=True)
                 trained.rename(kept)
-            self._note(key, found["seconds"], found["task_peak_gib"], primitives=found["primitives"])
-            self._save()
+            self.store.note(key, found["seconds"], found["task_peak_gib"], primitives=found["primitives"])
+            self.store.save()
         shutil.rmtree(folder, ignore_errors=True)
 
     def _train(self, key: str, setting: dict, errors: set, turn: int) -> None:
@@ -373,7 +338,7 @@ class Sweep:
             stages = Stages(self.progress)
             trained = train(self.scene_path, folder, scene_options, options, quiet=True)
             stages.lap("train")
-            self._note(key, trained["seconds"], stages.peak_gib["train"], primitives=trained["primitives"])
+            self.store.note(key, trained["seconds"], stages.peak_gib["train"], primitives=trained["primitives"])
             if folder.name == "again":
                 shutil.rmtree(folder)
         if not entry["errors"]:
@@ -384,8 +349,8 @@ class Sweep:
         count = {name: value for name, value in setting.items() if name != "equal_time"}
         both = [setting_key("train", {}), setting_key("train", count)]
         for key, of in zip(both, ({}, count), strict=True):
-            if not self.store.get(key, {}).get("times"):
-                self.store.setdefault(key, {"setting": of, "times": [], "peak_gib": 0.0, "errors": {}})
+            if not self.store.get(key).get("times"):
+                self.store.entry(key, of)
                 self._train(key, of, set(), 0)
         base, other = (float(np.median(self.store[key]["times"])) for key in both)
         return max(1, round(iterations * base / other))
@@ -428,7 +393,7 @@ class Sweep:
         target = self.folder / "meshes" / f"{setting_name(setting)}.ply"
         stats = extract_mesh(self.base, setting["method"], target, options, quiet=True)
         if len(entry["times"]) <= turn:
-            self._note(
+            self.store.note(
                 key,
                 stats["seconds"]["total"],
                 stats["peak_gib"]["total"],
@@ -467,7 +432,7 @@ class Sweep:
         stages = Stages(self.progress)
         scores = score_mesh(prediction, reference, samples=setting["samples"])
         stages.lap("score")
-        self._note(key, scores["seconds"], stages.peak_gib["score"], chamfer=scores["chamfer_percent_diagonal"])
+        self.store.note(key, scores["seconds"], stages.peak_gib["score"], chamfer=scores["chamfer_percent_diagonal"])
         self.store[key]["errors"] = {"standard_error_percent": scores["standard_error_percent_diagonal"]}
 
     # --- results ----------------------------------------------------------------------------------------
@@ -480,5 +445,5 @@ class Sweep:
                 for value in parameter.values
             ]
             measured[parameter.name] = [(value, entry) for value, entry in entries if entry and entry["times"]]
-        about = self.about | {"rounds": self.rounds, "load": os.getloadavg()[0], "cores": usable_cores()}
+        about = self.store.about | {"rounds": self.rounds, "load": os.getloadavg()[0], "cores": usable_cores()}
         return write_report(self.folder, about, parameters, measured)

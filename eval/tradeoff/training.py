@@ -1,4 +1,5 @@
-"""One training of a sweep as a task, and what its result is worth: held-out images, depth, surface."""
+"""The runs of a sweep: one training as a task, a copy of a given run, and what a run is worth: held-out images, depth,
+surface."""
 
 from __future__ import annotations
 
@@ -58,6 +59,19 @@ def training_errors(run: Run, scores: SurfaceScores, note: Callable[[str], None]
         else:
             found["chamfer_percent"] = scores.of(mesh)["chamfer_percent_diagonal"]
     return found
+
+
+def copy_run(given: Path, folder: Path) -> Path:
+    """`folder`, with a copy of what rendering and meshing need of a run. LinprimError if some of it is missing."""
+    Run.open(given)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("config.json", "transform.json", "run.json", "training_frame.npz"):
+        if not (given / name).exists():
+            raise LinprimError(
+                f"{given}: {name} is missing, so this is not the folder of a run that has saved something"
+            )
+        shutil.copy(given / name, folder / name)
+    return folder
 
 
 def train_task(folder: Path, scene: str, scene_options: dict, options: dict) -> dict:

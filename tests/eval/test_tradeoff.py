@@ -220,7 +220,7 @@ def swept(tiny_scene, tiny_run, tmp_path_factory):
     return out, results
 
 
-def test_every_rung_was_timed_and_judged(swept):
+def test_every_value_was_timed_and_judged(swept):
     out, results = swept
     assert "failed" not in (out / "measured.json").read_text()
     for name in MEASURED:
@@ -324,7 +324,7 @@ def shortened(monkeypatch, name, *values):
     monkeypatch.setitem(PARAMETERS, name, replace(each, values=tuple(r for r in each.values if r.name in values)))
 
 
-def test_training_knobs_run_on_every_rung(tiny_scene, tmp_path, monkeypatch):
+def test_training_parameters_run_on_every_value(tiny_scene, tmp_path, monkeypatch):
     """A few steps each; how runs are scored is tested by the ones that score."""
     monkeypatch.setattr(
         "linprim_geo.points.start_points.densify", lambda scene, *_: scene.points
@@ -390,7 +390,7 @@ def test_a_sweep_by_workers_goes_on_and_tells_what_fails(monkeypatch, photograph
         "quiet": True,
         "workers": 2,
     }
-    save = sweeping.Sweep._note
+    save = sweeping.Store.note
     noted = []
 
     def stopped(self, key, *rest, **more):
@@ -399,10 +399,10 @@ def test_a_sweep_by_workers_goes_on_and_tells_what_fails(monkeypatch, photograph
         noted.append(key)
         save(self, key, *rest, **more)
 
-    monkeypatch.setattr(sweeping.Sweep, "_note", stopped)
+    monkeypatch.setattr(sweeping.Store, "note", stopped)
     with pytest.raises(KeyboardInterrupt):
         tradeoff(photographs, tmp_path / "sweep", **how)
-    monkeypatch.setattr(sweeping.Sweep, "_note", save)
+    monkeypatch.setattr(sweeping.Store, "note", save)
     tasks = []
     run = sweeping.Executor.run
 

@@ -43,7 +43,7 @@ def sweep(folder, leave_out=(), chamfer=True):
     return folder
 
 
-def test_both_files_show_every_rung_in_both_panels(tmp_path, capsys):
+def test_both_files_show_every_value_in_both_panels(tmp_path, capsys):
     tradeoff_figures.main([str(sweep(tmp_path / "sweep")), "-o", str(tmp_path / "out")])
     names = ("tradeoff_ladder.svg", "tradeoff_surface.svg")
     assert capsys.readouterr().out.split() == [str(tmp_path / "out" / name) for name in names]

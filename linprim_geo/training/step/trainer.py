@@ -256,13 +256,17 @@ class Trainer:
             self._grow()
         elif self.step % FILTER_EVERY == 0:
             self._refilter()
-        loss, _, _, error = parts.detach().tolist()
-        psnr = -10 * math.log10(max(error, 1e-12)) if math.isfinite(error) else math.nan
-        self.loss = 0.98 * self.loss + 0.02 * loss if self.step > 1 else loss
-        self.psnr = 0.98 * self.psnr + 0.02 * psnr if self.step > 1 else psnr
         self.seconds += time.perf_counter() - begin
+        self._average(*parts.detach()[[0, 3]].tolist())
+
+    def _average(self, loss: float, squared_error: float) -> None:
+        """Takes a step's loss and mean squared error into the running means."""
         if not math.isfinite(loss):
             raise LinprimError(f"the loss is {loss}")
+        psnr = -10 * math.log10(max(squared_error, 1e-12))
+        first = self.step == 1
+        self.loss = loss if first else 0.98 * self.loss + 0.02 * loss
+        self.psnr = psnr if first else 0.98 * self.psnr + 0.02 * psnr
 
     def _update(self, grads: dict[str, torch.Tensor | None]) -> None:
         part = self.part()
