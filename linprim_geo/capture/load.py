@@ -21,6 +21,7 @@ from linprim_geo.capture.types import PHOTOGRAPHS, Frame, Listing, Scene, View, 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.lens import Intrinsics, Lens, check_lens, straightened, undistorted
 from linprim_geo.imaging import photos
+from linprim_geo.imaging.decoded_photos import DecodedPhotos
 
 # Of the images sorted by name, those whose index is a multiple of this are held out if the data set does
 # not say.
@@ -36,6 +37,7 @@ def load_scene(
     options: SceneOptions | None = None,
     *,
     cache: str | os.PathLike | None = None,
+    decoded: DecodedPhotos | None = None,
     **changes: Any,
 ) -> Scene:
     """Reads a posed capture: `transforms*.json` (NeRF-synthetic, nerfstudio, instant-ngp), ScanNet++, a COLMAP model,
@@ -56,6 +58,7 @@ def load_scene(
             `masks` are named as the images, and found without it in `masks` or `mask`; `images` scales the cameras to
             the size of these images. The pixels of `pinhole_below` are those of the averaged image.
         cache: where undistorted images and poses that were found are kept, see `photos.cache_folder`.
+        decoded: photographs that an earlier reading of the capture has decoded; default: those of this one.
         changes: fields of `options` by name, such as `downscale=2`.
 
     Raises:
@@ -104,9 +107,9 @@ def load_scene(
     if pinhole_below > 0:
         straight = {lens: straightened(lens, pinhole_below * downscale) for lens in {frame.lens for frame in posed}}
         posed = [replace(frame, lens=straight[frame.lens]) for frame in posed]
-    views = []
+    views, decoded = [], DecodedPhotos() if decoded is None else decoded
     for frame, name in zip(posed, names, strict=True):
-        views.append(_view(frame, name, downscale, has_alpha, folder, pinholes))
+        views.append(replace(_view(frame, name, downscale, has_alpha, folder, pinholes), decoded=decoded))
     train, test = _split(posed, views, options.test_every)
     scene = Scene(root, listing.kind, train, test, listing.points, listing.unit or "unit of the data set")
     return scene.with_training_views(options.views)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.lens import Intrinsics, Lens
 from linprim_geo.imaging import photos
+from linprim_geo.imaging.decoded_photos import DecodedPhotos
 
 # `Scene.kind` of photographs whose poses were found by structure from motion.
 PHOTOGRAPHS = "photographs"
@@ -62,15 +63,24 @@ class View:
     downscale: int = 1
     has_alpha: bool = False
     cache: Path | None = None
+    decoded: DecodedPhotos | None = field(default=None, compare=False, repr=False)
 
     def load(self) -> Photo:
-        """Decodes the photograph at the camera's size; undistorted ones are kept in the cache folder.
+        """The photograph at the camera's size; undistorted ones are kept in the cache folder, and what the capture has
+        room for stays in memory.
 
         A mask file replaces an alpha channel. Safe to call from several threads.
 
         Raises:
             LinprimError: a file is missing, damaged or of another size than at load time.
         """
+        if self.decoded is None:
+            return Photo(*self._decode())
+        files = [self.image_path] if self.mask_path is None else [self.image_path, self.mask_path]
+        key = (self.image_path, self.mask_path, self.has_alpha, self.downscale, self.lens)
+        return Photo(*self.decoded.get(key, files, self._decode))
+
+    def _decode(self) -> tuple[np.ndarray, np.ndarray | None]:
         store = None
         if self.lens is not None and self.cache is not None:
             flavour = "mask" if self.mask_path else "alpha" if self.has_alpha else "rgb"
@@ -78,7 +88,7 @@ class View:
             store = photos.UndistortedCache(self.cache, self.lens, self._full_target(), sources, flavour)
         found = store.get() if store is not None else None
         if found is not None:
-            return Photo(*photos.box_downscale(*found, self.downscale))
+            return photos.box_downscale(*found, self.downscale)
         rgb, alpha = photos.read_photo(self.image_path, self._file_size())
         if self.mask_path is not None:
             alpha = photos.read_mask(self.mask_path, self._file_size())
@@ -90,7 +100,7 @@ class View:
             rgb, alpha = photos.undistort_photo(rgb, alpha, self.lens, self._full_target())
             if store is not None:
                 store.put(rgb, alpha)
-        return Photo(*photos.box_downscale(rgb, alpha, self.downscale))
+        return photos.box_downscale(rgb, alpha, self.downscale)
 
     def load_depth(self) -> np.ndarray | None:
         """(H, W) float32 z-depth at the camera's pixel centres in the data set's unit, 0 = none; None without
@@ -159,6 +169,12 @@ class Scene:
     def has_alpha(self) -> bool:
         """Whether the views come with an alpha channel or a foreground mask."""
         return any(view.has_alpha for view in self.views)
+
+    def release_photos(self) -> None:
+        """Forgets the photographs that stay decoded."""
+        for view in self.views:
+            if view.decoded is not None:
+                view.decoded.clear()
 
     def with_training_views(self, count: int) -> Scene:
         """The same with `count` of the training views, evenly spread over them; with all of them for 0, or where there

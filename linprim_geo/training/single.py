@@ -79,6 +79,7 @@ def train_run(
         f"{ops.threads()} threads; background: {_background_in_words(trainer)}"
     )
     held_out = load_training_images(scene.test, run.similarity) if held_out is None else held_out
+    scene.release_photos()
     seconds, score, score_gain = run_steps(trainer, run, held_out, progress, pace, advance=advance)
     result = {
         "run": str(run.path),

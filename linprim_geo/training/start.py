@@ -24,6 +24,7 @@ from linprim_geo.capture.structure_from_motion import prepare
 from linprim_geo.capture.types import PointCloud, Scene
 from linprim_geo.geometry.environment_map import texels_for
 from linprim_geo.geometry.primitives import KINDS
+from linprim_geo.imaging.decoded_photos import DecodedPhotos
 from linprim_geo.kernels import ops
 from linprim_geo.points.initial_points import (
     CAMERA_DISTANCE,
@@ -51,8 +52,10 @@ def decided_scene(
     Returns: the decisions, the scene with points to start from, and both options with what was decided put in.
     """
 
+    decoded = DecodedPhotos()
+
     def read(how: SceneOptions) -> Scene:
-        return with_points(load_scene(path, how), options, log)
+        return with_points(load_scene(path, how, decoded=decoded), options, log)
 
     prepare(path, scene_options, threads=options.threads, log=log)
     scene = read(scene_options)

@@ -109,7 +109,7 @@ def test_defaults_of_the_registry_are_those_of_the_options():
         assert parameters.value_named(each, each.default).changes.items() <= base.items(), name
 
 
-def test_every_training_rung_changes_an_option_that_is_allowed():
+def test_every_training_value_changes_an_option_that_is_allowed():
     options, scene = TrainOptions(iterations=100, max_primitives=80), SceneOptions(downscale=2)
     for each in PARAMETERS.values():
         if each.group != "train":
@@ -235,7 +235,7 @@ def test_every_value_was_timed_and_judged(swept):
             assert all(row[error] is not None and row[error] >= 0 for error in PARAMETERS[name].errors), row
 
 
-def test_the_errors_are_those_of_the_knob(swept):
+def test_the_errors_are_those_of_the_parameter(swept):
     rows = {(row["parameter"], row["value"]): row for row in swept[1]["rows"]}
     # The integral itself differs from the reference by rounding and the early stop alone, the order of centres by more.
     assert rows["order", "overlap"]["image_percent"] < 0.2 * rows["order", "center"]["image_percent"]

@@ -1,0 +1,72 @@
+"""Photographs that stay decoded, so that a command decodes each of them once."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Hashable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+# Bytes of a capture's photographs that stay decoded: a thousand of 480x360, ten of 16 megapixels. Larger captures are
+# streams: the first photographs that are asked for stay, the others are decoded again whenever they are used.
+MOST_BYTES = 2**29
+
+Pixels = tuple[np.ndarray, np.ndarray | None]
+
+
+class DecodedPhotos:
+    """Pixels of photographs by a key of the caller's, up to `limit` bytes in all.
+
+    A photograph whose files have changed since is decoded again. Safe to use from several threads. A copy in another
+    process begins empty.
+    """
+
+    def __init__(self, limit: int = MOST_BYTES):
+        self.limit, self.used = limit, 0
+        self._kept: dict[Hashable, tuple[tuple, Pixels]] = {}
+        self._lock = threading.Lock()
+
+    def __reduce__(self):
+        return DecodedPhotos, (self.limit,)
+
+    def get(self, key: Hashable, files: Sequence[Path], decode: Callable[[], Pixels]) -> Pixels:
+        """What `decode` gives, or a copy of what it gave when these files were what they are now."""
+        state = tuple(_state(file) for file in files)
+        with self._lock:
+            kept = self._kept.get(key)
+        if kept is not None and kept[0] == state and None not in state:
+            return _copy(kept[1])
+        pixels = decode()
+        with self._lock:
+            if (old := self._kept.pop(key, None)) is not None:
+                self.used -= _bytes(old[1])
+            size = _bytes(pixels)
+            if self.used + size <= self.limit:
+                self._kept[key] = state, _copy(pixels)
+                self.used += size
+        return pixels
+
+    def clear(self) -> None:
+        """Forgets all of them."""
+        with self._lock:
+            self._kept.clear()
+            self.used = 0
+
+
+def _copy(pixels: Pixels) -> Pixels:
+    rgb, alpha = pixels
+    return rgb.copy(), None if alpha is None else alpha.copy()
+
+
+def _bytes(pixels: Pixels) -> int:
+    return sum(array.nbytes for array in pixels if array is not None)
+
+
+def _state(file: Path) -> tuple[int, int] | None:
+    """What tells a file that was written since; None if there is none."""
+    try:
+        found = file.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size
