@@ -212,6 +212,8 @@ class Run:
         save_primitives(self.path / "scene.npz", exported)
         write_primitive_ply(self.path / "scene.ply", exported)
         write_json(self.path / "run.json", state)
+        for name in ("state", "environment", "_trained"):  # read anew
+            self.__dict__.pop(name, None)
 
     @cached_property
     def environment(self) -> torch.Tensor | None:
@@ -222,7 +224,12 @@ class Run:
         return load_environment(self.path)
 
     def training_primitives(self) -> Primitives:
-        """The saved primitives in the training frame, bit for bit as trained."""
+        """The saved primitives in the training frame, bit for bit as trained. Not to be changed: the file is read
+        once."""
+        return self._trained
+
+    @cached_property
+    def _trained(self) -> Primitives:
         return load_primitives(self.path / "training_frame.npz")
 
     def primitives(self) -> Primitives:

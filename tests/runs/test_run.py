@@ -14,7 +14,8 @@ from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.capture.load import load_scene
 from linprim_geo.geometry.camera import Similarity
 from linprim_geo.geometry.primitive_files import read_primitive_ply
-from linprim_geo.geometry.primitives import Primitives, load_primitives
+from linprim_geo.geometry.primitives import ARRAYS, Primitives, load_primitives
+from linprim_geo.runs import run as runs
 from linprim_geo.runs.run import Run, to_data_set
 
 
@@ -178,3 +179,14 @@ def test_surfaces_begin_at_the_near_plane_of_training(tiny_scene, tmp_path, kind
     nearest = 0.6 if kind == "gaussian" else 0.1
     assert depth[depth > 0].min() == pytest.approx(nearest, abs=0.03)
     assert images["depth_median"][images["depth_median"] > 0].min() == pytest.approx(nearest, abs=0.03)
+
+
+def test_the_primitives_are_read_once_and_anew_after_they_were_saved(tiny_run, tmp_path, monkeypatch):
+    opened, read = Run.open(shutil.copytree(tiny_run, tmp_path / "run")), []
+    monkeypatch.setattr(runs, "load_primitives", lambda path: read.append(path) or load_primitives(path))
+    first = opened.training_primitives()
+    opened.primitives(), opened.raster_arguments(), next(opened.surface_depths(opened.scene().train, 0.5))
+    assert len(read) == 1
+    half = replace(first, **{name: getattr(first, name)[: len(first) // 2] for name in ARRAYS})
+    opened.save(half, opened.state | {"primitives": len(half)})
+    assert len(opened.primitives()) == len(half) == opened.state["primitives"] and len(read) == 2
