@@ -10,10 +10,16 @@ import torch
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.capture.types import Scene
 from linprim_geo.points.far_colors import OPEN_SHARE, FarColors, far_colors, far_share
+from linprim_geo.points.initial_points import VolumePoints, in_image
 from linprim_geo.training.step.training_images import TrainingImage
 
-# A backdrop is plain where this share of all border pixels lies this near to their median colour, per channel.
+# A backdrop is plain where this share of all border pixels lies this near to their median colour, per channel, and
+# beside no surface: a carpet of one colour has points, which are recognised from view to view. Beside are several
+# points (one may be a wrong match) within a distance in image diagonals.
 BACKDROP_SHARE, BACKDROP_TOLERANCE = 0.8, 0.1
+SURFACE_POINTS, BESIDE = 3, 0.05
+# Photographs whose borders are looked at, spread over the capture.
+BORDER_VIEWS = 60
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,7 @@ def chosen_background(text: str, scene: Scene, images: list[TrainingImage], begu
         text = "random"
         if begun:
             text = "environment"
-        elif not has_alpha and plain_border(images) > BACKDROP_SHARE:
+        elif not has_alpha and plain_border(scene) > BACKDROP_SHARE:
             text = "fitted"
         elif not has_alpha and begun is None:
             far = far_colors(scene)
@@ -80,10 +86,28 @@ def _border_colors(images: list[TrainingImage]) -> np.ndarray:
     return np.concatenate(edges).astype(np.float64) / 255
 
 
-def plain_border(images: list[TrainingImage]) -> float:
-    """Share of the outermost pixels of all views that lie near their median colour."""
-    colors = _border_colors(images)
-    return float(np.mean(np.abs(colors - np.median(colors, 0)).max(1) < BACKDROP_TOLERANCE))
+def plain_border(scene: Scene) -> float:
+    """Share of the outermost pixels of its photographs that lie near their median colour and beside no points of
+    surfaces; by their colour alone where the scene has none."""
+    from scipy.spatial import cKDTree
+
+    views = scene.train[:: max(1, len(scene.train) // BORDER_VIEWS)]
+    cloud = scene.points
+    points = np.zeros((0, 3)) if cloud is None or isinstance(cloud, VolumePoints) else cloud.xyz
+    colors, apart = [], []
+    for view in views:
+        rgb, camera = view.load().rgb, view.camera
+        border = np.ones(rgb.shape[:2], bool)
+        border[1:-1, 1:-1] = False
+        colors.append(rgb[border] / 255.0)
+        pixels = camera.project(points[in_image(camera, points)[0]])[0]
+        beside = BESIDE * float(np.hypot(camera.width, camera.height))
+        row, column = np.nonzero(border)
+        at = np.stack([column, row], 1) + 0.5
+        apart.append(cKDTree(pixels).query(at, SURFACE_POINTS)[0][:, -1] > beside)
+    color = np.concatenate(colors)
+    near = np.abs(color - np.median(color, 0)).max(1) < BACKDROP_TOLERANCE
+    return float(np.mean(near & np.concatenate(apart)))
 
 
 def _mean_color(images: list[TrainingImage]) -> np.ndarray:

@@ -21,7 +21,6 @@ from linprim_geo.points.far_colors import OPEN_SHARE, far_colors, far_share
 from linprim_geo.points.initial_points import CAMERA_DISTANCE, VolumePoints, scene_normalization
 from linprim_geo.points.photo_evidence import Observations, observe
 from linprim_geo.training.step.trainer import SMALLEST_PX
-from linprim_geo.training.step.training_images import load_training_images
 
 # Views that are enough for what is measured on the primitives of the start.
 START_VIEWS = 12
@@ -151,8 +150,7 @@ def _gain_spread(data: Data) -> float | None:
 def _plain_border(data: Data) -> float:
     from linprim_geo.training.background import plain_border
 
-    views = data.scene.train[:: max(1, len(data.scene.train) // 60)]
-    return 100 * plain_border(load_training_images(views, data.similarity))
+    return 100 * plain_border(data.scene)
 
 
 def _far(data: Data) -> float:
@@ -275,7 +273,7 @@ _REGISTRY = (
     Effect(
         "background",
         "one colour behind everything is fitted; without it a random one makes everything opaque",
-        "border pixels of one colour",
+        "border pixels of one colour, beside no point of a surface",
         "%",
         80.0,
         1.0,
