@@ -31,18 +31,21 @@ _MIN_SHARE = 0.5
 _GOOD_SHARE = 0.9
 _GOOD_ERROR_PX = 1.0
 _GOOD_TRACK = 3.0
+# Names in a message.
+_LISTED = 6
 
 
 @dataclass(frozen=True)
 class Verdict:
     """What became of the photographs: how many have a pose, the mean reprojection error in pixels, the mean number of
-    photographs that see a point, and the points."""
+    photographs that see a point, the points, and the names of those without a pose."""
 
     photographs: int
     registered: int
     points: int = 0
     error_px: float = 0.0
     track_length: float = 0.0
+    left_out: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         return (
@@ -57,15 +60,25 @@ class Verdict:
 
     @property
     def doubts(self) -> str:
-        """What makes the poses poor, "" if nothing does."""
+        """What makes the poses poor and what helps, "" if nothing does."""
         poor = []
         if self.registered < _GOOD_SHARE * self.photographs:
-            poor.append(f"{self.photographs - self.registered} photographs are left out")
+            missing = self.photographs - self.registered
+            count = f"{missing} photograph{' is' if missing == 1 else 's are'} left out{_listed(self.left_out)}"
+            poor.append(f"{count}, so take some between these and the others, which overlap with both by two thirds")
         if self.error_px > _GOOD_ERROR_PX:
-            poor.append(f"points miss their keypoints by {self.error_px:.2f} px")
+            poor.append(f"points miss their keypoints by {self.error_px:.2f} px, so let nothing move, and do not zoom")
         if self.track_length < _GOOD_TRACK:
-            poor.append(f"a point is seen by {self.track_length:.1f} photographs only")
-        return ", ".join(poor)
+            poor.append(f"a point is seen by {self.track_length:.1f} photographs only, so take more of each place")
+        return "; ".join(poor)
+
+
+def _listed(names: Sequence[str]) -> str:
+    """The first names in brackets, and how many there are beside them."""
+    if not names:
+        return ""
+    more = len(names) - _LISTED
+    return f" ({', '.join(names[:_LISTED])}{f' and {more} more' if more > 0 else ''})"
 
 
 def photographs(root: Path) -> tuple[Path, list[str]]:
@@ -142,7 +155,9 @@ def _stored(kept: Path) -> Verdict | None:
     """What is said of the result in a folder; None if there is none, or one that is of no use and made again."""
     try:
         verdict = Verdict(**json.loads((kept / "verdict.json").read_text(encoding="utf-8")))
-        usable = all(type(value) in (int, float) and 0 <= value < _LARGEST for value in astuple(verdict))
+        *numbers, names = astuple(verdict)
+        usable = all(type(value) in (int, float) and 0 <= value < _LARGEST for value in numbers)
+        usable = usable and isinstance(names, (list, tuple)) and all(isinstance(name, str) for name in names)
         return verdict if usable and (not verdict.registered or has_model(kept / "model")) else None
     except (OSError, ValueError, TypeError, RecursionError):
         return None

@@ -128,7 +128,9 @@ def _reconstruct(
         model.write_binary(str(part))
         part.rename(kept / "model")
         errors = model.compute_mean_reprojection_error(), model.compute_mean_track_length()
-        verdict = Verdict(len(names), model.num_reg_images(), model.num_points3D(), *errors)
+        posed = {model.images[number].name for number in model.reg_image_ids()}
+        left_out = tuple(name for name in names if name not in posed)
+        verdict = Verdict(len(names), model.num_reg_images(), model.num_points3D(), *errors, left_out)
     write_json(kept / "verdict.json", asdict(verdict))
     remove_work(kept)
     shutil.rmtree(kept / _COPIES, ignore_errors=True)

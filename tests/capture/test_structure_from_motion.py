@@ -152,7 +152,10 @@ def test_photographs_that_show_nothing_or_break_off_are_left_out(copied, tmp_pat
     (copied / "cut.png").write_bytes((copied / "2.png").read_bytes()[:5000])
     lines: list[str] = []
     find_poses(copied, tmp_path / "cache", threads=1, log=lines.append)
-    assert lines[-1].startswith("warning: the poses are poor") and lines[-1].endswith(": 2 photographs are left out")
+    assert lines[-1].startswith("warning: the poses are poor")
+    assert ": 2 photographs are left out (blank.png, cut.png), so take some between these and the others" in lines[-1]
+    find_poses(copied, tmp_path / "cache", threads=1, log=lines.append)
+    assert lines[-1] == lines[-3] and "; from " in lines[-2]  # what is kept says the same
     found = sorted(view.name for view in load_scene(copied, cache=tmp_path / "cache").views)
     assert found == [*"01245678", "my  photo 3"]
 
@@ -181,7 +184,9 @@ def test_verdicts():
         Verdict(4, 2).unusable and Verdict(10, 4).unusable and not Verdict(6, 3).unusable and not Verdict(3, 3).unusable
     )
     assert Verdict(10, 10, 500, 0.5, 4.0).doubts == ""
-    assert Verdict(10, 8, 500, 0.5, 4.0).doubts == "2 photographs are left out"
+    names = tuple(f"{k}.jpg" for k in range(8))
+    assert Verdict(9, 8, 500, 0.5, 4.0, names[:1]).doubts.startswith("1 photograph is left out (0.jpg), so take some")
+    assert "(0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg, 5.jpg and 2 more)" in Verdict(20, 12, 500, 0.5, 4.0, names).doubts
     poor = Verdict(10, 10, 500, 1.5, 2.5).doubts
     assert "1.50 px" in poor and "2.5 photographs only" in poor and "left out" not in poor
 
@@ -190,9 +195,8 @@ def test_poor_poses_are_warned_of_in_one_line(copied, tmp_path, monkeypatch):
     monkeypatch.setattr(structure_from_motion, "_reconstruct", lambda *_: Verdict(9, 6, 100, 0.4, 3.5))
     lines: list[str] = []
     find_poses(copied, tmp_path / "cache", log=lines.append)
-    assert [line for line in lines if "warning" in line] == [
-        "warning: the poses are poor, and so may be the result: 3 photographs are left out"
-    ]
+    (warning,) = [line for line in lines if "warning" in line]
+    assert warning.startswith("warning: the poses are poor, and so may be the result: 3 photographs are left out, so")
 
 
 def test_which_images_are_photographs(tmp_path):
