@@ -1,4 +1,4 @@
-"""Mesh scores: exact distances from samples of one surface to the triangles of another, and who asks for them.
+"""Mesh scores: exact distances from samples of one surface to the triangles of another; what `eval-mesh` calls.
 
 The headline protocol. Both surfaces are sampled uniformly by area, and each sample's distance to the
 *surface* of the other mesh is exact, so two meshes of one shape are 0 apart however they are triangulated.

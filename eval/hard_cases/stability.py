@@ -168,13 +168,13 @@ def _norm(x: Tensor) -> Tensor:
     return x.detach().flatten(1).norm(dim=1)
 
 
-def gradient_errors(scenes: Scenes, got: list[Tensor], wanted: list[Tensor], known: list[Tensor]) -> Tensor:
-    """(B,) largest over PARAMETERS of |got - wanted| / max(|wanted|, known / CLOSE), over whole scenes; `known` (B,)
+def gradient_errors(scenes: Scenes, got: list[Tensor], wanted: list[Tensor], slack: list[Tensor]) -> Tensor:
+    """(B,) largest over PARAMETERS of |got - wanted| / max(|wanted|, slack / CLOSE), over whole scenes; `slack` (B,)
     each: to what rounding leaves that gradient known."""
     length = scenes.rotation[: len(got[0])].norm(dim=-1, keepdim=True)
     got = [g * torch.where(length > 0, length, torch.ones_like(length)) if i == 1 else g for i, g in enumerate(got)]
     errors = []
-    for a, b, least in zip(got, wanted, known, strict=True):
+    for a, b, least in zip(got, wanted, slack, strict=True):
         off, size = _norm(a - b), torch.maximum(_norm(b), least / CLOSE)
         errors.append(torch.where(off <= 1e-37, torch.zeros_like(off), off / size.clamp(min=1e-300)))
     return torch.stack(errors).amax(0)
@@ -235,8 +235,8 @@ def judge(name: str, variant: Variant, scenes: Scenes, truth: Truth, weights: Te
     if gradients:
         some = scenes.rows(slice(0, gradients))
         found = _rows(truth.found, slice(0, gradients))
-        known = gradient_rounding(some, found, off[:gradients], weights[:gradients], truth.contributions, variant.eps)
-        errors = [gradient_errors(scenes, grads, choice, known) for choice in truth.gradients]
+        slack = gradient_rounding(some, found, off[:gradients], weights[:gradients], truth.contributions, variant.eps)
+        errors = [gradient_errors(scenes, grads, choice, slack) for choice in truth.gradients]
         errors = torch.stack(errors).amin(0)
         errors = errors.nan_to_num(math.inf, math.inf)
         resolved = (off.sum((1, 2)) <= CLOSE / 10 * alpha.sum(1))[:gradients] | (off.sum((1, 2)) == 0)[:gradients]

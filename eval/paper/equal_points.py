@@ -1,4 +1,4 @@
-"""Two curves of quality over cost compared where one of the two is the same."""
+"""Compares two curves of quality over cost at equal cost, or at equal quality."""
 
 from __future__ import annotations
 

@@ -54,11 +54,13 @@ def verdict(parameter: Parameter, rows: Sequence[dict]) -> dict:
     rows have decides.
     """
     rows = [row for row in rows if math.isfinite(row.get("seconds", math.nan))]
-    known = [name for name in parameter.errors if rows and all(math.isfinite(row.get(name, math.nan)) for row in rows)]
+    measured = [
+        name for name in parameter.errors if rows and all(math.isfinite(row.get(name, math.nan)) for row in rows)
+    ]
     title = parameter.title[0].upper() + parameter.title[1:]
-    if not known or len(rows) < 2:
+    if not measured or len(rows) < 2:
         return {"sentence": f"{title}: nothing here to judge it by.", "error": None}
-    error = known[0]
+    error = measured[0]
     on = [rows[k] for k in frontier([(row["seconds"], row[error]) for row in rows])]
     cheapest, best = on[0], on[-1]
     taken = cheapest

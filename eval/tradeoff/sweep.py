@@ -1,4 +1,4 @@
-"""What accuracy costs in time on a scene: every parameter of `eval/parameters.py` swept one at a time around the
+"""What accuracy costs in time on a scene: every parameter of `parameters.py` swept one at a time around the
 defaults.
 
 Writes `tradeoff.csv`, `tradeoff.json` and `tradeoff.html`. All settings of a group are timed in turn, round after

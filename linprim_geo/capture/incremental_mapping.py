@@ -24,11 +24,11 @@ def pairs_to_match(database, count: int) -> list[tuple[int, int]]:
     """Pairs (i < j) of photographs worth matching, counted from 0."""
     if count <= _MATCH_ALL:
         return [(i, j) for i in range(count) for j in range(i + 1, count)]
-    looks = [_largest(database, index + 1) for index in range(count)]
+    descriptors = [_largest(database, index + 1) for index in range(count)]
     alike = np.zeros((count, count), np.int32)
     for i in range(count):
         for j in range(i + 1, count):
-            alike[i, j] = alike[j, i] = _common(looks[i], looks[j])
+            alike[i, j] = alike[j, i] = _common(descriptors[i], descriptors[j])
     pairs = {(i, j) for i in range(count) for j in range(i + 1, min(count, i + 1 + _NEXT_BY_NAME))}
     for i, row in enumerate(alike):
         for j in np.argsort(-row, kind="stable")[:_PARTNERS]:
@@ -128,20 +128,20 @@ def _register(database_path: Path, folder: Path, names: list[str], sizes: list[t
             _rename(database, names)
             return
         database.clear_all_tables()
-        known = pycolmap.Reconstruction()
+        numbered = pycolmap.Reconstruction()
         numbers: dict[tuple, int] = {}
         for index, (name, size) in enumerate(zip(names, sizes, strict=True), start=1):
             camera = pycolmap.infer_camera_from_image(folder / name)
             alike = (Path(name).parent, size, round(camera.focal_length, 1))
             if alike not in numbers:
                 numbers[alike] = camera.camera_id = index
-                known.add_camera_with_trivial_rig(camera)
+                numbered.add_camera_with_trivial_rig(camera)
                 database.write_camera(camera, use_camera_id=True)
-                database.write_rig(known.rig(index), use_rig_id=True)
+                database.write_rig(numbered.rig(index), use_rig_id=True)
             image = pycolmap.Image(name=name, camera_id=numbers[alike], image_id=index)
-            known.add_image_with_trivial_frame(image)
+            numbered.add_image_with_trivial_frame(image)
             database.write_image(image, use_image_id=True)
-            database.write_frame(known.frame(index), use_frame_id=True)
+            database.write_frame(numbered.frame(index), use_frame_id=True)
 
 
 def _extract(database_path: Path, folder: Path, names: list[str], threads: int, say: Callable[[str], None]) -> None:

@@ -88,7 +88,7 @@ def view_run(
         parent = int(os.environ.get(PARENT, "0"))
         while not parent or os.getppid() == parent:
             time.sleep(LOOK_EVERY)
-            if follow and viewer.look():
+            if follow and viewer.reload_if_saved():
                 _end_when_asked()
     except KeyboardInterrupt:
         pass
@@ -142,7 +142,7 @@ class Viewer:
             self.server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="medium")
             self._controls()
             if follow:
-                self.look()
+                self.reload_if_saved()
             else:
                 self._load()
         except BaseException:
@@ -162,7 +162,7 @@ class Viewer:
         meshes = f"{len(self.seen.meshes)} mesh" + ("es" if len(self.seen.meshes) != 1 else "")
         return f"{self.path}, step {self.seen.step}, {self.seen.count} primitives, {meshes}"
 
-    def look(self) -> bool:
+    def reload_if_saved(self) -> bool:
         """Reads the run if it has saved since; whether it did. A run that is not there yet, or is being written, is
         looked at later."""
         now = stamps(self.path)

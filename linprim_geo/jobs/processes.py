@@ -1,4 +1,4 @@
-"""Tasks by processes of this machine: one per task, killed ones are told and tried again."""
+"""Tasks by processes of this machine: one per task, killed ones are reported and tried again."""
 
 from __future__ import annotations
 

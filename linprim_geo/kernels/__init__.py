@@ -1,1 +1,1 @@
-"""The only door to the compiled core: the rasterizer, the losses, Adam."""
+"""The only package that calls the compiled core: rasterizer, losses, optimiser, stereo, TSDF, operators on surfaces."""

@@ -81,14 +81,14 @@ def densify(scene: Scene, seed: int, backdrop: np.ndarray | None = None, far: Fa
     """
     cloud = scene.points
     assert cloud is not None, "of a scene without points there is nothing to fill"
-    views = [_Gaps(look, cloud.xyz) for look in evenly_spread_views(scene.train, MOST_VIEWS)]
-    at_infinity = [None if far is None else far.difference(view.look) for view in views]
+    views = [_Gaps(small_view, cloud.xyz) for small_view in evenly_spread_views(scene.train, MOST_VIEWS)]
+    at_infinity = [None if far is None else far.difference(view.small_view) for view in views]
     rng = np.random.default_rng([seed, 8])
     found = [np.empty((0, 3))]
     colors = [np.empty((0, 3), np.uint8)]
     for source in (_between_points, _same_colors, _nearest_points) if far is None else (_between_points,):
         if source is not _between_points:  # by now there are more points, and more space is known to be free
-            views = [_Gaps(view.look, np.concatenate([cloud.xyz, *found])) for view in views]
+            views = [_Gaps(view.small_view, np.concatenate([cloud.xyz, *found])) for view in views]
         cell = CELL if source is _between_points else PATCH_CELL
         for index in np.argsort([-len(view.pixels) for view in views], kind="stable"):
             view = views[index]
@@ -104,7 +104,7 @@ def densify(scene: Scene, seed: int, backdrop: np.ndarray | None = None, far: Fa
             free = _not_in_free_space(points, views, index)
             column, row = pixels[free].astype(np.int64).T
             found.append(points[free])
-            colors.append(view.look.rgb[row, column])
+            colors.append(view.small_view.rgb[row, column])
     if sum(map(len, found)) == 0:
         return cloud
     return PointCloud(
@@ -116,8 +116,8 @@ def densify(scene: Scene, seed: int, backdrop: np.ndarray | None = None, far: Fa
 class _Gaps:
     """A view, the points it sees, and the triangles between them: `pixels` (P, 2) and `inverse` (P,) depths."""
 
-    def __init__(self, look: SmallView, xyz: np.ndarray):
-        self.look, self.camera = look, look.camera
+    def __init__(self, small_view: SmallView, xyz: np.ndarray):
+        self.small_view, self.camera = small_view, small_view.camera
         inside = in_image(self.camera, xyz)[0]
         self.pixels, depth = self.camera.project(xyz[inside])
         self.inverse = 1.0 / depth
@@ -164,7 +164,7 @@ class _Gaps:
         in memory."""
         from scipy.ndimage import uniform_filter
 
-        return np.rint(9 * uniform_filter(self.look.rgb.astype(np.float32), (3, 3, 1), mode="nearest")).astype(
+        return np.rint(9 * uniform_filter(self.small_view.rgb.astype(np.float32), (3, 3, 1), mode="nearest")).astype(
             np.uint16
         )
 
@@ -194,10 +194,10 @@ class _Gaps:
         """(Q,) whether the photograph has neither background nor backdrop at (Q, 2) positions."""
         column, row = pixels.astype(np.int64).T
         shown = np.ones(len(pixels), dtype=bool)
-        if self.look.foreground is not None:
-            shown &= self.look.foreground[row, column]
+        if self.small_view.foreground is not None:
+            shown &= self.small_view.foreground[row, column]
         if backdrop is not None:
-            shown &= np.abs(self.look.rgb[row, column] - 255.0 * backdrop).max(1) > _BACKDROP
+            shown &= np.abs(self.small_view.rgb[row, column] - 255.0 * backdrop).max(1) > _BACKDROP
         return shown
 
     def depths_to_try(self) -> np.ndarray:

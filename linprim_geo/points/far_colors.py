@@ -46,26 +46,26 @@ class FarColors:
     before it differs from view to view.
     """
 
-    def __init__(self, looks: Sequence[SmallView]):
-        self.looks = looks
-        self.size = texels_for([look.camera for look in looks], most=SURVEY_TEXELS)
-        focal = float(np.median([look.camera.fx for look in looks]))
+    def __init__(self, small_views: Sequence[SmallView]):
+        self.small_views = small_views
+        self.size = texels_for([small_view.camera for small_view in small_views], most=SURVEY_TEXELS)
+        focal = float(np.median([small_view.camera.fx for small_view in small_views]))
         self.width = max(3, round(2 * focal / self.size)) | 1  # of a texel in pixels
         directions = texel_directions(self.size).reshape(6, -1, 3)
-        images = [self._image(look) for look in looks]
+        images = [self._image(small_view) for small_view in small_views]
         faces = [self._face(each, images) for each in directions]
         self.texels, self.views = (np.concatenate(parts) for parts in zip(*faces, strict=True))
 
-    def _image(self, look: SmallView) -> np.ndarray:
+    def _image(self, small_view: SmallView) -> np.ndarray:
         """(H, W, 3) float32, averaged as a texel averages."""
         from scipy.ndimage import uniform_filter
 
-        return uniform_filter(look.rgb.astype(np.float32), (self.width, self.width, 1), mode="nearest")
+        return uniform_filter(small_view.rgb.astype(np.float32), (self.width, self.width, 1), mode="nearest")
 
     def _face(self, directions: np.ndarray, images: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         seen = [np.full((len(directions), 3), np.nan, np.float32)]
-        for look, image in zip(self.looks, images, strict=True):
-            inside, row, column = in_image(_at_origin(look.camera), directions)
+        for small_view, image in zip(self.small_views, images, strict=True):
+            inside, row, column = in_image(_at_origin(small_view.camera), directions)
             if inside.any():
                 colors = np.full((len(directions), 3), np.nan, np.float32)
                 colors[inside] = image[row[inside], column[inside]]
@@ -74,20 +74,20 @@ class FarColors:
 
     @cached_property
     def _all_compared(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        return [self.compared(look) for look in self.looks]
+        return [self.compared(small_view) for small_view in self.small_views]
 
-    def compared(self, look: SmallView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def compared(self, small_view: SmallView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of a look, on the lattice of STRIDE pixels: (h, w) mean difference of a patch from the environment, (h, w)
         variation of its colours, both of 255, and (h, w) how many views show the direction."""
         from scipy.ndimage import uniform_filter
 
-        image = self._image(look)
+        image = self._image(small_view)
         lattice = _lattice(image)
         part = image[lattice]
-        texel = nearest_texel(look.camera.world_rays()[lattice], self.size)
+        texel = nearest_texel(small_view.camera.world_rays()[lattice], self.size)
         texels = torch.from_numpy(np.nan_to_num(self.texels)).reshape(6, self.size, self.size, 3)
         environment = (
-            ops.environment_light(torch.zeros(image.shape[:2]), texels, look.camera).numpy().transpose(1, 2, 0)
+            ops.environment_light(torch.zeros(image.shape[:2]), texels, small_view.camera).numpy().transpose(1, 2, 0)
         )
         difference = np.abs(part - environment[lattice]).mean(-1)
         mean = uniform_filter(part, (PATCH, PATCH, 1), mode="nearest")
@@ -95,10 +95,10 @@ class FarColors:
         variation = np.sqrt(np.maximum(variance.max(-1), 0))
         return uniform_filter(difference, PATCH, mode="nearest"), variation, self.views[texel]
 
-    def difference(self, look: SmallView) -> Callable[[np.ndarray], np.ndarray]:
+    def difference(self, small_view: SmallView) -> Callable[[np.ndarray], np.ndarray]:
         """A function of (Q, 2) positions in a look: (Q,) how much the patches there differ from the environment, of
         255; NaN where too few views tell."""
-        difference, _, views = self.compared(look)
+        difference, _, views = self.compared(small_view)
         known = np.where(views >= LEAST_VIEWS, difference, np.nan)
 
         def at(pixels: np.ndarray) -> np.ndarray:
@@ -112,14 +112,14 @@ class FarColors:
         show the nearer half of (P, 3) `points`, which it explains by chance, or because the cameras are too near to
         each other to tell. None without textured patches."""
         everywhere, at_points = [], []
-        for look, (difference, variation, views) in zip(self.looks, self._all_compared, strict=True):
+        for small_view, (difference, variation, views) in zip(self.small_views, self._all_compared, strict=True):
             usable = (views >= LEAST_VIEWS) & (variation > TEXTURED)
-            if look.foreground is not None:
-                usable &= look.foreground[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
+            if small_view.foreground is not None:
+                usable &= small_view.foreground[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
             good = difference < EXPLAINED * variation
             everywhere.append(good[usable])
-            inside = in_image(look.camera, points)[0]
-            pixels, depth = look.camera.project(points[inside])
+            inside = in_image(small_view.camera, points)[0]
+            pixels, depth = small_view.camera.project(points[inside])
             nearer = pixels[depth <= np.median(depth)] if len(depth) else pixels
             row, column = (np.clip((nearer[:, 1 - k] / STRIDE).astype(np.int64), 0, views.shape[k] - 1) for k in (0, 1))
             at_points.append(good[row, column][usable[row, column]])

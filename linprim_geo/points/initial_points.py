@@ -28,8 +28,8 @@ _FOCUS_MAX_MISS = 0.35
 _FOCUS_MIN_EIGENVALUE = 1e-3
 _FOCUS_ROUNDS = 5
 # Photographs are looked at with about so many pixels on the longer side, and no more than so many of them.
-_LOOK_SIZE = 512
-_MAX_LOOKS = 200
+_SMALL_SIZE = 512
+_MOST_SMALL_VIEWS = 200
 # Alpha from here on is foreground: half-covered edge pixels are.
 _FOREGROUND = 16
 # Of the views, this share may say background and be overruled: masks have errors.
@@ -163,25 +163,25 @@ def visual_hull_points(scene: Scene, count: int, seed: int) -> VolumePoints:
     if not scene.has_alpha:
         raise LinprimError(f"{scene.root}: the images have no alpha channel and no masks, wanted one for a visual hull")
     rng = np.random.default_rng(seed)
-    looks = evenly_spread_views(scene.train, _MAX_LOOKS)
-    box = _hull_box(scene, looks, rng)
+    small_views = evenly_spread_views(scene.train, _MOST_SMALL_VIEWS)
+    box = _hull_box(scene, small_views, rng)
     kept, total, batches = [], 0, 0
     while total < count and batches < _HULL_MAX_BATCHES:
         points = rng.uniform(box[0], box[1], (_HULL_SAMPLES, 3))
-        kept.append(points[_inside_hull(points, looks, grow=0)])
+        kept.append(points[_inside_hull(points, small_views, grow=0)])
         total += len(kept[-1])
         batches += 1
         if batches == 20 and not total:
             break
     if not total:
         raise LinprimError(
-            f"{scene.root}: no point is foreground in the masks of all {len(looks)} training views,"
+            f"{scene.root}: no point is foreground in the masks of all {len(small_views)} training views,"
             " wanted masks that fit the cameras"
         )
     xyz = np.concatenate(kept)[:count]
     if len(xyz) < count:  # a hull of hair-thin parts: what was found stands for the rest
         xyz = xyz[rng.integers(0, len(xyz), count)]
-    return VolumePoints(xyz, _colors(xyz, looks))
+    return VolumePoints(xyz, _colors(xyz, small_views))
 
 
 def frusta_points(scene: Scene, count: int, seed: int) -> VolumePoints:
@@ -222,7 +222,7 @@ class SmallView:
 
     def __init__(self, view: View):
         photo = view.load()
-        factor = max(1, max(view.camera.width, view.camera.height) // _LOOK_SIZE)
+        factor = max(1, max(view.camera.width, view.camera.height) // _SMALL_SIZE)
         self.rgb, alpha = photos.box_downscale(photo.rgb, photo.alpha, factor)
         height, width = self.rgb.shape[:2]
         c = view.camera
@@ -246,9 +246,9 @@ def evenly_spread_views(views: Sequence[View], limit: int) -> list[SmallView]:
     return [SmallView(views[i]) for i in chosen]
 
 
-def _hull_box(scene: Scene, looks: Sequence[SmallView], rng: np.random.Generator) -> np.ndarray:
+def _hull_box(scene: Scene, small_views: Sequence[SmallView], rng: np.random.Generator) -> np.ndarray:
     """(2, 3) corners of a box round the visual hull, from coarse to fine."""
-    cameras = [look.camera for look in looks]
+    cameras = [small_view.camera for small_view in small_views]
     center, distance = looked_at(scene)
     half = max(np.linalg.norm(camera.center - center) for camera in cameras)
     half = max(half, distance)
@@ -258,8 +258,11 @@ def _hull_box(scene: Scene, looks: Sequence[SmallView], rng: np.random.Generator
         # The mean distance of samples, so that masks are grown by what lies between two of them.
         spacing = (np.prod(box[1] - box[0]) / _HULL_SAMPLES) ** (1 / 3)
         grow = [int(np.ceil(spacing * camera.fx / distance)) for camera in cameras]
-        grow = [min(max(value, 1), max(look.rgb.shape[:2]) // 8) for value, look in zip(grow, looks, strict=True)]
-        inside = points[_inside_hull(points, looks, grow)]
+        grow = [
+            min(max(value, 1), max(small_view.rgb.shape[:2]) // 8)
+            for value, small_view in zip(grow, small_views, strict=True)
+        ]
+        inside = points[_inside_hull(points, small_views, grow)]
         if not len(inside):
             break
         box_new = np.stack([inside.min(axis=0) - spacing, inside.max(axis=0) + spacing])
@@ -267,18 +270,18 @@ def _hull_box(scene: Scene, looks: Sequence[SmallView], rng: np.random.Generator
     return box
 
 
-def _inside_hull(points: np.ndarray, looks: Sequence[SmallView], grow: int | Sequence[int]) -> np.ndarray:
+def _inside_hull(points: np.ndarray, small_views: Sequence[SmallView], grow: int | Sequence[int]) -> np.ndarray:
     """(P,) whether enough views see the points and hardly any sees background there."""
-    allowed = int(_MASK_ERRORS * len(looks))
-    needed = max(2, int(np.ceil(_HULL_MIN_SEEN * len(looks))))
+    allowed = int(_MASK_ERRORS * len(small_views))
+    needed = max(2, int(np.ceil(_HULL_MIN_SEEN * len(small_views))))
     alive = np.arange(len(points))
     against, seen = np.zeros(len(points), dtype=np.int64), np.zeros(len(points), dtype=np.int64)
-    grow = [grow] * len(looks) if isinstance(grow, int) else grow
-    for look, radius in zip(looks, grow, strict=True):
-        assert look.foreground is not None, "a visual hull is made of masks"
-        mask = _grown(look.foreground, radius)
-        inside, row, column = in_image(look.camera, points[alive])
-        background = np.zeros(len(alive), dtype=bool) if look.open else ~inside
+    grow = [grow] * len(small_views) if isinstance(grow, int) else grow
+    for small_view, radius in zip(small_views, grow, strict=True):
+        assert small_view.foreground is not None, "a visual hull is made of masks"
+        mask = _grown(small_view.foreground, radius)
+        inside, row, column = in_image(small_view.camera, points[alive])
+        background = np.zeros(len(alive), dtype=bool) if small_view.open else ~inside
         background[inside] = ~mask[row[inside], column[inside]]
         against[alive] += background
         seen[alive] += inside
@@ -323,18 +326,21 @@ def _along_pixels(cameras: Sequence[Camera], count: int, low: float, high: float
     return points
 
 
-def _colors(points: np.ndarray, looks: Sequence[SmallView]) -> np.ndarray:
+def _colors(points: np.ndarray, small_views: Sequence[SmallView]) -> np.ndarray:
     """(P, 3) uint8 mean of the foreground pixels that the points fall on; the images' mean where there is
     none."""
     total, weight = np.zeros((len(points), 3)), np.zeros(len(points))
-    step = max(1, len(looks) // _COLOR_VIEWS)
-    for look in looks[::step]:
-        inside, row, column = in_image(look.camera, points)
-        if look.foreground is not None:
-            inside[inside] = look.foreground[row[inside], column[inside]]
-        total[inside] += look.rgb[row[inside], column[inside]]
+    step = max(1, len(small_views) // _COLOR_VIEWS)
+    for small_view in small_views[::step]:
+        inside, row, column = in_image(small_view.camera, points)
+        if small_view.foreground is not None:
+            inside[inside] = small_view.foreground[row[inside], column[inside]]
+        total[inside] += small_view.rgb[row[inside], column[inside]]
         weight[inside] += 1.0
-    shown = [look.rgb.reshape(-1, 3) if look.foreground is None else look.rgb[look.foreground] for look in looks]
+    shown = [
+        small_view.rgb.reshape(-1, 3) if small_view.foreground is None else small_view.rgb[small_view.foreground]
+        for small_view in small_views
+    ]
     usual = np.mean([pixels.mean(axis=0) for pixels in shown if len(pixels)] or [np.full(3, 128.0)], axis=0)
     mean = np.where(weight[:, None] > 0, total / np.maximum(weight, 1.0)[:, None], usual)
     return np.clip(mean + 0.5, 0, 255).astype(np.uint8)

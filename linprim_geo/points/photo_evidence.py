@@ -150,7 +150,7 @@ def observe(scene: Scene, seed: int = 0, views: int = VIEWS) -> Observations | N
     cloud = scene.points
     if cloud is None or isinstance(cloud, VolumePoints) or len(cloud.xyz) < _LEAST_POINTS:
         return None
-    looks = evenly_spread_views(scene.train, views)
+    small_views = evenly_spread_views(scene.train, views)
     rng = np.random.default_rng([seed, 11])
     normal, flat = _normals(cloud.xyz, seed)
     good = np.flatnonzero(flat < _FLAT)
@@ -160,15 +160,15 @@ def observe(scene: Scene, seed: int = 0, views: int = VIEWS) -> Observations | N
         return None
     rows = np.sort(rng.choice(good, min(POINTS, len(good)), replace=False))
     xyz, normal = cloud.xyz[rows], normal[rows]
-    count = (len(rows), len(looks))
+    count = (len(rows), len(small_views))
     seen, plain = np.zeros(count, bool), np.zeros(count, bool)
     color, footprint = np.zeros((*count, 3)), np.ones(count)
-    towards = np.stack([look.camera.center - xyz for look in looks], 1)
+    towards = np.stack([small_view.camera.center - xyz for small_view in small_views], 1)
     towards /= np.maximum(np.linalg.norm(towards, axis=2, keepdims=True), np.finfo(float).tiny)
     cosine = np.einsum("pvc,pc->pv", towards, normal)
-    for index, (look, camera) in enumerate(zip(looks, _same_views(scene, looks), strict=True)):
+    for index, (small_view, camera) in enumerate(zip(small_views, _same_views(scene, small_views), strict=True)):
         facing = np.sign(cosine[:, index])[:, None] * normal
-        seen[:, index], plain[:, index], color[:, index], depth = _colors_in(look, cloud.xyz, rows, facing)
+        seen[:, index], plain[:, index], color[:, index], depth = _colors_in(small_view, cloud.xyz, rows, facing)
         footprint[:, index] = np.where(depth > 0, depth, 1.0) / max(camera.fx, camera.fy)
     difference = np.abs(color - cloud.rgb[rows][:, None] / 255.0).mean(2)
     unlike = []
@@ -181,38 +181,38 @@ def observe(scene: Scene, seed: int = 0, views: int = VIEWS) -> Observations | N
     return Observations(xyz, seen, plain & seen, color, footprint)
 
 
-def _same_views(scene: Scene, looks: Sequence[SmallView]) -> list[Camera]:
-    chosen = np.unique(np.linspace(0, len(scene.train) - 1, len(looks)).round().astype(int))
+def _same_views(scene: Scene, small_views: Sequence[SmallView]) -> list[Camera]:
+    chosen = np.unique(np.linspace(0, len(scene.train) - 1, len(small_views)).round().astype(int))
     return [scene.train[i].camera for i in chosen]
 
 
 def _colors_in(
-    look: SmallView, xyz: np.ndarray, rows: np.ndarray, facing: np.ndarray
+    small_view: SmallView, xyz: np.ndarray, rows: np.ndarray, facing: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Of the points `rows` of (N, 3) `xyz` in a view, whose planes have the normals (P, 3) `facing` it: (P,) whether it
     sees them, (P,) whether also in plain surroundings, (P, 3) colours in [0, 1], (P,) z-depths."""
     from scipy.ndimage import minimum_filter, uniform_filter
     from scipy.spatial import cKDTree
 
-    inside = np.flatnonzero(in_image(look.camera, xyz)[0])
-    pixels, depth = look.camera.project(xyz)
+    inside = np.flatnonzero(in_image(small_view.camera, xyz)[0])
+    pixels, depth = small_view.camera.project(xyz)
     seen = np.isin(rows, inside)
     if len(inside) > _NEIGHBOURS and seen.any():
         mine = rows[seen]
         distance, near = cKDTree(pixels[inside]).query(pixels[mine], k=_NEIGHBOURS + 1)
-        close = distance <= _HIDDEN_REACH * max(look.camera.width, look.camera.height)
+        close = distance <= _HIDDEN_REACH * max(small_view.camera.width, small_view.camera.height)
         before = np.einsum("pkc,pc->pk", xyz[inside][near] - xyz[mine][:, None], facing[seen])
         before = (before > _HIDDEN_BEFORE * depth[mine, None]) & (depth[inside][near] < depth[mine, None])
         seen[seen] = ~(close & before).any(1)
     places = np.where(seen[:, None], pixels[rows], 0.5)
-    column, row = np.clip(places.astype(np.int64), 0, [look.camera.width - 1, look.camera.height - 1]).T
-    image = look.rgb.astype(np.float64) / 255.0
+    column, row = np.clip(places.astype(np.int64), 0, [small_view.camera.width - 1, small_view.camera.height - 1]).T
+    image = small_view.rgb.astype(np.float64) / 255.0
     mean = uniform_filter(image, (_PATCH, _PATCH, 1), mode="nearest")
     variance = uniform_filter(image**2, (_PATCH, _PATCH, 1), mode="nearest") - mean**2
     plain = seen & (variance.max(2) < _PLAIN**2)[row, column]
-    if look.foreground is not None:
-        seen &= look.foreground[row, column]
-        plain &= minimum_filter(look.foreground, size=_PATCH + 2, mode="nearest")[row, column]
+    if small_view.foreground is not None:
+        seen &= small_view.foreground[row, column]
+        plain &= minimum_filter(small_view.foreground, size=_PATCH + 2, mode="nearest")[row, column]
     color = sample_bilinear(mean.astype(np.float32), places[None])[0].astype(np.float64)
     return seen, plain, color, depth[rows]
 

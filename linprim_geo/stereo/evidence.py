@@ -1,4 +1,4 @@
-"""What the maps of a photograph and of those that it was compared with say about each of its depths."""
+"""Agreement of depth maps: reprojection error, difference of depths and angle of every pixel in other views."""
 
 from __future__ import annotations
 

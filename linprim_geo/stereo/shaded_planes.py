@@ -99,7 +99,7 @@ class ShadedPlanes:
     ):
         self.shadings = [Shading.of(found) for found in maps]
         self.cameras = [found.camera for found in maps]
-        self.known, self.exact = np.concatenate([by_points, by_edges]), len(by_points)
+        self.given, self.by_points = np.concatenate([by_points, by_edges]), len(by_points)
         self.depths = [shading.small(depth) for shading, depth in zip(self.shadings, depths, strict=True)]
         self.shown: list[list[ShadedRegion]] = []
         self.regions: list[list[FittedRegion]] = []
@@ -167,7 +167,7 @@ class ShadedPlanes:
             far = self._far(replace(few, others=tuple(k for k in range(len(self.shadings)) if k != view)))
             if far is None:
                 continue
-            fits = (evaluate(plane, [few], self.shadings) for plane in self.planes[self.exact :])
+            fits = (evaluate(plane, [few], self.shadings) for plane in self.planes[self.by_points :])
             if all(fit is None or fit.left_share > HARDLY_MORE * far.left_share for fit in fits):
                 around = binary_dilation(self._inside(region), iterations=BOX)
                 row, column = np.nonzero(around.repeat(shading.factor, 0).repeat(shading.factor, 1))
@@ -202,7 +202,7 @@ class ShadedPlanes:
 
     def _common(self, fitted: list[FittedRegion]) -> np.ndarray:
         """The known planes, and those of regions in several views that none of these carries."""
-        planes = list(self.known)
+        planes = list(self.given)
         fitted = [one for one in fitted if not any(self._carries(plane, one) for plane in planes)]
         boxes = np.array([len(one.region.row) for one in fitted])
         alike, left = self._alike(fitted), np.ones(len(fitted), bool)
@@ -276,8 +276,8 @@ class ShadedPlanes:
             for one, of_region in zip(own, of_view, strict=True):
                 for k in of_region:
                     carried[k].append(one.region)
-        held = [self._held_plane(plane, carried[k]) for k, plane in enumerate(self.planes) if k >= self.exact]
-        return np.concatenate([self.planes[: self.exact], np.reshape(held, (-1, 4))])
+        held = [self._held_plane(plane, carried[k]) for k, plane in enumerate(self.planes) if k >= self.by_points]
+        return np.concatenate([self.planes[: self.by_points], np.reshape(held, (-1, 4))])
 
     def _held_plane(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> np.ndarray:
         """A plane fitted to the shading of regions and to the confirmed depths along their edges that are near it: a
@@ -333,7 +333,7 @@ class ShadedPlanes:
             for of_region in own:
                 for k, boxes in of_region.items():
                     carried[k] += np.count_nonzero(boxes)
-        carried[: len(self.known)] *= HARDLY_MORE
+        carried[: len(self.given)] *= HARDLY_MORE
         result = []
         for view, (own, of_view) in enumerate(zip(self.regions, carriers, strict=True)):
             number = np.full(self.shadings[view].plain.shape, -1)

@@ -35,8 +35,8 @@ class Plan:
 
 def seconds_per_pixel(photographs: Photographs, budget: Budget) -> float:
     """Of all of stereo, by the first stage of some photographs, evenly over the capture."""
-    known = [k for k, sources in enumerate(photographs.pairs) if sources]
-    chosen, rates = known[:: max(1, len(known) // TIMED)][:TIMED], []
+    with_sources = [k for k, sources in enumerate(photographs.pairs) if sources]
+    chosen, rates = with_sources[:: max(1, len(with_sources) // TIMED)][:TIMED], []
     begin = time.monotonic()
     for k in chosen:
         images, halves = [], []

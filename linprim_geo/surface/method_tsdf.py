@@ -60,9 +60,9 @@ def tsdf_surface(
             f"{run.path}: no ray of any training view crosses transmittance {options.level}, so there is no surface"
         )
     stages.lap("render")
-    if frames.beyond:
+    if frames.clamped_share:
         stages.note(
-            f"{frames.beyond:.1%} of the depths lie beyond {frames.limit:.4g} and only clear the space before it"
+            f"{frames.clamped_share:.1%} of the depths lie beyond {frames.limit:.4g} and only clear the space before it"
         )
     voxel = options.voxel_size if options.voxel_size > 0 else auto_voxel_size(frames)
     memory = int(options.memory_limit * 2**30) if options.memory_limit > 0 else None
@@ -147,18 +147,19 @@ def _agreeing(mesh: Mesh, views: Sequence[View], gains: np.ndarray) -> float:
     """Share of the vertices that two photographs see at which these agree best within reach of the surface: where
     something is missing or stands too far out, they do so beyond it. `gains`: see `best_agreement`."""
     found = best_agreement(mesh, [view.camera for view in views], (view.load() for view in views), gains)
-    return float(found.inside[found.known].mean()) if found.known.any() else 0.0
+    return float(found.inside[found.seen_by_two].mean()) if found.seen_by_two.any() else 0.0
 
 
 class DepthFrames(Sequence):
     """`tsdf_field.DepthFrame`s of the training views: depth at transmittance `level`, free background.
 
-    Depths beyond `limit` are clamped to it; 0 chooses one by `depth_limit`. `beyond` is their share. Frames are kept in
-    memory if they are at most KEPT_BYTES in all, else, and without `keep`, rendered whenever they are asked for.
+    Depths beyond `limit` are clamped to it; 0 chooses one by `depth_limit`. `clamped_share` is their share. Frames are
+    kept in memory if they are at most KEPT_BYTES in all, else, and without `keep`, rendered whenever they are asked
+    for.
     """
 
     def __init__(self, run: Run, level: float, limit: float = 0.0, keep: bool = True):
-        self.run, self.level, self.limit, self.beyond = run, level, limit or np.inf, 0.0
+        self.run, self.level, self.limit, self.clamped_share = run, level, limit or np.inf, 0.0
         self.views = run.scene().train
         keep = (
             keep and sum(view.camera.width * view.camera.height * BYTES_PER_PIXEL for view in self.views) <= KEPT_BYTES
@@ -172,7 +173,7 @@ class DepthFrames(Sequence):
         depths = depths[depths > 0]
         if len(depths):
             self.limit = limit or depth_limit([view.camera for view in self.views], float(np.median(depths)))
-            self.beyond = float((depths > self.limit).mean())
+            self.clamped_share = float((depths > self.limit).mean())
         self.kept = [self._clamp(frame) for frame in self.kept]
 
     def __len__(self) -> int:
@@ -190,10 +191,10 @@ class DepthFrames(Sequence):
             yield DepthFrame(view.camera, np.where(free, np.float32(0), depth), background=free)
 
     def _clamp(self, frame: DepthFrame) -> DepthFrame:
-        beyond = frame.depth > self.limit
-        if not beyond.any():
+        too_far = frame.depth > self.limit
+        if not too_far.any():
             return frame
-        return replace(frame, depth=np.where(beyond, np.float32(self.limit), frame.depth), clamped=beyond)
+        return replace(frame, depth=np.where(too_far, np.float32(self.limit), frame.depth), clamped=too_far)
 
 
 def depth_limit(cameras: Sequence[Camera], median: float, truncation: float = 3.0) -> float:

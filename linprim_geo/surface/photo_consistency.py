@@ -77,14 +77,14 @@ class Agreement:
 
     `offset` is the signed distance along the (V, 3) `normals`, in the unit of the mesh, to where they agree best;
     `sharpness` how much their disagreement rises within a footprint on either side of it, as a share of white: 0 for a
-    plain surface; `known` whether at least two of them see a vertex well, `inside` whether the best place lies within
-    the OFFSETS and not at their end.
+    plain surface; `seen_by_two` whether at least two of them see a vertex well, `inside` whether the best place lies
+    within the OFFSETS and not at their end.
     """
 
     normals: np.ndarray
     offset: np.ndarray
     sharpness: np.ndarray
-    known: np.ndarray
+    seen_by_two: np.ndarray
     inside: np.ndarray
 
 
@@ -107,12 +107,12 @@ def best_agreement(
         gains: (K,) exposure of each photograph (`photo_gains`), default 1.
         caster: of the mesh, if there is one already.
     """
-    normals, known, footprint, variance = _compared(mesh, cameras, photos, gains, caster, OFFSETS)
-    offset, sharpness, inside = np.zeros(len(known)), np.zeros(len(known)), np.zeros(len(known), bool)
-    place, sharpness[known] = _least(np.sqrt(variance))
-    offset[known] = place * footprint[known]
-    inside[known] = np.abs(place) < OFFSETS[-1] - 0.1
-    return Agreement(normals, offset, sharpness, known, inside)
+    normals, seen_by_two, footprint, variance = _compared(mesh, cameras, photos, gains, caster, OFFSETS)
+    offset, sharpness, inside = np.zeros(len(seen_by_two)), np.zeros(len(seen_by_two)), np.zeros(len(seen_by_two), bool)
+    place, sharpness[seen_by_two] = _least(np.sqrt(variance))
+    offset[seen_by_two] = place * footprint[seen_by_two]
+    inside[seen_by_two] = np.abs(place) < OFFSETS[-1] - 0.1
+    return Agreement(normals, offset, sharpness, seen_by_two, inside)
 
 
 def photo_gains(
@@ -172,17 +172,17 @@ def predicted_error(
     """
     from scipy.spatial import cKDTree
 
-    _, known, footprint, variance = _compared(mesh, cameras, photos, gains, caster, DENSE_OFFSETS)
-    error = np.full(len(known), np.nan)
-    if not known.any():
+    _, seen_by_two, footprint, variance = _compared(mesh, cameras, photos, gains, caster, DENSE_OFFSETS)
+    error = np.full(len(seen_by_two), np.nan)
+    if not seen_by_two.any():
         return error.astype(np.float32)
     scale = PRIOR_SCALE
     for _ in range(PRIOR_ROUNDS):
         distance = _expected_distance(variance, scale)
         scale = max(float(distance.mean()), FINEST_OFFSET)
-    error[known] = distance * footprint[known]
-    if not known.all():
-        tree, told, unknown = cKDTree(mesh.vertices[known]), error[known], np.flatnonzero(~known)
+    error[seen_by_two] = distance * footprint[seen_by_two]
+    if not seen_by_two.all():
+        tree, told, unknown = cKDTree(mesh.vertices[seen_by_two]), error[seen_by_two], np.flatnonzero(~seen_by_two)
         ranks = np.arange(1, min(NEIGHBOURS, len(told)) + 1)
         for start in range(0, len(unknown), ROWS_AT_ONCE):
             rows = unknown[start : start + ROWS_AT_ONCE]
@@ -248,10 +248,10 @@ def _compared(
             value,
             square,
         )
-    known = views >= 2
-    total = weight[known, None]
-    mean = value[known] / total
-    return normals, known, footprint, np.maximum(square[known] / total - mean * mean, 0)
+    seen_by_two = views >= 2
+    total = weight[seen_by_two, None]
+    mean = value[seen_by_two] / total
+    return normals, seen_by_two, footprint, np.maximum(square[seen_by_two] / total - mean * mean, 0)
 
 
 def _expected_distance(variance: np.ndarray, scale: float) -> np.ndarray:
@@ -325,8 +325,8 @@ def _footprints(points: np.ndarray, normals: np.ndarray, cameras: Sequence[Camer
     for camera in cameras:
         pose, lens = camera.pinhole()
         surface_ops.least_footprints(pose, lens, camera.width, camera.height, LEAST_COSINE, points, normals, least)
-    known = np.isfinite(least)
-    largest = LARGEST_FOOTPRINT * np.median(least[known]) if known.any() else 1.0
+    seen_by_two = np.isfinite(least)
+    largest = LARGEST_FOOTPRINT * np.median(least[seen_by_two]) if seen_by_two.any() else 1.0
     return np.minimum(least, largest)
 
 

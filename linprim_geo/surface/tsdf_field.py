@@ -39,7 +39,7 @@ FAR_FRONT_WEIGHT = 0.15
 """Least weight of a vote in front of a surface, so that free space close to it stays free."""
 
 COSINE_POWER = 0.5
-"""Weight of a pixel by the cosine between its ray and its surface normal."""
+"""A pixel counts by the cosine between its ray and its surface normal to this power."""
 
 GRAZED_WEIGHT = 1e-3
 GRAZED_VOXELS = 1.25

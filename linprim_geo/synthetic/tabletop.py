@@ -1,4 +1,4 @@
-"""Captures of an object on a wooden table: the slab, its wood, both as one surface, and three named captures."""
+"""An object on a wooden table: the slab, its wood, both as one surface."""
 
 from __future__ import annotations
 

@@ -20,6 +20,7 @@ from linprim_geo.geometry.primitives import KINDS
 from linprim_geo.points.far_colors import OPEN_SHARE, far_colors, far_share
 from linprim_geo.points.initial_points import CAMERA_DISTANCE, VolumePoints, scene_normalization
 from linprim_geo.points.photo_evidence import Observations, observe
+from linprim_geo.training.background import BACKDROP_SHARE, plain_border
 from linprim_geo.training.step.trainer import SMALLEST_PX
 
 # Views that are enough for what is measured on the primitives of the start.
@@ -148,8 +149,6 @@ def _gain_spread(data: Data) -> float | None:
 
 
 def _plain_border(data: Data) -> float:
-    from linprim_geo.training.background import plain_border
-
     return 100 * plain_border(data.scene)
 
 
@@ -275,7 +274,7 @@ _REGISTRY = (
         "one colour behind everything is fitted; without it a random one makes everything opaque",
         "border pixels of one colour, beside no point of a surface",
         "%",
-        80.0,
+        100 * BACKDROP_SHARE,
         1.0,
         _plain_border,
         {"background": "fitted"},

@@ -1,5 +1,4 @@
-"""A training that fits its photographs and not what lies between them: how far held-out views stay behind, why, and
-what to do."""
+"""Overfitting: how far held-out photographs stay behind training photographs, the likely cause, and what to do."""
 
 from __future__ import annotations
 

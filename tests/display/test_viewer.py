@@ -190,24 +190,24 @@ def test_it_follows_a_run(tiny_run, tmp_path):
     path = tmp_path / "later"
     viewer = Viewer(path, 0, follow=True)
     try:
-        assert viewer.loads == 0 and "waiting for" in viewer._text.content and not viewer.look()
+        assert viewer.loads == 0 and "waiting for" in viewer._text.content and not viewer.reload_if_saved()
         assert page(viewer.address)
         shutil.copytree(tiny_run, path, ignore=MESHES)
-        assert viewer.look() and not viewer.look()
+        assert viewer.reload_if_saved() and not viewer.reload_if_saved()
         faces = len(shown(viewer, "/primitives").faces)
         run = Run.open(path)
         primitives = run.training_primitives()
         half = select(primitives, np.flatnonzero(primitives.alpha >= 0.1)[::2])
         run.save(half, run.state | {"iteration": 777, "primitives": len(half)})
-        assert viewer.look()
+        assert viewer.reload_if_saved()
         assert len(shown(viewer, "/primitives").faces) == 8 * len(half) < faces
         assert "step 777" in viewer._text.content and viewer.loads == 2
         (path / "training_frame.npz").write_bytes(b"half of it")
-        assert not viewer.look() and "waiting" in viewer._text.content
+        assert not viewer.reload_if_saved() and "waiting" in viewer._text.content
         run.save(primitives, run.state)
-        assert viewer.look() and len(shown(viewer, "/primitives").faces) == faces
+        assert viewer.reload_if_saved() and len(shown(viewer, "/primitives").faces) == faces
         extract_mesh(path, options=ExtractOptions(level=0.7), quiet=True)
-        assert viewer.look() and "tsdf" in viewer._mesh.options
+        assert viewer.reload_if_saved() and "tsdf" in viewer._mesh.options
     finally:
         viewer.close()
 

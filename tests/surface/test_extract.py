@@ -221,10 +221,10 @@ def test_frames_are_in_the_frame_of_the_data_set(solid):
 def test_depths_that_no_disparity_can_tell_apart_are_clamped(solid):
     run = Run.open(solid)
     near = DepthFrames(run, 0.5)
-    assert near.beyond == 0 and all(frame.clamped is None for frame in near)
+    assert near.clamped_share == 0 and all(frame.clamped is None for frame in near)
     limit = float(np.median(np.concatenate([frame.depth[frame.depth > 0] for frame in near])))
     cut = DepthFrames(run, 0.5, limit)
-    assert 0.4 < cut.beyond < 0.6 and cut.limit == limit
+    assert 0.4 < cut.clamped_share < 0.6 and cut.limit == limit
     for frame, whole in zip(cut, near, strict=True):
         assert frame.depth.max() <= np.float32(limit)
         np.testing.assert_array_equal(frame.clamped, whole.depth > limit)

@@ -60,7 +60,7 @@ def test_exposures_are_found_on_a_wrong_surface_and_taken_out():
 def test_the_best_place_is_the_plane(shown, height):
     mesh = sheet(lambda x, y: np.full_like(x, height * FOOTPRINT))
     found, middle = agreement(mesh, shown), inner(mesh)
-    assert found.known[middle].all() and found.inside[middle].mean() > 0.99
+    assert found.seen_by_two[middle].all() and found.inside[middle].mean() > 0.99
     assert np.median(found.offset[middle]) == pytest.approx(-height * FOOTPRINT, abs=0.1 * FOOTPRINT)
     assert (np.abs(found.offset[middle] + height * FOOTPRINT) < 0.5 * FOOTPRINT).mean() > 0.95
 
@@ -134,13 +134,13 @@ def test_vertices_that_fewer_than_two_photographs_see_take_that_of_the_nearest(s
     below = Mesh(np.concatenate([mesh.vertices, above]), np.concatenate([mesh.faces, mesh.faces + len(above)]))
     found = agreement(below, shown)
     hidden = np.flatnonzero((np.abs(below.vertices[:, :2]) < 0.1).all(1) & (below.vertices[:, 2] < 0.25))
-    assert not found.known[hidden].any()
+    assert not found.seen_by_two[hidden].any()
     told = predicted(below, shown)
     assert np.isfinite(told).all()
-    known = np.flatnonzero(found.known)
+    seen_by_two = np.flatnonzero(found.seen_by_two)
     for row in hidden[:3]:
-        nearest = known[
-            np.argsort(np.linalg.norm(below.vertices[known] - below.vertices[row], axis=1))[
+        nearest = seen_by_two[
+            np.argsort(np.linalg.norm(below.vertices[seen_by_two] - below.vertices[row], axis=1))[
                 : photo_consistency.NEIGHBOURS
             ]
         ]
@@ -153,7 +153,7 @@ def test_a_transparent_photograph_counts_as_grey(shown):
     mesh = sheet(lambda x, y: np.full_like(x, 0.5 * FOOTPRINT))
     clear = [replace(s.photo, alpha=np.zeros((SIZE, SIZE), np.uint8)) for s in shown]
     found = best_agreement(mesh, [s.camera for s in shown], clear)
-    assert found.known[inner(mesh)].all() and found.sharpness.max() < 1e-3
+    assert found.seen_by_two[inner(mesh)].all() and found.sharpness.max() < 1e-3
 
 
 def test_the_core_adds_what_the_formulas_say(shown):
@@ -195,5 +195,5 @@ def test_the_same_bytes_at_any_number_of_threads(shown, few_threads):
     one = agreement(mesh, shown)
     ops.set_threads(3)
     three = agreement(mesh, shown)
-    for name in ("offset", "sharpness", "known", "inside"):
+    for name in ("offset", "sharpness", "seen_by_two", "inside"):
         assert getattr(one, name).tobytes() == getattr(three, name).tobytes()

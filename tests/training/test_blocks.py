@@ -133,19 +133,24 @@ def test_others_stand_in_full_as_far_as_they_are_known(whole, tmp_path, monkeypa
     own, other, margin = plan.blocks[0].block, plan.blocks[1].block, plan.margin
     theirs = load_primitives(block_folder(run, 1) / "run" / "training_frame.npz").center
     theirs = theirs[other.holds(theirs)]
-    known = float(np.median(own.distance(theirs)))
-    limited = replace(plan, blocks=tuple(replace(part, known=known) for part in plan.blocks))
+    exact_radius = float(np.median(own.distance(theirs)))
+    limited = replace(plan, blocks=tuple(replace(part, exact_radius=exact_radius) for part in plan.blocks))
     monkeypatch.setattr(block_tasks, "read_plan", lambda _: limited)
 
-    def trained(folder, run, scene, plan, block, frozen, known, end, begin):
-        taken.update(frozen=frozen, known=known)
+    def trained(folder, run, scene, plan, block, frozen, exact_radius, end, begin):
+        taken.update(frozen=frozen, exact_radius=exact_radius)
         return {}
 
     monkeypatch.setattr(block_tasks, "_trained", trained)
     assert join_task(tmp_path, str(run), 0, 1)["owned"] > 0
-    coarse = outside(Run.open(run / "blocks" / "coarse" / "run").training_primitives(), own, known)["center"]
-    beside = theirs[~own.holds(theirs, margin) & own.holds(theirs, known)]
-    assert known > margin and 0 < len(beside) < len(theirs) and 0 < len(coarse) and taken["known"] == known
+    coarse = outside(Run.open(run / "blocks" / "coarse" / "run").training_primitives(), own, exact_radius)["center"]
+    beside = theirs[~own.holds(theirs, margin) & own.holds(theirs, exact_radius)]
+    assert (
+        exact_radius > margin
+        and 0 < len(beside) < len(theirs)
+        and 0 < len(coarse)
+        and taken["exact_radius"] == exact_radius
+    )
     assert np.array_equal(taken["frozen"]["center"], np.concatenate([coarse, beside]))
 
 

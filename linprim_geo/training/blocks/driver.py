@@ -1,5 +1,5 @@
-"""Training a scene in blocks: the whole of it coarsely, a plan, every block before what the coarse scene shows of the
-rest, its later steps beside what other blocks have become, in rounds, and one run of all.
+"""Trains a large scene in blocks: a coarse model of the whole, every block before the frozen coarse model of the rest,
+then in rounds beside the primitives that its neighbours have by then, and all of them as one run.
 
 RUN/blocks holds `points.npz` (what the scene starts from), `coarse`, `plan`, and `000`, `000joined1`, ...,
 `000joined3`, `001`, ... with a run in each, and the markers of what is done. The result, in RUN itself, is like that of

@@ -53,7 +53,7 @@ class Part:
     max_primitives: int
     own_primitives: int  # at most in it without its margin
     initial_primitives: int
-    known: float  # so far from it others stand in full; may be infinite
+    exact_radius: float  # so far from it others stand in full; may be infinite
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Plan:
         for part in self.blocks:
             plain = {entry.name: getattr(part, entry.name) for entry in fields(part) if entry.name != "block"}
             ends = {name: [_json_number(x) for x in getattr(part.block, name)] for name in ("low", "high")}
-            parts.append(ends | plain | {"views": list(part.views), "known": _json_number(part.known)})
+            parts.append(ends | plain | {"views": list(part.views), "exact_radius": _json_number(part.exact_radius)})
         plain = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         return {"format": FORMAT} | plain | {"shown": list(self.shown), "blocks": parts}
 
@@ -98,8 +98,8 @@ class Plan:
                 for name, end in (("low", -math.inf), ("high", math.inf))
             )
             plain = {entry.name: part[entry.name] for entry in fields(Part) if entry.name != "block"}
-            known = math.inf if part["known"] is None else part["known"]
-            parts.append(Part(Block(low, high), **plain | {"views": tuple(part["views"]), "known": known}))
+            exact_radius = math.inf if part["exact_radius"] is None else part["exact_radius"]
+            parts.append(Part(Block(low, high), **plain | {"views": tuple(part["views"]), "exact_radius": exact_radius}))
         plain = {entry.name: saved[entry.name] for entry in fields(Plan)}
         return Plan(**plain | {"shown": tuple(saved["shown"]), "blocks": tuple(parts)})
 
@@ -168,20 +168,20 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
     assert scene.points is not None
     points = opened.similarity.apply(scene.points.xyz)
 
-    def looks() -> Iterator[tuple[View, Camera, np.ndarray]]:
+    def views_with_depth() -> Iterator[tuple[View, Camera, np.ndarray]]:
         """Rendered twice: depths of all views take more memory than there may be."""
         for view, (camera, depth) in zip(scene.train, small_depths(coarse, scene.train, factor), strict=True):
             yield view, camera, depth
 
     work = point_work(
-        points, ((camera, depth, view.camera.width * view.camera.height) for view, camera, depth in looks())
+        points, ((camera, depth, view.camera.width * view.camera.height) for view, camera, depth in views_with_depth())
     )
     used = work > 0
     if not used.any():
         raise LinprimError(f"{scene.root}: no camera sees a point of the scene, so no block can be made")
     blocks = split_space(points[used], work[used], count)
     margin = margin_of(blocks, points[used])
-    seen_by, pixels, within = _visible_points(blocks, looks(), margin, factor)
+    seen_by, pixels, within = _visible_points(blocks, views_with_depth(), margin, factor)
     options = opened.train_options
     # Where the coarse scene has grown primitives the whole would, too, and none larger.
     grown = coarse.training_primitives().center
@@ -205,7 +205,7 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
                 max_primitives=most,
                 own_primitives=own[k],
                 initial_primitives=min(most, math.ceil(share * options.initial_primitives)),
-                known=exact_radius_of(block.distance(grown), margin, options.max_primitives),
+                exact_radius=exact_radius_of(block.distance(grown), margin, options.max_primitives),
             )
         )
     behind = worker.result_of_folder(opened.path / FOLDER / "coarse")
@@ -225,13 +225,13 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
 
 
 def _visible_points(
-    blocks: Sequence[Block], looks: Iterable[tuple[View, Camera, np.ndarray]], margin: float, factor: int
+    blocks: Sequence[Block], views_with_depth: Iterable[tuple[View, Camera, np.ndarray]], margin: float, factor: int
 ) -> tuple[list[list[int]], list[int], np.ndarray]:
     """The views that show each block, the pixels of its windows in them, and (2, B) how much of the coarse scene they
     show in it, and in it and its margin."""
     seen_by: list[list[int]] = [[] for _ in blocks]
     pixels, within = [0] * len(blocks), np.zeros((2, len(blocks)))
-    for number, (view, camera, depth) in enumerate(looks):
+    for number, (view, camera, depth) in enumerate(views_with_depth):
         if not (depth > 0).any():
             continue
         surface = surface_points(camera, depth)

@@ -82,23 +82,23 @@ def join_task(folder: Path, run: str, block: int, exchange: int) -> dict:
     """
     opened, scene = _opened(run)
     plan = read_plan(opened.path)
-    own, known, margin = plan.blocks[block].block, plan.blocks[block].known, plan.margin
+    own, exact_radius, margin = plan.blocks[block].block, plan.blocks[block].exact_radius, plan.margin
     state = _state_of(opened.path, block, exchange - 1)
     begin = [_rows(state, is_owned(opened.path, plan, block, exchange - 1, state))]
-    frozen = [outside(Run.open(opened.path / FOLDER / "coarse" / "run").training_primitives(), own, known)]
+    frozen = [outside(Run.open(opened.path / FOLDER / "coarse" / "run").training_primitives(), own, exact_radius)]
     for other, part in enumerate(plan.blocks):
-        if other != block and not own.is_apart(part.block, known):
+        if other != block and not own.is_apart(part.block, exact_radius):
             theirs = _state_of(opened.path, other, exchange - 1)
             center, rows = _centers(theirs), is_owned(opened.path, plan, other, exchange - 1, theirs)
             inside = own.holds(center, margin)
             begin.append(_rows(theirs, rows & inside))
             still = Run.open(block_folder(opened.path, other, exchange - 1) / "run").training_primitives()
-            frozen.append(select(still, rows & ~inside & own.holds(center, known)))
+            frozen.append(select(still, rows & ~inside & own.holds(center, exact_radius)))
     count = len(_centers(begin[0]))
     if sum(len(_centers(each)) for each in begin):
         state |= _concatenate_rows(begin)
     end = until(opened.train_options, exchange)
-    trained = _trained(folder, opened, scene, plan, block, concatenated(frozen), known, end, state)
+    trained = _trained(folder, opened, scene, plan, block, concatenated(frozen), exact_radius, end, state)
     return trained | {"owned": count}
 
 
@@ -145,13 +145,13 @@ def _trained(
     plan: Plan,
     block: int,
     frozen: Arrays,
-    known: float,
+    exact_radius: float,
     end: float,
     begin: dict | None,
 ) -> dict:
     """Trains a block in folder/run up to a part of its steps, from its last checkpoint there, else from the state
-    `begin`, else from the points in it and its margin. Up to `known` from the block the frozen primitives are those
-    that the scene will have."""
+    `begin`, else from the points in it and its margin. Up to `exact_radius` from the block the frozen primitives are
+    those that the scene will have."""
     _prepared(opened.train_options)
     part, own = plan.blocks[block], plan.blocks[block].block
     options = replace(
@@ -171,7 +171,7 @@ def _trained(
         cloud = _points_of(seen, opened, plan, block, options) if state is None else None
         coarse = Run.open(opened.path / FOLDER / "coarse" / "run")
         margin, factor, still = plan.margin, plan.factor, tensors(frozen)
-        images = block_images(coarse, seen.train, own, margin, known, factor, opened.similarity, options, still)
+        images = block_images(coarse, seen.train, own, margin, exact_radius, factor, opened.similarity, options, still)
         here = replace(opened, path=path, train_options=options)
         trainer = start_trainer(seen, here, images, options, state, cloud, plan.extent)
         trainer.frozen = still

@@ -86,7 +86,7 @@ def block_images(
     views: Sequence[View],
     block: Block,
     margin: float,
-    known: float,
+    exact_radius: float,
     factor: int,
     similarity: Similarity,
     options: TrainOptions,
@@ -95,9 +95,9 @@ def block_images(
     """What a block is trained on.
 
     A photograph is cut to the window that shows the block and its margin, and counts by that window's share of its
-    pixels. Pixels whose surface lies farther than `known` from the block, where the frozen primitives are coarse, are
-    replaced by what these alone show there, with their opacity for alpha: a block is neither to explain the rest of the
-    scene nor to hide it. So are those that show the coarse scene's environment.
+    pixels. Pixels whose surface lies farther than `exact_radius` from the block, where the frozen primitives are
+    coarse, are replaced by what these alone show there, with their opacity for alpha: a block is neither to explain the
+    rest of the scene nor to hide it. So are those that show the coarse scene's environment.
 
     Raises:
         LinprimError: a photograph cannot be read, or the disk is full.
@@ -114,7 +114,7 @@ def block_images(
         small = cropped(view.camera.transformed(similarity), left, top, width, height)
         photo = view.load()
         part = np.s_[top : top + height, left : left + width]
-        explained = block.holds(surface, known) | math.isinf(known)
+        explained = block.holds(surface, exact_radius) | math.isinf(exact_radius)
         if coarse.environment is not None:
             explained &= depth > 0
         rgb, mask = photo.rgb[part], enlarged(explained, view.camera, factor)[part]

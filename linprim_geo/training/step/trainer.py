@@ -54,7 +54,7 @@ RATES = {
 # Parameters of the whole scene; the others have a row per primitive.
 SHARED = frozenset({"background", "environment"})
 # Parts of the run after which all views are looked at together, before an environment.
-LOOKS_AROUND = (0.1, 0.2, 0.35, 0.5, 0.7)
+SUPPORT_CHECKED_AT = (0.1, 0.2, 0.35, 0.5, 0.7)
 # Light that passes primitives to this part tells little of the environment: Adam would move its texels as fast as those
 # in full view.
 FAINT = 0.5
@@ -106,7 +106,7 @@ class Trainer:
         self.background = background
         if fitted:
             self.parameters["background"] = background
-        self.looks_around = {round(share * options.iterations) for share in LOOKS_AROUND}
+        self.support_checks = {round(share * options.iterations) for share in SUPPORT_CHECKED_AT}
         # Gradient of the loss to a texel through which a pixel's light passes to this part: below it Adam's steps get
         # small.
         camera = images[0].camera
@@ -250,8 +250,8 @@ class Trainer:
             self.control.add_noise(self.parameters, self.step + 1)
             self.control.accumulate(self.parameters, image.camera, image.size, screen_grad)
         self.step += 1
-        if self.step in self.looks_around:
-            self._look_around()
+        if self.step in self.support_checks:
+            self._check_support()
         if self.control.is_due(self.step):
             self._grow()
         elif self.step % FILTER_EVERY == 0:
@@ -331,7 +331,7 @@ class Trainer:
         self._refilter()
 
     @torch.no_grad()
-    def _look_around(self) -> None:
+    def _check_support(self) -> None:
         """Before an environment: makes primitives transparent that one view alone sees, so that growth moves them to
         where they are needed, and gives texels that no view sees past the primitives the colours round them."""
         if self.environment is None:
