@@ -24,6 +24,8 @@ ROOT = Path(__file__).resolve().parent.parent
 # The checkout's folders that become packages, and where.
 PACKAGES = {"linprim_geo": "linprim_geo", "eval": "linprim_geo/eval"}
 NOT_PACKED = (".pyc", ".so", ".pyi")
+# Studies, which make tables for the documents, stay in the repository.
+STUDIES = ("linprim_geo/eval/studies/", "linprim_geo/eval/paper/")
 
 SMOKE = (
     "doctor",
@@ -64,16 +66,18 @@ def build(python: Path, output: Path) -> tuple[Path, Path]:
 
 
 def check_contents(wheel: Path) -> int:
-    """Every file of the packages is in the wheel, and the core, the entry point and the licence; returns the number of
-    files."""
+    """Every file of the packages but STUDIES is in the wheel, and the core, the entry point and the licence; returns
+    the number of files."""
     packed = set(zipfile.ZipFile(wheel).namelist())
     for source, target in PACKAGES.items():
         for file in (ROOT / source).rglob("*"):
             if not file.is_file() or file.suffix in NOT_PACKED:
                 continue
             name = f"{target}/{file.relative_to(ROOT / source).as_posix()}"
-            if name not in packed:
+            if name not in packed and not name.startswith(STUDIES):
                 raise Failed(f"{wheel.name}: {name} is missing")
+    if studies := [name for name in packed if name.startswith(STUDIES)]:
+        raise Failed(f"{wheel.name}: holds {studies[0]}, which belongs to the repository alone")
     for part in ("linprim_geo/_core.", ".dist-info/entry_points.txt", "LICENSE"):
         if not any(part in name for name in packed):
             raise Failed(f"{wheel.name}: holds no {part}")

@@ -43,6 +43,7 @@ from linprim_geo.stereo.shading import (
     shaded_regions,
     unexplained,
 )
+from linprim_geo.stereo.vignetting import vignetting
 
 # Views that a region is compared with, at most and at least.
 MOST_VIEWS, LEAST_VIEWS = 8, 3
@@ -97,8 +98,9 @@ class ShadedPlanes:
         by_points: np.ndarray,
         by_edges: np.ndarray,
     ):
-        self.shadings = [Shading.of(found) for found in maps]
         self.cameras = [found.camera for found in maps]
+        law = vignetting(self.cameras, [found.grey for found in maps], depths)
+        self.shadings = [Shading.of(found, law) for found in maps]
         self.given, self.by_points = np.concatenate([by_points, by_edges]), len(by_points)
         self.depths = [shading.small(depth) for shading, depth in zip(self.shadings, depths, strict=True)]
         self.shown: list[list[ShadedRegion]] = []

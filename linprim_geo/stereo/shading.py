@@ -19,6 +19,7 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.sampling import sample_bilinear
 from linprim_geo.stereo.depth_maps import DepthMap, block_means
 from linprim_geo.stereo.plain_regions import edges_of, in_camera, rays_of
+from linprim_geo.stereo.vignetting import falloff
 
 # Larger photographs are averaged down.
 MOST_SIDE = 800
@@ -57,9 +58,12 @@ class Shading:
     factor: int
 
     @classmethod
-    def of(cls, found: DepthMap) -> Shading:
+    def of(cls, found: DepthMap, law: np.ndarray | None = None) -> Shading:
+        """Of a photograph whose corners are darker as `law` says (`vignetting.vignetting`)."""
         factor = -(-max(found.grey.shape) // MOST_SIDE)
-        grey = block_means(found.grey.astype(np.float32), factor)
+        grey, camera = block_means(found.grey.astype(np.float32), factor), smaller(found.camera, factor)
+        if law is not None and law.any():
+            grey = (grey / falloff(camera, law)).astype(np.float32)
         noise = found.noise / factor**2
         slope = np.hypot(*(_beyond_shading(one) for one in np.gradient(gaussian_filter(grey, EDGE_SIGMA))))
         # The variance of the derivative of white noise behind a Gaussian is that of the noise over 8 pi sigma^4.
@@ -72,7 +76,7 @@ class Shading:
         smooth = gaussian_filter(np.where(plain, mean, 0), SLOPE_SIGMA) / np.maximum(share, 1e-6)
         by_row, by_column = np.gradient(smooth)
         means = np.stack([mean, by_column, by_row], -1)
-        return cls(smaller(found.camera, factor), means, plain, noise / BOX**2, factor)
+        return cls(camera, means, plain, noise / BOX**2, factor)
 
     @cached_property
     def labels(self) -> np.ndarray:

@@ -8,11 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.captures import look_at
+from scipy.ndimage import gaussian_filter
 
+from linprim_geo.geometry.sampling import sample_bilinear
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.plain_regions import in_camera
 from linprim_geo.stereo.shaded_planes import ShadedPlanes
 from linprim_geo.stereo.shading import Shading, evaluate, fit_plane, shaded_regions
+from linprim_geo.stereo.vignetting import falloff
 
 # A wall y = 0, seen from an arc before it; a lamp near its left upper corner.
 WALL, LAMP, NOISE = np.array([0.0, 1.0, 0.0, 0.0]), np.array([-0.9, 0.7, 0.8]), 2.0
@@ -103,6 +106,29 @@ def test_exposures_that_differ_change_nothing():
     maps, depths = photographs(lambda points, view: gains[view] * light(points) + offsets[view])
     share, off = errors(planes_of(maps, depths), depths)
     assert share > 0.7 and np.quantile(off, 0.95) < 0.005
+
+
+@pytest.mark.parametrize("corners", [0.85, 0.7])
+def test_corners_that_are_darker_change_nothing(corners):
+    """The wall's ends are painted with a pattern that stereo confirms."""
+    pattern = gaussian_filter(np.random.default_rng(1).normal(size=(300, 300)), 3)[..., None]
+    law = np.array([np.log(corners), 0.0])
+
+    def painted(points):
+        return np.abs(points[..., 0]) > 0.9
+
+    def value(points, view):
+        at = 60 * points[..., [0, 2]] + 150
+        texture = 1 + 0.3 * sample_bilinear(pattern / pattern.std(), at)[..., 0]
+        return light(points) * np.where(painted(points), texture, 1) * falloff(camera_at(CENTERS[view]), law)
+
+    maps, depths = photographs(value)
+    points = [
+        found.camera.center + found.camera.world_rays() * d[..., None] for found, d in zip(maps, depths, strict=True)
+    ]
+    confirmed = [np.where(painted(at), depth, np.nan) for at, depth in zip(points, depths, strict=True)]
+    share, off = errors(planes_of(maps, depths, confirmed=confirmed), depths)
+    assert share > 0.3 and np.quantile(off, 0.95) < 0.005
 
 
 def test_larger_photographs_are_halved(monkeypatch):

@@ -99,7 +99,9 @@ class Plan:
             )
             plain = {entry.name: part[entry.name] for entry in fields(Part) if entry.name != "block"}
             exact_radius = math.inf if part["exact_radius"] is None else part["exact_radius"]
-            parts.append(Part(Block(low, high), **plain | {"views": tuple(part["views"]), "exact_radius": exact_radius}))
+            parts.append(
+                Part(Block(low, high), **plain | {"views": tuple(part["views"]), "exact_radius": exact_radius})
+            )
         plain = {entry.name: saved[entry.name] for entry in fields(Plan)}
         return Plan(**plain | {"shown": tuple(saved["shown"]), "blocks": tuple(parts)})
 

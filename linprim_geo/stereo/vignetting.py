@@ -1,0 +1,101 @@
+"""Vignetting: by how much photographs are darker away from their middle, from points that several of them show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.sampling import sample_bilinear
+from linprim_geo.points.initial_points import in_image
+from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
+
+# Each view is compared with those so many places after it, at so many of its points, by means of so many pixels a side.
+STEPS, POINTS, BOX = (1, 2, 4, 8), 2000, 3
+# Pairs with fewer points in common say nothing; with fewer pairs nothing is known.
+LEAST_POINTS, LEAST_PAIRS = 50, 3
+# Darker pixels and brighter ones are clipped, or too noisy for a logarithm.
+DARKEST, BRIGHTEST = 20, 245
+# Rounds in which differences of more than so many deviations lose weight: paint that shines, and wrong depths.
+ROUNDS, OUTLIER = 5, 2.0
+# What is found counts from so many of its standard errors.
+CERTAIN = 3.0
+
+
+def radius_square(camera: Camera, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Square of the distance of positions from the optical axis, 1 in the corner of an image that it is the middle
+    of."""
+    return ((x - camera.cx) ** 2 + (y - camera.cy) ** 2) / (0.25 * (camera.width**2 + camera.height**2))
+
+
+def falloff(camera: Camera, law: np.ndarray) -> np.ndarray:
+    """(H, W) what grey values are multiplied by, for what `vignetting` returns."""
+    square = radius_square(camera, np.arange(camera.width) + 0.5, np.arange(camera.height)[:, None] + 0.5)
+    return np.exp(law[0] * square + law[1] * square**2)
+
+
+def vignetting(cameras: Sequence[Camera], greys: Sequence[np.ndarray], depths: Sequence[np.ndarray]) -> np.ndarray:
+    """(2,) a and b: grey values are multiplied by exp(a s + b s^2), with s as `radius_square` gives it; zeros where
+    that cannot be told from none.
+
+    A point of a matt surface has the same brightness in all photographs but for a gain of each pair: what is left
+    depends on where in the image it lies. Weighted least squares of the logarithms, gains eliminated.
+
+    Args:
+        greys: (H, W) of each view, as displays show them: a power of brightness only changes a and b.
+        depths: (H, W) confirmed depth of each view, NaN elsewhere.
+    """
+    smooth = [uniform_filter(grey.astype(np.float32), BOX, mode="nearest") for grey in greys]
+    pairs = []
+    for one in range(len(cameras)):
+        rows, columns = np.nonzero(np.isfinite(depths[one]))
+        step = max(1, len(rows) // POINTS)
+        rows, columns = rows[::step], columns[::step]
+        rays = cameras[one].world_rays()[rows, columns]
+        points = cameras[one].center + rays * depths[one][rows, columns, None]
+        for other in (one + step for step in STEPS if one + step < len(cameras)):
+            pair = _pair(cameras, smooth, depths, one, other, (rows, columns), points)
+            if len(pair) >= LEAST_POINTS:
+                pairs.append(pair)
+    if len(pairs) < LEAST_PAIRS:
+        return np.zeros(2)
+    weights = [np.ones(len(pair)) for pair in pairs]
+    for _ in range(ROUNDS):
+        centered = [_centered(pair, weight) for pair, weight in zip(pairs, weights, strict=True)]
+        found, error = _least_squares(centered, weights)
+        left = [pair[:, 0] - pair[:, 1:] @ found for pair in centered]
+        deviation = 1.4826 * np.median(np.abs(np.concatenate(left)))
+        weights = [np.minimum(1, OUTLIER * deviation / np.maximum(np.abs(each), 1e-9)) for each in left]
+    return found if abs(found.sum()) > CERTAIN * error else np.zeros(2)
+
+
+def _pair(cameras, greys, depths, one, other, at, points) -> np.ndarray:
+    """(P, 3) of points that two views show: difference of the logarithms of their grey values, and of s and s^2."""
+    inside, row, column = in_image(cameras[other], points)
+    pixels, depth = cameras[other].project(points)
+    with np.errstate(invalid="ignore"):
+        good = np.flatnonzero(inside & (np.abs(depths[other][row, column] / depth - 1) < CONFIRMED_DEPTH))
+    here = np.stack([at[1][good], at[0][good]], 1) + 0.5
+    first = greys[one][at[0][good], at[1][good]]
+    second = sample_bilinear(greys[other][..., None], pixels[good])[:, 0]
+    usable = (np.minimum(first, second) > DARKEST) & (np.maximum(first, second) < BRIGHTEST)
+    a, b = radius_square(cameras[one], *here[usable].T), radius_square(cameras[other], *pixels[good][usable].T)
+    return np.stack([np.log(first[usable] / second[usable]), a - b, a**2 - b**2], 1)
+
+
+def _centered(pair: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Without the pair's gain."""
+    return pair - np.average(pair, axis=0, weights=weight)
+
+
+def _least_squares(pairs: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> tuple[np.ndarray, float]:
+    """The two factors, and the standard error of their sum: by how much pairs disagree, whose points have errors in
+    common."""
+    normal = [(pair[:, 1:] * w[:, None]).T @ pair[:, 1:] for pair, w in zip(pairs, weights, strict=True)]
+    right = [(pair[:, 1:] * w[:, None]).T @ pair[:, 0] for pair, w in zip(pairs, weights, strict=True)]
+    inverse = np.linalg.pinv(np.sum(normal, 0))
+    found = inverse @ np.sum(right, 0)
+    scatter = sum(np.outer(r - n @ found, r - n @ found) for n, r in zip(normal, right, strict=True))
+    return found, float(np.sqrt(np.ones(2) @ inverse @ scatter @ inverse @ np.ones(2)))
