@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-
-
 import os
 from pathlib import Path
 
@@ -12,9 +10,8 @@ import numpy as np
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write
 from linprim_geo.base.progress import Progress
-from linprim_geo.runs.run import Run
 from linprim_geo.imaging.colors import depth_preview
-
+from linprim_geo.runs.run import Run
 
 DEPTHS = ("depth_median", "depth_expected", "depth_first")
 

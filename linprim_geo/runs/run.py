@@ -12,8 +12,6 @@ metrics.jsonl     loss, PSNR, ... over time                        checkpoints/s
 
 from __future__ import annotations
 
-
-
 import json
 import math
 import os
@@ -27,21 +25,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from linprim_geo.base.version import __version__
-from linprim_geo.geometry.camera import Similarity
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import is_leftover, readable_write_errors, write_json
 from linprim_geo.base.options import SceneOptions, TrainOptions, check_train_options, from_saved, raster_options
-from linprim_geo.geometry.primitives import KINDS, Primitives, load_primitives, save_primitives
-from linprim_geo.capture.types import PHOTOGRAPHS, Scene, View
-from linprim_geo.capture.load import in_capture, load_scene
+from linprim_geo.base.version import __version__
 from linprim_geo.capture.found_poses import found_model
+from linprim_geo.capture.load import in_capture, load_scene
+from linprim_geo.capture.types import PHOTOGRAPHS, Scene, View
+from linprim_geo.geometry.camera import Similarity
+from linprim_geo.geometry.primitives import KINDS, Primitives, load_primitives, save_primitives
 
 if TYPE_CHECKING:
     import torch
 
     from linprim_geo.geometry.primitives import Tensors
-
 
 
 # Folder of the COLMAP model of a run on photographs whose poses were found.
@@ -172,9 +169,7 @@ class Run:
     def _scene(self) -> Scene:
         options = in_capture(self.scene_options, self.scene_path)
         found = self.path / FOUND_POSES
-        return load_scene(
-            self.scene_path, options, sparse=options.sparse or (str(found) if found.is_dir() else "")
-        )
+        return load_scene(self.scene_path, options, sparse=options.sparse or (str(found) if found.is_dir() else ""))
 
     @cached_property
     def state(self) -> dict:
