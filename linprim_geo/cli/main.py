@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import difflib
 import errno
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from typing import NoReturn
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.version import __version__
@@ -33,7 +36,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # times the work.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # The two flags are known before and after the subcommand, so neither parser may set a default for them.
-    parsed = build_parser().parse_args(arguments)
+    parsed, unknown = build_parser().parse_known_args(arguments)
+    if unknown:
+        parsed.command_parser.refuse(unknown)
     parsed.json, parsed.debug = getattr(parsed, "json", False), getattr(parsed, "debug", False)
     try:
         with printing(parsed.json) as print_output, limited_threads(getattr(parsed, "most_threads", 0)):
@@ -79,15 +84,34 @@ def explain(error: BaseException) -> tuple[str, int]:
     return f"internal error: {text}; run again with --debug", EXIT_INTERNAL
 
 
+class Parser(argparse.ArgumentParser):
+    """A parser that says in one sentence what is wrong, and what may have been meant."""
+
+    def error(self, message: str) -> NoReturn:
+        if found := re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message):
+            message += _meant(found[1], re.findall(r"[\w.-]+", found[2]))
+        self.exit(2, f"linprim-geo: error: {message}; {self.prog} --help explains\n")
+
+    def refuse(self, unknown: Sequence[str]) -> NoReturn:
+        """Arguments that nothing has taken."""
+        options = [option for action in self._actions for option in action.option_strings]
+        self.error(f"unrecognized arguments: {' '.join(unknown)}{_meant(unknown[0].split('=')[0], options)}")
+
+
+def _meant(given: str, possible: Sequence[str]) -> str:
+    close = difflib.get_close_matches(given, possible, n=1)
+    return f" (did you mean {close[0]}?)" if close else ""
+
+
 def build_parser() -> argparse.ArgumentParser:
     """The whole command line."""
-    common = argparse.ArgumentParser(add_help=False)
+    common = Parser(add_help=False)
     group = common.add_argument_group("output")
     hidden = argparse.SUPPRESS
     group.add_argument("--json", action="store_true", default=hidden, help="print one JSON object and nothing else")
     group.add_argument("--debug", action="store_true", default=hidden, help="show the traceback of an error")
 
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="linprim-geo",
         description="From posed photographs to a scored mesh, through transparent polyhedra, on a CPU.",
         epilog="linprim-geo COMMAND --help explains a command.",
@@ -97,11 +121,11 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"linprim-geo {__version__}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
-    def command(name: str, run: Callable[[argparse.Namespace], Output], text: str) -> argparse.ArgumentParser:
+    def command(name: str, run: Callable[[argparse.Namespace], Output], text: str) -> Parser:
         description = text[0].upper() + text[1:] + "."
         sub = subparsers.add_parser(name, parents=[common], help=text, description=description, allow_abbrev=False)
         # `parser` for completion.
-        sub.set_defaults(run_command=run, parser=parser)
+        sub.set_defaults(run_command=run, parser=parser, command_parser=sub)
         return sub
 
     for file in COMMANDS:

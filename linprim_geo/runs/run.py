@@ -346,7 +346,8 @@ def _read_json(file: Path, run: Path) -> dict:
         if not run.exists():
             raise LinprimError(f"{run}: no such folder, wanted that of a run") from None
         raise LinprimError(
-            f"{run}: {file.name} is missing, so this is not the folder of a run that has saved something"
+            f"{run}: {file.name} is missing, so this is not the folder of a run that has saved something; "
+            "linprim-geo train SCENE -o RUN makes one"
         ) from None
     except (OSError, ValueError, RecursionError) as error:
         raise LinprimError(f"{file}: cannot be read ({getattr(error, 'strerror', None) or error})") from None

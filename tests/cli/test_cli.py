@@ -361,7 +361,9 @@ def test_the_functions_have_the_arguments_that_the_commands_pass(line):
     function = getattr(importlib.import_module(f"linprim_geo.{module}"), name)
     options = {field.name for field in dataclasses.fields(ExtractOptions)} if line.startswith("extract") else set()
     passed = (
-        vars(cli.build_parser().parse_args(line.split())).keys() - {"run_command", "parser", "most_threads"} - options
+        vars(cli.build_parser().parse_args(line.split())).keys()
+        - {"run_command", "parser", "command_parser", "most_threads"}
+        - options
     )
     assert {renamed.get(key, key) for key in passed} <= set(inspect.signature(function).parameters)
 
@@ -484,3 +486,26 @@ def test_faces_that_are_not_finite_are_named_and_the_rest_is_scored(tmp_path, ca
     assert (
         shown.err == f"linprim-geo: {tmp_path / 'broken.ply'}: faces left out because a coordinate is not finite: 1\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("trian scene", "(did you mean train?); linprim-geo --help explains"),
+        ("train scene -o run --iteration 5", "--iteration 5 (did you mean --iterations?); linprim-geo train --help"),
+        ("eval-mesh a b --sampels=5", "(did you mean --samples?); linprim-geo eval-mesh --help explains"),
+        ("synth out --scene rom", "(did you mean room?); linprim-geo synth --help explains"),
+        ("train scene -o run --zzzz", "unrecognized arguments: --zzzz; linprim-geo train --help explains"),
+    ],
+)
+def test_a_wrong_argument_gets_one_sentence_that_says_what_may_have_been_meant(line, said, capsys):
+    with pytest.raises(SystemExit) as leaving:
+        cli.main(line.split())
+    out, error = capsys.readouterr()
+    assert leaving.value.code == 2 and not out
+    assert error.count("\n") == 1 and error.startswith("linprim-geo: error: ") and said in error
+
+
+def test_a_folder_that_is_no_run_says_what_makes_one(tmp_path, capsys):
+    assert cli.main(["extract-mesh", str(tmp_path)]) == 1
+    assert "config.json is missing" in (error := capsys.readouterr().err) and "linprim-geo train" in error
