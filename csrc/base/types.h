@@ -17,6 +17,10 @@ constexpr int kGeometrySums = 32;           // the same with the entry normals' 
 // What the tile kernels are compiled for, beside the scalar and the set of outputs. Numbers cross into Python.
 enum class PrimitiveKind : int { kOctahedron, kTetrahedron, kGaussian };
 constexpr int kKinds = 3;
+// Numbers of its extent: half-axes, vertex distances or standard deviations.
+constexpr int extents_of(PrimitiveKind kind) { return kind == PrimitiveKind::kTetrahedron ? 4 : 3; }
+// Whether it has faces, where rays enter and leave.
+constexpr bool is_solid(PrimitiveKind kind) { return kind != PrimitiveKind::kGaussian; }
 // Exact perspective, or the rays of one primitive parallel in the ray space of its centre (EWA). A Gaussian knows only
 // the latter.
 enum class RayModel : int { kExact, kAffine };
@@ -39,16 +43,15 @@ struct View {
   Order order;
 };
 
-// Arrays of n primitives, row major: center (n,3), rotation (n,4) as w,x,y,z of any length, extent (n, extents()):
-// half-axes, vertex distances or standard deviations; density (n) per world unit, or a Gaussian's peak opacity; sh (n,
-// sh_count, 3) with sh_count 1, 4, 9 or 16.
+// Arrays of n primitives, row major: center (n,3), rotation (n,4) as w,x,y,z of any length, extent (n, extents()),
+// density (n) per world unit, or a Gaussian's peak opacity; sh (n, sh_count, 3) with sh_count 1, 4, 9 or 16.
 template <class Real>
 struct Primitives {
   PrimitiveKind kind;
   int64_t n;
   const Real *center, *rotation, *extent, *density, *sh;
   int sh_count;
-  int extents() const { return kind == PrimitiveKind::kTetrahedron ? 4 : 3; }
+  int extents() const { return extents_of(kind); }
 };
 
 // Gradients with the layout of Primitives. screen (n,3): the gradient to the centre's position in pixels, and the sum

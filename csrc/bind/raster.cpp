@@ -57,7 +57,7 @@ linprim::Primitives<Real> make_primitives(int kind, const In<Real>& center, cons
     throw std::invalid_argument("sh has to have shape (N, 1 | 4 | 9 | 16, 3)");
   if (n >= (int64_t(1) << 31)) throw std::invalid_argument("more than 2^31 primitives");
   if (kind < 0 || kind >= linprim::kKinds) throw std::invalid_argument("unknown kind of primitive");
-  const int64_t extents = linprim::PrimitiveKind(kind) == linprim::PrimitiveKind::kTetrahedron ? 4 : 3;
+  const int64_t extents = linprim::extents_of(linprim::PrimitiveKind(kind));
   return {linprim::PrimitiveKind(kind),
           n,
           checked(center, {n, 3}, "center"),
@@ -173,8 +173,7 @@ void bind_real(nb::module_& m, const char* suffix) {
            RasterModel model, Out<Real> depth, Out<Real> opacity) {
           const linprim::View view = make_view(pose, intrinsics, width, height, near, 0, level, model);
           const auto primitives = make_primitives<Real>(kind, center, rotation, extent, density, sh);
-          if (primitives.kind == linprim::PrimitiveKind::kGaussian)
-            throw std::invalid_argument("a Gaussian has no entry and no exit");
+          if (!linprim::is_solid(primitives.kind)) throw std::invalid_argument("it has no entry and no exit");
           Real *depths = checked(depth, {height, width}, "depth"),
                *opacities = checked(opacity, {height, width}, "opacity");
           nb::gil_scoped_release release;

@@ -45,10 +45,10 @@ void bind_tree(nb::class_<linprim::SolidTree>& tree) {
                           In<Real> density) {
     const int64_t n = center.ndim() ? int64_t(center.shape(0)) : 0;
     if (n >= (int64_t(1) << 31)) throw std::invalid_argument("more than 2^31 primitives");
-    if (kind != int(linprim::PrimitiveKind::kOctahedron) && kind != int(linprim::PrimitiveKind::kTetrahedron))
+    if (kind < 0 || kind >= linprim::kKinds || !linprim::is_solid(linprim::PrimitiveKind(kind)))
       throw std::invalid_argument("segments have an optical depth in octahedra and tetrahedra only");
     const auto solid = linprim::PrimitiveKind(kind);
-    const int64_t extents = solid == linprim::PrimitiveKind::kTetrahedron ? 4 : 3;
+    const int64_t extents = linprim::extents_of(solid);
     const Real *c = checked(center, {n, 3}, "center"), *r = checked(rotation, {n, 4}, "rotation");
     const Real *e = checked(extent, {n, extents}, "extent"), *d = checked(density, {n}, "density");
     nb::gil_scoped_release release;

@@ -143,7 +143,7 @@ SegmentKernel kernel_in_use() {
 template <class Real>
 SolidTree::SolidTree(PrimitiveKind kind, int64_t n, const Real* center, const Real* rotation, const Real* extent,
                      const Real* density) {
-  const int extents = kind == PrimitiveKind::kTetrahedron ? 4 : 3;
+  const int extents = extents_of(kind);
   std::vector<SlabSolid> from;
   std::vector<Box> boxes;
   for (int64_t i = 0; i < n; ++i) {

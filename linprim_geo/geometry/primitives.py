@@ -72,6 +72,7 @@ _OCTAHEDRON_VERTICES = np.repeat(np.eye(3), 2, axis=0) * np.tile([-1.0, 1.0], 3)
 _TETRAHEDRON_VERTICES = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
 _TETRAHEDRON_FACES = np.array([[1, 3, 2], [0, 2, 3], [0, 3, 1], [0, 1, 2]], dtype=np.int64)
 
+# In the order of the core's enum `PrimitiveKind`.
 KINDS = {
     kind.name: kind
     for kind in (

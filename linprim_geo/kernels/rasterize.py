@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from linprim_geo import _core
+from linprim_geo.geometry import primitives
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.operators import as_array, check_dtypes, check_finite, define, scalar_suffix
 
@@ -33,7 +34,7 @@ def _planes(like: Tensor, width: int, height: int, geometry: bool) -> list[Tenso
 
 # What the two operators take beside tensors. `numbers`: fx, fy, cx, cy, near, stop, level, screen_filter; `choices`:
 # width, height, and the indices of primitive, ray model and order in these lists, and whether the geometry is wanted.
-KINDS = ("octahedron", "tetrahedron", "gaussian")
+KINDS = tuple(primitives.KINDS)
 RAY_MODELS = ("exact", "affine")
 ORDERS = ("center", "entry", "overlap")
 

@@ -16,6 +16,7 @@ from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.types import Scene
 from linprim_geo.geometry.mesh import Mesh, vertex_normals
 from linprim_geo.geometry.mesh_files import load_mesh
+from linprim_geo.stereo.depth_maps import depth_maps
 from linprim_geo.surface import method_tsdf, stereo_frames
 from linprim_geo.surface.extract import extract_mesh
 from linprim_geo.surface.stereo_frames import MergedFrames
@@ -180,8 +181,27 @@ def many_views(tmp_path_factory):
     return octahedron_run(tmp_path_factory.mktemp("many"), views=60, size=40)
 
 
+@pytest.fixture(scope="module")
+def kept_maps():
+    return []
+
+
+@pytest.fixture
+def stereo_once(many_views, kept_maps, monkeypatch):
+    """Stereo of `many_views` is computed once for all tests."""
+
+    def once(views, points, **options):
+        if not kept_maps:
+            kept_maps.append(depth_maps(views, points, **options))
+        return kept_maps[0]
+
+    monkeypatch.setattr(stereo_frames, "depth_maps", once)
+
+
 @pytest.mark.parametrize("shares, taken", [((0.8, 0.9), True), ((0.9, 0.88), False), ((0.9, 0.895), True)])
-def test_photographs_that_agree_clearly_less_often_speak_against_stereo(many_views, monkeypatch, shares, taken):
+def test_photographs_that_agree_clearly_less_often_speak_against_stereo(
+    many_views, stereo_once, monkeypatch, shares, taken
+):
     told = iter(shares)
     monkeypatch.setattr(Scene, "has_alpha", False)
     monkeypatch.setattr(method_tsdf, "LEAST_CONFIRMED", 0.0)
@@ -190,14 +210,14 @@ def test_photographs_that_agree_clearly_less_often_speak_against_stereo(many_vie
     assert stats["stereo"]["taken"] is taken and stats["refine"] == (0 if taken else 2)
 
 
-def test_a_surface_takes_stereo_into_account_where_it_is_asked_to(many_views):
+def test_a_surface_takes_stereo_into_account_where_it_is_asked_to(many_views, stereo_once):
     stats = extract_mesh(many_views, options=ExtractOptions(stereo="on", level=0.5), quiet=True)
     assert 0 <= stats["stereo"]["confirmed"] <= 1 and 0 < stats["stereo"]["rendered_weight"] <= 1
     with pytest.raises(LinprimError, match="without --blocks"):
         extract_mesh(many_views, options=ExtractOptions(stereo="on"), blocks=2, quiet=True)
 
 
-def test_where_nothing_is_supported_the_rendered_surface_stays(many_views, monkeypatch):
+def test_where_nothing_is_supported_the_rendered_surface_stays(many_views, stereo_once, monkeypatch):
     nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), int))
     monkeypatch.setattr(Scene, "has_alpha", False)
     monkeypatch.setattr(method_tsdf, "LEAST_CONFIRMED", 0.0)

@@ -14,13 +14,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from linprim_geo.geometry.primitives import KINDS
 from linprim_geo.kernels.reference.blend import blend_in_order, blend_overlapping
 from linprim_geo.kernels.reference.blend import mean_depth_fraction as mean_depth_fraction
 from linprim_geo.kernels.reference.shapes import FACE_SIGNS as FACE_SIGNS
 from linprim_geo.kernels.reference.shapes import clip_to_octahedron as clip_to_octahedron
 from linprim_geo.kernels.reference.shapes import gaussian_chords, polyhedron_chords, view_limits
 
-PRIMITIVES, RAY_MODELS = ("octahedron", "tetrahedron", "gaussian"), ("exact", "affine")
+PRIMITIVES, RAY_MODELS = tuple(KINDS), ("exact", "affine")
 ORDERS = ("center", "entry", "overlap")
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
@@ -212,7 +213,7 @@ def rasterize(
         raise ValueError(f"a Gaussian has no entry, so its order is center, not {order}")
     if not screen_filter >= 0:
         raise ValueError(f"screen_filter is {screen_filter}, wanted a number of pixels >= 0")
-    if extent.shape[1] != (4 if primitive == "tetrahedron" else 3):
+    if extent.shape[1] != KINDS[primitive].extents:
         raise ValueError(f"extent has {extent.shape[1]} columns, which is not a {primitive}")
     if primitive == "octahedron" and not bool((extent > 0).all()):
         raise ValueError("extent holds a half-axis that is not positive")
