@@ -20,8 +20,9 @@ LEAST_POINTS, LEAST_PAIRS = 50, 3
 DARKEST, BRIGHTEST = 20, 245
 # Rounds in which differences of more than so many deviations lose weight: paint that shines, and wrong depths.
 ROUNDS, OUTLIER = 5, 2.0
-# What is found counts from so many of its standard errors.
-CERTAIN = 3.0
+# What is found counts from so many of its standard errors, and if corners are between so many times as bright as the
+# middle: cos^4 of 45 degrees, and a correction that goes too far. What only the middle shows is not known of corners.
+CERTAIN, CORNERS = 3.0, (0.25, 1.1)
 
 
 def radius_square(camera: Camera, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -47,7 +48,7 @@ def vignetting(cameras: Sequence[Camera], greys: Sequence[np.ndarray], depths: S
         greys: (H, W) of each view, as displays show them: a power of brightness only changes a and b.
         depths: (H, W) confirmed depth of each view, NaN elsewhere.
     """
-    smooth = [uniform_filter(grey.astype(np.float32), BOX, mode="nearest") for grey in greys]
+    smooth: dict[int, np.ndarray] = {}  # of the views that are being compared
     pairs = []
     for one in range(len(cameras)):
         rows, columns = np.nonzero(np.isfinite(depths[one]))
@@ -56,9 +57,13 @@ def vignetting(cameras: Sequence[Camera], greys: Sequence[np.ndarray], depths: S
         rays = cameras[one].world_rays()[rows, columns]
         points = cameras[one].center + rays * depths[one][rows, columns, None]
         for other in (one + step for step in STEPS if one + step < len(cameras)):
+            for view in (one, other):
+                if view not in smooth:
+                    smooth[view] = uniform_filter(greys[view].astype(np.float32), BOX, mode="nearest")
             pair = _pair(cameras, smooth, depths, one, other, (rows, columns), points)
             if len(pair) >= LEAST_POINTS:
                 pairs.append(pair)
+        smooth.pop(one, None)
     if len(pairs) < LEAST_PAIRS:
         return np.zeros(2)
     weights = [np.ones(len(pair)) for pair in pairs]
@@ -68,7 +73,8 @@ def vignetting(cameras: Sequence[Camera], greys: Sequence[np.ndarray], depths: S
         left = [pair[:, 0] - pair[:, 1:] @ found for pair in centered]
         deviation = 1.4826 * np.median(np.abs(np.concatenate(left)))
         weights = [np.minimum(1, OUTLIER * deviation / np.maximum(np.abs(each), 1e-9)) for each in left]
-    return found if abs(found.sum()) > CERTAIN * error else np.zeros(2)
+    certain = abs(found.sum()) > CERTAIN * error and CORNERS[0] < np.exp(found.sum()) < CORNERS[1]
+    return found if certain else np.zeros(2)
 
 
 def _pair(cameras, greys, depths, one, other, at, points) -> np.ndarray:

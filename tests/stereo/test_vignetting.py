@@ -57,3 +57,11 @@ def test_without_vignetting_or_without_points_there_is_none():
     assert np.ptp(falloff(cameras[0], vignetting(cameras, greys, depths))) < 0.005
     nothing = [np.full_like(depth, np.nan) for depth in depths]
     assert not vignetting(cameras, greys, nothing).any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_in_the_middle_alone_make_no_law_for_corners(seed):
+    cameras, greys, depths = wall(seed, (0.0, 0.0))
+    square = falloff(cameras[0], np.array([1.0, 0.0]))
+    middle = [np.where(np.log(square) < 0.05, depth, np.nan) for depth in depths]
+    assert np.ptp(falloff(cameras[0], vignetting(cameras, greys, middle))) < 0.02
