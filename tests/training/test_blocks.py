@@ -166,7 +166,7 @@ def test_own_primitives_are_limited_to_what_is_asked_for(whole):
     run, done = whole
     plan = read_plan(run)
     assert sum(part.own_primitives for part in plan.blocks) == OPTIONS.max_primitives
-    # Some cross a border after the last growth: seeds 0 and 1 end with 300 and 305 of 300. Limits of blocks with their
+    # Some cross a border after the last growth: seed 1 ends with 305 of 300. Limits of blocks with their
     # margins alone would allow more.
     assert 0.95 * OPTIONS.max_primitives <= done["primitives"] <= 1.05 * OPTIONS.max_primitives
     assert sum(part.max_primitives for part in plan.blocks) > 1.05 * OPTIONS.max_primitives
