@@ -25,7 +25,7 @@ from linprim_geo.training.checkpoint import read_checkpoint
 
 FOLDER = "blocks"
 # Goes up whenever tasks need what those of before have not left.
-FORMAT = 3
+FORMAT = 4
 # The coarse scene: pixels averaged, parts of the steps and of the primitives of the whole, and the most of these and of
 # the views.
 COARSE_DOWNSCALE, COARSE_STEPS, COARSE_PRIMITIVES = 2, 0.25, 0.25
