@@ -173,7 +173,8 @@ void bind_real(nb::module_& m, const char* suffix) {
            RasterModel model, Out<Real> depth, Out<Real> opacity) {
           const linprim::View view = make_view(pose, intrinsics, width, height, near, 0, level, model);
           const auto primitives = make_primitives<Real>(kind, center, rotation, extent, density, sh);
-          if (!linprim::is_solid(primitives.kind)) throw std::invalid_argument("it has no entry and no exit");
+          if (!linprim::is_solid(primitives.kind))
+            throw std::invalid_argument("it has no faces, so no entry and no exit");
           Real *depths = checked(depth, {height, width}, "depth"),
                *opacities = checked(opacity, {height, width}, "opacity");
           nb::gil_scoped_release release;
