@@ -325,8 +325,8 @@ def _footprints(points: np.ndarray, normals: np.ndarray, cameras: Sequence[Camer
     for camera in cameras:
         pose, lens = camera.pinhole()
         surface_ops.least_footprints(pose, lens, camera.width, camera.height, LEAST_COSINE, points, normals, least)
-    seen_by_two = np.isfinite(least)
-    largest = LARGEST_FOOTPRINT * np.median(least[seen_by_two]) if seen_by_two.any() else 1.0
+    seen = np.isfinite(least)
+    largest = LARGEST_FOOTPRINT * np.median(least[seen]) if seen.any() else 1.0
     return np.minimum(least, largest)
 
 

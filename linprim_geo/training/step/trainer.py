@@ -257,7 +257,7 @@ class Trainer:
         elif self.step % FILTER_EVERY == 0:
             self._refilter()
         self.seconds += time.perf_counter() - begin
-        self._average(*parts.detach()[[0, 3]].tolist())
+        self._average(*parts.detach()[::3].tolist())
 
     def _average(self, loss: float, squared_error: float) -> None:
         """Takes a step's loss and mean squared error into the running means."""
