@@ -365,7 +365,7 @@ def test_a_sentence_stays_one_line_of_bounded_length():
 
 def test_some_hundred_damaged_inputs_of_every_reader():
     """The same command with --inputs 100000 takes some ten minutes."""
-    inputs = 40 * len(fuzz_readers.READERS)
+    inputs = 60 * len(fuzz_readers.READERS)
     command = ["--inputs", str(inputs), "--seed", "7"]
     done = subprocess.run([sys.executable, TOOLS / "fuzz.py", *command], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr

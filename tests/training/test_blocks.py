@@ -166,9 +166,9 @@ def test_own_primitives_are_limited_to_what_is_asked_for(whole):
     run, done = whole
     plan = read_plan(run)
     assert sum(part.own_primitives for part in plan.blocks) == OPTIONS.max_primitives
-    # Some cross a border after the last growth: seed 1 ends with 305 of 300. Limits of blocks with their
-    # margins alone would allow more.
-    assert 0.95 * OPTIONS.max_primitives <= done["primitives"] <= 1.05 * OPTIONS.max_primitives
+    # A few cross a border after the last growth, either way: seeds 0 to 2 end with 301, 305, 301 of 300. Limits of
+    # blocks with their margins alone would allow more.
+    assert 0.97 * OPTIONS.max_primitives <= done["primitives"] <= 1.03 * OPTIONS.max_primitives
     assert sum(part.max_primitives for part in plan.blocks) > 1.05 * OPTIONS.max_primitives
     assert apportioned([1, 1, 1], 10) == [4, 3, 3] and apportioned([0, 5, 2], 70) == [0, 50, 20]
 
@@ -440,7 +440,7 @@ def train_killed_at_random(
 
 def test_killed_at_random_moments_it_ends_in_the_same_bits(whole, tiny_scene, tmp_path):
     run = tmp_path / "run"
-    train_killed_at_random(tiny_scene, run, 2, random.Random(5), 3.0)
+    train_killed_at_random(tiny_scene, run, 3, random.Random(5), 3.0)
     assert_same(run, whole[0])
     assert not [path for path in run.rglob(".*") if ".tmp" in path.name]
 
