@@ -4,6 +4,8 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "base/kinds.h"
+
 namespace linprim {
 
 constexpr int kTile = 16;                   // pixels along a tile's side
@@ -14,13 +16,9 @@ constexpr int kMaxShCoefficients = 16;      // degree 3
 constexpr int kColorSums = 16;              // gradient sums per (tile, primitive) pair, see Sum
 constexpr int kGeometrySums = 32;           // the same with the entry normals' sums (28 used)
 
-// What the tile kernels are compiled for, beside the scalar and the set of outputs. Numbers cross into Python.
-enum class PrimitiveKind : int { kOctahedron, kTetrahedron, kGaussian };
-constexpr int kKinds = 3;
-// Numbers of its extent: half-axes, vertex distances or standard deviations.
-constexpr int extents_of(PrimitiveKind kind) { return kind == PrimitiveKind::kTetrahedron ? 4 : 3; }
-// Whether it has faces, where rays enter and leave.
-constexpr bool is_solid(PrimitiveKind kind) { return kind != PrimitiveKind::kGaussian; }
+// What the tile kernels are compiled for beside the kind of primitive, the scalar and the set of outputs. Numbers cross
+// into Python.
+//
 // Exact perspective, or the rays of one primitive parallel in the ray space of its centre (EWA). A Gaussian knows only
 // the latter.
 enum class RayModel : int { kExact, kAffine };
@@ -51,7 +49,7 @@ struct Primitives {
   int64_t n;
   const Real *center, *rotation, *extent, *density, *sh;
   int sh_count;
-  int extents() const { return extents_of(kind); }
+  int extents() const { return traits_of(kind).extents; }
 };
 
 // Gradients with the layout of Primitives. screen (n,3): the gradient to the centre's position in pixels, and the sum
@@ -60,40 +58,6 @@ struct Primitives {
 template <class Real>
 struct PrimitiveGradients {
   Real *center, *rotation, *extent, *density, *sh, *screen;
-};
-
-// Projected primitives, as the tile kernels read them, one type per kind.
-//
-// The faces of a polyhedron are planes w_f(x, y) = a_f + b_f (x - ref_x) + c_f (y - ref_y), x and y counted in pixels,
-// with w the inverse depth less w0, the inverse depth of the reference (exact rays), or the centre's distance w0 less
-// the distance (affine rays): either way a ray is inside for w from the largest of the back faces to the smallest of
-// the front faces.
-//
-// An octahedron's slots 0-3 hold, of each pair of opposite faces, the one turned to the camera; slots 4-7 their
-// opposites, always back faces.
-template <class Real>
-struct alignas(64) OctahedronRecord {
-  Real a[8], b[8], c[8];
-  Real w0, density, rgb[3];
-  Real ref_x, ref_y;  // integers
-  uint32_t flags;   // bits 0-3: slot 0-3 is a front face; bit 4: take the general path (not all are, or the near plane
-                    // is crossed)
-  Real face[3][8];  // s_k / h_s: derivative of the face's w with respect to the local form p_k
-};
-constexpr uint32_t kGeneral = 16;
-template <class Real>
-struct alignas(16) TetrahedronRecord {
-  Real a[4], b[4], c[4];
-  Real w0, density, rgb[3];
-  Real ref_x, ref_y;
-  uint32_t flags;  // bits 0-3: face 0-3 is a front face
-};
-template <class Real>
-struct alignas(16) GaussianRecord {
-  Real xx, xy, yy;           // inverse covariance, 1 / pixel^2
-  Real mean_x, mean_y;       // projected centre, relative to the reference
-  Real w0, density, rgb[3];  // depth of the centre, peak opacity, colour
-  Real ref_x, ref_y;
 };
 
 // Order of the gradient sums of a pair. The first twelve are the kind's own (see its add_gradient); then density and

@@ -57,7 +57,7 @@ linprim::Primitives<Real> make_primitives(int kind, const In<Real>& center, cons
     throw std::invalid_argument("sh has to have shape (N, 1 | 4 | 9 | 16, 3)");
   if (n >= (int64_t(1) << 31)) throw std::invalid_argument("more than 2^31 primitives");
   if (kind < 0 || kind >= linprim::kKinds) throw std::invalid_argument("unknown kind of primitive");
-  const int64_t extents = linprim::extents_of(linprim::PrimitiveKind(kind));
+  const int64_t extents = linprim::traits_of(linprim::PrimitiveKind(kind)).extents;
   return {linprim::PrimitiveKind(kind),
           n,
           checked(center, {n, 3}, "center"),

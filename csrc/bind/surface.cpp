@@ -48,7 +48,7 @@ void bind_tree(nb::class_<linprim::SolidTree>& tree) {
     if (kind < 0 || kind >= linprim::kKinds || !linprim::is_solid(linprim::PrimitiveKind(kind)))
       throw std::invalid_argument("segments have an optical depth in octahedra and tetrahedra only");
     const auto solid = linprim::PrimitiveKind(kind);
-    const int64_t extents = linprim::extents_of(solid);
+    const int64_t extents = linprim::traits_of(solid).extents;
     const Real *c = checked(center, {n, 3}, "center"), *r = checked(rotation, {n, 4}, "rotation");
     const Real *e = checked(extent, {n, extents}, "extent"), *d = checked(density, {n}, "density");
     nb::gil_scoped_release release;

@@ -9,6 +9,11 @@
 //   depths        z-depths of entry and exit
 //   add_gradient  from the gradients to thickness and depths to the pair's sums
 //   recenter      moves a finished slot's sums from their origin to the record's reference
+//
+// The faces of a polyhedron are planes w_f(x, y) = a_f + b_f (x - ref_x) + c_f (y - ref_y), x and y counted in pixels,
+// with w the inverse depth less w0, the inverse depth of the reference (exact rays), or the centre's distance w0 less
+// the distance (affine rays): either way a ray is inside for w from the largest of the back faces to the smallest of
+// the front faces.
 #pragma once
 
 #include "base/types.h"

@@ -1,7 +1,7 @@
 // What the polyhedra share when they are projected: face planes over the pixels for both ray models, screen boxes, the
 // screen filter; each with its adjoint beside it.
 //
-// A face is the plane n . (x - c) = 1 in camera space. Its w over the pixels (see OctahedronRecord) is (p - kappa) / h
+// A face is the plane n . (x - c) = 1 in camera space. Its w over the pixels (see polyhedron.h) is (p - kappa) / h
 // with p affine in the pixel and both p and h linear in n:
 //   exact rays   p = n . (v - w0 c), kappa = w0, h = 1 + m, m = n . c           (w = inverse depth - w0)
 //   affine rays  p = n'_u (u - u_c) + n'_v (v - v_c), kappa = 1, h = m, m = n . j / |j|,   n' = J^-T n   (w = |c| -

@@ -11,14 +11,12 @@
 #include "raster/blend_center.h"
 #include "raster/blend_overlap.h"
 #include "raster/blend_sorted.h"
-#include "primitives/gaussian_project.h"
+#include "primitives/gaussian.h"
 #include "loss/image_kernels.h"
 #include "raster/level_depth.h"
 #include "raster/machine_limits.h"
 #include "primitives/octahedron.h"
-#include "primitives/octahedron_project.h"
 #include "primitives/tetrahedron.h"
-#include "primitives/tetrahedron_project.h"
 
 namespace linprim {
 namespace LINPRIM_ISA {
@@ -73,6 +71,7 @@ constexpr Kernels<Real> all_kernels(const char* name) {
   constexpr RayModel kExact = RayModel::kExact, kAffine = RayModel::kAffine;
   Kernels<Real> k{};
   k.name = name, k.width = kWidth, k.bin = bin<kWidth>;
+  // A row for each kind, in the order of PrimitiveKind.
   k.solids[0][0] =
       solid_kernels<Octahedron<Real, kWidth, kExact>>(project_octahedra<Real, kExact>, chain_octahedra<Real, kExact>);
   k.solids[0][1] = solid_kernels<Octahedron<Real, kWidth, kAffine>>(project_octahedra<Real, kAffine>,

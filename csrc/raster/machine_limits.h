@@ -7,7 +7,6 @@
 
 #include "raster/blend_center.h"
 #include "primitives/octahedron.h"
-#include "primitives/octahedron_project.h"
 
 namespace linprim::LINPRIM_ISA {
 

@@ -41,47 +41,6 @@ void rotation_matrix(const double q_raw[4], double r[3][3]) {
   std::memcpy(r, m, sizeof m);
 }
 
-// |sum_k s_k (R^T x)_k / extent_k| <= 1 for the four sign patterns of which no two are opposite.
-void set_octahedron(const double r[3][3], const double* extent, SlabSolid& solid, Box& box) {
-  constexpr double kSigns[4][3] = {{1, 1, 1}, {1, 1, -1}, {1, -1, 1}, {-1, 1, 1}};
-  for (int i = 0; i < 3; ++i) {
-    double half = 0;
-    for (int k = 0; k < 3; ++k) half = std::max(half, std::abs(r[i][k]) * extent[k]);
-    box.low[i] = solid.center[i] - half, box.high[i] = solid.center[i] + half;
-    for (int j = 0; j < 4; ++j) {
-      solid.normal[j][i] = 0;
-      for (int k = 0; k < 3; ++k) solid.normal[j][i] += kSigns[j][k] * r[i][k] / extent[k];
-    }
-  }
-  for (double& s : solid.shift) s = 0;
-}
-
-// Barycentric coordinates l_j of p = sum_j l_j e_j b_j, where b_i . b_j = -1/3 and sum b_j = 0: with m_j = l_j e_j and
-// M their sum, p . b_j = (4 m_j - M) / 3, so m_j = (3 p . b_j + M) / 4, and sum l_j = 1 gives M = (4 - 3 p . sum_i b_i
-// / e_i) / sum_i 1 / e_i. The slabs are |2 l_j - 1| <= 1.
-void set_tetrahedron(const double r[3][3], const double* extent, SlabSolid& solid, Box& box) {
-  const double u = 1 / std::sqrt(3.0), b[4][3] = {{u, u, u}, {u, -u, -u}, {-u, u, -u}, {-u, -u, u}};
-  double inverses = 0, w[3] = {0, 0, 0};
-  for (int j = 0; j < 4; ++j) {
-    inverses += 1 / extent[j];
-    for (int k = 0; k < 3; ++k) w[k] += b[j][k] / extent[j];
-  }
-  for (int j = 0; j < 4; ++j) {
-    double local[3];
-    for (int k = 0; k < 3; ++k) local[k] = 1.5 * (b[j][k] - w[k] / inverses) / extent[j];
-    for (int i = 0; i < 3; ++i) solid.normal[j][i] = r[i][0] * local[0] + r[i][1] * local[1] + r[i][2] * local[2];
-    solid.shift[j] = 2 / (inverses * extent[j]) - 1;
-  }
-  for (int i = 0; i < 3; ++i) {
-    box.low[i] = std::numeric_limits<double>::infinity(), box.high[i] = -box.low[i];
-    for (int j = 0; j < 4; ++j) {
-      const double arm = extent[j] * (r[i][0] * b[j][0] + r[i][1] * b[j][1] + r[i][2] * b[j][2]);
-      box.low[i] = std::min(box.low[i], solid.center[i] + arm),
-      box.high[i] = std::max(box.high[i], solid.center[i] + arm);
-    }
-  }
-}
-
 struct Builder {
   const std::vector<Box>& boxes;
   const std::vector<SlabSolid>& from;
@@ -143,7 +102,8 @@ SegmentKernel kernel_in_use() {
 template <class Real>
 SolidTree::SolidTree(PrimitiveKind kind, int64_t n, const Real* center, const Real* rotation, const Real* extent,
                      const Real* density) {
-  const int extents = extents_of(kind);
+  const KindTraits& traits = traits_of(kind);
+  const int extents = traits.extents;
   std::vector<SlabSolid> from;
   std::vector<Box> boxes;
   for (int64_t i = 0; i < n; ++i) {
@@ -158,9 +118,12 @@ SolidTree::SolidTree(PrimitiveKind kind, int64_t n, const Real* center, const Re
     rotation_matrix(q, r);
     SlabSolid solid;
     Box box;
-    for (int k = 0; k < 3; ++k) solid.center[k] = double(center[3 * i + k]);
+    traits.slabs(r, e, solid.slabs);
+    for (int k = 0; k < 3; ++k) {
+      solid.center[k] = double(center[3 * i + k]);
+      box.low[k] = solid.center[k] + solid.slabs.low[k], box.high[k] = solid.center[k] + solid.slabs.high[k];
+    }
     solid.density = std::min(double(density[i]), kLargestDensity);
-    (extents == 4 ? set_tetrahedron : set_octahedron)(r, e, solid, box);
     from.push_back(solid), boxes.push_back(box);
   }
   if (from.empty()) return;
@@ -181,11 +144,11 @@ void SolidTree::optical_depth(const double* origin, const double* ends, const do
   std::vector<SeenSolid> seen(solids_.size());
   for (size_t i = 0; i < seen.size(); ++i) {
     const SlabSolid& from = solids_[i];
-    std::memcpy(seen[i].normal, from.normal, sizeof from.normal);
+    std::memcpy(seen[i].normal, from.slabs.normal, sizeof from.slabs.normal);
     seen[i].density = from.density;
     for (int j = 0; j < 4; ++j) {
-      seen[i].at[j] = from.shift[j];
-      for (int k = 0; k < 3; ++k) seen[i].at[j] += from.normal[j][k] * (origin[k] - from.center[k]);
+      seen[i].at[j] = from.slabs.shift[j];
+      for (int k = 0; k < 3; ++k) seen[i].at[j] += from.slabs.normal[j][k] * (origin[k] - from.center[k]);
     }
   }
   const SegmentParams params{seen.data(), nodes_.data(), origin, ends, begin, most, depth};

@@ -9,10 +9,10 @@
 
 namespace linprim {
 
-// A polyhedron as the intersection of four slabs |normal . (x - center) + shift| <= 1: the pairs of opposite faces of
-// an octahedron; of a tetrahedron the barycentric coordinates, each between 0 and 1.
 struct SlabSolid {
-  double center[3], normal[4][3], shift[4], density;
+  double center[3];
+  Slabs slabs;
+  double density;
 };
 
 // The same seen from a point: x is inside where |at + normal . (x - point)| <= 1 for all four.
