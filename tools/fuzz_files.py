@@ -28,7 +28,8 @@ def finite(array: np.ndarray, shape: tuple, what: str) -> None:
 
 
 def _primitives(kind: str, degree: int, count: int = 5):
-    from linprim_geo.geometry.primitives import KINDS, Primitives
+    from linprim_geo.base.kinds import KINDS
+    from linprim_geo.geometry.primitives import Primitives
 
     rng = np.random.default_rng(3)
     arrays = rng.normal(size=(count, 3)), rng.normal(size=(count, 4)), rng.uniform(0.1, 1, (count, KINDS[kind].extents))

@@ -8,14 +8,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from linprim_geo.base import kinds
 from linprim_geo.eval.hard_cases import many_scenes
 from linprim_geo.eval.hard_cases.many_scenes import Scenes
 from linprim_geo.kernels.reference.rasterize import rotation_matrix
 
 WINDOW = 4  # pixels along a side of the image of a scene
 NEAR = 0.01
-POLYHEDRA = ("octahedron", "tetrahedron")
-KINDS = (*POLYHEDRA, "gaussian")
+KINDS = tuple(kinds.KINDS)
+POLYHEDRA = tuple(kind.name for kind in kinds.KINDS.values() if kind.solid)
 
 
 def log_uniform(rng: np.random.Generator, low: float, high: float, *shape: int) -> np.ndarray:

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from linprim_geo.base import kinds
 from linprim_geo.eval.hard_cases import many_scenes
 from linprim_geo.eval.hard_cases.class_scenes import (
     KINDS,
@@ -30,7 +31,6 @@ from linprim_geo.eval.hard_cases.class_scenes import (
 )
 from linprim_geo.eval.hard_cases.many_scenes import Scenes
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.primitives import reference_length
 from linprim_geo.kernels.reference.rasterize import rotation_matrix
 
 
@@ -357,7 +357,7 @@ def ends_of_opacity(rng, primitive, ray_model, count):
     if primitive == "gaussian":
         density = 1 / (1 + np.exp(-raw))
     else:
-        density = np.logaddexp(0, raw) / reference_length(extent[:, 0], primitive)[:, None]
+        density = np.logaddexp(0, raw) / kinds.KINDS[primitive].reference_length(extent[:, 0])[:, None]
     return build(rng, primitive, ray_model, placed_before(rng, extent), extent, density=density)
 
 

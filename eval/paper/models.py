@@ -18,10 +18,11 @@ import torch
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import write_json
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.base.options import SceneOptions, TrainOptions, from_saved, raster_options
 from linprim_geo.base.version import __version__
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.primitives import ARRAYS, KINDS, Primitives
+from linprim_geo.geometry.primitives import ARRAYS, Primitives
 from linprim_geo.kernels import ops
 from linprim_geo.runs.run import is_unused
 from linprim_geo.training.step.trainer import Trainer

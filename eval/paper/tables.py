@@ -30,6 +30,7 @@ from tempfile import TemporaryDirectory
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write, write_json
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.base.progress import Progress
 from linprim_geo.capture.load import load_scene
@@ -40,7 +41,6 @@ from linprim_geo.eval.paper.models import Model, Variant, measure, train_model
 from linprim_geo.eval.paper.published import published
 from linprim_geo.eval.paper.studies import Case
 from linprim_geo.eval.study_tables import write_table
-from linprim_geo.geometry.primitives import KINDS
 from linprim_geo.jobs.executor import Task
 from linprim_geo.jobs.open import open_executor
 from linprim_geo.synthetic.built_in import SHAPES

@@ -10,6 +10,7 @@ from numbers import Integral, Real
 from typing import Any, get_args, get_type_hints
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.kinds import KINDS
 
 
 def option(
@@ -144,10 +145,10 @@ def from_saved(cls: type, values: object, where: str):
 def check_train_options(options: TrainOptions) -> None:
     """Raises LinprimError as `check`, and for two values that exclude each other."""
     check(options)
-    if options.primitive == "gaussian" and options.order != "center":
+    if not KINDS[options.primitive].solid and options.order != "center":
         raise LinprimError(
             f"--order is {options.order!r}, but a Gaussian has no place where a ray enters it: wanted center "
-            "with --primitive gaussian"
+            f"with --primitive {options.primitive}"
         )
     if options.initial_primitives > options.max_primitives:
         raise LinprimError(
@@ -171,25 +172,17 @@ GEOMETRY_WEIGHTS = (
     "sensor_normals",
     "patches",
 )
-# Screen filter in pixels that goes with --filter 3d+screen: LinPrim's kernel_size, and 3DGS's, which is a variance in
-# px^2.
-SCREEN_FILTER, SCREEN_FILTER_OF_GAUSSIANS = 0.1, 0.3
-# Depths, in the training frame, before which rays do not begin and Gaussians are not drawn. Projected near the camera's
-# plane a Gaussian would cover everything; 0.2 is 3DGS's. A polyhedron is cut exactly.
-NEAR, NEAR_OF_GAUSSIANS = 0.01, 0.2
 
 
 def raster_options(options: TrainOptions) -> dict:
     """The keywords of `ops.rasterize` that say what a run's primitives are and how they are blended."""
-    screen = 0.0
-    if options.filter == "3d+screen":
-        screen = SCREEN_FILTER_OF_GAUSSIANS if options.primitive == "gaussian" else SCREEN_FILTER
+    kind = KINDS[options.primitive]
     return {
         "primitive": options.primitive,
         "ray_model": options.ray_model,
         "order": options.order,
-        "screen_filter": screen,
-        "near": NEAR_OF_GAUSSIANS if options.primitive == "gaussian" else NEAR,
+        "screen_filter": kind.screen_filter if options.filter == "3d+screen" else 0.0,
+        "near": kind.near,
     }
 
 
@@ -231,9 +224,7 @@ class TrainOptions:
     """How a scene is trained."""
 
     iterations: int = option(7000, "training steps, one view each", low=1, high=10**8)
-    primitive: str = option(
-        "octahedron", "what the scene is made of", choices=("octahedron", "tetrahedron", "gaussian")
-    )
+    primitive: str = option("octahedron", "what the scene is made of", choices=tuple(KINDS))
     ray_model: str = option(
         "exact",
         "how rays meet them: exact perspective, or LinPrim's affine approximation at each centre (always so with "

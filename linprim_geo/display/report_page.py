@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.base.options import changed_options, flag_of
 from linprim_geo.base.progress import duration
 from linprim_geo.base.version import __version__
 from linprim_geo.display.report_data import Report
 from linprim_geo.display.report_mesh import ShownMesh
-from linprim_geo.geometry.primitives import KINDS
 from linprim_geo.geometry.topology import topology_line
 from linprim_geo.imaging import plots
 from linprim_geo.training.effects import REASONS

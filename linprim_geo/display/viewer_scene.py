@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.capture.types import View
 from linprim_geo.display.meshes import Layer, is_inside, layers, light_mesh, up_direction
 from linprim_geo.display.report_mesh import mesh_file, read_json
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh, validate_mesh
 from linprim_geo.geometry.mesh_files import load_mesh
-from linprim_geo.geometry.primitives import KINDS, Primitives
+from linprim_geo.geometry.primitives import Primitives
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.convert import MESH_SIGMAS
 from linprim_geo.surface.extract import METHODS

@@ -23,13 +23,9 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write
+from linprim_geo.base.kinds import KINDS, Kind
 from linprim_geo.geometry.ply import write_ply
-from linprim_geo.geometry.primitives import KINDS, SH_COEFFICIENTS, Primitives, reference_length, unit_quaternions
-
-# LinPrim's formula never reads more than this share of the opacity, so that the logarithm stays finite ...
-OPACITY_CAP = 0.99
-# ... and with it no reference length is optically thicker than ln(100).
-THICKEST = -np.log1p(-OPACITY_CAP)
+from linprim_geo.geometry.primitives import SH_COEFFICIENTS, Primitives, unit_quaternions
 
 # The logit of the largest float32 below 1, and that of the smallest normal float32: beyond them a
 # float32 sigmoid is 1 and 0.
@@ -86,13 +82,12 @@ class PlyHeader:
 
     @property
     def kind(self) -> str:
-        """`octahedron`, `tetrahedron` or `gaussian` by the properties of the vertices, else `mesh` or `points`."""
+        """A kind of primitive by the properties of the vertices, else `mesh` or `points`."""
         vertex = self.element("vertex")
         names = {name for name, _ in vertex.properties} if vertex else set()
-        if "dist_0" in names:
-            return "tetrahedron" if "dist_3" in names else "octahedron"
-        if "scale_0" in names and "f_dc_0" in names:
-            return "gaussian"
+        told = [kind for kind in KINDS.values() if names.issuperset(kind.told_by)]
+        if told:
+            return max(told, key=lambda kind: len(kind.told_by)).name
         face = self.element("face")
         return "mesh" if face is not None and face.count > 0 else "points"
 
@@ -165,13 +160,13 @@ def read_primitive_ply(path: str | os.PathLike) -> tuple[Primitives, dict]:
     rest = sum(name.startswith("f_rest_") for name in present)
     if rest % 3 or rest // 3 + 1 not in SH_COEFFICIENTS:
         raise LinprimError(f"{path}: has {rest} properties f_rest_*, wanted 0, 9, 24 or 45")
-    layout = "3DGS's" if header.kind == "gaussian" else "LinPrim's"
+    kind = KINDS[header.kind]
 
     def columns(*names: str) -> np.ndarray:
         for name in names:
             if name not in present:
                 raise LinprimError(
-                    f"{path}: the property {name} is missing, wanted {layout} {len(_names(header.kind))} properties"
+                    f"{path}: the property {name} is missing, wanted {kind.layout}'s {len(_names(kind))} properties"
                 )
             if table.dtype[name] != np.dtype("<f4"):
                 raise LinprimError(f"{path}: the property {name} is {table.dtype[name]}, wanted float32")
@@ -189,7 +184,7 @@ def read_primitive_ply(path: str | os.PathLike) -> tuple[Primitives, dict]:
         return out
 
     center = columns("x", "y", "z")
-    lengths = columns(*_length_names(header.kind))
+    lengths = columns(*kind.length_properties)
     logit = columns("opacity")[:, 0].astype(np.float64)
     rotation = columns("rot_0", "rot_1", "rot_2", "rot_3")
     rotation[~(rotation != 0).any(axis=1)] = (1, 0, 0, 0)
@@ -200,26 +195,20 @@ def read_primitive_ply(path: str | os.PathLike) -> tuple[Primitives, dict]:
 
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         opacity = 1.0 / (1.0 + np.exp(-logit))
-        if header.kind == "gaussian":
-            spread = np.exp(lengths.astype(np.float64))
-            wide = np.hypot(spread, columns("filter_3D")) if "filter_3D" in present else spread
-            extent, density = wide.astype(np.float32), opacity * (spread / wide).prod(axis=1)
-        else:
-            extent = np.abs(lengths) + columns("filter_3D") / np.float32(2)
-            length = reference_length(extent.astype(np.float64), header.kind)
-            density = -np.log1p(-OPACITY_CAP * opacity) / length
-        solid = ((extent > 0) & np.isfinite(extent)).all(axis=1) & (density <= np.finfo(np.float32).max)
-    if not solid.any():
+        has_filter = "filter_3D" in {*present, *kind.last_properties}
+        extent, density = kind.from_file(lengths, opacity, columns("filter_3D") if has_filter else None)
+        visible = ((extent > 0) & np.isfinite(extent)).all(axis=1) & (density <= np.finfo(np.float32).max)
+    if not visible.any():
         raise LinprimError(f"{path}: none of its {len(table)} primitives has a volume")
     primitives = Primitives(
-        center[solid],
-        unit_quaternions(rotation[solid]),
-        extent[solid],
-        density[solid],
-        _without_empty_bands(sh[solid]),
-        header.kind,
+        center[visible],
+        unit_quaternions(rotation[visible]),
+        extent[visible],
+        density[visible],
+        _without_empty_bands(sh[visible]),
+        kind.name,
     )
-    return primitives, {"rows": len(table), "dropped": int((~solid).sum())}
+    return primitives, {"rows": len(table), "dropped": int((~visible).sum())}
 
 
 def write_primitive_ply(path: str | os.PathLike, primitives: Primitives) -> dict:
@@ -236,27 +225,14 @@ def write_primitive_ply(path: str | os.PathLike, primitives: Primitives) -> dict
     Returns:
         {"rows": N, "clamped": rows that are thicker than LinPrim can hold}.
     """
-    count = len(primitives)
-    clamped = 0
+    count, kind = len(primitives), KINDS[primitives.kind]
     with np.errstate(divide="ignore", invalid="ignore"):
-        if primitives.kind == "gaussian":
-            opacity = primitives.density.astype(np.float64)
-            logit = np.log(opacity) - np.log1p(-opacity)
-            lengths = np.log(primitives.extent.astype(np.float64))
-        else:
-            lengths = primitives.extent
-            length = reference_length(lengths.astype(np.float64), primitives.kind)
-            thickness = primitives.density.astype(np.float64) * length
-            clamped = int((thickness > THICKEST * (1.0 + 1e-6)).sum())
-            # logit(o) with o = (1 - exp(-thickness)) / 0.99, written without the difference 1 - o of near numbers.
-            taken = -np.expm1(-thickness)
-            left = np.exp(-thickness) - (1.0 - OPACITY_CAP)
-            logit = np.where(left > 0, np.log(taken) - np.log(np.maximum(left, 0.0)), np.inf)
+        lengths, logit, clamped = kind.to_file(primitives.extent, primitives.density)
     logit = np.clip(logit, SMALLEST_LOGIT, LARGEST_LOGIT)
 
     padded = np.zeros((count, SH_COEFFICIENTS[-1], 3), dtype=np.float32)
     padded[:, : primitives.sh.shape[1]] = primitives.sh
-    names = _names(primitives.kind)
+    names = _names(kind)
     end = 55 + lengths.shape[1]
     table = np.zeros((count, len(names)), dtype=np.float32)
     table[:, 0:3] = primitives.center
@@ -270,18 +246,12 @@ def write_primitive_ply(path: str | os.PathLike, primitives: Primitives) -> dict
     return {"rows": count, "clamped": clamped}
 
 
-def _length_names(kind: str) -> list[str]:
-    """The properties that hold the extents."""
-    return [("scale_" if kind == "gaussian" else "dist_") + str(k) for k in range(KINDS[kind].extents)]
-
-
-def _names(kind: str) -> list[str]:
+def _names(kind: Kind) -> list[str]:
     """All properties of a kind's file, in order."""
     return [
         *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
         *(f"f_rest_{index}" for index in range(45)),
-        *("opacity", *_length_names(kind), "rot_0", "rot_1", "rot_2", "rot_3"),
-        *(() if kind == "gaussian" else ("filter_3D",)),
+        *("opacity", *kind.length_properties, "rot_0", "rot_1", "rot_2", "rot_3", *kind.last_properties),
     ]
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from linprim_geo.base.arrays import read_member
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write
+from linprim_geo.base.kinds import KINDS
 
 if TYPE_CHECKING:
     import torch
@@ -36,106 +37,6 @@ FORMAT_OF_OCTAHEDRA, FORMAT = "linprim-geo octahedra 1", "linprim-geo primitives
 # Primitives are never packed into fewer bytes than a part of so many; those of a file of a few bytes may be.
 _DENSEST, _SMALL = 32, 2**20
 ARRAYS = ("center", "rotation", "extent", "density", "sh")
-
-# An octahedron of half-axes d stands for a Gaussian of standard deviations d / 2.6: LinPrim's constant, chosen by eye
-# (DIST_TO_SCALE of its MCMC variant).
-DIST_TO_SCALE = 2.6
-
-
-@dataclass(frozen=True)
-class Kind:
-    """What one kind of primitive needs to know of itself; vertex v lies at center + extent[column[v]] R direction[v].
-
-    `directions` (V, 3) and `columns` (V,), both of length 0 without vertices; `faces` (F, 3) vertices,
-    counter-clockwise seen from outside; `size` the extent that looks as large as an octahedron's half-axes of 1;
-    `solid` whether it is of constant density, so that a chord l keeps exp(-density l) of the light.
-    """
-
-    name: str
-    plural: str
-    extents: int
-    size: float
-    solid: bool
-    directions: np.ndarray
-    columns: np.ndarray
-    faces: np.ndarray
-
-
-# Vertex 2 k + (0 for -, 1 for +) of an octahedron lies on axis k. One face per octant, counter-clockwise seen from
-# outside: the order x, y, z is so where the product of the three signs is positive.
-_OCTAHEDRON_FACES = np.array(
-    [(x, 2 + y, 4 + z) if (x + y + z) % 2 == 1 else (x, 4 + z, 2 + y) for x in (0, 1) for y in (0, 1) for z in (0, 1)],
-    dtype=np.int64,
-)
-_OCTAHEDRON_VERTICES = np.repeat(np.eye(3), 2, axis=0) * np.tile([-1.0, 1.0], 3)[:, None]
-# Face j of a tetrahedron omits vertex j.
-_TETRAHEDRON_VERTICES = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
-_TETRAHEDRON_FACES = np.array([[1, 3, 2], [0, 2, 3], [0, 3, 1], [0, 1, 2]], dtype=np.int64)
-
-# In the order of the core's enum `PrimitiveKind`.
-KINDS = {
-    kind.name: kind
-    for kind in (
-        Kind(
-            "octahedron",
-            "octahedra",
-            3,
-            1.0,
-            True,
-            _OCTAHEDRON_VERTICES,
-            np.repeat(np.arange(3), 2),
-            _OCTAHEDRON_FACES,
-        ),
-        # Of the same volume: 8 sqrt(3) / 27 size^3 = 4 / 3.
-        Kind(
-            "tetrahedron",
-            "tetrahedra",
-            4,
-            (4.5 / math.sqrt(3)) ** (1 / 3),
-            True,
-            _TETRAHEDRON_VERTICES,
-            np.arange(4),
-            _TETRAHEDRON_FACES,
-        ),
-        Kind(
-            "gaussian",
-            "Gaussians",
-            3,
-            1 / DIST_TO_SCALE,
-            False,
-            np.zeros((0, 3)),
-            np.zeros(0, np.int64),
-            np.zeros((0, 3), np.int64),
-        ),
-    )
-}
-
-
-def reference_length(extent, kind: str):
-    """(N,) length that opacity refers to: density = softplus(raw) / length, LinPrim's shortest diagonal made general.
-
-    2 min_k extent_k of an octahedron, the diameter 6 V / A of the inscribed sphere of a tetrahedron. With e3 the sum of
-    the products of three of the four distances, V = 2 e3 / (9 sqrt 3); a face whose vertices are p, q, r away has the
-    area sqrt(2)/3 sqrt(x^2 + y^2 + z^2 + x y + y z + z x) with x = p q, y = q r, z = r p, because directions that meet
-    at cos = -1/3 have the cross products' inner products 8/9 and 4/9.
-
-    `extent` (N, 3 or 4) of numpy or torch, > 0; differentiable in torch. At a regular tetrahedron of distances d: 2 d /
-    3.
-    """
-    if kind == "octahedron":
-        return 2 * (extent.min(1) if isinstance(extent, np.ndarray) else extent.amin(1))
-    if kind != "tetrahedron":
-        raise LinprimError(f"a {kind} has no reference length, its opacity is that of its middle")
-    distance = [extent[:, j] for j in range(4)]
-    products, area = 0, 0
-    for j in range(4):
-        p, q, r = distance[:j] + distance[j + 1 :]
-        x, y, z = p * q, q * r, r * p
-        products = products + x * r
-        square = x * x + y * y + z * z + x * y + y * z + z * x
-        # torch's square root has other last bits on processors of other makers (see `ops.exponential`).
-        area = area + (square**0.5 if isinstance(square, np.ndarray) else square * square.rsqrt())
-    return (6 * 2 / (9 * math.sqrt(3)) / (math.sqrt(2) / 3)) * products / area
 
 
 @dataclass(frozen=True)
@@ -255,7 +156,7 @@ class Primitives:
         """
         what = KINDS[self.kind]
         if not len(what.directions):
-            raise LinprimError("a Gaussian has no vertices and no faces, wanted octahedra or tetrahedra")
+            raise LinprimError(f"{what.plural} have no vertices and no faces, wanted octahedra or tetrahedra")
         arms = self.extent.astype(np.float64)[:, what.columns, None] * what.directions
         return self.center.astype(np.float64)[:, None, :] + arms @ self.axes.transpose(0, 2, 1)
 
@@ -263,10 +164,7 @@ class Primitives:
     def alpha(self) -> np.ndarray:
         """(N,) float64 share of light taken along the reference length, 1 - exp(-density length); a Gaussian's
         opacity."""
-        density = self.density.astype(np.float64)
-        if not KINDS[self.kind].solid:
-            return density
-        return -np.expm1(-density * reference_length(self.extent.astype(np.float64), self.kind))
+        return KINDS[self.kind].alpha(self.density.astype(np.float64), self.extent.astype(np.float64))
 
     @property
     def base_color(self) -> np.ndarray:
@@ -286,7 +184,7 @@ class Primitives:
         """
         from linprim_geo.geometry.mesh import Mesh
 
-        if self.kind == "gaussian" and sigmas is not None:
+        if not KINDS[self.kind].solid and sigmas is not None:
             ball, faces = _icosphere()
             arms = (sigmas * self.extent.astype(np.float64))[:, None, :] * ball
             vertices = self.center.astype(np.float64)[:, None, :] + arms @ self.axes.transpose(0, 2, 1)
@@ -301,18 +199,16 @@ class Primitives:
         )
 
     def as_gaussians(self) -> Primitives:
-        """Octahedra as Gaussians for a 3DGS viewer: standard deviations half-axes / 2.6, opacity alpha, the rest alike.
+        """As Gaussians for a 3DGS viewer: standard deviations an octahedron's half-axes / 2.6, opacity alpha, the rest
+        alike.
 
         An approximation to look at, not the same image. Source of the 2.6: LinPrim (see DIST_TO_SCALE).
 
         Raises:
-            LinprimError: the primitives are no octahedra.
+            LinprimError: the primitives are tetrahedra.
         """
-        if self.kind != "octahedron":
-            raise LinprimError(
-                f"{KINDS[self.kind].plural} cannot be written as Gaussians, wanted octahedra: only they have three axes"
-            )
-        return replace(self, extent=self.extent / DIST_TO_SCALE, density=self.alpha, kind="gaussian")
+        deviations = KINDS[self.kind].gaussian_deviations(self.extent)
+        return replace(self, extent=deviations, density=self.alpha, kind="gaussian")
 
 
 def _icosphere() -> tuple[np.ndarray, np.ndarray]:

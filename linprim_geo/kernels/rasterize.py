@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from linprim_geo import _core
-from linprim_geo.geometry import primitives
+from linprim_geo.base import kinds
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.operators import as_array, check_dtypes, check_finite, define, scalar_suffix
 
@@ -34,7 +34,7 @@ def _planes(like: Tensor, width: int, height: int, geometry: bool) -> list[Tenso
 
 # What the two operators take beside tensors. `numbers`: fx, fy, cx, cy, near, stop, level, screen_filter; `choices`:
 # width, height, and the indices of primitive, ray model and order in these lists, and whether the geometry is wanted.
-KINDS = tuple(primitives.KINDS)
+KINDS = tuple(kinds.KINDS)
 RAY_MODELS = ("exact", "affine")
 ORDERS = ("center", "entry", "overlap")
 
@@ -277,7 +277,7 @@ def rasterize(
             primitive=primitive,
             ray_model=ray_model,
             order=order,
-            screen_filter=screen_filter * (samples**2 if primitive == "gaussian" else samples),
+            screen_filter=kinds.KINDS[primitive].screen_filter_at(samples, screen_filter),
             near=near,
             stop=stop,
             level=level,
@@ -389,7 +389,7 @@ def level_depth(
         raise ValueError(f"level is {level}, wanted a transmittance between 0 and 1")
     depth = center.new_empty((camera.height, camera.width), requires_grad=False)
     opacity = torch.empty_like(depth)
-    if primitive == "gaussian":
+    if not kinds.KINDS[primitive].solid:
         raise ValueError("a Gaussian has no entry and no exit, so no depth at a level")
     getattr(_core, f"level_depth_{suffix}")(
         KINDS.index(primitive),

@@ -27,13 +27,14 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import is_leftover, readable_write_errors, write_json
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.base.options import SceneOptions, TrainOptions, check_train_options, from_saved, raster_options
 from linprim_geo.base.version import __version__
 from linprim_geo.capture.found_poses import found_model
 from linprim_geo.capture.load import in_capture, load_scene
 from linprim_geo.capture.types import PHOTOGRAPHS, Scene, View
 from linprim_geo.geometry.camera import Similarity
-from linprim_geo.geometry.primitives import KINDS, Primitives, load_primitives, save_primitives
+from linprim_geo.geometry.primitives import Primitives, load_primitives, save_primitives
 
 if TYPE_CHECKING:
     import torch

@@ -10,9 +10,10 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.geometry.ply import color_columns, write_ply, xyz_columns
 from linprim_geo.geometry.primitive_files import read_ply_header, read_primitive_ply, write_primitive_ply
-from linprim_geo.geometry.primitives import KINDS, Primitives, load_primitives, save_primitives
+from linprim_geo.geometry.primitives import Primitives, load_primitives, save_primitives
 
 if TYPE_CHECKING:
     from linprim_geo.geometry.mesh import Mesh
@@ -77,15 +78,15 @@ def convert(source: str | os.PathLike, target: str | os.PathLike, write_as: str 
     report |= {"read": KINDS[primitives.kind].plural, "count": len(primitives)} | {
         k: v for k, v in found.items() if k == "dropped" and v
     }
-    if write_as == "gaussians" and primitives.kind != "gaussian":
+    if write_as == "gaussians":
         primitives = primitives.as_gaussians()
-    kinds = KINDS[primitives.kind].plural
+    kind = KINDS[primitives.kind]
     if suffix == ".npz":
         save_primitives(target, primitives)
-        return report | {"wrote": kinds}
+        return report | {"wrote": kind.plural}
     if suffix == ".ply" and write_as != "mesh":
         written = write_primitive_ply(target, primitives)
-        report |= {"wrote": f"3DGS's {kinds}" if primitives.kind == "gaussian" else f"LinPrim's {kinds}"}
+        report |= {"wrote": f"{kind.layout}'s {kind.plural}"}
         return report | ({"clamped": written["clamped"]} if written["clamped"] else {})
     return report | {"wrote": "mesh", "faces": save_primitive_mesh(target, primitives)}
 

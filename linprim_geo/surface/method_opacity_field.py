@@ -16,12 +16,13 @@ from dataclasses import replace
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.base.memory import available_memory
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Stages
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh, face_components, remove_small_components, select_faces, vertex_normals
-from linprim_geo.geometry.primitives import KINDS, Primitives
+from linprim_geo.geometry.primitives import Primitives
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.march_tetrahedra import march_tetrahedra
 from linprim_geo.surface.visibility import visible_faces

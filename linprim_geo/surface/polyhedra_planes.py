@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.primitives import KINDS, Primitives
+from linprim_geo.geometry.primitives import Primitives
 from linprim_geo.kernels import surface_ops
 
 NEIGHBOURHOOD = 1.5

@@ -13,10 +13,10 @@ from functools import cached_property
 
 import numpy as np
 
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.base.options import TrainOptions, initial_count
 from linprim_geo.capture.types import Scene
 from linprim_geo.geometry.lens import largest_displacement
-from linprim_geo.geometry.primitives import KINDS
 from linprim_geo.points.far_colors import OPEN_SHARE, far_colors, far_share
 from linprim_geo.points.initial_points import CAMERA_DISTANCE, VolumePoints, scene_normalization
 from linprim_geo.points.photo_evidence import Observations, observe

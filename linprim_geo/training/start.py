@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.base.options import (
     GEOMETRY_WEIGHTS,
     SceneOptions,
@@ -23,7 +24,6 @@ from linprim_geo.capture.load import load_scene, settled_folders
 from linprim_geo.capture.structure_from_motion import prepare
 from linprim_geo.capture.types import PointCloud, Scene
 from linprim_geo.geometry.environment_map import texels_for
-from linprim_geo.geometry.primitives import KINDS
 from linprim_geo.imaging.decoded_photos import DecodedPhotos
 from linprim_geo.kernels import ops
 from linprim_geo.points.initial_points import (

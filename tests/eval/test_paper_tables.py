@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.eval.paper import equal_points
 from linprim_geo.eval.paper import kinds as paper_kinds
 from linprim_geo.eval.paper import models as paper_models
@@ -18,7 +19,7 @@ from linprim_geo.eval.paper import studies as paper_studies
 from linprim_geo.eval.paper import tables as paper_tables
 from linprim_geo.eval.paper.models import Model, Variant
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.primitives import KINDS, Primitives
+from linprim_geo.geometry.primitives import Primitives
 from linprim_geo.kernels.reference.rasterize import rotation_matrix
 
 NEAR = 0.01  # of ops.rasterize

@@ -1,5 +1,4 @@
-"""Kinds of primitives: vertices, faces, volumes and reference lengths against geometry computed another way, and the
-file."""
+"""Primitives: vertices, faces and volumes of each kind against geometry computed another way, and the file."""
 
 from __future__ import annotations
 
@@ -8,20 +7,10 @@ import math
 
 import numpy as np
 import pytest
-import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.options import TrainOptions
-from linprim_geo.geometry.primitives import (
-    ARRAYS,
-    KINDS,
-    Primitives,
-    load_primitives,
-    reference_length,
-    save_primitives,
-)
+from linprim_geo.base.kinds import KINDS
+from linprim_geo.geometry.primitives import ARRAYS, Primitives, load_primitives, save_primitives
 
 
 def some(kind: str, count: int = 20, seed: int = 0) -> Primitives:
@@ -41,12 +30,6 @@ def corners_of(primitives: Primitives) -> np.ndarray:
     """(N, F, 3, 3) corners of the faces of the mesh."""
     mesh = primitives.triangle_mesh()
     return mesh.vertices[mesh.faces].reshape(len(primitives), -1, 3, 3)
-
-
-def test_the_kinds_are_those_of_the_options():
-    choices = {entry.name: entry.metadata["choices"] for entry in dataclasses.fields(TrainOptions)}
-    assert tuple(KINDS) == choices["primitive"]
-    assert all(name == kind.name for name, kind in KINDS.items())
 
 
 def test_vertices_of_a_tetrahedron_lie_where_its_definition_says():
@@ -84,39 +67,10 @@ def test_a_kinds_size_gives_it_the_volume_of_an_octahedron():
     assert volume("tetrahedron") == pytest.approx(4 / 3, rel=1e-6)
 
 
-@settings(max_examples=100, deadline=None)
-@given(st.lists(st.floats(-5, 5), min_size=4, max_size=4))
-def test_the_reference_length_of_a_tetrahedron_is_its_inscribed_spheres_diameter(logs):
-    extent = np.exp([logs])
-    vertices = extent.T * KINDS["tetrahedron"].directions
-    volume = abs(np.linalg.det(vertices[1:] - vertices[0])) / 6
-    area = sum(
-        np.linalg.norm(np.cross(vertices[b] - vertices[a], vertices[c] - vertices[a])) / 2
-        for a, b, c in KINDS["tetrahedron"].faces
-    )
-    # The determinant loses what its products cancel: 1e-16 times the ratio of the largest to the smallest volume in it,
-    # e^15.
-    tolerance = 1e-9
-    assert reference_length(extent, "tetrahedron")[0] == pytest.approx(6 * volume / area, rel=tolerance)
-    # numpy and torch agree, and the length is homogeneous of degree 1.
-    tensor = torch.from_numpy(extent)
-    assert float(reference_length(tensor, "tetrahedron")[0]) == pytest.approx(6 * volume / area, rel=tolerance)
-    assert reference_length(3 * extent, "tetrahedron")[0] == pytest.approx(18 * volume / area, rel=tolerance)
-
-
-def test_reference_lengths_of_regular_solids_and_their_gradients():
-    assert reference_length(np.array([[2.0, 3, 1]]), "octahedron")[0] == 2
-    assert reference_length(np.full((1, 4), 3.0), "tetrahedron")[0] == pytest.approx(2)
-    extent = torch.tensor([[0.3, 0.5, 0.2, 0.9], [1.0, 1, 1, 1]], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: reference_length(x, "tetrahedron"), extent)
-    with pytest.raises(LinprimError, match="no reference length"):
-        reference_length(np.ones((1, 3)), "gaussian")
-
-
 @pytest.mark.parametrize("kind", ["octahedron", "tetrahedron"])
 def test_alpha_is_the_light_taken_along_the_reference_length(kind):
     primitives = some(kind)
-    length = reference_length(primitives.extent.astype(np.float64), kind)
+    length = KINDS[kind].reference_length(primitives.extent.astype(np.float64))
     np.testing.assert_allclose(primitives.alpha, 1 - np.exp(-primitives.density * length), rtol=1e-6)
     assert (some("gaussian").alpha == some("gaussian").density).all()
 
@@ -124,7 +78,7 @@ def test_alpha_is_the_light_taken_along_the_reference_length(kind):
 def test_a_gaussian_has_no_surface_unless_a_size_is_named():
     gaussians = some("gaussian", 5)
     for make in (lambda: gaussians.vertices, gaussians.triangle_mesh):
-        with pytest.raises(LinprimError, match="Gaussian has no vertices"):
+        with pytest.raises(LinprimError, match="Gaussians have no vertices"):
             make()
     mesh = gaussians.triangle_mesh(sigmas=2.0)
     assert mesh.vertices.shape == (5 * 42, 3) and mesh.faces.shape == (5 * 80, 3)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from linprim_geo.geometry.primitives import Primitives, reference_length, unit_quaternions
+from linprim_geo.base.kinds import KINDS
+from linprim_geo.geometry.primitives import Primitives, unit_quaternions
 
 FIELDS = ("center", "rotation", "extent", "density", "sh")
 
@@ -39,7 +40,7 @@ def random_tetrahedra(count=50, coefficients=9, seed=0, thickness=None):
         center=rng.normal(size=(count, 3)),
         rotation=unit_quaternions(rng.normal(size=(count, 4))),
         extent=extent,
-        density=thickness / reference_length(extent.astype(np.float64), "tetrahedron"),
+        density=thickness / KINDS["tetrahedron"].reference_length(extent.astype(np.float64)),
         sh=rng.normal(size=(count, coefficients, 3)),
         kind="tetrahedron",
     )

@@ -22,8 +22,8 @@ from helpers.octahedra import (
     random_scene,
 )
 
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.primitives import KINDS
 from linprim_geo.kernels import ops
 
 pytestmark = pytest.mark.usefixtures("few_threads")

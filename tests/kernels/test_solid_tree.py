@@ -9,8 +9,9 @@ import torch
 from helpers.octahedra import KERNELS, kernels
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.primitives import KINDS, Primitives
+from linprim_geo.geometry.primitives import Primitives
 from linprim_geo.kernels import ops
 from linprim_geo.kernels.solid_tree import SolidTree
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from linprim_geo.base.kinds import KINDS, Octahedron
 from linprim_geo.base.options import TrainOptions
-from linprim_geo.geometry.primitives import KINDS, Primitives
-from linprim_geo.training.step import population
+from linprim_geo.geometry.primitives import Primitives
 from linprim_geo.training.step.population import DEAD_OPACITY, GradientControl, Growth, grow
 
 SMALLEST = math.log(1e-3)
@@ -185,7 +185,7 @@ def test_all_dead_leaves_all_as_they_are():
 
 def test_halves_of_a_population_together_hold_most_of_its_volume():
     # Each half has 0.6 * 0.8^2 = 0.384 of the parent's volume, at unchanged opacity.
-    along, across = population.SPLIT_ALONG, population.SPLIT_ACROSS
+    along, across = Octahedron.ALONG, Octahedron.ACROSS
     table = parameters(10)
     parents, _, halves = event(table, torch.ones(10), rate=1.0)
     parent = table["log_extent"].numpy().astype(np.float64)[parents].sum(1)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.base.options import TrainOptions
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.primitives import KINDS
 from linprim_geo.training.step.population_papers import (
     GAUSSIANS,
     POLYHEDRA,

@@ -13,11 +13,12 @@ from helpers.training_runs import QUICK, assert_same_run, checkpoint, metrics, n
 from PIL import Image
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.cli.main import main
 from linprim_geo.eval.depth import eval_depth_run
 from linprim_geo.eval.images import eval_images_run
-from linprim_geo.geometry.primitives import KINDS, load_primitives
+from linprim_geo.geometry.primitives import load_primitives
 from linprim_geo.imaging.metrics import composite
 from linprim_geo.runs.run import Run
 from linprim_geo.synthetic.synth import synthesize

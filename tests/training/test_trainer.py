@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.base.options import TrainOptions
 from linprim_geo.capture.load import load_scene
-from linprim_geo.geometry.primitives import KINDS, SH_Y0, Primitives
+from linprim_geo.geometry.primitives import SH_Y0, Primitives
 from linprim_geo.kernels import ops
 from linprim_geo.training.step.parameters import activate, filter_lengths, initial_parameters
 from linprim_geo.training.step.trainer import Trainer

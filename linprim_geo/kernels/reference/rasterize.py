@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from linprim_geo.geometry.primitives import KINDS
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.kernels.reference.blend import blend_in_order, blend_overlapping
 from linprim_geo.kernels.reference.blend import mean_depth_fraction as mean_depth_fraction
 from linprim_geo.kernels.reference.shapes import FACE_SIGNS as FACE_SIGNS
@@ -209,7 +209,7 @@ def rasterize(
     ):
         if value not in known:
             raise ValueError(f"{name} is {value!r}, wanted one of {', '.join(known)}")
-    if primitive == "gaussian" and order != "center":
+    if not KINDS[primitive].solid and order != "center":
         raise ValueError(f"a Gaussian has no entry, so its order is center, not {order}")
     if not screen_filter >= 0:
         raise ValueError(f"screen_filter is {screen_filter}, wanted a number of pixels >= 0")
@@ -227,7 +227,7 @@ def rasterize(
 
     shape = (center_camera, rotation_camera, extent, density, rays)
     limits = view_limits((width, height), (fx, fy), (cx, cy))
-    if primitive == "gaussian":
+    if not KINDS[primitive].solid:
         chords = gaussian_chords(*shape, screen_filter=screen_filter, focal=(fx, fy), limits=limits, near=near)
     else:
         chords = polyhedron_chords(

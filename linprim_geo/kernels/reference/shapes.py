@@ -14,11 +14,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from linprim_geo.base.kinds import KINDS, Kind
+
 FACE_SIGNS = tuple(itertools.product((1.0, -1.0), repeat=3))
 """The eight faces of |y0| + |y1| + |y2| <= 1, as the s of s . y <= 1."""
-
-TETRAHEDRON_SIGNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
-"""Directions from the centre of a tetrahedron to its four vertices, times sqrt 3."""
 
 GAUSSIAN_CAP, GAUSSIAN_FLOOR = 0.99, 1 / 255
 """Largest alpha of a Gaussian, and the alpha under which it is skipped: those of 3D Gaussian splatting."""
@@ -61,6 +60,7 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _octahedron(rotation: Tensor, extent: Tensor) -> _Solid:
+    """In the frame where it is regular, which keeps the digits of one that is long and thin."""
     signs = rotation.new_tensor(FACE_SIGNS)
     outward = signs / extent
     outward = outward / outward.norm(dim=-1, keepdim=True)
@@ -68,22 +68,21 @@ def _octahedron(rotation: Tensor, extent: Tensor) -> _Solid:
     return _Solid(rotation, extent, signs, torch.ones_like(signs[:, 0]), outward, torch.cat([half, -half]))
 
 
-def _tetrahedron(rotation: Tensor, extent: Tensor) -> _Solid:
-    """Face j is spanned by the three vertices other than j and looks away from vertex j."""
-    basis = rotation.new_tensor(TETRAHEDRON_SIGNS) / math.sqrt(3)
-    vertices = extent[:, None] * (basis @ rotation.T)
+def _polyhedron(rotation: Tensor, extent: Tensor, kind: Kind) -> _Solid:
+    """The convex hull of a kind's vertices, whose faces are triangles of them."""
+    directions = torch.from_numpy(kind.directions).to(rotation)
+    vertices = extent[torch.from_numpy(kind.columns), None] * (directions @ rotation.T)
     size = extent.detach().max()  # keeps the squares of tiny edges from underflow
     normals, room = [], []
-    for j in range(4):
-        a, b, c = (vertices[k] for k in range(4) if k != j)
+    for corners in kind.faces:
+        a, b, c = (vertices[k] for k in corners)
         normal = torch.linalg.cross((b - a) / size, (c - a) / size)
         normal = normal / normal.norm()
-        normal = normal * torch.sign(_dot(normal, a - vertices[j])).detach()
         normals.append(normal)
         room.append(_dot(normal, a))
     faces = torch.stack(normals)
     eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
-    return _Solid(eye, torch.ones_like(extent[:3]), faces, torch.stack(room), faces, vertices)
+    return _Solid(eye, torch.ones_like(vertices[0]), faces, torch.stack(room), faces, vertices)
 
 
 @torch.no_grad()
@@ -218,7 +217,10 @@ def polyhedron_chords(
         affine = ray_model == "affine"
         if affine and not center[i, 2] > near or not bool((extent[i] > 0).all()):
             continue
-        solid = (_octahedron if primitive == "octahedron" else _tetrahedron)(rotation[i], extent[i])
+        if primitive == "octahedron":
+            solid = _octahedron(rotation[i], extent[i])
+        else:
+            solid = _polyhedron(rotation[i], extent[i], KINDS[primitive])
         jacobian = ray_space_jacobian(held_in_view(center[i], limits)) if affine else None
         inverse = torch.linalg.inv(jacobian) if affine else None
         sigma, scale = density[i], None

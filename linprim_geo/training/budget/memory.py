@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.base.memory import PIXEL_BYTES, PROCESS_GIB
 from linprim_geo.base.options import TrainOptions
 from linprim_geo.capture.types import View
-from linprim_geo.geometry.primitives import KINDS
 from linprim_geo.training.step.training_images import photo_bytes
 
 # Bytes that a primitive takes while a step is made: so many in any case, and so many for each of its numbers, with

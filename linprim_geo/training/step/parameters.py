@@ -7,12 +7,11 @@ import math
 import numpy as np
 import torch
 
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.primitives import KINDS, SH_Y0, Tensors, reference_length
+from linprim_geo.geometry.primitives import SH_Y0, Tensors
 from linprim_geo.kernels import ops
 
-# A Gaussian's standard deviation at the start, in mean distances to the 3 nearest points.
-GAUSSIAN_START = 0.5
 # The 3D filter: sqrt(0.2) of a pixel, from views in which the primitive is farther than 0.2 and at most 15 % of the
 # image's size outside of it (LinPrim's box_factor and Mip-Splatting's limits); made again after so many steps.
 FILTER_VARIANCE, FILTER_NEAR, FILTER_MARGIN, FILTER_EVERY = 0.2, 0.2, 0.15, 1000
@@ -27,11 +26,9 @@ def initial_parameters(
     kind: str = "octahedron",
 ) -> dict[str, torch.Tensor]:
     """One primitive per point: opacity 0.5, random rotation, equal extents by the mean distance to the 3 nearest
-    points.
+    points (`Kind.start_extent`).
 
-    Octahedra have it for half-axes, tetrahedra the same volume, Gaussians half of it for standard deviation. (3DGS's
-    start, the whole of it at opacity 0.1, scores 0.4 to 2 dB less under every rule of growth, and MCMC's noise tears it
-    apart.) `xyz` (P, 3) in the training frame, `rgb` (P, 3) uint8, `bounds` the least and largest extent.
+    `xyz` (P, 3) in the training frame, `rgb` (P, 3) uint8, `bounds` the least and largest extent.
     """
     from scipy.spatial import cKDTree
 
@@ -41,7 +38,7 @@ def initial_parameters(
     distance = cKDTree(xyz).query(xyz, k=neighbours)[0].reshape(count, -1)[:, 1:]
     size = np.full(count, bounds[1])
     if distance.shape[1]:
-        size = distance.mean(1) * (what.size if what.solid else GAUSSIAN_START)
+        size = what.start_extent(distance.mean(1))
     rotation = rng.normal(size=(count, 4))
     values = {
         "center": xyz,
@@ -62,18 +59,12 @@ def activate(
 ) -> Tensors:
     """Raw parameters to what the rasterizer takes: center, rotation, extent, density, sh.
 
-    extent = exp(log_extent), and with `filter_3d` f (N,), a constant, extent + f / 2, or sqrt(extent^2 + f^2) for
-    Gaussians. density = softplus(raw_opacity) / reference_length(extent), so that a ray along that length has alpha = 1
-    - exp(-softplus(raw)) = sigmoid(raw), with no cap and no logarithm of 0; for Gaussians the opacity itself,
-    sigmoid(raw).
+    extent = exp(log_extent), `widened` by `filter_3d` (N,), a constant; the density is the kind's.
     """
-    extent = ops.exponential(parameters["log_extent"])
-    if kind == "gaussian":
-        extent = extent if filter_3d is None else torch.hypot(extent, filter_3d[:, None])
-        density = torch.sigmoid(parameters["raw_opacity"])
-    else:
-        extent = extent if filter_3d is None else extent + filter_3d[:, None] / 2
-        density = torch.nn.functional.softplus(parameters["raw_opacity"]) / reference_length(extent, kind)
+    what, extent = KINDS[kind], ops.exponential(parameters["log_extent"])
+    if filter_3d is not None:
+        extent = what.widened(extent, filter_3d)
+    density = what.density(parameters["raw_opacity"], extent)
     count = (degree + 1) ** 2 - 1
     sh = parameters["sh_dc"] if count == 0 else torch.cat([parameters["sh_dc"], parameters["sh_rest"][:, :count]], 1)
     return parameters["center"], parameters["rotation"], extent, density, sh

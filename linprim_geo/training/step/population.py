@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
+from linprim_geo.base.kinds import KINDS
 from linprim_geo.base.options import TrainOptions
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.primitives import KINDS
 
 Parameters = dict[str, torch.Tensor]
 
@@ -24,18 +24,6 @@ Parameters = dict[str, torch.Tensor]
 GROWS_UNTIL = 0.6
 # A primitive whose opacity along its reference length is below this is moved to where it is needed.
 DEAD_OPACITY = 0.005
-# Two halves of a split octahedron: centres at +-0.4 of the half-axis that is cut, which becomes 0.6 of itself, the
-# others 0.8.
-SPLIT_OFFSET, SPLIT_ALONG, SPLIT_ACROSS = 0.4, 0.6, 0.8
-# Two halves of a split tetrahedron keep one vertex of its longest edge each: the tetrahedron shrunk to TETRA_SHRUNK
-# about that vertex, and the vertex at the other end brought to TETRA_OTHER of its distance. All corners are convex
-# combinations of the parent's, so a half never leaves it. (Exact halves have 12 degrees of freedom, these primitives
-# 10; see `split_tetrahedra`.)
-TETRA_SHRUNK, TETRA_OTHER = 0.82, 0.6
-# Two halves of a split Gaussian: middles at +-0.6 of the standard deviation that is cut, which becomes 0.8 of itself,
-# so that the second moment is kept (0.6^2 + 0.8^2 = 1); -ln(1 - opacity) becomes 1 / (2 * 0.8) of itself, so that its
-# integral is.
-GAUSSIAN_OFFSET, GAUSSIAN_ALONG = 0.6, 0.8
 
 
 @dataclass(frozen=True)
@@ -239,62 +227,5 @@ def grow(
     children = np.concatenate([recycled, count + np.arange(wanted - len(recycled))])
     center = parameters["center"].detach().numpy()[parents].astype(np.float64)
     rotation = parameters["rotation"].detach().numpy()[parents].astype(np.float64)
-    if kind == "tetrahedron":
-        return parents, children, split_tetrahedra(center, rotation, log_extent[parents])
-
-    extent = np.exp(log_extent[parents])
-    axis = (rng.random((wanted, 1)) > np.cumsum(extent**2, 1)[:, :2] / (extent**2).sum(1, keepdims=True)).sum(1)
-    chosen = np.eye(3)[axis]
-    along, across, part = SPLIT_ALONG, SPLIT_ACROSS, SPLIT_OFFSET
-    if kind == "gaussian":
-        along, across, part = GAUSSIAN_ALONG, 1.0, GAUSSIAN_OFFSET
-    offset = rotate(rotation, part * extent * chosen)
-    shrunk = log_extent[parents] + np.log(np.where(chosen == 1, along, across))
-    halves = {
-        "center": np.stack([center + offset, center - offset]),
-        "log_extent": np.stack([shrunk, shrunk]),
-    }
-    if kind == "gaussian":
-        thinner = thinned(parameters["raw_opacity"].detach().numpy()[parents], 1 / (2 * GAUSSIAN_ALONG))
-        halves["raw_opacity"] = np.stack([thinner, thinner])
-    return parents, children, halves
-
-
-def split_tetrahedra(center: np.ndarray, rotation: np.ndarray, log_extent: np.ndarray) -> dict[str, np.ndarray]:
-    """Two halves of each tetrahedron, at the two ends of its longest edge; `center` (P, 3), `rotation` (P, 4),
-    `log_extent` (P, 4).
-
-    Cutting at the middle of the edge would tile the parent, but such a half has no centre with these four directions
-    (12 degrees of freedom against 10): the best fits by least squares put 13 to 28 % of their volume outside of the
-    parent and leave 19 to 30 % of it empty. These lie inside, leave 25 to 27 % empty, keep the rotation, and have 0.85
-    to 0.88 of the volume together (the halves of an octahedron 0.77); measured on distances that differ up to 1 : 8.
-    """
-    rows = np.arange(len(center))
-    extent = np.exp(log_extent)
-    directions = KINDS["tetrahedron"].directions
-    corners = extent[:, :, None] * directions
-    one, other = np.triu_indices(4, 1)
-    longest = np.argmax(np.linalg.norm(corners[:, one] - corners[:, other], axis=2), axis=1)
-    ends = np.stack([one[longest], other[longest]])
-    centers, extents = [], []
-    for kept, opposite in (ends, ends[::-1]):
-        part = np.full(extent.shape, np.log(TETRA_SHRUNK))
-        part[rows, opposite] = np.log(TETRA_OTHER)
-        centers.append(center + rotate(rotation, (1 - TETRA_SHRUNK) * corners[rows, kept]))
-        extents.append(log_extent + part)
-    return {"center": np.stack(centers), "log_extent": np.stack(extents)}
-
-
-def thinned(raw_opacity: np.ndarray, part: float) -> np.ndarray:
-    """Raw opacity, float64, whose optical thickness softplus(raw) = -ln(1 - opacity) is `part` of that of
-    `raw_opacity`."""
-    thickness = part * np.logaddexp(0.0, raw_opacity.astype(np.float64))
-    return thickness + np.log(-np.expm1(-thickness))  # ln(e^t - 1)
-
-
-def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """(P, 3) vectors turned by (P, 4) quaternions w, x, y, z of any length."""
-    q = quaternion / np.maximum(np.linalg.norm(quaternion, axis=1, keepdims=True), 1e-30)
-    w, u = q[:, :1], q[:, 1:]
-    twice = 2 * np.cross(u, vector)
-    return vector + w * twice + np.cross(u, twice)
+    raw_opacity = parameters["raw_opacity"].detach().numpy()[parents]
+    return parents, children, KINDS[kind].halves(center, rotation, log_extent[parents], raw_opacity, rng)

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from linprim_geo.base.kinds import DIST_TO_SCALE, KINDS, rotate, thinned
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.primitives import DIST_TO_SCALE, KINDS
 from linprim_geo.kernels.ops import exponential
-from linprim_geo.training.step.population import DensityControl, Event, rotate, thinned
+from linprim_geo.training.step.population import DensityControl, Event
 
 # Shorter runs have proportionally shorter intervals.
 FULL_ITERATIONS = 7000
@@ -124,7 +124,7 @@ class ClassicControl(DensityControl):
         if len(split):
             center = parameters["center"].detach().numpy().astype(np.float64)
             parents = source[children]
-            local = constants.spread * _normal(rng, np.exp(log_extent[parents]), self.kind)
+            local = constants.spread * KINDS[self.kind].draw(np.exp(log_extent[parents]), rng)
             offset = rotate(parameters["rotation"].detach().numpy()[parents].astype(np.float64), local)
             values["center"] = children, center[parents] + offset
             values["log_extent"] = children, log_extent[parents] - math.log(constants.shrink)
@@ -170,7 +170,7 @@ class McmcControl(DensityControl):
         )
         self.last = round(self.GROWS_UNTIL * options.iterations)
         # Standard deviations per extent.
-        self.scale = 1.0 if self.kind == "gaussian" else 1 / (DIST_TO_SCALE * KINDS[self.kind].size)
+        self.scale = KINDS[self.kind].deviation
 
     def penalty(self, parameters):
         size = self.scale * exponential(parameters["log_extent"]).mean()
@@ -192,11 +192,7 @@ class McmcControl(DensityControl):
         q = parameters["rotation"].numpy()[rows].astype(np.float64)
         extent = self.scale * np.exp(parameters["log_extent"].numpy()[rows].astype(np.float64))
         local = rotate(q * [1, -1, -1, -1], noise)
-        if self.kind == "tetrahedron":
-            b = KINDS[self.kind].directions
-            local = 0.75 * (extent**2 * (local @ b.T)) @ b
-        else:
-            local = extent**2 * local
+        local = KINDS[self.kind].times_covariance(extent, local)
         moved = parameters["center"].numpy()[rows] + strength[:, None] * rotate(q, local)
         parameters["center"][torch.from_numpy(rows)] = torch.from_numpy(moved.astype(np.float32))
 
@@ -260,15 +256,6 @@ def in_view(parameters, camera: Camera, kind: str) -> torch.Tensor:
     x, y = camera.fx * local[:, 0] / depth + camera.cx, camera.fy * local[:, 1] / depth + camera.cy
     wide, high = camera.fx * reach / depth, camera.fy * reach / depth
     return (z > 0.01) & (x + wide > 0) & (x - wide < camera.width) & (y + high > 0) & (y - high < camera.height)
-
-
-def _normal(rng: np.random.Generator, extent: np.ndarray, kind: str) -> np.ndarray:
-    """(P, 3) normal draws in the local frame whose standard deviations are the extents; a tetrahedron's covariance is
-    3/4 sum_j extent_j^2 b_j b_j^T, which is extent^2 if all are equal."""
-    draws = rng.normal(size=extent.shape)
-    if kind != "tetrahedron":
-        return extent * draws
-    return math.sqrt(0.75) / KINDS[kind].size * (extent * draws) @ KINDS[kind].directions
 
 
 def _logit(opacity):

@@ -1,0 +1,352 @@
+"""The kinds of primitives: all that training, files and meshes do differently for octahedra, tetrahedra and Gaussians.
+
+A new kind is a subclass of `Kind` in `KINDS`. What only rendering knows of it is in the compiled core
+(csrc/base/kinds.h) and in its slow twin.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from linprim_geo.base.errors import LinprimError
+
+# An octahedron of half-axes d stands for a Gaussian of standard deviations d / 2.6: LinPrim's constant, chosen by eye
+# (DIST_TO_SCALE of its MCMC variant).
+DIST_TO_SCALE = 2.6
+# LinPrim's files never give more than this share of the opacity, so that the logarithm stays finite ...
+OPACITY_CAP = 0.99
+# ... and with it no reference length is optically thicker than ln(100).
+THICKEST = -np.log1p(-OPACITY_CAP)
+
+
+class Kind:
+    """One kind of primitive: a polyhedron of constant density, so that a chord l keeps exp(-density l) of the light.
+
+    Vertex v lies at center + extent[column[v]] R direction[v], R the matrix of the primitive's rotation. Extents are
+    (N, `extents`) lengths > 0. Where a method takes numpy or torch it is differentiable in torch.
+    """
+
+    name: str
+    plural: str
+    extents: int
+    # The extent that looks as large as an octahedron's half-axes of 1.
+    size: float
+    # (V, 3) and (V,), both of length 0 without vertices; (F, 3) vertices, counter-clockwise seen from outside.
+    directions: np.ndarray
+    columns: np.ndarray
+    faces: np.ndarray
+
+    # Depth, in the training frame, before which rays do not begin. A polyhedron is cut exactly there.
+    near = 0.01
+    # Pixels that go with --filter 3d+screen: LinPrim's kernel_size.
+    screen_filter = 0.1
+    # Files: whose layout it is, the prefix of the lengths' properties, the properties that tell this kind from others,
+    # and those after the rotation.
+    layout, length_prefix = "LinPrim", "dist_"
+    told_by: tuple[str, ...] = ("dist_0",)
+    last_properties: tuple[str, ...] = ("filter_3D",)
+
+    @property
+    def solid(self) -> bool:
+        """Whether it has faces, where rays enter and leave."""
+        return len(self.faces) > 0
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviations per extent of the Gaussian that it stands for."""
+        return 1 / (DIST_TO_SCALE * self.size)
+
+    def screen_filter_at(self, magnification: int, width: float) -> float:
+        """The screen filter that is `width` in an image whose pixels are so many times as large."""
+        return magnification * width
+
+    # What is trained.
+
+    def start_extent(self, spacing: np.ndarray) -> np.ndarray:
+        """(N,) extents of primitives that begin at points so far apart: octahedra have the distance for half-axes, the
+        others look as large."""
+        return spacing * self.size
+
+    def reference_length(self, extent):
+        """(N,) length that opacity refers to, density = softplus(raw) / length: the shortest way through, as LinPrim's.
+
+        `extent` (N, extents) of numpy or torch.
+        """
+        raise NotImplementedError
+
+    def widened(self, extent, filter_3d):
+        """Extents, of torch, with the 3D filter (N,), a constant."""
+        return extent + filter_3d[:, None] / 2
+
+    def density(self, raw_opacity, extent):
+        """(N,) densities of raw opacities, of torch.
+
+        A ray along the reference length has alpha = 1 - exp(-softplus(raw)) = sigmoid(raw), with no cap and no
+        logarithm of 0.
+        """
+        from torch.nn.functional import softplus
+
+        return softplus(raw_opacity) / self.reference_length(extent)
+
+    def alpha(self, density: np.ndarray, extent: np.ndarray) -> np.ndarray:
+        """(N,) share of light taken along the reference length, 1 - exp(-density length)."""
+        return -np.expm1(-density * self.reference_length(extent))
+
+    # How it is split.
+
+    def halves(
+        self,
+        center: np.ndarray,
+        rotation: np.ndarray,
+        log_extent: np.ndarray,
+        raw_opacity: np.ndarray,
+        rng: np.random.Generator,
+    ) -> dict[str, np.ndarray]:
+        """What the two halves of each of P parents have of their own: {"center": (2, P, 3), "log_extent": (2, P,
+        extents)} and perhaps "raw_opacity": (2, P)."""
+        raise NotImplementedError
+
+    def draw(self, extent: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """(P, 3) normal draws in the local frame with the covariance of `times_covariance`, whose deviations are the
+        extents if all are equal."""
+        return extent * rng.normal(size=extent.shape)
+
+    def times_covariance(self, extent: np.ndarray, vector: np.ndarray) -> np.ndarray:
+        """(P, 3) local vectors times the covariance."""
+        return extent**2 * vector
+
+    # How it is stored, see primitive_files.py.
+
+    @property
+    def length_properties(self) -> list[str]:
+        """The properties of a PLY file that hold the extents."""
+        return [self.length_prefix + str(k) for k in range(self.extents)]
+
+    def from_file(
+        self, lengths: np.ndarray, opacity: np.ndarray, filter_3d: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Extents (N, extents), float32, and densities (N,), float64, of a file's lengths, opacities and filter (N, 1).
+
+        Here |length| + filter / 2 and -ln(1 - 0.99 opacity) / reference length. May be infinite; raises nothing.
+        """
+        assert filter_3d is not None
+        extent = np.abs(lengths) + filter_3d / np.float32(2)
+        return extent, -np.log1p(-OPACITY_CAP * opacity) / self.reference_length(extent.astype(np.float64))
+
+    def to_file(self, extent: np.ndarray, density: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+        """The lengths and logits that `from_file` gives `extent` and `density` for with a filter of 0, and the number
+        of rows that are too dense for that; a logit may be infinite."""
+        thickness = density.astype(np.float64) * self.reference_length(extent.astype(np.float64))
+        # logit(o) with o = (1 - exp(-thickness)) / 0.99, written without the difference 1 - o of near numbers.
+        taken = -np.expm1(-thickness)
+        left = np.exp(-thickness) - (1.0 - OPACITY_CAP)
+        logit = np.where(left > 0, np.log(taken) - np.log(np.maximum(left, 0.0)), np.inf)
+        return extent, logit, int((thickness > THICKEST * (1.0 + 1e-6)).sum())
+
+    def gaussian_deviations(self, extent: np.ndarray) -> np.ndarray:
+        """(N, 3) standard deviations of the Gaussians that stand for these primitives in another viewer.
+
+        Raises:
+            LinprimError: none do.
+        """
+        raise LinprimError(f"{self.plural} cannot be written as Gaussians, wanted octahedra: only they have three axes")
+
+
+class Octahedron(Kind):
+    """{ p : sum_k |R^T (p - center)|_k / extent_k <= 1 }, extents its half-axes."""
+
+    name, plural, extents, size = "octahedron", "octahedra", 3, 1.0
+    # Vertex 2 k + (0 for -, 1 for +) lies on axis k. One face per octant, counter-clockwise seen from outside: the
+    # order x, y, z is so where the product of the three signs is positive.
+    directions = np.repeat(np.eye(3), 2, axis=0) * np.tile([-1.0, 1.0], 3)[:, None]
+    columns = np.repeat(np.arange(3), 2)
+    faces = np.array(
+        [
+            (x, 2 + y, 4 + z) if (x + y + z) % 2 == 1 else (x, 4 + z, 2 + y)
+            for x in (0, 1)
+            for y in (0, 1)
+            for z in (0, 1)
+        ],
+        dtype=np.int64,
+    )
+    # Centres of the halves at +-0.4 of the half-axis that is cut, which becomes 0.6 of itself, the others 0.8.
+    OFFSET, ALONG, ACROSS = 0.4, 0.6, 0.8
+
+    def reference_length(self, extent):
+        """2 min_k extent_k, LinPrim's shortest diagonal."""
+        return 2 * (extent.min(1) if isinstance(extent, np.ndarray) else extent.amin(1))
+
+    def halves(self, center, rotation, log_extent, raw_opacity, rng):
+        """Cut across an axis, drawn by the squares of the extents."""
+        return _cut_along_axis(center, rotation, log_extent, rng, self.OFFSET, self.ALONG, self.ACROSS)
+
+    def gaussian_deviations(self, extent):
+        return extent / DIST_TO_SCALE
+
+
+class Tetrahedron(Kind):
+    """Vertices center + extent_j R b_j with b = (1,1,1), (1,-1,-1), (-1,1,-1), (-1,-1,1), each / sqrt 3."""
+
+    name, plural, extents = "tetrahedron", "tetrahedra", 4
+    # Of the same volume: 8 sqrt(3) / 27 size^3 = 4 / 3.
+    size = (4.5 / math.sqrt(3)) ** (1 / 3)
+    directions = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
+    columns = np.arange(4)
+    # Face j omits vertex j.
+    faces = np.array([[1, 3, 2], [0, 2, 3], [0, 3, 1], [0, 1, 2]], dtype=np.int64)
+    told_by = ("dist_0", "dist_3")
+    # Two halves keep one vertex of the longest edge each: the tetrahedron shrunk to SHRUNK about that vertex, and the
+    # vertex at the other end brought to OTHER of its distance. All corners are convex combinations of the parent's, so
+    # a half never leaves it.
+    SHRUNK, OTHER = 0.82, 0.6
+
+    def reference_length(self, extent):
+        """The diameter 6 V / A of the inscribed sphere; 2 d / 3 of a regular tetrahedron of distances d.
+
+        With e3 the sum of the products of three of the four distances, V = 2 e3 / (9 sqrt 3); a face whose vertices are
+        p, q, r away has the area sqrt(2)/3 sqrt(x^2 + y^2 + z^2 + x y + y z + z x) with x = p q, y = q r, z = r p,
+        because directions that meet at cos = -1/3 have the cross products' inner products 8/9 and 4/9.
+        """
+        distance = [extent[:, j] for j in range(4)]
+        products, area = 0, 0
+        for j in range(4):
+            p, q, r = distance[:j] + distance[j + 1 :]
+            x, y, z = p * q, q * r, r * p
+            products = products + x * r
+            square = x * x + y * y + z * z + x * y + y * z + z * x
+            # torch's square root has other last bits on processors of other makers (see `ops.exponential`).
+            area = area + (square**0.5 if isinstance(square, np.ndarray) else square * square.rsqrt())
+        return (6 * 2 / (9 * math.sqrt(3)) / (math.sqrt(2) / 3)) * products / area
+
+    def halves(self, center, rotation, log_extent, raw_opacity, rng):
+        """At the two ends of the longest edge.
+
+        Cutting at the middle of the edge would tile the parent, but such a half has no centre with these four
+        directions (12 degrees of freedom against 10): the best fits by least squares put 13 to 28 % of their volume
+        outside of the parent and leave 19 to 30 % of it empty. These lie inside, leave 25 to 27 % empty, keep the
+        rotation, and have 0.85 to 0.88 of the volume together (the halves of an octahedron 0.77); measured on distances
+        that differ up to 1 : 8.
+        """
+        rows = np.arange(len(center))
+        corners = np.exp(log_extent)[:, :, None] * self.directions
+        one, other = np.triu_indices(4, 1)
+        longest = np.argmax(np.linalg.norm(corners[:, one] - corners[:, other], axis=2), axis=1)
+        ends = np.stack([one[longest], other[longest]])
+        centers, extents = [], []
+        for kept, opposite in (ends, ends[::-1]):
+            part = np.full(log_extent.shape, np.log(self.SHRUNK))
+            part[rows, opposite] = np.log(self.OTHER)
+            centers.append(center + rotate(rotation, (1 - self.SHRUNK) * corners[rows, kept]))
+            extents.append(log_extent + part)
+        return {"center": np.stack(centers), "log_extent": np.stack(extents)}
+
+    def draw(self, extent, rng):
+        return math.sqrt(0.75) / self.size * (extent * rng.normal(size=extent.shape)) @ self.directions
+
+    def times_covariance(self, extent, vector):
+        """The covariance is 3/4 sum_j extent_j^2 b_j b_j^T, which is extent^2 if all are equal."""
+        return 0.75 * (extent**2 * (vector @ self.directions.T)) @ self.directions
+
+
+class Gaussian(Kind):
+    """3D Gaussian splatting's: extents are standard deviations along the local axes, the density is the opacity of its
+    middle, 0 to 1."""
+
+    name, plural, extents, size = "gaussian", "Gaussians", 3, 1 / DIST_TO_SCALE
+    directions = np.zeros((0, 3))
+    columns = np.zeros(0, np.int64)
+    faces = np.zeros((0, 3), np.int64)
+    # Projected near the camera's plane it would cover everything; 3DGS's.
+    near = 0.2
+    # 3DGS's, a variance in px^2.
+    screen_filter = 0.3
+    layout, length_prefix, told_by, last_properties = "3DGS", "scale_", ("scale_0", "f_dc_0"), ()
+    # Standard deviation at the start, in mean distances to the 3 nearest points. (3DGS's start, the whole of it at
+    # opacity 0.1, scores 0.4 to 2 dB less under every rule of growth, and MCMC's noise tears it apart.)
+    START = 0.5
+    # Middles of the halves at +-0.6 of the standard deviation that is cut, which becomes 0.8 of itself, so that the
+    # second moment is kept (0.6^2 + 0.8^2 = 1); -ln(1 - opacity) becomes 1 / (2 * 0.8) of itself, so that its integral
+    # is.
+    OFFSET, ALONG, ACROSS = 0.6, 0.8, 1.0
+
+    def screen_filter_at(self, magnification, width):
+        return magnification**2 * width
+
+    def start_extent(self, spacing):
+        return spacing * self.START
+
+    def reference_length(self, extent):
+        """None.
+
+        Raises:
+            LinprimError: always.
+        """
+        raise LinprimError("a gaussian has no reference length, its opacity is that of its middle")
+
+    def widened(self, extent, filter_3d):
+        """sqrt(extent^2 + filter^2)."""
+        import torch
+
+        return torch.hypot(extent, filter_3d[:, None])
+
+    def density(self, raw_opacity, extent):
+        """The opacity itself, sigmoid(raw)."""
+        import torch
+
+        return torch.sigmoid(raw_opacity)
+
+    def alpha(self, density, extent):
+        return density
+
+    def halves(self, center, rotation, log_extent, raw_opacity, rng):
+        """Cut across an axis, drawn by the squares of the extents."""
+        halves = _cut_along_axis(center, rotation, log_extent, rng, self.OFFSET, self.ALONG, self.ACROSS)
+        thinner = thinned(raw_opacity, 1 / (2 * self.ALONG))
+        return halves | {"raw_opacity": np.stack([thinner, thinner])}
+
+    def from_file(self, lengths, opacity, filter_3d):
+        """exp(length), and where Mip-Splatting has added a filter sqrt(exp(length)^2 + filter^2), the opacity times the
+        product of the ratios."""
+        spread = np.exp(lengths.astype(np.float64))
+        wide = spread if filter_3d is None else np.hypot(spread, filter_3d)
+        return wide.astype(np.float32), opacity * (spread / wide).prod(axis=1)
+
+    def to_file(self, extent, density):
+        opacity = density.astype(np.float64)
+        return np.log(extent.astype(np.float64)), np.log(opacity) - np.log1p(-opacity), 0
+
+    def gaussian_deviations(self, extent):
+        return extent
+
+
+# By name, in the order of the core's enum `PrimitiveKind`.
+KINDS: dict[str, Kind] = {kind.name: kind for kind in (Octahedron(), Tetrahedron(), Gaussian())}
+
+
+def _cut_along_axis(center, rotation, log_extent, rng, offset: float, along: float, across: float) -> dict:
+    """Halves of (P, 3) extents along local axes: one axis is drawn by the squares of the extents; centres at +-`offset`
+    of its extent, which becomes `along` of itself, the others `across`."""
+    extent = np.exp(log_extent)
+    draws = rng.random((len(center), 1))
+    axis = (draws > np.cumsum(extent**2, 1)[:, :2] / (extent**2).sum(1, keepdims=True)).sum(1)
+    chosen = np.eye(3)[axis]
+    moved = rotate(rotation, offset * extent * chosen)
+    shrunk = log_extent + np.log(np.where(chosen == 1, along, across))
+    return {"center": np.stack([center + moved, center - moved]), "log_extent": np.stack([shrunk, shrunk])}
+
+
+def thinned(raw_opacity: np.ndarray, part: float) -> np.ndarray:
+    """Raw opacity, float64, whose optical thickness softplus(raw) = -ln(1 - opacity) is `part` of that of
+    `raw_opacity`."""
+    thickness = part * np.logaddexp(0.0, raw_opacity.astype(np.float64))
+    return thickness + np.log(-np.expm1(-thickness))  # ln(e^t - 1)
+
+
+def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """(P, 3) vectors turned by (P, 4) quaternions w, x, y, z of any length."""
+    q = quaternion / np.maximum(np.linalg.norm(quaternion, axis=1, keepdims=True), 1e-30)
+    w, u = q[:, :1], q[:, 1:]
+    twice = 2 * np.cross(u, vector)
+    return vector + w * twice + np.cross(u, twice)
