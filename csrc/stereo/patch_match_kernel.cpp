@@ -73,7 +73,7 @@ inline F photo_cost(const PatchMatch& M, const StereoSource& S, const Packet& P,
   const I bad = (p[2] <= 1e-6f) | (u0 < 0.0f) | (v0 < 0.0f) | (u0 > most_u) | (v0 > most_v);
   bool none = true;
   for (int l = 0; l < kWide; ++l) none &= bad[l] != 0;
-  if (none) return all(kWorst);
+  if (none) return splat(kWorst);
   F sum{}, square{}, product{};
   constexpr float kFirst = -0.5f * kWindowStep * (kWindowSide - 1);
   int k = 0;
@@ -82,8 +82,8 @@ inline F photo_cost(const PatchMatch& M, const StereoSource& S, const Packet& P,
     F q[3];
     for (int c = 0; c < 3; ++c) q[c] = p[c] + down * dy[c] + kFirst * dx[c];
     for (int j = 0; j < kWindowSide; ++j, ++k) {
-      const F inverse = 1.0f / high(q[2], all(1e-6f));
-      const F u = low(high(q[0] * inverse, F{}), all(most_u)), v = low(high(q[1] * inverse, F{}), all(most_v));
+      const F inverse = 1.0f / vmax(q[2], splat(1e-6f));
+      const F u = vmin(vmax(q[0] * inverse, F{}), splat(most_u)), v = vmin(vmax(q[1] * inverse, F{}), splat(most_v));
       const I column = __builtin_convertvector(u, I), row = __builtin_convertvector(v, I);
       const F a = u - __builtin_convertvector(column, F), b = v - __builtin_convertvector(row, F);
       const I quad = gather(S.quads, row * S.width + column);
@@ -96,9 +96,9 @@ inline F photo_cost(const PatchMatch& M, const StereoSource& S, const Packet& P,
       for (int c = 0; c < 3; ++c) q[c] += float(kWindowStep) * dx[c];
     }
   }
-  const F variance = high(square - sum * sum, F{}) + M.noise;
-  const F cost = 1.0f - product / (P.deviation * root(variance));
-  return bad ? all(kWorst) : low(high(cost, F{}), all(kWorst));
+  const F variance = vmax(square - sum * sum, F{}) + M.noise;
+  const F cost = 1.0f - product / (P.deviation * vsqrt(variance));
+  return bad ? splat(kWorst) : vmin(vmax(cost, F{}), splat(kWorst));
 }
 
 // Pixels between a pixel and where it comes back to from the surface that the source has there.
@@ -133,7 +133,7 @@ inline F view_cost(const PatchMatch& M, const StereoSource& S, const Packet& P, 
 inline F joint_cost(const PatchMatch& M, const Packet& P, const F* cost) {
   F sum{}, total{};
   for (int v = 0; v < M.sources; ++v) sum += P.view[v] * cost[v], total += P.view[v];
-  return sum / high(total, all(1e-12f));
+  return sum / vmax(total, splat(1e-12f));
 }
 
 // Unit normals of planes, and the direction of the rays; towards the camera z is negative.

@@ -1,5 +1,5 @@
-// Floats and integers of as many pixels as an instruction set takes at once. For files that are compiled once per
-// instruction set, with -DLINPRIM_ISA=<name> -DLINPRIM_ISA_<NAME>=1.
+// Floats and integers of as many pixels as an instruction set takes at once; base/lanes.h has doubles by the same
+// names. For files that are compiled once per instruction set, with -DLINPRIM_ISA=<name> -DLINPRIM_ISA_<NAME>=1.
 #pragma once
 
 #include <cmath>
@@ -24,10 +24,9 @@ constexpr int kWide = 4;
 typedef float F __attribute__((vector_size(4 * kWide)));
 typedef int32_t I __attribute__((vector_size(4 * kWide)));
 
-inline F all(float x) { return x - F{}; }
-inline F low(F a, F b) { return a < b ? a : b; }
-inline F high(F a, F b) { return a > b ? a : b; }
-inline F magnitude(F a) { return a < 0.0f ? -a : a; }
+inline F splat(float x) { return x - F{}; }
+inline F vmin(F a, F b) { return a < b ? a : b; }
+inline F vmax(F a, F b) { return a > b ? a : b; }
 
 inline I gather(const uint32_t* base, I at) {
 #if defined(LINPRIM_ISA_V4)
@@ -41,7 +40,7 @@ inline I gather(const uint32_t* base, I at) {
 #endif
 }
 
-inline F root(F a) {
+inline F vsqrt(F a) {
 #if defined(LINPRIM_ISA_V4)
   return (F)_mm512_sqrt_ps((__m512)a);
 #elif defined(LINPRIM_ISA_V3)

@@ -177,9 +177,9 @@ def cut(primitives: Primitives, planes: Planes, met: np.ndarray, least: float) -
             slot for slot, k in slots.items() if (vertices[row] @ planes.normal[k]).max() - planes.offset[k] > least
         }
         bounding = [frozenset(np.flatnonzero(planes.cuts[k]).tolist()) & deep for k in slots.values()] or [frozenset()]
-        for together in dict.fromkeys(bounding):
+        for cutting in dict.fromkeys(bounding):
             body = whole
-            for slot in sorted(together):
+            for slot in sorted(cutting):
                 k = slots[slot]
                 body = body.trim_by_plane(-planes.normal[k], -planes.offset[k])
             body = own_identity(body)
