@@ -250,6 +250,12 @@ class TrainOptions:
     initial_primitives: int = option(
         0, "primitives at the start; 0 chooses from the points and --max-primitives", low=0, high=2**30
     )
+    start: str = option(
+        "points",
+        "where primitives begin: at the capture's points alone, or also where stereo of small copies of the "
+        "photographs finds surfaces",
+        choices=("stereo", "points"),
+    )
     sh_degree: int = option(2, "degree of the view-dependent colour, 0 to 3", choices=(0, 1, 2, 3))
     seed: int = option(0, "seed of everything random", low=0, high=2**63)
     threads: int = option(0, "worker threads; 0 uses every core; the result does not depend on it", low=0, high=4096)

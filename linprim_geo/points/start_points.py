@@ -57,7 +57,17 @@ def initial_cloud(cloud: PointCloud, options: TrainOptions) -> PointCloud:
     return PointCloud(cloud.xyz[keep], cloud.rgb[keep])
 
 
-def filled_points(scene: Scene, seed: int, backdrop: np.ndarray | None, far: FarColors | None = None) -> PointCloud:
-    """The scene's points, filled up (`densify`) unless they are random ones, which lie on no surface."""
+def filled_points(
+    scene: Scene,
+    seed: int,
+    backdrop: np.ndarray | None,
+    far: FarColors | None = None,
+    surfaces: PointCloud | None = None,
+) -> PointCloud:
+    """The scene's points and those on `surfaces`, filled up (`densify`) unless they are random ones, which lie on no
+    surface."""
     assert scene.points is not None
+    if surfaces is not None:
+        xyz, rgb = ([getattr(cloud, name) for cloud in (scene.points, surfaces)] for name in ("xyz", "rgb"))
+        scene = replace(scene, points=PointCloud(np.concatenate(xyz), np.concatenate(rgb)))
     return scene.points if isinstance(scene.points, VolumePoints) else densify(scene, seed, backdrop, far)

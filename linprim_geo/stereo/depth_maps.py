@@ -39,6 +39,8 @@ SMALLEST = 24
 # Windows that cost more may match by chance: less than a tenth of their variance is common, as 1 / 12 is of 36 samples
 # of noise. Weak textures under noise cost nearly as much when they are right, which other views tell.
 MOST_COST = 0.9
+# A depth is confirmed by so many other views. One that fewer confirm is wrong two to four times as often.
+CONFIRMING = 3
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,10 @@ class DepthMap:
     deviation: np.ndarray
     grey: np.ndarray
     noise: float
+
+    def is_confirmed(self) -> np.ndarray:
+        """(H, W) bool: CONFIRMING other views confirm the depth, or two and all but one of fewer that show it."""
+        return self.confirmed >= np.minimum(CONFIRMING, np.maximum(2, self.seen.astype(np.int8) - 1))
 
 
 def depth_maps(views: Sequence[View], points: np.ndarray, *, seed: int = 0, quiet: bool = True) -> list[DepthMap]:

@@ -20,9 +20,8 @@ from linprim_geo.stereo.shaded_planes import ShadedPlanes
 from linprim_geo.surface.single_view import mesh_is_closed
 from linprim_geo.surface.tsdf_field import DepthFrame
 
-# A depth counts as confirmed if so many other views confirm it, or two and all but one of fewer that show the point.
-# One that fewer confirm is wrong two to four times as often and counts so much.
-CONFIRMING, DOUBTFUL_WEIGHT = 3, 0.1
+# A depth that fewer views confirm than `DepthMap.is_confirmed` wants counts so much.
+DOUBTFUL_WEIGHT = 0.1
 # A piece of surface is supported if so many views have depths on this share of it. What is true has 0.3 to 0.9 of it
 # so, what is not 0.1 at most.
 SUPPORTING_VIEWS, SUPPORTED_SHARE = 2, 0.25
@@ -44,7 +43,7 @@ class MergedFrames(Sequence):
         self.rendered, self.limit = rendered, limit
         points = np.concatenate([_some(frame.surface()[0], POINTS // len(views)) for frame in rendered])
         maps = depth_maps(views, points, quiet=quiet)
-        sure = [_is_confirmed(found) for found in maps]
+        sure = [found.is_confirmed() for found in maps]
         self.depths = [_depth_where(found, own) for found, own in zip(maps, sure, strict=True)]
         self.doubtful_depths = [
             _depth_where(found, ~own & (found.confirmed > 0)) for found, own in zip(maps, sure, strict=True)
@@ -174,11 +173,6 @@ def _near(mesh: Mesh, supported: np.ndarray, reach: float) -> Mesh:
 def _some(points: np.ndarray, count: int) -> np.ndarray:
     """About `count` of (P, 3) points, evenly over their order."""
     return points[:: max(1, len(points) // max(1, count))]
-
-
-def _is_confirmed(found: DepthMap) -> np.ndarray:
-    """(H, W) bool."""
-    return found.confirmed >= np.minimum(CONFIRMING, np.maximum(2, found.seen.astype(np.int8) - 1))
 
 
 def _depth_where(found: DepthMap, taken: np.ndarray) -> np.ndarray:

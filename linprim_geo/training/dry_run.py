@@ -23,6 +23,7 @@ from linprim_geo.training.loop import QUICK_VIEWS, evaluate
 from linprim_geo.training.start import begin_run, late_terms, start_trainer
 from linprim_geo.training.step.trainer import Trainer
 from linprim_geo.training.step.training_images import LazyTrainingImage, load_training_images, photo_bytes, photo_limit
+from linprim_geo.training.stereo_start import stereo_start
 
 # Timing takes at most CALIBRATION_SHARE of so many seconds.
 TIMING = 125.0
@@ -65,11 +66,12 @@ def dry_run(
         limit = photo_limit()
         images, held_out = (load_training_images(views, planned.similarity) for views in (loaded.train, loaded.test))
         terms = late_terms(planned, loaded, images, progress)
+        surfaces = stereo_start(loaded, planned.train_options, progress, budget)
 
         counts = []
 
         def start(options: TrainOptions) -> Trainer:
-            trainer = start_trainer(loaded, planned, images, options, None)
+            trainer = start_trainer(loaded, planned, images, options, None, surfaces=surfaces)
             counts.append(len(trainer))
             return trainer
 

@@ -9,7 +9,7 @@ from linprim_geo.base.budget import Budget
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import GEOMETRY_WEIGHTS
 from linprim_geo.base.progress import Progress, duration
-from linprim_geo.capture.types import Scene
+from linprim_geo.capture.types import PointCloud, Scene
 from linprim_geo.kernels import ops
 from linprim_geo.points.initial_points import VolumePoints
 from linprim_geo.points.start_points import SFM_START, with_points
@@ -21,6 +21,7 @@ from linprim_geo.training.loop import QUICK_VIEWS, evaluate, run_steps
 from linprim_geo.training.start import late_terms, start_trainer
 from linprim_geo.training.step.trainer import Trainer
 from linprim_geo.training.step.training_images import TrainingImage, load_training_images
+from linprim_geo.training.stereo_start import stereo_start
 
 
 def train_run(
@@ -49,12 +50,13 @@ def train_run(
     if all(image.alpha is not None and int(image.alpha.max()) == 0 for image in images):
         raise LinprimError(f"{scene.root}: the masks leave no pixel of any training image")
     held_out: list[TrainingImage] | None = None
+    surfaces = stereo_start(scene, options, progress, budget) if state is None else None
     pace = None
     if budget:
         held_out = load_training_images(scene.test, run.similarity)
-        run, scene, pace = _planned(run, scene, images, held_out, budget, progress)
+        run, scene, pace = _planned(run, scene, images, held_out, surfaces, budget, progress)
         options, progress.total = run.train_options, run.train_options.iterations
-    trainer = start_trainer(scene, run, images, options, state)
+    trainer = start_trainer(scene, run, images, options, state, surfaces=surfaces)
     trainer.terms = late_terms(run, scene, images, progress)
     if not (run.path / "config.json").exists():
         Run.create(
@@ -116,6 +118,7 @@ def _planned(
     scene: Scene,
     images: list[TrainingImage],
     held_out: list[TrainingImage],
+    surfaces: PointCloud | None,
     budget: Budget,
     progress: Progress,
 ) -> tuple[Run, Scene, Pace]:
@@ -128,7 +131,7 @@ def _planned(
         late_terms(run, scene, images, progress),
         budget,
         progress,
-        start=lambda options: start_trainer(scene, run, images, options, None),
+        start=lambda options: start_trainer(scene, run, images, options, None, surfaces=surfaces),
         score=evaluate,
         # The smaller limit that is chosen leaves too many points, not too few, and volumes are filled anew.
         start_share=0.0 if volume else SFM_START,

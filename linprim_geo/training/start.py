@@ -155,13 +155,14 @@ def start_trainer(
     state: dict | None,
     cloud: PointCloud | None = None,
     largest: float | None = None,
+    surfaces: PointCloud | None = None,
 ) -> Trainer:
     """A trainer at step 0, or at the step of a checkpoint's `state`.
 
     Args:
         scene: with points to start from; those of a checkpoint need none.
         images: its training views in the training frame.
-        cloud: the points to start from; default: `filled_points` of the scene.
+        cloud: the points to start from; default: `filled_points` of the scene and of `surfaces`.
         largest: extent that a primitive may have, in the training frame; default: by what the points reach.
 
     Raises:
@@ -176,7 +177,8 @@ def start_trainer(
         xyz, rgb, radius = np.zeros((4, 3)), np.zeros((4, 3)), 1.0  # replaced below
     else:
         if cloud is None:
-            cloud = filled_points(scene, options.seed, behind.color.numpy() if behind.fitted else None, behind.far)
+            backdrop = behind.color.numpy() if behind.fitted else None
+            cloud = filled_points(scene, options.seed, backdrop, behind.far, surfaces)
         cloud = initial_cloud(cloud, options)
         xyz, rgb = run.similarity.apply(cloud.xyz), cloud.rgb
         middle = np.median(xyz, 0)

@@ -1,0 +1,73 @@
+"""Points on surfaces, by stereo of small copies of the photographs: dense enough to start a training from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from linprim_geo.capture.types import Photo, PointCloud, View
+from linprim_geo.geometry.boxes import smaller
+from linprim_geo.imaging.photos import box_downscale
+from linprim_geo.stereo.confidence import FOREGROUND
+from linprim_geo.stereo.depth_maps import depth_maps
+
+# Photographs are averaged down until their longer side has no more pixels, and no more of them are taken: a training
+# starts with some ten thousand primitives, and a view of this size has 77,000 pixels.
+LONGER_SIDE, MOST_VIEWS = 320, 100
+
+
+@dataclass(frozen=True)
+class SmallCopy(View):
+    """A view whose photograph is averaged down by `factor` from that of `original`, which may be decoded already."""
+
+    original: View | None = None
+    factor: int = 1
+
+    @staticmethod
+    def of(view: View) -> SmallCopy:
+        """One of at most LONGER_SIDE pixels."""
+        factor = -(-max(view.camera.width, view.camera.height) // LONGER_SIDE)
+        own = {entry.name: getattr(view, entry.name) for entry in fields(View)}
+        return SmallCopy(**own | {"camera": smaller(view.camera, factor)}, original=view, factor=factor)
+
+    def load(self) -> Photo:
+        assert self.original is not None
+        photo = self.original.load()
+        return Photo(*box_downscale(photo.rgb, photo.alpha, self.factor))
+
+
+def small_copies(views: Sequence[View]) -> list[SmallCopy]:
+    """Of at most MOST_VIEWS views, evenly over their order."""
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(MOST_VIEWS, len(views))).round().astype(int))
+    return [SmallCopy.of(views[k]) for k in chosen]
+
+
+def surface_points(
+    views: Sequence[View], points: np.ndarray, count: int, seed: int, *, quiet: bool = True
+) -> tuple[PointCloud, float]:
+    """`count` points, or fewer, that stereo finds and neighbours confirm, drawn evenly from the pixels.
+
+    Returns: the points, and the share of all pixels that have one.
+
+    Args:
+        views: posed photographs; of masked ones the foreground counts.
+        points: (P, 3) of the scene, as for `depth_maps`.
+
+    Raises:
+        LinprimError: as `depth_maps`.
+    """
+    xyz, rgb, pixels = [], [], 0
+    for view, found in zip(views, depth_maps(views, points, seed=seed, quiet=quiet), strict=True):
+        photo, taken = view.load(), found.is_confirmed()
+        if photo.alpha is not None:
+            taken &= photo.alpha >= FOREGROUND
+        depth = found.depth[taken].astype(np.float64)
+        xyz.append(view.camera.world_rays()[taken] * depth[:, None] + view.camera.center)
+        rgb.append(photo.rgb[taken])
+        pixels += taken.size
+    every = np.concatenate(xyz)
+    rng = np.random.default_rng([seed, 12])
+    keep = np.sort(rng.choice(len(every), min(count, len(every)), replace=False))
+    return PointCloud(every[keep], np.concatenate(rgb)[keep]), len(every) / pixels

@@ -1,0 +1,56 @@
+"""Where stereo finds surfaces, a training starts on them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import numpy as np
+
+from linprim_geo.base.budget import Budget
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import TrainOptions, initial_count
+from linprim_geo.base.progress import Progress, duration
+from linprim_geo.capture.types import PointCloud, Scene, View
+from linprim_geo.points.initial_points import VolumePoints
+from linprim_geo.points.start_points import SFM_START
+from linprim_geo.stereo.planes_on_disk import Photographs
+from linprim_geo.stereo.surface_points import small_copies, surface_points
+from linprim_geo.stereo.time_plan import seconds_per_pixel
+
+# Of a time budget stereo takes at most this share: it saves about half of the time of a step.
+BUDGET_SHARE = 0.2
+
+
+def stereo_start(
+    scene: Scene, options: TrainOptions, progress: Progress, budget: Budget | None = None
+) -> PointCloud | None:
+    """As many points on surfaces as a training starts with, of the training views of a scene with points.
+
+    None where stereo has nothing to say, and where the scene's points are no surface's but anywhere in a volume.
+    """
+    if options.start != "stereo" or scene.points is None or isinstance(scene.points, VolumePoints):
+        return None
+    begin = time.monotonic()
+    views, points = small_copies(scene.train), scene.points.xyz
+    try:
+        if budget and not _fits(views, points, budget):
+            progress.note(f"start: stereo would take more than {BUDGET_SHARE:.0%} of the time that is left")
+            return None
+        count = initial_count(options, SFM_START)
+        found, share = surface_points(views, points, count, options.seed, quiet=progress.quiet)
+    except LinprimError as error:
+        progress.note(f"start: no stereo, {error}")
+        return None
+    progress.note(
+        f"start: stereo of {len(views)} photographs, averaged down, finds surfaces in {share:.0%} of the pixels "
+        f"({duration(time.monotonic() - begin)})"
+    )
+    return found
+
+
+def _fits(views: Sequence[View], points: np.ndarray, budget: Budget) -> bool:
+    """Whether stereo takes no more than BUDGET_SHARE of what is left, by its first photographs."""
+    rate = seconds_per_pixel(Photographs(views, points), budget)
+    pixels = sum(view.camera.width * view.camera.height for view in views)
+    return rate * pixels <= BUDGET_SHARE * budget.left()
