@@ -1,8 +1,9 @@
-"""What several test files share: a cache of their own, a tiny capture, one run trained on it, and a run whose
-surface is known exactly."""
+"""What several test files share: a cache of their own, a tiny capture, one run trained on it, one in blocks, and a
+run whose surface is known exactly."""
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -76,9 +77,10 @@ def made_once(tmp_path_factory, name: str, make) -> Path:
     base = tmp_path_factory.getbasetemp()
     base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
     with locked(base, "made", name, wait=lambda: None):
-        if not (base / name).exists():
-            make(base / f"{name}.part")
-            (base / f"{name}.part").rename(base / name)
+        if not (base / f"{name}.made").exists():
+            shutil.rmtree(base / name, ignore_errors=True)
+            make(base / name)
+            (base / f"{name}.made").touch()
     return base / name
 
 
@@ -119,6 +121,22 @@ def tiny_run(tiny_scene, tiny_options, tmp_path_factory) -> Path:
         tmp_path_factory, "tiny_run", lambda out: train(tiny_scene, out, options=tiny_options, quiet=True)
     )
     return Path(shutil.copytree(trained, tmp_path_factory.mktemp("tiny_run_copy") / "run"))
+
+
+@pytest.fixture(scope="session")
+def blocks_run(tiny_scene, tmp_path_factory) -> tuple[Path, dict]:
+    """An undisturbed run in two blocks, and what training said. For all processes of the tests, as it cannot be moved:
+    not to be changed."""
+    from helpers.block_runs import COUNT, OPTIONS
+
+    from linprim_geo.training.blocks.driver import train_blocks
+
+    def make(out):
+        said = train_blocks(tiny_scene, out / "run", options=OPTIONS, blocks=COUNT, workers=2, quiet=True)
+        (out / "said.json").write_text(json.dumps(said))
+
+    made = made_once(tmp_path_factory, "blocks_run", make)
+    return made / "run", json.loads((made / "said.json").read_text())
 
 
 @pytest.fixture

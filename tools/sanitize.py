@@ -26,6 +26,7 @@ TESTS = (
     "test_rasterize.py",
     "test_rasterize_gradients.py",
     "test_rasterize_interface.py",
+    "test_rasterize_invariants.py",
     "test_level_depth.py",
     "test_parallel.py",
     "test_ladder.py",

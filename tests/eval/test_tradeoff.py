@@ -1,11 +1,9 @@
-"""The sweep of parameters: every value sets something that runs, the frontier and the sentences follow their rules, the
-files agree."""
+"""The sweep of parameters: every value sets something that runs, is timed and judged, and the files agree."""
 
 from __future__ import annotations
 
 import csv
 import json
-import math
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -15,192 +13,12 @@ import pytest
 from helpers.here import Here
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.options import SceneOptions, TrainOptions, check_train_options
 from linprim_geo.eval.options import TradeoffOptions
-from linprim_geo.eval.tradeoff import page as tradeoff_page
-from linprim_geo.eval.tradeoff import parameters, training
 from linprim_geo.eval.tradeoff import sweep as sweeping
-from linprim_geo.eval.tradeoff.frontier import frontier, pays, verdict
-from linprim_geo.eval.tradeoff.parameters import (
-    ERRORS,
-    GROUPS,
-    PARAMETERS,
-    Parameter,
-    Value,
-    settings,
-    training_options,
-)
+from linprim_geo.eval.tradeoff import training
+from linprim_geo.eval.tradeoff.parameters import PARAMETERS
 from linprim_geo.eval.tradeoff.sweep import tradeoff
-from linprim_geo.imaging.plots import frontiers
 from linprim_geo.synthetic.synth import synthesize
-
-# What the design lists: every parameter that trades time for accuracy.
-LISTED = {
-    "rays",
-    "order",
-    "scalar",
-    "stop",
-    "degree",
-    "trained-degree",
-    "primitive",
-    "primitives",
-    "iterations",
-    "scale",
-    "views",
-    "extraction",
-    "samples",
-}
-
-
-def row(value, seconds, error, name="depth_percent", spread=0.0, rounds=3):
-    low, high = seconds * (1 - spread), seconds * (1 + spread)
-    return {
-        "value": value,
-        "seconds": seconds,
-        "low": low,
-        "high": high,
-        "rounds": rounds,
-        "default": False,
-        name: error,
-    }
-
-
-def parameter(*names, error="depth_percent"):
-    return Parameter("rays", "ray model", "render", tuple(Value(name) for name in names), names[0], (error,))
-
-
-# --- the registry ----------------------------------------------------------------------------------------
-
-
-def test_the_registry_is_complete():
-    assert set(PARAMETERS) == LISTED
-    for name, each in PARAMETERS.items():
-        assert each.name == name and each.group in GROUPS and set(each.errors) <= set(ERRORS) and each.errors
-        names = [r.name for r in each.values]
-        assert len(set(names)) == len(names) >= 2 and each.default in names
-    shown = [
-        json.dumps(settings(each, r), sort_keys=True)
-        for each in PARAMETERS.values()
-        for r in each.values
-        if r.name != each.default
-    ]
-    assert len(set(shown)) == len(shown), "two values that are not the default set the same"
-
-
-def test_defaults_of_the_registry_are_those_of_the_options():
-    rays = PARAMETERS["rays"]
-    assert settings(rays, parameters.value_named(rays, "exact")) == parameters.RENDER_DEFAULTS
-    options = TrainOptions()
-    for name, value in (
-        ("ray_model", options.ray_model),
-        ("order", options.order),
-        ("stop", options.stop),
-        ("degree", options.sh_degree),
-    ):
-        assert parameters.RENDER_DEFAULTS[name] == value
-    assert (
-        settings(PARAMETERS["primitive"], parameters.value_named(PARAMETERS["primitive"], "octahedron")) == {}
-        and options.primitive == "octahedron"
-    )
-    assert PARAMETERS["trained-degree"].default == str(options.sh_degree)
-    for name in ("order", "stop", "scalar", "degree", "extraction", "samples"):
-        each = PARAMETERS[name]
-        base = parameters.RENDER_DEFAULTS | parameters.EXTRACT_DEFAULTS | parameters.EVALUATE_DEFAULTS
-        assert parameters.value_named(each, each.default).changes.items() <= base.items(), name
-
-
-def test_every_training_value_changes_an_option_that_is_allowed():
-    options, scene = TrainOptions(iterations=100, max_primitives=80), SceneOptions(downscale=2)
-    for each in PARAMETERS.values():
-        if each.group != "train":
-            continue
-        found = [
-            training_options(options, scene, 24, settings(each, value))
-            for value in each.values
-            if "equal_time" not in value.changes
-        ]
-        assert len({(str(a), str(b)) for a, b in found}) == len(found), each.name
-        for changed, _ in found:
-            check_train_options(changed)
-    changed = {
-        name: training_options(options, scene, 24, change)
-        for name, change in {
-            "half": {"iterations_times": 0.5},
-            "cap": {"max_primitives_times": 2.0},
-            "scale": {"downscale_times": 4},
-            "views": {"views": 0.25},
-        }.items()
-    }
-    assert (changed["half"][0].iterations, changed["cap"][0].max_primitives) == (50, 160)
-    assert (changed["scale"][1].downscale, changed["views"][1].views) == (8, 6)
-
-
-# --- the rules -------------------------------------------------------------------------------------------
-
-
-def test_the_frontier_of_known_points():
-    points = [
-        (1.0, 5.0),
-        (2.0, 3.0),
-        (2.5, 3.0),
-        (3.0, 4.0),
-        (4.0, 1.0),
-        (0.5, 9.0),
-        (4.0, 2.0),
-        (math.nan, 0.0),
-        (9.0, math.nan),
-    ]
-    assert frontier(points) == [5, 0, 1, 4]
-    assert frontier([(1.0, 1.0), (1.0, 1.0)]) == [0] and frontier([]) == []
-    rng = np.random.default_rng(0)
-    points = [tuple(p) for p in rng.integers(1, 9, (60, 2)).astype(float)]
-    on = frontier(points)
-    for k, (t, e) in enumerate(points):
-        beaten = any(a <= t and b <= e and (a, b) != (t, e) for a, b in points)
-        assert (not beaten) == ((t, e) in [points[i] for i in on]), k
-
-
-def test_a_step_pays_if_the_error_falls_with_the_root_of_the_time():
-    assert pays(row("a", 1.0, 1.0), row("b", 4.0, 0.5), "depth_percent")
-    assert not pays(row("a", 1.0, 1.0), row("b", 4.0, 0.51), "depth_percent")
-    assert not pays(row("a", 1.0, 1.0), row("b", 1.0, 0.995), "depth_percent")  # less than 1 % is nothing
-    assert pays(
-        row("a", 1.0, 1.0, spread=0.2), row("b", 1.3, 0.95, spread=0.2), "depth_percent"
-    )  # equal within the spread
-    assert not pays(row("a", 1.0, 1.0, spread=0.01), row("b", 1.3, 0.95, spread=0.01), "depth_percent")
-    assert pays(row("a", 1.0, 1.0), row("b", 99.0, 0.0), "depth_percent")
-
-
-def test_the_sentences_follow_the_rule():
-    said = verdict(parameter("affine", "exact"), [row("affine", 1.0, 1.0), row("exact", 1.18, 0.8)])
-    assert said["sentence"] == (
-        "Ray model: exact costs 1.18x the time of affine and removes 20 % of the depth error (1 to 0.8 %): worth it."
-    )
-    assert (said["cheapest"], said["taken"], said["most_accurate"]) == ("affine", "exact", "exact")
-    said = verdict(parameter("a", "b"), [row("a", 1.0, 1.0), row("b", 4.0, 0.9)])
-    assert said["sentence"].endswith(
-        "b costs 4.00x the time of a and removes 10 % of the depth error (1 to 0.9 %): not worth it."
-    )
-    said = verdict(parameter("a", "b", "c"), [row("a", 1.0, 1.0), row("b", 1.5, 0.5), row("c", 9.0, 0.45)])
-    assert "worth it; c would cost 6.00x the time of b and remove 10 %" in said["sentence"] and said["taken"] == "b"
-    said = verdict(parameter("a", "b", "c"), [row("a", 1.0, 1.0), row("b", 2.0, 0.9), row("c", 3.0, 0.1)])
-    assert said["taken"] == "c"  # a step that does not pay is no obstacle to the next one
-    said = verdict(parameter("a", "b"), [row("a", 1.0, 0.5), row("b", 4.0, 0.9)])
-    assert "a is the fastest, and no other removes any of the depth error (b costs 4.00x)" in said["sentence"]
-    said = verdict(parameter("a", "b"), [row("a", 1.0, 1.0, spread=0.3), row("b", 1.2, 0.9, spread=0.3)])
-    assert "1.20x (within the spread of the timings)" in said["sentence"] and said["taken"] == "b"
-    assert verdict(parameter("a", "b"), [row("a", 1.0, math.nan), row("b", 2.0, math.nan)])["error"] is None
-    assert verdict(parameter("a", "b"), [])["error"] is None
-
-
-def test_what_only_some_rows_have_does_not_decide():
-    each = Parameter("x", "x", "train", (Value("a"), Value("b")), "a", ("chamfer_percent", "photo_percent"))
-    rows = [row("a", 1.0, math.nan, "chamfer_percent"), row("b", 2.0, 1.0, "chamfer_percent")]
-    rows[0]["photo_percent"], rows[1]["photo_percent"] = 2.0, 1.0
-    assert verdict(each, rows)["error"] == "photo_percent"
-
-
-# --- a sweep ---------------------------------------------------------------------------------------------
 
 RENDERED = ("rays", "order", "scalar", "stop", "degree")
 MEASURED = (*RENDERED, "extraction", "samples")
@@ -423,19 +241,6 @@ def test_a_trained_run_is_scored_by_image_depth_and_surface(swept, tiny_scene, t
     found = sweep._train_errors(swept[0] / "runs" / "given")
     assert 22 < found["psnr"] < 40 and found["photo_percent"] == pytest.approx(100 * 10 ** (-found["psnr"] / 20))
     assert 0 < found["depth_percent"] < 10 and 0 < found["chamfer_percent"] < 5
-
-
-# --- drawing ---------------------------------------------------------------------------------------------
-
-
-def test_an_error_of_zero_and_a_single_point_can_be_drawn():
-    for rows in ([row("a", 1.0, 0.0)], [row("a", 1.0, 0.0), row("b", 1e-6, 3.0)]):
-        panel = tradeoff_page.panel([each | {"frontier": True} for each in rows], "depth_percent")
-        assert [point.name for point in panel.points] == [each["value"] for each in rows]
-        assert panel.y_label == "depth error, %" and ElementTree.fromstring(frontiers([panel], "errors")) is not None
-
-
-# --- errors ----------------------------------------------------------------------------------------------
 
 
 def test_what_cannot_be_swept_is_one_sentence(swept, tiny_scene, tiny_run, tmp_path):

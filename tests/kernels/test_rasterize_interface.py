@@ -1,11 +1,17 @@
-"""What the compiled rasterizer takes and refuses, and that nothing it returns is not finite."""
+"""What the compiled rasterizer takes and refuses, and that nothing it returns is not finite, with primitives or none in
+view."""
 
 from __future__ import annotations
+
+import itertools
+import math
 
 import numpy as np
 import pytest
 import torch
+from helpers.ladder import DTYPES, LADDER, ladder, options_of, scene_of
 from helpers.octahedra import (
+    IMAGES,
     KERNELS,
     NAMES,
     assert_identical,
@@ -24,6 +30,7 @@ from helpers.octahedra import (
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels import ops
+from linprim_geo.kernels.reference import rasterize as reference
 
 pytestmark = pytest.mark.usefixtures("few_threads")
 
@@ -88,6 +95,78 @@ def test_a_denormal_axis_gives_finite_gradients(isa):
     assert all(bool(g.isfinite().all()) for g in grads)
 
 
+def test_the_distortion_of_a_length_of_1e12_has_a_finite_gradient():
+    pose = np.eye(4)
+    pose[:3] = [
+        [0.2375, 0.9251, -0.2964, 0.4593],
+        [0.9511, -0.1594, 0.2647, -1.8639],
+        [0.1977, -0.3448, -0.9176, 0.0787],
+    ]
+    view = Camera(4, 4, 86.0239, 82.3206, 153.2871, -79.6595, pose)
+    rows = (
+        [[239230.375, 152163.4375, -1350907.875]],
+        [[-0.7587, -0.9164, 0.1832, -0.441]],
+        [[1.2543e25, 1.0934e28, 1.7432e36]],
+    )
+    values = [torch.tensor(row, requires_grad=True) for row in (*rows, [1.1603e-17], [[[0.2104, 0.328, 0.5226]]])]
+    out = ops.rasterize(*values, torch.zeros(3), view, order="overlap", geometry=True, stop=0.0)
+    cotangent = torch.linspace(-1, 1, out.distortion.numel()).view_as(out.distortion)
+    gradients = torch.autograd.grad(out.distortion, values, cotangent, allow_unused=True)
+    assert float(out.distortion.max()) > 1e12
+    assert all(bool(torch.isfinite(g).all()) for g in gradients if g is not None) and float(gradients[3].abs()) > 0
+
+
+# --- few primitives, few pixels ---
+
+
+def assert_finite(parameters, view, options) -> bool:
+    """Images and gradients are finite and opacity is a share; returns whether anything was hit."""
+    *images, _, _, c, r, e, d, s, b, screen = everything(parameters, view, **options)
+    assert all(bool(x.isfinite().all()) for x in (*images, c, r, e, d, s, b, screen))
+    assert 0 <= float(images[1].min()) and float(images[1].max()) <= 1
+    return bool((images[1] > 0).any())
+
+
+@ladder(LADDER, DTYPES)
+def test_no_primitive_and_one_in_images_of_any_shape(variant, dtype):
+    options = options_of(variant)
+    for (width, height), count in itertools.product(((1, 1), (1, 5000), (5000, 1)), (0, 1)):
+        focal = max(4.0, 0.8 * max(width, height))
+        parameters, view = scene_of(variant, 5, 1, width=width, height=height, depth=2.0, spread=0.05, focal=focal)
+        parameters = [p[:count] if i < 5 else p for i, p in enumerate(parameters)]
+        assert assert_finite([p.to(dtype) for p in parameters], view, options) == (count == 1)
+        if width == height == count == 1:
+            wanted = reference.rasterize(
+                *parameters,
+                world_to_camera=torch.from_numpy(view.world_to_camera),
+                fx=view.fx,
+                fy=view.fy,
+                cx=view.cx,
+                cy=view.cy,
+                width=1,
+                height=1,
+                geometry=False,
+                **options,
+            )
+            got = ops.rasterize(*[p.to(dtype) for p in parameters], view, **options).rgb.double()
+            torch.testing.assert_close(got, wanted["rgb"], rtol=0, atol=1e3 * torch.finfo(dtype).eps)
+
+
+@ladder(LADDER, DTYPES)
+def test_nothing_in_view_leaves_the_background_and_no_gradient(variant, dtype):
+    options = options_of(variant)
+    parameters, view = scene_of(variant, 6, 4)
+    pose = view.world_to_camera.copy()
+    pose[2, 3] -= 100.0  # everything is behind the camera now
+    inputs = leaves(parameters, dtype)
+    view = Camera(view.width, view.height, view.fx, view.fy, view.cx, view.cy, pose)
+    out = ops.rasterize(*inputs, view, geometry=True, **options)
+    assert torch.equal(out.rgb, inputs[5].detach()[:, None, None].expand_as(out.rgb)) and not out.opacity.any()
+    assert not any(getattr(out, name).any() for name in IMAGES[1:]) and not out.pixels.any()
+    grads = torch.autograd.grad(out.rgb.sum() + out.depth_expected.sum(), inputs, allow_unused=True)
+    assert not any(g.any() for g in grads[:5] if g is not None)
+
+
 # --- the interface ---
 
 
@@ -100,6 +179,18 @@ def test_an_input_that_is_not_finite_is_named_with_its_row(name, bad):
     tensor.view(len(tensor), -1)[row, 0] = bad
     with pytest.raises(LinprimError, match=f"{name}: row {row} "):
         ops.rasterize(*scene, view)
+
+
+@ladder(LADDER, DTYPES)
+def test_what_is_not_finite_is_refused_with_its_tensor_and_row(variant, dtype):
+    options = options_of(variant)
+    for name, bad in itertools.product(NAMES, (math.nan, math.inf, -math.inf)):
+        parameters, view = scene_of(variant, 81, 5, 4)
+        parameters = [p.to(dtype) for p in parameters]
+        tensor = parameters[NAMES.index(name)]
+        tensor.view(len(tensor), -1)[2, -1] = bad
+        with pytest.raises(LinprimError, match=f"{name}: row 2 "):
+            ops.rasterize(*parameters, view, **options)
 
 
 @pytest.mark.parametrize("name", NAMES)
