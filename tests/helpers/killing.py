@@ -100,7 +100,11 @@ def convert(source: str, target: str) -> None:
 def _serve() -> None:
     # None of these starts a thread, which would not survive being copied.
     import open3d  # noqa: F401
+    import PIL.ImageOps  # noqa: F401
+    import PIL.PngImagePlugin  # noqa: F401
+    import psutil  # noqa: F401
     import pycolmap  # noqa: F401
+    import scipy.interpolate  # noqa: F401
     import trimesh  # noqa: F401
 
     import linprim_geo.points.triangulate
