@@ -11,7 +11,6 @@ from helpers.reference_scenes import random_scene
 
 POLYHEDRA, MODELS, ORDERS = ("octahedron", "tetrahedron"), ("exact", "affine"), ("center", "entry", "overlap")
 VARIANTS = list(itertools.product(POLYHEDRA, MODELS, ORDERS))
-FINITE_DIFFERENCES = dict(eps=1e-6, rtol=1e-5, check_undefined_grad=False)
 BASIS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
 
 
