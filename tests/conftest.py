@@ -7,17 +7,22 @@ import json
 import os
 import re
 import shutil
+import sys
 from pathlib import Path
 
 # The matrices here are small, and OpenBLAS's threads wait for each other in a loop: on a busy machine a hundredfold of
 # the work.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Tests start a hundred processes, each of which would compile the package again; so would this one the tests.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import numpy as np
 import pytest
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import locked
+
+sys.dont_write_bytecode = False
 
 # Half-axes and rotation (w, x, y, z) of the one octahedron of `solid`, whose middle is at CENTER.
 EXTENT, ROTATION, CENTER = (0.9, 0.6, 0.7), (0.8, 0.2, -0.4, 0.4), (3.0, -2.0, 1.0)
