@@ -130,14 +130,17 @@ def tiny_run(tiny_scene, tiny_options, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def blocks_run(tiny_scene, tmp_path_factory) -> tuple[Path, dict]:
-    """An undisturbed run in two blocks, and what training said. For all processes of the tests, as it cannot be moved:
-    not to be changed."""
+    """An undisturbed run in two blocks, all by this process, and what training said. For all processes of the tests, as
+    it cannot be moved: not to be changed."""
     from helpers.block_runs import COUNT, OPTIONS
+    from helpers.here import Here
 
-    from linprim_geo.training.blocks.driver import train_blocks
+    from linprim_geo.training.blocks import driver
 
     def make(out):
-        said = train_blocks(tiny_scene, out / "run", options=OPTIONS, blocks=COUNT, workers=2, quiet=True)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(driver, "open_executor", Here)
+            said = driver.train_blocks(tiny_scene, out / "run", options=OPTIONS, blocks=COUNT, quiet=True)
         (out / "said.json").write_text(json.dumps(said))
 
     made = made_once(tmp_path_factory, "blocks_run", make)

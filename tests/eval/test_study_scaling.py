@@ -7,6 +7,7 @@ from argparse import Namespace
 
 import numpy as np
 import pytest
+from helpers.here import Here
 
 from linprim_geo.eval.studies import block_quality, scaling
 from linprim_geo.eval.studies.street import HEIGHT, HOUSE, WIDTH, street
@@ -95,7 +96,8 @@ def test_distances_are_to_borders_between_blocks_only():
     assert np.allclose(block_quality.border_distance(blocks, points), [1.0, 0.1, 0.2, 7.0, np.inf])
 
 
-def test_scaling_measures_fits_and_writes_its_table(tmp_path, monkeypatch):
+def test_scaling_measures_fits_and_writes_its_table(tmp_path, monkeypatch, few_threads):
+    monkeypatch.setattr("linprim_geo.jobs.open.open_executor", Here)
     sizes = ((6, 1, 100), (6, 2, 200), (10, 1, 200), (10, 2, 100), (10, 1, 300))
     given = Namespace(output=tmp_path, sizes=sizes, views=10, side=48, steps=2, cluster=None, workers=1, run=None)
     result = scaling.run(given)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import signal
@@ -85,6 +86,8 @@ def test_killed_at_random_moments_it_ends_in_the_same_bits(blocks_run, tiny_scen
     run = tmp_path / "run"
     train_killed_at_random(tiny_scene, run, 3, random.Random(5), 3.0)
     assert_same(run, blocks_run[0])
+    (line,) = (json.loads(text) for text in (run / "metrics.jsonl").read_text().splitlines())
+    assert 0.1 < line["memory_gib"] < 4  # of the worker that took the most
     assert not [path for path in run.rglob(".*") if ".tmp" in path.name]
 
 
