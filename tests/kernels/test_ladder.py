@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -48,44 +49,67 @@ def scene_of(
     )
 
 
-def both(leaves, view, options, geometry=True):
-    """Images and gradients (of random weights) of the core and of the twin, as two pairs."""
-    results = []
-    weights = None
-    for core in (True, False):
-        inputs = [p.detach().to(p.dtype if core else torch.float64).requires_grad_() for p in leaves]
-        if core:
-            images = fields(
-                ops.rasterize(*inputs, view, geometry=geometry, **options), IMAGES if geometry else IMAGES[:2]
-            )
-        else:
-            out = reference.rasterize(
-                *inputs,
-                world_to_camera=torch.from_numpy(view.world_to_camera),
-                fx=view.fx,
-                fy=view.fy,
-                cx=view.cx,
-                cy=view.cy,
-                width=view.width,
-                height=view.height,
-                geometry=geometry,
-                **options,
-            )
-            images = {name: out[name] for name in (IMAGES if geometry else IMAGES[:2])}
-        if weights is None:
-            generator = torch.Generator().manual_seed(3)
-            weights = {
-                name: torch.rand(image.shape, generator=generator, dtype=torch.float64) - 0.3
-                for name, image in images.items()
-            }
-        loss = sum((image.double() * weights[name]).sum() for name, image in images.items())
-        grads = torch.autograd.grad(loss, inputs, allow_unused=True)
-        results.append((images, [torch.zeros_like(p) if g is None else g for p, g in zip(inputs, grads, strict=True)]))
-    return results
+def weighted(images, names):
+    """The sum of the named images with fixed random weights."""
+    generator = torch.Generator().manual_seed(3)
+    weights = [torch.rand(images[name].shape, generator=generator, dtype=torch.float64) - 0.3 for name in names]
+    return sum((images[name].double() * weight).sum() for name, weight in zip(names, weights, strict=True))
 
 
-def assert_alike(leaves, view, options, geometry, value: float, gradient: float):
-    (shown, grads), (wanted, wanted_grads) = both(leaves, view, options, geometry)
+def gradients(loss, inputs, **how):
+    grads = torch.autograd.grad(loss, inputs, allow_unused=True, **how)
+    return [torch.zeros_like(p) if g is None else g for p, g in zip(inputs, grads, strict=True)]
+
+
+def by_core(leaves, view, options, geometry=True):
+    """Images of the core, and gradients of their weighted sum."""
+    inputs = [p.detach().requires_grad_() for p in leaves]
+    names = IMAGES if geometry else IMAGES[:2]
+    images = fields(ops.rasterize(*inputs, view, geometry=geometry, **options), names)
+    return images, gradients(weighted(images, names), inputs)
+
+
+def by_twin(leaves, view, options, geometry=(True,)):
+    """{geometry: what `by_core` gives} of the twin in double precision, all from one of its images, which are the same
+    with and without geometry."""
+    inputs = [p.detach().double().requires_grad_() for p in leaves]
+    images = reference.rasterize(
+        *inputs,
+        world_to_camera=torch.from_numpy(view.world_to_camera),
+        fx=view.fx,
+        fy=view.fy,
+        cx=view.cx,
+        cy=view.cy,
+        width=view.width,
+        height=view.height,
+        geometry=any(geometry),
+        **options,
+    )
+    found = {}
+    for each in geometry:
+        names = IMAGES if each else IMAGES[:2]
+        grads = gradients(weighted(images, names), inputs, retain_graph=True)
+        found[each] = {name: images[name].detach() for name in names}, grads
+    return found
+
+
+@cache
+def twin_of(seed, variant, screen_filter):
+    """`by_twin` of a scene, for the tests with geometry and those without."""
+    leaves, view, options = scene_of(seed, variant)
+    return by_twin(leaves, view, options | {"screen_filter": screen_filter}, (True, False))
+
+
+@cache
+def rounded_twin_of(seed, variant):
+    """`by_twin` of a scene in single precision, for all instruction sets."""
+    return by_twin(*scene_of(seed, variant, dtype=torch.float32), (False,))
+
+
+def assert_alike(leaves, view, options, geometry, value: float, gradient: float, twin=None):
+    """The core equals the twin, or `twin`, which is what `by_twin` gave."""
+    shown, grads = by_core(leaves, view, options, geometry)
+    wanted, wanted_grads = (twin or by_twin(leaves, view, options, (geometry,)))[geometry]
     for name, image in wanted.items():
         scale = max(float(image.detach().abs().max()), 1e-3)
         off = float((shown[name].detach().double() - image).abs().max())
@@ -101,7 +125,8 @@ def assert_alike(leaves, view, options, geometry, value: float, gradient: float)
 def test_double_precision_equals_the_twin(variant, geometry, screen_filter):
     for seed in range(4):
         leaves, view, options = scene_of(100 + seed, variant)
-        assert_alike(leaves, view, options | {"screen_filter": screen_filter}, geometry, 1e-9, 1e-7)
+        twin = twin_of(100 + seed, variant, screen_filter)
+        assert_alike(leaves, view, options | {"screen_filter": screen_filter}, geometry, 1e-9, 1e-7, twin)
 
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=NAMES)
@@ -110,7 +135,7 @@ def test_single_precision_is_near_the_twin(variant, isa):
     with kernels(isa):
         for seed in range(2):
             leaves, view, options = scene_of(200 + seed, variant, dtype=torch.float32)
-            assert_alike(leaves, view, options, False, 1e-4, 2e-3)
+            assert_alike(leaves, view, options, False, 1e-4, 2e-3, rounded_twin_of(200 + seed, variant))
 
 
 def beside_the_view(primitive: str, count: int, least: float, size: float):
