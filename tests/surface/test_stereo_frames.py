@@ -181,6 +181,10 @@ def many_views(tmp_path_factory):
     return octahedron_run(tmp_path_factory.mktemp("many"), views=60, size=40)
 
 
+# A surface of few faces: what is tested is whether stereo is taken, which is known before it is made.
+COARSE = ExtractOptions(level=0.5, voxel_size=0.1)
+
+
 @pytest.fixture(scope="module")
 def kept_maps():
     return []
@@ -206,12 +210,12 @@ def test_photographs_that_agree_clearly_less_often_speak_against_stereo(
     monkeypatch.setattr(Scene, "has_alpha", False)
     monkeypatch.setattr(method_tsdf, "LEAST_CONFIRMED", 0.0)
     monkeypatch.setattr(method_tsdf, "_agreeing", lambda *_: next(told))
-    stats = extract_mesh(many_views, options=ExtractOptions(level=0.5), quiet=True)
+    stats = extract_mesh(many_views, options=COARSE, quiet=True)
     assert stats["stereo"]["taken"] is taken and stats["refine"] == (0 if taken else 2)
 
 
 def test_a_surface_takes_stereo_into_account_where_it_is_asked_to(many_views, stereo_once):
-    stats = extract_mesh(many_views, options=ExtractOptions(stereo="on", level=0.5), quiet=True)
+    stats = extract_mesh(many_views, options=replace(COARSE, stereo="on"), quiet=True)
     assert 0 <= stats["stereo"]["confirmed"] <= 1 and 0 < stats["stereo"]["rendered_weight"] <= 1
     with pytest.raises(LinprimError, match="without --blocks"):
         extract_mesh(many_views, options=ExtractOptions(stereo="on"), blocks=2, quiet=True)
@@ -222,10 +226,10 @@ def test_where_nothing_is_supported_the_rendered_surface_stays(many_views, stere
     monkeypatch.setattr(Scene, "has_alpha", False)
     monkeypatch.setattr(method_tsdf, "LEAST_CONFIRMED", 0.0)
     monkeypatch.setattr(MergedFrames, "supported", lambda *_: (nothing, 1.0))
-    stats = extract_mesh(many_views, options=ExtractOptions(level=0.5), quiet=True)
+    stats = extract_mesh(many_views, options=COARSE, quiet=True)
     assert not stats["stereo"]["taken"] and stats["stereo"]["unsupported"] == 1 and stats["faces"] > 0
     with pytest.raises(LinprimError, match="no two photographs support any surface"):
-        extract_mesh(many_views, options=ExtractOptions(stereo="on", level=0.5), quiet=True)
+        extract_mesh(many_views, options=replace(COARSE, stereo="on"), quiet=True)
 
 
 def test_photographs_agree_within_reach_of_the_true_surface_alone(tiny_scene):
