@@ -22,6 +22,8 @@ from linprim_geo.points.initial_points import (
 SFM_START, RANDOM_START = 0.8, 0.25
 # Triangulated points fewer than this leave too much of a scene empty.
 FEW_POINTS = 500
+# Points on surfaces by which gaps are found: cells of the image to be filled are 1,400, see `densify`.
+FILLED_BY = 4000
 
 
 def with_points(scene: Scene, options: TrainOptions, log: Callable[[str], None]) -> Scene:
@@ -67,7 +69,17 @@ def filled_points(
     """The scene's points and those on `surfaces`, filled up (`densify`) unless they are random ones, which lie on no
     surface."""
     assert scene.points is not None
-    if surfaces is not None:
-        xyz, rgb = ([getattr(cloud, name) for cloud in (scene.points, surfaces)] for name in ("xyz", "rgb"))
-        scene = replace(scene, points=PointCloud(np.concatenate(xyz), np.concatenate(rgb)))
-    return scene.points if isinstance(scene.points, VolumePoints) else densify(scene, seed, backdrop, far)
+    if isinstance(scene.points, VolumePoints):
+        return scene.points
+    if surfaces is None:
+        return densify(scene, seed, backdrop, far)
+    # Some of them say where nothing is missing.
+    step = max(1, len(surfaces.xyz) // FILLED_BY)
+    few = _joined(scene.points, PointCloud(surfaces.xyz[::step], surfaces.rgb[::step]))
+    filled = densify(replace(scene, points=few), seed, backdrop, far)
+    added = PointCloud(filled.xyz[len(few.xyz) :], filled.rgb[len(few.xyz) :])
+    return _joined(_joined(scene.points, surfaces), added)
+
+
+def _joined(one: PointCloud, other: PointCloud) -> PointCloud:
+    return PointCloud(np.concatenate([one.xyz, other.xyz]), np.concatenate([one.rgb, other.rgb]))
