@@ -315,7 +315,9 @@ def _zip(rng: np.random.Generator, data: bytes) -> bytes:
 
 
 def _enormous_header(rng: np.random.Generator) -> bytes:
-    """The start of a .npy file of 256 MiB."""
+    """The start of a .npy file of 256 MiB, in an array or in the header itself."""
+    if rng.random() < 0.2:
+        return b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**28)
     shape = _pick(rng, ((2**26,), (2**24, 4), (2**13, 2**13), (2**24, 4, 1)))
     header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}".encode().ljust(117) + b"\n"
     return b"\x93NUMPY\x01\x00\x76\x00" + header

@@ -3,6 +3,7 @@ taken for it, for a few bytes may claim, and a few more may unpack to, an array 
 
 from __future__ import annotations
 
+import io
 import os
 import zipfile
 from collections.abc import Callable
@@ -10,6 +11,9 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
+
+# Headers of arrays of numbers take some hundred bytes. numpy reads one whole, whatever its length, before it looks.
+_LONGEST_HEADER = 10_000
 
 # Raises LinprimError unless an array of this shape and type is wanted.
 Check = Callable[[tuple[int, ...], np.dtype], None]
@@ -47,8 +51,15 @@ def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0)):
         raise ValueError(f"the array format is {version}")
-    reader = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = reader(file)
+    field, reader = (
+        (file.read(2), np.lib.format.read_array_header_1_0)
+        if version == (1, 0)
+        else (file.read(4), np.lib.format.read_array_header_2_0)
+    )
+    length = int.from_bytes(field, "little")
+    if length > _LONGEST_HEADER:
+        raise ValueError(f"the header of an array claims {length} bytes")
+    shape, _, dtype = reader(io.BytesIO(field + file.read(length)))
     if dtype.hasobject:
         raise ValueError("it holds Python objects")
     return shape, dtype

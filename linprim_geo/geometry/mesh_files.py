@@ -55,9 +55,11 @@ def load_with_visual(path: str | os.PathLike, seams: bool = False) -> tuple[Mesh
         raise LinprimError(f"{path}: cannot be read as a mesh ({error or type(error).__name__})") from error
 
 
-def _check_glb(path: Path) -> None:
+def check_claims(path: Path) -> None:
     """Raises LinprimError if parts or arrays of a .glb claim to be larger than the file: trimesh makes room for them
-    first."""
+    first. Files of other formats pass."""
+    if path.suffix.lower() != ".glb":
+        return
     size, start = path.stat().st_size, _GLB_HEADER
     with open(path, "rb") as file:
         while start + _GLB_CHUNK_HEADER <= size:
@@ -78,8 +80,7 @@ def _load_mesh(path: Path, seams: bool) -> tuple[Mesh, Any]:
     """`load_with_visual` with whatever errors trimesh and numpy raise for damaged files."""
     import trimesh
 
-    if path.suffix.lower() == ".glb":
-        _check_glb(path)
+    check_claims(path)
     loaded = trimesh.load(path, process=False, maintain_order=not seams)
     pose = np.eye(4)
     if isinstance(loaded, trimesh.Scene):

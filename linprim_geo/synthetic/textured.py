@@ -11,6 +11,7 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.mesh import barycentric
+from linprim_geo.geometry.mesh_files import check_claims
 from linprim_geo.geometry.sampling import sample_bilinear
 
 Albedo = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -323,7 +324,10 @@ def load_textured(path: str | Path, *, detail: float = 1.0) -> TexturedMesh:
     if not path.is_file():
         raise LinprimError(f"{path}: no such mesh file")
     try:
+        check_claims(path)
         loaded = trimesh.load(path, process=False)
+    except LinprimError:
+        raise
     except Exception as error:
         raise LinprimError(f"{path}: cannot be read as a mesh ({error})") from error
     meshes = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 import zipfile
 from pathlib import Path
+from pickletools import genops
 
 import torch
 
@@ -13,6 +15,9 @@ from linprim_geo.base.files import atomic_write
 from linprim_geo.training.step.trainer import SHARED, Trainer
 
 KEPT = 2
+# What a checkpoint is made of. torch knows more that is harmless to call but not to every memory: a few bytes may ask
+# for a bytearray of any size.
+_MADE_OF = re.compile(r"torch\._utils _rebuild_tensor_v2|torch \w+Storage|collections OrderedDict")
 
 
 def write_checkpoint(folder: Path, trainer: Trainer) -> None:
@@ -78,8 +83,19 @@ def _check_archive(file: Path) -> None:
         if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
             raise LinprimError(f"{file}: is damaged and cannot be read (it is compressed, which no checkpoint is)")
         broken = archive.testzip()
+        for name in archive.namelist() if broken is None else ():
+            if name.endswith("data.pkl"):
+                _check_pickle(file, archive.read(name))
     if broken is not None:
         raise LinprimError(f"{file}: is damaged and cannot be read (the checksum of {broken[:100]!r} is wrong)")
+
+
+def _check_pickle(file: Path, content: bytes) -> None:
+    """Raises LinprimError unless all that unpickling would call is what a checkpoint is made of."""
+    for code, name, _ in genops(content):
+        if code.name in ("STACK_GLOBAL", "INST", "OBJ") or (code.name == "GLOBAL" and not _MADE_OF.fullmatch(name)):
+            found = f"it holds {str(name or code.name)[:100]!r}, wanted tensors and numbers"
+            raise LinprimError(f"{file}: is damaged and cannot be read ({found})")
 
 
 def _check_state(trainer: Trainer, state: dict) -> None:

@@ -20,6 +20,7 @@ import torch
 from scipy.io import savemat
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.memory import forget_peak, memory_gib, peak_gib
 from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.readers.ply_points import read_points_ply
 from linprim_geo.eval.protocols.files import read_crop, read_plane
@@ -27,6 +28,7 @@ from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.geometry.primitives import load_primitives
 from linprim_geo.imaging import photos
 from linprim_geo.runs.run import Run
+from linprim_geo.synthetic.textured import load_textured
 from linprim_geo.training.checkpoint import read_checkpoint
 from linprim_geo.training.train import train
 
@@ -192,6 +194,32 @@ def test_a_packed_checkpoint_is_not_unpacked(run_copy):
     assert time.perf_counter() - begin < 1
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the peak cannot be set back")
+def test_a_checkpoint_that_asks_for_memory_takes_none(run_copy):
+    """300 bytes in which torch's own unpickler, which runs no code, makes room for 400 MB."""
+    size = (400_000_000).to_bytes(4, "little")
+    content = b"\x80\x02}X\x01\x00\x00\x00ac__builtin__\nbytearray\nJ" + size + b"\x85Rs."
+    with zipfile.ZipFile(run_copy / "checkpoints" / "step_000400.pt", "w") as archive:
+        archive.writestr("archive/data.pkl", content)
+        archive.writestr("archive/version", "3\n")
+    forget_peak()
+    before = memory_gib()
+    assert "holds '__builtin__ bytearray', wanted tensors" in refused(read_checkpoint, run_copy)
+    assert peak_gib() < before + 0.02
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the peak cannot be set back")
+def test_an_array_header_without_an_end_in_sight_takes_no_memory(tmp_path):
+    """256 MiB of header pack into 256 KiB, and numpy reads a header whole."""
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("depth.npy", b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**28) + b" " * 2**28)
+    forget_peak()
+    before = memory_gib()
+    said = refused(photos.read_depth, tmp_path / "bomb.npz", 1.0, (6, 4))
+    assert "bomb.npz: " in said and "claims 268435456 bytes" in said
+    assert peak_gib() < before + 0.02
+
+
 def test_an_array_header_that_does_not_end_is_one_sentence(run_copy):
     content = as_npy(np.zeros((3, 3), np.float32), "{'descr': '<f4', 'shape': (")
     change_npz(run_copy / "scene.npz", "center.npy", content)
@@ -239,8 +267,9 @@ def test_a_glb_that_claims_more_than_it_holds_takes_no_memory(claim, tmp_path):
     if claim == "a part":
         parts += struct.pack("<I4s", 2**31, b"BIN\0")
     (tmp_path / "x.glb").write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(parts)) + parts)
-    said = refused(load_mesh, tmp_path / "x.glb")
-    assert "x.glb: " in said and "more than the file has" in said
+    for read in (load_mesh, load_textured):
+        said = refused(read, tmp_path / "x.glb")
+        assert "x.glb: " in said and "more than the file has" in said
 
 
 def test_depths_beyond_float32_are_none(tmp_path):
