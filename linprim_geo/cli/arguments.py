@@ -37,10 +37,12 @@ def effects_choice(parsed: argparse.Namespace):
 
 def blocks_and_workers(parsed: argparse.Namespace) -> dict:
     """--blocks, --cluster and --workers as keywords."""
-    if parsed.blocks == 1 and parsed.cluster is not None and not getattr(parsed, "resume", False):
-        raise LinprimError(
-            f"--cluster is {parsed.cluster}, but there is one block, which is done here: wanted --blocks as well"
-        )
+    alone = parsed.blocks == 1 and not getattr(parsed, "resume", False)
+    for name in ("cluster", "workers"):
+        if alone and (value := getattr(parsed, name)):
+            raise LinprimError(
+                f"--{name} is {value}, but there is one block, which is done here: wanted --blocks as well"
+            )
     return {"blocks": parsed.blocks, "cluster": parsed.cluster, "workers": parsed.workers}
 
 

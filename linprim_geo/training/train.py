@@ -117,7 +117,8 @@ def train(
         with locked(run_path, "trained into"):
             ops.set_threads(options.threads)
             if resume:
-                ignored = [flag for flag, given in (("--time-budget", budget), ("--cluster", cluster)) if given]
+                given = {"--time-budget": budget, "--cluster": cluster, "--workers": workers}
+                ignored = [flag for flag, value in given.items() if value]
                 opened, loaded = reopen_run(Path(scene), run_path, scene_options, options, progress, effects, ignored)
                 return train_run(opened, loaded, read_checkpoint(run_path), progress, advance=advance)
             opened, loaded, decisions = begin_run(

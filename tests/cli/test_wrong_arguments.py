@@ -41,6 +41,14 @@ def test_threads_have_a_range(capsys):
     assert "5000 is not 0 to 4096" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", ["train", "extract-mesh"])
+@pytest.mark.parametrize("given", ["--workers 3", "--cluster local"])
+def test_workers_for_one_block_are_refused(command, given, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main([command, "a", *given.split()]) == cli.EXIT_UNUSABLE
+    assert f"{given.replace(' ', ' is ')}, but there is one block" in capsys.readouterr().err
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="makes a symbolic link")
 @pytest.mark.parametrize("command", ["train", "inspect", "tradeoff", "render"])
 def test_a_link_to_itself_is_refused_in_one_sentence(command, tmp_path, monkeypatch, capsys):

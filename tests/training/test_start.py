@@ -67,12 +67,13 @@ def test_folders_of_older_runs_are_found_as_before(masked, tmp_path, monkeypatch
 
 def test_options_that_a_resumed_run_cannot_take_are_named_in_one_sentence(tiny_scene, run_copy, capsys):
     own = Run.open(run_copy).train_options
-    words = f"train {tiny_scene} -o {run_copy} --resume --effects auto --effect exposure=on --time-budget 1h"
+    words = f"train {tiny_scene} -o {run_copy} --resume --effects auto --effect exposure=on"
     assert own.iterations != 7000 and own.max_primitives == 300
     # One has its default value, which the run's is not, and one the run's.
-    assert main([*words.split(), "--iterations", "7000", "--max-primitives", "300", "--views", "5"]) == 0
+    words += " --time-budget 1h --workers 3 --iterations 7000 --max-primitives 300 --views 5"
+    assert main(words.split()) == 0
     (line,) = (line for line in capsys.readouterr().err.splitlines() if "ignored" in line)
-    flags = "--time-budget, --effects, --effect, --views, --iterations"
+    flags = "--time-budget, --workers, --effects, --effect, --views, --iterations"
     assert line.strip() == f"--resume goes on with the run's own options: {flags} ignored"
 
 
