@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 
+from linprim_geo.base.errors import printable
 from linprim_geo.base.memory import forget_peak, peak_gib
 
 
@@ -46,7 +47,7 @@ class Progress:
         if self.quiet:
             return
         self.clear()
-        print(text, file=sys.stderr, flush=True)
+        print(printable(text), file=sys.stderr, flush=True)
 
     def clear(self) -> None:
         """Removes the line that is being rewritten."""

@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import NoReturn
 
-from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.errors import LinprimError, printable
 from linprim_geo.base.version import __version__
 from linprim_geo.cli.arguments import limited_threads
 from linprim_geo.cli.output import Output, printing
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             traceback.print_exc()
         sentence, status = explain(error)
         with contextlib.suppress(OSError):
-            print(f"linprim-geo: error: {sentence}", file=sys.stderr, flush=True)
+            print(f"linprim-geo: error: {printable(sentence)}", file=sys.stderr, flush=True)
         return status
 
 

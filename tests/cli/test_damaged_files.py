@@ -21,8 +21,10 @@ from scipy.io import savemat
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.memory import forget_peak, memory_gib, peak_gib
+from linprim_geo.base.progress import Progress
 from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.readers.ply_points import read_points_ply
+from linprim_geo.cli import main as cli
 from linprim_geo.eval.protocols.files import read_crop, read_plane
 from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.geometry.primitives import load_primitives
@@ -390,6 +392,15 @@ def test_a_sentence_stays_one_line_of_bounded_length():
 
 
 # --- the fuzzing itself -----------------------------------------------------------------------------------
+
+
+def test_a_name_gives_no_orders_to_the_terminal(capsys, tmp_path):
+    name = "\x1b]0;title\x07\x1b[2J\udcff.png"
+    assert str(LinprimError(f"{name}: is none")) == "?]0;title??[2J?.png: is none"
+    Progress("x", 1).note(f"{name}: left out\n  and so on")
+    assert capsys.readouterr().err == "?]0;title??[2J?.png: left out\n  and so on\n"
+    assert cli.main(["report", str(tmp_path / "\x1b[2J")]) == 1
+    assert "\x1b" not in capsys.readouterr().err
 
 
 def test_some_hundred_damaged_inputs_of_every_reader():
