@@ -93,8 +93,9 @@ def _check_archive(file: Path) -> None:
 def _check_pickle(file: Path, content: bytes) -> None:
     """Raises LinprimError unless all that unpickling would call is what a checkpoint is made of."""
     for code, name, _ in genops(content):
-        if code.name in ("STACK_GLOBAL", "INST", "OBJ") or (code.name == "GLOBAL" and not _MADE_OF.fullmatch(name)):
-            found = f"it holds {str(name or code.name)[:100]!r}, wanted tensors and numbers"
+        called = str(name or code.name)
+        if code.name in ("STACK_GLOBAL", "INST", "OBJ") or (code.name == "GLOBAL" and not _MADE_OF.fullmatch(called)):
+            found = f"it holds {called[:100]!r}, wanted tensors and numbers"
             raise LinprimError(f"{file}: is damaged and cannot be read ({found})")
 
 
