@@ -140,14 +140,15 @@ def eval_mesh_files(
 
     Args:
         options: how it is scored. `mask`, `box` and `plane` are read by `protocols.files`; `cameras` takes the place of
-            the run's; `transform` takes the prediction into the reference's frame.
+            the run's; `transform` takes the prediction into the reference's frame, and so does what `align` finds
+            (`align.align`); the run's cameras go with the latter, those of `cameras` stay.
         run: a run folder, or an open run: its training cameras give the headline's `visible` and `rays` and
             the culling of scannetpp, its scene the unit.
         changes: fields of `options` by name, such as `samples=5000`.
 
     Returns:
-        what `score_mesh` or `protocols.score_by_protocol` returns, with `dropped`, `prediction`, `reference`
-        (paths) and `color_max`.
+        what `score_mesh` or `protocols.score_by_protocol` returns, with `align` (what was done, see `align.align`),
+        `dropped`, `prediction`, `reference` (paths) and `color_max`.
 
     Raises:
         LinprimError: a file cannot be read or written, an option does not belong to the protocol, or the
@@ -175,6 +176,14 @@ def eval_mesh_files(
         from linprim_geo.eval.culling import training_cameras
 
         seen_by = training_cameras(options.cameras)
+    aligned: dict = {"way": options.align}
+    if options.align != "none":
+        from linprim_geo.eval.align import align
+
+        motion, aligned = align(prediction, reference, options.align, options.seed)
+        prediction = replace(prediction, vertices=motion.apply(prediction.vertices), normals=None)
+        if run is not None and options.cameras is None:
+            seen_by = [motion.moved(camera) for camera in seen_by or ()]
     if protocol == "headline":
         drawn = {"samples": options.samples or DEFAULT_SAMPLES, "tau": options.tau, "seed": options.seed}
         results, forward, backward = _score_headline(prediction, reference, **drawn, cameras=seen_by, unit=unit)
@@ -182,7 +191,7 @@ def eval_mesh_files(
         settings = replace(settings, cameras=seen_by)
         scored = score_by_protocol(protocol, prediction, reference, settings, unit)
         results, forward, backward = scored.results, scored.forward, scored.backward
-    results["dropped"] = {"prediction": dropped_prediction, "reference": dropped_reference}
+    results |= {"align": aligned, "dropped": {"prediction": dropped_prediction, "reference": dropped_reference}}
     results |= {"prediction": os.fspath(prediction_path), "reference": os.fspath(reference_path)}
     results["color_max"] = max(results["accuracy_q95"], results["completeness_q95"])
     if output is not None:

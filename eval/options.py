@@ -45,6 +45,12 @@ class ScoreOptions:
     meters_per_unit: float | None = option(
         None, "metres in one unit of the meshes, for dtu, tnt and scannetpp (default 1, dtu 0.001)", positive=True
     )
+    align: str = option(
+        "none",
+        "bring MESH to REFERENCE before: icp turns and moves it from where it lies, similarity scales it as well and "
+        "needs no common frame",
+        choices=("none", "similarity", "icp"),
+    )
     mask: str | os.PathLike | None = option(None, "dtu: ObsMask .mat of the scan", metavar="FILE")
     box: str | None = option(
         None, "dtu: the box alone, in place of a mask; written --box=...", metavar="X0,Y0,Z0,X1,Y1,Z1"

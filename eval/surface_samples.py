@@ -70,14 +70,21 @@ class SurfaceDistance:
 
     def query(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the (P,) distances of (P, 3) finite points to the surface and the (P,) closest faces."""
+        square, face, _ = self._query(points)
+        return np.sqrt(square), face
+
+    def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the (P, 3) points of the surface that are closest to (P, 3) finite points, and the (P,) faces."""
+        _, face, place = self._query(points)
+        return place + self.origin, face
+
+    def _query(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         points = np.asarray(points, np.float64) - self.origin
         order = morton_order(points)
-        square, nearest, _ = self._tree.squared_distance(
-            self._vertices, self._faces, np.ascontiguousarray(points[order])
-        )
-        distance, face = np.empty(len(points)), np.empty(len(points), np.int64)
-        distance[order], face[order] = np.sqrt(square), nearest
-        return distance, face
+        found = self._tree.squared_distance(self._vertices, self._faces, np.ascontiguousarray(points[order]))
+        square, face, place = np.empty(len(points)), np.empty(len(points), np.int64), np.empty((len(points), 3))
+        square[order], face[order], place[order] = found
+        return square, face, place
 
 
 class PointDistance:

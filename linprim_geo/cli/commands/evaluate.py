@@ -66,6 +66,10 @@ def eval_mesh(parsed: argparse.Namespace) -> Output:
 
     options = from_args(ScoreOptions, parsed)
     results = eval_mesh_files(parsed.mesh, parsed.reference, parsed.output, options, run=parsed.run)
+    if options.align != "none":
+        from linprim_geo.eval.align import in_words
+
+        print(f"linprim-geo: {in_words(results['align'])}", file=sys.stderr)
     for which, file in (("prediction", parsed.mesh), ("reference", parsed.reference)):
         broken = results["dropped"][which].get("not_finite", 0)
         if broken:
