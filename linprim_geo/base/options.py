@@ -348,6 +348,15 @@ class ExtractOptions:
         "at clearly less of the surface, with --method tsdf, without --blocks and --time-budget",
         choices=("auto", "on", "off"),
     )
+    held_out: bool = option(
+        False, "held-out photographs count for the mesh, too: its depth, its refinement and its colours"
+    )
+    box: str = option(
+        "",
+        "the surface within these corners alone, in the data set's frame, written --box=...; auto: within what the "
+        "cameras look at",
+        metavar="auto|X0,Y0,Z0,X1,Y1,Z1",
+    )
     smallest_part: float = option(
         0.01,
         "drop components with less than this share of the largest one's area, if stereo does not support them",

@@ -166,6 +166,12 @@ class Run:
         """The capture it was trained on."""
         return self._scene
 
+    def with_held_out_views(self) -> Run:
+        """The same run, with its held-out views among those of training."""
+        other, scene = replace(self), self.scene()
+        other.__dict__["_scene"] = replace(scene, train=scene.views, test=())
+        return other
+
     @cached_property
     def _scene(self) -> Scene:
         options = in_capture(self.scene_options, self.scene_path)

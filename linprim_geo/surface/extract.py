@@ -18,8 +18,9 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import locked, remove_temporary, write_json
 from linprim_geo.base.options import ExtractOptions, check
 from linprim_geo.base.progress import Progress, Stages
-from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.geometry.mesh import Mesh, remove_small_components, select_faces
 from linprim_geo.geometry.mesh_files import SUFFIXES
+from linprim_geo.geometry.region import as_text, inside, read_box
 from linprim_geo.geometry.topology import manifold_status, topology, topology_line
 from linprim_geo.jobs.executor import Executor
 from linprim_geo.jobs.open import open_executor
@@ -69,6 +70,9 @@ def extract_mesh(
     options ask (`mesh_process`); with `texture` .obj and .glb have a texture out of the photographs in place of vertex
     colours.
 
+    With `held_out` the held-out views take part in all of it. With `box` only the faces in it are kept; --method tsdf
+    fuses nothing else.
+
     With `time_budget`, in seconds, the voxel size is the smallest with which everything takes that time at most, by
     what coarse passes take (`voxel_budget.choose_voxel`); stats.json has `time_budget`: what was chosen and why, and
     the seconds that it took.
@@ -102,6 +106,11 @@ def extract_mesh(
             f"--blocks fuses depth maps in parts, which --method {method} has none of: wanted --method tsdf"
         )
     opened = Run.open(run)
+    if options.held_out:
+        opened = opened.with_held_out_views()
+    box = read_box(options.box, [view.camera for view in opened.scene().train])
+    if box is not None:
+        options = replace(options, box=as_text(box))
     if blocks > 1 or budget or method != "tsdf":
         if options.stereo == "on":
             raise LinprimError("--stereo on is for --method tsdf, without --blocks and --time-budget")
@@ -165,12 +174,14 @@ def _extract(
     if executor is not None:
         from linprim_geo.surface.tsdf_parts import PartFusion
 
-        fuse = PartFusion(opened, float(options.level), blocks, executor(), folder / PARTS, progress.quiet)
+        fuse = PartFusion(opened, options, blocks, executor(), folder / PARTS, progress.quiet)
         mesh, about = surface(opened, options, stages, *kept, fuse=fuse)
         shutil.rmtree(folder / PARTS)
         about = about | {"blocks": blocks}
     else:
         mesh, about = surface(opened, options, stages, *kept)
+    if options.box:
+        mesh = _cropped(mesh, options)
     if opened.environment is not None:
         mesh, left_out = _seen_by_several(mesh, opened, options, stages)
         about = about | {"seen_by_one_view": left_out}
@@ -213,6 +224,18 @@ def _seen_by_several(mesh: Mesh, opened: Run, options: ExtractOptions, stages: S
         stages.note(f"left out: {left_out['pieces']} parts that one camera alone sees before the open background")
     stages.lap("support")
     return mesh, left_out
+
+
+def _cropped(mesh: Mesh, options: ExtractOptions) -> Mesh:
+    """The faces whose middle lies in the box of the options, without parts that are small beside the largest one
+    there."""
+    box = read_box(options.box)
+    assert box is not None
+    left = select_faces(mesh, inside(mesh.vertices[mesh.faces].mean(1), box))
+    if not len(left.faces):
+        reach = " to ".join(",".join(f"{value:.4g}" for value in end) for end in mesh.bounds)
+        raise LinprimError(f"--box {options.box} holds none of the surface, which reaches from {reach}")
+    return remove_small_components(left, options.smallest_part)
 
 
 def _statistics(done: Finished, opened: Run) -> dict:

@@ -14,6 +14,7 @@ from linprim_geo.base.progress import Stages
 from linprim_geo.capture.types import View
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.geometry.region import read_box
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.photo_consistency import best_agreement, photo_gains
 from linprim_geo.surface.stereo_frames import MergedFrames
@@ -72,6 +73,7 @@ def tsdf_surface(
             source,
             voxel_size=voxel,
             truncation_voxels=options.truncation,
+            bounds=read_box(options.box),
             memory_limit=memory,
             min_component=smallest_part,
             log=stages.note,

@@ -226,7 +226,7 @@ def _find_blocks(frames, voxel, truncation, bounds, resolution, limit):
             total = len(frames) if hasattr(frames, "__len__") else sum(1 for _ in frames)
             _refuse(need, limit, voxel, done, total)
     if origin is None:
-        where = "" if bounds is None else " inside the bounds"
+        where = "" if bounds is None else f" inside {bounds[0].tolist()} to {bounds[1].tolist()}"
         raise LinprimError(f"none of the {done} depth maps holds a surface{where}, nothing can be fused")
     blocks = _unpack(keys)
     # Coordinates are float32 from here on, so they are counted from the middle.

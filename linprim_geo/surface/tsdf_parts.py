@@ -18,6 +18,7 @@ import numpy as np
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write
 from linprim_geo.base.memory import PROCESS_GIB
+from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Progress
 from linprim_geo.geometry.boxes import split_space
 from linprim_geo.geometry.mesh import Mesh, select_faces
@@ -35,8 +36,10 @@ REMEDY = "more --blocks, a larger --voxel-size, fewer --workers, or more memory"
 class PartFusion:
     """Fuses a lattice in `count` parts, for `tsdf_fusion.fuse_tsdf`. What is done is in `folder` until all is."""
 
-    def __init__(self, run: Run, level: float, count: int, executor: Executor, folder: Path, quiet: bool = False):
-        self.run, self.level, self.count = run, level, count
+    def __init__(
+        self, run: Run, options: ExtractOptions, count: int, executor: Executor, folder: Path, quiet: bool = False
+    ):
+        self.run, self.level, self.count, self.held_out = run, float(options.level), count, options.held_out
         self.executor, self.folder, self.quiet = executor, folder, quiet
 
     def __call__(self, lattice: Lattice, frames: DepthFrames) -> Mesh:
@@ -44,6 +47,7 @@ class PartFusion:
         digest = hashlib.sha256((self.run.path / "training_frame.npz").read_bytes())
         options = (
             self.level,
+            self.held_out,
             frames.limit,
             count,
             lattice.voxel,
@@ -65,6 +69,7 @@ class PartFusion:
             size = int(halo(lattice.blocks, owner == part).sum())
             need = PROCESS_GIB + estimate_memory(size, lattice.resolution, largest) / 2**30
             where = {"run": str(self.run.path.resolve()), "level": self.level, "limit": frames.limit, "part": part}
+            where |= {"held_out": self.held_out}
             tasks.append(
                 Task(
                     f"part {part}",
@@ -99,7 +104,7 @@ def halo(blocks: np.ndarray, own: np.ndarray) -> np.ndarray:
     return np.isin(block_keys(blocks), near)
 
 
-def part_task(folder: Path, run: str, level: float, limit: float, part: int) -> dict:
+def part_task(folder: Path, run: str, level: float, limit: float, part: int, held_out: bool = False) -> dict:
     """Fuses what a part owns and writes it to part.npz."""
     import torch
 
@@ -109,7 +114,8 @@ def part_task(folder: Path, run: str, level: float, limit: float, part: int) -> 
     own = owner == part
     inside = halo(lattice.blocks, own)
     grid = replace(lattice, blocks=lattice.blocks[inside]).grid()
-    frames = DepthFrames(Run.open(run), level, limit, keep=False)
+    opened = Run.open(run)
+    frames = DepthFrames(opened.with_held_out_views() if held_out else opened, level, limit, keep=False)
     used = 0
     for number, view in enumerate(frames.views):
         if len(grid.in_view(view.camera)):
