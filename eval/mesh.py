@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import check
 from linprim_geo.eval import open_run, write_results
 from linprim_geo.eval.options import ScoreOptions, check_score_options
@@ -24,6 +25,7 @@ from linprim_geo.eval.surface_samples import Comparison, SurfaceDistance, reduce
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh, clean_mesh, face_normals
 from linprim_geo.geometry.mesh_files import load_mesh
+from linprim_geo.geometry.region import as_text, inside, read_box
 
 DEFAULT_SAMPLES = 200_000
 DEFAULT_TAU_SHARE = 0.01  # of the reference's diagonal
@@ -86,8 +88,11 @@ def score_mesh(
     return results | {"dropped": {"prediction": clean[0][1], "reference": clean[1][1]}}
 
 
-def _score_headline(prediction, reference, *, samples, tau, seed, cameras, unit) -> tuple[dict, Comparison, Comparison]:
-    """`score_mesh` of clean meshes, without `dropped`, and the two directions."""
+def _score_headline(
+    prediction, reference, *, samples, tau, seed, cameras, unit, box=None
+) -> tuple[dict, Comparison, Comparison]:
+    """`score_mesh` of clean meshes, without `dropped`, and the two directions; with `box` over the samples in it
+    alone."""
     start = time.perf_counter()
     diagonal = reference.diagonal
     tau = DEFAULT_TAU_SHARE * diagonal if tau is None else float(tau)
@@ -96,9 +101,14 @@ def _score_headline(prediction, reference, *, samples, tau, seed, cameras, unit)
     forward = _compare(prediction, SurfaceDistance(reference), samples, (seed, 0))
     backward = _compare(reference, SurfaceDistance(prediction), samples, (seed, 1))
     results = {"protocol": "headline", "unit": unit, "tau": tau, "samples": samples, "seed": seed}
-    results |= {"samples_reference": samples, "kept_prediction": 1.0, "kept_reference": 1.0}
+    if box is not None:
+        forward, backward = _within(forward, box, "prediction"), _within(backward, box, "reference")
+        results["box"] = box.tolist()
+    results |= {"samples_reference": samples}
+    results |= {"kept_prediction": float(forward.keep.mean()), "kept_reference": float(backward.keep.mean())}
     results["sampling"] = f"{samples} uniform points per surface, one in each equal share; point to triangle"
-    results["culling"] = "none" if cameras is None else "none; under visible, what the cameras see"
+    culling = "none" if box is None else "what lies in the box"
+    results["culling"] = culling if cameras is None else f"{culling}; under visible, what the cameras see"
     results |= reduce_scores(forward, backward, tau, oriented=oriented)
     results["hausdorff_warning"] = HAUSDORFF_WARNING
     if cameras is not None:
@@ -106,14 +116,16 @@ def _score_headline(prediction, reference, *, samples, tau, seed, cameras, unit)
 
         keep_prediction, recast = _seen(prediction, forward, cameras)
         keep_reference, recast_too = _seen(reference, backward, cameras)
+        keep_prediction, keep_reference = keep_prediction & forward.keep, keep_reference & backward.keep
         visible = {"kept_prediction": float(keep_prediction.mean())}
         visible |= {"kept_reference": float(keep_reference.mean()), "cameras": len(cameras)}
         visible["recast_rays"] = recast + recast_too
         sides = replace(forward, keep=keep_prediction), replace(backward, keep=keep_reference)
         visible |= reduce_scores(*sides, tau, oriented=oriented)
         results["visible"] = with_percent(visible, diagonal)
-        rays = compare_along_rays(prediction, reference, cameras, rays=samples, tau=tau, seed=seed)
-        results["rays"] = with_percent(rays, diagonal)
+        if box is None:  # a ray comes from outside of it
+            rays = compare_along_rays(prediction, reference, cameras, rays=samples, tau=tau, seed=seed)
+            results["rays"] = with_percent(rays, diagonal)
     results = with_percent(results, diagonal)
     results["reference_diagonal"] = diagonal
     results["seconds"] = time.perf_counter() - start
@@ -186,7 +198,10 @@ def eval_mesh_files(
             seen_by = [motion.moved(camera) for camera in seen_by or ()]
     if protocol == "headline":
         drawn = {"samples": options.samples or DEFAULT_SAMPLES, "tau": options.tau, "seed": options.seed}
-        results, forward, backward = _score_headline(prediction, reference, **drawn, cameras=seen_by, unit=unit)
+        box = read_box(options.box or "", seen_by or ())
+        results, forward, backward = _score_headline(
+            prediction, reference, **drawn, cameras=seen_by, unit=unit, box=box
+        )
     else:
         settings = replace(settings, cameras=seen_by)
         scored = score_by_protocol(protocol, prediction, reference, settings, unit)
@@ -235,6 +250,14 @@ def _write(folder: Path, prediction, reference, forward, backward, results: dict
     figures.plot_rates(folder / "precision_recall.png", forward, backward, tau, title, unit)
     figures.plot_histogram(folder / "error_histogram.png", forward, backward, tau, title, unit)
     write_results(folder, results)
+
+
+def _within(side: Comparison, box: np.ndarray, name: str) -> Comparison:
+    """The comparison with the samples in a box alone."""
+    keep = inside(side.points, box)
+    if not keep.any():
+        raise LinprimError(f"--box {as_text(box)} holds nothing of the {name}, wanted a box around a part of both")
+    return replace(side, keep=keep)
 
 
 def _compare(mesh: Mesh, other: SurfaceDistance, samples: int, seed) -> Comparison:

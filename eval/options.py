@@ -15,7 +15,7 @@ TAKEN_BY = {
     "samples": ("headline", "linprim"),
     "cameras": ("headline", "scannetpp"),
     "mask": ("dtu",),
-    "box": ("dtu",),
+    "box": ("headline", "dtu"),
     "plane": ("dtu",),
     "scene": ("tnt",),
     "crop": ("tnt",),
@@ -53,7 +53,10 @@ class ScoreOptions:
     )
     mask: str | os.PathLike | None = option(None, "dtu: ObsMask .mat of the scan", metavar="FILE")
     box: str | None = option(
-        None, "dtu: the box alone, in place of a mask; written --box=...", metavar="X0,Y0,Z0,X1,Y1,Z1"
+        None,
+        "headline: what lies within these corners alone; auto: within what the cameras of --run or --cameras look at; "
+        "dtu: the box alone, in place of a mask; written --box=...",
+        metavar="auto|X0,Y0,Z0,X1,Y1,Z1",
     )
     plane: str | os.PathLike | None = option(
         None, "dtu: Plane .mat, or --plane=A,B,C,D; above it counts", metavar="PLANE"

@@ -333,6 +333,28 @@ def test_options_out_of_range_are_refused(options):
         score_mesh(grid(), grid(), **options)
 
 
+def test_a_box_leaves_what_lies_in_it(tmp_path):
+    """A rectangle that is right up to x = 1 and 0.25 too high from there on."""
+    low, high = grid(4, 4, size=(1.0, 1.0)), grid(4, 4, size=(1.0, 1.0), height=0.25)
+    save_mesh(tmp_path / "a.ply", join(low, replace(high, vertices=high.vertices + [1, 0, 0])))
+    save_mesh(tmp_path / "b.ply", grid(8, 4))
+    files = tmp_path / "a.ply", tmp_path / "b.ply"
+    assert eval_mesh_files(*files, samples=2000)["chamfer"] > 0.1
+    result = eval_mesh_files(*files, samples=2000, box="0,0,-1,0.75,1,1")
+    # All of the box is at least as far from the step as the step is high.
+    assert result["chamfer"] <= result["hausdorff"] < ROUNDING and "box" in result["culling"]
+    assert result["kept_prediction"] == pytest.approx(0.375, abs=0.01) == result["kept_reference"]
+    cameras = [camera_above(3.0, target=(x, 0.5)) for x in (0.4, 0.6)]
+    scene = SimpleNamespace(train=[SimpleNamespace(camera=camera) for camera in cameras], unit="unit")
+    run = SimpleNamespace(path=tmp_path / "run", scene=lambda: scene)
+    culled = eval_mesh_files(*files, samples=2000, box="0,0,-1,0.75,1,1", run=run)
+    assert culled["visible"]["chamfer"] < ROUNDING and culled["visible"]["kept_prediction"] <= 0.385
+    with pytest.raises(LinprimError, match="holds nothing of the prediction"):
+        eval_mesh_files(*files, samples=2000, box="5,5,5,6,6,6")
+    with pytest.raises(LinprimError, match="--box auto: 0 cameras are known"):
+        eval_mesh_files(*files, samples=2000, box="auto")
+
+
 # --- files --------------------------------------------------------------------------------------------------
 
 
