@@ -3,6 +3,7 @@ exactly."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh, face_areas, select_faces, vertex_normals
 from linprim_geo.geometry.primitives import ARRAYS, Primitives
 from linprim_geo.runs.run import Run
-from linprim_geo.surface.method_tsdf import SEEN_THROUGH
+from linprim_geo.surface.method_tsdf import SEEN_THROUGH, kept_bytes
 from linprim_geo.surface.polyhedra_planes import Planes, fit_planes, level_points
 from linprim_geo.surface.polyhedra_union import convex_piece, kept_shells, own_identity, shells, unite
 
@@ -69,7 +70,8 @@ def polyhedra_surface(run: Run, options: ExtractOptions, stages: Stages) -> tupl
     primitives, rendered = _take(primitives, order), _take(rendered, order)
     cameras = [view.camera for view in run.scene().train]
     level = 1 - CUT_DEPTH * (1 - float(options.level))
-    weight, depths = _render(run, rendered, cameras, level)
+    depths = LevelDepths(run, rendered, cameras, level, kept_bytes(options))
+    weight = depths.weight
     candidates = np.flatnonzero(weight > LEAST_WEIGHT)
     if not len(candidates):
         raise LinprimError(
@@ -78,7 +80,8 @@ def polyhedra_surface(run: Run, options: ExtractOptions, stages: Stages) -> tupl
         )
     stages.lap("render")
 
-    points = level_points(depths, cameras, max(POINTS_PER_PRIMITIVE * len(candidates), LEAST_POINTS_IN_ALL))
+    wanted = max(POINTS_PER_PRIMITIVE * len(candidates), LEAST_POINTS_IN_ALL)
+    points = level_points(depths, cameras, wanted, depths.hits)
     if not len(points.position):
         raise LinprimError(
             f"{run.path}: no pixel of any training view crosses transmittance {level:g} together with its four "
@@ -134,29 +137,58 @@ def _take(primitives: Primitives, rows: np.ndarray) -> Primitives:
     return replace(primitives, **{name: getattr(primitives, name)[rows] for name in ARRAYS})
 
 
-def _render(
-    run: Run, primitives: Primitives, cameras: list[Camera], level: float
-) -> tuple[np.ndarray, list[np.ndarray]]:
-    """(N,) largest weight of each primitive (training frame) in any view, and each view's (H, W) float32 depth at the
-    level, 0 where it sees through."""
-    import torch
+class LevelDepths:
+    """Each view's (H, W) float32 depth at a level, 0 where it sees through, in the order of the cameras; iterated as
+    often as one likes. They are kept if they take at most `most` bytes in all, else rendered whenever they are asked
+    for.
 
-    from linprim_geo.kernels import ops
+    `weight` (N,) is the largest weight of each primitive (training frame) in any view, `hits` how many pixels have a
+    depth.
+    """
 
-    tensors = primitives.tensors()
-    _, background, how = run.raster_arguments()
-    kind = {"primitive": how["primitive"], "ray_model": how["ray_model"]}
-    weight, depths = np.zeros(len(primitives), dtype=np.float32), []
-    for camera in cameras:
-        seen = camera.transformed(run.similarity)
+    def __init__(self, run: Run, primitives: Primitives, cameras: Sequence[Camera], level: float, most: int):
+        import torch
+
+        from linprim_geo.kernels import ops
+
+        self.run, self.cameras, self.level = run, cameras, level
+        self.tensors = primitives.tensors()
+        _, background, self.how = run.raster_arguments()
+        keep = sum(camera.width * camera.height for camera in cameras) * np.dtype(np.float32).itemsize <= most
+        self.kept: list[np.ndarray] = []
+        self.weight, self.hits = np.zeros(len(primitives), dtype=np.float32), 0
+        for camera in cameras:
+            with torch.no_grad():
+                out = ops.rasterize(
+                    *self.tensors,
+                    background,
+                    camera.transformed(run.similarity),
+                    stop=run.train_options.stop,
+                    geometry=True,
+                    **self.how,
+                )
+            assert out.max_weight is not None
+            np.maximum(self.weight, out.max_weight.numpy(), out=self.weight)
+            del out
+            depth = self._depth(camera)
+            self.hits += int((depth > 0).sum())
+            if keep:
+                self.kept.append(depth)
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        return iter(self.kept) if self.kept else map(self._depth, self.cameras)
+
+    def _depth(self, camera: Camera) -> np.ndarray:
+        import torch
+
+        from linprim_geo.kernels import ops
+
+        kind = {name: self.how[name] for name in ("primitive", "ray_model", "near")}
+        seen = camera.transformed(self.run.similarity)
         with torch.no_grad():
-            out = ops.rasterize(*tensors, background, seen, stop=run.train_options.stop, geometry=True, **how)
-            depth, opacity = ops.level_depth(*tensors, seen, level=level, **kind)
-        assert out.max_weight is not None
-        np.maximum(weight, out.max_weight.numpy(), out=weight)
-        seen_depth = np.where(opacity.numpy() < SEEN_THROUGH, np.float32(0), depth.numpy() / run.similarity.scale)
-        depths.append(seen_depth.astype(np.float32))
-    return weight, depths
+            depth, opacity = ops.level_depth(*self.tensors, seen, level=self.level, **kind)
+        found = depth.numpy() / self.run.similarity.scale
+        return np.where(opacity.numpy() < SEEN_THROUGH, np.float32(0), found).astype(np.float32)
 
 
 def cut(primitives: Primitives, planes: Planes, met: np.ndarray, least: float) -> tuple[list, np.ndarray]:
@@ -189,7 +221,7 @@ def cut(primitives: Primitives, planes: Planes, met: np.ndarray, least: float) -
     return pieces, np.array(rows, dtype=np.int64)
 
 
-def core_boxes(depths: list[np.ndarray], cameras: list[Camera], bounds: np.ndarray, least: float) -> np.ndarray:
+def core_boxes(depths: Iterable[np.ndarray], cameras: list[Camera], bounds: np.ndarray, least: float) -> np.ndarray:
     """(B, 8, 3) corners of boxes that fill what lies behind the depth of every view that looks there.
 
     Cells of a grid over `bounds` (2, 3), as large as `least` but at most CORE_CELLS along its longest side. A cell is

@@ -54,7 +54,8 @@ def tsdf_surface(
     Raises:
         LinprimError: no ray crosses the level, or the grid would not fit into memory.
     """
-    frames = DepthFrames(run, float(options.level), options.depth_limit) if frames is None else frames
+    if frames is None:
+        frames = DepthFrames(run, float(options.level), options.depth_limit, most=kept_bytes(options))
     about: dict = {}
     if not any((frame.depth > 0).any() for frame in frames):
         raise LinprimError(
@@ -152,20 +153,26 @@ def _agreeing(mesh: Mesh, views: Sequence[View], gains: np.ndarray) -> float:
     return float(found.inside[found.seen_by_two].mean()) if found.seen_by_two.any() else 0.0
 
 
+def kept_bytes(options: ExtractOptions) -> int:
+    """Bytes that depth maps may take which stay in memory: KEPT_BYTES, or a quarter of --memory-limit if that is
+    less."""
+    limit = int(options.memory_limit * 2**30) // 4
+    return min(limit or KEPT_BYTES, KEPT_BYTES)
+
+
 class DepthFrames(Sequence):
     """`tsdf_field.DepthFrame`s of the training views: depth at transmittance `level`, free background.
 
     Depths beyond `limit` are clamped to it; 0 chooses one by `depth_limit`. `clamped_share` is their share. Frames are
-    kept in memory if they are at most KEPT_BYTES in all, else, and without `keep`, rendered whenever they are asked
-    for.
+    kept in memory if they take at most `most` bytes in all (default KEPT_BYTES), else, and without `keep`, rendered
+    whenever they are asked for.
     """
 
-    def __init__(self, run: Run, level: float, limit: float = 0.0, keep: bool = True):
+    def __init__(self, run: Run, level: float, limit: float = 0.0, keep: bool = True, most: int | None = None):
         self.run, self.level, self.limit, self.clamped_share = run, level, limit or np.inf, 0.0
         self.views = run.scene().train
-        keep = (
-            keep and sum(view.camera.width * view.camera.height * BYTES_PER_PIXEL for view in self.views) <= KEPT_BYTES
-        )
+        most = KEPT_BYTES if most is None else most
+        keep = keep and sum(view.camera.width * view.camera.height * BYTES_PER_PIXEL for view in self.views) <= most
         self.kept, sample = [], [np.zeros(0, np.float32)]
         for frame in self._render(self.views) if keep or not limit else ():
             sample.append(frame.depth[::SAMPLED, ::SAMPLED].ravel())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,25 +54,34 @@ class LevelPoints:
         return LEAST_SHARE_OF_PIXEL * self.footprint
 
 
-def level_points(depths: list[np.ndarray], cameras: list[Camera], wanted: int) -> LevelPoints:
+def level_points(
+    depths: Iterable[np.ndarray], cameras: list[Camera], wanted: int, hits: int | None = None
+) -> LevelPoints:
     """Points of about `wanted` pixels of all depth maps, in a regular pattern that moves from view to view.
 
     Normals are those of the surface through a pixel's four neighbours; pixels at the border, and beside one without
     depth, have none.
+
+    `hits`: how many pixels have a depth, if that is counted already.
     """
-    stride = max(1, round(np.sqrt(sum(int((depth > 0).sum()) for depth in depths) / max(wanted, 1))))
+    hits = sum(int((depth > 0).sum()) for depth in depths) if hits is None else hits
+    stride = max(1, round(np.sqrt(hits / max(wanted, 1))))
     positions, normals, footprints = [], [], []
     for number, (depth, camera) in enumerate(zip(depths, cameras, strict=True)):
         there = depth > 0
         if min(depth.shape) < 3 or not there.any():
             continue
         footprints.append(np.median(depth[there]) / np.sqrt(camera.fx * camera.fy))
-        local = camera.ray_grid() * depth[..., None].astype(np.float64)
-        across = np.cross(local[1:-1, 2:] - local[1:-1, :-2], local[2:, 1:-1] - local[:-2, 1:-1])
         inner = there[1:-1, 1:-1] & there[1:-1, 2:] & there[1:-1, :-2] & there[2:, 1:-1] & there[:-2, 1:-1]
         pattern = np.zeros_like(inner)
         pattern[number % stride :: stride, number // stride % stride :: stride] = True
-        point, normal = local[1:-1, 1:-1][inner & pattern], across[inner & pattern]
+        row, column = np.nonzero(inner & pattern)
+        row, column = row + 1, column + 1
+        point = _local(camera, depth, row, column)
+        normal = np.cross(
+            _local(camera, depth, row, column + 1) - _local(camera, depth, row, column - 1),
+            _local(camera, depth, row + 1, column) - _local(camera, depth, row - 1, column),
+        )
         length = np.linalg.norm(normal, axis=1)
         point, normal = point[length > 0], normal[length > 0] / length[length > 0, None]
         normal *= np.where(np.einsum("ij,ij->i", normal, point) > 0, -1.0, 1.0)[:, None]
@@ -80,6 +90,13 @@ def level_points(depths: list[np.ndarray], cameras: list[Camera], wanted: int) -
     if not positions:
         return LevelPoints(np.zeros((0, 3)), np.zeros((0, 3)), 0.0)
     return LevelPoints(np.concatenate(positions), np.concatenate(normals), float(np.median(footprints)))
+
+
+def _local(camera: Camera, depth: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """(P, 3) points in the camera's axes that (P,) pixels show."""
+    z = depth[row, column].astype(np.float64)
+    x, y = (column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy
+    return np.stack([x * z, y * z, z], axis=1)
 
 
 @dataclass(frozen=True)

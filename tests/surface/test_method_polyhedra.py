@@ -22,6 +22,7 @@ from linprim_geo.geometry.primitives import ARRAYS, Primitives, load_primitives,
 from linprim_geo.geometry.topology import manifold_status, topology
 from linprim_geo.kernels import surface_ops
 from linprim_geo.runs.run import Run
+from linprim_geo.surface import method_polyhedra
 from linprim_geo.surface.extract import extract_mesh
 from linprim_geo.surface.method_polyhedra import NO_PRIMITIVE, core_boxes, cut, polyhedra_surface
 from linprim_geo.surface.polyhedra_planes import LevelPoints, face_planes, fit_planes
@@ -325,6 +326,23 @@ def test_the_same_run_gives_the_same_bytes(tiny_run, tmp_path):
     for name in ("a", "b"):
         extract_mesh(tiny_run, "polyhedra", tmp_path / f"{name}.ply", quiet=True)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_depths_that_do_not_fit_are_rendered_again_and_give_the_same_bytes(tiny_run, tmp_path, monkeypatch):
+    held = []
+
+    class Watched(method_polyhedra.LevelDepths):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            held.append(len(self.kept))
+
+    monkeypatch.setattr(method_polyhedra, "LevelDepths", Watched)
+    # 12 depth maps of 48x48 float32 are 2^16.8 bytes; a quarter of the limit is theirs.
+    for name, limit in (("kept", 2**20), ("rendered", 2**18)):
+        options = ExtractOptions(level=0.75, memory_limit=limit / 2**30)
+        extract_mesh(tiny_run, "polyhedra", tmp_path / f"{name}.ply", options, quiet=True)
+    assert held == [12, 0]
+    assert (tmp_path / "kept.ply").read_bytes() == (tmp_path / "rendered.ply").read_bytes()
 
 
 def test_an_unseen_body_inside_is_removed(solid, tmp_path):
