@@ -329,8 +329,8 @@ class ExtractOptions:
     truncation: float = option(3.0, "truncation distance in voxels", low=1, high=100)
     memory_limit: float = option(
         0.0,
-        "memory the grid may take, and the depth maps that the level is chosen by, in GiB; 0 allows 60 % of what is "
-        "free",
+        "memory that the extraction may take, in GiB: depth maps that are kept, and the grid, whose voxels are larger "
+        "where they would not fit, unless their size is given; 0 allows 60 % of what is free for the grid",
         low=0,
         metavar="GIB",
     )

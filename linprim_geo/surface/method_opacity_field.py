@@ -25,6 +25,7 @@ from linprim_geo.geometry.mesh import Mesh, face_components, remove_small_compon
 from linprim_geo.geometry.primitives import Primitives
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.march_tetrahedra import march_tetrahedra
+from linprim_geo.surface.method_tsdf import memory_left
 from linprim_geo.surface.visibility import visible_faces
 
 NEAR = 0.01
@@ -110,7 +111,7 @@ def opacity_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[
         )
     cameras = [view.camera.transformed(run.similarity) for view in views]
     field = OpacityField(primitives, cameras)
-    limit = int(options.memory_limit * 2**30) if options.memory_limit > 0 else int(0.6 * available_memory())
+    limit = memory_left(options) or int(0.6 * available_memory())
     nothing = (
         f"{run.path}: nothing that the training views see crosses transmittance {options.level}, so there is no surface"
     )

@@ -70,7 +70,7 @@ def polyhedra_surface(run: Run, options: ExtractOptions, stages: Stages) -> tupl
     primitives, rendered = _take(primitives, order), _take(rendered, order)
     cameras = [view.camera for view in run.scene().train]
     level = 1 - CUT_DEPTH * (1 - float(options.level))
-    depths = LevelDepths(run, rendered, cameras, level, kept_bytes(options))
+    depths = LevelDepths(run, rendered, cameras, level, kept_bytes(options, cameras))
     weight = depths.weight
     candidates = np.flatnonzero(weight > LEAST_WEIGHT)
     if not len(candidates):

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.memory import PROCESS_GIB
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Stages
 from linprim_geo.capture.types import View
@@ -19,12 +20,14 @@ from linprim_geo.runs.run import Run
 from linprim_geo.surface.photo_consistency import best_agreement, photo_gains
 from linprim_geo.surface.stereo_frames import MergedFrames
 from linprim_geo.surface.tsdf_field import DepthFrame
-from linprim_geo.surface.tsdf_fusion import auto_voxel_size, fuse_tsdf
+from linprim_geo.surface.tsdf_fusion import TooFine, auto_voxel_size, estimate_memory, fuse_tsdf
 
 # A ray with less opacity than this has seen through the scene: it votes for free space.
 SEEN_THROUGH = 0.5
 # Depth, background and whether it is clamped, of a pixel; frames of more than this in all are not kept.
 BYTES_PER_PIXEL, KEPT_BYTES = 6, 2**30
+# How often voxels are made larger until they fit into memory; once, but for what is only known when all is fused.
+TRIES = 4
 
 LEAST_CONFIRMED = 0.01
 """Stereo that confirms less than this share of the pixels has nothing to say of a scene."""
@@ -52,10 +55,12 @@ def tsdf_surface(
     `frames` of the same level, if there are any already, are taken in place of new ones. `fuse`: see `fuse_tsdf`.
 
     Raises:
-        LinprimError: no ray crosses the level, or the grid would not fit into memory.
+        LinprimError: no ray crosses the level, or the grid would not fit into memory, with voxels of the size that is
+            given or any size.
     """
     if frames is None:
-        frames = DepthFrames(run, float(options.level), options.depth_limit, most=kept_bytes(options))
+        most = kept_bytes(options, [view.camera for view in run.scene().train])
+        frames = DepthFrames(run, float(options.level), options.depth_limit, most=most)
     about: dict = {}
     if not any((frame.depth > 0).any() for frame in frames):
         raise LinprimError(
@@ -67,19 +72,28 @@ def tsdf_surface(
             f"{frames.clamped_share:.1%} of the depths lie beyond {frames.limit:.4g} and only clear the space before it"
         )
     voxel = options.voxel_size if options.voxel_size > 0 else auto_voxel_size(frames)
-    memory = int(options.memory_limit * 2**30) if options.memory_limit > 0 else None
+    memory = memory_left(options, frames.bytes)
 
     def fused(source: Sequence[DepthFrame], smallest_part: float) -> Mesh:
-        return fuse_tsdf(
-            source,
-            voxel_size=voxel,
-            truncation_voxels=options.truncation,
-            bounds=read_box(options.box),
-            memory_limit=memory,
-            min_component=smallest_part,
-            log=stages.note,
-            fuse=fuse,
-        )
+        nonlocal voxel
+        for left in reversed(range(TRIES)):
+            try:
+                return fuse_tsdf(
+                    source,
+                    voxel_size=voxel,
+                    truncation_voxels=options.truncation,
+                    bounds=read_box(options.box),
+                    memory_limit=memory,
+                    min_component=smallest_part,
+                    log=stages.note,
+                    fuse=fuse,
+                )
+            except TooFine as error:
+                if options.voxel_size > 0 or not left:
+                    raise
+                stages.note(f"voxels of {voxel:.4g} would not fit into memory: {error.fits:.4g} in their place")
+                voxel = error.fits
+        raise AssertionError  # the last try has raised
 
     def fused_with_stereo(merged: MergedFrames) -> tuple[Mesh, dict]:
         mesh, left_out = merged.supported(fused(merged, 0), options.smallest_part, 2 * options.truncation * voxel)
@@ -153,11 +167,30 @@ def _agreeing(mesh: Mesh, views: Sequence[View], gains: np.ndarray) -> float:
     return float(found.inside[found.seen_by_two].mean()) if found.seen_by_two.any() else 0.0
 
 
-def kept_bytes(options: ExtractOptions) -> int:
-    """Bytes that depth maps may take which stay in memory: KEPT_BYTES, or a quarter of --memory-limit if that is
-    less."""
-    limit = int(options.memory_limit * 2**30) // 4
-    return min(limit or KEPT_BYTES, KEPT_BYTES)
+def memory_left(options: ExtractOptions, taken: int = 0) -> int | None:
+    """Bytes of --memory-limit that are left beside what this process takes in any case and `taken` bytes; None without
+    a limit.
+
+    Raises:
+        LinprimError: none are.
+    """
+    if options.memory_limit <= 0:
+        return None
+    left = int((options.memory_limit - PROCESS_GIB) * 2**30) - taken
+    if left <= 0:
+        least = PROCESS_GIB + taken / 2**30
+        raise LinprimError(f"--memory-limit is {options.memory_limit:g} GiB, wanted more than {least:.2g} GiB")
+    return left
+
+
+def kept_bytes(options: ExtractOptions, cameras: Sequence[Camera]) -> int:
+    """Bytes that depth maps may take which stay in memory: KEPT_BYTES, or if that is less a quarter of what the process
+    and a depth map at work leave of --memory-limit."""
+    if options.memory_limit <= 0:
+        return KEPT_BYTES
+    largest = max((camera.width * camera.height for camera in cameras), default=0)
+    left = (options.memory_limit - PROCESS_GIB) * 2**30 - estimate_memory(0, 8, largest)
+    return int(min(max(left / 4, 0), KEPT_BYTES))
 
 
 class DepthFrames(Sequence):
@@ -184,6 +217,11 @@ class DepthFrames(Sequence):
             self.limit = limit or depth_limit([view.camera for view in self.views], float(np.median(depths)))
             self.clamped_share = float((depths > self.limit).mean())
         self.kept = [self._clamp(frame) for frame in self.kept]
+
+    @property
+    def bytes(self) -> int:
+        """Memory that the kept frames take."""
+        return sum(frame.depth.size for frame in self.kept) * BYTES_PER_PIXEL
 
     def __len__(self) -> int:
         return len(self.views)

@@ -28,6 +28,14 @@ KEY_BITS = 21
 """Bits per axis of the key of a block or voxel: three fit into an int64."""
 
 
+class TooFine(LinprimError):
+    """A field that would not fit into memory; one with the voxel size `fits` would."""
+
+    def __init__(self, sentence: str, fits: float):
+        super().__init__(sentence)
+        self.fits = fits
+
+
 def fuse_tsdf(
     frames: Iterable[DepthFrame],
     *,
@@ -68,7 +76,7 @@ def fuse_tsdf(
     Returns:
         The mesh in the frame of the cameras.
     Raises:
-        LinprimError: no frame has a depth, the field would not fit in memory, or nothing comes out.
+        LinprimError: no frame has a depth, the field would not fit in memory (TooFine), or nothing comes out.
     Accuracy: Chamfer of 60 exact depth maps of 320x320 with a voxel of 1/200 of the diagonal, against what
         `VoxelBlockGrid.integrate` makes of them, in % of the diagonal: smooth body 0.003 (0.045), part with
         thin ribs and sharp edges 0.015 (0.046); a room, 80 maps of 400x300: 0.031 (0.050).
@@ -224,7 +232,7 @@ def _find_blocks(frames, voxel, truncation, bounds, resolution, limit):
         need = estimate_memory(len(keys), resolution, largest)
         if need > limit:
             total = len(frames) if hasattr(frames, "__len__") else sum(1 for _ in frames)
-            _refuse(need, limit, voxel, done, total)
+            _refuse(need, estimate_memory(0, resolution, largest), limit, voxel, done, total)
     if origin is None:
         where = "" if bounds is None else f" inside {bounds[0].tolist()} to {bounds[1].tolist()}"
         raise LinprimError(f"none of the {done} depth maps holds a surface{where}, nothing can be fused")
@@ -258,14 +266,22 @@ def _blocks_of(points, voxel, truncation, footprint, resolution):
     return np.unique(np.concatenate(found))
 
 
-def _refuse(need: float, limit: float, voxel: float, done: int, total: int):
+def _refuse(need: float, frame: float, limit: float, voxel: float, done: int, total: int):
+    """Of the bytes that are needed a `frame` at work takes some at any voxel size."""
+    if frame >= limit:
+        raise LinprimError(
+            f"a depth map takes {frame / 2**30:.2g} GiB while it is fused, {limit / 2**30:.2g} GiB are allowed: wanted "
+            "more memory, or a training with --downscale"
+        )
     # Blocks around a surface go with the inverse square of the voxel; frames still to come are assumed to add
     # as much as those seen, which is the most they can, and 5 % are left as room.
-    need = need * total / done
-    fits = voxel * np.sqrt(1.05 * need / limit)
+    blocks = (need - frame) * total / done
+    need = blocks + frame
+    fits = voxel * np.sqrt(1.05 * blocks / (limit - frame))
     digits = 10.0 ** (np.floor(np.log10(fits)) - 1)
     fits = np.ceil(fits / digits) * digits
-    raise LinprimError(
+    raise TooFine(
         f"voxel size {voxel:.4g} needs up to {need / 2**30:.2g} GiB, {limit / 2**30:.2g} GiB are allowed: "
-        f"a voxel size of {fits:.2g} fits"
+        f"a voxel size of {fits:.2g} fits",
+        float(fits),
     )

@@ -10,6 +10,7 @@ import pytest
 from conftest import CENTER, octahedron_run
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.memory import PROCESS_GIB
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.eval.mesh import score_mesh
 from linprim_geo.geometry.camera import Camera
@@ -240,6 +241,22 @@ def test_the_depth_limit_is_where_a_quarter_of_a_pixel_is_a_truncation():
     moved = 500 * 6 / (500 * 6 / limit - 0.25) - limit
     assert moved == pytest.approx(3 * 2.0 / 500, rel=0.01)
     assert depth_limit(cameras[:1], 2.0) == 8.0
+
+
+def test_voxels_grow_until_the_grid_fits_into_the_limit(solid, tmp_path, capsys):
+    options = ExtractOptions(level=0.5, refine=0, denoise="off")
+    whole = extract_mesh(solid, output=tmp_path / "whole.ply", options=options, quiet=True)
+    # 1 MiB, or 46 blocks of 22 KiB, beside what the process takes and a depth map of 64x64 at work.
+    limit = PROCESS_GIB + (300 * 64**2 + 2**20) / 2**30
+    small = extract_mesh(solid, output=tmp_path / "small.ply", options=replace(options, memory_limit=limit))
+    assert small["voxel_size"] > 1.5 * whole["voxel_size"]
+    assert "would not fit into memory" in capsys.readouterr().err
+    given = replace(options, memory_limit=limit, voxel_size=whole["voxel_size"])
+    with pytest.raises(LinprimError, match="a voxel size of .* fits"):
+        extract_mesh(solid, output=tmp_path / "given.ply", options=given, quiet=True)
+    least = replace(options, memory_limit=limit - 1.5 * 2**20 / 2**30)
+    with pytest.raises(LinprimError, match="a depth map takes .* while it is fused"):
+        extract_mesh(solid, output=tmp_path / "least.ply", options=least, quiet=True)
 
 
 def _shifted(x: float) -> np.ndarray:

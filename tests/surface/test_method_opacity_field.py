@@ -12,6 +12,7 @@ import pytest
 from conftest import CENTER, octahedron_run
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.memory import PROCESS_GIB
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.cli.main import main
 from linprim_geo.eval.mesh import score_mesh
@@ -310,8 +311,12 @@ def test_a_run_of_gaussians_is_refused(solid, tmp_path):
 
 
 def test_tetrahedra_that_do_not_fit_are_refused(solid, tmp_path):
-    with pytest.raises(LinprimError, match="GiB are allowed"):
-        extract_mesh(solid, METHOD, tmp_path / "m.ply", ExtractOptions(memory_limit=1e-5), quiet=True)
+    for limit, sentence in (
+        (PROCESS_GIB + 1e-5, "GiB are allowed"),
+        (1e-5, "--memory-limit is 1e-05 GiB, wanted more"),
+    ):
+        with pytest.raises(LinprimError, match=sentence):
+            extract_mesh(solid, METHOD, tmp_path / "m.ply", ExtractOptions(memory_limit=limit), quiet=True)
 
 
 def test_the_command_line_knows_it(solid, tmp_path, capsys):
