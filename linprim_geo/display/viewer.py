@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Iterator
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,9 @@ from linprim_geo.geometry.mesh import Mesh, select_faces
 from linprim_geo.runs.run import Run
 
 HOST = "127.0.0.1"
+# Pages that may look, in a browser of this machine or through a tunnel to it, and what is no browser. Pages of other
+# sites in the same browser reach 127.0.0.1, too.
+ORIGINS = (re.compile(r"http://(localhost|127\.0\.0\.1)(:\d+)?"), None)
 DEFAULT_PORT = 8080
 # Seconds between looks at the run's folder.
 LOOK_EVERY = 1.0
@@ -134,7 +138,7 @@ class Viewer:
         if not follow:
             Run.open(path)
         _check_port(port)
-        with _quiet():
+        with _quiet(), _own_pages_alone():
             self.server = viser.ViserServer(host=HOST, port=port, label=f"linprim-geo: {path.name}", verbose=False)
         try:
             if port and self.server.get_port() != port:  # taken since: viser goes on to the next
@@ -409,6 +413,18 @@ def _taken(port: int) -> LinprimError:
 def _quiet() -> contextlib.AbstractContextManager:
     """Keeps what viser prints about itself off the standard output, which is for results."""
     return contextlib.redirect_stdout(io.StringIO())
+
+
+@contextlib.contextmanager
+def _own_pages_alone() -> Iterator[None]:
+    """In the block viser starts servers that talk to pages of ORIGINS alone; it has no option for that."""
+    sockets: Any = import_module("websockets.asyncio.server")
+    serve = sockets.serve
+    sockets.serve = partial(serve, origins=ORIGINS)
+    try:
+        yield
+    finally:
+        sockets.serve = serve
 
 
 def _end_when_asked() -> None:

@@ -15,6 +15,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +79,33 @@ def test_it_serves_a_page_to_this_machine_alone(viewer):
     assert "<html" in text and "<script" in text
     assert viewer.server.get_host() == "127.0.0.1"
     assert "step 400" in viewer._text.content and "1 mesh" in viewer._text.content
+
+
+@pytest.mark.parametrize(
+    ("origin", "status"),
+    [
+        ("http://localhost:{port}", "101"),
+        ("http://127.0.0.1:9000", "101"),  # a tunnel
+        ("http://elsewhere.example", "403"),
+        ("http://localhost.elsewhere.example:{port}", "403"),
+        ("null", "403"),
+    ],
+)
+def test_pages_of_other_sites_in_the_same_browser_may_not_look(viewer, origin, status):
+    port = viewer.server.get_port()
+    lines = [
+        "GET / HTTP/1.1",
+        f"Host: localhost:{port}",
+        "Upgrade: websocket",
+        "Connection: Upgrade",
+        "Sec-WebSocket-Version: 13",
+        "Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==",
+        f"Sec-WebSocket-Protocol: viser-v{version('viser')}",
+        f"Origin: {origin.format(port=port)}",
+    ]
+    with socket.create_connection(("127.0.0.1", port), timeout=20) as connection:
+        connection.sendall(("\r\n".join(lines) + "\r\n\r\n").encode())
+        assert connection.recv(100).split()[1].decode() == status
 
 
 def test_primitives_are_polyhedra_from_an_opacity_on(viewer, meshed):
