@@ -9,11 +9,13 @@ import numpy as np
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
 
-# Share of the cameras that have to have the place where their axes meet before them.
-LOOKING = 0.9
-# The mean of the squared sines between the axes and the direction that they have most in common: nearer to parallel
-# than 5 degrees, axes meet nowhere in particular.
-LEAST_SPREAD = np.sin(np.radians(5)) ** 2
+# Axes meet in a focus if it lies before this share of the cameras, if they miss it by at most this share of
+# their distance (median), and if they are not parallel: the smallest eigenvalue of mean(1 - d d^T), sin^2
+# of their spread.
+_FOCUS_IN_FRONT = 0.75
+_FOCUS_MAX_MISS = 0.35
+_FOCUS_MIN_EIGENVALUE = 1e-3
+_FOCUS_ROUNDS = 5
 
 
 def read_box(text: str, cameras: Sequence[Camera] = ()) -> np.ndarray | None:
@@ -44,31 +46,48 @@ def as_text(corners: np.ndarray) -> str:
 
 
 def looked_at(cameras: Sequence[Camera]) -> np.ndarray:
-    """(2, 3) corners of the cube around the place that lies nearest to all optical axes, half as wide as the median
-    camera shows there, from the middle of its image to the nearer border.
+    """(2, 3) corners of the cube around the `focus_point` of the cameras, half as wide as the median of them shows
+    there, from the middle of its image to the nearer border.
 
     Raises:
-        LinprimError: fewer than two cameras, or their axes are near parallel, or meet behind them, as in a room that is
-            looked at from its middle.
+        LinprimError: fewer than two cameras, or they look at no one place.
     """
     if len(cameras) < 2:
         raise LinprimError(f"--box auto: {len(cameras)} cameras are known, wanted two or more that look at one place")
     axes = np.array([camera.rotation[2] for camera in cameras])
     centers = np.array([camera.center for camera in cameras])
-    # The normal equations of the distances from a point to the axes; their least eigenvalue is 0 for parallel ones.
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    total = across.sum(0)
-    if np.linalg.eigvalsh(total / len(axes))[0] < LEAST_SPREAD:
-        raise LinprimError("--box auto: the cameras look in much the same direction, wanted the corners of a box")
-    place = np.linalg.solve(total, np.einsum("nij,nj->i", across, centers))
+    place = focus_point(centers, axes)
+    if place is None:
+        raise LinprimError("--box auto: the cameras look at no one place, wanted the corners of a box")
     depth = ((place - centers) * axes).sum(1)
-    if (share := float((depth > 0).mean())) < LOOKING:
-        raise LinprimError(
-            f"--box auto: only {share:.0%} of the cameras look towards one place, wanted the corners of a box"
-        )
     slopes = [min(camera.width / camera.fx, camera.height / camera.fy) / 2 for camera in cameras]
     reach = float(np.median((depth * slopes)[depth > 0]))
     return np.stack([place - reach, place + reach])
+
+
+def focus_point(centers: np.ndarray, axes: np.ndarray) -> np.ndarray | None:
+    """The (3,) point nearest to the lines through (N, 3) `centers` along unit `axes`, or None if they have no
+    focus.
+
+    Minimises the sum of squared distances |(1 - d d^T)(x - c)|^2, then again over those within twice the
+    median.
+    """
+    use = np.ones(len(centers), dtype=bool)
+    for _ in range(_FOCUS_ROUNDS):
+        across = np.eye(3) - axes[use, :, None] * axes[use, None, :]
+        normal = across.mean(axis=0)
+        if np.linalg.eigvalsh(normal)[0] < _FOCUS_MIN_EIGENVALUE:
+            return None
+        focus = np.linalg.solve(normal, np.einsum("nij,nj->i", across, centers[use]) / use.sum())
+        along = ((focus - centers) * axes).sum(axis=1)
+        miss = np.linalg.norm(focus - centers - along[:, None] * axes, axis=1)
+        closer = miss <= 2.0 * np.median(miss) + np.finfo(float).eps * np.abs(along).max()
+        if (closer == use).all() or closer.sum() < 2:
+            break
+        use = closer
+    if (along > 0).mean() < _FOCUS_IN_FRONT or np.median(miss) > _FOCUS_MAX_MISS * np.median(along):
+        return None
+    return focus
 
 
 def inside(points: np.ndarray, corners: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.capture.types import PointCloud, Scene, View
 from linprim_geo.geometry.camera import Camera, Similarity
+from linprim_geo.geometry.region import focus_point
 from linprim_geo.imaging import photos
 
 # The frame of training has its cameras at this median distance from what they look at; learning rates
@@ -20,13 +21,6 @@ CAMERA_DISTANCE = 3.0
 _SAME_PLACE = 1e-9
 # A camera counts for the normalisation if it sees at least this many points.
 _MIN_POINTS_SEEN = 8
-# Axes meet in a focus if it lies before this share of the cameras, if they miss it by at most this share of
-# their distance (median), and if they are not parallel: the smallest eigenvalue of mean(1 - d d^T), sin^2
-# of their spread.
-_FOCUS_IN_FRONT = 0.75
-_FOCUS_MAX_MISS = 0.35
-_FOCUS_MIN_EIGENVALUE = 1e-3
-_FOCUS_ROUNDS = 5
 # Photographs are looked at with about so many pixels on the longer side, and no more than so many of them.
 _SMALL_SIZE = 512
 _MOST_SMALL_VIEWS = 200
@@ -120,31 +114,6 @@ def looked_at(scene: Scene) -> tuple[np.ndarray, float]:
         return focus, float(np.median(((focus - centers) * axes).sum(axis=1)))
     center = np.median(centers, axis=0)
     return center, float(np.median(np.linalg.norm(centers - center, axis=1)))
-
-
-def focus_point(centers: np.ndarray, axes: np.ndarray) -> np.ndarray | None:
-    """The (3,) point nearest to the lines through (N, 3) `centers` along unit `axes`, or None if they have no
-    focus.
-
-    Minimises the sum of squared distances |(1 - d d^T)(x - c)|^2, then again over those within twice the
-    median.
-    """
-    use = np.ones(len(centers), dtype=bool)
-    for _ in range(_FOCUS_ROUNDS):
-        across = np.eye(3) - axes[use, :, None] * axes[use, None, :]
-        normal = across.mean(axis=0)
-        if np.linalg.eigvalsh(normal)[0] < _FOCUS_MIN_EIGENVALUE:
-            return None
-        focus = np.linalg.solve(normal, np.einsum("nij,nj->i", across, centers[use]) / use.sum())
-        along = ((focus - centers) * axes).sum(axis=1)
-        miss = np.linalg.norm(focus - centers - along[:, None] * axes, axis=1)
-        closer = miss <= 2.0 * np.median(miss) + np.finfo(float).eps * np.abs(along).max()
-        if (closer == use).all() or closer.sum() < 2:
-            break
-        use = closer
-    if (along > 0).mean() < _FOCUS_IN_FRONT or np.median(miss) > _FOCUS_MAX_MISS * np.median(along):
-        return None
-    return focus
 
 
 def visual_hull_points(scene: Scene, count: int, seed: int) -> VolumePoints:

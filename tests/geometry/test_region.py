@@ -34,8 +34,8 @@ def test_cameras_that_look_at_no_one_place_are_refused():
     outward += [look_at(tuple(c.center), target=tuple(2 * c.center), size=(40, 30)) for c in around((0, 0, 0))]
     along = [look_at((0.1 * k, 0, 0), target=(0.1 * k, 5, 0), size=(40, 30)) for k in range(9)]
     for cameras, sentence in (
-        (outward, "only .* look towards one place"),
-        (along, "much the same direction"),
+        (outward, "look at no one place"),
+        (along, "look at no one place"),
         (along[:1], "1 cameras are known"),
     ):
         with pytest.raises(LinprimError, match=f"--box auto: .*{sentence}"):

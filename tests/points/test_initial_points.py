@@ -13,11 +13,11 @@ from PIL import Image
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.types import PointCloud, Scene, View
+from linprim_geo.geometry.region import focus_point
 from linprim_geo.points.initial_points import (
     CAMERA_DISTANCE,
     _colors,
     evenly_spread_views,
-    focus_point,
     frusta_points,
     scene_normalization,
     visual_hull_points,
