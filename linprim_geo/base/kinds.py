@@ -7,10 +7,23 @@ A new kind is a subclass of `Kind` in `KINDS`. What only rendering knows of it i
 from __future__ import annotations
 
 import math
-
-import numpy as np
+from functools import cached_property
+from importlib import import_module
+from typing import TYPE_CHECKING
 
 from linprim_geo.base.errors import LinprimError
+
+if TYPE_CHECKING:
+    import numpy as np
+else:
+
+    class _Numpy:
+        """numpy, imported by the first use: the help of a command names the kinds and takes no time for libraries."""
+
+        def __getattr__(self, name: str):
+            return getattr(import_module("numpy"), name)
+
+    np = _Numpy()
 
 # An octahedron of half-axes d stands for a Gaussian of standard deviations d / 2.6: LinPrim's constant, chosen by eye
 # (DIST_TO_SCALE of its MCMC variant).
@@ -18,7 +31,7 @@ DIST_TO_SCALE = 2.6
 # LinPrim's files never give more than this share of the opacity, so that the logarithm stays finite ...
 OPACITY_CAP = 0.99
 # ... and with it no reference length is optically thicker than ln(100).
-THICKEST = -np.log1p(-OPACITY_CAP)
+THICKEST = -math.log1p(-OPACITY_CAP)
 
 
 class Kind:
@@ -33,11 +46,6 @@ class Kind:
     extents: int
     # The extent that looks as large as an octahedron's half-axes of 1.
     size: float
-    # (V, 3) and (V,), both of length 0 without vertices; (F, 3) vertices, counter-clockwise seen from outside.
-    directions: np.ndarray
-    columns: np.ndarray
-    faces: np.ndarray
-
     # Depth, in the training frame, before which rays do not begin. A polyhedron is cut exactly there.
     near = 0.01
     # Pixels that go with --filter 3d+screen: LinPrim's kernel_size.
@@ -47,6 +55,21 @@ class Kind:
     layout, length_prefix = "LinPrim", "dist_"
     told_by: tuple[str, ...] = ("dist_0",)
     last_properties: tuple[str, ...] = ("filter_3D",)
+
+    @cached_property
+    def directions(self) -> np.ndarray:
+        """(V, 3), V = 0 without vertices."""
+        return np.zeros((0, 3))
+
+    @cached_property
+    def columns(self) -> np.ndarray:
+        """(V,) int64."""
+        return np.zeros(0, np.int64)
+
+    @cached_property
+    def faces(self) -> np.ndarray:
+        """(F, 3) int64 vertices, counter-clockwise seen from outside."""
+        return np.zeros((0, 3), np.int64)
 
     @property
     def solid(self) -> bool:
@@ -158,21 +181,24 @@ class Octahedron(Kind):
     """{ p : sum_k |R^T (p - center)|_k / extent_k <= 1 }, extents its half-axes."""
 
     name, plural, extents, size = "octahedron", "octahedra", 3, 1.0
-    # Vertex 2 k + (0 for -, 1 for +) lies on axis k. One face per octant, counter-clockwise seen from outside: the
-    # order x, y, z is so where the product of the three signs is positive.
-    directions = np.repeat(np.eye(3), 2, axis=0) * np.tile([-1.0, 1.0], 3)[:, None]
-    columns = np.repeat(np.arange(3), 2)
-    faces = np.array(
-        [
-            (x, 2 + y, 4 + z) if (x + y + z) % 2 == 1 else (x, 4 + z, 2 + y)
-            for x in (0, 1)
-            for y in (0, 1)
-            for z in (0, 1)
-        ],
-        dtype=np.int64,
-    )
     # Centres of the halves at +-0.4 of the half-axis that is cut, which becomes 0.6 of itself, the others 0.8.
     OFFSET, ALONG, ACROSS = 0.4, 0.6, 0.8
+
+    @cached_property
+    def directions(self):
+        """Vertex 2 k + (0 for -, 1 for +) lies on axis k."""
+        return np.repeat(np.eye(3), 2, axis=0) * np.tile([-1.0, 1.0], 3)[:, None]
+
+    @cached_property
+    def columns(self):
+        return np.repeat(np.arange(3), 2)
+
+    @cached_property
+    def faces(self):
+        """One per octant: the order x, y, z is counter-clockwise where the product of the three signs is positive."""
+        octants = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+        turned = [(x, 2 + y, 4 + z) if (x + y + z) % 2 == 1 else (x, 4 + z, 2 + y) for x, y, z in octants]
+        return np.array(turned, dtype=np.int64)
 
     def reference_length(self, extent):
         """2 min_k extent_k, LinPrim's shortest diagonal."""
@@ -192,15 +218,24 @@ class Tetrahedron(Kind):
     name, plural, extents = "tetrahedron", "tetrahedra", 4
     # Of the same volume: 8 sqrt(3) / 27 size^3 = 4 / 3.
     size = (4.5 / math.sqrt(3)) ** (1 / 3)
-    directions = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
-    columns = np.arange(4)
-    # Face j omits vertex j.
-    faces = np.array([[1, 3, 2], [0, 2, 3], [0, 3, 1], [0, 1, 2]], dtype=np.int64)
     told_by = ("dist_0", "dist_3")
     # Two halves keep one vertex of the longest edge each: the tetrahedron shrunk to SHRUNK about that vertex, and the
     # vertex at the other end brought to OTHER of its distance. All corners are convex combinations of the parent's, so
     # a half never leaves it.
     SHRUNK, OTHER = 0.82, 0.6
+
+    @cached_property
+    def directions(self):
+        return np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
+
+    @cached_property
+    def columns(self):
+        return np.arange(4)
+
+    @cached_property
+    def faces(self):
+        """Face j omits vertex j."""
+        return np.array([[1, 3, 2], [0, 2, 3], [0, 3, 1], [0, 1, 2]], dtype=np.int64)
 
     def reference_length(self, extent):
         """The diameter 6 V / A of the inscribed sphere; 2 d / 3 of a regular tetrahedron of distances d.
@@ -255,9 +290,6 @@ class Gaussian(Kind):
     middle, 0 to 1."""
 
     name, plural, extents, size = "gaussian", "Gaussians", 3, 1 / DIST_TO_SCALE
-    directions = np.zeros((0, 3))
-    columns = np.zeros(0, np.int64)
-    faces = np.zeros((0, 3), np.int64)
     # Projected near the camera's plane it would cover everything; 3DGS's.
     near = 0.2
     # 3DGS's, a variance in px^2.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.types import Scene
 from linprim_geo.geometry.mesh import Mesh, vertex_normals
 from linprim_geo.geometry.mesh_files import load_mesh
-from linprim_geo.stereo.depth_maps import depth_maps
+from linprim_geo.stereo.depth_maps import DepthMap, depth_maps
 from linprim_geo.surface import method_tsdf, stereo_frames
 from linprim_geo.surface.extract import extract_mesh
 from linprim_geo.surface.stereo_frames import MergedFrames
@@ -36,8 +35,8 @@ def found(monkeypatch):
     deviation = np.full((30, 40), 0.001, np.float32)
     grey = np.zeros((30, 40), np.uint8)
     seen = np.full((30, 40), 3, np.uint8)
-    maps = [SimpleNamespace(camera=CAMERA, depth=depth, seen=seen, confirmed=confirmed, deviation=deviation)]
-    maps[0].grey, maps[0].noise, maps[0].normal = grey, 1.0, np.zeros((30, 40, 3), np.float32)
+    normal, cost = np.zeros((30, 40, 3), np.float32), np.zeros((30, 40), np.float32)
+    maps = [DepthMap(CAMERA, depth, normal, cost, seen, confirmed, deviation, grey, 1.0)]
     monkeypatch.setattr(stereo_frames, "depth_maps", lambda *_, **__: maps)
 
 

@@ -324,7 +324,7 @@ def test_what_cannot_be_fused_is_one_sentence():
         (lambda: fuse_tsdf(empty, voxel_size=0.1), "none of the 3 depth maps"),
         (lambda: fuse_tsdf([], voxel_size=0.1), "none of the 0 depth maps"),
         (lambda: fuse.auto_voxel_size(empty), "no depth map holds a surface"),
-        (lambda: fuse_tsdf(frames, voxel_size=0.1, bounds=[[5] * 3, [6] * 3]), "inside the bounds"),
+        (lambda: fuse_tsdf(frames, voxel_size=0.1, bounds=[[5] * 3, [6] * 3]), r"inside \[5.0, 5.0, 5.0\] to"),
         (lambda: fuse_tsdf(frames, voxel_size=0.1, bounds=[[1] * 3, [0] * 3]), "bounds are"),
         (lambda: fuse_tsdf(frames, voxel_size=float("nan")), "voxel size is nan"),
         (lambda: fuse_tsdf(frames, voxel_size=1e-8), "what a pixel covers"),
