@@ -251,9 +251,9 @@ class TrainOptions:
         0, "primitives at the start; 0 chooses from the points and --max-primitives", low=0, high=2**30
     )
     start: str = option(
-        "points",
-        "where primitives begin: at the capture's points alone, or also where stereo of small copies of the "
-        "photographs finds surfaces",
+        "stereo",
+        "where primitives begin: where stereo of small copies of the photographs finds surfaces, if the capture has "
+        "fewer points than that takes, or at its points alone",
         choices=("stereo", "points"),
     )
     sh_degree: int = option(2, "degree of the view-dependent colour, 0 to 3", choices=(0, 1, 2, 3))

@@ -14,8 +14,8 @@ from linprim_geo.stereo.confidence import FOREGROUND
 from linprim_geo.stereo.depth_maps import depth_maps
 
 # Photographs are averaged down until their longer side has no more pixels, and no more of them are taken: a training
-# starts with some ten thousand primitives, and a view of this size has 77,000 pixels.
-LONGER_SIDE, MOST_VIEWS = 320, 100
+# starts with some ten thousand primitives, and a view of this size has 30,000 pixels.
+LONGER_SIDE, MOST_VIEWS = 200, 100
 
 
 @dataclass(frozen=True)

@@ -25,11 +25,14 @@ BUDGET_SHARE = 0.2
 def stereo_start(
     scene: Scene, options: TrainOptions, progress: Progress, budget: Budget | None = None
 ) -> PointCloud | None:
-    """As many points on surfaces as a training starts with, of the training views of a scene with points.
+    """Points on surfaces, as many as the scene has fewer than a training starts with, by stereo of its training views.
 
-    None where stereo has nothing to say, and where the scene's points are no surface's but anywhere in a volume.
+    None where it has enough, where its points are anywhere in a volume, and where stereo has nothing to say.
     """
     if options.start != "stereo" or scene.points is None or isinstance(scene.points, VolumePoints):
+        return None
+    missing = initial_count(options, SFM_START) - len(scene.points.xyz)
+    if missing <= 0:
         return None
     begin = time.monotonic()
     views, points = small_copies(scene.train), scene.points.xyz
@@ -37,8 +40,7 @@ def stereo_start(
         if budget and not _fits(views, points, budget):
             progress.note(f"start: stereo would take more than {BUDGET_SHARE:.0%} of the time that is left")
             return None
-        count = initial_count(options, SFM_START)
-        found, share = surface_points(views, points, count, options.seed, quiet=progress.quiet)
+        found, share = surface_points(views, points, missing, options.seed, quiet=progress.quiet)
     except LinprimError as error:
         progress.note(f"start: no stereo, {error}")
         return None
