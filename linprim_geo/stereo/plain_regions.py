@@ -20,6 +20,10 @@ from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 # An edge runs through 3 by 3 pixels whose variance is so many times that of the noise; fewer edge pixels than SPECK
 # together are noise.
 EDGE_VARIANCE, SPECK = 4.0, 9
+# At least a tenth of a photograph is taken to be plain, or as good as that. There the variance of 3 by 3 pixels is that
+# of the noise times chi-square of 8 degrees of freedom over 9, whose tenth percentile is 3.49.
+PLAIN_SHARE, LEAST_OF_PLAIN = 0.1, 3.49 / 9
+DARKEST, BRIGHTEST = 3, 252
 # Regions have at least so many pixels (two windows of stereo) and so many confirmed depths within RING pixels.
 LEAST_PIXELS, LEAST_POINTS, RING = 200, 30, 4
 # Depths are on a plane up to this share of them, and behind it from BEHIND times as much.
@@ -64,12 +68,23 @@ class PlainRegion:
 
 
 def edges_of(grey: np.ndarray, noise: float) -> np.ndarray:
-    """(H, W) bool: where an edge runs through a pixel or beside it."""
+    """(H, W) bool: where an edge runs through a pixel or beside it.
+
+    `noise` is the variance that differences of pixels tell. Blur, demosaicing and JPEG make it equal in neighbours,
+    whose differences tell less: where the plainest parts vary more, their variance counts.
+    """
     values = grey.astype(np.float64)
     mean = uniform_filter(values, 3, mode="nearest")
-    edge = uniform_filter(values * values, 3, mode="nearest") - mean * mean > EDGE_VARIANCE * noise
+    variance = uniform_filter(values * values, 3, mode="nearest") - mean * mean
+    edge = variance > EDGE_VARIANCE * max(noise, plainest(variance, values) / LEAST_OF_PLAIN)
     parts, _ = label(edge, np.ones((3, 3)))
     return edge & (np.bincount(parts.ravel())[parts] >= SPECK)
+
+
+def plainest(values: np.ndarray, grey: np.ndarray) -> float:
+    """The quantile of values at PLAIN_SHARE, without pixels that are black or white: clipped ones have no noise."""
+    varying = values[(grey > DARKEST) & (grey < BRIGHTEST)]
+    return float(np.quantile(varying, PLAIN_SHARE)) if len(varying) else 0.0
 
 
 def plain_regions(view: int, camera: Camera, edge: np.ndarray, depth: np.ndarray) -> list[PlainRegion]:

@@ -18,7 +18,7 @@ from linprim_geo.geometry.boxes import smaller
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.sampling import sample_bilinear
 from linprim_geo.stereo.depth_maps import DepthMap, block_means
-from linprim_geo.stereo.plain_regions import edges_of, in_camera, rays_of
+from linprim_geo.stereo.plain_regions import edges_of, in_camera, plainest, rays_of
 from linprim_geo.stereo.vignetting import falloff
 
 # Larger photographs are averaged down.
@@ -28,6 +28,8 @@ BOX, STRIDE, SLOPE_SIGMA = 9, 4, 8.0
 # Besides where `edges_of` finds one, an edge is where the slope, smoothed by EDGE_SIGMA pixels, differs by so many
 # deviations of its noise from the median of MEDIAN boxes a side around.
 EDGE_SIGMA, EDGE_SLOPE, MEDIAN = 2.0, 6.0, 9
+# The tenth percentile of the length of a slope both of whose parts have a deviation of 1: sqrt(-2 ln 0.9).
+LEAST_SLOPE = 0.459
 # A region has so many boxes, and stereo confirms no more than this share of them.
 LEAST_BOXES, KNOWN_SHARE = 60, 0.5
 # Another view shows at least this share of a region's boxes.
@@ -66,9 +68,10 @@ class Shading:
             grey = (grey / falloff(camera, law)).astype(np.float32)
         noise = found.noise / factor**2
         slope = np.hypot(*(_beyond_shading(one) for one in np.gradient(gaussian_filter(grey, EDGE_SIGMA))))
-        # The variance of the derivative of white noise behind a Gaussian is that of the noise over 8 pi sigma^4.
-        edge = edges_of(grey, noise)
-        edge |= slope > EDGE_SLOPE * np.sqrt(noise / (8 * np.pi * EDGE_SIGMA**4))
+        # The variance of the derivative of white noise behind a Gaussian is that of the noise over 8 pi sigma^4. Where
+        # neighbours have noise in common the plainest parts tell more, see `edges_of`.
+        deviation = max(np.sqrt(noise / (8 * np.pi * EDGE_SIGMA**4)), plainest(slope, grey) / LEAST_SLOPE)
+        edge = edges_of(grey, noise) | (slope > EDGE_SLOPE * deviation)
         plain = uniform_filter((~edge).astype(np.float32), BOX, mode="constant") > 1 - 0.5 / BOX**2
         mean = uniform_filter(grey, BOX, mode="nearest")
         # Of plain pixels far around: noise of the slopes would make the steps of a fit too small.
@@ -76,7 +79,7 @@ class Shading:
         smooth = gaussian_filter(np.where(plain, mean, 0), SLOPE_SIGMA) / np.maximum(share, 1e-6)
         by_row, by_column = np.gradient(smooth)
         means = np.stack([mean, by_column, by_row], -1)
-        return cls(camera, means, plain, noise / BOX**2, factor)
+        return cls(camera, means, plain, max(noise / BOX**2, _noise_of_boxes(mean, plain)), factor)
 
     @cached_property
     def labels(self) -> np.ndarray:
@@ -87,6 +90,17 @@ class Shading:
         """Every `factor`-th pixel of an image of the photograph's size."""
         height, width = self.plain.shape
         return image[self.factor // 2 :: self.factor, self.factor // 2 :: self.factor][:height, :width]
+
+
+def _noise_of_boxes(mean: np.ndarray, plain: np.ndarray) -> float:
+    """Variance of the means of plain boxes: by second differences of boxes side by side across both directions, which
+    shading cancels from (`depth_maps.noise_of`); 0 where there are few."""
+    mean, plain = mean[::BOX, ::BOX], plain[::BOX, ::BOX]
+    across, known = mean[:, :-2] - 2 * mean[:, 1:-1] + mean[:, 2:], plain[:, :-2] & plain[:, 1:-1] & plain[:, 2:]
+    both, known = across[:-2] - 2 * across[1:-1] + across[2:], known[:-2] & known[1:-1] & known[2:]
+    if np.count_nonzero(known) < LEAST_BOXES:
+        return 0.0
+    return float(np.median(np.abs(both[known])) / 0.6745) ** 2 / 36
 
 
 def _beyond_shading(slope: np.ndarray) -> np.ndarray:
@@ -163,20 +177,26 @@ def compare(region: ShadedRegion, plane: np.ndarray, own: Shading, other: Shadin
     return Comparison(shown, value, left, weight, gain * (by_column * by_x + by_row * by_y))
 
 
-def _matched(ours: np.ndarray, theirs: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """The gain of theirs, what is left of ours after it and an offset, and Huber's weights."""
+def _matched(ours: np.ndarray, theirs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The (N,) gain of theirs, what is left of ours after it, an offset and a bend of the gain, which a tone curve has
+    where exposures differ, and Huber's weights."""
     weight = np.ones_like(ours)
     for _ in range(ROUNDS):
         total = weight.sum()
         a, b = (x - weight @ x / total for x in (ours, theirs))
         weighted = weight * b
-        gain = min(max(float(weighted @ a / max(weighted @ b, 1e-6)), GAINS[0]), GAINS[1])
-        left = a - gain * b
+        power = max(float(weighted @ b), 1e-6)
+        gain = min(max(float(weighted @ a) / power, GAINS[0]), GAINS[1])
+        square, along = b * b, float(weighted @ (b * b)) / power
+        square -= weight @ square / total + along * b
+        weighted = weight * square
+        bend = float(weighted @ a) / max(float(weighted @ square), 1e-6)
+        left = a - gain * b - bend * square
         size = np.abs(left)
         # The middle one: np.median takes as long as all the rest.
         deviation = 1.4826 * np.partition(size, len(size) // 2)[len(size) // 2] + 0.05
         weight = 1 / np.maximum(1, size / (2 * deviation))
-    return gain, left, weight
+    return gain + bend * (2 * b - along), left, weight
 
 
 @dataclass(frozen=True)
@@ -211,12 +231,10 @@ def evaluate(plane: np.ndarray, regions: Sequence[ShadedRegion], shadings: Seque
                 continue
             root = np.sqrt(found.weight)
             slope = (found.slope * root)[:, None] * (region.rays[found.shown] @ moves)
-            # Less what gain and offset take.
-            offset = root / np.linalg.norm(root)
-            gained = found.value * root
-            gained -= (offset @ gained) * offset
-            gained /= max(float(np.linalg.norm(gained)), 1e-12)
-            slope -= np.outer(offset, offset @ slope) + np.outer(gained, gained @ slope)
+            # Less what offset, gain and its bend take.
+            value = (found.value - found.value.mean()) / max(float(found.value.std()), 1e-3)
+            taken = np.linalg.qr(np.stack([np.ones_like(value), value, value * value], 1) * root[:, None])[0]
+            slope -= taken @ (taken.T @ slope)
             variance = float((found.weight * found.left**2).mean()) + 1e-4
             information += slope.T @ slope / variance
             downhill += slope.T @ (found.left * root) / variance
