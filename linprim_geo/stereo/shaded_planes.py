@@ -53,7 +53,7 @@ FIRST_BOXES, MOST_BOXES, FIRST_STEPS = 200, 800, 6
 # no more than OTHERS_SHARE and hardly more than the region's own plane leaves: paint that shines makes up as much.
 LEFT_SHARE, OTHERS_SHARE, HARDLY_MORE = 0.2, 0.25, 1.1
 # Noise leaves one deviation: where this is left, smoothed, another surface is. Most of a flat region is below: tone
-# curves and vignetting leave more at its ends. Of a wall that is bent by 4 % of its depth most is above.
+# curves and vignetting leave more at its ends (DECISIONS 57).
 MOST_LEFT, FLAT_SHARE = 1.3, 0.75
 # A region's own plane is known to this share of its depth, or better; several regions know theirs better together.
 CERTAIN = 2 * CONFIRMED_DEPTH

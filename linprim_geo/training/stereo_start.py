@@ -18,7 +18,7 @@ from linprim_geo.stereo.planes_on_disk import Photographs
 from linprim_geo.stereo.surface_points import small_copies, surface_points
 from linprim_geo.stereo.time_plan import seconds_per_pixel
 
-# Of a time budget stereo takes at most this share: it saves about half of the time of a step.
+# Of a time budget stereo takes at most this share; steps in the rest are fewer and as long as before.
 BUDGET_SHARE = 0.2
 
 
