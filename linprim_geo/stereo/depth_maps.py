@@ -231,6 +231,13 @@ def depth_and_normal(camera: Camera, plane: np.ndarray) -> tuple[np.ndarray, np.
     return depth, -(normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)) @ camera.rotation
 
 
+def inverse_planes(camera: Camera, depth: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """(3, H, W) float32 inverse depth and its slopes, of (H, W) depth and (H, W, 3) normals in the camera's axes."""
+    distance = depth * (normal * camera.ray_grid()).sum(-1)  # n . X = distance: inverse depth = n . ray / distance
+    slopes = [normal[..., 0] / (camera.fx * distance), normal[..., 1] / (camera.fy * distance)]
+    return np.stack([1 / depth, *slopes]).astype(np.float32)
+
+
 def _depth_map(
     image: StereoImage, noise: float, planes: DepthPlanes | None, others: list[tuple[Camera, DepthPlanes | None]]
 ) -> DepthMap:

@@ -17,7 +17,7 @@ from linprim_geo.base.files import atomic_write
 from linprim_geo.base.progress import Progress
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.ply import color_columns, write_ply, xyz_columns
-from linprim_geo.stereo.depth_maps import MOST_SOURCES
+from linprim_geo.stereo.depth_maps import MOST_SOURCES, inverse_planes
 from linprim_geo.stereo.evidence import glance
 from linprim_geo.stereo.workspace import ModelPoint, Workspace
 
@@ -126,17 +126,10 @@ class PointFusion:
         # Errors grow with the size of pixels.
         weight = np.where(kept, maps.confidence / footprint**2, 0)
         level = np.where(kept, np.floor(np.log2(footprint)), np.inf)
-        self._kept[k] = side = _Side(camera, depth, _plane(camera, depth, maps.normal), values, level, weight)
+        self._kept[k] = side = _Side(camera, depth, inverse_planes(camera, depth, maps.normal), values, level, weight)
         if len(self._kept) > KEPT:
             self._kept.popitem(last=False)
         return side
-
-
-def _plane(camera: Camera, depth: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """(3, H, W) float32 inverse depth and its slopes, of (H, W) depth and (H, W, 3) normals in the camera's axes."""
-    distance = depth * (normal * camera.ray_grid()).sum(-1)  # n . X = distance: inverse depth = n . ray / distance
-    slopes = [normal[..., 0] / (camera.fx * distance), normal[..., 1] / (camera.fy * distance)]
-    return np.stack([1 / depth, *slopes]).astype(np.float32)
 
 
 def _model_points(points: np.ndarray, seen: list[tuple[int, np.ndarray]], count: int) -> list[ModelPoint]:

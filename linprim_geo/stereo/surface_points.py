@@ -11,11 +11,15 @@ from linprim_geo.capture.types import Photo, PointCloud, View
 from linprim_geo.geometry.boxes import smaller
 from linprim_geo.imaging.photos import box_downscale
 from linprim_geo.stereo.confidence import FOREGROUND
-from linprim_geo.stereo.depth_maps import depth_maps
+from linprim_geo.stereo.depth_maps import DepthMap, depth_maps, inverse_planes
+from linprim_geo.stereo.evidence import support
 
 # Photographs are averaged down until their longer side has no more pixels, and no more of them are taken: a training
 # starts with some ten thousand primitives, and a view of this size has 30,000 pixels.
 LONGER_SIDE, MOST_VIEWS = 200, 100
+# A point belongs to a surface that at least this share of the places around it continue (`support`): at the corner of a
+# flat face three of eight do. What lies beyond edges of surfaces, where windows of stereo hold them, has fewer.
+LEAST_SUPPORT = 3 / 8
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,7 @@ def small_copies(views: Sequence[View]) -> list[SmallCopy]:
 def surface_points(
     views: Sequence[View], points: np.ndarray, count: int, seed: int, *, quiet: bool = True
 ) -> tuple[PointCloud, float]:
-    """`count` points, or fewer, that stereo finds and neighbours confirm, drawn evenly from the pixels.
+    """`count` points, or fewer, that stereo finds, other views confirm and pixels around continue, evenly drawn.
 
     Returns: the points, and the share of all pixels that have one.
 
@@ -60,7 +64,7 @@ def surface_points(
     """
     xyz, rgb, pixels = [], [], 0
     for view, found in zip(views, depth_maps(views, points, seed=seed, quiet=quiet), strict=True):
-        photo, taken = view.load(), found.is_confirmed()
+        photo, taken = view.load(), _on_surfaces(found)
         if photo.alpha is not None:
             taken &= photo.alpha >= FOREGROUND
         depth = found.depth[taken].astype(np.float64)
@@ -71,3 +75,10 @@ def surface_points(
     rng = np.random.default_rng([seed, 12])
     keep = np.sort(rng.choice(len(every), min(count, len(every)), replace=False))
     return PointCloud(every[keep], np.concatenate(rgb)[keep]), len(every) / pixels
+
+
+def _on_surfaces(found: DepthMap) -> np.ndarray:
+    """(H, W) bool: confirmed depths on a surface that confirmed depths around continue."""
+    confirmed, camera = found.is_confirmed(), found.camera
+    planes = inverse_planes(camera, found.depth, found.normal @ camera.rotation.T)
+    return confirmed & (support(planes, confirmed) >= LEAST_SUPPORT)

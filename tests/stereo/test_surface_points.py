@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.captures import look_at
-from helpers.textured_room import HALF, photograph
+from helpers.textured_room import HALF, photograph, wall_texture
 from PIL import Image
 
 from linprim_geo.capture.types import View
@@ -14,6 +14,8 @@ from linprim_geo.stereo.surface_points import small_copies, surface_points
 
 CENTERS = [(x, y, 0.0) for y in (-0.35, 0.0) for x in (-0.7, -0.35, 0.0)]
 SIZE = (96, 72)
+# The middle and the normal of a plate before a corner of the room, and half of its sides.
+PLATE, HALF_PLATE = (np.array([0.5, 0.8, 0.0]), np.array([0.6, 0.8, 0.0])), 0.35
 # A pixel at the corner of the room is 2.6 / 80 there, and the best parallax 0.78: a tenth of a pixel of disparity
 # is 1 % of the depth. Depths are confirmed within CONFIRMED_DEPTH, 1 %.
 TOLERANCE = 0.03 * 2.6
@@ -80,6 +82,43 @@ def test_masked_pixels_give_no_points(views, known, tmp_path):
         pixels, depth = view.camera.project(found.xyz)
         shown |= (depth > 0) & (pixels[:, 1] < SIZE[1] / 2 + 1)
     assert shown.all()
+
+
+def with_a_plate(camera) -> np.ndarray:
+    """The room with a textured plate in it."""
+    rays = camera.world_rays()
+    along = rays @ PLATE[1]
+    t = (PLATE[0] - camera.center) @ PLATE[1] / along
+    points = camera.center + t[..., None] * rays
+    on = on_the_plate(points, 0.0) & (t > 0)
+    return np.where(on[..., None], wall_texture(points[..., [1, 2, 0]]), photograph(camera)).astype(np.uint8)
+
+
+def on_the_plate(points: np.ndarray, margin: float) -> np.ndarray:
+    middle, normal = PLATE
+    across = points - middle
+    off = across @ normal
+    inside = np.abs(across - off[..., None] * normal).max(-1) < HALF_PLATE + margin
+    return inside & (np.abs(off) < 0.03)
+
+
+def test_what_nothing_around_continues_gives_no_points(known, tmp_path, monkeypatch):
+    """Beyond the edges of what stands before a wall windows hold both: stereo takes the wall there for nearer."""
+    kept = []
+    for number, center in enumerate(CENTERS):
+        camera, path = look_at(center, target=(1.6, 2.0, 0.1), size=SIZE, focal=80.0), tmp_path / f"{number}.png"
+        Image.fromarray(with_a_plate(camera)).save(path)
+        kept.append(View(path.name, camera, path))
+
+    def in_the_air() -> tuple[float, int]:
+        xyz = surface_points(kept, known, 10**6, 0)[0].xyz
+        air = (off_the_walls(xyz) > TOLERANCE) & ~on_the_plate(xyz, 0.0)
+        return air.mean(), int(on_the_plate(xyz, 0.0).sum())
+
+    share, on_plate = in_the_air()
+    monkeypatch.setattr(module, "LEAST_SUPPORT", 0.0)
+    share_of_all, on_plate_of_all = in_the_air()
+    assert share_of_all > 0.002 and share < 0.3 * share_of_all and on_plate > 0.6 * on_plate_of_all > 1000
 
 
 def test_small_copies_are_means_of_the_photographs_and_few(views, monkeypatch):
