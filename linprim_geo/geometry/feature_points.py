@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.feature_matching import mutual_matches
 
 # Each view is matched with this many others, those that look most alike in place and direction.
 _PARTNERS = 12
@@ -64,7 +65,14 @@ class ObservedPoints:
 
 
 def triangulate_features(
-    cameras: Sequence[Camera], write_images: Callable[[Path], None], seed: int = 0, threads: int = -1
+    cameras: Sequence[Camera],
+    write_images: Callable[[Path], None],
+    seed: int = 0,
+    threads: int = -1,
+    *,
+    most_keypoints: int = _MAX_FEATURES,
+    longer_side: int = 0,
+    most_epipolar_px: float = _MAX_EPIPOLAR_PX,
 ) -> ObservedPoints:
     """Keypoints (SIFT on the CPU), matched between views that look alike, verified and triangulated with the cameras
     kept fixed; all points, reliable or not (`reliable_points`).
@@ -73,7 +81,10 @@ def triangulate_features(
         cameras: of the photographs, without distortion.
         write_images: puts them into a folder as `file_name` says.
         seed: of what pycolmap samples.
-        threads: for keypoints and matching; -1 uses all cores.
+        threads: for keypoints; -1 uses all cores.
+        most_keypoints: of a photograph.
+        longer_side: larger photographs are made so small for keypoints; 0 leaves that to COLMAP.
+        most_epipolar_px: matches may miss their epipolar lines by so much.
     """
     from linprim_geo.geometry.load_pycolmap import pycolmap
 
@@ -88,8 +99,8 @@ def triangulate_features(
         pairs = matching_pairs(cameras)
         if not pairs:
             return _collected([])
-        _match(database_path, images, pairs, threads)
-        verify_matches(cameras, database_path, pairs)
+        _match(database_path, images, pairs, threads, most_keypoints, longer_side)
+        verify_matches(cameras, database_path, pairs, most_epipolar_px)
         options = pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=1)
         options.triangulation.ignore_two_view_tracks = False
         output = folder / "model"
@@ -98,25 +109,20 @@ def triangulate_features(
         return _collected([point for _, point in sorted(result.points3D.items())], result)
 
 
-def _match(database_path: Path, images: Path, pairs: list, threads: int) -> None:
+def _match(database_path: Path, images: Path, pairs: list, threads: int, most: int, longer_side: int) -> None:
     """Finds keypoints in the photographs and matches them between the pairs."""
     from linprim_geo.geometry.load_pycolmap import pycolmap
 
     extraction = pycolmap.FeatureExtractionOptions(num_threads=threads)
-    extraction.sift.max_num_features = _MAX_FEATURES
+    extraction.sift.max_num_features = most
+    if longer_side:
+        extraction.max_image_size = longer_side
     extraction.sift.peak_threshold = _PEAK_THRESHOLD
     pycolmap.extract_features(database_path, images, extraction_options=extraction, device=pycolmap.Device.cpu)
-    pair_file = images.parent / "pairs.txt"
-    pair_file.write_text("".join(f"{file_name(i)} {file_name(j)}\n" for i, j in pairs))
-    matching = pycolmap.FeatureMatchingOptions(num_threads=threads, skip_geometric_verification=True)
-    # The approximate matcher draws random numbers that its threads share, so that now and then a match differs.
-    matching.sift.cpu_brute_force_matcher = True
-    pycolmap.match_image_pairs(
-        database_path,
-        matching_options=matching,
-        pairing_options=pycolmap.ImportedPairingOptions(match_list_path=str(pair_file)),
-        device=pycolmap.Device.cpu,
-    )
+    with pycolmap.Database.open(database_path) as database:
+        found = {image: database.read_descriptors(image + 1).data for image in {k for pair in pairs for k in pair}}
+        for i, j in pairs:
+            database.write_matches(i + 1, j + 1, mutual_matches(found[i], found[j]))
 
 
 def _collected(points: list, model=None) -> ObservedPoints:
@@ -186,8 +192,10 @@ def posed_model(cameras: Sequence[Camera], database_path: Path):
     return reconstruction
 
 
-def verify_matches(cameras: Sequence[Camera], database_path: Path, pairs: list) -> None:
-    """Keeps the matches that the known poses allow: those near each other's epipolar lines.
+def verify_matches(
+    cameras: Sequence[Camera], database_path: Path, pairs: list, most_px: float = _MAX_EPIPOLAR_PX
+) -> None:
+    """Keeps the matches that the known poses allow: those within `most_px` of each other's epipolar lines.
 
     The distance is Sampson's, |x2' F x1| / sqrt(|(F x1)_xy|^2 + |(F' x2)_xy|^2), first order in pixels.
     """
@@ -201,7 +209,7 @@ def verify_matches(cameras: Sequence[Camera], database_path: Path, pairs: list) 
                 continue
             matches = database.read_matches(first, second)
             error = sampson_px(cameras[i], cameras[j], keypoints[i][matches[:, 0]], keypoints[j][matches[:, 1]])
-            inliers = matches[error <= _MAX_EPIPOLAR_PX]
+            inliers = matches[error <= most_px]
             if database.exists_two_view_geometry(first, second):
                 database.delete_two_view_geometry(first, second)
             if len(inliers):
