@@ -217,6 +217,12 @@ class SceneOptions:
         number_or="auto",
     )
     views: int = option(0, "train with N of the training views, evenly spread over them; 0 takes all", low=0)
+    poses: str = option(
+        "auto",
+        "auto: poses that come with a capture are adjusted where keypoints say that they err; given: they are taken as "
+        "they are",
+        choices=("auto", "given"),
+    )
 
 
 @dataclass(frozen=True)

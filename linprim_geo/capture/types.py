@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.lens import Intrinsics, Lens
 from linprim_geo.imaging import photos
 from linprim_geo.imaging.decoded_photos import DecodedPhotos
+
+if TYPE_CHECKING:
+    from linprim_geo.capture.adjusted_poses import AdjustedPoses
 
 # `Scene.kind` of photographs whose poses were found by structure from motion.
 PHOTOGRAPHS = "photographs"
@@ -151,7 +155,8 @@ class View:
 
 @dataclass(frozen=True)
 class Scene:
-    """A capture in the data set's own frame and unit, split into training and held-out views."""
+    """A capture in the data set's own frame and unit, split into training and held-out views; `adjusted` are the poses
+    that they have in place of the given ones."""
 
     root: Path
     kind: str
@@ -159,6 +164,7 @@ class Scene:
     test: tuple[View, ...]
     points: PointCloud | None = None
     unit: str = "unit of the data set"
+    adjusted: AdjustedPoses | None = None
 
     @property
     def views(self) -> tuple[View, ...]:

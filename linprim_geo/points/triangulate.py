@@ -48,7 +48,7 @@ def triangulate_points(
         LinprimError: fewer than 16 points survive, or an image cannot be read.
     """
     say = log or (lambda line: None)
-    stored = cache_folder(cache) / "points" / f"{_key(scene, seed)}.npz"
+    stored = cache_folder(cache) / "points" / f"{digest_of(scene.train, (_CACHE_VERSION, seed))}.npz"
     cloud = _stored(stored)
     if cloud is not None:
         say(f"triangulated points: {len(cloud.xyz)} from {stored}")
@@ -56,7 +56,7 @@ def triangulate_points(
     say(f"triangulating points from {len(scene.train)} training images ...")
     start = time.monotonic()
     cameras = [view.camera for view in scene.train]
-    found = triangulate_features(cameras, lambda folder: _write_images(scene.train, folder), seed, threads)
+    found = triangulate_features(cameras, lambda folder: write_images(scene.train, folder), seed, threads)
     found = found.chosen(reliable_points(cameras, found))
     if len(found.xyz) < _MIN_POINTS:
         raise LinprimError(
@@ -70,7 +70,7 @@ def triangulate_points(
     return cloud
 
 
-def _write_images(views: Sequence[View], folder: Path) -> None:
+def write_images(views: Sequence[View], folder: Path) -> None:
     """Lossless copies at the cameras' size; what is transparent becomes black, so that no keypoint is
     hidden there."""
     from PIL import Image
@@ -83,9 +83,10 @@ def _write_images(views: Sequence[View], folder: Path) -> None:
         Image.fromarray(rgb).save(folder / file_name(index), compress_level=0)
 
 
-def _key(scene: Scene, seed: int) -> str:
-    digest = hashlib.blake2b(repr((_CACHE_VERSION, seed)).encode(), digest_size=16)
-    for view in scene.train:
+def digest_of(views: Sequence[View], how: tuple) -> str:
+    """A name for what is found in views with known poses, by their bytes and cameras, and by how it is found."""
+    digest = hashlib.blake2b(repr(how).encode(), digest_size=16)
+    for view in views:
         camera = view.camera
         digest.update(repr((camera.width, camera.height, view.downscale, view.lens, view.has_alpha)).encode())
         digest.update(np.array([camera.fx, camera.fy, camera.cx, camera.cy]).tobytes())

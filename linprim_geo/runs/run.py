@@ -7,6 +7,7 @@ training_frame.npz   primitives in the training frame, bit for bit as trained
 scene.npz, scene.ply the same in the data set's frame, ours and in LinPrim's format (Gaussians: 3DGS's)
 environment.npy, .png  cube map of what stands behind everything, if it was trained, and a picture of it (`environment`)
 found_poses/      COLMAP model of photographs that came without poses
+adjusted_poses.json  those that took the place of the capture's, if its photographs called for it
 metrics.jsonl     loss, PSNR, ... over time                        checkpoints/step_*.pt, latest
 """
 
@@ -30,6 +31,7 @@ from linprim_geo.base.files import is_leftover, readable_write_errors, write_jso
 from linprim_geo.base.kinds import KINDS
 from linprim_geo.base.options import SceneOptions, TrainOptions, check_train_options, from_saved, raster_options
 from linprim_geo.base.version import __version__
+from linprim_geo.capture.adjusted_poses import AdjustedPoses
 from linprim_geo.capture.found_poses import found_model
 from linprim_geo.capture.load import in_capture, load_scene
 from linprim_geo.capture.types import PHOTOGRAPHS, Scene, View
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
 
 # Folder of the COLMAP model of a run on photographs whose poses were found.
 FOUND_POSES = "found_poses"
+ADJUSTED_POSES = "adjusted_poses.json"
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,8 @@ class Run:
         if scene.kind == PHOTOGRAPHS and (model := found_model(scene.root)) is not None:
             with readable_write_errors(path / FOUND_POSES):
                 shutil.copytree(model, path / FOUND_POSES, dirs_exist_ok=True)
+        if scene.adjusted is not None:
+            scene.adjusted.write(path / ADJUSTED_POSES)
         write_json(
             path / "transform.json",
             {
@@ -176,7 +181,9 @@ class Run:
     def _scene(self) -> Scene:
         options = in_capture(self.scene_options, self.scene_path)
         found = self.path / FOUND_POSES
-        return load_scene(self.scene_path, options, sparse=options.sparse or (str(found) if found.is_dir() else ""))
+        scene = load_scene(self.scene_path, options, sparse=options.sparse or (str(found) if found.is_dir() else ""))
+        adjusted = self.path / ADJUSTED_POSES
+        return AdjustedPoses.read(adjusted).applied(scene) if adjusted.exists() else scene
 
     @cached_property
     def state(self) -> dict:

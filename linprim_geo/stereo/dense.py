@@ -23,6 +23,7 @@ from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.structure_from_motion import prepare
 from linprim_geo.capture.types import Scene, View
 from linprim_geo.kernels import ops
+from linprim_geo.points.adjust_poses import adjusted_scene
 from linprim_geo.points.start_points import with_points
 from linprim_geo.stereo.confidence import maps_of
 from linprim_geo.stereo.fused_points import PointFusion
@@ -138,6 +139,13 @@ def _photographs(
     """The photographs to take, and the notes about them."""
     prepare(path, scene_options, threads=options.threads, log=log)
     scene = load_scene(path, scene_options)
+    if scene_options.poses == "auto":
+        scene = adjusted_scene(scene, options.seed, threads=options.threads, log=log)
+
+    def reread(how: SceneOptions) -> list[View]:
+        again = load_scene(path, how)
+        return _sorted_views(again if scene.adjusted is None else scene.adjusted.applied(again))
+
     views = _sorted_views(scene)
     if len(views) < LEAST_VIEWS:
         raise LinprimError(f"{path}: {len(views)} photographs with poses, wanted at least {LEAST_VIEWS} for stereo")
@@ -145,8 +153,8 @@ def _photographs(
     assert found is not None
     points = found.xyz
     if notes:
-        reread = replace(scene_options, downscale=notes["downscale"])
-        views = _sorted_views(load_scene(path, reread)) if reread != scene_options else views
+        smaller = replace(scene_options, downscale=notes["downscale"])
+        views = reread(smaller) if smaller != scene_options else views
         by_name = {view.name: view for view in views}
         if missing := [name for name in notes["names"] if name not in by_name]:
             raise LinprimError(f"{path}: the photograph {missing[0]} is gone, which --resume needs")
@@ -157,7 +165,7 @@ def _photographs(
         log(_told(plan, views, budget))
     downscale = scene_options.downscale * plan.downscale
     if plan.downscale > 1:
-        views = _sorted_views(load_scene(path, replace(scene_options, downscale=downscale)))
+        views = reread(replace(scene_options, downscale=downscale))
     if plan.views < len(views):
         kept = np.linspace(0, len(views), plan.views, endpoint=False).astype(int)
         views = [views[k] for k in kept]

@@ -26,6 +26,7 @@ from linprim_geo.capture.types import PointCloud, Scene
 from linprim_geo.geometry.environment_map import texels_for
 from linprim_geo.imaging.decoded_photos import DecodedPhotos
 from linprim_geo.kernels import ops
+from linprim_geo.points.adjust_poses import adjusted_scene
 from linprim_geo.points.initial_points import (
     CAMERA_DISTANCE,
     VolumePoints,
@@ -55,7 +56,10 @@ def decided_scene(
     decoded = DecodedPhotos()
 
     def read(how: SceneOptions) -> Scene:
-        return with_points(load_scene(path, how, decoded=decoded), options, log)
+        scene = load_scene(path, how, decoded=decoded)
+        if how.poses == "auto":
+            scene = adjusted_scene(scene, options.seed, threads=options.threads, log=log)
+        return with_points(scene, options, log)
 
     prepare(path, scene_options, threads=options.threads, log=log)
     scene = read(scene_options)

@@ -48,6 +48,7 @@ def coarse_task(folder: Path, run: str) -> dict:
     _prepared(opened.train_options)
     coarse = coarse_of(opened, scene)
     small = replace(coarse.scene(), points=scene.points)
+    small = small if scene.adjusted is None else scene.adjusted.applied(small)
     with locked(coarse.path, "trained into"):
         behind = chosen_background(
             coarse.train_options.background, small, load_training_images(small.train, coarse.similarity)

@@ -1,0 +1,55 @@
+"""Poses of a capture after `points.adjust_poses`, as a file of a run and of the cache folder keep them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import read_json, write_json
+from linprim_geo.capture.types import Scene, View, check_pose
+
+
+@dataclass(frozen=True)
+class AdjustedPoses:
+    """World to camera (4, 4) by the names of views, none where the given poses are as good; a factor of all focal
+    lengths; and by how many pixels the given poses are taken to err, root mean square."""
+
+    poses: dict[str, np.ndarray]
+    focal_factor: float
+    error_px: float
+
+    def applied(self, scene: Scene) -> Scene:
+        """The scene with these poses; views without one keep theirs."""
+
+        def moved(view: View) -> View:
+            pose, own = self.poses.get(view.name, view.camera.world_to_camera), view.camera
+            fx, fy = self.focal_factor * own.fx, self.focal_factor * own.fy
+            return replace(view, camera=replace(own, fx=fx, fy=fy, world_to_camera=pose))
+
+        train, test = (tuple(map(moved, views)) for views in (scene.train, scene.test))
+        return replace(scene, train=train, test=test, adjusted=self)
+
+    def write(self, path: Path) -> None:
+        """Raises LinprimError if that fails."""
+        about = "world to camera by photograph (x right, y down, z forward), in place of the capture's own poses"
+        numbers = {"error_px": self.error_px, "focal_factor": self.focal_factor}
+        write_json(path, {"about": about, **numbers, "poses": self.poses})
+
+    @staticmethod
+    def read(path: Path) -> AdjustedPoses:
+        """Raises LinprimError for a file that holds no such poses."""
+        saved = read_json(path, "adjusted poses")
+        try:
+            assert isinstance(saved, dict)
+            poses = {str(name): np.array(pose, np.float64) for name, pose in saved["poses"].items()}
+            error, factor = float(saved["error_px"]), float(saved["focal_factor"])
+            assert np.isfinite(error) and 0.5 < factor < 2 and all(pose.shape == (4, 4) for pose in poses.values())
+        except (AssertionError, AttributeError, KeyError, TypeError, ValueError, OverflowError):
+            wanted = "error_px, focal_factor, and 4 by 4 numbers for each of the poses"
+            raise LinprimError(f"{path}: holds no adjusted poses, wanted {wanted}") from None
+        for pose in poses.values():
+            check_pose(pose, str(path))  # taken as they are: a run goes on with the same bits
+        return AdjustedPoses(poses, factor, error)

@@ -1,0 +1,191 @@
+"""Bundle adjustment of poses that are nearly right: the most probable ones by observed keypoints and as given.
+
+How far the given poses err is not known: each has an error of its own, of a variance that the observations tell, too
+(expectation maximisation). So poses that are exact stay, and where observations leave it open, as along a corridor of
+plain walls, poses stay as given instead of bending. Source: Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000
+(reduced camera system); Dempster et al., 1977.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.feature_points import ObservedPoints
+
+# Steps of Gauss and Newton: for points alone, and for poses and points.
+POINT_STEPS, STEPS = 10, 20
+# The constant of Cauchy's loss, in deviations of the noise: 95 % efficient where errors are normal.
+CAUCHY = 2.385
+# The median length of two normal errors of deviation 1.
+MEDIAN_LENGTH = float(np.sqrt(2 * np.log(2)))
+# Keypoints are no more exact than this, and poses are taken to err by so many pixels before anything is known.
+LEAST_NOISE, FIRST_ERROR = 0.02, 1.0
+# The deviation of focal lengths that come with poses, as a share: those of a calibration are right to some thousandths.
+FOCAL_ERROR = 0.003
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """Adjusted cameras, the points that they see, by how many pixels the given poses err, root mean square, by their
+    rotations and by their centres together, and the factor of all focal lengths."""
+
+    cameras: list[Camera]
+    points: ObservedPoints
+    error_px: float
+    focal_factor: float
+
+
+def bundle_adjusted(cameras: Sequence[Camera], points: ObservedPoints) -> Adjusted:
+    """The most probable poses and points; `points` have two observations or more each.
+
+    Raises:
+        numpy.linalg.LinAlgError: the observations determine nothing.
+    """
+    from scipy.linalg import cho_factor, cho_solve
+
+    given, points = list(cameras), placed_points(cameras, points)
+    depth = _median_depths(given, points)
+    focal = np.array([(camera.fx + camera.fy) / 2 for camera in given])
+    # Deviations of rotations about an axis, in radians, and of centres along one, in depths.
+    spread = np.full(2, FIRST_ERROR / 2 / np.median(focal))
+    moved, moves, log_factor = given, np.zeros((len(given), 6)), 0.0
+    for _ in range(STEPS):
+        found = _Equations(moved, points)
+        variance = np.repeat(np.stack([np.full_like(depth, spread[0]), spread[1] * depth], 1) ** 2, 3, axis=1)
+        information = np.append(1 / variance, FOCAL_ERROR**-2)
+        reduced, right = found.reduced(information, np.append(moves, log_factor))
+        if not np.isfinite(reduced).all():
+            raise np.linalg.LinAlgError("observations behind all cameras, or at one of them")
+        factor = cho_factor(reduced, check_finite=False)
+        step = cho_solve(factor, right, check_finite=False)
+        points = replace(points, xyz=points.xyz + found.of_points(step))
+        moves, log_factor = moves + step[:-1].reshape(-1, 6), log_factor + step[-1]
+        moved = [_moved(camera, own, step[-1]) for camera, own in zip(moved, step[:-1].reshape(-1, 6), strict=True)]
+        covariance = np.diag(cho_solve(factor, np.eye(len(reduced)), check_finite=False))[:-1].reshape(-1, 6)
+        square = ((moves**2 + covariance) / np.repeat([np.ones_like(depth), depth**2], 3, axis=0).T).reshape(-1, 2, 3)
+        spread = np.sqrt(square.mean((0, 2)))
+    # Two axes of each move what is seen.
+    error = float(np.sqrt(2 * (spread**2).sum()) * np.median(focal))
+    return Adjusted(moved, placed_points(moved, points), error, float(np.exp(log_factor)))
+
+
+def placed_points(cameras: Sequence[Camera], points: ObservedPoints) -> ObservedPoints:
+    """The points where the cameras see them, by Gauss-Newton steps from where they are; with their mean errors."""
+    for _ in range(POINT_STEPS):
+        found = _Equations(cameras, points)
+        points = replace(points, xyz=points.xyz + found.of_points(None))
+    total = np.bincount(points.point, weights=reprojection_px(cameras, points), minlength=len(points.xyz))
+    return replace(points, error_px=(total / np.maximum(points.track_length, 1)).astype(np.float32))
+
+
+def reprojection_px(cameras: Sequence[Camera], points: ObservedPoints) -> np.ndarray:
+    """(N,) distance of every observation from where its point is seen, infinite behind the camera."""
+    error = np.zeros(len(points.image))
+    for k, camera in enumerate(cameras):
+        rows = points.image == k
+        pixels, _ = camera.project(points.xyz[points.point[rows]])
+        error[rows] = np.linalg.norm(pixels - points.pixel[rows], axis=1)
+    return np.nan_to_num(error, nan=np.inf)
+
+
+class _Equations:
+    """Normal equations of all observations around cameras and points, weighted by Cauchy's loss and by the variance of
+    the noise, which their median tells.
+
+    A camera moves by six numbers: it turns about its centre by three, in radians about its axes, and what it sees
+    shifts by three along them. The last unknown is the logarithm of a factor of all focal lengths.
+    """
+
+    def __init__(self, cameras: Sequence[Camera], points: ObservedPoints):
+        self.image, self.point = points.image, points.point
+        self.cameras, self.points = len(cameras), len(points.xyz)
+        turn = np.array([camera.rotation for camera in cameras])[self.image]
+        shift = np.array([camera.world_to_camera[:3, 3] for camera in cameras])[self.image]
+        inner = np.array([(camera.fx, camera.fy, camera.cx, camera.cy) for camera in cameras])[self.image].T
+        local = np.einsum("nij,nj->ni", turn, points.xyz[self.point]) + shift
+        x, y, z = local.T
+        front = z > 0
+        z = np.where(front, z, 1)
+        self.by_focal = np.stack([inner[0] * x / z, inner[1] * y / z], 1)
+        miss = points.pixel - self.by_focal - inner[2:].T
+        length = np.linalg.norm(miss, axis=1)
+        noise = max(float(np.median(length[front])) / MEDIAN_LENGTH, LEAST_NOISE) if front.any() else 1.0
+        weight = np.where(front, 1 / (1 + (length / (CAUCHY * noise)) ** 2) / noise**2, 0)
+        zero = np.zeros_like(z)
+        by_local = np.stack([inner[0] / z, zero, -inner[0] * x / z**2, zero, inner[1] / z, -inner[1] * y / z**2], 1)
+        by_local = by_local.reshape(-1, 2, 3)
+        cross = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)  # d(turn x local) / d turn
+        self.by_camera = np.concatenate([by_local @ cross, by_local], axis=2)
+        self.by_point = by_local @ turn
+        self.weight, self.miss = weight, miss
+        self.point_matrix = np.zeros((self.points, 3, 3))
+        weighted = weight[:, None, None] * self.by_point
+        np.add.at(self.point_matrix, self.point, np.einsum("nki,nkj->nij", weighted, self.by_point))
+        self.point_right = np.zeros((self.points, 3))
+        np.add.at(self.point_right, self.point, np.einsum("nki,nk->ni", weighted, miss))
+        # Points that are seen from one direction do not leave along it.
+        damping = 1e-6 * np.trace(self.point_matrix, axis1=1, axis2=2) + 1e-300
+        self.point_inverse = np.linalg.inv(self.point_matrix + damping[:, None, None] * np.eye(3))
+
+    def reduced(self, information: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The (6 K + 1, 6 K + 1) matrix and the right side for cameras and the factor alone, with the `information`
+        (6 K + 1,) about the `moves` (6 K + 1,) that they have made from what was given."""
+        from scipy.sparse import bsr_matrix
+
+        weighted, zoomed = self.weight[:, None, None] * self.by_camera, self.weight[:, None] * self.by_focal
+        own, by_focal = np.zeros((self.cameras, 6, 6)), np.zeros((self.cameras, 6))
+        np.add.at(own, self.image, np.einsum("nki,nkj->nij", weighted, self.by_camera))
+        np.add.at(by_focal, self.image, np.einsum("nki,nk->ni", self.by_camera, zoomed))
+        right = np.zeros((self.cameras, 6))
+        np.add.at(right, self.image, np.einsum("nki,nk->ni", weighted, self.miss))
+        # One row of blocks per observation: of its camera, times those of its point.
+        order, both = np.argsort(self.image, kind="stable"), np.einsum("nki,nkj->nij", weighted, self.by_point)
+        bounds = np.searchsorted(self.image[order], np.arange(self.cameras + 1))
+        shape = (6 * self.cameras, 3 * self.points)
+        mixed = bsr_matrix((both[order], self.point[order], bounds), shape=shape)
+        solved = np.einsum("nij,njk->nik", both, self.point_inverse[self.point])
+        solved = bsr_matrix((solved[order], self.point[order], bounds), shape=shape)
+        mixed_focal = np.zeros((self.points, 3))
+        np.add.at(mixed_focal, self.point, np.einsum("nki,nk->ni", self.by_point, zoomed))
+        solved_focal = np.einsum("pij,pj->pi", self.point_inverse, mixed_focal).ravel()
+        matrix = np.diag(information)
+        matrix[:-1, :-1] -= (solved @ mixed.T).toarray()
+        for k in range(self.cameras):
+            matrix[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += own[k]
+        matrix[:-1, -1] = matrix[-1, :-1] = by_focal.ravel() - mixed @ solved_focal
+        matrix[-1, -1] += (zoomed * self.by_focal).sum() - mixed_focal.ravel() @ solved_focal
+        right = np.append(right - (solved @ self.point_right.ravel()).reshape(-1, 6), (zoomed * self.miss).sum())
+        right[-1] -= solved_focal @ self.point_right.ravel()
+        return matrix, right - information * moves
+
+    def of_points(self, step: np.ndarray | None) -> np.ndarray:
+        """(P, 3) the points' step where cameras and focal lengths step by (6 K + 1,), or stay."""
+        right = self.point_right
+        if step is not None:
+            right = right.copy()
+            moved = np.einsum("nkj,nj->nk", self.by_camera, step[:-1].reshape(-1, 6)[self.image])
+            moved = (moved + self.by_focal * step[-1]) * self.weight[:, None]
+            np.subtract.at(right, self.point, np.einsum("nki,nk->ni", self.by_point, moved))
+        return np.einsum("pij,pj->pi", self.point_inverse, right)
+
+
+def _median_depths(cameras: Sequence[Camera], points: ObservedPoints) -> np.ndarray:
+    """(K,) of the points that a camera sees; that of all where it sees none."""
+    depths = [camera.project(points.xyz[points.point[points.image == k]])[1] for k, camera in enumerate(cameras)]
+    usual = float(np.median(np.concatenate(depths)))
+    return np.array([max(float(np.median(own)), 1e-3 * usual) if len(own) else usual for own in depths])
+
+
+def _moved(camera: Camera, step: np.ndarray, log_factor: float = 0.0) -> Camera:
+    from scipy.spatial.transform import Rotation
+
+    pose = np.eye(4)
+    turn = Rotation.from_rotvec(step[:3]).as_matrix()
+    pose[:3, :3] = turn @ camera.rotation
+    pose[:3, 3] = turn @ camera.world_to_camera[:3, 3] + step[3:]
+    factor = float(np.exp(log_factor))
+    return replace(camera, fx=factor * camera.fx, fy=factor * camera.fy, world_to_camera=pose)

@@ -1,0 +1,128 @@
+"""Poses that come with a capture, adjusted where its photographs say that they err.
+
+Keypoints are matched and triangulated under the given poses. Poses are adjusted to half of the points; where these
+explain the other half better than the given ones do, they are adjusted to all. Exact poses fail this test: adjusted
+ones have errors of their own.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.progress import duration
+from linprim_geo.capture.adjusted_poses import AdjustedPoses
+from linprim_geo.capture.types import PHOTOGRAPHS, Scene, View
+from linprim_geo.geometry.bundle_adjustment import bundle_adjusted, placed_points, reprojection_px
+from linprim_geo.geometry.feature_points import ObservedPoints, triangulate_features
+from linprim_geo.imaging.photos import cache_folder
+from linprim_geo.points.triangulate import digest_of, write_images
+
+# Changed whenever poses come out differently.
+CACHE_VERSION = 2
+# Of more photographs so many, evenly spread, tell whether poses err. Adjusting needs all; the equations of all cameras
+# at once are dense, and with MOST_VIEWS take half a minute.
+ASKED_VIEWS, MOST_VIEWS = 60, 500
+# Keypoints of a photograph, the longer side of those that they are looked for in, and the least one: smaller ones have
+# a dozen keypoints.
+KEYPOINTS, LONGER_SIDE, LEAST_SIDE = 2048, 1000, 100
+# Poses may err by this share of the longer side, matches with them.
+EPIPOLAR_SHARE = 0.004
+# Points have so many observations, and so many of them are needed in either half: the median error of 200 points with
+# 5 observations each is known to 3 %.
+LEAST_TRACK, LEAST_POINTS = 3, 200
+# Adjusted poses are taken where they leave no more than this share of the given ones' median error, on points that took
+# no part. Errors of keypoints and of poses add up as squares: the latter are half of the former then.
+LEFT_SHARE = 0.9
+# Exact poses of rendered scenes err by 0.04 pixels and less by keypoints, which have systematic errors of their own:
+# less than this is none.
+LEAST_ERROR_PX = 0.1
+
+
+def adjusted_scene(
+    scene: Scene, seed: int = 0, *, threads: int = 0, cache: Path | None = None, log: Callable[[str], None]
+) -> Scene:
+    """The scene with adjusted poses where its photographs call for it; what was found is kept in the cache folder.
+
+    Args:
+        scene: held-out views are adjusted, too: by keypoints, their colours are not used.
+        seed: of what pycolmap samples.
+        threads: for keypoints; 0 uses all cores.
+        log: is called with a line when poses are adjusted, or cannot be.
+
+    Raises:
+        LinprimError: a photograph cannot be read.
+    """
+    if scene.kind == PHOTOGRAPHS:  # their poses are adjusted already
+        return scene
+    if min(max(view.camera.width, view.camera.height) for view in scene.views) < LEAST_SIDE:
+        return scene
+    stored = cache_folder(cache) / "adjusted_poses" / f"{digest_of(scene.views, (CACHE_VERSION, seed))}.json"
+    try:
+        found = AdjustedPoses.read(stored)
+    except LinprimError:  # none, or damaged: made again
+        begin = time.monotonic()
+        found = _adjusted(scene.views, seed, threads, log)
+        try:
+            found.write(stored)
+        except LinprimError:
+            pass  # a cache that cannot be written is no reason to stop
+        log(
+            f"poses: keypoints say that the given ones {'err' if found.poses else 'are right'} "
+            f"({duration(time.monotonic() - begin)})"
+        )
+    if not found.poses:
+        return scene
+    log(f"poses: given ones err by {found.error_px:.2f} pixels and are adjusted; --poses given keeps them")
+    return found.applied(scene)
+
+
+def _adjusted(views: Sequence[View], seed: int, threads: int, log: Callable[[str], None]) -> AdjustedPoses:
+    """Adjusted poses, or none."""
+    none = AdjustedPoses({}, 1.0, 0.0)
+    step = -(-len(views) // ASKED_VIEWS)
+    points = _observed(views[::step], seed, threads)
+    try:
+        if not _errs(views[::step], points, seed):
+            return none
+        if len(views) > MOST_VIEWS:
+            log(f"poses: the given ones err, but only those of {MOST_VIEWS} photographs or fewer can be adjusted")
+            return none
+        if step > 1:
+            points = _observed(views, seed, threads)
+        done = bundle_adjusted([view.camera for view in views], points)
+    except np.linalg.LinAlgError:  # keypoints do not determine them
+        return none
+    poses = {view.name: camera.world_to_camera for view, camera in zip(views, done.cameras, strict=True)}
+    return AdjustedPoses(poses, done.focal_factor, done.error_px)
+
+
+def _observed(views: Sequence[View], seed: int, threads: int) -> ObservedPoints:
+    cameras = [view.camera for view in views]
+    found = triangulate_features(
+        cameras,
+        lambda folder: write_images(views, folder),
+        seed,
+        threads or -1,
+        most_keypoints=KEYPOINTS,
+        longer_side=LONGER_SIDE,
+        most_epipolar_px=max(2.0, EPIPOLAR_SHARE * max(max(camera.width, camera.height) for camera in cameras)),
+    )
+    return found.chosen(found.track_length >= LEAST_TRACK)
+
+
+def _errs(views: Sequence[View], points: ObservedPoints, seed: int) -> bool:
+    """Whether poses that are adjusted to half of the points leave less of the others' errors than the given ones."""
+    first = np.random.default_rng([seed, 14]).random(len(points.xyz)) < 0.5
+    if min(np.count_nonzero(first), np.count_nonzero(~first)) < LEAST_POINTS:
+        return False
+    cameras, others = [view.camera for view in views], points.chosen(~first)
+    found = bundle_adjusted(cameras, points.chosen(first))
+    given_px, left_px = (
+        float(np.median(reprojection_px(poses, placed_points(poses, others)))) for poses in (cameras, found.cameras)
+    )
+    return found.error_px >= LEAST_ERROR_PX and left_px <= LEFT_SHARE * given_px

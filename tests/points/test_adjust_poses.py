@@ -1,0 +1,139 @@
+"""Poses of a capture that err are adjusted, exact ones stay; runs keep what was found."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.captures import look_at, transforms
+from helpers.textured_room import photograph
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import SceneOptions, TrainOptions
+from linprim_geo.capture.adjusted_poses import AdjustedPoses
+from linprim_geo.capture.load import load_scene
+from linprim_geo.capture.types import PHOTOGRAPHS
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.points import adjust_poses as module
+from linprim_geo.points.adjust_poses import adjusted_scene
+from linprim_geo.runs.run import ADJUSTED_POSES, Run
+from linprim_geo.training.train import train
+
+SIZE, FOCAL, COUNT, ERROR_PX = (240, 180), 200.0, 14, 1.0
+
+
+def true_cameras() -> list[Camera]:
+    places = [(-0.9 + 0.12 * i, -1.0 + 0.1 * (i % 4), 0.3 * np.sin(2.0 * i)) for i in range(COUNT)]
+    return [look_at(place, (1.5, 2.0, 0.2), SIZE, FOCAL) for place in places]
+
+
+def shaken(camera: Camera, rng: np.random.Generator) -> Camera:
+    """Half of the square of ERROR_PX by turning, half by moving, at a depth of 3.5."""
+    deviation = ERROR_PX / 2 / FOCAL
+    pose = camera.world_to_camera.copy()
+    pose[:3] = Rotation.from_rotvec(rng.normal(0, deviation, 3)).as_matrix() @ pose[:3]
+    pose[:3, 3] += rng.normal(0, 3.5 * deviation, 3)
+    return replace(camera, world_to_camera=pose)
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory):
+    """Two captures of one room, with exact poses and with wrong ones."""
+    rng, true = np.random.default_rng(2), true_cameras()
+    names = [f"{i:02d}.png" for i in range(COUNT)]
+    pictures = [Image.fromarray(photograph(camera)) for camera in true]
+    roots = {}
+    for kind, cameras in (("exact", true), ("wrong", [shaken(camera, rng) for camera in true])):
+        roots[kind] = root = tmp_path_factory.mktemp(kind)
+        for name, picture in zip(names, pictures, strict=True):
+            picture.save(root / name)
+        (root / "transforms.json").write_text(json.dumps(transforms(cameras, names)))
+    return roots
+
+
+def off_px(scene) -> float:
+    """By how far views see points of the walls from where true cameras do, root mean square."""
+    walls = np.random.default_rng(0).uniform(-1, 1, (300, 3)) * [0.6, 0.6, 0.4] + [1.4, 1.9, 0.2]
+    true, off = true_cameras(), []
+    for view in scene.views:
+        off.append(view.camera.project(walls)[0] - true[int(view.name)].project(walls)[0])
+    return float(np.sqrt(2 * np.mean(np.square(off))))
+
+
+def test_wrong_poses_are_adjusted_and_kept(rooms, tmp_path, monkeypatch):
+    given, lines = load_scene(rooms["wrong"]), []
+    found = adjusted_scene(given, cache=tmp_path, threads=1, log=lines.append)
+    assert found.adjusted is not None and found.adjusted.error_px == pytest.approx(ERROR_PX, rel=0.4)
+    assert off_px(found) < 0.5 * off_px(given)
+    assert len(lines) == 2 and "err" in lines[0] and "--poses given" in lines[1]
+    monkeypatch.setattr(module, "triangulate_features", None)  # what is kept is not found again
+    again = adjusted_scene(given, cache=tmp_path, log=lines.append)
+    assert len(lines) == 3
+    for one, other in zip(found.views, again.views, strict=True):
+        assert (one.camera.world_to_camera == other.camera.world_to_camera).all()
+        assert one.camera.fx == other.camera.fx == found.adjusted.focal_factor * FOCAL
+
+
+def test_exact_poses_stay_to_the_bit(rooms, tmp_path, monkeypatch):
+    given, lines = load_scene(rooms["exact"]), []
+    assert adjusted_scene(given, cache=tmp_path, threads=1, log=lines.append) is given
+    assert len(lines) == 1 and "right" in lines[0]
+    monkeypatch.setattr(module, "triangulate_features", None)
+    assert adjusted_scene(given, cache=tmp_path, log=lines.append) is given
+
+
+def test_poses_that_we_found_and_small_photographs_are_not_looked_at(rooms, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "triangulate_features", None)
+    given = replace(load_scene(rooms["wrong"]), kind=PHOTOGRAPHS)
+    assert adjusted_scene(given, cache=tmp_path, log=print) is given
+    small = load_scene(rooms["wrong"], downscale=3)
+    assert adjusted_scene(small, cache=tmp_path, log=print) is small
+
+
+def test_of_many_photographs_some_say_whether_poses_err(rooms, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "ASKED_VIEWS", 7)
+    monkeypatch.setattr(module, "LEAST_POINTS", 60)
+    found = adjusted_scene(load_scene(rooms["wrong"]), cache=tmp_path, threads=1, log=lambda line: None)
+    assert found.adjusted is not None and len(found.adjusted.poses) == COUNT
+    monkeypatch.setattr(module, "MOST_VIEWS", COUNT - 1)
+    lines: list[str] = []
+    assert adjusted_scene(load_scene(rooms["wrong"]), 1, cache=tmp_path, log=lines.append).adjusted is None
+    assert str(COUNT - 1) in lines[0]
+
+
+def test_a_run_keeps_its_poses(rooms, tmp_path, monkeypatch):
+    monkeypatch.setenv("LINPRIM_GEO_CACHE", str(tmp_path / "cache"))
+    options = TrainOptions(iterations=2, max_primitives=200, evaluate_every=0, start="points")
+    train(rooms["wrong"], tmp_path / "run", options=options, quiet=True)
+    monkeypatch.setenv("LINPRIM_GEO_CACHE", str(tmp_path / "empty"))
+    scene = Run.open(tmp_path / "run").scene()
+    assert off_px(scene) < 0.5 * off_px(load_scene(rooms["wrong"]))
+    train(rooms["wrong"], tmp_path / "as_given", SceneOptions(poses="given"), options, quiet=True)
+    assert not (tmp_path / "as_given" / ADJUSTED_POSES).exists()
+    assert off_px(Run.open(tmp_path / "as_given").scene()) == off_px(load_scene(rooms["wrong"]))
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"error_px": None},
+        {"focal_factor": 1e9},
+        {"focal_factor": "nan"},
+        {"poses": [1]},
+        {"poses": {"00": [[1, 0], [0, 1]]}},
+        {"poses": {"00": "x"}},
+        {"poses": {"00": (2 * np.eye(4)).tolist()}},
+    ],
+)
+def test_damaged_files_are_refused_in_one_sentence(tmp_path, damage):
+    path = tmp_path / ADJUSTED_POSES
+    whole = AdjustedPoses({"00": np.eye(4)}, 1.001, 0.5)
+    whole.write(path)
+    assert (AdjustedPoses.read(path).poses["00"] == np.eye(4)).all()
+    path.write_text(json.dumps(json.loads(path.read_text()) | damage))
+    with pytest.raises(LinprimError, match=ADJUSTED_POSES):
+        AdjustedPoses.read(path)
