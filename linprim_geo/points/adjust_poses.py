@@ -25,7 +25,7 @@ from linprim_geo.points.triangulate import digest_of, write_images
 # Changed whenever poses come out differently.
 CACHE_VERSION = 2
 # Of more photographs so many, evenly spread, tell whether poses err. Adjusting needs all; the equations of all cameras
-# at once are dense, and with MOST_VIEWS take half a minute.
+# at once are dense, and with MOST_VIEWS take a minute.
 ASKED_VIEWS, MOST_VIEWS = 60, 500
 # Keypoints of a photograph, the longer side of those that they are looked for in, and the least one: smaller ones have
 # a dozen keypoints.
@@ -72,7 +72,7 @@ def adjusted_scene(
         except LinprimError:
             pass  # a cache that cannot be written is no reason to stop
         log(
-            f"poses: keypoints say that the given ones {'err' if found.poses else 'are right'} "
+            f"poses: keypoints {'contradict' if found.poses else 'do not contradict'} the given ones "
             f"({duration(time.monotonic() - begin)})"
         )
     if not found.poses:
