@@ -28,6 +28,7 @@ from linprim_geo.stereo.plain_regions import (
     seen_enough,
     to_world,
 )
+from linprim_geo.stereo.right_angles import squared
 from linprim_geo.stereo.shading import (
     BOX,
     LEAST_BOXES,
@@ -64,6 +65,8 @@ SURE_DEPTHS, SURE_SHARE, AGREEING = 30, 0.1, 0.7
 # Confirmed depths along the edges of regions hold a plane if they are as near as NEAR, and after some steps as
 # TOLERANCE. Half of TOLERANCE is their deviation; as their errors have common causes, they count as so many at most.
 NEAR, NARROWER, HOLDING_STEPS, INDEPENDENT = 2 * TOLERANCE, 0.8, 6, 200
+# Planes at right angles leave so much more of the shading than planes that are free.
+NEARLY_AS_WELL = 1.03
 # A background is so many times as far as a region's other depths.
 FAR = 1e4
 # A plane carries a region if it does so around half of its boxes.
@@ -114,7 +117,7 @@ class ShadedPlanes:
             self.shown.append([region for region, _ in started])
             self.regions.append([one for one in fitted if one is not None])
         self.planes = self._common([one for own in self.regions for one in own if one.fit is not None])
-        self.planes = self._held(self._all_carriers())
+        self.planes = self._at_right_angles(*self._held(self._all_carriers()))
 
     def _camera(self, region: ShadedRegion) -> Camera:
         return self.shadings[region.view].camera
@@ -272,15 +275,41 @@ class ShadedPlanes:
         """`_carriers` of the regions of each view."""
         return [[self._carriers(one) for one in own] for own in self.regions]
 
-    def _held(self, carriers: Sequence[Sequence[dict[int, np.ndarray]]]) -> np.ndarray:
-        """The planes, each held by the confirmed depths along the edges of those regions whose shading it carries."""
+    def _held(self, carriers: Sequence[Sequence[dict[int, np.ndarray]]]) -> tuple[np.ndarray, list[list[ShadedRegion]]]:
+        """The planes, each held by the confirmed depths along the edges of those regions whose shading it carries, and
+        these regions."""
         carried: list[list[ShadedRegion]] = [[] for _ in self.planes]
         for own, of_view in zip(self.regions, carriers, strict=True):
             for one, of_region in zip(own, of_view, strict=True):
                 for k in of_region:
                     carried[k].append(one.region)
         held = [self._held_plane(plane, carried[k]) for k, plane in enumerate(self.planes) if k >= self.by_points]
-        return np.concatenate([self.planes[: self.by_points], np.reshape(held, (-1, 4))])
+        return np.concatenate([self.planes[: self.by_points], np.reshape(held, (-1, 4))]), carried
+
+    def _at_right_angles(self, planes: np.ndarray, carried: Sequence[Sequence[ShadedRegion]]) -> np.ndarray:
+        """The planes, turned to right angles with each other where that carries the shading of their regions nearly as
+        well, and then shifted to where most confirmed depths along the edges of these are."""
+        few = [[region.some(MOST_BOXES) for region in regions] for regions in carried]
+        fits = [
+            evaluate(plane, few[k], self.shadings) if few[k] and k >= self.by_points else None
+            for k, plane in enumerate(planes)
+        ]
+        known = [None if fit is None else fit.information for fit in fits]
+        turned = squared(planes, known, lambda k, plane: plane_moves(plane, few[k]))
+        for k, fit in enumerate(fits):
+            if fit is None or (turned[k] == planes[k]).all():
+                continue
+            points, centers = self._points_along(carried[k])
+            along = (points - centers) @ turned[k, :3]
+            off = (points @ turned[k, :3] - turned[k, 3]) / along
+            near = np.abs(off) < ALIKE_DEPTH
+            shifted = turned[k] + np.append(np.zeros(3), _commonest(off[near]) * float(np.median(along[near])))
+            for plane in (shifted, turned[k]):
+                tried = evaluate(plane, few[k], self.shadings)
+                if tried is not None and tried.left < NEARLY_AS_WELL * fit.left and tried.boxes > 0.7 * fit.boxes:
+                    planes[k] = plane
+                    break
+        return planes
 
     def _held_plane(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> np.ndarray:
         """A plane fitted to the shading of regions and to the confirmed depths along their edges that are near it: a
@@ -368,6 +397,16 @@ def _around(inside: np.ndarray, region: ShadedRegion, carried: np.ndarray) -> np
     grid[region.row[carried] // STRIDE, region.column[carried] // STRIDE] = True
     wide = binary_dilation(grid, np.ones((3, 3))).repeat(STRIDE, 0).repeat(STRIDE, 1)[:height, :width]
     return binary_dilation(inside, iterations=BOX // 2) & wide
+
+
+def _commonest(off: np.ndarray) -> float:
+    """Where most of (P,) values are within half of TOLERANCE; 0 without any."""
+    if not len(off):
+        return 0.0
+    places = np.arange(-ALIKE_DEPTH, ALIKE_DEPTH, TOLERANCE / 10)
+    ordered = np.sort(off)
+    count = np.searchsorted(ordered, places + TOLERANCE / 2) - np.searchsorted(ordered, places - TOLERANCE / 2)
+    return float(places[np.argmax(count)])
 
 
 def _plane(one: FittedRegion) -> np.ndarray:

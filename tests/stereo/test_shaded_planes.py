@@ -100,6 +100,20 @@ def test_a_lit_wall_without_texture_is_where_it_is(seed):
     assert np.quantile(off, 0.95) < 0.005
 
 
+@pytest.mark.parametrize("seed", [0, 100, 200])
+def test_a_floor_makes_a_wall_upright_unless_photographs_say_that_it_leans(seed):
+    maps, depths = photographs(lambda points, view: light(points), seed=seed, noise=3.0)
+    lean = np.radians(4)
+    floors = {"level": [0.0, 0.0, 1.0, -0.9], "leaning": [0.0, np.sin(lean), np.cos(lean), -0.9]}
+    planes = {name: planes_of(maps, depths, np.array([floor])).planes for name, floor in floors.items()}
+    alone = planes_of(maps, depths).planes[-1]
+    # Upright to the last digits; what is left is the turn about the vertical, as without a floor.
+    upright = planes["level"][-1]
+    assert abs(upright[2]) < 1e-4 < abs(alone[2]) and abs(upright[0]) < 2 * abs(alone[0]) + 1e-3
+    # By 4 degrees the shading of the wall would be off by more than noise is.
+    np.testing.assert_allclose(planes["leaning"][-1], alone, atol=1e-6)
+
+
 def test_exposures_that_differ_change_nothing():
     rng = np.random.default_rng(5)
     gains, offsets = rng.uniform(0.85, 1.15, len(CENTERS)), rng.uniform(-8, 8, len(CENTERS))

@@ -1,0 +1,57 @@
+"""Planes that are nearly at right angles become so, and no others."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from linprim_geo.stereo.right_angles import squared
+
+
+def turned(normal, degrees, axis, distance=1.0) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return np.append(Rotation.from_rotvec(np.radians(degrees) * np.asarray(axis, float)).apply(normal), distance)
+
+
+def moves(number: int, plane: np.ndarray) -> np.ndarray:
+    first = np.cross(plane[:3], np.eye(3)[np.argmin(np.abs(plane[:3]))])
+    first /= np.linalg.norm(first)
+    return np.array([[*first, 0], [*np.cross(plane[:3], first), 0], [0, 0, 0, 1]])
+
+
+def angle(one, other) -> float:
+    return float(np.degrees(np.arccos(abs(one[:3] @ other[:3]))))
+
+
+FLOOR = np.array([0.0, 0, 1, 0])
+
+
+def test_walls_turn_to_a_floor_that_stays_and_to_each_other_by_what_is_known_of_them():
+    one, other = turned([1, 0, 0], 3, [0, 0.6, 0.8]), turned([0, 1, 0], 2, [0, 0, -1], 2.0)
+    planes = np.array([FLOOR, one, other])
+    found = squared(planes, [None, np.eye(3), 100 * np.eye(3)], moves)
+    assert (found[0] == FLOOR).all()
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        assert angle(found[i], found[j]) == pytest.approx(90, abs=0.02)
+    # What more is known of turns less.
+    assert angle(found[2], other) < 0.1 < 3 < angle(found[1], one) < 6
+    assert found[1:, 3] == pytest.approx([1, 2], abs=0.01)
+    np.testing.assert_allclose(np.linalg.norm(found[:, :3], axis=1), 1)
+
+
+def test_other_angles_stay():
+    for leaning in (turned([1, 0, 0], 8, [0, 1, 0]), turned([0, 1, 0], 45, [1, 0, 0]), turned([0, 0, 1], 3, [0, 1, 0])):
+        planes = np.array([FLOOR, leaning])
+        assert (squared(planes, [None, np.eye(3)], moves) == planes).all()
+    assert (squared(planes[:1], [None], moves) == planes[:1]).all()
+    assert squared(np.zeros((0, 4)), [], moves).shape == (0, 4)
+
+
+def test_angles_that_exclude_each_other_leave_a_plane_as_it_is():
+    ramp = turned([0, 0, 1], 5, [0, 1, 0])
+    between, clear = turned([1, 0, 0], 2.5, [0, 1, 0]), turned([0, 1, 0], 2, [1, 0, 0])
+    found = squared(np.array([FLOOR, ramp, between, clear]), [None, None, np.eye(3), np.eye(3)], moves)
+    assert (found[:3] == [FLOOR, ramp, between]).all()
+    # It is at right angles to the floor and the ramp at once.
+    assert angle(found[3], FLOOR) == pytest.approx(90, abs=0.02) and angle(found[3], clear) > 1.5
