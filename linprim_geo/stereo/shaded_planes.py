@@ -294,22 +294,31 @@ class ShadedPlanes:
             evaluate(plane, few[k], self.shadings) if few[k] and k >= self.by_points else None
             for k, plane in enumerate(planes)
         ]
-        known = [None if fit is None else fit.information for fit in fits]
-        turned = squared(planes, known, lambda k, plane: plane_moves(plane, few[k]))
+        # Planes by edges that carry no shading are no reference.
+        rows = [k for k, fit in enumerate(fits) if k < self.by_points or fit is not None]
+        known = [None if (fit := fits[k]) is None else fit.information for k in rows]
+        turned = planes.copy()
+        turned[rows] = squared(planes[rows], known, lambda row, plane: plane_moves(plane, few[rows[row]]))
         for k, fit in enumerate(fits):
             if fit is None or (turned[k] == planes[k]).all():
                 continue
-            points, centers = self._points_along(carried[k])
-            along = (points - centers) @ turned[k, :3]
-            off = (points @ turned[k, :3] - turned[k, 3]) / along
-            near = np.abs(off) < ALIKE_DEPTH
-            shifted = turned[k] + np.append(np.zeros(3), _commonest(off[near]) * float(np.median(along[near])))
-            for plane in (shifted, turned[k]):
+            for plane in (self._shifted(turned[k], carried[k]), turned[k]):
                 tried = evaluate(plane, few[k], self.shadings)
                 if tried is not None and tried.left < NEARLY_AS_WELL * fit.left and tried.boxes > 0.7 * fit.boxes:
                     planes[k] = plane
                     break
         return planes
+
+    def _shifted(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> np.ndarray:
+        """A plane moved along its normal to where most confirmed depths along the edges of regions are."""
+        points, centers = self._points_along(regions)
+        along = (points - centers) @ plane[:3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            off = (points @ plane[:3] - plane[3]) / along
+        near = np.abs(off) < ALIKE_DEPTH
+        if not near.any():
+            return plane
+        return plane + np.append(np.zeros(3), _commonest(off[near]) * np.median(along[near]))
 
     def _held_plane(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> np.ndarray:
         """A plane fitted to the shading of regions and to the confirmed depths along their edges that are near it: a
@@ -400,9 +409,7 @@ def _around(inside: np.ndarray, region: ShadedRegion, carried: np.ndarray) -> np
 
 
 def _commonest(off: np.ndarray) -> float:
-    """Where most of (P,) values are within half of TOLERANCE; 0 without any."""
-    if not len(off):
-        return 0.0
+    """Where most of (P,) values are within half of TOLERANCE."""
     places = np.arange(-ALIKE_DEPTH, ALIKE_DEPTH, TOLERANCE / 10)
     ordered = np.sort(off)
     count = np.searchsorted(ordered, places + TOLERANCE / 2) - np.searchsorted(ordered, places - TOLERANCE / 2)
