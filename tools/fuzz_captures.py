@@ -241,6 +241,23 @@ def read_verdict_file(file: Path) -> None:
     check_scene(cache / "photos", cache)
 
 
+def make_adjusted_poses(folder: Path) -> None:
+    from linprim_geo.capture.adjusted_poses import AdjustedPoses
+
+    poses = {str(number): pose for number, pose in enumerate(_poses(3))}
+    AdjustedPoses(poses, 1.001, 0.5).write(folder / "adjusted_poses.json")
+
+
+def read_adjusted_poses_file(file: Path) -> None:
+    from linprim_geo.capture.adjusted_poses import AdjustedPoses
+
+    found = AdjustedPoses.read(file)
+    for pose in found.poses.values():
+        finite(pose, (4, 4), "pose")
+        check(abs(np.linalg.det(pose[:3, :3]) - 1) < 0.05, "a pose is no rotation")
+    check(0.5 < found.focal_factor < 2 and np.isfinite(found.error_px), "numbers that cannot be")
+
+
 def make_protocol(folder: Path) -> None:
     from scipy.io import savemat
 

@@ -80,6 +80,12 @@ READERS = (
         (("dslr/*.json", "json"), ("dslr/nerfstudio/*.json", "json")),
         captures.read_scannetpp_file,
     ),
+    Reader(
+        "adjusted poses",
+        captures.make_adjusted_poses,
+        (("adjusted_poses.json", "json"),),
+        captures.read_adjusted_poses_file,
+    ),
     Reader("found poses", captures.make_found_poses, (("**/verdict.json", "json"),), captures.read_verdict_file),
     Reader(
         "colmap bin",

@@ -43,11 +43,13 @@ class AdjustedPoses:
         """Raises LinprimError for a file that holds no such poses."""
         saved = read_json(path, "adjusted poses")
         try:
-            assert isinstance(saved, dict)
+            if not isinstance(saved, dict):
+                raise TypeError
             poses = {str(name): np.array(pose, np.float64) for name, pose in saved["poses"].items()}
             error, factor = float(saved["error_px"]), float(saved["focal_factor"])
-            assert np.isfinite(error) and 0.5 < factor < 2 and all(pose.shape == (4, 4) for pose in poses.values())
-        except (AssertionError, AttributeError, KeyError, TypeError, ValueError, OverflowError):
+            if not np.isfinite(error) or not 0.5 < factor < 2 or any(pose.shape != (4, 4) for pose in poses.values()):
+                raise ValueError
+        except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
             wanted = "error_px, focal_factor, and 4 by 4 numbers for each of the poses"
             raise LinprimError(f"{path}: holds no adjusted poses, wanted {wanted}") from None
         for pose in poses.values():

@@ -30,17 +30,16 @@ FOCAL_ERROR = 0.003
 
 @dataclass(frozen=True)
 class Adjusted:
-    """Adjusted cameras, the points that they see, by how many pixels the given poses err, root mean square, by their
-    rotations and by their centres together, and the factor of all focal lengths."""
+    """Adjusted cameras; by how many pixels the given poses err, root mean square, by their rotations and by their
+    centres together; and the factor of all focal lengths."""
 
     cameras: list[Camera]
-    points: ObservedPoints
     error_px: float
     focal_factor: float
 
 
 def bundle_adjusted(cameras: Sequence[Camera], points: ObservedPoints) -> Adjusted:
-    """The most probable poses and points; `points` have two observations or more each.
+    """The most probable poses and focal lengths; `points` have two observations or more each.
 
     Raises:
         numpy.linalg.LinAlgError: the observations determine nothing.
@@ -70,7 +69,7 @@ def bundle_adjusted(cameras: Sequence[Camera], points: ObservedPoints) -> Adjust
         spread = np.sqrt(square.mean((0, 2)))
     # Two axes of each move what is seen.
     error = float(np.sqrt(2 * (spread**2).sum()) * np.median(focal))
-    return Adjusted(moved, placed_points(moved, points), error, float(np.exp(log_factor)))
+    return Adjusted(moved, error, float(np.exp(log_factor)))
 
 
 def placed_points(cameras: Sequence[Camera], points: ObservedPoints) -> ObservedPoints:

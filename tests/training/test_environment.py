@@ -217,8 +217,7 @@ OPTIONS = TrainOptions(iterations=600, max_primitives=3000, sh_degree=1, evaluat
 
 def test_an_object_on_a_table_before_a_far_room(tabletop):
     """Seeds 0 to 9 (AVX-512): 27.5 to 27.9 dB held out, 1.6 to 1.9 dB behind training views, no vertex farther off than
-    4.2 % of the diagonal; over a random background 20.0 dB, and half of the vertices are 5 %
-    off, the farthest 31 %."""
+    4.2 % of the diagonal; over a random background 20.0 dB, and half of the vertices are 5 % off, the farthest 31 %."""
     decided = inspect_scene(tabletop / "scene", options=OPTIONS)["options"]
     assert decided["background"] == "environment"
     run = tabletop / "run"
