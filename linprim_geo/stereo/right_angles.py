@@ -25,15 +25,19 @@ def squared(
 ) -> np.ndarray:
     """Planes (K, 4) n . x = d of which those that may turn are at right angles where they nearly were.
 
-    A plane of which no such solution is found, as right angles with some others exclude each other, stays as it is.
+    A plane of which no such solution is found, as right angles with some others exclude each other, stays as it is. Of
+    planes that stay and are nearly parallel, the first counts.
 
     Args:
         information: (3, 3) about each plane's three `moves`; None for one that stays.
         moves: of a plane, by its number and what it is, (3, 4) how it changes by two turns and a shift.
     """
     free = [k for k, own in enumerate(information) if own is not None]
-    fixed = [k for k, own in enumerate(information) if own is None]
     lacking = np.abs(planes[:, :3] @ planes[:, :3].T)
+    fixed: list[int] = []
+    for k, own in enumerate(information):
+        if own is None and not (lacking[k, fixed] > np.cos(NEARLY)).any():
+            fixed.append(k)
     while free:
         pairs = [(i, j) for i in free for j in (*fixed, *free) if (j < i or j in fixed) and lacking[i, j] < NEARLY]
         turned = _solved(planes, free, pairs, information, moves)

@@ -49,9 +49,16 @@ def test_other_angles_stay():
 
 
 def test_angles_that_exclude_each_other_leave_a_plane_as_it_is():
-    ramp = turned([0, 0, 1], 5, [0, 1, 0])
-    between, clear = turned([1, 0, 0], 2.5, [0, 1, 0]), turned([0, 1, 0], 2, [1, 0, 0])
+    ramp = turned([0, 0, 1], 8, [0, 1, 0])
+    between, clear = turned([1, 0, 0], 4, [0, 1, 0]), turned([0, 1, 0], 2, [1, 0, 0])
     found = squared(np.array([FLOOR, ramp, between, clear]), [None, None, np.eye(3), np.eye(3)], moves)
     assert (found[:3] == [FLOOR, ramp, between]).all()
     # It is at right angles to the floor and the ramp at once.
     assert angle(found[3], FLOOR) == pytest.approx(90, abs=0.02) and angle(found[3], clear) > 1.5
+
+
+def test_of_planes_that_stay_and_are_nearly_parallel_the_first_counts():
+    table, wall = turned([0, 0, 1], 2, [0, 1, 0]), turned([1, 0, 0], 3, [0, 1, 0])
+    for stay in ([FLOOR, table], [table, FLOOR]):
+        found = squared(np.array([*stay, wall]), [None, None, np.eye(3)], moves)
+        assert (found[:2] == stay).all() and angle(found[2], stay[0]) == pytest.approx(90, abs=0.02)
