@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from itertools import repeat
+
 import numpy as np
 
 from linprim_geo.geometry.camera import Camera
@@ -9,22 +12,28 @@ from linprim_geo.geometry.camera import Camera
 # Views to compare with: so many for every point, whose rays to it make an angle between these, in degrees.
 SOURCES, LEAST_ANGLE, LARGEST_ANGLE = 4, 3.0, 30.0
 # A view that shows less than this share of the points to a camera, of those that want one, is not worth its time.
-LEAST_SHARE = 0.1
+LEAST_SHARE = 0.03
+# A point that is farther than the depth map of a view by more than this share of the depth is hidden from it.
+HIDDEN_SHARE = 0.03
 # Points of the scene by which views are matched with each other.
 COMPARED_POINTS = 2000
 
 
-def source_views(cameras: list[Camera], points: np.ndarray, most: int = SOURCES) -> list[list[int]]:
+def source_views(
+    cameras: Sequence[Camera], points: np.ndarray, most: int = SOURCES, depths: Iterable[np.ndarray] | None = None
+) -> list[list[int]]:
     """For every camera the indices of those to compare patches with, best first, `most` at most.
 
     Each is the one that sees, under an angle of LEAST_ANGLE to LARGEST_ANGLE to the camera's own rays, most of the
-    (P, 3) points that the camera sees and that fewer than SOURCES of those before it do. Occlusion is left out of it.
+    (P, 3) points that the camera sees and that fewer than SOURCES of those before it do. Surfaces with the (H, W)
+    `depths` of the views hide points; without them nothing does.
     """
     step = -(-len(points) // COMPARED_POINTS)
     points = points[::step]
     rays = np.stack([points - camera.center for camera in cameras])
     rays /= np.maximum(np.linalg.norm(rays, axis=2, keepdims=True), 1e-12)
-    seen = np.stack([visible_pixels(camera, points)[0] for camera in cameras])
+    nearest = repeat(None, len(cameras)) if depths is None else depths
+    seen = np.stack([_seen(*each, points) for each in zip(cameras, nearest, strict=True)])
     low, high = np.cos(np.radians([LARGEST_ANGLE, LEAST_ANGLE]))
     chosen = []
     for index in range(len(cameras)):
@@ -42,6 +51,15 @@ def source_views(cameras: list[Camera], points: np.ndarray, most: int = SOURCES)
             shared[best] = False
         chosen.append(own)
     return chosen
+
+
+def _seen(camera: Camera, depth: np.ndarray | None, points: np.ndarray) -> np.ndarray:
+    """(P,) bool, which of (P, 3) points lie in the image and not behind its (H, W) depths, 0 where there is none."""
+    inside, pixels, along = visible_pixels(camera, points)
+    if depth is not None:
+        nearest = depth[pixels[:, 1], pixels[:, 0]]
+        inside[inside] = (along <= (1 + HIDDEN_SHARE) * nearest) | ~(nearest > 0)
+    return inside
 
 
 def visible_pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ the same surface.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,12 +69,20 @@ class DepthMap:
         return self.confirmed >= np.minimum(CONFIRMING, np.maximum(2, self.seen.astype(np.int8) - 1))
 
 
-def depth_maps(views: Sequence[View], points: np.ndarray, *, seed: int = 0, quiet: bool = True) -> list[DepthMap]:
+def depth_maps(
+    views: Sequence[View],
+    points: np.ndarray,
+    *,
+    hiding: Iterable[np.ndarray] | None = None,
+    seed: int = 0,
+    quiet: bool = True,
+) -> list[DepthMap]:
     """Depth maps of all views, in their order.
 
     Args:
         views: posed photographs.
         points: (P, 3) of the scene, by which views that see the same are found, and the range of depths.
+        hiding: (H, W) depths of the views that hide points behind them, 0 where none is known.
 
     Raises:
         LinprimError: there are no two views that see the same points; photographs are too small for a window, or all
@@ -89,7 +97,7 @@ def depth_maps(views: Sequence[View], points: np.ndarray, *, seed: int = 0, quie
             f"stereo of {len(views)} photographs takes {wanted / 2**30:.1f} GiB of the {free / 2**30:.1f} that are "
             "free, wanted smaller photographs (--downscale) or fewer"
         )
-    pairs = source_views(cameras, points, MOST_SOURCES)
+    pairs = source_views(cameras, points, MOST_SOURCES, hiding)
     if not any(pairs):
         raise LinprimError(
             "no two photographs show the same points from directions that differ: stereo needs such pairs"

@@ -42,7 +42,7 @@ class MergedFrames(Sequence):
     def __init__(self, rendered: Sequence[DepthFrame], views: Sequence[View], limit: float, *, quiet: bool = True):
         self.rendered, self.limit = rendered, limit
         points = np.concatenate([_some(frame.surface()[0], POINTS // len(views)) for frame in rendered])
-        maps = depth_maps(views, points, quiet=quiet)
+        maps = depth_maps(views, points, hiding=(frame.depth for frame in rendered), quiet=quiet)
         sure = [found.is_confirmed() for found in maps]
         self.depths = [_depth_where(found, own) for found, own in zip(maps, sure, strict=True)]
         self.doubtful_depths = [

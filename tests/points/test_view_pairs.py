@@ -32,3 +32,24 @@ def test_no_more_views_than_show_something():
     cameras = [look_at((x, 0.0, 0.0), (x, 2.0, 0.0), size=(40, 30)) for x in (0.0, 0.3, -0.3)]
     cameras.append(look_at((0.0, 0.0, 0.0), (0.0, -2.0, 0.0), size=(40, 30)))
     assert sorted(view_pairs.source_views(cameras, points, 8)[0]) == [1, 2]
+
+
+def test_a_point_behind_a_surface_gets_views_that_see_past_it():
+    """A wall with a board before it, which hides more of the wall from the cameras on one side."""
+    rng = np.random.default_rng(0)
+    wall = rng.uniform([-1.5, 4, -1], [1.5, 4, 1], (2000, 3))
+    cameras = [look_at((0.0, 0.0, 0.0), (0.0, 4.0, 0.0), size=(60, 40))]
+    cameras += [look_at((x, 0.0, 0.0), (x, 4.0, 0.0), size=(60, 40)) for x in (0.4, 0.45, 0.5, 0.55, -0.4, -0.45, -0.5)]
+
+    def depth(camera) -> np.ndarray:
+        """The board is at y = 2, from x = 0.2 on."""
+        rays = camera.world_rays()
+        board = camera.center[0] + (2 - camera.center[1]) * rays[..., 0] / rays[..., 1] > 0.2
+        return np.where(board, 2.0, 4.0)
+
+    depths = [depth(camera) for camera in cameras]
+    blind, told = (view_pairs.source_views(cameras, wall, 8, known)[0] for known in (None, depths))
+    # What the first camera sees of the wall right of its middle only the last three see, too.
+    assert sorted(blind) == [1, 2, 3, 4] and sorted(told[:3]) == [5, 6, 7]
+    # Where a view has no depth nothing hides a point.
+    assert view_pairs.source_views(cameras, wall, 8, [0 * own for own in depths])[0] == blind
