@@ -9,17 +9,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from linprim_geo.stereo.depth_maps import MOST_COST, depth_and_normal
-from linprim_geo.stereo.evidence import Glance, glance, support
-from linprim_geo.stereo.planes_on_disk import Photographs, PlanesOnDisk
-from linprim_geo.stereo.workspace import Maps
+from linprim_geo.stereo.evidence import Glance, support
 
 # A depth is right if it differs from the true one by less than this share of it.
 RIGHT = 0.01
 # Powers of two of the pixels that RIGHT moves a point by, between these: from one pixel on, more of them do not help.
 FEWEST_PIXELS, MOST_PIXELS = -4.0, 0.0
-# Of masks, pixels below this alpha are background, whose depth is not asked for.
-FOREGROUND = 128
+# Windows that cost more may match by chance: less than a tenth of their variance is common, as 1 / 12 is of 36 samples
+# of noise. Weak textures under noise cost nearly as much when they are right, which other views tell.
+MOST_COST = 0.9
 # The logit of the probability: a constant, and weights of the evidence in the order of `evidence`.
 WEIGHTS = np.array([-1.324, 1.014, 2.011, -1.71, 0.425, 3.265])
 
@@ -45,30 +43,3 @@ def evidence(plane: np.ndarray, cost: np.ndarray, known: np.ndarray, glances: li
 def probability(found: np.ndarray) -> np.ndarray:
     """(...,) float32 of (..., 6) `evidence`."""
     return (1 / (1 + np.exp(-(found @ WEIGHTS)))).astype(np.float32)
-
-
-def seen_depths(photographs: Photographs, planes: PlanesOnDisk, k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of view k (H, W) float64 depth, NaN where it is unknown, (H, W, 3) normals in the world, and (H, W, 6)
-    `evidence`."""
-    camera, layers = photographs.cameras[k], np.array(planes.read(k))
-    depth, normal = depth_and_normal(camera, np.moveaxis(layers[:3], 0, 2))
-    known = np.isfinite(depth) & (layers[3] < MOST_COST)
-    alpha = photographs.views[k].load().alpha if photographs.views[k].has_alpha else None
-    if alpha is not None:
-        known &= alpha >= FOREGROUND
-    depth = np.where(known, depth, np.nan)
-    others = photographs.pairs[k]
-    glances = [glance(camera, depth, photographs.cameras[j], planes.read(j)[:3]) for j in others]
-    return depth, normal, evidence(layers[:3], layers[3], known, glances)
-
-
-def maps_of(photographs: Photographs, planes: PlanesOnDisk, k: int) -> Maps:
-    """The maps of view k."""
-    depth, normal, found = seen_depths(photographs, planes, k)
-    known = np.isfinite(depth)
-    in_camera = normal @ photographs.cameras[k].rotation.T
-    return Maps(
-        np.where(known, depth, 0).astype(np.float32),
-        np.where(known[..., None], in_camera, 0).astype(np.float32),
-        np.where(known, probability(found), 0).astype(np.float32),
-    )

@@ -25,8 +25,8 @@ from linprim_geo.capture.types import Scene, View
 from linprim_geo.kernels import ops
 from linprim_geo.points.adjust_poses import adjusted_scene
 from linprim_geo.points.start_points import with_points
-from linprim_geo.stereo.confidence import maps_of
 from linprim_geo.stereo.fused_points import PointFusion
+from linprim_geo.stereo.maps_from_disk import maps_of
 from linprim_geo.stereo.planes_on_disk import STAGES, Photographs, PlanesOnDisk
 from linprim_geo.stereo.time_plan import LEAST_VIEWS, Plan, planned, seconds_per_pixel
 from linprim_geo.stereo.workspace import Workspace

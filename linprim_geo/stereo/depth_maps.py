@@ -20,6 +20,7 @@ from linprim_geo.geometry.boxes import smaller
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, patch_match
 from linprim_geo.points.view_pairs import source_views, visible_pixels
+from linprim_geo.stereo.confidence import MOST_COST, evidence, probability
 from linprim_geo.stereo.evidence import glance
 
 # Photographs that one is matched with, at most: as many as the core takes.
@@ -30,43 +31,42 @@ COARSE_SWEEPS, FINE_SWEEPS, GEOMETRIC_SWEEPS = 3, 1, (1, 1)
 NEAREST_SHARE, NEARER = 0.01, 1.5
 # Variance of grey values that rounding them causes, at least.
 LEAST_NOISE = 1.0
-# Bytes per pixel of all views that are in memory at once: planes 17, images 7, depths of the last turn 4, maps 26.
-PIXEL_BYTES = 54
+# Bytes per pixel of all views that are in memory at once: planes 17, images 7, depths of the last turn 4, maps 29.
+PIXEL_BYTES = 57
 # Of the memory that is free, no more than this share is taken.
 MEMORY_SHARE = 0.5
+# Of masks, pixels below this alpha are background, whose depth is not asked for.
+FOREGROUND = 128
 # Both sides of a photograph have at least this many pixels: half of them hold a window.
 SMALLEST = 24
-# Windows that cost more may match by chance: less than a tenth of their variance is common, as 1 / 12 is of 36 samples
-# of noise. Weak textures under noise cost nearly as much when they are right, which other views tell.
-MOST_COST = 0.9
-# A depth is confirmed by so many other views. One that fewer confirm is wrong two to four times as often.
-CONFIRMING = 3
+# A depth is confirmed if so many other views confirm it, as two may be wrong about each other, and if it is right with
+# this probability.
+CONFIRMING, CONFIDENT = 2, 0.7
 
 
 @dataclass(frozen=True)
 class DepthMap:
     """What stereo says of a photograph.
 
-    `depth` (H, W) float32 along the optical axis in the scene's unit, NaN where unknown; `normal` (H, W, 3) float32 in
-    the world, towards the camera; `cost` (H, W) float32 of the match, 0 to 2; `seen` (H, W) uint8 how many other views
-    have a surface where the point falls, `confirmed` (H, W) uint8 how many of them the same, and `deviation` (H, W)
-    float32 the least share of the depth by which one of these differs, infinite where none has. `grey` (H, W) uint8 is
-    what was matched, `noise` the variance of its noise.
+    `depth` (H, W) float32 along the optical axis in the scene's unit, NaN where unknown; `normal` (H, W, 3) float32
+    in the world, towards the camera; `confidence` (H, W) float32 the probability that the depth is right within 1
+    %, 0 where it is unknown; `confirming` (H, W) uint8 how many other views have the same depth; `deviation` (H, W)
+    float32 the least share of the depth by which that of another view differs, infinite where none has one. `grey`
+    (H, W) uint8 is what was matched, `noise` the variance of its noise.
     """
 
     camera: Camera
     depth: np.ndarray
     normal: np.ndarray
-    cost: np.ndarray
-    seen: np.ndarray
-    confirmed: np.ndarray
+    confidence: np.ndarray
+    confirming: np.ndarray
     deviation: np.ndarray
     grey: np.ndarray
     noise: float
 
     def is_confirmed(self) -> np.ndarray:
-        """(H, W) bool: CONFIRMING other views confirm the depth, or two and all but one of fewer that show it."""
-        return self.confirmed >= np.minimum(CONFIRMING, np.maximum(2, self.seen.astype(np.int8) - 1))
+        """(H, W) bool."""
+        return (self.confirming >= CONFIRMING) & (self.confidence >= CONFIDENT)
 
 
 def depth_maps(
@@ -249,29 +249,28 @@ def inverse_planes(camera: Camera, depth: np.ndarray, normal: np.ndarray) -> np.
 def _depth_map(
     image: StereoImage, noise: float, planes: DepthPlanes | None, others: list[tuple[Camera, DepthPlanes | None]]
 ) -> DepthMap:
-    camera, (height, width) = image.camera, image.grey.shape
+    camera, shape = image.camera, image.grey.shape
     if planes is None:
-        empty = np.full((height, width), np.nan, np.float32)
-        none, infinite = np.zeros((height, width), np.uint8), np.full((height, width), np.inf, np.float32)
-        normal = np.zeros((height, width, 3), np.float32)
-        return DepthMap(camera, empty, normal, empty, none, none, infinite, image.grey, noise)
+        unknown, infinite = np.full(shape, np.nan, np.float32), np.full(shape, np.inf, np.float32)
+        normal, none = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
+        return DepthMap(camera, unknown, normal, none, none.astype(np.uint8), infinite, image.grey, noise)
     depth, normal = depth_and_normal(camera, planes.plane)
-    seen, confirmed = (np.zeros((height, width), np.uint8) for _ in range(2))
-    deviation = np.full((height, width), np.inf, np.float32)
-    for other, theirs in others:
-        if theirs is not None:
-            found = glance(camera, depth, other, np.moveaxis(theirs.plane, 2, 0))
-            seen += np.isfinite(found.miss)
-            confirmed += found.confirms
-            deviation = np.fmin(deviation, np.abs(found.relative))
     known = (planes.plane[..., 0] > 0) & (planes.cost < MOST_COST)
+    depth = np.where(known, depth, np.nan)
+    glances = [
+        glance(camera, depth, other, np.moveaxis(theirs.plane, 2, 0)) for other, theirs in others if theirs is not None
+    ]
+    confirming, deviation = np.zeros(shape, np.uint8), np.full(shape, np.inf, np.float32)
+    for found in glances:
+        confirming += found.confirms
+        deviation = np.fmin(deviation, np.abs(found.relative))
+    confidence = probability(evidence(np.moveaxis(planes.plane, 2, 0), planes.cost, known, glances))
     return DepthMap(
         camera,
-        np.where(known, depth, np.nan).astype(np.float32),
+        depth.astype(np.float32),
         normal.astype(np.float32),
-        planes.cost,
-        seen,
-        np.where(known, confirmed, 0).astype(np.uint8),
+        np.where(known, confidence, np.float32(0)),
+        confirming,
         deviation,
         image.grey,
         noise,

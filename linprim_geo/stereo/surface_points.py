@@ -10,8 +10,7 @@ import numpy as np
 from linprim_geo.capture.types import Photo, PointCloud, View
 from linprim_geo.geometry.boxes import smaller
 from linprim_geo.imaging.photos import box_downscale
-from linprim_geo.stereo.confidence import FOREGROUND
-from linprim_geo.stereo.depth_maps import DepthMap, depth_maps, inverse_planes
+from linprim_geo.stereo.depth_maps import FOREGROUND, DepthMap, depth_maps, inverse_planes
 from linprim_geo.stereo.evidence import support
 
 # Photographs are averaged down until their longer side has no more pixels, and no more of them are taken: a training

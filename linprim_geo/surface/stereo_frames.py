@@ -20,7 +20,7 @@ from linprim_geo.stereo.shaded_planes import ShadedPlanes
 from linprim_geo.surface.single_view import mesh_is_closed
 from linprim_geo.surface.tsdf_field import DepthFrame
 
-# A depth that fewer views confirm than `DepthMap.is_confirmed` wants counts so much.
+# A depth that other views have, but that is not confirmed (`DepthMap.is_confirmed`), counts so much.
 DOUBTFUL_WEIGHT = 0.1
 # A piece of surface is supported if so many views have depths on this share of it. What is true has 0.3 to 0.9 of it
 # so, what is not 0.1 at most.
@@ -35,7 +35,7 @@ class MergedFrames(Sequence):
 
     `weight` is what rendered depths count elsewhere: the squared deviation of confirmed depths from those of their
     neighbours over that of rendered ones from confirmed ones, 1 at most. `confirmed` is the share of pixels with
-    confirmed depths, `doubtful` that of those which too few views confirm, `flat` that of pixels on one of the
+    confirmed depths, `doubtful` that of less probable ones, `flat` that of pixels on one of the
     `planes` (K, 4).
     """
 
@@ -46,7 +46,7 @@ class MergedFrames(Sequence):
         sure = [found.is_confirmed() for found in maps]
         self.depths = [_depth_where(found, own) for found, own in zip(maps, sure, strict=True)]
         self.doubtful_depths = [
-            _depth_where(found, ~own & (found.confirmed > 0)) for found, own in zip(maps, sure, strict=True)
+            _depth_where(found, ~own & (found.confirming > 0)) for found, own in zip(maps, sure, strict=True)
         ]
         self.confirmed, self.doubtful = _share_known(self.depths), _share_known(self.doubtful_depths)
         deviations = Deviations()

@@ -118,7 +118,7 @@ def test_what_nothing_around_continues_gives_no_points(known, tmp_path, monkeypa
     share, on_plate = in_the_air()
     monkeypatch.setattr(module, "LEAST_SUPPORT", 0.0)
     share_of_all, on_plate_of_all = in_the_air()
-    assert share_of_all > 0.002 and share < 0.3 * share_of_all and on_plate > 0.6 * on_plate_of_all > 1000
+    assert share_of_all > 0.001 and share < 0.3 * share_of_all and on_plate > 0.6 * on_plate_of_all > 1000
 
 
 def test_small_copies_are_means_of_the_photographs_and_few(views, monkeypatch):
