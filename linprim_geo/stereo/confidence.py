@@ -7,6 +7,8 @@ others; docs/stereo.md has the tables.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from linprim_geo.stereo.evidence import Glance, support
@@ -22,7 +24,7 @@ MOST_COST = 0.9
 WEIGHTS = np.array([-1.324, 1.014, 2.011, -1.71, 0.425, 3.265])
 
 
-def evidence(plane: np.ndarray, cost: np.ndarray, known: np.ndarray, glances: list[Glance]) -> np.ndarray:
+def evidence(plane: np.ndarray, cost: np.ndarray, known: np.ndarray, glances: Iterable[Glance]) -> np.ndarray:
     """(H, W, 6) float32 about each depth: 1; whether another photograph confirms it; the share that confirm it of those
     that have a surface there; the cost of its match; log2 of the pixels that 1 % of it moves the point by in those that
     confirm it (in the best one if none does); `support`."""

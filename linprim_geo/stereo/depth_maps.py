@@ -7,7 +7,7 @@ the same surface.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +21,7 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, patch_match
 from linprim_geo.points.view_pairs import source_views, visible_pixels
 from linprim_geo.stereo.confidence import MOST_COST, evidence, probability
-from linprim_geo.stereo.evidence import glance
+from linprim_geo.stereo.evidence import Glance, glance
 
 # Photographs that one is matched with, at most: as many as the core takes.
 MOST_SOURCES = 8
@@ -31,8 +31,8 @@ COARSE_SWEEPS, FINE_SWEEPS, GEOMETRIC_SWEEPS = 3, 1, (1, 1)
 NEAREST_SHARE, NEARER = 0.01, 1.5
 # Variance of grey values that rounding them causes, at least.
 LEAST_NOISE = 1.0
-# Bytes per pixel of all views that are in memory at once: planes 17, images 7, depths of the last turn 4, maps 29.
-PIXEL_BYTES = 57
+# Bytes per pixel of all views that are in memory at once: planes 17, images 7, depths of the last turn 4, maps 25.
+PIXEL_BYTES = 53
 # Of the memory that is free, no more than this share is taken.
 MEMORY_SHARE = 0.5
 # Of masks, pixels below this alpha are background, whose depth is not asked for.
@@ -48,11 +48,11 @@ CONFIRMING, CONFIDENT = 2, 0.7
 class DepthMap:
     """What stereo says of a photograph.
 
-    `depth` (H, W) float32 along the optical axis in the scene's unit, NaN where unknown; `normal` (H, W, 3) float32
-    in the world, towards the camera; `confidence` (H, W) float32 the probability that the depth is right within 1
-    %, 0 where it is unknown; `confirming` (H, W) uint8 how many other views have the same depth; `deviation` (H, W)
-    float32 the least share of the depth by which that of another view differs, infinite where none has one. `grey`
-    (H, W) uint8 is what was matched, `noise` the variance of its noise.
+    `depth` (H, W) float32 along the optical axis in the scene's unit, NaN where unknown; `normal` (H, W, 3) float32 in
+    the world, towards the camera; `confidence` (H, W) float32 the probability that the depth is right within 1 %, 0
+    where it is unknown; `confirming` (H, W) uint8 how many other views have the same depth; `deviation` (H, W) float32
+    the least share of the depth by which that of another view differs, infinite where none has one. `grey` (H, W) uint8
+    is what was matched, `noise` the variance of its noise.
     """
 
     camera: Camera
@@ -257,14 +257,17 @@ def _depth_map(
     depth, normal = depth_and_normal(camera, planes.plane)
     known = (planes.plane[..., 0] > 0) & (planes.cost < MOST_COST)
     depth = np.where(known, depth, np.nan)
-    glances = [
-        glance(camera, depth, other, np.moveaxis(theirs.plane, 2, 0)) for other, theirs in others if theirs is not None
-    ]
     confirming, deviation = np.zeros(shape, np.uint8), np.full(shape, np.inf, np.float32)
-    for found in glances:
-        confirming += found.confirms
-        deviation = np.fmin(deviation, np.abs(found.relative))
-    confidence = probability(evidence(np.moveaxis(planes.plane, 2, 0), planes.cost, known, glances))
+
+    def glances() -> Iterator[Glance]:  # one at a time is in memory
+        for other, theirs in others:
+            if theirs is not None:
+                found = glance(camera, depth, other, np.moveaxis(theirs.plane, 2, 0))
+                np.add(confirming, found.confirms, out=confirming)
+                np.fmin(deviation, np.abs(found.relative), out=deviation)
+                yield found
+
+    confidence = probability(evidence(np.moveaxis(planes.plane, 2, 0), planes.cost, known, glances()))
     return DepthMap(
         camera,
         depth.astype(np.float32),

@@ -35,8 +35,7 @@ class MergedFrames(Sequence):
 
     `weight` is what rendered depths count elsewhere: the squared deviation of confirmed depths from those of their
     neighbours over that of rendered ones from confirmed ones, 1 at most. `confirmed` is the share of pixels with
-    confirmed depths, `doubtful` that of less probable ones, `flat` that of pixels on one of the
-    `planes` (K, 4).
+    confirmed depths, `doubtful` that of less probable ones, `flat` that of pixels on one of the `planes` (K, 4).
     """
 
     def __init__(self, rendered: Sequence[DepthFrame], views: Sequence[View], limit: float, *, quiet: bool = True):
