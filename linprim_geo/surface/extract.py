@@ -41,6 +41,8 @@ METHODS = {
 
 # Options that a method chooses where they are 0; what it took is in its statistics.
 CHOSEN = ("voxel_size", "depth_limit")
+# Options that not every method has a use for.
+METHODS_WITH = {"voxel_size": ("tsdf", "opacity-field"), "truncation": ("tsdf",), "depth_limit": ("tsdf",)}
 
 # Rounds of refinement with `refine` auto, where stereo has no part in the surface.
 REFINE_ROUNDS = 2
@@ -105,6 +107,9 @@ def extract_mesh(
         raise LinprimError(
             f"--blocks fuses depth maps in parts, which --method {method} has none of: wanted --method tsdf"
         )
+    for name, methods in METHODS_WITH.items():
+        if method not in methods and getattr(options, name) != getattr(ExtractOptions(), name):
+            raise LinprimError(f"--{name.replace('_', '-')} is for --method {' or '.join(methods)}, not for {method}")
     opened = Run.open(run)
     if options.held_out:
         opened = opened.with_held_out_views()

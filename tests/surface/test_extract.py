@@ -198,6 +198,22 @@ def test_a_wrong_suffix_or_method_is_refused_before_anything_is_rendered(solid, 
         extract_mesh(solid, method="magic", quiet=True)
 
 
+@pytest.mark.parametrize(
+    ("method", "change", "methods"),
+    [
+        ("polyhedra", {"voxel_size": 0.1}, "tsdf or opacity-field"),
+        ("polyhedra", {"truncation": 2.0}, "tsdf"),
+        ("opacity-field", {"depth_limit": 5.0}, "tsdf"),
+    ],
+)
+def test_an_option_that_the_method_has_no_use_for_is_refused(method, change, methods, solid, tmp_path):
+    (name,) = change
+    sentence = f"--{name.replace('_', '-')} is for --method {methods}, not for {method}"
+    with pytest.raises(LinprimError, match=sentence):
+        extract_mesh(solid, method, output=tmp_path / "m.ply", options=replace(ExtractOptions(), **change), quiet=True)
+    assert outputs(tmp_path) == []
+
+
 def test_a_run_that_saved_nothing_is_one_sentence(run_copy):
     (run_copy / "run.json").unlink()
     with pytest.raises(LinprimError, match="run.json is missing"):
