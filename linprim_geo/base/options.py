@@ -330,9 +330,12 @@ class ExtractOptions:
         number_or="auto",
     )
     voxel_size: float = option(
-        0.0, "grid spacing in the data set's unit; 0 chooses from the views", low=0, metavar="LENGTH"
+        0.0,
+        "grid spacing in the data set's unit, for tsdf and opacity-field; 0 chooses from the views",
+        low=0,
+        metavar="LENGTH",
     )
-    truncation: float = option(3.0, "truncation distance in voxels", low=1, high=100)
+    truncation: float = option(3.0, "truncation distance in voxels, for tsdf", low=1, high=100)
     memory_limit: float = option(
         0.0,
         "memory that the extraction may take, in GiB: depth maps that are kept, and the grid, whose voxels are larger "
@@ -342,8 +345,8 @@ class ExtractOptions:
     )
     depth_limit: float = option(
         0.0,
-        "depths beyond this, in the data set's unit, only clear the space before them; 0: beyond what so many "
-        "pixels can tell apart",
+        "depths beyond this, in the data set's unit, only clear the space before them, for tsdf; 0: beyond "
+        "what so many pixels can tell apart",
         low=0,
         metavar="LENGTH",
     )

@@ -13,7 +13,8 @@ from linprim_geo.geometry.camera import Camera
 SOURCES, LEAST_ANGLE, LARGEST_ANGLE = 4, 3.0, 30.0
 # A view that shows less than this share of the points to a camera, of those that want one, is not worth its time.
 LEAST_SHARE = 0.03
-# A point that is farther than the depth map of a view by more than this share of the depth is hidden from it.
+# A point that is farther than the depth map of a view by more than this share of the depth is hidden from it: three
+# times what a depth may be off by that counts as right.
 HIDDEN_SHARE = 0.03
 # Points of the scene by which views are matched with each other.
 COMPARED_POINTS = 2000
