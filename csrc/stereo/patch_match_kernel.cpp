@@ -60,30 +60,32 @@ struct Packet {
   int at[kWide];                           // pixel
 };
 
-// 1 - normalised cross correlation of the windows along planes, and in `middle` where the pixel falls.
+// 1 - normalised cross correlation of the windows along planes. A window is so small that it is mapped by the
+// derivative at its middle.
 inline F photo_cost(const PatchMatch& M, const StereoSource& S, const Packet& P, const Planes& plane) {
   F p[3], dx[3], dy[3];
   for (int k = 0; k < 3; ++k) {
     p[k] = S.to[3 * k] * P.column + S.to[3 * k + 1] * P.row + S.to[3 * k + 2] + S.shift[k] * plane.w;
     dx[k] = S.to[3 * k] + S.shift[k] * plane.x, dy[k] = S.to[3 * k + 1] + S.shift[k] * plane.y;
   }
-  const float most_u = float(S.width) - 1.001f, most_v = float(S.height) - 1.001f;
+  const F most_u = splat(float(S.width) - 1.001f), most_v = splat(float(S.height) - 1.001f), inverse = 1.0f / p[2];
   // Outside of the photograph, or behind it.
-  const F u0 = p[0] / p[2], v0 = p[1] / p[2];
+  const F u0 = p[0] * inverse, v0 = p[1] * inverse;
   const I bad = (p[2] <= 1e-6f) | (u0 < 0.0f) | (v0 < 0.0f) | (u0 > most_u) | (v0 > most_v);
   bool none = true;
   for (int l = 0; l < kWide; ++l) none &= bad[l] != 0;
   if (none) return splat(kWorst);
+  const F u_x = (dx[0] - u0 * dx[2]) * inverse, u_y = (dy[0] - u0 * dy[2]) * inverse;
+  const F v_x = (dx[1] - v0 * dx[2]) * inverse, v_y = (dy[1] - v0 * dy[2]) * inverse;
   F sum{}, square{}, product{};
   constexpr float kFirst = -0.5f * kWindowStep * (kWindowSide - 1);
   int k = 0;
   for (int i = 0; i < kWindowSide; ++i) {
     const float down = kFirst + kWindowStep * i;
-    F q[3];
-    for (int c = 0; c < 3; ++c) q[c] = p[c] + down * dy[c] + kFirst * dx[c];
+    const F u_row = u0 + down * u_y, v_row = v0 + down * v_y;
     for (int j = 0; j < kWindowSide; ++j, ++k) {
-      const F inverse = 1.0f / vmax(q[2], splat(1e-6f));
-      const F u = vmin(vmax(q[0] * inverse, F{}), splat(most_u)), v = vmin(vmax(q[1] * inverse, F{}), splat(most_v));
+      const float right = kFirst + kWindowStep * j;
+      const F u = vmin(vmax(u_row + right * u_x, F{}), most_u), v = vmin(vmax(v_row + right * v_x, F{}), most_v);
       const I column = __builtin_convertvector(u, I), row = __builtin_convertvector(v, I);
       const F a = u - __builtin_convertvector(column, F), b = v - __builtin_convertvector(row, F);
       const I quad = gather(S.quads, row * S.width + column);
@@ -93,7 +95,6 @@ inline F photo_cost(const PatchMatch& M, const StereoSource& S, const Packet& P,
       const F top = g00 + a * (g10 - g00), bottom = g01 + a * (g11 - g01), grey = top + b * (bottom - top);
       const F weighted = P.weight[k] * grey;
       sum += weighted, square += weighted * grey, product += P.centered[k] * grey;
-      for (int c = 0; c < 3; ++c) q[c] += float(kWindowStep) * dx[c];
     }
   }
   const F variance = vmax(square - sum * sum, F{}) + M.noise;
@@ -103,25 +104,21 @@ inline F photo_cost(const PatchMatch& M, const StereoSource& S, const Packet& P,
 
 // Pixels between a pixel and where it comes back to from the surface that the source has there.
 inline F geometry_cost(const StereoSource& S, const Packet& P, const Planes& plane) {
-  F error;
+  F p[3], q[3];
+  for (int k = 0; k < 3; ++k)
+    p[k] = S.to[3 * k] * P.column + S.to[3 * k + 1] * P.row + S.to[3 * k + 2] + S.shift[k] * plane.w;
+  const F u = p[0] / p[2], v = p[1] / p[2];
+  const I inside =
+      (p[2] > 1e-6f) & (u > -0.5f) & (v > -0.5f) & (u < float(S.width) - 0.5f) & (v < float(S.height) - 0.5f);
+  F w;
   for (int l = 0; l < kWide; ++l) {
-    float p[3];
-    for (int k = 0; k < 3; ++k)
-      p[k] = S.to[3 * k] * P.column[l] + S.to[3 * k + 1] * P.row[l] + S.to[3 * k + 2] + S.shift[k] * plane.w[l];
-    error[l] = kGeometryMost;
-    if (!(p[2] > 1e-6f)) continue;
-    const float u = p[0] / p[2], v = p[1] / p[2];
-    if (!(u > -0.5f && v > -0.5f && u < S.width - 0.5f && v < S.height - 0.5f)) continue;
-    const float w = S.inverse_depth[int(v + 0.5f) * S.width + int(u + 0.5f)];
-    if (!(w >= 0)) continue;
-    float q[3];
-    for (int k = 0; k < 3; ++k)
-      q[k] = S.back[3 * k] * u + S.back[3 * k + 1] * v + S.back[3 * k + 2] + S.back_shift[k] * w;
-    if (!(q[2] > 1e-6f)) continue;
-    const float a = q[0] / q[2] - P.column[l], b = q[1] / q[2] - P.row[l];
-    error[l] = std::min(kGeometryMost, std::sqrt(a * a + b * b));
+    w[l] = inside[l] ? S.inverse_depth[int(v[l] + 0.5f) * S.width + int(u[l] + 0.5f)] : -1.0f;
   }
-  return kGeometryWeight * error;
+  for (int k = 0; k < 3; ++k)
+    q[k] = S.back[3 * k] * u + S.back[3 * k + 1] * v + S.back[3 * k + 2] + S.back_shift[k] * w;
+  const F a = q[0] / q[2] - P.column, b = q[1] / q[2] - P.row;
+  const F error = vmin(vsqrt(a * a + b * b), splat(kGeometryMost));
+  return kGeometryWeight * ((w >= 0.0f) & (q[2] > 1e-6f) ? error : splat(kGeometryMost));
 }
 
 inline F view_cost(const PatchMatch& M, const StereoSource& S, const Packet& P, const Planes& plane) {

@@ -62,8 +62,8 @@ def patch_match(
 
     The cost of a plane in a source is 1 minus the normalised cross correlation of windows of 11 by 11 pixels, with
     bilateral weights and `noise` added to both variances, so that windows without texture agree and disagree by
-    nothing. With `source_depths` 0.1 is added for every pixel that a point misses its own by when it comes back from
-    the surface there, up to 0.4.
+    nothing; a plane maps a window by its derivative at the middle. With `source_depths` 0.1 is added for every pixel
+    that a point misses its own by when it comes back from the surface there, up to 0.4.
 
     Args:
         sources: 1 to 8 photographs to compare with.

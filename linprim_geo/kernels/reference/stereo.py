@@ -12,12 +12,15 @@ SIDE, NEAR_PIXELS, WORST = 6, 5.0, 2.0
 # Standard deviations in grey values, from the narrowest, and how many of them a sample may be off; the share of the
 # window that has to be like the pixel, and the variance that it needs, in that of the noise.
 NEAR_GREYS, FAR_GREY, OWN_SHARE, INFORMED = (10.0, 25.0, 60.0), 2.5, 0.5, 4.0
+# Pixels to both sides between which the derivative of a mapping is taken.
+STEP = np.array([-1e-4, 1e-4])
 
 
 def match_cost(
     camera: Camera, grey: np.ndarray, other: Camera, other_grey: np.ndarray, plane: np.ndarray, noise: float
 ) -> np.ndarray:
-    """(H, W) 1 - normalised cross correlation of windows along (H, W, 3) planes of inverse depth, 0 to 2."""
+    """(H, W) 1 - normalised cross correlation of windows along (H, W, 3) planes of inverse depth, 0 to 2. A plane maps
+    a window by its derivative at the middle."""
     height, width = grey.shape
     offset = np.arange(1 - SIDE, SIDE, 2)
     down, right = (x.ravel() for x in np.meshgrid(offset, offset, indexing="ij"))
@@ -33,7 +36,12 @@ def match_cost(
             middle = _pixels(camera, other, np.array([column]), np.array([row]), np.array([w]))[0]
             if not ((middle >= 0).all() and middle[0] <= other.width - 1.001 and middle[1] <= other.height - 1.001):
                 continue
-            there = _pixels(camera, other, column + right, row + down, w + slope_x * right + slope_y * down)
+            along_row, along_column = (
+                np.diff(_pixels(camera, other, column + STEP * x, row + STEP * y, w + slope * STEP), axis=0)
+                / np.ptp(STEP)
+                for x, y, slope in ((1, 0, slope_x), (0, 1, slope_y))
+            )
+            there = middle + right[:, None] * along_row + down[:, None] * along_column
             theirs = _bilinear(other_grey.astype(np.float64), there)
             a, b = own - weight @ own, theirs - weight @ theirs
             variances = (weight @ a**2 + noise) * (weight @ b**2 + noise)
