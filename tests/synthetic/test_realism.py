@@ -156,3 +156,16 @@ def test_the_same_seed_gives_the_same_picture_and_another_one_does_not():
     first, second = (render.PathTracer(stage, threads=threads).render(view, 4, 7)[0] for threads in (1, 2))
     assert np.array_equal(first, second)
     assert not np.array_equal(first, render.PathTracer(stage).render(view, 4, 8)[0])
+
+
+def test_what_is_no_number_or_far_too_bright_touches_no_other_pixel():
+    rng = np.random.default_rng(0)
+    images = rng.uniform(0.4, 0.6, (2, 8, 8, 3)).astype(np.float32)
+    usual = render.without_outliers(images)
+    assert (usual == images).all()
+    images[0, 2, 3], images[:, 5, 5, 1], images[1, 7, 0] = np.nan, np.inf, 1000.0
+    mended = render.without_outliers(images)
+    touched = np.zeros((8, 8, 3), bool)
+    touched[2, 3], touched[5, 5, 1], touched[7, 0] = True, True, True
+    assert (mended[:, ~touched] == usual[:, ~touched]).all() and mended.dtype == np.float32
+    assert (mended[0, 2, 3] == images[1, 2, 3]).all() and (0.4 < mended[:, 5, 5, 1]).all() and mended.max() < 50

@@ -79,8 +79,7 @@ class PathTracer:
                 for i in range(PASSES)
             ]
         ).astype(np.float32)
-        others = (images.sum(0) - images) / (PASSES - 1)
-        images = np.minimum(images, FIREFLY * others + FIREFLY_FLOOR * images.mean())
+        images = without_outliers(images)
         return images.mean(0), images.std(0, ddof=1) / np.float32(np.sqrt(PASSES))
 
     def _sensor(self, camera: Camera) -> dict[str, Any]:
@@ -167,6 +166,18 @@ class PathTracer:
         else:
             bsdf = {"type": "diffuse", "reflectance": color}
         return {"type": "twosided", "bsdf": bsdf}
+
+
+def without_outliers(images: np.ndarray) -> np.ndarray:
+    """(N, H, W, 3) renderings of one view without what is no number, which is the mean of the others there or of all
+    pixels, and without what is far brighter in one than in the others (FIREFLY)."""
+    known = np.isfinite(images)
+    images = np.where(known, images, np.float32(0))
+    times = known.sum(0)
+    mean = np.where(times, images.sum(0) / np.maximum(times, 1), images.sum() / max(1, known.sum()))
+    images = np.where(known, images, mean)
+    others = (images.sum(0) - images) / (len(images) - 1)
+    return np.minimum(images, FIREFLY * others + FIREFLY_FLOOR * images.mean()).astype(np.float32)
 
 
 def load_mitsuba(tracer: str, threads: int) -> Any:
