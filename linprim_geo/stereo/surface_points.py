@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
 
 import numpy as np
 
-from linprim_geo.capture.types import Photo, PointCloud, View
-from linprim_geo.geometry.boxes import smaller
-from linprim_geo.imaging.photos import box_downscale
+from linprim_geo.capture.small_copy import SmallCopy
+from linprim_geo.capture.types import PointCloud, View
 from linprim_geo.stereo.depth_maps import FOREGROUND, DepthMap, depth_maps, inverse_planes
 from linprim_geo.stereo.evidence import support
 
@@ -21,30 +19,12 @@ LONGER_SIDE, MOST_VIEWS = 200, 100
 LEAST_SUPPORT = 3 / 8
 
 
-@dataclass(frozen=True)
-class SmallCopy(View):
-    """A view whose photograph is averaged down by `factor` from that of `original`, which may be decoded already."""
-
-    original: View | None = None
-    factor: int = 1
-
-    @staticmethod
-    def of(view: View) -> SmallCopy:
-        """One of at most LONGER_SIDE pixels."""
-        factor = -(-max(view.camera.width, view.camera.height) // LONGER_SIDE)
-        own = {entry.name: getattr(view, entry.name) for entry in fields(View)}
-        return SmallCopy(**own | {"camera": smaller(view.camera, factor)}, original=view, factor=factor)
-
-    def load(self) -> Photo:
-        assert self.original is not None
-        photo = self.original.load()
-        return Photo(*box_downscale(photo.rgb, photo.alpha, self.factor))
-
-
 def small_copies(views: Sequence[View]) -> list[SmallCopy]:
-    """Of at most MOST_VIEWS views, evenly over their order."""
+    """Of at most MOST_VIEWS views, evenly over their order, with at most LONGER_SIDE pixels each way."""
     chosen = np.unique(np.linspace(0, len(views) - 1, min(MOST_VIEWS, len(views))).round().astype(int))
-    return [SmallCopy.of(views[k]) for k in chosen]
+    cameras = [views[k].camera for k in chosen]
+    factors = [-(-max(camera.width, camera.height) // LONGER_SIDE) for camera in cameras]
+    return [SmallCopy.of(views[k], factor) for k, factor in zip(chosen, factors, strict=True)]
 
 
 def surface_points(

@@ -26,7 +26,7 @@ from linprim_geo.jobs.executor import Executor
 from linprim_geo.jobs.open import open_executor
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.choose_level import USUAL_LEVEL, choose_level
-from linprim_geo.surface.postprocess import Finished, finish_surface, visible_file
+from linprim_geo.surface.postprocess import Finished, finish_surface, visible_file, with_rounds
 from linprim_geo.surface.single_view import without_single_views
 from linprim_geo.surface.texture import check_texture
 from linprim_geo.surface.voxel_budget import choose_voxel
@@ -44,8 +44,6 @@ CHOSEN = ("voxel_size", "depth_limit")
 # Options that not every method has a use for.
 METHODS_WITH = {"voxel_size": ("tsdf", "opacity-field"), "truncation": ("tsdf",), "depth_limit": ("tsdf",)}
 
-# Rounds of refinement with `refine` auto, where stereo has no part in the surface.
-REFINE_ROUNDS = 2
 # Folder of what workers have done, in that of the method.
 PARTS = "parts"
 
@@ -75,8 +73,9 @@ def extract_mesh(
     With `held_out` the held-out views take part in all of it. With `box` only the faces in it are kept; --method tsdf
     fuses nothing else.
 
-    With `time_budget`, in seconds, the voxel size is the smallest with which everything takes that time at most, by
-    what coarse passes take (`voxel_budget.choose_voxel`); stats.json has `time_budget`: what was chosen and why, and
+    With `time_budget`, in seconds, stereo takes photographs that are averaged down until it has time enough
+    (`stereo_budget.stereo_in_time`), and the voxel size is the smallest with which everything takes that time at most,
+    by what coarse passes take (`voxel_budget.choose_voxel`); stats.json has `time_budget`: what was chosen and why, and
     the seconds that it took.
 
     With `blocks` other than 1 the depth maps are fused in so many parts of one lattice by several workers, with the
@@ -116,9 +115,9 @@ def extract_mesh(
     box = read_box(options.box, [view.camera for view in opened.scene().train])
     if box is not None:
         options = replace(options, box=as_text(box))
-    if blocks > 1 or budget or method != "tsdf":
+    if blocks > 1 or method != "tsdf":
         if options.stereo == "on":
-            raise LinprimError("--stereo on is for --method tsdf, without --blocks and --time-budget")
+            raise LinprimError("--stereo on is for --method tsdf, without --blocks")
         options = replace(options, stereo="off")
     elif options.stereo == "auto" and opened.scene().has_alpha:
         # Masks say where an object ends better than windows do, and no wall is in the way.
@@ -159,8 +158,6 @@ def _extract(
     for file in written:
         remove_temporary(file)
     stages = Stages(progress)
-    if options.refine == "auto" and options.stereo == "off":
-        options = replace(options, refine=REFINE_ROUNDS)
 
     agreement = None
     if options.level == "auto":
@@ -171,28 +168,26 @@ def _extract(
         stages.lap("level")
     module, function = METHODS[method].split(".")
     surface = getattr(import_module(f".{module}", __package__), function)
-    kept: tuple = ()
+    kept: dict = {}
     chosen: dict = {}
     if budget:
-        options, frames, chosen = choose_voxel(opened, options, target, stages, budget)
-        kept = (frames,)
+        options, kept, chosen = choose_voxel(opened, options, target, stages, budget)
     if executor is not None:
         from linprim_geo.surface.tsdf_parts import PartFusion
 
         fuse = PartFusion(opened, options, blocks, executor(), folder / PARTS, progress.quiet)
-        mesh, about = surface(opened, options, stages, *kept, fuse=fuse)
+        mesh, about = surface(opened, options, stages, **kept, fuse=fuse)
         shutil.rmtree(folder / PARTS)
         about = about | {"blocks": blocks}
     else:
-        mesh, about = surface(opened, options, stages, *kept)
+        mesh, about = surface(opened, options, stages, **kept)
     if options.box:
         mesh = _cropped(mesh, options)
     if opened.environment is not None:
         mesh, left_out = _seen_by_several(mesh, opened, options, stages)
         about = about | {"seen_by_one_view": left_out}
     options = replace(options, **{name: about[name] for name in CHOSEN if name in about})
-    if options.refine == "auto":
-        options = replace(options, refine=0 if about.get("stereo", {}).get("taken") else REFINE_ROUNDS)
+    options = with_rounds(options, about)
     done = finish_surface(mesh, opened, options, target, stages)
     stats = {
         "mesh": str(target),

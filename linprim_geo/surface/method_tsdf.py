@@ -48,11 +48,17 @@ NEAREST_LIMIT = 4.0
 
 
 def tsdf_surface(
-    run: Run, options: ExtractOptions, stages: Stages, frames: DepthFrames | None = None, fuse: Callable | None = None
+    run: Run,
+    options: ExtractOptions,
+    stages: Stages,
+    frames: DepthFrames | None = None,
+    fuse: Callable | None = None,
+    merged: MergedFrames | None = None,
 ) -> tuple[Mesh, dict]:
     """Returns the fused mesh and `level`, `voxel_size` and `truncation_voxels` for the statistics.
 
-    `frames` of the same level, if there are any already, are taken in place of new ones. `fuse`: see `fuse_tsdf`.
+    `frames` of the same level, and what is `merged` of them and stereo, are taken in place of new ones if there are any
+    already. `fuse`: see `fuse_tsdf`.
 
     Raises:
         LinprimError: no ray crosses the level, or the grid would not fit into memory, with voxels of the size that is
@@ -100,7 +106,8 @@ def tsdf_surface(
         return mesh, merged.about() | {"unsupported": left_out}
 
     if options.stereo == "on":
-        merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)
+        if merged is None:
+            merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)
         stages.lap("stereo")
         mesh, about = fused_with_stereo(merged)
         if not len(mesh.faces):
@@ -111,7 +118,7 @@ def tsdf_surface(
         mesh = fused(frames, options.smallest_part)
         stages.lap("fuse")
         if options.stereo == "auto":
-            mesh, about = _better_by_stereo(mesh, fused_with_stereo, frames, stages)
+            mesh, about = _better_by_stereo(mesh, fused_with_stereo, frames, merged, stages)
     if about:
         stages.note(
             f"stereo: {about['confirmed']:.0%} of the pixels have a depth that other views confirm, "
@@ -131,12 +138,17 @@ def tsdf_surface(
 
 
 def _better_by_stereo(
-    rendered: Mesh, fused: Callable[[MergedFrames], tuple[Mesh, dict]], frames: DepthFrames, stages: Stages
+    rendered: Mesh,
+    fused: Callable[[MergedFrames], tuple[Mesh, dict]],
+    frames: DepthFrames,
+    merged: MergedFrames | None,
+    stages: Stages,
 ) -> tuple[Mesh, dict]:
     """The surface of stereo, or the `rendered` one where photographs agree at clearly more of its vertices or there is
     hardly any stereo; with what there is to say of it."""
     try:
-        merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)
+        if merged is None:
+            merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)
     except LinprimError as error:
         stages.note(f"no stereo: {error}")
         return rendered, {}
@@ -194,16 +206,24 @@ def kept_bytes(options: ExtractOptions, cameras: Sequence[Camera]) -> int:
 
 
 class DepthFrames(Sequence):
-    """`tsdf_field.DepthFrame`s of the training views: depth at transmittance `level`, free background.
+    """`tsdf_field.DepthFrame`s of the training views, or of `views`: depth at transmittance `level`, free background.
 
     Depths beyond `limit` are clamped to it; 0 chooses one by `depth_limit`. `clamped_share` is their share. Frames are
     kept in memory if they take at most `most` bytes in all (default KEPT_BYTES), else, and without `keep`, rendered
     whenever they are asked for.
     """
 
-    def __init__(self, run: Run, level: float, limit: float = 0.0, keep: bool = True, most: int | None = None):
+    def __init__(
+        self,
+        run: Run,
+        level: float,
+        limit: float = 0.0,
+        keep: bool = True,
+        most: int | None = None,
+        views: Sequence[View] | None = None,
+    ):
         self.run, self.level, self.limit, self.clamped_share = run, level, limit or np.inf, 0.0
-        self.views = run.scene().train
+        self.views = run.scene().train if views is None else views
         most = KEPT_BYTES if most is None else most
         keep = keep and sum(view.camera.width * view.camera.height * BYTES_PER_PIXEL for view in self.views) <= most
         self.kept, sample = [], [np.zeros(0, np.float32)]

@@ -19,6 +19,9 @@ from linprim_geo.surface.texture import make_texture
 from linprim_geo.surface.texture_files import save_textured
 from linprim_geo.surface.visibility import color_vertices, pixels_of, visible_faces
 
+# Rounds of refinement with `refine` auto, where stereo has no part in the surface.
+REFINE_ROUNDS = 2
+
 
 @dataclass(frozen=True)
 class Finished:
@@ -34,6 +37,13 @@ class Finished:
 def visible_file(target: Path) -> Path:
     """Where the part of a mesh goes that cameras see."""
     return target.with_name(f"{target.stem}_visible{target.suffix}")
+
+
+def with_rounds(options: ExtractOptions, about: dict) -> ExtractOptions:
+    """The options with the rounds of refinement that a surface gets, by the statistics of its method."""
+    if options.refine != "auto":
+        return options
+    return replace(options, refine=0 if about.get("stereo", {}).get("taken") else REFINE_ROUNDS)
 
 
 def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, stages: Stages) -> Finished:

@@ -40,8 +40,7 @@ class MergedFrames(Sequence):
 
     def __init__(self, rendered: Sequence[DepthFrame], views: Sequence[View], limit: float, *, quiet: bool = True):
         self.rendered, self.limit = rendered, limit
-        points = np.concatenate([_some(frame.surface()[0], POINTS // len(views)) for frame in rendered])
-        maps = depth_maps(views, points, hiding=(frame.depth for frame in rendered), quiet=quiet)
+        maps = depth_maps(views, pairing_points(rendered), hiding=(frame.depth for frame in rendered), quiet=quiet)
         sure = [found.is_confirmed() for found in maps]
         self.depths = [_depth_where(found, own) for found, own in zip(maps, sure, strict=True)]
         self.doubtful_depths = [
@@ -169,9 +168,10 @@ def _near(mesh: Mesh, supported: np.ndarray, reach: float) -> Mesh:
     return select_faces(mesh, near[mesh.faces].any(1))
 
 
-def _some(points: np.ndarray, count: int) -> np.ndarray:
-    """About `count` of (P, 3) points, evenly over their order."""
-    return points[:: max(1, len(points) // max(1, count))]
+def pairing_points(rendered: Sequence[DepthFrame]) -> np.ndarray:
+    """(P, 3) points of rendered surfaces by which stereo finds pairs of views, about POINTS evenly over the frames."""
+    surfaces = (frame.surface()[0] for frame in rendered)
+    return np.concatenate([points[:: max(1, len(points) // max(1, POINTS // len(rendered)))] for points in surfaces])
 
 
 def _depth_where(found: DepthMap, taken: np.ndarray) -> np.ndarray:

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import math
+import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 
 from linprim_geo.base.budget import AIM, Budget
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.progress import Progress, Stages
+from linprim_geo.surface.postprocess import finish_surface, with_rounds
 
 # Coarse passes of extraction take these multiples of the voxel that the views support, which is the finest that is
 # chosen: half of it has 2 % more Chamfer distance and 17 times the open edges on the built-in part, for four times the
 # time.
 COARSE, FINEST = (4.0, 2.0), 1.0
-# The first pass of all, which also loads libraries, is not counted.
+# A pass before these, of the least that a surface takes, loads libraries and is not counted.
 WARM_UP = 8.0
+# So many times what this takes is kept from stereo: with it a pass takes three times as long, as two surfaces are fused
+# and compared and one is denoised, and there is a coarse one and that of the result.
+RESERVED = 6
 
 
 @dataclass(frozen=True)
@@ -59,35 +67,45 @@ def choose_voxel(run, options, target, stages, budget: Budget):
     Args:
         run: an open run. options: ExtractOptions with a level that is a number. target: the file that will be written.
 
-    Returns: (ExtractOptions with the voxel size, the depth maps that were rendered, what was chosen and why for the
-    statistics).
+    Returns: (ExtractOptions with the voxel size and whether there is stereo, depth maps as keywords of
+    `method_tsdf.tsdf_surface`, what was chosen and why for the statistics).
 
     Raises:
         LinprimError: not even the coarsest voxel fits; no ray crosses the level.
     """
-    from dataclasses import replace
-
     from linprim_geo.surface.method_tsdf import DepthFrames
+    from linprim_geo.surface.stereo_budget import stereo_in_time
     from linprim_geo.surface.tsdf_fusion import auto_voxel_size
 
     begin = time.monotonic()
     frames = DepthFrames(run, options.level, options.depth_limit)
-    supported = auto_voxel_size(frames)
     stages.lap("render")
     rendering = time.monotonic() - begin
+    kept: dict = {"frames": frames}
+    least = replace(options, voxel_size=WARM_UP * auto_voxel_size(frames), stereo="off", refine=0, denoise="off")
+    begin = time.monotonic()
+    with suppress(LinprimError):  # too coarse for a surface
+        _timed_pass(run, least, kept, target)
+    reserve = RESERVED * (time.monotonic() - begin)
+    stages.lap("coarse passes")
+    stereo: dict = {}
+    if options.stereo != "off":
+        kept["frames"], kept["merged"], stereo = stereo_in_time(run, options, frames, stages, budget, reserve)
+        options = replace(options, stereo=options.stereo if stereo else "off")
+    supported = auto_voxel_size(kept["frames"])
     passes: list[tuple[float, float]] = []
-    for multiple in (WARM_UP, *COARSE):
+    for multiple in COARSE:
         voxel = multiple * supported
         if passes and budget.left() < (passes[0][0] / voxel) ** 2 * passes[0][1]:
             break  # a second pass might leave no time for the surface itself
         try:
-            seconds = _timed_pass(run, replace(options, voxel_size=voxel), frames, target, stages)
+            seconds = _timed_pass(run, replace(options, voxel_size=voxel), kept, target)
         except LinprimError:  # too coarse for a surface
             if multiple == COARSE[-1]:
                 raise
             continue
-        if multiple != WARM_UP:
-            passes.append((voxel, seconds))
+        passes.append((voxel, seconds))
+        stages.note(f"coarse pass with voxels of {voxel:.3g}: {seconds:.2f} s")
     stages.lap("coarse passes")
     cost = VoxelCost.fit(passes)
     left, coarsest, finest = budget.left(), passes[0][0], FINEST * supported
@@ -115,28 +133,22 @@ def choose_voxel(run, options, target, stages, budget: Budget):
         "why": why,
         "supported_voxel_size": supported,
         "render_seconds": rendering,
+        "stereo": stereo,
         "coarse_passes": [{"voxel_size": v, "seconds": t} for v, t in passes],
         "cost": asdict(cost),
         "predicted_seconds": predicted,
         "aim_seconds": AIM * budget.seconds,
     }
-    return replace(options, voxel_size=voxel), frames, chosen
+    return replace(options, voxel_size=voxel), kept, chosen
 
 
-def _timed_pass(run, options, frames, target, stages) -> float:
-    """Seconds of everything that follows the depth maps, written to a folder that is thrown away."""
-    import tempfile
-    from pathlib import Path
-
-    from linprim_geo.base.progress import Progress, Stages
+def _timed_pass(run, options, kept, target) -> float:
+    """Seconds of everything that follows the depth maps that are `kept`, written to a folder that is thrown away."""
     from linprim_geo.surface.method_tsdf import tsdf_surface
-    from linprim_geo.surface.postprocess import finish_surface
 
     quiet = Stages(Progress("coarse pass", 1, quiet=True))
     with tempfile.TemporaryDirectory(prefix="linprim_geo_") as folder:
         begin = time.monotonic()
-        mesh, _ = tsdf_surface(run, options, quiet, frames)
-        mesh = finish_surface(mesh, run, options, Path(folder) / target.name, quiet).mesh
-        seconds = time.monotonic() - begin
-    stages.note(f"coarse pass with voxels of {options.voxel_size:.3g}: {seconds:.2f} s, {len(mesh.faces)} triangles")
-    return seconds
+        mesh, about = tsdf_surface(run, options, quiet, **kept)
+        finish_surface(mesh, run, with_rounds(options, about), Path(folder) / target.name, quiet)
+        return time.monotonic() - begin

@@ -28,7 +28,7 @@ def add(command: AddCommand) -> None:
     )
     sub.add_argument("--method", choices=("tsdf", "polyhedra", "opacity-field"), default="tsdf", help=text)
     sub.add_argument("-o", "--output", metavar="FILE", help=".ply .obj .glb .stl (default RUN/mesh/METHOD/mesh.ply)")
-    text = "choose the voxel size so that everything takes this long, by what coarse passes take"
+    text = "choose the size of photographs for stereo, and of voxels, so that everything takes this long"
     sub.add_argument("--time-budget", type=seconds, metavar="TIME", help=text)
     add_threads(sub)
     add_quiet(sub)

@@ -1,0 +1,68 @@
+"""Stereo in a given time: of photographs that are averaged down until it fits."""
+
+from __future__ import annotations
+
+import time
+
+from linprim_geo.base.budget import Budget
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import ExtractOptions
+from linprim_geo.base.progress import Stages
+from linprim_geo.capture.small_copy import SmallCopy
+from linprim_geo.runs.run import Run
+from linprim_geo.stereo.planes_on_disk import Photographs
+from linprim_geo.stereo.time_plan import seconds_per_pixel
+from linprim_geo.surface.method_tsdf import DepthFrames
+from linprim_geo.surface.stereo_frames import MergedFrames, pairing_points
+
+# Of the time that is left stereo takes at most this share: the rest is for smaller voxels.
+SHARE = 0.5
+# Photographs are not made smaller than so many pixels along the longer side.
+SMALLEST_SIDE = 120
+# Stereo with its planes takes so many times as long as depth maps alone, by which it is estimated.
+WITH_PLANES = 1.2
+
+
+def stereo_in_time(
+    run: Run, options: ExtractOptions, frames: DepthFrames, stages: Stages, budget: Budget, reserve: float
+) -> tuple[DepthFrames, MergedFrames | None, dict]:
+    """Depth frames of a run and what is merged of them and stereo, of views as large as the time allows.
+
+    Views have means of K by K pixels, with the least K that fits, and leaves SMALLEST_SIDE pixels at least. Without the
+    time for any, or where stereo is impossible, there are the `frames` that are given and None. `reserve` seconds are
+    not stereo's in any case.
+
+    Returns: the frames, the merged ones, and for the statistics K as `downscale` and seconds that stereo was planned to
+    take and took.
+
+    Raises:
+        LinprimError: `options.stereo` is on, and there is no stereo.
+    """
+    try:
+        rate = WITH_PLANES * seconds_per_pixel(Photographs(frames.views, pairing_points(frames)), budget)
+        cameras = [view.camera for view in frames.views]
+        pixels = sum(camera.width * camera.height for camera in cameras)
+        largest = max(1, min(max(camera.width, camera.height) for camera in cameras) // SMALLEST_SIDE)
+        planned = {factor: rate * pixels / factor**2 for factor in range(1, largest + 1)}
+        most = min(SHARE * budget.left(), budget.left() - reserve)
+        fitting = [factor for factor, seconds in planned.items() if seconds <= most]
+        if not fitting:
+            raise LinprimError(
+                f"--time-budget is {budget.seconds:.3g} s, which leaves {max(most, 0):.0f} s for stereo, and the least "
+                f"that is of any use takes {planned[largest]:.0f} s"
+            )
+        factor = fitting[0]
+        if factor > 1:
+            views = [SmallCopy.of(view, factor) for view in frames.views]
+            frames = DepthFrames(run, float(options.level), frames.limit, views=views)
+        begin = time.monotonic()
+        merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)
+    except LinprimError as error:
+        if options.stereo == "on":
+            raise
+        stages.note(f"no stereo: {error}")
+        return frames, None, {}
+    taken = time.monotonic() - begin
+    stages.note(f"stereo of means of {factor} by {factor} pixels" if factor > 1 else "stereo of whole photographs")
+    stages.lap("stereo")
+    return frames, merged, {"downscale": factor, "planned_seconds": planned[factor], "seconds": taken}

@@ -1,0 +1,78 @@
+"""Stereo in a given time: photographs as large as it allows, or none."""
+
+from __future__ import annotations
+
+import pytest
+from conftest import octahedron_run
+
+from linprim_geo.base.budget import AIM, Budget
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import ExtractOptions
+from linprim_geo.base.progress import Progress, Stages
+from linprim_geo.runs.run import Run
+from linprim_geo.surface import stereo_budget
+from linprim_geo.surface.extract import extract_mesh
+from linprim_geo.surface.method_tsdf import DepthFrames
+from linprim_geo.surface.stereo_budget import SHARE, WITH_PLANES, stereo_in_time
+
+VIEWS, SIZE, SECONDS = 60, 64, 1000.0
+PIXELS = (VIEWS - 2) * SIZE**2
+
+
+@pytest.fixture(scope="module")
+def many_views(tmp_path_factory):
+    """A run of one octahedron whose views are so near to each other that stereo finds pairs."""
+    return Run.open(octahedron_run(tmp_path_factory.mktemp("many"), views=VIEWS, size=SIZE))
+
+
+@pytest.fixture(scope="module")
+def frames(many_views):
+    return DepthFrames(many_views, 0.5)
+
+
+@pytest.fixture
+def in_time(many_views, frames, monkeypatch):
+    """Stereo of `seconds` in a budget of SECONDS; depth maps are not made."""
+    monkeypatch.setattr(stereo_budget, "SMALLEST_SIDE", 20)
+    monkeypatch.setattr(stereo_budget, "MergedFrames", lambda rendered, *_, **__: rendered)
+
+    def call(seconds: float, stereo: str = "auto", reserve: float = 0.0):
+        monkeypatch.setattr(stereo_budget, "seconds_per_pixel", lambda *_: seconds / pixels / WITH_PLANES)
+        stages = Stages(Progress("test", 1, quiet=True))
+        options = ExtractOptions(level=0.5, stereo=stereo)
+        return stereo_in_time(many_views, options, frames, stages, Budget(SECONDS), reserve)
+
+    pixels = sum(view.camera.width * view.camera.height for view in frames.views)
+    return call
+
+
+@pytest.mark.parametrize("seconds, factor", [(0.9, 1), (1.1, 2), (3.9, 2), (4.1, 3), (8.9, 3)])
+def test_photographs_are_as_large_as_the_time_allows(in_time, frames, seconds, factor):
+    taken, merged, about = in_time(seconds * SHARE * AIM * SECONDS)
+    assert merged is taken and about["downscale"] == factor
+    assert about["planned_seconds"] == pytest.approx(seconds * SHARE * AIM * SECONDS / factor**2)
+    camera, full = taken.views[0].camera, frames.views[0].camera
+    assert (camera.width, taken[0].depth.shape) == (SIZE // factor, (SIZE // factor, SIZE // factor))
+    assert camera.fx == pytest.approx(full.fx / factor) and taken.limit == frames.limit
+    assert taken.views[0].load().rgb.shape == (SIZE // factor, SIZE // factor, 3)
+
+
+def test_without_the_time_there_is_none_and_who_asks_for_it_is_told(in_time, frames):
+    seconds = 9.1 * SHARE * AIM * SECONDS
+    assert in_time(seconds) == (frames, None, {})
+    with pytest.raises(LinprimError, match=r"--time-budget is 1e\+03 s, which leaves 485 s .* takes 490 s"):
+        in_time(seconds, "on")
+
+
+def test_what_is_reserved_is_not_taken(in_time):
+    seconds = 0.3 * AIM * SECONDS
+    assert in_time(seconds, reserve=0.6 * AIM * SECONDS)[2]["downscale"] == 1
+    assert in_time(seconds, reserve=0.8 * AIM * SECONDS)[2]["downscale"] == 2
+    assert in_time(seconds, reserve=2 * SECONDS)[1] is None
+
+
+def test_a_surface_in_a_given_time_has_stereo(many_views):
+    options = ExtractOptions(level=0.5, stereo="on")
+    stats = extract_mesh(many_views.path, options=options, time_budget=300.0, quiet=True)
+    assert stats["stereo"]["taken"] and stats["refine"] == 0 and stats["faces"] > 0
+    assert stats["time_budget"]["stereo"]["downscale"] == 1 and 0 < stats["time_budget"]["stereo"]["seconds"] < 300
