@@ -16,6 +16,7 @@ from scipy.ndimage import binary_dilation
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.points.initial_points import in_image
+from linprim_geo.stereo.common_surfaces import CommonSurfaces
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.plain_regions import (
@@ -366,7 +367,8 @@ class ShadedPlanes:
     def depth_maps(self) -> list[np.ndarray]:
         """(H, W) float32 depth of every view's regions, each by one plane where that carries its shading, else NaN.
 
-        Of planes that do so as well, such as those of one wall, the one is taken that carries most in all views.
+        Of planes that do so as well, such as those of one wall, the one is taken that carries most in all views, and
+        none on which fewer than LEAST_VIEWS know a surface there: floors go on behind walls.
         """
         carriers = self._all_carriers()
         carried = np.zeros(len(self.planes))
@@ -375,23 +377,46 @@ class ShadedPlanes:
                 for k, boxes in of_region.items():
                     carried[k] += np.count_nonzero(boxes)
         carried[: len(self.given)] *= HARDLY_MORE
-        result = []
-        for view, (own, of_view) in enumerate(zip(self.regions, carriers, strict=True)):
-            number = np.full(self.shadings[view].plain.shape, -1)
-            for one, of_region in zip(own, of_view, strict=True):
-                most = max((np.count_nonzero(boxes) for boxes in of_region.values()), default=0)
-                as_well = [k for k, boxes in of_region.items() if HARDLY_MORE * np.count_nonzero(boxes) >= most]
-                if as_well:
-                    best = max(as_well, key=lambda k: carried[k])
-                    number[_around(self._inside(one.region), one.region, of_region[best])] = best
-            result.append(self._depth(view, number))
+        # Of every region the numbers of the planes that carry it as well as any, the best first.
+        numbers: list[list[list[np.ndarray]]] = []
+        for own, of_view in zip(self.regions, carriers, strict=True):
+            numbers.append(
+                [self._numbers(one, of_region, carried) for one, of_region in zip(own, of_view, strict=True)]
+            )
+        known = []
+        for view, depth in enumerate(self.depths):
+            on_planes = self._depth(
+                self.shadings[view].camera, self._together(view, [own[:1] for own in numbers[view]])
+            )
+            known.append(np.where(np.isfinite(depth), depth, on_planes))
+        surfaces, result = CommonSurfaces([shading.camera for shading in self.shadings], known), []
+        for view, own in enumerate(numbers):
+            supposed = [self._depth(self.shadings[view].camera, number) for of_region in own for number in of_region]
+            enough = iter([1 + others >= LEAST_VIEWS for others in surfaces.known_by(view, supposed)])
+            left = [[number for number in of_region if next(enough)][:1] for of_region in own]
+            factor = self.shadings[view].factor
+            number = self._together(view, left).repeat(factor, 0).repeat(factor, 1)
+            result.append(self._depth(self.cameras[view], number))
         return result
 
-    def _depth(self, view: int, number: np.ndarray) -> np.ndarray:
-        """(H, W) float32 depth of the planes that `number` names at pixels of the small photograph, NaN for -1."""
-        camera, factor = self.cameras[view], self.shadings[view].factor
+    def _numbers(self, one: FittedRegion, carriers: dict[int, np.ndarray], carried: np.ndarray) -> list[np.ndarray]:
+        """(H, W) numbers of planes around the boxes of a region that they carry, -1 elsewhere: of each plane that
+        carries about as many as any, that first which has `carried` most."""
+        most = max((np.count_nonzero(boxes) for boxes in carriers.values()), default=0)
+        as_well = [k for k, boxes in carriers.items() if HARDLY_MORE * np.count_nonzero(boxes) >= most > 0]
+        inside = self._inside(one.region)
+        return [
+            np.where(_around(inside, one.region, carriers[k]), k, -1)
+            for k in sorted(as_well, key=lambda k: carried[k], reverse=True)
+        ]
+
+    def _together(self, view: int, numbers: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
+        """(H, W) numbers of planes of all regions of a view, of which each has one or none."""
+        return np.max([np.full(self.shadings[view].plain.shape, -1), *(n for own in numbers for n in own)], axis=0)
+
+    def _depth(self, camera: Camera, number: np.ndarray) -> np.ndarray:
+        """(H, W) float32 depth of the planes that `number` names, NaN for -1."""
         depth = np.full((camera.height, camera.width), np.nan, np.float32)
-        number = number.repeat(factor, 0).repeat(factor, 1)
         row, column = np.nonzero(number >= 0)
         planes = in_camera(camera, self.planes)[number[row, column]]
         inverse = np.einsum("nc,nc->n", rays_of(camera, row, column), planes)

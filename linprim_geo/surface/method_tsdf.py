@@ -118,7 +118,7 @@ def tsdf_surface(
         mesh = fused(frames, options.smallest_part)
         stages.lap("fuse")
         if options.stereo == "auto":
-            mesh, about = _better_by_stereo(mesh, fused_with_stereo, frames, merged, stages)
+            mesh, about = _better_by_stereo(mesh, fused_with_stereo, frames, merged, run.scene().train, stages)
     if about:
         stages.note(
             f"stereo: {about['confirmed']:.0%} of the pixels have a depth that other views confirm, "
@@ -142,10 +142,12 @@ def _better_by_stereo(
     fused: Callable[[MergedFrames], tuple[Mesh, dict]],
     frames: DepthFrames,
     merged: MergedFrames | None,
+    views: Sequence[View],
     stages: Stages,
 ) -> tuple[Mesh, dict]:
-    """The surface of stereo, or the `rendered` one where photographs agree at clearly more of its vertices or there is
-    hardly any stereo; with what there is to say of it."""
+    """The surface of stereo, or the `rendered` one where photographs of `views` agree at clearly more of its vertices
+    or there is hardly any stereo; with what there is to say of it. Frames of smaller views have stereo in any case:
+    within pixels as large as theirs photographs agree with walls of fog."""
     try:
         if merged is None:
             merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)
@@ -159,9 +161,12 @@ def _better_by_stereo(
     stages.lap("fuse")
     if not len(mesh.faces):
         return rendered, about | {"taken": False}
-    cameras = [view.camera for view in frames.views]
-    gains = photo_gains(rendered, cameras, (view.load() for view in frames.views))
-    without, with_stereo = (_agreeing(surface, frames.views, gains) for surface in (rendered, mesh))
+    if frames.views is not views:
+        stages.note("it is taken, as photographs of this size do not compare surfaces")
+        return mesh, about | {"taken": True}
+    cameras = [view.camera for view in views]
+    gains = photo_gains(rendered, cameras, (view.load() for view in views))
+    without, with_stereo = (_agreeing(surface, views, gains) for surface in (rendered, mesh))
     stages.lap("compare")
     taken = with_stereo > without - CLEARLY_LESS
     stages.note(

@@ -11,9 +11,10 @@ from helpers.captures import look_at
 from scipy.ndimage import gaussian_filter
 
 from linprim_geo.geometry.sampling import sample_bilinear
+from linprim_geo.stereo.common_surfaces import CommonSurfaces
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.plain_regions import in_camera
-from linprim_geo.stereo.shaded_planes import ShadedPlanes
+from linprim_geo.stereo.shaded_planes import LEAST_VIEWS, ShadedPlanes
 from linprim_geo.stereo.shading import Shading, evaluate, fit_plane, shaded_regions
 from linprim_geo.stereo.vignetting import falloff
 
@@ -208,6 +209,15 @@ def test_a_known_plane_is_taken_where_it_carries_the_shading_as_well():
     assert len(found.planes) == 2
     share, off = errors(found, depths)
     assert share > 0.7 and off.max() < 1e-5
+
+
+@pytest.mark.parametrize("others, kept", [(LEAST_VIEWS - 2, False), (LEAST_VIEWS - 1, True)])
+def test_a_plane_that_too_few_views_know_gives_no_depth(monkeypatch, others, kept):
+    """A floor goes on behind walls: two views alone may suppose it there."""
+    maps, depths = photographs(lambda points, view: light(points))
+    found = planes_of(maps, depths)
+    monkeypatch.setattr(CommonSurfaces, "known_by", lambda self, view, supposed: [others] * len(supposed))
+    assert any(np.isfinite(own).any() for own in found.depth_maps()) is kept
 
 
 def edge_points(depths, noise: float = 0.004, seed: int = 0):

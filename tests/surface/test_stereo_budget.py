@@ -9,10 +9,11 @@ from linprim_geo.base.budget import AIM, Budget
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Progress, Stages
+from linprim_geo.capture.small_copy import SmallCopy
 from linprim_geo.runs.run import Run
-from linprim_geo.surface import stereo_budget
+from linprim_geo.surface import method_tsdf, stereo_budget
 from linprim_geo.surface.extract import extract_mesh
-from linprim_geo.surface.method_tsdf import DepthFrames
+from linprim_geo.surface.method_tsdf import DepthFrames, tsdf_surface
 from linprim_geo.surface.stereo_budget import SHARE, WITH_PLANES, stereo_in_time
 
 VIEWS, SIZE, SECONDS = 60, 64, 1000.0
@@ -76,3 +77,16 @@ def test_a_surface_in_a_given_time_has_stereo(many_views):
     stats = extract_mesh(many_views.path, options=options, time_budget=300.0, quiet=True)
     assert stats["stereo"]["taken"] and stats["refine"] == 0 and stats["faces"] > 0
     assert stats["time_budget"]["stereo"]["downscale"] == 1 and 0 < stats["time_budget"]["stereo"]["seconds"] < 300
+
+
+@pytest.mark.parametrize("factor, taken", [(1, False), (2, True)])
+def test_small_photographs_do_not_speak_against_stereo(many_views, frames, monkeypatch, factor, taken):
+    shares = iter((0.9, 0.1))
+    monkeypatch.setattr(method_tsdf, "LEAST_CONFIRMED", 0.0)
+    monkeypatch.setattr(method_tsdf, "_agreeing", lambda *_: next(shares))
+    views = many_views.scene().train
+    if factor > 1:
+        views = [SmallCopy.of(view, factor) for view in views]
+    stages, options = Stages(Progress("test", 1, quiet=True)), ExtractOptions(level=0.5, voxel_size=0.1)
+    _, about = tsdf_surface(many_views, options, stages, DepthFrames(many_views, 0.5, frames.limit, views=views))
+    assert about["stereo"]["taken"] is taken and ("agreeing" in about["stereo"]) is not taken

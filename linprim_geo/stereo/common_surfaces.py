@@ -1,0 +1,39 @@
+"""How many views know a surface that one of them supposes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.points.view_pairs import visible_pixels
+from linprim_geo.stereo.plain_regions import rays_of, to_world
+
+# Depths of one of so many rows and columns are looked at, and a view knows a surface by so many points at least.
+STRIDE, LEAST_POINTS = 4, 30
+# Points are on a surface if their depths differ by no more than this share, which is what planes may be off by.
+ON_IT = 0.05
+
+
+class CommonSurfaces:
+    """Points on the surfaces that views know: `depths` (H, W) of each camera, NaN where unknown."""
+
+    def __init__(self, cameras: Sequence[Camera], depths: Sequence[np.ndarray]):
+        self.cameras = cameras
+        points, views = [np.zeros((0, 3))], [np.zeros(0, int)]
+        for view, (camera, depth) in enumerate(zip(cameras, depths, strict=True)):
+            row, column = (STRIDE * x for x in np.nonzero(np.isfinite(depth[::STRIDE, ::STRIDE])))
+            points.append(to_world(camera, rays_of(camera, row, column) * depth[row, column, None]))
+            views.append(np.full(len(row), view))
+        self.points, self.views = np.concatenate(points), np.concatenate(views)
+
+    def known_by(self, view: int, depths: Sequence[np.ndarray]) -> list[int]:
+        """How many other views have points on each of several (H, W) depths of a view, NaN where there are none."""
+        if not depths:
+            return []
+        others = self.views != view
+        inside, pixels, along = visible_pixels(self.cameras[view], self.points[others])
+        views, (column, row) = self.views[others][inside], pixels.T
+        on_it = (np.abs(along / depth[row, column] - 1) <= ON_IT for depth in depths)
+        return [int(np.count_nonzero(np.bincount(views[points]) >= LEAST_POINTS)) for points in on_it]

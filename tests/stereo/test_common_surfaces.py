@@ -1,0 +1,55 @@
+"""Surfaces that several views know, and what two alone suppose."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.captures import look_at
+
+from linprim_geo.stereo.common_surfaces import LEAST_POINTS, STRIDE, CommonSurfaces
+from linprim_geo.stereo.plain_regions import in_camera
+
+# A wall at y = 0 seen from y < 0, and the floor at z = 0 that goes on behind it.
+WALL, FLOOR = np.array([0.0, 1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0, 0.0])
+CAMERAS = [look_at((x, -3.0, 2.0), (0.0, 0.0, 1.0), size=(80, 60), focal=100.0) for x in (-0.6, -0.3, 0.0, 0.3, 0.6)]
+
+
+def depth_of(camera, plane) -> np.ndarray:
+    inverse = camera.ray_grid() @ in_camera(camera, plane[None])[0]
+    return np.where(inverse > 0.01, 1 / inverse, np.nan)
+
+
+def known(planes) -> CommonSurfaces:
+    depths = [np.full((60, 80), np.nan) if p is None else depth_of(c, p) for c, p in zip(CAMERAS, planes, strict=True)]
+    return CommonSurfaces(CAMERAS, depths)
+
+
+@pytest.fixture
+def supposed() -> list[np.ndarray]:
+    return [depth_of(CAMERAS[0], WALL), depth_of(CAMERAS[0], FLOOR)]
+
+
+def test_views_that_see_the_same_surface_know_it(supposed):
+    assert (supposed[1][:40] > 1.2 * supposed[0][:40]).all()
+    assert known([WALL] * 5).known_by(0, supposed) == [4, 0]
+    assert known([FLOOR, FLOOR, WALL, WALL, WALL]).known_by(0, supposed) == [3, 1]
+    assert known([WALL, None, None, None, FLOOR]).known_by(0, supposed) == [0, 1]
+
+
+def test_a_view_is_no_witness_of_its_own_and_nothing_is_known_of_nothing(supposed):
+    assert known([WALL, None, None, None, None]).known_by(0, supposed) == [0, 0]
+    assert known([None] * 5).known_by(0, supposed) == [0, 0]
+    assert known([WALL] * 5).known_by(0, []) == []
+
+
+def test_a_few_points_are_no_surface(supposed):
+    few = depth_of(CAMERAS[1], WALL)
+    few[STRIDE:] = np.nan  # one row of points
+    assert 80 // STRIDE < LEAST_POINTS
+    surfaces = CommonSurfaces(CAMERAS[:2], [supposed[0], few])
+    assert surfaces.known_by(0, supposed) == [0, 0]
+
+
+def test_depths_that_differ_by_less_than_planes_are_off_by_are_one_surface():
+    near, far = (CommonSurfaces(CAMERAS[:1] * 2, [np.full((60, 80), 3.0), np.full((60, 80), z)]) for z in (3.14, 3.17))
+    assert near.known_by(0, [np.full((60, 80), 3.0)]) == [1] and far.known_by(0, [np.full((60, 80), 3.0)]) == [0]
