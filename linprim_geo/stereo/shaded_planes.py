@@ -34,15 +34,17 @@ from linprim_geo.stereo.shading import (
     BOX,
     LEAST_BOXES,
     SHOWN_SHARE,
-    STRIDE,
+    SURE_DEPTHS,
     Fit,
     ShadedRegion,
     Shading,
+    around_boxes,
     depth_deviation,
     evaluate,
     fit_plane,
     plane_moves,
     shaded_regions,
+    starting_planes,
     unexplained,
 )
 from linprim_geo.stereo.vignetting import vignetting
@@ -62,7 +64,7 @@ CERTAIN = 2 * CONFIRMED_DEPTH
 # Planes of regions are taken together if they differ by no more than these: what the plane of one alone is off by.
 ALIKE_ANGLE, ALIKE_DEPTH = 4 * SAME_ANGLE, 5 * CONFIRMED_DEPTH
 # Stereo confirms up to SURE_SHARE of a plain region by chance; of more depths, AGREEING are on the plane.
-SURE_DEPTHS, SURE_SHARE, AGREEING = 30, 0.1, 0.7
+SURE_SHARE, AGREEING = 0.1, 0.7
 # Confirmed depths along the edges of regions hold a plane if they are as near as NEAR, and after some steps as
 # TOLERANCE. Half of TOLERANCE is their deviation; as their errors have common causes, they count as so many at most.
 NEAR, NARROWER, HOLDING_STEPS, INDEPENDENT = 2 * TOLERANCE, 0.8, 6, 200
@@ -129,7 +131,7 @@ class ShadedPlanes:
         # What noise leaves is too large a share of less.
         if np.var(region.value) < 2 * self.shadings[region.view].noise / OTHERS_SHARE**2:
             return None
-        starts = _starts(region, self.depths[region.view], rendered)
+        starts = starting_planes(region, self.depths[region.view], rendered)
         if not starts:
             return None
         depth = 1 / np.median(region.rays @ starts[0])
@@ -406,7 +408,7 @@ class ShadedPlanes:
         as_well = [k for k, boxes in carriers.items() if HARDLY_MORE * np.count_nonzero(boxes) >= most > 0]
         inside = self._inside(one.region)
         return [
-            np.where(_around(inside, one.region, carriers[k]), k, -1)
+            np.where(around_boxes(inside, one.region, carriers[k]), k, -1)
             for k in sorted(as_well, key=lambda k: carried[k], reverse=True)
         ]
 
@@ -424,15 +426,6 @@ class ShadedPlanes:
         return depth
 
 
-def _around(inside: np.ndarray, region: ShadedRegion, carried: np.ndarray) -> np.ndarray:
-    """(H, W) bool around those boxes of a region that are carried; `inside` (H, W) has the middles of all."""
-    height, width = inside.shape
-    grid = np.zeros((-(-height // STRIDE), -(-width // STRIDE)), bool)
-    grid[region.row[carried] // STRIDE, region.column[carried] // STRIDE] = True
-    wide = binary_dilation(grid, np.ones((3, 3))).repeat(STRIDE, 0).repeat(STRIDE, 1)[:height, :width]
-    return binary_dilation(inside, iterations=BOX // 2) & wide
-
-
 def _commonest(off: np.ndarray) -> float:
     """Where most of (P,) values are within half of TOLERANCE."""
     places = np.arange(-ALIKE_DEPTH, ALIKE_DEPTH, TOLERANCE / 10)
@@ -444,23 +437,3 @@ def _commonest(off: np.ndarray) -> float:
 def _plane(one: FittedRegion) -> np.ndarray:
     assert one.fit is not None
     return one.fit.plane
-
-
-def _starts(region: ShadedRegion, depth: np.ndarray, rendered: np.ndarray) -> list[np.ndarray]:
-    """Planes (3,) to start from: through rendered depths, and parallel to the image at confirmed depths around."""
-    starts, inside = [], rendered[region.row, region.column]
-    known = inside > 0
-    if np.count_nonzero(known) >= LEAST_BOXES:
-        rays, inverse = region.rays[known], 1 / inside[known].astype(np.float64)
-        weight = np.ones(len(inverse))
-        for _ in range(5):  # towards the least sum of absolute differences
-            plane = np.linalg.lstsq(rays * weight[:, None], inverse * weight, rcond=None)[0]
-            weight = np.maximum(np.abs(rays @ plane / inverse - 1), 2 * CONFIRMED_DEPTH) ** -0.5
-        starts.append(plane)
-    grid = np.zeros(depth[::STRIDE, ::STRIDE].shape, bool)
-    grid[region.row // STRIDE, region.column // STRIDE] = True
-    around = depth[::STRIDE, ::STRIDE][binary_dilation(grid, iterations=BOX // STRIDE + 2)]
-    around = around[np.isfinite(around)]
-    if len(around) >= SURE_DEPTHS:
-        starts += [np.array([0, 0, 1 / np.quantile(around, share)]) for share in (0.5, 0.9)]
-    return starts

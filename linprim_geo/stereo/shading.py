@@ -12,12 +12,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, label, median_filter, uniform_filter
+from scipy.ndimage import binary_dilation, gaussian_filter, label, median_filter, uniform_filter
 
 from linprim_geo.geometry.boxes import smaller
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.sampling import sample_bilinear
 from linprim_geo.stereo.depth_maps import DepthMap, block_means
+from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.plain_regions import edges_of, in_camera, plainest, rays_of
 from linprim_geo.stereo.vignetting import falloff
 
@@ -32,6 +33,8 @@ EDGE_SIGMA, EDGE_SLOPE, MEDIAN = 2.0, 6.0, 9
 LEAST_SLOPE = 0.459
 # A region has so many boxes, and stereo confirms no more than this share of them.
 LEAST_BOXES, KNOWN_SHARE = 60, 0.5
+# So many confirmed depths say something of a region.
+SURE_DEPTHS = 30
 # Another view shows at least this share of a region's boxes.
 SHOWN_SHARE = 0.3
 # Steps of a fit at most, the first one's size at most and the last one's, in radians and in depths.
@@ -197,6 +200,35 @@ def _matched(ours: np.ndarray, theirs: np.ndarray) -> tuple[np.ndarray, np.ndarr
         deviation = 1.4826 * np.partition(size, len(size) // 2)[len(size) // 2] + 0.05
         weight = 1 / np.maximum(1, size / (2 * deviation))
     return gain + bend * (2 * b - along), left, weight
+
+
+def around_boxes(inside: np.ndarray, region: ShadedRegion, carried: np.ndarray) -> np.ndarray:
+    """(H, W) bool around those boxes of a region that are carried; `inside` (H, W) has the middles of all."""
+    height, width = inside.shape
+    grid = np.zeros((-(-height // STRIDE), -(-width // STRIDE)), bool)
+    grid[region.row[carried] // STRIDE, region.column[carried] // STRIDE] = True
+    wide = binary_dilation(grid, np.ones((3, 3))).repeat(STRIDE, 0).repeat(STRIDE, 1)[:height, :width]
+    return binary_dilation(inside, iterations=BOX // 2) & wide
+
+
+def starting_planes(region: ShadedRegion, depth: np.ndarray, rendered: np.ndarray) -> list[np.ndarray]:
+    """Planes (3,) to start from: through rendered depths, and parallel to the image at confirmed depths around."""
+    starts, inside = [], rendered[region.row, region.column]
+    known = inside > 0
+    if np.count_nonzero(known) >= LEAST_BOXES:
+        rays, inverse = region.rays[known], 1 / inside[known].astype(np.float64)
+        weight = np.ones(len(inverse))
+        for _ in range(5):  # towards the least sum of absolute differences
+            plane = np.linalg.lstsq(rays * weight[:, None], inverse * weight, rcond=None)[0]
+            weight = np.maximum(np.abs(rays @ plane / inverse - 1), 2 * CONFIRMED_DEPTH) ** -0.5
+        starts.append(plane)
+    grid = np.zeros(depth[::STRIDE, ::STRIDE].shape, bool)
+    grid[region.row // STRIDE, region.column // STRIDE] = True
+    around = depth[::STRIDE, ::STRIDE][binary_dilation(grid, iterations=BOX // STRIDE + 2)]
+    around = around[np.isfinite(around)]
+    if len(around) >= SURE_DEPTHS:
+        starts += [np.array([0, 0, 1 / np.quantile(around, share)]) for share in (0.5, 0.9)]
+    return starts
 
 
 @dataclass(frozen=True)
