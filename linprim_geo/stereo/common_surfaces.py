@@ -10,7 +10,8 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.points.view_pairs import visible_pixels
 from linprim_geo.stereo.plain_regions import rays_of, to_world
 
-# Depths of one of so many rows and columns are looked at, and a view knows a surface by so many points at least.
+# Depths of one of so many rows and columns are looked at, and a view knows a surface by so many points at least: half
+# of those on the smallest region that has a plane (`shading.LEAST_BOXES`).
 STRIDE, LEAST_POINTS = 4, 30
 # Points are on a surface if their depths differ by no more than this share, which is what planes may be off by.
 ON_IT = 0.05

@@ -379,42 +379,43 @@ class ShadedPlanes:
                 for k, boxes in of_region.items():
                     carried[k] += np.count_nonzero(boxes)
         carried[: len(self.given)] *= HARDLY_MORE
-        # Of every region the numbers of the planes that carry it as well as any, the best first.
-        numbers: list[list[list[np.ndarray]]] = []
-        for own, of_view in zip(self.regions, carriers, strict=True):
-            numbers.append(
-                [self._numbers(one, of_region, carried) for one, of_region in zip(own, of_view, strict=True)]
-            )
-        known = []
-        for view, depth in enumerate(self.depths):
-            on_planes = self._depth(
-                self.shadings[view].camera, self._together(view, [own[:1] for own in numbers[view]])
-            )
-            known.append(np.where(np.isfinite(depth), depth, on_planes))
-        surfaces, result = CommonSurfaces([shading.camera for shading in self.shadings], known), []
-        for view, own in enumerate(numbers):
-            supposed = [self._depth(self.shadings[view].camera, number) for of_region in own for number in of_region]
+        ordered = [[_best_first(of_region, carried) for of_region in own] for own in carriers]
+        surfaces = self._surfaces(ordered, carriers)
+        result = []
+        for view, (own, of_view) in enumerate(zip(self.regions, carriers, strict=True)):
+            numbers = [
+                [self._number(one, boxes[k], k) for k in order]
+                for one, boxes, order in zip(own, of_view, ordered[view], strict=True)
+            ]
+            supposed = [self._depth(self.shadings[view].camera, number) for each in numbers for number in each]
             enough = iter([1 + others >= LEAST_VIEWS for others in surfaces.known_by(view, supposed)])
-            left = [[number for number in of_region if next(enough)][:1] for of_region in own]
+            left = [number for each in numbers for number in [n for n in each if next(enough)][:1]]
             factor = self.shadings[view].factor
             number = self._together(view, left).repeat(factor, 0).repeat(factor, 1)
             result.append(self._depth(self.cameras[view], number))
         return result
 
-    def _numbers(self, one: FittedRegion, carriers: dict[int, np.ndarray], carried: np.ndarray) -> list[np.ndarray]:
-        """(H, W) numbers of planes around the boxes of a region that they carry, -1 elsewhere: of each plane that
-        carries about as many as any, that first which has `carried` most."""
-        most = max((np.count_nonzero(boxes) for boxes in carriers.values()), default=0)
-        as_well = [k for k, boxes in carriers.items() if HARDLY_MORE * np.count_nonzero(boxes) >= most > 0]
-        inside = self._inside(one.region)
-        return [
-            np.where(around_boxes(inside, one.region, carriers[k]), k, -1)
-            for k in sorted(as_well, key=lambda k: carried[k], reverse=True)
-        ]
+    def _surfaces(
+        self, ordered: Sequence[Sequence[list[int]]], carriers: Sequence[Sequence[dict[int, np.ndarray]]]
+    ) -> CommonSurfaces:
+        """What all views know: confirmed depths, and the first of the planes of each region."""
+        known = []
+        for view, own in enumerate(self.regions):
+            each = zip(own, carriers[view], ordered[view], strict=True)
+            number = self._together(
+                view, [self._number(one, boxes[k], k) for one, boxes, order in each for k in order[:1]]
+            )
+            on_planes = self._depth(self.shadings[view].camera, number)
+            known.append(np.where(np.isfinite(self.depths[view]), self.depths[view], on_planes))
+        return CommonSurfaces([shading.camera for shading in self.shadings], known)
 
-    def _together(self, view: int, numbers: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
-        """(H, W) numbers of planes of all regions of a view, of which each has one or none."""
-        return np.max([np.full(self.shadings[view].plain.shape, -1), *(n for own in numbers for n in own)], axis=0)
+    def _number(self, one: FittedRegion, boxes: np.ndarray, number: int) -> np.ndarray:
+        """(H, W) the number of a plane around those boxes of a region that it carries, -1 elsewhere."""
+        return np.where(around_boxes(self._inside(one.region), one.region, boxes), number, -1)
+
+    def _together(self, view: int, numbers: Sequence[np.ndarray]) -> np.ndarray:
+        """(H, W) numbers of planes of all regions of a view."""
+        return np.max([np.full(self.shadings[view].plain.shape, -1), *numbers], axis=0)
 
     def _depth(self, camera: Camera, number: np.ndarray) -> np.ndarray:
         """(H, W) float32 depth of the planes that `number` names, NaN for -1."""
@@ -424,6 +425,13 @@ class ShadedPlanes:
         inverse = np.einsum("nc,nc->n", rays_of(camera, row, column), planes)
         depth[row, column] = 1 / np.where(inverse > 0, inverse, np.nan)
         return depth
+
+
+def _best_first(carriers: dict[int, np.ndarray], carried: np.ndarray) -> list[int]:
+    """The planes that carry about as many boxes of a region as any does; first the one that has `carried` most."""
+    most = max((np.count_nonzero(boxes) for boxes in carriers.values()), default=0)
+    as_well = [k for k, boxes in carriers.items() if HARDLY_MORE * np.count_nonzero(boxes) >= most]
+    return sorted(as_well, key=lambda k: carried[k], reverse=True)
 
 
 def _commonest(off: np.ndarray) -> float:
