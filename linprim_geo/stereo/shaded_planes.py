@@ -369,8 +369,8 @@ class ShadedPlanes:
     def depth_maps(self) -> list[np.ndarray]:
         """(H, W) float32 depth of every view's regions, each by one plane where that carries its shading, else NaN.
 
-        Of planes that do so as well, such as those of one wall, the one is taken that carries most in all views, and
-        none on which fewer than LEAST_VIEWS know a surface there: floors go on behind walls.
+        Of planes that do so as well, such as those of one wall, the one is taken that carries most in all views, but
+        none where fewer than LEAST_VIEWS, with this one, know a surface on it: floors go on behind walls.
         """
         carriers = self._all_carriers()
         carried = np.zeros(len(self.planes))

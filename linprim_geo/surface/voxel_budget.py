@@ -82,10 +82,10 @@ def choose_voxel(run, options, target, stages, budget: Budget):
     stages.lap("render")
     rendering = time.monotonic() - begin
     kept: dict = {"frames": frames}
-    least = replace(options, voxel_size=WARM_UP * auto_voxel_size(frames), stereo="off", refine=0, denoise="off")
+    cheapest = replace(options, voxel_size=WARM_UP * auto_voxel_size(frames), stereo="off", refine=0, denoise="off")
     begin = time.monotonic()
     with suppress(LinprimError):  # too coarse for a surface
-        _timed_pass(run, least, kept, target)
+        _timed_pass(run, cheapest, kept, target)
     reserve = RESERVED * (time.monotonic() - begin)
     stages.lap("coarse passes")
     stereo: dict = {}

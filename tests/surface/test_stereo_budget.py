@@ -65,6 +65,14 @@ def test_without_the_time_there_is_none_and_who_asks_for_it_is_told(in_time, fra
         in_time(seconds, "on")
 
 
+def test_where_small_photographs_have_no_stereo_the_whole_ones_stay(in_time, frames, monkeypatch):
+    def impossible(*_, **__):
+        raise LinprimError("no two photographs show the same points")
+
+    monkeypatch.setattr(stereo_budget, "MergedFrames", impossible)
+    assert in_time(2 * SHARE * AIM * SECONDS) == (frames, None, {})
+
+
 def test_what_is_reserved_is_not_taken(in_time):
     seconds = 0.3 * AIM * SECONDS
     assert in_time(seconds, reserve=0.6 * AIM * SECONDS)[2]["downscale"] == 1
