@@ -58,15 +58,16 @@ class MergedFrames(Sequence):
         regions = _plain_regions(maps, self.depths)
         by_points = planes_of_points(maps, self.depths)
         by_edges = common_planes([found.camera for found in maps], [region for own in regions for region in own])
-        shaded = ShadedPlanes(maps, self.depths, [frame.depth for frame in self.rendered], by_points, by_edges)
+        rendered = [frame.depth for frame in self.rendered]
+        shaded = ShadedPlanes(maps, self.depths, rendered, by_points, by_edges)
         self.planes, self.on_planes = shaded.planes, []
         # Planes with points all over have them in their plain regions, too.
         for_regions = self.planes[len(by_points) :]
         for view, by_shading in enumerate(shaded.depth_maps()):
-            frame, depth = self.rendered[view], self.depths[view]
+            camera, depth = maps[view].camera, self.depths[view]
             on_plane = point_plane_depth(maps[view], depth, by_points)
             self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(on_plane), on_plane, depth)
-            along_edges = plane_depths(frame.camera, regions[view], for_regions, frame.depth)
+            along_edges = plane_depths(camera, regions[view], for_regions, rendered[view])
             if np.isfinite(along_edges).any():
                 along_edges[shaded.is_background(view)] = np.nan
             self.on_planes.append(_first_known((on_plane, by_shading, along_edges)))

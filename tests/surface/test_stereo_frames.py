@@ -72,6 +72,14 @@ def test_confirmed_depths_that_stereo_cannot_tell_from_a_plane_are_on_it(found, 
     assert (frame.depth[2:, :10] == 3).all() and (frame.depth[2:5, 10:20] == 3).all()
 
 
+def test_frames_are_rendered_for_all_views_together(found):
+    class Rendered(list):
+        def __getitem__(self, index):
+            raise AssertionError("frames that are not kept are rendered again whenever one is asked for")
+
+    assert MergedFrames(Rendered(rendered(0.01)), [None], 5.0).flat == 0
+
+
 def test_rendered_depths_that_are_as_good_count_as_much(found):
     assert MergedFrames(rendered(1e-5), [None], 5.0).weight == 1
 
