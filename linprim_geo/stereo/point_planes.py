@@ -7,12 +7,13 @@ tell it from confirmed depths, and where depths that nothing confirms lie on it 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import uniform_filter
 
+from linprim_geo.geometry.camera import Camera
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.plain_regions import FITS, LEAST_VIEWS, TOLERANCE, in_camera, rays_of, to_world
 
@@ -41,17 +42,27 @@ class SurfacePoints:
     view: np.ndarray
 
     @classmethod
-    def of(cls, maps: Sequence[DepthMap], depths: Sequence[np.ndarray], rng: np.random.Generator) -> SurfacePoints:
-        """About POINTS at the (H, W) confirmed `depths` of views, NaN elsewhere."""
-        parts = []
-        for view, (found, depth) in enumerate(zip(maps, depths, strict=True)):
-            row, column = np.nonzero(np.isfinite(depth))
-            some = rng.permutation(len(row))[: -(-POINTS // len(maps))]
-            row, column = row[some], column[some]
-            points = to_world(found.camera, rays_of(found.camera, row, column) * depth[row, column, None])
-            center = np.broadcast_to(found.camera.center, points.shape)
-            parts.append((points, found.normal[row, column].astype(np.float64), center, np.full(len(row), view)))
-        return cls(*map(np.concatenate, zip(*parts, strict=True)))
+    def of_view(
+        cls,
+        view: int,
+        camera: Camera,
+        depth: np.ndarray,
+        normal: np.ndarray,
+        count: int,
+        rng: np.random.Generator,
+    ) -> SurfacePoints:
+        """At most `count` at the (H, W) depths of a view, NaN where unknown, with their (H, W, 3) normals."""
+        row, column = np.nonzero(np.isfinite(depth))
+        some = rng.permutation(len(row))[:count]
+        row, column = row[some], column[some]
+        points = to_world(camera, rays_of(camera, row, column) * depth[row, column, None])
+        center = np.broadcast_to(camera.center, points.shape)
+        return cls(points, normal[row, column].astype(np.float64), center, np.full(len(row), view))
+
+    @classmethod
+    def together(cls, parts: Iterable[SurfacePoints]) -> SurfacePoints:
+        columns = zip(*((one.position, one.normal, one.center, one.view) for one in parts), strict=True)
+        return cls(*map(np.concatenate, columns))
 
     def __len__(self) -> int:
         return len(self.view)
@@ -70,7 +81,11 @@ class SurfacePoints:
 def planes_of_points(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> np.ndarray:
     """(K, 4) planes n . x = d of the world with the most of the confirmed `depths` (H, W) of views, NaN elsewhere."""
     rng = np.random.default_rng(0)
-    points = SurfacePoints.of(maps, depths, rng)
+    count = -(-POINTS // len(maps))
+    points = SurfacePoints.together(
+        SurfacePoints.of_view(view, found.camera, depth, found.normal, count, rng)
+        for view, (found, depth) in enumerate(zip(maps, depths, strict=True))
+    )
     least, planes, left = LEAST_SHARE * len(points), [], np.arange(len(points))
     for _ in range(MOST_PLANES):
         rest = points[left]
