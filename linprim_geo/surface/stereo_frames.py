@@ -1,5 +1,6 @@
-"""Depth maps for fusing out of three sources: what stereo finds and its neighbours confirm, planes of regions without
-texture, and what the primitives render everywhere else, with the weight that its deviation from the first deserves.
+"""Depth maps for fusing out of four sources: what stereo finds and its neighbours confirm, planes of regions without
+texture, the surface that spans gaps between these, and what the primitives render everywhere else, with the weight that
+its deviation from the first deserves.
 
 Of the surface that is fused from them, what stereo and planes of several views do not support is left out."""
 
@@ -15,8 +16,9 @@ from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.depth_maps import DepthMap, depth_maps
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.plain_regions import PlainRegion, common_planes, edges_of, plain_regions, plane_depths
-from linprim_geo.stereo.point_planes import planes_of_points, point_plane_depth
+from linprim_geo.stereo.point_planes import SurfacePoints, planes_of_points, point_plane_depth
 from linprim_geo.stereo.shaded_planes import ShadedPlanes
+from linprim_geo.stereo.visibility_cut import plane_normals, points_per_view, spanned_depths
 from linprim_geo.surface.single_view import mesh_is_closed
 from linprim_geo.surface.tsdf_field import DepthFrame
 
@@ -35,7 +37,8 @@ class MergedFrames(Sequence):
 
     `weight` is what rendered depths count elsewhere: the squared deviation of confirmed depths from those of their
     neighbours over that of rendered ones from confirmed ones, 1 at most. `confirmed` is the share of pixels with
-    confirmed depths, `doubtful` that of less probable ones, `flat` that of pixels on one of the `planes` (K, 4).
+    confirmed depths, `doubtful` that of less probable ones, `flat` that of pixels on one of the `planes` (K, 4),
+    `spanned` that of pixels without texture between all these.
     """
 
     def __init__(self, rendered: Sequence[DepthFrame], views: Sequence[View], limit: float, *, quiet: bool = True):
@@ -51,16 +54,20 @@ class MergedFrames(Sequence):
         for found, depth, frame in zip(maps, self.depths, rendered, strict=True):
             deviations.add(found, depth, frame)
         self.weight = deviations.weight()
-        self._take_planes(maps)
+        rendered_depths = [frame.depth for frame in rendered]
+        backgrounds = self._take_planes(maps, rendered_depths)
+        self._span_gaps(maps, rendered_depths, backgrounds)
 
-    def _take_planes(self, maps: Sequence[DepthMap]) -> None:
-        """Finds planes by points, by edges and by shading, and what lies on them; moves confirmed depths to them."""
+    def _take_planes(self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Finds planes by points, by edges and by shading, and what lies on them; moves confirmed depths to them.
+
+        Returns (H, W) bool of every view: regions that are background by their shading.
+        """
         regions = _plain_regions(maps, self.depths)
         by_points = planes_of_points(maps, self.depths)
         by_edges = common_planes([found.camera for found in maps], [region for own in regions for region in own])
-        rendered = [frame.depth for frame in self.rendered]
         shaded = ShadedPlanes(maps, self.depths, rendered, by_points, by_edges)
-        self.planes, self.on_planes = shaded.planes, []
+        self.planes, self.on_planes, backgrounds = shaded.planes, [], []
         # Planes with points all over have them in their plain regions, too.
         for_regions = self.planes[len(by_points) :]
         for view, by_shading in enumerate(shaded.depth_maps()):
@@ -68,10 +75,30 @@ class MergedFrames(Sequence):
             on_plane = point_plane_depth(maps[view], depth, by_points)
             self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(on_plane), on_plane, depth)
             along_edges = plane_depths(camera, regions[view], for_regions, rendered[view])
-            if np.isfinite(along_edges).any():
-                along_edges[shaded.is_background(view)] = np.nan
+            backgrounds.append(shaded.is_background(view))
+            along_edges[backgrounds[-1]] = np.nan
             self.on_planes.append(_first_known((on_plane, by_shading, along_edges)))
         self.flat = _share_known(self.on_planes)
+        return backgrounds
+
+    def _span_gaps(
+        self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray], backgrounds: Sequence[np.ndarray]
+    ) -> None:
+        """Adds depths of the surface that spans what is known to doubtful ones, but not in background, and not at edges
+        of photographs, where rendered ones are finer."""
+        cameras, rng = [found.camera for found in maps], np.random.default_rng(0)
+        count = points_per_view(cameras)
+        known = [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
+        points = []
+        for view, (found, depth) in enumerate(zip(maps, known, strict=True)):
+            confirmed = np.isfinite(self.depths[view])[..., None]
+            normal = np.where(confirmed, found.normal, plane_normals(found.camera, depth))
+            points.append(SurfacePoints.of_view(view, found.camera, depth, normal, count, rng))
+        spanned = spanned_depths(cameras, known, SurfacePoints.together(points), rendered)
+        for view, (found, depth, background) in enumerate(zip(maps, spanned, backgrounds, strict=True)):
+            depth[background | edges_of(found.grey, found.noise)] = np.nan
+            self.doubtful_depths[view] = _first_known((self.doubtful_depths[view], depth))
+        self.spanned = _share_known(spanned)
 
     def about(self) -> dict:
         """For the statistics."""
@@ -80,6 +107,7 @@ class MergedFrames(Sequence):
             "doubtful": self.doubtful,
             "rendered_weight": self.weight,
             "flat": self.flat,
+            "spanned": self.spanned,
             "planes": len(self.planes),
         }
 

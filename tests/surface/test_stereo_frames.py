@@ -72,6 +72,20 @@ def test_confirmed_depths_that_stereo_cannot_tell_from_a_plane_are_on_it(found, 
     assert (frame.depth[2:, :10] == 3).all() and (frame.depth[2:5, 10:20] == 3).all()
 
 
+def test_spans_stand_where_nothing_is_known_and_photographs_have_no_edges(found, monkeypatch):
+    edge = np.zeros((30, 40), bool)
+    edge[:, 30:] = True
+    monkeypatch.setattr(stereo_frames, "spanned_depths", lambda *_: [np.full((30, 40), 3.2, np.float32)])
+    monkeypatch.setattr(stereo_frames, "edges_of", lambda *_: edge)
+    merged = MergedFrames(rendered(0.01), [None], 5.0)
+    frame = merged[0]
+    assert (frame.depth[1:, :20] == 3).all(), "confirmed and doubtful depths stay"
+    assert np.allclose(frame.depth[0, :30], 3.2) and np.allclose(frame.depth[:, 20:30], 3.2)
+    assert np.allclose(frame.confidence[:, 20:30], stereo_frames.DOUBTFUL_WEIGHT)
+    assert np.allclose(frame.depth[:, 30:], 3.03) and np.allclose(frame.confidence[:, 30:], merged.weight)
+    assert merged.spanned == 0.75 and merged.about()["spanned"] == 0.75
+
+
 def test_frames_are_rendered_for_all_views_together(found):
     class Rendered(list):
         def __getitem__(self, index):
