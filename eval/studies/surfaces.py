@@ -5,9 +5,11 @@ Each scene is photographed, trained once with octahedra and once with Gaussians 
 by every method that it allows; `--data` adds captures, scored against their `--references`. `surfaces.json` and
 `surfaces.md` hold per mesh, of what the cameras see unless it says whole:
 
-    Chamfer distance in % of the reference's diagonal (point to surface, both ways), and of the whole mesh; F1 at 1 %;
-    normal consistency; faces, boundary edges, what manifold3d says of closed meshes; the rank correlation of `quality`
-    with the exact distance of vertices, and the ratio of their means; seconds and peak memory of the extraction.
+    Chamfer distance in % of the reference's diagonal (point to surface, both ways), the median distance of the mesh
+    from the reference, and the Chamfer distance of the whole mesh; F1 at 1 %; normal consistency; faces, boundary
+    edges, what manifold3d says of closed meshes; the rank correlation of `quality` with the exact distance of vertices,
+    and the ratio of their means; seconds and peak memory of the extraction; CPU seconds of training (none where it was
+    resumed) and extraction.
 
 What the output folder holds already is not done again.
 """
@@ -17,6 +19,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import time
 from dataclasses import asdict
 from pathlib import Path
 
@@ -36,6 +39,7 @@ COLUMNS = {
     "primitive": "primitives",
     "method": "method",
     "chamfer": "Chamfer %",
+    "median": "median %",
     "chamfer_whole": "whole %",
     "f1": "F1",
     "normal_consistency": "normals",
@@ -46,6 +50,8 @@ COLUMNS = {
     "quality_ratio": "error / quality",
     "seconds": "s",
     "gib": "GiB",
+    "train_cpu_seconds": "training CPU s",
+    "cpu_seconds": "extraction CPU s",
 }
 
 
@@ -60,7 +66,9 @@ def score(run: Path, reference: Path, method: str, options: ExtractOptions, targ
     from linprim_geo.runs.run import Run
     from linprim_geo.surface.extract import extract_mesh
 
+    began = time.process_time()
     stats = extract_mesh(run, method, target, options, quiet=True)
+    cpu_seconds = time.process_time() - began
     cameras = [view.camera for view in Run.open(run).scene().train]
     truth = load_mesh(reference)
     whole = score_mesh(load_mesh(target), truth, samples=SAMPLES, cameras=cameras)
@@ -71,6 +79,7 @@ def score(run: Path, reference: Path, method: str, options: ExtractOptions, targ
         "method": method,
         "level": stats["level"],
         "chamfer": seen["chamfer_percent_diagonal"],
+        "median": seen["accuracy_q50_percent_diagonal"],
         "chamfer_whole": whole["chamfer_percent_diagonal"],
         "f1": seen["f1"],
         "normal_consistency": seen["normal_consistency"],
@@ -81,6 +90,8 @@ def score(run: Path, reference: Path, method: str, options: ExtractOptions, targ
         "quality_ratio": float(error[told].mean() / shown.quality[told].mean()),
         "seconds": stats["seconds"]["total"],
         "gib": max(stats["peak_gib"].values()),
+        "train_cpu_seconds": json.loads((run / "seconds.json").read_text())["cpu_seconds"],
+        "cpu_seconds": cpu_seconds,
     }
 
 
@@ -115,7 +126,10 @@ def main(arguments: list[str] | None = None) -> int:
         "--methods", nargs="+", choices=METHODS["octahedron"], default=METHODS["octahedron"], help="default: all"
     )
     parser.add_argument(
-        "--refine", type=int, default=ExtractOptions.refine, help="rounds, see extract-mesh (default: %(default)s)"
+        "--refine",
+        type=lambda text: text if text == "auto" else int(text),
+        default=ExtractOptions.refine,
+        help="rounds or auto, see extract-mesh (default: %(default)s)",
     )
     parser.add_argument("--size", type=int, default=320, help="pixels of the built-in scenes (default: %(default)s)")
     parser.add_argument("--iterations", type=int, default=7000, help="default: %(default)s")
@@ -162,7 +176,10 @@ def run(given: argparse.Namespace) -> None:
                 evaluate_every=0,
             )
             trained = given.output / f"{name}_{primitive}"
-            train(capture, trained, scene_options, options, resume=trained.exists(), quiet=True)
+            if not (trained / "seconds.json").exists():
+                resumed, began = trained.exists(), time.process_time()
+                train(capture, trained, scene_options, options, resume=resumed, quiet=True)
+                write_json(trained / "seconds.json", {"cpu_seconds": None if resumed else time.process_time() - began})
             for method in [m for m in METHODS[primitive] if m in given.methods]:
                 target = given.output / "meshes" / f"{name}_{primitive}_{method}_{given.refine}.ply"
                 saved = target.with_suffix(".json")
