@@ -353,8 +353,8 @@ class ExtractOptions:
     stereo: str = option(
         "auto",
         "fuse the depths that PatchMatch stereo finds in the photographs where views confirm them, and leave out what "
-        "no two photographs support: on, off, or auto: where these are without masks, and do not agree with each other "
-        "at clearly less of the surface, with --method tsdf, without --blocks and --time-budget",
+        "no two photographs support: on, off, or auto: where these are without masks, but not where that leaves most "
+        "pixels open and photographs agree with it clearly less, with --method tsdf, without --blocks",
         choices=("auto", "on", "off"),
     )
     held_out: bool = option(

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -32,9 +33,12 @@ TRIES = 4
 LEAST_CONFIRMED = 0.01
 """Stereo that confirms less than this share of the pixels has nothing to say of a scene."""
 
+MOST_PIXELS = 0.5
+"""A surface of stereo that shows in this share of the pixels with a rendered depth is taken."""
+
 CLEARLY_LESS = 0.01
-"""Where photographs agree at a share of the vertices that is smaller by this, they speak against stereo. Where they
-agree anywhere, as on plain walls, the shares are the same but for chance."""
+"""Where one shows in fewer, and photographs agree at a share of its vertices that is smaller by this, they speak
+against it. Where they agree anywhere, as on plain walls, the shares are the same but for chance."""
 
 SMALLEST_DISPARITY = 0.25
 """Depths are trusted as far as this many pixels between the two cameras that are furthest apart move a point by a
@@ -115,10 +119,11 @@ def tsdf_surface(
         about |= {"taken": True}
         stages.lap("fuse")
     else:
-        mesh = fused(frames, options.smallest_part)
-        stages.lap("fuse")
+        rendered = partial(_rendered, fused, frames, options.smallest_part, stages)
         if options.stereo == "auto":
-            mesh, about = _better_by_stereo(mesh, fused_with_stereo, frames, merged, run.scene().train, stages)
+            mesh, about = _better_by_stereo(rendered, fused_with_stereo, frames, merged, run.scene().train, stages)
+        else:
+            mesh = rendered()
     if about:
         stages.note(
             f"stereo: {about['confirmed']:.0%} of the pixels have a depth that other views confirm, "
@@ -137,44 +142,55 @@ def tsdf_surface(
     }
 
 
+def _rendered(fused: Callable[..., Mesh], frames: DepthFrames, smallest_part: float, stages: Stages) -> Mesh:
+    """The surface without stereo."""
+    mesh = fused(frames, smallest_part)
+    stages.lap("fuse")
+    return mesh
+
+
 def _better_by_stereo(
-    rendered: Mesh,
+    rendered: Callable[[], Mesh],
     fused: Callable[[MergedFrames], tuple[Mesh, dict]],
     frames: DepthFrames,
     merged: MergedFrames | None,
     views: Sequence[View],
     stages: Stages,
 ) -> tuple[Mesh, dict]:
-    """The surface of stereo, or the `rendered` one where photographs of `views` agree at clearly more of its vertices
-    or there is hardly any stereo; with what there is to say of it. Frames of smaller views have stereo in any case:
-    within pixels as large as theirs photographs agree with walls of fog."""
+    """The surface of stereo, or the `rendered` one where there is hardly any stereo, or where the surface of stereo is
+    missing in most pixels and photographs of `views` agree at clearly more of the rendered one's vertices; with what
+    there is to say of it. Frames of smaller views have stereo in any case: within pixels as large as theirs photographs
+    agree with walls of fog."""
     try:
         if merged is None:
             merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)
     except LinprimError as error:
         stages.note(f"no stereo: {error}")
-        return rendered, {}
+        return rendered(), {}
     stages.lap("stereo")
     if merged.confirmed < LEAST_CONFIRMED:
-        return rendered, merged.about() | {"taken": False}
+        return rendered(), merged.about() | {"taken": False}
     mesh, about = fused(merged)
     stages.lap("fuse")
     if not len(mesh.faces):
-        return rendered, about | {"taken": False}
-    if frames.views is not views:
-        stages.note("it is taken, as photographs of this size do not compare surfaces")
+        return rendered(), about | {"taken": False}
+    about |= {"covered": merged.covered(mesh)}
+    said = f"the surface of stereo shows in {about['covered']:.0%} of the pixels with a rendered depth"
+    if about["covered"] >= MOST_PIXELS or frames.views is not views:
+        stages.note(f"{said}: it is taken")
         return mesh, about | {"taken": True}
+    without_stereo = rendered()
     cameras = [view.camera for view in views]
-    gains = photo_gains(rendered, cameras, (view.load() for view in views))
-    without, with_stereo = (_agreeing(surface, views, gains) for surface in (rendered, mesh))
+    gains = photo_gains(without_stereo, cameras, (view.load() for view in views))
+    without, with_stereo = (_agreeing(surface, views, gains) for surface in (without_stereo, mesh))
     stages.lap("compare")
     taken = with_stereo > without - CLEARLY_LESS
     stages.note(
-        f"photographs agree at {without:.1%} of the vertices without stereo and at {with_stereo:.1%} with it: "
-        f"{'it is' if taken else 'it is not'} taken"
+        f"{said}, and photographs agree at {without:.1%} of the vertices without stereo and at {with_stereo:.1%} with "
+        f"it: it is{'' if taken else ' not'} taken"
     )
     about |= {"taken": taken, "agreeing": with_stereo, "agreeing_without": without}
-    return mesh if taken else rendered, about
+    return mesh if taken else without_stereo, about
 
 
 def _agreeing(mesh: Mesh, views: Sequence[View], gains: np.ndarray) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 
 from linprim_geo.capture.types import View
 from linprim_geo.geometry.mesh import Mesh, face_areas, face_components, select_faces
+from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.depth_maps import DepthMap, depth_maps
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
@@ -27,6 +28,8 @@ DOUBTFUL_WEIGHT = 0.1
 # A piece of surface is supported if so many views have depths on this share of it. What is true has 0.3 to 0.9 of it
 # so, what is not 0.1 at most.
 SUPPORTING_VIEWS, SUPPORTED_SHARE = 2, 0.25
+# One of so many rows and columns is looked at to tell what a surface covers.
+SAMPLED = 4
 # Points of the rendered surface by which stereo finds pairs of views.
 POINTS = 20_000
 
@@ -44,6 +47,7 @@ class MergedFrames(Sequence):
     def __init__(self, rendered: Sequence[DepthFrame], views: Sequence[View], limit: float, *, quiet: bool = True):
         self.rendered, self.limit = rendered, limit
         maps = depth_maps(views, pairing_points(rendered), hiding=(frame.depth for frame in rendered), quiet=quiet)
+        self.cameras = [found.camera for found in maps]
         sure = [found.is_confirmed() for found in maps]
         self.depths = [_depth_where(found, own) for found, own in zip(maps, sure, strict=True)]
         self.doubtful_depths = [
@@ -55,6 +59,7 @@ class MergedFrames(Sequence):
             deviations.add(found, depth, frame)
         self.weight = deviations.weight()
         rendered_depths = [frame.depth for frame in rendered]
+        self.shown = [depth[::SAMPLED, ::SAMPLED] > 0 for depth in rendered_depths]
         backgrounds = self._take_planes(maps, rendered_depths)
         self._span_gaps(maps, rendered_depths, backgrounds)
 
@@ -65,7 +70,7 @@ class MergedFrames(Sequence):
         """
         regions = _plain_regions(maps, self.depths)
         by_points = planes_of_points(maps, self.depths)
-        by_edges = common_planes([found.camera for found in maps], [region for own in regions for region in own])
+        by_edges = common_planes(self.cameras, [region for own in regions for region in own])
         shaded = ShadedPlanes(maps, self.depths, rendered, by_points, by_edges)
         self.planes, self.on_planes, backgrounds = shaded.planes, [], []
         # Planes with points all over have them in their plain regions, too.
@@ -86,19 +91,27 @@ class MergedFrames(Sequence):
     ) -> None:
         """Adds depths of the surface that spans what is known to doubtful ones, but not in background, and not at edges
         of photographs, where rendered ones are finer."""
-        cameras, rng = [found.camera for found in maps], np.random.default_rng(0)
-        count = points_per_view(cameras)
+        count, rng = points_per_view(self.cameras), np.random.default_rng(0)
         known = [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
         points = []
         for view, (found, depth) in enumerate(zip(maps, known, strict=True)):
             confirmed = np.isfinite(self.depths[view])[..., None]
             normal = np.where(confirmed, found.normal, plane_normals(found.camera, depth))
             points.append(SurfacePoints.of_view(view, found.camera, depth, normal, count, rng))
-        spanned = spanned_depths(cameras, known, SurfacePoints.together(points), rendered)
+        spanned = spanned_depths(self.cameras, known, SurfacePoints.together(points), rendered)
         for view, (found, depth, background) in enumerate(zip(maps, spanned, backgrounds, strict=True)):
             depth[background | edges_of(found.grey, found.noise)] = np.nan
             self.doubtful_depths[view] = _first_known((self.doubtful_depths[view], depth))
         self.spanned = _share_known(spanned)
+
+    def covered(self, mesh: Mesh) -> float:
+        """Share of the pixels with a rendered depth whose rays hit a mesh, of one of SAMPLED rows and columns."""
+        caster, shown, hit = RayCaster(mesh.vertices, mesh.faces), 0, 0
+        for camera, sampled in zip(self.cameras, self.shown, strict=True):
+            row, column = (x * SAMPLED for x in np.nonzero(sampled))
+            shown += len(row)
+            hit += np.count_nonzero(caster.cast_single(camera.center, camera.world_rays()[row, column])[1] >= 0)
+        return hit / max(shown, 1)
 
     def about(self) -> dict:
         """For the statistics."""

@@ -11,7 +11,7 @@ from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Progress, Stages
 from linprim_geo.capture.small_copy import SmallCopy
 from linprim_geo.runs.run import Run
-from linprim_geo.surface import method_tsdf, stereo_budget
+from linprim_geo.surface import method_tsdf, stereo_budget, stereo_frames
 from linprim_geo.surface.extract import extract_mesh
 from linprim_geo.surface.method_tsdf import DepthFrames, tsdf_surface
 from linprim_geo.surface.stereo_budget import SHARE, WITH_PLANES, stereo_in_time
@@ -92,6 +92,7 @@ def test_small_photographs_do_not_speak_against_stereo(many_views, frames, monke
     shares = iter((0.9, 0.1))
     monkeypatch.setattr(method_tsdf, "LEAST_CONFIRMED", 0.0)
     monkeypatch.setattr(method_tsdf, "_agreeing", lambda *_: next(shares))
+    monkeypatch.setattr(stereo_frames.MergedFrames, "covered", lambda *_: 0.1)
     views = many_views.scene().train
     if factor > 1:
         views = [SmallCopy.of(view, factor) for view in views]

@@ -217,16 +217,36 @@ def stereo_once(many_views, kept_maps, monkeypatch):
     monkeypatch.setattr(stereo_frames, "depth_maps", once)
 
 
-@pytest.mark.parametrize("shares, taken", [((0.8, 0.9), True), ((0.9, 0.88), False), ((0.9, 0.895), True)])
-def test_photographs_that_agree_clearly_less_often_speak_against_stereo(
-    many_views, stereo_once, monkeypatch, shares, taken
+def test_a_surface_covers_the_pixels_whose_rays_hit_it(found):
+    (frame,) = rendered(0.0)
+    frame.depth[:, 36:] = 0
+    merged = MergedFrames([frame], [None], 5.0)
+    # The view is 4 wide at the depth of 3, and every fourth column of 40 is looked at.
+    assert merged.covered(sheet((-9, -9), (9, 9), 0.0)) == 1
+    assert merged.covered(sheet((-9, -9), (-0.01, 9), 1.0)) == pytest.approx(5 / 9)
+    assert merged.covered(sheet((-9, -9), (9, 9), -4.0)) == 0
+
+
+@pytest.mark.parametrize(
+    "covered, shares, taken",
+    [
+        (0.4, (0.8, 0.9), True),
+        (0.4, (0.9, 0.88), False),
+        (0.4, (0.9, 0.895), True),
+        (0.5, (), True),
+    ],
+)
+def test_photographs_that_agree_clearly_less_often_speak_against_a_surface_in_few_pixels(
+    many_views, stereo_once, monkeypatch, covered, shares, taken
 ):
     told = iter(shares)
+    monkeypatch.setattr(MergedFrames, "covered", lambda *_: covered)
     monkeypatch.setattr(Scene, "has_alpha", False)
     monkeypatch.setattr(method_tsdf, "LEAST_CONFIRMED", 0.0)
     monkeypatch.setattr(method_tsdf, "_agreeing", lambda *_: next(told))
     stats = extract_mesh(many_views, options=COARSE, quiet=True)
     assert stats["stereo"]["taken"] is taken and stats["refine"] == (0 if taken else 2)
+    assert stats["stereo"]["covered"] == covered and ("agreeing" in stats["stereo"]) is bool(shares)
 
 
 def test_a_surface_takes_stereo_into_account_where_it_is_asked_to(many_views, stereo_once):
