@@ -370,7 +370,8 @@ class ShadedPlanes:
         """(H, W) float32 depth of every view's regions, each by one plane where that carries its shading, else NaN.
 
         Of planes that do so as well, such as those of one wall, the one is taken that carries most in all views, but
-        none where fewer than LEAST_VIEWS, with this one, know a surface on it: floors go on behind walls.
+        none where fewer than LEAST_VIEWS, with this one, know a surface on it: floors go on behind walls. Of planes
+        with points all over that has to be a confirmed one, not one that a region of another view supposes.
         """
         carriers = self._all_carriers()
         carried = np.zeros(len(self.planes))
@@ -380,7 +381,7 @@ class ShadedPlanes:
                     carried[k] += np.count_nonzero(boxes)
         carried[: len(self.given)] *= HARDLY_MORE
         ordered = [[_best_first(of_region, carried) for of_region in own] for own in carriers]
-        surfaces = self._surfaces(ordered, carriers)
+        surfaces, confirmed = self._surfaces(ordered, carriers), CommonSurfaces(self._small_cameras(), self.depths)
         result = []
         for view, (own, of_view) in enumerate(zip(self.regions, carriers, strict=True)):
             numbers = [
@@ -388,7 +389,9 @@ class ShadedPlanes:
                 for one, boxes, order in zip(own, of_view, ordered[view], strict=True)
             ]
             supposed = [self._depth(self.shadings[view].camera, number) for each in numbers for number in each]
-            enough = iter([1 + others >= LEAST_VIEWS for others in surfaces.known_by(view, supposed)])
+            by_points = [k < self.by_points for order in ordered[view] for k in order]
+            known_by = np.where(by_points, confirmed.known_by(view, supposed), surfaces.known_by(view, supposed))
+            enough = iter(1 + known_by >= LEAST_VIEWS)
             left = [number for each in numbers for number in [n for n in each if next(enough)][:1]]
             factor = self.shadings[view].factor
             number = self._together(view, left).repeat(factor, 0).repeat(factor, 1)
@@ -407,7 +410,10 @@ class ShadedPlanes:
             )
             on_planes = self._depth(self.shadings[view].camera, number)
             known.append(np.where(np.isfinite(self.depths[view]), self.depths[view], on_planes))
-        return CommonSurfaces([shading.camera for shading in self.shadings], known)
+        return CommonSurfaces(self._small_cameras(), known)
+
+    def _small_cameras(self) -> list[Camera]:
+        return [shading.camera for shading in self.shadings]
 
     def _number(self, one: FittedRegion, boxes: np.ndarray, number: int) -> np.ndarray:
         """(H, W) the number of a plane around those boxes of a region that it carries, -1 elsewhere."""

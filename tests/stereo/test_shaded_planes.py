@@ -81,6 +81,13 @@ def planes_of(maps, depths, by_points=NO_PLANES, by_edges=NO_PLANES, confirmed=N
     return ShadedPlanes(maps, confirmed, rendered, by_points, by_edges)
 
 
+def in_the_middle(depth) -> np.ndarray:
+    """A depth map, NaN but for a ninth."""
+    known = np.full_like(depth, np.nan)
+    known[60:120, 80:160] = depth[60:120, 80:160]
+    return known
+
+
 def errors(found: ShadedPlanes, depths) -> tuple[float, np.ndarray]:
     """The share of pixels that have depths, and how far these are off."""
     own = found.depth_maps()
@@ -205,7 +212,9 @@ def test_stereo_that_is_sure_of_something_else_refuses_a_plane():
 
 def test_a_known_plane_is_taken_where_it_carries_the_shading_as_well():
     maps, depths = photographs(lambda points, view: light(points))
-    found = planes_of(maps, depths, by_points=np.array([WALL, [0.0, 1.0, 0.0, 0.2]]))
+    found = planes_of(
+        maps, depths, np.array([WALL, [0.0, 1.0, 0.0, 0.2]]), confirmed=[in_the_middle(d) for d in depths]
+    )
     assert len(found.planes) == 2
     share, off = errors(found, depths)
     assert share > 0.7 and off.max() < 1e-5
@@ -218,6 +227,16 @@ def test_a_plane_that_too_few_views_know_gives_no_depth(monkeypatch, others, kep
     found = planes_of(maps, depths)
     monkeypatch.setattr(CommonSurfaces, "known_by", lambda self, view, supposed: [others] * len(supposed))
     assert any(np.isfinite(own).any() for own in found.depth_maps()) is kept
+
+
+@pytest.mark.parametrize("others, kept", [(LEAST_VIEWS - 2, False), (LEAST_VIEWS - 1, True)])
+def test_a_plane_with_points_all_over_gives_a_depth_where_others_confirm_it(others, kept):
+    """That their regions suppose it, too, is not enough: a floor may carry their shading as well as this one's."""
+    maps, depths = photographs(lambda points, view: light(points))
+    confirmed = [np.full_like(depth, np.nan) for depth in depths]
+    confirmed[1 : 1 + others] = [in_the_middle(depth) for depth in depths[1 : 1 + others]]
+    found = planes_of(maps, depths, by_points=WALL[None], confirmed=confirmed)
+    assert np.isfinite(found.depth_maps()[0]).any() == kept
 
 
 def edge_points(depths, noise: float = 0.004, seed: int = 0):
