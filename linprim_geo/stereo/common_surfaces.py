@@ -1,4 +1,4 @@
-"""How many views know a surface that one of them supposes."""
+"""Which views know a surface that one of them supposes."""
 
 from __future__ import annotations
 
@@ -29,12 +29,13 @@ class CommonSurfaces:
             views.append(np.full(len(row), view))
         self.points, self.views = np.concatenate(points), np.concatenate(views)
 
-    def known_by(self, view: int, depths: Sequence[np.ndarray]) -> list[int]:
-        """How many other views have points on each of several (H, W) depths of a view, NaN where there are none."""
+    def known_by(self, view: int, depths: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """The numbers of other views with points on each of several (H, W) depths of a view, NaN where there are
+        none."""
         if not depths:
             return []
         others = self.views != view
         inside, pixels, along = visible_pixels(self.cameras[view], self.points[others])
         views, (column, row) = self.views[others][inside], pixels.T
         on_it = (np.abs(along / depth[row, column] - 1) <= ON_IT for depth in depths)
-        return [int(np.count_nonzero(np.bincount(views[points]) >= LEAST_POINTS)) for points in on_it]
+        return [np.flatnonzero(np.bincount(views[points]) >= LEAST_POINTS) for points in on_it]

@@ -370,8 +370,9 @@ class ShadedPlanes:
         """(H, W) float32 depth of every view's regions, each by one plane where that carries its shading, else NaN.
 
         Of planes that do so as well, such as those of one wall, the one is taken that carries most in all views, but
-        none where fewer than LEAST_VIEWS, with this one, know a surface on it: floors go on behind walls. Of planes
-        with points all over that has to be a confirmed one, not one that a region of another view supposes.
+        none where fewer than LEAST_VIEWS, with this one, know a surface on it, or from one direction only: floors go on
+        behind walls. Of planes with points all over that has to be a confirmed one, not one that a region of another
+        view supposes.
         """
         carriers = self._all_carriers()
         carried = np.zeros(len(self.planes))
@@ -389,13 +390,30 @@ class ShadedPlanes:
                 for one, boxes, order in zip(own, of_view, ordered[view], strict=True)
             ]
             supposed = [self._depth(self.shadings[view].camera, number) for each in numbers for number in each]
-            by_points = [k < self.by_points for order in ordered[view] for k in order]
-            known_by = np.where(by_points, confirmed.known_by(view, supposed), surfaces.known_by(view, supposed))
-            enough = iter(1 + known_by >= LEAST_VIEWS)
-            left = [number for each in numbers for number in [n for n in each if next(enough)][:1]]
+            planes = [k for order in ordered[view] for k in order]
+            known = iter(self._known(view, planes, supposed, confirmed, surfaces))
+            left = [number for each in numbers for number in [n for n in each if next(known)][:1]]
             factor = self.shadings[view].factor
             number = self._together(view, left).repeat(factor, 0).repeat(factor, 1)
             result.append(self._depth(self.cameras[view], number))
+        return result
+
+    def _known(
+        self,
+        view: int,
+        planes: Sequence[int],
+        depths: Sequence[np.ndarray],
+        confirmed: CommonSurfaces,
+        surfaces: CommonSurfaces,
+    ) -> list[bool]:
+        """Whether enough views know a surface at each of several (H, W) depths of a view on one of the planes."""
+        camera, cameras, result = self.shadings[view].camera, self._small_cameras(), []
+        by_both = zip(planes, depths, confirmed.known_by(view, depths), surfaces.known_by(view, depths), strict=True)
+        for plane, depth, confirming, supposing in by_both:
+            row, column = np.nonzero(np.isfinite(depth))
+            points = to_world(camera, rays_of(camera, row, column) * depth[row, column, None])
+            views = np.append(confirming if plane < self.by_points else supposing, view)
+            result.append(len(points) > 0 and seen_enough(cameras, views, np.median(points, axis=0)))
         return result
 
     def _surfaces(
