@@ -1,4 +1,4 @@
-"""Depth maps of three sources as one, each by what it deserves, and what is supported of the surface made of them."""
+"""Depth maps of four sources as one, each by what it deserves, and what is supported of the surface made of them."""
 
 from __future__ import annotations
 
