@@ -108,6 +108,7 @@ class ShadedPlanes:
         self.cameras = [found.camera for found in maps]
         law = vignetting(self.cameras, [found.grey for found in maps], depths)
         self.shadings = [Shading.of(found, law) for found in maps]
+        self.small_cameras = [shading.camera for shading in self.shadings]
         self.given, self.by_points = np.concatenate([by_points, by_edges]), len(by_points)
         self.depths = [shading.small(depth) for shading, depth in zip(self.shadings, depths, strict=True)]
         self.shown: list[list[ShadedRegion]] = []
@@ -123,7 +124,7 @@ class ShadedPlanes:
         self.planes = self._at_right_angles(*self._held(self._all_carriers()))
 
     def _camera(self, region: ShadedRegion) -> Camera:
-        return self.shadings[region.view].camera
+        return self.small_cameras[region.view]
 
     def _started(self, region: ShadedRegion, rendered: np.ndarray) -> tuple[ShadedRegion, list[np.ndarray]] | None:
         """A region with its depth and the views that show it, and planes to start from; None for one whose shading is
@@ -248,7 +249,7 @@ class ShadedPlanes:
             camera, ray = self._camera(region), np.median(region.rays, axis=0)
             middles.append(to_world(camera, ray / (ray @ in_camera(camera, plane[None])[0])))
         views = np.array(sorted(finding.union(*(region.others for region in regions))))
-        return seen_enough([shading.camera for shading in self.shadings], views, np.mean(middles, axis=0))
+        return seen_enough(self.small_cameras, views, np.mean(middles, axis=0))
 
     def _carries(self, plane: np.ndarray, one: FittedRegion) -> bool:
         """Whether a plane leaves hardly more of a region's shading than the region's own, of as many boxes."""
@@ -382,16 +383,16 @@ class ShadedPlanes:
                     carried[k] += np.count_nonzero(boxes)
         carried[: len(self.given)] *= HARDLY_MORE
         ordered = [[_best_first(of_region, carried) for of_region in own] for own in carriers]
-        surfaces, confirmed = self._surfaces(ordered, carriers), CommonSurfaces(self._small_cameras(), self.depths)
+        surfaces = self._surfaces(ordered, carriers)
         result = []
         for view, (own, of_view) in enumerate(zip(self.regions, carriers, strict=True)):
             numbers = [
                 [self._number(one, boxes[k], k) for k in order]
                 for one, boxes, order in zip(own, of_view, ordered[view], strict=True)
             ]
-            supposed = [self._depth(self.shadings[view].camera, number) for each in numbers for number in each]
+            supposed = [self._depth(self.small_cameras[view], number) for each in numbers for number in each]
             planes = [k for order in ordered[view] for k in order]
-            known = iter(self._known(view, planes, supposed, confirmed, surfaces))
+            known = iter(self._known(view, planes, supposed, surfaces))
             left = [number for each in numbers for number in [n for n in each if next(known)][:1]]
             factor = self.shadings[view].factor
             number = self._together(view, left).repeat(factor, 0).repeat(factor, 1)
@@ -399,39 +400,32 @@ class ShadedPlanes:
         return result
 
     def _known(
-        self,
-        view: int,
-        planes: Sequence[int],
-        depths: Sequence[np.ndarray],
-        confirmed: CommonSurfaces,
-        surfaces: CommonSurfaces,
+        self, view: int, planes: Sequence[int], depths: Sequence[np.ndarray], surfaces: CommonSurfaces
     ) -> list[bool]:
-        """Whether enough views know a surface at each of several (H, W) depths of a view on one of the planes."""
-        camera, cameras, result = self.shadings[view].camera, self._small_cameras(), []
-        by_both = zip(planes, depths, confirmed.known_by(view, depths), surfaces.known_by(view, depths), strict=True)
-        for plane, depth, confirming, supposing in by_both:
+        """Whether enough views know a surface at each of several (H, W) depths of a view, each on one of the planes."""
+        camera, result = self.small_cameras[view], []
+        known_by = surfaces.known_by(view, depths, [plane < self.by_points for plane in planes])
+        for depth, others in zip(depths, known_by, strict=True):
             row, column = np.nonzero(np.isfinite(depth))
             points = to_world(camera, rays_of(camera, row, column) * depth[row, column, None])
-            views = np.append(confirming if plane < self.by_points else supposing, view)
-            result.append(len(points) > 0 and seen_enough(cameras, views, np.median(points, axis=0)))
+            enough = len(points) > 0 and seen_enough(
+                self.small_cameras, np.append(others, view), np.median(points, axis=0)
+            )
+            result.append(enough)
         return result
 
     def _surfaces(
         self, ordered: Sequence[Sequence[list[int]]], carriers: Sequence[Sequence[dict[int, np.ndarray]]]
     ) -> CommonSurfaces:
         """What all views know: confirmed depths, and the first of the planes of each region."""
-        known = []
+        supposed = []
         for view, own in enumerate(self.regions):
             each = zip(own, carriers[view], ordered[view], strict=True)
             number = self._together(
                 view, [self._number(one, boxes[k], k) for one, boxes, order in each for k in order[:1]]
             )
-            on_planes = self._depth(self.shadings[view].camera, number)
-            known.append(np.where(np.isfinite(self.depths[view]), self.depths[view], on_planes))
-        return CommonSurfaces(self._small_cameras(), known)
-
-    def _small_cameras(self) -> list[Camera]:
-        return [shading.camera for shading in self.shadings]
+            supposed.append(self._depth(self.small_cameras[view], number))
+        return CommonSurfaces(self.small_cameras, self.depths, supposed)
 
     def _number(self, one: FittedRegion, boxes: np.ndarray, number: int) -> np.ndarray:
         """(H, W) the number of a plane around those boxes of a region that it carries, -1 elsewhere."""

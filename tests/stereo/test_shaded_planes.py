@@ -228,7 +228,7 @@ def test_a_plane_that_too_few_views_know_gives_no_depth(monkeypatch, others, kep
     monkeypatch.setattr(plain_regions, "SPREAD", np.radians(22))
     maps, depths = photographs(lambda points, view: light(points))
     found = planes_of(maps, depths)
-    monkeypatch.setattr(CommonSurfaces, "known_by", lambda self, view, supposed: [np.array(others)] * len(supposed))
+    monkeypatch.setattr(CommonSurfaces, "known_by", lambda self, view, depths, _: [np.array(others)] * len(depths))
     monkeypatch.setattr(found, "regions", [found.regions[0], *[[] for _ in CENTERS[1:]]])
     assert np.isfinite(found.depth_maps()[0]).any() == kept
 
