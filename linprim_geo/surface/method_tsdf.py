@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -105,6 +104,11 @@ def tsdf_surface(
                 voxel = error.fits
         raise AssertionError  # the last try has raised
 
+    def rendered() -> Mesh:
+        surface = fused(frames, options.smallest_part)
+        stages.lap("fuse")
+        return surface
+
     def fused_with_stereo(merged: MergedFrames) -> tuple[Mesh, dict]:
         mesh, left_out = merged.supported(fused(merged, 0), options.smallest_part, 2 * options.truncation * voxel)
         return mesh, merged.about() | {"unsupported": left_out}
@@ -118,12 +122,10 @@ def tsdf_surface(
             raise LinprimError(f"{run.path}: no two photographs support any surface; use --stereo auto or off")
         about |= {"taken": True}
         stages.lap("fuse")
+    elif options.stereo == "auto":
+        mesh, about = _better_by_stereo(rendered, fused_with_stereo, frames, merged, run.scene().train, stages)
     else:
-        rendered = partial(_rendered, fused, frames, options.smallest_part, stages)
-        if options.stereo == "auto":
-            mesh, about = _better_by_stereo(rendered, fused_with_stereo, frames, merged, run.scene().train, stages)
-        else:
-            mesh = rendered()
+        mesh = rendered()
     if about:
         stages.note(
             f"stereo: {about['confirmed']:.0%} of the pixels have a depth that other views confirm, "
@@ -140,13 +142,6 @@ def tsdf_surface(
         "depth_limit": frames.limit,
         **about,
     }
-
-
-def _rendered(fused: Callable[..., Mesh], frames: DepthFrames, smallest_part: float, stages: Stages) -> Mesh:
-    """The surface without stereo."""
-    mesh = fused(frames, smallest_part)
-    stages.lap("fuse")
-    return mesh
 
 
 def _better_by_stereo(
@@ -176,8 +171,11 @@ def _better_by_stereo(
         return rendered(), about | {"taken": False}
     about |= {"covered": merged.covered(mesh)}
     said = f"the surface of stereo shows in {about['covered']:.0%} of the pixels with a rendered depth"
-    if about["covered"] >= MOST_PIXELS or frames.views is not views:
+    if about["covered"] >= MOST_PIXELS:
         stages.note(f"{said}: it is taken")
+        return mesh, about | {"taken": True}
+    if frames.views is not views:
+        stages.note(f"{said}, and is taken, as photographs of this size do not compare surfaces")
         return mesh, about | {"taken": True}
     without_stereo = rendered()
     cameras = [view.camera for view in views]
