@@ -100,11 +100,16 @@ def table(rows: list[dict]) -> str:
     lines = ["| " + " | ".join(COLUMNS.values()) + " |", "|---" * len(COLUMNS) + "|"]
     for row in rows:
         cells = [
-            "–" if row[name] is None else f"{row[name]:.3g}" if isinstance(row[name], float) else str(row[name])
-            for name in COLUMNS
+            "–" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+            for value in map(row.get, COLUMNS)
         ]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
+
+
+def rounds(text: str) -> int | str:
+    """An argument of --refine."""
+    return text if text == "auto" else int(text)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -127,7 +132,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument(
         "--refine",
-        type=lambda text: text if text == "auto" else int(text),
+        type=rounds,
         default=ExtractOptions.refine,
         help="rounds or auto, see extract-mesh (default: %(default)s)",
     )

@@ -27,6 +27,11 @@ def test_a_scene_is_trained_meshed_and_scored_once(tmp_path, monkeypatch, capsys
     assert json.loads((tmp_path / "surfaces.json").read_text())["rows"] == [row]
 
 
+def test_rows_of_earlier_folders_lack_what_is_new():
+    *_, line = surfaces.table([{"scene": "cad", "chamfer": 0.07, "manifold": None}]).splitlines()
+    assert line.startswith("| cad | – | – | 0.07 | – |")
+
+
 def test_references_go_with_captures(tmp_path, capsys):
     assert surfaces.main(["-o", str(tmp_path), "--data", str(tmp_path), "--scenes"]) == 1
     assert "0 references go with 1 captures" in capsys.readouterr().err
