@@ -170,7 +170,6 @@ GEOMETRY_WEIGHTS = (
     "point_depth",
     "sensor_depth",
     "sensor_normals",
-    "patches",
 )
 
 
@@ -305,7 +304,6 @@ class TrainOptions:
     )
     sensor_depth: float = option(0.0, "weight: surfaces lie at the depths that the data set brings", low=0, high=1e6)
     sensor_normals: float = option(0.0, "weight: faces point as the normals that the data set brings", low=0, high=1e6)
-    patches: float = option(0.0, "weight: small planes look alike in neighbouring views", low=0, high=1e6)
     stop: float = option(1e-3, "transmittance below which a ray ends", low=0, high=0.5, metavar="T")
     samples: int = option(
         1, "K by K rays per pixel: 1 is fastest, 2 resolves edges that cut through pixels", low=1, high=8, metavar="K"

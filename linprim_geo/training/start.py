@@ -139,16 +139,11 @@ def reopen_run(
 
 
 def late_terms(run: Run, scene: Scene, images: list[TrainingImage], progress: Progress) -> GeometryTerms | None:
-    """The late terms for geometry that have a weight, of a scene with points; None if none has."""
+    """The late terms for geometry that have a weight, None if none has."""
     options = run.train_options
     if not any(getattr(options, name) > 0 for name in GEOMETRY_WEIGHTS):
         return None
-    assert scene.points is not None
-    evidence = gather_evidence(scene, options, run.similarity, progress.note)
-    terms = GeometryTerms(options, images, evidence, run.similarity.apply(scene.points.xyz))
-    if terms.sources is not None and not any(terms.sources):
-        progress.note("--patches: no two views see the same places from angles that suit it, so it does nothing")
-    return terms
+    return GeometryTerms(options, images, gather_evidence(scene, options, run.similarity, progress.note))
 
 
 def start_trainer(

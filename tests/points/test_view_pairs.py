@@ -29,9 +29,11 @@ def test_every_point_gets_its_views_where_more_may_be_taken():
 
 def test_no_more_views_than_show_something():
     points = np.random.default_rng(0).uniform([-0.3, 1.9, -0.3], [0.3, 2.1, 0.3], (300, 3))
-    cameras = [look_at((x, 0.0, 0.0), (x, 2.0, 0.0), size=(40, 30)) for x in (0.0, 0.3, -0.3)]
+    cameras = [look_at((x, 0.0, 0.0), (x, 2.0, 0.0), size=(40, 30)) for x in (0.0, 0.3, -0.3, 0.02)]
     cameras.append(look_at((0.0, 0.0, 0.0), (0.0, -2.0, 0.0), size=(40, 30)))
+    # The fourth is too near, the last looks away.
     assert sorted(view_pairs.source_views(cameras, points, 8)[0]) == [1, 2]
+    assert view_pairs.source_views(cameras[:1], points) == [[]]
 
 
 def test_a_point_behind_a_surface_gets_views_that_see_past_it():

@@ -197,7 +197,7 @@ def test_a_run_of_one_block_is_not_resumed_in_several(tiny_run, tiny_scene):
     ("options", "blocks", "sentence"),
     [
         ({"exposure": "gain"}, 2, "--exposure gain is fitted over all photographs at once"),
-        ({"patches": 0.1}, 2, "--patches looks at whole views"),
+        ({"distortion": 0.1}, 2, "--distortion looks at whole views"),
         ({}, 0, "--blocks is 0, wanted auto, or a number from 1"),
     ],
 )

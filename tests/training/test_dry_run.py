@@ -41,7 +41,7 @@ def everything(folder) -> dict:
 
 @pytest.mark.parametrize("kept", [0, 5])
 def test_photographs_on_disk_train_to_the_same_bits(kept, tiny_scene, tmp_path, monkeypatch):
-    options = replace(OPTIONS, exposure="gain", patches=0.1, geometry_from=0.5)
+    options = replace(OPTIONS, exposure="gain", normal_consistency=0.1, geometry_from=0.5)
     train(tiny_scene, tmp_path / "memory", options=options, quiet=True)
     one = photo_bytes(load_scene(tiny_scene).train[:1])
     monkeypatch.setattr(images, "available_memory", lambda: int(one * (kept + 0.5) / images.MEMORY_SHARE))

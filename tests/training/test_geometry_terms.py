@@ -16,15 +16,12 @@ from linprim_geo.base.options import GEOMETRY_WEIGHTS, TrainOptions, check_train
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels import ops
 from linprim_geo.kernels.ops import Rendering
-from linprim_geo.points import view_pairs
 from linprim_geo.training.step import geometry_terms as terms
 
 
-def camera(x: float = 0.0, size: int = 64) -> Camera:
-    """Looks along +z from (x, 0, 0)."""
-    pose = np.eye(4)
-    pose[0, 3] = -x
-    return Camera(size, size - 8, 70.0, 72.0, size / 2 + 1, size / 2 - 5, pose)
+def camera() -> Camera:
+    """Looks along +z from the origin."""
+    return Camera(64, 56, 70.0, 72.0, 33.0, 27.0, np.eye(4))
 
 
 def plane_depth(cam: Camera, normal, offset: float) -> torch.Tensor:
@@ -108,76 +105,6 @@ def test_normal_error_counts_pixels_that_have_a_normal():
     assert float(terms.normal_error(found, 0 * wanted, depth)) == 0
 
 
-def textured(points: np.ndarray) -> np.ndarray:
-    """A smooth texture on the plane z = 2: grey values in [0, 1] of (..., 3) points."""
-    x, y = points[..., 0], points[..., 1]
-    return 0.5 + 0.2 * np.sin(9 * x + 2 * y) + 0.2 * np.cos(7 * y - 3 * x) + 0.1 * np.sin(23 * x * y)
-
-
-def two_views(normal, offset):
-    """(camera, grey) of two views of the textured plane, and the second one's depth."""
-    views = []
-    for x in (0.0, 0.35):
-        cam = camera(x, 96)
-        depth = plane_depth(cam, normal, offset)
-        points = cam.center + cam.world_rays() * depth.numpy()[..., None]
-        views.append((cam, torch.from_numpy(textured(points)).float()))
-    return views, depth.float()
-
-
-def patch_loss(shift: float, tilt: float = 0.0) -> tuple[float, float]:
-    """(loss, its derivative by a shift of all depths) where the surface is rendered `shift` too deep and its normal
-    tilted."""
-    (one, grey), (other, other_grey) = two_views(NORMAL, OFFSET)[0]
-    other_depth = two_views(NORMAL, OFFSET)[1]
-    moved = torch.tensor(shift, requires_grad=True)
-    depth = plane_depth(one, NORMAL, OFFSET).float() + moved
-    normal = NORMAL + np.array([tilt, 0, 0])
-    normals = constant_normals(normal / np.linalg.norm(normal), depth)
-    pixels = terms.patch_pixels(torch.ones_like(grey, dtype=torch.bool), np.random.default_rng(0))
-    loss = terms.patch_consistency(rendering(depth, normals), one, grey, other, other_grey, other_depth, pixels)
-    return float(loss.detach()), float(torch.autograd.grad(loss, moved)[0])
-
-
-def test_patches_look_alike_where_the_surface_is_and_pull_towards_it():
-    right, _ = patch_loss(0.0)
-    (deep, pull_up), (near, pull_down) = patch_loss(0.1), patch_loss(-0.1)
-    assert right < 2e-3 < 5e-3 < min(deep, near)
-    assert pull_up > 0 > pull_down
-    assert patch_loss(0.0, tilt=0.6)[0] > 3 * right
-
-
-def test_patches_that_the_other_view_does_not_see_say_nothing():
-    (one, grey), (other, other_grey) = two_views(NORMAL, OFFSET)[0]
-    depth = plane_depth(one, NORMAL, OFFSET).float()
-    out = rendering(depth, constant_normals(NORMAL, depth))
-    pixels = terms.patch_pixels(torch.ones_like(grey, dtype=torch.bool), np.random.default_rng(0))
-    hidden = torch.full_like(depth, 0.7)  # something in front of all of it
-    assert float(terms.patch_consistency(out, one, grey, other, other_grey, hidden, pixels)) == 0
-    plain = torch.full_like(grey, 0.4)
-    assert float(terms.patch_consistency(out, one, plain, other, plain, depth, pixels)) == 0
-    none = torch.zeros(0, 2, dtype=torch.int64)
-    assert float(terms.patch_consistency(out, one, grey, other, other_grey, depth, none)) == 0
-
-
-def test_patch_pixels_keep_whole_patches_inside():
-    opaque = torch.zeros(20, 30, dtype=torch.bool)
-    opaque[:5, :5] = True
-    found = terms.patch_pixels(opaque, np.random.default_rng(0))
-    assert sorted(map(tuple, found.tolist())) == [(3, 3), (3, 4), (4, 3), (4, 4)]
-    assert len(terms.patch_pixels(torch.ones(100, 100, dtype=torch.bool), np.random.default_rng(0))) == terms.PATCHES
-    assert terms.patch_pixels(torch.ones(6, 6, dtype=torch.bool), np.random.default_rng(0)).shape == (0, 2)
-
-
-def test_sources_see_the_same_points_from_another_angle():
-    points = np.random.default_rng(0).uniform([-0.3, -0.3, 1.9], [0.3, 0.3, 2.1], (300, 3))
-    away = camera(0.5)
-    turned = away.world_to_camera @ np.diag([-1.0, 1, -1, 1])
-    cameras = [camera(0.0), camera(0.02), camera(0.3), camera(-0.5), replace(away, world_to_camera=turned)]
-    assert sorted(view_pairs.source_views(cameras, points)[0]) == [2, 3]  # the second is too near, the last looks away
-    assert view_pairs.source_views(cameras[:1], points) == [[]]
-
-
 @pytest.fixture(scope="module")
 def options(tiny_options):
     return replace(tiny_options, iterations=120, checkpoint_every=60, evaluate_every=0, geometry_from=0.5)
@@ -212,28 +139,11 @@ def test_without_weights_the_renderer_is_not_asked_for_geometry(tiny_scene, opti
     assert asked and not any(asked[:20])
 
 
-@pytest.mark.parametrize("name", [name for name in GEOMETRY_WEIGHTS if name != "patches"])
+@pytest.mark.parametrize("name", GEOMETRY_WEIGHTS)
 def test_every_term_changes_the_run(name, tiny_scene, options, plain, tmp_path):
     found = trained(tiny_scene, tmp_path / "run", replace(options, **{name: 1.0}))
     assert len(found) == len(plain) and not np.array_equal(found.center, plain.center)
     assert all(np.isfinite(getattr(found, key)).all() for key in ("center", "extent", "density"))
-
-
-def test_patches_change_a_run_of_views_that_overlap_and_say_when_none_do(tiny_scene, options, plain, tmp_path, capsys):
-    from linprim_geo.synthetic.synth import synthesize
-    from linprim_geo.training.train import train
-
-    synthesize(tmp_path / "scene", shape="smooth", views=30, test_views=2, size=48, points=300, supersample=1)
-    found = [
-        trained(tmp_path / "scene", tmp_path / f"{weight}", replace(options, patches=weight)) for weight in (0.0, 1.0)
-    ]
-    assert not np.array_equal(found[0].center, found[1].center)
-    # The tiny scene's views are too far apart from each other.
-    train(tiny_scene, tmp_path / "far", options=replace(options, patches=1.0))
-    assert "--patches: no two views see the same places" in capsys.readouterr().err
-    from linprim_geo.runs.run import Run
-
-    assert np.array_equal(Run.open(tmp_path / "far").training_primitives().center, plain.center)
 
 
 def test_a_run_with_every_term_resumes_to_the_last_bit(tiny_scene, options, tmp_path):

@@ -18,17 +18,13 @@ from torch import Tensor
 from linprim_geo.base.options import GEOMETRY_WEIGHTS, TrainOptions
 from linprim_geo.capture.types import Scene
 from linprim_geo.geometry.camera import Camera, Similarity
-from linprim_geo.kernels.ops import Rendering, exponential
+from linprim_geo.kernels.ops import Rendering
 from linprim_geo.points.initial_points import VolumePoints
-from linprim_geo.points.view_pairs import source_views, visible_pixels
+from linprim_geo.points.view_pairs import visible_pixels
 
 # Depths that miss a point or a measured depth by more than this share of it count as much as this: they belong to
 # another surface.
 DEPTH_CAP = 0.1
-# Multi-view patches: how many a step compares, samples along an edge of one, least standard deviation of its grey
-# values in [0, 1] (a plain patch looks the same everywhere), and the largest distance in pixels by which a pixel may
-# miss itself when it is sent to the other view's surface and back.
-PATCHES, PATCH, PLAIN, ROUND_TRIP_PX = 1024, 7, 0.01, 1.0
 
 
 @dataclass(frozen=True)
@@ -50,15 +46,13 @@ class Evidence:
 class GeometryTerms:
     """The weighted sum of the terms for a view at a step. `needs_geometry` says whether one looks at the renderer's."""
 
-    def __init__(self, options: TrainOptions, images: list, evidence: list[Evidence], points: np.ndarray):
-        """`images` as the trainer has them, an `evidence` each; `points` (P, 3) of the scene in the training frame."""
+    def __init__(self, options: TrainOptions, images: list, evidence: list[Evidence]):
+        """`images` as the trainer has them, an `evidence` each."""
         self.options, self.images, self.evidence = options, images, evidence
-        self.sources = source_views([image.camera for image in images], points) if options.patches > 0 else None
         self.needs_geometry = any(getattr(options, name) > 0 for name in GEOMETRY_WEIGHTS if name != "binarisation")
 
-    def loss(self, out: Rendering, index: int, step: int, raw_opacity: Tensor, render_depth) -> Tensor:
-        """Scalar. `out` is the rendering of view `index`, with its geometry where that is needed;
-        `render_depth(camera)` gives the (H, W) depth of another view."""
+    def loss(self, out: Rendering, index: int, raw_opacity: Tensor) -> Tensor:
+        """Scalar. `out` is the rendering of view `index`, with its geometry where that is needed."""
         o, image, evidence = self.options, self.images[index], self.evidence[index]
         total = raw_opacity.new_zeros(())
         if o.binarisation > 0:
@@ -77,15 +71,6 @@ class GeometryTerms:
             found = _geometry(out)[0][row, column]
             assert evidence.point_depth is not None and evidence.point_weight is not None
             total = total + o.point_depth * depth_error(found, evidence.point_depth, evidence.point_weight)
-        if self.sources is not None and self.sources[index]:
-            rng = np.random.default_rng([o.seed, 9, step])
-            other = self.images[self.sources[index][rng.integers(len(self.sources[index]))]]
-            opaque = out.opacity.detach() > 0.5
-            if image.alpha is not None:
-                opaque = opaque & (image.alpha > 127)
-            pixels = patch_pixels(opaque, rng)
-            views = (image.camera, grey(image), other.camera, grey(other), render_depth(other.camera))
-            total = total + o.patches * patch_consistency(out, *views, pixels)
         return total
 
 
@@ -124,11 +109,6 @@ def gather_evidence(
         if weight > 0 and all(getattr(evidence, name) is None for evidence in gathered):
             log(what + ", so it does nothing")
     return gathered
-
-
-def grey(image) -> Tensor:
-    """(H, W) float32 mean of a photograph's channels, in [0, 1]."""
-    return image.rgb.to(torch.float32).mean(0) / 255
 
 
 def depth_normals(depth: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
@@ -191,99 +171,3 @@ def normal_error(normal: Tensor, wanted: Tensor, opacity: Tensor) -> Tensor:
     """Mean of opacity - n . wanted over pixels that have a wanted normal; the opacity takes no gradient."""
     some = (wanted != 0).any(0)
     return ((opacity.detach() - (normal * wanted).sum(0)) * some).sum() / some.sum().clamp_min(1)
-
-
-def patch_consistency(
-    out: Rendering, camera: Camera, grey: Tensor, other: Camera, other_grey: Tensor, other_depth: Tensor, pixels: Tensor
-) -> Tensor:
-    """How unlike the patches round pixels look in another view, if the surface there is the plane that the renderer
-    says.
-
-    A patch is sent into the other view by the homography of the plane through the pixel's median depth with the blended
-    normal, and compared by normalised cross-correlation: the mean of 1 - NCC over patches that are not plain, weighted
-    by exp(-d), d the distance in pixels by which a pixel misses itself on its way to the other view's depth map and
-    back (none from ROUND_TRIP_PX on: hidden there). Source: PGSR (Chen et al. 2024).
-
-    Args:
-        grey, other_grey: (H, W) in [0, 1] of the two photographs.
-        other_depth: (H, W) median depth of the other view, a constant.
-        pixels: (P, 2) int64 columns and rows, at least PATCH // 2 from the border.
-    Gradient: to the depth and the normal of `out`.
-    """
-    half = PATCH // 2
-    column, row = pixels.T
-    depths, normals = _geometry(out)
-    depth, normal = depths[row, column], normals[:, row, column]
-    focal, middle = _pair(camera.fx, camera.fy), _pair(camera.cx, camera.cy)
-    ray = _with_one((pixels + 0.5 - middle) / focal)
-    steps = torch.arange(-half, half + 1)
-    offset = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1).reshape(-1, 2)
-    place = pixels[:, None] + offset
-    own = grey[place[..., 1], place[..., 0]]
-    rays = _with_one((place + 0.5 - middle) / focal)
-    along = depth * (normal * ray.T).sum(0)
-    slope = (rays * normal.T[:, None]).sum(2)
-    steep = slope.abs() < 0.1 * torch.linalg.vector_norm(normal, dim=0)[:, None]  # seen under less than six degrees
-    reach = along[:, None] / torch.where(steep, torch.full_like(slope, -1), slope)
-    usable = (depth > 0) & ~steep.any(1) & (reach > 0.5 * depth[:, None]).all(1) & (reach < 2 * depth[:, None]).all(1)
-
-    pose = other.world_to_camera @ np.linalg.inv(camera.world_to_camera)
-    rotation, shift = torch.from_numpy(pose[:3, :3]).to(depth), torch.from_numpy(pose[:3, 3]).to(depth)
-    there = _turned(rays * reach[..., None], rotation) + shift
-    usable = usable & (there[..., 2] > 1e-3).all(1)
-    focal_there, middle_there = _pair(other.fx, other.fy), _pair(other.cx, other.cy)
-    seen = there[..., :2] / there[..., 2:].clamp_min(1e-3) * focal_there + middle_there
-    size = torch.tensor([other.width, other.height], dtype=depth.dtype)
-    usable = usable & ((seen > 1) & (seen < size - 1)).all(-1).all(1)
-    theirs = _bilinear(other_grey, seen, size)
-
-    with torch.no_grad():
-        centre = seen[:, len(offset) // 2]
-        back = _bilinear(other_depth, centre, size)
-        point = _with_one((centre - middle_there) / focal_there) * back[:, None]
-        point = _turned(point - shift, rotation.T)
-        again = point[:, :2] / point[:, 2:].clamp_min(1e-3) * focal + middle
-        miss = torch.linalg.vector_norm(again - pixels - 0.5, dim=1)
-        usable = usable & (back > 0) & (miss < ROUND_TRIP_PX)
-        for values in (own, theirs):
-            usable = usable & (torch.linalg.vector_norm(values - values.mean(1, keepdim=True), dim=1) > PATCH * PLAIN)
-        weight = torch.where(usable, exponential(-miss), torch.zeros_like(miss))
-    own, theirs = own - own.mean(1, keepdim=True), theirs - theirs.mean(1, keepdim=True)
-    scale = torch.linalg.vector_norm(own, dim=1) * torch.linalg.vector_norm(theirs, dim=1)
-    likeness = (own * theirs).sum(1) / torch.where(usable, scale, torch.ones_like(scale))
-    return (torch.where(usable, 1 - likeness, torch.zeros_like(likeness)) * weight).sum() / weight.sum().clamp_min(1)
-
-
-def patch_pixels(opaque: Tensor, rng: np.random.Generator) -> Tensor:
-    """(P, 2) int64 columns and rows of at most PATCHES pixels of (H, W) bool `opaque`, whole patches inside the
-    image."""
-    half = PATCH // 2
-    inside = opaque[half:-half, half:-half]
-    if inside.numel() == 0:
-        return torch.zeros(0, 2, dtype=torch.int64)
-    rows, columns = np.nonzero(inside.numpy())
-    if len(rows) > PATCHES:
-        chosen = rng.choice(len(rows), PATCHES, replace=False)
-        rows, columns = rows[chosen], columns[chosen]
-    return torch.from_numpy(np.stack([columns, rows], 1).astype(np.int64) + half)
-
-
-def _pair(a: float, b: float) -> Tensor:
-    return torch.tensor([a, b], dtype=torch.float32)
-
-
-def _with_one(pairs: Tensor) -> Tensor:
-    return torch.cat([pairs, torch.ones_like(pairs[..., :1])], -1)
-
-
-def _turned(points: Tensor, rotation: Tensor) -> Tensor:
-    """Points (..., 3) turned by a matrix; without a matrix product, whose last bits differ between makers of
-    processors."""
-    return (points[..., None, :] * rotation).sum(-1)
-
-
-def _bilinear(image: Tensor, pixels: Tensor, size: Tensor) -> Tensor:
-    """Values of an (H, W) image at (..., 2) positions in pixels; the border's beyond it."""
-    grid = (pixels / size * 2 - 1).reshape(1, 1, -1, 2)
-    found = torch.nn.functional.grid_sample(image[None, None], grid, padding_mode="border", align_corners=False)
-    return found.reshape(pixels.shape[:-1])

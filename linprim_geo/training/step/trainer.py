@@ -227,18 +227,10 @@ class Trainer:
             photo = target if log_gain is None else target * ops.exponential(-log_gain.detach())[:, None, None]
             objective = objective + CONTRADICTION * contradiction(photo, passed.detach(), 1 - out.opacity)
         if terms is not None:
-
-            def surface(camera: Camera, tensors: Tensors) -> ops.Rendering:
-                return _single(ops.rasterize(*tensors, behind, camera, geometry=True, **how))
-
-            def depth_of(camera: Camera) -> torch.Tensor:
-                center, rotation, extent, density, sh = (tensor.detach() for tensor in active)
-                depth = surface(camera, (center, rotation, extent, density, sh)).depth_median
-                assert depth is not None
-                return depth
-
-            geometry = surface(image.camera, active) if needed and not shared else out
-            objective = objective + terms.loss(geometry, index, self.step, leaves["raw_opacity"], depth_of)
+            geometry = out
+            if needed and not shared:
+                geometry = _single(ops.rasterize(*active, behind, image.camera, geometry=True, **how))
+            objective = objective + terms.loss(geometry, index, leaves["raw_opacity"])
         wanted = [*leaves.values(), screen] + ([] if log_gain is None else [log_gain])
         grads = torch.autograd.grad(objective, wanted, allow_unused=True)
         screen_grad = grads[len(leaves)].float()[: len(self)]
