@@ -162,7 +162,7 @@ def initial_count(options: TrainOptions, share: float) -> int:
     return min(options.max_primitives, options.initial_primitives or max(500, round(share * options.max_primitives)))
 
 
-# Weights of the terms of geometry_terms.py.
+# Weights of the late terms of geometry_terms.py.
 GEOMETRY_WEIGHTS = (
     "normal_consistency",
     "distortion",
@@ -285,6 +285,13 @@ class TrainOptions:
         "dense",
         "optimiser step over all primitives, or over those that a view touched (sparse: the others' moments rest)",
         choices=("dense", "sparse"),
+    )
+    stereo_depth: float = option(
+        1.0,
+        "weight: surfaces lie within 1 % of the depths that stereo of small copies of the photographs finds; not of "
+        "captures with masks, and not in --blocks",
+        low=0,
+        high=1e6,
     )
     order_from: float = option(
         0.0,

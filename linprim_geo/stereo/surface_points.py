@@ -1,14 +1,16 @@
-"""Points on surfaces, by stereo of small copies of the photographs: dense enough to start a training from."""
+"""Surfaces by stereo of small copies of the photographs: dense enough to start a training from, and to hold it to
+them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from linprim_geo.capture.small_copy import SmallCopy
 from linprim_geo.capture.types import PointCloud, View
-from linprim_geo.stereo.depth_maps import FOREGROUND, DepthMap, depth_maps, inverse_planes
+from linprim_geo.stereo.depth_maps import FOREGROUND, depth_maps, inverse_planes
 from linprim_geo.stereo.evidence import support
 
 # Photographs are averaged down until their longer side has no more pixels, and no more of them are taken: a training
@@ -27,37 +29,50 @@ def small_copies(views: Sequence[View]) -> list[SmallCopy]:
     return [SmallCopy.of(views[k], factor) for k, factor in zip(chosen, factors, strict=True)]
 
 
-def surface_points(
-    views: Sequence[View], points: np.ndarray, count: int, seed: int, *, quiet: bool = True
-) -> tuple[PointCloud, float]:
-    """`count` points, or fewer, that stereo finds, other views confirm and pixels around continue, evenly drawn.
+@dataclass(frozen=True)
+class SurfaceMap:
+    """Of a small copy: (3, H, W) float32 `planes`, the inverse depth in the scene's unit and its slopes per pixel, 0
+    where no surface is known, and (H, W, 3) uint8 `rgb`."""
 
-    Returns: the points, and the share of all pixels that have one.
+    view: SmallCopy
+    planes: np.ndarray
+    rgb: np.ndarray
+
+    @property
+    def known(self) -> np.ndarray:
+        """(H, W) bool."""
+        return self.planes[0] > 0
+
+
+def surface_maps(views: Sequence[SmallCopy], points: np.ndarray, seed: int, *, quiet: bool = True) -> list[SurfaceMap]:
+    """Of every view the surfaces that stereo finds, other views confirm and pixels around continue; of masked
+    photographs those of the foreground.
 
     Args:
-        views: posed photographs; of masked ones the foreground counts.
         points: (P, 3) of the scene, as for `depth_maps`.
 
     Raises:
         LinprimError: as `depth_maps`.
     """
-    xyz, rgb, pixels = [], [], 0
+    maps = []
     for view, found in zip(views, depth_maps(views, points, seed=seed, quiet=quiet), strict=True):
-        photo, taken = view.load(), _on_surfaces(found)
+        photo, camera, known = view.load(), found.camera, found.is_confirmed()
+        planes = inverse_planes(camera, found.depth, found.normal @ camera.rotation.T)
+        known &= support(planes, known) >= LEAST_SUPPORT
         if photo.alpha is not None:
-            taken &= photo.alpha >= FOREGROUND
-        depth = found.depth[taken].astype(np.float64)
-        xyz.append(view.camera.world_rays()[taken] * depth[:, None] + view.camera.center)
-        rgb.append(photo.rgb[taken])
-        pixels += taken.size
+            known &= photo.alpha >= FOREGROUND
+        maps.append(SurfaceMap(view, np.where(known, planes, np.float32(0)), photo.rgb))
+    return maps
+
+
+def surface_points(maps: Sequence[SurfaceMap], count: int, seed: int) -> PointCloud:
+    """`count` points, or fewer, evenly drawn from all that are known."""
+    cameras = [found.view.camera for found in maps]
+    xyz = [
+        camera.world_rays()[found.known] / found.planes[0][found.known].astype(np.float64)[:, None] + camera.center
+        for camera, found in zip(cameras, maps, strict=True)
+    ]
     every = np.concatenate(xyz)
     rng = np.random.default_rng([seed, 12])
     keep = np.sort(rng.choice(len(every), min(count, len(every)), replace=False))
-    return PointCloud(every[keep], np.concatenate(rgb)[keep]), len(every) / pixels
-
-
-def _on_surfaces(found: DepthMap) -> np.ndarray:
-    """(H, W) bool: confirmed depths on a surface that confirmed depths around continue."""
-    confirmed, camera = found.is_confirmed(), found.camera
-    planes = inverse_planes(camera, found.depth, found.normal @ camera.rotation.T)
-    return confirmed & (support(planes, confirmed) >= LEAST_SUPPORT)
+    return PointCloud(every[keep], np.concatenate([found.rgb[found.known] for found in maps])[keep])

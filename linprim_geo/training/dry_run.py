@@ -20,10 +20,10 @@ from linprim_geo.training.budget.pacing import calibrate, plan_run
 from linprim_geo.training.budget.plan import SAVE_SECONDS, mean_population
 from linprim_geo.training.effects import Choice
 from linprim_geo.training.loop import QUICK_VIEWS, evaluate
-from linprim_geo.training.start import begin_run, late_terms, start_trainer
+from linprim_geo.training.start import begin_run, geometry_terms, start_trainer
 from linprim_geo.training.step.trainer import Trainer
 from linprim_geo.training.step.training_images import LazyTrainingImage, load_training_images, photo_bytes, photo_limit
-from linprim_geo.training.stereo_start import stereo_start
+from linprim_geo.training.stereo_surfaces import stereo_surfaces
 
 # Timing takes at most CALIBRATION_SHARE of so many seconds.
 TIMING = 125.0
@@ -65,13 +65,13 @@ def dry_run(
         # What is there now is what would be there for all of it.
         limit = photo_limit()
         images, held_out = (load_training_images(views, planned.similarity) for views in (loaded.train, loaded.test))
-        terms = late_terms(planned, loaded, images, progress)
-        surfaces = stereo_start(loaded, planned.train_options, progress, budget)
+        surfaces = stereo_surfaces(loaded, planned.train_options, progress, budget)
+        terms = geometry_terms(planned, loaded, images, surfaces, progress)
 
         counts = []
 
         def start(options: TrainOptions) -> Trainer:
-            trainer = start_trainer(loaded, planned, images, options, None, surfaces=surfaces)
+            trainer = start_trainer(loaded, planned, images, options, None, surfaces=surfaces.points)
             counts.append(len(trainer))
             return trainer
 

@@ -9,7 +9,7 @@ from linprim_geo.base.budget import Budget
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import GEOMETRY_WEIGHTS
 from linprim_geo.base.progress import Progress, duration
-from linprim_geo.capture.types import PointCloud, Scene
+from linprim_geo.capture.types import Scene
 from linprim_geo.kernels import ops
 from linprim_geo.points.initial_points import VolumePoints
 from linprim_geo.points.start_points import SFM_START, with_points
@@ -18,10 +18,10 @@ from linprim_geo.training.budget.pacing import Pace, plan_run
 from linprim_geo.training.effects import Decision
 from linprim_geo.training.held_out_gap import gap_advice
 from linprim_geo.training.loop import QUICK_VIEWS, evaluate, run_steps
-from linprim_geo.training.start import late_terms, start_trainer
+from linprim_geo.training.start import geometry_terms, start_trainer
 from linprim_geo.training.step.trainer import Trainer
 from linprim_geo.training.step.training_images import TrainingImage, load_training_images
-from linprim_geo.training.stereo_start import stereo_start
+from linprim_geo.training.stereo_surfaces import Surfaces, stereo_surfaces
 
 
 def train_run(
@@ -43,21 +43,25 @@ def train_run(
     Returns, raises: as `train`.
     """
     options = run.train_options
-    wanted = [name for name in GEOMETRY_WEIGHTS if getattr(options, name) > 0]
-    if state is None or wanted:
+    if state is None or any(getattr(options, name) > 0 for name in (*GEOMETRY_WEIGHTS, "stereo_depth")):
         scene = with_points(scene, options, progress.note)
     images = load_training_images(scene.train, run.similarity)
     if all(image.alpha is not None and int(image.alpha.max()) == 0 for image in images):
         raise LinprimError(f"{scene.root}: the masks leave no pixel of any training image")
     held_out: list[TrainingImage] | None = None
-    surfaces = stereo_start(scene, options, progress, budget) if state is None else None
+    surfaces = Surfaces()
+    if state is None or state["step"] < options.iterations:
+        surfaces = stereo_surfaces(scene, options, progress, None if state else budget, started=state is not None)
+    if state is None and not surfaces.maps:  # nor when the run is resumed
+        options = replace(options, stereo_depth=0.0)
+        run = replace(run, train_options=options)
     pace = None
     if budget:
         held_out = load_training_images(scene.test, run.similarity)
         run, scene, pace = _planned(run, scene, images, held_out, surfaces, budget, progress)
         options, progress.total = run.train_options, run.train_options.iterations
-    trainer = start_trainer(scene, run, images, options, state, surfaces=surfaces)
-    trainer.terms = late_terms(run, scene, images, progress)
+    trainer = start_trainer(scene, run, images, options, state, surfaces=surfaces.points)
+    trainer.terms = geometry_terms(run, scene, images, surfaces, progress)
     if not (run.path / "config.json").exists():
         Run.create(
             run.path,
@@ -118,7 +122,7 @@ def _planned(
     scene: Scene,
     images: list[TrainingImage],
     held_out: list[TrainingImage],
-    surfaces: PointCloud | None,
+    surfaces: Surfaces,
     budget: Budget,
     progress: Progress,
 ) -> tuple[Run, Scene, Pace]:
@@ -128,10 +132,10 @@ def _planned(
         run,
         images,
         held_out,
-        late_terms(run, scene, images, progress),
+        geometry_terms(run, scene, images, surfaces, progress),
         budget,
         progress,
-        start=lambda options: start_trainer(scene, run, images, options, None, surfaces=surfaces),
+        start=lambda options: start_trainer(scene, run, images, options, None, surfaces=surfaces.points),
         score=evaluate,
         # The smaller limit that is chosen leaves too many points, not too few, and volumes are filled anew.
         start_share=0.0 if volume else SFM_START,

@@ -43,6 +43,7 @@ from linprim_geo.training.step.geometry_terms import GeometryTerms, gather_evide
 from linprim_geo.training.step.parameters import initial_parameters
 from linprim_geo.training.step.trainer import LARGEST_PART, SMALLEST_PX, Trainer
 from linprim_geo.training.step.training_images import TrainingImage
+from linprim_geo.training.stereo_surfaces import Surfaces
 
 
 def decided_scene(
@@ -138,12 +139,14 @@ def reopen_run(
     return replace(opened, train_options=replace(opened.train_options, threads=options.threads)), loaded
 
 
-def late_terms(run: Run, scene: Scene, images: list[TrainingImage], progress: Progress) -> GeometryTerms | None:
-    """The late terms for geometry that have a weight, None if none has."""
+def geometry_terms(
+    run: Run, scene: Scene, images: list[TrainingImage], surfaces: Surfaces, progress: Progress
+) -> GeometryTerms | None:
+    """The terms for geometry that have a weight, None if none has."""
     options = run.train_options
-    if not any(getattr(options, name) > 0 for name in GEOMETRY_WEIGHTS):
+    if not surfaces.maps and not any(getattr(options, name) > 0 for name in GEOMETRY_WEIGHTS):
         return None
-    return GeometryTerms(options, images, gather_evidence(scene, options, run.similarity, progress.note))
+    return GeometryTerms(options, images, gather_evidence(scene, options, run.similarity, progress.note, surfaces.maps))
 
 
 def start_trainer(

@@ -40,6 +40,7 @@ OPTIONS = {
     "threads": 1,
     "checkpoint_every": 4,
     "evaluate_every": 20,
+    "stereo_depth": 0.0,
 }
 SAVED = ("training_frame.npz", "scene.npz", "scene.ply")
 

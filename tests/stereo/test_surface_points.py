@@ -10,7 +10,7 @@ from PIL import Image
 
 from linprim_geo.capture.types import View
 from linprim_geo.stereo import surface_points as module
-from linprim_geo.stereo.surface_points import small_copies, surface_points
+from linprim_geo.stereo.surface_points import SurfaceMap, small_copies, surface_maps, surface_points
 
 CENTERS = [(x, y, 0.0) for y in (-0.35, 0.0) for x in (-0.7, -0.35, 0.0)]
 SIZE = (96, 72)
@@ -43,9 +43,14 @@ def off_the_walls(points: np.ndarray) -> np.ndarray:
     return np.abs(np.abs(points).max(1) - HALF)
 
 
+def share_known(maps: list[SurfaceMap]) -> float:
+    return float(np.mean([found.known.mean() for found in maps]))
+
+
 def test_points_lie_on_the_walls(views, known):
-    found, share = surface_points(views, known, 500, 0)
-    assert share > 0.5 and found.xyz.shape == found.rgb.shape == (500, 3)
+    maps = surface_maps(small_copies(views), known, 0)
+    found = surface_points(maps, 500, 0)
+    assert share_known(maps) > 0.5 and found.xyz.shape == found.rgb.shape == (500, 3)
     assert np.median(off_the_walls(found.xyz)) < TOLERANCE / 3
     assert (off_the_walls(found.xyz) < TOLERANCE).mean() > 0.95
     # As the photographs show them: the nearest pixel of one of them, in the mean over views.
@@ -58,11 +63,10 @@ def test_points_lie_on_the_walls(views, known):
 
 
 def test_fewer_are_given_than_there_are_and_the_same_each_time(views, known):
-    few, _ = surface_points(views, known, 100, 3)
-    again, _ = surface_points(views, known, 100, 3)
-    every, share = surface_points(views, known, 10**6, 3)
+    maps, same = (surface_maps(small_copies(views), known, 3) for _ in range(2))
+    few, again, every = surface_points(maps, 100, 3), surface_points(same, 100, 3), surface_points(maps, 10**6, 3)
     assert len(few.xyz) == 100 and (few.xyz == again.xyz).all()
-    assert len(every.xyz) == round(share * len(views) * SIZE[0] * SIZE[1])
+    assert len(every.xyz) == sum(int(found.known.sum()) for found in maps)
     rows = {tuple(point) for point in every.xyz}
     assert all(tuple(point) in rows for point in few.xyz)
 
@@ -74,8 +78,9 @@ def test_masked_pixels_give_no_points(views, known, tmp_path):
         alpha[: SIZE[1] // 2] = 255
         Image.fromarray(alpha).save(tmp_path / view.name)
         kept.append(View(view.name, view.camera, view.image_path, mask_path=tmp_path / view.name, has_alpha=True))
-    found, share = surface_points(kept, known, 10**6, 0)
-    assert 0 < share <= 0.5 and len(found.xyz)
+    maps = surface_maps(small_copies(kept), known, 0)
+    found = surface_points(maps, 10**6, 0)
+    assert 0 < share_known(maps) <= 0.5 and len(found.xyz)
     # What is masked in every view lies below all their middle rows.
     shown = np.zeros(len(found.xyz), bool)
     for view in views:
@@ -111,7 +116,7 @@ def test_what_nothing_around_continues_gives_no_points(known, tmp_path, monkeypa
         kept.append(View(path.name, camera, path))
 
     def in_the_air() -> tuple[float, int]:
-        xyz = surface_points(kept, known, 10**6, 0)[0].xyz
+        xyz = surface_points(surface_maps(small_copies(kept), known, 0), 10**6, 0).xyz
         air = (off_the_walls(xyz) > TOLERANCE) & ~on_the_plate(xyz, 0.0)
         return air.mean(), int(on_the_plate(xyz, 0.0).sum())
 

@@ -13,6 +13,7 @@ from conftest import octahedron_run
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import GEOMETRY_WEIGHTS, TrainOptions, check_train_options
+from linprim_geo.geometry.boxes import smaller
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels import ops
 from linprim_geo.kernels.ops import Rendering
@@ -94,6 +95,31 @@ def test_depth_error_is_relative_capped_and_weighted():
     weight = torch.tensor([1.0, 3.0, 0.0, 1.0, 1.0])
     assert float(terms.depth_error(depth, wanted, weight).detach()) == pytest.approx((0.05 + 3 * 0.02) / 4)
     assert float(terms.depth_error(torch.zeros(2), torch.ones(2))) == 0
+
+
+@pytest.mark.parametrize(("column", "row"), [(0, 0), (2, 1)])
+def test_plane_error_is_what_exceeds_the_accuracy_of_stereo(column, row):
+    """Of a tilted plane in an image that is three times as small, at one of the nine pixels of each of its pixels."""
+    full, small = camera(), smaller(camera(), 3)
+    depth = plane_depth(full, NORMAL, OFFSET)
+    inverse = 1 / plane_depth(small, NORMAL, OFFSET)
+    planes = torch.zeros(3, *inverse.shape, dtype=torch.float64)
+    planes[:, :-1, :-1] = torch.stack([inverse, *torch.gradient(inverse, dim=(1, 0))])[:, :-1, :-1]
+
+    def error(depth: torch.Tensor) -> torch.Tensor:
+        return terms.plane_error(depth, planes, 3, column, row)
+
+    for share in (-0.03, 0.02):
+        assert float(error(depth * (1 + share))) == pytest.approx(abs(share) - terms.CONFIRMED_DEPTH, abs=1e-9)
+    assert float(error(depth * 1.005)) == 0 == float(error(depth * 0))
+    assert float(error(3 * depth)) == terms.DEPTH_CAP
+    off = (1.02 * depth).requires_grad_()
+    (gradient,) = torch.autograd.grad(error(off), off)
+    height, width = inverse.shape
+    wanted = torch.zeros_like(depth)
+    wanted[row::3, column::3][: height - 1, : width - 1] = 1
+    wanted *= 1 / depth / wanted.sum()
+    assert (gradient - wanted).abs().max() < 1e-9
 
 
 def test_normal_error_counts_pixels_that_have_a_normal():

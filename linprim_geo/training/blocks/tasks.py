@@ -35,7 +35,7 @@ from linprim_geo.training.single import train_run
 from linprim_geo.training.start import start_trainer
 from linprim_geo.training.step.trainer import CONTROLS
 from linprim_geo.training.step.training_images import load_training_images
-from linprim_geo.training.stereo_start import stereo_start
+from linprim_geo.training.stereo_surfaces import stereo_surfaces
 
 # Arrays of primitives by name, of any number: the frozen ones may be none.
 Arrays = dict[str, np.ndarray]
@@ -193,8 +193,8 @@ def _points_of(scene: Scene, run: Run, plan: Plan, number: int, options: TrainOp
     has the block's own primitives in the one and the others of its `options` in the other."""
     far = far_colors(scene) if plan.environment else None
     backdrop = np.asarray(plan.shown) if plan.fitted else None
-    surfaces = stereo_start(scene, options, Progress("block", 1, quiet=True))
-    cloud = filled_points(scene, options.seed, backdrop, far, surfaces)
+    surfaces = stereo_surfaces(scene, replace(options, stereo_depth=0.0), Progress("block", 1, quiet=True))
+    cloud = filled_points(scene, options.seed, backdrop, far, surfaces.points)
     where, block = run.similarity.apply(cloud.xyz), plan.blocks[number].block
     own = max(1, plan.blocks[number].own_primitives)
     inside, beside = block.holds(where), block.holds(where, plan.margin)

@@ -2,13 +2,13 @@
 evidence puts them.
 
 Every term is a mean over pixels, points or primitives, has a weight of its own, and costs nothing at weight 0: the
-renderer's geometry is not even asked for. They act in the last part of a run only (`--geometry-from`): early on they
-hold misplaced primitives where they are.
+renderer's geometry is not even asked for. Surfaces of stereo hold from the start. The others act in the last part of a
+run only (`--geometry-from`): early on they hold misplaced primitives where they are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,10 +21,14 @@ from linprim_geo.geometry.camera import Camera, Similarity
 from linprim_geo.kernels.ops import Rendering
 from linprim_geo.points.initial_points import VolumePoints
 from linprim_geo.points.view_pairs import visible_pixels
+from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
+from linprim_geo.stereo.surface_points import SurfaceMap
 
 # Depths that miss a point or a measured depth by more than this share of it count as much as this: they belong to
 # another surface.
 DEPTH_CAP = 0.1
+# Surfaces of stereo are looked at in one of so many steps, for as many times their weight.
+STEREO_EVERY = 2
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,8 @@ class Evidence:
 
     `depth` (H, W) z-depth, 0 = none; `normal` (3, H, W) unit normals in the camera's axes, 0 = none; `pixels` (P, 2)
     int64 columns and rows of points of the scene that this view sees, their z-depths `point_depth` (P,) and weights
-    `point_weight` (P,).
+    `point_weight` (P,). `planes` (3, h, w) inverse depth and its slopes per pixel of an image that is smaller by
+    `factor`, 0 = none.
     """
 
     depth: Tensor | None = None
@@ -41,43 +46,70 @@ class Evidence:
     pixels: Tensor | None = None
     point_depth: Tensor | None = None
     point_weight: Tensor | None = None
+    planes: Tensor | None = None
+    factor: int = 1
 
 
 class GeometryTerms:
-    """The weighted sum of the terms for a view at a step. `needs_geometry` says whether one looks at the renderer's."""
+    """The weighted sum of the terms for a view at a step."""
 
     def __init__(self, options: TrainOptions, images: list, evidence: list[Evidence]):
         """`images` as the trainer has them, an `evidence` each."""
         self.options, self.images, self.evidence = options, images, evidence
-        self.needs_geometry = any(getattr(options, name) > 0 for name in GEOMETRY_WEIGHTS if name != "binarisation")
 
-    def loss(self, out: Rendering, index: int, raw_opacity: Tensor) -> Tensor:
-        """Scalar. `out` is the rendering of view `index`, with its geometry where that is needed."""
-        o, image, evidence = self.options, self.images[index], self.evidence[index]
+    def weights(self, index: int, step: int, late: bool) -> dict[str, float]:
+        """Of the terms that act on view `index` at a step, which is `late` in the run or not."""
+        weights = {name: getattr(self.options, name) for name in GEOMETRY_WEIGHTS} if late else {}
+        if self.evidence[index].planes is not None and step % STEREO_EVERY == 0:
+            weights["stereo_depth"] = STEREO_EVERY * self.options.stereo_depth
+        return {name: weight for name, weight in weights.items() if weight > 0}
+
+    def loss(self, weights: dict[str, float], out: Rendering, index: int, step: int, raw_opacity: Tensor) -> Tensor:
+        """Scalar: the terms with `weights`. `out` is the rendering of view `index`, with its geometry where one of them
+        `needs_geometry`."""
+        image, evidence = self.images[index], self.evidence[index]
         total = raw_opacity.new_zeros(())
-        if o.binarisation > 0:
-            total = total + o.binarisation * binarisation(raw_opacity)
-        if o.normal_consistency > 0:
-            total = total + o.normal_consistency * normal_consistency(out, image.camera)
-        if o.distortion > 0:
-            assert out.distortion is not None
-            total = total + o.distortion * out.distortion.mean()
-        if o.sensor_depth > 0 and evidence.depth is not None:
-            total = total + o.sensor_depth * depth_error(_geometry(out)[0], evidence.depth)
-        if o.sensor_normals > 0 and evidence.normal is not None:
-            total = total + o.sensor_normals * normal_error(_geometry(out)[1], evidence.normal, out.opacity)
-        if o.point_depth > 0 and evidence.pixels is not None:
-            column, row = evidence.pixels.T
-            found = _geometry(out)[0][row, column]
-            assert evidence.point_depth is not None and evidence.point_weight is not None
-            total = total + o.point_depth * depth_error(found, evidence.point_depth, evidence.point_weight)
+        for name, weight in weights.items():
+            if name == "binarisation":
+                term = binarisation(raw_opacity)
+            elif name == "normal_consistency":
+                term = normal_consistency(out, image.camera)
+            elif name == "distortion":
+                assert out.distortion is not None
+                term = out.distortion.mean()
+            elif name == "stereo_depth":
+                offset = np.random.default_rng([self.options.seed, 9, step]).integers(evidence.factor, size=2)
+                assert evidence.planes is not None
+                term = plane_error(_geometry(out)[0], evidence.planes, evidence.factor, *offset)
+            elif name == "sensor_depth" and evidence.depth is not None:
+                term = depth_error(_geometry(out)[0], evidence.depth)
+            elif name == "sensor_normals" and evidence.normal is not None:
+                term = normal_error(_geometry(out)[1], evidence.normal, out.opacity)
+            elif name == "point_depth" and evidence.pixels is not None:
+                column, row = evidence.pixels.T
+                assert evidence.point_depth is not None and evidence.point_weight is not None
+                term = depth_error(_geometry(out)[0][row, column], evidence.point_depth, evidence.point_weight)
+            else:
+                continue  # this view has no evidence for it
+            total = total + weight * term
         return total
 
 
+def needs_geometry(weights: dict[str, float]) -> bool:
+    """Whether one of the terms looks at the renderer's geometry."""
+    return any(name != "binarisation" for name in weights)
+
+
 def gather_evidence(
-    scene: Scene, options: TrainOptions, similarity: Similarity, log: Callable[[str], None]
+    scene: Scene,
+    options: TrainOptions,
+    similarity: Similarity,
+    log: Callable[[str], None],
+    surfaces: Sequence[SurfaceMap] = (),
 ) -> list[Evidence]:
-    """What the terms in use need of each training view. A term that finds nothing of its kind is named by `log`."""
+    """What the terms in use need of each training view; `surfaces` are those of stereo. A late term that finds nothing
+    of its kind is named by `log`."""
+    by_name = {found.view.name: found for found in surfaces}
     points, cloud = None, scene.points
     if options.point_depth > 0 and cloud is not None and not isinstance(cloud, VolumePoints):
         points = similarity.apply(cloud.xyz)
@@ -87,7 +119,10 @@ def gather_evidence(
     gathered = []
     for view in scene.train:
         depth = view.load_depth() if options.sensor_depth > 0 else None
-        found = {} if depth is None else {"depth": torch.from_numpy(depth * np.float32(similarity.scale))}
+        found: dict = {} if depth is None else {"depth": torch.from_numpy(depth * np.float32(similarity.scale))}
+        if (surface := by_name.get(view.name)) and options.stereo_depth > 0 and surface.known.any():
+            found["planes"] = torch.from_numpy(surface.planes / np.float32(similarity.scale))
+            found["factor"] = surface.view.factor
         normals = view.load_normals() if options.sensor_normals > 0 else None
         if normals is not None:
             found["normal"] = torch.from_numpy(np.ascontiguousarray(normals.transpose(2, 0, 1)))
@@ -165,6 +200,26 @@ def depth_error(depth: Tensor, wanted: Tensor, weight: Tensor | None = None) -> 
     error = ((depth - wanted).abs() / torch.where(some, wanted, torch.ones_like(wanted))).clamp_max(DEPTH_CAP) * some
     weight = some.to(depth.dtype) if weight is None else some * weight
     return (error * weight).sum() / weight.sum().clamp_min(1e-6)
+
+
+def plane_error(depth: Tensor, planes: Tensor, factor: int, column: int, row: int) -> Tensor:
+    """Mean of what |depth - wanted| / wanted exceeds CONFIRMED_DEPTH by, at most DEPTH_CAP, over what has both.
+
+    Within CONFIRMED_DEPTH stereo is not sure, and photographs decide.
+
+    Args:
+        depth: (H, W).
+        planes: (3, h, w), see `Evidence`; they are wanted at one of the `factor` by `factor` pixels of each of their
+            own, in this `column` and `row` of them.
+    """
+    _, height, width = planes.shape
+    inverse, right, down = planes
+    across, along = ((place + 0.5) / factor - 0.5 for place in (column, row))
+    there = inverse + across * right + along * down
+    found = depth[row : row + factor * height : factor, column : column + factor * width : factor]
+    some = (inverse > 0) & (there > 0) & (found > 0)
+    error = ((found * there - 1).abs() - CONFIRMED_DEPTH).clamp(0, DEPTH_CAP) * some
+    return error.sum() / some.sum().clamp_min(1)
 
 
 def normal_error(normal: Tensor, wanted: Tensor, opacity: Tensor) -> Tensor:

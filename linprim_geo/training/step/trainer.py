@@ -27,7 +27,7 @@ from linprim_geo.kernels.adam import adam_rows, adam_step
 from linprim_geo.points.far_colors import SURVEY_VIEWS
 from linprim_geo.training.step.environment import contradiction, seen_through
 from linprim_geo.training.step.exposure import Exposure, exposed
-from linprim_geo.training.step.geometry_terms import GeometryTerms
+from linprim_geo.training.step.geometry_terms import GeometryTerms, needs_geometry
 from linprim_geo.training.step.parameters import FILTER_EVERY, activate, filter_lengths
 from linprim_geo.training.step.population import DensityControl, GradientControl
 from linprim_geo.training.step.population_papers import ClassicControl, McmcControl
@@ -199,9 +199,10 @@ class Trainer:
         active = self._cast(*self._with_frozen(activate(leaves, self.degree, self.kind, self.filter_3d)))
         screen = torch.zeros(len(active[0]), 3, dtype=active[0].dtype, requires_grad=True)
         behind = self._flat(background).to(active[0].dtype)
-        terms = self.terms if self.has_reached(self.options.geometry_from) else None
+        late = self.has_reached(self.options.geometry_from)
+        weights = {} if self.terms is None else self.terms.weights(index, self.step, late)
         # Geometry has no average over the rays of a pixel: with several of them it is rendered by itself.
-        needed = terms is not None and terms.needs_geometry
+        needed = needs_geometry(weights)
         shared = needed and self.options.samples == 1
         how = {"stop": self.options.stop, **self.raster_options_now()}
         samples = self.options.samples
@@ -226,11 +227,11 @@ class Trainer:
         if passed is not None:
             photo = target if log_gain is None else target * ops.exponential(-log_gain.detach())[:, None, None]
             objective = objective + CONTRADICTION * contradiction(photo, passed.detach(), 1 - out.opacity)
-        if terms is not None:
+        if self.terms is not None and weights:
             geometry = out
             if needed and not shared:
                 geometry = _single(ops.rasterize(*active, behind, image.camera, geometry=True, **how))
-            objective = objective + terms.loss(geometry, index, leaves["raw_opacity"])
+            objective = objective + self.terms.loss(weights, geometry, index, self.step, leaves["raw_opacity"])
         wanted = [*leaves.values(), screen] + ([] if log_gain is None else [log_gain])
         grads = torch.autograd.grad(objective, wanted, allow_unused=True)
         screen_grad = grads[len(leaves)].float()[: len(self)]

@@ -1,0 +1,74 @@
+"""Where stereo finds surfaces, a training starts on them and is held to them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from linprim_geo.base.budget import Budget
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import TrainOptions, initial_count
+from linprim_geo.base.progress import Progress, duration
+from linprim_geo.capture.types import PointCloud, Scene, View
+from linprim_geo.points.initial_points import VolumePoints
+from linprim_geo.points.start_points import SFM_START
+from linprim_geo.stereo.planes_on_disk import Photographs
+from linprim_geo.stereo.surface_points import SurfaceMap, small_copies, surface_maps, surface_points
+from linprim_geo.stereo.time_plan import seconds_per_pixel
+
+# Of a time budget stereo takes at most this share; steps in the rest are fewer and as long as before.
+BUDGET_SHARE = 0.2
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """What stereo of training views finds, if it does. `points` are as many as the scene has fewer than a training
+    starts with, None where it has enough; `maps`, which a training is held to, are of some of the views, in small."""
+
+    points: PointCloud | None = None
+    maps: Sequence[SurfaceMap] = ()
+
+
+def stereo_surfaces(
+    scene: Scene, options: TrainOptions, progress: Progress, budget: Budget | None = None, *, started: bool = False
+) -> Surfaces:
+    """Surfaces by stereo of the training views; nothing where nothing wants them, where the scene's points are anywhere
+    in a volume, and where stereo has nothing to say. With masks there are no `maps`: they clear the space before
+    backgrounds already.
+
+    Args:
+        started: the training goes on, and wants no points.
+    """
+    if scene.points is None or isinstance(scene.points, VolumePoints):
+        return Surfaces()
+    wanted = initial_count(options, SFM_START) if options.start == "stereo" and not started else 0
+    missing = wanted - len(scene.points.xyz)
+    held = options.stereo_depth > 0 and not scene.has_alpha
+    if missing <= 0 and not held:
+        return Surfaces()
+    begin = time.monotonic()
+    views, points = small_copies(scene.train), scene.points.xyz
+    try:
+        if budget and not _fits(views, points, budget):
+            progress.note(f"no stereo: it would take more than {BUDGET_SHARE:.0%} of the time that is left")
+            return Surfaces()
+        maps = surface_maps(views, points, options.seed, quiet=progress.quiet)
+    except LinprimError as error:
+        progress.note(f"no stereo: {error}")
+        return Surfaces()
+    share = sum(int(found.known.sum()) for found in maps) / sum(found.known.size for found in maps)
+    progress.note(
+        f"stereo of {len(views)} photographs, averaged down, finds surfaces in {share:.0%} of the pixels "
+        f"({duration(time.monotonic() - begin)})"
+    )
+    return Surfaces(surface_points(maps, missing, options.seed) if missing > 0 else None, maps if held else ())
+
+
+def _fits(views: Sequence[View], points: np.ndarray, budget: Budget) -> bool:
+    """Whether stereo takes no more than BUDGET_SHARE of what is left, by its first photographs."""
+    rate = seconds_per_pixel(Photographs(views, points), budget)
+    pixels = sum(view.camera.width * view.camera.height for view in views)
+    return rate * pixels <= BUDGET_SHARE * budget.left()
