@@ -17,6 +17,7 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.geometry.region import read_box
 from linprim_geo.runs.run import Run
+from linprim_geo.surface.depth_error import error_by_depths
 from linprim_geo.surface.photo_consistency import best_agreement, photo_gains
 from linprim_geo.surface.stereo_frames import MergedFrames
 from linprim_geo.surface.tsdf_field import DepthFrame
@@ -58,7 +59,8 @@ def tsdf_surface(
     fuse: Callable | None = None,
     merged: MergedFrames | None = None,
 ) -> tuple[Mesh, dict]:
-    """Returns the fused mesh and `level`, `voxel_size` and `truncation_voxels` for the statistics.
+    """Returns the fused mesh and `level`, `voxel_size` and `truncation_voxels` for the statistics. With stereo it has a
+    `quality`, see `error_by_depths`.
 
     `frames` of the same level, and what is `merged` of them and stereo, are taken in place of new ones if there are any
     already. `fuse`: see `fuse_tsdf`.
@@ -110,7 +112,10 @@ def tsdf_surface(
         return surface
 
     def fused_with_stereo(merged: MergedFrames) -> tuple[Mesh, dict]:
-        mesh, left_out = merged.supported(fused(merged, 0), options.smallest_part, 2 * options.truncation * voxel)
+        mesh = fused(merged, 0)
+        reach = options.truncation * voxel
+        mesh, left_out = merged.supported(mesh, options.smallest_part, 2 * reach)
+        mesh = replace(mesh, quality=error_by_depths(mesh, merged, reach))
         return mesh, merged.about() | {"unsupported": left_out}
 
     if options.stereo == "on":

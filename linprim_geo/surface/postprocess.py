@@ -6,6 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Stages
 from linprim_geo.geometry.mesh import Mesh, select_faces
@@ -47,7 +49,10 @@ def with_rounds(options: ExtractOptions, about: dict) -> ExtractOptions:
 
 
 def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, stages: Stages) -> Finished:
-    """Finishes a surface as the options ask, and writes it to `target` and `visible_file(target)`."""
+    """Finishes a surface as the options ask, and writes it to `target` and `visible_file(target)`.
+
+    A `quality` that it has is kept, else vertices get that of photographs (`predicted_error`)."""
+    given = mesh
     views = run.scene().train
     cameras = [view.camera for view in views]
     caster = RayCaster(mesh.vertices, mesh.faces)
@@ -63,7 +68,9 @@ def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, 
         stages.lap("process")
     if options.refine or options.denoise == "on" or processing:
         caster = RayCaster(mesh.vertices, mesh.faces)
-    if processing or options.denoise == "off":
+    if given.quality is not None:
+        mesh = replace(mesh, quality=_of_nearest(given, mesh.vertices))
+    elif processing or options.denoise == "off":
         mesh = replace(mesh, quality=predicted_error(mesh, cameras, (view.load() for view in views), gains, caster))
         stages.lap("quality")
     mesh = replace(mesh, colors=color_vertices(mesh, cameras, (pixels_of(view.load()) for view in views), caster))
@@ -82,3 +89,11 @@ def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, 
     save_textured(visible_file(target), visible, texture.select(seen))
     stages.lap("write")
     return Finished(mesh, visible, processing, texture.about)
+
+
+def _of_nearest(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+    """(P,) `quality` of the vertex that is nearest to each of the points."""
+    from scipy.spatial import cKDTree
+
+    assert mesh.quality is not None
+    return mesh.quality[cKDTree(mesh.vertices).query(points, workers=-1)[1]]

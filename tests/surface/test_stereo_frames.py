@@ -16,7 +16,7 @@ from linprim_geo.capture.types import Scene
 from linprim_geo.geometry.mesh import Mesh, vertex_normals
 from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.stereo.depth_maps import CONFIDENT, DepthMap, depth_maps
-from linprim_geo.surface import method_tsdf, stereo_frames
+from linprim_geo.surface import method_tsdf, postprocess, stereo_frames
 from linprim_geo.surface.extract import extract_mesh
 from linprim_geo.surface.stereo_frames import MergedFrames
 from linprim_geo.surface.tsdf_field import DepthFrame
@@ -249,9 +249,13 @@ def test_photographs_that_agree_clearly_less_often_speak_against_a_surface_in_fe
     assert stats["stereo"]["covered"] == covered and ("agreeing" in stats["stereo"]) is bool(shares)
 
 
-def test_a_surface_takes_stereo_into_account_where_it_is_asked_to(many_views, stereo_once):
+def test_a_surface_takes_stereo_into_account_where_it_is_asked_to(many_views, stereo_once, monkeypatch):
+    monkeypatch.setattr(postprocess, "predicted_error", lambda *_: pytest.fail("depths predict it"))
     stats = extract_mesh(many_views, options=replace(COARSE, stereo="on"), quiet=True)
     assert 0 <= stats["stereo"]["confirmed"] <= 1 and 0 < stats["stereo"]["rendered_weight"] <= 1
+    predicted = load_mesh(stats["mesh"]).quality
+    reach = np.float32(stats["truncation_voxels"] * stats["voxel_size"])
+    assert (predicted > 0).all() and (predicted <= reach).all() and np.median(predicted) < reach / 5
     with pytest.raises(LinprimError, match="without --blocks"):
         extract_mesh(many_views, options=ExtractOptions(stereo="on"), blocks=2, quiet=True)
 
