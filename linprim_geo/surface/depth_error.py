@@ -32,6 +32,16 @@ def error_by_depths(mesh: Mesh, frames: Sequence[DepthFrame], reach: float) -> n
     return np.where(weight >= SUPPORTING_VIEWS, error, reach).astype(np.float32)
 
 
+def error_of_nearest(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+    """(P,) `quality` of the vertex that is nearest to each of (P, 3) points, or its distance where that exceeds all
+    predicted errors: there a hole was closed."""
+    from scipy.spatial import cKDTree
+
+    assert mesh.quality is not None
+    distance, row = cKDTree(mesh.vertices).query(points, workers=-1)
+    return np.where(distance > mesh.quality.max(), distance, mesh.quality[row]).astype(np.float32)
+
+
 def _spread(mesh: Mesh, frames: Sequence[DepthFrame], reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(V,) weight of the depths no farther than `reach` from a vertex, along its normal; (V,) their root mean square
     distance from it, NaN where there are none; (V,) what a pixel of the nearest view covers there."""

@@ -6,8 +6,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Stages
 from linprim_geo.geometry.mesh import Mesh, select_faces
@@ -16,6 +14,7 @@ from linprim_geo.geometry.mesh_process import process_mesh
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.denoise import denoised
+from linprim_geo.surface.depth_error import error_of_nearest
 from linprim_geo.surface.photo_consistency import photo_gains, predicted_error, refine_surface
 from linprim_geo.surface.texture import make_texture
 from linprim_geo.surface.texture_files import save_textured
@@ -69,7 +68,7 @@ def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, 
     if options.refine or options.denoise == "on" or processing:
         caster = RayCaster(mesh.vertices, mesh.faces)
     if given.quality is not None:
-        mesh = replace(mesh, quality=_of_nearest(given, mesh.vertices))
+        mesh = replace(mesh, quality=error_of_nearest(given, mesh.vertices))
     elif processing or options.denoise == "off":
         mesh = replace(mesh, quality=predicted_error(mesh, cameras, (view.load() for view in views), gains, caster))
         stages.lap("quality")
@@ -89,11 +88,3 @@ def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, 
     save_textured(visible_file(target), visible, texture.select(seen))
     stages.lap("write")
     return Finished(mesh, visible, processing, texture.about)
-
-
-def _of_nearest(mesh: Mesh, points: np.ndarray) -> np.ndarray:
-    """(P,) `quality` of the vertex that is nearest to each of the points."""
-    from scipy.spatial import cKDTree
-
-    assert mesh.quality is not None
-    return mesh.quality[cKDTree(mesh.vertices).query(points, workers=-1)[1]]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.captures import look_at
 
 from linprim_geo.geometry.mesh import Mesh
-from linprim_geo.surface.depth_error import FINEST, error_by_depths
+from linprim_geo.surface.depth_error import FINEST, error_by_depths, error_of_nearest
 from linprim_geo.surface.tsdf_field import DepthFrame
 
 SIZE, FOCAL, DISTANCE, REACH = (60, 48), 60.0, 3.0, 0.2
@@ -62,3 +64,11 @@ def test_what_no_two_views_confirm_may_lie_anywhere_within_reach():
     mesh = plane()
     for frames in ([frame(0.0, 0.0)], [frame(x, 0.0, confidence=0.1) for x in (-0.4, 0.0, 0.4)], []):
         assert (error_by_depths(mesh, frames, REACH) == np.float32(REACH)).all()
+
+
+def test_a_vertex_that_closes_a_hole_is_as_uncertain_as_it_is_far():
+    mesh = replace(plane(), quality=np.linspace(0.01, 0.05, 144, dtype=np.float32))
+    moved = mesh.vertices + 0.01 * NORMAL
+    assert (error_of_nearest(mesh, moved) == mesh.quality).all()
+    far = mesh.vertices[:1] + 0.4 * NORMAL
+    assert error_of_nearest(mesh, far) == pytest.approx([0.4])
