@@ -58,6 +58,8 @@ def _spread(mesh: Mesh, frames: Sequence[DepthFrame], reach: float) -> tuple[np.
         # To the plane of the vertex: the pixel's own ray passes beside it.
         off = ((camera.center + depth[:, None] * ray - own) * normal).sum(1)
         near = (depth > 0) & ((ray * normal).sum(1) < 0) & (np.abs(off) <= reach)
+        if frame.clamped is not None:
+            near &= ~frame.clamped[row, column]
         rows, off, depth = rows[near], off[near], depth[near]
         assert frame.confidence is not None
         counts = frame.confidence[row[near], column[near]].astype(np.float64)

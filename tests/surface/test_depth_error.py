@@ -56,7 +56,9 @@ def test_depths_that_had_no_part_in_the_surface_do_not_count():
     behind = look_at((0.0, DISTANCE, 0.1), (0.0, 0.0, 0.0), size=SIZE, focal=FOCAL)
     depth = -(behind.center @ NORMAL) / (behind.world_rays() @ NORMAL)
     from_behind = DepthFrame(behind, depth * 1.01, confidence=np.ones(depth.shape, np.float32))
-    more = [frame(-0.4, 0.0), frame(0.0, 0.0), frame(0.4, 1.1 * REACH), nothing, from_behind]
+    clamped = frame(0.3, 0.5 * REACH)
+    clamped = replace(clamped, clamped=np.ones(clamped.depth.shape, bool))
+    more = [frame(-0.4, 0.0), frame(0.0, 0.0), frame(0.4, 1.1 * REACH), nothing, from_behind, clamped]
     assert error_by_depths(mesh, more, REACH) == pytest.approx(exact, rel=1e-6)
 
 
