@@ -1,4 +1,4 @@
-// PatchMatch stereo.
+// PatchMatch stereo, and what supports its planes.
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
@@ -14,6 +14,7 @@
 #include "bind/arrays.h"
 #include "bind/parts.h"
 #include "stereo/patch_match.h"
+#include "stereo/support.h"
 
 void bind_stereo(nb::module_& m) {
   // `sources`: (to, shift, back, back_shift, quads, inverse depth or None) of each.
@@ -47,5 +48,14 @@ void bind_stereo(nb::module_& m) {
     nb::gil_scoped_release release;
     linprim::patch_match_begin(match);
     for (int number = first; number < first + count; ++number) linprim::patch_match_iterate(match, number);
+  });
+
+  m.def("support", [](In<uint8_t> grey, In<float> plane, float tolerance, Out<float> share) {
+    if (grey.ndim() != 2 || grey.size() == 0) throw std::invalid_argument("grey has to have shape (H, W)");
+    const int64_t height = int64_t(grey.shape(0)), width = int64_t(grey.shape(1));
+    const float* planes = checked(plane, {3, height, width}, "plane");
+    float* result = checked(share, {height, width}, "share");
+    nb::gil_scoped_release release;
+    linprim::support(grey.data(), planes, int(height), int(width), tolerance, result);
   });
 }

@@ -100,6 +100,27 @@ def patch_match(
     )
 
 
+def support(grey: np.ndarray, plane: np.ndarray, tolerance: float) -> np.ndarray:
+    """(H, W) float32 share of the pixels that belong to each that go on with its surface; 0 where there is no plane.
+
+    A cross of grey values within 25 belongs to a pixel, 10 up and down and, from each of these, 10 to the left and to
+    the right: no edge parts them from it. One goes on with the surface if its inverse depth is what the plane of the
+    pixel has there, or the pixel's what its plane has at the pixel, up to the share `tolerance`.
+
+    Args:
+        grey: (H, W) uint8.
+        plane: (3, H, W) float32 inverse depths, not positive or NaN where unknown, and their slopes per pixel.
+
+    Raises:
+        ValueError: shapes that do not fit.
+
+    Source: Zhang, Lu, Lafruit 2009, cross-based local stereo matching.
+    """
+    share = np.empty(grey.shape, np.float32)
+    _core.support(grey, np.ascontiguousarray(plane), tolerance, share)
+    return share
+
+
 def _between(one: Camera, other: Camera) -> tuple[list[float], list[float]]:
     """The 9 numbers A and 3 numbers b with A (x, y, 1) + b w the homogeneous pixel in `other` of the pixel (x, y) of
     `one` at inverse depth w; the middle of the first pixel is (0, 0)."""

@@ -11,7 +11,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from linprim_geo.stereo.evidence import Glance, support
+from linprim_geo.kernels.stereo_ops import support
+from linprim_geo.stereo.evidence import Glance
 
 # A depth is right if it differs from the true one by less than this share of it.
 RIGHT = 0.01
@@ -21,13 +22,15 @@ FEWEST_PIXELS, MOST_PIXELS = -4.0, 0.0
 # of noise. Weak textures under noise cost nearly as much when they are right, which other views tell.
 MOST_COST = 0.9
 # The logit of the probability: a constant, and weights of the evidence in the order of `evidence`.
-WEIGHTS = np.array([-1.324, 1.014, 2.011, -1.71, 0.425, 3.265])
+WEIGHTS = np.array([-2.667, 0.555, 2.214, -1.144, 0.329, 4.14])
 
 
-def evidence(plane: np.ndarray, cost: np.ndarray, known: np.ndarray, glances: Iterable[Glance]) -> np.ndarray:
+def evidence(
+    grey: np.ndarray, plane: np.ndarray, cost: np.ndarray, known: np.ndarray, glances: Iterable[Glance]
+) -> np.ndarray:
     """(H, W, 6) float32 about each depth: 1; whether another photograph confirms it; the share that confirm it of those
     that have a surface there; the cost of its match; log2 of the pixels that 1 % of it moves the point by in those that
-    confirm it (in the best one if none does); `support`."""
+    confirm it (in the best one if none does); `support` by depths that are `known`, up to RIGHT."""
     confirmed, seen, squares, best = (np.zeros(cost.shape, np.float32) for _ in range(4))
     for each in glances:
         confirms = each.confirms
@@ -38,7 +41,8 @@ def evidence(plane: np.ndarray, cost: np.ndarray, known: np.ndarray, glances: It
     parallax = RIGHT * np.where(confirmed > 0, np.sqrt(squares), best)
     pixels = np.clip(np.log2(np.maximum(parallax, 2**FEWEST_PIXELS)), FEWEST_PIXELS, MOST_PIXELS)
     share = confirmed / np.maximum(seen, 1)
-    layers = [np.ones_like(cost), confirmed > 0, share, np.clip(cost, 0, MOST_COST), pixels, support(plane, known)]
+    supported = support(grey, np.where(known, plane, np.float32(0)), RIGHT)
+    layers = [np.ones_like(cost), confirmed > 0, share, np.clip(cost, 0, MOST_COST), pixels, supported]
     return np.stack(layers, axis=2).astype(np.float32)
 
 

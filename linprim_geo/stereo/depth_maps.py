@@ -40,8 +40,8 @@ FOREGROUND = 128
 # Both sides of a photograph have at least this many pixels: half of them hold a window.
 SMALLEST = 24
 # A depth is confirmed if so many other views confirm it, as two may be wrong about each other, and if it is right with
-# this probability.
-CONFIRMING, CONFIDENT = 2, 0.7
+# this probability; it is sure if it is right with the other one.
+CONFIRMING, CONFIDENT, SURE = 2, 0.7, 0.9
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,9 @@ class DepthMap:
     grey: np.ndarray
     noise: float
 
-    def is_confirmed(self) -> np.ndarray:
+    def is_confirmed(self, probability: float = CONFIDENT) -> np.ndarray:
         """(H, W) bool."""
-        return (self.confirming >= CONFIRMING) & (self.confidence >= CONFIDENT)
+        return (self.confirming >= CONFIRMING) & (self.confidence >= probability)
 
 
 def depth_maps(
@@ -267,7 +267,7 @@ def _depth_map(
                 np.fmin(deviation, np.abs(found.relative), out=deviation)
                 yield found
 
-    confidence = probability(evidence(np.moveaxis(planes.plane, 2, 0), planes.cost, known, glances()))
+    confidence = probability(evidence(image.grey, np.moveaxis(planes.plane, 2, 0), planes.cost, known, glances()))
     return DepthMap(
         camera,
         depth.astype(np.float32),

@@ -10,9 +10,6 @@ from linprim_geo.geometry.camera import Camera
 
 # A depth is confirmed by another view that comes back to within so many pixels, and so near in depth.
 CONFIRMED_PX, CONFIRMED_DEPTH = 1.0, 0.01
-# Pixels from a pixel to those that are to continue its plane, half a window of PatchMatch, and by what share of their
-# inverse depth they may differ from it, half of what counts as right.
-REACH, CONTINUED = 5, 0.005
 
 
 @dataclass(frozen=True)
@@ -68,18 +65,3 @@ def glance(camera: Camera, depth: np.ndarray, other: Camera, plane: np.ndarray) 
     miss[rows, columns] = np.where(z > 0, back, np.inf)
     relative[rows, columns] = z / own - 1
     return Glance(pixel, miss, relative, parallax)
-
-
-def support(plane: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """(H, W) float32 share of 8 pixels around each, REACH columns or rows away, whose depth continues its plane up to
-    CONTINUED; `plane` (3, H, W) are inverse depths and their slopes, `known` (H, W) where they count."""
-    height, width = known.shape
-    total = np.zeros((height, width), np.float32)
-    for down, right in np.ndindex(3, 3):
-        rows = np.clip(np.arange(height) + REACH * (down - 1), 0, height - 1)
-        columns = np.clip(np.arange(width) + REACH * (right - 1), 0, width - 1)
-        at = np.ix_(rows, columns)
-        moved = plane[1] * (columns - np.arange(width)) + plane[2] * (rows - np.arange(height))[:, None]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            total += known[at] & (np.abs(plane[0][at] / (plane[0] + moved) - 1) < CONTINUED)
-    return (total - known) / 8  # the pixel itself is one of the 9

@@ -23,7 +23,7 @@ def seen_depths(photographs: Photographs, planes: PlanesOnDisk, k: int) -> tuple
     depth = np.where(known, depth, np.nan)
     others = photographs.pairs[k]
     glances = [glance(camera, depth, photographs.cameras[j], planes.read(j)[:3]) for j in others]
-    return depth, normal, evidence(layers[:3], layers[3], known, glances)
+    return depth, normal, evidence(photographs.image(k).grey, layers[:3], layers[3], known, glances)
 
 
 def maps_of(photographs: Photographs, planes: PlanesOnDisk, k: int) -> Maps:

@@ -10,14 +10,15 @@ import numpy as np
 
 from linprim_geo.capture.small_copy import SmallCopy
 from linprim_geo.capture.types import PointCloud, View
+from linprim_geo.kernels.stereo_ops import support
+from linprim_geo.stereo.confidence import RIGHT
 from linprim_geo.stereo.depth_maps import FOREGROUND, depth_maps, inverse_planes
-from linprim_geo.stereo.evidence import support
 
 # Photographs are averaged down until their longer side has no more pixels, and no more of them are taken: a training
 # starts with some ten thousand primitives, and a view of this size has 30,000 pixels.
 LONGER_SIDE, MOST_VIEWS = 200, 100
-# A point belongs to a surface that at least this share of the places around it continue (`support`): at the corner of a
-# flat face three of eight do. What lies beyond edges of surfaces, where windows of stereo hold them, has fewer.
+# A point belongs to a surface that at least this share of the pixels on its side of edges go on with (`support`), known
+# ones: beyond edges of surfaces, where windows of stereo hold them, fewer do. At the corner of a face all would.
 LEAST_SUPPORT = 3 / 8
 
 
@@ -58,7 +59,7 @@ def surface_maps(views: Sequence[SmallCopy], points: np.ndarray, seed: int, *, q
     for view, found in zip(views, depth_maps(views, points, seed=seed, quiet=quiet), strict=True):
         photo, camera, known = view.load(), found.camera, found.is_confirmed()
         planes = inverse_planes(camera, found.depth, found.normal @ camera.rotation.T)
-        known &= support(planes, known) >= LEAST_SUPPORT
+        known &= support(found.grey, np.where(known, planes, np.float32(0)), RIGHT) >= LEAST_SUPPORT
         if photo.alpha is not None:
             known &= photo.alpha >= FOREGROUND
         maps.append(SurfaceMap(view, np.where(known, planes, np.float32(0)), photo.rgb))

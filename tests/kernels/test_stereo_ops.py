@@ -8,8 +8,9 @@ from helpers.captures import look_at
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels import ops
-from linprim_geo.kernels.reference.stereo import match_cost
-from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, patch_match
+from linprim_geo.kernels.reference.stereo import CROSS_GREY, CROSS_REACH, match_cost
+from linprim_geo.kernels.reference.stereo import support as reference_support
+from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, patch_match, support
 
 # A wall through the origin, seen from points around (0, 0, -3).
 NORMAL = np.array([0.35, -0.2, 1.0]) / np.linalg.norm([0.35, -0.2, 1.0])
@@ -161,3 +162,63 @@ def test_what_does_not_fit_is_refused(images):
         patch_match(images[0], images[1:], planes, (0.5, 0.5), 1.0, 1)
     with pytest.raises(ValueError, match="plane"):
         patch_match(images[0], images[1:], DepthPlanes.unknown(5, 5), (0.0, 0.8), 1.0, 1)
+
+
+def slanted(height: int, width: int, inverse: float) -> np.ndarray:
+    """(3, H, W) a plane of inverse depth, `inverse` in the middle."""
+    right, down = 2e-3 * inverse, -1e-3 * inverse
+    rows, columns = np.indices((height, width))
+    values = inverse + right * (columns - width // 2) + down * (rows - height // 2)
+    return np.stack([values, np.full_like(values, right), np.full_like(values, down)]).astype(np.float32)
+
+
+def test_support_agrees_with_float64():
+    rng = np.random.default_rng(3)
+    height, width = 30, 34
+    grey = np.cumsum(rng.integers(-12, 13, (height, width)), axis=1) + 128
+    plane = slanted(height, width, 0.5)
+    plane[0] *= 1 + 0.02 * rng.normal(size=(height, width)).astype(np.float32)
+    plane[0, rng.random((height, width)) < 0.2] = np.nan
+    grey = np.clip(grey, 0, 255).astype(np.uint8)
+    found, wanted = support(grey, plane, 0.01), reference_support(grey, plane, 0.01)
+    # A comparison that rounding to float32 turns over would be off by one pixel of a cross: there is none.
+    assert np.allclose(found, wanted, rtol=1e-6, atol=0) and len(np.unique(wanted)) > 100
+    assert not found[np.isnan(plane[0])].any()
+
+
+def test_a_plane_supports_all_of_its_pixels_at_any_slope():
+    assert (support(np.full((24, 40), 90, np.uint8), slanted(24, 40, 0.3), 1e-4) == 1).all()
+
+
+def test_support_ends_at_edges_of_the_photograph():
+    height, width, edge, halo = 40, 60, 30, 5
+    grey = np.full((height, width), 60, np.uint8)
+    grey[:, edge:] = 60 + CROSS_GREY
+    # What lies before the edge goes on beyond it by a window of stereo, and a wall is behind.
+    plane = slanted(height, width, 0.5)
+    plane[:, :, edge + halo :] = slanted(height, width, 0.3)[:, :, edge + halo :]
+    found = support(grey, plane, 0.01)[height // 2]
+    assert (found[:edge] == 1).all()
+    # Of its own side, 10 columns and those to the edge, the halo has 5 columns.
+    wanted = halo / np.minimum(2 * CROSS_REACH + 1, CROSS_REACH + 1 + np.arange(halo))
+    assert np.allclose(found[edge : edge + halo], wanted) and (wanted < 0.5).all()
+    assert (found[edge + halo : edge + 2 * halo] > 0.5).all() and (found[-CROSS_REACH:] == 1).all()
+
+
+def test_support_does_not_depend_on_the_threads():
+    rng = np.random.default_rng(4)
+    grey = rng.integers(0, 60, (50, 70)).astype(np.uint8)
+    plane = slanted(50, 70, 0.5) * (1 + 0.01 * rng.normal(size=(50, 70))).astype(np.float32)
+    before, found = ops.threads(), []
+    try:
+        for count in (1, 3):
+            ops.set_threads(count)
+            found.append(support(grey, plane, 0.01))
+    finally:
+        ops.set_threads(before)
+    assert np.array_equal(*found)
+
+
+def test_arrays_that_do_not_fit_support_are_refused():
+    with pytest.raises(ValueError, match=r"plane has shape \(3, 8, 9\), wanted \(3, 8, 8\)"):
+        support(np.zeros((8, 8), np.uint8), np.zeros((3, 8, 9), np.float32), 0.01)

@@ -7,7 +7,7 @@ from helpers.captures import look_at
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.stereo.confidence import MOST_PIXELS, RIGHT, evidence
-from linprim_geo.stereo.evidence import CONTINUED, REACH, glance, support
+from linprim_geo.stereo.evidence import glance
 
 NORMAL = np.array([0.3, -0.25, 1.0]) / np.linalg.norm([0.3, -0.25, 1.0])
 
@@ -62,19 +62,6 @@ def test_another_depth_is_not_confirmed_and_unknown_ones_are_not_seen():
     assert np.isinf(nothing.miss).all() and not nothing.confirms.any()
 
 
-def test_support_is_whole_on_a_plane_and_lost_beside_a_step():
-    plane, known = plane_of(ONE), np.ones((72, 96), bool)
-    inside = np.s_[REACH:-REACH, REACH:-REACH]
-    assert (support(plane, known)[inside] == 1).all()
-    stepped = plane.copy()
-    stepped[0, :, 48:] *= 1 + 3 * CONTINUED
-    found = support(stepped, known)[REACH:-REACH]
-    # Of the 8 pixels around, 3 lie beyond the step.
-    assert (found[:, 48 - REACH : 48 + REACH] == 5 / 8).all()
-    assert (found[:, REACH : 48 - REACH] == 1).all() and (found[:, 48 + REACH : -REACH] == 1).all()
-    assert not support(plane, ~known).any()
-
-
 def test_evidence_counts_those_in_which_a_point_falls_inside_and_that_see_a_depth():
     plane, known = plane_of(ONE), np.ones((72, 96), bool)
     same, other = (glance(ONE, scale / plane[0], OTHER, plane_of(OTHER)) for scale in (1.0, 1.05))
@@ -85,7 +72,17 @@ def test_evidence_counts_those_in_which_a_point_falls_inside_and_that_see_a_dept
     cost = np.full((72, 96), 0.1, np.float32)
     at = (36, 48)
     assert outside.pixel[at] == -1 and (outside.pixel >= 0).any()
-    found = evidence(plane, cost, known, [same, other, unseen, outside])[at]
+    grey = np.full((72, 96), 100, np.uint8)
+    found = evidence(grey, plane, cost, known, [same, other, unseen, outside])[at]
     pixels = min(np.log2(RIGHT * same.parallax[at]), MOST_PIXELS)
     assert np.allclose(found, [1, 1, 1 / 2, 0.1, pixels, 1], atol=1e-6)
-    assert np.allclose(evidence(plane, cost, known, [unseen])[at][1:3], 0)
+    assert np.allclose(evidence(grey, plane, cost, known, [unseen])[at][1:3], 0)
+
+
+def test_depths_that_are_not_known_support_nothing():
+    plane, known = plane_of(ONE), np.zeros((72, 96), bool)
+    known[:, :48] = True
+    grey = np.full((72, 96), 100, np.uint8)
+    supported = evidence(grey, plane, np.zeros((72, 96), np.float32), known, [])[..., 5]
+    # A window of 21 columns round one that is known, of which one less is, the nearer it is to the middle of the image.
+    assert np.allclose(supported[30], [*np.ones(38), *(np.arange(20, 10, -1) / 21), *np.zeros(48)])

@@ -10,6 +10,7 @@ from PIL import Image
 
 from linprim_geo.capture.types import View
 from linprim_geo.stereo import surface_points as module
+from linprim_geo.stereo.depth_maps import CONFIRMING, DepthMap
 from linprim_geo.stereo.surface_points import SurfaceMap, small_copies, surface_maps, surface_points
 
 CENTERS = [(x, y, 0.0) for y in (-0.35, 0.0) for x in (-0.7, -0.35, 0.0)]
@@ -122,6 +123,7 @@ def test_what_nothing_around_continues_gives_no_points(known, tmp_path, monkeypa
 
     share, on_plate = in_the_air()
     monkeypatch.setattr(module, "LEAST_SUPPORT", 0.0)
+    monkeypatch.setattr(DepthMap, "is_confirmed", lambda self: self.confirming >= CONFIRMING)
     share_of_all, on_plate_of_all = in_the_air()
     assert share_of_all > 0.001 and share < 0.3 * share_of_all and on_plate > 0.6 * on_plate_of_all > 1000
 

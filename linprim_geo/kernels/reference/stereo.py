@@ -1,4 +1,5 @@
-"""The cost of planes in PatchMatch stereo, in float64: what `stereo_ops.patch_match` begins with."""
+"""The cost of planes in PatchMatch stereo, what `stereo_ops.patch_match` begins with, and `stereo_ops.support`, in
+float64."""
 
 from __future__ import annotations
 
@@ -14,6 +15,8 @@ SIDE, NEAR_PIXELS, WORST = 6, 5.0, 2.0
 NEAR_GREYS, FAR_GREY, OWN_SHARE, INFORMED = (10.0, 25.0, 60.0), 2.5, 0.5, 4.0
 # Pixels to both sides between which the derivative of a mapping is taken.
 STEP = np.array([-1e-4, 1e-4])
+# How far the cross of `support` reaches, in pixels, and where it ends, in grey values.
+CROSS_REACH, CROSS_GREY = 10, 25
 
 
 def match_cost(
@@ -80,3 +83,35 @@ def _bilinear(image: np.ndarray, places: np.ndarray) -> np.ndarray:
     a, b = u - x, v - y
     top, bottom = (image[y + k, x] * (1 - a) + image[y + k, x + 1] * a for k in (0, 1))
     return top * (1 - b) + bottom * b
+
+
+def support(grey: np.ndarray, plane: np.ndarray, tolerance: float) -> np.ndarray:
+    """(H, W) share of the pixels that belong to each that go on with its surface, see `stereo_ops.support`."""
+    height, width = grey.shape
+    grey, plane = grey.astype(int), plane.astype(np.float64)
+    share = np.zeros(grey.shape)
+    for row, column in np.argwhere(plane[0] > 0):
+        cross = [(y, x) for y in _alike(grey[:, column], row) for x in _alike(grey[y], column)]
+        y, x = np.array(cross).T
+        inverse, right, down = plane[:, row, column]
+        here = inverse + right * (x - column) + down * (y - row)
+        there, their_right, their_down = plane[:, y, x]
+        back = there - their_right * (x - column) - their_down * (y - row)
+        goes_on = (np.abs(there - here) < tolerance * here) | (np.abs(inverse - back) < tolerance * back)
+        share[row, column] = (goes_on & (there > 0)).mean()
+    return share
+
+
+def _alike(line: np.ndarray, middle: int) -> range:
+    """The places along a line of grey values, around the middle, that belong to it."""
+    ends = []
+    for step in (-1, 1):
+        place = middle
+        while (
+            abs(place + step - middle) <= CROSS_REACH
+            and 0 <= place + step < len(line)
+            and abs(line[place + step] - line[middle]) < CROSS_GREY
+        ):
+            place += step
+        ends.append(place)
+    return range(ends[0], ends[1] + 1)
