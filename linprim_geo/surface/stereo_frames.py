@@ -14,7 +14,7 @@ from linprim_geo.capture.types import View
 from linprim_geo.geometry.mesh import Mesh, face_areas, face_components, select_faces
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.points.initial_points import in_image
-from linprim_geo.stereo.depth_maps import DepthMap, depth_maps
+from linprim_geo.stereo.depth_maps import SURE, DepthMap, depth_maps
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.plain_regions import PlainRegion, common_planes, edges_of, plain_regions, plane_depths
 from linprim_geo.stereo.point_planes import SurfacePoints, planes_of_points, point_plane_depth
@@ -48,10 +48,10 @@ class MergedFrames(Sequence):
         self.rendered, self.limit = rendered, limit
         maps = depth_maps(views, pairing_points(rendered), hiding=(frame.depth for frame in rendered), quiet=quiet)
         self.cameras = [found.camera for found in maps]
-        sure = [found.is_confirmed() for found in maps]
-        self.depths = [_depth_where(found, own) for found, own in zip(maps, sure, strict=True)]
+        confirmed = [found.is_confirmed() for found in maps]
+        self.depths = [_depth_where(found, own) for found, own in zip(maps, confirmed, strict=True)]
         self.doubtful_depths = [
-            _depth_where(found, ~own & (found.confirming > 0)) for found, own in zip(maps, sure, strict=True)
+            _depth_where(found, ~own & (found.confirming > 0)) for found, own in zip(maps, confirmed, strict=True)
         ]
         self.confirmed, self.doubtful = _share_known(self.depths), _share_known(self.doubtful_depths)
         deviations = Deviations()
@@ -64,25 +64,28 @@ class MergedFrames(Sequence):
         self._span_gaps(maps, rendered_depths, backgrounds)
 
     def _take_planes(self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Finds planes by points, by edges and by shading, and what lies on them; moves confirmed depths to them.
+        """Finds planes by points, by edges and by shading, of depths that are sure, and what lies on them; moves
+        confirmed depths to them.
 
         Returns (H, W) bool of every view: regions that are background by their shading.
         """
-        regions = _plain_regions(maps, self.depths)
-        by_points = planes_of_points(maps, self.depths)
+        sure = [_depth_where(found, found.is_confirmed(SURE)) for found in maps]
+        regions = _plain_regions(maps, sure)
+        by_points = planes_of_points(maps, sure)
         by_edges = common_planes(self.cameras, [region for own in regions for region in own])
-        shaded = ShadedPlanes(maps, self.depths, rendered, by_points, by_edges)
+        shaded = ShadedPlanes(maps, sure, rendered, by_points, by_edges)
         self.planes, self.on_planes, backgrounds = shaded.planes, [], []
         # Planes with points all over have them in their plain regions, too.
         for_regions = self.planes[len(by_points) :]
         for view, by_shading in enumerate(shaded.depth_maps()):
             camera, depth = maps[view].camera, self.depths[view]
-            on_plane = point_plane_depth(maps[view], depth, by_points)
-            self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(on_plane), on_plane, depth)
+            on_plane = point_plane_depth(maps[view], sure[view], by_points)
             along_edges = plane_depths(camera, regions[view], for_regions, rendered[view])
             backgrounds.append(shaded.is_background(view))
             along_edges[backgrounds[-1]] = np.nan
             self.on_planes.append(_first_known((on_plane, by_shading, along_edges)))
+            moved = np.where(np.isfinite(sure[view]), on_plane, self.on_planes[view])
+            self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(moved), moved, depth)
         self.flat = _share_known(self.on_planes)
         return backgrounds
 

@@ -15,7 +15,7 @@ from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.types import Scene
 from linprim_geo.geometry.mesh import Mesh, vertex_normals
 from linprim_geo.geometry.mesh_files import load_mesh
-from linprim_geo.stereo.depth_maps import CONFIDENT, DepthMap, depth_maps
+from linprim_geo.stereo.depth_maps import CONFIDENT, SURE, DepthMap, depth_maps
 from linprim_geo.surface import method_tsdf, postprocess, stereo_frames
 from linprim_geo.surface.extract import extract_mesh
 from linprim_geo.surface.stereo_frames import MergedFrames
@@ -29,12 +29,13 @@ CAMERA = look_at((0.0, -3.0, 0.0), size=(40, 30))
 def found(monkeypatch):
     """Stereo that finds depth 3 in the left half, confirmed by two views but for the first two rows, by one in the
     second, with a deviation of 0.001."""
-    depth, confidence, deviation = (np.full((30, 40), value, np.float32) for value in (3.0, CONFIDENT, 0.001))
+    depth, confidence, deviation = (np.full((30, 40), value, np.float32) for value in (3.0, SURE, 0.001))
     confirming = np.full((30, 40), 2, np.uint8)
     confirming[0], confirming[1], confirming[:, 20:] = 0, 1, 0
     normal, grey = np.zeros((30, 40, 3), np.float32), np.zeros((30, 40), np.uint8)
     maps = [DepthMap(CAMERA, depth, normal, confidence, confirming, deviation, grey, 1.0)]
     monkeypatch.setattr(stereo_frames, "depth_maps", lambda *_, **__: maps)
+    return maps
 
 
 def rendered(error: float) -> list[DepthFrame]:
@@ -50,6 +51,14 @@ def test_confirmed_depths_take_the_place_of_rendered_ones(found):
     assert merged.weight == pytest.approx(0.005, rel=1e-4)
     assert (frame.confidence[2:, :20] == 1).all() and np.allclose(frame.confidence[:, 20:], merged.weight)
     assert np.allclose(frame.confidence[1, :20], stereo_frames.DOUBTFUL_WEIGHT)
+
+
+def test_planes_of_walls_stand_where_confirmed_depths_are_not_sure(found, monkeypatch):
+    found[0].confidence[:, 5:] = CONFIDENT
+    monkeypatch.setattr(stereo_frames, "plane_depths", lambda *_: np.full((30, 40), 3.5, np.float32))
+    frame = MergedFrames(rendered(0.01), [None], 5.0)[0]
+    assert (frame.depth[2:, :5] == 3).all() and (frame.depth[2:, 5:20] == 3.5).all()
+    assert (frame.confidence[2:, :20] == 1).all()
 
 
 def test_planes_stand_where_nothing_is_confirmed(found, monkeypatch):
