@@ -19,7 +19,7 @@ from linprim_geo.stereo.depth_maps import FOREGROUND, depth_maps, inverse_planes
 LONGER_SIDE, MOST_VIEWS = 200, 100
 # A point belongs to a surface that at least this share of the pixels on its side of edges go on with (`support`), known
 # ones: beyond edges of surfaces, where windows of stereo hold them, fewer do. At the corner of a face all would.
-LEAST_SUPPORT = 3 / 8
+LEAST_SUPPORT = 1 / 2
 
 
 def small_copies(views: Sequence[View]) -> list[SmallCopy]:
