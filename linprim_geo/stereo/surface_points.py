@@ -17,8 +17,8 @@ from linprim_geo.stereo.depth_maps import FOREGROUND, depth_maps, inverse_planes
 # Photographs are averaged down until their longer side has no more pixels, and no more of them are taken: a training
 # starts with some ten thousand primitives, and a view of this size has 30,000 pixels.
 LONGER_SIDE, MOST_VIEWS = 200, 100
-# A point belongs to a surface that at least this share of the pixels on its side of edges go on with (`support`), known
-# ones: beyond edges of surfaces, where windows of stereo hold them, fewer do. At the corner of a face all would.
+# A point is taken if at least this share of the pixels on its side of the photograph's edges are known and go on with
+# its surface (`support`). Beside a thing, where windows of stereo hold its depth for the wall's behind it, fewer do.
 LEAST_SUPPORT = 1 / 2
 
 
