@@ -1,4 +1,4 @@
-// PatchMatch stereo, and what supports its planes.
+// PatchMatch stereo, what supports its planes, and surfaces fitted to them.
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
@@ -13,6 +13,7 @@
 
 #include "bind/arrays.h"
 #include "bind/parts.h"
+#include "stereo/fit_surfaces.h"
 #include "stereo/patch_match.h"
 #include "stereo/support.h"
 
@@ -57,5 +58,18 @@ void bind_stereo(nb::module_& m) {
     float* result = checked(share, {height, width}, "share");
     nb::gil_scoped_release release;
     linprim::support(grey.data(), planes, int(height), int(width), tolerance, result);
+  });
+
+  m.def("fit_surfaces", [](In<uint8_t> grey, In<float> plane, In<float> cost, float tolerance, Out<float> fitted,
+                           Out<float> fitted_cost) {
+    if (grey.ndim() != 2 || grey.size() == 0) throw std::invalid_argument("grey has to have shape (H, W)");
+    if (!(tolerance > 0 && tolerance < 1)) throw std::invalid_argument("tolerance has to be between 0 and 1");
+    const int64_t height = int64_t(grey.shape(0)), width = int64_t(grey.shape(1));
+    const float* planes = checked(plane, {3, height, width}, "plane");
+    const float* costs = checked(cost, {height, width}, "cost");
+    float* result = checked(fitted, {3, height, width}, "fitted");
+    float* result_cost = checked(fitted_cost, {height, width}, "fitted_cost");
+    nb::gil_scoped_release release;
+    linprim::fit_surfaces(grey.data(), planes, costs, int(height), int(width), tolerance, result, result_cost);
   });
 }

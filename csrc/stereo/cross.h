@@ -10,8 +10,9 @@
 
 namespace linprim {
 
-// A cross reaches so many pixels in each direction, twice as far as a window of PatchMatch holds a surface beyond its
-// edge, and ends where grey values differ from the pixel's by this much, as a window's do.
+// A cross reaches so many pixels in each direction, about twice as far as a window of PatchMatch holds a surface beyond
+// its edge. Up and down it ends where grey values differ from the pixel's by this much, and to the sides where they do
+// from those of the pixel in the middle of the row.
 constexpr int kCrossReach = 10, kCrossGrey = 25;
 
 // Of every pixel of a photograph the pixels alike up and down, and to the left and right of each of these. Source:

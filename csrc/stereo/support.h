@@ -5,9 +5,9 @@
 
 namespace linprim {
 
-// For every pixel the share of the pixels of its cross (stereo/cross.h) that go on with its surface: their inverse depth
-// is what its plane has there, or its own is what theirs has here, up to the share `tolerance` of it. 0 for pixels
-// without a plane.
+// For every pixel the share of the pixels of its cross (stereo/cross.h) that go on with its surface: their inverse
+// depth is what its plane has there, or its own is what theirs has here, up to the share `tolerance` of it. 0 for
+// pixels without a plane.
 //
 // `plane` holds inverse depths, not positive where they are unknown, then their change per column, then per row, each
 // (height, width); `share` has the same shape as one of them.

@@ -9,8 +9,9 @@ from helpers.captures import look_at
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels import ops
 from linprim_geo.kernels.reference.stereo import CROSS_GREY, CROSS_REACH, match_cost
+from linprim_geo.kernels.reference.stereo import fit_surfaces as reference_fit
 from linprim_geo.kernels.reference.stereo import support as reference_support
-from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, patch_match, support
+from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, fit_surfaces, patch_match, support
 
 # A wall through the origin, seen from points around (0, 0, -3).
 NORMAL = np.array([0.35, -0.2, 1.0]) / np.linalg.norm([0.35, -0.2, 1.0])
@@ -222,3 +223,135 @@ def test_support_does_not_depend_on_the_threads():
 def test_arrays_that_do_not_fit_support_are_refused():
     with pytest.raises(ValueError, match=r"plane has shape \(3, 8, 9\), wanted \(3, 8, 8\)"):
         support(np.zeros((8, 8), np.uint8), np.zeros((3, 8, 9), np.float32), 0.01)
+
+
+def fitted(grey: np.ndarray, plane: np.ndarray, cost: np.ndarray | None = None, tolerance: float = 0.01) -> DepthPlanes:
+    """What `fit_surfaces` makes of (3, H, W) planes."""
+    cost = np.full(grey.shape, 0.1, np.float32) if cost is None else cost
+    planes = DepthPlanes(np.moveaxis(plane, 0, 2).copy(), cost.copy(), np.zeros(grey.shape, np.uint8))
+    fit_surfaces(grey, planes, plane[0] > 0, tolerance)
+    return planes
+
+
+def blotched(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A grey image of areas, (3, H, W) planes of two walls with noise, mistakes and gaps, and costs."""
+    rng = np.random.default_rng(5)
+    grey = np.full((height, width), 60, np.uint8)
+    grey[:, width // 2 :] = 120
+    grey[height // 3 : height // 2] += 40
+    plane = slanted(height, width, 0.5)
+    plane[:, :, width // 2 + 3 :] = slanted(height, width, 0.3)[:, :, width // 2 + 3 :]
+    plane[0] *= 1 + 1e-3 * rng.normal(size=grey.shape).astype(np.float32)
+    wrong = rng.random(grey.shape)
+    plane[0] *= np.where(wrong < 0.3, 1.1, 1).astype(np.float32)
+    plane[:, wrong > 0.9] = 0
+    return grey, plane, rng.random(grey.shape).astype(np.float32)
+
+
+def test_fitted_surfaces_agree_with_float64():
+    grey, plane, cost = blotched(30, 34)
+    found, (wanted, wanted_cost) = fitted(grey, plane, cost), reference_fit(grey, plane, cost, 0.01)
+    relative = np.abs(found.plane[..., 0] - wanted[0]) / np.maximum(wanted[0], 0.1)
+    # Rounding turns comparisons over for a few of a cross, and then for what is fitted to them.
+    assert np.quantile(relative, 0.98) < 2e-6 and relative.max() < 2e-3
+    assert np.quantile(np.abs(found.plane[..., 1:] - np.moveaxis(wanted[1:], 0, 2)), 0.98) < 2e-6
+    assert np.quantile(np.abs(found.cost - wanted_cost), 0.98) < 1e-5
+    # Of mistakes and gaps nearly all are gone.
+    assert (np.abs(wanted[0] / plane[0].clip(1e-6) - 1) > 0.05).mean() > 0.25
+
+
+def test_planes_stay_planes():
+    plane = slanted(24, 40, 0.3)
+    found = fitted(np.full((24, 40), 90, np.uint8), plane)
+    assert np.allclose(np.moveaxis(found.plane, 2, 0), plane, rtol=0, atol=1e-6)
+
+
+def test_noise_on_a_curved_surface_gets_less_and_the_curve_stays():
+    rng, (rows, columns) = np.random.default_rng(6), np.indices((60, 60))
+    # A ball of 40 pixels: 0.3 % nearer in the middle of a cross than at its ends.
+    true = 0.5 + 0.5 * (np.sqrt(40**2 - (rows - 30.0) ** 2 * 0.5 - (columns - 30.0) ** 2 * 0.5) - 40) / 400
+    noisy = true * (1 + 2e-3 * rng.normal(size=true.shape))
+    plane = np.stack([noisy, np.zeros_like(true), np.zeros_like(true)]).astype(np.float32)
+    found = fitted(np.full(true.shape, 90, np.uint8), plane)
+    inner = (slice(10, 50),) * 2
+    error = (found.plane[..., 0] / true - 1)[inner]
+    assert np.std(error) < 0.3 * 2e-3 and abs(error.mean()) < 1e-4
+    slopes = np.gradient(true)
+    # The noise of a slope from one difference of two pixels would be 7e-4.
+    assert np.std(found.plane[..., 1] - slopes[1]) < 1e-4 and np.std(found.plane[..., 2] - slopes[0]) < 1e-4
+
+
+def test_beyond_an_edge_of_the_photograph_the_surface_of_that_side_is_taken():
+    height, width, edge, halo = 40, 60, 30, 5
+    grey = np.full((height, width), 60, np.uint8)
+    grey[:, edge:] = 60 + CROSS_GREY
+    plane, wall = slanted(height, width, 0.5), slanted(height, width, 0.3)
+    plane[:, :, edge + halo :] = wall[:, :, edge + halo :]
+    cost = np.where(np.arange(width) < edge + halo, np.float32(0.2), np.float32(0.4)) * np.ones((height, 1), np.float32)
+    found = fitted(grey, plane, cost)
+    beyond, before = found.plane[:, edge:], found.plane[:, :edge]
+    assert np.allclose(beyond, np.moveaxis(wall, 0, 2)[:, edge:], rtol=0, atol=1e-5)
+    assert np.allclose(before, np.moveaxis(plane, 0, 2)[:, :edge], rtol=0, atol=1e-5)
+    assert np.allclose(found.cost[:, edge : edge + halo], 0.4) and np.allclose(found.cost[:, :edge], 0.2)
+
+
+def test_noise_beyond_an_edge_gets_less_though_all_that_is_fitted_lies_to_one_side():
+    rng, (height, width, edge, halo) = np.random.default_rng(8), (40, 60, 30, 5)
+    grey = np.full((height, width), 60, np.uint8)
+    grey[:, edge:] = 60 + CROSS_GREY
+    plane, wall = slanted(height, width, 0.5), slanted(height, width, 0.3)
+    plane[:, :, edge + halo :] = wall[:, :, edge + halo :]
+    plane[0] *= 1 + 2e-3 * rng.normal(size=(height, width)).astype(np.float32)
+    found, beyond = fitted(grey, plane).plane, np.s_[10:30, edge : edge + halo]
+    # A surface of second order would have 0.4 % and slopes that are off by 1e-3 of the inverse depth.
+    assert np.std(found[..., 0][beyond] / wall[0][beyond] - 1) < 1.5e-3
+    assert np.std(found[..., 1][beyond] / 0.3) < 3e-4
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 30), (30, 1), (30, 2), (1, 1)])
+def test_narrow_images_are_fitted_as_in_float64(height, width):
+    rng = np.random.default_rng(9)
+    plane = slanted(height, width, 0.5)
+    plane[0] *= 1 + 1e-3 * rng.normal(size=(height, width)).astype(np.float32)
+    grey, cost = np.full((height, width), 90, np.uint8), np.full((height, width), 0.1, np.float32)
+    found, (wanted, _) = fitted(grey, plane, cost), reference_fit(grey, plane, cost, 0.01)
+    assert np.allclose(np.moveaxis(found.plane, 2, 0), wanted, rtol=0, atol=2e-6)
+
+
+def test_a_thin_thing_that_the_photograph_tells_apart_stays():
+    height, width = 40, 60
+    grey = np.full((height, width), 60, np.uint8)
+    grey[:, 30:33] = 60 + CROSS_GREY
+    plane = slanted(height, width, 0.3)
+    plane[:, :, 30:33] = slanted(height, width, 0.5)[:, :, 30:33]
+    found = fitted(grey, plane)
+    assert np.allclose(found.plane, np.moveaxis(plane, 0, 2), rtol=0, atol=1e-5)
+
+
+def test_without_half_of_a_cross_planes_stay():
+    rng = np.random.default_rng(7)
+    plane = slanted(30, 30, 0.5)
+    plane[0] *= rng.choice(np.array([0.8, 1, 1.2], np.float32), (30, 30))
+    plane[:, 10:20, 10:20] = 0
+    found = fitted(np.full((30, 30), 90, np.uint8), plane)
+    assert np.array_equal(found.plane, np.moveaxis(plane, 0, 2))
+
+
+def test_fitted_surfaces_do_not_depend_on_the_threads():
+    grey, plane, cost = blotched(50, 70)
+    before, found = ops.threads(), []
+    try:
+        for count in (1, 3):
+            ops.set_threads(count)
+            found.append(fitted(grey, plane, cost))
+    finally:
+        ops.set_threads(before)
+    assert np.array_equal(found[0].plane, found[1].plane) and np.array_equal(found[0].cost, found[1].cost)
+
+
+def test_arrays_that_do_not_fit_surfaces_are_refused():
+    planes = DepthPlanes.unknown(8, 9)
+    with pytest.raises(ValueError, match=r"plane has shape \(3, 8, 9\), wanted \(3, 8, 8\)"):
+        fit_surfaces(np.zeros((8, 8), np.uint8), planes, np.ones((8, 9), bool), 0.01)
+    with pytest.raises(ValueError, match="tolerance has to be between 0 and 1"):
+        fit_surfaces(np.zeros((8, 9), np.uint8), planes, np.ones((8, 9), bool), 1.0)

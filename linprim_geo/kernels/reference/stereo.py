@@ -1,5 +1,5 @@
-"""The cost of planes in PatchMatch stereo, what `stereo_ops.patch_match` begins with, and `stereo_ops.support`, in
-float64."""
+"""The cost of planes in PatchMatch stereo, what `stereo_ops.patch_match` begins with, `stereo_ops.support`, and
+`stereo_ops.fit_surfaces`, in float64."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ NEAR_GREYS, FAR_GREY, OWN_SHARE, INFORMED = (10.0, 25.0, 60.0), 2.5, 0.5, 4.0
 STEP = np.array([-1e-4, 1e-4])
 # How far the cross of `support` reaches, in pixels, and where it ends, in grey values.
 CROSS_REACH, CROSS_GREY = 10, 25
+# `fit_surfaces` tries the planes of every so manieth row and column of a cross; it fits to so many pixels at least, in
+# so many rounds; terms are dropped of which others leave less than this share of the sum of squares.
+CANDIDATE_STEP, FEWEST_FITTED, FIT_ROUNDS, TERM_LEFT = 5, 12, 2, 1e-6
 
 
 def match_cost(
@@ -91,8 +94,7 @@ def support(grey: np.ndarray, plane: np.ndarray, tolerance: float) -> np.ndarray
     grey, plane = grey.astype(int), plane.astype(np.float64)
     share = np.zeros(grey.shape)
     for row, column in np.argwhere(plane[0] > 0):
-        cross = [(y, x) for y in _alike(grey[:, column], row) for x in _alike(grey[y], column)]
-        y, x = np.array(cross).T
+        y, x = _cross(grey, row, column)
         inverse, right, down = plane[:, row, column]
         here = inverse + right * (x - column) + down * (y - row)
         there, their_right, their_down = plane[:, y, x]
@@ -100,6 +102,62 @@ def support(grey: np.ndarray, plane: np.ndarray, tolerance: float) -> np.ndarray
         goes_on = (np.abs(there - here) < tolerance * here) | (np.abs(inverse - back) < tolerance * back)
         share[row, column] = (goes_on & (there > 0)).mean()
     return share
+
+
+def fit_surfaces(
+    grey: np.ndarray, plane: np.ndarray, cost: np.ndarray, tolerance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(3, H, W) planes and (H, W) costs that `stereo_ops.fit_surfaces` makes of (3, H, W) ones, whose inverse depth is
+    0 where it is unknown."""
+    grey, plane = grey.astype(int), plane.astype(np.float64)
+    fitted, fitted_cost = plane.copy(), cost.astype(np.float64)
+    for row, column in np.ndindex(grey.shape):
+        y, x = _cross(grey, row, column)
+        inverse, right, down = plane[:, y, x]
+        dy, dx = y - row, x - column
+        terms = np.stack([np.ones(len(x)), dx, dy, dx**2, dx * dy, dy**2], axis=1)
+
+        def on(surface: np.ndarray, inverse=inverse, terms=terms) -> np.ndarray:
+            there = terms @ surface
+            return np.abs(inverse - there) < tolerance * there
+
+        own = np.append(plane[:, row, column], np.zeros(3))
+        start, most = (own, len(x)) if 2 * on(own).sum() > len(x) else (None, len(x) // 2)
+        for k in np.flatnonzero((dx % CANDIDATE_STEP == 0) & (dy % CANDIDATE_STEP == 0) & (inverse > 0)):
+            other = np.array([inverse[k] - right[k] * dx[k] - down[k] * dy[k], right[k], down[k], 0, 0, 0])
+            if other[0] > 0 and on(other).sum() > most:
+                start, most = other, on(other).sum()
+        if start is None:
+            continue
+        if start is not own:
+            fitted_cost[row, column] = cost[y, x][on(start)].mean()
+        surface, enough, count = start, True, 6 if start is own else 3
+        for _ in range(FIT_ROUNDS):
+            near = on(surface)
+            enough &= near.sum() >= FEWEST_FITTED
+            if enough:
+                surface = surface + _least_squares(terms[near, :count], (inverse - terms @ surface)[near])
+        taken = enough and abs(surface[0] - start[0]) < tolerance * start[0]
+        fitted[:, row, column] = (surface if taken else start)[:3]
+    return fitted, fitted_cost
+
+
+def _least_squares(terms: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """(6,) coefficients of (N, T) terms, 0 for those that earlier ones explain."""
+    kept: list[int] = []
+    for k, column in enumerate(terms.T):
+        left = column - terms[:, kept] @ np.linalg.lstsq(terms[:, kept], column, rcond=None)[0] if kept else column
+        if left @ left > TERM_LEFT * (column @ column):
+            kept.append(k)
+    solution = np.zeros(6)
+    solution[kept] = np.linalg.lstsq(terms[:, kept], values, rcond=None)[0]
+    return solution
+
+
+def _cross(grey: np.ndarray, row: int, column: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of the pixels that belong to one."""
+    y, x = np.array([(y, x) for y in _alike(grey[:, column], row) for x in _alike(grey[y], column)]).T
+    return y, x
 
 
 def _alike(line: np.ndarray, middle: int) -> range:

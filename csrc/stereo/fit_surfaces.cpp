@@ -1,0 +1,178 @@
+#include "stereo/fit_surfaces.h"
+
+#include <cmath>
+
+#include "base/parallel.h"
+#include "stereo/cross.h"
+
+namespace linprim {
+namespace {
+
+constexpr int kAcross = 2 * kCrossReach + 1, kPlaneTerms = 3, kTerms = 6;
+// Powers of x and y of the terms of a surface: those of a plane, then those of second order.
+constexpr int kX[kTerms] = {0, 1, 0, 2, 1, 0}, kY[kTerms] = {0, 0, 1, 0, 1, 2};
+// A term is dropped if earlier ones leave less than this share of its sum of squares: in two columns x * x equals x.
+constexpr double kLeft = 1e-6;
+
+// Inverse depth around a pixel, by columns x and rows y from it.
+struct Surface {
+  float c[kTerms];
+};
+
+// The cross of a pixel in an image of inverse depths.
+struct PixelCross {
+  const Crosses& crosses;
+  const float* inverse;
+  int64_t at;
+  int width, up, down;
+
+  // body(y, inverse depths of row y at the pixel's column, how far the row reaches to the left and right)
+  template <class Body>
+  void for_each_row(Body body) const {
+    for (int y = -up; y <= down; ++y) {
+      const int64_t middle = at + int64_t(y) * width;
+      body(y, inverse + middle, crosses.left(middle), crosses.right(middle));
+    }
+  }
+
+  int pixels() const {
+    int all = 0;
+    for_each_row([&](int, const float*, int left, int right) { all += left + right + 1; });
+    return all;
+  }
+
+  int count_on(const Surface& plane, float tolerance) const {
+    int count = 0;
+    for_each_row([&](int y, const float* row, int left, int right) {
+      const float base = plane.c[0] + plane.c[2] * float(y);
+      for (int x = -left; x <= right; ++x) {
+        const float there = base + plane.c[1] * float(x);
+        count += std::abs(row[x] - there) < tolerance * there;
+      }
+    });
+    return count;
+  }
+
+  // The mean of another image over what lies on a plane.
+  float mean_on(const Surface& plane, float tolerance, const float* image) const {
+    double sum = 0;
+    int count = 0;
+    for_each_row([&](int y, const float* row, int left, int right) {
+      for (int x = -left; x <= right; ++x) {
+        const float there = plane.c[0] + plane.c[2] * float(y) + plane.c[1] * float(x);
+        if (std::abs(row[x] - there) < tolerance * there) sum += image[row + x - inverse], ++count;
+      }
+    });
+    return float(sum / std::max(count, 1));
+  }
+};
+
+// Sums over the pixels that lie on a surface, column by column: of powers of y, and of what they differ by times these.
+struct Columns {
+  float ones[5][kAcross] = {}, differences[3][kAcross] = {};
+};
+
+Columns sums(const PixelCross& cross, const Surface& surface, float tolerance) {
+  Columns columns;
+  const float* c = surface.c;
+  cross.for_each_row([&](int row, const float* inverse, int left, int right) {
+    const float y = float(row), first = c[0] + c[2] * y + c[5] * y * y, slope = c[1] + c[4] * y;
+    for (int column = -left; column <= right; ++column) {
+      const float x = float(column), there = first + slope * x + c[3] * x * x, difference = inverse[column] - there;
+      const bool on = std::abs(difference) < tolerance * there;
+      const float one = on ? 1.0f : 0.0f, off = on ? difference : 0.0f;
+      const int k = column + kCrossReach;
+      columns.ones[0][k] += one, columns.ones[1][k] += one * y, columns.ones[2][k] += one * (y * y);
+      columns.ones[3][k] += one * (y * y * y), columns.ones[4][k] += one * (y * y * y * y);
+      columns.differences[0][k] += off, columns.differences[1][k] += off * y,
+          columns.differences[2][k] += off * (y * y);
+    }
+  });
+  return columns;
+}
+
+// Solves n normal equations, s[i][j] for n > j >= i and s[i][n], by elimination.
+void solve(double s[kTerms][kTerms + 1], int n, double* solution) {
+  double least[kTerms];
+  for (int i = 0; i < n; ++i) least[i] = kLeft * s[i][i];
+  for (int i = 0; i < n; ++i) {
+    for (int k = 0; k < i; ++k) {
+      if (!(s[k][k] > 0)) continue;
+      const double factor = s[k][i] / s[k][k];
+      for (int j = i; j <= n; ++j) s[i][j] -= factor * s[k][j];
+    }
+    if (!(s[i][i] > least[i])) s[i][i] = 0;
+  }
+  for (int i = n - 1; i >= 0; --i) {
+    solution[i] = 0;
+    if (!(s[i][i] > 0)) continue;
+    double rest = s[i][n];
+    for (int j = i + 1; j < n; ++j) rest -= s[i][j] * solution[j];
+    solution[i] = rest / s[i][i];
+  }
+}
+
+// Moves the first `terms` of a surface to the least squares of the pixels that lie on it. False if they are too few.
+bool improve(const Columns& columns, int terms, Surface& surface) {
+  double ones[5][5] = {}, differences[3][3] = {};  // by powers of x, then y
+  for (int k = 0; k < kAcross; ++k) {
+    double power = 1;
+    for (int a = 0; a < 5; ++a, power *= k - kCrossReach) {
+      for (int b = 0; a + b < 5; ++b) ones[a][b] += power * columns.ones[b][k];
+      for (int b = 0; a + b < 3; ++b) differences[a][b] += power * columns.differences[b][k];
+    }
+  }
+  if (ones[0][0] < kFewestFitted) return false;
+  double s[kTerms][kTerms + 1], change[kTerms];
+  for (int i = 0; i < terms; ++i) {
+    for (int j = i; j < terms; ++j) s[i][j] = ones[kX[i] + kX[j]][kY[i] + kY[j]];
+    s[i][terms] = differences[kX[i]][kY[i]];
+  }
+  solve(s, terms, change);
+  for (int i = 0; i < terms; ++i) surface.c[i] += float(change[i]);
+  return true;
+}
+
+}  // namespace
+
+void fit_surfaces(const uint8_t* grey, const float* plane, const float* cost, int height, int width, float tolerance,
+                  float* fitted, float* fitted_cost) {
+  const Crosses crosses(grey, height, width);
+  const int64_t pixels = int64_t(height) * width;
+  const float *right_slope = plane + pixels, *down_slope = plane + 2 * pixels;
+  parallel_for(height, [&](int64_t row, int) {
+    for (int column = 0; column < width; ++column) {
+      const int64_t at = row * width + column;
+      const PixelCross cross{crosses, plane, at, width, crosses.up(at), crosses.down(at)};
+      const int half = cross.pixels() / 2;
+      Surface start{{plane[at], right_slope[at], down_slope[at], 0, 0, 0}};
+      const bool own = cross.count_on(start, tolerance) > half;
+      int most = half;
+      if (!own) {
+        cross.for_each_row([&](int y, const float* inverse, int left, int right) {
+          if (y % kCandidateStep) return;
+          for (int x = -(left - left % kCandidateStep); x <= right; x += kCandidateStep) {
+            const int64_t other = inverse + x - plane;
+            const float to_right = right_slope[other], to_bottom = down_slope[other];
+            const Surface tried{{plane[other] - to_right * float(x) - to_bottom * float(y), to_right, to_bottom}};
+            if (!(plane[other] > 0 && tried.c[0] > 0)) continue;
+            const int count = cross.count_on(tried, tolerance);
+            if (count > most) most = count, start = tried;
+          }
+        });
+      }
+      const bool others = most > half;
+      fitted_cost[at] = others ? cross.mean_on(start, tolerance, cost) : cost[at];
+      Surface surface = start;
+      if (own || others) {
+        bool enough = true;
+        for (int round = 0; enough && round < kFitRounds; ++round)
+          enough = improve(sums(cross, surface, tolerance), own ? kTerms : kPlaneTerms, surface);
+        if (!enough || !(std::abs(surface.c[0] - start.c[0]) < tolerance * start.c[0])) surface = start;
+      }
+      for (int k = 0; k < 3; ++k) fitted[at + k * pixels] = surface.c[k];
+    }
+  });
+}
+
+}  // namespace linprim
