@@ -22,7 +22,7 @@ FEWEST_PIXELS, MOST_PIXELS = -4.0, 0.0
 # of noise. Weak textures under noise cost nearly as much when they are right, which other views tell.
 MOST_COST = 0.9
 # The logit of the probability: a constant, and weights of the evidence in the order of `evidence`.
-WEIGHTS = np.array([-2.667, 0.555, 2.214, -1.144, 0.329, 4.14])
+WEIGHTS = np.array([-2.243, 0.554, 2.574, -1.737, 0.335, 3.001])
 
 
 def evidence(

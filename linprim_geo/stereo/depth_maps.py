@@ -1,8 +1,8 @@
 """Depth and normals of every photograph of a capture by PatchMatch stereo.
 
 Each photograph is matched with a few that show the same points under an angle: at half the size from random planes,
-then at full size, then twice more with the depths that its neighbours have found. A depth counts where neighbours see
-the same surface.
+then at full size, then twice more with the depths that its neighbours have found. Then surfaces are fitted to what lies
+around each pixel, within the edges of the photograph. A depth counts where neighbours see the same surface.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from linprim_geo.base.progress import Progress
 from linprim_geo.capture.types import View
 from linprim_geo.geometry.boxes import smaller
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, patch_match
+from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, fit_surfaces, patch_match
 from linprim_geo.points.view_pairs import source_views, visible_pixels
-from linprim_geo.stereo.confidence import MOST_COST, evidence, probability
+from linprim_geo.stereo.confidence import MOST_COST, RIGHT, evidence, probability
 from linprim_geo.stereo.evidence import Glance, glance
 
 # Photographs that one is matched with, at most: as many as the core takes.
@@ -74,6 +74,7 @@ def depth_maps(
     points: np.ndarray,
     *,
     hiding: Iterable[np.ndarray] | None = None,
+    fit: bool = True,
     seed: int = 0,
     quiet: bool = True,
 ) -> list[DepthMap]:
@@ -83,6 +84,7 @@ def depth_maps(
         views: posed photographs.
         points: (P, 3) of the scene, by which views that see the same are found, and the range of depths.
         hiding: (H, W) depths of the views that hide points behind them, 0 where none is known.
+        fit: surfaces are fitted within edges; not to small copies, where 10 pixels span several things.
 
     Raises:
         LinprimError: there are no two views that see the same points; photographs are too small for a window, or all
@@ -126,6 +128,9 @@ def depth_maps(
                 continue
             images, theirs = [full[j] for j in (k, *sources)], [depths[j] for j in sources]
             geometric_planes(images, planes, theirs, ranges[k], noises[k], turn, seed * len(views) + k)
+    for image, planes in zip(full, found, strict=True):
+        if fit and planes is not None:
+            fit_within_edges(image, planes)
     return [
         _depth_map(full[k], noises[k], planes, [(cameras[j], found[j]) for j in pairs[k]])
         for k, planes in enumerate(found)
@@ -171,6 +176,18 @@ def geometric_planes(
         seed=seed,
         source_depths=source_depths,
     )
+
+
+def fit_within_edges(image: StereoImage, planes: DepthPlanes, alpha: np.ndarray | None = None) -> None:
+    """Moves planes in place to surfaces fitted around them, within the edges of the photograph, of the foreground of
+    (H, W) `alpha` alone."""
+    known = known_planes(planes)
+    fit_surfaces(image.grey, planes, known if alpha is None else known & (alpha >= FOREGROUND), RIGHT)
+
+
+def known_planes(planes: DepthPlanes) -> np.ndarray:
+    """(H, W) bool: where photographs agree about them, and they are nearer than infinity."""
+    return (planes.plane[..., 0] > 0) & (planes.cost < MOST_COST)
 
 
 def grey_of(view: View) -> np.ndarray:
@@ -255,7 +272,7 @@ def _depth_map(
         normal, none = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
         return DepthMap(camera, unknown, normal, none, none.astype(np.uint8), infinite, image.grey, noise)
     depth, normal = depth_and_normal(camera, planes.plane)
-    known = (planes.plane[..., 0] > 0) & (planes.cost < MOST_COST)
+    known = known_planes(planes)
     depth = np.where(known, depth, np.nan)
     confirming, deviation = np.zeros(shape, np.uint8), np.full(shape, np.inf, np.float32)
 

@@ -20,6 +20,7 @@ from linprim_geo.stereo.depth_maps import (
     GEOMETRIC_SWEEPS,
     MOST_SOURCES,
     SMALLEST,
+    fit_within_edges,
     geometric_planes,
     grey_of,
     halved,
@@ -126,6 +127,9 @@ class PlanesOnDisk:
         if len(near) > 1:
             theirs = [np.array(each[0]) for each in before[1:]]
             geometric_planes(images, planes, theirs, depths, noise, stage - 1, seed)
+        if stage + 1 == STAGES:
+            view = photographs.views[k]
+            fit_within_edges(images[0], planes, view.load().alpha if view.has_alpha else None)
         return planes
 
     def _write(self, k: int, stage: int, planes: DepthPlanes) -> None:

@@ -56,7 +56,8 @@ def surface_maps(views: Sequence[SmallCopy], points: np.ndarray, seed: int, *, q
         LinprimError: as `depth_maps`.
     """
     maps = []
-    for view, found in zip(views, depth_maps(views, points, seed=seed, quiet=quiet), strict=True):
+    found_maps = depth_maps(views, points, fit=False, seed=seed, quiet=quiet)
+    for view, found in zip(views, found_maps, strict=True):
         photo, camera, known = view.load(), found.camera, found.is_confirmed()
         planes = inverse_planes(camera, found.depth, found.normal @ camera.rotation.T)
         known &= support(found.grey, np.where(known, planes, np.float32(0)), RIGHT) >= LEAST_SUPPORT
