@@ -8,8 +8,8 @@
 namespace linprim {
 namespace {
 
-constexpr int kAcross = 2 * kCrossReach + 1, kPlaneTerms = 3, kTerms = 6;
-// Powers of x and y of the terms of a surface: those of a plane, then those of second order.
+constexpr int kAcross = 2 * kCrossReach + 1, kTerms = 6;
+// Powers of x and y of the terms of a surface of second order.
 constexpr int kX[kTerms] = {0, 1, 0, 2, 1, 0}, kY[kTerms] = {0, 0, 1, 0, 1, 2};
 // A term is dropped if earlier ones leave less than this share of its sum of squares: in two columns x * x equals x.
 constexpr double kLeft = 1e-6;
@@ -91,9 +91,10 @@ Columns sums(const PixelCross& cross, const Surface& surface, float tolerance) {
   return columns;
 }
 
-// Solves n normal equations, s[i][j] for n > j >= i and s[i][n], by elimination.
-void solve(double s[kTerms][kTerms + 1], int n, double* solution) {
-  double least[kTerms];
+// Solves the normal equations, s[i][j] for j >= i and s[i][kTerms], by elimination.
+void solve(double s[kTerms][kTerms + 1], double* solution) {
+  constexpr int n = kTerms;
+  double least[n];
   for (int i = 0; i < n; ++i) least[i] = kLeft * s[i][i];
   for (int i = 0; i < n; ++i) {
     for (int k = 0; k < i; ++k) {
@@ -112,8 +113,8 @@ void solve(double s[kTerms][kTerms + 1], int n, double* solution) {
   }
 }
 
-// Moves the first `terms` of a surface to the least squares of the pixels that lie on it. False if they are too few.
-bool improve(const Columns& columns, int terms, Surface& surface) {
+// Moves a surface to the least squares of the pixels that lie on it. False if they are too few.
+bool improve(const Columns& columns, Surface& surface) {
   double ones[5][5] = {}, differences[3][3] = {};  // by powers of x, then y
   for (int k = 0; k < kAcross; ++k) {
     double power = 1;
@@ -124,12 +125,12 @@ bool improve(const Columns& columns, int terms, Surface& surface) {
   }
   if (ones[0][0] < kFewestFitted) return false;
   double s[kTerms][kTerms + 1], change[kTerms];
-  for (int i = 0; i < terms; ++i) {
-    for (int j = i; j < terms; ++j) s[i][j] = ones[kX[i] + kX[j]][kY[i] + kY[j]];
-    s[i][terms] = differences[kX[i]][kY[i]];
+  for (int i = 0; i < kTerms; ++i) {
+    for (int j = i; j < kTerms; ++j) s[i][j] = ones[kX[i] + kX[j]][kY[i] + kY[j]];
+    s[i][kTerms] = differences[kX[i]][kY[i]];
   }
-  solve(s, terms, change);
-  for (int i = 0; i < terms; ++i) surface.c[i] += float(change[i]);
+  solve(s, change);
+  for (int i = 0; i < kTerms; ++i) surface.c[i] += float(change[i]);
   return true;
 }
 
@@ -167,7 +168,7 @@ void fit_surfaces(const uint8_t* grey, const float* plane, const float* cost, in
       if (own || others) {
         bool enough = true;
         for (int round = 0; enough && round < kFitRounds; ++round)
-          enough = improve(sums(cross, surface, tolerance), own ? kTerms : kPlaneTerms, surface);
+          enough = improve(sums(cross, surface, tolerance), surface);
         if (!enough || !(std::abs(surface.c[0] - start.c[0]) < tolerance * start.c[0])) surface = start;
       }
       for (int k = 0; k < 3; ++k) fitted[at + k * pixels] = surface.c[k];

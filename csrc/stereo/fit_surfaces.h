@@ -15,9 +15,8 @@ constexpr int kFewestFitted = 12, kFitRounds = 2;
 //
 // A pixel starts from its own plane if more than half of its cross lies on that, up to the share `tolerance` of the
 // inverse depth; else from the plane that is tried on which the most of it lies, and more than half. Without such a
-// plane the pixel keeps its own. Then the surface is fitted to what lies on it, in rounds: one of second order around a
-// pixel's own plane, a plane where the pixel starts from another's, as there it may lie beyond all that is fitted. The
-// pixel keeps the plane that it starts from if there are too few to fit, or if the surface would move it by more than
+// plane the pixel keeps its own. Then a surface of second order is fitted to what lies on it, in rounds. The pixel
+// keeps the plane that it starts from if there are too few to fit, or if the surface would move it by more than
 // `tolerance`.
 //
 // `plane` holds inverse depths, not positive where they are unknown, then their change per column, then per row, each

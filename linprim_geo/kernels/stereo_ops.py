@@ -127,11 +127,11 @@ def fit_surfaces(grey: np.ndarray, planes: DepthPlanes, known: np.ndarray, toler
     to the tangent plane there.
 
     A pixel starts from its own plane if more than half of the cross lies on that, up to the share `tolerance`, or else
-    from that of every fifth pixel each way on which the most of it lies, and more than half; without one it keeps
-    its own. What lies on it is fitted in two rounds: a surface of second order to a pixel's own plane, and a plane
-    to another's, as the pixel may lie beyond what is fitted. The pixel keeps the plane that it starts from if there
-    are fewer than 12 pixels to fit, or if it would move by more than `tolerance`. One that starts from another's
-    plane takes the mean `cost` of those on it: it may be one without a match of its own. `chosen` stays as it was.
+    from that of every fifth pixel each way on which the most of it lies, and more than half; without one it keeps its
+    own. A surface of second order is fitted in two rounds to what lies on it. The pixel keeps the plane that it starts
+    from if there are fewer than 12 pixels to fit, or if it would move by more than `tolerance`. One that starts from
+    another's plane takes the mean `cost` of those on it: it may be one without a match of its own. `chosen` stays as it
+    was.
 
     Args:
         grey: (H, W) uint8.

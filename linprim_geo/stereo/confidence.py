@@ -21,8 +21,10 @@ FEWEST_PIXELS, MOST_PIXELS = -4.0, 0.0
 # Windows that cost more may match by chance: less than a tenth of their variance is common, as 1 / 12 is of 36 samples
 # of noise. Weak textures under noise cost nearly as much when they are right, which other views tell.
 MOST_COST = 0.9
-# The logit of the probability: a constant, and weights of the evidence in the order of `evidence`.
+# The logit of the probability: a constant, and weights of the evidence in the order of `evidence`; of depths to which
+# surfaces are fitted (`depth_maps.fit_within_edges`), and of those of matching alone.
 WEIGHTS = np.array([-2.243, 0.554, 2.574, -1.737, 0.335, 3.001])
+MATCHED_WEIGHTS = np.array([-2.667, 0.555, 2.214, -1.144, 0.329, 4.14])
 
 
 def evidence(
@@ -46,6 +48,6 @@ def evidence(
     return np.stack(layers, axis=2).astype(np.float32)
 
 
-def probability(found: np.ndarray) -> np.ndarray:
+def probability(found: np.ndarray, weights: np.ndarray = WEIGHTS) -> np.ndarray:
     """(...,) float32 of (..., 6) `evidence`."""
-    return (1 / (1 + np.exp(-(found @ WEIGHTS)))).astype(np.float32)
+    return (1 / (1 + np.exp(-(found @ weights)))).astype(np.float32)

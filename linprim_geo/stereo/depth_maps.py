@@ -20,7 +20,7 @@ from linprim_geo.geometry.boxes import smaller
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, fit_surfaces, patch_match
 from linprim_geo.points.view_pairs import source_views, visible_pixels
-from linprim_geo.stereo.confidence import MOST_COST, RIGHT, evidence, probability
+from linprim_geo.stereo.confidence import MATCHED_WEIGHTS, MOST_COST, RIGHT, WEIGHTS, evidence, probability
 from linprim_geo.stereo.evidence import Glance, glance
 
 # Photographs that one is matched with, at most: as many as the core takes.
@@ -131,8 +131,9 @@ def depth_maps(
     for image, planes in zip(full, found, strict=True):
         if fit and planes is not None:
             fit_within_edges(image, planes)
+    weights = WEIGHTS if fit else MATCHED_WEIGHTS
     return [
-        _depth_map(full[k], noises[k], planes, [(cameras[j], found[j]) for j in pairs[k]])
+        _depth_map(full[k], noises[k], planes, [(cameras[j], found[j]) for j in pairs[k]], weights)
         for k, planes in enumerate(found)
     ]
 
@@ -264,7 +265,11 @@ def inverse_planes(camera: Camera, depth: np.ndarray, normal: np.ndarray) -> np.
 
 
 def _depth_map(
-    image: StereoImage, noise: float, planes: DepthPlanes | None, others: list[tuple[Camera, DepthPlanes | None]]
+    image: StereoImage,
+    noise: float,
+    planes: DepthPlanes | None,
+    others: list[tuple[Camera, DepthPlanes | None]],
+    weights: np.ndarray,
 ) -> DepthMap:
     camera, shape = image.camera, image.grey.shape
     if planes is None:
@@ -284,7 +289,8 @@ def _depth_map(
                 np.fmin(deviation, np.abs(found.relative), out=deviation)
                 yield found
 
-    confidence = probability(evidence(image.grey, np.moveaxis(planes.plane, 2, 0), planes.cost, known, glances()))
+    found = evidence(image.grey, np.moveaxis(planes.plane, 2, 0), planes.cost, known, glances())
+    confidence = probability(found, weights)
     return DepthMap(
         camera,
         depth.astype(np.float32),

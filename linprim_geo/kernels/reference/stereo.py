@@ -131,25 +131,25 @@ def fit_surfaces(
             continue
         if start is not own:
             fitted_cost[row, column] = cost[y, x][on(start)].mean()
-        surface, enough, count = start, True, 6 if start is own else 3
+        surface, enough = start, True
         for _ in range(FIT_ROUNDS):
             near = on(surface)
             enough &= near.sum() >= FEWEST_FITTED
             if enough:
-                surface = surface + _least_squares(terms[near, :count], (inverse - terms @ surface)[near])
+                surface = surface + _least_squares(terms[near], (inverse - terms @ surface)[near])
         taken = enough and abs(surface[0] - start[0]) < tolerance * start[0]
         fitted[:, row, column] = (surface if taken else start)[:3]
     return fitted, fitted_cost
 
 
 def _least_squares(terms: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """(6,) coefficients of (N, T) terms, 0 for those that earlier ones explain."""
+    """(T,) coefficients of (N, T) terms, 0 for those that earlier ones explain."""
     kept: list[int] = []
     for k, column in enumerate(terms.T):
         left = column - terms[:, kept] @ np.linalg.lstsq(terms[:, kept], column, rcond=None)[0] if kept else column
         if left @ left > TERM_LEFT * (column @ column):
             kept.append(k)
-    solution = np.zeros(6)
+    solution = np.zeros(terms.shape[1])
     solution[kept] = np.linalg.lstsq(terms[:, kept], values, rcond=None)[0]
     return solution
 
