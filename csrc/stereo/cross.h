@@ -19,34 +19,48 @@ constexpr int kCrossReach = 10, kCrossGrey = 25;
 // Zhang, Lu, Lafruit 2009, cross-based local stereo matching.
 class Crosses {
  public:
-  Crosses(const uint8_t* grey, int height, int width) : grey_(grey), height_(height), width_(width) {
-    left_.resize(int64_t(height) * width), right_.resize(left_.size());
+  Crosses(const uint8_t* grey, int height, int width) : width_(width), arms_(int64_t(height) * width) {
     parallel_for(height, [&](int64_t row, int) {
       for (int column = 0; column < width; ++column) {
-        const int64_t at = row * width + column;
-        left_[at] = uint8_t(arm(at, -1, column));
-        right_[at] = uint8_t(arm(at, 1, width - 1 - column));
+        const uint8_t* at = grey + row * width + column;
+        arms_[at - grey] = {arm(at, -1, column), arm(at, 1, width - 1 - column), arm(at, -width, int(row)),
+                            arm(at, width, height - 1 - int(row))};
       }
     });
   }
 
-  // How far the cross of a pixel reaches in its own row and column.
-  int left(int64_t at) const { return left_[at]; }
-  int right(int64_t at) const { return right_[at]; }
-  int up(int64_t at) const { return arm(at, -width_, int(at / width_)); }
-  int down(int64_t at) const { return arm(at, width_, height_ - 1 - int(at / width_)); }
-
- private:
-  int arm(int64_t at, int64_t step, int room) const {
-    const int most = std::min(kCrossReach, room);
-    int length = 0;
-    while (length < most && std::abs(grey_[at + (length + 1) * step] - grey_[at]) < kCrossGrey) ++length;
-    return length;
+  // body(at) for every pixel, on several threads.
+  template <class Body>
+  void for_each_pixel(Body body) const {
+    parallel_for(int64_t(arms_.size()) / width_, [&](int64_t row, int) {
+      for (int64_t at = row * width_; at < (row + 1) * width_; ++at) body(at);
+    });
   }
 
-  const uint8_t* grey_;
-  int height_, width_;
-  std::vector<uint8_t> left_, right_;
+  // body(y, pixel of row y above or below that at `at`, how far the cross reaches to its left and right)
+  template <class Body>
+  void for_each_row(int64_t at, Body body) const {
+    for (int y = -arms_[at].up; y <= arms_[at].down; ++y) {
+      const int64_t middle = at + int64_t(y) * width_;
+      body(y, middle, int(arms_[middle].left), int(arms_[middle].right));
+    }
+  }
+
+ private:
+  struct Arms {
+    uint8_t left, right, up, down;
+  };
+
+  // How many pixels from `at` on, every `step`, are like it.
+  static uint8_t arm(const uint8_t* at, int64_t step, int room) {
+    const int most = std::min(kCrossReach, room);
+    int length = 0;
+    while (length < most && std::abs(at[(length + 1) * step] - *at) < kCrossGrey) ++length;
+    return uint8_t(length);
+  }
+
+  int width_;
+  std::vector<Arms> arms_;
 };
 
 }  // namespace linprim

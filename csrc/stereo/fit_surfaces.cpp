@@ -1,8 +1,8 @@
 #include "stereo/fit_surfaces.h"
 
+#include <algorithm>
 #include <cmath>
 
-#include "base/parallel.h"
 #include "stereo/cross.h"
 
 namespace linprim {
@@ -19,32 +19,28 @@ struct Surface {
   float c[kTerms];
 };
 
-// The cross of a pixel in an image of inverse depths.
+// The cross of the pixel at `at` in an image of inverse depths.
 struct PixelCross {
   const Crosses& crosses;
   const float* inverse;
   int64_t at;
-  int width, up, down;
 
-  // body(y, inverse depths of row y at the pixel's column, how far the row reaches to the left and right)
+  // body(y, pixel of row y above or below, how far the row reaches to the left and right)
   template <class Body>
   void for_each_row(Body body) const {
-    for (int y = -up; y <= down; ++y) {
-      const int64_t middle = at + int64_t(y) * width;
-      body(y, inverse + middle, crosses.left(middle), crosses.right(middle));
-    }
+    crosses.for_each_row(at, body);
   }
 
   int pixels() const {
     int all = 0;
-    for_each_row([&](int, const float*, int left, int right) { all += left + right + 1; });
+    for_each_row([&](int, int64_t, int left, int right) { all += left + right + 1; });
     return all;
   }
 
   int count_on(const Surface& plane, float tolerance) const {
     int count = 0;
-    for_each_row([&](int y, const float* row, int left, int right) {
-      const float base = plane.c[0] + plane.c[2] * float(y);
+    for_each_row([&](int y, int64_t middle, int left, int right) {
+      const float base = plane.c[0] + plane.c[2] * float(y), *row = inverse + middle;
       for (int x = -left; x <= right; ++x) {
         const float there = base + plane.c[1] * float(x);
         count += std::abs(row[x] - there) < tolerance * there;
@@ -57,10 +53,10 @@ struct PixelCross {
   float mean_on(const Surface& plane, float tolerance, const float* image) const {
     double sum = 0;
     int count = 0;
-    for_each_row([&](int y, const float* row, int left, int right) {
+    for_each_row([&](int y, int64_t middle, int left, int right) {
       for (int x = -left; x <= right; ++x) {
         const float there = plane.c[0] + plane.c[2] * float(y) + plane.c[1] * float(x);
-        if (std::abs(row[x] - there) < tolerance * there) sum += image[row + x - inverse], ++count;
+        if (std::abs(inverse[middle + x] - there) < tolerance * there) sum += image[middle + x], ++count;
       }
     });
     return float(sum / std::max(count, 1));
@@ -75,8 +71,9 @@ struct Columns {
 Columns sums(const PixelCross& cross, const Surface& surface, float tolerance) {
   Columns columns;
   const float* c = surface.c;
-  cross.for_each_row([&](int row, const float* inverse, int left, int right) {
+  cross.for_each_row([&](int row, int64_t middle, int left, int right) {
     const float y = float(row), first = c[0] + c[2] * y + c[5] * y * y, slope = c[1] + c[4] * y;
+    const float* inverse = cross.inverse + middle;
     for (int column = -left; column <= right; ++column) {
       const float x = float(column), there = first + slope * x + c[3] * x * x, difference = inverse[column] - there;
       const bool on = std::abs(difference) < tolerance * there;
@@ -141,38 +138,35 @@ void fit_surfaces(const uint8_t* grey, const float* plane, const float* cost, in
   const Crosses crosses(grey, height, width);
   const int64_t pixels = int64_t(height) * width;
   const float *right_slope = plane + pixels, *down_slope = plane + 2 * pixels;
-  parallel_for(height, [&](int64_t row, int) {
-    for (int column = 0; column < width; ++column) {
-      const int64_t at = row * width + column;
-      const PixelCross cross{crosses, plane, at, width, crosses.up(at), crosses.down(at)};
-      const int half = cross.pixels() / 2;
-      Surface start{{plane[at], right_slope[at], down_slope[at], 0, 0, 0}};
-      const bool own = cross.count_on(start, tolerance) > half;
-      int most = half;
-      if (!own) {
-        cross.for_each_row([&](int y, const float* inverse, int left, int right) {
-          if (y % kCandidateStep) return;
-          for (int x = -(left - left % kCandidateStep); x <= right; x += kCandidateStep) {
-            const int64_t other = inverse + x - plane;
-            const float to_right = right_slope[other], to_bottom = down_slope[other];
-            const Surface tried{{plane[other] - to_right * float(x) - to_bottom * float(y), to_right, to_bottom}};
-            if (!(plane[other] > 0 && tried.c[0] > 0)) continue;
-            const int count = cross.count_on(tried, tolerance);
-            if (count > most) most = count, start = tried;
-          }
-        });
-      }
-      const bool others = most > half;
-      fitted_cost[at] = others ? cross.mean_on(start, tolerance, cost) : cost[at];
-      Surface surface = start;
-      if (own || others) {
-        bool enough = true;
-        for (int round = 0; enough && round < kFitRounds; ++round)
-          enough = improve(sums(cross, surface, tolerance), surface);
-        if (!enough || !(std::abs(surface.c[0] - start.c[0]) < tolerance * start.c[0])) surface = start;
-      }
-      for (int k = 0; k < 3; ++k) fitted[at + k * pixels] = surface.c[k];
+  crosses.for_each_pixel([&](int64_t at) {
+    const PixelCross cross{crosses, plane, at};
+    const int half = cross.pixels() / 2;
+    Surface start{{plane[at], right_slope[at], down_slope[at], 0, 0, 0}};
+    const bool own = cross.count_on(start, tolerance) > half;
+    int most = half;
+    if (!own) {
+      cross.for_each_row([&](int y, int64_t middle, int left, int right) {
+        if (y % kCandidateStep) return;
+        for (int x = -(left - left % kCandidateStep); x <= right; x += kCandidateStep) {
+          const int64_t other = middle + x;
+          const float to_right = right_slope[other], to_bottom = down_slope[other];
+          const Surface tried{{plane[other] - to_right * float(x) - to_bottom * float(y), to_right, to_bottom}};
+          if (!(plane[other] > 0 && tried.c[0] > 0)) continue;
+          const int count = cross.count_on(tried, tolerance);
+          if (count > most) most = count, start = tried;
+        }
+      });
     }
+    const bool others = most > half;
+    fitted_cost[at] = others ? cross.mean_on(start, tolerance, cost) : cost[at];
+    Surface surface = start;
+    if (own || others) {
+      bool enough = true;
+      for (int round = 0; enough && round < kFitRounds; ++round)
+        enough = improve(sums(cross, surface, tolerance), surface);
+      if (!enough || !(std::abs(surface.c[0] - start.c[0]) < tolerance * start.c[0])) surface = start;
+    }
+    for (int k = 0; k < 3; ++k) fitted[at + k * pixels] = surface.c[k];
   });
 }
 

@@ -5,8 +5,8 @@
 
 namespace linprim {
 
-// Of a pixel's cross (stereo/cross.h) only the planes of every so manieth row and column, counted from the pixel, are
-// tried.
+// Of a pixel's cross (stereo/cross.h) only the planes in every kCandidateStep-th row and column, counted from the
+// pixel, are tried.
 constexpr int kCandidateStep = 5;
 // Surfaces are fitted to so many pixels at least, twice as many as the most terms that they have, in so many rounds.
 constexpr int kFewestFitted = 12, kFitRounds = 2;

@@ -2,7 +2,6 @@
 
 #include <cmath>
 
-#include "base/parallel.h"
 #include "stereo/cross.h"
 
 namespace linprim {
@@ -11,28 +10,22 @@ void support(const uint8_t* grey, const float* plane, int height, int width, flo
   const Crosses crosses(grey, height, width);
   const int64_t pixels = int64_t(height) * width;
   const float *right_slope = plane + pixels, *down_slope = plane + 2 * pixels;
-  parallel_for(height, [&](int64_t row, int) {
-    for (int column = 0; column < width; ++column) {
-      const int64_t at = row * width + column;
-      share[at] = 0;
-      if (!(plane[at] > 0)) continue;
-      const int up = crosses.up(at), down = crosses.down(at);
-      int all = 0, alike = 0;
-      for (int y = -up; y <= down; ++y) {
-        const int64_t middle = at + int64_t(y) * width;
-        const int left = crosses.left(middle), right = crosses.right(middle);
-        for (int x = -left; x <= right; ++x) {
-          const int64_t other = middle + x;
-          const float here = plane[at] + right_slope[at] * float(x) + down_slope[at] * float(y);
-          const float back = plane[other] - right_slope[other] * float(x) - down_slope[other] * float(y);
-          const bool continues = std::abs(plane[other] - here) < tolerance * here;
-          const bool is_continued = std::abs(plane[at] - back) < tolerance * back;
-          alike += plane[other] > 0 && (continues || is_continued);
-        }
-        all += left + right + 1;
+  crosses.for_each_pixel([&](int64_t at) {
+    share[at] = 0;
+    if (!(plane[at] > 0)) return;
+    int all = 0, alike = 0;
+    crosses.for_each_row(at, [&](int y, int64_t middle, int left, int right) {
+      for (int x = -left; x <= right; ++x) {
+        const int64_t other = middle + x;
+        const float here = plane[at] + right_slope[at] * float(x) + down_slope[at] * float(y);
+        const float back = plane[other] - right_slope[other] * float(x) - down_slope[other] * float(y);
+        const bool continues = std::abs(plane[other] - here) < tolerance * here;
+        const bool is_continued = std::abs(plane[at] - back) < tolerance * back;
+        alike += plane[other] > 0 && (continues || is_continued);
       }
-      share[at] = float(alike) / float(all);
-    }
+      all += left + right + 1;
+    });
+    share[at] = float(alike) / float(all);
   });
 }
 

@@ -182,13 +182,13 @@ def geometric_planes(
 def fit_within_edges(image: StereoImage, planes: DepthPlanes, alpha: np.ndarray | None = None) -> None:
     """Moves planes in place to surfaces fitted around them, within the edges of the photograph, of the foreground of
     (H, W) `alpha` alone."""
-    known = known_planes(planes)
+    known = are_known(planes.plane[..., 0], planes.cost)
     fit_surfaces(image.grey, planes, known if alpha is None else known & (alpha >= FOREGROUND), RIGHT)
 
 
-def known_planes(planes: DepthPlanes) -> np.ndarray:
-    """(H, W) bool: where photographs agree about them, and they are nearer than infinity."""
-    return (planes.plane[..., 0] > 0) & (planes.cost < MOST_COST)
+def are_known(inverse: np.ndarray, cost: np.ndarray) -> np.ndarray:
+    """(H, W) bool: which inverse depths are nearer than infinity, and photographs agree about them."""
+    return (inverse > 0) & (cost < MOST_COST)
 
 
 def grey_of(view: View) -> np.ndarray:
@@ -277,7 +277,7 @@ def _depth_map(
         normal, none = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
         return DepthMap(camera, unknown, normal, none, none.astype(np.uint8), infinite, image.grey, noise)
     depth, normal = depth_and_normal(camera, planes.plane)
-    known = known_planes(planes)
+    known = are_known(planes.plane[..., 0], planes.cost)
     depth = np.where(known, depth, np.nan)
     confirming, deviation = np.zeros(shape, np.uint8), np.full(shape, np.inf, np.float32)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from linprim_geo.stereo.confidence import MOST_COST, evidence, probability
-from linprim_geo.stereo.depth_maps import FOREGROUND, depth_and_normal
+from linprim_geo.stereo.confidence import evidence, probability
+from linprim_geo.stereo.depth_maps import FOREGROUND, are_known, depth_and_normal
 from linprim_geo.stereo.evidence import glance
 from linprim_geo.stereo.planes_on_disk import Photographs, PlanesOnDisk
 from linprim_geo.stereo.workspace import Maps
@@ -16,7 +16,7 @@ def seen_depths(photographs: Photographs, planes: PlanesOnDisk, k: int) -> tuple
     `evidence`."""
     camera, layers = photographs.cameras[k], np.array(planes.read(k))
     depth, normal = depth_and_normal(camera, np.moveaxis(layers[:3], 0, 2))
-    known = np.isfinite(depth) & (layers[3] < MOST_COST)
+    known = are_known(layers[0], layers[3])
     alpha = photographs.views[k].load().alpha if photographs.views[k].has_alpha else None
     if alpha is not None:
         known &= alpha >= FOREGROUND

@@ -17,8 +17,8 @@ NEAR_GREYS, FAR_GREY, OWN_SHARE, INFORMED = (10.0, 25.0, 60.0), 2.5, 0.5, 4.0
 STEP = np.array([-1e-4, 1e-4])
 # How far the cross of `support` reaches, in pixels, and where it ends, in grey values.
 CROSS_REACH, CROSS_GREY = 10, 25
-# `fit_surfaces` tries the planes of every so manieth row and column of a cross; it fits to so many pixels at least, in
-# so many rounds; terms are dropped of which others leave less than this share of the sum of squares.
+# `fit_surfaces` tries the planes in every CANDIDATE_STEP-th row and column of a cross; it fits to FEWEST_FITTED pixels
+# at least, in FIT_ROUNDS; terms are dropped of which earlier ones leave less than TERM_LEFT of the sum of squares.
 CANDIDATE_STEP, FEWEST_FITTED, FIT_ROUNDS, TERM_LEFT = 5, 12, 2, 1e-6
 
 
