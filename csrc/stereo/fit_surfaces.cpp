@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <numeric>
 
 #include "stereo/cross.h"
 
@@ -19,41 +20,49 @@ struct Surface {
   float c[kTerms];
 };
 
+// How many pixels lie on a plane within the tolerance, and within 1/2, 1/4 and 1/8 of it.
+struct Counts {
+  int on[kScales] = {};
+  int sum() const { return std::accumulate(on, on + kScales, 0); }
+};
+
 // The cross of the pixel at `at` in an image of inverse depths.
 struct PixelCross {
   const Crosses& crosses;
   const float* inverse;
   int64_t at;
 
-  // body(y, pixel of row y above or below, how far the row reaches to the left and right)
-  template <class Body>
-  void for_each_row(Body body) const {
-    crosses.for_each_row(at, body);
-  }
-
   int pixels() const {
     int all = 0;
-    for_each_row([&](int, int64_t, int left, int right) { all += left + right + 1; });
+    crosses.for_each_row(at, [&](int, int64_t, int left, int right) { all += left + right + 1; });
     return all;
   }
 
-  int count_on(const Surface& plane, float tolerance) const {
-    int count = 0;
-    for_each_row([&](int y, int64_t middle, int left, int right) {
+  // How many of the `all` pixels lie on a plane, within the tolerance and 1/2, 1/4 and 1/8 of it. Not counted to the
+  // end where they cannot be more than `most` in all.
+  Counts count_on(const Surface& plane, float tolerance, int all, int most) const {
+    Counts counts;
+    int uncounted = all;
+    crosses.for_each_row(at, [&](int y, int64_t middle, int left, int right) {
+      if (counts.sum() + kScales * uncounted <= most) return;
+      uncounted -= left + right + 1;
       const float base = plane.c[0] + plane.c[2] * float(y), *row = inverse + middle;
+      int on[kScales] = {};
       for (int x = -left; x <= right; ++x) {
-        const float there = base + plane.c[1] * float(x);
-        count += std::abs(row[x] - there) < tolerance * there;
+        const float there = base + plane.c[1] * float(x), off = std::abs(row[x] - there), most_off = tolerance * there;
+        on[0] += off < most_off, on[1] += off < 0.5f * most_off;
+        on[2] += off < 0.25f * most_off, on[3] += off < 0.125f * most_off;
       }
+      for (int k = 0; k < kScales; ++k) counts.on[k] += on[k];
     });
-    return count;
+    return counts;
   }
 
   // The mean of another image over what lies on a plane.
   float mean_on(const Surface& plane, float tolerance, const float* image) const {
     double sum = 0;
     int count = 0;
-    for_each_row([&](int y, int64_t middle, int left, int right) {
+    crosses.for_each_row(at, [&](int y, int64_t middle, int left, int right) {
       for (int x = -left; x <= right; ++x) {
         const float there = plane.c[0] + plane.c[2] * float(y) + plane.c[1] * float(x);
         if (std::abs(inverse[middle + x] - there) < tolerance * there) sum += image[middle + x], ++count;
@@ -63,28 +72,31 @@ struct PixelCross {
   }
 };
 
-// Sums over the pixels that lie on a surface, column by column: of powers of y, and of what they differ by times these.
+// Sums over the pixels around one that lie on a surface, column by column: of powers of y, and of what they differ by
+// times these.
 struct Columns {
   float ones[5][kAcross] = {}, differences[3][kAcross] = {};
 };
 
-Columns sums(const PixelCross& cross, const Surface& surface, float tolerance) {
+Columns sums(const float* inverse, int height, int width, int64_t at, const Surface& surface, float tolerance) {
   Columns columns;
   const float* c = surface.c;
-  cross.for_each_row([&](int row, int64_t middle, int left, int right) {
-    const float y = float(row), first = c[0] + c[2] * y + c[5] * y * y, slope = c[1] + c[4] * y;
-    const float* inverse = cross.inverse + middle;
-    for (int column = -left; column <= right; ++column) {
-      const float x = float(column), there = first + slope * x + c[3] * x * x, difference = inverse[column] - there;
+  const int row = int(at / width), column = int(at % width);
+  const int left = std::min(kCrossReach, column), right = std::min(kCrossReach, width - 1 - column);
+  for (int dy = -std::min(kCrossReach, row); dy <= std::min(kCrossReach, height - 1 - row); ++dy) {
+    const float y = float(dy), first = c[0] + c[2] * y + c[5] * y * y, slope = c[1] + c[4] * y;
+    const float* middle = inverse + at + int64_t(dy) * width;
+    for (int dx = -left; dx <= right; ++dx) {
+      const float x = float(dx), there = first + slope * x + c[3] * x * x, difference = middle[dx] - there;
       const bool on = std::abs(difference) < tolerance * there;
       const float one = on ? 1.0f : 0.0f, off = on ? difference : 0.0f;
-      const int k = column + kCrossReach;
+      const int k = dx + kCrossReach;
       columns.ones[0][k] += one, columns.ones[1][k] += one * y, columns.ones[2][k] += one * (y * y);
       columns.ones[3][k] += one * (y * y * y), columns.ones[4][k] += one * (y * y * y * y);
       columns.differences[0][k] += off, columns.differences[1][k] += off * y,
           columns.differences[2][k] += off * (y * y);
     }
-  });
+  }
   return columns;
 }
 
@@ -140,30 +152,32 @@ void fit_surfaces(const uint8_t* grey, const float* plane, const float* cost, in
   const float *right_slope = plane + pixels, *down_slope = plane + 2 * pixels;
   crosses.for_each_pixel([&](int64_t at) {
     const PixelCross cross{crosses, plane, at};
-    const int half = cross.pixels() / 2;
+    const int all = cross.pixels(), half = all / 2;
     Surface start{{plane[at], right_slope[at], down_slope[at], 0, 0, 0}};
-    const bool own = cross.count_on(start, tolerance) > half;
-    int most = half;
-    if (!own) {
-      cross.for_each_row([&](int y, int64_t middle, int left, int right) {
-        if (y % kCandidateStep) return;
-        for (int x = -(left - left % kCandidateStep); x <= right; x += kCandidateStep) {
-          const int64_t other = middle + x;
-          const float to_right = right_slope[other], to_bottom = down_slope[other];
-          const Surface tried{{plane[other] - to_right * float(x) - to_bottom * float(y), to_right, to_bottom}};
-          if (!(plane[other] > 0 && tried.c[0] > 0)) continue;
-          const int count = cross.count_on(tried, tolerance);
-          if (count > most) most = count, start = tried;
-        }
-      });
-    }
-    const bool others = most > half;
-    fitted_cost[at] = others ? cross.mean_on(start, tolerance, cost) : cost[at];
+    Counts best = cross.count_on(start, tolerance, all, 0);
+    bool found = best.on[0] > half, own = true;
+    int most = found ? best.sum() : 0;
+    crosses.for_each_row(at, [&](int y, int64_t middle, int left, int right) {
+      if (y % kCandidateStep) return;
+      for (int x = -(left - left % kCandidateStep); x <= right; x += kCandidateStep) {
+        const int64_t other = middle + x;
+        const float to_right = right_slope[other], to_bottom = down_slope[other];
+        const Surface tried{{plane[other] - to_right * float(x) - to_bottom * float(y), to_right, to_bottom}};
+        if (!(plane[other] > 0 && tried.c[0] > 0)) continue;
+        const Counts counts = cross.count_on(tried, tolerance, all, most);
+        if (counts.on[0] <= half || counts.sum() <= most) continue;
+        found = true, start = tried, best = counts, most = counts.sum();
+        own = std::abs(plane[at] - start.c[0]) < tolerance * start.c[0];
+      }
+    });
+    fitted_cost[at] = own ? cost[at] : cross.mean_on(start, tolerance, cost);
     Surface surface = start;
-    if (own || others) {
+    if (found) {
+      float narrow = tolerance;
+      for (int k = 1; k < kScales && best.on[k] > half; ++k) narrow *= 0.5f;
       bool enough = true;
       for (int round = 0; enough && round < kFitRounds; ++round)
-        enough = improve(sums(cross, surface, tolerance), surface);
+        enough = improve(sums(plane, height, width, at, surface, narrow), surface);
       if (!enough || !(std::abs(surface.c[0] - start.c[0]) < tolerance * start.c[0])) surface = start;
     }
     for (int k = 0; k < 3; ++k) fitted[at + k * pixels] = surface.c[k];

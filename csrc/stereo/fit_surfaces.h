@@ -6,22 +6,23 @@
 namespace linprim {
 
 // Of a pixel's cross (stereo/cross.h) only the planes in every kCandidateStep-th row and column, counted from the
-// pixel, are tried.
-constexpr int kCandidateStep = 5;
+// pixel, are tried. They are judged by so many tolerances, each half of the one before.
+constexpr int kCandidateStep = 5, kScales = 4;
 // Surfaces are fitted to so many pixels at least, twice as many as the most terms that they have, in so many rounds.
 constexpr int kFewestFitted = 12, kFitRounds = 2;
 
-// Fits a surface of inverse depth to the cross of every pixel, and takes its tangent plane at the pixel.
+// Fits a surface of inverse depth around every pixel, and takes its tangent plane at the pixel.
 //
-// A pixel starts from its own plane if more than half of its cross lies on that, up to the share `tolerance` of the
-// inverse depth; else from the plane that is tried on which the most of it lies, and more than half. Without such a
-// plane the pixel keeps its own. Then a surface of second order is fitted to what lies on it, in rounds. The pixel
-// keeps the plane that it starts from if there are too few to fit, or if the surface would move it by more than
-// `tolerance`.
+// A pixel starts from its own plane or one that is tried: that on which the most of its cross lies, in the sum over the
+// tolerances, of those on which more than half lies within `tolerance`, a share of the inverse depth. Without such a
+// plane the pixel keeps its own. Then a surface of second order is fitted, in rounds, to what lies on it of the square
+// around the pixel, as wide as crosses are, within the narrowest of the tolerances that more than half of the cross
+// keeps. The pixel keeps the plane that it starts from if there are too few to fit, or if the surface would move it by
+// more than `tolerance`.
 //
 // `plane` holds inverse depths, not positive where they are unknown, then their change per column, then per row, each
-// (height, width), as does `fitted`. In `fitted_cost` pixels that start from another's plane have the mean `cost` of
-// those on that plane, others their own. `tolerance` is between 0 and 1.
+// (height, width), as does `fitted`. In `fitted_cost` pixels that start from a plane beyond `tolerance` from their own
+// have the mean `cost` of those of their cross on that plane, others their own. `tolerance` is between 0 and 1.
 void fit_surfaces(const uint8_t* grey, const float* plane, const float* cost, int height, int width, float tolerance,
                   float* fitted, float* fitted_cost);
 

@@ -123,15 +123,16 @@ def support(grey: np.ndarray, plane: np.ndarray, tolerance: float) -> np.ndarray
 
 
 def fit_surfaces(grey: np.ndarray, planes: DepthPlanes, known: np.ndarray, tolerance: float) -> None:
-    """Fits a surface of inverse depth to the cross (see `support`) of every pixel, and moves the pixel's plane in place
-    to the tangent plane there.
+    """Fits a surface of inverse depth around every pixel, and moves the pixel's plane in place to the tangent plane
+    there.
 
-    A pixel starts from its own plane if more than half of the cross lies on that, up to the share `tolerance`, or else
-    from that of every fifth pixel each way on which the most of it lies, and more than half; without one it keeps its
-    own. A surface of second order is fitted in two rounds to what lies on it. The pixel keeps the plane that it starts
-    from if there are fewer than 12 pixels to fit, or if it would move by more than `tolerance`. One that starts from
-    another's plane takes the mean `cost` of those on it: it may be one without a match of its own. `chosen` stays as it
-    was.
+    A pixel starts from its own plane or that of every fifth pixel each way of its cross (see `support`): the one on
+    which the most of the cross lies, in the sum over what lies there within `tolerance`, 1/2, 1/4 and 1/8 of it. More
+    than half has to lie there within `tolerance`; without such a plane the pixel keeps its own. A surface of second
+    order is fitted in two rounds to what lies on it in the 21x21 pixels around, within the narrowest of the tolerances
+    that more than half of the cross keeps. The pixel keeps the plane that it starts from if there are fewer than 12
+    pixels to fit, or if it would move by more than `tolerance`. One that starts from a plane farther than that from its
+    own takes the mean `cost` of those on it: it may be one without a match of its own. `chosen` stays as it was.
 
     Args:
         grey: (H, W) uint8.
@@ -142,7 +143,8 @@ def fit_surfaces(grey: np.ndarray, planes: DepthPlanes, known: np.ndarray, toler
         ValueError: shapes that do not fit, or such a tolerance.
 
     Accuracy: that of float32. Sources: Mei and others 2011, "On building an accurate stereo matching system on graphics
-    hardware", for votes of a region; Cleveland 1979 for local regression.
+    hardware", for votes of a region; Barath and others 2019, MAGSAC, for sums over tolerances; Cleveland 1979 for local
+    regression.
     """
     plane = np.ascontiguousarray(np.where(known, np.moveaxis(planes.plane, 2, 0), np.float32(0)))
     fitted, cost = np.empty(plane.shape, np.float32), np.empty(planes.cost.shape, np.float32)

@@ -23,7 +23,7 @@ FEWEST_PIXELS, MOST_PIXELS = -4.0, 0.0
 MOST_COST = 0.9
 # The logit of the probability: a constant, and weights of the evidence in the order of `evidence`; of depths to which
 # surfaces are fitted (`depth_maps.fit_within_edges`), and of those of matching alone.
-WEIGHTS = np.array([-2.243, 0.554, 2.574, -1.737, 0.335, 3.001])
+WEIGHTS = np.array([-2.202, 0.532, 2.648, -1.741, 0.331, 2.928])
 MATCHED_WEIGHTS = np.array([-2.667, 0.555, 2.214, -1.144, 0.329, 4.14])
 
 

@@ -84,7 +84,7 @@ def depth_maps(
         views: posed photographs.
         points: (P, 3) of the scene, by which views that see the same are found, and the range of depths.
         hiding: (H, W) depths of the views that hide points behind them, 0 where none is known.
-        fit: surfaces are fitted within edges; not to small copies, where 10 pixels span several things.
+        fit: surfaces are fitted within edges. Trainings hold to small copies without: DECISIONS 71.
 
     Raises:
         LinprimError: there are no two views that see the same points; photographs are too small for a window, or all

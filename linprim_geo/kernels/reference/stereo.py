@@ -17,9 +17,10 @@ NEAR_GREYS, FAR_GREY, OWN_SHARE, INFORMED = (10.0, 25.0, 60.0), 2.5, 0.5, 4.0
 STEP = np.array([-1e-4, 1e-4])
 # How far the cross of `support` reaches, in pixels, and where it ends, in grey values.
 CROSS_REACH, CROSS_GREY = 10, 25
-# `fit_surfaces` tries the planes in every CANDIDATE_STEP-th row and column of a cross; it fits to FEWEST_FITTED pixels
-# at least, in FIT_ROUNDS; terms are dropped of which earlier ones leave less than TERM_LEFT of the sum of squares.
-CANDIDATE_STEP, FEWEST_FITTED, FIT_ROUNDS, TERM_LEFT = 5, 12, 2, 1e-6
+# `fit_surfaces` tries the planes in every CANDIDATE_STEP-th row and column of a cross, by SCALES tolerances, each half
+# of the one before; it fits to FEWEST_FITTED pixels at least, in FIT_ROUNDS; terms are dropped of which earlier ones
+# leave less than TERM_LEFT of the sum of squares.
+CANDIDATE_STEP, SCALES, FEWEST_FITTED, FIT_ROUNDS, TERM_LEFT = 5, 4, 12, 2, 1e-6
 
 
 def match_cost(
@@ -111,32 +112,39 @@ def fit_surfaces(
     0 where it is unknown."""
     grey, plane = grey.astype(int), plane.astype(np.float64)
     fitted, fitted_cost = plane.copy(), cost.astype(np.float64)
+    tolerances = tolerance / 2.0 ** np.arange(SCALES)
     for row, column in np.ndindex(grey.shape):
         y, x = _cross(grey, row, column)
         inverse, right, down = plane[:, y, x]
         dy, dx = y - row, x - column
-        terms = np.stack([np.ones(len(x)), dx, dy, dx**2, dx * dy, dy**2], axis=1)
-
-        def on(surface: np.ndarray, inverse=inverse, terms=terms) -> np.ndarray:
-            there = terms @ surface
-            return np.abs(inverse - there) < tolerance * there
-
-        own = np.append(plane[:, row, column], np.zeros(3))
-        start, most = (own, len(x)) if 2 * on(own).sum() > len(x) else (None, len(x) // 2)
-        for k in np.flatnonzero((dx % CANDIDATE_STEP == 0) & (dy % CANDIDATE_STEP == 0) & (inverse > 0)):
-            other = np.array([inverse[k] - right[k] * dx[k] - down[k] * dy[k], right[k], down[k], 0, 0, 0])
-            if other[0] > 0 and on(other).sum() > most:
-                start, most = other, on(other).sum()
+        own, start, most = plane[:, row, column], None, 0
+        tried = np.flatnonzero((dx % CANDIDATE_STEP == 0) & (dy % CANDIDATE_STEP == 0) & (inverse > 0))
+        others = np.stack([inverse - right * dx - down * dy, right, down], axis=1)[tried]
+        for candidate in [own, *others[others[:, 0] > 0]]:
+            there = candidate[0] + candidate[1] * dx + candidate[2] * dy
+            counts = (np.abs(inverse - there) < tolerances[:, None] * there).sum(1)
+            if counts[0] > len(x) // 2 and counts.sum() > most:
+                start, most = candidate, counts.sum()
+                narrowest = tolerances[(counts > len(x) // 2).sum() - 1]
         if start is None:
             continue
-        if start is not own:
-            fitted_cost[row, column] = cost[y, x][on(start)].mean()
-        surface, enough = start, True
+        if abs(own[0] - start[0]) >= tolerance * start[0]:
+            there = start[0] + start[1] * dx + start[2] * dy
+            fitted_cost[row, column] = cost[y, x][np.abs(inverse - there) < tolerance * there].mean()
+        y, x = (
+            np.arange(max(middle - CROSS_REACH, 0), min(middle + CROSS_REACH + 1, end))
+            for middle, end in zip((row, column), grey.shape, strict=True)
+        )
+        y, x = np.meshgrid(y, x, indexing="ij")
+        inverse, dy, dx = plane[0, y, x].ravel(), y.ravel() - row, x.ravel() - column
+        terms = np.stack([np.ones(len(dx)), dx, dy, dx**2, dx * dy, dy**2], axis=1)
+        surface, enough = np.append(start, np.zeros(3)), True
         for _ in range(FIT_ROUNDS):
-            near = on(surface)
+            there = terms @ surface
+            near = np.abs(inverse - there) < narrowest * there
             enough &= near.sum() >= FEWEST_FITTED
             if enough:
-                surface = surface + _least_squares(terms[near], (inverse - terms @ surface)[near])
+                surface = surface + _least_squares(terms[near], (inverse - there)[near])
         taken = enough and abs(surface[0] - start[0]) < tolerance * start[0]
         fitted[:, row, column] = (surface if taken else start)[:3]
     return fitted, fitted_cost
