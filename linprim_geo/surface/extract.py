@@ -66,9 +66,9 @@ def extract_mesh(
     sibling *_visible, in the format of the suffix (.ply, .obj, .glb, .stl). Vertices have normals, colours and, as
     `quality`, the predicted error (`photo_consistency.predicted_error`); everything is in the data set's frame and
     unit. The photographs move the vertices to where they agree best (`photo_consistency.refine_surface`), noise
-    is smoothed away (`denoise.denoised`), then holes are closed, the surface smoothed, remeshed and simplified as the
-    options ask (`mesh_process`); with `texture` .obj and .glb have a texture out of the photographs in place of vertex
-    colours.
+    is smoothed away (`denoise.denoised`, after stereo `fairing.faired`), then holes are closed, the surface smoothed,
+    remeshed and simplified as the options ask (`mesh_process`); with `texture` .obj and .glb have a texture out of the
+    photographs in place of vertex colours.
 
     With `held_out` the held-out views take part in all of it. With `box` only the faces in it are kept; --method tsdf
     fuses nothing else.

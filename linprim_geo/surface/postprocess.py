@@ -15,6 +15,7 @@ from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.denoise import denoised
 from linprim_geo.surface.depth_error import error_of_nearest
+from linprim_geo.surface.fairing import faired
 from linprim_geo.surface.photo_consistency import photo_gains, predicted_error, refine_surface
 from linprim_geo.surface.texture import make_texture
 from linprim_geo.surface.texture_files import save_textured
@@ -50,17 +51,20 @@ def with_rounds(options: ExtractOptions, about: dict) -> ExtractOptions:
 def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, stages: Stages) -> Finished:
     """Finishes a surface as the options ask, and writes it to `target` and `visible_file(target)`.
 
-    A `quality` that it has is kept, else vertices get that of photographs (`predicted_error`)."""
+    By a `quality` that it has, noise is smoothed away, and it is kept; else by that of photographs
+    (`predicted_error`)."""
     given = mesh
     views = run.scene().train
     cameras = [view.camera for view in views]
     caster = RayCaster(mesh.vertices, mesh.faces)
-    gains = photo_gains(mesh, cameras, (view.load() for view in views), caster)
+    gains = None
+    if options.refine or mesh.quality is None:
+        gains = photo_gains(mesh, cameras, (view.load() for view in views), caster)
     if options.refine:
         mesh = refine_surface(mesh, views, int(options.refine), gains, caster)
         stages.lap("refine")
     if options.denoise == "on":
-        mesh = denoised(mesh, views, gains)
+        mesh = denoised(mesh, views, gains) if mesh.quality is None else faired(mesh)
         stages.lap("denoise")
     mesh, processing = process_mesh(mesh, options, stages.note)
     if processing:

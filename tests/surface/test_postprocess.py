@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from helpers.captures import look_at
 from helpers.surfaces import sphere
 
@@ -14,10 +16,10 @@ from linprim_geo.capture.types import Photo
 from linprim_geo.surface.postprocess import finish_surface
 
 
-def test_colours_are_not_of_pixels_that_masks_leave_out(tmp_path):
-    """A ball before a red background that masks leave out: not even its outline is red."""
-    ball, views = sphere(rounds=3), []
-    for angle in np.linspace(0, 2 * np.pi, 8, endpoint=False):
+def ring_of(ball, count: int = 8) -> list:
+    """Views around a ball, green before a red background that masks leave out."""
+    views = []
+    for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
         camera = look_at((4 * np.cos(angle), 4 * np.sin(angle), 0.5), size=(64, 64))
         x, y = (np.stack(np.meshgrid(np.arange(64) + 0.5, np.arange(64) + 0.5)) - 32) / camera.fx
         # Where rays meet a ball a little smaller than the mesh.
@@ -26,7 +28,33 @@ def test_colours_are_not_of_pixels_that_masks_leave_out(tmp_path):
         rgb = np.where(alpha[..., None] > 0, [0, 200, 0], [255, 0, 0]).astype(np.uint8)
         photo = Photo(rgb, alpha)
         views.append(SimpleNamespace(camera=camera, load=lambda photo=photo: photo))
+    return views
+
+
+def finished(mesh, views, folder, **options):
     run = SimpleNamespace(scene=lambda: SimpleNamespace(train=views))
-    options = ExtractOptions(refine=0, denoise="off", stereo="off")
-    done = finish_surface(ball, run, options, tmp_path / "mesh.ply", Stages(Progress("extract", 1, quiet=True)))
-    assert (done.mesh.colors[:, 1] > 150).all() and (done.mesh.colors[:, 0] < 50).all()
+    options = ExtractOptions(refine=0, stereo="off", **options)
+    return finish_surface(mesh, run, options, folder / "mesh.ply", Stages(Progress("extract", 1, quiet=True))).mesh
+
+
+def test_colours_are_not_of_pixels_that_masks_leave_out(tmp_path):
+    """A ball before a red background that masks leave out: not even its outline is red."""
+    ball = sphere(rounds=3)
+    colors = finished(ball, ring_of(ball), tmp_path, denoise="off").colors
+    assert (colors[:, 1] > 150).all() and (colors[:, 0] < 50).all()
+
+
+@pytest.mark.parametrize("denoise", ["on", "off"])
+def test_a_surface_that_knows_its_error_is_smooth_within_it(denoise, tmp_path):
+    ball, rng = sphere(rounds=4), np.random.default_rng(0)
+    error = np.where(ball.vertices[:, 2] > 0, 0.02, 1e-4).astype(np.float32)
+    rough = ball.vertices * (1 + error * rng.uniform(-1, 1, len(error)))[:, None]
+    done = finished(replace(ball, vertices=rough, quality=error), ring_of(ball), tmp_path, denoise=denoise)
+    off, off_before = (np.abs(np.linalg.norm(v, axis=1) - 1) for v in (done.vertices, rough))
+    assert (np.linalg.norm(done.vertices - rough, axis=1) <= 1.001 * error).all()
+    inside = ball.vertices[:, 2] > 0.2
+    if denoise == "on":
+        assert off[inside].mean() < 0.5 * off_before[inside].mean()
+        assert set(np.unique(done.quality)) <= set(np.unique(error))
+    else:
+        assert np.allclose(done.vertices, rough, atol=1e-6) and np.array_equal(done.quality, error)

@@ -1,0 +1,66 @@
+"""Faces that edges go through, against all pairs in exact numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from helpers.surfaces import grid, join, sphere
+
+from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.geometry.self_intersections import crossings
+
+
+def by_all_pairs(mesh: Mesh) -> list[int]:
+    """Each face against each edge, in fractions."""
+    corners = [[Fraction(float(x)) for x in vertex] for vertex in mesh.vertices]
+
+    def volume(*rows: int) -> Fraction:
+        a, b, c, d = (corners[row] for row in rows)
+        p, q, r = ([x - y for x, y in zip(end, a, strict=True)] for end in (b, c, d))
+        cross = [p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]]
+        return sum((x * y for x, y in zip(cross, r, strict=True)), Fraction(0))
+
+    faces = mesh.faces.tolist()
+    edges = {tuple(sorted((face[k], face[k - 1]))) for face in faces for k in range(3)}
+    found = set()
+    for number, (a, b, c) in enumerate(faces):
+        for p, q in edges:
+            if {p, q} & {a, b, c} or volume(a, b, c, p) * volume(a, b, c, q) >= 0:
+                continue
+            around = [volume(p, q, a, b), volume(p, q, b, c), volume(p, q, c, a)]
+            if min(around) > 0 or max(around) < 0:
+                found.add(number)
+    return sorted(found)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e5])
+def test_a_soup_of_triangles_as_by_all_pairs(scale):
+    vertices = scale * np.random.default_rng(3).normal(size=(60, 3))
+    mesh = Mesh(vertices, np.arange(60).reshape(-1, 3))
+    expected = by_all_pairs(mesh)
+    assert 5 < len(expected) < 20 and np.unique(crossings(mesh)[0]).tolist() == expected
+
+
+def test_two_spheres_that_overlap_as_by_all_pairs():
+    mesh = join(sphere(rounds=2), sphere(rounds=2, center=(0.9, 0.31, 0.17)))
+    expected = by_all_pairs(mesh)
+    assert len(expected) > 10 and np.unique(crossings(mesh)[0]).tolist() == expected
+
+
+def test_a_fold_over_itself_is_found_though_neighbours_share_its_vertices():
+    mesh = grid(6, 6, size=(1.0, 1.0))
+    middle = np.flatnonzero(np.abs(mesh.vertices[:, :2] - 0.5).max(1) < 0.01)[0]
+    folded = mesh.vertices.copy()
+    folded[middle] += [0.4, 0.05, 0.01]
+    folded[:, 2] += 0.05 * np.sin(9 * folded[:, 0])
+    mesh = replace(mesh, vertices=folded)
+    expected = by_all_pairs(mesh)
+    assert expected and np.unique(crossings(mesh)[0]).tolist() == expected
+
+
+@pytest.mark.parametrize("mesh", [sphere(rounds=4), grid(30, 20), join(grid(), grid(height=1e-3))])
+def test_a_surface_that_is_simple_has_none(mesh):
+    assert len(crossings(mesh)[0]) == 0
