@@ -21,6 +21,7 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import check
 from linprim_geo.eval import open_run, write_results
 from linprim_geo.eval.options import ScoreOptions, check_score_options
+from linprim_geo.eval.shape import ShapeComparison, triangle_scores
 from linprim_geo.eval.surface_samples import Comparison, SurfaceDistance, reduce_scores, sample_surface, with_percent
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh, clean_mesh, face_normals
@@ -32,6 +33,8 @@ DEFAULT_TAU_SHARE = 0.01  # of the reference's diagonal
 # How far in front of a sample, in diagonals of its mesh, a ray may meet another face and the sample still
 # counts as seen: sixteen times the single-precision error of Embree in a centred scene.
 OCCLUSION_TOLERANCE = 1e-5
+# Samples are on creases in this part of their number.
+CREASE_PART = 10
 HAUSDORFF_WARNING = "largest sampled distance: a lower bound of the Hausdorff distance, and one stray face decides it"
 
 
@@ -54,7 +57,8 @@ def score_mesh(
     other mesh, averaged over the two directions; `normal_consistency_signed` keeps the sign (-1: inside out)
     and is None unless both meshes are consistently oriented. `accuracy_q50`, `_q90`, `_q95` and the same of
     completeness are quantiles. `hausdorff` is the largest distance met. Nothing is aligned, scaled or
-    cropped.
+    cropped. `shape` says how the prediction looks beside the reference (`ShapeComparison.scores`), `triangles` what its
+    faces are like (`triangle_scores`).
 
     With `cameras`, `visible` holds the same scores over the samples that a camera sees: inside its image, in
     front of it, and not hidden by the sample's own mesh. Only the samples are culled; distances are still
@@ -111,17 +115,26 @@ def _score_headline(
     results["culling"] = culling if cameras is None else f"{culling}; under visible, what the cameras see"
     results |= reduce_scores(forward, backward, tau, oriented=oriented)
     results["hausdorff_warning"] = HAUSDORFF_WARNING
+    shape = ShapeComparison.of(prediction, reference, forward, backward, tau, samples // CREASE_PART, seed)
+    on_creases = [np.ones(len(points), bool) if box is None else inside(points, box) for points, _ in shape.creases]
+    results["shape"] = shape.scores((forward.keep, backward.keep), on_creases, diagonal)
+    results["triangles"] = triangle_scores(prediction)
     if cameras is not None:
         from linprim_geo.eval.culling import compare_along_rays
 
-        keep_prediction, recast = _seen(prediction, forward, cameras)
-        keep_reference, recast_too = _seen(reference, backward, cameras)
-        keep_prediction, keep_reference = keep_prediction & forward.keep, keep_reference & backward.keep
+        seen = _Seen(prediction, cameras), _Seen(reference, cameras)
+        keep_prediction, keep_reference = (
+            side.keep & by.shows(side.points, side.face) for side, by in zip((forward, backward), seen, strict=True)
+        )
+        on_creases = [
+            on & by.shows(points) for on, by, (points, _) in zip(on_creases, seen, shape.creases, strict=True)
+        ]
         visible = {"kept_prediction": float(keep_prediction.mean())}
         visible |= {"kept_reference": float(keep_reference.mean()), "cameras": len(cameras)}
-        visible["recast_rays"] = recast + recast_too
+        visible["recast_rays"] = sum(by.caster.recast for by in seen)
         sides = replace(forward, keep=keep_prediction), replace(backward, keep=keep_reference)
         visible |= reduce_scores(*sides, tau, oriented=oriented)
+        visible["shape"] = shape.scores((keep_prediction, keep_reference), on_creases, diagonal)
         results["visible"] = with_percent(visible, diagonal)
         if box is None:  # a ray comes from outside of it
             rays = compare_along_rays(prediction, reference, cameras, rays=samples, tau=tau, seed=seed)
@@ -267,14 +280,20 @@ def _compare(mesh: Mesh, other: SurfaceDistance, samples: int, seed) -> Comparis
     return Comparison(distance, np.ones(samples, bool), cosine, points, face, stratified=True)
 
 
-def _seen(mesh: Mesh, side: Comparison, cameras: Sequence[Camera]) -> tuple[np.ndarray, int]:
-    """(samples,) bool: some camera sees the sample; and how many rays were re-cast."""
-    from linprim_geo.eval.culling import count_views
-    from linprim_geo.geometry.raycast import RayCaster
+class _Seen:
+    """What cameras see of a mesh."""
 
-    caster = RayCaster(mesh.vertices, mesh.faces)
-    slack = OCCLUSION_TOLERANCE * mesh.diagonal
-    return count_views(caster, side.points, cameras, slack, faces=side.face) > 0, caster.recast
+    def __init__(self, mesh: Mesh, cameras: Sequence[Camera]):
+        from linprim_geo.geometry.raycast import RayCaster
+
+        self.cameras, self.slack = cameras, OCCLUSION_TOLERANCE * mesh.diagonal
+        self.caster = RayCaster(mesh.vertices, mesh.faces)
+
+    def shows(self, points: np.ndarray, faces: np.ndarray | None = None) -> np.ndarray:
+        """(P,) bool: whether some camera sees each of (P, 3) points of the mesh, on its (P,) faces."""
+        from linprim_geo.eval.culling import count_views
+
+        return count_views(self.caster, points, self.cameras, self.slack, faces=faces) > 0
 
 
 def _is_oriented(mesh: Mesh) -> bool:

@@ -230,7 +230,7 @@ def reduce_scores(
 
 def with_percent(results: dict, diagonal: float) -> dict:
     """Adds `*_percent_diagonal` beside every length among `results`."""
-    lengths = ["accuracy", "completeness", "chamfer", "hausdorff", "tau", "standard_error"]
+    lengths = ["accuracy", "completeness", "chamfer", "hausdorff", "tau", "standard_error", "rms"]
     for name in ("accuracy", "completeness", "distance"):
         lengths += [f"{name}_q{q}" for q in QUANTILES]
     lengths += ["distance_mean", "distance_signed_mean"]

@@ -33,7 +33,8 @@ SECTIONS = (
     ("cost", "Time and memory"),
     ("repeat", "Versions, and how to repeat it"),
 )
-# Scores of a mesh: key, title, unit; lengths as a percentage of the reference's diagonal.
+# Scores of a mesh: key, with a space before each that is looked up in what it gives, title, unit; lengths as a
+# percentage of the reference's diagonal.
 MESH_SCORES = (
     ("chamfer_percent_diagonal", "Chamfer", "% diag."),
     ("accuracy_percent_diagonal", "accuracy", "% diag."),
@@ -42,6 +43,10 @@ MESH_SCORES = (
     ("recall", "recall", ""),
     ("f1", "F1", ""),
     ("normal_consistency", "normals", "|cos|"),
+    ("shape normals median", "angle, median", "degrees"),
+    ("shape normals_off_creases mean", "off creases, mean", "degrees"),
+    ("shape creases recall", "creases found", ""),
+    ("shape flatness rms_percent_diagonal", "flatness", "% diag."),
 )
 # Of the held-out views, with the digits to show; the first two are always there.
 IMAGE_SCORES = (
@@ -272,7 +277,7 @@ def _scores(report: Report) -> tuple[list[tuple[str, Table]], list[str]]:
         for scores in mesh.scores:
             for part, values in (("whole", scores), ("seen by cameras", scores.get("visible"))):
                 if values:
-                    found = [_short(values.get(key)) for key, _, _ in MESH_SCORES]
+                    found = [_short(_looked_up(values, key)) for key, _, _ in MESH_SCORES]
                     rows.append((mesh.method, str(scores.get("protocol")), part, *found))
             sources.append(
                 f"{scores.get('protocol')} of {mesh.method} against {scores.get('reference')}: "
@@ -283,6 +288,13 @@ def _scores(report: Report) -> tuple[list[tuple[str, Table]], list[str]]:
         head = ("mesh", "protocol", "part", *(_with_unit(title, unit) for _, title, unit in MESH_SCORES))
         tables.append(("Meshes", Table(head, rows, "", "figures")))
     return tables, sources if rows else []
+
+
+def _looked_up(values: dict, key: str):
+    """The value of a key of `MESH_SCORES`, None where scores do not have it, as older ones."""
+    for name in key.split(" "):
+        values = values.get(name) if isinstance(values, dict) else None
+    return values
 
 
 def _stops() -> str:
