@@ -11,17 +11,26 @@ HITS = 8
 """Faces that are looked at along an edge."""
 
 
-def crossings(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+def edges_of(faces: np.ndarray) -> np.ndarray:
+    """(E, 2) int64 vertices of the edges of (F, 3) faces, each once, the lower number first, in order."""
+    start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel().astype(np.int64)
+    count = int(faces.max(initial=0)) + 1
+    edges = np.sort(np.minimum(start, end) * count + np.maximum(start, end))
+    return np.stack(np.divmod(edges[np.diff(edges, prepend=-1) > 0], count), axis=1)
+
+
+def crossings(mesh: Mesh, edges: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Faces that an edge crosses with which they share no vertex: (N,) numbers of faces and (N, 2) ends of edges.
 
     Rays along the edges find them in single precision, float64 decides. Faces that only touch or lie in one plane do
     not count. Missed may be what comes after HITS other faces along an edge, and crossings within a thousandth of an
     edge of its ends, or a millionth of the diagonal. Faces without area are crossed by nothing.
+
+    Args:
+        edges: (E, 2) of `edges_of` that are looked along; None for all.
     """
     vertices, faces = mesh.vertices.astype(np.float64), mesh.faces
-    start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel()
-    edges = np.sort(np.minimum(start, end) * len(vertices) + np.maximum(start, end))
-    ends = np.stack(np.divmod(edges[np.diff(edges, prepend=-1) > 0], len(vertices)), axis=1)
+    ends = edges_of(faces) if edges is None else edges
     caster = RayCaster(vertices, faces)
     along = vertices[ends[:, 1]] - vertices[ends[:, 0]]
     # Past the faces around the vertex that the edge starts from, by what single precision tells apart.

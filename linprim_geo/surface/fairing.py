@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from linprim_geo.geometry.mesh import Mesh, face_normals, vertex_normals
-from linprim_geo.geometry.self_intersections import crossings
+from linprim_geo.geometry.mesh import Mesh, vertex_normals
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -27,18 +26,13 @@ that of a radius of curvature of five edges."""
 ROUNDS, PRECISION = 300, 1e-3
 """Of conjugate gradients: most rounds, and what they leave of the right side."""
 
-GIVING_BACK = 8
-"""Rounds in which vertices give moves back that do harm."""
-
 
 def faired(mesh: Mesh) -> Mesh:
     """The mesh with vertices of the least energy, each at most its `quality` from where it was, and normals anew.
 
     A vertex on a border has its two neighbours along the border, and moves along its normal alone, so that holes do not
-    grow. Vertices go back part of their way where a face would turn over, and all of it where an edge would pierce a
-    face: none does afterwards, in GIVING_BACK rounds, unless one did before. Edges are weighed alike, as suits a
-    surface of voxels; those of slivers pull too hard. Memory: some 500 bytes per vertex. The same to the last bit for
-    any number of threads.
+    grow. Edges are weighed alike, as suits a surface of voxels; those of slivers pull too hard. Memory: some 500 bytes
+    per vertex. The same to the last bit for any number of threads.
 
     Args:
         mesh: with a positive `quality`, the predicted error in the mesh's unit.
@@ -51,7 +45,7 @@ def faired(mesh: Mesh) -> Mesh:
     normals = vertex_normals(replace(mesh, vertices=vertices + moves))[border].astype(np.float64)
     moves[border] = (moves[border] * normals).sum(1, keepdims=True) * normals
     moves *= np.minimum(1, error / np.maximum(np.linalg.norm(moves, axis=1), 1e-300))[:, None]
-    mesh = replace(mesh, vertices=vertices + _share_without_harm(mesh, vertices, moves)[:, None] * moves)
+    mesh = replace(mesh, vertices=vertices + moves)
     return replace(mesh, normals=vertex_normals(mesh))
 
 
@@ -76,30 +70,6 @@ def _least(mesh: Mesh, vertices: np.ndarray, error: np.ndarray) -> tuple[np.ndar
     wanted = -(bending_back @ (bending @ vertices)).ravel()
     solve = LinearOperator(shape, pull), LinearOperator(shape, scaled)
     return cg(solve[0], wanted, rtol=PRECISION, maxiter=ROUNDS, M=solve[1])[0].reshape(-1, 3), border
-
-
-def _share_without_harm(mesh: Mesh, vertices: np.ndarray, moves: np.ndarray) -> np.ndarray:
-    """(V,) share of its move that each vertex can take."""
-    share, faces, before = np.ones(len(vertices)), mesh.faces, face_normals(replace(mesh, vertices=vertices))
-
-    def moved() -> Mesh:
-        return replace(mesh, vertices=vertices + share[:, None] * moves)
-
-    for _ in range(GIVING_BACK):
-        turned = np.einsum("ij,ij->i", before, face_normals(moved())) < 0
-        if not turned.any():
-            break
-        share[faces[turned]] *= 0.5
-    for _ in range(GIVING_BACK):
-        pierced, edges = crossings(moved())
-        at = np.union1d(faces[pierced], edges)
-        if not share[at].any():
-            break
-        touched = np.zeros(len(vertices), bool)
-        touched[at] = True
-        share[faces[touched[faces].any(1)]] *= 0.5
-        share[at] = 0
-    return share
 
 
 def _off_the_mean(mesh: Mesh) -> tuple[csr_matrix, np.ndarray]:

@@ -17,6 +17,7 @@ from linprim_geo.surface.denoise import denoised
 from linprim_geo.surface.depth_error import error_of_nearest
 from linprim_geo.surface.fairing import faired
 from linprim_geo.surface.photo_consistency import photo_gains, predicted_error, refine_surface
+from linprim_geo.surface.safe_moves import moved_safely
 from linprim_geo.surface.texture import make_texture
 from linprim_geo.surface.texture_files import save_textured
 from linprim_geo.surface.visibility import color_vertices, pixels_of, visible_faces
@@ -64,7 +65,7 @@ def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, 
         mesh = refine_surface(mesh, views, int(options.refine), gains, caster)
         stages.lap("refine")
     if options.denoise == "on":
-        mesh = denoised(mesh, views, gains) if mesh.quality is None else faired(mesh)
+        mesh = denoised(mesh, views, gains) if mesh.quality is None else moved_safely(mesh, faired(mesh).vertices)
         stages.lap("denoise")
     mesh, processing = process_mesh(mesh, options, stages.note)
     if processing:

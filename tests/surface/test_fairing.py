@@ -8,9 +8,7 @@ import numpy as np
 from helpers.textured_plane import sheet
 
 from linprim_geo.geometry.mesh import Mesh, select_faces
-from linprim_geo.geometry.self_intersections import crossings
 from linprim_geo.kernels import ops
-from linprim_geo.surface import fairing
 from linprim_geo.surface.fairing import BEND, faired
 
 
@@ -80,22 +78,6 @@ def test_a_hole_does_not_grow():
     found = faired(replace(mesh, quality=np.full(len(mesh.vertices), 0.1))).vertices
     border = np.linalg.norm(mesh.vertices, axis=1) < 0.2
     assert border.sum() > 20 and np.abs(found[border] - mesh.vertices[border]).max() < 1e-9
-
-
-def test_two_sheets_within_each_others_error_stay_apart(monkeypatch):
-    rng, lower = np.random.default_rng(5), sheet(lambda x, y: 0 * x)
-    # Neighbouring vertices are bent to opposite sides, so that the smooth sheets would lie in one another.
-    heights = rng.uniform(0, 0.02, len(lower.vertices))
-    lower = replace(lower, vertices=lower.vertices + np.outer(heights, [0, 0, 1]))
-    gap = np.where(rng.random(len(heights)) < 0.5, 0.001, 0.02) - 0.01
-    upper = lower.vertices + np.outer(np.maximum(gap + 0.01, 0.001), [0, 0, 1])
-    count = len(heights)
-    mesh = Mesh(np.concatenate([lower.vertices, upper]), np.concatenate([lower.faces, lower.faces + count]))
-    mesh = replace(mesh, quality=rng.choice([1e-4, 0.05], 2 * count))
-    assert len(crossings(mesh)[0]) == 0
-    assert len(crossings(faired(mesh))[0]) == 0
-    monkeypatch.setattr(fairing, "_share_without_harm", lambda mesh, vertices, moves: np.ones(len(vertices)))
-    assert len(crossings(faired(mesh))[0]) > 10
 
 
 def test_pieces_and_corners_where_borders_meet_are_no_trouble():
