@@ -2,7 +2,8 @@
 
 Photographs tell where a vertex is up to its predicted error; what the surface does within it is noise, and wrinkles in
 the shading. Normals of faces are averaged within flat parts, vertices follow them by no more than their predicted
-error, and stay where they were where photographs agree less afterwards: on thin and strongly curved parts.
+error, and then bend as little as that allows (`fairing`). They stay where they were where photographs agree less
+afterwards: on thin and strongly curved parts.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 from linprim_geo.capture.types import View
 from linprim_geo.geometry.mesh import Mesh, vertex_normals
 from linprim_geo.kernels import surface_ops
+from linprim_geo.surface.fairing import faired
 from linprim_geo.surface.photo_consistency import neighbour_average, predicted_error
 
 # Length of the difference of two unit normals: faces with 41 degrees or more between them are on two sides of an edge,
@@ -44,7 +46,7 @@ def denoised(mesh: Mesh, views: Sequence[View], gains: np.ndarray | None = None)
     error = error_of(mesh)
     if not np.isfinite(error).any():
         return replace(mesh, quality=error)
-    smooth = replace(mesh, vertices=filtered(mesh, error))
+    smooth = faired(replace(mesh, vertices=filtered(mesh, error), quality=error))
     error_then = error_of(smooth)
     average = neighbour_average(mesh)
     means, means_then = error, error_then
