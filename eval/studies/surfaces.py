@@ -2,8 +2,13 @@
 linprim_geo.eval.studies.surfaces -o runs/surfaces`.
 
 Each scene is photographed, trained once with octahedra and once with Gaussians (the baseline), and each training meshed
-by every method that it allows; `--data` adds captures, scored against their `--references`. `surfaces.json` and
-`surfaces.md` hold per mesh, of what the cameras see unless it says whole:
+by every method that it allows; `--data` adds captures, scored against their `--references`. `--stereo auto off` does
+everything a second time without stereo: training starts at the capture's points alone, nothing holds it to stereo's
+surfaces, and depth maps are the rendered ones. `surfaces.json` and `surfaces.md` hold per mesh, of what the cameras see
+unless it says whole:
+
+    PSNR of held-out photographs; share of the pixels with a depth image at which the mesh is within 1 % of it, from the
+    poses of the run;
 
     Chamfer distance in % of the reference's diagonal (point to surface, both ways), the median distance of the mesh
     from the reference, and the Chamfer distance of the whole mesh; F1 at 1 %; normal consistency; faces, boundary
@@ -20,7 +25,9 @@ import argparse
 import json
 import sys
 import time
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -28,16 +35,27 @@ import numpy as np
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import write_json
 from linprim_geo.base.options import ExtractOptions, SceneOptions, TrainOptions
+from linprim_geo.capture.types import View
 from linprim_geo.eval.study_tables import write_table
+from linprim_geo.geometry.mesh import Mesh
 
 BUILT_IN = ("cad", "smooth", "room", "wires")
 METHODS = {"octahedron": ("tsdf", "polyhedra", "opacity-field"), "gaussian": ("tsdf",)}
+# Stereo in training and extraction, and neither.
+STEREO = ("auto", "off")
+# A capture without a mesh to compare with.
+NO_REFERENCE = Path("none")
+# A depth of the mesh is right if it is off by no more, as a share of the depth image's.
+RIGHT_DEPTH = 0.01
 # Points per surface: the standard error of a Chamfer distance is about 0.3 % of it.
 SAMPLES = 100_000
 COLUMNS = {
     "scene": "scene",
     "primitive": "primitives",
     "method": "method",
+    "stereo": "stereo",
+    "psnr": "held-out dB",
+    "depth_right": "depth within 1 %",
     "chamfer": "Chamfer %",
     "median": "median %",
     "chamfer_whole": "whole %",
@@ -61,7 +79,57 @@ COLUMNS = {
 
 
 def score(run: Path, reference: Path, method: str, options: ExtractOptions, target: Path) -> dict:
-    """Extracts one mesh to `target` and returns its row."""
+    """Extracts one mesh to `target` and returns its row; `reference` may be NO_REFERENCE."""
+    from linprim_geo.surface.extract import extract_mesh
+
+    began = time.process_time()
+    stats = extract_mesh(run, method, target, options, quiet=True)
+    cpu_seconds = time.process_time() - began
+    return {
+        "method": method,
+        "level": stats["level"],
+        **_photographs(run, Path(stats["mesh_visible"])),
+        **({} if reference == NO_REFERENCE else _distances(run, reference, target, Path(stats["mesh_visible"]))),
+        "faces": stats["faces"],
+        "boundary_edges": stats["boundary_edges"],
+        "manifold": stats["manifold_status"],
+        "seconds": stats["seconds"]["total"],
+        "gib": max(stats["peak_gib"].values()),
+        "train_cpu_seconds": json.loads((run / "seconds.json").read_text())["cpu_seconds"],
+        "cpu_seconds": cpu_seconds,
+    }
+
+
+def _photographs(run: Path, visible: Path) -> dict:
+    """What held-out photographs and the depth images of a capture say of a run and its mesh."""
+    from linprim_geo.eval.images import eval_images_run
+    from linprim_geo.geometry.mesh_files import load_mesh
+    from linprim_geo.runs.run import Run
+
+    scene = Run.open(run).scene()
+    return {
+        "psnr": eval_images_run(run)["psnr"] if scene.test else None,
+        "depth_right": depth_right(load_mesh(visible), scene.train),
+    }
+
+
+def depth_right(mesh: Mesh, views: Sequence[View]) -> float | None:
+    """Share of the pixels with a depth image at which a mesh is within RIGHT_DEPTH of it, None without such images."""
+    from linprim_geo.geometry.raycast import RayCaster
+
+    caster, right, known = RayCaster(mesh.vertices, mesh.faces), 0, 0
+    for view in views:
+        if view.depth_path is None:
+            continue
+        truth = np.asarray(view.load_depth(), np.float64)
+        valid = np.isfinite(truth) & (truth > 0)
+        off = np.abs(caster.render_depth(view.camera)[0][valid] / truth[valid] - 1)
+        right, known = right + np.count_nonzero(off <= RIGHT_DEPTH), known + len(off)
+    return right / known if known else None
+
+
+def _distances(run: Path, reference: Path, target: Path, visible: Path) -> dict:
+    """Scores of a mesh, and of its part that cameras see, against the reference."""
     from scipy.stats import spearmanr
 
     from linprim_geo.eval.mesh import score_mesh
@@ -69,20 +137,14 @@ def score(run: Path, reference: Path, method: str, options: ExtractOptions, targ
     from linprim_geo.geometry.mesh import clean_mesh
     from linprim_geo.geometry.mesh_files import load_mesh
     from linprim_geo.runs.run import Run
-    from linprim_geo.surface.extract import extract_mesh
 
-    began = time.process_time()
-    stats = extract_mesh(run, method, target, options, quiet=True)
-    cpu_seconds = time.process_time() - began
     cameras = [view.camera for view in Run.open(run).scene().train]
     truth = load_mesh(reference)
     whole = score_mesh(load_mesh(target), truth, samples=SAMPLES, cameras=cameras)
-    seen, shown = whole["visible"], load_mesh(stats["mesh_visible"])
+    seen, shown = whole["visible"], load_mesh(visible)
     error, _ = SurfaceDistance(clean_mesh(truth)[0]).query(shown.vertices)
     told = np.isfinite(shown.quality)
     return {
-        "method": method,
-        "level": stats["level"],
         "chamfer": seen["chamfer_percent_diagonal"],
         "median": seen["accuracy_q50_percent_diagonal"],
         "chamfer_whole": whole["chamfer_percent_diagonal"],
@@ -93,15 +155,8 @@ def score(run: Path, reference: Path, method: str, options: ExtractOptions, targ
         "crease_recall": seen["shape"]["creases"]["recall"],
         "flatness": seen["shape"]["flatness"]["rms_percent_diagonal"],
         "self_intersecting": whole["triangles"]["self_intersecting"],
-        "faces": stats["faces"],
-        "boundary_edges": stats["boundary_edges"],
-        "manifold": stats["manifold_status"],
         "quality_correlation": float(spearmanr(shown.quality[told], error[told])[0]),
         "quality_ratio": float(error[told].mean() / shown.quality[told].mean()),
-        "seconds": stats["seconds"]["total"],
-        "gib": max(stats["peak_gib"].values()),
-        "train_cpu_seconds": json.loads((run / "seconds.json").read_text())["cpu_seconds"],
-        "cpu_seconds": cpu_seconds,
     }
 
 
@@ -134,11 +189,19 @@ def main(arguments: list[str] | None = None) -> int:
         "--data", nargs="*", type=Path, default=[], metavar="CAPTURE", help="folders of further captures"
     )
     parser.add_argument(
-        "--references", nargs="*", type=Path, default=[], metavar="MESH", help="their surfaces, in the same order"
+        "--references",
+        nargs="*",
+        type=Path,
+        default=[],
+        metavar="MESH",
+        help="their surfaces, in the same order; none for one without",
     )
     parser.add_argument("--primitives", nargs="+", choices=list(METHODS), default=list(METHODS), help="default: all")
     parser.add_argument(
         "--methods", nargs="+", choices=METHODS["octahedron"], default=METHODS["octahedron"], help="default: all"
+    )
+    parser.add_argument(
+        "--stereo", nargs="+", choices=STEREO, default=["auto"], help="with it, without (default: with)"
     )
     parser.add_argument(
         "--refine",
@@ -181,7 +244,7 @@ def run(given: argparse.Namespace) -> None:
         jobs.append((capture.name, capture, reference, SceneOptions(downscale=given.downscale)))
     rows, options = [], None
     for name, capture, reference, scene_options in jobs:
-        for primitive in given.primitives:
+        for primitive, stereo in product(given.primitives, given.stereo):
             options = TrainOptions(
                 primitive=primitive,
                 iterations=given.iterations,
@@ -190,17 +253,21 @@ def run(given: argparse.Namespace) -> None:
                 seed=given.seed,
                 evaluate_every=0,
             )
-            trained = given.output / f"{name}_{primitive}"
+            label = f"{name}_{primitive}"
+            if stereo == "off":
+                options, label = replace(options, start="points", stereo_depth=0), f"{label}_without_stereo"
+            trained = given.output / label
             if not (trained / "seconds.json").exists():
                 resumed, began = trained.exists(), time.process_time()
                 train(capture, trained, scene_options, options, resume=resumed, quiet=True)
                 write_json(trained / "seconds.json", {"cpu_seconds": None if resumed else time.process_time() - began})
             for method in [m for m in METHODS[primitive] if m in given.methods]:
-                target = given.output / "meshes" / f"{name}_{primitive}_{method}_{given.refine}.ply"
+                target = given.output / "meshes" / f"{label}_{method}_{given.refine}.ply"
                 saved = target.with_suffix(".json")
                 if not saved.exists():
-                    write_json(saved, score(trained, reference, method, ExtractOptions(refine=given.refine), target))
-                rows.append({"scene": name, "primitive": primitive, **json.loads(saved.read_text())})
+                    extraction = ExtractOptions(refine=given.refine, stereo=stereo)
+                    write_json(saved, score(trained, reference, method, extraction, target))
+                rows.append({"scene": name, "primitive": primitive, "stereo": stereo, **json.loads(saved.read_text())})
                 print(json.dumps(rows[-1]), flush=True)
     write_json(given.output / "surfaces.json", {"train_options": asdict(options), "refine": given.refine, "rows": rows})
     write_table(given.output / "surfaces.md", table(rows))

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
+from linprim_geo.capture.load import load_scene
 from linprim_geo.eval.studies import surfaces
+from linprim_geo.geometry.mesh_files import load_mesh
+from linprim_geo.runs.run import Run
+from linprim_geo.synthetic.synth import synthesize
 
 
 def test_a_scene_is_trained_meshed_and_scored_once(tmp_path, monkeypatch, capsys):
@@ -27,9 +32,33 @@ def test_a_scene_is_trained_meshed_and_scored_once(tmp_path, monkeypatch, capsys
     assert json.loads((tmp_path / "surfaces.json").read_text())["rows"] == [row]
 
 
+def test_a_capture_without_a_reference_has_photographs_and_depth_images_alone(tmp_path):
+    synthesize(tmp_path / "ball", shape="smooth", views=6, test_views=2, size=(48, 48), points=200)
+    command = ["-o", str(tmp_path / "out"), "--scenes", "--data", str(tmp_path / "ball"), "--references", "none"]
+    command += ["--iterations", "40", "--max-primitives", "300", "--primitives", "octahedron", "--methods", "tsdf"]
+    assert surfaces.main([*command, "--stereo", "auto", "off"]) == 0
+    rows = json.loads((tmp_path / "out" / "surfaces.json").read_text())["rows"]
+    assert [row["stereo"] for row in rows] == ["auto", "off"]
+    for row in rows:
+        assert row["psnr"] > 5 and 0 <= row["depth_right"] <= 1 and "chamfer" not in row
+    options = Run.open(tmp_path / "out" / "ball_octahedron_without_stereo").train_options
+    assert options.start == "points" and options.stereo_depth == 0
+
+
+def test_depth_of_a_mesh_is_right_within_one_percent_of_the_depth_images(tmp_path):
+    synthesize(tmp_path / "ball", shape="smooth", views=6, test_views=2, size=(48, 48), points=200, depth_format="npy")
+    views = load_scene(tmp_path / "ball").train
+    mesh = load_mesh(tmp_path / "ball" / "reference.ply")
+    assert surfaces.depth_right(mesh, views) > 0.98
+    # Nearer to the cameras by several times the tolerance, but at outlines.
+    larger = replace(mesh, vertices=1.2 * mesh.vertices)
+    assert surfaces.depth_right(larger, views) < 0.2
+    assert surfaces.depth_right(mesh, [replace(view, depth_path=None) for view in views]) is None
+
+
 def test_rows_of_earlier_folders_lack_what_is_new():
     *_, line = surfaces.table([{"scene": "cad", "chamfer": 0.07, "manifold": None}]).splitlines()
-    assert line.startswith("| cad | – | – | 0.07 | – |")
+    assert line.startswith("| cad | – | – | – | – | – | 0.07 | – |")
 
 
 def test_references_go_with_captures(tmp_path, capsys):
