@@ -110,6 +110,7 @@ class ShadedPlanes:
         self.shadings = [Shading.of(found, law) for found in maps]
         self.small_cameras = [shading.camera for shading in self.shadings]
         self.given, self.by_points = np.concatenate([by_points, by_edges]), len(by_points)
+        self.given_count = len(self.given)
         self.depths = [shading.small(depth) for shading, depth in zip(self.shadings, depths, strict=True)]
         self.shown: list[list[ShadedRegion]] = []
         self.regions: list[list[FittedRegion]] = []
@@ -121,7 +122,8 @@ class ShadedPlanes:
             self.shown.append([region for region, _ in started])
             self.regions.append([one for one in fitted if one is not None])
         self.planes = self._common([one for own in self.regions for one in own if one.fit is not None])
-        self.planes = self._at_right_angles(*self._held(self._all_carriers()))
+        carried = self._take_originals(self._all_carriers())
+        self.planes = self._at_right_angles(self._held(carried), carried)
 
     def _camera(self, region: ShadedRegion) -> Camera:
         return self.small_cameras[region.view]
@@ -279,16 +281,46 @@ class ShadedPlanes:
         """`_carriers` of the regions of each view."""
         return [[self._carriers(one) for one in own] for own in self.regions]
 
-    def _held(self, carriers: Sequence[Sequence[dict[int, np.ndarray]]]) -> tuple[np.ndarray, list[list[ShadedRegion]]]:
-        """The planes, each held by the confirmed depths along the edges of those regions whose shading it carries, and
-        these regions."""
-        carried: list[list[ShadedRegion]] = [[] for _ in self.planes]
+    def _take_originals(self, carriers: Sequence[Sequence[dict[int, np.ndarray]]]) -> list[list[ShadedRegion]]:
+        """Keeps the planes but for copies, of whose boxes another one carries most; returns the regions that each
+        carries.
+
+        A plane by edges that is one by points takes its place and stays as it is, as if it carried nothing.
+        """
+        count = len(self.planes)
+        shared, carried = np.zeros((count, count)), [list[ShadedRegion]() for _ in range(count)]
         for own, of_view in zip(self.regions, carriers, strict=True):
             for one, of_region in zip(own, of_view, strict=True):
-                for k in of_region:
+                for k, boxes in of_region.items():
                     carried[k].append(one.region)
+                    for j, others in of_region.items():
+                        shared[j, k] += np.count_nonzero(boxes & others)
+        by_points, kept = range(self.by_points), list[int]()
+        for k in sorted(range(self.by_points, count), key=lambda k: -shared[k, k]):
+            same = next((j for j in by_points if self._same(j, k, carried[k], TOLERANCE)), None)
+            if same is not None:
+                self.planes[k] = np.sign(self.planes[same, :3] @ self.planes[k, :3]) * self.planes[same]
+                carried[k] = []
+            copied = [j for j in kept if shared[j, k] > CARRIED_SHARE * shared[k, k]]
+            if same is not None or not any(self._same(j, k, carried[k], ALIKE_DEPTH) for j in copied):
+                kept.append(k)
+        kept = sorted([*by_points, *kept])
+        self.planes, self.given_count = self.planes[kept], sum(k < self.given_count for k in kept)
+        return [carried[k] for k in kept]
+
+    def _same(self, first: int, second: int, regions: Sequence[ShadedRegion], tolerance: float) -> bool:
+        """Whether two planes have nearly one direction, and over regions one inverse depth in the median."""
+        planes = self.planes[[first, second]]
+        if not regions or abs(planes[0, :3] @ planes[1, :3]) < np.cos(ALIKE_ANGLE):
+            return False
+        inverse = [region.some(LEAST_BOXES).rays @ in_camera(self._camera(region), planes).T for region in regions]
+        one, other = np.concatenate(inverse).T
+        return bool(np.median(np.abs(one / other - 1)) < tolerance)
+
+    def _held(self, carried: Sequence[Sequence[ShadedRegion]]) -> np.ndarray:
+        """The planes, each held by the confirmed depths along the edges of those regions whose shading it carries."""
         held = [self._held_plane(plane, carried[k]) for k, plane in enumerate(self.planes) if k >= self.by_points]
-        return np.concatenate([self.planes[: self.by_points], np.reshape(held, (-1, 4))]), carried
+        return np.concatenate([self.planes[: self.by_points], np.reshape(held, (-1, 4))])
 
     def _at_right_angles(self, planes: np.ndarray, carried: Sequence[Sequence[ShadedRegion]]) -> np.ndarray:
         """The planes, turned to right angles with each other where that carries the shading of their regions nearly as
@@ -381,7 +413,7 @@ class ShadedPlanes:
             for of_region in own:
                 for k, boxes in of_region.items():
                     carried[k] += np.count_nonzero(boxes)
-        carried[: len(self.given)] *= HARDLY_MORE
+        carried[: self.given_count] *= HARDLY_MORE
         ordered = [[_best_first(of_region, carried) for of_region in own] for own in carriers]
         surfaces = self._surfaces(ordered, carriers)
         result = []

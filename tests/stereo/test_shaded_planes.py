@@ -122,6 +122,30 @@ def test_a_floor_makes_a_wall_upright_unless_photographs_say_that_it_leans(seed)
     np.testing.assert_allclose(planes["leaning"][-1], alone, atol=1e-6)
 
 
+def tilted(degrees: float) -> np.ndarray:
+    """The wall, leaning to its left by so much."""
+    angle = np.radians(degrees)
+    return np.array([np.sin(angle), np.cos(angle), 0.0, 0.0])
+
+
+def test_a_wall_that_edges_give_twice_is_one_plane():
+    maps, depths = photographs(lambda points, view: light(points))
+    found = planes_of(maps, depths, by_edges=np.array([tilted(-0.3), tilted(0.3)]))
+    assert len(found.planes) == 1
+    share, off = errors(found, depths)
+    assert share > 0.7 and np.quantile(off, 0.95) < 0.005
+
+
+def test_a_plane_that_edges_give_is_the_one_that_points_give():
+    maps, depths = photographs(lambda points, view: light(points))
+    by_points = np.array([tilted(0.1)])
+    found = planes_of(maps, depths, by_points, by_edges=-np.array([tilted(-0.4)]))
+    np.testing.assert_array_equal(found.planes, [by_points[0], -by_points[0]])
+    # Two that differ by more than depths are certain stay two.
+    found = planes_of(maps, depths, by_points, by_edges=np.array([tilted(0) + [0, 0, 0, 0.1]]))
+    assert (found.planes[1] != by_points[0]).any()
+
+
 def test_exposures_that_differ_change_nothing():
     rng = np.random.default_rng(5)
     gains, offsets = rng.uniform(0.85, 1.15, len(CENTERS)), rng.uniform(-8, 8, len(CENTERS))
