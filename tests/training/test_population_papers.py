@@ -106,6 +106,25 @@ def test_a_gradient_is_averaged_over_the_views_that_see():
     assert not in_view(parameters, CAMERAS[0], "octahedron")[0]
 
 
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("ray_model", ["exact", "affine"])
+def test_what_reaches_beyond_the_near_plane_is_seen_from_a_centre_behind_the_camera(kind, ray_model):
+    """As far as the kernels draw it: a polyhedron is cut at the near plane, a centre there ends all others."""
+    near, reach = KINDS[kind].near, 0.5
+    parameters = table(6, kind)
+    parameters["log_extent"][:] = math.log(reach / (1 if KINDS[kind].solid else 3))
+    # Depths of the centre: no part lies beyond the near plane; a part does; nearly all; the centre, too. Two are beside
+    # the image, which ends at slopes of 0.5: the first reaches forward of the near plane and not into it.
+    z = torch.tensor([-reach - 1e-3, -reach + 1e-3, -1e-3, 1e-3, -reach / 2, -reach / 2]) + near
+    parameters["center"][:] = 0
+    parameters["center"][:, 2] = z - 3
+    parameters["center"][4, 0] = reach + 0.5 * (near + reach / 2) + 1e-3
+    parameters["center"][5, 0] = reach + 0.5 * near - 1e-3
+    cut = KINDS[kind].solid and ray_model == "exact"
+    seen = in_view(parameters, CAMERAS[0], kind, ray_model)
+    assert list(seen) == [False, cut, cut, True, False, cut]
+
+
 def test_small_ones_are_cloned_and_large_ones_split():
     control, parameters = classic(4), table(4)
     # Diameters 0.01 and 0.012 around 0.01 * 1.1.

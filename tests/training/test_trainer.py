@@ -14,7 +14,7 @@ from linprim_geo.capture.load import load_scene
 from linprim_geo.geometry.primitives import SH_Y0, Primitives
 from linprim_geo.kernels import ops
 from linprim_geo.training.step.parameters import activate, filter_lengths, initial_parameters
-from linprim_geo.training.step.trainer import Trainer
+from linprim_geo.training.step.trainer import CONTROLS, Trainer
 from linprim_geo.training.step.training_images import load_training_images
 
 
@@ -64,6 +64,31 @@ def test_what_crosses_the_near_plane_is_trained_and_pulls(trainer, adam):
     assert trainer.control.accumulated["screen_gradient"][row] > 0
     if adam == "sparse":
         assert trainer.steps[row] == 1 and trainer.steps[8] == 0
+
+
+@pytest.mark.parametrize("population", ["gradient", "3dgs"])
+@pytest.mark.parametrize("shift", [0.3, -0.3])
+def test_what_crosses_the_near_plane_is_split(trainer, population, shift):
+    """Its centre before the camera or behind it."""
+    options = replace(trainer.options, population=population)
+    trainer.control = CONTROLS[population](options, len(trainer), [s.camera for s in trainer.images], trainer.bounds)
+    camera, row, extent = trainer.images[trainer.view_of(0)].camera, 7, 0.2
+    center = camera.center + shift * extent * camera.rotation[2]
+    trainer.parameters["center"][row] = torch.from_numpy(center)
+    trainer.parameters["log_extent"][row] = np.log(extent)
+    trainer.parameters["raw_opacity"][row] = 0.0
+    trainer.advance()
+    # Nothing else pulls.
+    for table in trainer.control.accumulated.values():
+        table[torch.arange(len(trainer)) != row] = 0
+    # An event of either rule, after what shorter runs leave out.
+    event = trainer.control.grow(trainer.parameters, 20)
+    sources, counts = np.unique(event.source, return_counts=True)
+    assert sources[counts > 1].tolist() == [row] and counts.max() == 2
+    places, moved = event.values["center"]
+    halves = moved[event.source[places] == row]
+    # Halves of their own: not where the parent was.
+    assert len(halves) == 2 and (np.linalg.norm(halves - center, axis=1) > 1e-3).all()
 
 
 def test_every_view_is_seen_once_per_round(trainer):

@@ -81,7 +81,7 @@ class ClassicControl(DensityControl):
 
     def accumulate(self, parameters, camera, size, screen_grad):
         half = torch.tensor([size[0] / 2, size[1] / 2])
-        seen = in_view(parameters, camera, self.kind)
+        seen = in_view(parameters, camera, self.kind, self.options.ray_model)
         screen_gradient = torch.linalg.vector_norm(screen_grad[:, :2] * half, dim=1)
         self.accumulated["gradient"] += torch.where(seen, screen_gradient, 0.0)
         self.accumulated["seen"] += seen
@@ -245,17 +245,26 @@ def relocated(opacity: np.ndarray, copies: np.ndarray) -> tuple[np.ndarray, np.n
     return np.clip(shared, DEAD, 1 - 1e-6), opacity / total
 
 
-def in_view(parameters, camera: Camera, kind: str) -> torch.Tensor:
-    """(N,) bool: the primitive's bounding sphere (3 standard deviations of a Gaussian) may reach into the image."""
+def in_view(parameters, camera: Camera, kind: str, ray_model: str = "exact") -> torch.Tensor:
+    """(N,) bool: the primitive's bounding sphere (3 standard deviations of a Gaussian) may reach into the image.
+
+    As in the kernels, a polyhedron with exact rays counts as soon as a part of it lies beyond the near plane, wherever
+    its centre is; a Gaussian, and a polyhedron with affine rays, if its centre does.
+    """
     pose = torch.from_numpy(camera.world_to_camera[:3].astype(np.float32))
     # A sum of three, no matrix product: the library for those has other code for the processors of each maker.
     local = (parameters["center"].detach()[:, None] * pose[:, :3]).sum(2) + pose[:, 3]
-    reach = exponential(parameters["log_extent"].detach().amax(1)) * (1 if KINDS[kind].solid else 3)
-    z = local[:, 2]
+    solid, near = KINDS[kind].solid, KINDS[kind].near
+    reach = exponential(parameters["log_extent"].detach().amax(1)) * (1 if solid else 3)
+    z, farthest = local[:, 2], local[:, 2]
+    if solid and ray_model == "exact":
+        farthest = z + reach
+        # The frustum is widest where the sphere ends.
+        z = torch.where(z - reach < near, farthest, z)
     depth = z.clamp_min(1e-6)
     x, y = camera.fx * local[:, 0] / depth + camera.cx, camera.fy * local[:, 1] / depth + camera.cy
     wide, high = camera.fx * reach / depth, camera.fy * reach / depth
-    return (z > 0.01) & (x + wide > 0) & (x - wide < camera.width) & (y + high > 0) & (y - high < camera.height)
+    return (farthest > near) & (x + wide > 0) & (x - wide < camera.width) & (y + high > 0) & (y - high < camera.height)
 
 
 def _logit(opacity):
