@@ -4,13 +4,16 @@ taken for it, for a few bytes may claim, and a few more may unpack to, an array 
 from __future__ import annotations
 
 import io
+import math
 import os
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO
 
 import numpy as np
+
+from linprim_geo.base.errors import LinprimError
 
 # Headers of arrays of numbers take some hundred bytes. numpy reads one whole, whatever its length, before it looks.
 _LONGEST_HEADER = 10_000
@@ -44,6 +47,45 @@ def read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, check: Check)
         check(*_header(file))
     with archive.open(member) as file:
         return np.lib.format.read_array(file, allow_pickle=False)
+
+
+def read_named(path: str | os.PathLike, wanted: Mapping[str, tuple[tuple[int | None, ...], str]]) -> list[np.ndarray]:
+    """Arrays of an .npz file that `numpy.savez` has written.
+
+    Args:
+        wanted: name to shape, None where any length will do, and the letter of numpy's kinds: "f", "i", "u", "b".
+
+    Raises:
+        LinprimError: the file is missing or damaged, or an array is missing, of another shape or kind, or claims more
+            bytes than the file has.
+    """
+    path = Path(path)
+    try:
+        size = path.stat().st_size
+        with zipfile.ZipFile(path) as archive:
+            members = {info.filename: info for info in archive.infolist()}
+            if missing := [name for name in wanted if f"{name}.npy" not in members]:
+                raise LinprimError(f"{path}: the array {missing[0]} is missing")
+            checks = {name: _check_of(f"{path}: {name}", shape, kind, size) for name, (shape, kind) in wanted.items()}
+            return [read_member(archive, members[f"{name}.npy"], check) for name, check in checks.items()]
+    except LinprimError:
+        raise
+    except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds for damaged files
+        raise LinprimError(f"{path}: cannot be read ({error})") from None
+
+
+def _check_of(what: str, shape: tuple[int | None, ...], kind: str, size: int) -> Check:
+    """A check for an array of this shape and kind in a file of `size` bytes, which does not pack it."""
+
+    def check(claimed: tuple[int, ...], dtype: np.dtype) -> None:
+        fits = len(claimed) == len(shape) and all(n in (None, found) for n, found in zip(shape, claimed, strict=True))
+        if dtype.kind != kind or not fits:
+            lengths = ", ".join("any" if length is None else str(length) for length in shape)
+            raise LinprimError(f"{what} is {dtype} of shape {claimed}, wanted kind {kind} of shape ({lengths})")
+        if not 0 <= math.prod(claimed) * dtype.itemsize <= size:
+            raise LinprimError(f"{what} claims {claimed} {dtype}, but the file has {size} bytes")
+
+    return check
 
 
 def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:

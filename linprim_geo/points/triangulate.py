@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from linprim_geo.base.arrays import read_named
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write
 from linprim_geo.capture.types import PointCloud, Scene, View
@@ -103,16 +104,14 @@ def digest_of(views: Sequence[View], how: tuple) -> str:
 def _stored(path: Path) -> PointCloud | None:
     """What an earlier run kept; None if there is nothing or it is damaged."""
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            xyz, rgb, error_px = (arrays[name] for name in ("xyz", "rgb", "error_px"))
-        usable = xyz.shape == (len(error_px), 3) == rgb.shape and rgb.dtype == np.uint8 and error_px.ndim == 1
-        return (
-            PointCloud(xyz, rgb, error_px)
-            if usable and np.isfinite(xyz).all() and np.isfinite(error_px).all()
-            else None
+        xyz, rgb, error_px = read_named(
+            path, {"xyz": ((None, 3), "f"), "rgb": ((None, 3), "u"), "error_px": ((None,), "f")}
         )
-    except Exception:  # noqa: BLE001 - a cache entry that cannot be read is made again
+    except LinprimError:  # it is made again
         return None
+    usable = len(xyz) == len(rgb) == len(error_px) and rgb.dtype == np.uint8
+    usable = usable and bool(np.isfinite(xyz).all() and np.isfinite(error_px).all())
+    return PointCloud(xyz, rgb, error_px) if usable else None
 
 
 def _store(path: Path, cloud: PointCloud) -> None:

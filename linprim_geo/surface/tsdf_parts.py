@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.arrays import read_named
 from linprim_geo.base.files import atomic_write
 from linprim_geo.base.memory import PROCESS_GIB
 from linprim_geo.base.options import ExtractOptions
@@ -30,6 +30,16 @@ from linprim_geo.surface.method_tsdf import DepthFrames
 from linprim_geo.surface.tsdf_field import placed
 from linprim_geo.surface.tsdf_fusion import Lattice, block_keys, estimate_memory
 
+# What `save_lattice` writes: shapes and kinds.
+_LATTICE: dict[str, tuple[tuple[int | None, ...], str]] = {
+    "blocks": ((None, 3), "i"),
+    "owner": ((None,), "i"),
+    "origin": ((3,), "f"),
+    "voxel": ((), "f"),
+    "resolution": ((), "i"),
+    "truncation": ((), "f"),
+    "rules": ((None,), "f"),
+}
 REMEDY = "more --blocks, a larger --voxel-size, fewer --workers, or more memory"
 
 
@@ -157,12 +167,14 @@ def save_lattice(path: Path, lattice: Lattice, owner: np.ndarray) -> None:
 
 
 def load_lattice(path: Path) -> tuple[Lattice, np.ndarray]:
-    """Reads what `save_lattice` wrote."""
-    with np.load(path, allow_pickle=False) as file:
-        rules, truncation = tuple(float(x) for x in file["rules"]), float(file["truncation"])
-        return Lattice(
-            file["blocks"], file["origin"], float(file["voxel"]), int(file["resolution"]), truncation, rules
-        ), file["owner"]
+    """Reads what `save_lattice` wrote.
+
+    Raises:
+        LinprimError: it is damaged.
+    """
+    blocks, owner, origin, voxel, resolution, truncation, rules = read_named(path, _LATTICE)
+    numbers = float(voxel), int(resolution), float(truncation), tuple(float(x) for x in rules)
+    return Lattice(blocks, origin, *numbers), owner
 
 
 def load_part(path: Path) -> Mesh:
@@ -171,8 +183,4 @@ def load_part(path: Path) -> Mesh:
     Raises:
         LinprimError: it is damaged.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return Mesh(file["vertices"], file["faces"])
-    except (OSError, ValueError, KeyError) as error:
-        raise LinprimError(f"{path}: cannot be read ({error})") from None
+    return Mesh(*read_named(path, {"vertices": ((None, 3), "f"), "faces": ((None, 3), "i")}))

@@ -10,6 +10,7 @@ import pickle
 import struct
 import sys
 import time
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -23,13 +24,18 @@ from linprim_geo.base.memory import forget_peak, memory_gib, peak_gib
 from linprim_geo.base.progress import Progress
 from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.readers.ply_points import read_points_ply
+from linprim_geo.capture.types import PointCloud
 from linprim_geo.cli import main as cli
 from linprim_geo.eval.protocols.files import read_crop, read_plane
 from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.geometry.primitives import load_primitives
 from linprim_geo.imaging import photos
+from linprim_geo.points import triangulate
 from linprim_geo.runs.run import Run
+from linprim_geo.surface.tsdf_fusion import Lattice
+from linprim_geo.surface.tsdf_parts import load_lattice, load_part, save_lattice
 from linprim_geo.synthetic.textured import load_textured
+from linprim_geo.training.blocks.plan import load_points, save_points
 from linprim_geo.training.checkpoint import read_checkpoint
 from linprim_geo.training.train import train
 
@@ -47,11 +53,11 @@ def refused(call, *arguments) -> str:
     return sentence
 
 
-def change_npz(path: Path, name: str, content: bytes) -> None:
+def change_npz(path: Path, name: str, content: bytes, packed: bool = False) -> None:
     """Replaces a member, with a checksum that fits."""
     with zipfile.ZipFile(path) as archive:
         members = {info.filename: archive.read(info) for info in archive.infolist()}
-    with zipfile.ZipFile(path, "w") as archive:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED if packed else zipfile.ZIP_STORED) as archive:
         for member, old in members.items():
             archive.writestr(member, content if member == name else old)
 
@@ -252,6 +258,81 @@ def test_primitives_that_unpack_to_hundreds_of_megabytes_are_one_sentence(tmp_pa
         archive.writestr("kind.npy", as_npy(np.array("octahedron")))
         archive.writestr("center.npy", as_npy(np.zeros((5_000_000, 3), np.float32)))
     assert "center claims" in refused(load_primitives, tmp_path / "bomb.npz")
+
+
+def write_own_arrays(folder: Path) -> dict:
+    """Files of arrays that the package keeps for itself, by what reads each of them back."""
+    grid = np.zeros((4, 3), np.int64)
+    save_points(folder / "points.npz", PointCloud(np.zeros((5, 3)), np.zeros((5, 3), np.uint8)))
+    save_lattice(
+        folder / "lattice.npz", Lattice(grid, np.zeros(3), 0.1, 8, 3.0, (1.0, 0.5)), np.zeros(4, dtype=np.int64)
+    )
+    np.savez(folder / "part.npz", vertices=np.zeros((4, 3)), faces=grid)
+    cloud = PointCloud(np.zeros((5, 3)), np.zeros((5, 3), np.uint8), np.zeros(5, np.float32))
+    triangulate._store(folder / "stored.npz", cloud)
+    return {
+        "points.npz": load_points,
+        "lattice.npz": load_lattice,
+        "part.npz": load_part,
+        "stored.npz": lambda path: triangulate._stored(path) or raise_none(path),
+    }
+
+
+def raise_none(path: Path):
+    """A cache entry that cannot be used is none, which a training says nothing of."""
+    raise LinprimError(f"{path}: claims nothing")
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [
+        ("points.npz", "xyz"),
+        ("points.npz", "rgb"),
+        ("lattice.npz", "blocks"),
+        ("lattice.npz", "rules"),
+        ("part.npz", "faces"),
+        ("stored.npz", "error_px"),
+    ],
+)
+@pytest.mark.parametrize("packed", [False, True])
+def test_arrays_that_a_run_keeps_for_itself_take_no_more_memory_than_their_file(file, name, packed, tmp_path):
+    """A header that claims 100 MB, and as many zeros packed into 100 kB."""
+    read = write_own_arrays(tmp_path)[file]
+    assert read(tmp_path / file) is not None
+    with np.load(tmp_path / file) as arrays:
+        array = arrays[name]
+    shape = (100_000_000 // array[:1].nbytes, *array.shape[1:])
+    header = f"{{'descr': '{array.dtype.str}', 'fortran_order': False, 'shape': {shape}}}"
+    content = as_npy(np.zeros((40, *array.shape[1:]), array.dtype), header)
+    change_npz(tmp_path / file, f"{name}.npy", content + bytes(100_000_000 if packed else 0), packed)
+    assert (tmp_path / file).stat().st_size < 1e6
+    tracemalloc.start()
+    said = refused(read, tmp_path / file)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert f"{file}: " in said and "claims" in said and peak < 10e6
+
+
+@pytest.mark.parametrize("content", [b"PK", b"", as_npy(np.zeros(3))], ids=["a piece", "nothing", "an array"])
+def test_damaged_arrays_of_a_run_are_one_sentence(content, tmp_path):
+    for file, read in write_own_arrays(tmp_path).items():
+        (tmp_path / file).write_bytes(content)
+        assert f"{file}: " in refused(read, tmp_path / file)
+    assert "no.npz: " in refused(load_points, tmp_path / "no.npz")
+
+
+def test_arrays_of_a_run_of_another_shape_or_type_are_one_sentence(tmp_path):
+    write_own_arrays(tmp_path)
+    file = tmp_path / "points.npz"
+    for rgb, sentence in (
+        (np.zeros((5, 4), np.uint8), "rgb is uint8 of shape (5, 4), wanted kind u of shape (any, 3)"),
+        (np.zeros((5, 3)), "rgb is float64 of shape (5, 3), wanted kind u"),
+        (np.zeros((4, 3), np.uint8), "holds 5 points and 4 colours"),
+    ):
+        change_npz(file, "rgb.npy", as_npy(rgb))
+        assert sentence in refused(load_points, file)
+    np.savez(file, xyz=np.zeros((5, 3)))
+    assert "the array rgb is missing" in refused(load_points, file)
 
 
 @pytest.mark.parametrize("claim", ["a part", "an array"])

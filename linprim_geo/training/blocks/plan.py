@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from linprim_geo.base.arrays import read_named
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write
 from linprim_geo.base.options import TrainOptions
@@ -122,9 +123,15 @@ def save_points(path: Path, cloud: PointCloud) -> None:
 
 
 def load_points(path: Path) -> PointCloud:
-    """Reads what `save_points` wrote."""
-    with np.load(path, allow_pickle=False) as file:
-        return (VolumePoints if file["volume"] else PointCloud)(file["xyz"], file["rgb"])
+    """Reads what `save_points` wrote.
+
+    Raises:
+        LinprimError: it is damaged.
+    """
+    xyz, rgb, volume = read_named(path, {"xyz": ((None, 3), "f"), "rgb": ((None, 3), "u"), "volume": ((), "b")})
+    if len(xyz) != len(rgb):
+        raise LinprimError(f"{path}: holds {len(xyz)} points and {len(rgb)} colours, wanted as many")
+    return (VolumePoints if volume else PointCloud)(xyz, rgb)
 
 
 def coarse_of(run: Run, scene: Scene) -> Run:
