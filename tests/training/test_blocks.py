@@ -198,6 +198,7 @@ def test_a_run_of_one_block_is_not_resumed_in_several(tiny_run, tiny_scene):
     [
         ({"exposure": "gain"}, 2, "--exposure gain is fitted over all photographs at once"),
         ({"distortion": 0.1}, 2, "--distortion looks at whole views"),
+        ({"stereo_depth": 0.5}, 2, "--stereo-depth looks at whole views"),
         ({}, 0, "--blocks is 0, wanted auto, or a number from 1"),
     ],
 )
@@ -219,6 +220,8 @@ def test_a_time_budget_and_a_lone_cluster_are_refused(tiny_scene, tmp_path, caps
         (["--blocks", "2", "--time-budget", "5m"], "--time-budget plans one training"),
         (["--cluster", "local"], "there is one block, which is done here: wanted --blocks as well"),
         (["--blocks", "2", "--dry-run"], "wanted without --blocks"),
+        # Its default, which says nothing unless it is asked for.
+        (["--blocks", "2", "--stereo-depth", "1"], "--stereo-depth looks at whole views, of which a block has parts"),
     ):
         assert main(["train", str(tiny_scene), "-o", str(tmp_path / "run"), *arguments]) == 1
         assert sentence in capsys.readouterr().err

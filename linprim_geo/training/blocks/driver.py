@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -88,7 +88,8 @@ def train_blocks(
     run_path, where = Path(run).resolve(), Path(scene)
     check_train_options(options := options or TrainOptions())
     scene_options = scene_options or SceneOptions()
-    check_options(options, blocks)
+    given = frozenset() if effects is None else effects.given
+    check_options(options, blocks, given)
     progress = Progress("blocks", 1, quiet=quiet)
     before = torch.get_num_threads()
     resume = resume and not is_unused(run_path)
@@ -137,15 +138,18 @@ def train_blocks(
     return None
 
 
-def check_options(options: TrainOptions, blocks: int | str) -> None:
-    """Raises LinprimError for what blocks cannot do."""
+def check_options(options: TrainOptions, blocks: int | str, given: Collection[str] = ()) -> None:
+    """Raises LinprimError for what blocks cannot do; `given` are names of options that the user has set, to their
+    defaults or not."""
     if blocks != "auto" and not 1 <= int(blocks) <= 10**6:
         raise LinprimError(f"--blocks is {blocks}, wanted auto, or a number from 1")
     if options.exposure != "none":
         raise LinprimError(
             "--exposure gain is fitted over all photographs at once: wanted --exposure none with --blocks"
         )
-    for name in GEOMETRY_WEIGHTS:
+    # By default the coarse scene alone is held to depths of stereo.
+    asked = "stereo_depth" in given or options.stereo_depth != TrainOptions.stereo_depth
+    for name in (*GEOMETRY_WEIGHTS, *["stereo_depth"] * asked):
         if getattr(options, name) > 0:
             raise LinprimError(
                 f"--{name.replace('_', '-')} looks at whole views, of which a block has parts: wanted 0 with --blocks"
