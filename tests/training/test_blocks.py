@@ -161,6 +161,25 @@ def test_a_finished_run_is_not_done_again(run_alone, tiny_scene):
         train_blocks(tiny_scene, run, options=OPTIONS, blocks=COUNT, quiet=True)
 
 
+@pytest.mark.parametrize(("blocks", "ignored"), [(3, ["--blocks"]), ("auto", ["--blocks"]), (COUNT, []), (1, [])])
+def test_another_number_of_blocks_is_named_as_ignored(blocks, ignored, run_alone, tiny_scene, monkeypatch, capsys):
+    """The number that it was begun with, and 1, which is also that of nobody who says none, are not; --workers and
+    --cluster are taken."""
+    called = []
+
+    def executor(cluster, shared, workers):
+        called.append((cluster, workers))
+        return Here(cluster, shared, workers)
+
+    monkeypatch.setattr(block_training, "open_executor", executor)
+    train(tiny_scene, run_alone[0], options=OPTIONS, resume=True, blocks=blocks, cluster="local", workers=2)
+    lines = [line for line in capsys.readouterr().err.splitlines() if "ignored" in line]
+    assert [line.strip() for line in lines] == [
+        f"--resume goes on with the run's own options: {flag} ignored" for flag in ignored
+    ]
+    assert called == [("local", 2)]
+
+
 @pytest.mark.parametrize("blocks", ["1", "auto"])
 def test_what_fits_one_block_is_trained_as_it_always_was(blocks, tiny_scene, tmp_path):
     short = replace(OPTIONS, iterations=30)

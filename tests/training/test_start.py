@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
+from pathlib import Path
 
 import pytest
+from helpers.captures import write_colmap
 from PIL import Image
 
 from linprim_geo.base.options import SceneOptions, TrainOptions
@@ -15,54 +17,76 @@ from linprim_geo.runs.run import Run
 from linprim_geo.training.effects import Choice
 from linprim_geo.training.start import begin_run
 
+FOLDERS = ("masks", "images", "sparse")
+
+
+@pytest.fixture(params=FOLDERS)
+def option(request) -> str:
+    """An option that names a folder."""
+    return request.param
+
 
 @pytest.fixture
-def masked(tiny_scene, tmp_path):
-    """A capture, and the folder `cut` of its masks beside it."""
-    capture, cut = tmp_path / "capture", tmp_path / "cut"
-    shutil.copytree(tiny_scene, capture)
-    for file in capture.glob("*/*.png"):
-        (cut / file.parent.name).mkdir(parents=True, exist_ok=True)
-        Image.new("L", (48, 48), 255).save(cut / file.parent.name / file.name)
-    return capture
+def capture(option, tmp_path) -> Path:
+    """A capture, and beside it the folder `cut` that the option is to name."""
+    write_colmap(tmp_path / "capture")
+    if option == "sparse":
+        write_colmap(tmp_path / "other", points=31)
+        (tmp_path / "other" / "sparse" / "0").rename(tmp_path / "cut")
+    else:
+        (tmp_path / "cut").mkdir()
+        for file in (tmp_path / "capture" / "images").iterdir():
+            with Image.open(file) as photo:
+                changed = Image.new("L", photo.size, 255) if option == "masks" else photo.rotate(180)
+                changed.save(tmp_path / "cut" / file.name)
+    return tmp_path / "capture"
+
+
+def found(option: str, scene) -> tuple[set[Path], int]:
+    """The files that come from an option's folder, and the number of points, which says where those come from."""
+    paths = {getattr(view, "mask_path" if option == "masks" else "image_path") for view in scene.train}
+    return {path.resolve() for path in paths if path} if option != "sparse" else set(), len(scene.points.xyz)
+
+
+def expected(option: str, folder: Path) -> tuple[set[Path], int]:
+    """As `found`, where `folder` was taken."""
+    # Every 8th of ten photographs is held out.
+    names = () if option == "sparse" else (f"{i:02d}.png" for i in range(10) if i % 8)
+    return {(folder / name).resolve() for name in names}, 31 if option == "sparse" else 20
 
 
 def begun(capture, run, **options):
-    """A run of so many scene options, as a training begins one."""
-    options = SceneOptions(**options)
-    new, scene, _ = begin_run(capture, run, options, TrainOptions(), Choice("none"), Progress("", 1, quiet=True))
+    """A run of such scene options, as a training begins one."""
+    settings, quiet = SceneOptions(poses="given", **options), Progress("", 1, quiet=True)
+    new, scene, _ = begin_run(capture, run, settings, TrainOptions(start="points"), Choice("none"), quiet)
     Run.create(run, scene, new.scene_path, new.scene_options, new.train_options, new.similarity)
-    return {view.mask_path.resolve() for view in scene.train}
 
 
-def test_folders_are_found_from_elsewhere_and_no_others_of_their_names(masked, tmp_path, monkeypatch):
+def test_folders_are_found_from_elsewhere_and_no_others_of_their_names(option, capture, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    masks = begun(masked, tmp_path / "outside", masks="cut")
-    shutil.copytree(tmp_path / "cut", masked / "inside")
-    begun(masked, tmp_path / "inside", masks="inside")
+    begun(capture, tmp_path / "outside", **{option: "cut"})
+    shutil.copytree(tmp_path / "cut", capture / "inside")
+    begun(capture, tmp_path / "inside", **{option: "inside"})
     for name in ("cut", "inside"):
         (tmp_path / "elsewhere" / name).mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "elsewhere")
-    outside = Run.open(tmp_path / "outside").scene()
-    assert masks and {view.mask_path.resolve() for view in outside.train} == masks
+    assert found(option, Run.open(tmp_path / "outside").scene()) == expected(option, tmp_path / "cut")
     # In the capture, it moves with it.
-    masked.rename(tmp_path / "moved")
+    capture.rename(tmp_path / "moved")
     moved = Run.open(tmp_path / "inside").with_scene_at(tmp_path / "moved")
-    inside = (tmp_path / "moved" / "inside").resolve()
-    assert all(view.mask_path.resolve().is_relative_to(inside) for view in moved.scene().train)
+    assert found(option, moved.scene()) == expected(option, tmp_path / "moved" / "inside")
 
 
-def test_folders_of_older_runs_are_found_as_before(masked, tmp_path, monkeypatch):
-    shutil.copytree(tmp_path / "cut", masked / "inside")
+def test_folders_of_older_runs_are_found_as_before(option, capture, tmp_path, monkeypatch):
+    shutil.copytree(tmp_path / "cut", capture / "inside")
     for name in ("cut", "inside"):
-        begun(masked, tmp_path / f"run_{name}", masks=str(masked / "inside"))
+        begun(capture, tmp_path / f"run_{name}", **{option: str(capture / "inside")})
         config = json.loads((tmp_path / f"run_{name}" / "config.json").read_text())
-        config["scene_options"]["masks"] = name
+        config["scene_options"][option] = name
         (tmp_path / f"run_{name}" / "config.json").write_text(json.dumps(config))
     monkeypatch.chdir(tmp_path)
-    for name, folder in (("cut", tmp_path / "cut"), ("inside", masked / "inside")):
-        train_views = Run.open(tmp_path / f"run_{name}").scene().train
-        assert all(view.mask_path.resolve().is_relative_to(folder.resolve()) for view in train_views)
+    for name, folder in (("cut", tmp_path / "cut"), ("inside", capture / "inside")):
+        assert found(option, Run.open(tmp_path / f"run_{name}").scene()) == expected(option, folder)
 
 
 def test_options_that_a_resumed_run_cannot_take_are_named_in_one_sentence(tiny_scene, run_copy, capsys):
@@ -70,10 +94,10 @@ def test_options_that_a_resumed_run_cannot_take_are_named_in_one_sentence(tiny_s
     words = f"train {tiny_scene} -o {run_copy} --resume --effects auto --effect exposure=on"
     assert own.iterations != 7000 and own.max_primitives == 300
     # One has its default value, which the run's is not, and one the run's.
-    words += " --time-budget 1h --workers 3 --iterations 7000 --max-primitives 300 --views 5"
+    words += " --time-budget 1h --cluster local --workers 3 --iterations 7000 --max-primitives 300 --views 5"
     assert main(words.split()) == 0
     (line,) = (line for line in capsys.readouterr().err.splitlines() if "ignored" in line)
-    flags = "--time-budget, --workers, --effects, --effect, --views, --iterations"
+    flags = "--time-budget, --cluster, --workers, --effects, --effect, --views, --iterations"
     assert line.strip() == f"--resume goes on with the run's own options: {flags} ignored"
 
 
