@@ -427,3 +427,38 @@ def test_threads_limit_what_a_command_takes(line, function, monkeypatch):
     monkeypatch.setattr(function, stand_in)
     assert cli.main([*line.split(), "--threads", "1"]) == 1 and found == [(1, 1, "1")]
     assert (usable_cores(), ops.threads(), os.environ.get("OMP_NUM_THREADS")) == before
+
+
+# Commands that leave --threads to the options of their stage, and those that compute nothing in the core.
+THREADS_OF_OPTIONS = {"train", "inspect", "stereo", "tradeoff", "synth"}
+NO_THREADS = {"convert", "doctor", "completion"}
+
+
+def test_every_command_that_computes_takes_threads():
+    (commands,) = (
+        action.choices for action in cli.build_parser()._actions if isinstance(action, cli.argparse._SubParsersAction)
+    )
+    taken_by: dict[str, set[str]] = {"threads": set(), "most_threads": set(), "": set()}
+    for command, parser in commands.items():
+        (dest,) = [action.dest for action in parser._actions if "--threads" in action.option_strings] or [""]
+        taken_by[dest].add(command)
+    assert taken_by["threads"] == THREADS_OF_OPTIONS and taken_by[""] == NO_THREADS
+    assert taken_by["most_threads"] == {line.split()[0] for line in WITH_THREADS}
+
+
+@pytest.mark.parametrize("line", ["RUN p.npz", "RUN p.ply", "RUN p.glb", "SCENE/reference.ply m.obj", "BALL m.ply"])
+def test_converting_computes_nothing_in_the_core(line, tiny_run, tiny_scene, tmp_path, monkeypatch):
+    from helpers.surfaces import sphere
+
+    from linprim_geo.geometry.mesh_files import save_mesh
+    from linprim_geo.kernels import surface_ops
+
+    save_mesh(tmp_path / "ball.glb", sphere(rounds=2))
+    for name in [name for name in sys.modules if name.startswith("linprim_geo.kernels.")]:
+        if hasattr(sys.modules[name], "_core"):
+            monkeypatch.setattr(sys.modules[name], "_core", None)
+    assert surface_ops._core is None
+    monkeypatch.chdir(tmp_path)
+    for name, path in (("RUN", tiny_run), ("SCENE", tiny_scene), ("BALL", tmp_path / "ball.glb")):
+        line = line.replace(name, str(path))
+    assert cli.main(["convert", *line.split()]) == 0
