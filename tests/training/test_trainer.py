@@ -98,6 +98,36 @@ def test_every_view_is_seen_once_per_round(trainer):
     assert len({tuple(order) for order in rounds}) > 1
 
 
+@pytest.mark.parametrize("adam", ["dense", "sparse"])
+def test_learning_rates_fall_exponentially_to_a_part_of_themselves(trainer, adam, monkeypatch):
+    given = {}
+
+    def dense(parameter, grad, first, second, rate, step, **_):
+        given[id(parameter)] = rate
+
+    def sparse(parameters, grads, first, second, rates, steps):
+        given.update(zip(map(id, parameters), rates, strict=True))
+
+    monkeypatch.setattr("linprim_geo.training.step.trainer.adam_step", dense)
+    monkeypatch.setattr("linprim_geo.training.step.trainer.adam_rows", sparse)
+    trainer.options = replace(trainer.options, adam=adam)
+    # What is left of each at the end of the run, which has 100 steps.
+    falls = {"center": 0.02, "rotation": 0.1, "log_extent": 0.1, "raw_opacity": 0.1, "sh_dc": 0.1}
+    rates = {name: [] for name in falls}
+    for step in (0, 25, 50, 99):
+        trainer.step = step
+        trainer.advance()
+        for name, rate in rates.items():
+            rate.append(given[id(trainer.parameters[name])])
+    for name, (start, *later) in rates.items():
+        assert start > 0
+        assert later == pytest.approx([start * falls[name] ** part for part in (0.25, 0.5, 0.99)], rel=1e-12), name
+    # A run that is to end after 150 steps, as of step 50, stretches what is left of the fall.
+    trainer.step, trainer.correction = 100, (50, 150)
+    trainer.advance()
+    assert given[id(trainer.parameters["center"])] == pytest.approx(rates["center"][0] * 0.02**0.75, rel=1e-12)
+
+
 def test_half_axes_stay_within_their_bounds_and_rotations_are_of_length_one(trainer):
     trainer.bounds = (0.04, 0.05)
     for _ in range(5):
