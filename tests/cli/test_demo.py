@@ -36,7 +36,8 @@ def test_the_demo_makes_a_scored_mesh_and_a_second_one_replaces_it(tiny_size, tm
         f"{i}/6" for i in range(1, 7)
     ]
     assert all(math.isfinite(first[name]) for name in SCORES)
-    assert first["psnr"] > 15 and first["chamfer_percent_diagonal"] < 10 and first["primitives"] <= 120
+    # Measured (see tests/README.md): 21.75 to 22.21 dB, 1.15 to 1.26 %.
+    assert first["psnr"] > 20.7 and first["chamfer_percent_diagonal"] < 1.57 and first["primitives"] <= 120
     for file in (
         "scene/reference.ply",
         "run/mesh/tsdf/mesh.ply",

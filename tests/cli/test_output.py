@@ -39,7 +39,8 @@ def test_every_command_prints_one_object_and_does_what_it_says(result, tmp_path,
         "train s -o r --iterations 150 --max-primitives 200 --sh-degree 0 --threads 1 --checkpoint-every 100"
     )
     assert (trained["iterations"], trained["views"]) == (150, 2) and trained["primitives"] <= 200
-    assert trained["psnr"] > 15
+    # Measured (see tests/README.md): 21.26 to 21.75 dB.
+    assert trained["psnr"] > 20.2
     assert result("train s -o r --resume")["psnr"] == pytest.approx(trained["psnr"], abs=1e-6)
     rendered = result("render r")
     assert rendered["views"] == 2 and os.path.isdir("r/renders/test/depth_median")
@@ -60,7 +61,8 @@ def test_every_command_prints_one_object_and_does_what_it_says(result, tmp_path,
     assert against_mesh["normal_mean_deg"] > 0 and depths["overlap"]["normal_mean_deg"] is None
     scores = result("eval-mesh r/mesh/tsdf/mesh.ply s/reference.ply --samples 20000 --run r")
     assert {"accuracy", "completeness", "chamfer", "precision", "recall", "f1", "visible"} <= scores.keys()
-    assert 0 < scores["chamfer_percent_diagonal"] < 10
+    # Measured: 1.21 to 1.36.
+    assert 0 < scores["chamfer_percent_diagonal"] < 1.7
     assert json.loads(open("r/eval/mesh/results.json").read())["chamfer"] == scores["chamfer"]
     assert result("convert r p.ply")["count"] == trained["primitives"]
     assert result("convert p.ply p.glb")["faces"] == 8 * trained["primitives"]

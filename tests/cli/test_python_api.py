@@ -54,7 +54,8 @@ def test_the_examples_of_the_page_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names, printed = run_examples(PYTHON)
     assert len(examples(PYTHON)) == 5
-    assert names["trained"]["psnr"] > 15 and 0 < names["scores"]["chamfer_percent_diagonal"] < 10
+    # Measured (see tests/README.md): 23.38 to 23.76 dB, 0.84 to 0.96 %.
+    assert names["trained"]["psnr"] > 22.3 and 0 < names["scores"]["chamfer_percent_diagonal"] < 1.2
     assert all(float(tensor.grad.abs().sum()) > 0 for tensor in names["tensors"])
     assert printed.splitlines()[-1].startswith("no such folder: ")
     for name in ("half.glb", "part.ply", "primitives.ply", "part.npz"):

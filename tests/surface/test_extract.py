@@ -160,8 +160,9 @@ def test_the_same_run_gives_the_same_mesh(tiny_run, tmp_path):
 def test_a_trained_part_is_near_the_truth(tiny_run, tiny_scene, tmp_path):
     stats = extract_mesh(tiny_run, output=tmp_path / "m.ply", quiet=True)
     scores = score_mesh(load_mesh(stats["mesh"]), load_mesh(tiny_scene / "reference.ply"), samples=20_000)
-    # 12 photographs of 48 pixels: a pixel is 2 % of the diagonal.
-    assert scores["chamfer_percent_diagonal"] < 4 and scores["f1"] > 0.1
+    # 12 photographs of 48 pixels: a pixel is 2 % of the diagonal. Measured (see tests/README.md): 0.94 to 1.09 %, F1
+    # 0.63 to 0.69.
+    assert scores["chamfer_percent_diagonal"] < 1.36 and scores["f1"] > 0.58
 
 
 def test_no_surface_at_the_level_writes_nothing(tmp_path):

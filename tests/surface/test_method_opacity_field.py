@@ -291,7 +291,8 @@ def test_a_trained_part_is_closed_near_the_truth_and_the_same_again(tiny_run, ti
     assert files[0].read_bytes() == files[1].read_bytes()
     assert stats["watertight"] and manifold_status(load_mesh(files[0])) == "NoError"
     scores = score_mesh(load_mesh(files[0]), load_mesh(tiny_scene / "reference.ply"), samples=20_000)
-    assert scores["chamfer_percent_diagonal"] < 4 and scores["f1"] > 0.1
+    # Measured (see tests/README.md): 1.01 to 1.13 %, F1 0.62 to 0.66.
+    assert scores["chamfer_percent_diagonal"] < 1.41 and scores["f1"] > 0.57
 
 
 def test_no_surface_at_the_level_writes_nothing(tmp_path):

@@ -34,7 +34,8 @@ from linprim_geo.training.train import train
 def test_the_run_renders_extracts_and_scores_as_any_other(blocks_run, tmp_path):
     run, done = blocks_run
     opened = Run.open(run)
-    assert done["blocks"] == COUNT and done["views"] == 3 and done["psnr"] > 18
+    # Measured (see tests/README.md): 22.48 to 23.02 dB.
+    assert done["blocks"] == COUNT and done["views"] == 3 and done["psnr"] > 21.4
     assert opened.train_options == OPTIONS and opened.state["primitives"] == done["primitives"] == len(
         opened.primitives()
     )

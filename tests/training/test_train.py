@@ -26,9 +26,8 @@ from linprim_geo.synthetic.textured import TexturedMesh
 from linprim_geo.training.step.parameters import activate
 from linprim_geo.training.train import train
 
-# Pictures of the best single colour score at most 14.4 dB on the held-out views of these scenes: this is half of that
-# error, whatever the seed.
-LEARNT = 17.4
+# Bounds on PSNR are 1 dB below the least that was measured, see tests/README.md; the comment beside each gives the
+# range in dB. Pictures of the best single colour score at most 14.4 dB on the held-out views of these scenes.
 
 # --- what a run leaves behind ----------------------------------------------------------------------------
 
@@ -38,7 +37,7 @@ def test_a_run_learns_and_says_so(tiny_run, tiny_options):
     assert [line["step"] for line in lines] == [100, 200, 300, 400]
     assert lines[-1]["loss"] < 0.7 * lines[0]["loss"] and lines[-1]["train_psnr"] > lines[0]["train_psnr"]
     assert [("psnr" in line) for line in lines] == [False, True, False, True]
-    assert lines[-1]["psnr"] > LEARNT
+    assert lines[-1]["psnr"] > 22.0  # 23.07 to 24.15
     assert [line["primitives"] for line in lines] == sorted(line["primitives"] for line in lines)
     assert lines[0]["primitives"] >= 200 and lines[-1]["primitives"] == tiny_options.max_primitives
     assert all(line["memory_gib"] > 0 for line in lines) and lines[-1]["seconds"] > lines[0]["seconds"] > 0
@@ -90,7 +89,7 @@ def test_the_background_of_opaque_images_is_fitted(room, tmp_path):
     result = train(room, tmp_path / "run", options=options, quiet=True)
     run = Run.open(tmp_path / "run")
     assert np.abs(run.background - [0.2, 0.6, 0.4]).max() < 0.03
-    assert result["psnr"] > 20
+    assert result["psnr"] > 22.4  # 23.43 to 24.08
     assert checkpoint(tmp_path / "run")["parameters"]["background"].shape == (3,)
 
 
@@ -160,7 +159,7 @@ def test_a_colmap_model_alone(scene_copy, tmp_path):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
     shutil.move(scene_copy / "train", scene_copy / "images" / "train")
     result = train(scene_copy, tmp_path / "run", options=replace(QUICK, iterations=150), quiet=True)
-    assert result["views"] == 2 and result["psnr"] > 15
+    assert result["views"] == 2 and result["psnr"] > 19.0  # 20.05 to 20.86
     assert Run.open(tmp_path / "run").scene().kind == "colmap"
 
 
@@ -172,7 +171,7 @@ def test_no_points_start_from_the_masks(scene_copy, tmp_path):
         content.pop("ply_file_path")
         (scene_copy / name).write_text(json.dumps(content))
     result = train(scene_copy, tmp_path / "run", options=replace(QUICK, iterations=150), quiet=True)
-    assert result["psnr"] > 15
+    assert result["psnr"] > 18.5  # 19.56 to 20.04
 
 
 def test_an_off_centre_principal_point(tmp_path):
@@ -220,12 +219,13 @@ def test_cameras_of_two_sizes(tmp_path):
     result = train(wide, tmp_path / "run", options=replace(QUICK, iterations=300, max_primitives=150), quiet=True)
     run = Run.open(tmp_path / "run")
     assert {(v.camera.width, v.camera.height) for v in run.scene().test} == {(48, 32), (28, 40)}
-    assert result["views"] == 4 and result["psnr"] > LEARNT
+    assert result["views"] == 4 and result["psnr"] > 20.6  # 21.64 to 22.54
 
 
 def test_downscaled_photographs(tiny_scene, tmp_path):
     result = train(tiny_scene, tmp_path / "run", SceneOptions(downscale=2), replace(QUICK, iterations=100), quiet=True)
-    assert Run.open(tmp_path / "run").scene().train[0].camera.width == 24 and result["psnr"] > 15
+    assert Run.open(tmp_path / "run").scene().train[0].camera.width == 24
+    assert result["psnr"] > 18.8  # 19.87 to 20.49
 
 
 def test_the_population_never_exceeds_its_limit(tiny_scene, tmp_path):
@@ -311,7 +311,8 @@ def test_every_kind_learns_under_every_rule_and_goes_on_bit_for_bit(kind, popula
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     result = train(tiny_scene, whole, options=options, quiet=True)
     lines = metrics(whole)
-    assert result["psnr"] > LEARNT
+    # 22.25 to 25.16, but for Gaussians by 3DGS's rule 20.26 to 20.89.
+    assert result["psnr"] > (19.2 if (kind, population) == ("gaussian", "3dgs") else 21.2)
     # A reset of the opacities, at step 129, costs 3dgs most of what it had learnt.
     assert population == "3dgs" or lines[-1]["loss"] < 0.8 * lines[0]["loss"]
     assert 200 < result["primitives"] <= 260
@@ -353,7 +354,7 @@ def test_every_way_of_rendering_trains_and_is_used_by_renders(kind, ray_model, o
         filter=smooth,
     )
     result = train(tiny_scene, tmp_path / "run", options=options, quiet=True)
-    assert result["psnr"] > 15
+    assert result["psnr"] > 20.2  # 21.27 to 22.83
     scored = eval_images_run(tmp_path / "run", output=tmp_path / "scores")
     assert scored["psnr"] == pytest.approx(result["psnr"], abs=2e-3)
 
@@ -403,7 +404,7 @@ def test_the_frame_of_the_data_set_comes_back(tmp_path):
         score = eval_depth_run(run, scene / "reference.ply")
         assert score["abs_rel"] < 0.05 and score["coverage"] > 0.9
     # Not the same: positions were rounded in other places, and a training amplifies that.
-    assert min(results) > LEARNT
+    assert min(results) > 26.0  # 27.09 to 29.54
     both = (depths[0] > 0) & (depths[1] > 0)
     assert both.mean() > 0.1
     assert abs(np.median(depths[1][both] / depths[0][both]) / scale - 1) < 0.003
