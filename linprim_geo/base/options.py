@@ -358,8 +358,8 @@ class ExtractOptions:
     stereo: str = option(
         "auto",
         "fuse the depths that PatchMatch stereo finds in the photographs where views confirm them, and leave out what "
-        "no two photographs support: on, off, or auto: where these are without masks, but not where that leaves most "
-        "pixels open and photographs agree with it clearly less, with --method tsdf, without --blocks",
+        "no two photographs support: on, off, or auto: not where that leaves most pixels open and photographs agree "
+        "with it clearly less, and with masks only where they agree with it more; with --method tsdf, without --blocks",
         choices=("auto", "on", "off"),
     )
     held_out: bool = option(

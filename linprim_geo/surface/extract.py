@@ -119,8 +119,8 @@ def extract_mesh(
         if options.stereo == "on":
             raise LinprimError("--stereo on is for --method tsdf, without --blocks")
         options = replace(options, stereo="off")
-    elif options.stereo == "auto" and opened.scene().has_alpha:
-        # Masks say where an object ends better than windows do, and no wall is in the way.
+    elif options.stereo == "auto" and opened.scene().has_alpha and budget:
+        # Masks say where an object ends better than windows do: stereo is seldom worth its time.
         options = replace(options, stereo="off")
     folder = opened.path / "mesh" / method
     target = Path(output) if output else folder / "mesh.ply"

@@ -40,6 +40,10 @@ CLEARLY_LESS = 0.01
 """Where one shows in fewer, and photographs agree at a share of its vertices that is smaller by this, they speak
 against it. Where they agree anywhere, as on plain walls, the shares are the same but for chance."""
 
+MOSTLY = 0.95
+"""Objects with masks have no stereo where photographs agree at this share of the vertices without it: masks say where
+an object ends better than windows do (DECISIONS 76)."""
+
 SMALLEST_DISPARITY = 0.25
 """Depths are trusted as far as this many pixels between the two cameras that are furthest apart move a point by a
 truncation."""
@@ -128,7 +132,8 @@ def tsdf_surface(
         about |= {"taken": True}
         stages.lap("fuse")
     elif options.stereo == "auto":
-        mesh, about = _better_by_stereo(rendered, fused_with_stereo, frames, merged, run.scene().train, stages)
+        better = _better_for_object if run.scene().has_alpha else _better_by_stereo
+        mesh, about = better(rendered, fused_with_stereo, frames, merged, run.scene().train, stages)
     else:
         mesh = rendered()
     if about:
@@ -161,20 +166,9 @@ def _better_by_stereo(
     missing in most pixels and photographs of `views` agree at clearly more of the rendered one's vertices; with what
     there is to say of it. Frames of smaller views have stereo in any case: within pixels as large as theirs photographs
     agree with walls of fog."""
-    try:
-        if merged is None:
-            merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)
-    except LinprimError as error:
-        stages.note(f"no stereo: {error}")
-        return rendered(), {}
-    stages.lap("stereo")
-    if merged.confirmed < LEAST_CONFIRMED:
-        return rendered(), merged.about() | {"taken": False}
-    mesh, about = fused(merged)
-    stages.lap("fuse")
-    if not len(mesh.faces):
-        return rendered(), about | {"taken": False}
-    about |= {"covered": merged.covered(mesh)}
+    mesh, about = _surface_of_stereo(fused, frames, merged, stages)
+    if mesh is None:
+        return rendered(), about
     said = f"the surface of stereo shows in {about['covered']:.0%} of the pixels with a rendered depth"
     if about["covered"] >= MOST_PIXELS:
         stages.note(f"{said}: it is taken")
@@ -183,17 +177,83 @@ def _better_by_stereo(
         stages.note(f"{said}, and is taken, as photographs of this size do not compare surfaces")
         return mesh, about | {"taken": True}
     without_stereo = rendered()
-    cameras = [view.camera for view in views]
-    gains = photo_gains(without_stereo, cameras, (view.load() for view in views))
-    without, with_stereo = (_agreeing(surface, views, gains) for surface in (without_stereo, mesh))
-    stages.lap("compare")
-    taken = with_stereo > without - CLEARLY_LESS
-    stages.note(
-        f"{said}, and photographs agree at {without:.1%} of the vertices without stereo and at {with_stereo:.1%} with "
-        f"it: it is{'' if taken else ' not'} taken"
-    )
-    about |= {"taken": taken, "agreeing": with_stereo, "agreeing_without": without}
+    gains = _gains(without_stereo, views)
+    agreeing = _agreeing(without_stereo, views, gains)
+    taken, about = _agreed(mesh, about, views, gains, agreeing, agreeing - CLEARLY_LESS, f"{said}, and ", stages)
     return mesh if taken else without_stereo, about
+
+
+def _better_for_object(
+    rendered: Callable[[], Mesh],
+    fused: Callable[[MergedFrames], tuple[Mesh, dict]],
+    frames: DepthFrames,
+    merged: MergedFrames | None,
+    views: Sequence[View],
+    stages: Stages,
+) -> tuple[Mesh, dict]:
+    """The `rendered` surface of an object with masks, unless photographs of `views` agree at few of its vertices, and
+    at more of those of stereo's; with what there is to say of it."""
+    without_stereo = rendered()
+    gains = _gains(without_stereo, views)
+    agreeing = _agreeing(without_stereo, views, gains)
+    stages.lap("compare")
+    if agreeing >= MOSTLY:
+        stages.note(f"no stereo: photographs agree at {agreeing:.1%} of the vertices without it")
+        return without_stereo, {}
+    mesh, about = _surface_of_stereo(fused, frames, merged, stages)
+    if mesh is None:
+        return without_stereo, about
+    taken, about = _agreed(mesh, about, views, gains, agreeing, agreeing, "", stages)
+    return mesh if taken else without_stereo, about
+
+
+def _surface_of_stereo(
+    fused: Callable[[MergedFrames], tuple[Mesh, dict]],
+    frames: DepthFrames,
+    merged: MergedFrames | None,
+    stages: Stages,
+) -> tuple[Mesh | None, dict]:
+    """The surface of stereo, None where there is hardly any, and what there is to say of it."""
+    try:
+        if merged is None:
+            merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)
+    except LinprimError as error:
+        stages.note(f"no stereo: {error}")
+        return None, {}
+    stages.lap("stereo")
+    if merged.confirmed < LEAST_CONFIRMED:
+        return None, merged.about() | {"taken": False}
+    mesh, about = fused(merged)
+    stages.lap("fuse")
+    if not len(mesh.faces):
+        return None, about | {"taken": False}
+    return mesh, about | {"covered": merged.covered(mesh)}
+
+
+def _agreed(
+    mesh: Mesh,
+    about: dict,
+    views: Sequence[View],
+    gains: np.ndarray,
+    without: float,
+    least: float,
+    said: str,
+    stages: Stages,
+) -> tuple[bool, dict]:
+    """Whether photographs agree at a share of the vertices of stereo's surface above `least`, and what there is to say
+    of it. `without`: the share of the surface without stereo."""
+    agreeing = _agreeing(mesh, views, gains)
+    stages.lap("compare")
+    taken = agreeing > least
+    stages.note(
+        f"{said}photographs agree at {without:.1%} of the vertices without stereo and at {agreeing:.1%} with it: it "
+        f"is{'' if taken else ' not'} taken"
+    )
+    return taken, about | {"taken": taken, "agreeing": agreeing, "agreeing_without": without}
+
+
+def _gains(mesh: Mesh, views: Sequence[View]) -> np.ndarray:
+    return photo_gains(mesh, [view.camera for view in views], (view.load() for view in views))
 
 
 def _agreeing(mesh: Mesh, views: Sequence[View], gains: np.ndarray) -> float:

@@ -69,6 +69,7 @@ def test_what_is_written(extracted, solid):
         "level",
         "render",
         "fuse",
+        "compare",
         "refine",
         "denoise",
         "colours",

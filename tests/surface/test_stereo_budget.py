@@ -10,6 +10,7 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Progress, Stages
 from linprim_geo.capture.small_copy import SmallCopy
+from linprim_geo.capture.types import Scene
 from linprim_geo.runs.run import Run
 from linprim_geo.surface import method_tsdf, stereo_budget, stereo_frames
 from linprim_geo.surface.extract import extract_mesh
@@ -90,6 +91,7 @@ def test_a_surface_in_a_given_time_has_stereo(many_views):
 @pytest.mark.parametrize("factor, taken", [(1, False), (2, True)])
 def test_small_photographs_do_not_speak_against_stereo(many_views, frames, monkeypatch, factor, taken):
     shares = iter((0.9, 0.1))
+    monkeypatch.setattr(Scene, "has_alpha", False)
     monkeypatch.setattr(method_tsdf, "LEAST_CONFIRMED", 0.0)
     monkeypatch.setattr(method_tsdf, "_agreeing", lambda *_: next(shares))
     monkeypatch.setattr(stereo_frames.MergedFrames, "covered", lambda *_: 0.1)

@@ -15,6 +15,7 @@ from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.types import Scene
 from linprim_geo.geometry.mesh import Mesh, vertex_normals
 from linprim_geo.geometry.mesh_files import load_mesh
+from linprim_geo.runs.run import Run
 from linprim_geo.stereo.depth_maps import CONFIDENT, SURE, DepthMap, depth_maps
 from linprim_geo.surface import method_tsdf, postprocess, stereo_frames
 from linprim_geo.surface.extract import extract_mesh
@@ -256,6 +257,23 @@ def test_photographs_that_agree_clearly_less_often_speak_against_a_surface_in_fe
     stats = extract_mesh(many_views, options=COARSE, quiet=True)
     assert stats["stereo"]["taken"] is taken and stats["refine"] == (0 if taken else 2)
     assert stats["stereo"]["covered"] == covered and ("agreeing" in stats["stereo"]) is bool(shares)
+
+
+@pytest.mark.parametrize(
+    "shares, asked, taken",
+    [((0.95,), False, False), ((0.94, 0.95), True, True), ((0.94, 0.94), True, False)],
+)
+def test_an_object_with_masks_has_stereo_where_photographs_agree_more_often_with_it(
+    many_views, stereo_once, monkeypatch, shares, asked, taken
+):
+    told = iter(shares)
+    assert Run.open(many_views).scene().has_alpha
+    monkeypatch.setattr(MergedFrames, "covered", lambda *_: 1.0)
+    monkeypatch.setattr(method_tsdf, "LEAST_CONFIRMED", 0.0)
+    monkeypatch.setattr(method_tsdf, "_agreeing", lambda *_: next(told))
+    stats = extract_mesh(many_views, options=COARSE, quiet=True)
+    assert next(told, None) is None and ("stereo" in stats) is asked and stats["refine"] == (0 if taken else 2)
+    assert not asked or (stats["stereo"]["taken"] is taken and stats["stereo"]["agreeing_without"] == 0.94)
 
 
 def test_a_surface_takes_stereo_into_account_where_it_is_asked_to(many_views, stereo_once, monkeypatch):
