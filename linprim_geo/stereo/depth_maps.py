@@ -93,7 +93,7 @@ def depth_maps(
     cameras = [view.camera for view in views]
     if any(min(camera.width, camera.height) < SMALLEST for camera in cameras):
         raise LinprimError(f"stereo needs photographs of {SMALLEST} pixels a side at least")
-    wanted, free = PIXEL_BYTES * sum(camera.width * camera.height for camera in cameras), available_memory()
+    wanted, free = memory_of(cameras), available_memory()
     if wanted > MEMORY_SHARE * free:
         raise LinprimError(
             f"stereo of {len(views)} photographs takes {wanted / 2**30:.1f} GiB of the {free / 2**30:.1f} that are "
@@ -136,6 +136,11 @@ def depth_maps(
         _depth_map(full[k], noises[k], planes, [(cameras[j], found[j]) for j in pairs[k]], weights)
         for k, planes in enumerate(found)
     ]
+
+
+def memory_of(cameras: Sequence[Camera]) -> int:
+    """Bytes that depth maps of all views take at once."""
+    return PIXEL_BYTES * sum(camera.width * camera.height for camera in cameras)
 
 
 def photometric_planes(

@@ -9,14 +9,16 @@ from dataclasses import replace
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.memory import PROCESS_GIB
+from linprim_geo.base.memory import PROCESS_GIB, available_memory
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Stages
+from linprim_geo.capture.small_copy import SmallCopy
 from linprim_geo.capture.types import View
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.geometry.region import read_box
 from linprim_geo.runs.run import Run
+from linprim_geo.stereo.depth_maps import MEMORY_SHARE, memory_of
 from linprim_geo.surface.depth_error import error_by_depths
 from linprim_geo.surface.photo_consistency import best_agreement, photo_gains
 from linprim_geo.surface.stereo_frames import MergedFrames
@@ -43,6 +45,9 @@ against it. Where they agree anywhere, as on plain walls, the shares are the sam
 MOSTLY = 0.95
 """Objects with masks have no stereo where photographs agree at this share of the vertices without it: masks say where
 an object ends better than windows do (DECISIONS 76)."""
+
+SMALLEST_SIDE = 120
+"""Photographs are not averaged down to fewer pixels along the longer side for stereo."""
 
 SMALLEST_DISPARITY = 0.25
 """Depths are trusted as far as this many pixels between the two cameras that are furthest apart move a point by a
@@ -73,9 +78,14 @@ def tsdf_surface(
         LinprimError: no ray crosses the level, or the grid would not fit into memory, with voxels of the size that is
             given or any size.
     """
+    whole = run.scene().train
+    most = kept_bytes(options, [view.camera for view in whole])
+    shrunk = frames is None and (factor := stereo_factor(run, options)) > 1
+    if shrunk:
+        stages.note(f"stereo of means of {factor} by {factor} pixels, for which there is memory")
     if frames is None:
-        most = kept_bytes(options, [view.camera for view in run.scene().train])
-        frames = DepthFrames(run, float(options.level), options.depth_limit, most=most)
+        views = [SmallCopy.of(view, factor) for view in whole] if shrunk else whole
+        frames = DepthFrames(run, float(options.level), options.depth_limit, most=most, views=views)
     about: dict = {}
     if not any((frame.depth > 0).any() for frame in frames):
         raise LinprimError(
@@ -111,7 +121,8 @@ def tsdf_surface(
         raise AssertionError  # the last try has raised
 
     def rendered() -> Mesh:
-        surface = fused(frames, options.smallest_part)
+        own = DepthFrames(run, float(options.level), options.depth_limit, most=most) if shrunk else frames
+        surface = fused(own, options.smallest_part)
         stages.lap("fuse")
         return surface
 
@@ -133,7 +144,7 @@ def tsdf_surface(
         stages.lap("fuse")
     elif options.stereo == "auto":
         better = _better_for_object if run.scene().has_alpha else _better_by_stereo
-        mesh, about = better(rendered, fused_with_stereo, frames, merged, run.scene().train, stages)
+        mesh, about = better(rendered, fused_with_stereo, frames, merged, whole, stages)
     else:
         mesh = rendered()
     if about:
@@ -261,6 +272,19 @@ def _agreeing(mesh: Mesh, views: Sequence[View], gains: np.ndarray) -> float:
     something is missing or stands too far out, they do so beyond it. `gains`: see `best_agreement`."""
     found = best_agreement(mesh, [view.camera for view in views], (view.load() for view in views), gains)
     return float(found.inside[found.seen_by_two].mean()) if found.seen_by_two.any() else 0.0
+
+
+def stereo_factor(run: Run, options: ExtractOptions) -> int:
+    """The least K with which stereo of means of K by K pixels fits into the memory that is free and half of what
+    --memory-limit leaves, with SMALLEST_SIDE pixels at least; 1 where none fits, and for objects with masks, whose
+    rendered surface wants whole photographs."""
+    if options.stereo == "off" or (options.stereo == "auto" and run.scene().has_alpha):
+        return 1
+    cameras = [view.camera for view in run.scene().train]
+    room = MEMORY_SHARE * min(available_memory(), memory_left(options) or np.inf)
+    largest = min(max(camera.width, camera.height) for camera in cameras) // SMALLEST_SIDE
+    fitting = (k for k in range(1, largest + 1) if memory_of(cameras) <= room * k**2)
+    return next(fitting, 1)
 
 
 def memory_left(options: ExtractOptions, taken: int = 0) -> int | None:

@@ -12,13 +12,11 @@ from linprim_geo.capture.small_copy import SmallCopy
 from linprim_geo.runs.run import Run
 from linprim_geo.stereo.planes_on_disk import Photographs
 from linprim_geo.stereo.time_plan import seconds_per_pixel
-from linprim_geo.surface.method_tsdf import DepthFrames
+from linprim_geo.surface.method_tsdf import SMALLEST_SIDE, DepthFrames
 from linprim_geo.surface.stereo_frames import MergedFrames, pairing_points
 
 # Of the time that is left stereo takes at most this share: the rest is for smaller voxels.
 SHARE = 0.5
-# Photographs are not made smaller than so many pixels along the longer side.
-SMALLEST_SIDE = 120
 # Stereo with its planes takes so many times as long as depth maps alone, by which it is estimated: 1.1 and 1.3 times on
 # `temple_ring`.
 WITH_PLANES = 1.2

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from conftest import octahedron_run
 
 from linprim_geo.base.budget import AIM, Budget
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.memory import PROCESS_GIB
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Progress, Stages
 from linprim_geo.capture.small_copy import SmallCopy
 from linprim_geo.capture.types import Scene
 from linprim_geo.runs.run import Run
+from linprim_geo.stereo.depth_maps import MEMORY_SHARE, memory_of
 from linprim_geo.surface import method_tsdf, stereo_budget, stereo_frames
 from linprim_geo.surface.extract import extract_mesh
-from linprim_geo.surface.method_tsdf import DepthFrames, tsdf_surface
+from linprim_geo.surface.method_tsdf import DepthFrames, stereo_factor, tsdf_surface
 from linprim_geo.surface.stereo_budget import SHARE, WITH_PLANES, stereo_in_time
 
 VIEWS, SIZE, SECONDS = 60, 64, 1000.0
@@ -101,3 +105,43 @@ def test_small_photographs_do_not_speak_against_stereo(many_views, frames, monke
     stages, options = Stages(Progress("test", 1, quiet=True)), ExtractOptions(level=0.5, voxel_size=0.1)
     _, about = tsdf_surface(many_views, options, stages, DepthFrames(many_views, 0.5, frames.limit, views=views))
     assert about["stereo"]["taken"] is taken and ("agreeing" in about["stereo"]) is not taken
+
+
+@pytest.fixture
+def little_memory(many_views, monkeypatch):
+    """For stereo of a third of the pixels, of a capture without masks."""
+    cameras = [view.camera for view in many_views.scene().train]
+    monkeypatch.setattr(Scene, "has_alpha", False)
+    monkeypatch.setattr(method_tsdf, "SMALLEST_SIDE", 12)
+    monkeypatch.setattr(method_tsdf, "LEAST_CONFIRMED", 0.0)
+    monkeypatch.setattr(method_tsdf, "available_memory", lambda: memory_of(cameras) / 3 / MEMORY_SHARE)
+    return many_views
+
+
+def test_stereo_takes_smaller_photographs_where_memory_is_short(little_memory, monkeypatch):
+    options = ExtractOptions(level=0.5)
+    assert stereo_factor(little_memory, options) == 2
+    assert stereo_factor(little_memory, replace(options, stereo="off")) == 1
+    # Half of what --memory-limit leaves beside what the program takes itself.
+    cameras = [view.camera for view in little_memory.scene().train]
+    limit = PROCESS_GIB + memory_of(cameras) / 8 / MEMORY_SHARE / 2**30
+    assert stereo_factor(little_memory, replace(options, memory_limit=limit)) == 3
+    monkeypatch.setattr(method_tsdf, "SMALLEST_SIDE", 48)
+    assert stereo_factor(little_memory, options) == 1
+    monkeypatch.setattr(Scene, "has_alpha", True)
+    monkeypatch.setattr(method_tsdf, "SMALLEST_SIDE", 12)
+    assert stereo_factor(little_memory, options) == 1
+
+
+def test_without_stereo_a_surface_is_of_whole_photographs_all_the_same(little_memory, monkeypatch):
+    options = ExtractOptions(level=0.5, voxel_size=0.1)
+    stages = Stages(Progress("test", 1, quiet=True))
+
+    def impossible(frames, views, *_, **__):
+        assert {view.camera.width for view in views} == {32}
+        raise LinprimError("no two photographs show the same points")
+
+    monkeypatch.setattr(method_tsdf, "MergedFrames", impossible)
+    with_small, about = tsdf_surface(little_memory, options, stages)
+    whole, _ = tsdf_surface(little_memory, replace(options, stereo="off"), stages)
+    assert "stereo" not in about and (with_small.vertices == whole.vertices).all()
