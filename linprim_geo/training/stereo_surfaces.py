@@ -15,10 +15,17 @@ from linprim_geo.base.progress import Progress, duration
 from linprim_geo.capture.types import PointCloud, Scene, View
 from linprim_geo.points.initial_points import VolumePoints
 from linprim_geo.points.start_points import SFM_START
+from linprim_geo.points.view_pairs import visible_pixels
+from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.planes_on_disk import Photographs
 from linprim_geo.stereo.surface_points import SurfaceMap, small_copies, surface_maps, surface_points
 from linprim_geo.stereo.time_plan import seconds_per_pixel
 
+# Depths of small copies and points of the capture agree up to this share of the depth.
+AGREE = 2 * CONFIRMED_DEPTH
+# Where so many points do not, stereo is taken for chance: 0.88 of them in a hall without texture, 0.02 to 0.40 on eight
+# other captures (DECISIONS 78).
+CONTRADICTING = 2 / 3
 # Of a time budget stereo takes at most this share; steps in the rest are fewer and as long as before.
 BUDGET_SHARE = 0.2
 
@@ -36,7 +43,8 @@ def stereo_surfaces(
     scene: Scene, options: TrainOptions, progress: Progress, budget: Budget | None = None, *, started: bool = False
 ) -> Surfaces:
     """Surfaces by stereo of the training views; nothing where nothing wants them, where the scene's points are anywhere
-    in a volume, and where stereo has nothing to say. With masks there are no `maps`: they clear the space before
+    in a volume, and where stereo has nothing to say, or the points contradict it, as in a room without any texture,
+    where it is chance. With masks there are no `maps`: they clear the space before
     backgrounds already.
 
     Args:
@@ -64,7 +72,21 @@ def stereo_surfaces(
         f"stereo of {len(views)} photographs, averaged down, finds surfaces in {share:.0%} of the pixels "
         f"({duration(time.monotonic() - begin)})"
     )
+    if contradicting(maps, points) > CONTRADICTING:
+        progress.note("no stereo: it is elsewhere than most points of the capture")
+        return Surfaces()
     return Surfaces(surface_points(maps, missing, options.seed) if missing > 0 else None, maps if held else ())
+
+
+def contradicting(maps: Sequence[SurfaceMap], points: np.ndarray) -> float:
+    """The share of (P, 3) points where maps have a surface that are not within AGREE of it; 0 without any."""
+    known = agreeing = 0
+    for found in maps:
+        _, pixel, depth = visible_pixels(found.view.camera, points)
+        inverse = found.planes[0][pixel[:, 1], pixel[:, 0]]
+        known += np.count_nonzero(inverse)
+        agreeing += np.count_nonzero(np.abs(depth * inverse - 1) < AGREE)
+    return 1 - agreeing / known if known else 0.0
 
 
 def _fits(views: Sequence[View], points: np.ndarray, budget: Budget) -> bool:

@@ -15,7 +15,7 @@ from linprim_geo.capture.load import load_scene
 from linprim_geo.runs.run import Run
 from linprim_geo.training import stereo_surfaces as module
 from linprim_geo.training.step.geometry_terms import plane_error
-from linprim_geo.training.stereo_surfaces import stereo_surfaces
+from linprim_geo.training.stereo_surfaces import contradicting, stereo_surfaces
 
 OPTIONS = TrainOptions(
     iterations=200, max_primitives=1500, sh_degree=0, threads=1, evaluate_every=0, checkpoint_every=100
@@ -59,6 +59,19 @@ def test_there_are_points_where_some_are_missing_and_maps_where_training_is_held
     assert np.array_equal(only_points.points.xyz, found.points.xyz) and not only_points.maps
     masked = replace(scene, train=tuple(replace(view, has_alpha=True) for view in scene.train))
     assert not stereo_surfaces(masked, replace(OPTIONS, start="points"), QUIET).maps
+
+
+def test_stereo_that_most_points_contradict_says_nothing(room):
+    scene = load_scene(room)
+    maps = stereo_surfaces(scene, OPTIONS, QUIET).maps
+    points = scene.points.xyz
+    assert contradicting(maps, points) < 0.4
+    assert contradicting(maps, points[:0]) == 0
+    # Points that are nearer to the middle by a tenth, as if stereo were wrong everywhere.
+    middle = np.mean([view.camera.center for view in scene.train], axis=0)
+    elsewhere = replace(scene.points, xyz=middle + 0.9 * (points - middle))
+    assert contradicting(maps, elsewhere.xyz) > 0.8
+    assert stereo_surfaces(replace(scene, points=elsewhere), OPTIONS, QUIET) == module.Surfaces()
 
 
 def error_at_stereo(run: Run) -> float:
