@@ -23,7 +23,7 @@ from linprim_geo.stereo.time_plan import seconds_per_pixel
 
 # Depths of small copies and points of the capture agree up to this share of the depth.
 AGREE = 2 * CONFIRMED_DEPTH
-# Where so many points do not, stereo is taken for chance: 0.88 of them in a hall without texture, 0.02 to 0.40 on eight
+# Where so many points do not, stereo is taken for chance: 0.88 of them in a hall without texture, 0.08 to 0.40 on eight
 # other captures (DECISIONS 78).
 CONTRADICTING = 2 / 3
 # Of a time budget stereo takes at most this share; steps in the rest are fewer and as long as before.
