@@ -142,9 +142,14 @@ def tsdf_surface(
             raise LinprimError(f"{run.path}: no two photographs support any surface; use --stereo auto or off")
         about |= {"taken": True}
         stages.lap("fuse")
+    elif options.stereo == "auto" and run.scene().has_alpha:
+        if memory_of([view.camera for view in whole]) <= stereo_room(options):
+            mesh, about = _better_for_object(rendered, fused_with_stereo, frames, merged, whole, stages)
+        else:
+            stages.note("no stereo: there is no memory for it")
+            mesh = rendered()
     elif options.stereo == "auto":
-        better = _better_for_object if run.scene().has_alpha else _better_by_stereo
-        mesh, about = better(rendered, fused_with_stereo, frames, merged, whole, stages)
+        mesh, about = _better_by_stereo(rendered, fused_with_stereo, frames, merged, whole, stages)
     else:
         mesh = rendered()
     if about:
@@ -274,14 +279,18 @@ def _agreeing(mesh: Mesh, views: Sequence[View], gains: np.ndarray) -> float:
     return float(found.inside[found.seen_by_two].mean()) if found.seen_by_two.any() else 0.0
 
 
+def stereo_room(options: ExtractOptions) -> float:
+    """Bytes that depth maps of stereo may take: half of the memory that is free, and of what --memory-limit leaves."""
+    return MEMORY_SHARE * min(available_memory(), memory_left(options) or np.inf)
+
+
 def stereo_factor(run: Run, options: ExtractOptions) -> int:
-    """The least K with which stereo of means of K by K pixels fits into the memory that is free and half of what
-    --memory-limit leaves, with SMALLEST_SIDE pixels at least; 1 where none fits, and for objects with masks, whose
-    rendered surface wants whole photographs."""
+    """The least K with which stereo of means of K by K pixels fits into `stereo_room`, with SMALLEST_SIDE pixels at
+    least; 1 where none fits, and for objects with masks, whose rendered surface wants whole photographs."""
     if options.stereo == "off" or (options.stereo == "auto" and run.scene().has_alpha):
         return 1
     cameras = [view.camera for view in run.scene().train]
-    room = MEMORY_SHARE * min(available_memory(), memory_left(options) or np.inf)
+    room = stereo_room(options)
     largest = min(max(camera.width, camera.height) for camera in cameras) // SMALLEST_SIDE
     fitting = (k for k in range(1, largest + 1) if memory_of(cameras) <= room * k**2)
     return next(fitting, 1)

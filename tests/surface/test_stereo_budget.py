@@ -145,3 +145,11 @@ def test_without_stereo_a_surface_is_of_whole_photographs_all_the_same(little_me
     with_small, about = tsdf_surface(little_memory, options, stages)
     whole, _ = tsdf_surface(little_memory, replace(options, stereo="off"), stages)
     assert "stereo" not in about and (with_small.vertices == whole.vertices).all()
+
+
+def test_an_object_with_masks_has_no_stereo_that_does_not_fit(little_memory, monkeypatch):
+    monkeypatch.setattr(Scene, "has_alpha", True)
+    monkeypatch.setattr(method_tsdf, "MergedFrames", lambda *_, **__: pytest.fail("it does not fit"))
+    options = ExtractOptions(level=0.5, voxel_size=0.1)
+    mesh, about = tsdf_surface(little_memory, options, Stages(Progress("test", 1, quiet=True)))
+    assert len(mesh.faces) and "stereo" not in about
