@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -42,7 +43,7 @@ CLEARLY_LESS = 0.01
 """Where one shows in fewer, and photographs agree at a share of its vertices that is smaller by this, they speak
 against it. Where they agree anywhere, as on plain walls, the shares are the same but for chance."""
 
-MOSTLY = 0.95
+ENOUGH_AGREE = 0.95
 """Objects with masks have no stereo where photographs agree at this share of the vertices without it: masks say where
 an object ends better than windows do (DECISIONS 76)."""
 
@@ -58,6 +59,10 @@ SAMPLED = 2
 
 NEAREST_LIMIT = 4.0
 """And at least this many median depths: cameras that are close together fuse what they see all the same."""
+
+
+ByStereo = Callable[[], tuple[Mesh | None, dict]]
+"""Gives the surface of stereo, see `_surface_of_stereo`."""
 
 
 def tsdf_surface(
@@ -121,8 +126,12 @@ def tsdf_surface(
         raise AssertionError  # the last try has raised
 
     def rendered() -> Mesh:
-        own = DepthFrames(run, float(options.level), options.depth_limit, most=most) if shrunk else frames
-        surface = fused(own, options.smallest_part)
+        nonlocal frames, voxel, memory
+        if shrunk:  # whole photographs are rendered finer
+            frames = DepthFrames(run, float(options.level), options.depth_limit, most=most)
+            voxel = options.voxel_size if options.voxel_size > 0 else auto_voxel_size(frames)
+            memory = memory_left(options, frames.bytes)
+        surface = fused(frames, options.smallest_part)
         stages.lap("fuse")
         return surface
 
@@ -133,6 +142,7 @@ def tsdf_surface(
         mesh = replace(mesh, quality=error_by_depths(mesh, merged, reach))
         return mesh, merged.about() | {"unsupported": left_out}
 
+    by_stereo = partial(_surface_of_stereo, fused_with_stereo, frames, merged, stages)
     if options.stereo == "on":
         if merged is None:
             merged = MergedFrames(frames, frames.views, frames.limit, quiet=stages.progress.quiet)
@@ -144,12 +154,12 @@ def tsdf_surface(
         stages.lap("fuse")
     elif options.stereo == "auto" and run.scene().has_alpha:
         if memory_of([view.camera for view in whole]) <= stereo_room(options):
-            mesh, about = _better_for_object(rendered, fused_with_stereo, frames, merged, whole, stages)
+            mesh, about = _better_for_object(rendered, by_stereo, whole, stages)
         else:
             stages.note("no stereo: there is no memory for it")
             mesh = rendered()
     elif options.stereo == "auto":
-        mesh, about = _better_by_stereo(rendered, fused_with_stereo, frames, merged, whole, stages)
+        mesh, about = _better_by_stereo(rendered, by_stereo, whole, frames.views is not whole, stages)
     else:
         mesh = rendered()
     if about:
@@ -171,56 +181,45 @@ def tsdf_surface(
 
 
 def _better_by_stereo(
-    rendered: Callable[[], Mesh],
-    fused: Callable[[MergedFrames], tuple[Mesh, dict]],
-    frames: DepthFrames,
-    merged: MergedFrames | None,
-    views: Sequence[View],
-    stages: Stages,
+    rendered: Callable[[], Mesh], by_stereo: ByStereo, views: Sequence[View], small: bool, stages: Stages
 ) -> tuple[Mesh, dict]:
     """The surface of stereo, or the `rendered` one where there is hardly any stereo, or where the surface of stereo is
     missing in most pixels and photographs of `views` agree at clearly more of the rendered one's vertices; with what
-    there is to say of it. Frames of smaller views have stereo in any case: within pixels as large as theirs photographs
-    agree with walls of fog."""
-    mesh, about = _surface_of_stereo(fused, frames, merged, stages)
+    there is to say of it. Stereo of `small` photographs is taken in any case: within pixels as large as theirs
+    photographs agree with walls of fog."""
+    mesh, about = by_stereo()
     if mesh is None:
         return rendered(), about
     said = f"the surface of stereo shows in {about['covered']:.0%} of the pixels with a rendered depth"
     if about["covered"] >= MOST_PIXELS:
         stages.note(f"{said}: it is taken")
         return mesh, about | {"taken": True}
-    if frames.views is not views:
+    if small:
         stages.note(f"{said}, and is taken, as photographs of this size do not compare surfaces")
         return mesh, about | {"taken": True}
+    stages.note(said)
     without_stereo = rendered()
-    gains = _gains(without_stereo, views)
-    agreeing = _agreeing(without_stereo, views, gains)
-    taken, about = _agreed(mesh, about, views, gains, agreeing, agreeing - CLEARLY_LESS, f"{said}, and ", stages)
-    return mesh if taken else without_stereo, about
+    vote = Vote(without_stereo, views)
+    about |= vote.on(mesh, vote.without - CLEARLY_LESS, stages)
+    return mesh if about["taken"] else without_stereo, about
 
 
 def _better_for_object(
-    rendered: Callable[[], Mesh],
-    fused: Callable[[MergedFrames], tuple[Mesh, dict]],
-    frames: DepthFrames,
-    merged: MergedFrames | None,
-    views: Sequence[View],
-    stages: Stages,
+    rendered: Callable[[], Mesh], by_stereo: ByStereo, views: Sequence[View], stages: Stages
 ) -> tuple[Mesh, dict]:
     """The `rendered` surface of an object with masks, unless photographs of `views` agree at few of its vertices, and
     at more of those of stereo's; with what there is to say of it."""
     without_stereo = rendered()
-    gains = _gains(without_stereo, views)
-    agreeing = _agreeing(without_stereo, views, gains)
+    vote = Vote(without_stereo, views)
     stages.lap("compare")
-    if agreeing >= MOSTLY:
-        stages.note(f"no stereo: photographs agree at {agreeing:.1%} of the vertices without it")
+    if vote.without >= ENOUGH_AGREE:
+        stages.note(f"no stereo: photographs agree at {vote.without:.1%} of the vertices without it")
         return without_stereo, {}
-    mesh, about = _surface_of_stereo(fused, frames, merged, stages)
+    mesh, about = by_stereo()
     if mesh is None:
         return without_stereo, about
-    taken, about = _agreed(mesh, about, views, gains, agreeing, agreeing, "", stages)
-    return mesh if taken else without_stereo, about
+    about |= vote.on(mesh, vote.without, stages)
+    return mesh if about["taken"] else without_stereo, about
 
 
 def _surface_of_stereo(
@@ -246,30 +245,26 @@ def _surface_of_stereo(
     return mesh, about | {"covered": merged.covered(mesh)}
 
 
-def _agreed(
-    mesh: Mesh,
-    about: dict,
-    views: Sequence[View],
-    gains: np.ndarray,
-    without: float,
-    least: float,
-    said: str,
-    stages: Stages,
-) -> tuple[bool, dict]:
-    """Whether photographs agree at a share of the vertices of stereo's surface above `least`, and what there is to say
-    of it. `without`: the share of the surface without stereo."""
-    agreeing = _agreeing(mesh, views, gains)
-    stages.lap("compare")
-    taken = agreeing > least
-    stages.note(
-        f"{said}photographs agree at {without:.1%} of the vertices without stereo and at {agreeing:.1%} with it: it "
-        f"is{'' if taken else ' not'} taken"
-    )
-    return taken, about | {"taken": taken, "agreeing": agreeing, "agreeing_without": without}
+class Vote:
+    """Photographs between the surface without stereo and that with it. `without`: at what share of the vertices of the
+    first they agree; differences of their exposure are those that it tells."""
 
+    def __init__(self, without_stereo: Mesh, views: Sequence[View]):
+        self.views = views
+        self.gains = photo_gains(without_stereo, [view.camera for view in views], (view.load() for view in views))
+        self.without = _agreeing(without_stereo, views, self.gains)
 
-def _gains(mesh: Mesh, views: Sequence[View]) -> np.ndarray:
-    return photo_gains(mesh, [view.camera for view in views], (view.load() for view in views))
+    def on(self, mesh: Mesh, least: float, stages: Stages) -> dict:
+        """For the statistics: whether stereo's surface is taken, as photographs agree at a share of its vertices above
+        `least`, and both shares."""
+        agreeing = _agreeing(mesh, self.views, self.gains)
+        stages.lap("compare")
+        taken = agreeing > least
+        stages.note(
+            f"photographs agree at {self.without:.1%} of the vertices without stereo and at {agreeing:.1%} with it: it "
+            f"is{'' if taken else ' not'} taken"
+        )
+        return {"taken": taken, "agreeing": agreeing, "agreeing_without": self.without}
 
 
 def _agreeing(mesh: Mesh, views: Sequence[View], gains: np.ndarray) -> float:

@@ -44,8 +44,7 @@ def stereo_surfaces(
 ) -> Surfaces:
     """Surfaces by stereo of the training views; nothing where nothing wants them, where the scene's points are anywhere
     in a volume, and where stereo has nothing to say, or the points contradict it, as in a room without any texture,
-    where it is chance. With masks there are no `maps`: they clear the space before
-    backgrounds already.
+    where it is chance. With masks there are no `maps`: they clear the space before backgrounds already.
 
     Args:
         started: the training goes on, and wants no points.
