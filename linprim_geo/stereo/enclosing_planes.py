@@ -1,0 +1,215 @@
+"""Floors and walls where nothing is known of them: planes behind which nothing lies go on.
+
+A plane encloses the scene if all cameras and nearly all known points lie on one side of it, and another such plane
+meets it at a right angle, as the floor and the walls of a room do. A ray of which nothing is known ends at the first of
+these, but only within the rectangle that holds the plane's own known points, as walls do not go on into the sky. Where
+hardly any view looks, as below a table, stereo can know nothing: there it ends within the rectangle that holds all
+known points, if the plane's own reach across that one way. Where most of the views that look at a place know it, one
+that does not has something before it.
+
+A plain wall in even light has no points. Where two planes that enclose the scene end at the same place, as a floor and
+a wall do at the next wall, a plane at right angles to both closes the room there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.points.view_pairs import visible_pixels
+from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
+from linprim_geo.stereo.plain_regions import in_camera, rays_of, to_world
+from linprim_geo.stereo.point_planes import LEAST_SHARE, SAME_NORMAL, SurfacePoints
+from linprim_geo.stereo.right_angles import NEARLY
+
+# Of the known points so many are wrong, and may lie behind a plane or beyond an end of it.
+OUTLIERS = 0.01
+# A point is behind a plane by more than this share of its distance: twice what depths may be off by.
+MARGIN = 2 * CONFIRMED_DEPTH
+# So few of the points on a plane lie beyond its ends, and ends are known to this share of the distance between them.
+BEYOND, END_MARGIN = 0.002, 0.02
+# A plane whose points reach along this share of the scene one way bounds it, and may go on the other way. The front of
+# a sideboard does not.
+SPANNING = 0.9
+# A place that more of the views looking at it know is not what a view sees that knows nothing: something is before it.
+MOST_KNOW = 0.5
+# No more views than stereo compares with a photograph at each point, so that it may know nothing.
+FEW_VIEWS = 4
+
+
+@dataclass(frozen=True)
+class EnclosingPlane:
+    """A plane normal . x = offset, with (3,) `normal` towards the cameras.
+
+    `axes` (2, 3) are unit vectors in it; `own` (2, 2) the least and greatest coordinates along them of its own known
+    points, and `whole` of all known points if its own reach as far along one of the axes, else the same.
+    """
+
+    normal: np.ndarray
+    offset: float
+    axes: np.ndarray
+    own: np.ndarray
+    whole: np.ndarray
+
+    def within(self, points: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        """(P,) bool which of (P, 3) points on the plane lie within `own` or `whole`."""
+        along = points @ self.axes.T
+        return ((along >= ends[0]) & (along <= ends[1])).all(1)
+
+
+def enclosing_planes(cameras: Sequence[Camera], planes: np.ndarray, points: SurfacePoints) -> list[EnclosingPlane]:
+    """Those of (K, 4) planes n . x = d that enclose the scene, without copies and those that meet no other at right
+    angles, and planes at right angles to two of them where both end."""
+    if not len(points):
+        return []
+    known = _Known(cameras, points)
+    found = known.without_copies([plane for plane in map(known.facing, planes) if known.is_enclosing(plane)])
+    found = [plane for plane in found if any(_at_right_angles(plane, other) for other in found)]
+    closing = known.closing(found)
+    return [known.with_ends(plane, found, points.on(plane[None], CONFIRMED_DEPTH)[:, 0]) for plane in found] + [
+        known.with_ends(plane, found, slice(None)) for plane in closing
+    ]
+
+
+class _Known:
+    """Known points, by which planes (4,) n . x = d are judged whose normals are towards the cameras."""
+
+    def __init__(self, cameras: Sequence[Camera], points: SurfacePoints):
+        self.cameras, self.points = cameras, points
+        self.centers = np.array([camera.center for camera in cameras])
+        self.distance = np.linalg.norm(points.position - points.center, axis=1)
+
+    def facing(self, plane: np.ndarray) -> np.ndarray:
+        """The plane with its normal towards the cameras."""
+        return plane if (self.centers @ plane[:3]).mean() > plane[3] else -plane
+
+    def is_enclosing(self, plane: np.ndarray) -> bool:
+        """Whether points lie on the plane, with normals alike, and hardly any behind it."""
+        return self.points.on(plane[None], CONFIRMED_DEPTH).mean() >= LEAST_SHARE and self.is_before_all(plane)
+
+    def is_before_all(self, plane: np.ndarray) -> bool:
+        behind = self.height(plane) < -MARGIN * self.distance
+        return behind.mean() < OUTLIERS and bool((self.centers @ plane[:3] > plane[3]).all())
+
+    def height(self, plane: np.ndarray) -> np.ndarray:
+        """(P,) how far points are before a plane."""
+        return self.points.position @ plane[:3] - plane[3]
+
+    def on(self, plane: np.ndarray) -> np.ndarray:
+        """(P,) bool which points are on a plane, whatever their normals, which are bent in corners."""
+        return np.abs(self.height(plane)) < CONFIRMED_DEPTH * self.distance
+
+    def without_copies(self, planes: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Planes in the order of how many points are on them, each unless most of these are on one before, too."""
+        kept: list[np.ndarray] = []
+        for plane in sorted(planes, key=lambda plane: -self.on(plane).sum()):
+            own = self.on(plane)
+            alike = [other for other in kept if plane[:3] @ other[:3] > SAME_NORMAL]
+            near = (np.abs(self.height(other)[own]) < MARGIN * self.distance[own] for other in alike)
+            if not any(share.mean() > 0.5 for share in near):
+                kept.append(plane)
+        return kept
+
+    def closing(self, found: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Planes at right angles to two of those `found` where both end, on sides where there is none."""
+        closing: list[np.ndarray] = []
+        for number, first in enumerate(found):
+            for second in (other for other in found[:number] if _at_right_angles(first, other)):
+                across = np.cross(first[:3], second[:3])
+                across /= np.linalg.norm(across)
+                for normal in (across, -across):
+                    sides = [self.on(plane) for plane in (first, second)]
+                    ends = [np.quantile(self.points.position[own] @ normal, OUTLIERS) for own in sides]
+                    apart = MARGIN * min(np.median(self.distance[own]) for own in sides)
+                    there = any(normal @ other[:3] > SAME_NORMAL for other in (*found, *closing))
+                    plane = np.append(normal, np.mean(ends))
+                    if there or abs(ends[0] - ends[1]) > apart or not self.is_before_all(plane):
+                        continue
+                    if all(self.ends_in_images(own, plane, apart) for own in sides):
+                        closing.append(plane)
+        return closing
+
+    def ends_in_images(self, own: np.ndarray, end: np.ndarray, near: float) -> bool:
+        """Whether most views of the points of a plane that are `near` its end at another plane show what lies beyond,
+        so that it does not end where photographs do."""
+        rows = np.flatnonzero(own & (self.height(end) < near))
+        beyond = self.points.position[rows] - 2 * near * end[:3]
+        views = self.points.view[rows]
+        inside = [visible_pixels(self.cameras[view], beyond[views == view])[0] for view in np.unique(views)]
+        return bool(np.concatenate(inside).mean() > 0.5)
+
+    def with_ends(self, plane: np.ndarray, found: Sequence[np.ndarray], own: np.ndarray | slice) -> EnclosingPlane:
+        """A plane with its ends by its `own` points, along the normal of the first of those `found` that is at right
+        angles to it."""
+        normal = plane[:3]
+        first = next(other[:3] for other in found if _at_right_angles(other, plane))
+        first = first - normal * (first @ normal)
+        first /= np.linalg.norm(first)
+        axes = np.stack([first, np.cross(normal, first)])
+        along = self.points.position @ axes.T
+        ends, whole = _ends(along[own]), _ends(along)
+        spans = (np.diff(ends, axis=0) >= SPANNING * np.diff(whole, axis=0)).any()
+        return EnclosingPlane(normal, float(plane[3]), axes, ends, whole if spans else ends)
+
+
+def _ends(along: np.ndarray) -> np.ndarray:
+    """(2, 2) least and greatest of (P, 2) coordinates."""
+    low, high = np.quantile(along, [BEYOND, 1 - BEYOND], axis=0)
+    return np.stack([low, high]) + END_MARGIN * np.stack([low - high, high - low])
+
+
+def _at_right_angles(first: np.ndarray, second: np.ndarray) -> bool:
+    return bool(abs(first[:3] @ second[:3]) < np.sin(NEARLY))
+
+
+def enclosing_depths(
+    cameras: Sequence[Camera],
+    enclosing: Sequence[EnclosingPlane],
+    known: Sequence[np.ndarray],
+    wanted: Sequence[np.ndarray],
+) -> list[np.ndarray]:
+    """(H, W) float32 depth of every view at its `wanted` pixels where their rays end at an enclosing plane, else NaN.
+
+    Args:
+        known: (H, W) depth of every view, NaN where nothing is known.
+        wanted: (H, W) bool.
+    """
+    result = [np.full(depth.shape, np.nan, np.float32) for depth in known]
+    planes = np.array([[*plane.normal, plane.offset] for plane in enclosing]).reshape(-1, 4)
+    for camera, depth, pixels in zip(cameras, result, wanted, strict=True):
+        row, column = np.nonzero(pixels)
+        if not len(row) or not len(planes):
+            continue
+        rays = rays_of(camera, row, column)
+        inverse = rays @ in_camera(camera, planes).T
+        first, nearest = inverse.argmax(1), inverse.max(1)
+        with np.errstate(divide="ignore"):
+            ends_at = np.where(nearest > 0, 1 / nearest, np.nan)
+        places = to_world(camera, rays * ends_at[:, None])
+        looking, knowing = _looking(places, cameras, known)
+        taken = np.zeros(len(row), bool)
+        for number, plane in enumerate(enclosing):
+            rows = np.flatnonzero((first == number) & (nearest > 0))
+            inside, few = plane.within(places[rows], plane.own), looking[rows] <= FEW_VIEWS
+            taken[rows] = inside | (few & plane.within(places[rows], plane.whole))
+        taken &= knowing <= MOST_KNOW * looking
+        depth[row, column] = np.where(taken, ends_at, np.nan)
+    return result
+
+
+def _looking(
+    points: np.ndarray, cameras: Sequence[Camera], known: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) how many views look at (N, 3) points, which are in their images with nothing known before, and (N,) how many
+    of these know a depth there."""
+    looking, knowing = np.zeros(len(points), int), np.zeros(len(points), int)
+    for camera, depth in zip(cameras, known, strict=True):
+        inside, pixels, along = visible_pixels(camera, points)
+        ratio = depth[pixels[:, 1], pixels[:, 0]] / along
+        rows = np.flatnonzero(inside)
+        looking[rows] += ~(ratio < 1 - MARGIN)
+        knowing[rows] += np.abs(ratio - 1) <= MARGIN
+    return looking, knowing

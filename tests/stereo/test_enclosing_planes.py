@@ -1,0 +1,161 @@
+"""Floors and walls that go on where nothing is known of them, in a corner of a room with exact depths."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.captures import look_at
+
+from linprim_geo.stereo.enclosing_planes import FEW_VIEWS, EnclosingPlane, enclosing_depths, enclosing_planes
+from linprim_geo.stereo.plain_regions import in_camera
+from linprim_geo.stereo.point_planes import SurfacePoints
+
+# The corner of a room at the origin: floor, and walls at x = 0 and y = 0; n . x = 0.
+FLOOR, WALL, SIDE = np.array([0.0, 0, 1, 0]), np.array([0.0, 1, 0, 0]), np.array([1.0, 0, 0, 0])
+SIZE = (48, 36)
+CAMERAS = [
+    look_at(eye, (0.8, 0.5, 0.6), size=SIZE)
+    for eye in ((2.6, 2.9, 1.4), (2.9, 2.3, 1.6), (2.2, 3.2, 1.5), (3.0, 2.8, 2.0), (2.4, 2.6, 1.8), (3.1, 3.1, 1.2))
+]
+
+
+def depth_of(camera, planes) -> np.ndarray:
+    """(H, W) depth of the first of some planes, NaN without one."""
+    with np.errstate(divide="ignore"):
+        nearest = (camera.ray_grid() @ in_camera(camera, np.array(planes)).T).max(-1)
+        return np.where(nearest > 0, 1 / nearest, np.nan)
+
+
+def places_of(camera, depth) -> np.ndarray:
+    return camera.center + camera.world_rays() * depth[..., None]
+
+
+def points_of(known) -> SurfacePoints:
+    """Of all known pixels of all views, with the normals of the floor and the walls."""
+    parts = []
+    for view, (camera, depth) in enumerate(zip(CAMERAS, known, strict=True)):
+        on = np.abs(places_of(camera, np.nan_to_num(depth))).argmin(-1)
+        parts.append(SurfacePoints.of_view(view, camera, depth, np.eye(3)[on], depth.size, np.random.default_rng(view)))
+    return SurfacePoints.together(parts)
+
+
+def room(unknown) -> list[np.ndarray]:
+    """Depth of the corner in every view, NaN where `unknown` says so of its (H, W, 3) places."""
+    whole = [depth_of(camera, [FLOOR, WALL, SIDE]) for camera in CAMERAS]
+    return [np.where(unknown(places_of(c, depth)), np.nan, depth) for c, depth in zip(CAMERAS, whole, strict=True)]
+
+
+def normals(found: list[EnclosingPlane]) -> set:
+    return {tuple(np.round(plane.normal, 6) + 0.0) for plane in found}
+
+
+def test_floor_and_walls_enclose_a_corner_whichever_way_their_normals_are():
+    points = points_of(room(lambda place: np.zeros(place.shape[:2], bool)))
+    found = enclosing_planes(CAMERAS, np.array([FLOOR, -WALL, SIDE]), points)
+    assert normals(found) == {(0, 0, 1), (0, 1, 0), (1, 0, 0)} and len(found) == 3
+    assert all(abs(plane.offset) < 1e-9 for plane in found)
+
+
+def test_a_copy_and_a_table_do_not_enclose():
+    known = room(lambda place: np.zeros(place.shape[:2], bool))
+    copy, table = np.array([0.02, 0, 1, 0.01]), np.array([0.0, 0, 1, 0.5])
+    copy[:3] /= np.linalg.norm(copy[:3])
+    found = enclosing_planes(CAMERAS, np.array([copy, table, FLOOR, WALL, SIDE]), points_of(known))
+    assert normals(found) == {(0, 0, 1), (0, 1, 0), (1, 0, 0)}
+
+
+def test_a_plane_that_meets_no_other_at_a_right_angle_goes_nowhere():
+    points = points_of(room(lambda place: np.zeros(place.shape[:2], bool)))
+    assert enclosing_planes(CAMERAS, FLOOR[None], points) == []
+    slope = np.array([0, 0.5**0.5, 0.5**0.5, 0])
+    assert enclosing_planes(CAMERAS, np.array([FLOOR, slope]), points) == []
+
+
+def test_a_camera_or_points_behind_a_plane_speak_against_it():
+    points = points_of(room(lambda place: np.zeros(place.shape[:2], bool)))
+    planes = np.array([FLOOR, WALL, SIDE])
+    below = [*CAMERAS, look_at((2.0, 2.0, -0.5), size=SIZE)]
+    assert (0, 0, 1) not in normals(enclosing_planes(below, planes, points))
+    few, many = (int(share * len(points)) for share in (0.005, 0.02))
+    for count, holds in ((few, True), (many, False)):
+        moved = points.position.copy()
+        moved[:count] = 2 * moved[:count] - points.center[:count]  # twice as far along their rays
+        behind = SurfacePoints(moved, points.normal, points.center, points.view)
+        assert (normals(enclosing_planes(CAMERAS, planes, behind)) != set()) == holds
+
+
+def test_a_wall_without_points_closes_the_room_where_the_others_end():
+    """The wall at x = 0 is unknown; the floor and the other wall end there, and nothing lies behind."""
+    known = room(lambda place: np.abs(place[..., 0]) < 1e-6)
+    found = enclosing_planes(CAMERAS, np.array([FLOOR, WALL]), points_of(known))
+    sides = [plane for plane in found if plane.normal[0] > 0.99]
+    assert len(sides) == 1 and abs(sides[0].offset) < 0.02 * 3
+    wanted = [np.isnan(depth) for depth in known]
+    filled = enclosing_depths(CAMERAS, found, known, wanted)
+    truth = room(lambda place: np.zeros(place.shape[:2], bool))
+    for ours, theirs, pixels in zip(filled, truth, wanted, strict=True):
+        there = pixels & np.isfinite(ours)
+        assert there.sum() > 0.8 * pixels.sum() and np.abs(ours / theirs - 1)[there].max() < 0.03
+
+
+def test_where_floor_and_wall_end_at_different_places_nothing_closes_the_room():
+    known = room(lambda place: (place[..., 0] < 0.5) & (place[..., 2] > 1e-6) | (np.abs(place[..., 0]) < 1e-6))
+    found = enclosing_planes(CAMERAS, np.array([FLOOR, WALL]), points_of(known))
+    assert not any(plane.normal[0] > 0.99 for plane in found)
+
+
+def test_a_gap_in_a_wall_is_filled_where_it_is_wanted_and_no_more():
+    def gap(place):
+        return (np.abs(place[..., 1]) < 1e-6) & (np.abs(place[..., :3:2] - (0.9, 0.6)) < 0.3).all(-1)
+
+    known, truth = room(gap), room(lambda place: np.zeros(place.shape[:2], bool))
+    found = enclosing_planes(CAMERAS, np.array([FLOOR, WALL, SIDE]), points_of(known))
+    wanted = [np.isnan(depth) for depth in known]
+    wanted[0][:] = False
+    filled = enclosing_depths(CAMERAS, found, known, wanted)
+    assert np.isnan(filled[0]).all()
+    for ours, theirs, pixels in list(zip(filled, truth, wanted, strict=True))[1:]:
+        there = np.isfinite(ours)  # but at its border, where pixels of other views know what is beside the gap
+        assert there.sum() > 0.7 * pixels.sum() > 0 and pixels[there].all()
+        np.testing.assert_allclose(ours[there], theirs[there], rtol=1e-5)
+
+
+def test_a_wall_does_not_go_on_beyond_its_points_but_where_hardly_any_view_looks():
+    plane = EnclosingPlane(
+        WALL[:3],
+        0.0,
+        np.array([[1.0, 0, 0], [0, 0, 1]]),
+        own=np.array([[0.0, 0], [0.5, 2]]),
+        whole=np.array([[0.0, 0], [2.0, 2]]),
+    )
+    nothing = [np.full(SIZE[::-1], np.nan) for _ in CAMERAS]
+    wanted = [np.ones(SIZE[::-1], bool)] + [np.zeros(SIZE[::-1], bool)] * (len(CAMERAS) - 1)
+    assert len(CAMERAS) > FEW_VIEWS
+    all_look = enclosing_depths(CAMERAS, [plane], nothing, wanted)[0]
+    few_look = enclosing_depths(CAMERAS[:FEW_VIEWS], [plane], nothing[:FEW_VIEWS], wanted[:FEW_VIEWS])[0]
+    for depth, reach in ((all_look, 0.5), (few_look, 2.0)):
+        along = places_of(CAMERAS[0], depth)[np.isfinite(depth)][:, 0]
+        assert reach - 0.15 < along.max() <= reach + 1e-6
+
+
+@pytest.mark.parametrize("knowing, filled", [(3, True), (4, False)])
+def test_a_place_that_most_views_know_is_not_what_the_others_see(knowing, filled):
+    """Of six views that look at a wall some know it: the first does not, so something is before it in most cases."""
+    whole = [depth_of(camera, [WALL]) for camera in CAMERAS]
+    known = [depth if 0 < view <= knowing else np.full_like(depth, np.nan) for view, depth in enumerate(whole)]
+    ends = np.array([[-9.0, -9.0], [9.0, 9.0]])
+    plane = EnclosingPlane(WALL[:3], 0.0, np.array([[1.0, 0, 0], [0, 0, 1]]), ends, ends)
+    wanted = [np.zeros(depth.shape, bool) for depth in whole]
+    wanted[0][18, 24] = True  # the middle, which all of them have in the image
+    depth = enclosing_depths(CAMERAS, [plane], known, wanted)[0]
+    assert np.isfinite(depth).sum() == filled
+
+
+def test_without_points_or_planes_there_is_nothing():
+    known = room(lambda place: np.zeros(place.shape[:2], bool))
+    points = points_of(known)
+    nobody = points[np.zeros(len(points), bool)]
+    assert enclosing_planes(CAMERAS, np.array([FLOOR, WALL]), nobody) == []
+    assert enclosing_planes(CAMERAS, np.zeros((0, 4)), points) == []
+    filled = enclosing_depths(CAMERAS, [], known, [np.ones(depth.shape, bool) for depth in known])
+    assert all(np.isnan(depth).all() and depth.dtype == np.float32 for depth in filled)
