@@ -55,7 +55,7 @@ def stereo_in_time(
             views = [SmallCopy.of(view, factor) for view in frames.views]
             own = DepthFrames(run, float(options.level), frames.limit, views=views)
         begin = time.monotonic()
-        merged = MergedFrames(own, own.views, own.limit, quiet=stages.progress.quiet)
+        merged = own.merged(quiet=stages.progress.quiet)
     except LinprimError as error:
         if options.stereo == "on":
             raise

@@ -1,12 +1,12 @@
-"""Depth maps for fusing out of four sources: what stereo finds and its neighbours confirm, planes of regions without
-texture, the surface that spans gaps between these, and what the primitives render everywhere else, with the weight that
-its deviation from the first deserves.
+"""Depth maps for fusing out of five sources: what stereo finds and its neighbours confirm, planes of regions without
+texture, the surface that spans gaps between these, floors and walls that enclose the scene, and what the primitives
+render everywhere else, with the weight that its deviation from the first deserves.
 
 Of the surface that is fused from them, what stereo and planes of several views do not support is left out."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from linprim_geo.geometry.mesh import Mesh, face_areas, face_components, select_
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.depth_maps import SURE, DepthMap, depth_maps
+from linprim_geo.stereo.enclosing_planes import enclosing_depths, enclosing_planes
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.plain_regions import PlainRegion, common_planes, edges_of, plain_regions, plane_depths
 from linprim_geo.stereo.point_planes import SurfacePoints, planes_of_points, point_plane_depth
@@ -41,10 +42,19 @@ class MergedFrames(Sequence):
     `weight` is what rendered depths count elsewhere: the squared deviation of confirmed depths from those of their
     neighbours over that of rendered ones from confirmed ones, 1 at most. `confirmed` is the share of pixels with
     confirmed depths, `doubtful` that of less probable ones, `flat` that of pixels on one of the `planes` (K, 4),
-    `spanned` that of pixels without texture between all these.
+    `spanned` that of pixels without texture between all these, `enclosed` that of pixels whose rays end at an enclosing
+    plane because nothing else is known: nor do the primitives render a `sharp` (H, W) depth there, or any if None.
     """
 
-    def __init__(self, rendered: Sequence[DepthFrame], views: Sequence[View], limit: float, *, quiet: bool = True):
+    def __init__(
+        self,
+        rendered: Sequence[DepthFrame],
+        views: Sequence[View],
+        limit: float,
+        *,
+        sharp: Iterable[np.ndarray] | None = None,
+        quiet: bool = True,
+    ):
         self.rendered, self.limit = rendered, limit
         maps = depth_maps(views, pairing_points(rendered), hiding=(frame.depth for frame in rendered), quiet=quiet)
         self.cameras = [found.camera for found in maps]
@@ -61,7 +71,14 @@ class MergedFrames(Sequence):
         rendered_depths = [frame.depth for frame in rendered]
         self.shown = [depth[::SAMPLED, ::SAMPLED] > 0 for depth in rendered_depths]
         backgrounds = self._take_planes(maps, rendered_depths)
-        self._span_gaps(maps, rendered_depths, backgrounds)
+        points = self._span_gaps(maps, rendered_depths, backgrounds)
+        if sharp is None:
+            sharp = (depth > 0 for depth in rendered_depths)
+        unknown = [
+            (depth > 0) & ~(of_surface | background)
+            for depth, of_surface, background in zip(rendered_depths, sharp, backgrounds, strict=True)
+        ]
+        self._enclose(points, unknown)
 
     def _take_planes(self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Finds planes by points, by edges and by shading, of depths that are sure, and what lies on them; moves
@@ -91,21 +108,39 @@ class MergedFrames(Sequence):
 
     def _span_gaps(
         self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray], backgrounds: Sequence[np.ndarray]
-    ) -> None:
+    ) -> SurfacePoints:
         """Adds depths of the surface that spans what is known to doubtful ones, but not in background, and not at edges
-        of photographs, where rendered ones are finer."""
+        of photographs, where rendered ones are finer. Returns points of what is known."""
         count, rng = points_per_view(self.cameras), np.random.default_rng(0)
-        known = [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
-        points = []
+        known, points = self._known(), []
         for view, (found, depth) in enumerate(zip(maps, known, strict=True)):
             confirmed = np.isfinite(self.depths[view])[..., None]
             normal = np.where(confirmed, found.normal, plane_normals(found.camera, depth))
             points.append(SurfacePoints.of_view(view, found.camera, depth, normal, count, rng))
-        spanned = spanned_depths(self.cameras, known, SurfacePoints.together(points), rendered)
+        of_all = SurfacePoints.together(points)
+        spanned = spanned_depths(self.cameras, known, of_all, rendered)
         for view, (found, depth, background) in enumerate(zip(maps, spanned, backgrounds, strict=True)):
             depth[background | edges_of(found.grey, found.noise)] = np.nan
             self.doubtful_depths[view] = _first_known((self.doubtful_depths[view], depth))
         self.spanned = _share_known(spanned)
+        return of_all
+
+    def _enclose(self, points: SurfacePoints, unknown: Sequence[np.ndarray]) -> None:
+        """Adds depths of planes that enclose known `points` to doubtful ones, of pixels (H, W) bool that are `unknown`
+        to training, too."""
+        known = self._known()
+        wanted = [
+            pixels & ~np.isfinite(depth) & ~np.isfinite(doubtful)
+            for pixels, depth, doubtful in zip(unknown, known, self.doubtful_depths, strict=True)
+        ]
+        planes = enclosing_planes(self.cameras, self.planes, points)
+        enclosed = enclosing_depths(self.cameras, planes, known, wanted)
+        self.doubtful_depths = [_first_known(pair) for pair in zip(self.doubtful_depths, enclosed, strict=True)]
+        self.enclosed = _share_known(enclosed)
+
+    def _known(self) -> list[np.ndarray]:
+        """(H, W) confirmed depth of every view, or that of a plane, or NaN."""
+        return [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
 
     def covered(self, mesh: Mesh) -> float:
         """Share of the pixels with a rendered depth whose rays hit a mesh, of one of SAMPLED rows and columns."""
@@ -124,6 +159,7 @@ class MergedFrames(Sequence):
             "rendered_weight": self.weight,
             "flat": self.flat,
             "spanned": self.spanned,
+            "enclosed": self.enclosed,
             "planes": len(self.planes),
         }
 

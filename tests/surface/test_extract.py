@@ -250,6 +250,19 @@ def test_depths_that_no_disparity_can_tell_apart_are_clamped(solid):
         np.testing.assert_array_equal(frame.depth[~frame.clamped], whole.depth[~frame.clamped])
 
 
+@pytest.mark.parametrize("within", [0.03, 0.08])
+def test_depths_are_sharp_where_the_light_is_gone_within_a_twentieth_of_them(tmp_path, within):
+    """A density at which the transmittance falls from 0.9 to 0.3 within a share of the depth, along a ray."""
+    clear = Run.open(octahedron_run(tmp_path / "any"))
+    depth = float(np.median(np.concatenate([frame.depth[frame.depth > 0] for frame in DepthFrames(clear, 0.9)])))
+    run = Run.open(octahedron_run(tmp_path / "fog", density=np.log(0.9 / 0.3) / (within * depth)))
+    frames = DepthFrames(run, 0.35)  # where it falls so far
+    sharp = [own[frame.depth > 0] for own, frame in zip(frames.sharp(), frames, strict=True)]
+    assert len(sharp) == len(frames) and all(len(own) > 200 for own in sharp)
+    share = np.concatenate(sharp).mean()
+    assert share > 0.9 if within < 0.05 else share < 0.1
+
+
 def test_the_depth_limit_is_where_a_quarter_of_a_pixel_is_a_truncation():
     cameras = [
         replace(Camera(64, 48, 500.0, 500.0, 32.0, 24.0, np.eye(4)), world_to_camera=_shifted(x)) for x in (0.0, 6.0)

@@ -40,7 +40,7 @@ def frames(many_views):
 def in_time(many_views, frames, monkeypatch):
     """Stereo of `seconds` in a budget of SECONDS; depth maps are not made."""
     monkeypatch.setattr(stereo_budget, "SMALLEST_SIDE", 20)
-    monkeypatch.setattr(stereo_budget, "MergedFrames", lambda rendered, *_, **__: rendered)
+    monkeypatch.setattr(DepthFrames, "merged", lambda self, **_: self)
 
     def call(seconds: float, stereo: str = "auto", reserve: float = 0.0):
         monkeypatch.setattr(stereo_budget, "seconds_per_pixel", lambda *_: seconds / pixels / WITH_PLANES)
@@ -74,7 +74,7 @@ def test_where_small_photographs_have_no_stereo_the_whole_ones_stay(in_time, fra
     def impossible(*_, **__):
         raise LinprimError("no two photographs show the same points")
 
-    monkeypatch.setattr(stereo_budget, "MergedFrames", impossible)
+    monkeypatch.setattr(DepthFrames, "merged", impossible)
     assert in_time(2 * SHARE * AIM * SECONDS) == (frames, None, {})
 
 

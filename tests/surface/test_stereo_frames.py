@@ -96,6 +96,26 @@ def test_spans_stand_where_nothing_is_known_and_photographs_have_no_edges(found,
     assert merged.spanned == 0.75 and merged.about()["spanned"] == 0.75
 
 
+def test_rays_end_at_enclosing_planes_where_nothing_is_known_and_nothing_sharp_is_rendered(found, monkeypatch):
+    sharp = np.zeros((30, 40), bool)
+    sharp[:, 30:] = True
+    asked = []
+
+    def enclosing(cameras, planes, known, wanted):
+        asked.extend(wanted)
+        return [np.where(pixels, np.float32(3.4), np.float32(np.nan)) for pixels in wanted]
+
+    monkeypatch.setattr(stereo_frames, "enclosing_depths", enclosing)
+    merged = MergedFrames(rendered(0.01), [None], 5.0, sharp=iter([sharp]))
+    frame = merged[0]
+    assert (frame.depth[1:, :20] == 3).all(), "confirmed and doubtful depths stay"
+    assert np.allclose(frame.depth[0, :30], 3.4) and np.allclose(frame.depth[:, 20:30], 3.4)
+    assert np.allclose(frame.confidence[:, 20:30], stereo_frames.DOUBTFUL_WEIGHT)
+    assert np.allclose(frame.depth[:, 30:], 3.03), "what is sharp stays"
+    assert merged.enclosed == pytest.approx((29 * 10 + 30) / 1200) and merged.about()["enclosed"] == merged.enclosed
+    assert len(asked) == 1 and not asked[0][1:, :20].any()
+
+
 def test_frames_are_rendered_for_all_views_together(found):
     class Rendered(list):
         def __getitem__(self, index):
