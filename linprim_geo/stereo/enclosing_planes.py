@@ -186,17 +186,15 @@ def enclosing_depths(
         rays = rays_of(camera, row, column)
         inverse = rays @ in_camera(camera, planes).T
         first, nearest = inverse.argmax(1), inverse.max(1)
-        with np.errstate(divide="ignore"):
-            ends_at = np.where(nearest > 0, 1 / nearest, np.nan)
-        places = to_world(camera, rays * ends_at[:, None])
-        looking, knowing = _looking(places, cameras, known)
-        taken = np.zeros(len(row), bool)
+        own, whole = np.zeros(len(row), bool), np.zeros(len(row), bool)
         for number, plane in enumerate(enclosing):
             rows = np.flatnonzero((first == number) & (nearest > 0))
-            inside, few = plane.within(places[rows], plane.own), looking[rows] <= FEW_VIEWS
-            taken[rows] = inside | (few & plane.within(places[rows], plane.whole))
-        taken &= knowing <= MOST_KNOW * looking
-        depth[row, column] = np.where(taken, ends_at, np.nan)
+            places = to_world(camera, rays[rows] / nearest[rows, None])
+            own[rows], whole[rows] = plane.within(places, plane.own), plane.within(places, plane.whole)
+        rows = np.flatnonzero(own | whole)
+        looking, knowing = _looking(to_world(camera, rays[rows] / nearest[rows, None]), cameras, known)
+        rows = rows[(own[rows] | (looking <= FEW_VIEWS)) & (knowing <= MOST_KNOW * looking)]
+        depth[row[rows], column[rows]] = 1 / nearest[rows]
     return result
 
 
