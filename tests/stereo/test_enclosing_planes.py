@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.captures import look_at
 
-from linprim_geo.stereo.enclosing_planes import FEW_VIEWS, EnclosingPlane, enclosing_depths, enclosing_planes
+from linprim_geo.stereo.enclosing_planes import EnclosingPlane, enclosing_depths, enclosing_planes
 from linprim_geo.stereo.plain_regions import in_camera
 from linprim_geo.stereo.point_planes import SurfacePoints
 
@@ -71,6 +71,31 @@ def test_a_plane_that_meets_no_other_at_a_right_angle_goes_nowhere():
     assert enclosing_planes(CAMERAS, np.array([FLOOR, slope]), points) == []
 
 
+def test_a_plane_that_only_crosses_the_others_does_not_enclose():
+    points = points_of(room(lambda place: np.zeros(place.shape[:2], bool)))
+    across = np.array([0.5**0.5, 0.5**0.5, 0, 0])  # through the edge between the walls
+    assert normals(enclosing_planes(CAMERAS, np.array([FLOOR, across]), points)) == set()
+
+
+def test_the_front_of_a_sideboard_ends_where_its_own_points_do():
+    """Nothing is known behind it; the floor goes on beside it, and lies on its plane, too."""
+    planes = np.array([SIDE, [0.0, 1, 0, 0.4], FLOOR])
+    parts = []
+    for view, camera in enumerate(CAMERAS):
+        depth = depth_of(camera, planes)
+        place = places_of(camera, depth)
+        on = np.abs(place - (0, 0.4, 0)).argmin(-1)
+        unknown = (on == 1) & (np.abs(place[..., :3:2] - (1.0, 0.3)) > 0.3).any(-1)
+        known = np.where(unknown, np.nan, depth)
+        parts.append(SurfacePoints.of_view(view, camera, known, np.eye(3)[on], depth.size, np.random.default_rng(view)))
+    found = enclosing_planes(CAMERAS, planes, SurfacePoints.together(parts))
+    (front,) = (plane for plane in found if plane.normal[1] > 0.99)
+    across = np.abs(front.axes[:, 0]).argmax()
+    ends = np.sort(np.abs(front.own[:, across]))
+    np.testing.assert_allclose(ends, (0.7, 1.3), atol=0.06)
+    np.testing.assert_array_equal(front.whole, front.own)
+
+
 def test_a_camera_or_points_behind_a_plane_speak_against_it():
     points = points_of(room(lambda place: np.zeros(place.shape[:2], bool)))
     planes = np.array([FLOOR, WALL, SIDE])
@@ -100,8 +125,13 @@ def test_a_wall_without_points_closes_the_room_where_the_others_end():
 
 def test_where_floor_and_wall_end_at_different_places_nothing_closes_the_room():
     known = room(lambda place: (place[..., 0] < 0.5) & (place[..., 2] > 1e-6) | (np.abs(place[..., 0]) < 1e-6))
-    found = enclosing_planes(CAMERAS, np.array([FLOOR, WALL]), points_of(known))
-    assert not any(plane.normal[0] > 0.99 for plane in found)
+    points = points_of(known)
+    on_floor = np.flatnonzero(points.normal[:, 2] > 0.5)
+    for few in (False, True):  # so few that nearly all points lie on one side of a plane between the ends
+        kept = np.ones(len(points), bool)
+        kept[on_floor[len(points) // 25 :] if few else []] = False
+        found = enclosing_planes(CAMERAS, np.array([FLOOR, WALL]), points[kept])
+        assert len(found) >= 2 and not any(plane.normal[0] > 0.99 for plane in found)
 
 
 def test_a_gap_in_a_wall_is_filled_where_it_is_wanted_and_no_more():
@@ -130,10 +160,11 @@ def test_a_wall_does_not_go_on_beyond_its_points_but_where_hardly_any_view_looks
     )
     nothing = [np.full(SIZE[::-1], np.nan) for _ in CAMERAS]
     wanted = [np.ones(SIZE[::-1], bool)] + [np.zeros(SIZE[::-1], bool)] * (len(CAMERAS) - 1)
-    assert len(CAMERAS) > FEW_VIEWS
-    all_look = enclosing_depths(CAMERAS, [plane], nothing, wanted)[0]
-    few_look = enclosing_depths(CAMERAS[:FEW_VIEWS], [plane], nothing[:FEW_VIEWS], wanted[:FEW_VIEWS])[0]
-    for depth, reach in ((all_look, 0.5), (few_look, 2.0)):
+    before = [*nothing[:4], *(np.full(SIZE[::-1], 0.1) for _ in CAMERAS[4:])]
+    five_look = enclosing_depths(CAMERAS[:5], [plane], nothing[:5], wanted[:5])[0]
+    four_look = enclosing_depths(CAMERAS[:4], [plane], nothing[:4], wanted[:4])[0]
+    others_see_what_is_before = enclosing_depths(CAMERAS, [plane], before, wanted)[0]
+    for depth, reach in ((five_look, 0.5), (four_look, 2.0), (others_see_what_is_before, 2.0)):
         along = places_of(CAMERAS[0], depth)[np.isfinite(depth)][:, 0]
         assert reach - 0.15 < along.max() <= reach + 1e-6
 
