@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.points.view_pairs import visible_pixels
+from linprim_geo.points.view_pairs import SOURCES, visible_pixels
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.plain_regions import in_camera, rays_of, to_world
 from linprim_geo.stereo.point_planes import LEAST_SHARE, SAME_NORMAL, SurfacePoints
@@ -36,8 +36,8 @@ BEYOND, END_MARGIN = 0.002, 0.02
 SPANNING = 0.9
 # A place that more of the views looking at it know is not what a view sees that knows nothing: something is before it.
 MOST_KNOW = 0.5
-# No more views than stereo compares with a photograph at each point, so that it may know nothing.
-FEW_VIEWS = 4
+# So many views of each place are wanted for stereo: where no more look, it may know nothing of a surface.
+FEW_VIEWS = SOURCES
 
 
 @dataclass(frozen=True)
@@ -120,10 +120,10 @@ class _Known:
             for second in (other for other in found[:number] if _at_right_angles(first, other)):
                 across = np.cross(first[:3], second[:3])
                 across /= np.linalg.norm(across)
+                sides = [self.on(plane) for plane in (first, second)]
+                apart = MARGIN * min(np.median(self.distance[own]) for own in sides)
                 for normal in (across, -across):
-                    sides = [self.on(plane) for plane in (first, second)]
                     ends = [np.quantile(self.points.position[own] @ normal, OUTLIERS) for own in sides]
-                    apart = MARGIN * min(np.median(self.distance[own]) for own in sides)
                     there = any(normal @ other[:3] > SAME_NORMAL for other in (*found, *closing))
                     plane = np.append(normal, np.mean(ends))
                     if there or abs(ends[0] - ends[1]) > apart or not self.is_before_all(plane):

@@ -50,7 +50,7 @@ an object ends better than windows do (DECISIONS 76)."""
 
 SHARP_LEVELS = (0.9, 0.3)
 """A rendered depth is sharp if the transmittance falls from the first to the second within RENDERED_MARGIN of it. A
-surface takes 0.3 to 3 % of its depth, what training makes of a wall that nothing tells it about 5 to 50 %."""
+surface takes 0.3 to 4 % of its depth, what training makes of a wall that nothing tells it about 5 to 50 %."""
 
 SMALLEST_SIDE = 120
 """Photographs are not averaged down to fewer pixels along the longer side for stereo."""

@@ -42,8 +42,9 @@ class MergedFrames(Sequence):
     `weight` is what rendered depths count elsewhere: the squared deviation of confirmed depths from those of their
     neighbours over that of rendered ones from confirmed ones, 1 at most. `confirmed` is the share of pixels with
     confirmed depths, `doubtful` that of less probable ones, `flat` that of pixels on one of the `planes` (K, 4),
-    `spanned` that of pixels without texture between all these, `enclosed` that of pixels whose rays end at an enclosing
-    plane because nothing else is known: nor do the primitives render a `sharp` (H, W) depth there, or any if None.
+    `spanned` that of pixels without texture between all these, `enclosed` that of pixels whose rays end at a floor
+    or wall because nothing else is known. Rendered depths stay there where they are `sharp`, (H, W) bool of every view,
+    or all of them if None.
     """
 
     def __init__(
@@ -71,14 +72,15 @@ class MergedFrames(Sequence):
         rendered_depths = [frame.depth for frame in rendered]
         self.shown = [depth[::SAMPLED, ::SAMPLED] > 0 for depth in rendered_depths]
         backgrounds = self._take_planes(maps, rendered_depths)
-        points = self._span_gaps(maps, rendered_depths, backgrounds)
+        known = [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
+        points = self._span_gaps(maps, known, rendered_depths, backgrounds)
         if sharp is None:
             sharp = (depth > 0 for depth in rendered_depths)
         unknown = [
             (depth > 0) & ~(of_surface | background)
             for depth, of_surface, background in zip(rendered_depths, sharp, backgrounds, strict=True)
         ]
-        self._enclose(points, unknown)
+        self._enclose(points, known, unknown)
 
     def _take_planes(self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Finds planes by points, by edges and by shading, of depths that are sure, and what lies on them; moves
@@ -107,12 +109,16 @@ class MergedFrames(Sequence):
         return backgrounds
 
     def _span_gaps(
-        self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray], backgrounds: Sequence[np.ndarray]
+        self,
+        maps: Sequence[DepthMap],
+        known: Sequence[np.ndarray],
+        rendered: Sequence[np.ndarray],
+        backgrounds: Sequence[np.ndarray],
     ) -> SurfacePoints:
-        """Adds depths of the surface that spans what is known to doubtful ones, but not in background, and not at edges
-        of photographs, where rendered ones are finer. Returns points of what is known."""
+        """Adds depths of the surface that spans what is `known` to doubtful ones, but not in background, and not at
+        edges of photographs, where rendered ones are finer. Returns points of what is known."""
         count, rng = points_per_view(self.cameras), np.random.default_rng(0)
-        known, points = self._known(), []
+        points = []
         for view, (found, depth) in enumerate(zip(maps, known, strict=True)):
             confirmed = np.isfinite(self.depths[view])[..., None]
             normal = np.where(confirmed, found.normal, plane_normals(found.camera, depth))
@@ -125,10 +131,9 @@ class MergedFrames(Sequence):
         self.spanned = _share_known(spanned)
         return of_all
 
-    def _enclose(self, points: SurfacePoints, unknown: Sequence[np.ndarray]) -> None:
-        """Adds depths of planes that enclose known `points` to doubtful ones, of pixels (H, W) bool that are `unknown`
-        to training, too."""
-        known = self._known()
+    def _enclose(self, points: SurfacePoints, known: Sequence[np.ndarray], unknown: Sequence[np.ndarray]) -> None:
+        """Adds depths of planes that enclose `points` of what is `known` to doubtful ones, of pixels (H, W) bool that
+        are `unknown` to training, too."""
         wanted = [
             pixels & ~np.isfinite(depth) & ~np.isfinite(doubtful)
             for pixels, depth, doubtful in zip(unknown, known, self.doubtful_depths, strict=True)
@@ -137,10 +142,6 @@ class MergedFrames(Sequence):
         enclosed = enclosing_depths(self.cameras, planes, known, wanted)
         self.doubtful_depths = [_first_known(pair) for pair in zip(self.doubtful_depths, enclosed, strict=True)]
         self.enclosed = _share_known(enclosed)
-
-    def _known(self) -> list[np.ndarray]:
-        """(H, W) confirmed depth of every view, or that of a plane, or NaN."""
-        return [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
 
     def covered(self, mesh: Mesh) -> float:
         """Share of the pixels with a rendered depth whose rays hit a mesh, of one of SAMPLED rows and columns."""
