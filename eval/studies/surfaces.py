@@ -4,8 +4,9 @@ linprim_geo.eval.studies.surfaces -o runs/surfaces`.
 Each scene is photographed, trained once with octahedra and once with Gaussians (the baseline), and each training meshed
 by every method that it allows; `--data` adds captures, scored against their `--references`. `--stereo auto off` does
 everything a second time without stereo: training starts at the capture's points alone, nothing holds it to stereo's
-surfaces, and depth maps are the rendered ones. `surfaces.json` and `surfaces.md` hold per mesh, of what the cameras see
-unless it says whole:
+surfaces, and depth maps are the rendered ones. `--true-depth` adds what the same fusion makes of exact depth maps of
+the reference, without training: the best that depth can give. `surfaces.json` and `surfaces.md` hold per mesh, of what
+the cameras see unless it says whole:
 
     PSNR of held-out photographs; share of the pixels with a depth image at which the mesh is within 1 % of it, from the
     poses of the run;
@@ -25,8 +26,9 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -37,6 +39,7 @@ from linprim_geo.base.files import write_json
 from linprim_geo.base.options import ExtractOptions, SceneOptions, TrainOptions
 from linprim_geo.capture.types import View
 from linprim_geo.eval.study_tables import write_table
+from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh
 
 BUILT_IN = ("cad", "smooth", "room", "wires")
@@ -128,22 +131,57 @@ def depth_right(mesh: Mesh, views: Sequence[View]) -> float | None:
     return right / known if known else None
 
 
+def score_true_depth(capture: Path, reference: Path, options: SceneOptions, target: Path) -> dict:
+    """Fuses exact depth maps of the training cameras as `extract-mesh --method tsdf` fuses rendered ones, to `target`,
+    and returns the row."""
+    from linprim_geo.capture.load import load_scene
+    from linprim_geo.geometry.mesh_files import load_mesh, save_mesh
+    from linprim_geo.geometry.raycast import RayCaster
+    from linprim_geo.surface.tsdf_field import DepthFrame
+    from linprim_geo.surface.tsdf_fusion import auto_voxel_size, fuse_tsdf
+
+    began, truth = time.process_time(), load_mesh(reference)
+    caster, frames = RayCaster(truth.vertices, truth.faces), []
+    cameras = [view.camera for view in load_scene(capture, options).train]
+    for camera in cameras:
+        depth = np.nan_to_num(caster.render_depth(camera)[0], posinf=0).astype(np.float32)
+        frames.append(DepthFrame(camera, depth, background=depth == 0))
+    mesh = fuse_tsdf(frames, voxel_size=auto_voxel_size(frames))
+    target.parent.mkdir(parents=True, exist_ok=True)
+    save_mesh(target, mesh)
+    return {
+        "method": "true depth",
+        **_against(mesh, truth, cameras),
+        "faces": len(mesh.faces),
+        "cpu_seconds": time.process_time() - began,
+    }
+
+
 def _distances(run: Path, reference: Path, target: Path, visible: Path) -> dict:
-    """Scores of a mesh, and of its part that cameras see, against the reference."""
+    """Scores of the mesh of a run, and of what is predicted of its part that cameras see, against the reference."""
     from scipy.stats import spearmanr
 
-    from linprim_geo.eval.mesh import score_mesh
     from linprim_geo.eval.surface_samples import SurfaceDistance
     from linprim_geo.geometry.mesh import clean_mesh
     from linprim_geo.geometry.mesh_files import load_mesh
     from linprim_geo.runs.run import Run
 
-    cameras = [view.camera for view in Run.open(run).scene().train]
-    truth = load_mesh(reference)
-    whole = score_mesh(load_mesh(target), truth, samples=SAMPLES, cameras=cameras)
-    seen, shown = whole["visible"], load_mesh(visible)
+    truth, shown = load_mesh(reference), load_mesh(visible)
     error, _ = SurfaceDistance(clean_mesh(truth)[0]).query(shown.vertices)
     told = np.isfinite(shown.quality)
+    return {
+        **_against(load_mesh(target), truth, [view.camera for view in Run.open(run).scene().train]),
+        "quality_correlation": float(spearmanr(shown.quality[told], error[told])[0]),
+        "quality_ratio": float(error[told].mean() / shown.quality[told].mean()),
+    }
+
+
+def _against(mesh: Mesh, truth: Mesh, cameras: Sequence[Camera]) -> dict:
+    """Scores of a mesh against the reference, of what the cameras see unless it says whole."""
+    from linprim_geo.eval.mesh import score_mesh
+
+    whole = score_mesh(mesh, truth, samples=SAMPLES, cameras=cameras)
+    seen = whole["visible"]
     return {
         "chamfer": seen["chamfer_percent_diagonal"],
         "median": seen["accuracy_q50_percent_diagonal"],
@@ -155,8 +193,6 @@ def _distances(run: Path, reference: Path, target: Path, visible: Path) -> dict:
         "crease_recall": seen["shape"]["creases"]["recall"],
         "flatness": seen["shape"]["flatness"]["rms_percent_diagonal"],
         "self_intersecting": whole["triangles"]["self_intersecting"],
-        "quality_correlation": float(spearmanr(shown.quality[told], error[told])[0]),
-        "quality_ratio": float(error[told].mean() / shown.quality[told].mean()),
     }
 
 
@@ -170,6 +206,16 @@ def table(rows: list[dict]) -> str:
         ]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
+
+
+def _saved(target: Path, measure: Callable[[], dict]) -> dict:
+    """The row of a mesh, measured unless it lies beside it already."""
+    saved = target.with_suffix(".json")
+    if not saved.exists():
+        write_json(saved, measure())
+    found = json.loads(saved.read_text())
+    print(json.dumps({"mesh": target.stem} | found), flush=True)
+    return found
 
 
 def rounds(text: str) -> int | str:
@@ -203,6 +249,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--stereo", nargs="+", choices=STEREO, default=["auto"], help="with it, without (default: with)"
     )
+    parser.add_argument("--true-depth", action="store_true", help="fuse exact depth maps of the references, too")
     parser.add_argument(
         "--refine",
         type=rounds,
@@ -244,6 +291,10 @@ def run(given: argparse.Namespace) -> None:
         jobs.append((capture.name, capture, reference, SceneOptions(downscale=given.downscale)))
     rows, options = [], None
     for name, capture, reference, scene_options in jobs:
+        if given.true_depth and reference != NO_REFERENCE:
+            target = given.output / "meshes" / f"{name}_true_depth.ply"
+            found = _saved(target, partial(score_true_depth, capture, reference, scene_options, target))
+            rows.append({"scene": name} | found)
         for primitive, stereo in product(given.primitives, given.stereo):
             options = TrainOptions(
                 primitive=primitive,
@@ -263,12 +314,9 @@ def run(given: argparse.Namespace) -> None:
                 write_json(trained / "seconds.json", {"cpu_seconds": None if resumed else time.process_time() - began})
             for method in [m for m in METHODS[primitive] if m in given.methods]:
                 target = given.output / "meshes" / f"{label}_{method}_{given.refine}.ply"
-                saved = target.with_suffix(".json")
-                if not saved.exists():
-                    extraction = ExtractOptions(refine=given.refine, stereo=stereo)
-                    write_json(saved, score(trained, reference, method, extraction, target))
-                rows.append({"scene": name, "primitive": primitive, "stereo": stereo, **json.loads(saved.read_text())})
-                print(json.dumps(rows[-1]), flush=True)
+                extraction = ExtractOptions(refine=given.refine, stereo=stereo)
+                found = _saved(target, partial(score, trained, reference, method, extraction, target))
+                rows.append({"scene": name, "primitive": primitive, "stereo": stereo} | found)
     write_json(given.output / "surfaces.json", {"train_options": asdict(options), "refine": given.refine, "rows": rows})
     write_table(given.output / "surfaces.md", table(rows))
     print(table(rows))
