@@ -1,8 +1,8 @@
 """What a camera does to the light before it is a photograph: blur, vignetting, exposure, noise, white balance, tone.
 
 The effects are applied in the order in which light meets them, on linear intensities, 1 being white: motion blur during
-the exposure, light lost towards the corners, the length of the exposure, photons and electronics, white balance, the
-tone curve. Rounding to 8 bits and JPEG come after that (`photos`).
+the exposure, light lost towards the corners, the length of the exposure, photons and electronics, one colour per pixel,
+white balance, the tone curve. Rounding to 8 bits and JPEG come after that (`photos`).
 """
 
 from __future__ import annotations
@@ -63,7 +63,8 @@ class CameraEffects:
     def on(self) -> bool:
         """Whether any effect is."""
         o = self.options
-        return bool(o.full_well or o.exposure_walk or o.white_balance or o.vignetting or o.tone or o.motion_blur)
+        drifts = o.exposure_walk or o.white_balance
+        return bool(o.full_well or drifts or o.vignetting or o.tone or o.motion_blur or o.mosaic != "none")
 
     def apply(self, color: np.ndarray, split: str, number: int) -> np.ndarray:
         """sRGB (H, W, 3) of the light as sRGB (H, W, 3) of the photograph `number` of `train` or `test`.
@@ -81,6 +82,8 @@ class CameraEffects:
         if split == "train":
             light = light * 2.0 ** self.stops[number]
         light = exposed(light, self.options.full_well, self.options.read_noise, rng)
+        if self.options.mosaic == "bayer":
+            light = demosaiced(light)
         if split == "train":
             light = light * (1.0 + self.balance[number] * np.array([1.0, 0.0, -1.0]))
         return toned(to_srgb(np.clip(light, 0.0, 1.0)), self.options.tone).astype(np.float32)
@@ -124,6 +127,20 @@ def exposed(light: np.ndarray, full_well: float, read_noise: float, rng: np.rand
         return light
     electrons = np.maximum(light, 0.0) * full_well
     return (electrons + np.sqrt(electrons + read_noise**2) * rng.standard_normal(light.shape)) / full_well
+
+
+def demosaiced(light: np.ndarray) -> np.ndarray:
+    """(H, W, 3) intensities of which a pixel measures one colour, by Bayer's pattern: red where row and column are
+    even, blue where both are odd, else green. The other two are means of the nearest pixels that measure them (bilinear
+    interpolation)."""
+    from scipy.ndimage import convolve
+
+    row, column = np.indices(light.shape[:2]) % 2
+    measured = np.stack([(row == 0) & (column == 0), row != column, (row == 1) & (column == 1)], -1)
+    cross, square = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]]), np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]])
+    kernels = (square, cross, square)
+    kept = [convolve(light[..., k] * measured[..., k], kernels[k], mode="mirror") / 4 for k in range(3)]
+    return np.stack(kept, -1)
 
 
 def toned(value: np.ndarray, strength: float) -> np.ndarray:

@@ -109,6 +109,9 @@ class SynthOptions:
         0.0, "electrons of a pixel at white, whose random arrival is shot noise; 0: none", low=0, metavar="ELECTRONS"
     )
     read_noise: float = option(0.0, "standard deviation of the electronics", low=0, metavar="ELECTRONS")
+    mosaic: str = option(
+        "none", "bayer: a pixel measures one colour, and has the others from its neighbours", choices=("none", "bayer")
+    )
     exposure_walk: float = option(
         0.0, "exposure drifts smoothly along the training views by up to X stops", low=0, high=4
     )

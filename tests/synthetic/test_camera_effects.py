@@ -52,6 +52,24 @@ def test_corners_lose_the_share_that_vignetting_says():
     assert seen[0, 0] == pytest.approx(middle * (1 - 0.4 * inside), rel=1e-5)
 
 
+def test_a_mosaic_keeps_what_a_pixel_measures_and_blurs_the_rest():
+    rng = np.random.default_rng(0)
+    light = rng.random((10, 12, 3))
+    seen = effects.demosaiced(light)
+    np.testing.assert_allclose(seen[::2, ::2, 0], light[::2, ::2, 0])
+    np.testing.assert_allclose(seen[1::2, 1::2, 2], light[1::2, 1::2, 2])
+    np.testing.assert_allclose(seen[::2, 1::2, 1], light[::2, 1::2, 1])
+    np.testing.assert_allclose(seen[1::2, ::2, 1], light[1::2, ::2, 1])
+    # Red of a green pixel in a row of red ones is the mean of its neighbours, of a blue one that of its four corners.
+    np.testing.assert_allclose(seen[2, 3, 0], (light[2, 2, 0] + light[2, 4, 0]) / 2)
+    np.testing.assert_allclose(seen[3, 3, 0], light[2:5:2, 2:5:2, 0].mean())
+    np.testing.assert_allclose(seen[4, 4, 1], (light[3, 4, 1] + light[5, 4, 1] + light[4, 3, 1] + light[4, 5, 1]) / 4)
+    # What is linear is the same but for the border: interpolation is exact there.
+    ramp = np.indices((10, 12)).sum(0)[..., None] * np.ones(3) / 30
+    np.testing.assert_allclose(effects.demosaiced(ramp)[1:-1, 1:-1], ramp[1:-1, 1:-1])
+    np.testing.assert_allclose(photographed(np.full((8, 8, 3), 0.4), mosaic="bayer"), 0.4, atol=1e-6)
+
+
 def test_motion_blur_is_a_line_of_its_length_and_keeps_the_light():
     dot = np.zeros((81, 81, 1))
     dot[40, 40] = 1.0
