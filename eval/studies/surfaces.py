@@ -187,6 +187,7 @@ def _against(mesh: Mesh, truth: Mesh, cameras: Sequence[Camera]) -> dict:
         "median": seen["accuracy_q50_percent_diagonal"],
         "chamfer_whole": whole["chamfer_percent_diagonal"],
         "f1": seen["f1"],
+        "far_off": 1 - seen["precision"],
         "normal_consistency": seen["normal_consistency"],
         "angle": seen["shape"]["normals"]["median"],
         "angle_off_creases": seen["shape"]["normals_off_creases"]["mean"],
