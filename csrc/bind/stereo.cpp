@@ -1,4 +1,4 @@
-// PatchMatch stereo, what supports its planes, and surfaces fitted to them.
+// PatchMatch stereo, what supports its planes, surfaces fitted to them, and planes of plain regions by their shading.
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
@@ -15,6 +15,7 @@
 #include "bind/parts.h"
 #include "stereo/fit_surfaces.h"
 #include "stereo/patch_match.h"
+#include "stereo/shading.h"
 #include "stereo/support.h"
 
 void bind_stereo(nb::module_& m) {
@@ -71,5 +72,28 @@ void bind_stereo(nb::module_& m) {
     float* result_cost = checked(fitted_cost, {height, width}, "fitted_cost");
     nb::gil_scoped_release release;
     linprim::fit_surfaces(grey.data(), planes, costs, int(height), int(width), tolerance, result, result_cost);
+  });
+
+  m.def("compare_shading", [](In<double> rays, In<double> value, std::array<double, 3> plane, In<double> turn,
+                              std::array<double, 3> shift, std::array<double, 4> lens, In<float> means,
+                              In<uint8_t> plain, In<double> moves, int64_t least, Out<uint8_t> shown, Out<double> left,
+                              Out<double> information, Out<double> downhill) {
+    if (means.ndim() != 3) throw std::invalid_argument("means have to have shape (H, W, 3)");
+    const int64_t boxes = int64_t(value.size()), height = int64_t(means.shape(0)), width = int64_t(means.shape(1));
+    linprim::ShadedPair pair{};
+    pair.boxes = boxes, pair.height = int(height), pair.width = int(width), pair.least = least;
+    pair.rays = checked(rays, {boxes, 3}, "rays"), pair.value = checked(value, {boxes}, "value");
+    pair.means = checked(means, {height, width, 3}, "means"), pair.plain = checked(plain, {height, width}, "plain");
+    std::copy_n(plane.data(), 3, pair.plane), std::copy_n(shift.data(), 3, pair.shift);
+    std::copy_n(checked(turn, {3, 3}, "turn"), 9, pair.turn),
+        std::copy_n(checked(moves, {3, 3}, "moves"), 9, pair.moves);
+    pair.focal_x = lens[0], pair.focal_y = lens[1], pair.center_x = lens[2], pair.center_y = lens[3];
+    uint8_t* is_shown = checked(shown, {boxes}, "shown");
+    double* rest = checked(left, {boxes}, "left");
+    double *matrix = checked(information, {3, 3}, "information"), *right = checked(downhill, {3}, "downhill");
+    nb::gil_scoped_release release;
+    const linprim::ShadedComparison found = linprim::compare_shading(pair, is_shown, rest);
+    std::copy_n(found.information, 9, matrix), std::copy_n(found.downhill, 3, right);
+    return std::tuple(found.boxes, found.left_variance, found.variance);
   });
 }

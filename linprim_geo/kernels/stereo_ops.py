@@ -1,4 +1,5 @@
-"""The core's PatchMatch stereo: a plane of inverse depth for every pixel of a photograph."""
+"""The core's PatchMatch stereo, a plane of inverse depth for every pixel of a photograph, and its comparison of plain
+regions by their shading."""
 
 from __future__ import annotations
 
@@ -152,6 +153,79 @@ def fit_surfaces(grey: np.ndarray, planes: DepthPlanes, known: np.ndarray, toler
     changed = fitted[0] > 0
     planes.plane[changed] = np.moveaxis(fitted, 0, 2)[changed]
     planes.cost[changed] = cost[changed]
+
+
+@dataclass(frozen=True)
+class ShadedComparison:
+    """N boxes of a plain region as a plane carries them into another photograph.
+
+    `boxes` are shown by both, 0 if these are too few; `shown` (N,) bool says which, and `left` (N,) what is left of
+    their values after an offset, a gain and its bend, 0 of the others. `left_variance` is the weighted variance of
+    that, `variance` that of the values themselves, in squared grey levels. `information` (3, 3) and `downhill` (3,) are
+    Gauss-Newton's equations for the plane's parameters.
+    """
+
+    boxes: int
+    shown: np.ndarray
+    left: np.ndarray
+    left_variance: float
+    variance: float
+    information: np.ndarray
+    downhill: np.ndarray
+
+
+def compare_shading(
+    rays: np.ndarray,
+    value: np.ndarray,
+    plane: np.ndarray,
+    moves: np.ndarray,
+    own: Camera,
+    other: Camera,
+    means: np.ndarray,
+    plain: np.ndarray,
+    least: int,
+) -> ShadedComparison:
+    """Compares boxes of a photograph with another one along a plane.
+
+    Differences lose weight beyond two deviations (Huber). The gain of the other photograph is between 0.7 and 1.4 and
+    may bend with brightness, as tone curves make it.
+
+    Args:
+        rays: (N, 3) float64 of depth 1 in the camera `own`.
+        value: (N,) float64 mean grey values of the boxes.
+        plane: (3,) with ray . plane = inverse depth.
+        moves: (3, 3) how the plane changes by each of three parameters, in columns.
+        means: (H, W, 3) float32 of the other photograph: means of the boxes around its pixels, and their slopes per
+            column and per row.
+        plain: (H, W) bool, where such a box has no edge.
+        least: fewer boxes than this are none.
+
+    Raises:
+        ValueError: shapes that do not fit.
+
+    Accuracy: float64; places in the other photograph are interpolated bilinearly.
+    """
+    shown, left = np.empty(len(value), np.uint8), np.empty(len(value))
+    information, downhill = np.empty((3, 3)), np.empty(3)
+    turn = other.rotation @ own.rotation.T
+    shift = other.world_to_camera[:3, 3] - turn @ own.world_to_camera[:3, 3]
+    boxes, left_variance, variance = _core.compare_shading(
+        rays,
+        value,
+        plane.tolist(),
+        np.ascontiguousarray(turn),
+        shift.tolist(),
+        [other.fx, other.fy, other.cx, other.cy],
+        means,
+        plain.view(np.uint8),
+        np.ascontiguousarray(moves),
+        least,
+        shown,
+        left,
+        information,
+        downhill,
+    )
+    return ShadedComparison(boxes, shown.view(bool), left, left_variance, variance, information, downhill)
 
 
 def _between(one: Camera, other: Camera) -> tuple[list[float], list[float]]:

@@ -16,7 +16,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter, label, median_filter
 
 from linprim_geo.geometry.boxes import smaller
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.sampling import sample_bilinear
+from linprim_geo.kernels.stereo_ops import ShadedComparison, compare_shading
 from linprim_geo.stereo.depth_maps import DepthMap, block_means
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.plain_regions import edges_of, in_camera, plainest, rays_of
@@ -39,8 +39,6 @@ SURE_DEPTHS = 30
 SHOWN_SHARE = 0.3
 # Steps of a fit at most, the first one's size at most and the last one's, in radians and in depths.
 STEPS, FIRST_STEP, LAST_STEP = 20, 0.3, 5e-4
-# The range of gains, and rounds in which differences beyond two deviations lose weight.
-GAINS, ROUNDS = (0.7, 1.4), 3
 # Variance that JPEG adds to differences of box means: it rounds means of its blocks to thirds of a grey level.
 ROUNDING = 0.1
 # Differences are smoothed over so many boxes a side before they are compared with the noise.
@@ -145,61 +143,23 @@ def shaded_regions(view: int, shading: Shading, confirmed: np.ndarray) -> list[S
     return regions
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Boxes of a region in another view by a plane: `shown` (N,) bool which are plain there; of these (M,) their
-    `value` there, the differences `left` after gain and offset, their `weight`, and `slope` by inverse depth."""
-
-    shown: np.ndarray
-    value: np.ndarray
-    left: np.ndarray
-    weight: np.ndarray
-    slope: np.ndarray
-
-
-def compare(region: ShadedRegion, plane: np.ndarray, own: Shading, other: Shading) -> Comparison | None:
-    """None where the other view shows too little. `plane` (3,) with ray . plane = inverse depth."""
-    camera = other.camera
-    turn = camera.rotation @ own.camera.rotation.T
-    shift = camera.world_to_camera[:3, 3] - turn @ own.camera.world_to_camera[:3, 3]
-    inverse = region.rays @ plane
-    point = region.rays @ turn.T + inverse[:, None] * shift
-    with np.errstate(divide="ignore", invalid="ignore"):
-        x = point[:, 0] / point[:, 2] * camera.fx + camera.cx - 0.5
-        y = point[:, 1] / point[:, 2] * camera.fy + camera.cy - 0.5
-    height, width = other.plain.shape
-    shown = (inverse > 0) & (point[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < width - 1) & (y < height - 1)
-    shown[shown] = other.plain[np.rint(y[shown]).astype(int), np.rint(x[shown]).astype(int)]
-    if np.count_nonzero(shown) < max(LEAST_BOXES, SHOWN_SHARE * len(shown)):
-        return None
-    x, y, point = x[shown], y[shown], point[shown]
-    value, by_column, by_row = sample_bilinear(other.means, np.stack([x, y], 1) + 0.5).T
-    gain, left, weight = _matched(region.value[shown], value)
-    by_x = (shift[0] - point[:, 0] / point[:, 2] * shift[2]) / point[:, 2] * camera.fx
-    by_y = (shift[1] - point[:, 1] / point[:, 2] * shift[2]) / point[:, 2] * camera.fy
-    return Comparison(shown, value, left, weight, gain * (by_column * by_x + by_row * by_y))
-
-
-def _matched(ours: np.ndarray, theirs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The (N,) gain of theirs, what is left of ours after it, an offset and a bend of the gain, which a tone curve has
-    where exposures differ, and Huber's weights."""
-    weight = np.ones_like(ours)
-    for _ in range(ROUNDS):
-        total = weight.sum()
-        a, b = (x - weight @ x / total for x in (ours, theirs))
-        weighted = weight * b
-        power = max(float(weighted @ b), 1e-6)
-        gain = min(max(float(weighted @ a) / power, GAINS[0]), GAINS[1])
-        square, along = b * b, float(weighted @ (b * b)) / power
-        square -= weight @ square / total + along * b
-        weighted = weight * square
-        bend = float(weighted @ a) / max(float(weighted @ square), 1e-6)
-        left = a - gain * b - bend * square
-        size = np.abs(left)
-        # The middle one: np.median takes as long as all the rest.
-        deviation = 1.4826 * np.partition(size, len(size) // 2)[len(size) // 2] + 0.05
-        weight = 1 / np.maximum(1, size / (2 * deviation))
-    return gain + bend * (2 * b - along), left, weight
+def compare(
+    region: ShadedRegion, plane: np.ndarray, own: Shading, other: Shading, moves: np.ndarray | None = None
+) -> ShadedComparison | None:
+    """Boxes of a region in another view by a plane (3,) with ray . plane = inverse depth, which (3, 3) `moves` change;
+    None where the other view shows too little."""
+    found = compare_shading(
+        region.rays,
+        region.value,
+        plane,
+        np.zeros((3, 3)) if moves is None else moves,
+        own.camera,
+        other.camera,
+        other.means,
+        other.plain,
+        max(LEAST_BOXES, int(np.ceil(SHOWN_SHARE * len(region.value)))),
+    )
+    return found if found.boxes else None
 
 
 def around_boxes(inside: np.ndarray, region: ShadedRegion, carried: np.ndarray) -> np.ndarray:
@@ -258,21 +218,14 @@ def evaluate(plane: np.ndarray, regions: Sequence[ShadedRegion], shadings: Seque
     for region in regions:
         local, moves = _with_moves(shadings[region.view].camera, plane, scale)
         for other in region.others:
-            found = compare(region, local, shadings[region.view], shadings[other])
+            found = compare(region, local, shadings[region.view], shadings[other], moves)
             if found is None:
                 continue
-            root = np.sqrt(found.weight)
-            slope = (found.slope * root)[:, None] * (region.rays[found.shown] @ moves)
-            # Less what offset, gain and its bend take.
-            value = (found.value - found.value.mean()) / max(float(found.value.std()), 1e-3)
-            taken = np.linalg.qr(np.stack([np.ones_like(value), value, value * value], 1) * root[:, None])[0]
-            slope -= taken @ (taken.T @ slope)
-            variance = float((found.weight * found.left**2).mean()) + 1e-4
-            information += slope.T @ slope / variance
-            downhill += slope.T @ (found.left * root) / variance
-            left += len(root) * np.log(variance) / 2
-            deviation += len(root) * np.log(np.var(region.value[found.shown]) + 1e-4) / 2
-            boxes, views = boxes + len(root), views + 1
+            information += found.information
+            downhill += found.downhill
+            left += found.boxes * np.log(found.left_variance) / 2
+            deviation += found.boxes * np.log(found.variance + 1e-4) / 2
+            boxes, views = boxes + found.boxes, views + 1
     if not boxes:
         return None
     left, deviation = float(np.exp(left / boxes)), float(np.exp(deviation / boxes))
@@ -347,7 +300,7 @@ def unexplained(region: ShadedRegion, plane: np.ndarray, shadings: Sequence[Shad
         if found is None:
             continue
         left, share = np.zeros(shape), np.zeros(shape)
-        left[row[found.shown], column[found.shown]] = found.left
+        left[row, column] = found.left
         share[row[found.shown], column[found.shown]] = 1
         left, share = (uniform_filter(x, SMOOTH, mode="constant")[row, column] for x in (left, share))
         left, share = left[found.shown], share[found.shown]

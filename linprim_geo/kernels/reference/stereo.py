@@ -1,5 +1,5 @@
-"""The cost of planes in PatchMatch stereo, what `stereo_ops.patch_match` begins with, `stereo_ops.support`, and
-`stereo_ops.fit_surfaces`, in float64."""
+"""The cost of planes in PatchMatch stereo, what `stereo_ops.patch_match` begins with, `stereo_ops.support`,
+`stereo_ops.fit_surfaces`, and `stereo_ops.compare_shading`, in float64."""
 
 from __future__ import annotations
 
@@ -21,6 +21,9 @@ CROSS_REACH, CROSS_GREY = 10, 25
 # of the one before; it fits to FEWEST_FITTED pixels at least, in FIT_ROUNDS; terms are dropped of which earlier ones
 # leave less than TERM_LEFT of the sum of squares.
 CANDIDATE_STEP, SCALES, FEWEST_FITTED, FIT_ROUNDS, TERM_LEFT = 5, 4, 12, 2, 1e-6
+
+# Of `compare_shading`: the range of gains, and rounds of weights.
+GAINS, ROUNDS = (0.7, 1.4), 3
 
 
 def match_cost(
@@ -181,3 +184,62 @@ def _alike(line: np.ndarray, middle: int) -> range:
             place += step
         ends.append(place)
     return range(ends[0], ends[1] + 1)
+
+
+def compare_shading(
+    rays: np.ndarray,
+    value: np.ndarray,
+    plane: np.ndarray,
+    moves: np.ndarray,
+    own: Camera,
+    other: Camera,
+    means: np.ndarray,
+    plain: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, float, float, np.ndarray, np.ndarray]:
+    """`shown`, `left`, `left_variance`, `variance`, `information` and `downhill` of `stereo_ops.ShadedComparison`."""
+    points = own.center + (rays / (rays @ plane)[:, None]) @ own.rotation
+    pixels, along = other.project(points)
+    height, width = plain.shape
+    x, y = (pixels - 0.5).T
+    shown = (rays @ plane > 0) & (along > 0) & (x >= 0) & (y >= 0) & (x < width - 1) & (y < height - 1)
+    shown[shown] = plain[np.rint(y[shown]).astype(int), np.rint(x[shown]).astype(int)]
+    rays, ours = rays[shown], value[shown]
+
+    def seen(plane: np.ndarray) -> np.ndarray:
+        return other.project(own.center + (rays / (rays @ plane)[:, None]) @ own.rotation)[0]
+
+    theirs, by_column, by_row = (_at(means[..., k], seen(plane)) for k in range(3))
+    weight = np.ones(len(ours))
+    for _ in range(ROUNDS):
+        a, b = (values - np.average(values, weights=weight) for values in (ours, theirs))
+        gain = np.clip((weight * a * b).sum() / (weight * b * b).sum(), *GAINS)
+        along = (weight * b**3).sum() / (weight * b * b).sum()
+        square = b * b - (weight * b * b).sum() / weight.sum() - along * b
+        bend = (weight * square * a).sum() / (weight * square**2).sum()
+        left = a - gain * b - bend * square
+        deviation = 1.4826 * np.sort(np.abs(left))[len(left) // 2] + 0.05
+        weight = 1 / np.maximum(1, np.abs(left) / (2 * deviation))
+    step = 1e-6
+    slopes = []
+    for move in moves.T:
+        moved = (seen(plane + step * move) - seen(plane - step * move)) / (2 * step)
+        slopes.append(by_column * moved[:, 0] + by_row * moved[:, 1])
+    root = np.sqrt(weight)
+    slope = np.stack(slopes, 1) * ((gain + bend * (2 * b - along)) * root)[:, None]
+    taken = np.linalg.qr(np.stack([np.ones_like(theirs), theirs, theirs**2], 1) * root[:, None])[0]
+    slope -= taken @ (taken.T @ slope)
+    variance = (weight * left**2).mean() + 1e-4
+    whole = np.zeros(len(shown))
+    whole[shown] = left
+    downhill = slope.T @ (left * root) / variance
+    return shown, whole, variance, ours.var(), slope.T @ slope / variance, downhill
+
+
+def _at(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Bilinear values of an image at pixels, whose middles are at +0.5."""
+    x, y = (pixels - 0.5).T
+    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
+    u, v = x - left, y - top
+    upper = image[top, left] * (1 - u) + image[top, left + 1] * u
+    lower = image[top + 1, left] * (1 - u) + image[top + 1, left + 1] * u
+    return upper * (1 - v) + lower * v

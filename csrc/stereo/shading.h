@@ -1,0 +1,34 @@
+// How well a plane carries the shading of a plain region into another photograph, and how to move it.
+#pragma once
+
+#include <cstdint>
+
+namespace linprim {
+
+// A region of `boxes` boxes, with rays (boxes, 3) of depth 1 and mean grey values, and another photograph.
+struct ShadedPair {
+  int64_t boxes;
+  const double *rays, *value;
+  double plane[3];           // ray . plane = inverse depth
+  double turn[9], shift[3];  // from the region's camera to the other one
+  double focal_x, focal_y, center_x, center_y;
+  int height, width;     // of the other photograph, in which
+  const float* means;    // (height, width, 3) are means of boxes and their slopes per column and row,
+  const uint8_t* plain;  // and (height, width) says where a box has no edge
+  double moves[9];       // (3, 3), how the plane changes by each of three parameters
+  int64_t least;         // fewer boxes that both show say nothing
+};
+
+// What compare_shading finds: how many boxes both photographs show, 0 for fewer than `least`; the weighted variance of
+// what is left of them, and the variance of their own values; Gauss-Newton's matrix and right side for the parameters.
+struct ShadedComparison {
+  int64_t boxes;
+  double left_variance, variance;
+  double information[9], downhill[3];
+};
+
+// Writes per box whether the other photograph shows it without an edge (`shown`), and what is left of its value after
+// an offset, a gain and the gain's bend (`left`, 0 where it is not shown).
+ShadedComparison compare_shading(const ShadedPair& pair, uint8_t* shown, double* left);
+
+}  // namespace linprim
