@@ -371,6 +371,11 @@ class ExtractOptions:
         "cameras look at",
         metavar="auto|X0,Y0,Z0,X1,Y1,Z1",
     )
+    object: bool = option(
+        False,
+        "the object alone that the cameras look at: without the plane that it stands on, which closes it, and without "
+        "what reaches out of --box, by default auto",
+    )
     smallest_part: float = option(
         0.01,
         "drop components with less than this share of the largest one's area, if stereo does not support them",

@@ -26,6 +26,7 @@ from linprim_geo.jobs.executor import Executor
 from linprim_geo.jobs.open import open_executor
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.choose_level import USUAL_LEVEL, choose_level
+from linprim_geo.surface.object_alone import object_alone
 from linprim_geo.surface.postprocess import Finished, finish_surface, visible_file, with_rounds
 from linprim_geo.surface.single_view import without_single_views
 from linprim_geo.surface.texture import check_texture
@@ -71,7 +72,8 @@ def extract_mesh(
     photographs in place of vertex colours.
 
     With `held_out` the held-out views take part in all of it. With `box` only the faces in it are kept; --method tsdf
-    fuses nothing else.
+    fuses nothing else. With `object` only the object in the box is kept (`object_alone`), which is auto unless it is
+    given.
 
     With `time_budget`, in seconds, stereo takes photographs that are averaged down until it has time enough
     (`stereo_budget.stereo_in_time`), and the voxel size is the smallest with which everything takes that time at most,
@@ -112,6 +114,8 @@ def extract_mesh(
     opened = Run.open(run)
     if options.held_out:
         opened = opened.with_held_out_views()
+    if options.object and not options.box:
+        options = replace(options, box="auto")
     box = read_box(options.box, [view.camera for view in opened.scene().train])
     if box is not None:
         options = replace(options, box=as_text(box))
@@ -181,8 +185,10 @@ def _extract(
         about = about | {"blocks": blocks}
     else:
         mesh, about = surface(opened, options, stages, **kept)
-    if options.box:
-        mesh = _cropped(mesh, options)
+    if options.object:
+        mesh, about["object"] = _object(mesh, opened, options, stages)
+    elif options.box:
+        mesh = remove_small_components(_cropped(mesh, options), options.smallest_part)
     if opened.environment is not None:
         mesh, left_out = _seen_by_several(mesh, opened, options, stages)
         about = about | {"seen_by_one_view": left_out}
@@ -226,16 +232,26 @@ def _seen_by_several(mesh: Mesh, opened: Run, options: ExtractOptions, stages: S
     return mesh, left_out
 
 
+def _object(mesh: Mesh, opened: Run, options: ExtractOptions, stages: Stages) -> tuple[Mesh, dict]:
+    """See `object_alone`."""
+    box = read_box(options.box)
+    assert box is not None
+    mesh, about = object_alone(_cropped(mesh, options), [view.camera for view in opened.scene().train], box)
+    stands = "it stands on no plane" if about["stands_on"] is None else "with the plane that it stands on"
+    stages.note(f"the object alone: {about['cut']:.0%} of the surface in the box is left out, {stands}")
+    stages.lap("object")
+    return mesh, about
+
+
 def _cropped(mesh: Mesh, options: ExtractOptions) -> Mesh:
-    """The faces whose middle lies in the box of the options, without parts that are small beside the largest one
-    there."""
+    """The faces whose middle lies in the box of the options."""
     box = read_box(options.box)
     assert box is not None
     left = select_faces(mesh, inside(mesh.vertices[mesh.faces].mean(1), box))
     if not len(left.faces):
         reach = " to ".join(",".join(f"{value:.4g}" for value in end) for end in mesh.bounds)
         raise LinprimError(f"--box {options.box} holds none of the surface, which reaches from {reach}")
-    return remove_small_components(left, options.smallest_part)
+    return left
 
 
 def _statistics(done: Finished, opened: Run) -> dict:
