@@ -1,6 +1,7 @@
-"""Depth maps for fusing out of five sources: what stereo finds and its neighbours confirm, planes of regions without
-texture, the surface that spans gaps between these, floors and walls that enclose the scene, and what the primitives
-render everywhere else, with the weight that its deviation from the first deserves.
+"""Depth maps for fusing out of six sources: what stereo finds and its neighbours confirm, planes of regions without
+texture, the surface that spans gaps between these, floors and walls that enclose the scene, thin things that the
+primitives render before all these, and what they render everywhere else, with the weight that its deviation from the
+first deserves.
 
 Of the surface that is fused from them, what stereo and planes of several views do not support is left out."""
 
@@ -20,6 +21,7 @@ from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.plain_regions import PlainRegion, common_planes, edges_of, plain_regions, plane_depths
 from linprim_geo.stereo.point_planes import SurfacePoints, planes_of_points, point_plane_depth
 from linprim_geo.stereo.shaded_planes import ShadedPlanes
+from linprim_geo.stereo.thin_things import SeenDepths, thin_things
 from linprim_geo.stereo.visibility_cut import plane_normals, points_per_view, spanned_depths
 from linprim_geo.surface.single_view import mesh_is_closed
 from linprim_geo.surface.tsdf_field import DepthFrame
@@ -43,8 +45,9 @@ class MergedFrames(Sequence):
     neighbours over that of rendered ones from confirmed ones, 1 at most. `confirmed` is the share of pixels with
     confirmed depths, `doubtful` that of less probable ones, `flat` that of pixels on one of the `planes` (K, 4),
     `spanned` that of pixels without texture between all these, `enclosed` that of pixels whose rays end at a floor
-    or wall because nothing else is known. Rendered depths stay there where they are `sharp`, (H, W) bool of every view,
-    or all of them if None.
+    or wall because nothing else is known, `thin` that of thin things before what is known. `sharp` (H, W) bool of every
+    view says where rendered depths are those of a surface, and None everywhere: they stay where nothing is known, and
+    thin things are among them.
     """
 
     def __init__(
@@ -74,13 +77,13 @@ class MergedFrames(Sequence):
         backgrounds = self._take_planes(maps, rendered_depths)
         known = [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
         points = self._span_gaps(maps, known, rendered_depths, backgrounds)
-        if sharp is None:
-            sharp = (depth > 0 for depth in rendered_depths)
+        are_sharp = [depth > 0 for depth in rendered_depths] if sharp is None else list(sharp)
         unknown = [
             (depth > 0) & ~(of_surface | background)
-            for depth, of_surface, background in zip(rendered_depths, sharp, backgrounds, strict=True)
+            for depth, of_surface, background in zip(rendered_depths, are_sharp, backgrounds, strict=True)
         ]
         self._enclose(points, known, unknown)
+        self._keep_thin_things(views, maps, rendered_depths, are_sharp)
 
     def _take_planes(self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Finds planes by points, by edges and by shading, of depths that are sure, and what lies on them; moves
@@ -143,6 +146,27 @@ class MergedFrames(Sequence):
         self.doubtful_depths = [_first_known(pair) for pair in zip(self.doubtful_depths, enclosed, strict=True)]
         self.enclosed = _share_known(enclosed)
 
+    def _keep_thin_things(
+        self,
+        views: Sequence[View],
+        maps: Sequence[DepthMap],
+        rendered: Sequence[np.ndarray],
+        sharp: Sequence[np.ndarray],
+    ) -> None:
+        """Takes rendered depths of thin things in place of those of the wall behind them, as if they were confirmed."""
+        known = map(_first_known, zip(self.depths, self.on_planes, self.doubtful_depths, strict=True))
+        things = thin_things(
+            [
+                SeenDepths(found.camera, view.load().rgb, found.noise, depth, is_sharp, behind)
+                for view, found, depth, is_sharp, behind in zip(views, maps, rendered, sharp, known, strict=True)
+            ]
+        )
+        for view, thing in enumerate(things):
+            self.depths[view] = np.where(thing, rendered[view], self.depths[view])
+            for others in (self.on_planes, self.doubtful_depths):
+                others[view] = np.where(thing, np.float32(np.nan), others[view])
+        self.thin = float(np.mean([thing.mean() for thing in things]))
+
     def covered(self, mesh: Mesh) -> float:
         """Share of the pixels with a rendered depth whose rays hit a mesh, of one of SAMPLED rows and columns."""
         caster, shown, hit = RayCaster(mesh.vertices, mesh.faces), 0, 0
@@ -161,6 +185,7 @@ class MergedFrames(Sequence):
             "flat": self.flat,
             "spanned": self.spanned,
             "enclosed": self.enclosed,
+            "thin": self.thin,
             "planes": len(self.planes),
         }
 

@@ -1,8 +1,9 @@
-"""Depth maps of four sources as one, each by what it deserves, and what is supported of the surface made of them."""
+"""Depth maps of several sources as one, each by what it deserves, and what is supported of the surface made of them."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from helpers.captures import look_at
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.capture.load import load_scene
-from linprim_geo.capture.types import Scene
+from linprim_geo.capture.types import Photo, Scene
 from linprim_geo.geometry.mesh import Mesh, vertex_normals
 from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.runs.run import Run
@@ -24,6 +25,7 @@ from linprim_geo.surface.tsdf_field import DepthFrame
 from linprim_geo.surface.tsdf_parts import merge_parts
 
 CAMERA = look_at((0.0, -3.0, 0.0), size=(40, 30))
+VIEW = SimpleNamespace(load=lambda: Photo(np.zeros((30, 40, 3), np.uint8)))
 
 
 @pytest.fixture
@@ -44,7 +46,7 @@ def rendered(error: float) -> list[DepthFrame]:
 
 
 def test_confirmed_depths_take_the_place_of_rendered_ones(found):
-    merged = MergedFrames(rendered(0.01), [None], 5.0)
+    merged = MergedFrames(rendered(0.01), [VIEW], 5.0)
     frame = merged[0]
     assert (frame.depth[1:, :20] == 3).all() and np.allclose(frame.depth[0], 3.03)
     assert merged.confirmed == pytest.approx(28 / 60) and merged.doubtful == pytest.approx(1 / 60)
@@ -57,7 +59,7 @@ def test_confirmed_depths_take_the_place_of_rendered_ones(found):
 def test_planes_of_walls_stand_where_confirmed_depths_are_not_sure(found, monkeypatch):
     found[0].confidence[:, 5:] = CONFIDENT
     monkeypatch.setattr(stereo_frames, "plane_depths", lambda *_: np.full((30, 40), 3.5, np.float32))
-    frame = MergedFrames(rendered(0.01), [None], 5.0)[0]
+    frame = MergedFrames(rendered(0.01), [VIEW], 5.0)[0]
     assert (frame.depth[2:, :5] == 3).all() and (frame.depth[2:, 5:20] == 3.5).all()
     assert (frame.confidence[2:, :20] == 1).all()
 
@@ -66,7 +68,7 @@ def test_planes_stand_where_nothing_is_confirmed(found, monkeypatch):
     on_plane = np.full((30, 40), np.nan, np.float32)
     on_plane[:, 10:30] = 3.5
     monkeypatch.setattr(stereo_frames, "plane_depths", lambda *_: on_plane)
-    merged = MergedFrames(rendered(0.01), [None], 5.0)
+    merged = MergedFrames(rendered(0.01), [VIEW], 5.0)
     frame = merged[0]
     assert (frame.depth[2:, :20] == 3).all() and (frame.depth[:, 20:30] == 3.5).all() and merged.flat == 0.5
     assert (frame.depth[:2, 10:20] == 3.5).all()
@@ -77,7 +79,7 @@ def test_confirmed_depths_that_stereo_cannot_tell_from_a_plane_are_on_it(found, 
     on_plane = np.full((30, 40), np.nan, np.float32)
     on_plane[5:, 10:30] = 3.001
     monkeypatch.setattr(stereo_frames, "point_plane_depth", lambda *_: on_plane)
-    frame = MergedFrames(rendered(0.01), [None], 5.0)[0]
+    frame = MergedFrames(rendered(0.01), [VIEW], 5.0)[0]
     assert np.allclose(frame.depth[5:, 10:30], 3.001) and (frame.confidence[5:, 10:30] == 1).all()
     assert (frame.depth[2:, :10] == 3).all() and (frame.depth[2:5, 10:20] == 3).all()
 
@@ -87,7 +89,7 @@ def test_spans_stand_where_nothing_is_known_and_photographs_have_no_edges(found,
     edge[:, 30:] = True
     monkeypatch.setattr(stereo_frames, "spanned_depths", lambda *_: [np.full((30, 40), 3.2, np.float32)])
     monkeypatch.setattr(stereo_frames, "edges_of", lambda *_: edge)
-    merged = MergedFrames(rendered(0.01), [None], 5.0)
+    merged = MergedFrames(rendered(0.01), [VIEW], 5.0)
     frame = merged[0]
     assert (frame.depth[1:, :20] == 3).all(), "confirmed and doubtful depths stay"
     assert np.allclose(frame.depth[0, :30], 3.2) and np.allclose(frame.depth[:, 20:30], 3.2)
@@ -106,7 +108,7 @@ def test_rays_end_at_enclosing_planes_where_nothing_is_known_and_nothing_sharp_i
         return [np.where(pixels, np.float32(3.4), np.float32(np.nan)) for pixels in wanted]
 
     monkeypatch.setattr(stereo_frames, "enclosing_depths", enclosing)
-    merged = MergedFrames(rendered(0.01), [None], 5.0, sharp=iter([sharp]))
+    merged = MergedFrames(rendered(0.01), [VIEW], 5.0, sharp=iter([sharp]))
     frame = merged[0]
     assert (frame.depth[1:, :20] == 3).all(), "confirmed and doubtful depths stay"
     assert np.allclose(frame.depth[0, :30], 3.4) and np.allclose(frame.depth[:, 20:30], 3.4)
@@ -116,27 +118,52 @@ def test_rays_end_at_enclosing_planes_where_nothing_is_known_and_nothing_sharp_i
     assert len(asked) == 1 and not asked[0][1:, :20].any()
 
 
+def test_thin_things_stand_before_what_is_known(found, monkeypatch):
+    thing = np.zeros((30, 40), bool)
+    thing[:, 7:9] = True
+    asked = []
+
+    def thin(views):
+        asked.extend(views)
+        return [thing]
+
+    monkeypatch.setattr(stereo_frames, "thin_things", thin)
+    monkeypatch.setattr(stereo_frames, "plane_depths", lambda *_: np.full((30, 40), 3.5, np.float32))
+    sharp = np.ones((30, 40), bool)
+    merged = MergedFrames(rendered(-0.1), [VIEW], 5.0, sharp=[sharp])
+    frame = merged[0]
+    assert np.allclose(frame.depth[:, 7:9], 2.7) and (frame.confidence[:, 7:9] == 1).all()
+    assert (frame.depth[2:, :7] == 3).all() and (frame.depth[2:, 9:20] == 3).all()
+    assert merged.thin == merged.about()["thin"] == pytest.approx(2 / 40)
+    (view,) = asked
+    # What is known is of all sources, confirmed ones first.
+    assert (view.known[2:, :20] == 3).all() and (view.known[:, 20:] == 3.5).all() and view.sharp.all()
+    # It is supported where it is taken.
+    middle = CAMERA.center + CAMERA.world_rays()[15, 7] * 2.7
+    assert merged.supporting(middle[None]) == [1]
+
+
 def test_frames_are_rendered_for_all_views_together(found):
     class Rendered(list):
         def __getitem__(self, index):
             raise AssertionError("frames that are not kept are rendered again whenever one is asked for")
 
-    assert MergedFrames(Rendered(rendered(0.01)), [None], 5.0).flat == 0
+    assert MergedFrames(Rendered(rendered(0.01)), [VIEW], 5.0).flat == 0
 
 
 def test_rendered_depths_that_are_as_good_count_as_much(found):
-    assert MergedFrames(rendered(1e-5), [None], 5.0).weight == 1
+    assert MergedFrames(rendered(1e-5), [VIEW], 5.0).weight == 1
 
 
 def test_depths_beyond_the_limit_are_left_to_the_rendering(found):
-    merged = MergedFrames(rendered(0.01), [None], 2.5)
+    merged = MergedFrames(rendered(0.01), [VIEW], 2.5)
     assert np.allclose(merged[0].depth, 3.03)
 
 
 def test_what_primitives_let_through_is_no_surface(found):
     (frame,) = rendered(0.01)
     frame.background[:, :5] = True
-    merged = MergedFrames([frame], [None], 5.0)[0]
+    merged = MergedFrames([frame], [VIEW], 5.0)[0]
     assert (
         np.allclose(merged.depth[:, :5], 3.03)
         and merged.background[:, :5].all()
@@ -146,7 +173,7 @@ def test_what_primitives_let_through_is_no_surface(found):
 
 def test_depths_of_little_confidence_count_a_tenth_though_views_confirm_them(found):
     stereo_frames.depth_maps()[0].confidence[2:, :10] = 0.6
-    frame = MergedFrames(rendered(0.01), [None], 5.0)[0]
+    frame = MergedFrames(rendered(0.01), [VIEW], 5.0)[0]
     assert np.allclose(frame.confidence[2:, :10], stereo_frames.DOUBTFUL_WEIGHT) and (frame.depth[2:, :20] == 3).all()
     assert (frame.confidence[2:, 10:20] == 1).all()
 
@@ -162,7 +189,7 @@ def merged_of(views: int, monkeypatch) -> MergedFrames:
     """Views that see depth 3, so y = 0, in the picture's left half, where x < 0."""
     maps = views * stereo_frames.depth_maps()[:1]
     monkeypatch.setattr(stereo_frames, "depth_maps", lambda *_, **__: maps)
-    return MergedFrames(views * rendered(0.0), views * [None], 5.0)
+    return MergedFrames(views * rendered(0.0), views * [VIEW], 5.0)
 
 
 def test_small_pieces_stay_where_views_support_them(found, monkeypatch):
@@ -206,14 +233,14 @@ def test_a_view_supports_a_point_once_and_only_by_what_is_fused(found, monkeypat
     monkeypatch.setattr(stereo_frames, "plane_depths", lambda *_: on_plane)
     point = np.array([[-0.4, 0.0, -0.2]])
     (frame,) = rendered(0.0)
-    assert MergedFrames([frame], [None], 5.0).supporting(point) == [1]
-    assert MergedFrames([frame], [None], 2.5).supporting(point) == [0]  # beyond the limit
+    assert MergedFrames([frame], [VIEW], 5.0).supporting(point) == [1]
+    assert MergedFrames([frame], [VIEW], 2.5).supporting(point) == [0]  # beyond the limit
     frame.background[:] = True
-    assert MergedFrames([frame], [None], 5.0).supporting(point) == [0]
+    assert MergedFrames([frame], [VIEW], 5.0).supporting(point) == [0]
 
 
 def test_doubtful_depths_support_only_where_they_are_asked_for(found):
-    merged = MergedFrames(rendered(0.0), [None], 5.0)
+    merged = MergedFrames(rendered(0.0), [VIEW], 5.0)
     # Row 1 of the picture, 30 pixels a unit of depth: z = 13.5 / 30 * 3.
     doubtful, unknown = [-0.4, 0.0, 1.35], [-0.4, 0.0, 1.45]
     assert merged.supporting(np.array([doubtful, unknown])).tolist() == [0, 0]
@@ -250,7 +277,7 @@ def stereo_once(many_views, kept_maps, monkeypatch):
 def test_a_surface_covers_the_pixels_whose_rays_hit_it(found):
     (frame,) = rendered(0.0)
     frame.depth[:, 36:] = 0
-    merged = MergedFrames([frame], [None], 5.0)
+    merged = MergedFrames([frame], [VIEW], 5.0)
     # The view is 4 wide at the depth of 3, and every fourth column of 40 is looked at.
     assert merged.covered(sheet((-9, -9), (9, 9), 0.0)) == 1
     assert merged.covered(sheet((-9, -9), (-0.01, 9), 1.0)) == pytest.approx(5 / 9)
