@@ -286,6 +286,15 @@ class TrainOptions:
         "optimiser step over all primitives, or over those that a view touched (sparse: the others' moments rest)",
         choices=("dense", "sparse"),
     )
+    dropout: float | str = option(
+        "auto",
+        "share of the primitives that each step leaves out at random, neighbours together; auto: 0.2 of captures with "
+        "10 training photographs at most, not in --blocks, else 0",
+        low=0,
+        high=0.9,
+        metavar="X",
+        number_or="auto",
+    )
     stereo_depth: float = option(
         1.0,
         "weight: surfaces lie within 1 % of the depths that stereo of small copies of the photographs finds; not of "

@@ -21,8 +21,8 @@ SEEDS, TRIED_ON = 300, 6000
 # A face is on a plane up to this share of the box's shortest side, if their normals differ by 30 degrees at most.
 TOLERANCE, SAME_NORMAL = 0.005, float(np.cos(np.radians(30)))
 # A plane that something stands on has this share of the area in the box at least, all but a few cameras above it, and
-# looks up: at most 45 degrees from the cameras' own upward direction.
-LEAST_SHARE, CAMERAS_ABOVE, UPWARD = 0.05, 0.95, float(np.cos(np.radians(45)))
+# looks up within 45 degrees, or has cameras all around that look down on it by no more.
+LEAST_SHARE, CAMERAS_ABOVE, STEEP = 0.05, 0.95, float(np.radians(45))
 # How often a plane is fitted to what lies on it.
 FITS = 3
 # What stands out from the plane by so many deviations of its own surface is not a part of it.
@@ -72,25 +72,18 @@ def object_alone(mesh: Mesh, cameras: Sequence[Camera], box: np.ndarray) -> tupl
 
 
 def supporting_plane(mesh: Mesh, cameras: Sequence[Camera], box: np.ndarray) -> SupportingPlane | None:
-    """The plane that most of the surface lies on, of those that see nearly all cameras above them and that look up;
-    None where there is none."""
+    """The plane that most of the surface lies on, of those that something may stand on; None where there is none."""
     rng = np.random.default_rng(0)
     area, middle, normal = face_areas(mesh), mesh.vertices[mesh.faces].mean(1), face_normals(mesh)
     drawn = rng.choice(len(area), TRIED_ON, p=area / area.sum())
     middle, normal = middle[drawn], normal[drawn]
     tolerance = TOLERANCE * float((box[1] - box[0]).min())
-    centers = np.array([camera.center for camera in cameras])
-    up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
-    up /= max(float(np.linalg.norm(up)), 1e-12)
 
     def on(plane: np.ndarray) -> np.ndarray:
         return (np.abs(middle @ plane[:3] - plane[3]) < tolerance) & (normal @ plane[:3] > SAME_NORMAL)
 
-    def is_below(plane: np.ndarray) -> bool:
-        return plane[:3] @ up > UPWARD and (centers @ plane[:3] > plane[3]).mean() >= CAMERAS_ABOVE
-
     tried = (np.append(normal[k], normal[k] @ middle[k]) for k in range(SEEDS))
-    counted = [(np.count_nonzero(on(plane)), plane) for plane in tried if is_below(plane)]
+    counted = [(np.count_nonzero(on(plane)), plane) for plane in tried if is_below(plane, cameras, box.mean(0))]
     most, plane = max(counted, key=lambda pair: pair[0], default=(0, np.zeros(4)))
     if most < LEAST_SHARE * len(drawn):
         return None
@@ -106,8 +99,31 @@ def supporting_plane(mesh: Mesh, cameras: Sequence[Camera], box: np.ndarray) -> 
     return SupportingPlane(plane[:3], float(plane[3]), max(DEVIATIONS * deviation, 2 * edge))
 
 
+def is_below(plane: np.ndarray, cameras: Sequence[Camera], middle: np.ndarray) -> bool:
+    """Whether something that cameras look at, at `middle` (3,), may stand on a plane (4,): nearly all are above it, and
+    it looks up as their photographs do, or, should these be turned, they stand all around and not too high."""
+    normal = plane[:3]
+    centers = np.array([camera.center for camera in cameras])
+    if (centers @ normal > plane[3]).mean() < CAMERAS_ABOVE:
+        return False
+    up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
+    if up @ normal > np.cos(STEEP) * np.linalg.norm(up):
+        return True
+    away = centers - middle
+    x, y = (away @ axis for axis in _across(normal))
+    height = np.arctan2(away @ normal, np.hypot(x, y))
+    around = np.sort(np.arctan2(y, x))
+    gap = np.diff(around, append=around[0] + 2 * np.pi).max()
+    return bool(np.median(height) < STEEP and gap < np.pi)
+
+
+def _across(normal: np.ndarray) -> np.ndarray:
+    """(2, 3) unit vectors at right angles to a (3,) one and to each other."""
+    return np.linalg.svd(normal[None])[2][1:]
+
+
 def _within(mesh: Mesh, box: np.ndarray) -> Mesh:
-    """The pieces that end within a box, or all if none does, but for small ones."""
+    """The pieces that end within a box, or all if these are little of them, but for small ones."""
     count, label = face_components(mesh)
     if not count:
         return mesh
@@ -115,7 +131,7 @@ def _within(mesh: Mesh, box: np.ndarray) -> Mesh:
     outer = ((mesh.vertices < box[0] + reach) | (mesh.vertices > box[1] - reach)).any(1)[mesh.faces].any(1)
     ends = np.bincount(label, weights=outer, minlength=count) == 0
     area = np.bincount(label, weights=face_areas(mesh), minlength=count)
-    wanted = ends if ends.any() else np.ones(count, bool)
+    wanted = ends if area[ends].sum() > LEAST_PIECE * area.sum() else np.ones(count, bool)
     return select_faces(mesh, (wanted & (area >= LEAST_PIECE * area[wanted].max()))[label])
 
 
@@ -128,7 +144,7 @@ def closed_by(mesh: Mesh, plane: SupportingPlane) -> tuple[Mesh, int]:
     loops = [loop for loop in border_loops(mesh.faces) if (plane.height(mesh.vertices[loop]) < low).mean() > MOSTLY]
     if not loops:
         return mesh, 0
-    across = np.linalg.svd(plane.normal[None])[2][1:]
+    across = _across(plane.normal)
     if np.cross(*across) @ plane.normal > 0:  # seen from below
         across = across[::-1]
     vertices, faces, polygons, count = [mesh.vertices], [mesh.faces], [], len(mesh.vertices)

@@ -19,6 +19,7 @@ from linprim_geo.training.effects import Decision
 from linprim_geo.training.held_out_gap import gap_advice
 from linprim_geo.training.loop import QUICK_VIEWS, evaluate, run_steps
 from linprim_geo.training.start import geometry_terms, start_trainer
+from linprim_geo.training.step.dropout import chosen_share
 from linprim_geo.training.step.trainer import Trainer
 from linprim_geo.training.step.training_images import TrainingImage, load_training_images
 from linprim_geo.training.stereo_surfaces import Surfaces, stereo_surfaces
@@ -54,6 +55,9 @@ def train_run(
         surfaces = stereo_surfaces(scene, options, progress, None if state else budget, started=state is not None)
     if state is None and not surfaces.maps:  # nor when the run is resumed
         options = replace(options, stereo_depth=0.0)
+        run = replace(run, train_options=options)
+    if state is None:
+        options = replace(options, dropout=chosen_share(options.dropout, len(scene.train)))
         run = replace(run, train_options=options)
     pace = None
     if budget:

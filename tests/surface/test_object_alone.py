@@ -113,8 +113,33 @@ def test_surroundings_that_reach_out_of_the_box_go_and_small_pieces_too():
 def test_a_wall_that_cameras_look_at_is_nothing_to_stand_on():
     wall = sheet(1.0)
     wall.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
-    low = [camera for camera in ring(24, radius=3.0) if camera.center[1] * wall.face_normals[0][1] > 0.5]
-    assert supporting_plane(together(wall, dome()), low, BOX) is None
+    before = [camera for camera in ring(24, radius=3.0) if camera.center[1] * wall.face_normals[0][1] > 0.5]
+    assert supporting_plane(together(wall, dome()), before, BOX) is None
+    # Nor if the photographs are turned.
+    turn = np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+    turned = [replace(camera, world_to_camera=turn @ camera.world_to_camera) for camera in before]
+    assert supporting_plane(together(wall, dome()), turned, BOX) is None
+
+
+@pytest.mark.parametrize("turn", [1, -1, 0])
+def test_photographs_may_be_turned(turn):
+    """By 90 degrees, as a telephone held upright writes them."""
+    across = {1: [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], -1: [[0, -1, 0], [1, 0, 0], [0, 0, 1]], 0: np.eye(3)}[turn]
+    pose = np.eye(4)
+    pose[:3, :3] = across
+    cameras = [replace(camera, world_to_camera=pose @ camera.world_to_camera) for camera in CAMERAS]
+    plane = supporting_plane(together(sheet(0.9), dome()), cameras, BOX)
+    assert plane is not None
+    np.testing.assert_allclose(plane.normal, [0, 0, 1], atol=1e-6)
+
+
+def test_a_thing_that_reaches_out_of_the_box_stays():
+    """Pieces that end within it are crumbs beside it."""
+    column = trimesh.creation.cylinder(0.3, 3.0, sections=64).subdivide_to_size(0.05)
+    crumb = trimesh.creation.icosphere(2, 0.05).apply_translation([-0.7, 0.5, 0.3])
+    alone, about = object_alone(shown(together(column, crumb)), CAMERAS, BOX)
+    assert about["stands_on"] is None and np.abs(alone.vertices[:, 2]).max() > 0.9
+    assert np.linalg.norm(alone.vertices[:, :2], axis=1).max() < 0.31
 
 
 def test_a_thing_in_the_air_stays_as_it_is():

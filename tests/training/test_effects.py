@@ -260,7 +260,7 @@ def test_training_decides_records_and_resumes_by_it(scenes, tmp_path, own_points
     assert again["iterations"] == 12 and Run.open(tmp_path / "run").train_options == chosen
     train(scenes("exposure"), tmp_path / "python", options=options, quiet=True)
     # With masks nothing is held to stereo.
-    assert Run.open(tmp_path / "python").train_options == replace(options, stereo_depth=0.0)
+    assert Run.open(tmp_path / "python").train_options == replace(options, stereo_depth=0.0, dropout=0.0)
     assert json.loads((tmp_path / "python" / "config.json").read_text())["effects"] == []
 
 

@@ -59,7 +59,7 @@ def test_a_killed_run_goes_on_bit_for_bit(tiny_scene, tmp_path):
     assert process.returncode == -signal.SIGKILL
     assert checkpoint(killed)["step"] < 200
     # Stereo finds nothing in photographs as small.
-    assert Run.open(killed).train_options == replace(options, stereo_depth=0.0)
+    assert Run.open(killed).train_options == replace(options, stereo_depth=0.0, dropout=0.0)
     result = train(tiny_scene, killed, resume=True, quiet=True)
     assert result["iterations"] == 200 and result["primitives"] == 260
     assert_same_run(whole, killed)

@@ -25,6 +25,7 @@ from linprim_geo.geometry.view_support import Support
 from linprim_geo.kernels import ops
 from linprim_geo.kernels.adam import adam_rows, adam_step
 from linprim_geo.points.far_colors import SURVEY_VIEWS
+from linprim_geo.training.step.dropout import with_dropout
 from linprim_geo.training.step.environment import contradiction, seen_through
 from linprim_geo.training.step.exposure import Exposure, exposed
 from linprim_geo.training.step.geometry_terms import GeometryTerms, needs_geometry
@@ -123,6 +124,7 @@ class Trainer:
         self.steps = torch.zeros(len(self), dtype=torch.int32)  # sparse Adam: updates of each primitive
         self.seconds = 0.0
         self.loss = self.psnr = math.nan  # running means
+        self.dropout = 0.0 if isinstance(options.dropout, str) else options.dropout
         self.kind, self.raster_options = options.primitive, raster_options(options)
         self.control = CONTROLS[options.population](options, len(self), [image.camera for image in images], bounds)
         self.filter_3d: torch.Tensor | None = None
@@ -196,7 +198,10 @@ class Trainer:
             )
         target = image.over(background.detach())
         leaves = {k: v.requires_grad_() for k, v in self.parameters.items()}
-        active = self._cast(*self._with_frozen(activate(leaves, self.degree, self.kind, self.filter_3d)))
+        own = activate(leaves, self.degree, self.kind, self.filter_3d)
+        if self.dropout > 0:
+            own = with_dropout(own, self.dropout, self.options.seed, self.step)
+        active = self._cast(*self._with_frozen(own))
         screen = torch.zeros(len(active[0]), 3, dtype=active[0].dtype, requires_grad=True)
         behind = self._flat(background).to(active[0].dtype)
         late = self.has_reached(self.options.geometry_from)
