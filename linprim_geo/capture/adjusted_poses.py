@@ -1,4 +1,4 @@
-"""Poses of a capture after `points.adjust_poses`, as a file of a run and of the cache folder keep them."""
+"""Poses of a capture after `stereo.adjust_poses`, as a file of a run and of the cache folder keep them."""
 
 from __future__ import annotations
 

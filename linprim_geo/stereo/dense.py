@@ -23,8 +23,8 @@ from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.structure_from_motion import prepare
 from linprim_geo.capture.types import Scene, View
 from linprim_geo.kernels import ops
-from linprim_geo.points.adjust_poses import adjusted_scene
 from linprim_geo.points.start_points import with_points
+from linprim_geo.stereo.adjust_poses import adjusted_scene
 from linprim_geo.stereo.fused_points import PointFusion
 from linprim_geo.stereo.maps_from_disk import maps_of
 from linprim_geo.stereo.planes_on_disk import STAGES, Photographs, PlanesOnDisk

@@ -18,9 +18,9 @@ from linprim_geo.capture.adjusted_poses import AdjustedPoses
 from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.types import PHOTOGRAPHS
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.points import adjust_poses as module
-from linprim_geo.points.adjust_poses import adjusted_scene
 from linprim_geo.runs.run import ADJUSTED_POSES, Run
+from linprim_geo.stereo import adjust_poses as module
+from linprim_geo.stereo.adjust_poses import adjusted_scene
 from linprim_geo.training.train import train
 
 SIZE, FOCAL, COUNT, ERROR_PX = (240, 180), 200.0, 14, 1.0
