@@ -38,8 +38,11 @@ class Adjusted:
     focal_factor: float
 
 
-def bundle_adjusted(cameras: Sequence[Camera], points: ObservedPoints) -> Adjusted:
+def bundle_adjusted(cameras: Sequence[Camera], points: ObservedPoints, *, together: float = 1.0) -> Adjusted:
     """The most probable poses and focal lengths; `points` have two observations or more each.
+
+    Args:
+        together: so many observations err alike and count as one.
 
     Raises:
         numpy.linalg.LinAlgError: the observations determine nothing.
@@ -53,7 +56,7 @@ def bundle_adjusted(cameras: Sequence[Camera], points: ObservedPoints) -> Adjust
     spread = np.full(2, FIRST_ERROR / 2 / np.median(focal))
     moved, moves, log_factor = given, np.zeros((len(given), 6)), 0.0
     for _ in range(STEPS):
-        found = _Equations(moved, points)
+        found = _Equations(moved, points, together)
         variance = np.repeat(np.stack([np.full_like(depth, spread[0]), spread[1] * depth], 1) ** 2, 3, axis=1)
         information = np.append(1 / variance, FOCAL_ERROR**-2)
         reduced, right = found.reduced(information, np.append(moves, log_factor))
@@ -99,7 +102,7 @@ class _Equations:
     shifts by three along them. The last unknown is the logarithm of a factor of all focal lengths.
     """
 
-    def __init__(self, cameras: Sequence[Camera], points: ObservedPoints):
+    def __init__(self, cameras: Sequence[Camera], points: ObservedPoints, together: float = 1.0):
         self.image, self.point = points.image, points.point
         self.cameras, self.points = len(cameras), len(points.xyz)
         turn = np.array([camera.rotation for camera in cameras])[self.image]
@@ -111,12 +114,17 @@ class _Equations:
         z = np.where(front, z, 1)
         self.by_focal = np.stack([inner[0] * x / z, inner[1] * y / z], 1)
         miss = points.pixel - self.by_focal - inner[2:].T
+        if points.precision is not None:
+            miss = np.einsum("nij,nj->ni", points.precision, miss)
+            self.by_focal = np.einsum("nij,nj->ni", points.precision, self.by_focal)
         length = np.linalg.norm(miss, axis=1)
         noise = max(float(np.median(length[front])) / MEDIAN_LENGTH, LEAST_NOISE) if front.any() else 1.0
-        weight = np.where(front, 1 / (1 + (length / (CAUCHY * noise)) ** 2) / noise**2, 0)
+        weight = np.where(front, 1 / (1 + (length / (CAUCHY * noise)) ** 2) / (together * noise**2), 0)
         zero = np.zeros_like(z)
         by_local = np.stack([inner[0] / z, zero, -inner[0] * x / z**2, zero, inner[1] / z, -inner[1] * y / z**2], 1)
         by_local = by_local.reshape(-1, 2, 3)
+        if points.precision is not None:
+            by_local = points.precision @ by_local
         cross = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)  # d(turn x local) / d turn
         self.by_camera = np.concatenate([by_local @ cross, by_local], axis=2)
         self.by_point = by_local @ turn

@@ -37,7 +37,8 @@ _ISOLATION_ROUNDS = 3
 @dataclass(frozen=True)
 class ObservedPoints:
     """Points and where photographs see them: `xyz` (P, 3), `rgb` (P, 3) uint8, mean `error_px` (P,), and observations,
-    ordered by point: `point` (N,), `image` (N,) and `pixel` (N, 2)."""
+    ordered by point: `point` (N,), `image` (N,) and `pixel` (N, 2). `precision` (N, 2, 2) are symmetric roots of their
+    inverse covariances, up to a factor; None if all are alike."""
 
     xyz: np.ndarray
     rgb: np.ndarray
@@ -45,6 +46,7 @@ class ObservedPoints:
     point: np.ndarray
     image: np.ndarray
     pixel: np.ndarray
+    precision: np.ndarray | None = None
 
     @property
     def track_length(self) -> np.ndarray:
@@ -61,7 +63,8 @@ class ObservedPoints:
         number = np.cumsum(keep) - 1
         rows = keep[self.point]
         kept = self.xyz[keep], self.rgb[keep], self.error_px[keep]
-        return ObservedPoints(*kept, number[self.point[rows]], self.image[rows], self.pixel[rows])
+        precision = None if self.precision is None else self.precision[rows]
+        return ObservedPoints(*kept, number[self.point[rows]], self.image[rows], self.pixel[rows], precision)
 
 
 def triangulate_features(

@@ -2,13 +2,16 @@
 
 Keypoints are matched and triangulated under the given poses. Poses are adjusted to half of the points; where these
 explain the other half better than the given ones do, they are adjusted to all. Exact poses fail this test: adjusted
-ones have errors of their own.
+ones have errors of their own. Under the adjusted poses stereo of small copies finds surfaces, and the given ones are
+adjusted again, to where photographs show patches of these (`stereo.patch_tracks`), which are more exact than keypoints
+and are on walls, too.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +20,14 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.progress import duration
 from linprim_geo.capture.adjusted_poses import AdjustedPoses
 from linprim_geo.capture.types import PHOTOGRAPHS, Scene, View
-from linprim_geo.geometry.bundle_adjustment import bundle_adjusted, placed_points, reprojection_px
+from linprim_geo.geometry.bundle_adjustment import Adjusted, bundle_adjusted, placed_points, reprojection_px
 from linprim_geo.geometry.feature_points import ObservedPoints, triangulate_features
 from linprim_geo.imaging.photos import cache_folder
 from linprim_geo.points.triangulate import digest_of, write_images
+from linprim_geo.stereo.patch_tracks import patch_tracks
 
 # Changed whenever poses come out differently.
-CACHE_VERSION = 2
+CACHE_VERSION = 3
 # Of more photographs so many, evenly spread, tell whether poses err. Adjusting needs all; the equations of all cameras
 # at once are dense, and with MOST_VIEWS take a minute.
 ASKED_VIEWS, MOST_VIEWS = 60, 500
@@ -41,6 +45,11 @@ LEFT_SHARE = 0.9
 # Exact poses of rendered scenes err by 0.04 pixels and less by keypoints, which have systematic errors of their own:
 # less than this is none.
 LEAST_ERROR_PX = 0.1
+# So many patches count as one: a highlight or a wrong slope moves all patches of a surface alike. The same for all, by
+# measurement: DECISIONS 86.
+TOGETHER = 36
+# A photograph with patches in so many places goes by them: its pose has six unknowns, and a third of them may err.
+LEAST_PATCHES = 20
 
 
 def adjusted_scene(
@@ -95,10 +104,34 @@ def _adjusted(views: Sequence[View], seed: int, threads: int, log: Callable[[str
         if step > 1:
             points = _observed(views, seed, threads)
         done = bundle_adjusted([view.camera for view in views], points)
+        done = _by_patches(views, done, points, seed, log)
     except np.linalg.LinAlgError:  # keypoints do not determine them
         return none
     poses = {view.name: camera.world_to_camera for view, camera in zip(views, done.cameras, strict=True)}
     return AdjustedPoses(poses, done.focal_factor, done.error_px)
+
+
+def _by_patches(
+    views: Sequence[View], keypoints: Adjusted, points: ObservedPoints, seed: int, log: Callable[[str], None]
+) -> Adjusted:
+    """Poses by patches of surfaces that stereo finds under those by `keypoints`, which photographs with few keep."""
+    nearly = [replace(view, camera=camera) for view, camera in zip(views, keypoints.cameras, strict=True)]
+    xyz = placed_points(keypoints.cameras, points).xyz
+    try:
+        tracks = patch_tracks(nearly, xyz, seed=seed)
+    except LinprimError as error:
+        log(f"poses: by keypoints alone: {error}")
+        return keypoints
+    shown = np.bincount(tracks.image, minlength=len(views)) >= LEAST_PATCHES
+    if not shown.any():
+        return keypoints
+    done = bundle_adjusted([view.camera for view in views], tracks, together=TOGETHER)
+    factor = done.focal_factor / keypoints.focal_factor
+    cameras = [
+        found if enough else replace(other, fx=factor * other.fx, fy=factor * other.fy)
+        for found, other, enough in zip(done.cameras, keypoints.cameras, shown, strict=True)
+    ]
+    return replace(done, cameras=cameras)
 
 
 def _observed(views: Sequence[View], seed: int, threads: int) -> ObservedPoints:

@@ -58,15 +58,19 @@ def off_px(cameras, true) -> float:
     )
 
 
-def test_equations_against_finite_differences():
+@pytest.mark.parametrize("precise", [False, True])
+def test_equations_against_finite_differences(precise):
     rng = np.random.default_rng(0)
     cameras = cameras_around(3)
     points = seen(cameras, rng, 5, noise=0.0, most_views=3)
+    if precise:
+        root = rng.normal(size=(len(points.point), 2, 2))
+        points = replace(points, precision=root + root.swapaxes(1, 2))
     found, step = _Equations(cameras, points), 1e-6
 
     def pixels(cameras, xyz):
         moved = [cameras[k].project(xyz[row][None])[0][0] for row, k in zip(points.point, points.image, strict=True)]
-        return np.array(moved)
+        return np.array(moved) if not precise else np.einsum("nij,nj->ni", points.precision, moved)
 
     for axis in range(6):
         by = [pixels([_moved(c, sign * step * np.eye(6)[axis]) for c in cameras], points.xyz) for sign in (1, -1)]
@@ -117,6 +121,34 @@ def test_a_wrong_focal_length_is_found(seed):
     found = bundle_adjusted(given, placed_points(given, seen(true, rng, 3000, wrong=0.05, most_views=12)))
     assert found.focal_factor * 1.006 == pytest.approx(1, abs=0.0025)
     assert found.cameras[0].fx == pytest.approx(found.focal_factor * given[0].fx)
+
+
+def test_observations_that_are_more_exact_count_more():
+    """Half of the observations are twenty times as noisy along one axis: 0.31 pixels are left, and 0.20 where their
+    precision says so."""
+    rng = np.random.default_rng(3)
+    true = cameras_around()
+    given, points = shaken(true, rng, 0.8), seen(true, rng, noise=0.1)
+    noisy = rng.random(len(points.point)) < 0.5
+    turn = rng.uniform(0, np.pi, len(points.point))
+    along = np.stack([np.cos(turn), np.sin(turn)], 1) * noisy[:, None]
+    points = replace(points, pixel=points.pixel + along * rng.normal(0, 2.0, (len(along), 1)))
+    precision = np.eye(2) - 0.95 * along[:, :, None] * along[:, None]
+    told = bundle_adjusted(given, placed_points(given, replace(points, precision=precision)))
+    alike = bundle_adjusted(given, placed_points(given, points))
+    assert off_px(told.cameras, true) < 0.8 * off_px(alike.cameras, true)
+    assert replace(points, precision=precision).chosen(points.track_length > 3).precision.shape[1:] == (2, 2)
+
+
+def test_observations_that_err_together_say_less():
+    """All that a camera sees is shifted alike, by 0.3 pixels: that the given poses are exact counts for more the fewer
+    observations count."""
+    rng = np.random.default_rng(6)
+    true = cameras_around()
+    points = seen(true, rng, noise=0.02)
+    points = replace(points, pixel=points.pixel + rng.normal(0, 0.3, (len(true), 2))[points.image])
+    one, many = (bundle_adjusted(true, placed_points(true, points), together=count) for count in (1, 1000))
+    assert off_px(many.cameras, true) < 0.8 * off_px(one.cameras, true)
 
 
 @pytest.mark.parametrize("seed", range(3))
