@@ -4,14 +4,14 @@ Keypoints are matched and triangulated under the given poses. Poses are adjusted
 explain the other half better than the given ones do, they are adjusted to all. Exact poses fail this test: adjusted
 ones have errors of their own. Under the adjusted poses stereo of small copies finds surfaces, and the given ones are
 adjusted again, to where photographs show patches of these (`stereo.patch_tracks`), which are more exact than keypoints
-and are on walls, too.
+and are on walls, too. The half of the keypoints that took no part judges these, too.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from linprim_geo.base.progress import duration
 from linprim_geo.capture.adjusted_poses import AdjustedPoses
 from linprim_geo.capture.types import PHOTOGRAPHS, Scene, View
 from linprim_geo.geometry.bundle_adjustment import Adjusted, bundle_adjusted, placed_points, reprojection_px
+from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.feature_points import ObservedPoints, triangulate_features
 from linprim_geo.imaging.photos import cache_folder
 from linprim_geo.points.triangulate import digest_of, write_images
@@ -38,7 +39,7 @@ KEYPOINTS, LONGER_SIDE, LEAST_SIDE = 2048, 1000, 100
 EPIPOLAR_SHARE = 0.004
 # Points have so many observations, and so many of them are needed in either half: the median error of 200 points with
 # 5 observations each is known to 3 %.
-LEAST_TRACK, LEAST_POINTS = 3, 200
+LEAST_TRACK, LEAST_POINTS, KNOWN_TO = 3, 200, 0.03
 # Adjusted poses are taken where they leave no more than this share of the given ones' median error, on points that took
 # no part. Errors of keypoints and of poses add up as squares: the latter are half of the former then.
 LEFT_SHARE = 0.9
@@ -96,7 +97,8 @@ def _adjusted(views: Sequence[View], seed: int, threads: int, log: Callable[[str
     step = -(-len(views) // ASKED_VIEWS)
     points = _observed(views[::step], seed, threads)
     try:
-        if not _errs(views[::step], points, seed):
+        check = _check(views[::step], points, seed)
+        if check is None:
             return none
         if len(views) > MOST_VIEWS:
             log(f"poses: the given ones err, but only those of {MOST_VIEWS} photographs or fewer can be adjusted")
@@ -104,7 +106,11 @@ def _adjusted(views: Sequence[View], seed: int, threads: int, log: Callable[[str
         if step > 1:
             points = _observed(views, seed, threads)
         done = bundle_adjusted([view.camera for view in views], points)
-        done = _by_patches(views, done, points, seed, log)
+        by_patches = _by_patches(views, done, points, seed, log)
+        if by_patches is not None and _agrees(by_patches.cameras[::step], check):
+            done = by_patches
+        elif by_patches is not None:
+            log("poses: by keypoints alone, which contradict patches of surfaces")
     except np.linalg.LinAlgError:  # keypoints do not determine them
         return none
     poses = {view.name: camera.world_to_camera for view, camera in zip(views, done.cameras, strict=True)}
@@ -113,18 +119,19 @@ def _adjusted(views: Sequence[View], seed: int, threads: int, log: Callable[[str
 
 def _by_patches(
     views: Sequence[View], keypoints: Adjusted, points: ObservedPoints, seed: int, log: Callable[[str], None]
-) -> Adjusted:
-    """Poses by patches of surfaces that stereo finds under those by `keypoints`, which photographs with few keep."""
+) -> Adjusted | None:
+    """Poses by patches of surfaces that stereo finds under those by `keypoints`, which photographs with few keep; None
+    if there are none."""
     nearly = [replace(view, camera=camera) for view, camera in zip(views, keypoints.cameras, strict=True)]
     xyz = placed_points(keypoints.cameras, points).xyz
     try:
         tracks = patch_tracks(nearly, xyz, seed=seed)
     except LinprimError as error:
         log(f"poses: by keypoints alone: {error}")
-        return keypoints
+        return None
     shown = np.bincount(tracks.image, minlength=len(views)) >= LEAST_PATCHES
     if not shown.any():
-        return keypoints
+        return None
     done = bundle_adjusted([view.camera for view in views], tracks, together=TOGETHER)
     factor = done.focal_factor / keypoints.focal_factor
     cameras = [
@@ -148,14 +155,31 @@ def _observed(views: Sequence[View], seed: int, threads: int) -> ObservedPoints:
     return found.chosen(found.track_length >= LEAST_TRACK)
 
 
-def _errs(views: Sequence[View], points: ObservedPoints, seed: int) -> bool:
-    """Whether poses that are adjusted to half of the points leave less of the others' errors than the given ones."""
+@dataclass(frozen=True)
+class _Check:
+    """Keypoints that took no part in an adjustment to others, and their median error under it, `left_px`."""
+
+    points: ObservedPoints
+    left_px: float
+
+
+def _check(views: Sequence[View], points: ObservedPoints, seed: int) -> _Check | None:
+    """Of poses that are adjusted to half of the points; None unless they leave less of the others' errors than the
+    given ones."""
     first = np.random.default_rng([seed, 14]).random(len(points.xyz)) < 0.5
     if min(np.count_nonzero(first), np.count_nonzero(~first)) < LEAST_POINTS:
-        return False
+        return None
     cameras, others = [view.camera for view in views], points.chosen(~first)
     found = bundle_adjusted(cameras, points.chosen(first))
-    given_px, left_px = (
-        float(np.median(reprojection_px(poses, placed_points(poses, others)))) for poses in (cameras, found.cameras)
-    )
-    return found.error_px >= LEAST_ERROR_PX and left_px <= LEFT_SHARE * given_px
+    given_px, left_px = _median_px(cameras, others), _median_px(found.cameras, others)
+    errs = found.error_px >= LEAST_ERROR_PX and left_px <= LEFT_SHARE * given_px
+    return _Check(others, left_px) if errs else None
+
+
+def _agrees(cameras: Sequence[Camera], check: _Check) -> bool:
+    """Whether keypoints are as near under these poses as under those by others of them, as far as that is known."""
+    return _median_px(cameras, check.points) <= (1 + KNOWN_TO) * check.left_px
+
+
+def _median_px(cameras: Sequence[Camera], points: ObservedPoints) -> float:
+    return float(np.median(reprojection_px(cameras, placed_points(cameras, points))))

@@ -22,6 +22,7 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.runs.run import ADJUSTED_POSES, Run
 from linprim_geo.stereo import adjust_poses as module
 from linprim_geo.stereo.adjust_poses import adjusted_scene
+from linprim_geo.stereo.patch_tracks import patch_tracks
 from linprim_geo.training.train import train
 
 SIZE, FOCAL, COUNT, ERROR_PX = (240, 180), 200.0, 14, 1.0
@@ -93,6 +94,21 @@ def test_patches_are_more_exact_than_keypoints(rooms, tmp_path, monkeypatch):
     assert any("by keypoints alone: no room for stereo" in line for line in lines)
     for one, other in zip(keypoints.views, without.views, strict=True):
         assert (one.camera.world_to_camera == other.camera.world_to_camera).all()
+
+
+def test_keypoints_judge_patches(rooms, tmp_path, monkeypatch):
+    """Patches of one photograph in two move with it, as highlights would."""
+
+    def gliding(*given, **how):
+        tracks = patch_tracks(*given, **how)
+        off = np.random.default_rng(1).normal(0, 3, (COUNT, 2))[tracks.image]
+        return replace(tracks, pixel=tracks.pixel + off * (tracks.image % 2)[:, None])
+
+    given, lines = load_scene(rooms["wrong"]), []
+    monkeypatch.setattr(module, "patch_tracks", gliding)
+    found = adjusted_scene(given, cache=tmp_path, threads=1, log=lines.append)
+    assert any("contradict patches" in line for line in lines)
+    assert bent_px(found) < 0.02
 
 
 def test_wrong_poses_are_adjusted_and_kept(rooms, tmp_path, monkeypatch):
