@@ -124,6 +124,7 @@ def _copy(view: View, longer_side: int) -> SmallCopy:
     return SmallCopy.of(view, -(-max(view.camera.width, view.camera.height) // longer_side))
 
 
+@lru_cache
 def _offsets() -> tuple[np.ndarray, np.ndarray]:
     """(S, 2) pixels from the middle of a patch, and (S,) weights, whose sum is 1."""
     along = np.arange(-RADIUS, RADIUS + 1.0)
