@@ -80,8 +80,16 @@ def bent_px(scene) -> float:
 
 def test_patches_are_more_exact_than_keypoints(rooms, tmp_path, monkeypatch):
     """Left are 0.0035 pixels of 0.78, and 0.0092 by keypoints alone, which photographs without patches keep."""
-    given, lines = load_scene(rooms["wrong"]), []
+    given, lines, counts = load_scene(rooms["wrong"]), [], []
+    adjust = module.bundle_adjusted
+
+    def counted(*given, together=1, **how):
+        counts.append(together)
+        return adjust(*given, together=together, **how)
+
+    monkeypatch.setattr(module, "bundle_adjusted", counted)
     assert bent_px(adjusted_scene(given, cache=tmp_path / "patches", threads=1, log=lines.append)) < 0.006
+    assert counts == [1, 1, module.TOGETHER]  # half of the keypoints, all, patches
     monkeypatch.setattr(module, "LEAST_PATCHES", 10**6)
     keypoints = adjusted_scene(given, cache=tmp_path / "keypoints", threads=1, log=lines.append)
     assert 0.006 < bent_px(keypoints) < 0.02

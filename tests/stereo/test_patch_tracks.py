@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.captures import look_at
-from helpers.textured_room import photograph
+from helpers.textured_room import HALF, photograph
 from scipy.ndimage import gaussian_filter
 
 from linprim_geo.capture.types import Photo, View
@@ -73,6 +73,12 @@ def test_tracks_are_exact_whatever_the_poses(room, deviation):
     assert np.median(off) < 0.03 and np.quantile(off, 0.9) < 0.1
 
 
+def test_points_lie_on_the_walls(room):
+    """Off by 0.0034 of a depth of 3 to 4 in the median; by 0.0094 where planes are half a pixel off."""
+    points = patch_tracks(room, walls()).xyz
+    assert np.median(np.abs(np.abs(points).max(1) - HALF)) < 0.006
+
+
 def test_light_moves_no_patch(room):
     """Off by 0.021 pixels in the median."""
     across = np.linspace(0.7, 1.0, SIZE[0])[:, None]
@@ -82,11 +88,12 @@ def test_light_moves_no_patch(room):
 
 
 def test_pixels_are_those_of_whole_photographs(room, monkeypatch):
-    """Off by 0.028 pixels in the median."""
+    """Off by 0.028 pixels in the median, by 0.077 in the worst of ten."""
     monkeypatch.setattr(module, "LONGER_SIDE", 120)
     tracks = patch_tracks(room, walls())
     assert len(tracks.xyz) > 100 and tracks.pixel[:, 0].max() > 180
-    assert np.median(off_px(tracks, room)) < 0.04
+    off = off_px(tracks, room)
+    assert np.median(off) < 0.04 and np.quantile(off, 0.9) < 0.12
     here = np.linalg.eigvalsh(tracks.precision)[:, -1]
     assert here.max() == pytest.approx(1 / (2 * module.LEAST_ERROR))
 
