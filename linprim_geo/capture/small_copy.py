@@ -22,6 +22,11 @@ class SmallCopy(View):
         own = {entry.name: getattr(view, entry.name) for entry in fields(View)}
         return SmallCopy(**own | {"camera": smaller(view.camera, factor)}, original=view, factor=factor)
 
+    @staticmethod
+    def within(view: View, longer_side: int) -> SmallCopy:
+        """By the least factor with which the longer side has at most so many pixels."""
+        return SmallCopy.of(view, -(-max(view.camera.width, view.camera.height) // longer_side))
+
     def load(self) -> Photo:
         assert self.original is not None
         photo = self.original.load()

@@ -132,7 +132,10 @@ def _by_patches(
     shown = np.bincount(tracks.image, minlength=len(views)) >= LEAST_PATCHES
     if not shown.any():
         return None
-    done = bundle_adjusted([view.camera for view in views], tracks, together=TOGETHER)
+    try:
+        done = bundle_adjusted([view.camera for view in views], tracks, together=TOGETHER)
+    except np.linalg.LinAlgError:  # patches do not determine them
+        return None
     factor = done.focal_factor / keypoints.focal_factor
     cameras = [
         found if enough else replace(other, fx=factor * other.fx, fy=factor * other.fy)

@@ -41,6 +41,9 @@ SAME_DEPTH = 0.02
 # Steps; the last one is no longer than CONVERGED pixels, all together are no more than LARGEST_SHIFT each way, and
 # patches correlate by more than ALIKE.
 STEPS, CONVERGED, LARGEST_SHIFT, ALIKE = 8, 0.1, 3.0, 0.8
+# This many variances of the noise are added to mean squares of gradients: more than noise alone gives them, so that
+# patches without texture take short steps.
+DAMPED = 0.08
 # No patch is more exact than this many pixels: planes bend, and light changes.
 LEAST_ERROR = 0.05
 # A point is seen by so many photographs.
@@ -83,8 +86,8 @@ def patch_tracks(views: Sequence[View], points: np.ndarray, *, seed: int = 0) ->
     Raises:
         LinprimError: as `depth_maps`.
     """
-    copies = [_copy(view, LONGER_SIDE) for view in views]
-    maps = depth_maps([_copy(view, LONGER_SIDE_OF_DEPTHS) for view in views], points, fit=False, seed=seed)
+    copies = [SmallCopy.within(view, LONGER_SIDE) for view in views]
+    maps = depth_maps([SmallCopy.within(view, LONGER_SIDE_OF_DEPTHS) for view in views], points, fit=False, seed=seed)
     image = lru_cache(IN_MEMORY)(lambda number: _Image.of(copies[number]))
     centers = np.array([view.camera.center for view in views])
     exact = np.eye(2) / LEAST_ERROR
@@ -93,14 +96,8 @@ def patch_tracks(views: Sequence[View], points: np.ndarray, *, seed: int = 0) ->
     for number, copy in enumerate(copies):
         patches = _patches(image(number), copy, maps[number])
         own = np.arange(len(patches.middle))
-        found = [
-            (
-                own,
-                np.full(len(own), number),
-                patches.middle * copy.factor,
-                np.tile(exact / copy.factor, (len(own), 1, 1)),
-            )
-        ]
+        here = np.tile(exact / copy.factor, (len(own), 1, 1))
+        found = [(own, np.full(len(own), number), patches.middle * copy.factor, here)]
         nearest = np.argsort(np.linalg.norm(centers - centers[number], axis=1), kind="stable")
         for other in [k for k in nearest[: OTHERS + 1] if k != number]:
             rows = _showing(maps[other], patches)
@@ -114,14 +111,10 @@ def patch_tracks(views: Sequence[View], points: np.ndarray, *, seed: int = 0) ->
         seen.append((row_of[rows[taken]], *(column[taken] for column in rest)))
         places.append(patches.points[often, _middle()])
         count += np.count_nonzero(often)
-    point, number, pixel, precision = (np.concatenate(column) for column in zip(*seen, strict=True))
-    order = np.argsort(point, kind="stable")
+    columns = [np.concatenate(column) for column in zip(*seen, strict=True)]
+    order = np.argsort(columns[0], kind="stable")
     nothing = np.zeros((count, 3), np.uint8), np.zeros(count, np.float32)
-    return ObservedPoints(np.concatenate(places), *nothing, point[order], number[order], pixel[order], precision[order])
-
-
-def _copy(view: View, longer_side: int) -> SmallCopy:
-    return SmallCopy.of(view, -(-max(view.camera.width, view.camera.height) // longer_side))
+    return ObservedPoints(np.concatenate(places), *nothing, *(column[order] for column in columns))
 
 
 @lru_cache
@@ -137,21 +130,26 @@ def _middle() -> int:
     return len(_offsets()[0]) // 2
 
 
-def _without_light(values: np.ndarray) -> np.ndarray:
-    """(P, S) values without their weighted mean and slopes, which exposure, vignetting and shading change."""
+@lru_cache
+def _light() -> np.ndarray:
+    """(S, 3) of mean square 1: what exposure changes, and vignetting and shading along x and y."""
     offset, weight = _offsets()
     basis = np.column_stack([np.ones(len(offset)), offset])
-    basis /= np.sqrt(weight @ basis**2)  # orthogonal, as the window is symmetric
-    return values - (values * weight) @ basis @ basis.T
+    return basis / np.sqrt(weight @ basis**2)  # orthogonal, as the window is symmetric
+
+
+def _without_light(values: np.ndarray) -> np.ndarray:
+    """(P, S) values without their weighted mean and slopes."""
+    return values - (values * _offsets()[1]) @ _light() @ _light().T
 
 
 def _patches(image: _Image, copy: SmallCopy, found: DepthMap) -> _Patches:
     """Those with texture on planes of a small depth map."""
     camera, offset = copy.camera, _offsets()[0]
-    middle = _textured(image, _flat(found, copy))
-    scale = found.camera.width / camera.width
-    small = np.clip((middle * scale).astype(int), 0, (found.camera.width - 1, found.camera.height - 1))
+    scale = found.camera.fx / camera.fx  # not of widths: columns that were left over are cut off
     planes = inverse_planes(found.camera, found.depth, found.normal @ camera.rotation.T)
+    middle = _textured(image, _flat(found.is_confirmed(), planes, camera, scale))
+    small = (middle * scale).astype(int)
     inverse, by_x, by_y = planes[:, small[:, 1], small[:, 0]].astype(np.float64)
     pixel = middle[:, None] + offset
     from_small = pixel * scale - (small[:, None] + 0.5)
@@ -166,12 +164,12 @@ def _patches(image: _Image, copy: SmallCopy, found: DepthMap) -> _Patches:
     )
 
 
-def _flat(found: DepthMap, copy: SmallCopy) -> np.ndarray:
-    """(H, W) bool of the copy: pixels in the middle of a patch that lies on one plane of a small depth map."""
-    known = found.is_confirmed()
-    inverse, by_x, by_y = inverse_planes(found.camera, found.depth, found.normal @ found.camera.rotation.T)
+def _flat(known: np.ndarray, planes: np.ndarray, camera: Camera, scale: float) -> np.ndarray:
+    """(H, W) bool of a camera's pixels: those in the middle of a patch that lies on one of the `planes` (3, h, w) of a
+    depth map, which is smaller by `scale` and `known` (h, w) in part."""
+    inverse, by_x, by_y = planes
     height, width = known.shape
-    reach = int(np.ceil(RADIUS * width / copy.camera.width))
+    reach = int(np.ceil(RADIUS * scale))
     padded = np.pad(np.where(known, inverse, np.float32(np.nan)), reach, constant_values=np.nan)
     on_plane = np.zeros(known.shape, int)
     for dy in range(-reach, reach + 1):
@@ -180,9 +178,10 @@ def _flat(found: DepthMap, copy: SmallCopy) -> np.ndarray:
             with np.errstate(invalid="ignore", divide="ignore"):
                 on_plane += np.abs(there / (inverse + dx * by_x + dy * by_y) - 1) < ON_PLANE
     flat = known & (on_plane >= (1 - MOST_OFF) * (2 * reach + 1) ** 2)
-    row = (np.arange(copy.camera.height) + 0.5) * height / copy.camera.height
-    column = (np.arange(copy.camera.width) + 0.5) * width / copy.camera.width
-    return flat[np.ix_(row.astype(int), column.astype(int))]
+    row, column = (((np.arange(count) + 0.5) * scale).astype(int) for count in (camera.height, camera.width))
+    within = np.zeros((camera.height, camera.width), bool)
+    within[np.ix_(row < height, column < width)] = flat[np.ix_(row[row < height], column[column < width])]
+    return within
 
 
 def _textured(image: _Image, allowed: np.ndarray) -> np.ndarray:
@@ -235,23 +234,21 @@ def _matched(
         )
         size = np.sqrt(np.maximum(_mean(value**2), 1e-6))[:, None]
         by_x, by_y, miss = by_x / size, by_y / size, patches.values[rows] - value / size
-        # What noise alone gives: smooths steps over patches that it makes up.
         noise = image.noise / size[:, 0] ** 2
-        damping = 0.08 * noise
+        damping = DAMPED * noise
         xx, xy, yy = _mean(by_x**2) + damping, _mean(by_x * by_y), _mean(by_y**2) + damping
         right = np.stack([_mean(by_x * miss), _mean(by_y * miss)], 1)
         matrix = np.stack([xx, xy, xy, yy], 1).reshape(-1, 2, 2)
         step = np.linalg.solve(matrix, right[..., None])[..., 0]
         shift += np.clip(step, -1, 1)
     square = _mean(miss**2)
-    good = (
-        (1 - square / 2 > ALIKE) & (np.abs(shift) <= LARGEST_SHIFT).all(1) & (np.linalg.norm(step, axis=1) <= CONVERGED)
-    )
+    still = (np.linalg.norm(step, axis=1) <= CONVERGED) & (np.abs(shift) <= LARGEST_SHIFT).all(1)
+    good = still & (1 - square / 2 > ALIKE)
     matrix, square, noise, damping = matrix[good], square[good], noise[good], damping[good]
     # The covariance of least squares, from what the noise's own gradients do not make up.
     own, axes = np.linalg.eigh(matrix - damping[:, None, None] * np.eye(2))
     told = np.maximum(own - 2 * _gradient_noise() * noise[:, None], 1e-9)
-    independent = 0.5 * weight.sum() ** 2 / (weight**2).sum()  # smoothing ties neighbours together
+    independent = 0.5 / (weight**2).sum()  # smoothing ties neighbours together
     variance = (square / independent)[:, None] / told + LEAST_ERROR**2
     precision = (axes / np.sqrt(variance)[:, None]) @ axes.swapaxes(1, 2)
     return rows[good], (seen[:, samples // 2] + shift)[good], precision

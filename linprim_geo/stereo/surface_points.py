@@ -25,9 +25,7 @@ LEAST_SUPPORT = 1 / 2
 def small_copies(views: Sequence[View]) -> list[SmallCopy]:
     """Of at most MOST_VIEWS views, evenly over their order, with at most LONGER_SIDE pixels each way."""
     chosen = np.unique(np.linspace(0, len(views) - 1, min(MOST_VIEWS, len(views))).round().astype(int))
-    cameras = [views[k].camera for k in chosen]
-    factors = [-(-max(camera.width, camera.height) // LONGER_SIDE) for camera in cameras]
-    return [SmallCopy.of(views[k], factor) for k, factor in zip(chosen, factors, strict=True)]
+    return [SmallCopy.within(views[k], LONGER_SIDE) for k in chosen]
 
 
 @dataclass(frozen=True)

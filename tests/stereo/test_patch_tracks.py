@@ -11,11 +11,21 @@ from helpers.captures import look_at
 from helpers.textured_room import HALF, photograph
 from scipy.ndimage import gaussian_filter
 
+from linprim_geo.capture.small_copy import SmallCopy
 from linprim_geo.capture.types import Photo, View
 from linprim_geo.geometry.bundle_adjustment import placed_points, reprojection_px
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.stereo import patch_tracks as module
-from linprim_geo.stereo.patch_tracks import _Image, _matched, _offsets, _Patches, _without_light, patch_tracks
+from linprim_geo.stereo.depth_maps import DepthMap
+from linprim_geo.stereo.patch_tracks import (
+    _Image,
+    _matched,
+    _offsets,
+    _Patches,
+    _patches,
+    _without_light,
+    patch_tracks,
+)
 
 SIZE, FOCAL, COUNT = (240, 180), 200.0, 7
 
@@ -42,7 +52,7 @@ def room() -> list[Made]:
 
 
 def shaken(views, deviation: float) -> list[Made]:
-    """Each camera turned and moved by a normal error of about `deviation` pixels."""
+    """Each camera moved by a normal error of `deviation` pixels along each axis."""
     rng, moved = np.random.default_rng(3), []
     for view in views:
         pose = view.camera.world_to_camera.copy()
@@ -77,6 +87,29 @@ def test_points_lie_on_the_walls(room):
     """Off by 0.0034 of a depth of 3 to 4 in the median; by 0.0094 where planes are half a pixel off."""
     points = patch_tracks(room, walls()).xyz
     assert np.median(np.abs(np.abs(points).max(1) - HALF)) < 0.006
+
+
+@pytest.mark.parametrize("longer_side", [35, 40, 200])
+def test_patches_lie_on_the_planes_of_smaller_photographs(room, longer_side):
+    """Of 240 by 180 pixels 238 by 175 are averaged down by 7: where a pixel lies in the copy is told by the factor."""
+    photograph, small = SmallCopy.of(room[0], 1), SmallCopy.within(room[0], longer_side).camera
+    normal = np.array([0.36, -0.48, -0.8])
+    depth = (-2.0 / (small.ray_grid() @ normal)).astype(np.float32)  # normal . X = -2 in the camera's axes
+    shape = depth.shape
+    found = DepthMap(
+        small,
+        depth,
+        np.broadcast_to((normal @ small.rotation).astype(np.float32), (*shape, 3)),
+        np.ones(shape, np.float32),
+        np.full(shape, 3, np.uint8),
+        np.zeros(shape, np.float32),
+        np.zeros(shape, np.uint8),
+        1.0,
+    )
+    patches = _patches(_Image.of(photograph), photograph, found)
+    local = patches.points @ small.rotation.T + small.world_to_camera[:3, 3]
+    assert len(patches.middle) > 100 and patches.middle[:, 0].max() > 220
+    np.testing.assert_allclose(local @ normal, -2.0, rtol=1e-5)
 
 
 def test_light_moves_no_patch(room):
