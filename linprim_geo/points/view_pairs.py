@@ -11,6 +11,10 @@ from linprim_geo.geometry.camera import Camera
 
 # Views to compare with: so many for every point, whose rays to it make an angle between these, in degrees.
 SOURCES, LEAST_ANGLE, LARGEST_ANGLE = 4, 3.0, 30.0
+# So many other views confirm a depth, as two may be wrong about each other. Points that fewer see under such angles are
+# compared under larger ones, up to this, in degrees: of few photographs there are no others. A surface that both views
+# look onto evenly is turned by half of it.
+CONFIRMING, WIDEST_ANGLE = 2, 60.0
 # A view that shows less than this share of the points to a camera, of those that want one, is not worth its time.
 LEAST_SHARE = 0.03
 # A point that is farther than the depth map of a view by more than this share of the depth is hidden from it: three
@@ -26,8 +30,9 @@ def source_views(
     """For every camera the indices of those to compare patches with, best first, `most` at most.
 
     Each is the one that sees, under an angle of LEAST_ANGLE to LARGEST_ANGLE to the camera's own rays, most of the
-    (P, 3) points that the camera sees and that fewer than SOURCES of those before it do. Surfaces with the (H, W)
-    `depths` of the views hide points; without them nothing does.
+    (P, 3) points that the camera sees and that fewer than SOURCES of those before it do; then, under an angle of up to
+    WIDEST_ANGLE, most of those that fewer than CONFIRMING do. Surfaces with the (H, W) `depths` of the views hide
+    points; without them nothing does.
     """
     step = -(-len(points) // COMPARED_POINTS)
     points = points[::step]
@@ -35,21 +40,21 @@ def source_views(
     rays /= np.maximum(np.linalg.norm(rays, axis=2, keepdims=True), 1e-12)
     nearest = repeat(None, len(cameras)) if depths is None else depths
     seen = np.stack([_seen(*each, points) for each in zip(cameras, nearest, strict=True)])
-    low, high = np.cos(np.radians([LARGEST_ANGLE, LEAST_ANGLE]))
+    widest, largest, least = np.cos(np.radians([WIDEST_ANGLE, LARGEST_ANGLE, LEAST_ANGLE]))
     chosen = []
     for index in range(len(cameras)):
         cosine = np.einsum("vpc,pc->vp", rays, rays[index])
-        shared = (seen & seen[index] & (cosine > low) & (cosine < high))[:, seen[index]]
-        times = np.zeros(shared.shape[1], int)
+        shared = (seen & seen[index] & (cosine > widest) & (cosine < least))[:, seen[index]]
+        narrow = shared & (cosine > largest)[:, seen[index]]
         own: list[int] = []
-        while len(own) < most:
-            gain = (shared & (times < SOURCES)).sum(1)
-            best = int(np.argmax(gain))
-            if gain[best] <= LEAST_SHARE * len(times):
-                break
-            own.append(best)
-            times += shared[best]
-            shared[best] = False
+        for among, wanted in ((narrow, SOURCES), (shared, CONFIRMING)):
+            while len(own) < most:
+                gain = (among & (among[own].sum(0) < wanted)).sum(1)
+                gain[own] = 0
+                best = int(np.argmax(gain))
+                if gain[best] <= LEAST_SHARE * shared.shape[1]:
+                    break
+                own.append(best)
         chosen.append(own)
     return chosen
 

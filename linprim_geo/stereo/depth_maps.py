@@ -19,7 +19,7 @@ from linprim_geo.capture.types import View
 from linprim_geo.geometry.boxes import smaller
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, fit_surfaces, patch_match
-from linprim_geo.points.view_pairs import source_views, visible_pixels
+from linprim_geo.points.view_pairs import CONFIRMING, source_views, visible_pixels
 from linprim_geo.stereo.confidence import MATCHED_WEIGHTS, MOST_COST, RIGHT, WEIGHTS, evidence, probability
 from linprim_geo.stereo.evidence import Glance, glance
 
@@ -39,9 +39,9 @@ MEMORY_SHARE = 0.5
 FOREGROUND = 128
 # Both sides of a photograph have at least this many pixels: half of them hold a window.
 SMALLEST = 24
-# A depth is confirmed if so many other views confirm it, as two may be wrong about each other, and if it is right with
-# this probability; it is sure if it is right with the other one.
-CONFIRMING, CONFIDENT, SURE = 2, 0.7, 0.9
+# A depth is confirmed if CONFIRMING other views confirm it and it is right with this probability; it is sure if it is
+# right with the other one.
+CONFIDENT, SURE = 0.7, 0.9
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,11 @@ from linprim_geo.base.files import atomic_write
 from linprim_geo.base.progress import Progress
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.ply import color_columns, write_ply, xyz_columns
+from linprim_geo.points.view_pairs import CONFIRMING
 from linprim_geo.stereo.depth_maps import MOST_SOURCES, inverse_planes
 from linprim_geo.stereo.evidence import glance
 from linprim_geo.stereo.workspace import ModelPoint, Workspace
 
-# Other views that confirm a point, at least; all of them where there are fewer.
-CONFIRMING = 2
 # Views whose maps are in memory: one, and those that it is compared with.
 KEPT = 1 + MOST_SOURCES
 # Points of the model from each view, and the most in all.

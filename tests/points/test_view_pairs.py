@@ -55,3 +55,18 @@ def test_a_point_behind_a_surface_gets_views_that_see_past_it():
     assert sorted(blind) == [1, 2, 3, 4] and sorted(told[:3]) == [5, 6, 7]
     # Where a view has no depth nothing hides a point.
     assert view_pairs.source_views(cameras, wall, 8, [0 * own for own in depths])[0] == blind
+
+
+def test_few_photographs_are_compared_under_larger_angles():
+    """Cameras on a circle around what they look at: where 30 degrees hold too few, up to 60 do, and no more than it
+    takes to confirm a depth."""
+    points = np.random.default_rng(0).uniform(-0.3, 0.3, (300, 3))
+
+    def compared(degrees: list[float]) -> list[int]:
+        eyes = [(2 * np.cos(angle), 2 * np.sin(angle), 0.0) for angle in np.radians(degrees)]
+        return sorted(view_pairs.source_views([look_at(eye, (0.0, 0.0, 0.0)) for eye in eyes], points, 8)[0])
+
+    assert compared([0, 50, -50]) == [1, 2]
+    assert compared([0, 20, -20, 50, -50]) == [1, 2]
+    assert compared([0, 20, 50, 52, 54]) == [1, 2]
+    assert compared([0, 75, -75]) == []
