@@ -245,7 +245,6 @@ _REGISTRY = (
         _scale_ratio,
         {"filter": "3d"},
         {"filter": "none"},
-        usually=True,
     ),
     Effect(
         "lens",

@@ -121,7 +121,7 @@ def test_an_effect_is_on_from_its_threshold_upwards(name, photographs):
         return
     assert (above.on, above.reason) == (True, "data") and above.options == effect.on
     # What costs next to nothing, and is usually on, stays on without evidence.
-    free = name in ("exact-rays", "filter")
+    free = name == "exact-rays"
     assert (below.on, below.reason) == (free, "free" if free else "data")
 
 

@@ -73,10 +73,10 @@ def decisions(scene, choice=None, options=OPTIONS, scene_options=None):
 def test_a_plain_scene_calls_for_what_is_free_and_for_its_masks(scenes):
     found = decisions(scenes("plain"))
     assert list(found) == list(EFFECTS)
-    assert {name for name, d in found.items() if d.on} == {"exact-rays", "filter", "masks"}
+    assert {name for name, d in found.items() if d.on} == {"exact-rays", "masks"}
     assert {name for name, d in found.items() if d.reason == "request"} == {"depth", "normals"}
     assert found["depth"].value == found["normals"].value == 100
-    assert found["filter"].reason == "free"
+    assert found["exact-rays"].value > 0.02 and found["filter"].reason == "data"
     assert found["background"].reason == "impossible" and found["background"].value is None
     assert found["view-dependence"].value < 0.2 and found["exposure"].value < 0.5
     assert 1 < found["filter"].value < 1.6 and found["lens"].value == 0
@@ -148,7 +148,7 @@ def test_points_that_say_nothing_leave_the_usual_setting(scenes):
 
     anywhere = replace(loaded, points=VolumePoints(loaded.points.xyz, loaded.points.rgb))
     found = decisions(anywhere)
-    for name, on in (("view-dependence", True), ("exposure", False), ("filter", True)):
+    for name, on in (("view-dependence", True), ("exposure", False), ("filter", False)):
         assert (found[name].on, found[name].reason, found[name].value) == (on, "unknown", None)
 
 
@@ -255,7 +255,7 @@ def test_training_decides_records_and_resumes_by_it(scenes, tmp_path, own_points
     recorded = {entry["name"]: entry for entry in config["effects"]}
     assert recorded["exposure"]["on"] and recorded["exposure"]["value"] > 10 and recorded["depth"]["reason"] == "asked"
     chosen = Run.open(tmp_path / "run").train_options
-    assert (chosen.exposure, chosen.sensor_depth, chosen.sensor_normals, chosen.filter) == ("gain", 1.0, 0.0, "3d")
+    assert (chosen.exposure, chosen.sensor_depth, chosen.sensor_normals, chosen.filter) == ("gain", 1.0, 0.0, "none")
     again = train(scenes("exposure"), tmp_path / "run", resume=True, quiet=True, effects=Choice("all"))
     assert again["iterations"] == 12 and Run.open(tmp_path / "run").train_options == chosen
     train(scenes("exposure"), tmp_path / "python", options=options, quiet=True)
