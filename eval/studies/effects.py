@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -215,10 +216,12 @@ def scatter(trainings: list[list[dict]], name: str) -> float | None:
     return (median(variances.values()) / (1 - 2 / (9 * freedom)) ** 3) ** 0.5 if freedom else None
 
 
-def compare_modes(folder: Path, path: Path, size: Size, seeds: int, downscale: int = 1) -> dict:
-    """Trainings in each of WAYS; all other options are the defaults."""
+def compare_modes(
+    folder: Path, path: Path, size: Size, seeds: int, downscale: int = 1, ways: Sequence[str] = tuple(WAYS)
+) -> dict:
+    """Trainings in some of WAYS; all other options are the defaults."""
     found: dict = {"scene": path.name}
-    for way, choice in WAYS.items():
+    for way, choice in ((way, WAYS[way]) for way in ways):
         found[way] = []
         for seed in range(seeds):
             options = TrainOptions(size.iterations, max_primitives=size.primitives, seed=seed, **QUIET)
@@ -261,7 +264,7 @@ def table(rows: list[dict], comparisons: list[dict], seeds: int) -> str:
     if comparisons:
         lines += ["", "| scene | effects | PSNR dB | depth error % | CPU s |", "|---" * 5 + "|"]
     for found in comparisons:
-        for way in WAYS:
+        for way in (way for way in WAYS if way in found):
             depth = f"{mean(found[way], 'depth'):.2f}" if "depth" in found[way][0] else "–"
             cells = f"{mean(found[way], 'psnr'):.2f} | {depth} | {mean(found[way], 'cpu_seconds'):.1f}"
             lines.append(f"| {found['scene']} | {way} | {cells} |")
@@ -310,6 +313,13 @@ def main() -> None:
         help="for auto against none and all",
     )
     parser.add_argument(
+        "--ways",
+        nargs="+",
+        choices=tuple(WAYS),
+        default=tuple(WAYS),
+        help="of choosing effects that are compared on these",
+    )
+    parser.add_argument(
         "--captures", nargs="*", default=[], metavar="DIR[:K]", help="captures for the same, downscaled by K"
     )
     parsed = parser.parse_args()
@@ -324,11 +334,11 @@ def main() -> None:
             rows += judge(folder, name, size, seeds)
             print(table([row for row in rows if row["effect"] == name], [], seeds), flush=True)
         for name in parsed.scenes:
-            comparisons.append(compare_modes(folder, make_scene(folder, name, size), size, seeds))
+            comparisons.append(compare_modes(folder, make_scene(folder, name, size), size, seeds, ways=parsed.ways))
             print(table([], comparisons[-1:], seeds), flush=True)
         for word in parsed.captures:
             path, _, downscale = word.partition(":")
-            comparisons.append(compare_modes(folder, Path(path), size, seeds, int(downscale or 1)))
+            comparisons.append(compare_modes(folder, Path(path), size, seeds, int(downscale or 1), ways=parsed.ways))
     except LinprimError as error:
         raise SystemExit(str(error)) from None
     text = table(rows, comparisons, seeds)
