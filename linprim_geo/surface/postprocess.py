@@ -20,7 +20,7 @@ from linprim_geo.surface.photo_consistency import photo_gains, predicted_error, 
 from linprim_geo.surface.safe_moves import moved_safely
 from linprim_geo.surface.texture import make_texture
 from linprim_geo.surface.texture_files import save_textured
-from linprim_geo.surface.visibility import color_vertices, pixels_of, visible_faces
+from linprim_geo.surface.visibility import color_vertices, pixels_of, visible_faces, with_gain
 
 # Rounds of refinement with `refine` auto, where stereo has no part in the surface.
 REFINE_ROUNDS = 2
@@ -52,15 +52,14 @@ def with_rounds(options: ExtractOptions, about: dict) -> ExtractOptions:
 def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, stages: Stages) -> Finished:
     """Finishes a surface as the options ask, and writes it to `target` and `visible_file(target)`.
 
-    By a `quality` that it has, noise is smoothed away, and it is kept; else by that of photographs
+    Colours are those of photographs without the gains by which their brightness differs (`photo_gains`). By a `quality`
+    that it has, noise is smoothed away, and it is kept; else by that of photographs
     (`predicted_error`)."""
     given = mesh
     views = run.scene().train
     cameras = [view.camera for view in views]
     caster = RayCaster(mesh.vertices, mesh.faces)
-    gains = None
-    if options.refine or mesh.quality is None:
-        gains = photo_gains(mesh, cameras, (view.load() for view in views), caster)
+    gains = photo_gains(mesh, cameras, (view.load() for view in views), caster)
     if options.refine:
         mesh = refine_surface(mesh, views, int(options.refine), gains, caster)
         stages.lap("refine")
@@ -77,7 +76,8 @@ def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, 
     elif processing or options.denoise == "off":
         mesh = replace(mesh, quality=predicted_error(mesh, cameras, (view.load() for view in views), gains, caster))
         stages.lap("quality")
-    mesh = replace(mesh, colors=color_vertices(mesh, cameras, (pixels_of(view.load()) for view in views), caster))
+    pixels = (with_gain(pixels_of(view.load()), gain) for view, gain in zip(views, gains, strict=True))
+    mesh = replace(mesh, colors=color_vertices(mesh, cameras, pixels, caster))
     stages.lap("colours")
     seen = visible_faces(mesh, cameras, caster)
     visible = select_faces(mesh, seen)
@@ -87,7 +87,7 @@ def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, 
         save_mesh(visible_file(target), visible)
         stages.lap("write")
         return Finished(mesh, visible, processing, None)
-    texture = make_texture(mesh, options.texture, views, stages.note)
+    texture = make_texture(mesh, options.texture, views, gains, stages.note)
     stages.lap("texture")
     save_textured(target, mesh, texture)
     save_textured(visible_file(target), visible, texture.select(seen))

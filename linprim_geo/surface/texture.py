@@ -15,7 +15,7 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.mesh import Mesh, face_areas, face_normals
-from linprim_geo.surface.visibility import POOR_RINGS, color_vertices, photographed, pixels_of
+from linprim_geo.surface.visibility import POOR_RINGS, color_vertices, photographed, pixels_of, with_gain
 
 if TYPE_CHECKING:
     from linprim_geo.capture.types import View
@@ -58,7 +58,13 @@ def _check_suffix(path: Path) -> None:
         )
 
 
-def make_texture(mesh: Mesh, size: int, views: Sequence[View], note: Callable[[str], None] | None = None) -> Texture:
+def make_texture(
+    mesh: Mesh,
+    size: int,
+    views: Sequence[View],
+    gains: np.ndarray | None = None,
+    note: Callable[[str], None] | None = None,
+) -> Texture:
     """Charts of a mesh and their colours out of photographs.
 
     Each texel has a point of the surface; its colour is the robust mean of the views that see it
@@ -72,6 +78,8 @@ def make_texture(mesh: Mesh, size: int, views: Sequence[View], note: Callable[[s
         views: `capture.types.View`s, or anything with a `camera` and a `load()` that gives `rgb` (H, W, 3) uint8 and
             `alpha` (H, W) uint8 or None. They are decoded once if they take at most KEPT_BYTES in all, else again for
             every TEXELS_PER_PASS texels.
+        gains: (K,) brightness of each photograph (`photo_consistency.photo_gains`), which colours are without; default
+            1.
         note: called with lines for the user.
     Raises:
         LinprimError: an empty mesh or one that is not finite, or so many charts that they do not fit.
@@ -87,7 +95,7 @@ def make_texture(mesh: Mesh, size: int, views: Sequence[View], note: Callable[[s
         )
         if density < FEWEST_TEXELS:
             note(f"texture: {density:.1f} texels per face show little more than vertex colours, see --target-faces")
-    image, seen, well = _bake(mesh, corners, owner, rows, size, _Photographs(views))
+    image, seen, well = _bake(mesh, corners, owner, rows, size, _Photographs(views, gains))
     uv = np.stack([corners[..., 0] / size, 1.0 - corners[..., 1] / size], axis=2)
     about = {
         "size": size,
@@ -101,16 +109,18 @@ def make_texture(mesh: Mesh, size: int, views: Sequence[View], note: Callable[[s
 
 
 class _Photographs:
-    """The photographs of views, (H, W, 3) uint8 or with alpha (H, W, 4), in order; decoded once if they fit into
-    KEPT_BYTES."""
+    """The photographs of views without their gains, (H, W, 3) in units of white or with alpha (H, W, 4), in order;
+    decoded once if they fit into KEPT_BYTES."""
 
-    def __init__(self, views: Sequence[View]):
+    def __init__(self, views: Sequence[View], gains: np.ndarray | None):
         self.views, self.cameras = views, [view.camera for view in views]
+        self.gains = np.ones(len(views)) if gains is None else gains
         size = sum(4 * camera.width * camera.height for camera in self.cameras)
         self.kept = list(self._load()) if size <= KEPT_BYTES else None
 
     def __iter__(self):
-        return iter(self.kept) if self.kept is not None else self._load()
+        images = self._load() if self.kept is None else self.kept
+        return map(with_gain, images, self.gains)
 
     def _load(self):
         for view in self.views:

@@ -118,6 +118,13 @@ def pixels_of(photo: Photo) -> np.ndarray:
     return photo.rgb if photo.alpha is None else np.dstack([photo.rgb, photo.alpha])
 
 
+def with_gain(pixels: np.ndarray, gain: float) -> np.ndarray:
+    """(H, W, 3 or 4) float32 in units of white, as `pixels_of` a photograph are without its `gain`."""
+    image = pixels.astype(np.float32) / 255
+    image[..., :3] /= gain
+    return image
+
+
 def color_vertices(
     mesh: Mesh, cameras: Sequence[Camera], images: Iterable[np.ndarray], caster: RayCaster | None = None
 ) -> np.ndarray:

@@ -93,6 +93,23 @@ def test_a_spoiled_photograph_does_not_show(ball, ball_texture):
     assert np.abs(again.image.astype(int) - ball_texture.image).mean() < 2
 
 
+def test_exposure_that_drifts_does_not_show(ball, ball_texture):
+    mesh, views, _ = ball
+    gains = np.linspace(0.8, 1.0, len(views))
+
+    def darker(view, gain):
+        photo = view.load()
+        return Photo(np.round(photo.rgb * gain).astype(np.uint8), photo.alpha)
+
+    drifting = [
+        SimpleNamespace(camera=view.camera, load=lambda view=view, gain=gain: darker(view, gain))
+        for view, gain in zip(views, gains, strict=True)
+    ]
+    seams, level = (make_texture(mesh, SIZE, drifting, given).image.astype(int) for given in (None, gains))
+    plain = ball_texture.image.astype(int)
+    assert np.abs(level - plain).mean() < 0.5 and np.abs(seams - plain).mean() > 5
+
+
 @pytest.mark.parametrize("with_alpha", [True, False])
 def test_pixels_of_the_background_are_not_used_where_alpha_says_so(ball, with_alpha):
     mesh, views, _ = ball
@@ -224,7 +241,7 @@ def test_too_many_charts_and_unusable_meshes_are_one_sentence(ball):
 
 def test_faces_with_few_texels_are_said(ball):
     lines = []
-    make_texture(ball[0], 48, ball[1][:2], lines.append)
+    make_texture(ball[0], 48, ball[1][:2], note=lines.append)
     assert len(lines) == 2 and "512 faces" in lines[0] and "--target-faces" in lines[1]
 
 
