@@ -25,13 +25,17 @@ COMPARED_POINTS = 2000
 
 
 def source_views(
-    cameras: Sequence[Camera], points: np.ndarray, most: int = SOURCES, depths: Iterable[np.ndarray] | None = None
+    cameras: Sequence[Camera],
+    points: np.ndarray,
+    most: int = SOURCES,
+    depths: Iterable[np.ndarray] | None = None,
+    widest: float = WIDEST_ANGLE,
 ) -> list[list[int]]:
     """For every camera the indices of those to compare patches with, best first, `most` at most.
 
     Each is the one that sees, under an angle of LEAST_ANGLE to LARGEST_ANGLE to the camera's own rays, most of the
     (P, 3) points that the camera sees and that fewer than SOURCES of those before it do; then, under an angle of up to
-    WIDEST_ANGLE, most of those that fewer than CONFIRMING do. Surfaces with the (H, W) `depths` of the views hide
+    `widest` degrees, most of those that fewer than CONFIRMING do. Surfaces with the (H, W) `depths` of the views hide
     points; without them nothing does.
     """
     step = -(-len(points) // COMPARED_POINTS)
@@ -40,7 +44,7 @@ def source_views(
     rays /= np.maximum(np.linalg.norm(rays, axis=2, keepdims=True), 1e-12)
     nearest = repeat(None, len(cameras)) if depths is None else depths
     seen = np.stack([_seen(*each, points) for each in zip(cameras, nearest, strict=True)])
-    widest, largest, least = np.cos(np.radians([WIDEST_ANGLE, LARGEST_ANGLE, LEAST_ANGLE]))
+    widest, largest, least = np.cos(np.radians([widest, LARGEST_ANGLE, LEAST_ANGLE]))
     chosen = []
     for index in range(len(cameras)):
         cosine = np.einsum("vpc,pc->vp", rays, rays[index])

@@ -15,7 +15,7 @@ import numpy as np
 from linprim_geo.capture.types import Photo
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.sampling import sample_bilinear
-from linprim_geo.points.view_pairs import source_views
+from linprim_geo.points.view_pairs import LARGEST_ANGLE, source_views
 from linprim_geo.runs.run import Run
 
 LEVELS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
@@ -52,7 +52,7 @@ def choose_level(run: Run, memory_limit: int = 0) -> tuple[float, dict[float, fl
     """
     views = run.scene().train
     cameras = [view.camera for view in views]
-    sources = source_views(cameras, run.primitives().center)
+    sources = source_views(cameras, run.primitives().center, widest=LARGEST_ANGLE)
     chosen = [k for k in range(0, len(views), -(-len(views) // VIEWS)) if sources[k]]
     largest = max((camera.width * camera.height for camera in cameras), default=1)
     room = min(memory_limit or KEPT_BYTES, KEPT_BYTES) // (largest * PIXEL_BYTES)
