@@ -1,11 +1,14 @@
 """Floors and walls where nothing is known of them: planes behind which nothing lies go on.
 
 A plane encloses the scene if all cameras and nearly all known points lie on one side of it, and another such plane
-meets it at a right angle, as the floor and the walls of a room do. A ray of which nothing is known ends at the first of
-these, but only within the rectangle that holds the plane's own known points, as walls do not go on into the sky. Where
-hardly any view looks, as below a table, stereo can know nothing: there it ends within the rectangle that holds all
-known points, if the plane's own reach across that one way. Where most of the views that look at a place know it, one
-that does not has something before it.
+meets it at a right angle, as the floor and the walls of a room do, or its points are all over it, as those of a table
+are. A ray of which nothing is known ends at the first of these, but only within the rectangle that holds the plane's
+own known points, as walls do not go on into the sky. Where hardly any view looks, as below a table, stereo can know
+nothing: there it ends within the rectangle that holds all known points, if the plane's own reach across that one way.
+Where most of the views that look at a place know it, one that does not has something before it.
+
+Of few photographs training can explain much as background: what hardly any view shows agrees with any far background.
+There a known depth on such a plane counts all the same (`known_on_planes`).
 
 A plain wall in even light has no points. Where two planes that enclose the scene end at the same place, as a floor and
 a wall do at the next wall, a plane at right angles to both closes the room there.
@@ -36,6 +39,9 @@ BEYOND, END_MARGIN = 0.002, 0.02
 SPANNING = 0.9
 # A place that more of the views looking at it know is not what a view sees that knows nothing: something is before it.
 MOST_KNOW = 0.5
+# The points of a plane are all over it if they are in a share FILLED of CELLS by CELLS parts of their rectangle, whose
+# sides run along one of so many DIRECTIONS. On a plane through a row of eaves and the sky they are in a few.
+CELLS, FILLED, DIRECTIONS = 8, 0.5, 45
 # So many views of each place are wanted for stereo: where no more look, it may know nothing of a surface.
 FEW_VIEWS = SOURCES
 
@@ -61,17 +67,20 @@ class EnclosingPlane:
 
 
 def enclosing_planes(cameras: Sequence[Camera], planes: np.ndarray, points: SurfacePoints) -> list[EnclosingPlane]:
-    """Those of (K, 4) planes n . x = d that enclose the scene, without copies and those that meet no other at right
-    angles, and planes at right angles to two of them where both end."""
+    """Those of (K, 4) planes n . x = d that enclose the scene, without copies, of those that meet no other at right
+    angles only what points are all over, and planes at right angles to two of them where both end."""
     if not len(points):
         return []
     known = _Known(cameras, points)
     found = known.without_copies([plane for plane in map(known.facing, planes) if known.is_enclosing(plane)])
-    found = [plane for plane in found if any(_at_right_angles(plane, other) for other in found)]
-    closing = known.closing(found)
-    return [known.with_ends(plane, found, points.on(plane[None], CONFIRMED_DEPTH)[:, 0]) for plane in found] + [
-        known.with_ends(plane, found, slice(None)) for plane in closing
+    corners = [plane for plane in found if any(_at_right_angles(plane, other) for other in found)]
+    own = [points.on(plane[None], CONFIRMED_DEPTH)[:, 0] for plane in found]
+    enclosing = [
+        known.with_ends(plane, corners, rows)
+        for plane, rows in zip(found, own, strict=True)
+        if any(plane is corner for corner in corners) or known.is_filled(plane, rows)
     ]
+    return enclosing + [known.with_ends(plane, corners, slice(None)) for plane in known.closing(corners)]
 
 
 class _Known:
@@ -141,18 +150,45 @@ class _Known:
         inside = [visible_pixels(self.cameras[view], beyond[views == view])[0] for view in np.unique(views)]
         return bool(np.concatenate(inside).mean() > 0.5)
 
-    def with_ends(self, plane: np.ndarray, found: Sequence[np.ndarray], own: np.ndarray | slice) -> EnclosingPlane:
-        """A plane with its ends by its `own` points, along the normal of the first of those `found` that is at right
-        angles to it."""
+    def with_ends(self, plane: np.ndarray, corners: Sequence[np.ndarray], own: np.ndarray | slice) -> EnclosingPlane:
+        """A plane with its ends by its `own` points, along the normal of the first of the `corners` that is at right
+        angles to it, or else along the sides of the smallest rectangle. Without another one it ends with its points."""
         normal = plane[:3]
-        first = next(other[:3] for other in found if _at_right_angles(other, plane))
-        first = first - normal * (first @ normal)
-        first /= np.linalg.norm(first)
-        axes = np.stack([first, np.cross(normal, first)])
+        first = next((other[:3] for other in corners if _at_right_angles(other, plane)), None)
+        if first is None:
+            axes, ends = self.smallest_rectangle(plane, own)
+            return EnclosingPlane(normal, float(plane[3]), axes, ends, ends)
+        axes = _axes(normal, first)
         along = self.points.position @ axes.T
         ends, whole = _ends(along[own]), _ends(along)
         spans = (np.diff(ends, axis=0) >= SPANNING * np.diff(whole, axis=0)).any()
         return EnclosingPlane(normal, float(plane[3]), axes, ends, whole if spans else ends)
+
+    def smallest_rectangle(self, plane: np.ndarray, own: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray]:
+        """Axes and ends of the rectangle in a plane that holds its `own` points on the least area."""
+        one, other = _axes(plane[:3], np.eye(3)[np.abs(plane[:3]).argmin()])
+        points, tried = self.points.position[own], []
+        for angle in np.linspace(0, np.pi / 2, DIRECTIONS, endpoint=False):
+            axes = np.cos(angle) * np.stack([one, other]) + np.sin(angle) * np.stack([other, -one])
+            ends = _ends(points @ axes.T)
+            tried.append((float(np.diff(ends, axis=0).prod()), axes, ends))
+        _, axes, ends = min(tried, key=lambda each: each[0])
+        return axes, ends
+
+    def is_filled(self, plane: np.ndarray, own: np.ndarray) -> bool:
+        """Whether a plane's `own` points are all over it."""
+        axes, ends = self.smallest_rectangle(plane, own)
+        along = (self.points.position[own] @ axes.T - ends[0]) / np.diff(ends, axis=0)
+        cells = np.floor(CELLS * along[(along >= 0).all(1) & (along < 1).all(1)]).astype(int)
+        return len(np.unique(cells, axis=0)) >= FILLED * CELLS**2
+
+
+def _axes(normal: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """(2, 3) unit vectors at right angles to a `normal` and to each other, the first as `near` to another as can
+    be."""
+    first = near - normal * (near @ normal)
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(normal, first)])
 
 
 def _ends(along: np.ndarray) -> np.ndarray:
@@ -170,16 +206,20 @@ def enclosing_depths(
     enclosing: Sequence[EnclosingPlane],
     known: Sequence[np.ndarray],
     wanted: Sequence[np.ndarray],
+    shown: Sequence[np.ndarray] | None = None,
 ) -> list[np.ndarray]:
     """(H, W) float32 depth of every view at its `wanted` pixels where their rays end at an enclosing plane, else NaN.
 
     Args:
         known: (H, W) depth of every view, NaN where nothing is known.
         wanted: (H, W) bool.
+        shown: (H, W) depth of every view that a pixel probably has, NaN where none is more probable than others: a
+            plane has to be near it. None: such are nowhere.
     """
+    shown = [np.full(depth.shape, np.nan) for depth in known] if shown is None else shown
     result = [np.full(depth.shape, np.nan, np.float32) for depth in known]
     planes = np.array([[*plane.normal, plane.offset] for plane in enclosing]).reshape(-1, 4)
-    for camera, depth, pixels in zip(cameras, result, wanted, strict=True):
+    for camera, depth, pixels, probable in zip(cameras, result, wanted, shown, strict=True):
         row, column = np.nonzero(pixels)
         if not len(row) or not len(planes):
             continue
@@ -191,10 +231,29 @@ def enclosing_depths(
             rows = np.flatnonzero((first == number) & (nearest > 0))
             places = to_world(camera, rays[rows] / nearest[rows, None])
             own[rows], whole[rows] = plane.within(places, plane.own), plane.within(places, plane.whole)
-        rows = np.flatnonzero(own | whole)
+        elsewhere = np.abs(probable[row, column] * nearest - 1) > MARGIN  # not where it is NaN
+        rows = np.flatnonzero((own | whole) & ~elsewhere)
         looking, knowing = _looking(to_world(camera, rays[rows] / nearest[rows, None]), cameras, known)
         rows = rows[(own[rows] | (looking <= FEW_VIEWS)) & (knowing <= MOST_KNOW * looking)]
         depth[row[rows], column[rows]] = 1 / nearest[rows]
+    return result
+
+
+def known_on_planes(
+    cameras: Sequence[Camera], enclosing: Sequence[EnclosingPlane], known: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """(H, W) bool of every view: where a `known` (H, W) depth, NaN where there is none, lies on an enclosing plane
+    within the rectangle of its own points, and hardly any view looks there, but most of these know it."""
+    result = [np.zeros(depth.shape, bool) for depth in known]
+    for camera, depth, on in zip(cameras, known, result, strict=True):
+        row, column = np.nonzero(np.isfinite(depth))
+        places = to_world(camera, rays_of(camera, row, column) * depth[row, column, None])
+        least = CONFIRMED_DEPTH * np.linalg.norm(places - camera.center, axis=1)
+        near = np.zeros(len(places), bool)
+        for plane in enclosing:
+            near |= (np.abs(places @ plane.normal - plane.offset) < least) & plane.within(places, plane.own)
+        looking, knowing = _looking(places[near], cameras, known)
+        on[row[near], column[near]] = (looking <= FEW_VIEWS) & (knowing > MOST_KNOW * looking)
     return result
 
 

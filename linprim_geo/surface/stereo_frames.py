@@ -8,6 +8,7 @@ Of the surface that is fused from them, what stereo and planes of several views 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from linprim_geo.geometry.mesh import Mesh, face_areas, face_components, select_
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.depth_maps import SURE, DepthMap, depth_maps
-from linprim_geo.stereo.enclosing_planes import enclosing_depths, enclosing_planes
+from linprim_geo.stereo.enclosing_planes import enclosing_depths, enclosing_planes, known_on_planes
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.plain_regions import PlainRegion, common_planes, edges_of, plain_regions, plane_depths
 from linprim_geo.stereo.point_planes import SurfacePoints, planes_of_points, point_plane_depth
@@ -78,11 +79,7 @@ class MergedFrames(Sequence):
         known = [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
         points = self._span_gaps(maps, known, rendered_depths, backgrounds)
         are_sharp = [depth > 0 for depth in rendered_depths] if sharp is None else list(sharp)
-        unknown = [
-            (depth > 0) & ~(of_surface | background)
-            for depth, of_surface, background in zip(rendered_depths, are_sharp, backgrounds, strict=True)
-        ]
-        self._enclose(points, known, unknown)
+        self._enclose(points, known, are_sharp, backgrounds)
         self._keep_thin_things(views, maps, rendered_depths, are_sharp)
 
     def _take_planes(self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -134,17 +131,30 @@ class MergedFrames(Sequence):
         self.spanned = _share_known(spanned)
         return of_all
 
-    def _enclose(self, points: SurfacePoints, known: Sequence[np.ndarray], unknown: Sequence[np.ndarray]) -> None:
-        """Adds depths of planes that enclose `points` of what is `known` to doubtful ones, of pixels (H, W) bool that
-        are `unknown` to training, too."""
-        wanted = [
-            pixels & ~np.isfinite(depth) & ~np.isfinite(doubtful)
-            for pixels, depth, doubtful in zip(unknown, known, self.doubtful_depths, strict=True)
-        ]
+    def _enclose(
+        self,
+        points: SurfacePoints,
+        known: Sequence[np.ndarray],
+        sharp: Sequence[np.ndarray],
+        backgrounds: Sequence[np.ndarray],
+    ) -> None:
+        """Adds depths of planes that enclose `points` of what is `known` to doubtful ones, where training has a depth
+        that is not `sharp` (H, W) or is near them, but not in background; what is known on them is not background where
+        hardly any view looks."""
         planes = enclosing_planes(self.cameras, self.planes, points)
-        enclosed = enclosing_depths(self.cameras, planes, known, wanted)
+        wanted, shown = [], []
+        for frame, depth, doubtful, of_surface, background in zip(
+            self.rendered, known, self.doubtful_depths, sharp, backgrounds, strict=True
+        ):
+            wanted.append((frame.depth > 0) & ~(background | np.isfinite(depth) | np.isfinite(doubtful)))
+            shown.append(np.where(of_surface, frame.depth, np.nan))
+        enclosed = enclosing_depths(self.cameras, planes, known, wanted, shown)
         self.doubtful_depths = [_first_known(pair) for pair in zip(self.doubtful_depths, enclosed, strict=True)]
         self.enclosed = _share_known(enclosed)
+        self.rendered = [
+            frame if frame.background is None else replace(frame, background=frame.background & ~on)
+            for frame, on in zip(self.rendered, known_on_planes(self.cameras, planes, known), strict=True)
+        ]
 
     def _keep_thin_things(
         self,

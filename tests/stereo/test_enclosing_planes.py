@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.captures import look_at
 
-from linprim_geo.stereo.enclosing_planes import EnclosingPlane, enclosing_depths, enclosing_planes
+from linprim_geo.stereo.enclosing_planes import EnclosingPlane, enclosing_depths, enclosing_planes, known_on_planes
 from linprim_geo.stereo.plain_regions import in_camera
 from linprim_geo.stereo.point_planes import SurfacePoints
 
@@ -49,32 +49,62 @@ def normals(found: list[EnclosingPlane]) -> set:
     return {tuple(np.round(plane.normal, 6) + 0.0) for plane in found}
 
 
+def everything(place):
+    return np.zeros(place.shape[:2], bool)
+
+
 def test_floor_and_walls_enclose_a_corner_whichever_way_their_normals_are():
-    points = points_of(room(lambda place: np.zeros(place.shape[:2], bool)))
+    points = points_of(room(everything))
     found = enclosing_planes(CAMERAS, np.array([FLOOR, -WALL, SIDE]), points)
     assert normals(found) == {(0, 0, 1), (0, 1, 0), (1, 0, 0)} and len(found) == 3
     assert all(abs(plane.offset) < 1e-9 for plane in found)
 
 
 def test_a_copy_and_a_table_do_not_enclose():
-    known = room(lambda place: np.zeros(place.shape[:2], bool))
+    known = room(everything)
     copy, table = np.array([0.02, 0, 1, 0.01]), np.array([0.0, 0, 1, 0.5])
     copy[:3] /= np.linalg.norm(copy[:3])
     found = enclosing_planes(CAMERAS, np.array([copy, table, FLOOR, WALL, SIDE]), points_of(known))
     assert normals(found) == {(0, 0, 1), (0, 1, 0), (1, 0, 0)}
 
 
-def test_a_plane_that_meets_no_other_at_a_right_angle_goes_nowhere():
-    points = points_of(room(lambda place: np.zeros(place.shape[:2], bool)))
-    assert enclosing_planes(CAMERAS, FLOOR[None], points) == []
+def test_a_plane_that_meets_no_other_at_a_right_angle_ends_with_its_points():
+    found = enclosing_planes(CAMERAS, FLOOR[None], points_of(room(everything)))
+    assert normals(found) == {(0, 0, 1)} and found[0].whole is found[0].own
     slope = np.array([0, 0.5**0.5, 0.5**0.5, 0])
-    assert enclosing_planes(CAMERAS, np.array([FLOOR, slope]), points) == []
+    both = enclosing_planes(CAMERAS, np.array([FLOOR, slope]), points_of(room(everything)))
+    assert normals(both) == {(0, 0, 1)}  # few points are on the slope
+
+
+def test_alone_a_plane_has_points_all_over():
+    """The floor is known along both walls only, as a plane over a row of eaves is."""
+
+    def inside(place):
+        return (np.abs(place[..., 2]) < 1e-6) & (place[..., :2] > 0.2).all(-1)
+
+    points = points_of(room(inside))
+    assert enclosing_planes(CAMERAS, FLOOR[None], points) == []
+    assert normals(enclosing_planes(CAMERAS, np.array([FLOOR, WALL]), points)) >= {(0, 0, 1), (0, 1, 0)}
+
+
+def test_the_rectangle_of_a_plane_alone_is_the_smallest():
+    turn = np.array([[np.cos(0.5), np.sin(0.5), 0], [-np.sin(0.5), np.cos(0.5), 0]])
+    size = np.array([0.6, 0.3])
+
+    def outside(place):
+        along = (place - (0.9, 0.9, 0)) @ turn.T
+        return (np.abs(along) > size).any(-1) | (np.abs(place[..., 2]) > 1e-6)
+
+    (table,) = enclosing_planes(CAMERAS, FLOOR[None], points_of(room(outside)))
+    assert np.abs(table.axes @ turn.T).max(1).min() > np.cos(np.radians(2))
+    sides = np.sort(np.diff(table.own, axis=0)[0])
+    np.testing.assert_allclose(sides, 2 * size[::-1], atol=0.1)
 
 
 def test_a_plane_that_only_crosses_the_others_does_not_enclose():
-    points = points_of(room(lambda place: np.zeros(place.shape[:2], bool)))
     across = np.array([0.5**0.5, 0.5**0.5, 0, 0])  # through the edge between the walls
-    assert normals(enclosing_planes(CAMERAS, np.array([FLOOR, across]), points)) == set()
+    found = enclosing_planes(CAMERAS, np.array([FLOOR, across]), points_of(room(everything)))
+    assert normals(found) == {(0, 0, 1)}
 
 
 def test_the_front_of_a_sideboard_ends_where_its_own_points_do():
@@ -97,7 +127,7 @@ def test_the_front_of_a_sideboard_ends_where_its_own_points_do():
 
 
 def test_a_camera_or_points_behind_a_plane_speak_against_it():
-    points = points_of(room(lambda place: np.zeros(place.shape[:2], bool)))
+    points = points_of(room(everything))
     planes = np.array([FLOOR, WALL, SIDE])
     below = [*CAMERAS, look_at((2.0, 2.0, -0.5), size=SIZE)]
     assert (0, 0, 1) not in normals(enclosing_planes(below, planes, points))
@@ -117,7 +147,7 @@ def test_a_wall_without_points_closes_the_room_where_the_others_end():
     assert len(sides) == 1 and abs(sides[0].offset) < 0.02 * 3
     wanted = [np.isnan(depth) for depth in known]
     filled = enclosing_depths(CAMERAS, found, known, wanted)
-    truth = room(lambda place: np.zeros(place.shape[:2], bool))
+    truth = room(everything)
     for ours, theirs, pixels in zip(filled, truth, wanted, strict=True):
         there = pixels & np.isfinite(ours)
         assert there.sum() > 0.8 * pixels.sum() and np.abs(ours / theirs - 1)[there].max() < 0.03
@@ -138,7 +168,7 @@ def test_a_gap_in_a_wall_is_filled_where_it_is_wanted_and_no_more():
     def gap(place):
         return (np.abs(place[..., 1]) < 1e-6) & (np.abs(place[..., :3:2] - (0.9, 0.6)) < 0.3).all(-1)
 
-    known, truth = room(gap), room(lambda place: np.zeros(place.shape[:2], bool))
+    known, truth = room(gap), room(everything)
     found = enclosing_planes(CAMERAS, np.array([FLOOR, WALL, SIDE]), points_of(known))
     wanted = [np.isnan(depth) for depth in known]
     wanted[0][:] = False
@@ -182,8 +212,35 @@ def test_a_place_that_most_views_know_is_not_what_the_others_see(knowing, filled
     assert np.isfinite(depth).sum() == filled
 
 
+def test_where_a_depth_is_probable_the_plane_is_near_it():
+    ends = np.array([[-9.0, -9.0], [9.0, 9.0]])
+    plane = EnclosingPlane(WALL[:3], 0.0, np.array([[1.0, 0, 0], [0, 0, 1]]), ends, ends)
+    wall = depth_of(CAMERAS[0], [WALL])
+    nothing, wanted = [np.full_like(wall, np.nan)], [wall < 9]
+    probable = np.where(np.arange(SIZE[0]) < 16, 1.01 * wall, np.where(np.arange(SIZE[0]) < 32, 0.9 * wall, np.nan))
+    filled = enclosing_depths(CAMERAS[:1], [plane], nothing, wanted, [probable])[0]
+    assert np.isnan(filled[:, 16:32]).all()
+    there = wanted[0] & ((np.arange(SIZE[0]) < 16) | (np.arange(SIZE[0]) >= 32))
+    np.testing.assert_allclose(filled[there], wall[there], rtol=1e-5)
+
+
+@pytest.mark.parametrize("views, knowing, counts", [(4, 3, True), (4, 2, False), (6, 6, False)])
+def test_what_few_views_know_on_a_plane_counts(views, knowing, counts):
+    """Of `views` that look at a wall `knowing` know it, and in one of these a part that is before it."""
+    ends = np.array([[-9.0, -9.0], [9.0, 9.0]])
+    plane = EnclosingPlane(WALL[:3], 0.0, np.array([[1.0, 0, 0], [0, 0, 1]]), ends, ends)
+    whole = [depth_of(camera, [WALL]) for camera in CAMERAS[:views]]
+    known = [depth if view < knowing else np.full_like(depth, np.nan) for view, depth in enumerate(whole)]
+    known[0][:9] *= 0.9
+    on = known_on_planes(CAMERAS[:views], [plane], known)
+    assert on[0][18, 24] == counts  # the middle, which all of them have in the image
+    assert not on[0][:9].any() and not any(pixels[~np.isfinite(d)].any() for pixels, d in zip(on, known, strict=True))
+    elsewhere = EnclosingPlane(WALL[:3], 0.0, plane.axes, ends + 20, ends)
+    assert not any(pixels.any() for pixels in known_on_planes(CAMERAS[:views], [elsewhere], known))
+
+
 def test_without_points_or_planes_there_is_nothing():
-    known = room(lambda place: np.zeros(place.shape[:2], bool))
+    known = room(everything)
     points = points_of(known)
     nobody = points[np.zeros(len(points), bool)]
     assert enclosing_planes(CAMERAS, np.array([FLOOR, WALL]), nobody) == []

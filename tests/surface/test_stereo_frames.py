@@ -103,9 +103,12 @@ def test_rays_end_at_enclosing_planes_where_nothing_is_known_and_nothing_sharp_i
     sharp[:, 30:] = True
     asked = []
 
-    def enclosing(cameras, planes, known, wanted):
+    def enclosing(cameras, planes, known, wanted, shown):
         asked.extend(wanted)
-        return [np.where(pixels, np.float32(3.4), np.float32(np.nan)) for pixels in wanted]
+        return [
+            np.where(pixels & np.isnan(depth), np.float32(3.4), np.float32(np.nan))
+            for pixels, depth in zip(wanted, shown, strict=True)
+        ]
 
     monkeypatch.setattr(stereo_frames, "enclosing_depths", enclosing)
     merged = MergedFrames(rendered(0.01), [VIEW], 5.0, sharp=iter([sharp]))
@@ -116,6 +119,16 @@ def test_rays_end_at_enclosing_planes_where_nothing_is_known_and_nothing_sharp_i
     assert np.allclose(frame.depth[:, 30:], 3.03), "what is sharp stays"
     assert merged.enclosed == pytest.approx((29 * 10 + 30) / 1200) and merged.about()["enclosed"] == merged.enclosed
     assert len(asked) == 1 and not asked[0][1:, :20].any()
+
+
+def test_what_few_views_know_on_a_plane_is_not_background(found, monkeypatch):
+    on_plane, background = np.zeros((30, 40), bool), np.zeros((30, 40), bool)
+    on_plane[:, :5], background[:, :10] = True, True
+    monkeypatch.setattr(stereo_frames, "known_on_planes", lambda *_: [on_plane])
+    merged = MergedFrames([replace(rendered(0.01)[0], background=background)], [VIEW], 5.0)
+    frame = merged[0]
+    assert (frame.depth[2:, :5] == 3).all() and (frame.confidence[2:, :5] == 1).all()
+    assert not (frame.depth[:, 5:10] == 3).any() and (frame.background == background & ~on_plane).all()
 
 
 def test_thin_things_stand_before_what_is_known(found, monkeypatch):
