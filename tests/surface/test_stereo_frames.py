@@ -121,6 +121,20 @@ def test_rays_end_at_enclosing_planes_where_nothing_is_known_and_nothing_sharp_i
     assert len(asked) == 1 and not asked[0][1:, :20].any()
 
 
+def test_no_ray_ends_at_an_enclosing_plane_in_background(found, monkeypatch):
+    background = np.zeros((30, 40), bool)
+    background[:, 25:] = True
+    monkeypatch.setattr(stereo_frames.ShadedPlanes, "is_background", lambda *_: background)
+    filled = [np.full((30, 40), 3.4, np.float32)]
+    monkeypatch.setattr(
+        stereo_frames,
+        "enclosing_depths",
+        lambda cameras, planes, known, wanted, shown: [np.where(wanted[0], filled[0], np.nan)],
+    )
+    frame = MergedFrames(rendered(0.01), [VIEW], 5.0, sharp=iter([np.zeros((30, 40), bool)]))[0]
+    assert np.allclose(frame.depth[:, 20:25], 3.4) and np.allclose(frame.depth[:, 25:], 3.03)
+
+
 def test_what_few_views_know_on_a_plane_is_not_background(found, monkeypatch):
     on_plane, background = np.zeros((30, 40), bool), np.zeros((30, 40), bool)
     on_plane[:, :5], background[:, :10] = True, True
