@@ -68,6 +68,7 @@ class MergedFrames(Sequence):
         self.doubtful_depths = [
             _depth_where(found, ~own & (found.confirming > 0)) for found, own in zip(maps, confirmed, strict=True)
         ]
+        measured = [_first_known(pair) for pair in zip(self.depths, self.doubtful_depths, strict=True)]
         self.confirmed, self.doubtful = _share_known(self.depths), _share_known(self.doubtful_depths)
         deviations = Deviations()
         for found, depth, frame in zip(maps, self.depths, rendered, strict=True):
@@ -79,7 +80,7 @@ class MergedFrames(Sequence):
         known = [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
         points = self._span_gaps(maps, known, rendered_depths, backgrounds)
         are_sharp = [depth > 0 for depth in rendered_depths] if sharp is None else list(sharp)
-        self._enclose(points, known, are_sharp, backgrounds)
+        self._enclose(points, known, measured, are_sharp, backgrounds)
         self._keep_thin_things(views, maps, rendered_depths, are_sharp)
 
     def _take_planes(self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -135,12 +136,13 @@ class MergedFrames(Sequence):
         self,
         points: SurfacePoints,
         known: Sequence[np.ndarray],
+        measured: Sequence[np.ndarray],
         sharp: Sequence[np.ndarray],
         backgrounds: Sequence[np.ndarray],
     ) -> None:
         """Adds depths of planes that enclose `points` of what is `known` to doubtful ones, where training has a depth
-        that is not `sharp` (H, W) or is near them, but not in background; what is known on them is not background where
-        hardly any view looks."""
+        that is not `sharp` (H, W) or is near them, but not in background; what stereo has `measured` on them is not
+        background where hardly any view looks."""
         planes = enclosing_planes(self.cameras, self.planes, points)
         wanted, shown = [], []
         for frame, depth, doubtful, of_surface, background in zip(
@@ -153,7 +155,7 @@ class MergedFrames(Sequence):
         self.enclosed = _share_known(enclosed)
         self.rendered = [
             frame if frame.background is None else replace(frame, background=frame.background & ~on)
-            for frame, on in zip(self.rendered, known_on_planes(self.cameras, planes, known), strict=True)
+            for frame, on in zip(self.rendered, known_on_planes(self.cameras, planes, measured), strict=True)
         ]
 
     def _keep_thin_things(

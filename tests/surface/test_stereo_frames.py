@@ -138,11 +138,19 @@ def test_no_ray_ends_at_an_enclosing_plane_in_background(found, monkeypatch):
 def test_what_few_views_know_on_a_plane_is_not_background(found, monkeypatch):
     on_plane, background = np.zeros((30, 40), bool), np.zeros((30, 40), bool)
     on_plane[:, :5], background[:, :10] = True, True
-    monkeypatch.setattr(stereo_frames, "known_on_planes", lambda *_: [on_plane])
+    asked = []
+
+    def known_on_planes(cameras, planes, known):
+        asked.extend(known)
+        return [on_plane]
+
+    monkeypatch.setattr(stereo_frames, "plane_depths", lambda *_: np.full((30, 40), 3.5, np.float32))
+    monkeypatch.setattr(stereo_frames, "known_on_planes", known_on_planes)
     merged = MergedFrames([replace(rendered(0.01)[0], background=background)], [VIEW], 5.0)
     frame = merged[0]
     assert (frame.depth[2:, :5] == 3).all() and (frame.confidence[2:, :5] == 1).all()
     assert not (frame.depth[:, 5:10] == 3).any() and (frame.background == background & ~on_plane).all()
+    assert np.isfinite(asked[0][1:, :20]).all() and np.isnan(asked[0][:, 20:]).all(), "planes themselves know nothing"
 
 
 def test_thin_things_stand_before_what_is_known(found, monkeypatch):
