@@ -8,7 +8,7 @@ nothing: there it ends within the rectangle that holds all known points, if the 
 Where most of the views that look at a place know it, one that does not has something before it.
 
 Of few photographs training can explain much as background: what hardly any view shows agrees with any far background.
-There a known depth on such a plane counts all the same (`known_on_planes`).
+There a depth of stereo on such a plane counts all the same (`known_on_planes`).
 
 A plain wall in even light has no points. Where two planes that enclose the scene end at the same place, as a floor and
 a wall do at the next wall, a plane at right angles to both closes the room there.
