@@ -206,7 +206,7 @@ def enclosing_depths(
     enclosing: Sequence[EnclosingPlane],
     known: Sequence[np.ndarray],
     wanted: Sequence[np.ndarray],
-    shown: Sequence[np.ndarray] | None = None,
+    shown: Sequence[np.ndarray],
 ) -> list[np.ndarray]:
     """(H, W) float32 depth of every view at its `wanted` pixels where their rays end at an enclosing plane, else NaN.
 
@@ -214,9 +214,8 @@ def enclosing_depths(
         known: (H, W) depth of every view, NaN where nothing is known.
         wanted: (H, W) bool.
         shown: (H, W) depth of every view that a pixel probably has, NaN where none is more probable than others: a
-            plane has to be near it. None: such are nowhere.
+            plane has to be near it.
     """
-    shown = [np.full(depth.shape, np.nan) for depth in known] if shown is None else shown
     result = [np.full(depth.shape, np.nan, np.float32) for depth in known]
     planes = np.array([[*plane.normal, plane.offset] for plane in enclosing]).reshape(-1, 4)
     for camera, depth, pixels, probable in zip(cameras, result, wanted, shown, strict=True):

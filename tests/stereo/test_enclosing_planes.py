@@ -45,6 +45,11 @@ def room(unknown) -> list[np.ndarray]:
     return [np.where(unknown(places_of(c, depth)), np.nan, depth) for c, depth in zip(CAMERAS, whole, strict=True)]
 
 
+def ending(cameras, planes, known, wanted) -> list[np.ndarray]:
+    """Depths of `enclosing_depths` where no depth is more probable than others."""
+    return enclosing_depths(cameras, planes, known, wanted, [np.full(depth.shape, np.nan) for depth in known])
+
+
 def normals(found: list[EnclosingPlane]) -> set:
     return {tuple(np.round(plane.normal, 6) + 0.0) for plane in found}
 
@@ -146,7 +151,7 @@ def test_a_wall_without_points_closes_the_room_where_the_others_end():
     sides = [plane for plane in found if plane.normal[0] > 0.99]
     assert len(sides) == 1 and abs(sides[0].offset) < 0.02 * 3
     wanted = [np.isnan(depth) for depth in known]
-    filled = enclosing_depths(CAMERAS, found, known, wanted)
+    filled = ending(CAMERAS, found, known, wanted)
     truth = room(everything)
     for ours, theirs, pixels in zip(filled, truth, wanted, strict=True):
         there = pixels & np.isfinite(ours)
@@ -172,7 +177,7 @@ def test_a_gap_in_a_wall_is_filled_where_it_is_wanted_and_no_more():
     found = enclosing_planes(CAMERAS, np.array([FLOOR, WALL, SIDE]), points_of(known))
     wanted = [np.isnan(depth) for depth in known]
     wanted[0][:] = False
-    filled = enclosing_depths(CAMERAS, found, known, wanted)
+    filled = ending(CAMERAS, found, known, wanted)
     assert np.isnan(filled[0]).all()
     for ours, theirs, pixels in list(zip(filled, truth, wanted, strict=True))[1:]:
         there = np.isfinite(ours)  # but at its border, where pixels of other views know what is beside the gap
@@ -191,9 +196,9 @@ def test_a_wall_does_not_go_on_beyond_its_points_but_where_hardly_any_view_looks
     nothing = [np.full(SIZE[::-1], np.nan) for _ in CAMERAS]
     wanted = [np.ones(SIZE[::-1], bool)] + [np.zeros(SIZE[::-1], bool)] * (len(CAMERAS) - 1)
     before = [*nothing[:4], *(np.full(SIZE[::-1], 0.1) for _ in CAMERAS[4:])]
-    five_look = enclosing_depths(CAMERAS[:5], [plane], nothing[:5], wanted[:5])[0]
-    four_look = enclosing_depths(CAMERAS[:4], [plane], nothing[:4], wanted[:4])[0]
-    others_see_what_is_before = enclosing_depths(CAMERAS, [plane], before, wanted)[0]
+    five_look = ending(CAMERAS[:5], [plane], nothing[:5], wanted[:5])[0]
+    four_look = ending(CAMERAS[:4], [plane], nothing[:4], wanted[:4])[0]
+    others_see_what_is_before = ending(CAMERAS, [plane], before, wanted)[0]
     for depth, reach in ((five_look, 0.5), (four_look, 2.0), (others_see_what_is_before, 2.0)):
         along = places_of(CAMERAS[0], depth)[np.isfinite(depth)][:, 0]
         assert reach - 0.15 < along.max() <= reach + 1e-6
@@ -208,7 +213,7 @@ def test_a_place_that_most_views_know_is_not_what_the_others_see(knowing, filled
     plane = EnclosingPlane(WALL[:3], 0.0, np.array([[1.0, 0, 0], [0, 0, 1]]), ends, ends)
     wanted = [np.zeros(depth.shape, bool) for depth in whole]
     wanted[0][18, 24] = True  # the middle, which all of them have in the image
-    depth = enclosing_depths(CAMERAS, [plane], known, wanted)[0]
+    depth = ending(CAMERAS, [plane], known, wanted)[0]
     assert np.isfinite(depth).sum() == filled
 
 
@@ -245,5 +250,5 @@ def test_without_points_or_planes_there_is_nothing():
     nobody = points[np.zeros(len(points), bool)]
     assert enclosing_planes(CAMERAS, np.array([FLOOR, WALL]), nobody) == []
     assert enclosing_planes(CAMERAS, np.zeros((0, 4)), points) == []
-    filled = enclosing_depths(CAMERAS, [], known, [np.ones(depth.shape, bool) for depth in known])
+    filled = ending(CAMERAS, [], known, [np.ones(depth.shape, bool) for depth in known])
     assert all(np.isnan(depth).all() and depth.dtype == np.float32 for depth in filled)
