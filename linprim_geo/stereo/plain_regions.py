@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import binary_dilation, find_objects, label, uniform_filter
+from scipy.ndimage import binary_dilation, distance_transform_edt, find_objects, label, uniform_filter
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
@@ -26,6 +26,9 @@ PLAIN_SHARE, LEAST_OF_PLAIN = 0.1, 3.49 / 9
 DARKEST, BRIGHTEST = 3, 252
 # Regions have at least so many pixels (two windows of stereo) and so many confirmed depths within RING pixels.
 LEAST_PIXELS, LEAST_POINTS, RING = 200, 30, 4
+# Half of the grey values by which a cross parts two pixels (`csrc/stereo/cross.h`), and the side of the square
+# over which the grey of a region is taken.
+HALF_EDGE, AROUND = 12.5, 9
 # Depths are on a plane up to this share of them, and behind it from BEHIND times as much.
 TOLERANCE, BEHIND = CONFIRMED_DEPTH, 3.0
 # At least and at most such shares of a region's confirmed depths are on its plane, and behind it.
@@ -79,6 +82,18 @@ def edges_of(grey: np.ndarray, noise: float) -> np.ndarray:
     edge = variance > EDGE_VARIANCE * max(noise, plainest(variance, values) / LEAST_OF_PLAIN)
     parts, _ = label(edge, np.ones((3, 3)))
     return edge & (np.bincount(parts.ravel())[parts] >= SPECK)
+
+
+def grown_alike(region: np.ndarray, grey: np.ndarray, edge: np.ndarray) -> np.ndarray:
+    """(H, W) bool: of a plain region what no `edge` runs through, and of edges what is no farther from that than RING
+    pixels and of the same grey, up to HALF_EDGE: blur mixes pixels on an edge out of both sides."""
+    inside = region & ~edge
+    if not inside.any():
+        return inside
+    share = uniform_filter(inside.astype(np.float64), AROUND)
+    mean = uniform_filter(np.where(inside, grey, 0.0), AROUND) / np.maximum(share, 1e-9)
+    distance, nearest = distance_transform_edt(~inside, return_indices=True)
+    return inside | (edge & (distance <= RING) & (np.abs(grey - mean[tuple(nearest)]) < HALF_EDGE))
 
 
 def plainest(values: np.ndarray, grey: np.ndarray) -> float:

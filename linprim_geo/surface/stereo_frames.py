@@ -19,7 +19,14 @@ from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.depth_maps import SURE, DepthMap, depth_maps
 from linprim_geo.stereo.enclosing_planes import enclosing_depths, enclosing_planes, known_on_planes
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
-from linprim_geo.stereo.plain_regions import PlainRegion, common_planes, edges_of, plain_regions, plane_depths
+from linprim_geo.stereo.plain_regions import (
+    PlainRegion,
+    common_planes,
+    edges_of,
+    grown_alike,
+    plain_regions,
+    plane_depths,
+)
 from linprim_geo.stereo.point_planes import SurfacePoints, planes_of_points, point_plane_depth
 from linprim_geo.stereo.shaded_planes import ShadedPlanes
 from linprim_geo.stereo.thin_things import SeenDepths, thin_things
@@ -60,7 +67,7 @@ class MergedFrames(Sequence):
         sharp: Iterable[np.ndarray] | None = None,
         quiet: bool = True,
     ):
-        self.rendered, self.limit = rendered, limit
+        self.limit = limit
         maps = depth_maps(views, pairing_points(rendered), hiding=(frame.depth for frame in rendered), quiet=quiet)
         self.cameras = [found.camera for found in maps]
         confirmed = [found.is_confirmed() for found in maps]
@@ -75,8 +82,12 @@ class MergedFrames(Sequence):
             deviations.add(found, depth, frame)
         self.weight = deviations.weight()
         rendered_depths = [frame.depth for frame in rendered]
-        self.shown = [depth[::SAMPLED, ::SAMPLED] > 0 for depth in rendered_depths]
         backgrounds = self._take_planes(maps, rendered_depths)
+        self.rendered = [
+            _seen_past(frame, grown_alike(background, found.grey, edges_of(found.grey, found.noise)))
+            for frame, found, background in zip(rendered, maps, backgrounds, strict=True)
+        ]
+        self.shown = [frame.depth[::SAMPLED, ::SAMPLED] > 0 for frame in self.rendered]
         known = [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
         points = self._span_gaps(maps, known, rendered_depths, backgrounds)
         are_sharp = [depth > 0 for depth in rendered_depths] if sharp is None else list(sharp)
@@ -291,6 +302,18 @@ def pairing_points(rendered: Sequence[DepthFrame]) -> np.ndarray:
     """(P, 3) points of rendered surfaces by which stereo finds pairs of views, about POINTS evenly over the frames."""
     surfaces = (frame.surface()[0] for frame in rendered)
     return np.concatenate([points[:: max(1, len(points) // max(1, POINTS // len(rendered)))] for points in surfaces])
+
+
+def _seen_past(frame: DepthFrame, background: np.ndarray) -> DepthFrame:
+    """The frame with rays that are free where (H, W) `background` says so: training fills a plain sky with fog."""
+    if frame.background is None or not background.any():
+        return frame
+    return replace(
+        frame,
+        depth=np.where(background, np.float32(0), frame.depth),
+        background=frame.background | background,
+        clamped=None if frame.clamped is None else frame.clamped & ~background,
+    )
 
 
 def _depth_where(found: DepthMap, taken: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.captures import look_at
 
-from linprim_geo.stereo.plain_regions import common_planes, edges_of, plain_regions, plane_depths
+from linprim_geo.stereo.plain_regions import common_planes, edges_of, grown_alike, plain_regions, plane_depths
 
 # A corner of a room: floor z = 0 and two walls x = 0 and y = 0, from the air where all are positive.
 WALLS = np.eye(3)
@@ -119,3 +119,17 @@ def test_a_wall_that_is_slightly_bent_becomes_no_plane():
         band = (height > 0) & (height < 1.6)
         regions.append(seen(camera, depth, np.where(band, 150, 60), number))
     assert all(regions) and not len(common_planes(cameras, [region for own in regions for region in own]))
+
+
+def test_a_plain_region_reaches_to_where_pixels_are_half_of_it():
+    grey = np.full((40, 60), 200.0)
+    grey[:, 30:] = 100
+    grey[:, 29], grey[:, 30] = 190, 150  # blur
+    grey[:5, 40:] = 200  # as bright, but nowhere near
+    edge = np.zeros(grey.shape, bool)
+    edge[:, 28:32] = True
+    region = np.zeros(grey.shape, bool)
+    region[:, :32] = True
+    found = grown_alike(region, grey, edge)
+    assert found[:, :30].all() and not found[:, 30:].any()
+    assert not grown_alike(np.zeros_like(region), grey, edge).any() and not grown_alike(edge, grey, edge).any()

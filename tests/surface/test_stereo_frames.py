@@ -132,7 +132,23 @@ def test_no_ray_ends_at_an_enclosing_plane_in_background(found, monkeypatch):
         lambda cameras, planes, known, wanted, shown: [np.where(wanted[0], filled[0], np.nan)],
     )
     frame = MergedFrames(rendered(0.01), [VIEW], 5.0, sharp=iter([np.zeros((30, 40), bool)]))[0]
-    assert np.allclose(frame.depth[:, 20:25], 3.4) and np.allclose(frame.depth[:, 25:], 3.03)
+    assert np.allclose(frame.depth[:, 20:25], 3.4) and (frame.depth[:, 25:] == 0).all()
+
+
+def test_rays_are_free_where_shading_says_background_whatever_stereo_and_training_say(found, monkeypatch):
+    background = np.zeros((30, 40), bool)
+    background[:, 10:] = True
+    found[0].grey[:, 12:] = 200
+    found[0].grey[:, 10] = 80  # a pixel of the outline, less than half sky
+    monkeypatch.setattr(stereo_frames.ShadedPlanes, "is_background", lambda *_: background)
+    clamped = np.ones((30, 40), bool)
+    merged = MergedFrames([replace(rendered(0.01)[0], clamped=clamped)], [VIEW], 5.0)
+    frame = merged[0]
+    assert frame.background[:, 12:].all() and not frame.background[:, :11].any()
+    assert (frame.depth[:, 12:] == 0).all() and not frame.clamped[:, 12:].any()
+    assert (frame.depth[1:, :11] == 3).all(), "of the outline what stereo confirms stays"
+    square = Mesh(np.array([(-9, 1, -9), (9, 1, -9), (9, 1, 9), (-9, 1, 9)], float), np.array([(0, 1, 2), (0, 2, 3)]))
+    assert merged.covered(square) == 1 and len(merged.shown) == 1 and not merged.shown[0][:, 3:].any()
 
 
 def test_what_few_views_know_on_a_plane_is_not_background(found, monkeypatch):
