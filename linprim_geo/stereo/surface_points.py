@@ -13,6 +13,7 @@ from linprim_geo.capture.types import PointCloud, View
 from linprim_geo.kernels.stereo_ops import support
 from linprim_geo.stereo.confidence import RIGHT
 from linprim_geo.stereo.depth_maps import FOREGROUND, depth_maps, inverse_planes
+from linprim_geo.stereo.skies import shows_sky
 
 # Photographs are averaged down until their longer side has no more pixels, and no more of them are taken: a training
 # starts with some ten thousand primitives, and a view of this size has 30,000 pixels.
@@ -31,11 +32,12 @@ def small_copies(views: Sequence[View]) -> list[SmallCopy]:
 @dataclass(frozen=True)
 class SurfaceMap:
     """Of a small copy: (3, H, W) float32 `planes`, the inverse depth in the scene's unit and its slopes per pixel, 0
-    where no surface is known, and (H, W, 3) uint8 `rgb`."""
+    where no surface is known, (H, W, 3) uint8 `rgb`, and whether it `shows_sky`."""
 
     view: SmallCopy
     planes: np.ndarray
     rgb: np.ndarray
+    shows_sky: bool
 
     @property
     def known(self) -> np.ndarray:
@@ -55,13 +57,13 @@ def surface_maps(views: Sequence[SmallCopy], points: np.ndarray, seed: int, *, q
     """
     maps = []
     found_maps = depth_maps(views, points, fit=False, seed=seed, quiet=quiet)
-    for view, found in zip(views, found_maps, strict=True):
+    for view, found, sky in zip(views, found_maps, shows_sky(found_maps), strict=True):
         photo, camera, known = view.load(), found.camera, found.is_confirmed()
         planes = inverse_planes(camera, found.depth, found.normal @ camera.rotation.T)
         known &= support(found.grey, np.where(known, planes, np.float32(0)), RIGHT) >= LEAST_SUPPORT
         if photo.alpha is not None:
             known &= photo.alpha >= FOREGROUND
-        maps.append(SurfaceMap(view, np.where(known, planes, np.float32(0)), photo.rgb))
+        maps.append(SurfaceMap(view, np.where(known, planes, np.float32(0)), photo.rgb, sky))
     return maps
 
 

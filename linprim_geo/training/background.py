@@ -34,13 +34,15 @@ class Background:
     far: FarColors | None = None
 
 
-def chosen_background(text: str, scene: Scene, images: list[TrainingImage], begun: bool | None = None) -> Background:
+def chosen_background(
+    text: str, scene: Scene, images: list[TrainingImage], begun: bool | None = None, sky: bool = False
+) -> Background:
     """What the option's text stands for. Of a training that goes on, `begun` says whether it has an environment: that
     has its colours.
 
     Without alpha a random background makes everything opaque: a fitted one would let a wall of its colour become
     transparent. It is fitted only where photographs have a plain backdrop, and an environment is trained only where
-    they say that a scene is open.
+    they say that a scene is open: by what they show at infinity, or by a `sky` that has nothing to recognise.
 
     Raises:
         LinprimError: the text is no name and not three numbers in [0, 1].
@@ -56,7 +58,7 @@ def chosen_background(text: str, scene: Scene, images: list[TrainingImage], begu
             text = "fitted"
         elif not has_alpha and begun is None:
             far = far_colors(scene)
-            text = "environment" if far_share(far, scene) >= OPEN_SHARE else "random"
+            text = "environment" if sky or far_share(far, scene) >= OPEN_SHARE else "random"
     if text == "random":
         return Background(torch.ones(3) if has_alpha else torch.from_numpy(_mean_color(images)), random=True)
     if text == "environment":

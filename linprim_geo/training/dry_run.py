@@ -71,7 +71,7 @@ def dry_run(
         counts = []
 
         def start(options: TrainOptions) -> Trainer:
-            trainer = start_trainer(loaded, planned, images, options, None, surfaces=surfaces.points)
+            trainer = start_trainer(loaded, planned, images, options, None, surfaces=surfaces)
             counts.append(len(trainer))
             return trainer
 

@@ -64,7 +64,7 @@ def train_run(
         held_out = load_training_images(scene.test, run.similarity)
         run, scene, pace = _planned(run, scene, images, held_out, surfaces, budget, progress)
         options, progress.total = run.train_options, run.train_options.iterations
-    trainer = start_trainer(scene, run, images, options, state, surfaces=surfaces.points)
+    trainer = start_trainer(scene, run, images, options, state, surfaces=surfaces)
     trainer.terms = geometry_terms(run, scene, images, surfaces, progress)
     if not (run.path / "config.json").exists():
         Run.create(
@@ -139,7 +139,7 @@ def _planned(
         geometry_terms(run, scene, images, surfaces, progress),
         budget,
         progress,
-        start=lambda options: start_trainer(scene, run, images, options, None, surfaces=surfaces.points),
+        start=lambda options: start_trainer(scene, run, images, options, None, surfaces=surfaces),
         score=evaluate,
         # The smaller limit that is chosen leaves too many points, not too few, and volumes are filled anew.
         start_share=0.0 if volume else SFM_START,

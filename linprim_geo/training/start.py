@@ -43,7 +43,7 @@ from linprim_geo.training.step.geometry_terms import GeometryTerms, gather_evide
 from linprim_geo.training.step.parameters import initial_parameters
 from linprim_geo.training.step.trainer import LARGEST_PART, SMALLEST_PX, Trainer
 from linprim_geo.training.step.training_images import TrainingImage
-from linprim_geo.training.stereo_surfaces import Surfaces
+from linprim_geo.training.stereo_surfaces import NO_SURFACES, Surfaces
 
 
 def decided_scene(
@@ -157,14 +157,15 @@ def start_trainer(
     state: dict | None,
     cloud: PointCloud | None = None,
     largest: float | None = None,
-    surfaces: PointCloud | None = None,
+    surfaces: Surfaces = NO_SURFACES,
 ) -> Trainer:
     """A trainer at step 0, or at the step of a checkpoint's `state`.
 
     Args:
         scene: with points to start from; those of a checkpoint need none.
         images: its training views in the training frame.
-        cloud: the points to start from; default: `filled_points` of the scene and of `surfaces`.
+        cloud: the points to start from; default: `filled_points` of the scene and of `surfaces`,
+            which say as well whether there is a sky.
         largest: extent that a primitive may have, in the training frame; default: by what the points reach.
 
     Raises:
@@ -173,14 +174,14 @@ def start_trainer(
     focal = float(np.median([max(s.camera.fx, s.camera.fy) for s in images]))
     centers = np.stack([s.camera.center for s in images])
     begun = None if state is None else "environment" in state.get("parameters", {})
-    behind = chosen_background(options.background, scene, images, begun)
+    behind = chosen_background(options.background, scene, images, begun, surfaces.sky)
     surface = state is None and not isinstance(scene.points, VolumePoints)
     if state is not None:
         xyz, rgb, radius = np.zeros((4, 3)), np.zeros((4, 3)), 1.0  # replaced below
     else:
         if cloud is None:
             backdrop = behind.color.numpy() if behind.fitted else None
-            cloud = filled_points(scene, options.seed, backdrop, behind.far, surfaces)
+            cloud = filled_points(scene, options.seed, backdrop, behind.far, surfaces.points)
         cloud = initial_cloud(cloud, options)
         xyz, rgb = run.similarity.apply(cloud.xyz), cloud.rgb
         middle = np.median(xyz, 0)

@@ -26,6 +26,9 @@ AGREE = 2 * CONFIRMED_DEPTH
 # Where so many points do not, stereo is taken for chance: 0.88 of them in a hall without texture, 0.08 to 0.40 on eight
 # other captures (DECISIONS 78).
 CONTRADICTING = 2 / 3
+# A scene is open if so many views show a sky, and such a share of all: 4 of 22 and 6 of 28 do of two facades, none of
+# ten other captures (DECISIONS 89).
+SKY_VIEWS, SKY_SHARE = 3, 0.1
 # Of a time budget stereo takes at most this share; steps in the rest are fewer and as long as before.
 BUDGET_SHARE = 0.2
 
@@ -33,10 +36,15 @@ BUDGET_SHARE = 0.2
 @dataclass(frozen=True)
 class Surfaces:
     """What stereo of training views finds, if it does. `points` are as many as the scene has fewer than a training
-    starts with, None where it has enough; `maps`, which a training is held to, are of some of the views, in small."""
+    starts with, None where it has enough; `maps`, which a training is held to, are of some of the views, in small;
+    `sky` says whether enough of them show one."""
 
     points: PointCloud | None = None
     maps: Sequence[SurfaceMap] = ()
+    sky: bool = False
+
+
+NO_SURFACES = Surfaces()
 
 
 def stereo_surfaces(
@@ -74,7 +82,12 @@ def stereo_surfaces(
     if contradicting(maps, points) > CONTRADICTING:
         progress.note("no stereo: it is elsewhere than most points of the capture")
         return Surfaces()
-    return Surfaces(surface_points(maps, missing, options.seed) if missing > 0 else None, maps if held else ())
+    cloud = surface_points(maps, missing, options.seed) if missing > 0 else None
+    skies = sum(found.shows_sky for found in maps)
+    sky = skies >= max(SKY_VIEWS, SKY_SHARE * len(maps))
+    if sky:
+        progress.note(f"{skies} of {len(maps)} photographs show a plain sky: the scene is open")
+    return Surfaces(cloud, maps if held else (), sky)
 
 
 def contradicting(maps: Sequence[SurfaceMap], points: np.ndarray) -> float:

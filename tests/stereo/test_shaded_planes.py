@@ -17,6 +17,7 @@ from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.plain_regions import in_camera
 from linprim_geo.stereo.shaded_planes import LEAST_VIEWS, ShadedPlanes
 from linprim_geo.stereo.shading import Shading, evaluate, fit_plane, shaded_regions
+from linprim_geo.stereo.skies import shows_sky
 from linprim_geo.stereo.vignetting import falloff
 
 # A wall y = 0, seen from an arc before it; a lamp near its left upper corner.
@@ -199,14 +200,15 @@ def test_a_wall_in_even_light_gets_no_plane():
     assert errors(planes_of(maps, depths), depths)[0] == 0
 
 
-def sky():
-    """Maps and depths that are no depths: colours depend on the direction alone."""
+def sky(clouds: float = 0.0):
+    """Maps and depths that are no depths: grey values depend on the direction alone."""
     maps, depths = [], []
     for view, center in enumerate(CENTERS):
         camera = camera_at(center)
         rays = camera.world_rays()
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        maps.append(map_of(camera, 120 + 60 * rays[..., 0] ** 2 + 50 * rays[..., 2], view))
+        grey = 120 + 60 * rays[..., 0] ** 2 + 50 * rays[..., 2] + clouds * np.sin(9 * rays[..., 0]) * rays[..., 2]
+        maps.append(map_of(camera, grey, view))
         depths.append(wall_depth(camera))
     return maps, depths
 
@@ -218,6 +220,28 @@ def test_a_plane_of_edges_does_not_reach_into_the_sky():
     maps, depths = photographs(lambda points, view: light(points))
     found = planes_of(maps, depths, by_edges=WALL[None])
     assert not any(found.is_background(view).any() for view in range(len(maps)))
+
+
+def above_a_house(maps, depths):
+    """Maps whose lowest rows show a house with texture, of which stereo is sure."""
+    result = []
+    for found, depth in zip(maps, depths, strict=True):
+        points = found.camera.center + found.camera.world_rays() * depth[..., None]
+        texture = 60 + 30 * np.sin(40 * points[..., 0]) * np.sin(40 * points[..., 2])
+        grey, own, seen = found.grey.copy(), found.depth.copy(), found.confirming.copy()
+        grey[140:], own[140:], seen[140:] = texture[140:], depth[140:], 2
+        result.append(replace(found, grey=grey, depth=own, confirming=seen, confidence=(seen > 0).astype(np.float32)))
+    return result
+
+
+def test_a_sky_is_told_from_a_wall_before_anything_is_rendered():
+    above, before_wall = (
+        above_a_house(*sky(clouds=100.0)),
+        above_a_house(*photographs(lambda points, view: light(points))),
+    )
+    assert np.mean(shows_sky(above)) > 0.5 and not any(shows_sky(before_wall))
+    even = above_a_house(*photographs(lambda points, view: np.full(points.shape[:-1], 140.0)))
+    assert not any(shows_sky(even)) and not any(shows_sky(sky()[0])), "without shading, and without a depth"
 
 
 def test_a_sky_gets_no_plane():

@@ -123,7 +123,7 @@ def test_what_nothing_around_continues_gives_no_points(known, tmp_path, monkeypa
 
     share, on_plate = in_the_air()
     monkeypatch.setattr(module, "LEAST_SUPPORT", 0.0)
-    monkeypatch.setattr(DepthMap, "is_confirmed", lambda self: self.confirming >= CONFIRMING)
+    monkeypatch.setattr(DepthMap, "is_confirmed", lambda self, *_: self.confirming >= CONFIRMING)
     share_of_all, on_plate_of_all = in_the_air()
     assert share_of_all > 0.001 and share < 0.3 * share_of_all and on_plate > 0.6 * on_plate_of_all > 1000
 

@@ -61,6 +61,24 @@ def test_there_are_points_where_some_are_missing_and_maps_where_training_is_held
     assert not stereo_surfaces(masked, replace(OPTIONS, start="points"), QUIET).maps
 
 
+def test_a_sky_that_three_views_show_is_trained_as_an_environment(room, monkeypatch, tmp_path):
+    scene = load_scene(room)
+    found = stereo_surfaces(scene, OPTIONS, QUIET)
+    assert not found.sky and not any(each.shows_sky for each in found.maps)
+    maps = list(found.maps)
+    for k in range(3):
+        assert not sky_of(scene, maps, monkeypatch)
+        maps[k] = replace(maps[k], shows_sky=True)
+    assert sky_of(scene, maps, monkeypatch)
+    run = trained(room, tmp_path / "open", iterations=20)
+    assert (run.path / "environment.npy").exists()
+
+
+def sky_of(scene, maps, monkeypatch) -> bool:
+    monkeypatch.setattr(module, "surface_maps", lambda *_, **__: maps)
+    return stereo_surfaces(scene, OPTIONS, QUIET).sky
+
+
 def test_stereo_that_most_points_contradict_says_nothing(room):
     scene = load_scene(room)
     maps = stereo_surfaces(scene, OPTIONS, QUIET).maps
