@@ -15,6 +15,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt, find_objects, label, uniform_filter
 
 from linprim_geo.geometry.camera import Camera
+from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 
 # An edge runs through 3 by 3 pixels whose variance is so many times that of the noise; fewer edge pixels than SPECK
@@ -29,6 +30,9 @@ LEAST_PIXELS, LEAST_POINTS, RING = 200, 30, 4
 # Half of the grey values by which a cross parts two pixels (`csrc/stereo/cross.h`), and the side of the square
 # over which the grey of a region is taken.
 HALF_EDGE, AROUND = 12.5, 9
+# Stereo knows six in ten edges of a far background as farther than so many times the median depth, and of surfaces one
+# in 3,000 (DECISIONS 90).
+BEYOND = 10.0
 # Depths are on a plane up to this share of them, and behind it from BEHIND times as much.
 TOLERANCE, BEHIND = CONFIRMED_DEPTH, 3.0
 # At least and at most such shares of a region's confirmed depths are on its plane, and behind it.
@@ -122,6 +126,20 @@ def plain_regions(view: int, camera: Camera, edge: np.ndarray, depth: np.ndarray
         rays, corners = rays_of(camera, row + top, column + left), rays_of(camera, ends[:, 0] + top, ends[:, 1] + left)
         regions.append(PlainRegion(view, top, left, mask, rays, inverse, corners))
     return regions
+
+
+def regions_of_views(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> list[list[PlainRegion]]:
+    """The plain regions of every view with its (H, W) `depths`, NaN where they are not sure.
+
+    What is BEYOND all of these is never sure within 1 %, as it hardly moves, but it is behind every plane.
+    """
+    result = []
+    for number, (found, depth) in enumerate(zip(maps, depths, strict=True)):
+        sure = np.isfinite(depth)
+        if sure.any():
+            depth = np.where(~sure & (found.depth > BEYOND * np.median(depth[sure])), found.depth, depth)
+        result.append(plain_regions(number, found.camera, edges_of(found.grey, found.noise), depth))
+    return result
 
 
 def rays_of(camera: Camera, row: np.ndarray, column: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from linprim_geo.stereo.depth_maps import SURE, DepthMap
-from linprim_geo.stereo.plain_regions import common_planes, edges_of, in_world, plain_regions
+from linprim_geo.stereo.plain_regions import common_planes, in_world, regions_of_views
 from linprim_geo.stereo.point_planes import planes_of_points
 from linprim_geo.stereo.shaded_planes import (
     FAR,
@@ -37,11 +37,7 @@ def shows_sky(maps: Sequence[DepthMap]) -> list[bool]:
     """
     cameras = [found.camera for found in maps]
     sure = [np.where(found.is_confirmed(SURE), found.depth, np.float32(np.nan)) for found in maps]
-    regions = [
-        region
-        for view, (found, depth) in enumerate(zip(maps, sure, strict=True))
-        for region in plain_regions(view, found.camera, edges_of(found.grey, found.noise), depth)
-    ]
+    regions = [region for own in regions_of_views(maps, sure) for region in own]
     nothing = [np.zeros_like(depth) for depth in sure]
     by_points, by_edges = planes_of_points(maps, sure), common_planes(cameras, regions)
     shaded = ShadedPlanes(maps, sure, nothing, by_points, by_edges)

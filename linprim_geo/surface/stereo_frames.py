@@ -19,14 +19,7 @@ from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.depth_maps import SURE, DepthMap, depth_maps
 from linprim_geo.stereo.enclosing_planes import enclosing_depths, enclosing_planes, known_on_planes
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
-from linprim_geo.stereo.plain_regions import (
-    PlainRegion,
-    common_planes,
-    edges_of,
-    grown_alike,
-    plain_regions,
-    plane_depths,
-)
+from linprim_geo.stereo.plain_regions import common_planes, edges_of, grown_alike, plane_depths, regions_of_views
 from linprim_geo.stereo.point_planes import SurfacePoints, planes_of_points, point_plane_depth
 from linprim_geo.stereo.shaded_planes import ShadedPlanes
 from linprim_geo.stereo.thin_things import SeenDepths, thin_things
@@ -101,7 +94,7 @@ class MergedFrames(Sequence):
         Returns (H, W) bool of every view: regions that are background by their shading.
         """
         sure = [_depth_where(found, found.is_confirmed(SURE)) for found in maps]
-        regions = _plain_regions(maps, sure)
+        regions = regions_of_views(maps, sure)
         by_points = planes_of_points(maps, sure)
         by_edges = common_planes(self.cameras, [region for own in regions for region in own])
         shaded = ShadedPlanes(maps, sure, rendered, by_points, by_edges)
@@ -331,14 +324,6 @@ def _first_known(depths: Sequence[np.ndarray]) -> np.ndarray:
 
 def _share_known(depths: Sequence[np.ndarray]) -> float:
     return float(np.mean([np.isfinite(depth).mean() for depth in depths]))
-
-
-def _plain_regions(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> list[list[PlainRegion]]:
-    """Those of each view."""
-    return [
-        plain_regions(number, found.camera, edges_of(found.grey, found.noise), depth)
-        for number, (found, depth) in enumerate(zip(maps, depths, strict=True))
-    ]
 
 
 class Deviations:

@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 from helpers.captures import look_at
 
-from linprim_geo.stereo.plain_regions import common_planes, edges_of, grown_alike, plain_regions, plane_depths
+from linprim_geo.stereo.depth_maps import DepthMap
+from linprim_geo.stereo.plain_regions import (
+    common_planes,
+    edges_of,
+    grown_alike,
+    in_world,
+    plain_regions,
+    plane_depths,
+    regions_of_views,
+)
 
 # A corner of a room: floor z = 0 and two walls x = 0 and y = 0, from the air where all are positive.
 WALLS = np.eye(3)
@@ -133,3 +142,27 @@ def test_a_plain_region_reaches_to_where_pixels_are_half_of_it():
     found = grown_alike(region, grey, edge)
     assert found[:, :30].all() and not found[:, 30:].any()
     assert not grown_alike(np.zeros_like(region), grey, edge).any() and not grown_alike(edge, grey, edge).any()
+
+
+def beside_a_house(edge_depth: float) -> np.ndarray:
+    """(H, W) depth by the plane of a house's front in a plain band beside it, before a horizon whose edges stereo holds
+    to be so far away, without being sure of it."""
+    camera = camera_at(CENTERS[0])
+    grey = np.full((120, 160), 120, np.uint8)
+    grey[:40], grey[80:], grey[:, :80] = 200, 60, 10
+    grey[::6, :80:6] = 90  # marks on the house
+    edge = edges_of(grey, 1.0)
+    outline = np.zeros(grey.shape, bool)
+    outline[:, :83] = True
+    depth = np.where(edge, np.where(outline, 3.0, edge_depth), np.nan).astype(np.float32)
+    none = np.zeros(grey.shape, np.uint8)
+    found = DepthMap(camera, depth, np.zeros((*grey.shape, 3)), none, none, depth, grey, 1.0)
+    (regions,) = regions_of_views([found], [np.where(outline, depth, np.nan)])
+    front = in_world(camera, np.array([0, 0, 1 / 3]))
+    return plane_depths(camera, regions, front[None], np.full(grey.shape, 3.0, np.float32))[44:76, 90:]
+
+
+def test_a_plane_does_not_go_on_beside_a_house_before_what_is_far():
+    assert np.allclose(beside_a_house(np.nan), 3.0), "nothing contradicts it"
+    assert np.allclose(beside_a_house(9.0), 3.0), "depths that are not sure do not"
+    assert np.isnan(beside_a_house(300.0)).all()
