@@ -42,6 +42,10 @@ METHODS = {
 
 # Options that a method chooses where they are 0; what it took is in its statistics.
 CHOSEN = ("voxel_size", "depth_limit")
+# Where more vertices than this share have no depth that two photographs confirm, predicted errors say which vertices to
+# trust more, and not by how much: true ones were 0.6 to 7 times as large in the mean, else 0.7 to 1.3 times as large
+# (DECISIONS 91).
+MOST_UNCONFIRMED = 1 / 8
 # Options that not every method has a use for.
 METHODS_WITH = {"voxel_size": ("tsdf", "opacity-field"), "truncation": ("tsdf",), "depth_limit": ("tsdf",)}
 
@@ -202,7 +206,7 @@ def _extract(
         "options": asdict(options),
         **about,
         "level_differences": agreement,
-        **_statistics(done, opened),
+        **_statistics(done, opened, about.get("stereo", {}).get("largest_error")),
         "refine": options.refine,
         **stages.report(),
     }
@@ -216,6 +220,11 @@ def _extract(
             f"predicted error, seen part: median {predicted['median']:.3g}, 90 % below {predicted['q90']:.3g} "
             f"({opened.unit})"
         )
+        unconfirmed = predicted.get("unconfirmed", 0.0)
+        if unconfirmed > MOST_UNCONFIRMED:
+            stages.note(
+                f"how large errors are cannot be told: no two photographs confirm {unconfirmed:.0%} of the vertices"
+            )
     stages.note(stages.line())
     return stats
 
@@ -254,8 +263,8 @@ def _cropped(mesh: Mesh, options: ExtractOptions) -> Mesh:
     return left
 
 
-def _statistics(done: Finished, opened: Run) -> dict:
-    """What stats.json says of a mesh and its run."""
+def _statistics(done: Finished, opened: Run, largest_error: float | None) -> dict:
+    """What stats.json says of a mesh and its run; `largest_error` as for `error_summary`."""
     shape = topology(done.mesh)
     return {
         "unit": opened.unit,
@@ -266,13 +275,17 @@ def _statistics(done: Finished, opened: Run) -> dict:
         "processing": done.processing,
         "texture": done.texture,
         "visible": topology(done.visible),
-        "predicted_error": error_summary(done.visible.quality),
+        "predicted_error": error_summary(done.visible.quality, largest_error),
     }
 
 
-def error_summary(quality: np.ndarray | None) -> dict[str, float] | None:
-    """Median and 90 % quantile of the (V,) predicted errors of vertices, None where none is known."""
+def error_summary(quality: np.ndarray | None, largest: float | None = None) -> dict[str, float] | None:
+    """Median and 90 % quantile of the (V,) predicted errors of vertices, None where none is known. With `largest`, the
+    error of vertices that no two photographs confirm (`depth_error.py`), their share, too, as `unconfirmed`."""
     known = np.zeros(0) if quality is None else quality[np.isfinite(quality)]
     if not len(known):
         return None
-    return {"median": float(np.median(known)), "q90": float(np.quantile(known, 0.9))}
+    found = {"median": float(np.median(known)), "q90": float(np.quantile(known, 0.9))}
+    if largest is not None:
+        found["unconfirmed"] = float(np.mean(known >= 0.999 * largest))
+    return found

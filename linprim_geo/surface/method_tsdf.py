@@ -21,7 +21,7 @@ from linprim_geo.geometry.region import read_box
 from linprim_geo.runs.run import Run
 from linprim_geo.stereo.depth_maps import MEMORY_SHARE, memory_of
 from linprim_geo.stereo.visibility_cut import RENDERED_MARGIN
-from linprim_geo.surface.depth_error import error_by_depths
+from linprim_geo.surface.depth_error import error_by_depths, largest_error
 from linprim_geo.surface.photo_consistency import best_agreement, photo_gains
 from linprim_geo.surface.stereo_frames import MergedFrames
 from linprim_geo.surface.tsdf_field import DepthFrame
@@ -145,7 +145,7 @@ def tsdf_surface(
         reach = options.truncation * voxel
         mesh, left_out = merged.supported(mesh, options.smallest_part, 2 * reach)
         mesh = replace(mesh, quality=error_by_depths(mesh, merged, reach))
-        return mesh, merged.about() | {"unsupported": left_out}
+        return mesh, merged.about() | {"unsupported": left_out, "largest_error": largest_error(reach)}
 
     by_stereo = partial(_surface_of_stereo, fused_with_stereo, frames, merged, stages)
     if options.stereo == "on":

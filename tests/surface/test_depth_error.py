@@ -9,10 +9,10 @@ import pytest
 from helpers.captures import look_at
 
 from linprim_geo.geometry.mesh import Mesh
-from linprim_geo.surface.depth_error import FINEST, error_by_depths, error_of_nearest
+from linprim_geo.surface.depth_error import FINEST, error_by_depths, error_of_nearest, largest_error
 from linprim_geo.surface.tsdf_field import DepthFrame
 
-SIZE, FOCAL, DISTANCE, REACH = (60, 48), 60.0, 3.0, 0.2
+SIZE, FOCAL, DISTANCE, REACH = (60, 48), 60.0, 3.0, 0.3
 PIXEL = DISTANCE / FOCAL
 # A tilted plane that all cameras see, and triangles on it.
 NORMAL = np.array([0.3, -1.0, 0.2]) / np.linalg.norm([0.3, -1.0, 0.2])
@@ -65,7 +65,11 @@ def test_depths_that_had_no_part_in_the_surface_do_not_count():
 def test_what_no_two_views_confirm_may_lie_anywhere_within_reach():
     mesh = plane()
     for frames in ([frame(0.0, 0.0)], [frame(x, 0.0, confidence=0.1) for x in (-0.4, 0.0, 0.4)], []):
-        assert (error_by_depths(mesh, frames, REACH) == np.float32(REACH)).all()
+        assert (error_by_depths(mesh, frames, REACH) == np.float32(largest_error(REACH))).all()
+    anywhere = np.random.default_rng(0).uniform(-REACH, REACH, 100_000)
+    assert largest_error(REACH) == pytest.approx(np.sqrt(np.mean(anywhere**2)), rel=0.01)
+    apart = [frame(x, off) for x, off in ((-0.4, 0.9 * REACH), (0.0, -0.9 * REACH), (0.4, 0.9 * REACH))]
+    assert (error_by_depths(mesh, apart, REACH) == np.float32(largest_error(REACH))).all(), "nothing is known either"
 
 
 def test_a_vertex_that_closes_a_hole_is_as_uncertain_as_it_is_far():

@@ -19,7 +19,7 @@ from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.geometry.topology import topology
 from linprim_geo.runs.run import Run
-from linprim_geo.surface.extract import extract_mesh
+from linprim_geo.surface.extract import error_summary, extract_mesh
 from linprim_geo.surface.method_tsdf import DepthFrames, depth_limit
 
 STATS = {
@@ -86,6 +86,12 @@ def test_what_is_written(extracted, solid):
         {"median": np.median(predicted), "q90": np.quantile(predicted, 0.9)}
     )
     assert stats["visible"].keys() == topology(load_mesh(folder / "mesh.ply")).keys()
+
+
+def test_the_share_of_vertices_that_nothing_confirms_is_told_where_it_is_known():
+    quality = np.array([0.1, 0.2, 0.3, 0.3, np.nan], np.float32)
+    assert error_summary(quality, 0.3) == pytest.approx({"median": 0.25, "q90": 0.3, "unconfirmed": 0.5})
+    assert "unconfirmed" not in error_summary(quality) and error_summary(None, 0.3) is None
 
 
 def test_the_mesh_is_the_surface(extracted, solid):
