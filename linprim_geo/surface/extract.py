@@ -43,8 +43,8 @@ METHODS = {
 # Options that a method chooses where they are 0; what it took is in its statistics.
 CHOSEN = ("voxel_size", "depth_limit")
 # Where more vertices than this share have no depth that two photographs confirm, predicted errors say which vertices to
-# trust more, and not by how much: true ones were 0.6 to 7 times as large in the mean, else 0.7 to 1.3 times as large
-# (DECISIONS 91).
+# trust more, and not by how much: true ones were 0.6 to 7 times as large in the mean, else 0.7 to 1.3 times, but 2 to 4
+# of facades (DECISIONS 91).
 MOST_UNCONFIRMED = 1 / 8
 # Options that not every method has a use for.
 METHODS_WITH = {"voxel_size": ("tsdf", "opacity-field"), "truncation": ("tsdf",), "depth_limit": ("tsdf",)}
