@@ -20,7 +20,6 @@ from linprim_geo.stereo.shaded_planes import (
     HARDLY_MORE,
     LEAST_VIEWS,
     LEFT_SHARE,
-    OTHERS_SHARE,
     ShadedPlanes,
 )
 from linprim_geo.stereo.shading import Fit, ShadedRegion, Shading, evaluate, fit_plane, shaded_regions, starting_planes
@@ -52,8 +51,8 @@ def _is_sky(region: ShadedRegion, known: np.ndarray, planes: np.ndarray, shading
     """Whether a region of a view with these (H, W) sure depths, NaN elsewhere, is one, and lies on none of (K, 4)
     planes."""
     shading = shadings[region.view]
-    if not np.isfinite(known).any() or np.var(region.value) < 2 * shading.noise / OTHERS_SHARE**2:
-        return False  # nothing to compare with, or what noise leaves is too large a share
+    if not np.isfinite(known).any():
+        return False
     depth = float(np.nanmedian(known))
     others = tuple(view for view in range(len(shadings)) if view != region.view)
     region = replace(region, depth=depth, others=others).some(FIRST_BOXES)

@@ -11,7 +11,7 @@ from helpers.captures import look_at
 from scipy.ndimage import gaussian_filter
 
 from linprim_geo.geometry.sampling import sample_bilinear
-from linprim_geo.stereo import plain_regions
+from linprim_geo.stereo import plain_regions, skies
 from linprim_geo.stereo.common_surfaces import CommonSurfaces
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.plain_regions import in_camera
@@ -234,14 +234,20 @@ def above_a_house(maps, depths):
     return result
 
 
-def test_a_sky_is_told_from_a_wall_before_anything_is_rendered():
+def test_a_sky_is_told_from_a_wall_before_anything_is_rendered(monkeypatch):
     above, before_wall = (
         above_a_house(*sky(clouds=100.0)),
         above_a_house(*photographs(lambda points, view: light(points))),
     )
     assert np.mean(shows_sky(above)) > 0.5 and not any(shows_sky(before_wall))
     even = above_a_house(*photographs(lambda points, view: np.full(points.shape[:-1], 140.0)))
-    assert not any(shows_sky(even)) and not any(shows_sky(sky()[0])), "without shading, and without a depth"
+    assert not any(shows_sky(even)) and not any(shows_sky(sky(clouds=100.0)[0])), "without shading, and without a depth"
+    assert not any(shows_sky(above_a_house(*sky()))), "a plane explains so smooth a sky as well"
+    fields = np.random.default_rng(0).normal(0, 1, (len(CENTERS), 180, 240))
+    moving = photographs(lambda points, view: 120 + 400 * gaussian_filter(fields[view], 14))
+    monkeypatch.setattr(skies, "fit_plane", lambda *_: None)
+    assert any(shows_sky(above)), "no plane is seen by other views"
+    assert not any(shows_sky(above_a_house(*moving))), "a direction does not explain it either"
 
 
 def test_a_sky_gets_no_plane():
