@@ -27,7 +27,7 @@ AGREE = 2 * CONFIRMED_DEPTH
 # other captures (DECISIONS 78).
 CONTRADICTING = 2 / 3
 # A scene is open if so many views show a sky, and such a share of all: 4 of 22 and 6 of 28 do of two facades, none of
-# ten other captures (DECISIONS 89).
+# eleven other captures (DECISIONS 89).
 SKY_VIEWS, SKY_SHARE = 3, 0.1
 # Of a time budget stereo takes at most this share; steps in the rest are fewer and as long as before.
 BUDGET_SHARE = 0.2
