@@ -177,7 +177,7 @@ class ShadedPlanes:
             few = region.some(FIRST_BOXES)
             # All other views: those that show it at its depth may not show it far away.
             far = self._far(replace(few, others=tuple(k for k in range(len(self.shadings)) if k != view)))
-            if far is None:
+            if far is None or far.left_share > LEFT_SHARE:
                 continue
             fits = (evaluate(plane, [few], self.shadings) for plane in self.planes[self.by_points :])
             if all(fit is None or fit.left_share > HARDLY_MORE * far.left_share for fit in fits):

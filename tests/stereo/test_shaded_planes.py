@@ -220,6 +220,9 @@ def test_a_plane_of_edges_does_not_reach_into_the_sky():
     maps, depths = photographs(lambda points, view: light(points))
     found = planes_of(maps, depths, by_edges=WALL[None])
     assert not any(found.is_background(view).any() for view in range(len(maps)))
+    maps, depths = unrelated()
+    found = planes_of(maps, depths)
+    assert any(found.shown) and not any(found.is_background(view).any() for view in range(len(maps)))
 
 
 def above_a_house(maps, depths):
@@ -234,6 +237,12 @@ def above_a_house(maps, depths):
     return result
 
 
+def unrelated():
+    """Maps whose shading has nothing to do with each other's, and depths."""
+    fields = np.random.default_rng(0).normal(0, 1, (len(CENTERS), 180, 240))
+    return photographs(lambda points, view: 120 + 400 * gaussian_filter(fields[view], 14))
+
+
 def test_a_sky_is_told_from_a_wall_before_anything_is_rendered(monkeypatch):
     above, before_wall = (
         above_a_house(*sky(clouds=100.0)),
@@ -243,8 +252,7 @@ def test_a_sky_is_told_from_a_wall_before_anything_is_rendered(monkeypatch):
     even = above_a_house(*photographs(lambda points, view: np.full(points.shape[:-1], 140.0)))
     assert not any(shows_sky(even)) and not any(shows_sky(sky(clouds=100.0)[0])), "without shading, and without a depth"
     assert not any(shows_sky(above_a_house(*sky()))), "a plane explains so smooth a sky as well"
-    fields = np.random.default_rng(0).normal(0, 1, (len(CENTERS), 180, 240))
-    moving = photographs(lambda points, view: 120 + 400 * gaussian_filter(fields[view], 14))
+    moving = unrelated()
     monkeypatch.setattr(skies, "fit_plane", lambda *_: None)
     assert any(shows_sky(above)), "no plane is seen by other views"
     assert not any(shows_sky(above_a_house(*moving))), "a direction does not explain it either"
