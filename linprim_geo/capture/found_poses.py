@@ -17,7 +17,7 @@ from linprim_geo.capture.readers.colmap import has_model
 from linprim_geo.imaging import photos
 
 # Changed whenever the poses come out differently, so that old cache entries are not found any more.
-_CACHE_VERSION = 1
+_CACHE_VERSION = 2
 # Where photographs lie in a capture's folder; in the first that has any. Those in the folder itself are not looked for
 # any deeper.
 _PHOTO_FOLDERS = ("images", "image", "input", "rgb", ".")

@@ -21,7 +21,7 @@ from linprim_geo.base.files import locked
 from linprim_geo.capture import found_poses, incremental_mapping, structure_from_motion
 from linprim_geo.capture import incremental_mapping as image_pairs
 from linprim_geo.capture.found_poses import Verdict, found_model, photographs
-from linprim_geo.capture.incremental_mapping import pairs_to_match
+from linprim_geo.capture.incremental_mapping import adjust_robustly, pairs_to_match
 from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.structure_from_motion import find_poses, prepare
 from linprim_geo.capture.types import PHOTOGRAPHS
@@ -397,3 +397,30 @@ def test_pycolmap_is_imported_in_one_place():
         if re.search(r"^\s*(import|from) pycolmap", path.read_text(), re.MULTILINE)
     ]
     assert found == ["load_pycolmap.py"]
+
+
+def test_wrong_matches_do_not_decide_about_the_focal_length():
+    import pycolmap
+
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=12, num_points3D=300, num_points2D_without_point3D=0
+    )
+    model = pycolmap.synthesize_dataset(options)
+    (camera,) = model.cameras.values()
+    true, rng = camera.params.copy(), np.random.default_rng(0)
+    wrong = set()
+    for number, image in model.images.items():
+        for index, point in enumerate(image.points2D):
+            outward = point.xy - true[1:3]
+            point.xy = point.xy + rng.normal(0, 0.5, 2)
+            if rng.uniform() < 0.1:  # matched with what is farther out, as a longer lens would show it
+                wrong.add((number, index))
+                point.xy = point.xy + 6.0 * outward / np.linalg.norm(outward)
+    camera.params = true * (1.05, 1, 1, 1)
+    adjust_robustly(model, 4.0, 1.5)
+    (camera,) = model.cameras.values()
+    assert abs(camera.params[0] / true[0] - 1) < 0.001
+    assert model.num_reg_images() == 12 and model.compute_mean_reprojection_error() < 1.0
+    left = sum(model.images[number].points2D[index].has_point3D() for number, index in wrong)
+    assert len(wrong) > 20 and left < 0.2 * len(wrong), "most of what is that wrong is left out"
