@@ -37,7 +37,7 @@ BUDGET_SHARE = 0.2
 class Surfaces:
     """What stereo of training views finds, if it does. `points` are as many as the scene has fewer than a training
     starts with, None where it has enough; `maps`, which a training is held to, are of some of the views, in small;
-    `sky` says whether enough of them show one."""
+    `sky` says whether enough of them show one, and no masks cut it off."""
 
     points: PointCloud | None = None
     maps: Sequence[SurfaceMap] = ()
@@ -84,7 +84,7 @@ def stereo_surfaces(
         return Surfaces()
     cloud = surface_points(maps, missing, options.seed) if missing > 0 else None
     skies = sum(found.shows_sky for found in maps)
-    sky = skies >= max(SKY_VIEWS, SKY_SHARE * len(maps))
+    sky = not scene.has_alpha and skies >= max(SKY_VIEWS, SKY_SHARE * len(maps))
     if sky:
         progress.note(f"{skies} of {len(maps)} photographs show a plain sky: the scene is open")
     return Surfaces(cloud, maps if held else (), sky)

@@ -70,6 +70,8 @@ def test_a_sky_that_three_views_show_is_trained_as_an_environment(room, monkeypa
         assert not sky_of(scene, maps, monkeypatch)
         maps[k] = replace(maps[k], shows_sky=True)
     assert sky_of(scene, maps, monkeypatch)
+    masked = replace(scene, train=tuple(replace(view, has_alpha=True) for view in scene.train))
+    assert not sky_of(masked, maps, monkeypatch)
     run = trained(room, tmp_path / "open", iterations=20)
     assert (run.path / "environment.npy").exists()
 
