@@ -32,7 +32,7 @@ def small_copies(views: Sequence[View]) -> list[SmallCopy]:
 @dataclass(frozen=True)
 class SurfaceMap:
     """Of a small copy: (3, H, W) float32 `planes`, the inverse depth in the scene's unit and its slopes per pixel, 0
-    where no surface is known, (H, W, 3) uint8 `rgb`, and whether it `shows_sky`."""
+    where no surface is known, (H, W, 3) uint8 `rgb`, and whether it `shows_sky`, if that was asked."""
 
     view: SmallCopy
     planes: np.ndarray
@@ -45,19 +45,23 @@ class SurfaceMap:
         return self.planes[0] > 0
 
 
-def surface_maps(views: Sequence[SmallCopy], points: np.ndarray, seed: int, *, quiet: bool = True) -> list[SurfaceMap]:
+def surface_maps(
+    views: Sequence[SmallCopy], points: np.ndarray, seed: int, *, skies: bool = False, quiet: bool = True
+) -> list[SurfaceMap]:
     """Of every view the surfaces that stereo finds, other views confirm and pixels around continue; of masked
     photographs those of the foreground.
 
     Args:
         points: (P, 3) of the scene, as for `depth_maps`.
+        skies: whether photographs that show one are looked for.
 
     Raises:
         LinprimError: as `depth_maps`.
     """
     maps = []
     found_maps = depth_maps(views, points, fit=False, seed=seed, quiet=quiet)
-    for view, found, sky in zip(views, found_maps, shows_sky(found_maps), strict=True):
+    shown = shows_sky(found_maps) if skies else [False] * len(found_maps)
+    for view, found, sky in zip(views, found_maps, shown, strict=True):
         photo, camera, known = view.load(), found.camera, found.is_confirmed()
         planes = inverse_planes(camera, found.depth, found.normal @ camera.rotation.T)
         known &= support(found.grey, np.where(known, planes, np.float32(0)), RIGHT) >= LEAST_SUPPORT

@@ -164,8 +164,8 @@ def start_trainer(
     Args:
         scene: with points to start from; those of a checkpoint need none.
         images: its training views in the training frame.
-        cloud: the points to start from; default: `filled_points` of the scene and of `surfaces`,
-            which say as well whether there is a sky.
+        cloud: the points to start from; default: `filled_points` of the scene and of `surfaces`.
+        surfaces: what stereo finds, points and a sky.
         largest: extent that a primitive may have, in the training frame; default: by what the points reach.
 
     Raises:

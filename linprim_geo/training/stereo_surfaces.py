@@ -37,7 +37,7 @@ BUDGET_SHARE = 0.2
 class Surfaces:
     """What stereo of training views finds, if it does. `points` are as many as the scene has fewer than a training
     starts with, None where it has enough; `maps`, which a training is held to, are of some of the views, in small;
-    `sky` says whether enough of them show one, and no masks cut it off."""
+    `sky` says whether enough of them show one, where the background depends on that."""
 
     points: PointCloud | None = None
     maps: Sequence[SurfaceMap] = ()
@@ -66,11 +66,12 @@ def stereo_surfaces(
         return Surfaces()
     begin = time.monotonic()
     views, points = small_copies(scene.train), scene.points.xyz
+    asked = options.background == "auto" and not started and not scene.has_alpha
     try:
         if budget and not _fits(views, points, budget):
             progress.note(f"no stereo: it would take more than {BUDGET_SHARE:.0%} of the time that is left")
             return Surfaces()
-        maps = surface_maps(views, points, options.seed, quiet=progress.quiet)
+        maps = surface_maps(views, points, options.seed, skies=asked, quiet=progress.quiet)
     except LinprimError as error:
         progress.note(f"no stereo: {error}")
         return Surfaces()
@@ -84,7 +85,7 @@ def stereo_surfaces(
         return Surfaces()
     cloud = surface_points(maps, missing, options.seed) if missing > 0 else None
     skies = sum(found.shows_sky for found in maps)
-    sky = not scene.has_alpha and skies >= max(SKY_VIEWS, SKY_SHARE * len(maps))
+    sky = skies >= max(SKY_VIEWS, SKY_SHARE * len(maps))
     if sky:
         progress.note(f"{skies} of {len(maps)} photographs show a plain sky: the scene is open")
     return Surfaces(cloud, maps if held else (), sky)

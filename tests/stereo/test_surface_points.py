@@ -72,6 +72,14 @@ def test_fewer_are_given_than_there_are_and_the_same_each_time(views, known):
     assert all(tuple(point) in rows for point in few.xyz)
 
 
+def test_skies_are_looked_for_where_that_is_asked(views, known, monkeypatch):
+    seen = [number % 2 == 0 for number in range(len(views))]
+    monkeypatch.setattr(module, "shows_sky", lambda maps: seen)
+    assert [found.shows_sky for found in surface_maps(small_copies(views), known, 0, skies=True)] == seen
+    monkeypatch.setattr(module, "shows_sky", lambda maps: pytest.fail("nobody asks"))
+    assert not any(found.shows_sky for found in surface_maps(small_copies(views), known, 0))
+
+
 def test_masked_pixels_give_no_points(views, known, tmp_path):
     kept = []
     for view in views:

@@ -71,14 +71,18 @@ def test_a_sky_that_three_views_show_is_trained_as_an_environment(room, monkeypa
         maps[k] = replace(maps[k], shows_sky=True)
     assert sky_of(scene, maps, monkeypatch)
     masked = replace(scene, train=tuple(replace(view, has_alpha=True) for view in scene.train))
-    assert not sky_of(masked, maps, monkeypatch)
+    assert not sky_of(masked, maps, monkeypatch) and not sky_of(scene, maps, monkeypatch, background="random")
+    assert not stereo_surfaces(scene, OPTIONS, QUIET, started=True).sky, "its background is chosen"
     run = trained(room, tmp_path / "open", iterations=20)
     assert (run.path / "environment.npy").exists()
 
 
-def sky_of(scene, maps, monkeypatch) -> bool:
-    monkeypatch.setattr(module, "surface_maps", lambda *_, **__: maps)
-    return stereo_surfaces(scene, OPTIONS, QUIET).sky
+def sky_of(scene, maps, monkeypatch, **changed) -> bool:
+    def surface_maps(*_, skies, **__):
+        return maps if skies else [replace(each, shows_sky=False) for each in maps]
+
+    monkeypatch.setattr(module, "surface_maps", surface_maps)
+    return stereo_surfaces(scene, replace(OPTIONS, **changed), QUIET).sky
 
 
 def test_stereo_that_most_points_contradict_says_nothing(room):
