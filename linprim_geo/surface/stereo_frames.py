@@ -76,10 +76,7 @@ class MergedFrames(Sequence):
         self.weight = deviations.weight()
         rendered_depths = [frame.depth for frame in rendered]
         backgrounds = self._take_planes(maps, rendered_depths)
-        self.rendered = [
-            _seen_past(frame, grown_alike(background, found.grey, edges_of(found.grey, found.noise)))
-            for frame, found, background in zip(rendered, maps, backgrounds, strict=True)
-        ]
+        self.rendered = [_seen_past(*each) for each in zip(rendered, maps, backgrounds, strict=True)]
         self.shown = [frame.depth[::SAMPLED, ::SAMPLED] > 0 for frame in self.rendered]
         known = [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
         points = self._span_gaps(maps, known, rendered_depths, backgrounds)
@@ -297,10 +294,12 @@ def pairing_points(rendered: Sequence[DepthFrame]) -> np.ndarray:
     return np.concatenate([points[:: max(1, len(points) // max(1, POINTS // len(rendered)))] for points in surfaces])
 
 
-def _seen_past(frame: DepthFrame, background: np.ndarray) -> DepthFrame:
-    """The frame with rays that are free where (H, W) `background` says so: training fills a plain sky with fog."""
+def _seen_past(frame: DepthFrame, found: DepthMap, background: np.ndarray) -> DepthFrame:
+    """The frame with rays that are free where (H, W) regions are `background`, and beside these where pixels are of
+    their grey: training fills a plain sky with fog."""
     if frame.background is None or not background.any():
         return frame
+    background = grown_alike(background, found.grey, edges_of(found.grey, found.noise))
     return replace(
         frame,
         depth=np.where(background, np.float32(0), frame.depth),
