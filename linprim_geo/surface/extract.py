@@ -287,5 +287,5 @@ def error_summary(quality: np.ndarray | None, largest: float | None = None) -> d
         return None
     found = {"median": float(np.median(known)), "q90": float(np.quantile(known, 0.9))}
     if largest is not None:
-        found["unconfirmed"] = float(np.mean(known >= 0.999 * largest))
+        found["unconfirmed"] = float(np.mean(known >= np.float32(largest)))
     return found
