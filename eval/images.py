@@ -16,6 +16,7 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.eval import open_run, views_of, write_results
+from linprim_geo.eval.mesh_images import render_mesh
 from linprim_geo.imaging.metrics import composite, psnr, ssim, to_8bit
 
 
@@ -38,16 +39,19 @@ def eval_images_run(
     *,
     split: str = "test",
     output: str | os.PathLike | None = None,
+    mesh: str | os.PathLike | None = None,
     lpips_weights: str | os.PathLike | None = None,
 ) -> dict:
-    """Renders the held-out views of a run and scores them against the photographs.
+    """Renders the held-out views of a run, or a `mesh` from there, and scores them against the photographs.
 
     Writes `results.json` and `per_view.csv` (name, psnr, ssim, LPIPS) to `output`, by default the run's
-    `eval/images`.
+    `eval/images`, of a mesh `eval/mesh_images`.
 
     Args:
         run: a run folder, or an open run.
         split: "test", "train" or "all".
+        mesh: a file in the data set's frame, with a texture or colours (`mesh_images.render_mesh`), in place of the
+            primitives; it is shown as it is, without light.
         lpips_weights: file or folder, see `lpips.find_lpips`; None takes what is installed or was downloaded before,
             "none" leaves LPIPS out.
 
@@ -58,8 +62,8 @@ def eval_images_run(
         LinPrim have it), and `lpips_files`; where they are not, `lpips_missing` says so.
 
     Raises:
-        LinprimError: the split is empty, a render is not finite or of another size than its photograph, or the weights
-            that are given cannot be used.
+        LinprimError: the split is empty, the mesh cannot be read or has no colours, a render is not finite or of
+            another size than its photograph, or the weights that are given cannot be used.
     """
     start = time.perf_counter()
     run = open_run(run)
@@ -67,7 +71,8 @@ def eval_images_run(
     distances, missing = _distances(views, lpips_weights)
     background = np.asarray(run.background, np.float64)
     rows = []
-    for view, rendered in run.render_views(views, geometry=False):
+    renders = run.render_views(views, geometry=False) if mesh is None else render_mesh(run, views, mesh)
+    for view, rendered in renders:
         render = np.moveaxis(np.asarray(rendered["rgb"]), 0, -1)
         truth = composite(view.load(), background)
         if render.shape != truth.shape:
@@ -99,7 +104,10 @@ def eval_images_run(
         "background": background.tolist(),
         "seconds": time.perf_counter() - start,
     }
-    write_results(Path(run.path) / "eval" / "images" if output is None else output, results, rows)
+    if mesh is not None:
+        results["mesh"] = str(mesh)
+    usual = Path(run.path) / "eval" / ("images" if mesh is None else "mesh_images")
+    write_results(usual if output is None else output, results, rows)
     return results
 
 

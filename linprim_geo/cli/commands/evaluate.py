@@ -28,6 +28,8 @@ def add(command: AddCommand) -> None:
     add_run(sub)
     add_split(sub)
     sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/eval/images)")
+    text = "score this mesh as the cameras see it, in its texture or colours, in place of the primitives"
+    sub.add_argument("--mesh", metavar="MESH", help=text)
     text = (
         "weights of LPIPS, file or folder (default: torch's cache, and packages lpips or torchmetrics; none: "
         "leaves it out)"
@@ -57,7 +59,7 @@ def eval_depth(parsed: argparse.Namespace) -> Output:
 def eval_images(parsed: argparse.Namespace) -> Output:
     from linprim_geo.eval.images import eval_images_run
 
-    how = {"split": parsed.split, "output": parsed.output, "lpips_weights": parsed.lpips_weights}
+    how = {"split": parsed.split, "output": parsed.output, "mesh": parsed.mesh, "lpips_weights": parsed.lpips_weights}
     return Output(eval_images_run(parsed.run, **how))
 
 
