@@ -22,16 +22,21 @@ from functools import cache
 from pathlib import Path
 from statistics import median, variance
 
+import numpy as np
+
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import write_json
 from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.capture.load import load_scene
 from linprim_geo.eval.depth import eval_depth_run
 from linprim_geo.eval.study_tables import write_table
+from linprim_geo.imaging.metrics import composite, psnr, to_8bit
 from linprim_geo.points import start_points
+from linprim_geo.runs.run import Run
 from linprim_geo.synthetic.synth import synthesize
 from linprim_geo.training.effect_registry import EFFECTS
 from linprim_geo.training.effects import Choice, Decision, decide
+from linprim_geo.training.step.exposure import with_best_gain
 from linprim_geo.training.train import train
 
 VIEWS, TEST_VIEWS, POINTS = 32, 8, 3000
@@ -126,8 +131,8 @@ def make_scene(folder: Path, name: str, size: Size) -> Path:
 
 
 def trained(folder: Path, path: Path, label: str, choice: Choice, options: tuple[SceneOptions, TrainOptions]) -> dict:
-    """PSNR, depth error in percent (if there is truth, a mesh or depth images) and CPU seconds of a training; taken
-    from the folder if it is there."""
+    """PSNR, the same with gains (`psnr_with_gains`), depth error in percent (if there is truth, a mesh or depth images)
+    and CPU seconds of a training; taken from the folder if it is there."""
     run = folder / "runs" / f"{path.name}.{label}.{options[1].seed}"
     result = run / "effects_scores.json"
     if result.is_file():
@@ -135,6 +140,7 @@ def trained(folder: Path, path: Path, label: str, choice: Choice, options: tuple
     begin = time.process_time()
     found = train(path, run, *options, quiet=True, effects=choice)
     row = {"psnr": found["psnr"], "cpu_seconds": time.process_time() - begin}
+    row["psnr_with_gains"] = psnr_with_gains(run)
     reference = path / "reference.ply"
     if reference.is_file() or any(view.depth_path for view in load_scene(path).test):
         scores = eval_depth_run(run, reference if reference.is_file() else None)
@@ -142,6 +148,21 @@ def trained(folder: Path, path: Path, label: str, choice: Choice, options: tuple
         row["depth"] = 100 * (1 - covered + (covered * scores["abs_rel"] if covered else 0))
     write_json(result, row)
     return row
+
+
+def psnr_with_gains(run: Path) -> float:
+    """Mean PSNR of held-out views, each render times the gain per channel that brings it nearest to its photograph:
+    whose exposure nothing else can tell."""
+    opened = Run.open(run)
+    background = np.asarray(opened.background, np.float64)
+    scores = []
+    for view, rendered in opened.render_views(opened.scene().test, geometry=False):
+        photo = view.load()
+        truth = composite(photo, background)
+        render = np.moveaxis(rendered["rgb"], 0, -1)
+        render = with_best_gain(render, truth / 255, None if photo.alpha is None else photo.alpha / 255)
+        scores.append(psnr(to_8bit(render), truth))
+    return float(np.mean(scores))
 
 
 def switched(folder: Path, path: Path, name: str, on: bool, size: Size, seeds: int) -> list[dict]:
@@ -262,11 +283,12 @@ def table(rows: list[dict], comparisons: list[dict], seeds: int) -> str:
             "(standard deviation)."
         )
     if comparisons:
-        lines += ["", "| scene | effects | PSNR dB | depth error % | CPU s |", "|---" * 5 + "|"]
+        lines += ["", "| scene | effects | PSNR dB | with gains | depth error % | CPU s |", "|---" * 6 + "|"]
     for found in comparisons:
         for way in (way for way in WAYS if way in found):
             depth = f"{mean(found[way], 'depth'):.2f}" if "depth" in found[way][0] else "–"
-            cells = f"{mean(found[way], 'psnr'):.2f} | {depth} | {mean(found[way], 'cpu_seconds'):.1f}"
+            cells = f"{mean(found[way], 'psnr'):.2f} | {mean(found[way], 'psnr_with_gains'):.2f} | {depth}"
+            cells += f" | {mean(found[way], 'cpu_seconds'):.1f}"
             lines.append(f"| {found['scene']} | {way} | {cells} |")
     return "\n".join(lines)
 
@@ -287,8 +309,8 @@ def verdict(row: dict, spread: dict, seeds: int) -> str:
     change = "gains" if clear[by] > 1 else "loses" if clear[by] < -1 else "no change"
     if row["reason"] == "request":
         return f"{change}, on request"
-    if row["reason"] == "free":
-        return f"{'wrong' if change == 'loses' else 'right'}: {change}, free"
+    if row["reason"] == "kept":
+        return f"{'wrong' if change == 'loses' else 'right'}: {change}, kept"
     if row["called_for"] and change == "no change":
         return "gain not shown"
     if not row["called_for"] and change == "gains" and min(clear.values()) <= -clear[by]:

@@ -27,12 +27,13 @@ def given_options(options: type, parsed: argparse.Namespace) -> list[str]:
 
 
 def effects_choice(parsed: argparse.Namespace):
-    """What the command line says about effects."""
+    """What the command line says about effects. Who resumes a run has chosen before."""
     from linprim_geo.base.options import SceneOptions, TrainOptions
     from linprim_geo.training.effects import Choice, parse_asked
 
     given = given_options(SceneOptions, parsed) + given_options(TrainOptions, parsed)
-    return Choice(parsed.effects, parse_asked(parsed.effect), frozenset(given))
+    usual = "none" if getattr(parsed, "resume", False) else "auto"
+    return Choice(parsed.effects or usual, parse_asked(parsed.effect), frozenset(given))
 
 
 def blocks_and_workers(parsed: argparse.Namespace) -> dict:

@@ -61,14 +61,14 @@ def _type_of(kind: type, word: str | None, parse: Callable[[str], Any] | None) -
     return parsed
 
 
-def add_effects(parser: argparse.ArgumentParser, default: str) -> None:
+def add_effects(parser: argparse.ArgumentParser) -> None:
     """Adds --effects and --effect, by which options are chosen that were not given."""
     group = parser.add_argument_group("effects")
     text = (
-        "none: the options as they are (default of train); auto: what the data call for (default of inspect); "
-        "all: everything on. An option that is given stays"
+        "auto: what the data call for (default); none: the options as they are; all: everything on. An option that "
+        "is given stays"
     )
-    group.add_argument("--effects", choices=("auto", "none", "all"), default=default, help=text)
+    group.add_argument("--effects", choices=("auto", "none", "all"), help=text)
     text = "decide about one by hand, such as exposure=on; may be repeated; linprim-geo inspect SCENE names them"
     group.add_argument("--effect", action="append", default=[], metavar="NAME=on|off", help=text)
 

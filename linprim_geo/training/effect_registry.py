@@ -71,7 +71,9 @@ class Effect:
     effect is on from `threshold` upwards. `cost` is the time of a training with the effect by that without: for
     exact-rays from docs/accuracy_and_time.md, for the others as eval/studies/effects.py measures it. `on` and `off` are
     the settings that it stands for; who gives an option of `off` decides by that. `needs` returns why a scene or the
-    options rule it out, "" if they do not. `on_request` says why evidence alone does not switch it on, "" if it does.
+    options rule it out, "" if they do not. `on_request` says why evidence alone does not switch it on, and `kept` why
+    evidence does not switch it off, "" if it does. `left` are the settings where evidence is below the threshold, if
+    not `off`.
     """
 
     name: str
@@ -86,6 +88,8 @@ class Effect:
     usually: bool = False
     needs: Callable[[Data], str] = field(default=lambda data: "")
     on_request: str = ""
+    kept: str = ""
+    left: dict[str, object] | None = None
 
     @property
     def options(self) -> set[str]:
@@ -197,6 +201,8 @@ def _absent(name: str, what: str) -> Callable[[Data], str]:
     return lambda data: "" if _share(data, name) else f"the data set has no {what}"
 
 
+# A sky is looked for where training starts, in stereo of small copies, and makes a scene open, too.
+_BY_PHOTOGRAPHS: dict[str, object] = {"background": "auto"}
 _TRUTH = "the data do not say whether it is there to train by or to score by"
 _REGISTRY = (
     Effect(
@@ -210,6 +216,7 @@ _REGISTRY = (
         {"sh_degree": 2},
         {"sh_degree": 0},
         usually=True,
+        kept="it also stands for detail that primitives are too few to show",
     ),
     Effect(
         "exact-rays",
@@ -222,6 +229,7 @@ _REGISTRY = (
         {"ray_model": "exact"},
         {"ray_model": "affine"},
         usually=True,
+        kept="it costs next to nothing",
     ),
     Effect(
         "overlap",
@@ -262,7 +270,8 @@ _REGISTRY = (
         "a gain per channel for every training photograph",
         "spread of how bright the photographs show the same points",
         "%",
-        3.0,
+        # What is shown half bright is then off by 2.5 % of white, as much as renders of 32 dB are.
+        5.0,
         1.3,
         _gain_spread,
         {"exposure": "gain"},
@@ -279,6 +288,7 @@ _REGISTRY = (
         {"background": "fitted"},
         {"background": "random"},
         needs=_masked,
+        left=_BY_PHOTOGRAPHS,
     ),
     Effect(
         "environment",
@@ -291,6 +301,7 @@ _REGISTRY = (
         {"background": "environment"},
         {"background": "random"},
         needs=_masked,
+        left=_BY_PHOTOGRAPHS,
     ),
     Effect(
         "masks",

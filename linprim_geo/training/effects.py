@@ -15,8 +15,6 @@ from linprim_geo.capture.types import Scene
 from linprim_geo.training.effect_registry import EFFECTS, Data, Effect
 
 MODES = ("auto", "none", "all")
-# An effect that makes a step of training more expensive by less than this costs nothing worth saving.
-FREE = 1.05
 
 
 @dataclass(frozen=True)
@@ -38,7 +36,7 @@ class Decision:
 
 REASONS = {
     "data": "the data say so",
-    "free": "it costs nothing",
+    "kept": "evidence does not switch it off",
     "unknown": "the data do not say; the usual setting",
     "request": "only when asked for",
     "asked": "--effect asks for it",
@@ -118,10 +116,11 @@ def _decide(effect: Effect, data: Data, settings: dict, choice: Choice) -> Decis
         on, reason, note = False, "request", effect.on_request
     elif value is None:
         on, reason = effect.usually, "unknown"
-    elif effect.usually and effect.cost < FREE and value < effect.threshold:
-        on, reason = True, "free"
+    elif effect.kept and value < effect.threshold:
+        on, reason, note = True, "kept", effect.kept
     else:
         on, reason = value >= effect.threshold, "data"
+    settings_off = effect.left if reason == "data" and effect.left is not None else effect.off
     return Decision(
         name=effect.name,
         what=effect.what,
@@ -132,7 +131,7 @@ def _decide(effect: Effect, data: Data, settings: dict, choice: Choice) -> Decis
         on=bool(on),
         reason=reason,
         cost=effect.cost,
-        options={k: v for k, v in (effect.on if on else effect.off).items() if not given and k not in choice.given},
+        options={k: v for k, v in (effect.on if on else settings_off).items() if not given and k not in choice.given},
         note=note,
     )
 

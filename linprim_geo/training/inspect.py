@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 
 from linprim_geo.base.options import SceneOptions, TrainOptions
-from linprim_geo.training.effects import FREE, REASONS, Choice, Decision, chosen_options
+from linprim_geo.training.effects import REASONS, Choice, Decision, chosen_options
 
 
 def inspect_scene(
@@ -34,6 +34,10 @@ def inspect_scene(
         "effects": [asdict(decision) for decision in decisions],
         "options": chosen,
     }
+
+
+# An effect that makes a step of training more expensive by less than this is said to cost no time.
+FREE = 1.05
 
 
 def describe(result: dict) -> str:

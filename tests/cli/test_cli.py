@@ -136,12 +136,14 @@ def test_options_become_the_dataclass_they_come_from():
 def test_train_gets_what_was_said(recorded_train, capsys):
     assert cli.main("train data/lego -o out --iterations 12 --downscale 4 --resume --quiet".split()) == 0
     assert cli.main(["train", "data/lego/"]) == 0
-    (scene, run, scene_options, train_options, settings), (_, default_run, *_) = recorded_train
+    (scene, run, scene_options, train_options, settings), (_, default_run, *_, by_default) = recorded_train
     assert (scene, run, default_run) == ("data/lego", "out", os.path.join("runs", "lego"))
     assert scene_options == SceneOptions(downscale=4)
     assert train_options == TrainOptions(iterations=12)
     choice = settings.pop("effects")
+    # A run that goes on has its effects.
     assert (choice.mode, choice.asked, choice.given) == ("none", {}, {"iterations", "downscale"})
+    assert (by_default["effects"].mode, by_default["effects"].given) == ("auto", frozenset())
     assert settings == {"resume": True, "quiet": True, "blocks": 1, "cluster": None, "workers": 0}
     assert "primitives: 7" in capsys.readouterr().out
 

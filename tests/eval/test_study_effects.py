@@ -42,8 +42,8 @@ def test_verdicts(psnr, depth, called_for, decided_on, expected):
 
 
 def test_what_is_free_asked_for_or_ruled_out_is_not_called_for():
-    assert effects.verdict(row(0.0, 0.0, False, True, "free"), SPREAD, SEEDS) == "right: no change, free"
-    assert effects.verdict(row(-0.5, 0.0, False, True, "free"), SPREAD, SEEDS) == "wrong: loses, free"
+    assert effects.verdict(row(0.0, 0.0, False, True, "kept"), SPREAD, SEEDS) == "right: no change, kept"
+    assert effects.verdict(row(-0.5, 0.0, False, True, "kept"), SPREAD, SEEDS) == "wrong: loses, kept"
     assert effects.verdict(row(0.5, 0.0, False, False, "request"), SPREAD, SEEDS) == "gains, on request"
     assert effects.verdict(row(0.5, 0.0, False, False, "impossible"), SPREAD, SEEDS) == "ruled out"
     assert effects.verdict(row(0.5, 0.0, True, True), {"psnr": None, "depth": None}, 1) == "–"
@@ -52,8 +52,9 @@ def test_what_is_free_asked_for_or_ruled_out_is_not_called_for():
 def test_pixels_without_a_surface_count_as_wholly_wrong(tmp_path, monkeypatch):
     write_json(tmp_path / "reference.ply", {})
     monkeypatch.setattr(effects, "train", lambda *_, **__: {"psnr": 30.0})
+    monkeypatch.setattr(effects, "psnr_with_gains", lambda _: 31.0)
     monkeypatch.setattr(effects, "eval_depth_run", lambda *_: {"coverage": 0.9, "abs_rel": 0.02})
     monkeypatch.setattr(effects, "write_json", lambda *_: None)
     options = effects.base_options(effects.Size(32, 10, 50))
     found = effects.trained(tmp_path, tmp_path, "base", effects.Choice("none"), options)
-    assert found["psnr"] == 30.0 and found["depth"] == pytest.approx(0.9 * 2 + 10)
+    assert found["psnr"] == 30.0 and found["psnr_with_gains"] == 31.0 and found["depth"] == pytest.approx(0.9 * 2 + 10)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -80,7 +79,7 @@ CASES = {
     "overlap": surrounded_by,
     "filter": observed("scale_ratio", 2.5),
     "lens": bent_by,
-    "exposure": observed("gain_spread", 0.03),
+    "exposure": observed("gain_spread", 0.05),
     "background": lambda part: data(found={"border": 0.8 * part}),
     "environment": lambda part: data(found={"far": 0.1 * part}),
     "masks": share_of(has_alpha=True),
@@ -88,6 +87,8 @@ CASES = {
     "normals": share_of(normal_path="normal.png"),
     "double": reaches,
 }
+# Without evidence of either the training goes on looking for a sky.
+LEFT = dict.fromkeys(("background", "environment"), {"background": "auto"})
 
 
 @pytest.fixture(autouse=True)
@@ -120,16 +121,9 @@ def test_an_effect_is_on_from_its_threshold_upwards(name, photographs):
         assert (below.on, above.on, above.reason) == (False, False, "request")
         return
     assert (above.on, above.reason) == (True, "data") and above.options == effect.on
-    # What costs next to nothing, and is usually on, stays on without evidence.
-    free = name == "exact-rays"
-    assert (below.on, below.reason) == (free, "free" if free else "data")
-
-
-@pytest.mark.parametrize(("cost", "on"), [(1.04, True), (1.06, False)])
-def test_what_costs_less_than_a_twentieth_stays_on_without_evidence(cost, on, photographs):
-    effect = replace(EFFECTS["exact-rays"], cost=cost)
-    found = decided(effect, shifted_by(0.99), photographs)
-    assert (found.on, found.reason) == (on, "free" if on else "data")
+    kept = name in ("view-dependence", "exact-rays")
+    assert (below.on, below.reason) == (kept, "kept" if kept else "data")
+    assert below.options == (effect.on if kept else LEFT.get(name, effect.off))
 
 
 def depths_of(factors: np.ndarray):

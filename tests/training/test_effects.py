@@ -73,7 +73,7 @@ def decisions(scene, choice=None, options=OPTIONS, scene_options=None):
 def test_a_plain_scene_calls_for_what_is_free_and_for_its_masks(scenes):
     found = decisions(scenes("plain"))
     assert list(found) == list(EFFECTS)
-    assert {name for name, d in found.items() if d.on} == {"exact-rays", "masks"}
+    assert {name for name, d in found.items() if d.on} == {"view-dependence", "exact-rays", "masks"}
     assert {name for name, d in found.items() if d.reason == "request"} == {"depth", "normals"}
     assert found["depth"].value == found["normals"].value == 100
     assert found["exact-rays"].value > 0.02 and found["filter"].reason == "data"
@@ -100,7 +100,7 @@ def test_each_effect_is_seen_where_it_is(scene, name, least, scenes):
     assert found[name].on and found[name].value > least and found[name].reason == "data"
     others = {"view-dependence", "exposure", "filter", "lens", "background", "overlap", "double"} - {name}
     # Where too few points are seen often enough, the usual setting stays: that says nothing about the detector.
-    assert not [other for other in others if found[other].on and found[other].reason not in ("unknown", "free")]
+    assert not [other for other in others if found[other].on and found[other].reason not in ("unknown", "kept")]
     assert {**found[name].options} == dict(EFFECTS[name].on)
 
 

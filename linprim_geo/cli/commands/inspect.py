@@ -14,7 +14,7 @@ def add(command: AddCommand) -> None:
     sub = command("inspect", run, "say which effects a scene calls for, by which evidence, and what they cost")
     add_scene(sub)
     add_quiet(sub)
-    add_effects(sub, "auto")
+    add_effects(sub)
     add_options(sub.add_argument_group("scene"), SceneOptions)
     add_options(sub.add_argument_group("training"), TrainOptions)
 

@@ -49,7 +49,7 @@ def add(command: AddCommand) -> None:
     text = "as in 3DGS: divide the size by 1, 2, 4 or 8, or a width to go down to; -1: to 1600 if it is more"
     sub.add_argument("-r", "--resolution", type=int, metavar="K", help=text)
     sub.add_argument("--eval", action="store_true", help="accepted as in 3DGS: views are held out anyway")
-    add_effects(sub, "none")
+    add_effects(sub)
     text = (
         "train in so many blocks of space, each by a worker of its own; auto: as few as a worker's memory allows "
         "(default 1); a block's photographs lie in a temporary file, see TMPDIR"
