@@ -154,8 +154,9 @@ def settle(
 
 
 def chosen_options(decisions: Iterable[Decision]) -> dict[str, Any]:
-    """{name: value} of the options that follow. Of two effects with the same option the one that is on counts."""
-    ordered = sorted(decisions, key=lambda decision: decision.on)
+    """{name: value} of the options that follow. Of two effects with the same option the one that is on counts, and of
+    two that are off the one that is so for another reason than the data."""
+    ordered = sorted(decisions, key=lambda decision: (decision.on, decision.reason != "data"))
     return {name: value for decision in ordered for name, value in decision.options.items()}
 
 

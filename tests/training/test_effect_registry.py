@@ -14,7 +14,7 @@ from linprim_geo.geometry.camera import Camera, Similarity
 from linprim_geo.geometry.lens import Lens
 from linprim_geo.training import effect_registry
 from linprim_geo.training.effect_registry import EFFECTS
-from linprim_geo.training.effects import Choice, _decide
+from linprim_geo.training.effects import Choice, _decide, chosen_options
 
 FOCAL, SIZE, DISTANCE = 100.0, 80, 3.0
 
@@ -124,6 +124,22 @@ def test_an_effect_is_on_from_its_threshold_upwards(name, photographs):
     kept = name in ("view-dependence", "exact-rays")
     assert (below.on, below.reason) == (kept, "kept" if kept else "data")
     assert below.options == (effect.on if kept else LEFT.get(name, effect.off))
+
+
+@pytest.mark.parametrize("asked", ["background", "environment"])
+def test_no_sky_is_looked_for_where_a_background_is_not_wanted(asked, photographs):
+    """Else what photographs do not call for is left to the start of the training, which may find one."""
+    settings = {**vars(SceneOptions()), **vars(TrainOptions())}
+    photographs.update(border=0.0, far=0.0)
+
+    def background(choice):
+        names = ("background", "environment")
+        return chosen_options(_decide(EFFECTS[name], data(), settings, choice) for name in names)["background"]
+
+    assert background(Choice()) == "auto"
+    assert background(Choice("auto", {asked: False})) == "random"
+    photographs.update(border=1.0)
+    assert background(Choice("auto", {asked: False})) == ("random" if asked == "background" else "fitted")
 
 
 def depths_of(factors: np.ndarray):
