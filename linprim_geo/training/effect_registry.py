@@ -72,8 +72,8 @@ class Effect:
     exact-rays from docs/accuracy_and_time.md, for the others as eval/studies/effects.py measures it. `on` and `off` are
     the settings that it stands for; who gives an option of `off` decides by that. `needs` returns why a scene or the
     options rule it out, "" if they do not. `on_request` says why evidence alone does not switch it on, and `kept` why
-    evidence does not switch it off, "" if it does. `left` are the settings where evidence is below the threshold, if
-    not `off`.
+    evidence, or none, does not switch it off, "" if it does. `left` are the settings where evidence is below the
+    threshold, if not `off`.
     """
 
     name: str
@@ -85,7 +85,6 @@ class Effect:
     measure: Callable[[Data], float | None]
     on: dict[str, object]
     off: dict[str, object]
-    usually: bool = False
     needs: Callable[[Data], str] = field(default=lambda data: "")
     on_request: str = ""
     kept: str = ""
@@ -215,7 +214,6 @@ _REGISTRY = (
         _view_dependence,
         {"sh_degree": 2},
         {"sh_degree": 0},
-        usually=True,
         kept="it also stands for detail that primitives are too few to show",
     ),
     Effect(
@@ -228,7 +226,6 @@ _REGISTRY = (
         _affine_error,
         {"ray_model": "exact"},
         {"ray_model": "affine"},
-        usually=True,
         kept="it costs next to nothing",
     ),
     Effect(

@@ -115,7 +115,7 @@ def _decide(effect: Effect, data: Data, settings: dict, choice: Choice) -> Decis
     elif effect.on_request:
         on, reason, note = False, "request", effect.on_request
     elif value is None:
-        on, reason = effect.usually, "unknown"
+        on, reason = bool(effect.kept), "unknown"
     elif effect.kept and value < effect.threshold:
         on, reason, note = True, "kept", effect.kept
     else:

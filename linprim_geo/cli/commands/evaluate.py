@@ -27,7 +27,8 @@ def add(command: AddCommand) -> None:
     sub = command("eval-images", eval_images, "score a run's colours: PSNR, SSIM and LPIPS on held-out views")
     add_run(sub)
     add_split(sub)
-    sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/eval/images)")
+    text = "folder to write to (default RUN/eval/images, or RUN/eval/mesh_images of a mesh)"
+    sub.add_argument("-o", "--output", metavar="DIR", help=text)
     text = "score this mesh as the cameras see it, in its texture or colours, in place of the primitives"
     sub.add_argument("--mesh", metavar="MESH", help=text)
     text = (
