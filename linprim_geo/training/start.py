@@ -69,6 +69,8 @@ def decided_scene(
     decisions = decide(scene, scene_options, options, choice)
     settled, options = settle(scene_options, options, decisions)
     check_train_options(options)
+    if not scene.has_alpha:  # without masks there is nothing to leave out, and nothing to read again for it
+        settled = replace(settled, masks=scene_options.masks)
     distorted = any(view.lens is not None for view in scene.views)
     if replace(settled, pinhole_below=scene_options.pinhole_below) != scene_options or (
         distorted and settled.pinhole_below != scene_options.pinhole_below

@@ -12,6 +12,7 @@ from PIL import Image
 
 from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.base.progress import Progress
+from linprim_geo.capture.load import load_scene
 from linprim_geo.cli.main import main
 from linprim_geo.runs.run import Run
 from linprim_geo.training.effects import Choice
@@ -104,3 +105,15 @@ def test_options_that_a_resumed_run_cannot_take_are_named_in_one_sentence(tiny_s
 def test_a_resumed_run_that_takes_everything_says_nothing(tiny_scene, run_copy, capsys):
     assert main(["train", str(tiny_scene), "-o", str(run_copy), "--resume", "--threads", "1"]) == 0
     assert "ignored" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("asked", [{}, {"lens": False}, {"masks": False}])
+def test_a_capture_is_read_once_where_effects_do_not_change_how(asked, tmp_path, monkeypatch):
+    """Points and poses of a second reading would cost as much as a short training."""
+    write_colmap(tmp_path / "capture")
+    read = []
+    monkeypatch.setattr("linprim_geo.training.start.load_scene", lambda *a, **k: read.append(a) or load_scene(*a, **k))
+    settings, quiet = SceneOptions(poses="given"), Progress("", 1, quiet=True)
+    options, choice = TrainOptions(start="points", max_primitives=100), Choice("auto", asked)
+    run, _, decisions = begin_run(tmp_path / "capture", tmp_path / "run", settings, options, choice, quiet)
+    assert len(read) == 1 and decisions and run.scene_options.masks == settings.masks
