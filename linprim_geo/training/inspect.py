@@ -7,6 +7,9 @@ from dataclasses import asdict
 from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.training.effects import REASONS, Choice, Decision, chosen_options
 
+# An effect that makes a step of training more expensive by less than this is said to cost no time.
+FREE = 1.05
+
 
 def inspect_scene(
     path,
@@ -34,10 +37,6 @@ def inspect_scene(
         "effects": [asdict(decision) for decision in decisions],
         "options": chosen,
     }
-
-
-# An effect that makes a step of training more expensive by less than this is said to cost no time.
-FREE = 1.05
 
 
 def describe(result: dict) -> str:

@@ -41,7 +41,7 @@ def test_verdicts(psnr, depth, called_for, decided_on, expected):
     assert effects.verdict(row(psnr, depth, called_for, decided_on), SPREAD, SEEDS) == expected
 
 
-def test_what_is_free_asked_for_or_ruled_out_is_not_called_for():
+def test_what_is_kept_asked_for_or_ruled_out_is_not_called_for():
     assert effects.verdict(row(0.0, 0.0, False, True, "kept"), SPREAD, SEEDS) == "right: no change, kept"
     assert effects.verdict(row(-0.5, 0.0, False, True, "kept"), SPREAD, SEEDS) == "wrong: loses, kept"
     assert effects.verdict(row(0.5, 0.0, False, False, "request"), SPREAD, SEEDS) == "gains, on request"

@@ -70,7 +70,7 @@ def decisions(scene, choice=None, options=OPTIONS, scene_options=None):
     return {decision.name: decision for decision in found}
 
 
-def test_a_plain_scene_calls_for_what_is_free_and_for_its_masks(scenes):
+def test_a_plain_scene_calls_for_what_is_kept_and_for_its_masks(scenes):
     found = decisions(scenes("plain"))
     assert list(found) == list(EFFECTS)
     assert {name for name, d in found.items() if d.on} == {"view-dependence", "exact-rays", "masks"}
