@@ -5,10 +5,11 @@
 
 For every effect the detector decides about the scenes of its pair; then they are trained with the effect on and off,
 everything else off. Then some scenes are trained as `--effects auto`, `none` and `all` would, and with all that
-photographs alone tell. `effects.md` has both tables: evidence and whether the decision is right, what the effect gains,
-whether that is more than the scatter of trainings with other seeds, and what it costs; PSNR of the second one also with
-the gain that suits each held-out photograph. Times are CPU seconds of the whole training on one thread. Depth errors are relative to the truth; the share of the pixels where the render has no
-surface counts as 100 %, so holes are no gain.
+photographs alone tell. `effects.md` has both tables: evidence and whether the decision is right, what the effect
+gains, whether that is more than the scatter of trainings with other seeds, and what it costs; PSNR of the second one
+also with the gain that suits each held-out photograph. Times are CPU seconds of the whole training on one thread.
+Depth errors are relative to the truth; the share of the pixels where the render has no surface counts as 100 %, so
+holes are no gain.
 """
 
 from __future__ import annotations
