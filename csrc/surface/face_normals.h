@@ -1,0 +1,73 @@
+// The faces of a triangle mesh: which share a vertex, and their normals, as they are and averaged but for edges.
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+#include "base/parallel.h"
+
+namespace linprim {
+
+using Vector = std::array<double, 3>;
+
+inline double dot(const Vector& a, const Vector& b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+inline Vector minus(const Vector& a, const Vector& b) { return {a[0] - b[0], a[1] - b[1], a[2] - b[2]}; }
+
+// Adds `factor` b to a.
+inline void add(Vector& a, double factor, const Vector& b) {
+  for (int axis = 0; axis < 3; ++axis) a[axis] += factor * b[axis];
+}
+
+// Scales to length 1; 0 stays 0. Returns the length.
+inline double normalize(Vector& v) {
+  const double length = std::sqrt(dot(v, v));
+  if (length > 0)
+    for (double& x : v) x /= length;
+  return length;
+}
+
+// Calls body(row) for each of `rows`, on all threads.
+template <class Body>
+void for_rows(int64_t rows, const Body& body) {
+  constexpr int64_t kRowsPerTask = 4096;
+  parallel_for((rows + kRowsPerTask - 1) / kRowsPerTask, [&](int64_t task, int) {
+    const int64_t end = std::min((task + 1) * kRowsPerTask, rows);
+    for (int64_t row = task * kRowsPerTask; row < end; ++row) body(row);
+  });
+}
+
+// A mesh and the faces around each of its vertices. `corner` (faces, 3) are rows of `vertex` (vertices, 3).
+struct FaceFans {
+  int64_t vertices, faces;
+  const int64_t* corner;
+  std::vector<int64_t> first, face;  // face[first[v]] to face[first[v + 1] - 1] have the vertex v
+
+  FaceFans(int64_t vertices, int64_t faces, const int64_t* corner);
+
+  // Calls body(g) for the faces that share a vertex with f, once per vertex that they share, f among them.
+  template <class Body>
+  void around(int64_t f, const Body& body) const {
+    for (int k = 0; k < 3; ++k) {
+      const int64_t v = corner[3 * f + k];
+      for (int64_t i = first[v]; i < first[v + 1]; ++i) body(face[i]);
+    }
+  }
+};
+
+struct FaceNormals {
+  std::vector<Vector> normal;  // of length 1, 0 of faces without area
+  std::vector<double> area;
+};
+
+FaceNormals face_normals(const FaceFans& fans, const double* vertex);
+
+// The normals after `rounds` in which each becomes the mean of those of the faces around it, weighted by area and
+// Tukey's function of their difference: from the length `contrast` on one does not count for another. Source: Zheng et
+// al. 2011, with another weight.
+std::vector<Vector> average_normals(const FaceFans& fans, const FaceNormals& faces, double contrast, int rounds);
+
+}  // namespace linprim
