@@ -14,6 +14,7 @@
 #include "bind/arrays.h"
 #include "bind/parts.h"
 #include "linprim.h"
+#include "surface/crease_sides.h"
 #include "surface/face_samples.h"
 #include "surface/filter_normals.h"
 #include "surface/fuse.h"
@@ -25,10 +26,11 @@
 namespace {
 
 // A numpy array that has the values.
-nb::ndarray<nb::numpy, int64_t, nb::ndim<1>> owned(std::vector<int64_t>&& values) {
-  auto* kept = new std::vector<int64_t>(std::move(values));
+template <class T>
+nb::ndarray<nb::numpy, T, nb::ndim<1>> owned(std::vector<T>&& values) {
+  auto* kept = new std::vector<T>(std::move(values));
   return {kept->data(), {kept->size()}, nb::capsule(kept, [](void* p) noexcept {
-            delete static_cast<std::vector<int64_t>*>(p);
+            delete static_cast<std::vector<T>*>(p);
           })};
 }
 
@@ -194,5 +196,23 @@ void bind_surface(nb::module_& m) {
       throw std::invalid_argument("corners are outside of the vertices");
     nb::gil_scoped_release release;
     linprim::filter_normals({contrast, normal_rounds, vertex_rounds}, vertices, faces, corners, most, moved);
+  });
+  // (2 N,) ends, (8 N,) planes, (N,) which cross a crease, and the median length of all edges.
+  m.def("crease_edges", [](In<int64_t> corner, In<double> vertex, std::array<double, 9> rules) {
+    const int64_t vertices = int64_t(vertex.shape(0)), faces = int64_t(corner.shape(0));
+    const int64_t* corners = checked(corner, {faces, 3}, "corner");
+    const double* at = checked(vertex, {vertices, 3}, "vertex");
+    const auto [contrast, normal_rounds, flat, side, crease, even, rings, falloff, wide] = rules;
+    if (!(contrast > 0 && falloff > 0)) throw std::invalid_argument("contrast and falloff have to be positive");
+    if (std::any_of(corners, corners + 3 * faces, [&](int64_t row) { return row < 0 || row >= vertices; }))
+      throw std::invalid_argument("corners are outside of the vertices");
+    const linprim::CreaseRules how{contrast, int(normal_rounds), flat, side, crease, even, int(rings), falloff, wide};
+    linprim::CreaseEdges found;
+    {
+      nb::gil_scoped_release release;
+      found = linprim::crease_edges(how, vertices, faces, corners, at);
+    }
+    return std::tuple(owned(std::move(found.end)), owned(std::move(found.plane)), owned(std::move(found.crosses)),
+                      found.length);
   });
 }

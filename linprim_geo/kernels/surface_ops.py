@@ -100,3 +100,19 @@ def filter_normals(corner, bound, contrast: float, normal_rounds: int, vertex_ro
         vertex: (V, 3) float64, changed in place.
     """
     _core.filter_normals(corner, bound, contrast, normal_rounds, vertex_rounds, vertex)
+
+
+def crease_edges(corner, vertex, rules) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """The planes on which the ends of edges lie that are not on flat parts of a mesh, and which meet at a crease.
+
+    Args:
+        corner: (M, 3) int64 faces.
+        vertex: (V, 3) float64.
+        rules: nine numbers, see csrc/surface/crease_sides.h.
+
+    Returns:
+        (E, 2) int64 ends, the lower one first, in order; (E, 2, 4) the plane n . x = d of each as n, d; (E,) bool
+        whether the two meet at a crease between the ends; the median length of all edges.
+    """
+    end, plane, crosses, length = _core.crease_edges(corner, vertex, rules)
+    return end.reshape(-1, 2), plane.reshape(-1, 2, 4), crosses.astype(bool), length

@@ -198,7 +198,7 @@ def _extract(
         about = about | {"seen_by_one_view": left_out}
     options = replace(options, **{name: about[name] for name in CHOSEN if name in about})
     options = with_rounds(options, about)
-    done = finish_surface(mesh, opened, options, target, stages)
+    done = finish_surface(mesh, opened, options, target, stages, creases=method != "polyhedra")
     stats = {
         "mesh": str(target),
         "mesh_visible": str(visible_target),

@@ -13,6 +13,7 @@ from linprim_geo.geometry.mesh_files import save_mesh
 from linprim_geo.geometry.mesh_process import process_mesh
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.runs.run import Run
+from linprim_geo.surface.creases import sharpened
 from linprim_geo.surface.denoise import denoised
 from linprim_geo.surface.depth_error import error_of_nearest
 from linprim_geo.surface.fairing import faired
@@ -49,12 +50,14 @@ def with_rounds(options: ExtractOptions, about: dict) -> ExtractOptions:
     return replace(options, refine=0 if about.get("stereo", {}).get("taken") else REFINE_ROUNDS)
 
 
-def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, stages: Stages) -> Finished:
+def finish_surface(
+    mesh: Mesh, run: Run, options: ExtractOptions, target: Path, stages: Stages, *, creases: bool = True
+) -> Finished:
     """Finishes a surface as the options ask, and writes it to `target` and `visible_file(target)`.
 
     Colours are those of photographs without the gains by which their brightness differs (`photo_gains`). By a `quality`
     that it has, noise is smoothed away, and it is kept; else by that of photographs
-    (`predicted_error`)."""
+    (`predicted_error`). With `creases` these are put where flat parts meet, as voxels cut them off."""
     given = mesh
     views = run.scene().train
     cameras = [view.camera for view in views]
@@ -65,6 +68,7 @@ def finish_surface(mesh: Mesh, run: Run, options: ExtractOptions, target: Path, 
         stages.lap("refine")
     if options.denoise == "on":
         mesh = denoised(mesh, views, gains) if mesh.quality is None else moved_safely(mesh, faired(mesh).vertices)
+        mesh = sharpened(mesh) if creases else mesh
         stages.lap("denoise")
     mesh, processing = process_mesh(mesh, options, stages.note)
     if processing:

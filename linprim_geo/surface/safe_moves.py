@@ -13,7 +13,8 @@ FOLD_ROUNDS, ROUNDS = 3, 8
 """In which vertices give moves back that fold a face over, and that push one through another."""
 
 REACH = 4.0
-"""How far around what was given back crossings are looked for anew, in median edges, before all edges are again."""
+"""How far around what moved crossings are looked for, in median edges; and around what was given back anew, before all
+these edges are again."""
 
 
 def moved_safely(mesh: Mesh, vertices: np.ndarray) -> Mesh:
@@ -35,7 +36,8 @@ def moved_safely(mesh: Mesh, vertices: np.ndarray) -> Mesh:
         if not share[faces[folded]].any():
             break
         share[faces[folded]] *= 0.5
-    edges = edges_of(faces)
+    moving = faces[(moves[faces] != 0).any((1, 2))]
+    edges = _near(moved().vertices, edges_of(faces), moving)
     some = edges
     for _ in range(ROUNDS):
         pierced, piercing = crossings(moved(), some)

@@ -63,9 +63,9 @@ def test_a_box_without_a_surface_is_one_sentence(method, solid, tmp_path):
 def test_held_out_photographs_count_when_asked(solid, tmp_path, monkeypatch):
     finished = []
 
-    def finish(mesh, run, *rest, original=postprocess.finish_surface):
+    def finish(mesh, run, *rest, original=postprocess.finish_surface, **how):
         finished.append(len(run.scene().train))
-        return original(mesh, run, *rest)
+        return original(mesh, run, *rest, **how)
 
     monkeypatch.setattr("linprim_geo.surface.extract.finish_surface", finish)
     scene = Run.open(solid).scene()

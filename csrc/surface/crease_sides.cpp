@@ -1,0 +1,262 @@
+#include "surface/crease_sides.h"
+
+#include <memory>
+#include <numeric>
+
+#include "surface/face_normals.h"
+
+namespace linprim {
+namespace {
+
+constexpr int kMostSides = 6, kLeastFaces = 3, kSideRounds = 3;
+constexpr int64_t kEdgesPerTask = 512;
+// Squared sine below which two planes are too near to parallel to have a line.
+constexpr double kLeastSine = 0.05;
+
+struct Mesh {
+  const FaceFans& fans;
+  const double* vertex;
+  FaceNormals faces;
+  std::vector<Vector> averaged, middle;
+  std::vector<uint8_t> flat, inner;  // inner: so are all around it
+  double length;
+
+  Vector at(int64_t v) const { return {vertex[3 * v], vertex[3 * v + 1], vertex[3 * v + 2]}; }
+};
+
+struct Side {
+  int part;  // of the faces that hang together
+  Vector normal, middle;
+  double weight = 0;
+  int faces = 0;
+};
+
+double median_edge(const Mesh& mesh) {
+  std::vector<double> lengths(3 * mesh.fans.faces);
+  for_rows(mesh.fans.faces, [&](int64_t f) {
+    const int64_t* corner = mesh.fans.corner + 3 * f;
+    for (int k = 0; k < 3; ++k) {
+      const Vector along = minus(mesh.at(corner[k]), mesh.at(corner[(k + 1) % 3]));
+      lengths[3 * f + k] = std::sqrt(dot(along, along));
+    }
+  });
+  if (lengths.empty()) return 0;
+  std::nth_element(lengths.begin(), lengths.begin() + lengths.size() / 2, lengths.end());
+  return lengths[lengths.size() / 2];
+}
+
+Mesh prepared(const CreaseRules& how, const FaceFans& fans, const double* vertex) {
+  Mesh mesh{fans, vertex, face_normals(fans, vertex), {}, {}, {}, {}, 0};
+  mesh.averaged = average_normals(fans, mesh.faces, how.contrast, how.normal_rounds);
+  mesh.middle.resize(fans.faces), mesh.flat.resize(fans.faces), mesh.inner.resize(fans.faces);
+  for_rows(fans.faces, [&](int64_t f) {
+    Vector& middle = mesh.middle[f];
+    middle = {};
+    for (int k = 0; k < 3; ++k) add(middle, 1.0 / 3, mesh.at(fans.corner[3 * f + k]));
+    double least = 1;
+    fans.around(f, [&](int64_t g) { least = std::min(least, dot(mesh.averaged[f], mesh.averaged[g])); });
+    mesh.flat[f] = least >= how.flat && mesh.faces.area[f] > 0;
+  });
+  for_rows(fans.faces, [&](int64_t f) {
+    uint8_t all = 1;
+    fans.around(f, [&](int64_t g) { all &= mesh.flat[g]; });
+    mesh.inner[f] = all;
+  });
+  mesh.length = median_edge(mesh);
+  return mesh;
+}
+
+// What lies around one edge after the other; one of these per thread.
+class Around {
+ public:
+  Around(const CreaseRules& how, const Mesh& mesh) : how_(how), mesh_(mesh), stamp_(mesh.fans.faces), row_(stamp_) {}
+
+  // False where an end has no side. Else the planes of the ends, and whether they meet at a crease.
+  bool ask(const int64_t* ends, double* plane, uint8_t& crosses) {
+    gather(ends);
+    const Vector end[2] = {mesh_.at(ends[0]), mesh_.at(ends[1])};
+    for (int axis = 0; axis < 3; ++axis) here_[axis] = 0.5 * (end[0][axis] + end[1][axis]);
+    if (!find_sides()) return false;
+    const Side* own[2];
+    for (int j = 0; j < 2; ++j)
+      if (!(own[j] = nearest(end[j])) || !even(*own[j])) return false;
+    for (int j = 0; j < 2; ++j) {
+      std::copy_n(own[j]->normal.data(), 3, plane + 4 * j);
+      plane[4 * j + 3] = dot(own[j]->normal, own[j]->middle);
+    }
+    crosses = own[0] != own[1] && make_crease(*own[0], *own[1]);
+    return own[0] == own[1] || crosses;
+  }
+
+ private:
+  // The inner faces within the rings, and which of them hang together.
+  void gather(const int64_t* ends) {
+    ++now_;
+    faces_.clear(), reached_.clear(), parent_.clear();
+    const FaceFans& fans = mesh_.fans;
+    const auto visit = [&](int64_t g) {
+      if (stamp_[g] == now_) return;
+      stamp_[g] = now_, row_[g] = -1;
+      reached_.push_back(g);
+      if (!mesh_.inner[g]) return;
+      row_[g] = int64_t(faces_.size());
+      parent_.push_back(int(faces_.size())), faces_.push_back(g);
+    };
+    for (int j = 0; j < 2; ++j)
+      for (int64_t i = fans.first[ends[j]]; i < fans.first[ends[j] + 1]; ++i) visit(fans.face[i]);
+    size_t begin = 0;
+    for (int ring = 0; ring <= how_.rings; ++ring) {
+      const size_t end = reached_.size();
+      for (size_t q = begin; q < end; ++q) {
+        const int64_t f = reached_[q];
+        fans.around(f, [&](int64_t g) {
+          if (ring < how_.rings) visit(g);
+          if (stamp_[g] == now_ && row_[f] >= 0 && row_[g] >= 0 &&
+              dot(mesh_.averaged[f], mesh_.averaged[g]) >= how_.flat)
+            parent_[root(int(row_[f]))] = root(int(row_[g]));
+        });
+      }
+      begin = end;
+    }
+  }
+
+  int root(int i) {
+    while (parent_[i] != i) i = parent_[i] = parent_[parent_[i]];
+    return i;
+  }
+
+  // The parts that hang together, split where normals differ. False if there are too many.
+  bool find_sides() {
+    const int count = int(faces_.size());
+    weight_.resize(count), order_.resize(count), side_.resize(count);
+    for (int i = 0; i < count; ++i) {
+      const Vector away = minus(mesh_.middle[faces_[i]], here_);
+      const double far = std::max(0.0, std::sqrt(dot(away, away)) / mesh_.length - 1) / how_.falloff;
+      weight_[i] = mesh_.faces.area[faces_[i]] * std::exp(-0.5 * far * far);
+    }
+    std::iota(order_.begin(), order_.end(), 0);
+    std::sort(order_.begin(), order_.end(),
+              [&](int a, int b) { return weight_[a] != weight_[b] ? weight_[a] > weight_[b] : a < b; });
+    sides_.clear();
+    for (const int i : order_) {
+      const int part = root(i);
+      const Vector& normal = mesh_.averaged[faces_[i]];
+      if (std::any_of(sides_.begin(), sides_.end(),
+                      [&](const Side& s) { return s.part == part && dot(s.normal, normal) > how_.side; }))
+        continue;
+      if (sides_.size() == kMostSides) return false;
+      sides_.push_back({part, normal, {}});
+    }
+    for (int round = 0; round < kSideRounds; ++round) {
+      std::vector<Side> sums(sides_.size());
+      for (int i = 0; i < count; ++i) {
+        const Vector& normal = mesh_.averaged[faces_[i]];
+        const int part = root(i);
+        double most = -2;
+        for (size_t k = 0; k < sides_.size(); ++k)
+          if (sides_[k].part == part && dot(sides_[k].normal, normal) > most)
+            most = dot(sides_[k].normal, normal), side_[i] = int(k);
+        Side& sum = sums[side_[i]];
+        add(sum.normal, weight_[i], normal), add(sum.middle, weight_[i], mesh_.middle[faces_[i]]);
+        sum.weight += weight_[i], ++sum.faces;
+      }
+      for (size_t k = 0; k < sides_.size(); ++k) {
+        if (!(sums[k].weight > 0 && normalize(sums[k].normal) > 0)) sums[k].normal = sides_[k].normal;
+        if (sums[k].weight > 0)
+          for (double& x : sums[k].middle) x /= sums[k].weight;
+        sums[k].part = sides_[k].part, sides_[k] = sums[k];
+      }
+    }
+    return true;
+  }
+
+  const Side* nearest(const Vector& point) const {
+    const Side* best = nullptr;
+    double least = INFINITY;
+    for (const Side& side : sides_) {
+      const double far = std::abs(dot(minus(point, side.middle), side.normal));
+      if (side.faces >= kLeastFaces && side.weight > 0 && far < least) least = far, best = &side;
+    }
+    return best;
+  }
+
+  bool even(const Side& side) const {
+    double mean = 0;
+    for (size_t i = 0; i < faces_.size(); ++i)
+      if (&sides_[side_[i]] == &side) mean += weight_[i] * dot(side.normal, mesh_.averaged[faces_[i]]);
+    return mean >= how_.even * side.weight;
+  }
+
+  bool make_crease(const Side& a, const Side& b) const {
+    const double cosine = dot(a.normal, b.normal);
+    if (cosine > how_.crease || 1 - cosine * cosine < kLeastSine) return false;
+    Vector one, other;
+    return goes_on(a, one) && goes_on(b, other) && dot(one, other) <= how_.crease;
+  }
+
+  // The normal of a side where the edge is, by a linear fit to those of the mesh. False if the side is not wide.
+  bool goes_on(const Side& side, Vector& normal) const {
+    Vector across = minus(here_, side.middle);
+    add(across, -dot(across, side.normal), side.normal);
+    const double reach = normalize(across);
+    double low = INFINITY, high = -INFINITY, squares = 0;
+    Vector mean{}, turn{};
+    for (size_t i = 0; i < faces_.size(); ++i) {
+      if (&sides_[side_[i]] != &side) continue;
+      const double x = dot(minus(mesh_.middle[faces_[i]], side.middle), across);
+      const Vector& own = mesh_.faces.normal[faces_[i]];
+      low = std::min(low, x), high = std::max(high, x), squares += weight_[i] * x * x;
+      add(mean, weight_[i], own), add(turn, weight_[i] * x, own);
+    }
+    if (!(high - low >= how_.wide * mesh_.length && squares > 0)) return false;
+    normal = {};
+    add(normal, 1 / side.weight, mean), add(normal, reach / squares, turn);
+    normalize(normal);
+    return true;
+  }
+
+  const CreaseRules& how_;
+  const Mesh& mesh_;
+  std::vector<int64_t> stamp_, row_;  // per face of the mesh: when it was reached last, its row in `faces_`, or -1
+  int64_t now_ = 0;
+  std::vector<int64_t> reached_, faces_;
+  std::vector<int> parent_, order_, side_;  // per row of `faces_`, as are weights
+  std::vector<double> weight_;
+  std::vector<Side> sides_;
+  Vector here_;
+};
+
+}  // namespace
+
+CreaseEdges crease_edges(const CreaseRules& how, int64_t vertices, int64_t faces, const int64_t* corner,
+                         const double* vertex) {
+  const FaceFans fans(vertices, faces, corner);
+  const Mesh mesh = prepared(how, fans, vertex);
+  std::vector<std::array<int64_t, 2>> edges;
+  for (int64_t f = 0; f < faces; ++f)
+    for (int k = 0; k < 3 && !mesh.flat[f]; ++k) {
+      const int64_t a = corner[3 * f + k], b = corner[3 * f + (k + 1) % 3];
+      edges.push_back({std::min(a, b), std::max(a, b)});
+    }
+  std::sort(edges.begin(), edges.end());
+  edges.erase(std::unique(edges.begin(), edges.end()), edges.end());
+  const int64_t count = int64_t(edges.size());
+  std::vector<std::array<double, 8>> planes(count);
+  std::vector<uint8_t> known(count), crosses(count);
+  std::vector<std::unique_ptr<Around>> around(threads());
+  parallel_for((count + kEdgesPerTask - 1) / kEdgesPerTask, [&](int64_t task, int thread) {
+    if (!around[thread]) around[thread] = std::make_unique<Around>(how, mesh);
+    for (int64_t e = task * kEdgesPerTask; e < std::min((task + 1) * kEdgesPerTask, count); ++e)
+      known[e] = around[thread]->ask(edges[e].data(), planes[e].data(), crosses[e]);
+  });
+  CreaseEdges out{{}, {}, {}, mesh.length};
+  for (int64_t e = 0; e < count; ++e) {
+    if (!known[e]) continue;
+    out.end.insert(out.end.end(), edges[e].begin(), edges[e].end());
+    out.plane.insert(out.plane.end(), planes[e].begin(), planes[e].end());
+    out.crosses.push_back(crosses[e]);
+  }
+  return out;
+}
+
+}  // namespace linprim
