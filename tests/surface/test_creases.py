@@ -11,9 +11,10 @@ from helpers.surfaces import sphere
 from helpers.textured_plane import sheet
 
 from linprim_geo.eval.surface_samples import SurfaceDistance
-from linprim_geo.geometry.mesh import Mesh, face_normals
+from linprim_geo.geometry.mesh import Mesh, face_areas, face_normals
 from linprim_geo.geometry.self_intersections import crossings
 from linprim_geo.kernels import ops, surface_ops
+from linprim_geo.surface import creases
 from linprim_geo.surface.creases import sharpened
 
 VOXEL = 0.05
@@ -163,6 +164,46 @@ def test_faces_without_area_and_vertices_without_faces_do_no_harm():
     found = sharpened(odd).vertices
     assert np.isfinite(found).all() and (found[-1] == 9).all()
     assert off(replace(mesh, vertices=found[:-1]), np.concatenate(EDGES)).mean() < 0.04
+
+
+def test_nothing_moves_farther_than_it_may(monkeypatch):
+    """Edges of length 1: the first crosses a crease near its first end, the third one whose line is far away."""
+    floor, wall, far = [0, 0, 1.0, 0], [1.0, 0, 0, 0], [1.0, 0, 0, 9]
+    planes = np.array([[wall, floor], [floor, floor], [floor, far]])
+    ends, crosses = np.array([[0, 1], [1, 2], [2, 3]]), np.array([True, False, True])
+    monkeypatch.setattr(surface_ops, "crease_edges", lambda *_: (ends, planes, crosses, 1.0))
+    vertices = np.array([[0.2, 0, 0.3], [1, 0, 0.4], [1, 1, 0.6], [2, 1, 0]])
+    found, on_crease = creases._to_creases(vertices, np.array([[0, 1, 2], [1, 3, 2]]))
+    assert np.allclose(found, [[0, 0, 0], [1, 0, 0], [1, 1, 0.6], [2, 1, 0]], rtol=0, atol=1e-12)
+    assert on_crease.tolist() == [True, False, False, False]
+
+
+def test_slivers_along_a_crease_are_flipped_where_that_helps():
+    vertices = np.array([[0, 0, 0], [2, 0, 0], [1, 0.05, 0], [1, -1, 0], [1, 2, 0.0]])
+    sliver, below, others = [0, 1, 2], [1, 0, 3], [[1, 4, 2], [4, 0, 2]]
+    on_crease = np.array([True, True, True, False, False])
+    flipped = creases._flipped(vertices, np.array([sliver, below, *others]), on_crease)
+    assert {frozenset(face) for face in flipped[:2].tolist()} == {frozenset({0, 3, 2}), frozenset({1, 3, 2})}
+    assert (face_normals(Mesh(vertices, flipped))[:, 2] > 0).all() and flipped[2:].tolist() == others
+    # On a border, beside three faces, where the other edge is there already, and off creases they stay.
+    for faces, along in (
+        ([sliver, *others], on_crease),
+        ([sliver, below, [1, 0, 4]], on_crease),
+        ([sliver, below, [2, 3, 4]], on_crease),
+        ([sliver, below], ~on_crease),
+    ):
+        assert creases._flipped(vertices, np.array(faces), along).tolist() == faces
+    # Where the new faces have smaller angles nothing is gained.
+    wide = np.array([[0, 0, 0], [2, 0, 0], [1, 0.05, 0], [3, -0.1, 0]])
+    assert creases._flipped(wide, np.array([sliver, below]), np.ones(4, bool)).tolist() == [sliver, below]
+
+
+def test_of_slivers_that_share_a_neighbour_one_is_flipped():
+    vertices = np.array([[0, 0, 0], [2, 0, 0], [1, -2, 0], [1, 0.05, 0], [0.45, -1, 0], [1.55, -1, 0]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [2, 0, 4], [1, 2, 5]])
+    flipped = creases._flipped(vertices, faces, np.ones(6, bool))
+    assert (flipped != faces).any(1).sum() == 2
+    assert np.isclose(face_areas(Mesh(vertices, flipped)).sum(), face_areas(Mesh(vertices, faces)).sum())
 
 
 @pytest.mark.parametrize("faces", [np.zeros((0, 3), int), np.array([[0, 1, 2]])])
