@@ -85,6 +85,10 @@ def test_edges_and_corners_of_a_block_are_where_they_belong():
     away = np.abs(box(*BLOCK)(block.vertices)) / VOXEL
     assert away.max() < 0.25 and away.mean() < np.abs(box(*BLOCK)(cut.vertices)).mean() / VOXEL
     assert len(block.faces) == len(cut.faces) and len(crossings(block)[0]) == 0
+    directed = np.stack([block.faces.ravel(), np.roll(block.faces, -1, axis=1).ravel()], axis=1)
+    assert len(np.unique(directed, axis=0)) == len(directed) and np.array_equal(
+        np.unique(directed, axis=0), np.unique(directed[:, ::-1], axis=0)
+    )
 
 
 def test_edges_that_point_inwards_are_too():
