@@ -3,6 +3,7 @@
 // Results never depend on the number of threads: a job's items are independent and each writes its own place.
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 #include <functional>
 
@@ -16,5 +17,15 @@ int threads();
 // a body throws (out of memory is all that can), the remaining items are skipped and the exception is thrown here.
 // `thread` is below threads(). Items are handed out in order. Calls from several threads take turns.
 void parallel_for(int64_t items, const std::function<void(int64_t item, int thread)>& body);
+
+// Calls body(row) once for each row in [0, rows), some thousands per item: for what is cheap for one row.
+template <class Body>
+void for_rows(int64_t rows, const Body& body) {
+  constexpr int64_t kRowsPerItem = 4096;
+  parallel_for((rows + kRowsPerItem - 1) / kRowsPerItem, [&](int64_t item, int) {
+    const int64_t end = std::min((item + 1) * kRowsPerItem, rows);
+    for (int64_t row = item * kRowsPerItem; row < end; ++row) body(row);
+  });
+}
 
 }  // namespace linprim

@@ -1,8 +1,11 @@
 #include "surface/crease_sides.h"
 
+#include <algorithm>
+#include <cmath>
 #include <memory>
 #include <numeric>
 
+#include "base/parallel.h"
 #include "surface/face_normals.h"
 
 namespace linprim {

@@ -1,5 +1,9 @@
 #include "surface/face_normals.h"
 
+#include <algorithm>
+
+#include "base/parallel.h"
+
 namespace linprim {
 
 FaceFans::FaceFans(int64_t vertices, int64_t faces, const int64_t* corner)

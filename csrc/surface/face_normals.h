@@ -1,13 +1,10 @@
 // The faces of a triangle mesh: which share a vertex, and their normals, as they are and averaged but for edges.
 #pragma once
 
-#include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstdint>
 #include <vector>
-
-#include "base/parallel.h"
 
 namespace linprim {
 
@@ -28,16 +25,6 @@ inline double normalize(Vector& v) {
   if (length > 0)
     for (double& x : v) x /= length;
   return length;
-}
-
-// Calls body(row) for each of `rows`, on all threads.
-template <class Body>
-void for_rows(int64_t rows, const Body& body) {
-  constexpr int64_t kRowsPerTask = 4096;
-  parallel_for((rows + kRowsPerTask - 1) / kRowsPerTask, [&](int64_t task, int) {
-    const int64_t end = std::min((task + 1) * kRowsPerTask, rows);
-    for (int64_t row = task * kRowsPerTask; row < end; ++row) body(row);
-  });
 }
 
 // A mesh and the faces around each of its vertices. `corner` (faces, 3) are rows of `vertex` (vertices, 3).

@@ -1,5 +1,7 @@
 #include "surface/face_samples.h"
 
+#include "base/parallel.h"
+
 namespace linprim {
 namespace {
 
@@ -22,7 +24,7 @@ bool maybe_seen(const PhotoView& view, const double* point, double behind, doubl
 
 void face_samples(const PhotoView& view, const Faces& faces, const double* bary, int samples, double behind,
                   double slack, uint8_t* found) {
-  for_points(faces.count, [&](int64_t f) {
+  for_rows(faces.count, [&](int64_t f) {
     found[f] = 0;
     if (faces.skip[f]) return;
     const int64_t* corner = faces.corner + 3 * f;

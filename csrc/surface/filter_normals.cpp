@@ -1,5 +1,8 @@
 #include "surface/filter_normals.h"
 
+#include <vector>
+
+#include "base/parallel.h"
 #include "surface/face_normals.h"
 
 namespace linprim {

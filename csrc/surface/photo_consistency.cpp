@@ -1,5 +1,7 @@
 #include "surface/photo_consistency.h"
 
+#include "base/parallel.h"
+
 namespace linprim {
 namespace {
 
@@ -33,13 +35,13 @@ void add_point(const PhotoView& view, const float* jump, const PhotoRules& rules
 
 void add_photo(const PhotoView& view, const float* jump, const PhotoRules& rules, const double* offset, int offsets,
                const PhotoSums& sums) {
-  for_points(sums.count, [&](int64_t p) { add_point(view, jump, rules, offset, offsets, sums, p); });
+  for_rows(sums.count, [&](int64_t p) { add_point(view, jump, rules, offset, offsets, sums, p); });
 }
 
 void least_footprints(const PhotoView& view, double least_cosine, const double* point, const double* normal,
                       int64_t count, double* least) {
   const double focal = std::sqrt(view.fx * view.fy);
-  for_points(count, [&](int64_t p) {
+  for_rows(count, [&](int64_t p) {
     SeenPoint seen;
     if (look(view, least_cosine, point + 3 * p, normal + 3 * p, seen))
       least[p] = std::min(least[p], seen.at[2] / (focal * seen.facing));

@@ -5,8 +5,6 @@
 #include <cmath>
 #include <cstdint>
 
-#include "base/parallel.h"
-
 namespace linprim {
 
 // Pixel centres at +0.5. Arrays are (height, width).
@@ -73,16 +71,6 @@ inline void bilinear(const PhotoView& view, double u, double v, float* out) {
     const float under = bottom[j * n + c] + a * (bottom[right * n + c] - bottom[j * n + c]);
     out[c] = above + b * (under - above);
   }
-}
-
-// Calls body(p) for every point, some thousands per task.
-template <class Body>
-void for_points(int64_t count, const Body& body) {
-  constexpr int64_t kPointsPerTask = 4096;
-  parallel_for((count + kPointsPerTask - 1) / kPointsPerTask, [&](int64_t task, int) {
-    const int64_t end = std::min((task + 1) * kPointsPerTask, count);
-    for (int64_t p = task * kPointsPerTask; p < end; ++p) body(p);
-  });
 }
 
 }  // namespace linprim

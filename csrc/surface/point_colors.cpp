@@ -1,5 +1,7 @@
 #include "surface/point_colors.h"
 
+#include "base/parallel.h"
+
 namespace linprim {
 namespace {
 
@@ -41,7 +43,7 @@ void add_color(const PhotoView& view, const float* near, const float* far, const
 
 void add_colors(const PhotoView& view, const float* near, const float* far, const ColorRules& rules,
                 const ColorSamples& samples) {
-  for_points(samples.count, [&](int64_t p) { add_color(view, near, far, rules, samples, p); });
+  for_rows(samples.count, [&](int64_t p) { add_color(view, near, far, rules, samples, p); });
 }
 
 }  // namespace linprim
