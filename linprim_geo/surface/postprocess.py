@@ -57,7 +57,7 @@ def finish_surface(
 
     Colours are those of photographs without the gains by which their brightness differs (`photo_gains`). By a `quality`
     that it has, noise is smoothed away, and it is kept; else by that of photographs
-    (`predicted_error`). With `creases` these are put where flat parts meet, as voxels cut them off."""
+    (`predicted_error`). With `creases`, denoising also puts these where flat parts meet, as voxels cut them off."""
     given = mesh
     views = run.scene().train
     cameras = [view.camera for view in views]
