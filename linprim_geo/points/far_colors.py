@@ -8,8 +8,8 @@ environment begins. `ops.environment_light` says how the six faces of its cube m
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -19,17 +19,21 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.environment_map import filled, nearest_texel, texel_directions, texels_for
 from linprim_geo.kernels import ops
 from linprim_geo.points.initial_points import SmallView, VolumePoints, evenly_spread_views, in_image
+from linprim_geo.points.photo_evidence import VIEWS, Observations
 
 # The photographs' own colours at infinity are gathered with fewer, from views spread over the capture.
-SURVEY_TEXELS, SURVEY_VIEWS = 128, 60
-# A scene is open where colours at infinity explain this share of the textured parts of its photographs: 0.31 to 0.39 of
-# four objects before far rooms, 0.06 at most of six captures of rooms, facades, and objects on black or near a wall.
-OPEN_SHARE = 0.1
+SURVEY_TEXELS, SURVEY_VIEWS = 128, VIEWS
+# A scene is open where colours at infinity, as half of its photographs show them, explain this share of the textured
+# parts of the others (DECISIONS 96).
+OPEN_SHARE = 0.018
+# Where fewer of all patches are textured and known from the other half, as of few photographs, each is compared with
+# all, itself among them. It agrees with itself by chance, and what it explains counts so much less.
+LEAST_TEXTURED, BY_ITSELF = 0.02, 0.18
 # A patch is explained by the environment if its mean difference, of 255, is below this, or below this part of its
 # variation: noise of 12 averages to this over 4 by 4 pixels, and what is finer than a texel is filtered.
 SAME_COLOR, EXPLAINED = 3.0, 1 / 3
-# Photographs that show a direction, at least, for its colour to be known.
-LEAST_VIEWS = 3
+# Photographs that show a direction, at least, for its colour to be known; so many of another half of them.
+LEAST_VIEWS, LEAST_OTHERS = 3, 2
 # Of more photographs of a direction than this, so many are compared with each other.
 COMPARED = 24
 # One pixel of so many rows and columns is compared with the environment, averaged over as many by as many of these.
@@ -72,10 +76,6 @@ class FarColors:
                 seen.append(colors)
         return _commonest(np.stack(seen[1:] or seen, 1))
 
-    @cached_property
-    def _all_compared(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        return [self.compared(small_view) for small_view in self.small_views]
-
     def compared(self, small_view: SmallView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of a look, on the lattice of STRIDE pixels: (h, w) mean difference of a patch from the environment, (h, w)
         variation of its colours, both of 255, and (h, w) how many views show the direction."""
@@ -107,27 +107,6 @@ class FarColors:
 
         return at
 
-    def explained(self, points: np.ndarray) -> float | None:
-        """Share of the textured patches of all photographs that the environment explains, less the share of those that
-        show the nearer half of (P, 3) `points`, which it explains by chance, or because the cameras are too near to
-        each other to tell. None without textured patches."""
-        everywhere, at_points = [], []
-        for small_view, (difference, variation, views) in zip(self.small_views, self._all_compared, strict=True):
-            usable = (views >= LEAST_VIEWS) & (variation > TEXTURED)
-            if small_view.foreground is not None:
-                usable &= small_view.foreground[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
-            good = difference < EXPLAINED * variation
-            everywhere.append(good[usable])
-            inside = in_image(small_view.camera, points)[0]
-            pixels, depth = small_view.camera.project(points[inside])
-            nearer = pixels[depth <= np.median(depth)] if len(depth) else pixels
-            row, column = (np.clip((nearer[:, 1 - k] / STRIDE).astype(np.int64), 0, views.shape[k] - 1) for k in (0, 1))
-            at_points.append(good[row, column][usable[row, column]])
-        rest, chance = np.concatenate(everywhere), np.concatenate(at_points)
-        if not len(rest):
-            return None
-        return float(rest.mean() - (chance.mean() if len(chance) else 0.0))
-
     def start(self, size: int) -> torch.Tensor:
         """(6, size, size, 3) texels in [0, 1] that training begins with; a direction that too few photographs show is
         as those round it."""
@@ -146,10 +125,64 @@ def far_colors(scene: Scene) -> FarColors:
     return FarColors(evenly_spread_views(scene.train, SURVEY_VIEWS))
 
 
-def far_share(far: FarColors, scene: Scene) -> float:
-    """`FarColors.explained` by the scene's points; 0 where the photographs do not tell."""
-    points = scene.points
-    return far.explained(np.zeros((0, 3)) if points is None or isinstance(points, VolumePoints) else points.xyz) or 0.0
+def far_share(scene: Scene, observations: Observations | None) -> float:
+    """Share of the textured patches of a scene's photographs that what they show at infinity explains; 0 where they do
+    not tell.
+
+    The colours of every second photograph are compared with the others and the other way round: one that is compared
+    with its own colours agrees by chance. Where halves know too little of each other it is, and counts less. Taken off
+    is the share at pixels that show the nearer half of the scene's points, which is large where the cameras are too
+    near to each other to tell.
+
+    Args:
+        observations: of SURVEY_VIEWS views, by which exposures are made alike; None if there are none.
+    """
+    looks, points = evenly_spread_views(scene.train, SURVEY_VIEWS), scene.points
+    xyz = np.zeros((0, 3)) if points is None or isinstance(points, VolumePoints) else points.xyz
+    if observations is not None:
+        looks = [_brighter(look, 1 / gain) for look, gain in zip(looks, observations.gains, strict=True)]
+    halves = looks[::2], looks[1::2]
+    if all(halves):
+        pairs = [(FarColors(halves[1]), halves[0]), (FarColors(halves[0]), halves[1])]
+        share, known = _explained(pairs, xyz, LEAST_OTHERS)
+        if known >= LEAST_TEXTURED:
+            return share
+    share, known = _explained([(FarColors(looks), looks)], xyz, LEAST_VIEWS)
+    return BY_ITSELF * share if known else 0.0
+
+
+def _explained(
+    pairs: Sequence[tuple[FarColors, Sequence[SmallView]]], points: np.ndarray, least: int
+) -> tuple[float, float]:
+    """Of views, each with the colours at infinity that it is compared with: the share of the textured patches that
+    these explain, less that at the nearer half of (P, 3) points, and the share of all patches that are textured and
+    known from `least` views."""
+    everywhere, at_points, patches = [np.zeros(0, bool)], [np.zeros(0, bool)], 0
+    for far, small_views in pairs:
+        for small_view in small_views:
+            difference, variation, views = far.compared(small_view)
+            usable = (views >= least) & (variation > TEXTURED)
+            if small_view.foreground is not None:
+                usable &= small_view.foreground[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
+            good = difference < EXPLAINED * variation
+            inside = in_image(small_view.camera, points)[0]
+            pixels, depth = small_view.camera.project(points[inside])
+            nearer = pixels[depth <= np.median(depth)] if len(depth) else pixels
+            row, column = (np.clip((nearer[:, 1 - k] / STRIDE).astype(np.int64), 0, views.shape[k] - 1) for k in (0, 1))
+            everywhere.append(good[usable])
+            at_points.append(good[row, column][usable[row, column]])
+            patches += usable.size
+    rest, chance = np.concatenate(everywhere), np.concatenate(at_points)
+    if not len(rest):
+        return 0.0, 0.0
+    return float(rest.mean() - (chance.mean() if len(chance) else 0.0)), len(rest) / patches
+
+
+def _brighter(small_view: SmallView, factor: np.ndarray) -> SmallView:
+    """The view with (3,) factors on its channels, white where they take it beyond."""
+    result = copy(small_view)
+    result.rgb = np.clip(small_view.rgb * factor, 0, 255).astype(np.float32)
+    return result
 
 
 def _commonest(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

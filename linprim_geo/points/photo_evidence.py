@@ -80,6 +80,11 @@ class Observations:
         return gains, errors
 
     @property
+    def gains(self) -> np.ndarray:
+        """(V, 3) how bright each photograph shows the points, of geometric mean 1 per channel."""
+        return np.exp(self.log_gains[0])
+
+    @property
     def gain_spread(self) -> float | None:
         """Standard deviation over the photographs of the logarithm of their brightness, of the channel where it is
         largest, less what the estimate itself scatters; without the most extreme of 20, which a highlight may have.
@@ -107,7 +112,7 @@ class Observations:
         """
         from scipy.spatial import cKDTree
 
-        color = self.color / np.exp(self.log_gains[0])[None]
+        color = self.color / self.gains[None]
         usable = self.plain & (self.color > 0).all(2)
         middle = _median(np.where(usable[..., None], color, np.nan), 1)
         rest = np.nan_to_num(color - middle[:, None])

@@ -11,6 +11,7 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.capture.types import Scene
 from linprim_geo.points.far_colors import OPEN_SHARE, FarColors, far_colors, far_share
 from linprim_geo.points.initial_points import VolumePoints, in_image
+from linprim_geo.points.photo_evidence import observe
 from linprim_geo.training.step.training_images import TrainingImage
 
 # A backdrop is plain where this share of all border pixels lies this near to their median colour, per channel, and
@@ -49,7 +50,6 @@ def chosen_background(
     """
     named = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
     has_alpha = images[0].alpha is not None
-    far = None
     if text == "auto":
         text = "random"
         if begun:
@@ -57,14 +57,13 @@ def chosen_background(
         elif not has_alpha and plain_border(scene) > BACKDROP_SHARE:
             text = "fitted"
         elif not has_alpha and begun is None:
-            far = far_colors(scene)
-            text = "environment" if sky or far_share(far, scene) >= OPEN_SHARE else "random"
+            text = "environment" if sky or far_share(scene, observe(scene)) >= OPEN_SHARE else "random"
     if text == "random":
         return Background(torch.ones(3) if has_alpha else torch.from_numpy(_mean_color(images)), random=True)
     if text == "environment":
         if has_alpha:
             raise LinprimError("--background environment: masks or alpha say already what is background")
-        far = far_colors(scene) if far is None and begun is None else far
+        far = far_colors(scene) if begun is None else None
         return Background(torch.from_numpy(_mean_color(images)), environment=True, far=far)
     if text == "fitted":
         return Background(torch.from_numpy(np.median(_border_colors(images), 0).astype(np.float32)), fitted=True)

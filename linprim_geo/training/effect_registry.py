@@ -17,7 +17,7 @@ from linprim_geo.base.kinds import KINDS
 from linprim_geo.base.options import TrainOptions, initial_count
 from linprim_geo.capture.types import Scene
 from linprim_geo.geometry.lens import largest_displacement
-from linprim_geo.points.far_colors import OPEN_SHARE, far_colors, far_share
+from linprim_geo.points.far_colors import OPEN_SHARE, far_share
 from linprim_geo.points.initial_points import CAMERA_DISTANCE, VolumePoints, scene_normalization
 from linprim_geo.points.photo_evidence import Observations, observe
 from linprim_geo.training.background import BACKDROP_SHARE, plain_border
@@ -156,7 +156,7 @@ def _plain_border(data: Data) -> float:
 
 
 def _far(data: Data) -> float:
-    return 100 * far_share(far_colors(data.scene), data.scene)
+    return 100 * far_share(data.scene, data.observations)
 
 
 def _masked(data: Data) -> str:

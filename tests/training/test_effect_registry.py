@@ -81,7 +81,7 @@ CASES = {
     "lens": bent_by,
     "exposure": observed("gain_spread", 0.05),
     "background": lambda part: data(found={"border": 0.8 * part}),
-    "environment": lambda part: data(found={"far": 0.1 * part}),
+    "environment": lambda part: data(found={"far": 0.018 * part}),
     "masks": share_of(has_alpha=True),
     "depth": share_of(depth_path="depth.png"),
     "normals": share_of(normal_path="normal.png"),
@@ -96,8 +96,7 @@ def photographs(monkeypatch):
     """What detectors of whole photographs find there: tests of `background` and `far_colors` say what that is."""
     shown: dict[str, float] = {}
     monkeypatch.setattr(effect_registry, "plain_border", lambda scene: shown["border"])
-    monkeypatch.setattr(effect_registry, "far_colors", lambda scene: None)
-    monkeypatch.setattr(effect_registry, "far_share", lambda colors, scene: shown["far"])
+    monkeypatch.setattr(effect_registry, "far_share", lambda scene, observations: shown["far"])
     return shown
 
 

@@ -261,4 +261,4 @@ def test_closed_scenes_masks_and_plain_backdrops_have_none(tiny_run, tabletop, t
     synthesize(tmp_path / "room", shape="room", views=24, test_views=0, size=(96, 72), points=600, supersample=1)
     found = inspect_scene(tmp_path / "room", options=OPTIONS)
     (entry,) = (effect for effect in found["effects"] if effect["name"] == "environment")
-    assert not entry["on"] and entry["value"] < 5 < entry["threshold"]
+    assert not entry["on"] and entry["value"] < 1 < entry["threshold"]
