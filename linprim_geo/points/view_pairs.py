@@ -63,6 +63,16 @@ def source_views(
     return chosen
 
 
+def nearest_views(cameras: Sequence[Camera], most: int) -> list[list[int]]:
+    """Of every view the numbers of the `most` other ones whose cameras are nearest to its own, nearest first."""
+    centers = np.array([camera.center for camera in cameras])
+    result = []
+    for number, center in enumerate(centers):
+        order = np.argsort(np.linalg.norm(centers - center, axis=1), kind="stable")
+        result.append([int(other) for other in order if other != number][:most])
+    return result
+
+
 def _seen(camera: Camera, depth: np.ndarray | None, points: np.ndarray) -> np.ndarray:
     """(P,) bool, which of (P, 3) points lie in the image and not behind its (H, W) depths, 0 where there is none."""
     inside, pixels, along = visible_pixels(camera, points)

@@ -16,7 +16,7 @@ from scipy.ndimage import uniform_filter
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.sampling import sample_bilinear
-from linprim_geo.points.view_pairs import visible_pixels
+from linprim_geo.points.view_pairs import nearest_views, visible_pixels
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 
 # A thin thing is before the known surface by more than this share of the depth: twice what depths may be off by.
@@ -65,11 +65,8 @@ class Colors:
 def thin_things(views: Sequence[SeenDepths]) -> list[np.ndarray]:
     """(H, W) bool of every view: where its rendered depth is that of a thin thing before the known surface."""
     colors = Colors([uniform_filter(view.rgb, (MEAN, MEAN, 1), mode="nearest") for view in views], channel_gains(views))
-    centers = np.array([view.camera.center for view in views])
     found = []
-    for number in range(len(views)):
-        nearest = np.argsort(np.linalg.norm(centers - centers[number], axis=1), kind="stable")
-        others = [other for other in nearest[: COMPARED + 1] if other != number]
+    for number, others in enumerate(nearest_views([view.camera for view in views], COMPARED)):
         before, thin = _compared(number, others, views, colors)
         share = uniform_filter(thin.astype(np.float32), WINDOW, mode="constant")
         of_all = uniform_filter(before.astype(np.float32), WINDOW, mode="constant")

@@ -19,6 +19,7 @@ from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.depth_maps import SURE, DepthMap, depth_maps
 from linprim_geo.stereo.enclosing_planes import enclosing_depths, enclosing_planes, known_on_planes
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
+from linprim_geo.stereo.lone_backgrounds import lone_backgrounds
 from linprim_geo.stereo.plain_regions import common_planes, edges_of, grown_alike, plane_depths, regions_of_views
 from linprim_geo.stereo.point_planes import SurfacePoints, planes_of_points, point_plane_depth
 from linprim_geo.stereo.shaded_planes import ShadedPlanes
@@ -83,6 +84,8 @@ class MergedFrames(Sequence):
         are_sharp = [depth > 0 for depth in rendered_depths] if sharp is None else list(sharp)
         self._enclose(points, known, measured, are_sharp, backgrounds)
         self._keep_thin_things(views, maps, rendered_depths, are_sharp)
+        if not any(view.has_alpha for view in views):  # else masks say what is background
+            self._end_lone_backgrounds()
 
     def _take_planes(self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Finds planes by points, by edges and by shading, of depths that are sure, and what lies on them; moves
@@ -179,6 +182,15 @@ class MergedFrames(Sequence):
             for others in (self.on_planes, self.doubtful_depths):
                 others[view] = np.where(thing, np.float32(np.nan), others[view])
         self.thin = float(np.mean([thing.mean() for thing in things]))
+
+    def _end_lone_backgrounds(self) -> None:
+        """Lets rays end at confirmed surfaces that no other view looks past."""
+        backgrounds = [_background_of(frame) for frame in self.rendered]
+        lone = lone_backgrounds(self.cameras, backgrounds, self.depths)
+        self.rendered = [
+            frame if frame.background is None else replace(frame, background=frame.background & ~ended)
+            for frame, ended in zip(self.rendered, lone, strict=True)
+        ]
 
     def covered(self, mesh: Mesh) -> float:
         """Share of the pixels with a rendered depth whose rays hit a mesh, of one of SAMPLED rows and columns."""
@@ -306,6 +318,11 @@ def _seen_past(frame: DepthFrame, found: DepthMap, background: np.ndarray) -> De
         background=frame.background | background,
         clamped=None if frame.clamped is None else frame.clamped & ~background,
     )
+
+
+def _background_of(frame: DepthFrame) -> np.ndarray:
+    """(H, W) bool."""
+    return np.zeros(frame.depth.shape, bool) if frame.background is None else frame.background
 
 
 def _depth_where(found: DepthMap, taken: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ from linprim_geo.surface.tsdf_field import DepthFrame
 from linprim_geo.surface.tsdf_parts import merge_parts
 
 CAMERA = look_at((0.0, -3.0, 0.0), size=(40, 30))
-VIEW = SimpleNamespace(load=lambda: Photo(np.zeros((30, 40, 3), np.uint8)))
+VIEW = SimpleNamespace(load=lambda: Photo(np.zeros((30, 40, 3), np.uint8)), has_alpha=False)
 
 
 @pytest.fixture
@@ -167,6 +167,26 @@ def test_what_few_views_know_on_a_plane_is_not_background(found, monkeypatch):
     assert (frame.depth[2:, :5] == 3).all() and (frame.confidence[2:, :5] == 1).all()
     assert not (frame.depth[:, 5:10] == 3).any() and (frame.background == background & ~on_plane).all()
     assert np.isfinite(asked[0][1:, :20]).all() and np.isnan(asked[0][:, 20:]).all(), "planes themselves know nothing"
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_rays_end_at_confirmed_depths_in_lone_backgrounds_unless_masks_say_so(found, monkeypatch, masked):
+    hole, background = np.zeros((30, 40), bool), np.zeros((30, 40), bool)
+    hole[:, :5], background[:, :10] = True, True
+    asked = []
+
+    def lone(cameras, backgrounds, known):
+        asked.extend([*backgrounds, *known])
+        return [hole]
+
+    monkeypatch.setattr(stereo_frames, "lone_backgrounds", lone)
+    view = SimpleNamespace(load=VIEW.load, has_alpha=masked)
+    frame = MergedFrames([replace(rendered(0.01)[0], background=background)], [view], 5.0)[0]
+    if masked:
+        assert not asked and (frame.background == background).all()
+    else:
+        assert (frame.background == background & ~hole).all() and (frame.depth[2:, :5] == 3).all()
+        assert (asked[0] == background).all() and np.isfinite(asked[1][2:, :20]).all()
 
 
 def test_thin_things_stand_before_what_is_known(found, monkeypatch):
