@@ -3,7 +3,9 @@
 Growth only splits primitives that are there, so a surface without a start is either left open or covered by primitives
 that drift in front of it. Two sources fill the gaps, both checked against all the photographs: the points that surround
 a gap, between which inverse depth is linear on a plane, and where these are too far apart or too unlike, the depth at
-which other views show the same colours.
+which other views show the same colours. What has neither starts behind everything that is known: nearer, it would be
+fog between the cameras, which those that look past it do not see. Of a masked object it starts beside the nearest
+points.
 """
 
 from __future__ import annotations
@@ -65,9 +67,10 @@ def densify(scene: Scene, seed: int, backdrop: np.ndarray | None = None, far: Fa
     View by view, those with most points first, every cell that neither a given nor a new point falls into gets a
     candidate, at a random place in it. Its depth is that between the three points round it (inverse depth is linear
     over a plane) if theirs agree, or else, in a second round with larger cells, the one of 64 at which the patch round
-    it looks the same in other views. A candidate is kept if it looks the same in other views and if hardly any view
-    sees surfaces through it. Masked background, and pixels of the colour of a plain backdrop, get no points. Colours
-    are those of the photograph.
+    it looks the same in other views, or else, in a third, the farthest of these, on masked objects that of the nearest
+    points. A candidate is kept if it looks the same in other views, which one of the third round need not, and if
+    hardly any view sees surfaces through it. Masked background, and pixels of the colour of a plain backdrop, get no
+    points. Colours are those of the photograph.
 
     Args:
         scene: with points; held-out views are not used.
@@ -84,9 +87,13 @@ def densify(scene: Scene, seed: int, backdrop: np.ndarray | None = None, far: Fa
     views = [_Gaps(small_view, cloud.xyz) for small_view in evenly_spread_views(scene.train, MOST_VIEWS)]
     at_infinity = [None if far is None else far.difference(view.small_view) for view in views]
     rng = np.random.default_rng([seed, 8])
+    sources_of_depth = [_between_points]
+    if far is None:
+        # All that a mask shows is the object.
+        sources_of_depth += [_same_colors, _nearest_points if scene.has_alpha else _behind_all]
     found = [np.empty((0, 3))]
     colors = [np.empty((0, 3), np.uint8)]
-    for source in (_between_points, _same_colors, _nearest_points) if far is None else (_between_points,):
+    for source in sources_of_depth:
         if source is not _between_points:  # by now there are more points, and more space is known to be free
             views = [_Gaps(view.small_view, np.concatenate([cloud.xyz, *found])) for view in views]
         cell = CELL if source is _between_points else PATCH_CELL
@@ -267,6 +274,11 @@ def _nearest_points(view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray) -
 
     _, near = cKDTree(view.pixels).query(pixels, k=_NEIGHBOURS)
     return pixels, np.median(view.inverse[near], axis=1)
+
+
+def _behind_all(view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """All of the (Q, 2) positions, at the farthest depth that is tried."""
+    return pixels, np.full(len(pixels), view.depths_to_try()[0])
 
 
 def _rays(camera: Camera, pixels: np.ndarray) -> np.ndarray:
