@@ -25,7 +25,8 @@ from linprim_geo.surface.depth_error import error_by_depths, largest_error
 from linprim_geo.surface.photo_consistency import best_agreement, photo_gains
 from linprim_geo.surface.stereo_frames import MergedFrames
 from linprim_geo.surface.tsdf_field import DepthFrame
-from linprim_geo.surface.tsdf_fusion import TooFine, auto_voxel_size, estimate_memory, fuse_tsdf
+from linprim_geo.surface.tsdf_fusion import auto_voxel_size, fuse_tsdf
+from linprim_geo.surface.voxel_blocks import TooFine, estimate_memory
 
 # A ray with less opacity than this has seen through the scene: it votes for free space.
 SEEN_THROUGH = 0.5

@@ -28,7 +28,7 @@ from linprim_geo.kernels import ops
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.method_tsdf import DepthFrames
 from linprim_geo.surface.tsdf_field import placed
-from linprim_geo.surface.tsdf_fusion import Lattice, block_keys, estimate_memory
+from linprim_geo.surface.voxel_blocks import Lattice, block_keys, estimate_memory
 
 # What `save_lattice` writes: shapes and kinds.
 _LATTICE: dict[str, tuple[tuple[int | None, ...], str]] = {

@@ -17,8 +17,9 @@ from linprim_geo.runs.run import Run
 from linprim_geo.surface.extract import extract_mesh
 from linprim_geo.surface.method_tsdf import DepthFrames
 from linprim_geo.surface.tsdf_field import placed, vote_rules
-from linprim_geo.surface.tsdf_fusion import Lattice, _find_blocks, fuse_lattice
+from linprim_geo.surface.tsdf_fusion import fuse_lattice
 from linprim_geo.surface.tsdf_parts import halo, load_lattice, load_part, merge_parts, owners, part_task, save_lattice
+from linprim_geo.surface.voxel_blocks import Lattice, find_blocks
 
 LEVEL = 0.5
 
@@ -27,7 +28,7 @@ LEVEL = 0.5
 def lattice(tiny_run):
     frames = DepthFrames(Run.open(tiny_run), LEVEL)
     voxel, rules = 0.02, vote_rules(3.0, 0.75, 0.0)
-    blocks, origin, _ = _find_blocks(frames, voxel, 3.0, None, 8, np.inf)
+    blocks, origin, _ = find_blocks(frames, voxel, 3.0, None, 8, np.inf)
     made = Lattice(blocks, origin, voxel, 8, 3.0, rules)
     return made, fuse_lattice(made, frames)
 
