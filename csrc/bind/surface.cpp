@@ -18,6 +18,7 @@
 #include "surface/face_samples.h"
 #include "surface/filter_normals.h"
 #include "surface/fuse.h"
+#include "surface/marching_cubes.h"
 #include "surface/photo_consistency.h"
 #include "surface/point_colors.h"
 #include "surface/points_within.h"
@@ -184,6 +185,33 @@ void bind_surface(nb::module_& m) {
       throw std::invalid_argument("rows are outside of the blocks");
     nb::gil_scoped_release release;
     linprim::add_votes(view, how, chosen, count, sums);
+  });
+  // (3 V,) vertices and (3 F,) corners.
+  m.def("marching_cubes", [](In<int64_t> index, In<int64_t> level, int resolution, In<float> distance,
+                             In<uint8_t> known, In<uint8_t> mine) {
+    const int64_t count = int64_t(level.size()), voxels = int64_t(resolution) * resolution * resolution;
+    const linprim::VoxelBlocks blocks{count,
+                                      resolution,
+                                      checked(index, {count, 3}, "index"),
+                                      checked(level, {count}, "level"),
+                                      checked(distance, {count, voxels}, "distance"),
+                                      checked(known, {count, voxels}, "known"),
+                                      checked(mine, {count}, "owned")};
+    constexpr int64_t kFarthest = (int64_t(1) << (linprim::kIndexBits - 1)) - 2;
+    const auto outside = [](int64_t low, int64_t high) {
+      return [=](int64_t value) { return value < low || value > high; };
+    };
+    if (resolution < 1 || count * voxels > int64_t(UINT32_MAX)) throw std::invalid_argument("too many voxels");
+    if (std::any_of(blocks.index, blocks.index + 3 * count, outside(-kFarthest, kFarthest)))
+      throw std::invalid_argument("index is too large");
+    if (std::any_of(blocks.level, blocks.level + count, outside(0, linprim::kMostLevels - 1)))
+      throw std::invalid_argument("level is out of range");
+    linprim::Triangles found;
+    {
+      nb::gil_scoped_release release;
+      found = linprim::marching_cubes(blocks);
+    }
+    return std::tuple(owned(std::move(found.vertex)), owned(std::move(found.corner)));
   });
   m.def("filter_normals", [](In<int64_t> corner, In<double> bound, double contrast, int normal_rounds,
                              int vertex_rounds, Out<double> vertex) {

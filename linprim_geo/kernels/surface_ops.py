@@ -86,6 +86,27 @@ def add_votes(
     _core.add_votes(project, width, height, surfels, rules, rows, corner, voxel, resolution, total, weight, free)
 
 
+def marching_cubes(index, level, resolution: int, distance, known, owned) -> tuple[np.ndarray, np.ndarray]:
+    """The surface between voxels inside and outside, of blocks of several sizes that do not overlap, without cracks.
+
+    A voxel of level l is 2^l long, in finest voxels, as are all lengths; it has its distance at its centre. Block
+    (0, 0, 0) of any level starts at the origin. A manifold, but for borders, if the levels of blocks that touch differ
+    by one at most. Source: Schaefer and Warren 2004.
+
+    Args:
+        index: (B, 3) int64, in blocks of its level.
+        level: (B,) int64, from 0.
+        distance: (B, resolution^3) float32, x fastest, negative inside, never 0.
+        known: (B, resolution^3) uint8; there is no surface beside a voxel that is not.
+        owned: (B,) uint8; only cubes are marched of which the first of the smallest blocks is owned.
+
+    Returns:
+        (V, 3) float64 vertices, (F, 3) int64 faces, counter-clockwise seen from outside.
+    """
+    vertices, faces = _core.marching_cubes(index, level, resolution, distance, known, owned)
+    return vertices.reshape(-1, 3), faces.reshape(-1, 3)
+
+
 def filter_normals(corner, bound, contrast: float, normal_rounds: int, vertex_rounds: int, vertex) -> None:
     """Moves the vertices of a mesh so that the normals of its faces become those of their neighbours, but for edges.
 

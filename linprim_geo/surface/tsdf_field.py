@@ -5,8 +5,7 @@ follow in closed form from the inverse depths around it. A voxel takes its dista
 pixel it falls on, which is exact on flat surfaces at any angle and resolution; `VoxelBlockGrid.integrate`
 takes the difference of depths at the nearest pixel instead, a staircase across the pixels that grows with
 the angle. Votes weigh what they are worth: a distance in front of a surface bounds the true one from above,
-so near ones count more, and a view knows nothing of what lies far behind the surface it sees. Open3D holds
-the blocks and runs marching cubes.
+so near ones count more, and a view knows nothing of what lies far behind the surface it sees.
 """
 
 from __future__ import annotations
@@ -182,36 +181,40 @@ def vote_rules(truncation: float, behind: float, occluded: float) -> tuple[float
 
 
 class Grid:
-    """The field in its blocks. Coordinates are float32, relative to `origin`."""
+    """The field in its blocks: `blocks` (B, 3) int64 of `resolution`^3 voxels, of which `levels` (B,) says how large
+    they are: 2^level times `voxel`. `truncation` is in voxels of the block. Coordinates are relative to `origin`, where
+    block (0, 0, 0) of every level starts."""
 
-    def __init__(self, blocks, origin, voxel, truncation, resolution):
-        self.blocks, self.origin = blocks, origin
+    def __init__(self, blocks, levels, origin, voxel, truncation, resolution):
+        self.blocks, self.levels, self.origin = np.ascontiguousarray(blocks), levels, origin
         self.voxel, self.truncation, self.resolution = voxel, truncation, resolution
         size = resolution**3
         self.total = np.zeros((len(blocks), size), dtype=np.float32)
         self.weight = np.zeros((len(blocks), size), dtype=np.float32)
         self.free = np.zeros((len(blocks), size), dtype=np.float32)
-        self.corner = np.ascontiguousarray(blocks * (resolution * voxel), np.float64)
+        self.edge = voxel * 2.0**levels
+        self.corner = (blocks * resolution + 0.5) * self.edge[:, None]
 
     def integrate(self, frame: DepthFrame, rules: tuple[float, ...]) -> None:
         """Adds the votes of one frame to every block in its frustum; `rules` are `vote_rules`."""
         camera = frame.camera
-        rows = self.in_view(camera)
-        if len(rows) == 0:
-            return
+        seen = self.in_view(camera)
         project = np.empty((3, 4))
         project[:, :3] = camera.K @ camera.rotation
         project[:, 3] = camera.K @ (camera.rotation @ self.origin + camera.world_to_camera[:3, 3])
-        table = surfels(frame, self.voxel, self.truncation, self.origin)
         sums = (self.total, self.weight, self.free)
-        surface_ops.add_votes(
-            project, camera.width, camera.height, table, rules, rows, self.corner, self.voxel, self.resolution, *sums
-        )
+        for level in np.unique(self.levels[seen]):
+            rows = seen[self.levels[seen] == level]
+            voxel = self.voxel * 2.0**level
+            table = surfels(frame, voxel, self.truncation * voxel, self.origin)
+            surface_ops.add_votes(
+                project, camera.width, camera.height, table, rules, rows, self.corner, voxel, self.resolution, *sums
+            )
 
     def in_view(self, camera: Camera) -> np.ndarray:
         """Blocks whose bounding sphere meets the frustum."""
-        middle = 0.5 * (self.resolution - 1) * self.voxel
-        centers = (self.corner + middle + self.origin) @ camera.rotation.T + camera.world_to_camera[:3, 3]
+        middle = 0.5 * (self.resolution - 1) * self.edge
+        centers = (self.corner + middle[:, None] + self.origin) @ camera.rotation.T + camera.world_to_camera[:3, 3]
         radius = np.sqrt(3.0) * middle
         seen = centers[:, 2] > -radius
         width, height = camera.width, camera.height
@@ -226,16 +229,14 @@ class Grid:
 
     def extract(self) -> Mesh:
         """The surface in the order of its coordinates; empty if the field never changes sign. Uses the field up."""
-        return placed(self.surface(), self.origin)
+        return placed(self.surface(np.ones(len(self.blocks), bool)), self.origin)
 
-    def surface(self) -> Mesh:
-        """Marching cubes between voxels that any view has voted on, relative to `origin`, in any order.
+    def surface(self, owned: np.ndarray) -> Mesh:
+        """Marching cubes between voxels that any view has voted on, relative to `origin`: the part that belongs to the
+        `owned` (B,) bool blocks, see `surface_ops.marching_cubes`.
 
         Uses the field up, to have its memory for the mesh.
         """
-        import open3d
-
-        core, cpu = open3d.core, open3d.core.Device("CPU:0")
         field, weight, free = self.total, self.weight, self.free
         self.total = self.weight = self.free = None
         known = weight + free > LEAST_SUPPORT
@@ -250,30 +251,11 @@ class Grid:
         gap = np.where(field < 0, np.float32(-ZERO_GAP), np.float32(ZERO_GAP))
         np.copyto(field, gap, where=np.abs(field) < ZERO_GAP)
         del weight, free, gap, voted
-        grid = open3d.t.geometry.VoxelBlockGrid(
-            ("tsdf", "weight"),
-            (core.float32, core.float32),
-            (core.SizeVector([1]), core.SizeVector([1])),
-            self.voxel,
-            self.resolution,
-            len(self.blocks),
-            cpu,
+        field *= (self.truncation * 2.0**self.levels).astype(np.float32)[:, None]
+        vertices, faces = surface_ops.marching_cubes(
+            self.blocks, self.levels, self.resolution, field, known.view(np.uint8), owned.view(np.uint8)
         )
-        keys = core.Tensor(np.ascontiguousarray(self.blocks.astype(np.int32)), core.int32, cpu)
-        grid.hashmap().activate(keys)
-        slots, _ = grid.hashmap().find(keys)
-        slots = slots.numpy().astype(np.int64)
-        # The arrays alias the grid's memory.
-        grid.attribute("tsdf").numpy().reshape(-1, self.resolution**3)[slots] = field
-        grid.attribute("weight").numpy().reshape(-1, self.resolution**3)[slots] = known
-        del field, known
-        try:
-            raw = grid.extract_triangle_mesh(0.5)
-            vertices = raw.vertex.positions.numpy().astype(np.float64)
-            faces = raw.triangle.indices.numpy().astype(np.int64)
-        except RuntimeError:  # what Open3D raises where there is no surface
-            return Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
-        return Mesh(vertices, faces)
+        return Mesh(vertices * self.voxel, faces)
 
 
 def placed(surface: Mesh, origin: np.ndarray) -> Mesh:
@@ -286,11 +268,7 @@ def placed(surface: Mesh, origin: np.ndarray) -> Mesh:
 
 
 def _canonical(mesh: Mesh) -> Mesh:
-    """Vertices in the order of their coordinates, faces in the order of their vertices, coincident ones
-    merged.
-
-    Open3D's threads number vertices as they come; the set of them is always the same.
-    """
+    """Vertices in the order of their coordinates, faces in the order of their vertices, coincident ones merged."""
     order = np.lexsort(mesh.vertices.T[::-1])
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))

@@ -26,7 +26,7 @@ def fuse_tsdf(
     truncation_voxels: float = 3.0,
     bounds: np.ndarray | None = None,
     memory_limit: int | None = None,
-    block_resolution: int = 8,
+    block_resolution: int = 4,
     min_component: float = 1e-3,
     behind_voxels: float = BEHIND_VOXELS,
     occluded_vote: float = 0.0,
@@ -80,7 +80,8 @@ def fuse_tsdf(
         f"{need / 2**20:.0f} MiB of {limit / 2**20:.0f} MiB"
     )
     rules = vote_rules(truncation_voxels, behind_voxels, occluded_vote)
-    lattice = Lattice(blocks, origin, voxel_size, block_resolution, truncation_voxels, rules)
+    levels = np.zeros(len(blocks), dtype=np.int64)
+    lattice = Lattice(blocks, levels, origin, voxel_size, block_resolution, truncation_voxels, rules)
     mesh = _trimmed((fuse or fuse_lattice)(lattice, frames), bounds, min_component)
     if len(mesh.faces) == 0:
         raise LinprimError(

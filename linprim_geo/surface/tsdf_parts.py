@@ -2,7 +2,7 @@
 to the last bit.
 
 A part's field is that of the blocks that it owns and of their neighbours. It votes there in the order of the views, as
-the whole does, and hands on the triangles whose middle lies in a block of its own.
+the whole does, and hands on the triangles of the cubes that belong to its blocks (`surface_ops.marching_cubes`).
 """
 
 from __future__ import annotations
@@ -21,18 +21,19 @@ from linprim_geo.base.memory import PROCESS_GIB
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Progress
 from linprim_geo.geometry.boxes import split_space
-from linprim_geo.geometry.mesh import Mesh, select_faces
+from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.jobs import worker
 from linprim_geo.jobs.executor import Executor, Task
 from linprim_geo.kernels import ops
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.method_tsdf import DepthFrames
 from linprim_geo.surface.tsdf_field import placed
-from linprim_geo.surface.voxel_blocks import Lattice, block_keys, estimate_memory
+from linprim_geo.surface.voxel_blocks import Lattice, block_keys, estimate_memory, touching, unpack_keys
 
 # What `save_lattice` writes: shapes and kinds.
 _LATTICE: dict[str, tuple[tuple[int | None, ...], str]] = {
     "blocks": ((None, 3), "i"),
+    "levels": ((None,), "i"),
     "owner": ((None,), "i"),
     "origin": ((3,), "f"),
     "voxel": ((), "f"),
@@ -66,17 +67,17 @@ class PartFusion:
             lattice.rules,
         )
         digest.update(repr(options).encode())
-        digest.update(lattice.blocks.tobytes() + lattice.origin.tobytes())
+        digest.update(lattice.blocks.tobytes() + lattice.levels.tobytes() + lattice.origin.tobytes())
         place = self.folder / digest.hexdigest()[:16]
         for other in self.folder.iterdir():  # of other options
             if other.is_dir() and other != place:
                 shutil.rmtree(other)
-        owner = owners(lattice.blocks, count)
+        owner = owners(lattice, count)
         save_lattice(place / "lattice.npz", lattice, owner)
         largest = max(view.camera.width * view.camera.height for view in self.run.scene().train)
         tasks = []
         for part in range(count):
-            size = int(halo(lattice.blocks, owner == part).sum())
+            size = int(halo(lattice, owner == part).sum())
             need = PROCESS_GIB + estimate_memory(size, lattice.resolution, largest) / 2**30
             where = {"run": str(self.run.path.resolve()), "level": self.level, "limit": frames.limit, "part": part}
             where |= {"held_out": self.held_out}
@@ -99,19 +100,29 @@ class PartFusion:
         return mesh
 
 
-def owners(blocks: np.ndarray, count: int) -> np.ndarray:
-    """(B,) which of `count` parts each block (B, 3) belongs to; as many in each, near each other."""
-    owner = np.zeros(len(blocks), dtype=np.int64)
-    for part, box in enumerate(split_space(blocks, np.ones(len(blocks)), count)):
-        owner[box.holds(blocks)] = part
+def owners(lattice: Lattice, count: int) -> np.ndarray:
+    """(B,) which of `count` parts each block belongs to; as many in each, near each other."""
+    middle = (lattice.blocks + 0.5) * 2.0 ** lattice.levels[:, None]
+    owner = np.zeros(len(middle), dtype=np.int64)
+    for part, box in enumerate(split_space(middle, np.ones(len(middle)), count)):
+        owner[box.holds(middle)] = part
     return owner
 
 
-def halo(blocks: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """(B,) bool: the blocks of (B, 3) that are `own` (B,) or touch one that is."""
-    steps = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
-    near = np.unique(np.concatenate([block_keys(blocks[own] + step) for step in steps]))
-    return np.isin(block_keys(blocks), near)
+def halo(lattice: Lattice, own: np.ndarray) -> np.ndarray:
+    """(B,) bool: the blocks that are `own` (B,) or touch one that is."""
+    inside = own.copy()
+    for level in np.unique(lattice.levels[own]):
+        # Blocks of the level as far as its own touch; larger ones hold one of them, smaller ones are in one.
+        near = np.unique(touching(lattice.blocks[own & (lattice.levels == level)]))
+        for other in np.unique(lattice.levels):
+            these = lattice.levels == other
+            if other <= level:
+                inside[these] |= np.isin(block_keys(lattice.blocks[these] >> (level - other)), near)
+            else:
+                larger = block_keys(unpack_keys(near) >> (other - level))
+                inside[these] |= np.isin(block_keys(lattice.blocks[these]), larger)
+    return inside
 
 
 def part_task(folder: Path, run: str, level: float, limit: float, part: int, held_out: bool = False) -> dict:
@@ -122,8 +133,8 @@ def part_task(folder: Path, run: str, level: float, limit: float, part: int, hel
     ops.set_threads(worker.cores)
     lattice, owner = load_lattice(folder.parent / "lattice.npz")
     own = owner == part
-    inside = halo(lattice.blocks, own)
-    grid = replace(lattice, blocks=lattice.blocks[inside]).grid()
+    inside = halo(lattice, own)
+    grid = replace(lattice, blocks=lattice.blocks[inside], levels=lattice.levels[inside]).grid()
     opened = Run.open(run)
     frames = DepthFrames(opened.with_held_out_views() if held_out else opened, level, limit, keep=False)
     used = 0
@@ -131,11 +142,7 @@ def part_task(folder: Path, run: str, level: float, limit: float, part: int, hel
         if len(grid.in_view(view.camera)):
             grid.integrate(frames[number], lattice.rules)
             used += 1
-    surface = grid.surface()
-    if len(surface.faces):
-        middle = surface.vertices[surface.faces].mean(1)
-        block = np.floor(middle / (lattice.voxel * lattice.resolution)).astype(np.int64)
-        surface = select_faces(surface, np.isin(block_keys(block), block_keys(lattice.blocks[own])))
+    surface = grid.surface(own[inside])
     with atomic_write(folder / "part.npz") as temporary, open(temporary, "wb") as file:
         np.savez(file, vertices=surface.vertices, faces=surface.faces)
     return {"faces": len(surface.faces), "views": used, "blocks": int(own.sum())}
@@ -157,6 +164,7 @@ def save_lattice(path: Path, lattice: Lattice, owner: np.ndarray) -> None:
         np.savez(
             file,
             blocks=lattice.blocks,
+            levels=lattice.levels,
             owner=owner,
             origin=lattice.origin,
             voxel=lattice.voxel,
@@ -172,9 +180,9 @@ def load_lattice(path: Path) -> tuple[Lattice, np.ndarray]:
     Raises:
         LinprimError: it is damaged.
     """
-    blocks, owner, origin, voxel, resolution, truncation, rules = read_named(path, _LATTICE)
+    blocks, levels, owner, origin, voxel, resolution, truncation, rules = read_named(path, _LATTICE)
     numbers = float(voxel), int(resolution), float(truncation), tuple(float(x) for x in rules)
-    return Lattice(blocks, origin, *numbers), owner
+    return Lattice(blocks, levels, origin, *numbers), owner
 
 
 def load_part(path: Path) -> Mesh:

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.surface.tsdf_field import Grid
+from linprim_geo.surface.tsdf_field import DepthFrame, Grid
 
-BYTES_PER_VOXEL = 44
-"""12 for the votes; when they are done, 5 for the field, 8 for Open3D's copy of it, and marching cubes: 37
-measured on a room of 53,000 blocks that gave 3.6 million faces."""
+BYTES_PER_VOXEL = 34
+"""12 for the votes; when they are done, 5 for the field, what it is made with, and marching cubes: 25 and 26 measured
+on an office of 192,000 and 742,000 blocks of 4^3 that gave 0.8 and 3.4 million faces."""
 
 FINEST_PART = 8
 """A voxel smaller than this part of a pixel's footprint holds nothing that a pixel has seen."""
 
 KEY_BITS = 21
 """Bits per axis of the key of a block or voxel: three fit into an int64."""
+
+
+MOST_NEW = 2**21
+"""Keys of `NearBlocks` that wait for being merged."""
 
 
 class TooFine(LinprimError):
@@ -30,19 +35,25 @@ class TooFine(LinprimError):
 
 @dataclass(frozen=True)
 class Lattice:
-    """Where a field is kept: `blocks` (B, 3) of `resolution`^3 voxels of edge `voxel`; block (0, 0, 0) starts at
-    `origin` (3,). `truncation` is in voxels, `rules` are `tsdf_field.vote_rules`."""
+    """Where a field is kept: `blocks` (B, 3) int64 of `resolution`^3 voxels. Those of `levels` (B,) int64 are 2^level
+    times as long as `voxel`, and so are their blocks; block (0, 0, 0) of every level starts at `origin` (3,). Blocks do
+    not overlap. `truncation` is in voxels, `rules` are `tsdf_field.vote_rules`."""
 
     blocks: np.ndarray
+    levels: np.ndarray
     origin: np.ndarray
     voxel: float
     resolution: int
     truncation: float
     rules: tuple[float, ...]
 
+    def voxel_sizes(self) -> np.ndarray:
+        """(B,) edge of the voxels of each block."""
+        return self.voxel * 2.0**self.levels
+
     def grid(self) -> Grid:
         """An empty field on it."""
-        return Grid(self.blocks, self.origin, self.voxel, self.truncation * self.voxel, self.resolution)
+        return Grid(self.blocks, self.levels, self.origin, self.voxel, self.truncation, self.resolution)
 
 
 def estimate_memory(blocks: int, block_resolution: int = 8, frame_pixels: int = 0) -> int:
@@ -65,12 +76,77 @@ def unpack_keys(key: np.ndarray) -> np.ndarray:
     return np.stack([key >> (2 * KEY_BITS), (key >> KEY_BITS) & mask, key & mask], axis=1) - half
 
 
-def find_blocks(frames, voxel, truncation, bounds, resolution, limit):
-    """Blocks within a truncation of any depth sample; refuses what does not fit in memory.
+def touching(index: np.ndarray) -> np.ndarray:
+    """(27 B,) keys of blocks (B, 3) and of those that touch them, in 27 runs."""
+    steps = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
+    return np.concatenate([block_keys(index + step) for step in steps])
 
-    Returns sorted (B, 3) indices, the world point that block (0, 0, 0) starts at, and the pixels of the largest frame.
+
+class NearBlocks:
+    """Collects the blocks within a `truncation` of points, in voxels, of a lattice of one size. Points are relative to
+    its origin."""
+
+    def __init__(self, voxel: float, truncation: float, resolution: int):
+        self.voxel, self.truncation, self.resolution = voxel, truncation, resolution
+        # Keys of pairs of voxels, which are far fewer than points, by how far blocks around them reach.
+        self.pairs: dict[int, np.ndarray] = {}
+        self.new: dict[int, list[np.ndarray]] = {}
+
+    def add(self, points: np.ndarray, footprint: float = 0.0) -> None:
+        """Adds (P, 3) points, between neighbours of which there are gaps of `footprint`.
+
+        Raises:
+            LinprimError: one is too far from the origin.
+        """
+        reach = int(np.ceil(max(self.truncation, footprint / self.voxel)))
+        index = points / self.voxel
+        if np.abs(index).max(initial=0) / self.resolution >= (1 << (KEY_BITS - 1)) - reach - 2:
+            raise LinprimError(
+                f"voxel size {self.voxel:.4g} is too small for a scene in which depths reach "
+                f"{np.abs(points).max():.4g} from the middle, wanted at most a few million voxels across: "
+                "give bounds, or a larger voxel size"
+            )
+        new = self.new.setdefault(reach, [])
+        new.append(np.unique(block_keys(np.floor(index).astype(np.int64) >> 1)))
+        if sum(map(len, new)) > MOST_NEW:
+            self._merge(reach)
+
+    def _merge(self, reach: int) -> None:
+        new = self.new.pop(reach, [])
+        self.pairs[reach] = np.unique(np.concatenate([self.pairs.get(reach, np.zeros(0, np.int64)), *new]))
+
+    def keys(self) -> np.ndarray:
+        """(B,) sorted keys of the blocks."""
+        for reach in list(self.new):
+            self._merge(reach)
+        found = [np.zeros(0, np.int64)]
+        for reach, pairs in self.pairs.items():
+            low, width = 2 * unpack_keys(pairs) - reach, 2 * reach + 1
+            steps = np.append(np.arange(0, width, self.resolution), width)
+            found += [
+                np.unique(block_keys((low + [x, y, z]) // self.resolution)) for x in steps for y in steps for z in steps
+            ]
+        return np.unique(np.concatenate(found))
+
+
+def find_blocks(
+    frames: Iterable[DepthFrame],
+    voxel: float,
+    truncation: float,
+    bounds: np.ndarray | None,
+    resolution: int,
+    limit: float,
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Blocks within a truncation of any depth sample in the `bounds`, of voxels whose middles are at multiples of their
+    size.
+
+    Returns: sorted (B, 3) indices, the world point that block (0, 0, 0) starts at, and the pixels of the largest frame.
+
+    Raises:
+        LinprimError: there are no samples, or they are too far apart, or the voxels are too small for any pixel.
+        TooFine: the field takes more than `limit` bytes.
     """
-    keys, origin, largest, done = np.zeros(0, dtype=np.int64), None, 0, 0
+    near, origin, largest, done = NearBlocks(voxel, truncation, resolution), None, 0, 0
     for frame in frames:
         done += 1
         points, depth = frame.surface()
@@ -81,62 +157,47 @@ def find_blocks(frames, voxel, truncation, bounds, resolution, limit):
         if len(points) == 0:
             continue
         if origin is None:
-            origin = np.round(np.median(points, axis=0) / voxel) * voxel
+            origin = (np.round(np.median(points, axis=0) / voxel) - 0.5) * voxel
         footprint = float(np.median(depth)) / min(frame.camera.fx, frame.camera.fy)
-        keys = np.union1d(keys, blocks_near(points - origin, voxel, truncation, footprint, resolution))
-        need = estimate_memory(len(keys), resolution, largest)
-        if need > limit:
-            total = len(frames) if hasattr(frames, "__len__") else sum(1 for _ in frames)
-            _refuse(need, estimate_memory(0, resolution, largest), limit, voxel, done, total)
+        if footprint > FINEST_PART * voxel:
+            raise LinprimError(
+                f"voxel size {voxel:.4g} is less than 1/{FINEST_PART} of what a pixel covers on the surface "
+                f"({footprint:.3g}), which no view "
+                f"can fill: wanted at least {footprint / FINEST_PART:.2g}"
+            )
+        near.add(points - origin, footprint)
     if origin is None:
         where = "" if bounds is None else f" inside {bounds[0].tolist()} to {bounds[1].tolist()}"
         raise LinprimError(f"none of the {done} depth maps holds a surface{where}, nothing can be fused")
+    keys = near.keys()
+    check_memory(len(keys), resolution, largest, limit, voxel)
     blocks = unpack_keys(keys)
     # Coordinates are float32 from here on, so they are counted from the middle.
     middle = (blocks.min(0) + blocks.max(0)) // 2
     return blocks - middle, origin + middle * (resolution * voxel), largest
 
 
-def blocks_near(points, voxel, truncation, footprint, resolution):
-    if footprint > FINEST_PART * voxel:
-        raise LinprimError(
-            f"voxel size {voxel:.4g} is less than 1/{FINEST_PART} of what a pixel covers on the surface "
-            f"({footprint:.3g}), which no view "
-            f"can fill: wanted at least {footprint / FINEST_PART:.2g}"
-        )
-    reach = int(np.ceil(max(truncation, footprint / voxel)))
-    index = points / voxel
-    if np.abs(index).max() / resolution >= (1 << (KEY_BITS - 1)) - reach - 2:
-        raise LinprimError(
-            f"voxel size {voxel:.4g} is too small for a scene in which depths reach "
-            f"{np.abs(points).max():.4g} from the middle, wanted at most a few million voxels across: "
-            "give bounds, or a larger voxel size"
-        )
-    # Pairs of voxels first: far fewer than samples.
-    pairs = np.unique(block_keys(np.floor(index).astype(np.int64) >> 1))
-    low = 2 * unpack_keys(pairs) - reach
-    width = 2 * reach + 1
-    steps = np.append(np.arange(0, width, resolution), width)
-    found = [np.unique(block_keys((low + [x, y, z]) // resolution)) for x in steps for y in steps for z in steps]
-    return np.unique(np.concatenate(found))
+def check_memory(blocks: int, resolution: int, pixels: int, limit: float, voxel: float) -> None:
+    """Refuses a field that takes more than `limit` bytes, with voxels of about `voxel`, of frames of at most `pixels`.
 
-
-def _refuse(need: float, frame: float, limit: float, voxel: float, done: int, total: int):
-    """Of the bytes that are needed a `frame` at work takes some at any voxel size."""
+    Raises:
+        TooFine: with the voxel size that fits.
+        LinprimError: a frame at work takes more at any voxel size.
+    """
+    need, frame = estimate_memory(blocks, resolution, pixels), estimate_memory(0, resolution, pixels)
+    if need <= limit:
+        return
     if frame >= limit:
         raise LinprimError(
             f"a depth map takes {frame / 2**30:.2g} GiB while it is fused, {limit / 2**30:.2g} GiB are allowed: wanted "
             "more memory, or a training with --downscale"
         )
-    # Blocks around a surface go with the inverse square of the voxel; frames still to come are assumed to add
-    # as much as those seen, which is the most they can, and 5 % are left as room.
-    blocks = (need - frame) * total / done
-    need = blocks + frame
-    fits = voxel * np.sqrt(1.05 * blocks / (limit - frame))
+    # Blocks around a surface go with the inverse square of the voxel; 5 % are left as room.
+    fits = voxel * np.sqrt(1.05 * (need - frame) / (limit - frame))
     digits = 10.0 ** (np.floor(np.log10(fits)) - 1)
     fits = np.ceil(fits / digits) * digits
     raise TooFine(
-        f"voxel size {voxel:.4g} needs up to {need / 2**30:.2g} GiB, {limit / 2**30:.2g} GiB are allowed: "
+        f"voxel size {voxel:.4g} needs {need / 2**30:.2g} GiB, {limit / 2**30:.2g} GiB are allowed: "
         f"a voxel size of {fits:.2g} fits",
         float(fits),
     )

@@ -24,12 +24,17 @@ from linprim_geo.surface.voxel_blocks import Lattice, find_blocks
 LEVEL = 0.5
 
 
-@pytest.fixture(scope="module")
-def lattice(tiny_run):
+@pytest.fixture(scope="module", params=["of one size", "of two sizes"])
+def lattice(tiny_run, request):
     frames = DepthFrames(Run.open(tiny_run), LEVEL)
     voxel, rules = 0.02, vote_rules(3.0, 0.75, 0.0)
     blocks, origin, _ = find_blocks(frames, voxel, 3.0, None, 8, np.inf)
-    made = Lattice(blocks, origin, voxel, 8, 3.0, rules)
+    levels = np.zeros(len(blocks), np.int64)
+    if request.param == "of two sizes":  # one quadrant in voxels twice as large
+        large = (blocks[:, 0] < 0) & (blocks[:, 1] < 0)
+        blocks = np.concatenate([blocks[~large], np.unique(blocks[large] >> 1, axis=0)])
+        levels = (np.arange(len(blocks)) >= (~large).sum()).astype(np.int64)
+    made = Lattice(blocks, levels, origin, voxel, 8, 3.0, rules)
     return made, fuse_lattice(made, frames)
 
 
@@ -47,7 +52,7 @@ def parts_of(run: Path, lattice: Lattice, owner: np.ndarray, folder: Path) -> li
 def test_parts_are_together_the_whole_to_the_last_bit(kind, tiny_run, lattice, tmp_path):
     made, whole = lattice
     if kind == "boxes":
-        owner = owners(made.blocks, 5)
+        owner = owners(made, 5)
     else:  # nearly every block is a seam
         owner = np.random.default_rng(0).integers(0, 3, len(made.blocks))
     parts = parts_of(tiny_run, made, owner, tmp_path)
@@ -59,27 +64,32 @@ def test_parts_are_together_the_whole_to_the_last_bit(kind, tiny_run, lattice, t
 
 def test_a_part_without_its_neighbours_would_leave_a_seam(tiny_run, lattice, tmp_path):
     made, whole = lattice
-    owner = owners(made.blocks, 2)
+    owner = owners(made, 2)
     faces = 0
     for part in range(2):
-        alone = replace(made, blocks=made.blocks[owner == part])
+        own = owner == part
+        alone = replace(made, blocks=made.blocks[own], levels=made.levels[own])
         faces += len(fuse_lattice(alone, DepthFrames(Run.open(tiny_run), LEVEL)).faces)
     assert faces < len(whole.faces)
 
 
 def test_owners_share_the_blocks_and_halos_touch_them(lattice):
-    blocks = lattice[0].blocks
-    owner = owners(blocks, 4)
+    made = lattice[0]
+    owner = owners(made, 4)
     counts = np.bincount(owner, minlength=4)
-    assert counts.min() > 0.4 * len(blocks) / 4 and counts.sum() == len(blocks)
+    assert counts.min() > 0.4 * len(owner) / 4 and counts.sum() == len(owner)
+    size = 2 ** made.levels[:, None]
+    low, high = made.blocks * size, (made.blocks + 1) * size
     for part in range(4):
-        near = halo(blocks, owner == part)
-        distance = np.abs(blocks[:, None] - blocks[owner == part][None]).max(2).min(1)
-        assert np.array_equal(near, distance <= 1)
+        own = owner == part
+        touch = ((low[:, None] <= high[own]) & (low[own] <= high[:, None])).all(2).any(1)
+        near = halo(made, own)
+        assert near[touch].all()
+        assert (made.levels > 0).any() or np.array_equal(near, touch)
 
 
 def test_a_lattice_comes_back_from_its_file(lattice, tmp_path):
-    made, owner = lattice[0], owners(lattice[0].blocks, 3)
+    made, owner = lattice[0], owners(lattice[0], 3)
     save_lattice(tmp_path / "lattice.npz", made, owner)
     found, other = load_lattice(tmp_path / "lattice.npz")
     assert (
