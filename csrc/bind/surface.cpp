@@ -225,7 +225,7 @@ void bind_surface(nb::module_& m) {
     nb::gil_scoped_release release;
     linprim::filter_normals({contrast, normal_rounds, vertex_rounds}, vertices, faces, corners, most, moved);
   });
-  // (2 N,) ends, (8 N,) planes, (N,) which cross a crease, and the median length of all edges.
+  // (2 N,) ends, (8 N,) planes, (N,) which cross a crease, and (N,) the length of edges around.
   m.def("crease_edges", [](In<int64_t> corner, In<double> vertex, std::array<double, 9> rules) {
     const int64_t vertices = int64_t(vertex.shape(0)), faces = int64_t(corner.shape(0));
     const int64_t* corners = checked(corner, {faces, 3}, "corner");
@@ -241,6 +241,6 @@ void bind_surface(nb::module_& m) {
       found = linprim::crease_edges(how, vertices, faces, corners, at);
     }
     return std::tuple(owned(std::move(found.end)), owned(std::move(found.plane)), owned(std::move(found.crosses)),
-                      found.length);
+                      owned(std::move(found.length)));
   });
 }

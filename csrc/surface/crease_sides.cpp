@@ -22,7 +22,7 @@ struct Mesh {
   FaceNormals faces;
   std::vector<Vector> averaged, middle;
   std::vector<uint8_t> flat, inner;  // inner: so are all around it
-  double length;
+  std::vector<double> edge;          // the second longest
 
   Vector at(int64_t v) const { return {vertex[3 * v], vertex[3 * v + 1], vertex[3 * v + 2]}; }
 };
@@ -34,24 +34,22 @@ struct Side {
   int faces = 0;
 };
 
-double median_edge(const Mesh& mesh) {
-  std::vector<double> lengths(3 * mesh.fans.faces);
-  for_rows(mesh.fans.faces, [&](int64_t f) {
-    const int64_t* corner = mesh.fans.corner + 3 * f;
-    for (int k = 0; k < 3; ++k) {
-      const Vector along = minus(mesh.at(corner[k]), mesh.at(corner[(k + 1) % 3]));
-      lengths[3 * f + k] = std::sqrt(dot(along, along));
-    }
-  });
-  if (lengths.empty()) return 0;
-  std::nth_element(lengths.begin(), lengths.begin() + lengths.size() / 2, lengths.end());
-  return lengths[lengths.size() / 2];
+// The second longest edge of a face.
+double middle_edge(const Mesh& mesh, int64_t face) {
+  const int64_t* corner = mesh.fans.corner + 3 * face;
+  double length[3];
+  for (int k = 0; k < 3; ++k) {
+    const Vector along = minus(mesh.at(corner[k]), mesh.at(corner[(k + 1) % 3]));
+    length[k] = std::sqrt(dot(along, along));
+  }
+  return std::max(std::min(length[0], length[1]), std::min(std::max(length[0], length[1]), length[2]));
 }
 
 Mesh prepared(const CreaseRules& how, const FaceFans& fans, const double* vertex) {
-  Mesh mesh{fans, vertex, face_normals(fans, vertex), {}, {}, {}, {}, 0};
+  Mesh mesh{fans, vertex, face_normals(fans, vertex), {}, {}, {}, {}, {}};
   mesh.averaged = average_normals(fans, mesh.faces, how.contrast, how.normal_rounds);
   mesh.middle.resize(fans.faces), mesh.flat.resize(fans.faces), mesh.inner.resize(fans.faces);
+  mesh.edge.resize(fans.faces);
   for_rows(fans.faces, [&](int64_t f) {
     Vector& middle = mesh.middle[f];
     middle = {};
@@ -59,13 +57,13 @@ Mesh prepared(const CreaseRules& how, const FaceFans& fans, const double* vertex
     double least = 1;
     fans.around(f, [&](int64_t g) { least = std::min(least, dot(mesh.averaged[f], mesh.averaged[g])); });
     mesh.flat[f] = least >= how.flat && mesh.faces.area[f] > 0;
+    mesh.edge[f] = middle_edge(mesh, f);
   });
   for_rows(fans.faces, [&](int64_t f) {
     uint8_t all = 1;
     fans.around(f, [&](int64_t g) { all &= mesh.flat[g]; });
     mesh.inner[f] = all;
   });
-  mesh.length = median_edge(mesh);
   return mesh;
 }
 
@@ -74,9 +72,12 @@ class Around {
  public:
   Around(const CreaseRules& how, const Mesh& mesh) : how_(how), mesh_(mesh), stamp_(mesh.fans.faces), row_(stamp_) {}
 
-  // False where an end has no side. Else the planes of the ends, and whether they meet at a crease.
-  bool ask(const int64_t* ends, double* plane, uint8_t& crosses) {
+  // False where an end has no side. Else the planes of the ends, whether they meet at a crease, and how long edges
+  // around are.
+  bool ask(const int64_t* ends, double* plane, uint8_t& crosses, double& length) {
     gather(ends);
+    measure();
+    length = length_;
     const Vector end[2] = {mesh_.at(ends[0]), mesh_.at(ends[1])};
     for (int axis = 0; axis < 3; ++axis) here_[axis] = 0.5 * (end[0][axis] + end[1][axis]);
     if (!find_sides()) return false;
@@ -123,6 +124,15 @@ class Around {
     }
   }
 
+  // The length of edges around.
+  void measure() {
+    lengths_.clear();
+    for (const int64_t f : reached_) lengths_.push_back(mesh_.edge[f]);
+    const auto middle = lengths_.begin() + int64_t(lengths_.size() / 2);
+    std::nth_element(lengths_.begin(), middle, lengths_.end());
+    length_ = *middle;
+  }
+
   int root(int i) {
     while (parent_[i] != i) i = parent_[i] = parent_[parent_[i]];
     return i;
@@ -134,7 +144,7 @@ class Around {
     weight_.resize(count), order_.resize(count), side_.resize(count);
     for (int i = 0; i < count; ++i) {
       const Vector away = minus(mesh_.middle[faces_[i]], here_);
-      const double far = std::max(0.0, std::sqrt(dot(away, away)) / mesh_.length - 1) / how_.falloff;
+      const double far = std::max(0.0, std::sqrt(dot(away, away)) / length_ - 1) / how_.falloff;
       weight_[i] = mesh_.faces.area[faces_[i]] * std::exp(-0.5 * far * far);
     }
     std::iota(order_.begin(), order_.end(), 0);
@@ -211,7 +221,7 @@ class Around {
       low = std::min(low, x), high = std::max(high, x), squares += weight_[i] * x * x;
       add(mean, weight_[i], own), add(turn, weight_[i] * x, own);
     }
-    if (!(high - low >= how_.wide * mesh_.length && squares > 0)) return false;
+    if (!(high - low >= how_.wide * length_ && squares > 0)) return false;
     normal = {};
     add(normal, 1 / side.weight, mean), add(normal, reach / squares, turn);
     normalize(normal);
@@ -224,7 +234,8 @@ class Around {
   int64_t now_ = 0;
   std::vector<int64_t> reached_, faces_;
   std::vector<int> parent_, order_, side_;  // per row of `faces_`, as are weights
-  std::vector<double> weight_;
+  std::vector<double> weight_, lengths_;
+  double length_ = 0;
   std::vector<Side> sides_;
   Vector here_;
 };
@@ -246,18 +257,20 @@ CreaseEdges crease_edges(const CreaseRules& how, int64_t vertices, int64_t faces
   const int64_t count = int64_t(edges.size());
   std::vector<std::array<double, 8>> planes(count);
   std::vector<uint8_t> known(count), crosses(count);
+  std::vector<double> length(count);
   std::vector<std::unique_ptr<Around>> around(threads());
   parallel_for((count + kEdgesPerTask - 1) / kEdgesPerTask, [&](int64_t task, int thread) {
     if (!around[thread]) around[thread] = std::make_unique<Around>(how, mesh);
     for (int64_t e = task * kEdgesPerTask; e < std::min((task + 1) * kEdgesPerTask, count); ++e)
-      known[e] = around[thread]->ask(edges[e].data(), planes[e].data(), crosses[e]);
+      known[e] = around[thread]->ask(edges[e].data(), planes[e].data(), crosses[e], length[e]);
   });
-  CreaseEdges out{{}, {}, {}, mesh.length};
+  CreaseEdges out;
   for (int64_t e = 0; e < count; ++e) {
     if (!known[e]) continue;
     out.end.insert(out.end.end(), edges[e].begin(), edges[e].end());
     out.plane.insert(out.plane.end(), planes[e].begin(), planes[e].end());
     out.crosses.push_back(crosses[e]);
+    out.length.push_back(length[e]);
   }
   return out;
 }

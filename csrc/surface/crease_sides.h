@@ -27,7 +27,7 @@ struct CreaseEdges {
   std::vector<int64_t> end;      // (N, 2)
   std::vector<double> plane;     // (N, 2, 4) unit normal n and offset n . x of the side of each end
   std::vector<uint8_t> crosses;  // (N,) whether the two meet at a crease between the ends
-  double length;                 // median of all edges of the mesh
+  std::vector<double> length;    // (N,) of the edges around, in the median
 };
 
 // `corner` (faces, 3) are rows of `vertex` (vertices, 3). Asked are the edges of faces that are not flat, once their

@@ -123,7 +123,7 @@ def filter_normals(corner, bound, contrast: float, normal_rounds: int, vertex_ro
     _core.filter_normals(corner, bound, contrast, normal_rounds, vertex_rounds, vertex)
 
 
-def crease_edges(corner, vertex, rules) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+def crease_edges(corner, vertex, rules) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The planes on which the ends of edges lie that are not on flat parts of a mesh, and which meet at a crease.
 
     Args:
@@ -133,7 +133,7 @@ def crease_edges(corner, vertex, rules) -> tuple[np.ndarray, np.ndarray, np.ndar
 
     Returns:
         (E, 2) int64 ends, the lower one first, in order; (E, 2, 4) the plane n . x = d of each as n, d; (E,) bool
-        whether the two meet at a crease between the ends; the median length of all edges.
+        whether the two meet at a crease between the ends; (E,) the length of edges around.
     """
     end, plane, crosses, length = _core.crease_edges(corner, vertex, rules)
     return end.reshape(-1, 2), plane.reshape(-1, 2, 4), crosses.astype(bool), length

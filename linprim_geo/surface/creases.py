@@ -30,7 +30,7 @@ PASSES = 2
 """The second knows sides better, as what lies beside creases is on their planes then."""
 
 FARTHEST, CORNER_FARTHEST, BESIDE = 1.0, 1.5, 0.5
-"""Edges: how far away the line of a crease, a corner, and the plane of what lies beside a crease may be."""
+"""Edges around: how far away the line of a crease, a corner, and the plane of what lies beside a crease may be."""
 
 CORNER = 0.1
 """Eigenvalue of the sum of n n^T over the planes of a vertex, by its number of edges across creases, below which a
@@ -64,38 +64,37 @@ def _to_creases(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np
     ends, planes, crosses, length = surface_ops.crease_edges(faces, vertices, rules)
     ahead = np.einsum("ejk,ejk->ej", planes[..., :3], vertices[ends]) - planes[..., 3]
     moved, count = vertices.copy(), len(vertices)
-    rows, sides = _nearer_ends(vertices, ends[crosses], planes[crosses], FARTHEST * length)
+    sides, around = planes[crosses], length[crosses]
+    rows, near = _nearer_ends(vertices, ends[crosses], sides)
+    close = near <= FARTHEST * around
+    rows, sides, around = rows[close], sides[close], around[close]
     found, place = np.unique(rows, return_inverse=True)
-    moved[found] += _to_planes(vertices[found], place, sides, CORNER_FARTHEST * length)
+    farthest = CORNER_FARTHEST * np.bincount(place, around, len(found)) / np.bincount(place, minlength=len(found))
+    moved[found] += _to_planes(vertices[found], place, sides, farthest)
     on_crease = np.zeros(count, bool)
     on_crease[found] = True
 
     beside = np.zeros(count, bool)
     beside[faces[on_crease[faces].any(1)]] = True
-    told = (np.abs(ahead) <= BESIDE * length) & (beside & ~on_crease)[ends]
+    told = (np.abs(ahead) <= BESIDE * length[:, None]) & (beside & ~on_crease)[ends]
     rows, moves = ends[told], -ahead[told][:, None] * planes[told][:, :3]
     times = np.maximum(np.bincount(rows, minlength=count), 1)
     return moved + _sums(rows, moves, count) / times[:, None], on_crease
 
 
-def _nearer_ends(
-    vertices: np.ndarray, ends: np.ndarray, planes: np.ndarray, farthest: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Of (E, 2) edges across creases the end that is nearer to the line of their (E, 2, 4) planes, and these, without
-    those that are farther than `farthest`."""
+def _nearer_ends(vertices: np.ndarray, ends: np.ndarray, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of (E, 2) edges across creases the end nearer to the line of their (E, 2, 4) planes, and how near it is."""
     normals = planes[..., :3]
     cosine = np.einsum("ek,ek->e", normals[:, 0], normals[:, 1])[:, None]
     # Both (E, ends, planes): how far an end is behind the planes, and what has to be gone along their normals.
     behind = planes[:, None, :, 3] - np.einsum("eik,ejk->eij", vertices[ends], normals)
     along = (behind - cosine[..., None] * behind[..., ::-1]) / (1 - cosine**2)[..., None]
     far = np.linalg.norm(np.einsum("eij,ejk->eik", along, normals), axis=2)
-    nearer = far.argmin(1)
-    near = far.min(1) <= farthest
-    return ends[np.arange(len(ends)), nearer][near], planes[near]
+    return ends[np.arange(len(ends)), far.argmin(1)], far.min(1)
 
 
-def _to_planes(vertices: np.ndarray, rows: np.ndarray, planes: np.ndarray, farthest: float) -> np.ndarray:
-    """(V, 3) least moves of vertices to planes, at most `farthest`: of `rows` (N,) to their (N, 2, 4) planes, each
+def _to_planes(vertices: np.ndarray, rows: np.ndarray, planes: np.ndarray, farthest: np.ndarray) -> np.ndarray:
+    """(V, 3) least moves of vertices to planes, at most `farthest` (V,): of `rows` (N,) to their (N, 2, 4) planes, each
     vertex as often as it occurs. Least squares, where planes disagree; directions that few of them know are left."""
     count = len(vertices)
     normals = planes[..., :3]
@@ -107,7 +106,7 @@ def _to_planes(vertices: np.ndarray, rows: np.ndarray, planes: np.ndarray, farth
     inverse = np.divide(1, value, out=np.zeros_like(value), where=value > CORNER)
     moves = np.einsum("vij,vj,vkj,vk->vi", axes, inverse, axes, right / times[:, None])
     length = np.linalg.norm(moves, axis=1, keepdims=True)
-    return moves * np.minimum(1, farthest / np.maximum(length, 1e-300))
+    return moves * np.minimum(1, farthest[:, None] / np.maximum(length, 1e-300))
 
 
 def _sums(rows: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:

@@ -91,6 +91,39 @@ def test_edges_and_corners_of_a_block_are_where_they_belong():
     )
 
 
+def voxels_of_two_sizes(distance, blocks: int = 3, resolution: int = 8) -> Mesh:
+    """The zero level as `voxels` has it, where x > 0 with voxels half as large."""
+    index, level = [], []
+    for block in np.ndindex(*[2 * blocks] * 3):
+        place = np.array(block) - blocks
+        halves = [place] if place[0] < 0 else [2 * place + half for half in np.ndindex(2, 2, 2)]
+        index += halves
+        level += [int(place[0] < 0)] * len(halves)
+    index, level = np.array(index, np.int64), np.array(level, np.int64)
+    z, y, x = np.meshgrid(*[np.arange(resolution) + 0.5] * 3, indexing="ij")
+    cells = np.stack([x, y, z], -1).reshape(-1, 3)
+    points = (index[:, None] * resolution + cells) * 2.0 ** level[:, None, None] * VOXEL / 2
+    found = distance(points.reshape(-1, 3)).reshape(len(index), -1).astype(np.float32)
+    vertices, faces = surface_ops.marching_cubes(
+        index,
+        level,
+        resolution,
+        np.where(found == 0, 1e-6, found),
+        np.ones(found.shape, np.uint8),
+        np.ones_like(level, np.uint8),
+    )
+    return Mesh(vertices * VOXEL / 2, faces)
+
+
+def test_edges_are_where_they_belong_in_voxels_of_two_sizes():
+    mesh = voxels_of_two_sizes(box(*BLOCK))
+    points = np.concatenate(EDGES)
+    before, after = off(mesh, points), off(sharpened(mesh), points)
+    small = points[:, 0] > 2 * VOXEL
+    for here, voxel in ((small, 0.5), (points[:, 0] < -2 * VOXEL, 1.0)):
+        assert before[here].mean() > 0.2 * voxel and after[here].mean() < 0.05 * voxel
+
+
 def test_edges_that_point_inwards_are_too():
     parts = box([-0.8, -0.8, -0.5], [0.8, 0.0, 0.5]), box([-0.8, -0.8, -0.5], [0.0, 0.8, 0.5])
     cut = voxels(lambda points: np.minimum(parts[0](points), parts[1](points)), 1.4)
@@ -175,7 +208,7 @@ def test_nothing_moves_farther_than_it_may(monkeypatch):
     floor, wall, far = [0, 0, 1.0, 0], [1.0, 0, 0, 0], [1.0, 0, 0, 9]
     planes = np.array([[wall, floor], [floor, floor], [floor, far]])
     ends, crosses = np.array([[0, 1], [1, 2], [2, 3]]), np.array([True, False, True])
-    monkeypatch.setattr(surface_ops, "crease_edges", lambda *_: (ends, planes, crosses, 1.0))
+    monkeypatch.setattr(surface_ops, "crease_edges", lambda *_: (ends, planes, crosses, np.ones(3)))
     vertices = np.array([[0.2, 0, 0.3], [1, 0, 0.4], [1, 1, 0.6], [2, 1, 0]])
     found, on_crease = creases._to_creases(vertices, np.array([[0, 1, 2], [1, 3, 2]]))
     assert np.allclose(found, [[0, 0, 0], [1, 0, 0], [1, 1, 0.6], [2, 1, 0]], rtol=0, atol=1e-12)
