@@ -345,7 +345,8 @@ class ExtractOptions:
     )
     voxel_size: float = option(
         0.0,
-        "grid spacing in the data set's unit, for tsdf and opacity-field; 0 chooses from the views",
+        "grid spacing in the data set's unit, for tsdf and opacity-field; 0 chooses from the views, and for tsdf "
+        "small voxels where the surface bends",
         low=0,
         metavar="LENGTH",
     )

@@ -110,7 +110,7 @@ def tsdf_surface(
     voxel = options.voxel_size if options.voxel_size > 0 else auto_voxel_size(frames)
     memory = memory_left(options, frames.bytes)
 
-    def fused(source: Sequence[DepthFrame], smallest_part: float) -> Mesh:
+    def fused(source: Sequence[DepthFrame], smallest_part: float, supported: Callable[[Mesh], Mesh]) -> Mesh:
         nonlocal voxel
         for left in reversed(range(TRIES)):
             try:
@@ -123,6 +123,7 @@ def tsdf_surface(
                     min_component=smallest_part,
                     log=stages.note,
                     fuse=fuse,
+                    counts=None if options.voxel_size > 0 else supported,
                 )
             except TooFine as error:
                 if options.voxel_size > 0 or not left:
@@ -137,14 +138,16 @@ def tsdf_surface(
             frames = DepthFrames(run, float(options.level), options.depth_limit, most=most)
             voxel = options.voxel_size if options.voxel_size > 0 else auto_voxel_size(frames)
             memory = memory_left(options, frames.bytes)
-        surface = fused(frames, options.smallest_part)
+        surface = fused(frames, options.smallest_part, lambda surface: surface)
         stages.lap("fuse")
         return surface
 
     def fused_with_stereo(merged: MergedFrames) -> tuple[Mesh, dict]:
-        mesh = fused(merged, 0)
+        def supported(surface: Mesh) -> tuple[Mesh, float]:
+            return merged.supported(surface, options.smallest_part, 2 * options.truncation * voxel)
+
+        mesh, left_out = supported(fused(merged, 0, lambda surface: supported(surface)[0]))
         reach = options.truncation * voxel
-        mesh, left_out = merged.supported(mesh, options.smallest_part, 2 * reach)
         mesh = replace(mesh, quality=error_by_depths(mesh, merged, reach))
         return mesh, merged.about() | {"unsupported": left_out, "largest_error": largest_error(reach)}
 

@@ -11,7 +11,8 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.memory import available_memory
 from linprim_geo.geometry.mesh import Mesh, remove_small_components, select_faces, vertex_normals
 from linprim_geo.surface.tsdf_field import BEHIND_VOXELS, DepthFrame, vote_rules
-from linprim_geo.surface.voxel_blocks import Lattice, estimate_memory, find_blocks
+from linprim_geo.surface.voxel_blocks import Lattice, TooFine, estimate_memory, find_blocks
+from linprim_geo.surface.voxel_levels import COARSE, divided
 
 MOST_FACES, CELLS_PER_AREA, AREA_CELLS = 1e6, 1.5, 64
 """Without a voxel size given a mesh has about so many faces at most. A plane crosses so many cubes per area of a side
@@ -32,10 +33,11 @@ def fuse_tsdf(
     occluded_vote: float = 0.0,
     log: Callable[[str], None] | None = None,
     fuse: Callable[[Lattice, Iterable[DepthFrame]], Mesh] | None = None,
+    counts: Callable[[Mesh], Mesh] | None = None,
 ) -> Mesh:
     """Fuses depth maps into a triangle mesh with normals.
 
-    `frames` is iterated several times (blocks, field), so it must be re-iterable; a
+    `frames` is iterated several times (blocks, field, sizes of voxels), so it must be re-iterable; a
     sequence that renders on demand keeps only one frame in memory. Blocks around every depth sample are
     allocated, then every frame votes in all blocks inside its frustum, so background and far depths carve
     what other views put there. The mesh is oriented with its front towards the cameras. The same input gives
@@ -55,6 +57,8 @@ def fuse_tsdf(
             surface than the truncation; 0.01 to 0.02 closes tunnels that too deep pixels dig into solids.
         log: called with lines such as the memory that will be taken.
         fuse: makes the surface of a lattice in place of `fuse_lattice`; then `memory_limit` is its own affair.
+        counts: with it voxels have several sizes: twice `voxel_size` where the surface is flat, smaller ones where it
+            bends, see `voxel_levels`. Gives what counts of the surface that voxels of the first size make.
 
     Returns:
         The mesh in the frame of the cameras.
@@ -71,21 +75,29 @@ def fuse_tsdf(
     limit = memory_limit or int(0.6 * available_memory())
     say = log or (lambda line: None)
 
-    blocks, origin, largest = find_blocks(
-        frames, voxel_size, truncation_voxels, bounds, block_resolution, limit if fuse is None else np.inf
-    )
-    need = estimate_memory(len(blocks), block_resolution, largest)
-    say(
-        f"fusing: {len(blocks)} blocks of {block_resolution}^3 voxels of {voxel_size:.4g}, "
-        f"{need / 2**20:.0f} MiB of {limit / 2**20:.0f} MiB"
-    )
+    allowed, make = limit if fuse is None else np.inf, fuse or fuse_lattice
+
+    first_size = voxel_size if counts is None else COARSE * voxel_size
+    try:
+        found = find_blocks(frames, first_size, truncation_voxels, bounds, block_resolution, allowed)
+    except TooFine as error:
+        raise TooFine(str(error), error.fits * voxel_size / first_size) from None
+    blocks, origin, largest = found
     rules = vote_rules(truncation_voxels, behind_voxels, occluded_vote)
     levels = np.zeros(len(blocks), dtype=np.int64)
-    lattice = Lattice(blocks, levels, origin, voxel_size, block_resolution, truncation_voxels, rules)
-    mesh = _trimmed((fuse or fuse_lattice)(lattice, frames), bounds, min_component)
+    lattice = Lattice(blocks, levels, origin, first_size, block_resolution, truncation_voxels, rules)
+    if counts is not None:
+        lattice = divided(lattice, counts(make(lattice, frames)), frames, MOST_FACES, allowed)
+    need, sizes = estimate_memory(len(lattice.blocks), block_resolution, largest), lattice.voxel_sizes()
+    say(
+        f"fusing: {len(lattice.blocks)} blocks of {block_resolution}^3 voxels of "
+        f"{' to '.join(f'{size:.4g}' for size in dict.fromkeys((sizes.min(), sizes.max())))}, "
+        f"{need / 2**20:.0f} MiB of {limit / 2**20:.0f} MiB"
+    )
+    mesh = _trimmed(make(lattice, frames), bounds, min_component)
     if len(mesh.faces) == 0:
         raise LinprimError(
-            f"fusing {len(blocks)} blocks at voxel size {voxel_size:.4g} gave no surface: the views' "
+            f"fusing {len(lattice.blocks)} blocks at voxel size {voxel_size:.4g} gave no surface: the views' "
             "depths disagree by more than the truncation, or all of it lies outside the bounds; "
             "try a larger voxel size"
         )

@@ -8,7 +8,6 @@ the whole does, and hands on the triangles of the cubes that belong to its block
 from __future__ import annotations
 
 import hashlib
-import shutil
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -45,7 +44,8 @@ REMEDY = "more --blocks, a larger --voxel-size, fewer --workers, or more memory"
 
 
 class PartFusion:
-    """Fuses a lattice in `count` parts, for `tsdf_fusion.fuse_tsdf`. What is done is in `folder` until all is."""
+    """Fuses lattices in `count` parts each, for `tsdf_fusion.fuse_tsdf`. What is done stays in `folder`, which whoever
+    extracts removes in the end."""
 
     def __init__(
         self, run: Run, options: ExtractOptions, count: int, executor: Executor, folder: Path, quiet: bool = False
@@ -69,9 +69,6 @@ class PartFusion:
         digest.update(repr(options).encode())
         digest.update(lattice.blocks.tobytes() + lattice.levels.tobytes() + lattice.origin.tobytes())
         place = self.folder / digest.hexdigest()[:16]
-        for other in self.folder.iterdir():  # of other options
-            if other.is_dir() and other != place:
-                shutil.rmtree(other)
         owner = owners(lattice, count)
         save_lattice(place / "lattice.npz", lattice, owner)
         largest = max(view.camera.width * view.camera.height for view in self.run.scene().train)
@@ -93,11 +90,8 @@ class PartFusion:
                 )
             )
         self.executor.run(tasks, Progress("parts", 1, quiet=self.quiet))
-        mesh = placed(
-            merge_parts([load_part(place / f"{part:03d}" / "part.npz") for part in range(count)]), lattice.origin
-        )
-        shutil.rmtree(place)
-        return mesh
+        parts = [load_part(place / f"{part:03d}" / "part.npz") for part in range(count)]
+        return placed(merge_parts(parts), lattice.origin)
 
 
 def owners(lattice: Lattice, count: int) -> np.ndarray:

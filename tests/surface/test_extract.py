@@ -283,8 +283,8 @@ def test_the_depth_limit_is_where_a_quarter_of_a_pixel_is_a_truncation():
 def test_voxels_grow_until_the_grid_fits_into_the_limit(solid, tmp_path, capsys):
     options = ExtractOptions(level=0.5, refine=0, denoise="off")
     whole = extract_mesh(solid, output=tmp_path / "whole.ply", options=options, quiet=True)
-    # 1 MiB, or 46 blocks of 22 KiB, beside what the process takes and a depth map of 64x64 at work.
-    limit = PROCESS_GIB + (300 * 64**2 + 2**20) / 2**30
+    # Half a MiB, or 240 blocks, beside what the process takes and a depth map of 64x64 at work.
+    limit = PROCESS_GIB + (300 * 64**2 + 2**19) / 2**30
     small = extract_mesh(solid, output=tmp_path / "small.ply", options=replace(options, memory_limit=limit))
     assert small["voxel_size"] > 1.5 * whole["voxel_size"]
     assert "would not fit into memory" in capsys.readouterr().err

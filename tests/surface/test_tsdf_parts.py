@@ -121,11 +121,10 @@ def test_parts_that_are_done_are_not_done_again_and_those_of_other_options_go(ru
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "rmtree", lambda path: None)  # what a kill before the end leaves
         extract_mesh(run_copy, options=options, quiet=True, blocks=2)
-        (place,) = [path for path in folder.iterdir() if path.is_dir()]
-        before = {path: path.stat().st_mtime_ns for path in place.glob(f"*/{worker.DONE}")}
-        assert len(before) == 2
+        before = {path: path.stat().st_mtime_ns for path in folder.glob(f"*/*/{worker.DONE}")}
+        assert len(before) == 4  # of coarse voxels and of all
         extract_mesh(run_copy, options=options, quiet=True, blocks=2)
-        assert before == {path: path.stat().st_mtime_ns for path in place.glob(f"*/{worker.DONE}")}
+        assert before == {path: path.stat().st_mtime_ns for path in folder.glob(f"*/*/{worker.DONE}")}
     extract_mesh(run_copy, options=replace(options, voxel_size=0.03), quiet=True, blocks=2)
     assert not folder.exists()
 
