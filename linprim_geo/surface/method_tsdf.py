@@ -322,7 +322,7 @@ def kept_bytes(options: ExtractOptions, cameras: Sequence[Camera]) -> int:
     if options.memory_limit <= 0:
         return KEPT_BYTES
     largest = max((camera.width * camera.height for camera in cameras), default=0)
-    left = (options.memory_limit - PROCESS_GIB) * 2**30 - estimate_memory(0, 8, largest)
+    left = (options.memory_limit - PROCESS_GIB) * 2**30 - estimate_memory(0, frame_pixels=largest)
     return int(min(max(left / 4, 0), KEPT_BYTES))
 
 

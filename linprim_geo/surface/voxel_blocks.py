@@ -20,9 +20,8 @@ FINEST_PART = 8
 KEY_BITS = 21
 """Bits per axis of the key of a block or voxel: three fit into an int64."""
 
-
-MOST_NEW = 2**21
-"""Keys of `NearBlocks` that wait for being merged."""
+MOST_NEW, CHUNK = 2**21, 2**18
+"""Keys of `NearBlocks` that wait for being merged, and of how many the blocks around are sought at once."""
 
 
 class TooFine(LinprimError):
@@ -56,7 +55,7 @@ class Lattice:
         return Grid(self.blocks, self.levels, self.origin, self.voxel, self.truncation, self.resolution)
 
 
-def estimate_memory(blocks: int, block_resolution: int = 8, frame_pixels: int = 0) -> int:
+def estimate_memory(blocks: int, block_resolution: int = 4, frame_pixels: int = 0) -> int:
     """Bytes that fusing takes at its peak: blocks of voxels, and one frame of `frame_pixels` with its tables.
 
     Accuracy: an upper estimate, 1.1 to 1.5 times the growth measured.
@@ -72,6 +71,7 @@ def block_keys(index: np.ndarray) -> np.ndarray:
 
 
 def unpack_keys(key: np.ndarray) -> np.ndarray:
+    """(B, 3) the blocks that have these keys."""
     half, mask = 1 << (KEY_BITS - 1), (1 << KEY_BITS) - 1
     return np.stack([key >> (2 * KEY_BITS), (key >> KEY_BITS) & mask, key & mask], axis=1) - half
 
@@ -115,18 +115,23 @@ class NearBlocks:
         new = self.new.pop(reach, [])
         self.pairs[reach] = np.unique(np.concatenate([self.pairs.get(reach, np.zeros(0, np.int64)), *new]))
 
+    def least(self) -> int:
+        """There are at least so many blocks: none holds more pairs than these take."""
+        return max(map(len, self.pairs.values()), default=0) // (self.resolution // 2 + 1) ** 3
+
     def keys(self) -> np.ndarray:
         """(B,) sorted keys of the blocks."""
         for reach in list(self.new):
             self._merge(reach)
-        found = [np.zeros(0, np.int64)]
+        found = np.zeros(0, np.int64)
         for reach, pairs in self.pairs.items():
-            low, width = 2 * unpack_keys(pairs) - reach, 2 * reach + 1
+            width = 2 * reach + 1
             steps = np.append(np.arange(0, width, self.resolution), width)
-            found += [
-                np.unique(block_keys((low + [x, y, z]) // self.resolution)) for x in steps for y in steps for z in steps
-            ]
-        return np.unique(np.concatenate(found))
+            for first in range(0, len(pairs), CHUNK):
+                low = 2 * unpack_keys(pairs[first : first + CHUNK]) - reach
+                near = [block_keys((low + [x, y, z]) // self.resolution) for x in steps for y in steps for z in steps]
+                found = np.union1d(found, np.concatenate([np.unique(keys) for keys in near]))
+        return found
 
 
 def find_blocks(
@@ -166,6 +171,7 @@ def find_blocks(
                 f"can fill: wanted at least {footprint / FINEST_PART:.2g}"
             )
         near.add(points - origin, footprint)
+        check_memory(near.least(), resolution, largest, limit, voxel)
     if origin is None:
         where = "" if bounds is None else f" inside {bounds[0].tolist()} to {bounds[1].tolist()}"
         raise LinprimError(f"none of the {done} depth maps holds a surface{where}, nothing can be fused")

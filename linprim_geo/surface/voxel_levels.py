@@ -198,7 +198,7 @@ class _Samples:
 
     def __init__(self, blocks: _Blocks, frames: Iterable[DepthFrame], most: int):
         self.blocks = blocks
-        count = sum(1 for _ in frames) if not isinstance(frames, Sized) else len(frames)
+        count = len(frames) if isinstance(frames, Sized) else sum(1 for _ in frames)
         samples, pixels, self.pixels_of_frame = [], [], 0
         for frame in frames:
             self.pixels_of_frame = max(self.pixels_of_frame, frame.camera.width * frame.camera.height)
