@@ -12,7 +12,7 @@ from linprim_geo.base.memory import available_memory
 from linprim_geo.geometry.mesh import Mesh, remove_small_components, select_faces, vertex_normals
 from linprim_geo.surface.tsdf_field import BEHIND_VOXELS, DepthFrame, vote_rules
 from linprim_geo.surface.voxel_blocks import Lattice, TooFine, estimate_memory, find_blocks
-from linprim_geo.surface.voxel_levels import COARSE, divided
+from linprim_geo.surface.voxel_levels import COARSE, VoxelLevels
 
 MOST_FACES, CELLS_PER_AREA, AREA_CELLS = 1e6, 1.5, 64
 """Without a voxel size given a mesh has about so many faces at most. A plane crosses so many cubes per area of a side
@@ -86,15 +86,19 @@ def fuse_tsdf(
     rules = vote_rules(truncation_voxels, behind_voxels, occluded_vote)
     levels = np.zeros(len(blocks), dtype=np.int64)
     lattice = Lattice(blocks, levels, origin, first_size, block_resolution, truncation_voxels, rules)
+    surface = make(lattice, frames)
     if counts is not None:
-        lattice = divided(lattice, counts(make(lattice, frames)), frames, MOST_FACES, allowed)
+        coarse, levels = surface, VoxelLevels(lattice, counts(surface), frames, MOST_FACES, allowed)
+        surface, lattice = make(levels.lattice, frames), levels.lattice
+        if levels.mend(coarse, surface):
+            surface, lattice = make(levels.lattice, frames), levels.lattice
     need, sizes = estimate_memory(len(lattice.blocks), block_resolution, largest), lattice.voxel_sizes()
     say(
         f"fusing: {len(lattice.blocks)} blocks of {block_resolution}^3 voxels of "
         f"{' to '.join(f'{size:.4g}' for size in dict.fromkeys((sizes.min(), sizes.max())))}, "
         f"{need / 2**20:.0f} MiB of {limit / 2**20:.0f} MiB"
     )
-    mesh = _trimmed(make(lattice, frames), bounds, min_component)
+    mesh = _trimmed(surface, bounds, min_component)
     if len(mesh.faces) == 0:
         raise LinprimError(
             f"fusing {len(lattice.blocks)} blocks at voxel size {voxel_size:.4g} gave no surface: the views' "

@@ -45,53 +45,81 @@ UNEXPLAINED = 0.05
 there is any, has something that this has lost, and gets the voxels that all would have."""
 
 SURE, LEAST_SAMPLES = 0.5, 6
-"""Depths with at least this confidence tell of pixels and noise; of noise, so many in one voxel."""
+"""Depths with at least this confidence tell of pixels and noise; of noise, so many in one voxel, and of tears, so many
+in a block."""
 
 MOST_SAMPLES, BYTES_PER_SAMPLE = 2**21, 200
 """About so many depths are looked at, or as many as fit into a quarter of the memory that the field may take."""
 
 
-def divided(lattice: Lattice, surface: Mesh, frames: Iterable[DepthFrame], most_faces: float, limit: float) -> Lattice:
-    """The lattice with blocks divided where the `surface` that was fused on it bends.
+class VoxelLevels:
+    """Which blocks of a lattice of one level are divided, and how often.
 
-    What is fused on the new one has about `most_faces` at most, and takes `limit` bytes: voxels are as small as these
-    leave. Levels of blocks that touch differ by one at most.
+    What is fused on the `lattice` then has about `most_faces` at most, and takes `limit` bytes: voxels are as small as
+    these leave. Levels of blocks that touch differ by one at most.
 
     Args:
-        lattice: of one level.
-        surface: what counts of its surface, in the frame of the cameras.
+        coarse: of one level.
+        surface: what counts of the surface that was fused on it, in the frame of the cameras.
         frames: that it was fused from, re-iterable.
     """
-    blocks = _Blocks(lattice)
-    usual = lattice.voxel / COARSE
-    row = blocks.rows(surface.vertices)
-    faces = 2.0 * np.bincount(row[row >= 0], minlength=blocks.count)
-    planes, lost = _shapes(blocks, surface.vertices)
-    samples = _Samples(blocks, frames, int(min(MOST_SAMPLES, max(1, limit / (4 * BYTES_PER_SAMPLE)))))
-    pixel, noise = samples.pixels(), samples.noise()
-    least = samples.share_off(planes, lattice.voxel) >= UNEXPLAINED
-    finest = np.fmin(np.maximum(pixel, NOISE_VOXELS * noise), usual)  # the usual ones where too little is known
-    pixel = np.where(np.isnan(pixel), usual, pixel)
-    most = np.clip(np.floor(np.log2(lattice.voxel / finest) + 0.5), 1, MOST_HALVINGS)
-    with np.errstate(divide="ignore"):
-        wanted = np.log2(lost / (TOLERANCE * pixel))
 
-    def fits(count: float) -> bool:
-        return estimate_memory(int(count), lattice.resolution, samples.pixels_of_frame) <= limit
+    def __init__(
+        self, coarse: Lattice, surface: Mesh, frames: Iterable[DepthFrame], most_faces: float, limit: float = np.inf
+    ):
+        self.blocks, self.frames = _Blocks(coarse), frames
+        blocks, usual = self.blocks, coarse.voxel / COARSE
+        row = blocks.rows(surface.vertices)
+        faces = 2.0 * np.bincount(row[row >= 0], minlength=blocks.count)
+        planes, lost = _shapes(blocks, surface.vertices)
+        most_samples = int(min(MOST_SAMPLES, max(1, limit / (4 * BYTES_PER_SAMPLE))))
+        self.samples = samples = _Samples(blocks, frames, most_samples)
+        pixel, noise = samples.pixels(), samples.noise()
+        least = samples.share_off(planes, coarse.voxel) >= UNEXPLAINED
+        finest = np.fmin(np.maximum(pixel, NOISE_VOXELS * noise), usual)  # the usual ones where too little is known
+        pixel = np.where(np.isnan(pixel), usual, pixel)
+        most = np.clip(np.floor(np.log2(coarse.voxel / finest) + 0.5), 1, MOST_HALVINGS)
+        with np.errstate(divide="ignore"):
+            wanted = np.log2(lost / (TOLERANCE * pixel))
 
-    eighths = 0
-    while True:
-        halvings = blocks.graded(np.clip(np.ceil(wanted - eighths / 8), least, most).astype(np.int64))
-        parts = 4.0**halvings  # in which a block is divided, along the surface
-        if (faces * parts).sum() <= most_faces and fits(parts.sum()):
-            finer = blocks.divided(halvings, frames)
-            if fits(len(finer.blocks)):
-                return finer
-        if not halvings.any():
-            return lattice
-        if not (wanted > eighths / 8).any():  # what coarse voxels have lost stays lost
-            least = np.zeros_like(least)
-        eighths += 1
+        def fits(count: float) -> bool:
+            return estimate_memory(int(count), coarse.resolution, samples.pixels_of_frame) <= limit
+
+        eighths = 0
+        while True:
+            self.halvings = blocks.graded(np.clip(np.ceil(wanted - eighths / 8), least, most).astype(np.int64))
+            parts = 4.0**self.halvings  # in which a block is divided, along the surface
+            if (faces * parts).sum() <= most_faces and fits(parts.sum()):
+                self.lattice = blocks.divided(self.halvings, frames)
+                if fits(len(self.lattice.blocks)):
+                    return
+            if not self.halvings.any():
+                self.lattice = coarse
+                return
+            if not (wanted > eighths / 8).any():  # what coarse voxels have lost stays lost
+                least = np.zeros_like(least)
+            eighths += 1
+
+    def mend(self, coarse: Mesh, fine: Mesh) -> bool:
+        """Whether there were blocks where the `fine` surface, of the `lattice`, is torn; these have fewer levels then.
+
+        A surface is torn where depths lie on the `coarse` one and the fine one is missing: there different views agree
+        within large voxels and not within small ones. Such blocks get the voxels that all would have."""
+        from scipy.spatial import cKDTree
+
+        asked = self.halvings[self.samples.row] > 1
+        points, row = self.samples.points[asked], self.samples.row[asked]
+        reach = self.blocks.lattice.voxel / 2
+        for surface, there in ((fine, False), (coarse, True)):
+            if len(surface.vertices):
+                away = cKDTree(surface.vertices).query(points, distance_upper_bound=reach, workers=-1)[0]
+                points, row = (each[np.isfinite(away) == there] for each in (points, row))
+        torn = np.bincount(row, minlength=self.blocks.count) >= LEAST_SAMPLES
+        if not torn.any():
+            return False
+        self.halvings = self.blocks.lowered(np.where(torn, 1, self.halvings))
+        self.lattice = self.blocks.divided(self.halvings, self.frames)
+        return True
 
 
 class _Blocks:
@@ -124,6 +152,14 @@ class _Blocks:
             if np.array_equal(raised, halvings):
                 return halvings
             halvings = raised
+
+    def lowered(self, halvings: np.ndarray) -> np.ndarray:
+        """Halvings (B,) that are lowered until those of blocks that touch differ by one at most."""
+        while True:
+            lower = np.minimum(halvings, np.append(halvings, MOST_HALVINGS)[self.around].min(0) + 1)
+            if np.array_equal(lower, halvings):
+                return halvings
+            halvings = lower
 
     def divided(self, halvings: np.ndarray, frames: Iterable[DepthFrame]) -> Lattice:
         """The lattice with voxels halved so often in each block; of smaller blocks, those within the truncation of the

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.geometry.mesh import Mesh, select_faces
 from linprim_geo.geometry.topology import topology
 from linprim_geo.surface.tsdf_field import DepthFrame, vote_rules
 from linprim_geo.surface.tsdf_fusion import fuse_lattice, fuse_tsdf
@@ -19,7 +19,7 @@ from linprim_geo.surface.voxel_blocks import (
     touching,
     unpack_keys,
 )
-from linprim_geo.surface.voxel_levels import COARSE, NOISE_VOXELS, divided
+from linprim_geo.surface.voxel_levels import COARSE, NOISE_VOXELS, VoxelLevels
 from linprim_geo.synthetic.camera_paths import look_at
 
 SIZE, FOCAL, RADIUS = 160, 200.0, 0.12
@@ -65,7 +65,7 @@ def coarse_lattice(frames) -> Lattice:
 
 def split(frames, most_faces=1e6, limit=np.inf) -> Lattice:
     lattice = coarse_lattice(frames)
-    return divided(lattice, fuse_lattice(lattice, frames), frames, most_faces, limit)
+    return VoxelLevels(lattice, fuse_lattice(lattice, frames), frames, most_faces, limit).lattice
 
 
 def fused(frames, **options) -> Mesh:
@@ -159,7 +159,7 @@ def test_a_plane_alone_stays_coarse():
         for each in around(6, height=3.0)
     ]
     lattice = coarse_lattice(plane)
-    assert divided(lattice, fuse_lattice(lattice, plane), plane, 1e6, np.inf).voxel == lattice.voxel
+    assert VoxelLevels(lattice, fuse_lattice(lattice, plane), plane, 1e6).lattice is lattice
 
 
 def test_what_does_not_count_is_not_divided(frames):
@@ -169,7 +169,23 @@ def test_what_does_not_count_is_not_divided(frames):
     inner = np.abs(surface.vertices).max(1) < 0.7
     floor = Mesh(surface.vertices[floor & inner], np.zeros((0, 3), np.int64))
     # What has depths and no surface gets the usual voxels.
-    assert divided(lattice, floor, frames, 1e6, np.inf).voxel == pytest.approx(USUAL)
+    assert VoxelLevels(lattice, floor, frames, 1e6).lattice.voxel == pytest.approx(USUAL)
+
+
+def test_where_small_voxels_tear_the_surface_the_usual_ones_mend_it(frames):
+    """As if depths of views agreed on the top of the ball within large voxels alone."""
+    lattice = coarse_lattice(frames)
+    coarse = fuse_lattice(lattice, frames)
+    levels = VoxelLevels(lattice, coarse, frames, 1e6)
+    fine = fuse_lattice(levels.lattice, frames)
+    assert not levels.mend(coarse, fine)  # what both end at is no tear
+    hole = np.linalg.norm(fine.vertices[fine.faces].mean(1) - [0, 0, 2 * RADIUS], axis=1) > 0.04
+    at_top = lambda points: np.linalg.norm(points - [0, 0, 2 * RADIUS], axis=1) < 0.03  # noqa: E731
+    assert edges_near(fine, at_top) < 0.6 * USUAL
+    assert hole.any() and levels.mend(coarse, select_faces(fine, hole))
+    mended = fuse_lattice(levels.lattice, frames)
+    assert edges_near(mended, at_top) > 0.6 * USUAL and levels.lattice.voxel < USUAL  # no other block was torn
+    assert mended.vertices[:, 2].max() > 1.9 * RADIUS and topology(mended)["non_manifold_edges"] == 0
 
 
 def test_blocks_are_divided_as_far_as_memory_goes(frames):
