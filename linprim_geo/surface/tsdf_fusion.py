@@ -85,7 +85,7 @@ def fuse_tsdf(
     blocks, origin, largest = found
     rules = vote_rules(truncation_voxels, behind_voxels, occluded_vote)
     levels = np.zeros(len(blocks), dtype=np.int64)
-    lattice = Lattice(blocks, levels, origin, first_size, block_resolution, truncation_voxels, rules)
+    lattice = Lattice(blocks, levels, levels, origin, first_size, block_resolution, truncation_voxels, rules)
     surface = make(lattice, frames)
     if counts is not None:
         coarse, levels = surface, VoxelLevels(lattice, counts(surface), frames, MOST_FACES, allowed)

@@ -33,6 +33,7 @@ from linprim_geo.surface.voxel_blocks import Lattice, block_keys, estimate_memor
 _LATTICE: dict[str, tuple[tuple[int | None, ...], str]] = {
     "blocks": ((None, 3), "i"),
     "levels": ((None,), "i"),
+    "reach": ((None,), "i"),
     "owner": ((None,), "i"),
     "origin": ((3,), "f"),
     "voxel": ((), "f"),
@@ -67,7 +68,8 @@ class PartFusion:
             lattice.rules,
         )
         digest.update(repr(options).encode())
-        digest.update(lattice.blocks.tobytes() + lattice.levels.tobytes() + lattice.origin.tobytes())
+        for array in (lattice.blocks, lattice.levels, lattice.reach, lattice.origin):
+            digest.update(array.tobytes())
         place = self.folder / digest.hexdigest()[:16]
         owner = owners(lattice, count)
         save_lattice(place / "lattice.npz", lattice, owner)
@@ -128,7 +130,8 @@ def part_task(folder: Path, run: str, level: float, limit: float, part: int, hel
     lattice, owner = load_lattice(folder.parent / "lattice.npz")
     own = owner == part
     inside = halo(lattice, own)
-    grid = replace(lattice, blocks=lattice.blocks[inside], levels=lattice.levels[inside]).grid()
+    blocks, levels, reach = (array[inside] for array in (lattice.blocks, lattice.levels, lattice.reach))
+    grid = replace(lattice, blocks=blocks, levels=levels, reach=reach).grid()
     opened = Run.open(run)
     frames = DepthFrames(opened.with_held_out_views() if held_out else opened, level, limit, keep=False)
     used = 0
@@ -159,6 +162,7 @@ def save_lattice(path: Path, lattice: Lattice, owner: np.ndarray) -> None:
             file,
             blocks=lattice.blocks,
             levels=lattice.levels,
+            reach=lattice.reach,
             owner=owner,
             origin=lattice.origin,
             voxel=lattice.voxel,
@@ -174,9 +178,9 @@ def load_lattice(path: Path) -> tuple[Lattice, np.ndarray]:
     Raises:
         LinprimError: it is damaged.
     """
-    blocks, levels, owner, origin, voxel, resolution, truncation, rules = read_named(path, _LATTICE)
+    blocks, levels, reach, owner, origin, voxel, resolution, truncation, rules = read_named(path, _LATTICE)
     numbers = float(voxel), int(resolution), float(truncation), tuple(float(x) for x in rules)
-    return Lattice(blocks, levels, origin, *numbers), owner
+    return Lattice(blocks, levels, reach, origin, *numbers), owner
 
 
 def load_part(path: Path) -> Mesh:

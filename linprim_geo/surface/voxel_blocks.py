@@ -36,10 +36,13 @@ class TooFine(LinprimError):
 class Lattice:
     """Where a field is kept: `blocks` (B, 3) int64 of `resolution`^3 voxels. Those of `levels` (B,) int64 are 2^level
     times as long as `voxel`, and so are their blocks; block (0, 0, 0) of every level starts at `origin` (3,). Blocks do
-    not overlap. `truncation` is in voxels, `rules` are `tsdf_field.vote_rules`."""
+    not overlap. `truncation` is in voxels, of the level `reach` (B,), which is larger than that of the block where it
+    touches a larger one: else votes behind a surface would not get as far as the cubes between both. `rules` are
+    `tsdf_field.vote_rules`."""
 
     blocks: np.ndarray
     levels: np.ndarray
+    reach: np.ndarray
     origin: np.ndarray
     voxel: float
     resolution: int
@@ -52,7 +55,7 @@ class Lattice:
 
     def grid(self) -> Grid:
         """An empty field on it."""
-        return Grid(self.blocks, self.levels, self.origin, self.voxel, self.truncation, self.resolution)
+        return Grid(self.blocks, self.levels, self.reach, self.origin, self.voxel, self.truncation, self.resolution)
 
 
 def estimate_memory(blocks: int, block_resolution: int = 4, frame_pixels: int = 0) -> int:

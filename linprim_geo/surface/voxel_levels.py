@@ -167,25 +167,32 @@ class _Blocks:
         lattice, top = self.lattice, int(halvings.max(initial=0))
         if not top:
             return lattice
-        near = [np.append(halvings == often, False)[self.around].any(0) for often in range(top + 1)]
-        smaller = [
-            NearBlocks(lattice.voxel / 2**often, lattice.truncation, lattice.resolution) for often in range(1, top + 1)
-        ]
+        beside = np.append(halvings, top)[self.around].min(0) < halvings  # touches larger ones
+        collect = []
+        for often in range(1, top + 1):
+            for parents, wide in ((halvings == often, 1), ((halvings == often) & beside, 2)):
+                near = np.append(parents, False)[self.around].any(0)
+                blocks = NearBlocks(lattice.voxel / 2**often, wide * lattice.truncation, lattice.resolution)
+                collect.append((often, parents, wide > 1, near, blocks))
         for frame in frames:
             points = frame.surface()[0]
             row = self.rows(points)
             points, row = points[row >= 0] - lattice.origin, row[row >= 0]
-            for mask, blocks in zip(near[1:], smaller, strict=True):
-                blocks.add(points[mask[row]])
-        found = [self.keys[halvings == 0]]
-        for often, blocks in enumerate(smaller, 1):
+            for *_, near, blocks in collect:
+                blocks.add(points[near[row]])
+        found = [(self.keys[halvings == 0], top, False)]
+        for often, parents, wide, _, blocks in collect:
             keys = blocks.keys()
             parent = self.find(block_keys(unpack_keys(keys) >> often))
-            found.append(keys[(parent >= 0) & (halvings[parent] == often)])
+            keys = keys[(parent >= 0) & parents[parent]]
+            around = self.find(block_keys(unpack_keys(touching(unpack_keys(keys))) >> often)).reshape(27, -1)
+            at_larger = (np.append(halvings, top)[around] < often).any(0)
+            found.append((keys[at_larger == wide], top - often, wide))
         return replace(
             lattice,
-            blocks=np.concatenate([unpack_keys(keys) for keys in found]),
-            levels=np.concatenate([np.full(len(keys), top - often) for often, keys in enumerate(found)]),
+            blocks=np.concatenate([unpack_keys(keys) for keys, _, _ in found]),
+            levels=np.concatenate([np.full(len(keys), level) for keys, level, _ in found]),
+            reach=np.concatenate([np.full(len(keys), level + wide) for keys, level, wide in found]),
             voxel=lattice.voxel / 2**top,
         )
 

@@ -266,7 +266,7 @@ def write_own_arrays(folder: Path) -> dict:
     save_points(folder / "points.npz", PointCloud(np.zeros((5, 3)), np.zeros((5, 3), np.uint8)))
     save_lattice(
         folder / "lattice.npz",
-        Lattice(grid, grid[:, 0], np.zeros(3), 0.1, 8, 3.0, (1.0, 0.5)),
+        Lattice(grid, grid[:, 0], grid[:, 0], np.zeros(3), 0.1, 8, 3.0, (1.0, 0.5)),
         np.zeros(4, dtype=np.int64),
     )
     np.savez(folder / "part.npz", vertices=np.zeros((4, 3)), faces=grid)

@@ -268,7 +268,7 @@ def test_votes_are_those_of_the_rules(occluded):
     table[:, 5] = table[:, 5].clip(0.05, 1)
     blocks = np.array([[-1, -1, 2], [0, 0, 2], [0, -2, 3], [5, 5, -1]])
     rules = vote_rules(3.0, 0.75, occluded)
-    grid = Grid(blocks, np.zeros(4, np.int64), np.array([0.0137, 0.0211, 0.0071]), 0.1, 3.0, 8)
+    grid = Grid(blocks, np.zeros(4, np.int64), np.zeros(4, np.int64), np.array([0.0137, 0.0211, 0.0071]), 0.1, 3.0, 8)
     project = np.concatenate([camera.K, (camera.K @ grid.origin)[:, None]], axis=1)
     sums = (grid.total, grid.weight, grid.free)
     rows = np.array([0, 1, 2, 3])

@@ -34,7 +34,8 @@ def lattice(tiny_run, request):
         large = (blocks[:, 0] < 0) & (blocks[:, 1] < 0)
         blocks = np.concatenate([blocks[~large], np.unique(blocks[large] >> 1, axis=0)])
         levels = (np.arange(len(blocks)) >= (~large).sum()).astype(np.int64)
-    made = Lattice(blocks, levels, origin, voxel, 8, 3.0, rules)
+    reach = np.random.default_rng(0).integers(levels, 2)  # as if beside larger ones
+    made = Lattice(blocks, levels, reach, origin, voxel, 8, 3.0, rules)
     return made, fuse_lattice(made, frames)
 
 
@@ -68,7 +69,7 @@ def test_a_part_without_its_neighbours_would_leave_a_seam(tiny_run, lattice, tmp
     faces = 0
     for part in range(2):
         own = owner == part
-        alone = replace(made, blocks=made.blocks[own], levels=made.levels[own])
+        alone = replace(made, blocks=made.blocks[own], levels=made.levels[own], reach=made.reach[own])
         faces += len(fuse_lattice(alone, DepthFrames(Run.open(tiny_run), LEVEL)).faces)
     assert faces < len(whole.faces)
 

@@ -60,7 +60,8 @@ def ball_on_floor(cameras, noise=0.0, rod=0.0) -> list[DepthFrame]:
 def coarse_lattice(frames) -> Lattice:
     blocks, origin, _ = find_blocks(frames, COARSE * USUAL, 3.0, None, 4, np.inf)
     rules = vote_rules(3.0, 0.75, 0.0)
-    return Lattice(blocks, np.zeros(len(blocks), np.int64), origin, COARSE * USUAL, 4, 3.0, rules)
+    levels = np.zeros(len(blocks), np.int64)
+    return Lattice(blocks, levels, levels, origin, COARSE * USUAL, 4, 3.0, rules)
 
 
 def split(frames, most_faces=1e6, limit=np.inf) -> Lattice:
