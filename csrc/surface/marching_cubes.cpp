@@ -17,20 +17,11 @@ using Index = std::array<int64_t, 3>;
 struct CubeEdge {
   int8_t low, high;
 };
-constexpr std::array<CubeEdge, 12> kEdges = {{{0, 1},
-                                              {2, 3},
-                                              {4, 5},
-                                              {6, 7},  // along x
-                                              {0, 2},
-                                              {1, 3},
-                                              {4, 6},
-                                              {5, 7},  // along y
-                                              {0, 4},
-                                              {1, 5},
-                                              {2, 6},
-                                              {3, 7}}};                  // along z
-constexpr int kFaces[6][4] = {{0, 4, 6, 2}, {1, 3, 7, 5}, {0, 1, 5, 4},  // counter-clockwise seen from outside
-                              {2, 6, 7, 3}, {0, 2, 3, 1}, {4, 5, 7, 6}};
+// Four along x, four along y, four along z.
+constexpr CubeEdge kEdges[12] = {{0, 1}, {2, 3}, {4, 5}, {6, 7}, {0, 2}, {1, 3},
+                                 {4, 6}, {5, 7}, {0, 4}, {1, 5}, {2, 6}, {3, 7}};
+// Counter-clockwise seen from outside.
+constexpr int kFaces[6][4] = {{0, 4, 6, 2}, {1, 3, 7, 5}, {0, 1, 5, 4}, {2, 6, 7, 3}, {0, 2, 3, 1}, {4, 5, 7, 6}};
 
 int edge_between(int a, int b) {
   for (int e = 0; e < 12; ++e)

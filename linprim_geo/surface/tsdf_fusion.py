@@ -88,14 +88,16 @@ def fuse_tsdf(
     lattice = Lattice(blocks, levels, levels, origin, first_size, block_resolution, truncation_voxels, rules)
     surface = make(lattice, frames)
     if counts is not None:
-        coarse, levels = surface, VoxelLevels(lattice, counts(surface), frames, MOST_FACES, allowed)
-        surface, lattice = make(levels.lattice, frames), levels.lattice
-        if levels.mend(coarse, surface):
-            surface, lattice = make(levels.lattice, frames), levels.lattice
-    need, sizes = estimate_memory(len(lattice.blocks), block_resolution, largest), lattice.voxel_sizes()
+        coarse, sizes = surface, VoxelLevels(lattice, counts(surface), frames, MOST_FACES, allowed)
+        if sizes.lattice is not lattice:
+            surface = make(sizes.lattice, frames)
+            if sizes.mend(coarse, surface):
+                surface = make(sizes.lattice, frames)
+            lattice = sizes.lattice
+    need, voxels = estimate_memory(len(lattice.blocks), block_resolution, largest), lattice.voxel_sizes()
     say(
         f"fusing: {len(lattice.blocks)} blocks of {block_resolution}^3 voxels of "
-        f"{' to '.join(f'{size:.4g}' for size in dict.fromkeys((sizes.min(), sizes.max())))}, "
+        f"{' to '.join(f'{size:.4g}' for size in dict.fromkeys((voxels.min(), voxels.max())))}, "
         f"{need / 2**20:.0f} MiB of {limit / 2**20:.0f} MiB"
     )
     mesh = _trimmed(surface, bounds, min_component)

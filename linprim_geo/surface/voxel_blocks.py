@@ -103,7 +103,7 @@ class NearBlocks:
         """
         reach = int(np.ceil(max(self.truncation, footprint / self.voxel)))
         index = points / self.voxel
-        if np.abs(index).max(initial=0) / self.resolution >= (1 << (KEY_BITS - 1)) - reach - 2:
+        if np.abs(index).max(initial=0) / 2 >= (1 << (KEY_BITS - 1)) - reach - 2:  # keys of pairs
             raise LinprimError(
                 f"voxel size {self.voxel:.4g} is too small for a scene in which depths reach "
                 f"{np.abs(points).max():.4g} from the middle, wanted at most a few million voxels across: "

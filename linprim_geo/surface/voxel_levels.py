@@ -170,10 +170,12 @@ class _Blocks:
         beside = np.append(halvings, top)[self.around].min(0) < halvings  # touches larger ones
         collect = []
         for often in range(1, top + 1):
-            for parents, wide in ((halvings == often, 1), ((halvings == often) & beside, 2)):
+            own = halvings == often
+            for parents, wide in ((own, False), (own & beside, True)):
                 near = np.append(parents, False)[self.around].any(0)
-                blocks = NearBlocks(lattice.voxel / 2**often, wide * lattice.truncation, lattice.resolution)
-                collect.append((often, parents, wide > 1, near, blocks))
+                truncation = lattice.truncation * (2 if wide else 1)
+                blocks = NearBlocks(lattice.voxel / 2**often, truncation, lattice.resolution)
+                collect.append((often, parents, wide, near, blocks))
         for frame in frames:
             points = frame.surface()[0]
             row = self.rows(points)
@@ -184,9 +186,11 @@ class _Blocks:
         for often, parents, wide, _, blocks in collect:
             keys = blocks.keys()
             parent = self.find(block_keys(unpack_keys(keys) >> often))
-            keys = keys[(parent >= 0) & parents[parent]]
-            around = self.find(block_keys(unpack_keys(touching(unpack_keys(keys))) >> often)).reshape(27, -1)
-            at_larger = (np.append(halvings, top)[around] < often).any(0)
+            inside = (parent >= 0) & parents[parent]
+            keys, at_larger = keys[inside], beside[parent[inside]]
+            around = unpack_keys(touching(unpack_keys(keys[at_larger]))) >> often
+            around = self.find(block_keys(around)).reshape(27, -1)
+            at_larger[at_larger] = (np.append(halvings, top)[around] < often).any(0)
             found.append((keys[at_larger == wide], top - often, wide))
         return replace(
             lattice,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh, select_faces
 from linprim_geo.geometry.topology import topology
@@ -12,6 +13,7 @@ from linprim_geo.surface.tsdf_field import DepthFrame, vote_rules
 from linprim_geo.surface.tsdf_fusion import fuse_lattice, fuse_tsdf
 from linprim_geo.surface.voxel_blocks import (
     Lattice,
+    NearBlocks,
     TooFine,
     block_keys,
     estimate_memory,
@@ -203,3 +205,15 @@ def test_a_coarse_field_that_does_not_fit_is_refused_with_a_size_that_does(frame
         fused(frames, memory_limit=9_000_000)
     found = fuse_tsdf(frames, voxel_size=caught.value.fits, counts=lambda surface: surface, memory_limit=9_000_000)
     assert caught.value.fits > USUAL and len(found.faces) > 1000
+
+
+def test_points_far_from_each_other_are_in_blocks_of_their_own():
+    """Keys of pairs of voxels hold two million voxels on either side."""
+    place = np.array([[1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [0.25, 0.5, -1.0]]) * 2_000_000
+    near = NearBlocks(1.0, 3.0, 4)
+    near.add(place)
+    blocks = unpack_keys(near.keys())
+    gap = np.abs(blocks[:, None] * 4 + 2 - place).max(2).min(1)
+    assert gap.max() <= 3 + 2 + 2 and (np.abs(blocks[:, None] * 4 + 2 - place).max(2).min(0) <= 2).all()
+    with pytest.raises(LinprimError, match="a few million voxels"):
+        near.add(1.1 * place)
