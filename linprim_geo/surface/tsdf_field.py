@@ -182,8 +182,8 @@ def vote_rules(truncation: float, behind: float, occluded: float) -> tuple[float
 
 class Grid:
     """The field in its blocks: `blocks` (B, 3) int64 of `resolution`^3 voxels, of which `levels` (B,) says how large
-    they are: 2^level times `voxel`. `truncation` is in voxels of the level `reach` (B,). Coordinates are relative to
-    `origin`, where block (0, 0, 0) of every level starts."""
+    they are: 2^level times `voxel`. `truncation` is in voxels of the block; where nothing votes within it, in those of
+    the level `reach` (B,). Coordinates are relative to `origin`, where block (0, 0, 0) of every level starts."""
 
     def __init__(self, blocks, levels, reach, origin, voxel, truncation, resolution):
         self.blocks, self.levels, self.reach = np.ascontiguousarray(blocks), levels, reach
@@ -204,15 +204,16 @@ class Grid:
         project[:, :3] = camera.K @ camera.rotation
         project[:, 3] = camera.K @ (camera.rotation @ self.origin + camera.world_to_camera[:3, 3])
         sums = (self.total, self.weight, self.free)
-        for reach in np.unique(self.reach[seen]):
-            voxel = self.voxel * 2.0**reach
-            table = surfels(frame, voxel, self.truncation * voxel, self.origin)
-            near = seen[self.reach[seen] == reach]
-            for level in np.unique(self.levels[near]):
-                rows, edge = near[self.levels[near] == level], self.voxel * 2.0**level
-                surface_ops.add_votes(
-                    project, camera.width, camera.height, table, rules, rows, self.corner, edge, self.resolution, *sums
-                )
+        for level in np.unique(self.levels[seen]):
+            rows, voxel = seen[self.levels[seen] == level], self.voxel * 2.0**level
+            for reach in np.unique(np.append(self.reach[rows], level)):
+                table = surfels(frame, voxel, self.truncation * self.voxel * 2.0**reach, self.origin)
+                if reach > level:  # where nothing else votes
+                    table[:, WEIGHT] *= GRAZED_WEIGHT
+                    table[:, FREE] = 0
+                these = rows if reach == level else rows[self.reach[rows] == reach]
+                grid = rules, these, self.corner, voxel, self.resolution
+                surface_ops.add_votes(project, camera.width, camera.height, table, *grid, *sums)
 
     def in_view(self, camera: Camera) -> np.ndarray:
         """Blocks whose bounding sphere meets the frustum."""
@@ -254,7 +255,7 @@ class Grid:
         gap = np.where(field < 0, np.float32(-ZERO_GAP), np.float32(ZERO_GAP))
         np.copyto(field, gap, where=np.abs(field) < ZERO_GAP)
         del weight, free, gap, voted
-        field *= (self.truncation * 2.0**self.reach).astype(np.float32)[:, None]
+        field *= (self.truncation * 2.0**self.levels).astype(np.float32)[:, None]
         vertices, faces = surface_ops.marching_cubes(
             self.blocks, self.levels, self.resolution, field, known.view(np.uint8), owned.view(np.uint8)
         )

@@ -36,9 +36,9 @@ class TooFine(LinprimError):
 class Lattice:
     """Where a field is kept: `blocks` (B, 3) int64 of `resolution`^3 voxels. Those of `levels` (B,) int64 are 2^level
     times as long as `voxel`, and so are their blocks; block (0, 0, 0) of every level starts at `origin` (3,). Blocks do
-    not overlap. `truncation` is in voxels, of the level `reach` (B,), which is larger than that of the block where it
-    touches a larger one: else votes behind a surface would not get as far as the cubes between both. `rules` are
-    `tsdf_field.vote_rules`."""
+    not overlap. `truncation` is in voxels; where nothing votes within it, it is in those of the level `reach` (B,),
+    which is above that of the block where it touches a larger one: else votes behind a surface would not get as far as
+    the cubes between both. `rules` are `tsdf_field.vote_rules`."""
 
     blocks: np.ndarray
     levels: np.ndarray
