@@ -71,7 +71,7 @@ def enclosing_planes(cameras: Sequence[Camera], planes: np.ndarray, points: Surf
     angles only what points are all over, and planes at right angles to two of them where both end."""
     if not len(points):
         return []
-    known = _Known(cameras, points)
+    known = KnownPoints(cameras, points)
     found = known.without_copies([plane for plane in map(known.facing, planes) if known.is_enclosing(plane)])
     corners = [plane for plane in found if any(_at_right_angles(plane, other) for other in found)]
     own = [points.on(plane[None], CONFIRMED_DEPTH)[:, 0] for plane in found]
@@ -83,7 +83,7 @@ def enclosing_planes(cameras: Sequence[Camera], planes: np.ndarray, points: Surf
     return enclosing + [known.with_ends(plane, corners, slice(None)) for plane in known.closing(corners)]
 
 
-class _Known:
+class KnownPoints:
     """Known points, by which planes (4,) n . x = d are judged whose normals are towards the cameras."""
 
     def __init__(self, cameras: Sequence[Camera], points: SurfacePoints):
@@ -121,6 +121,15 @@ class _Known:
             if not any(share.mean() > 0.5 for share in near):
                 kept.append(plane)
         return kept
+
+    def is_there(self, plane: EnclosingPlane, others: Sequence[EnclosingPlane]) -> bool:
+        """Whether the middle of a plane is on one of others that faces the same way."""
+        middle = plane.own.mean(0) @ plane.axes + plane.normal * plane.offset
+        near = MARGIN * float(np.median(np.linalg.norm(self.centers - middle, axis=1)))
+        return any(
+            plane.normal @ other.normal > SAME_NORMAL and abs(middle @ other.normal - other.offset) < near
+            for other in others
+        )
 
     def closing(self, found: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Planes at right angles to two of those `found` where both end, on sides where there is none."""

@@ -22,6 +22,7 @@ from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.lone_backgrounds import lone_backgrounds
 from linprim_geo.stereo.plain_regions import common_planes, edges_of, grown_alike, plane_depths, regions_of_views
 from linprim_geo.stereo.point_planes import SurfacePoints, planes_of_points, point_plane_depth
+from linprim_geo.stereo.room_corners import corner_walls
 from linprim_geo.stereo.shaded_planes import ShadedPlanes
 from linprim_geo.stereo.thin_things import SeenDepths, thin_things
 from linprim_geo.stereo.visibility_cut import plane_normals, points_per_view, spanned_depths
@@ -82,7 +83,7 @@ class MergedFrames(Sequence):
         known = [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
         points = self._span_gaps(maps, known, rendered_depths, backgrounds)
         are_sharp = [depth > 0 for depth in rendered_depths] if sharp is None else list(sharp)
-        self._enclose(points, known, measured, are_sharp, backgrounds)
+        self._enclose(maps, points, known, measured, are_sharp, backgrounds)
         self._keep_thin_things(views, maps, rendered_depths, are_sharp)
         if not any(view.has_alpha for view in views):  # else masks say what is background
             self._end_lone_backgrounds()
@@ -138,23 +139,25 @@ class MergedFrames(Sequence):
 
     def _enclose(
         self,
+        maps: Sequence[DepthMap],
         points: SurfacePoints,
         known: Sequence[np.ndarray],
         measured: Sequence[np.ndarray],
         sharp: Sequence[np.ndarray],
         backgrounds: Sequence[np.ndarray],
     ) -> None:
-        """Adds depths of planes that enclose `points` of what is `known` to doubtful ones, where training has a depth
-        that is not `sharp` (H, W) or is near them, but not in background; what stereo has `measured` on them is not
-        background where hardly any view looks."""
+        """Adds depths of planes that enclose `points` of what is `known`, and of walls that meet at their corners, to
+        doubtful ones, where training has a depth that is not `sharp` (H, W) or is near them, but not in background.
+        What stereo has `measured` on planes with points is not background where hardly any view looks."""
         planes = enclosing_planes(self.cameras, self.planes, points)
+        walls = corner_walls(maps, known, [frame.background for frame in self.rendered], planes, points)
         wanted, shown = [], []
         for frame, depth, doubtful, of_surface, background in zip(
             self.rendered, known, self.doubtful_depths, sharp, backgrounds, strict=True
         ):
             wanted.append((frame.depth > 0) & ~(background | np.isfinite(depth) | np.isfinite(doubtful)))
             shown.append(np.where(of_surface, frame.depth, np.nan))
-        enclosed = enclosing_depths(self.cameras, planes, known, wanted, shown)
+        enclosed = enclosing_depths(self.cameras, [*planes, *walls], known, wanted, shown)
         self.doubtful_depths = [_first_known(pair) for pair in zip(self.doubtful_depths, enclosed, strict=True)]
         self.enclosed = _share_known(enclosed)
         self.rendered = [

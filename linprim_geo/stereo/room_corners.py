@@ -1,0 +1,338 @@
+"""Walls without texture, by the edges in which they meet.
+
+A floor that ends along a line does not say what is there: a wall that rises from it, or nothing, as at the end of a
+table. In the corner of a room two walls meet in an edge at right angles to the floor, and photographs show that edge
+however plain the walls are, as light falls on them from different sides. Such edges are looked for around the corners
+of known floors. One photograph has an edge along a line by chance; several that look from directions that differ do
+not have theirs along the same line of the world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+from scipy.stats import chi2, rankdata
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.points.view_pairs import visible_pixels
+from linprim_geo.stereo.depth_maps import DepthMap
+from linprim_geo.stereo.enclosing_planes import CELLS, FILLED, MARGIN, EnclosingPlane, KnownPoints
+from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
+from linprim_geo.stereo.plain_regions import LEAST_VIEWS, SAME_ANGLE, seen_enough
+from linprim_geo.stereo.point_planes import SurfacePoints
+
+# A plane is a floor if its normal is as near to the mean direction that is up in photographs, whose camera may look far
+# down; that of a wall is at right angles to it.
+UPRIGHT = np.cos(np.radians(60))
+# A corner is looked for as near to that of a floor's rectangle as this share of its longer side: its ends are known to
+# END_MARGIN, and windows of stereo reach beyond an edge.
+REACH = 0.05
+# Photographs are blurred by this standard deviation in pixels before edges are looked for, and places that are tried
+# are as far from each other, MOST_STEPS to either side at most. Around the best they are FINER.
+BLUR, MOST_STEPS, FINER = 1.5, 20, 5
+# A photograph says something about an edge of which it shows so many pixels.
+LEAST_PIXELS = 20
+# An edge may end at each of so many heights, evenly up to the longer side of its floor, and is looked at in so many
+# samples between two of these. It is at least half as high as the cameras are, in the middle: a table's is not.
+HEIGHTS, SAMPLES, LOWEST = 16, 8, 0.5
+STEPS = (np.arange(HEIGHTS * SAMPLES) + 0.5) / (HEIGHTS * SAMPLES)
+# Fewer than one place in so many has an edge by chance. A view shows an edge if no more than one in ten of the places
+# that are tried have a stronger one there.
+BY_CHANCE, SHOWN = 1e-3, 0.1
+# Directions of a wall that are tried, in SAME_ANGLE to either side.
+DIRECTIONS = 61
+# Behind a wall a floor has fewer points than this share of those before it, in strips as wide.
+BEHIND_SHARE = 0.1
+# What is nearer than the place of an edge by this share hides it.
+HIDING = 3 * CONFIRMED_DEPTH
+# A wall is looked at in so many places each way; no more than half of the views that show one see a background there.
+PLACES, MOST_BACKGROUND = 16, 0.5
+
+
+@dataclass(frozen=True)
+class Corner:
+    """Where an edge stands on a floor, (2,) along its axes, and how far it reaches along the floor's normal."""
+
+    place: np.ndarray
+    height: float
+
+
+def corner_walls(
+    maps: Sequence[DepthMap],
+    known: Sequence[np.ndarray],
+    backgrounds: Sequence[np.ndarray | None],
+    enclosing: Sequence[EnclosingPlane],
+    points: SurfacePoints,
+) -> list[EnclosingPlane]:
+    """Walls without an `enclosing` plane of their own that rise from those of these planes that are floors.
+
+    A wall has an edge at either end, or one at which it meets such a wall or one that is known. It is as high as its
+    edges and goes from one to the other, or to the end of its floor. The floor is known along half of it at least and
+    ends there.
+
+    Args:
+        known: (H, W) depth of every view, NaN where nothing is known.
+        backgrounds: (H, W) bool of every view, or None.
+        points: of what is known.
+    """
+    cameras = [found.camera for found in maps]
+    upward = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
+    floors = [plane for plane in enclosing if plane.normal @ upward > UPRIGHT * np.linalg.norm(upward)]
+    if not floors:
+        return []
+    edges, seen = EdgeImages(maps, known), KnownPoints(cameras, points)
+    walls: list[EnclosingPlane] = []
+    for floor in floors:
+        for wall in _walls_on(floor, [*enclosing, *walls], edges, seen):
+            if not _is_seen_past(wall, cameras, known, backgrounds):
+                walls.append(wall)
+    return walls
+
+
+def _walls_on(
+    floor: EnclosingPlane, others: Sequence[EnclosingPlane], edges: EdgeImages, seen: KnownPoints
+) -> list[EnclosingPlane]:
+    """Walls on the four sides of the rectangle that holds a floor's own points, without those that `others` are."""
+    lowest = LOWEST * float(np.median(seen.centers @ floor.normal - floor.offset))
+    corners = [[find_corner(floor, np.array([x, y]), lowest, edges) for y in floor.own[:, 1]] for x in floor.own[:, 0]]
+    on_floor = seen.points.on(np.append(floor.normal, floor.offset)[None], CONFIRMED_DEPTH)[:, 0]
+    places, margin = seen.points.position[on_floor] @ floor.axes.T, MARGIN * seen.distance[on_floor]
+    found: dict[tuple[int, int], EnclosingPlane] = {}
+    meeting: dict[tuple[int, int], set[tuple[int, int]]] = {}
+    sure: set[tuple[int, int]] = set()
+    for axis, end in product((0, 1), (0, 1)):
+        ends = corners[end] if axis == 0 else [row[end] for row in corners]
+        line = _line(floor, 1 - axis, ends, edges)
+        if line is None:
+            continue
+        inward = floor.axes[axis] if end == 0 else -floor.axes[axis]
+        wall = _wall(floor, line, inward, max(corner.height for corner in ends if corner))
+        if seen.is_there(wall, others):
+            sure.add((axis, end))
+        elif _ends_at(line, inward @ floor.axes.T, places, margin, REACH * _longer_side(floor)):
+            if seen.is_before_all(np.append(wall.normal, wall.offset)):
+                found[axis, end] = wall
+                meeting[axis, end] = {(1 - axis, k) for k in (0, 1) if ends[k]}
+                if all(ends):
+                    sure.add((axis, end))
+    return [wall for side, wall in found.items() if side in sure or sure & meeting[side]]
+
+
+def find_corner(floor: EnclosingPlane, near: np.ndarray, lowest: float, edges: EdgeImages) -> Corner | None:
+    """The corner of a floor around a place `near` (2,) along its axes; None if photographs show no edge there that is
+    as high as `lowest`."""
+    longer = _longer_side(floor)
+    pixel, reach = edges.pixel_at(_on(floor, near)), REACH * longer
+    along = longer * STEPS
+    places = near + _grid(reach, max(BLUR * pixel, reach / MOST_STEPS))
+    shares = edges.shares(_on(floor, places), floor.normal[None], along, HEIGHTS)
+    heights = longer * np.arange(1, HEIGHTS + 1) / HEIGHTS
+    chance = np.where(heights >= lowest, by_chance(shares), 0)
+    row, part = np.unravel_index(chance.argmin(), chance.shape)
+    if chance[row, part] + np.log(chance.size) > np.log(BY_CHANCE):
+        return None
+    showing = np.flatnonzero(shares[:, row, part] <= SHOWN)
+    if not seen_enough(edges.cameras, showing, _on(floor, places[row])):
+        return None
+    finer = places[row] + _grid(2 * BLUR * pixel, BLUR * pixel / FINER)
+    best = edges.strongest(_on(floor, finer), floor.normal[None], along[: (part + 1) * SAMPLES])
+    return Corner(places[row] if best is None else finer[best], float(heights[part]))
+
+
+def _grid(reach: float, apart: float) -> np.ndarray:
+    """(N, 2) places up to `reach` either way."""
+    steps = np.arange(-reach, reach + apart / 2, apart)
+    return np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def _line(
+    floor: EnclosingPlane, axis: int, ends: Sequence[Corner | None], edges: EdgeImages
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """(2,) ends of the wall along an axis of a floor, at the corners that are given for its lower and its upper end, or
+    where the floor ends; None without corners.
+
+    From one corner alone it has the direction in which photographs show the strongest edge.
+    """
+    low, high = ends
+    if low and high:
+        run = high.place - low.place
+        along_axis = run[axis] > np.cos(2 * SAME_ANGLE) * np.linalg.norm(run)
+        return (low.place, high.place) if along_axis else None
+    corner = low or high
+    if corner is None:
+        return None
+    angles = np.linspace(-SAME_ANGLE, SAME_ANGLE, DIRECTIONS)
+    runs = np.zeros((DIRECTIONS, 2))
+    runs[:, axis] = floor.own[1 if low else 0, axis] - corner.place[axis]
+    runs[:, 1 - axis] = runs[:, axis] * np.tan(angles)
+    starts = np.broadcast_to(_on(floor, corner.place), (DIRECTIONS, 3))
+    best = edges.strongest(starts, runs @ floor.axes, STEPS)
+    end = corner.place + runs[DIRECTIONS // 2 if best is None else best]
+    return (corner.place, end) if low else (end, corner.place)
+
+
+def _ends_at(
+    line: tuple[np.ndarray, np.ndarray], inward: np.ndarray, places: np.ndarray, margin: np.ndarray, near: float
+) -> bool:
+    """Whether a floor, of which (P, 2) places are known to a (P,) margin, is known along half of a line, in a strip as
+    wide as `near`, and ends there."""
+    start, run = line[0], line[1] - line[0]
+    length = float(np.linalg.norm(run))
+    across = np.array([-run[1], run[0]]) / length
+    before = (places - start) @ (across if across @ inward > 0 else -across)
+    along = (places - start) @ run / length**2
+    beside = (along >= 0) & (along < 1)
+    inside = beside & (before >= -margin) & (before < near)
+    behind = beside & (before < -margin) & (before > -near - margin)
+    cells = np.unique(np.floor(CELLS * along[inside]))
+    ends = np.count_nonzero(behind) < BEHIND_SHARE * np.count_nonzero(inside)
+    return bool(ends) and len(cells) >= FILLED * CELLS
+
+
+def _wall(
+    floor: EnclosingPlane, line: tuple[np.ndarray, np.ndarray], inward: np.ndarray, height: float
+) -> EnclosingPlane:
+    """The wall over a line on a floor, seen from the side where `inward` (3,) points."""
+    start, end = (_on(floor, place) for place in line)
+    direction = (end - start) / np.linalg.norm(end - start)
+    normal = np.cross(direction, floor.normal)
+    normal = normal if normal @ inward > 0 else -normal
+    ends = np.array([[start @ direction, floor.offset], [end @ direction, floor.offset + height]])
+    ends = np.sort(ends, axis=0)
+    return EnclosingPlane(normal, float(normal @ start), np.stack([direction, floor.normal]), ends, ends)
+
+
+def _is_seen_past(
+    wall: EnclosingPlane,
+    cameras: Sequence[Camera],
+    known: Sequence[np.ndarray],
+    backgrounds: Sequence[np.ndarray | None],
+) -> bool:
+    """Whether views see a background in place of a wall."""
+    steps = (np.arange(PLACES) + 0.5) / PLACES
+    share = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
+    places = (wall.own[0] + share * np.diff(wall.own, axis=0)) @ wall.axes + wall.normal * wall.offset
+    looking, past = 0, 0
+    for camera, depth, background in zip(cameras, known, backgrounds, strict=True):
+        _, pixels, along = visible_pixels(camera, places)
+        column, row = pixels.T
+        clear = ~(depth[row, column] < (1 - MARGIN) * along)
+        looking += np.count_nonzero(clear)
+        past += 0 if background is None else np.count_nonzero(clear & background[row, column])
+    return bool(past > MOST_BACKGROUND * looking)
+
+
+def _on(floor: EnclosingPlane, places: np.ndarray) -> np.ndarray:
+    """(..., 3) points of (..., 2) places along the axes of a floor."""
+    return places @ floor.axes + floor.normal * floor.offset
+
+
+def _longer_side(floor: EnclosingPlane) -> float:
+    return float(np.diff(floor.own, axis=0).max())
+
+
+class EdgeImages:
+    """How the grey of every view changes across lines of the world where nothing `known` (H, W) hides them."""
+
+    def __init__(self, maps: Sequence[DepthMap], known: Sequence[np.ndarray]):
+        self.cameras, self.known = [found.camera for found in maps], known
+        greys = (found.grey.astype(np.float32) for found in maps)
+        self.slopes = [[gaussian_filter(grey, BLUR, order=order) for order in ((0, 1), (1, 0))] for grey in greys]
+
+    def pixel_at(self, place: np.ndarray) -> float:
+        """How large a pixel is at a place (3,), for the camera in the middle by that."""
+        return float(np.median([np.linalg.norm(camera.center - place) / camera.fx for camera in self.cameras]))
+
+    def strongest(self, starts: np.ndarray, directions: np.ndarray, along: np.ndarray) -> int | None:
+        """Which of some lines, as those of `strengths`, has the strongest edge in the views that show all of them, of
+        which each counts the same; None if there is none."""
+        strength = self.strengths(starts, directions, along, 1)[:, :, 0]
+        most = strength.max(1, keepdims=True)  # NaN where a line is not shown
+        every = most[:, 0] > 0
+        return int((strength[every] / most[every]).sum(0).argmax()) if every.any() else None
+
+    def shares(self, starts: np.ndarray, directions: np.ndarray, along: np.ndarray, parts: int) -> np.ndarray:
+        """(V, N, parts) how many of the lines of `strengths` have as strong an edge in a view as each of them, as a
+        share of those that it shows; NaN where it does not."""
+        result = self.strengths(starts, directions, along, parts)
+        for view, part in np.ndindex(len(result), parts):
+            strength = result[view, :, part]
+            shown = np.isfinite(strength)
+            strength[shown] = rankdata(-strength[shown], method="max") / max(np.count_nonzero(shown), 1)
+        return result
+
+    def strengths(self, starts: np.ndarray, directions: np.ndarray, along: np.ndarray, parts: int) -> np.ndarray:
+        """(V, N, parts) by how much grey changes per pixel across lines of the world; NaN where a view shows fewer than
+        LEAST_PIXELS.
+
+        It is the median along them: lines that stand before a wall cross the end of the floor, which is the stronger
+        edge as a rule.
+
+        Args:
+            starts: (N, 3).
+            directions: (N or 1, 3).
+            along: (parts * S,) where lines are looked at, in units of `directions`.
+            parts: a line ends with each of so many parts of `along` in turn.
+        """
+        result = np.full((len(self.cameras), len(starts), parts), np.nan)
+        apart, places = along[1] - along[0], starts[:, None] + along[:, None] * directions[:, None]
+        box = _box_of(places)
+        for camera, known, slopes, strength in zip(self.cameras, self.known, self.slopes, result, strict=True):
+            if not _may_show(camera, box):
+                continue
+            shown, pixels, depth = visible_pixels(camera, places.reshape(-1, 3))
+            column, row = pixels.T
+            clear = ~(known[row, column] < (1 - HIDING) * depth)
+            # By how many pixels a line goes on per sample, and how grey changes across it.
+            local = places.reshape(-1, 3)[shown] @ camera.rotation.T + camera.world_to_camera[:3, 3]
+            steps = np.broadcast_to(directions[:, None] * apart, places.shape).reshape(-1, 3)[shown] @ camera.rotation.T
+            right = camera.fx * (steps[:, 0] - local[:, 0] / depth * steps[:, 2]) / depth
+            down = camera.fy * (steps[:, 1] - local[:, 1] / depth * steps[:, 2]) / depth
+            change, length = np.zeros((2, *places.shape[:2])).reshape(2, -1)
+            change[shown] = clear * (slopes[1][row, column] * right - slopes[0][row, column] * down)
+            length[shown] = clear * np.hypot(right, down)
+            change, length = (x.reshape(len(starts), parts, -1) for x in (change, length))
+            slope = np.divide(change, length, out=np.full(change.shape, np.nan), where=length > 0).astype(np.float32)
+            length = length.sum(2)
+            enough = length.cumsum(1) >= LEAST_PIXELS
+            for part in range(parts):
+                if part and not length[:, part].any():
+                    strength[:, part] = strength[:, part - 1]
+                else:
+                    rows = enough[:, part]
+                    own = slope[rows, : part + 1].reshape(-1, (part + 1) * slope.shape[2])
+                    strength[rows, part] = np.abs(_medians(own))
+        return result
+
+
+def _box_of(places: np.ndarray) -> np.ndarray:
+    """(8, 3) corners of the box that holds (..., 3) places."""
+    every = places.reshape(-1, 3)
+    return np.array(list(product(*zip(every.min(0), every.max(0), strict=True))))
+
+
+def _may_show(camera: Camera, box: np.ndarray) -> bool:
+    """Whether (8, 3) corners of a box are not all beyond one side of an image."""
+    x, y, z = camera.rotation @ box.T + camera.world_to_camera[:3, 3:]
+    left, top = camera.fx * x + camera.cx * z, camera.fy * y + camera.cy * z
+    beyond = (z <= 0, left < 0, left > camera.width * z, top < 0, top > camera.height * z)
+    return not any(side.all() for side in beyond)
+
+
+def _medians(values: np.ndarray) -> np.ndarray:
+    """(N,) of each of N rows with at least one number, without what is NaN; nanmedian takes ten times as long."""
+    ordered, count = np.sort(values, axis=1), np.isfinite(values).sum(1)
+    rows = np.arange(len(values))
+    return (ordered[rows, (count - 1) // 2] + ordered[rows, count // 2]) / 2
+
+
+def by_chance(shares: np.ndarray) -> np.ndarray:
+    """(N, K) natural logarithm of the probability of (V, N, K) shares as small by chance, by Fisher's method; 0 where
+    fewer than LEAST_VIEWS have one that is not NaN."""
+    views = np.isfinite(shares).sum(0)
+    surprise = -2 * np.log(np.where(np.isfinite(shares), shares, 1)).sum(0)
+    return np.where(views >= LEAST_VIEWS, chi2.logsf(surprise, 2 * np.maximum(views, 1)), 0)
