@@ -16,6 +16,7 @@ from linprim_geo.capture.types import View
 from linprim_geo.geometry.mesh import Mesh, face_areas, face_components, select_faces
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.points.initial_points import in_image
+from linprim_geo.stereo.common_surfaces import ON_IT
 from linprim_geo.stereo.depth_maps import SURE, DepthMap, depth_maps
 from linprim_geo.stereo.enclosing_planes import enclosing_depths, enclosing_planes, known_on_planes
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
@@ -147,18 +148,21 @@ class MergedFrames(Sequence):
         backgrounds: Sequence[np.ndarray],
     ) -> None:
         """Adds depths of planes that enclose `points` of what is `known`, and of walls that meet at their corners, to
-        doubtful ones, where training has a depth that is not `sharp` (H, W) or is near them, but not in background.
-        What stereo has `measured` on planes with points is not background where hardly any view looks."""
+        doubtful ones, where training has a depth that is not `sharp` (H, W) or is near them, but not in background. Of
+        doubtful depths those stay that are before a plane by more than these may be off. What stereo has `measured` on
+        planes with points is not background where hardly any view looks."""
         planes = enclosing_planes(self.cameras, self.planes, points)
         walls = corner_walls(maps, known, [frame.background for frame in self.rendered], planes, points)
         wanted, shown = [], []
-        for frame, depth, doubtful, of_surface, background in zip(
-            self.rendered, known, self.doubtful_depths, sharp, backgrounds, strict=True
-        ):
-            wanted.append((frame.depth > 0) & ~(background | np.isfinite(depth) | np.isfinite(doubtful)))
+        for frame, depth, of_surface, background in zip(self.rendered, known, sharp, backgrounds, strict=True):
+            wanted.append((frame.depth > 0) & ~(background | np.isfinite(depth)))
             shown.append(np.where(of_surface, frame.depth, np.nan))
         enclosed = enclosing_depths(self.cameras, [*planes, *walls], known, wanted, shown)
-        self.doubtful_depths = [_first_known(pair) for pair in zip(self.doubtful_depths, enclosed, strict=True)]
+        enclosed = [
+            np.where(doubtful < (1 - ON_IT) * depth, np.nan, depth)
+            for doubtful, depth in zip(self.doubtful_depths, enclosed, strict=True)
+        ]
+        self.doubtful_depths = [_first_known(pair) for pair in zip(enclosed, self.doubtful_depths, strict=True)]
         self.enclosed = _share_known(enclosed)
         self.rendered = [
             frame if frame.background is None else replace(frame, background=frame.background & ~on)

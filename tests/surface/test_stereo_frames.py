@@ -118,7 +118,20 @@ def test_rays_end_at_enclosing_planes_where_nothing_is_known_and_nothing_sharp_i
     assert np.allclose(frame.confidence[:, 20:30], stereo_frames.DOUBTFUL_WEIGHT)
     assert np.allclose(frame.depth[:, 30:], 3.03), "what is sharp stays"
     assert merged.enclosed == pytest.approx((29 * 10 + 30) / 1200) and merged.about()["enclosed"] == merged.enclosed
-    assert len(asked) == 1 and not asked[0][1:, :20].any()
+    assert len(asked) == 1 and not asked[0][2:, :20].any()
+
+
+@pytest.mark.parametrize("plane, taken", [(2.5, 2.5), (3.1, 3.1), (3.2, 3)])
+def test_doubtful_depths_stay_where_they_are_well_before_an_enclosing_plane(found, monkeypatch, plane, taken):
+    monkeypatch.setattr(
+        stereo_frames,
+        "enclosing_depths",
+        lambda cameras, planes, known, wanted, shown: [np.where(wanted[0], np.float32(plane), np.nan)],
+    )
+    merged = MergedFrames(rendered(0.01), [VIEW], 5.0)
+    doubtful = np.isfinite(found[0].depth) & (found[0].confirming > 0) & ~found[0].is_confirmed()
+    assert doubtful.any() and np.allclose(merged[0].depth[doubtful], taken)
+    assert (merged[0].depth[found[0].is_confirmed()] == 3).all()
 
 
 def test_no_ray_ends_at_an_enclosing_plane_in_background(found, monkeypatch):
