@@ -11,7 +11,7 @@ from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.enclosing_planes import EnclosingPlane, enclosing_depths
 from linprim_geo.stereo.plain_regions import in_camera
 from linprim_geo.stereo.point_planes import SurfacePoints
-from linprim_geo.stereo.room_corners import by_chance, corner_walls
+from linprim_geo.stereo.room_corners import EdgeImages, by_chance, corner_walls, find_corner
 
 # A room of 3 by 2 m and 2 m high with its floor at z = 0: n . x = d of what is inside; the last is the ceiling.
 PLANES = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [-1, 0, 0, -3], [0, -1, 0, -2], [0, 0, -1, -2]])
@@ -26,6 +26,24 @@ def cameras(count: int = 24) -> list[Camera]:
     turns = np.linspace(0, 2 * np.pi, count, endpoint=False)
     eyes = MIDDLE + np.stack([1.1 * np.cos(turns), 0.7 * np.sin(turns), 0.7 + 0.1 * np.sin(5 * turns)], axis=1)
     return [look_at(eye, MIDDLE - 0.3 * (eye - MIDDLE) * [1, 1, 0], size=SIZE, focal=220.0) for eye in eyes]
+
+
+def at_corner(count: int = 12, spread: float = 1.0, roll: bool = False) -> list[Camera]:
+    """On an arc in the room, looking at its corner at the origin; `roll` turns them on their side."""
+    turns = np.pi / 4 + spread * np.linspace(-0.6, 0.6, count)
+    eyes = np.stack([1.9 * np.cos(turns), 1.9 * np.sin(turns), 0.9 + 0.2 * spread * np.sin(5 * turns)], axis=1)
+    up = (1.0, -1.0, 0.0) if roll else (0.0, 0.0, 1.0)
+    return [look_at(eye, (0.3, 0.3, 0.4), size=SIZE, focal=300.0, up=up) for eye in eyes]
+
+
+def at_corner_walls(of: list[Camera], *others: EnclosingPlane, floor: EnclosingPlane = FLOOR):
+    known = floors(of)
+    near = EnclosingPlane(floor.normal, 0.0, floor.axes, floor.own * 0.5, floor.own * 0.5)
+    return corner_walls(photographs(of), known, [None] * len(of), [near, *others], points_of(of, known))
+
+
+def directions(walls) -> list[tuple]:
+    return sorted(tuple(int(x) for x in np.round(wall.normal)) for wall in walls)
 
 
 def seen(camera: Camera, planes: np.ndarray = PLANES) -> tuple[np.ndarray, np.ndarray]:
@@ -134,7 +152,7 @@ def test_a_wall_that_is_known_is_not_found_again():
 
     walls = found(enclosing=(FLOOR, known))
 
-    assert sorted(tuple(np.round(wall.normal).astype(int)) for wall in walls) == [(-1, 0, 0), (0, -1, 0), (0, 1, 0)]
+    assert directions(walls) == [(-1, 0, 0), (0, -1, 0), (0, 1, 0)]
 
 
 def test_a_wall_meets_one_that_is_known_at_the_only_edge_that_shows():
@@ -146,7 +164,7 @@ def test_a_wall_meets_one_that_is_known_at_the_only_edge_that_shows():
 
     walls = found(greys=greys, enclosing=(FLOOR, known, other))
 
-    assert [tuple(np.round(wall.normal).astype(int)) for wall in walls] == [(1, 0, 0)]
+    assert directions(walls) == [(1, 0, 0)]
 
 
 def test_a_wall_in_place_of_which_views_see_a_background_is_none():
@@ -166,13 +184,96 @@ def test_a_floor_that_goes_on_behind_a_wall_has_none_there():
 
     walls = corner_walls(photographs(of), known, [None] * len(of), [FLOOR], SurfacePoints.together([points, behind]))
 
-    assert sorted(tuple(np.round(wall.normal).astype(int)) for wall in walls) == [(-1, 0, 0), (0, -1, 0), (0, 1, 0)]
+    assert directions(walls) == [(-1, 0, 0), (0, -1, 0), (0, 1, 0)]
 
 
 def test_walls_are_no_floors():
     side = EnclosingPlane(np.array([1.0, 0, 0]), 0.0, np.eye(3)[1:], *2 * [np.array([[0.0, 0.0], [2.0, 2.0]])])
 
     assert found(enclosing=(side,)) == []
+
+
+KNOWN_WALL = EnclosingPlane(np.array([0.0, 1, 0]), 0.0, np.eye(3)[[0, 2]], *2 * [np.array([[0.0, 0.0], [3.0, 1.0]])])
+
+
+def test_one_edge_alone_is_no_wall_but_one_at_a_known_wall():
+    of = at_corner()
+    assert at_corner_walls(of) == []
+    assert directions(at_corner_walls(of, KNOWN_WALL)) == [(1, 0, 0)]
+
+
+def test_photographs_have_to_be_upright():
+    assert at_corner_walls(at_corner(roll=True), KNOWN_WALL) == []
+
+
+def test_edges_have_to_be_seen_from_directions_that_differ():
+    assert at_corner_walls(at_corner(spread=0.01), KNOWN_WALL) == []
+
+
+def test_a_wall_from_one_edge_has_the_direction_in_which_the_floor_ends():
+    turned = np.radians(2.0)
+    axes = np.array([[np.cos(turned), np.sin(turned), 0], [-np.sin(turned), np.cos(turned), 0]])
+    floor = EnclosingPlane(FLOOR.normal, 0.0, axes, FLOOR.own, FLOOR.own)
+
+    (wall,) = at_corner_walls(at_corner(), KNOWN_WALL, floor=floor)
+
+    assert wall.normal @ [1, 0, 0] > np.cos(np.radians(0.7))
+
+
+def test_edges_reach_up_as_far_as_is_asked():
+    of = cameras()
+    edges = EdgeImages(photographs(of), floors(of))
+    near = FLOOR.own[0]
+    corner = find_corner(FLOOR, near, 0.5, edges)
+    assert corner is not None and corner.height >= 0.5
+    assert find_corner(FLOOR, near, 4.0, edges) is None
+
+
+def test_a_floor_that_is_known_along_a_quarter_of_a_wall_says_nothing_of_it():
+    of = cameras()
+    known = floors(of)
+    points = points_of(of, known)
+    ends = np.abs(points.position[:, 0] - 1.5) > 1.2
+    some = SurfacePoints(points.position[ends], points.normal[ends], points.center[ends], points.view[ends])
+
+    walls = corner_walls(photographs(of), known, [None] * len(of), [FLOOR], some)
+
+    assert directions(walls) == [(-1, 0, 0), (1, 0, 0)]
+
+
+def test_a_wall_with_known_points_behind_it_is_none():
+    of = cameras()
+    known = floors(of)
+    points = points_of(of, known)
+    higher = SurfacePoints(points.position[::20] * [1, 1, 0] + [-3, 0, 0.5], *each_20th(points))
+
+    walls = corner_walls(photographs(of), known, [None] * len(of), [FLOOR], SurfacePoints.together([points, higher]))
+
+    assert directions(walls) == [(-1, 0, 0), (0, -1, 0), (0, 1, 0)]
+
+
+def each_20th(points: SurfacePoints) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return points.normal[::20], points.center[::20], points.view[::20]
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.7, -0.7])
+def test_lines_along_an_edge_are_strong_and_hidden_ones_are_not_seen(slope):
+    camera = look_at((0.0, -2.0, 0.0), size=SIZE, focal=300.0)
+    x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5 - camera.cx, np.arange(SIZE[1]) + 0.5 - camera.cy)
+    grey = np.where(x + slope * y > 0, 180, 100).astype(np.uint8)
+    unknown = np.full(grey.shape, np.nan, np.float32)
+    found = DepthMap(camera, unknown, np.zeros((*grey.shape, 3), np.float32), unknown, grey, unknown, grey, 1.0)
+    # In the plane y = 0, where a pixel is 1 / 150: x to the right, z up, so that the edge is along (slope, 0, 1).
+    directions = np.array([[slope, 0, 1.0], [-1, 0, slope], [-0.3, 0, 1]])
+    along = np.linspace(-0.5, 0.5, 64)
+
+    strength = EdgeImages([found], [unknown]).strengths(np.zeros((3, 3)), directions, along, 1)[0, :, 0]
+
+    # A step of 80, blurred by 1.5 pixels.
+    assert strength[0] == pytest.approx(80 / np.sqrt(2 * np.pi) / 1.5, rel=0.15)
+    assert strength[1] < 0.02 * strength[0] and strength[2] < 0.05 * strength[0]
+    hidden = EdgeImages([found], [np.full(grey.shape, 1.9)]).strengths(np.zeros((3, 3)), directions, along, 1)
+    assert np.isnan(hidden).all()
 
 
 def test_shares_that_are_even_are_not_surprising():
