@@ -60,6 +60,10 @@ class EnclosingPlane:
     own: np.ndarray
     whole: np.ndarray
 
+    def at(self, along: np.ndarray) -> np.ndarray:
+        """(..., 3) points of the plane at (..., 2) coordinates along its axes."""
+        return along @ self.axes + self.normal * self.offset
+
     def within(self, points: np.ndarray, ends: np.ndarray) -> np.ndarray:
         """(P,) bool which of (P, 3) points on the plane lie within `own` or `whole`."""
         along = points @ self.axes.T
@@ -124,7 +128,7 @@ class KnownPoints:
 
     def is_there(self, plane: EnclosingPlane, others: Sequence[EnclosingPlane]) -> bool:
         """Whether the middle of a plane is on one of others that faces the same way."""
-        middle = plane.own.mean(0) @ plane.axes + plane.normal * plane.offset
+        middle = plane.at(plane.own.mean(0))
         near = MARGIN * float(np.median(np.linalg.norm(self.centers - middle, axis=1)))
         return any(
             plane.normal @ other.normal > SAME_NORMAL and abs(middle @ other.normal - other.offset) < near

@@ -40,8 +40,8 @@ LEAST_PIXELS = 20
 # samples between two of these. It is at least half as high as the cameras are, in the middle: a table's is not.
 HEIGHTS, SAMPLES, LOWEST = 16, 8, 0.5
 STEPS = (np.arange(HEIGHTS * SAMPLES) + 0.5) / (HEIGHTS * SAMPLES)
-# Fewer than one place in so many has an edge by chance. A view shows an edge if no more than one in ten of the places
-# that are tried have a stronger one there.
+# Fewer than one search in so many finds an edge by chance, were views independent; neighbours are not quite. A view
+# shows an edge if no more than one in ten of the places that are tried have a stronger one there.
 BY_CHANCE, SHOWN = 1e-3, 0.1
 # Directions of a wall that are tried, in SAME_ANGLE to either side.
 DIRECTIONS = 61
@@ -64,7 +64,7 @@ class Corner:
 def corner_walls(
     maps: Sequence[DepthMap],
     known: Sequence[np.ndarray],
-    backgrounds: Sequence[np.ndarray | None],
+    backgrounds: Sequence[np.ndarray],
     enclosing: Sequence[EnclosingPlane],
     points: SurfacePoints,
 ) -> list[EnclosingPlane]:
@@ -76,7 +76,7 @@ def corner_walls(
 
     Args:
         known: (H, W) depth of every view, NaN where nothing is known.
-        backgrounds: (H, W) bool of every view, or None.
+        backgrounds: (H, W) bool of every view.
         points: of what is known.
     """
     cameras = [found.camera for found in maps]
@@ -126,20 +126,20 @@ def find_corner(floor: EnclosingPlane, near: np.ndarray, lowest: float, edges: E
     """The corner of a floor around a place `near` (2,) along its axes; None if photographs show no edge there that is
     as high as `lowest`."""
     longer = _longer_side(floor)
-    pixel, reach = edges.pixel_at(_on(floor, near)), REACH * longer
+    pixel, reach = edges.pixel_at(floor.at(near)), REACH * longer
     along = longer * STEPS
     places = near + _grid(reach, max(BLUR * pixel, reach / MOST_STEPS))
-    shares = edges.shares(_on(floor, places), floor.normal[None], along, HEIGHTS)
+    shares = edges.shares(floor.at(places), floor.normal[None], along, HEIGHTS)
     heights = longer * np.arange(1, HEIGHTS + 1) / HEIGHTS
     chance = np.where(heights >= lowest, by_chance(shares), 0)
     row, part = np.unravel_index(chance.argmin(), chance.shape)
     if chance[row, part] + np.log(chance.size) > np.log(BY_CHANCE):
         return None
     showing = np.flatnonzero(shares[:, row, part] <= SHOWN)
-    if not seen_enough(edges.cameras, showing, _on(floor, places[row])):
+    if not seen_enough(edges.cameras, showing, floor.at(places[row])):
         return None
     finer = places[row] + _grid(2 * BLUR * pixel, BLUR * pixel / FINER)
-    best = edges.strongest(_on(floor, finer), floor.normal[None], along[: (part + 1) * SAMPLES])
+    best = edges.strongest(floor.at(finer), floor.normal[None], along[: (part + 1) * SAMPLES])
     return Corner(places[row] if best is None else finer[best], float(heights[part]))
 
 
@@ -169,7 +169,7 @@ def _line(
     runs = np.zeros((DIRECTIONS, 2))
     runs[:, axis] = floor.own[1 if low else 0, axis] - corner.place[axis]
     runs[:, 1 - axis] = runs[:, axis] * np.tan(angles)
-    starts = np.broadcast_to(_on(floor, corner.place), (DIRECTIONS, 3))
+    starts = np.broadcast_to(floor.at(corner.place), (DIRECTIONS, 3))
     best = edges.strongest(starts, runs @ floor.axes, STEPS)
     end = corner.place + runs[DIRECTIONS // 2 if best is None else best]
     return (corner.place, end) if low else (end, corner.place)
@@ -197,12 +197,11 @@ def _wall(
     floor: EnclosingPlane, line: tuple[np.ndarray, np.ndarray], inward: np.ndarray, height: float
 ) -> EnclosingPlane:
     """The wall over a line on a floor, seen from the side where `inward` (3,) points."""
-    start, end = (_on(floor, place) for place in line)
+    start, end = (floor.at(place) for place in line)
     direction = (end - start) / np.linalg.norm(end - start)
     normal = np.cross(direction, floor.normal)
     normal = normal if normal @ inward > 0 else -normal
     ends = np.array([[start @ direction, floor.offset], [end @ direction, floor.offset + height]])
-    ends = np.sort(ends, axis=0)
     return EnclosingPlane(normal, float(normal @ start), np.stack([direction, floor.normal]), ends, ends)
 
 
@@ -210,25 +209,20 @@ def _is_seen_past(
     wall: EnclosingPlane,
     cameras: Sequence[Camera],
     known: Sequence[np.ndarray],
-    backgrounds: Sequence[np.ndarray | None],
+    backgrounds: Sequence[np.ndarray],
 ) -> bool:
     """Whether views see a background in place of a wall."""
     steps = (np.arange(PLACES) + 0.5) / PLACES
     share = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-    places = (wall.own[0] + share * np.diff(wall.own, axis=0)) @ wall.axes + wall.normal * wall.offset
+    places = wall.at(wall.own[0] + share * np.diff(wall.own, axis=0))
     looking, past = 0, 0
     for camera, depth, background in zip(cameras, known, backgrounds, strict=True):
         _, pixels, along = visible_pixels(camera, places)
         column, row = pixels.T
         clear = ~(depth[row, column] < (1 - MARGIN) * along)
         looking += np.count_nonzero(clear)
-        past += 0 if background is None else np.count_nonzero(clear & background[row, column])
+        past += np.count_nonzero(clear & background[row, column])
     return bool(past > MOST_BACKGROUND * looking)
-
-
-def _on(floor: EnclosingPlane, places: np.ndarray) -> np.ndarray:
-    """(..., 3) points of (..., 2) places along the axes of a floor."""
-    return places @ floor.axes + floor.normal * floor.offset
 
 
 def _longer_side(floor: EnclosingPlane) -> float:

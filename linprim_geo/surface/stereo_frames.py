@@ -48,10 +48,10 @@ class MergedFrames(Sequence):
     `weight` is what rendered depths count elsewhere: the squared deviation of confirmed depths from those of their
     neighbours over that of rendered ones from confirmed ones, 1 at most. `confirmed` is the share of pixels with
     confirmed depths, `doubtful` that of less probable ones, `flat` that of pixels on one of the `planes` (K, 4),
-    `spanned` that of pixels without texture between all these, `enclosed` that of pixels whose rays end at a floor
-    or wall because nothing else is known, `thin` that of thin things before what is known. `sharp` (H, W) bool of every
-    view says where rendered depths are those of a surface, and None everywhere: they stay where nothing is known, and
-    thin things are among them.
+    `spanned` that of pixels without texture between all these, `enclosed` that of pixels whose rays end at a floor or
+    wall because nothing else is known, or because what is doubtful is near it, `thin` that of thin things before what
+    is known. `sharp` (H, W) bool of every view says where rendered depths are those of a surface, and None everywhere:
+    they stay where nothing is known, and thin things are among them.
     """
 
     def __init__(
@@ -152,7 +152,7 @@ class MergedFrames(Sequence):
         doubtful depths those stay that are before a plane by more than these may be off. What stereo has `measured` on
         planes with points is not background where hardly any view looks."""
         planes = enclosing_planes(self.cameras, self.planes, points)
-        walls = corner_walls(maps, known, [frame.background for frame in self.rendered], planes, points)
+        walls = corner_walls(maps, known, [_background_of(frame) for frame in self.rendered], planes, points)
         wanted, shown = [], []
         for frame, depth, of_surface, background in zip(self.rendered, known, sharp, backgrounds, strict=True):
             wanted.append((frame.depth > 0) & ~(background | np.isfinite(depth)))

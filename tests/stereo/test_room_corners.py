@@ -39,7 +39,11 @@ def at_corner(count: int = 12, spread: float = 1.0, roll: bool = False) -> list[
 def at_corner_walls(of: list[Camera], *others: EnclosingPlane, floor: EnclosingPlane = FLOOR):
     known = floors(of)
     near = EnclosingPlane(floor.normal, 0.0, floor.axes, floor.own * 0.5, floor.own * 0.5)
-    return corner_walls(photographs(of), known, [None] * len(of), [near, *others], points_of(of, known))
+    return corner_walls(photographs(of), known, no_background(of), [near, *others], points_of(of, known))
+
+
+def no_background(of: list[Camera]) -> list[np.ndarray]:
+    return [np.zeros((camera.height, camera.width), bool) for camera in of]
 
 
 def directions(walls) -> list[tuple]:
@@ -80,7 +84,7 @@ def found(greys=GREYS, planes: np.ndarray = PLANES, enclosing=(FLOOR,), backgrou
     of = cameras()
     known = floors(of, planes)
     maps = photographs(of, greys, planes, seed)
-    return corner_walls(maps, known, backgrounds or [None] * len(of), list(enclosing), points_of(of, known))
+    return corner_walls(maps, known, backgrounds or no_background(of), list(enclosing), points_of(of, known))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -91,7 +95,7 @@ def test_walls_without_texture_are_found_by_the_edges_between_them(seed):
     for wall in walls:
         true = PLANES[1:5][(PLANES[1:5, :3] @ wall.normal).argmax()]
         assert true[:3] @ wall.normal > np.cos(np.radians(0.5))
-        middle = wall.own.mean(0) @ wall.axes + wall.offset * wall.normal
+        middle = wall.at(wall.own.mean(0))
         assert abs(true[:3] @ middle - true[3]) < 0.01
         # From corner to corner, and no higher than the ceiling by more than one of the heights that are tried.
         length = 2 if abs(wall.normal[0]) > 0.5 else 3
@@ -135,7 +139,7 @@ def test_no_walls_rise_from_a_table_in_a_far_room():
     for view, depth in zip(maps, table, strict=True):
         view.grey[np.isfinite(depth)] = 60
 
-    assert corner_walls(maps, table, [None] * len(of), [FLOOR], points_of(of, table)) == []
+    assert corner_walls(maps, table, no_background(of), [FLOOR], points_of(of, table)) == []
 
 
 def is_on(camera: Camera) -> np.ndarray:
@@ -182,7 +186,7 @@ def test_a_floor_that_goes_on_behind_a_wall_has_none_there():
     points = points_of(of, known)
     behind = SurfacePoints(points.position - [0.3, 0, 0], points.normal, points.center, points.view)
 
-    walls = corner_walls(photographs(of), known, [None] * len(of), [FLOOR], SurfacePoints.together([points, behind]))
+    walls = corner_walls(photographs(of), known, no_background(of), [FLOOR], SurfacePoints.together([points, behind]))
 
     assert directions(walls) == [(-1, 0, 0), (0, -1, 0), (0, 1, 0)]
 
@@ -236,7 +240,7 @@ def test_a_floor_that_is_known_along_a_quarter_of_a_wall_says_nothing_of_it():
     ends = np.abs(points.position[:, 0] - 1.5) > 1.2
     some = SurfacePoints(points.position[ends], points.normal[ends], points.center[ends], points.view[ends])
 
-    walls = corner_walls(photographs(of), known, [None] * len(of), [FLOOR], some)
+    walls = corner_walls(photographs(of), known, no_background(of), [FLOOR], some)
 
     assert directions(walls) == [(-1, 0, 0), (1, 0, 0)]
 
@@ -247,7 +251,7 @@ def test_a_wall_with_known_points_behind_it_is_none():
     points = points_of(of, known)
     higher = SurfacePoints(points.position[::20] * [1, 1, 0] + [-3, 0, 0.5], *each_20th(points))
 
-    walls = corner_walls(photographs(of), known, [None] * len(of), [FLOOR], SurfacePoints.together([points, higher]))
+    walls = corner_walls(photographs(of), known, no_background(of), [FLOOR], SurfacePoints.together([points, higher]))
 
     assert directions(walls) == [(-1, 0, 0), (0, -1, 0), (0, 1, 0)]
 
