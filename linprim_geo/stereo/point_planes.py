@@ -19,6 +19,9 @@ from linprim_geo.stereo.plain_regions import FITS, LEAST_VIEWS, TOLERANCE, in_ca
 
 # Confirmed points of all views that planes are looked for in, of these that seeds are tried on, and seeds.
 POINTS, TRIED_ON, SEEDS = 40_000, 4_000, 300
+# Of the seeds so many are fitted. Points are on a plane within TOLERANCES, the first of which is twice to four times
+# what stereo is off by on surfaces with texture.
+BEST_SEEDS, TOLERANCES = 10, (TOLERANCE / 4, TOLERANCE / 2, TOLERANCE)
 # Planes at most, and the least share of the points that one has.
 MOST_PLANES, LEAST_SHARE = 30, 0.01
 # Normals of points on a plane are within 30 degrees of its own.
@@ -79,36 +82,62 @@ class SurfacePoints:
 
 
 def planes_of_points(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> np.ndarray:
-    """(K, 4) planes n . x = d of the world with the most of the confirmed `depths` (H, W) of views, NaN elsewhere."""
+    """(K, 4) planes n . x = d of the world with the most of the confirmed `depths` (H, W) of views, NaN elsewhere.
+
+    Those come first that hold their points within the least of TOLERANCES: within a large one a plane may lie across
+    two surfaces, such as a picture on a wall and the head of a bed before it, and on neither.
+    """
     rng = np.random.default_rng(0)
     count = -(-POINTS // len(maps))
     points = SurfacePoints.together(
         SurfacePoints.of_view(view, found.camera, depth, found.normal, count, rng)
         for view, (found, depth) in enumerate(zip(maps, depths, strict=True))
     )
-    least, planes, left = LEAST_SHARE * len(points), [], np.arange(len(points))
-    for _ in range(MOST_PLANES):
-        rest = points[left]
-        if len(rest) < max(least, 3):
-            break
-        seeds = rest[rng.integers(0, len(rest), SEEDS)]
-        tried = np.column_stack([seeds.normal, (seeds.normal * seeds.position).sum(1)])
-        some = rest[rng.permutation(len(rest))[:TRIED_ON]]
-        plane = tried[np.argmax(some.on(tried).sum(0))]
-        on = rest.on(plane[None])[:, 0]
-        for _ in range(FITS):
-            if np.count_nonzero(on) < max(least, 3):
+    least, planes, free = max(LEAST_SHARE * len(points), 3), list[np.ndarray](), np.arange(len(points))
+    for tolerance in TOLERANCES:
+        left = free
+        while len(planes) < MOST_PLANES and len(left) >= least:
+            rest = points[left]
+            plane = _commonest_plane(rest, tolerance, least, rng)
+            if plane is None:
                 break
-            plane = _fitted(rest[on])
-            on = rest.on(plane[None])[:, 0]
-        count = np.count_nonzero(on)
-        if count < max(least, 3):
-            break
-        central = np.count_nonzero(rest.on(plane[None], TOLERANCE / 2))
-        if central >= CENTRAL_SHARE * count and len(np.unique(rest.view[on])) >= LEAST_VIEWS:
-            planes.append(plane)
-        left = left[~on]
+            on = rest.on(plane[None], tolerance)[:, 0]
+            central = np.count_nonzero(rest.on(plane[None], tolerance / 2))
+            if central >= CENTRAL_SHARE * np.count_nonzero(on) and len(np.unique(rest.view[on])) >= LEAST_VIEWS:
+                planes.append(plane)
+                free = free[~points[free].on(plane[None])[:, 0]]
+            left = left[~rest.on(plane[None])[:, 0]]
     return np.array(planes).reshape(-1, 4)
+
+
+def _commonest_plane(
+    points: SurfacePoints, tolerance: float, least: float, rng: np.random.Generator
+) -> np.ndarray | None:
+    """The plane (4,) that holds the most of points within half of a `tolerance`, less those in its other half; None
+    if fewer than `least` are within it. Points that lie across it come out even."""
+    seeds = points[rng.integers(0, len(points), SEEDS)]
+    tried = np.column_stack([seeds.normal, (seeds.normal * seeds.position).sum(1)])
+    some = points[rng.permutation(len(points))[:TRIED_ON]]
+    # Normals of points alone are not exact enough for a small tolerance.
+    best, most = None, -len(some)
+    for seed in tried[np.argsort(-some.on(tried, tolerance).sum(0), kind="stable")[:BEST_SEEDS]]:
+        plane = _fitted_within(some, seed, tolerance, 3)
+        if plane is not None:
+            central, on = (np.count_nonzero(some.on(plane[None], part)) for part in (tolerance / 2, tolerance))
+            if 2 * central - on > most:
+                best, most = plane, 2 * central - on
+    return None if best is None else _fitted_within(points, best, tolerance, least)
+
+
+def _fitted_within(points: SurfacePoints, plane: np.ndarray, tolerance: float, least: float) -> np.ndarray | None:
+    """A plane fitted to the points that are on it, within TOLERANCE first and then within a smaller `tolerance`; None
+    if they are fewer than `least`."""
+    for step in range(FITS):
+        on = points.on(plane[None], max(TOLERANCE / 2**step, tolerance))[:, 0]
+        if np.count_nonzero(on) < least:
+            return None
+        plane = _fitted(points[on])
+    return plane if np.count_nonzero(points.on(plane[None], tolerance)) >= least else None
 
 
 def _fitted(points: SurfacePoints) -> np.ndarray:

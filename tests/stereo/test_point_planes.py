@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.captures import look_at
@@ -53,6 +55,32 @@ def test_a_wall_and_a_floor_are_found(seed):
         assert min(np.abs(found * np.sign(found[:3] @ plane[:3]) - plane).max() for found in planes) < 2e-3
     again = planes_of_points(maps, [found.depth for found in maps])
     assert (planes == again).all()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_plane_does_not_lie_across_two_surfaces(seed):
+    """A picture on a wall, and a board 4 cm before the wall beside it: one plane holds both within a share of 0.01 of
+    their distance, a degree and a half askew."""
+    rng, maps = np.random.default_rng(seed), []
+    board = np.array([0.0, 1.0, 0.0, 0.04])
+    for center in CENTERS:
+        camera = look_at(center, target=(0.0, 0.0, 0.0), size=(96, 72), focal=80.0)
+        inverse = camera.ray_grid() @ in_camera(camera, np.array([WALL, board])).T
+        on_wall, on_board = (camera.center + camera.world_rays() / inverse[..., [k]] for k in (0, 1))
+        is_board = (on_board[..., 0] > -1.0) & (on_board[..., 0] < -0.3) & (on_board[..., 2] < 0.2)
+        known = is_board | ((on_wall[..., 0] > 0.3) & (on_wall[..., 0] < 1.0) & (on_wall[..., 2] > -0.2))
+        depth = 1 / np.where(is_board, inverse[..., 1], inverse[..., 0])
+        noisy = depth * (1 + rng.normal(0, NOISE / 3, depth.shape))
+        found = map_of(camera, depth, WALL[:3], rng, known)
+        normal = WALL[:3] + rng.normal(0, 0.05, (*depth.shape, 3))
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        noisy = np.where(known, noisy, np.nan)
+        maps.append(replace(found, depth=noisy.astype(np.float32), normal=normal.astype(np.float32)))
+    planes = planes_of_points(maps, [found.depth for found in maps])
+    planes *= np.sign(planes[:, [1]])
+    assert np.degrees(np.arccos(planes[:, 1].min())) < 0.3
+    offsets = np.sort(planes[:, 3])
+    assert np.abs(offsets[[0, -1]] - [0.0, 0.04]).max() < 3e-3
 
 
 def test_one_or_two_views_are_not_enough():
