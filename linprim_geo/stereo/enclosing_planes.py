@@ -17,7 +17,7 @@ a wall do at the next wall, a plane at right angles to both closes the room ther
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -68,6 +68,16 @@ class EnclosingPlane:
         """(P,) bool which of (P, 3) points on the plane lie within `own` or `whole`."""
         along = points @ self.axes.T
         return ((along >= ends[0]) & (along <= ends[1])).all(1)
+
+    def with_place_for(self, other: EnclosingPlane) -> EnclosingPlane:
+        """The plane with rectangles that hold the `own` one of another, too, projected onto it."""
+        corners = other.at(np.array([[other.own[i, 0], other.own[j, 1]] for i in (0, 1) for j in (0, 1)]))
+        along = corners @ self.axes.T
+        own, whole = (
+            np.stack([np.minimum(ends[0], along.min(0)), np.maximum(ends[1], along.max(0))])
+            for ends in (self.own, self.whole)
+        )
+        return replace(self, own=own, whole=whole)
 
 
 def enclosing_planes(cameras: Sequence[Camera], planes: np.ndarray, points: SurfacePoints) -> list[EnclosingPlane]:
@@ -126,14 +136,14 @@ class KnownPoints:
                 kept.append(plane)
         return kept
 
-    def is_there(self, plane: EnclosingPlane, others: Sequence[EnclosingPlane]) -> bool:
-        """Whether the middle of a plane is on one of others that faces the same way."""
+    def which_is_there(self, plane: EnclosingPlane, others: Sequence[EnclosingPlane]) -> int | None:
+        """The number of the first of others that faces the same way and on which the middle of a plane is."""
         middle = plane.at(plane.own.mean(0))
         near = MARGIN * float(np.median(np.linalg.norm(self.centers - middle, axis=1)))
-        return any(
-            plane.normal @ other.normal > SAME_NORMAL and abs(middle @ other.normal - other.offset) < near
-            for other in others
-        )
+        for number, other in enumerate(others):
+            if plane.normal @ other.normal > SAME_NORMAL and abs(middle @ other.normal - other.offset) < near:
+                return number
+        return None
 
     def closing(self, found: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Planes at right angles to two of those `found` where both end, on sides where there is none."""

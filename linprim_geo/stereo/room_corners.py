@@ -61,18 +61,18 @@ class Corner:
     height: float
 
 
-def corner_walls(
+def with_corner_walls(
     maps: Sequence[DepthMap],
     known: Sequence[np.ndarray],
     backgrounds: Sequence[np.ndarray],
     enclosing: Sequence[EnclosingPlane],
     points: SurfacePoints,
 ) -> list[EnclosingPlane]:
-    """Walls without an `enclosing` plane of their own that rise from those of these planes that are floors.
+    """The `enclosing` planes, and walls without one that rise from those of these planes that are floors.
 
     A wall has an edge at either end, or one at which it meets such a wall or one that is known. It is as high as its
     edges and goes from one to the other, or to the end of its floor. The floor is known along half of it at least and
-    ends there.
+    ends there. A known wall, too, goes on as far.
 
     Args:
         known: (H, W) depth of every view, NaN where nothing is known.
@@ -83,25 +83,29 @@ def corner_walls(
     upward = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
     floors = [plane for plane in enclosing if plane.normal @ upward > UPRIGHT * np.linalg.norm(upward)]
     if not floors:
-        return []
+        return list(enclosing)
     edges, seen = EdgeImages(maps, known), KnownPoints(cameras, points)
-    walls: list[EnclosingPlane] = []
+    planes = list(enclosing)
     for floor in floors:
-        for wall in _walls_on(floor, [*enclosing, *walls], edges, seen):
-            if not _is_seen_past(wall, cameras, known, backgrounds):
-                walls.append(wall)
-    return walls
+        for wall, same in _walls_on(floor, planes, edges, seen):
+            if _is_seen_past(wall, cameras, known, backgrounds):
+                continue
+            if same is None:
+                planes.append(wall)
+            else:
+                planes[same] = planes[same].with_place_for(wall)
+    return planes
 
 
 def _walls_on(
     floor: EnclosingPlane, others: Sequence[EnclosingPlane], edges: EdgeImages, seen: KnownPoints
-) -> list[EnclosingPlane]:
-    """Walls on the four sides of the rectangle that holds a floor's own points, without those that `others` are."""
+) -> list[tuple[EnclosingPlane, int | None]]:
+    """Walls on the four sides of the rectangle that holds a floor's own points, and which of the `others` each is."""
     lowest = LOWEST * float(np.median(seen.centers @ floor.normal - floor.offset))
     corners = [[find_corner(floor, np.array([x, y]), lowest, edges) for y in floor.own[:, 1]] for x in floor.own[:, 0]]
     on_floor = seen.points.on(np.append(floor.normal, floor.offset)[None], CONFIRMED_DEPTH)[:, 0]
     places, margin = seen.points.position[on_floor] @ floor.axes.T, MARGIN * seen.distance[on_floor]
-    found: dict[tuple[int, int], EnclosingPlane] = {}
+    found: dict[tuple[int, int], tuple[EnclosingPlane, int | None]] = {}
     meeting: dict[tuple[int, int], set[tuple[int, int]]] = {}
     sure: set[tuple[int, int]] = set()
     for axis, end in product((0, 1), (0, 1)):
@@ -111,11 +115,12 @@ def _walls_on(
             continue
         inward = floor.axes[axis] if end == 0 else -floor.axes[axis]
         wall = _wall(floor, line, inward, max(corner.height for corner in ends if corner))
-        if seen.is_there(wall, others):
+        same = seen.which_is_there(wall, others)
+        if same is not None:
             sure.add((axis, end))
-        elif _ends_at(line, inward @ floor.axes.T, places, margin, REACH * _longer_side(floor)):
-            if seen.is_before_all(np.append(wall.normal, wall.offset)):
-                found[axis, end] = wall
+        if _ends_at(line, inward @ floor.axes.T, places, margin, REACH * _longer_side(floor)):
+            if same is not None or seen.is_before_all(np.append(wall.normal, wall.offset)):
+                found[axis, end] = wall, same
                 meeting[axis, end] = {(1 - axis, k) for k in (0, 1) if ends[k]}
                 if all(ends):
                     sure.add((axis, end))

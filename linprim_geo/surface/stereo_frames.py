@@ -23,7 +23,7 @@ from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.lone_backgrounds import lone_backgrounds
 from linprim_geo.stereo.plain_regions import common_planes, edges_of, grown_alike, plane_depths, regions_of_views
 from linprim_geo.stereo.point_planes import SurfacePoints, planes_of_points, point_plane_depth
-from linprim_geo.stereo.room_corners import corner_walls
+from linprim_geo.stereo.room_corners import with_corner_walls
 from linprim_geo.stereo.shaded_planes import ShadedPlanes
 from linprim_geo.stereo.thin_things import SeenDepths, thin_things
 from linprim_geo.stereo.visibility_cut import plane_normals, points_per_view, spanned_depths
@@ -152,12 +152,12 @@ class MergedFrames(Sequence):
         doubtful depths those stay that are before a plane by more than these may be off. What stereo has `measured` on
         planes with points is not background where hardly any view looks."""
         planes = enclosing_planes(self.cameras, self.planes, points)
-        walls = corner_walls(maps, known, [_background_of(frame) for frame in self.rendered], planes, points)
+        walled = with_corner_walls(maps, known, [_background_of(frame) for frame in self.rendered], planes, points)
         wanted, shown = [], []
         for frame, depth, of_surface, background in zip(self.rendered, known, sharp, backgrounds, strict=True):
             wanted.append((frame.depth > 0) & ~(background | np.isfinite(depth)))
             shown.append(np.where(of_surface, frame.depth, np.nan))
-        enclosed = enclosing_depths(self.cameras, [*planes, *walls], known, wanted, shown)
+        enclosed = enclosing_depths(self.cameras, walled, known, wanted, shown)
         enclosed = [
             np.where(doubtful < (1 - ON_IT) * depth, np.nan, depth)
             for doubtful, depth in zip(self.doubtful_depths, enclosed, strict=True)

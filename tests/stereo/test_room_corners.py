@@ -11,7 +11,7 @@ from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.enclosing_planes import EnclosingPlane, enclosing_depths
 from linprim_geo.stereo.plain_regions import in_camera
 from linprim_geo.stereo.point_planes import SurfacePoints
-from linprim_geo.stereo.room_corners import EdgeImages, by_chance, corner_walls, find_corner
+from linprim_geo.stereo.room_corners import EdgeImages, by_chance, find_corner, with_corner_walls
 
 # A room of 3 by 2 m and 2 m high with its floor at z = 0: n . x = d of what is inside; the last is the ceiling.
 PLANES = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [-1, 0, 0, -3], [0, -1, 0, -2], [0, 0, -1, -2]])
@@ -40,6 +40,11 @@ def at_corner_walls(of: list[Camera], *others: EnclosingPlane, floor: EnclosingP
     known = floors(of)
     near = EnclosingPlane(floor.normal, 0.0, floor.axes, floor.own * 0.5, floor.own * 0.5)
     return corner_walls(photographs(of), known, no_background(of), [near, *others], points_of(of, known))
+
+
+def corner_walls(maps, known, backgrounds, enclosing, points) -> list[EnclosingPlane]:
+    """Walls that are none of the enclosing planes."""
+    return with_corner_walls(maps, known, backgrounds, enclosing, points)[len(enclosing) :]
 
 
 def no_background(of: list[Camera]) -> list[np.ndarray]:
@@ -157,6 +162,28 @@ def test_a_wall_that_is_known_is_not_found_again():
     walls = found(enclosing=(FLOOR, known))
 
     assert directions(walls) == [(-1, 0, 0), (0, -1, 0), (0, 1, 0)]
+
+
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_a_wall_that_is_known_in_part_goes_on_to_its_edges_if_its_floor_does_not(goes_on):
+    of = cameras()
+    floor = floors(of)
+    points = points_of(of, floor)
+    if goes_on:
+        behind = SurfacePoints(points.position - [0.3, 0, 0], points.normal, points.center, points.view)
+        points = SurfacePoints.together([points, behind])
+    ends = np.array([[0.5, 0.2], [1.2, 0.6]])
+    part = EnclosingPlane(np.array([1.0, 0, 0]), 0.01, np.eye(3)[1:], ends, ends)
+
+    same = with_corner_walls(photographs(of), floor, no_background(of), [FLOOR, part], points)[1]
+
+    assert same.normal @ part.normal == 1 and same.offset == part.offset
+    if goes_on:
+        assert (same.own == ends).all()
+    else:
+        assert same.own[:, 0] == pytest.approx([0, 2], abs=0.02)
+        assert same.own[0, 1] == pytest.approx(0, abs=1e-9) and same.own[1, 1] > 1
+        assert (same.whole == same.own).all()
 
 
 def test_a_wall_meets_one_that_is_known_at_the_only_edge_that_shows():
