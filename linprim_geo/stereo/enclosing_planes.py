@@ -23,6 +23,7 @@ import numpy as np
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.points.view_pairs import SOURCES, visible_pixels
+from linprim_geo.stereo.common_surfaces import ON_IT
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.plain_regions import in_camera, rays_of, to_world
 from linprim_geo.stereo.point_planes import LEAST_SHARE, SAME_NORMAL, SurfacePoints
@@ -230,6 +231,7 @@ def enclosing_depths(
     known: Sequence[np.ndarray],
     wanted: Sequence[np.ndarray],
     shown: Sequence[np.ndarray],
+    doubtful: Sequence[np.ndarray],
 ) -> list[np.ndarray]:
     """(H, W) float32 depth of every view at its `wanted` pixels where their rays end at an enclosing plane, else NaN.
 
@@ -238,10 +240,12 @@ def enclosing_depths(
         wanted: (H, W) bool.
         shown: (H, W) depth of every view that a pixel probably has, NaN where none is more probable than others: a
             plane has to be near it.
+        doubtful: (H, W) depth of every view that is on a plane if it is near one, NaN where there is none; elsewhere a
+            place that MOST_KNOW is not what a pixel shows of which nothing is known.
     """
     result = [np.full(depth.shape, np.nan, np.float32) for depth in known]
     planes = np.array([[*plane.normal, plane.offset] for plane in enclosing]).reshape(-1, 4)
-    for camera, depth, pixels, probable in zip(cameras, result, wanted, shown, strict=True):
+    for camera, depth, pixels, probable, supposed in zip(cameras, result, wanted, shown, doubtful, strict=True):
         row, column = np.nonzero(pixels)
         if not len(row) or not len(planes):
             continue
@@ -256,7 +260,8 @@ def enclosing_depths(
         elsewhere = np.abs(probable[row, column] * nearest - 1) > MARGIN  # not where it is NaN
         rows = np.flatnonzero((own | whole) & ~elsewhere)
         looking, knowing = _looking(to_world(camera, rays[rows] / nearest[rows, None]), cameras, known)
-        rows = rows[(own[rows] | (looking <= FEW_VIEWS)) & (knowing <= MOST_KNOW * looking)]
+        on_it = np.abs(supposed[row[rows], column[rows]] * nearest[rows] - 1) <= ON_IT
+        rows = rows[(own[rows] | (looking <= FEW_VIEWS)) & (on_it | (knowing <= MOST_KNOW * looking))]
         depth[row[rows], column[rows]] = 1 / nearest[rows]
     return result
 

@@ -157,7 +157,7 @@ class MergedFrames(Sequence):
         for frame, depth, of_surface, background in zip(self.rendered, known, sharp, backgrounds, strict=True):
             wanted.append((frame.depth > 0) & ~(background | np.isfinite(depth)))
             shown.append(np.where(of_surface, frame.depth, np.nan))
-        enclosed = enclosing_depths(self.cameras, walled, known, wanted, shown)
+        enclosed = enclosing_depths(self.cameras, walled, known, wanted, shown, self.doubtful_depths)
         enclosed = [
             np.where(doubtful < (1 - ON_IT) * depth, np.nan, depth)
             for doubtful, depth in zip(self.doubtful_depths, enclosed, strict=True)

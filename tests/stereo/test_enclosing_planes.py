@@ -47,7 +47,8 @@ def room(unknown) -> list[np.ndarray]:
 
 def ending(cameras, planes, known, wanted) -> list[np.ndarray]:
     """Depths of `enclosing_depths` where no depth is more probable than others."""
-    return enclosing_depths(cameras, planes, known, wanted, [np.full(depth.shape, np.nan) for depth in known])
+    nothing = [np.full(depth.shape, np.nan) for depth in known]
+    return enclosing_depths(cameras, planes, known, wanted, nothing, nothing)
 
 
 def normals(found: list[EnclosingPlane]) -> set:
@@ -215,6 +216,12 @@ def test_a_place_that_most_views_know_is_not_what_the_others_see(knowing, filled
     wanted[0][18, 24] = True  # the middle, which all of them have in the image
     depth = ending(CAMERAS, [plane], known, wanted)[0]
     assert np.isfinite(depth).sum() == filled
+    # One that doubts a depth does see it if that is near.
+    nothing = [np.full(depth.shape, np.nan) for depth in whole]
+    for factor, near in ((0.97, True), (1.03, True), (0.9, False), (1.1, False)):
+        doubtful = [factor * whole[0], *nothing[1:]]
+        depth = enclosing_depths(CAMERAS, [plane], known, wanted, nothing, doubtful)[0]
+        assert np.isfinite(depth).sum() == (filled or near)
 
 
 def test_where_a_depth_is_probable_the_plane_is_near_it():
@@ -223,7 +230,7 @@ def test_where_a_depth_is_probable_the_plane_is_near_it():
     wall = depth_of(CAMERAS[0], [WALL])
     nothing, wanted = [np.full_like(wall, np.nan)], [wall < 9]
     probable = np.where(np.arange(SIZE[0]) < 16, 1.01 * wall, np.where(np.arange(SIZE[0]) < 32, 0.9 * wall, np.nan))
-    filled = enclosing_depths(CAMERAS[:1], [plane], nothing, wanted, [probable])[0]
+    filled = enclosing_depths(CAMERAS[:1], [plane], nothing, wanted, [probable], nothing)[0]
     assert np.isnan(filled[:, 16:32]).all()
     there = wanted[0] & ((np.arange(SIZE[0]) < 16) | (np.arange(SIZE[0]) >= 32))
     np.testing.assert_allclose(filled[there], wall[there], rtol=1e-5)

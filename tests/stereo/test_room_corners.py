@@ -117,7 +117,7 @@ def test_rays_that_meet_a_wall_end_there():
         pixels[::6, ::6] = True
     nothing = [np.full(depth.shape, np.nan) for depth in known]
 
-    depths = enclosing_depths(of, [FLOOR, *walls], known, wanted, nothing)
+    depths = enclosing_depths(of, [FLOOR, *walls], known, wanted, nothing, nothing)
 
     of_walls, filled = 0, 0
     for camera, depth, pixels in zip(of, depths, wanted, strict=True):

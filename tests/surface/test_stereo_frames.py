@@ -101,10 +101,11 @@ def test_spans_stand_where_nothing_is_known_and_photographs_have_no_edges(found,
 def test_rays_end_at_enclosing_planes_where_nothing_is_known_and_nothing_sharp_is_rendered(found, monkeypatch):
     sharp = np.zeros((30, 40), bool)
     sharp[:, 30:] = True
-    asked = []
+    asked, doubted = [], []
 
-    def enclosing(cameras, planes, known, wanted, shown):
+    def enclosing(cameras, planes, known, wanted, shown, doubtful):
         asked.extend(wanted)
+        doubted.extend(doubtful)
         return [
             np.where(pixels & np.isnan(depth), np.float32(3.4), np.float32(np.nan))
             for pixels, depth in zip(wanted, shown, strict=True)
@@ -119,6 +120,8 @@ def test_rays_end_at_enclosing_planes_where_nothing_is_known_and_nothing_sharp_i
     assert np.allclose(frame.depth[:, 30:], 3.03), "what is sharp stays"
     assert merged.enclosed == pytest.approx((29 * 10 + 30) / 1200) and merged.about()["enclosed"] == merged.enclosed
     assert len(asked) == 1 and not asked[0][2:, :20].any()
+    uncertain = (found[0].confirming > 0) & ~found[0].is_confirmed()
+    assert uncertain.any() and (doubted[0][uncertain] == found[0].depth[uncertain]).all()
 
 
 @pytest.mark.parametrize("plane, taken", [(2.5, 2.5), (3.1, 3.1), (3.2, 3)])
@@ -126,7 +129,7 @@ def test_doubtful_depths_stay_where_they_are_well_before_an_enclosing_plane(foun
     monkeypatch.setattr(
         stereo_frames,
         "enclosing_depths",
-        lambda cameras, planes, known, wanted, shown: [np.where(wanted[0], np.float32(plane), np.nan)],
+        lambda cameras, planes, known, wanted, shown, doubtful: [np.where(wanted[0], np.float32(plane), np.nan)],
     )
     merged = MergedFrames(rendered(0.01), [VIEW], 5.0)
     doubtful = np.isfinite(found[0].depth) & (found[0].confirming > 0) & ~found[0].is_confirmed()
@@ -142,7 +145,7 @@ def test_no_ray_ends_at_an_enclosing_plane_in_background(found, monkeypatch):
     monkeypatch.setattr(
         stereo_frames,
         "enclosing_depths",
-        lambda cameras, planes, known, wanted, shown: [np.where(wanted[0], filled[0], np.nan)],
+        lambda cameras, planes, known, wanted, shown, doubtful: [np.where(wanted[0], filled[0], np.nan)],
     )
     frame = MergedFrames(rendered(0.01), [VIEW], 5.0, sharp=iter([np.zeros((30, 40), bool)]))[0]
     assert np.allclose(frame.depth[:, 20:25], 3.4) and (frame.depth[:, 25:] == 0).all()
