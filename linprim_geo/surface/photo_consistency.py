@@ -56,9 +56,10 @@ footprints."""
 LEAST_DEVIATION = 0.5 / (255 * np.sqrt(12))
 """Disagreement that is always there, of white: half of what rounding brightness to 255 steps causes."""
 
-INDEPENDENT_PHOTOS = 8
-"""Photographs of a vertex count as so many independent ones: as a rule there are more, but the errors of neighbouring
-views are alike."""
+INDEPENDENT_PHOTOS = 4
+"""Photographs of a vertex count as so many independent ones. There are more, but neighbouring views err alike, and
+refinement has put vertices where photographs agree, right or wrong. Chosen by how large the true errors of four
+surfaces were (DECISIONS 103)."""
 
 PRIOR_SCALE, PRIOR_ROUNDS = 1.0, 2
 """Mean distance of vertices from the surface before photographs are asked, in footprints, and how often they are: from
