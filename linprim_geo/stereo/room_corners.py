@@ -43,6 +43,8 @@ STEPS = (np.arange(HEIGHTS * SAMPLES) + 0.5) / (HEIGHTS * SAMPLES)
 # Fewer than one search in so many finds an edge by chance, were views independent; neighbours are not quite. A view
 # shows an edge if no more than one in ten of the places that are tried have a stronger one there.
 BY_CHANCE, SHOWN = 1e-3, 0.1
+# An edge goes on where chance alone would show one in the next of its parts less often.
+GOES_ON = 0.05
 # Directions of a wall that are tried, in SAME_ANGLE to either side.
 DIRECTIONS = 61
 # Behind a wall a floor has fewer points than this share of those before it, in strips as wide.
@@ -143,6 +145,12 @@ def find_corner(floor: EnclosingPlane, near: np.ndarray, lowest: float, edges: E
     showing = np.flatnonzero(shares[:, row, part] <= SHOWN)
     if not seen_enough(edges.cameras, showing, floor.at(places[row])):
         return None
+    # What is above may show it less clearly and count against it together, although it does show it.
+    while part + 1 < HEIGHTS:
+        strip = along[(part + 1) * SAMPLES : (part + 2) * SAMPLES]
+        if by_chance(edges.shares(floor.at(places), floor.normal[None], strip, 1))[row, 0] > np.log(GOES_ON):
+            break
+        part += 1
     finer = places[row] + _grid(2 * BLUR * pixel, BLUR * pixel / FINER)
     best = edges.strongest(floor.at(finer), floor.normal[None], along[: (part + 1) * SAMPLES])
     return Corner(places[row] if best is None else finer[best], float(heights[part]))

@@ -260,6 +260,24 @@ def test_edges_reach_up_as_far_as_is_asked():
     assert find_corner(FLOOR, near, 4.0, edges) is None
 
 
+class FaintAbove(EdgeImages):
+    """Whose lines show an edge less clearly if they reach above 1.2 m."""
+
+    def shares(self, starts, directions, along, parts):
+        result = super().shares(starts, directions, along, parts)
+        if parts > 1:
+            result[:, :, 6:] = np.sqrt(result[:, :, 6:])
+        return result
+
+
+def test_an_edge_goes_on_as_far_as_its_next_part_shows_it():
+    of = cameras()
+    corner = find_corner(FLOOR, FLOOR.own[0], 0.5, FaintAbove(photographs(of), floors(of)))
+    assert corner is not None
+    # They show no more than 1.6 m of it; heights are 3.1 m / 16 apart.
+    assert 1.3 < corner.height < 1.6
+
+
 def test_a_floor_that_is_known_along_a_quarter_of_a_wall_says_nothing_of_it():
     of = cameras()
     known = floors(of)
