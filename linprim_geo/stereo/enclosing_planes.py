@@ -5,7 +5,8 @@ meets it at a right angle, as the floor and the walls of a room do, or its point
 are. A ray of which nothing is known ends at the first of these, but only within the rectangle that holds the plane's
 own known points, as walls do not go on into the sky. Where hardly any view looks, as below a table, stereo can know
 nothing: there it ends within the rectangle that holds all known points, if the plane's own reach across that one way.
-Where most of the views that look at a place know it, one that does not has something before it.
+Where most of the views that look at a place know it, one that does not has something before it, unless it has a
+doubtful depth there.
 
 Of few photographs training can explain much as background: what hardly any view shows agrees with any far background.
 There a depth of stereo on such a plane counts all the same (`known_on_planes`).
@@ -70,10 +71,13 @@ class EnclosingPlane:
         along = points @ self.axes.T
         return ((along >= ends[0]) & (along <= ends[1])).all(1)
 
-    def with_place_for(self, other: EnclosingPlane) -> EnclosingPlane:
-        """The plane with rectangles that hold the `own` one of another, too, projected onto it."""
-        corners = other.at(np.array([[other.own[i, 0], other.own[j, 1]] for i in (0, 1) for j in (0, 1)]))
-        along = corners @ self.axes.T
+    def corners(self) -> np.ndarray:
+        """(4, 3) of its own rectangle."""
+        return self.at(np.array([[x, y] for x in self.own[:, 0] for y in self.own[:, 1]]))
+
+    def with_place_for(self, points: np.ndarray) -> EnclosingPlane:
+        """The plane with rectangles that hold (P, 3) points, too, projected onto it."""
+        along = points @ self.axes.T
         own, whole = (
             np.stack([np.minimum(ends[0], along.min(0)), np.maximum(ends[1], along.max(0))])
             for ends in (self.own, self.whole)
@@ -139,12 +143,16 @@ class KnownPoints:
 
     def which_is_there(self, plane: EnclosingPlane, others: Sequence[EnclosingPlane]) -> int | None:
         """The number of the first of others that faces the same way and on which the middle of a plane is."""
-        middle = plane.at(plane.own.mean(0))
-        near = MARGIN * float(np.median(np.linalg.norm(self.centers - middle, axis=1)))
+        middle = plane.at(plane.own.mean(0))[None]
         for number, other in enumerate(others):
-            if plane.normal @ other.normal > SAME_NORMAL and abs(middle @ other.normal - other.offset) < near:
+            if plane.normal @ other.normal > SAME_NORMAL and self.are_on(middle, other):
                 return number
         return None
+
+    def are_on(self, places: np.ndarray, plane: EnclosingPlane) -> bool:
+        """Whether (P, 3) places are on a plane, for a camera as far from them as the one in the middle by that."""
+        near = MARGIN * float(np.median(np.linalg.norm(self.centers - places.mean(0), axis=1)))
+        return bool((np.abs(places @ plane.normal - plane.offset) < near).all())
 
     def closing(self, found: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Planes at right angles to two of those `found` where both end, on sides where there is none."""

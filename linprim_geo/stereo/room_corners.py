@@ -43,7 +43,7 @@ STEPS = (np.arange(HEIGHTS * SAMPLES) + 0.5) / (HEIGHTS * SAMPLES)
 # Fewer than one search in so many finds an edge by chance, were views independent; neighbours are not quite. A view
 # shows an edge if no more than one in ten of the places that are tried have a stronger one there.
 BY_CHANCE, SHOWN = 1e-3, 0.1
-# An edge goes on where chance alone would show one in the next of its parts less often.
+# An edge goes on upwards while in its next part chance alone would show one in fewer than this share of the cases.
 GOES_ON = 0.05
 # Directions of a wall that are tried, in SAME_ANGLE to either side.
 DIRECTIONS = 61
@@ -74,7 +74,7 @@ def with_corner_walls(
 
     A wall has an edge at either end, or one at which it meets such a wall or one that is known. It is as high as its
     edges and goes from one to the other, or to the end of its floor. The floor is known along half of it at least and
-    ends there. A known wall, too, goes on as far.
+    ends there. A known wall on which all of it lies goes on as far.
 
     Args:
         known: (H, W) depth of every view, NaN where nothing is known.
@@ -94,8 +94,8 @@ def with_corner_walls(
                 continue
             if same is None:
                 planes.append(wall)
-            else:
-                planes[same] = planes[same].with_place_for(wall)
+            elif seen.are_on(wall.corners(), planes[same]):
+                planes[same] = planes[same].with_place_for(wall.corners())
     return planes
 
 

@@ -186,6 +186,21 @@ def test_a_wall_that_is_known_in_part_goes_on_to_its_edges_if_its_floor_does_not
         assert (same.whole == same.own).all()
 
 
+def test_a_plane_that_is_askew_does_not_go_on():
+    """It faces nearly as the wall at x = 0 does, and holds the middle of that, but not its corners."""
+    of = cameras()
+    turn = np.radians(10.0)
+    normal, middle = np.array([np.cos(turn), np.sin(turn), 0]), np.array([0.0, 1.0, 0.5])
+    axes = np.array([[-normal[1], normal[0], 0], [0.0, 0, 1]])
+    ends = middle @ axes.T + np.array([[-0.3, -0.2], [0.3, 0.2]])
+    askew = EnclosingPlane(normal, float(normal @ middle), axes, ends, ends)
+    floor = floors(of)
+
+    same = with_corner_walls(photographs(of), floor, no_background(of), [FLOOR, askew], points_of(of, floor))[1]
+
+    assert (same.own == ends).all()
+
+
 def test_a_wall_meets_one_that_is_known_at_the_only_edge_that_shows():
     # The walls at x = 3, y = 0 and y = 2 have the same grey: their edges do not show.
     greys = (90.0, 120, 150, 150, 150, 240)
