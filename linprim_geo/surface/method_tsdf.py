@@ -3,6 +3,7 @@ distance field."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -27,6 +28,7 @@ from linprim_geo.surface.stereo_frames import MergedFrames
 from linprim_geo.surface.tsdf_field import DepthFrame
 from linprim_geo.surface.tsdf_fusion import auto_voxel_size, fuse_tsdf
 from linprim_geo.surface.voxel_blocks import TooFine, estimate_memory
+from linprim_geo.surface.voxel_levels import COARSE
 
 # A ray with less opacity than this has seen through the scene: it votes for free space.
 SEEN_THROUGH = 0.5
@@ -65,6 +67,9 @@ SAMPLED = 2
 
 NEAREST_LIMIT = 4.0
 """And at least this many median depths: cameras that are close together fuse what they see all the same."""
+
+FAR_TRIES = 5
+"""So many limits are tried, from the farthest that stereo tells to that of rendered depths."""
 
 
 ByStereo = Callable[[], tuple[Mesh | None, dict]]
@@ -151,12 +156,16 @@ def tsdf_surface(
         mesh = replace(mesh, quality=error_by_depths(mesh, merged, reach))
         return mesh, merged.about() | {"unsupported": left_out, "largest_error": largest_error(reach)}
 
-    by_stereo = partial(_surface_of_stereo, fused_with_stereo, frames, merged, stages)
+    def with_stereo() -> MergedFrames:
+        if merged is not None:
+            return merged
+        return with_far_depths(frames, options, voxel).merged(quiet=stages.progress.quiet)
+
+    by_stereo = partial(_surface_of_stereo, fused_with_stereo, with_stereo, stages)
     if options.stereo == "on":
-        if merged is None:
-            merged = frames.merged(quiet=stages.progress.quiet)
+        found = with_stereo()
         stages.lap("stereo")
-        mesh, about = fused_with_stereo(merged)
+        mesh, about = fused_with_stereo(found)
         if not len(mesh.faces):
             raise LinprimError(f"{run.path}: no two photographs support any surface; use --stereo auto or off")
         about |= {"taken": True}
@@ -171,6 +180,7 @@ def tsdf_surface(
         mesh, about = _better_by_stereo(rendered, by_stereo, whole, frames.views is not whole, stages)
     else:
         mesh = rendered()
+    limit = about["depth_limit"] if about.get("taken") else frames.limit
     if about:
         stages.note(
             f"stereo: {about['confirmed']:.0%} of the pixels have a depth that other views confirm, "
@@ -184,7 +194,7 @@ def tsdf_surface(
         "level": options.level,
         "voxel_size": voxel,
         "truncation_voxels": options.truncation,
-        "depth_limit": frames.limit,
+        "depth_limit": limit,
         **about,
     }
 
@@ -233,14 +243,12 @@ def _better_for_object(
 
 def _surface_of_stereo(
     fused: Callable[[MergedFrames], tuple[Mesh, dict]],
-    frames: DepthFrames,
-    merged: MergedFrames | None,
+    with_stereo: Callable[[], MergedFrames],
     stages: Stages,
 ) -> tuple[Mesh | None, dict]:
     """The surface of stereo, None where there is hardly any, and what there is to say of it."""
     try:
-        if merged is None:
-            merged = frames.merged(quiet=stages.progress.quiet)
+        merged = with_stereo()
     except LinprimError as error:
         stages.note(f"no stereo: {error}")
         return None, {}
@@ -357,7 +365,6 @@ class DepthFrames(Sequence):
         if len(depths):
             self.limit = limit or depth_limit([view.camera for view in self.views], float(np.median(depths)))
             self.clamped_share = float((depths > self.limit).mean())
-        self.kept = [self._clamp(frame) for frame in self.kept]
 
     @property
     def bytes(self) -> int:
@@ -368,10 +375,16 @@ class DepthFrames(Sequence):
         return len(self.views)
 
     def __getitem__(self, index):
-        return self.kept[index] if self.kept else self._clamp(next(self._render([self.views[index]])))
+        return self._clamp(self.kept[index] if self.kept else next(self._render([self.views[index]])))
 
     def __iter__(self):
-        return iter(self.kept) if self.kept else map(self._clamp, self._render(self.views))
+        return map(self._clamp, self.kept or self._render(self.views))
+
+    def up_to(self, limit: float) -> DepthFrames:
+        """The same with depths up to another limit."""
+        frames = copy.copy(self)
+        frames.limit = limit
+        return frames
 
     def merged(self, *, quiet: bool = True) -> MergedFrames:
         """These frames with the depths of stereo."""
@@ -395,13 +408,37 @@ class DepthFrames(Sequence):
         return replace(frame, depth=np.where(too_far, np.float32(self.limit), frame.depth), clamped=too_far)
 
 
-def depth_limit(cameras: Sequence[Camera], median: float, truncation: float = 3.0) -> float:
-    """How far depths are worth fusing, from the median depth that the cameras see, in their unit.
+def with_far_depths(frames: DepthFrames, options: ExtractOptions, voxel: float) -> DepthFrames:
+    """The frames as far as disparity tells depths within the truncation of the largest voxels, those of what is flat;
+    less far where such voxels would give the surface more than half of the faces that it may have.
 
-    A disparity of d pixels between cameras that are b apart moves a point at depth z by d z^2 / (b f) (a derivative of
-    z = b f / d); voxels are about as large as the median's pixel, median / f, so this exceeds the truncation beyond
-    sqrt(truncation median b / d).
-    """
+    Frames stay as they are with a limit, or a size of voxels, that is asked for."""
+    limit = _told_by_disparity([view.camera for view in frames.views], options.truncation * COARSE * voxel)
+    if options.depth_limit > 0 or options.voxel_size > 0 or limit <= frames.limit:
+        return frames
+    for farther in np.geomspace(limit, frames.limit, FAR_TRIES, endpoint=False):
+        far = frames.up_to(float(farther))
+        if auto_voxel_size(far) <= COARSE * np.sqrt(0.5) * voxel:
+            return far
+    return frames
+
+
+def depth_limit(cameras: Sequence[Camera], median: float, truncation: float = 3.0) -> float:
+    """How far rendered depths are worth fusing, from the median depth that the cameras see, in their unit: at least
+    NEAREST_LIMIT times that, and as far as disparity tells them with voxels as large as the median's pixel."""
+    pixel = median / _focal_length(cameras)
+    return max(NEAREST_LIMIT * median, _told_by_disparity(cameras, truncation * pixel))
+
+
+def _told_by_disparity(cameras: Sequence[Camera], reach: float) -> float:
+    """The depth beyond which SMALLEST_DISPARITY moves a point by more than `reach`.
+
+    A disparity of d pixels between cameras that are b apart moves a point at depth z by d z^2 / (b f), a derivative of
+    z = b f / d."""
     centers = np.array([camera.center for camera in cameras])
     baseline = float(np.linalg.norm(np.ptp(centers, axis=0)))
-    return max(NEAREST_LIMIT * median, float(np.sqrt(truncation * median * baseline / SMALLEST_DISPARITY)))
+    return float(np.sqrt(reach * baseline * _focal_length(cameras) / SMALLEST_DISPARITY))
+
+
+def _focal_length(cameras: Sequence[Camera]) -> float:
+    return float(np.median([np.sqrt(camera.fx * camera.fy) for camera in cameras]))

@@ -12,8 +12,9 @@ from linprim_geo.capture.small_copy import SmallCopy
 from linprim_geo.runs.run import Run
 from linprim_geo.stereo.planes_on_disk import Photographs
 from linprim_geo.stereo.time_plan import seconds_per_pixel
-from linprim_geo.surface.method_tsdf import SMALLEST_SIDE, DepthFrames
+from linprim_geo.surface.method_tsdf import SMALLEST_SIDE, DepthFrames, with_far_depths
 from linprim_geo.surface.stereo_frames import MergedFrames, pairing_points
+from linprim_geo.surface.tsdf_fusion import auto_voxel_size
 
 # Of the time that is left stereo takes at most this share: the rest is for smaller voxels.
 SHARE = 0.5
@@ -55,7 +56,7 @@ def stereo_in_time(
             views = [SmallCopy.of(view, factor) for view in frames.views]
             own = DepthFrames(run, float(options.level), frames.limit, views=views)
         begin = time.monotonic()
-        merged = own.merged(quiet=stages.progress.quiet)
+        merged = with_far_depths(own, options, auto_voxel_size(own)).merged(quiet=stages.progress.quiet)
     except LinprimError as error:
         if options.stereo == "on":
             raise

@@ -219,6 +219,7 @@ class MergedFrames(Sequence):
             "enclosed": self.enclosed,
             "thin": self.thin,
             "planes": len(self.planes),
+            "depth_limit": self.limit,
         }
 
     def __len__(self) -> int:

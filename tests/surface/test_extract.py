@@ -19,8 +19,10 @@ from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.geometry.topology import topology
 from linprim_geo.runs.run import Run
+from linprim_geo.surface import method_tsdf
 from linprim_geo.surface.extract import error_summary, extract_mesh
-from linprim_geo.surface.method_tsdf import DepthFrames, depth_limit
+from linprim_geo.surface.method_tsdf import FAR_TRIES, SMALLEST_DISPARITY, DepthFrames, depth_limit, with_far_depths
+from linprim_geo.surface.tsdf_fusion import auto_voxel_size
 
 STATS = {
     "mesh",
@@ -278,6 +280,36 @@ def test_the_depth_limit_is_where_a_quarter_of_a_pixel_is_a_truncation():
     moved = 500 * 6 / (500 * 6 / limit - 0.25) - limit
     assert moved == pytest.approx(3 * 2.0 / 500, rel=0.01)
     assert depth_limit(cameras[:1], 2.0) == 8.0
+
+
+def test_depths_of_stereo_go_as_far_as_the_largest_voxels_bear(solid):
+    run = Run.open(solid)
+    frames = DepthFrames(run, 0.5)
+    depth = float(np.median(frames[0].depth[frames[0].depth > 0]))
+    near, voxel = frames.up_to(0.9 * depth), auto_voxel_size(frames)
+    far = with_far_depths(near, ExtractOptions(), voxel)
+    cameras = [view.camera for view in frames.views]
+    baseline = np.linalg.norm(np.ptp([camera.center for camera in cameras], axis=0))
+    # A quarter of a pixel between the outermost cameras moves a point by the truncation of voxels twice as large.
+    assert SMALLEST_DISPARITY * far.limit**2 / (baseline * cameras[0].fx) == pytest.approx(3 * 2 * voxel, rel=1e-6)
+    assert any(frame.clamped is not None for frame in near) and all(frame.clamped is None for frame in far)
+    for options in (ExtractOptions(depth_limit=near.limit), ExtractOptions(voxel_size=voxel)):
+        assert with_far_depths(near, options, voxel).limit == near.limit
+
+
+@pytest.mark.parametrize("fits", [0.0, 0.5, 1.0])
+def test_far_depths_leave_half_of_the_faces(solid, fits, monkeypatch):
+    run = Run.open(solid)
+    frames = DepthFrames(run, 0.5)
+    near, voxel = frames.up_to(0.1 * frames.limit), auto_voxel_size(frames)
+    farthest = with_far_depths(near, ExtractOptions(), voxel).limit
+    most = near.limit + fits * (farthest - near.limit)
+    monkeypatch.setattr(
+        method_tsdf, "auto_voxel_size", lambda far: voxel * (1.5 if far.limit > most * (1 + 1e-9) else 1.4)
+    )
+    taken = with_far_depths(near, ExtractOptions(), voxel).limit
+    assert near.limit <= taken <= most * (1 + 1e-9)
+    assert taken > (farthest / near.limit) ** (-1 / FAR_TRIES) * most * (1 - 1e-9)
 
 
 def test_voxels_grow_until_the_grid_fits_into_the_limit(solid, tmp_path, capsys):
