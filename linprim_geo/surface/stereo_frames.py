@@ -25,6 +25,7 @@ from linprim_geo.stereo.plain_regions import common_planes, edges_of, grown_alik
 from linprim_geo.stereo.point_planes import SurfacePoints, planes_of_points, point_plane_depth
 from linprim_geo.stereo.room_corners import with_corner_walls
 from linprim_geo.stereo.shaded_planes import ShadedPlanes
+from linprim_geo.stereo.textured_backgrounds import textured_backgrounds
 from linprim_geo.stereo.thin_things import SeenDepths, thin_things
 from linprim_geo.stereo.visibility_cut import plane_normals, points_per_view, spanned_depths
 from linprim_geo.surface.single_view import mesh_is_closed
@@ -87,7 +88,7 @@ class MergedFrames(Sequence):
         self._enclose(maps, points, known, measured, are_sharp, backgrounds)
         self._keep_thin_things(views, maps, rendered_depths, are_sharp)
         if not any(view.has_alpha for view in views):  # else masks say what is background
-            self._end_lone_backgrounds()
+            self._end_backgrounds(maps)
 
     def _take_planes(self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Finds planes by points, by edges and by shading, of depths that are sure, and what lies on them; moves
@@ -152,7 +153,7 @@ class MergedFrames(Sequence):
         doubtful depths those stay that are before a plane by more than these may be off. What stereo has `measured` on
         planes with points is not background where hardly any view looks."""
         planes = enclosing_planes(self.cameras, self.planes, points)
-        walled = with_corner_walls(maps, known, [_background_of(frame) for frame in self.rendered], planes, points)
+        walled = with_corner_walls(maps, known, self._backgrounds(), planes, points)
         wanted, shown = [], []
         for frame, depth, of_surface, background in zip(self.rendered, known, sharp, backgrounds, strict=True):
             wanted.append((frame.depth > 0) & ~(background | np.isfinite(depth)))
@@ -164,10 +165,7 @@ class MergedFrames(Sequence):
         ]
         self.doubtful_depths = [_first_known(pair) for pair in zip(enclosed, self.doubtful_depths, strict=True)]
         self.enclosed = _share_known(enclosed)
-        self.rendered = [
-            frame if frame.background is None else replace(frame, background=frame.background & ~on)
-            for frame, on in zip(self.rendered, known_on_planes(self.cameras, planes, measured), strict=True)
-        ]
+        self._end_at(known_on_planes(self.cameras, planes, measured))
 
     def _keep_thin_things(
         self,
@@ -190,13 +188,19 @@ class MergedFrames(Sequence):
                 others[view] = np.where(thing, np.float32(np.nan), others[view])
         self.thin = float(np.mean([thing.mean() for thing in things]))
 
-    def _end_lone_backgrounds(self) -> None:
-        """Lets rays end at confirmed surfaces that no other view looks past."""
-        backgrounds = [_background_of(frame) for frame in self.rendered]
-        lone = lone_backgrounds(self.cameras, backgrounds, self.depths)
+    def _end_backgrounds(self, maps: Sequence[DepthMap]) -> None:
+        """Lets rays end at confirmed surfaces that no other view looks past, and at those with texture."""
+        self._end_at(lone_backgrounds(self.cameras, self._backgrounds(), self.depths))
+        self._end_at(textured_backgrounds(maps, self._backgrounds(), self.depths))
+
+    def _backgrounds(self) -> list[np.ndarray]:
+        return [_background_of(frame) for frame in self.rendered]
+
+    def _end_at(self, surfaces: Sequence[np.ndarray]) -> None:
+        """Lets rays end in these pixels (H, W) of every view."""
         self.rendered = [
-            frame if frame.background is None else replace(frame, background=frame.background & ~ended)
-            for frame, ended in zip(self.rendered, lone, strict=True)
+            frame if frame.background is None else replace(frame, background=frame.background & ~surface)
+            for frame, surface in zip(self.rendered, surfaces, strict=True)
         ]
 
     def covered(self, mesh: Mesh) -> float:
