@@ -235,12 +235,12 @@ def _pictures(report: Report, views: list[View]) -> list[ShownView]:
     return shown
 
 
-def embedded_png(pixels: np.ndarray) -> tuple[str, int, int]:
-    """(data URI, width, height) of an image, averaged down to at most PIXELS along its longer side."""
+def embedded_png(pixels: np.ndarray, most: int = PIXELS) -> tuple[str, int, int]:
+    """(data URI, width, height) of an image, averaged down to at most so many pixels along its longer side."""
     from PIL import Image
 
     image = Image.fromarray(np.ascontiguousarray(pixels))
-    share = PIXELS / max(image.size)
+    share = most / max(image.size)
     if share < 1:
         image = image.resize([max(1, round(side * share)) for side in image.size], Image.Resampling.BOX)
     file = io.BytesIO()

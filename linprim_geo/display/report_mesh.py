@@ -17,8 +17,10 @@ from linprim_geo.display.meshes import Layer, is_inside, layers, light_mesh, up_
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.geometry.mesh_files import load_mesh
+from linprim_geo.imaging.photos import read_photo
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.extract import METHODS
+from linprim_geo.surface.shaded_views import shaded_file
 
 # Triangles of all meshes of a page together: about 4 MB of it.
 MOST_FACES = 150_000
@@ -29,8 +31,8 @@ FIRST_LOOK = 0.4
 
 @dataclass
 class ShownMesh:
-    """One method's mesh: its statistics, the file that is shown, scores by protocol, and `packed`, what the page's
-    script reads.
+    """One method's mesh: its statistics, the file that is shown, scores by protocol, `packed`, what the page's script
+    reads, and `shaded`, the picture that extraction left (`shaded_views`), (H, W, 3) uint8.
 
     `problem` says what is missing or wrong, "" if nothing is.
     """
@@ -40,6 +42,7 @@ class ShownMesh:
     path: Path | None = None
     light: Mesh | None = None
     packed: dict | None = None
+    shaded: np.ndarray | None = None
     scores: list[dict] = field(default_factory=list)
     problem: str = ""
 
@@ -99,6 +102,7 @@ def _fill(
     path = shown.path
     assert path is not None
     mesh = load_mesh(path)
+    shown.shaded = _shaded(path, missing)
     for file, scores in stored:
         if refers_to(scores.get("prediction"), path):
             if file.stat().st_mtime < path.stat().st_mtime:
@@ -147,6 +151,19 @@ def _fill(
         said += "; the cameras stand inside, so backs of faces are hidden, and what no camera sees is left out"
     shown.light = light
     shown.packed = pack(shown.method, light, colors, cameras, run.unit, said, inside)
+
+
+def _shaded(path: Path, missing: list[str]) -> np.ndarray | None:
+    """The picture of a mesh, None where there is none: older versions made none."""
+    file = shaded_file(path)
+    if not file.exists():
+        missing.append(f"{file}: there is no picture of the mesh, extract-mesh makes one")
+        return None
+    try:
+        return read_photo(file)[0]
+    except LinprimError as error:
+        missing.append(str(error))
+        return None
 
 
 def pack(

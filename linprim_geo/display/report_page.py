@@ -15,7 +15,7 @@ from linprim_geo.base.kinds import KINDS
 from linprim_geo.base.options import changed_options, flag_of
 from linprim_geo.base.progress import duration
 from linprim_geo.base.version import __version__
-from linprim_geo.display.report_data import Report
+from linprim_geo.display.report_data import Report, embedded_png
 from linprim_geo.display.report_mesh import ShownMesh
 from linprim_geo.geometry.topology import topology_line
 from linprim_geo.imaging import plots
@@ -24,6 +24,7 @@ from linprim_geo.training.effects import REASONS
 # The browser itself refuses whatever is not in the page.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 SECTIONS = (
+    ("shaded", "The mesh, shaded"),
     ("input", "What went in"),
     ("decisions", "What was decided"),
     ("training", "Training"),
@@ -33,6 +34,8 @@ SECTIONS = (
     ("cost", "Time and memory"),
     ("repeat", "Versions, and how to repeat it"),
 )
+# Pixels along the longer side of the pictures that the page opens with, which are as wide as it is.
+SHADED = 1440
 # Scores of a mesh: key, with a space before each that is looked up in what it gives, title, unit; lengths as a
 # percentage of the reference's diagonal.
 MESH_SCORES = (
@@ -106,6 +109,7 @@ def page(report: Report) -> Page:
         f"{time.strftime('%Y-%m-%d %H:%M')}.",
         cards=_cards(report),
         advice=report.notes.get("advice"),
+        shaded=[(each.method, *embedded_png(each.shaded, SHADED)) for each in shown if each.shaded is not None],
         facts=_facts(report),
         evidence=Table(("at the capture's points", "measured"), report.evidence or ()),
         options=_options(report),

@@ -28,6 +28,7 @@ from linprim_geo.runs.run import Run
 from linprim_geo.surface.choose_level import USUAL_LEVEL, choose_level
 from linprim_geo.surface.object_alone import object_alone
 from linprim_geo.surface.postprocess import Finished, finish_surface, visible_file, with_rounds
+from linprim_geo.surface.shaded_views import shaded_file
 from linprim_geo.surface.single_view import without_single_views
 from linprim_geo.surface.texture import check_texture
 from linprim_geo.surface.voxel_budget import choose_voxel
@@ -67,13 +68,13 @@ def extract_mesh(
 ) -> dict:
     """Extracts the surface of a run and writes it, the part that cameras see, and statistics.
 
-    RUN/mesh/METHOD holds mesh.ply, mesh_visible.ply and stats.json; with `output` the two meshes go to OUTPUT and its
-    sibling *_visible, in the format of the suffix (.ply, .obj, .glb, .stl). Vertices have normals, colours and, as
-    `quality`, the predicted error (`photo_consistency.predicted_error`); everything is in the data set's frame and
-    unit. The photographs move the vertices to where they agree best (`photo_consistency.refine_surface`), noise
-    is smoothed away (`denoise.denoised`, after stereo `fairing.faired`), then holes are closed, the surface smoothed,
-    remeshed and simplified as the options ask (`mesh_process`); with `texture` .obj and .glb have a texture out of the
-    photographs in place of vertex colours.
+    RUN/mesh/METHOD holds mesh.ply, mesh_visible.ply, mesh_shaded.png and stats.json; with `output` the two meshes go
+    to OUTPUT and its sibling *_visible, in the format of the suffix (.ply, .obj, .glb, .stl), and the picture to
+    *_shaded.png. Vertices have normals, colours and, as `quality`, the predicted error
+    (`photo_consistency.predicted_error`); everything is in the data set's frame and unit. The photographs move the
+    vertices to where they agree best (`photo_consistency.refine_surface`), noise is smoothed away (`denoise.denoised`,
+    after stereo `fairing.faired`), then holes are closed, the surface smoothed, remeshed and simplified as the options
+    ask (`mesh_process`); with `texture` .obj and .glb have a texture out of the photographs in place of vertex colours.
 
     With `held_out` the held-out views take part in all of it. With `box` only the faces in it are kept; --method tsdf
     fuses nothing else. With `object` only the object in the box is kept (`object_alone`), which is auto unless it is
@@ -160,7 +161,7 @@ def _extract(
 ) -> dict:
     """What `extract_mesh` does when everything is in order and its folder is held."""
     visible_target = visible_file(target)
-    written = [target, visible_target, folder / "stats.json"]
+    written = [target, visible_target, shaded_file(target), folder / "stats.json"]
     if options.texture:
         written += [file.with_suffix(suffix) for file in (target, visible_target) for suffix in (".png", ".mtl")]
     for file in written:
@@ -202,6 +203,7 @@ def _extract(
     stats = {
         "mesh": str(target),
         "mesh_visible": str(visible_target),
+        "picture": str(done.picture),
         "method": method,
         "options": asdict(options),
         **about,

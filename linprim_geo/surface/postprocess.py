@@ -19,6 +19,7 @@ from linprim_geo.surface.depth_error import error_of_nearest
 from linprim_geo.surface.fairing import faired
 from linprim_geo.surface.photo_consistency import photo_gains, predicted_error, refine_surface
 from linprim_geo.surface.safe_moves import moved_safely
+from linprim_geo.surface.shaded_views import save_shaded
 from linprim_geo.surface.texture import make_texture
 from linprim_geo.surface.texture_files import save_textured
 from linprim_geo.surface.visibility import color_vertices, pixels_of, visible_faces, with_gain
@@ -29,11 +30,12 @@ REFINE_ROUNDS = 2
 
 @dataclass(frozen=True)
 class Finished:
-    """The mesh and the part that cameras see, as written; what was done step by step; what the texture says of itself,
-    if there is one."""
+    """The mesh and the part that cameras see, as written, and the file with a picture of it; what was done step by
+    step; what the texture says of itself, if there is one."""
 
     mesh: Mesh
     visible: Mesh
+    picture: Path
     processing: list[dict]
     texture: dict | None
 
@@ -53,7 +55,8 @@ def with_rounds(options: ExtractOptions, about: dict) -> ExtractOptions:
 def finish_surface(
     mesh: Mesh, run: Run, options: ExtractOptions, target: Path, stages: Stages, *, creases: bool = True
 ) -> Finished:
-    """Finishes a surface as the options ask, and writes it to `target` and `visible_file(target)`.
+    """Finishes a surface as the options ask, and writes it to `target` and `visible_file(target)`, and how it looks,
+    before and after, to `shaded_views.shaded_file(target)`.
 
     Colours are those of photographs without the gains by which their brightness differs (`photo_gains`). By a `quality`
     that it has, noise is smoothed away, and it is kept; else by that of photographs
@@ -62,6 +65,7 @@ def finish_surface(
     views = run.scene().train
     cameras = [view.camera for view in views]
     caster = RayCaster(mesh.vertices, mesh.faces)
+    pictured = [(mesh, caster)]
     gains = photo_gains(mesh, cameras, (view.load() for view in views), caster)
     if options.refine:
         mesh = refine_surface(mesh, views, int(options.refine), gains, caster)
@@ -75,6 +79,7 @@ def finish_surface(
         stages.lap("process")
     if options.refine or options.denoise == "on" or processing:
         caster = RayCaster(mesh.vertices, mesh.faces)
+        pictured.append((mesh, caster))
     if given.quality is not None:
         mesh = replace(mesh, quality=error_of_nearest(given, mesh.vertices))
     elif processing or options.denoise == "off":
@@ -86,14 +91,16 @@ def finish_surface(
     seen = visible_faces(mesh, cameras, caster)
     visible = select_faces(mesh, seen)
     stages.lap("visibility")
+    picture = save_shaded(target, pictured, cameras)
+    stages.lap("picture")
     if not options.texture:
         save_mesh(target, mesh)
         save_mesh(visible_file(target), visible)
         stages.lap("write")
-        return Finished(mesh, visible, processing, None)
+        return Finished(mesh, visible, picture, processing, None)
     texture = make_texture(mesh, options.texture, views, gains, stages.note)
     stages.lap("texture")
     save_textured(target, mesh, texture)
     save_textured(visible_file(target), visible, texture.select(seen))
     stages.lap("write")
-    return Finished(mesh, visible, processing, texture.about)
+    return Finished(mesh, visible, picture, processing, texture.about)

@@ -259,6 +259,7 @@ def render_preview(
     smooth: bool = False,
     supersample: int = 2,
     background: tuple[int, int, int] = (255, 255, 255),
+    caster: RayCaster | None = None,
 ) -> np.ndarray:
     """A picture of a mesh by rays, without a graphics library: Lambert shading with the light at the camera.
 
@@ -268,6 +269,7 @@ def render_preview(
         from
             behind are drawn bluish, so holes and inverted parts can be told.
         supersample: rays per pixel along each axis.
+        caster: of the mesh, if there is one.
 
     Returns:
         (H, W, 3) uint8.
@@ -275,17 +277,8 @@ def render_preview(
     from linprim_geo.geometry.raycast import RayCaster
 
     k = supersample
-    fine = Camera(
-        camera.width * k,
-        camera.height * k,
-        camera.fx * k,
-        camera.fy * k,
-        camera.cx * k,
-        camera.cy * k,
-        camera.world_to_camera,
-    )
-    rays = fine.world_rays().reshape(-1, 3)
-    caster = RayCaster(mesh.vertices, mesh.faces)
+    rays = camera.magnified(k).world_rays().reshape(-1, 3)
+    caster = caster or RayCaster(mesh.vertices, mesh.faces)
     _, face, bary = caster.cast(camera.center, rays)
     hit = face >= 0
     corners = mesh.faces[face[hit]]

@@ -104,7 +104,7 @@ def test_pictures_are_those_of_the_views(made, meshed):
     _, _, tree = made
     run = Run.open(meshed)
     by_name = {view.name: view for view in run.scene().test}
-    figures = list(tree.iter("figure"))
+    figures = [each for each in tree.iter("figure") if each.get("class") != "wide"]
     assert len(figures) == 3
     shown_psnr = []
     for figure in figures:
@@ -133,6 +133,32 @@ def test_pictures_are_those_of_the_views(made, meshed):
     shown, unit = cards[0].split()
     # Each figure is rounded to 0.01, and so is their mean.
     assert unit == "dB" and abs(float(shown) - np.mean(shown_psnr)) < 0.01 + 1e-9
+
+
+def test_the_page_opens_with_the_picture_of_the_mesh(made, meshed):
+    _, _, tree = made
+    (figure,) = (each for each in tree.iter("figure") if each.get("class") == "wide")
+    assert figure in list(next(tree.iter("section")))
+    shown = Image.open(io.BytesIO(base64.b64decode(figure.find("img").get("src").partition(",")[2])))
+    kept = np.asarray(Image.open(meshed / "mesh" / "tsdf" / "mesh_shaded.png"))
+    assert np.array_equal(shown, kept) and kept.shape == (2 * 48, 3 * 48, 3)
+    before, after = kept[:48], kept[48:]
+    assert (before != 255).any() and 0 < np.abs(before.astype(int) - after).mean() < 20
+
+
+@pytest.mark.parametrize("kept", [0, 200])
+def test_without_the_picture_of_the_mesh_the_page_says_so(meshed, kept, tmp_path):
+    file = meshed / "mesh" / "tsdf" / "mesh_shaded.png"
+    whole = file.read_bytes()
+    try:
+        file.unlink()
+        if kept:
+            file.write_bytes(whole[:kept])
+        result = report_run(meshed, tmp_path / "page.html")
+    finally:
+        file.write_bytes(whole)
+    assert result["meshes"] == ["tsdf"] and [file.name in sentence for sentence in result["missing"]] == [True]
+    assert "no picture of a mesh" in (tmp_path / "page.html").read_text()
 
 
 def test_the_mesh_of_the_page_is_the_mesh_of_the_file(made, meshed, tiny_scene):

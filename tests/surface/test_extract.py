@@ -27,6 +27,7 @@ from linprim_geo.surface.tsdf_fusion import auto_voxel_size
 STATS = {
     "mesh",
     "mesh_visible",
+    "picture",
     "method",
     "level",
     "voxel_size",
@@ -62,7 +63,7 @@ def outputs(folder):
 
 def test_what_is_written(extracted, solid):
     stats, folder = extracted
-    assert outputs(folder) == ["mesh.ply", "mesh_visible.ply", "stats.json"]
+    assert outputs(folder) == ["mesh.ply", "mesh_shaded.png", "mesh_visible.ply", "stats.json"]
     assert STATS <= stats.keys()
     assert json.loads((folder / "stats.json").read_text()) == json.loads(json.dumps(stats))
     assert stats["mesh"] == str(folder / "mesh.ply") and stats["mesh_visible"] == str(folder / "mesh_visible.ply")
@@ -76,6 +77,7 @@ def test_what_is_written(extracted, solid):
         "denoise",
         "colours",
         "visibility",
+        "picture",
         "write",
         "total",
     }
@@ -135,7 +137,7 @@ def test_what_no_camera_sees_is_not_in_the_visible_mesh(extracted):
 def test_every_format_holds_the_same_surface(suffix, solid, extracted, tmp_path):
     options = ExtractOptions(voxel_size=0.08)
     stats = extract_mesh(solid, output=tmp_path / f"part{suffix}", options=options, quiet=True)
-    assert outputs(tmp_path) == sorted([f"part{suffix}", f"part_visible{suffix}"])
+    assert outputs(tmp_path) == sorted([f"part{suffix}", "part_shaded.png", f"part_visible{suffix}"])
     mesh = load_mesh(tmp_path / f"part{suffix}")
     assert stats["voxel_size"] == pytest.approx(0.08) and len(mesh.faces) == stats["faces"]
     assert np.abs(mesh.vertices.mean(0) - np.array(CENTER)).max() < 0.1

@@ -209,11 +209,17 @@ def test_components_that_no_camera_sees_are_dropped():
 
 def test_what_is_written(extracted):
     stats, folder = extracted
-    assert sorted(path.name for path in folder.iterdir()) == ["mesh.ply", "mesh_visible.ply", "stats.json"]
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "mesh.ply",
+        "mesh_shaded.png",
+        "mesh_visible.ply",
+        "stats.json",
+    ]
     assert json.loads((folder / "stats.json").read_text()) == json.loads(json.dumps(stats))
     assert stats["method"] == METHOD and stats["level"] == 0.75 and stats["spacing"] > 0
-    steps = ("first round", "second round", "typical cameras", "refine", "denoise", "colours", "visibility", "write")
-    assert stats["seconds"].keys() == {"level", *steps, "total"}
+    steps = ("first round", "second round", "typical cameras", "refine", "denoise")
+    last = ("colours", "visibility", "picture", "write")
+    assert stats["seconds"].keys() == {"level", *steps, *last, "total"}
     assert 0.97 * stats["faces"] <= stats["visible"]["faces"] <= stats["faces"]
 
 
