@@ -416,7 +416,8 @@ def with_far_depths(frames: DepthFrames, options: ExtractOptions, voxel: float) 
     limit = _told_by_disparity([view.camera for view in frames.views], options.truncation * COARSE * voxel)
     if options.depth_limit > 0 or options.voxel_size > 0 or limit <= frames.limit:
         return frames
-    for farther in np.geomspace(limit, frames.limit, FAR_TRIES, endpoint=False):
+    tries = FAR_TRIES if frames.kept else 1  # else each try renders all of them
+    for farther in np.geomspace(limit, frames.limit, tries, endpoint=False):
         far = frames.up_to(float(farther))
         if auto_voxel_size(far) <= COARSE * np.sqrt(0.5) * voxel:
             return far
