@@ -55,11 +55,10 @@ def textured_backgrounds(
         surface = _Compared(own)
         infinity = _Compared(own)
         for other in others:
-            camera, grey = cameras[other], greys[other]
-            points = found.camera.center + rays * depth[asked][:, None]
-            surface.add(camera, grey, points, lambda pixels, along, o=other: _agree(known[o], pixels, along))
-            points = found.camera.center + rays * far
-            infinity.add(camera, grey, points, lambda pixels, _, o=other: sample_nearest(backgrounds[o], pixels))
+            inside, pixels, along = _shown(cameras[other], found.camera.center + rays * depth[asked][:, None])
+            surface.add(greys[other], inside, pixels, _agree(known[other], pixels, along))
+            inside, pixels, _ = _shown(cameras[other], found.camera.center + rays * far)
+            infinity.add(greys[other], inside, pixels, sample_nearest(backgrounds[other], pixels))
         both = (surface.views > 0) & (infinity.views > 0)
         nearer, number = np.zeros(background.shape), np.zeros(background.shape)
         nearer[asked], number[asked] = np.where(both, infinity.mean() - surface.mean(), 0), both
@@ -79,17 +78,24 @@ class _Compared:
     def __init__(self, own: np.ndarray):
         self.own, self.sum, self.views = own, np.zeros(len(own)), np.zeros(len(own), int)
 
-    def add(self, camera: Camera, grey: np.ndarray, points: np.ndarray, counts) -> None:
-        """A photograph, for those of (P, 3) points that lie in it and whose (Q, 2) pixels and (Q,) depths count."""
-        pixels, along = camera.project(points)
-        with np.errstate(invalid="ignore"):
-            inside = (along > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
-        inside[inside] = counts(pixels[inside], along[inside])
-        self.sum[inside] += np.abs(sample_bilinear(grey, pixels[inside])[:, 0] - self.own[inside])
-        self.views[inside] += 1
+    def add(self, grey: np.ndarray, inside: np.ndarray, pixels: np.ndarray, count: np.ndarray) -> None:
+        """A photograph that shows those of the points that are `inside` (P,) at `pixels` (Q, 2), of which some (Q,)
+        count."""
+        counted = inside.copy()
+        counted[inside] = count
+        self.sum[counted] += np.abs(sample_bilinear(grey, pixels[count])[:, 0] - self.own[counted])
+        self.views[counted] += 1
 
     def mean(self) -> np.ndarray:
         return self.sum / np.maximum(self.views, 1)
+
+
+def _shown(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(P,) whether a photograph shows points (P, 3), and of those that it does (Q, 2) pixels and (Q,) depths."""
+    pixels, along = camera.project(points)
+    with np.errstate(invalid="ignore"):
+        inside = (along > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
+    return inside, pixels[inside], along[inside]
 
 
 def _agree(known: np.ndarray, pixels: np.ndarray, along: np.ndarray) -> np.ndarray:
