@@ -297,9 +297,8 @@ def test_only_obj_and_glb_hold_a_texture(ball, ball_texture, tmp_path):
 def test_extraction_writes_textures(solid, tmp_path):
     options = ExtractOptions(voxel_size=0.12, target_faces=300, texture=128)
     stats = extract_mesh(solid, output=tmp_path / "m.obj", options=options, quiet=True)
-    assert {p.name for p in tmp_path.iterdir()} == {
-        f"{stem}.{s}" for stem in ("m", "m_visible") for s in ("obj", "mtl", "png")
-    }
+    written = {f"{stem}.{s}" for stem in ("m", "m_visible") for s in ("obj", "mtl", "png")} | {"m_shaded.png"}
+    assert {p.name for p in tmp_path.iterdir()} == written
     assert stats["texture"]["size"] == 128 and stats["texture"]["texels_seen"] > 0.9 and "texture" in stats["seconds"]
     # One flat colour, 0.5 + 0.7 Y0 = 0.697 of 255 in every channel.
     image = np.asarray(Image.open(tmp_path / "m.png")).astype(int)
