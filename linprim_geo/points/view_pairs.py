@@ -85,7 +85,13 @@ def _seen(camera: Camera, depth: np.ndarray | None, points: np.ndarray) -> np.nd
 def visible_pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of (P, 3) points: (P,) bool whether they lie in the image, and of those that do (Q, 2) int64 columns and rows,
     and (Q,) z-depths."""
+    inside, pixels, depth = visible_places(camera, points)
+    return inside, pixels.astype(np.int64), depth
+
+
+def visible_places(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """As `visible_pixels`, with (Q, 2) positions in the image in place of pixels."""
     pixels, depth = camera.project(points)
     with np.errstate(invalid="ignore"):
         inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
-    return inside, pixels[inside].astype(np.int64), depth[inside]
+    return inside, pixels[inside], depth[inside]

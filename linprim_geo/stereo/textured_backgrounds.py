@@ -12,9 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import binary_closing, binary_dilation, distance_transform_edt, uniform_filter
 
-from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.sampling import sample_bilinear, sample_nearest
-from linprim_geo.points.view_pairs import nearest_views
+from linprim_geo.points.view_pairs import nearest_views, visible_places
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.lone_backgrounds import AGREEING, COMPARED, FAR
@@ -55,9 +54,9 @@ def textured_backgrounds(
         surface = _Compared(own)
         infinity = _Compared(own)
         for other in others:
-            inside, pixels, along = _shown(cameras[other], found.camera.center + rays * depth[asked][:, None])
+            inside, pixels, along = visible_places(cameras[other], found.camera.center + rays * depth[asked][:, None])
             surface.add(greys[other], inside, pixels, _agree(known[other], pixels, along))
-            inside, pixels, _ = _shown(cameras[other], found.camera.center + rays * far)
+            inside, pixels, _ = visible_places(cameras[other], found.camera.center + rays * far)
             infinity.add(greys[other], inside, pixels, sample_nearest(backgrounds[other], pixels))
         both = (surface.views > 0) & (infinity.views > 0)
         nearer, number = np.zeros(background.shape), np.zeros(background.shape)
@@ -88,14 +87,6 @@ class _Compared:
 
     def mean(self) -> np.ndarray:
         return self.sum / np.maximum(self.views, 1)
-
-
-def _shown(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(P,) whether a photograph shows points (P, 3), and of those that it does (Q, 2) pixels and (Q,) depths."""
-    pixels, along = camera.project(points)
-    with np.errstate(invalid="ignore"):
-        inside = (along > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
-    return inside, pixels[inside], along[inside]
 
 
 def _agree(known: np.ndarray, pixels: np.ndarray, along: np.ndarray) -> np.ndarray:
