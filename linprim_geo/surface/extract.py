@@ -203,7 +203,7 @@ def _extract(
     stats = {
         "mesh": str(target),
         "mesh_visible": str(visible_target),
-        "picture": str(done.picture),
+        "mesh_shaded": str(shaded_file(target)),
         "method": method,
         "options": asdict(options),
         **about,

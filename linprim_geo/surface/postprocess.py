@@ -19,7 +19,7 @@ from linprim_geo.surface.depth_error import error_of_nearest
 from linprim_geo.surface.fairing import faired
 from linprim_geo.surface.photo_consistency import photo_gains, predicted_error, refine_surface
 from linprim_geo.surface.safe_moves import moved_safely
-from linprim_geo.surface.shaded_views import save_shaded
+from linprim_geo.surface.shaded_views import save_shaded, shaded_row
 from linprim_geo.surface.texture import make_texture
 from linprim_geo.surface.texture_files import save_textured
 from linprim_geo.surface.visibility import color_vertices, pixels_of, visible_faces, with_gain
@@ -30,12 +30,11 @@ REFINE_ROUNDS = 2
 
 @dataclass(frozen=True)
 class Finished:
-    """The mesh and the part that cameras see, as written, and the file with a picture of it; what was done step by
-    step; what the texture says of itself, if there is one."""
+    """The mesh and the part that cameras see, as written; what was done step by step; what the texture says of itself,
+    if there is one."""
 
     mesh: Mesh
     visible: Mesh
-    picture: Path
     processing: list[dict]
     texture: dict | None
 
@@ -65,7 +64,8 @@ def finish_surface(
     views = run.scene().train
     cameras = [view.camera for view in views]
     caster = RayCaster(mesh.vertices, mesh.faces)
-    pictured = [(mesh, caster)]
+    pictures = [shaded_row(mesh, caster, cameras)]
+    stages.lap("picture")
     gains = photo_gains(mesh, cameras, (view.load() for view in views), caster)
     if options.refine:
         mesh = refine_surface(mesh, views, int(options.refine), gains, caster)
@@ -79,7 +79,8 @@ def finish_surface(
         stages.lap("process")
     if options.refine or options.denoise == "on" or processing:
         caster = RayCaster(mesh.vertices, mesh.faces)
-        pictured.append((mesh, caster))
+        pictures.append(shaded_row(mesh, caster, cameras))
+        stages.lap("picture")
     if given.quality is not None:
         mesh = replace(mesh, quality=error_of_nearest(given, mesh.vertices))
     elif processing or options.denoise == "off":
@@ -91,16 +92,15 @@ def finish_surface(
     seen = visible_faces(mesh, cameras, caster)
     visible = select_faces(mesh, seen)
     stages.lap("visibility")
-    picture = save_shaded(target, pictured, cameras)
-    stages.lap("picture")
-    if not options.texture:
+    texture = None
+    if options.texture:
+        texture = make_texture(mesh, options.texture, views, gains, stages.note)
+        stages.lap("texture")
+        save_textured(target, mesh, texture)
+        save_textured(visible_file(target), visible, texture.select(seen))
+    else:
         save_mesh(target, mesh)
         save_mesh(visible_file(target), visible)
-        stages.lap("write")
-        return Finished(mesh, visible, picture, processing, None)
-    texture = make_texture(mesh, options.texture, views, gains, stages.note)
-    stages.lap("texture")
-    save_textured(target, mesh, texture)
-    save_textured(visible_file(target), visible, texture.select(seen))
+    save_shaded(target, pictures)
     stages.lap("write")
-    return Finished(mesh, visible, picture, processing, texture.about)
+    return Finished(mesh, visible, processing, texture.about if texture else None)

@@ -8,13 +8,16 @@ from pathlib import Path
 import numpy as np
 
 from linprim_geo.base.files import atomic_write
+from linprim_geo.geometry.boxes import smaller
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.surface.visibility import render_preview
 
-# Pictures next to each other, and pixels along the longer side of each.
+# Pictures next to each other, and pixels along the longer side of each at most.
 VIEWS, PIXELS = 3, 480
+# Of the surface, of 255, where it faces the light.
+GREY = 205
 
 
 def shaded_file(target: Path) -> Path:
@@ -22,27 +25,28 @@ def shaded_file(target: Path) -> Path:
     return target.with_name(f"{target.stem}_shaded.png")
 
 
-def save_shaded(target: Path, meshes: Sequence[tuple[Mesh, RayCaster]], cameras: Sequence[Camera]) -> Path:
-    """Writes `shaded_file(target)`: a row per mesh, each from the same cameras in the same light, and returns it."""
+def save_shaded(target: Path, rows: Sequence[np.ndarray]) -> None:
+    """Writes `shaded_file(target)` of rows by `shaded_row`, one below the other."""
     from PIL import Image
 
-    chosen = [_small(cameras[index]) for index in apart(cameras)]
-    height = max(camera.height for camera in chosen)
-    rows = []
-    for mesh, caster in meshes:
-        grey = np.full(mesh.vertices.shape, 205, np.uint8)
-        pictures = [render_preview(mesh, camera, colors=grey, caster=caster) for camera in chosen]
-        lower = [np.pad(each, ((0, height - len(each)), (0, 0), (0, 0)), constant_values=255) for each in pictures]
-        rows.append(np.concatenate(lower, axis=1))
-    path = shaded_file(target)
-    with atomic_write(path) as temporary:
+    with atomic_write(shaded_file(target)) as temporary:
         Image.fromarray(np.concatenate(rows)).save(temporary)
-    return path
 
 
-def apart(cameras: Sequence[Camera]) -> list[int]:
-    """At most VIEWS cameras: the one most like all of them by where it stands and looks, and then those that are least
-    like the ones before."""
+def shaded_row(mesh: Mesh, caster: RayCaster, cameras: Sequence[Camera]) -> np.ndarray:
+    """(H, W, 3) uint8: the mesh from the cameras that `most_different` chooses, beside each other, lit from each."""
+    chosen = [cameras[index] for index in most_different(cameras)]
+    chosen = [smaller(camera, -(-max(camera.width, camera.height) // PIXELS)) for camera in chosen]
+    height = max(camera.height for camera in chosen)
+    colors = np.full(mesh.vertices.shape, GREY, np.uint8)
+    pictures = [render_preview(mesh, camera, colors=colors, caster=caster) for camera in chosen]
+    padded = [np.pad(each, ((0, height - len(each)), (0, 0), (0, 0)), constant_values=255) for each in pictures]
+    return np.concatenate(padded, axis=1)
+
+
+def most_different(cameras: Sequence[Camera]) -> list[int]:
+    """Indices of VIEWS cameras, or of all if there are fewer: the one most like all of them by where it stands and
+    looks, and then those that are least like the ones before."""
     centers = np.array([camera.center for camera in cameras])
     spread = float(np.sqrt(centers.var(axis=0).sum()))
     looks = np.array([camera.rotation[2] for camera in cameras])  # the world's direction of the optical axis
@@ -52,11 +56,3 @@ def apart(cameras: Sequence[Camera]) -> list[int]:
         nearest = np.linalg.norm(places[:, None] - places[chosen], axis=2).min(axis=1)
         chosen.append(int(np.argmax(nearest)))
     return chosen
-
-
-def _small(camera: Camera) -> Camera:
-    """The camera with pictures of at most PIXELS along the longer side."""
-    scale = min(1.0, PIXELS / max(camera.width, camera.height))
-    width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-    x, y = width / camera.width, height / camera.height
-    return Camera(width, height, camera.fx * x, camera.fy * y, camera.cx * x, camera.cy * y, camera.world_to_camera)

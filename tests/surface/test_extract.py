@@ -27,7 +27,7 @@ from linprim_geo.surface.tsdf_fusion import auto_voxel_size
 STATS = {
     "mesh",
     "mesh_visible",
-    "picture",
+    "mesh_shaded",
     "method",
     "level",
     "voxel_size",
