@@ -360,8 +360,8 @@ class ExtractOptions:
     )
     depth_limit: float = option(
         0.0,
-        "depths beyond this, in the data set's unit, only clear the space before them, for tsdf; 0: beyond "
-        "what so many pixels can tell apart",
+        "depths beyond this, in the data set's unit, only clear the space before them, for tsdf; 0: where "
+        "photographs cannot measure them",
         low=0,
         metavar="LENGTH",
     )

@@ -381,7 +381,7 @@ class DepthFrames(Sequence):
         return map(self._clamp, self.kept or self._render(self.views))
 
     def up_to(self, limit: float) -> DepthFrames:
-        """The same with depths up to another limit."""
+        """The same with depths up to another limit; `clamped_share` stays as it is."""
         frames = copy.copy(self)
         frames.limit = limit
         return frames
