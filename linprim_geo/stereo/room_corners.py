@@ -3,8 +3,7 @@
 A floor that ends along a line does not say what is there: a wall that rises from it, or nothing, as at the end of a
 table. In the corner of a room two walls meet in an edge at right angles to the floor, and photographs show that edge
 however plain the walls are, as light falls on them from different sides. Such edges are looked for around the corners
-of known floors. One photograph has an edge along a line by chance; several that look from directions that differ do
-not have theirs along the same line of the world.
+of known floors (`edge_images.py`).
 """
 
 from __future__ import annotations
@@ -14,15 +13,14 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
-from scipy.stats import chi2, rankdata
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.points.view_pairs import visible_pixels
 from linprim_geo.stereo.depth_maps import DepthMap
+from linprim_geo.stereo.edge_images import BLUR, BY_CHANCE, SHOWN, EdgeImages, by_chance
 from linprim_geo.stereo.enclosing_planes import CELLS, FILLED, MARGIN, EnclosingPlane, KnownPoints
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
-from linprim_geo.stereo.plain_regions import LEAST_VIEWS, SAME_ANGLE, seen_enough
+from linprim_geo.stereo.plain_regions import SAME_ANGLE, seen_enough
 from linprim_geo.stereo.point_planes import SurfacePoints
 
 # A plane is a floor if its normal is as near to the mean direction that is up in photographs, whose camera may look far
@@ -31,26 +29,19 @@ UPRIGHT = np.cos(np.radians(60))
 # A corner is looked for as near to that of a floor's rectangle as this share of its longer side: its ends are known to
 # END_MARGIN, and windows of stereo reach beyond an edge.
 REACH = 0.05
-# Photographs are blurred by this standard deviation in pixels before edges are looked for, and places that are tried
-# are as far from each other, MOST_STEPS to either side at most. Around the best they are FINER.
-BLUR, MOST_STEPS, FINER = 1.5, 20, 5
-# A photograph says something about an edge of which it shows so many pixels.
-LEAST_PIXELS = 20
+# Places that are tried are as far from each other as photographs are blurred, MOST_STEPS to either side at most. Around
+# the best they are FINER.
+MOST_STEPS, FINER = 20, 5
 # An edge may end at each of so many heights, evenly up to the longer side of its floor, and is looked at in so many
 # samples between two of these. It is at least half as high as the cameras are, in the middle: a table's is not.
 HEIGHTS, SAMPLES, LOWEST = 16, 8, 0.5
 STEPS = (np.arange(HEIGHTS * SAMPLES) + 0.5) / (HEIGHTS * SAMPLES)
-# Fewer than one search in so many finds an edge by chance, were views independent; neighbours are not quite. A view
-# shows an edge if no more than one in ten of the places that are tried have a stronger one there.
-BY_CHANCE, SHOWN = 1e-3, 0.1
 # An edge goes on upwards while in its next part chance alone would show one in fewer than this share of the cases.
 GOES_ON = 0.05
 # Directions of a wall that are tried, in SAME_ANGLE to either side.
 DIRECTIONS = 61
 # Behind a wall a floor has fewer points than this share of those before it, in strips as wide.
 BEHIND_SHARE = 0.1
-# What is nearer than the place of an edge by this share hides it.
-HIDING = 3 * CONFIRMED_DEPTH
 # A wall is looked at in so many places each way; no more than half of the views that show one see a background there.
 PLACES, MOST_BACKGROUND = 16, 0.5
 
@@ -240,106 +231,3 @@ def _is_seen_past(
 
 def _longer_side(floor: EnclosingPlane) -> float:
     return float(np.diff(floor.own, axis=0).max())
-
-
-class EdgeImages:
-    """How the grey of every view changes across lines of the world where nothing `known` (H, W) hides them."""
-
-    def __init__(self, maps: Sequence[DepthMap], known: Sequence[np.ndarray]):
-        self.cameras, self.known = [found.camera for found in maps], known
-        greys = (found.grey.astype(np.float32) for found in maps)
-        self.slopes = [[gaussian_filter(grey, BLUR, order=order) for order in ((0, 1), (1, 0))] for grey in greys]
-
-    def pixel_at(self, place: np.ndarray) -> float:
-        """How large a pixel is at a place (3,), for the camera in the middle by that."""
-        return float(np.median([np.linalg.norm(camera.center - place) / camera.fx for camera in self.cameras]))
-
-    def strongest(self, starts: np.ndarray, directions: np.ndarray, along: np.ndarray) -> int | None:
-        """Which of some lines, as those of `strengths`, has the strongest edge in the views that show all of them, of
-        which each counts the same; None if there is none."""
-        strength = self.strengths(starts, directions, along, 1)[:, :, 0]
-        most = strength.max(1, keepdims=True)  # NaN where a line is not shown
-        every = most[:, 0] > 0
-        return int((strength[every] / most[every]).sum(0).argmax()) if every.any() else None
-
-    def shares(self, starts: np.ndarray, directions: np.ndarray, along: np.ndarray, parts: int) -> np.ndarray:
-        """(V, N, parts) how many of the lines of `strengths` have as strong an edge in a view as each of them, as a
-        share of those that it shows; NaN where it does not."""
-        result = self.strengths(starts, directions, along, parts)
-        for view, part in np.ndindex(len(result), parts):
-            strength = result[view, :, part]
-            shown = np.isfinite(strength)
-            strength[shown] = rankdata(-strength[shown], method="max") / max(np.count_nonzero(shown), 1)
-        return result
-
-    def strengths(self, starts: np.ndarray, directions: np.ndarray, along: np.ndarray, parts: int) -> np.ndarray:
-        """(V, N, parts) by how much grey changes per pixel across lines of the world; NaN where a view shows fewer than
-        LEAST_PIXELS.
-
-        It is the median along them: lines that stand before a wall cross the end of the floor, which is the stronger
-        edge as a rule.
-
-        Args:
-            starts: (N, 3).
-            directions: (N or 1, 3).
-            along: (parts * S,) where lines are looked at, in units of `directions`.
-            parts: a line ends with each of so many parts of `along` in turn.
-        """
-        result = np.full((len(self.cameras), len(starts), parts), np.nan)
-        apart, places = along[1] - along[0], starts[:, None] + along[:, None] * directions[:, None]
-        box = _box_of(places)
-        for camera, known, slopes, strength in zip(self.cameras, self.known, self.slopes, result, strict=True):
-            if not _may_show(camera, box):
-                continue
-            shown, pixels, depth = visible_pixels(camera, places.reshape(-1, 3))
-            column, row = pixels.T
-            clear = ~(known[row, column] < (1 - HIDING) * depth)
-            # By how many pixels a line goes on per sample, and how grey changes across it.
-            local = places.reshape(-1, 3)[shown] @ camera.rotation.T + camera.world_to_camera[:3, 3]
-            steps = np.broadcast_to(directions[:, None] * apart, places.shape).reshape(-1, 3)[shown] @ camera.rotation.T
-            right = camera.fx * (steps[:, 0] - local[:, 0] / depth * steps[:, 2]) / depth
-            down = camera.fy * (steps[:, 1] - local[:, 1] / depth * steps[:, 2]) / depth
-            change, length = np.zeros((2, *places.shape[:2])).reshape(2, -1)
-            change[shown] = clear * (slopes[1][row, column] * right - slopes[0][row, column] * down)
-            length[shown] = clear * np.hypot(right, down)
-            change, length = (x.reshape(len(starts), parts, -1) for x in (change, length))
-            slope = np.divide(change, length, out=np.full(change.shape, np.nan), where=length > 0).astype(np.float32)
-            length = length.sum(2)
-            enough = length.cumsum(1) >= LEAST_PIXELS
-            for part in range(parts):
-                if part and not length[:, part].any():
-                    strength[:, part] = strength[:, part - 1]
-                else:
-                    rows = enough[:, part]
-                    own = slope[rows, : part + 1].reshape(-1, (part + 1) * slope.shape[2])
-                    strength[rows, part] = np.abs(_medians(own))
-        return result
-
-
-def _box_of(places: np.ndarray) -> np.ndarray:
-    """(8, 3) corners of the box that holds (..., 3) places."""
-    every = places.reshape(-1, 3)
-    return np.array(list(product(*zip(every.min(0), every.max(0), strict=True))))
-
-
-def _may_show(camera: Camera, box: np.ndarray) -> bool:
-    """Whether (8, 3) corners of a box are not all beyond one side of an image."""
-    x, y, z = camera.rotation @ box.T + camera.world_to_camera[:3, 3:]
-    left, top = camera.fx * x + camera.cx * z, camera.fy * y + camera.cy * z
-    beyond = (z <= 0, left < 0, left > camera.width * z, top < 0, top > camera.height * z)
-    return not any(side.all() for side in beyond)
-
-
-def _medians(values: np.ndarray) -> np.ndarray:
-    """(N,) of each of N rows with at least one number, without what is NaN; nanmedian takes ten times as long."""
-    ordered, count = np.sort(values, axis=1), np.isfinite(values).sum(1)
-    rows = np.arange(len(values))
-    return (ordered[rows, (count - 1) // 2] + ordered[rows, count // 2]) / 2
-
-
-def by_chance(shares: np.ndarray) -> np.ndarray:
-    """(N, K) natural logarithm of the probability of (V, N, K) shares as small by chance, by Fisher's method; 0 where
-    fewer than LEAST_VIEWS have one that is not NaN."""
-    views = np.isfinite(shares).sum(0)
-    surprise = -2 * np.log(np.where(np.isfinite(shares), shares, 1)).sum(0)
-    return np.where(views >= LEAST_VIEWS, chi2.logsf(surprise, 2 * np.maximum(views, 1)), 0)
