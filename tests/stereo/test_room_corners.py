@@ -5,6 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.captures import look_at
+from helpers.plain_room import (
+    GREYS,
+    PLANES,
+    SIZE,
+    at_corner,
+    cameras,
+    floors,
+    no_background,
+    photographs,
+    points_of,
+    seen,
+)
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.stereo.depth_maps import DepthMap
@@ -14,27 +26,7 @@ from linprim_geo.stereo.plain_regions import in_camera
 from linprim_geo.stereo.point_planes import SurfacePoints
 from linprim_geo.stereo.room_corners import find_corner, with_corner_walls
 
-# A room of 3 by 2 m and 2 m high with its floor at z = 0: n . x = d of what is inside; the last is the ceiling.
-PLANES = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [-1, 0, 0, -3], [0, -1, 0, -2], [0, 0, -1, -2]])
-GREYS = (90.0, 120, 150, 140, 170, 240)
 FLOOR = EnclosingPlane(np.array([0.0, 0, 1]), 0.0, np.eye(3)[:2], *2 * [np.array([[-0.05, -0.04], [3.05, 2.04]])])
-NOISE, SIZE = 4.0, (400, 300)
-MIDDLE = np.array([1.5, 1.0, 0.4])
-
-
-def cameras(count: int = 24) -> list[Camera]:
-    """In the room all round, looking at its other side."""
-    turns = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    eyes = MIDDLE + np.stack([1.1 * np.cos(turns), 0.7 * np.sin(turns), 0.7 + 0.1 * np.sin(5 * turns)], axis=1)
-    return [look_at(eye, MIDDLE - 0.3 * (eye - MIDDLE) * [1, 1, 0], size=SIZE, focal=220.0) for eye in eyes]
-
-
-def at_corner(count: int = 12, spread: float = 1.0, roll: bool = False) -> list[Camera]:
-    """On an arc in the room, looking at its corner at the origin; `roll` turns them on their side."""
-    turns = np.pi / 4 + spread * np.linspace(-0.6, 0.6, count)
-    eyes = np.stack([1.9 * np.cos(turns), 1.9 * np.sin(turns), 0.9 + 0.2 * spread * np.sin(5 * turns)], axis=1)
-    up = (1.0, -1.0, 0.0) if roll else (0.0, 0.0, 1.0)
-    return [look_at(eye, (0.3, 0.3, 0.4), size=SIZE, focal=300.0, up=up) for eye in eyes]
 
 
 def at_corner_walls(of: list[Camera], *others: EnclosingPlane, floor: EnclosingPlane = FLOOR):
@@ -48,42 +40,8 @@ def corner_walls(maps, known, backgrounds, enclosing, points) -> list[EnclosingP
     return with_corner_walls(maps, known, backgrounds, enclosing, points)[len(enclosing) :]
 
 
-def no_background(of: list[Camera]) -> list[np.ndarray]:
-    return [np.zeros((camera.height, camera.width), bool) for camera in of]
-
-
 def directions(walls) -> list[tuple]:
     return sorted(tuple(int(x) for x in np.round(wall.normal)) for wall in walls)
-
-
-def seen(camera: Camera, planes: np.ndarray = PLANES) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) depth inside the planes, and which of them it is."""
-    inverse = camera.ray_grid() @ in_camera(camera, planes).T
-    return 1 / inverse.max(-1), inverse.argmax(-1)
-
-
-def photographs(of: list[Camera], greys=GREYS, planes: np.ndarray = PLANES, seed: int = 0) -> list[DepthMap]:
-    maps = []
-    for number, camera in enumerate(of):
-        noise = np.random.default_rng([seed, number]).normal(0, NOISE, (camera.height, camera.width))
-        grey = np.clip(np.array(greys)[seen(camera, planes)[1]] + noise, 0, 255).astype(np.uint8)
-        unknown = np.full(grey.shape, np.nan, np.float32)
-        normal = np.zeros((*grey.shape, 3), np.float32)
-        maps.append(DepthMap(camera, unknown, normal, unknown, grey, unknown, grey, NOISE**2))
-    return maps
-
-
-def floors(of: list[Camera], planes: np.ndarray = PLANES) -> list[np.ndarray]:
-    """(H, W) depth of the floor in every view, NaN elsewhere."""
-    return [np.where(which == 0, depth, np.nan) for depth, which in (seen(camera, planes) for camera in of)]
-
-
-def points_of(of: list[Camera], known: list[np.ndarray]) -> SurfacePoints:
-    """Of known pixels."""
-    parts, up = [], np.broadcast_to([0.0, 0, 1], (SIZE[1], SIZE[0], 3))
-    for view, (camera, depth) in enumerate(zip(of, known, strict=True)):
-        parts.append(SurfacePoints.of_view(view, camera, depth, up, 3000, np.random.default_rng(view)))
-    return SurfacePoints.together(parts)
 
 
 def found(greys=GREYS, planes: np.ndarray = PLANES, enclosing=(FLOOR,), backgrounds=None, seed: int = 0):
