@@ -7,7 +7,7 @@ in light and noise.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import product
 
 import numpy as np
@@ -75,10 +75,32 @@ class EdgeImages:
             parts: a line ends with each of so many parts of `along` in turn.
         """
         result = np.full((len(self.cameras), len(starts), parts), np.nan)
+        for strength, changes in zip(result, self.changes(starts, directions, along), strict=True):
+            if changes is None:
+                continue
+            slope, length = changes
+            slope, length = slope.reshape(len(starts), parts, -1), length.reshape(len(starts), parts, -1).sum(2)
+            enough = length.cumsum(1) >= LEAST_PIXELS
+            for part in range(parts):
+                if part and not length[:, part].any():
+                    strength[:, part] = strength[:, part - 1]
+                else:
+                    rows = enough[:, part]
+                    own = slope[rows, : part + 1].reshape(-1, (part + 1) * slope.shape[2])
+                    strength[rows, part] = np.abs(_medians(own))
+        return result
+
+    def changes(
+        self, starts: np.ndarray, directions: np.ndarray, along: np.ndarray
+    ) -> Iterator[tuple[np.ndarray, np.ndarray] | None]:
+        """Of each view (N, S) float32 by how much grey changes per pixel across lines as those of `strengths`, NaN
+        where a view does not show it, and (N, S) how many pixels a line goes on there; None for a view that shows
+        nothing."""
         apart, places = along[1] - along[0], starts[:, None] + along[:, None] * directions[:, None]
         box = _box_of(places)
-        for camera, known, slopes, strength in zip(self.cameras, self.known, self.slopes, result, strict=True):
+        for camera, known, slopes in zip(self.cameras, self.known, self.slopes, strict=True):
             if not _may_show(camera, box):
+                yield None
                 continue
             shown, pixels, depth = visible_pixels(camera, places.reshape(-1, 3))
             column, row = pixels.T
@@ -91,18 +113,8 @@ class EdgeImages:
             change, length = np.zeros((2, *places.shape[:2])).reshape(2, -1)
             change[shown] = clear * (slopes[1][row, column] * right - slopes[0][row, column] * down)
             length[shown] = clear * np.hypot(right, down)
-            change, length = (x.reshape(len(starts), parts, -1) for x in (change, length))
             slope = np.divide(change, length, out=np.full(change.shape, np.nan), where=length > 0).astype(np.float32)
-            length = length.sum(2)
-            enough = length.cumsum(1) >= LEAST_PIXELS
-            for part in range(parts):
-                if part and not length[:, part].any():
-                    strength[:, part] = strength[:, part - 1]
-                else:
-                    rows = enough[:, part]
-                    own = slope[rows, : part + 1].reshape(-1, (part + 1) * slope.shape[2])
-                    strength[rows, part] = np.abs(_medians(own))
-        return result
+            yield slope.reshape(places.shape[:2]), length.reshape(places.shape[:2])
 
 
 def _box_of(places: np.ndarray) -> np.ndarray:

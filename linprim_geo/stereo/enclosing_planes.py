@@ -44,6 +44,9 @@ MOST_KNOW = 0.5
 # The points of a plane are all over it if they are in a share FILLED of CELLS by CELLS parts of their rectangle, whose
 # sides run along one of so many DIRECTIONS. On a plane through a row of eaves and the sky they are in a few.
 CELLS, FILLED, DIRECTIONS = 8, 0.5, 45
+# A plane is level if its normal is as near to the mean direction that is up in photographs, whose camera may look far
+# down.
+UPRIGHT = np.cos(np.radians(60))
 # So many views of each place are wanted for stereo: where no more look, it may know nothing of a surface.
 FEW_VIEWS = SOURCES
 
@@ -85,13 +88,23 @@ class EnclosingPlane:
         return replace(self, own=own, whole=whole)
 
 
-def enclosing_planes(cameras: Sequence[Camera], planes: np.ndarray, points: SurfacePoints) -> list[EnclosingPlane]:
+def enclosing_planes(
+    cameras: Sequence[Camera], planes: np.ndarray, points: SurfacePoints, standing: np.ndarray | None = None
+) -> list[EnclosingPlane]:
     """Those of (K, 4) planes n . x = d that enclose the scene, without copies, of those that meet no other at right
-    angles only what points are all over, and planes at right angles to two of them where both end."""
+    angles only what points are all over, and planes at right angles to two of them where both end.
+
+    Of those `standing` (K,) on floors, which are walls, few points are enough."""
     if not len(points):
         return []
     known = KnownPoints(cameras, points)
-    found = known.without_copies([plane for plane in map(known.facing, planes) if known.is_enclosing(plane)])
+    standing = np.zeros(len(planes), bool) if standing is None else standing
+    sides = [
+        known.facing(plane)
+        for plane, stands in zip(planes, standing, strict=True)
+        if known.is_enclosing(known.facing(plane), least=0 if stands else LEAST_SHARE)
+    ]
+    found = known.without_copies(sides)
     corners = [plane for plane in found if any(_at_right_angles(plane, other) for other in found)]
     own = [points.on(plane[None], CONFIRMED_DEPTH)[:, 0] for plane in found]
     enclosing = [
@@ -110,13 +123,20 @@ class KnownPoints:
         self.centers = np.array([camera.center for camera in cameras])
         self.distance = np.linalg.norm(points.position - points.center, axis=1)
 
+    def is_level(self, plane: np.ndarray) -> bool:
+        """Whether a plane (4,), or its normal (3,), is that of a floor, or of a table."""
+        upward = -np.mean([camera.rotation[1] for camera in self.cameras], axis=0)
+        return bool(plane[:3] @ upward > UPRIGHT * np.linalg.norm(upward))
+
     def facing(self, plane: np.ndarray) -> np.ndarray:
         """The plane with its normal towards the cameras."""
         return plane if (self.centers @ plane[:3]).mean() > plane[3] else -plane
 
-    def is_enclosing(self, plane: np.ndarray) -> bool:
-        """Whether points lie on the plane, with normals alike, and hardly any behind it."""
-        return self.points.on(plane[None], CONFIRMED_DEPTH).mean() >= LEAST_SHARE and self.is_before_all(plane)
+    def is_enclosing(self, plane: np.ndarray, least: float = LEAST_SHARE) -> bool:
+        """Whether at least a share `least` of the points lies on the plane, with normals alike, and hardly any behind
+        it."""
+        on = self.points.on(plane[None], CONFIRMED_DEPTH)
+        return bool(on.any()) and on.mean() >= least and self.is_before_all(plane)
 
     def is_before_all(self, plane: np.ndarray) -> bool:
         behind = self.height(plane) < -MARGIN * self.distance

@@ -23,9 +23,6 @@ from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.plain_regions import SAME_ANGLE, seen_enough
 from linprim_geo.stereo.point_planes import SurfacePoints
 
-# A plane is a floor if its normal is as near to the mean direction that is up in photographs, whose camera may look far
-# down; that of a wall is at right angles to it.
-UPRIGHT = np.cos(np.radians(60))
 # A corner is looked for as near to that of a floor's rectangle as this share of its longer side: its ends are known to
 # END_MARGIN, and windows of stereo reach beyond an edge.
 REACH = 0.05
@@ -73,11 +70,11 @@ def with_corner_walls(
         points: of what is known.
     """
     cameras = [found.camera for found in maps]
-    upward = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
-    floors = [plane for plane in enclosing if plane.normal @ upward > UPRIGHT * np.linalg.norm(upward)]
+    seen = KnownPoints(cameras, points)
+    floors = [plane for plane in enclosing if seen.is_level(plane.normal)]
     if not floors:
         return list(enclosing)
-    edges, seen = EdgeImages(maps, known), KnownPoints(cameras, points)
+    edges = EdgeImages(maps, known)
     planes = list(enclosing)
     for floor in floors:
         for wall, same in _walls_on(floor, planes, edges, seen):

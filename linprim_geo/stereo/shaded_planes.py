@@ -8,7 +8,7 @@ shading, and whatever is not flat, get none.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.common_surfaces import CommonSurfaces
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
+from linprim_geo.stereo.meeting_lines import is_same, on_meeting_lines
 from linprim_geo.stereo.plain_regions import (
     RING,
     SAME_ANGLE,
@@ -89,6 +90,9 @@ class FittedRegion:
 class ShadedPlanes:
     """`planes` (K, 4) of the world that carry the shading of plain regions in several views, the known ones first.
 
+    Those `standing` (K,) are walls set right by the line along which they meet a floor. Those `hanging` (K,) have their
+    points on what is before such a wall, which is among the others.
+
     Args:
         maps: of all views.
         depths: (H, W) confirmed depth of each view, NaN elsewhere.
@@ -123,7 +127,14 @@ class ShadedPlanes:
             self.regions.append([one for one in fitted if one is not None])
         self.planes = self._common([one for own in self.regions for one in own if one.fit is not None])
         carried = self._take_originals(self._all_carriers())
-        self.planes = self._at_right_angles(self._held(carried), carried)
+        planes = self._at_right_angles(self._held(carried), carried, range(self.by_points))
+        standing = self._standing(on_meeting_lines(planes, self.by_points, maps, depths), planes, carried)
+        self.standing = np.isin(np.arange(len(planes)), list(standing))
+        self.hanging = np.array([any(is_same(plane, planes[k]) for k in standing) for plane in planes], bool)
+        self.hanging[self.by_points :] = False
+        for number, plane in standing.items():
+            planes[number] = plane
+        self.planes = self._at_right_angles(planes, carried, {*range(self.by_points), *standing})
 
     def _camera(self, region: ShadedRegion) -> Camera:
         return self.small_cameras[region.view]
@@ -322,16 +333,18 @@ class ShadedPlanes:
         held = [self._held_plane(plane, carried[k]) for k, plane in enumerate(self.planes) if k >= self.by_points]
         return np.concatenate([self.planes[: self.by_points], np.reshape(held, (-1, 4))])
 
-    def _at_right_angles(self, planes: np.ndarray, carried: Sequence[Sequence[ShadedRegion]]) -> np.ndarray:
+    def _at_right_angles(
+        self, planes: np.ndarray, carried: Sequence[Sequence[ShadedRegion]], staying: Container[int]
+    ) -> np.ndarray:
         """The planes, turned to right angles with each other where that carries the shading of their regions nearly as
-        well, and then shifted to where most confirmed depths along the edges of these are."""
+        well, and then shifted to where most confirmed depths along the edges of these are; but those `staying` stay."""
         few = [[region.some(MOST_BOXES) for region in regions] for regions in carried]
         fits = [
-            evaluate(plane, few[k], self.shadings) if few[k] and k >= self.by_points else None
+            evaluate(plane, few[k], self.shadings) if few[k] and k not in staying else None
             for k, plane in enumerate(planes)
         ]
         # Planes by edges that carry no shading are no reference.
-        rows = [k for k, fit in enumerate(fits) if k < self.by_points or fit is not None]
+        rows = [k for k, fit in enumerate(fits) if k in staying or fit is not None]
         known = [None if (fit := fits[k]) is None else fit.information for k in rows]
         turned = planes.copy()
         turned[rows] = squared(planes[rows], known, lambda row, plane: plane_moves(plane, few[rows[row]]))
@@ -339,11 +352,27 @@ class ShadedPlanes:
             if fit is None or (turned[k] == planes[k]).all():
                 continue
             for plane in (self._shifted(turned[k], carried[k]), turned[k]):
-                tried = evaluate(plane, few[k], self.shadings)
-                if tried is not None and tried.left < NEARLY_AS_WELL * fit.left and tried.boxes > 0.7 * fit.boxes:
+                if self._leaves_as_little(plane, few[k], fit):
                     planes[k] = plane
                     break
         return planes
+
+    def _standing(
+        self, moved: dict[int, np.ndarray], planes: np.ndarray, carried: Sequence[Sequence[ShadedRegion]]
+    ) -> dict[int, np.ndarray]:
+        """Those of `moved` planes, by their number, that carry the shading of their regions nearly as well, if any."""
+        result = {}
+        for k, plane in moved.items():
+            few = [region.some(MOST_BOXES) for region in carried[k]]
+            fit = evaluate(planes[k], few, self.shadings) if few else None
+            if fit is None or self._leaves_as_little(plane, few, fit):
+                result[k] = plane
+        return result
+
+    def _leaves_as_little(self, plane: np.ndarray, regions: Sequence[ShadedRegion], fit: Fit) -> bool:
+        """Whether a plane leaves nearly as little of the shading of regions as a fit to them does."""
+        tried = evaluate(plane, regions, self.shadings)
+        return tried is not None and tried.left < NEARLY_AS_WELL * fit.left and tried.boxes > 0.7 * fit.boxes
 
     def _shifted(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> np.ndarray:
         """A plane moved along its normal to where most confirmed depths along the edges of regions are."""

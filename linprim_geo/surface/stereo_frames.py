@@ -101,9 +101,10 @@ class MergedFrames(Sequence):
         by_points = planes_of_points(maps, sure)
         by_edges = common_planes(self.cameras, [region for own in regions for region in own])
         shaded = ShadedPlanes(maps, sure, rendered, by_points, by_edges)
-        self.planes, self.on_planes, backgrounds = shaded.planes, [], []
+        self.planes, self.standing = shaded.planes[~shaded.hanging], shaded.standing[~shaded.hanging]
+        self.on_planes, backgrounds = [], []
         # Planes with points all over have them in their plain regions, too.
-        for_regions = self.planes[len(by_points) :]
+        for_regions = shaded.planes[len(by_points) :]
         for view, by_shading in enumerate(shaded.depth_maps()):
             camera, depth = maps[view].camera, self.depths[view]
             on_plane = point_plane_depth(maps[view], sure[view], by_points)
@@ -152,7 +153,7 @@ class MergedFrames(Sequence):
         doubtful ones, where training has a depth that is not `sharp` (H, W) or is near them, but not in background. Of
         doubtful depths those stay that are before a plane by more than these may be off. What stereo has `measured` on
         planes with points is not background where hardly any view looks."""
-        planes = enclosing_planes(self.cameras, self.planes, points)
+        planes = enclosing_planes(self.cameras, self.planes, points, self.standing)
         walled = with_corner_walls(maps, known, self._backgrounds(), planes, points)
         wanted, shown = [], []
         for frame, depth, of_surface, background in zip(self.rendered, known, sharp, backgrounds, strict=True):

@@ -55,6 +55,17 @@ def normals(found: list[EnclosingPlane]) -> set:
     return {tuple(np.round(plane.normal, 6) + 0.0) for plane in found}
 
 
+def test_of_a_wall_that_stands_on_a_line_few_points_are_enough():
+    def hardly_any(place):  # of the wall at y = 0
+        return (np.abs(place[..., 1]) < 1e-6) & (np.abs(place[..., 0] - 1) > 0.02)
+
+    points, planes = points_of(room(hardly_any)), np.array([FLOOR, WALL])
+    assert 0 < points.on(WALL[None]).mean() < 0.01
+
+    assert (0, 1, 0) not in normals(enclosing_planes(CAMERAS, planes, points))
+    assert (0, 1, 0) in normals(enclosing_planes(CAMERAS, planes, points, np.array([False, True])))
+
+
 def everything(place):
     return np.zeros(place.shape[:2], bool)
 

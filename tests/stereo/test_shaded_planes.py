@@ -11,7 +11,7 @@ from helpers.captures import look_at
 from scipy.ndimage import gaussian_filter
 
 from linprim_geo.geometry.sampling import sample_bilinear
-from linprim_geo.stereo import plain_regions, skies
+from linprim_geo.stereo import plain_regions, shaded_planes, skies
 from linprim_geo.stereo.common_surfaces import CommonSurfaces
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.plain_regions import in_camera
@@ -348,3 +348,32 @@ def test_the_fit_goes_downhill_and_ends_at_the_truth_without_noise():
     assert first is not None and last is not None and last.left < 0.2 * first.left
     inverse = region.rays @ in_camera(shadings[4].camera, last.plane[None])[0]
     assert np.abs(inverse * depths[4][region.row, region.column] - 1).max() < 0.005
+
+
+def lines_at(monkeypatch, moved):
+    monkeypatch.setattr(shaded_planes, "on_meeting_lines", lambda *_: moved)
+
+
+def test_a_wall_behind_a_plane_with_points_takes_its_place_in_plain_regions(monkeypatch):
+    maps, depths = photographs(lambda points, view: light(points))
+    before = WALL + [0, 0, 0, 0.004]
+    lines_at(monkeypatch, {1: WALL})
+
+    found = planes_of(maps, depths, by_points=before[None], by_edges=before[None])
+
+    assert list(found.standing) == [False, True] and list(found.hanging) == [True, False]
+    assert found.planes == pytest.approx(np.array([before, WALL]))
+    share, off = errors(found, depths)
+    assert share > 0.7 and np.quantile(off, 0.95) < 1e-6
+
+
+@pytest.mark.parametrize(("degrees", "stands"), [(0.1, True), (12.0, False)])
+def test_shading_refuses_a_line_that_it_contradicts(monkeypatch, degrees, stands):
+    maps, depths = photographs(lambda points, view: light(points))
+    turned = np.array([np.sin(np.radians(degrees)), np.cos(np.radians(degrees)), 0, 0])
+    lines_at(monkeypatch, {0: turned})
+
+    found = planes_of(maps, depths)
+
+    assert list(found.standing) == [stands] and not found.hanging.any()
+    assert (np.abs(found.planes[0] @ turned) > 1 - 1e-9) == stands

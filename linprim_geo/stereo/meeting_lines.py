@@ -1,0 +1,199 @@
+"""Walls set right by the lines along which they meet the floor and each other.
+
+Shading leaves the angle of a plain wall open by degrees, and points on what hangs on a wall give a plane that lies
+before it. A floor with texture is known exactly as a rule, and photographs show where it ends: of the lines on it near
+to where a wall meets it, views from directions that differ show one most clearly. The wall stands on that line, at
+right angles to the floor. A wall whose foot is hidden is set right by the line along which it meets one that stands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from linprim_geo.stereo.depth_maps import DepthMap
+from linprim_geo.stereo.edge_images import BLUR, BY_CHANCE, LEAST_PIXELS, SHOWN, EdgeImages, by_chance
+from linprim_geo.stereo.enclosing_planes import BEYOND, KnownPoints
+from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
+from linprim_geo.stereo.plain_regions import seen_enough
+from linprim_geo.stereo.point_planes import POINTS, SurfacePoints
+from linprim_geo.stereo.right_angles import NEARLY
+
+# A line is looked for up to this share of its distance away from where planes meet: what those of shading are off by.
+# One that has points all over is known to CONFIRMED_DEPTH, with what hangs on the wall behind.
+REACH = 5 * CONFIRMED_DEPTH
+# Lines that are tried are as far from each other, at their ends, as photographs are blurred, MOST_STEPS to either side
+# at most, and are looked at in so many samples.
+MOST_STEPS, SAMPLES = 20, 128
+# Around the line that is found edges are looked for up to so many of these steps away, in quarters of a pixel; a line
+# is fitted to those that are at least half as strong as they are in the median. Once more around that line: what the
+# first one is off by cuts edges off on one side.
+AROUND, FINER, HALF, ROUNDS = 2, 4, 0.5, 2
+# Steps of a fit in which each edge counts less the farther it is from the line.
+FITS = 20
+
+
+def on_meeting_lines(
+    planes: np.ndarray, by_points: int, maps: Sequence[DepthMap], known: Sequence[np.ndarray]
+) -> dict[int, np.ndarray]:
+    """Those of (K, 4) planes n . x = d, by their number, that are walls on a line that photographs show, as they stand
+    there: on a floor, or else at a wall that does.
+
+    Args:
+        by_points: the first so many planes have points all over; they stay, but the same planes among the others do
+            not.
+        known: (H, W) confirmed depth of every view, NaN elsewhere.
+    """
+    rng, count = np.random.default_rng(0), -(-POINTS // len(maps))
+    points = SurfacePoints.together(
+        SurfacePoints.of_view(view, found.camera, depth, found.normal, count, rng)
+        for view, (found, depth) in enumerate(zip(maps, known, strict=True))
+    )
+    seen = KnownPoints([found.camera for found in maps], points)
+    floors = floors_of([seen.facing(plane) for plane in planes[:by_points]], seen) if len(points) else []
+    if not floors:
+        return {}
+    edges, found = EdgeImages(maps, known), dict[int, np.ndarray]()
+    walls = {number: seen.facing(planes[number]) for number in range(by_points, len(planes))}
+    walls = {number: wall for number, wall in walls.items() if seen.is_before_all(wall)}
+    reach = {
+        number: CONFIRMED_DEPTH if any(is_same(wall, plane) for plane in planes[:by_points]) else REACH
+        for number, wall in walls.items()
+    }
+    for floor in floors:
+        for number in sorted(walls.keys() - found.keys()):
+            wall = walls[number]
+            if _at_right_angles(wall, floor):
+                line = clearest_line(wall, floor, _foot(wall, floor, seen), reach[number], edges)
+                if line is not None:
+                    found[number] = _through(line, np.cross(line[1] - line[0], floor[:3]), wall)
+    up = floors[0]
+    for base in list(found.values()):
+        for number in sorted(walls.keys() - found.keys()):
+            wall = walls[number]
+            if _at_right_angles(wall, base) and _at_right_angles(wall, up):
+                line = clearest_line(wall, base, _corner(wall, base, up, seen), reach[number], edges)
+                if line is not None:
+                    found[number] = _through(line, np.cross(up[:3], base[:3]), wall)
+    return {k: plane if plane[:3] @ planes[k, :3] > 0 else -plane for k, plane in found.items()}
+
+
+def is_same(plane: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two planes (4,) are one, up to the direction of their normals."""
+    return np.allclose(plane, other) or np.allclose(plane, -other)
+
+
+def floors_of(planes: Sequence[np.ndarray], seen: KnownPoints) -> list[np.ndarray]:
+    """Those of planes with points all over, their normals towards the cameras, that are floors, with most points first:
+    nothing is below. Of those nearly parallel to one with more points, the direction is that one's: the floor below a
+    table, which hardly any view shows, may be askew."""
+    level = sorted(filter(seen.is_level, planes), key=lambda plane: -np.count_nonzero(seen.on(plane)))
+    floors: list[np.ndarray] = []
+    for plane in level:
+        if seen.is_before_all(plane):
+            normal = next(other[:3] for other in level if other[:3] @ plane[:3] > np.cos(NEARLY))
+            own = seen.points.on(plane[None], CONFIRMED_DEPTH)[:, 0]
+            floors.append(np.append(normal, np.median(seen.points.position[own] @ normal)))
+    return floors
+
+
+def _at_right_angles(first: np.ndarray, second: np.ndarray) -> bool:
+    return bool(abs(first[:3] @ second[:3]) < np.sin(NEARLY))
+
+
+def _meeting(wall: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A point (3,) of both planes, and the direction (3,) in which they meet."""
+    along = np.cross(base[:3], wall[:3])
+    along /= np.linalg.norm(along)
+    return np.linalg.solve(np.stack([base[:3], wall[:3], along]), [base[3], wall[3], 0.0]), along
+
+
+def _foot(wall: np.ndarray, floor: np.ndarray, seen: KnownPoints) -> np.ndarray | None:
+    """(2, 3) ends of the line along which a wall meets a floor, as far as there are points of the floor near it."""
+    meeting, along = _meeting(wall, floor)
+    on_floor = seen.points.position[seen.points.on(floor[None], CONFIRMED_DEPTH)[:, 0]]
+    apart = np.abs((on_floor - meeting) @ np.cross(along, floor[:3]))
+    beside = on_floor[apart < REACH * np.linalg.norm(seen.centers.mean(0) - meeting)]
+    if len(beside) < LEAST_PIXELS:
+        return None
+    return meeting + along * np.quantile(beside @ along, [BEYOND, 1 - BEYOND])[:, None]
+
+
+def _corner(wall: np.ndarray, base: np.ndarray, floor: np.ndarray, seen: KnownPoints) -> np.ndarray:
+    """(2, 3) ends of the line along which two walls meet, from the floor as high as cameras are."""
+    meeting, along = _meeting(wall, base)
+    levels = np.array([floor[3], (seen.centers @ floor[:3]).max()])
+    return meeting + along * ((levels - meeting @ floor[:3]) / (along @ floor[:3]))[:, None]
+
+
+def _through(line: np.ndarray, normal: np.ndarray, wall: np.ndarray) -> np.ndarray:
+    """The plane (4,) through the middle of (2, 3) ends of a line, its normal on the side of that of a wall."""
+    normal = normal / (np.linalg.norm(normal) * np.sign(normal @ wall[:3]))
+    return np.append(normal, normal @ line.mean(0))
+
+
+def clearest_line(
+    wall: np.ndarray, base: np.ndarray, near: np.ndarray | None, reach: float, edges: EdgeImages
+) -> np.ndarray | None:
+    """(2, 3) ends of the line on a base that photographs show most clearly around the line `near` (2, 3) along which a
+    wall meets it; None where they show none, or where that is farther away than a share `reach` of its distance."""
+    if near is None:
+        return None
+    inward = wall[:3] - base[:3] * (wall[:3] @ base[:3])
+    inward /= np.linalg.norm(inward)
+    middle = near.mean(0)
+    distance = float(np.median([np.linalg.norm(camera.center - middle) for camera in edges.cameras]))
+    pixel = edges.pixel_at(middle)
+    apart = max(BLUR * pixel, REACH * distance / MOST_STEPS)
+    steps = np.arange(-REACH * distance, REACH * distance + apart / 2, apart)
+    moved = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
+    starts, ends = (end + moved[:, [k]] * inward for k, end in enumerate(near))
+    shares = edges.shares(starts, ends - starts, (np.arange(SAMPLES) + 0.5) / SAMPLES, 1)
+    chance = by_chance(shares)[:, 0]
+    best = int(chance.argmin())
+    if chance[best] + np.log(len(chance)) > np.log(BY_CHANCE):
+        return None
+    if np.abs(moved[best]).max() > min(reach * distance, steps[-1] - apart / 2):
+        return None
+    showing = np.flatnonzero(shares[:, best, 0] <= SHOWN)
+    line = np.stack([starts[best], ends[best]])
+    if not seen_enough(edges.cameras, showing, line.mean(0)):
+        return None
+    for _ in range(ROUNDS):
+        fitted = _fitted_line(line, inward, apart, pixel, edges, showing)
+        if fitted is None:
+            return None
+        line = fitted
+    return line
+
+
+def _fitted_line(
+    line: np.ndarray, inward: np.ndarray, apart: float, pixel: float, edges: EdgeImages, showing: np.ndarray
+) -> np.ndarray | None:
+    """(2, 3) ends of the line that is nearest to the edges that the views `showing` one have around it."""
+    across = np.arange(-AROUND * apart, AROUND * apart, pixel / FINER)
+    along = (np.arange(2 * SAMPLES) + 0.5) / (2 * SAMPLES)
+    lines = line[0] + across[:, None] * inward
+    places, off = list[np.ndarray](), list[np.ndarray]()
+    for view, changes in enumerate(edges.changes(lines, (line[1] - line[0])[None], along)):
+        if changes is None or view not in showing:
+            continue
+        shown = np.isfinite(changes[0]).all(0)
+        if not shown.any():
+            continue
+        change = changes[0][:, shown]
+        change *= np.sign(np.median(change[len(across) // 2]))
+        strongest, strength = change.argmax(0), change.max(0)
+        taken = (strongest > 0) & (strongest < len(across) - 1) & (strength > HALF * np.median(strength))
+        places.append(along[shown][taken])
+        off.append(across[strongest[taken]])
+    at, moved = (np.concatenate(each) if each else np.zeros(0) for each in (places, off))
+    if len(at) < LEAST_PIXELS or np.ptp(at) == 0:
+        return None
+    ends, weight = np.stack([1 - at, at], axis=1), np.ones(len(at))
+    for _ in range(FITS):
+        found = np.linalg.solve((ends * weight[:, None]).T @ ends, (ends * weight[:, None]).T @ moved)
+        residual = np.abs(moved - ends @ found)
+        weight = 1 / np.maximum(1, residual / max(float(np.median(residual)), pixel / FINER))
+    return line + found[:, None] * inward
