@@ -64,6 +64,11 @@ class EnclosingPlane:
     axes: np.ndarray
     own: np.ndarray
     whole: np.ndarray
+    closes: bool = False
+
+    def as_vector(self) -> np.ndarray:
+        """(4,) normal and offset."""
+        return np.append(self.normal, self.offset)
 
     def at(self, along: np.ndarray) -> np.ndarray:
         """(..., 3) points of the plane at (..., 2) coordinates along its axes."""
@@ -112,7 +117,8 @@ def enclosing_planes(
         for plane, rows in zip(found, own, strict=True)
         if any(plane is corner for corner in corners) or known.is_filled(plane, rows)
     ]
-    return enclosing + [known.with_ends(plane, corners, slice(None)) for plane in known.closing(corners)]
+    closing = (known.with_ends(plane, corners, slice(None)) for plane in known.closing(corners))
+    return enclosing + [replace(plane, closes=True) for plane in closing]
 
 
 class KnownPoints:
@@ -272,19 +278,12 @@ def enclosing_depths(
             place that MOST_KNOW is not what a pixel shows of which nothing is known.
     """
     result = [np.full(depth.shape, np.nan, np.float32) for depth in known]
-    planes = np.array([[*plane.normal, plane.offset] for plane in enclosing]).reshape(-1, 4)
     for camera, depth, pixels, probable, supposed in zip(cameras, result, wanted, shown, doubtful, strict=True):
         row, column = np.nonzero(pixels)
-        if not len(row) or not len(planes):
+        if not len(row) or not enclosing:
             continue
         rays = rays_of(camera, row, column)
-        inverse = rays @ in_camera(camera, planes).T
-        first, nearest = inverse.argmax(1), inverse.max(1)
-        own, whole = np.zeros(len(row), bool), np.zeros(len(row), bool)
-        for number, plane in enumerate(enclosing):
-            rows = np.flatnonzero((first == number) & (nearest > 0))
-            places = to_world(camera, rays[rows] / nearest[rows, None])
-            own[rows], whole[rows] = plane.within(places, plane.own), plane.within(places, plane.whole)
+        nearest, own, whole = _first_met(camera, rays, enclosing)
         elsewhere = np.abs(probable[row, column] * nearest - 1) > MARGIN  # not where it is NaN
         rows = np.flatnonzero((own | whole) & ~elsewhere)
         looking, knowing = _looking(to_world(camera, rays[rows] / nearest[rows, None]), cameras, known)
@@ -292,6 +291,22 @@ def enclosing_depths(
         rows = rows[(own[rows] | (looking <= FEW_VIEWS)) & (on_it | (knowing <= MOST_KNOW * looking))]
         depth[row[rows], column[rows]] = 1 / nearest[rows]
     return result
+
+
+def _first_met(
+    camera: Camera, rays: np.ndarray, enclosing: Sequence[EnclosingPlane]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(N,) inverse depth of the first enclosing plane that each of (N, 3) rays of a camera meets, not positive where it
+    meets none, and (N,) bool whether that is within the rectangle of its own points, and within that of all."""
+    planes = np.array([plane.as_vector() for plane in enclosing])
+    inverse = rays @ in_camera(camera, planes).T
+    first, nearest = inverse.argmax(1), inverse.max(1)
+    own, whole = np.zeros(len(rays), bool), np.zeros(len(rays), bool)
+    for number, plane in enumerate(enclosing):
+        rows = np.flatnonzero((first == number) & (nearest > 0))
+        places = to_world(camera, rays[rows] / nearest[rows, None])
+        own[rows], whole[rows] = plane.within(places, plane.own), plane.within(places, plane.whole)
+    return nearest, own, whole
 
 
 def known_on_planes(

@@ -26,10 +26,9 @@ REACH = 5 * CONFIRMED_DEPTH
 # Lines that are tried are as far from each other, at their ends, as photographs are blurred, MOST_STEPS to either side
 # at most, and are looked at in so many samples.
 MOST_STEPS, SAMPLES = 20, 128
-# Around the line that is found edges are looked for up to so many of these steps away, in quarters of a pixel; a line
-# is fitted to those that are at least half as strong as they are in the median. Once more around that line: what the
-# first one is off by cuts edges off on one side.
-AROUND, FINER, HALF, ROUNDS = 2, 4, 0.5, 2
+# Around the line that is found the strongest edges are looked for up to so many of these steps away, in quarters of a
+# pixel, and a line is fitted to them; once more around that line, as what the first is off by cuts edges off.
+AROUND, FINER, ROUNDS = 2, 4, 2
 # Steps of a fit in which each edge counts less the farther it is from the line.
 FITS = 20
 
@@ -65,7 +64,7 @@ def on_meeting_lines(
         for number in sorted(walls.keys() - found.keys()):
             wall = walls[number]
             if _at_right_angles(wall, floor):
-                line = clearest_line(wall, floor, _foot(wall, floor, seen), reach[number], edges)
+                line = clearest_line(wall, floor, _foot(wall, floor, seen), edges, reach[number])
                 if line is not None:
                     found[number] = _through(line, np.cross(line[1] - line[0], floor[:3]), wall)
     up = floors[0]
@@ -73,7 +72,7 @@ def on_meeting_lines(
         for number in sorted(walls.keys() - found.keys()):
             wall = walls[number]
             if _at_right_angles(wall, base) and _at_right_angles(wall, up):
-                line = clearest_line(wall, base, _corner(wall, base, up, seen), reach[number], edges)
+                line = clearest_line(wall, base, _corner(wall, base, up, seen), edges, reach[number])
                 if line is not None:
                     found[number] = _through(line, np.cross(up[:3], base[:3]), wall)
     return {k: plane if plane[:3] @ planes[k, :3] > 0 else -plane for k, plane in found.items()}
@@ -134,7 +133,7 @@ def _through(line: np.ndarray, normal: np.ndarray, wall: np.ndarray) -> np.ndarr
 
 
 def clearest_line(
-    wall: np.ndarray, base: np.ndarray, near: np.ndarray | None, reach: float, edges: EdgeImages
+    wall: np.ndarray, base: np.ndarray, near: np.ndarray | None, edges: EdgeImages, reach: float = REACH
 ) -> np.ndarray | None:
     """(2, 3) ends of the line on a base that photographs show most clearly around the line `near` (2, 3) along which a
     wall meets it; None where they show none, or where that is farther away than a share `reach` of its distance."""
@@ -161,7 +160,7 @@ def clearest_line(
     if not seen_enough(edges.cameras, showing, line.mean(0)):
         return None
     for _ in range(ROUNDS):
-        fitted = _fitted_line(line, inward, apart, pixel, edges, showing)
+        fitted = _fitted_line(line, inward, apart, pixel, edges)
         if fitted is None:
             return None
         line = fitted
@@ -169,23 +168,23 @@ def clearest_line(
 
 
 def _fitted_line(
-    line: np.ndarray, inward: np.ndarray, apart: float, pixel: float, edges: EdgeImages, showing: np.ndarray
+    line: np.ndarray, inward: np.ndarray, apart: float, pixel: float, edges: EdgeImages
 ) -> np.ndarray | None:
-    """(2, 3) ends of the line that is nearest to the edges that the views `showing` one have around it."""
+    """(2, 3) ends of the line that is nearest to the strongest edges that photographs have around it."""
     across = np.arange(-AROUND * apart, AROUND * apart, pixel / FINER)
     along = (np.arange(2 * SAMPLES) + 0.5) / (2 * SAMPLES)
     lines = line[0] + across[:, None] * inward
     places, off = list[np.ndarray](), list[np.ndarray]()
-    for view, changes in enumerate(edges.changes(lines, (line[1] - line[0])[None], along)):
-        if changes is None or view not in showing:
+    for changes in edges.changes(lines, (line[1] - line[0])[None], along):
+        if changes is None:
             continue
         shown = np.isfinite(changes[0]).all(0)
         if not shown.any():
             continue
         change = changes[0][:, shown]
         change *= np.sign(np.median(change[len(across) // 2]))
-        strongest, strength = change.argmax(0), change.max(0)
-        taken = (strongest > 0) & (strongest < len(across) - 1) & (strength > HALF * np.median(strength))
+        strongest = change.argmax(0)
+        taken = (strongest > 0) & (strongest < len(across) - 1)
         places.append(along[shown][taken])
         off.append(across[strongest[taken]])
     at, moved = (np.concatenate(each) if each else np.zeros(0) for each in (places, off))

@@ -9,7 +9,7 @@ of known floors (`edge_images.py`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -20,8 +20,10 @@ from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.edge_images import BLUR, BY_CHANCE, SHOWN, EdgeImages, by_chance
 from linprim_geo.stereo.enclosing_planes import CELLS, FILLED, MARGIN, EnclosingPlane, KnownPoints
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
+from linprim_geo.stereo.meeting_lines import clearest_line
 from linprim_geo.stereo.plain_regions import SAME_ANGLE, seen_enough
 from linprim_geo.stereo.point_planes import SurfacePoints
+from linprim_geo.stereo.right_angles import NEARLY
 
 # A corner is looked for as near to that of a floor's rectangle as this share of its longer side: its ends are known to
 # END_MARGIN, and windows of stereo reach beyond an edge.
@@ -62,7 +64,8 @@ def with_corner_walls(
 
     A wall has an edge at either end, or one at which it meets such a wall or one that is known. It is as high as its
     edges and goes from one to the other, or to the end of its floor. The floor is known along half of it at least and
-    ends there. A known wall on which all of it lies goes on as far.
+    ends there. A known wall on which all of it lies goes on as far. Of planes that close the scene those are left that
+    meet another one along an edge, and stand there.
 
     Args:
         known: (H, W) depth of every view, NaN where nothing is known.
@@ -70,12 +73,11 @@ def with_corner_walls(
         points: of what is known.
     """
     cameras = [found.camera for found in maps]
-    seen = KnownPoints(cameras, points)
-    floors = [plane for plane in enclosing if seen.is_level(plane.normal)]
-    if not floors:
-        return list(enclosing)
-    edges = EdgeImages(maps, known)
-    planes = list(enclosing)
+    seen, edges = KnownPoints(cameras, points), EdgeImages(maps, known)
+    own = [plane for plane in enclosing if not plane.closes]
+    shown = (set_on_edge(plane, own, edges) for plane in enclosing if plane.closes)
+    planes = own + [plane for plane in shown if plane is not None]
+    floors = [plane for plane in planes if seen.is_level(plane.normal)]
     for floor in floors:
         for wall, same in _walls_on(floor, planes, edges, seen):
             if _is_seen_past(wall, cameras, known, backgrounds):
@@ -87,13 +89,31 @@ def with_corner_walls(
     return planes
 
 
+def set_on_edge(plane: EnclosingPlane, others: Sequence[EnclosingPlane], edges: EdgeImages) -> EnclosingPlane | None:
+    """A plane that closes the scene, shifted to the edge along which photographs show that it meets one of others at
+    right angles; None if they show none."""
+    for base in others:
+        if abs(plane.normal @ base.normal) > np.sin(NEARLY):
+            continue
+        along = np.cross(base.normal, plane.normal)
+        along /= np.linalg.norm(along)
+        offsets = np.array([base.offset, plane.offset, 0.0])
+        meeting = np.linalg.solve(np.stack([base.normal, plane.normal, along]), offsets)
+        ends = base.corners() @ along
+        near = meeting + along * np.array([ends.min(), ends.max()])[:, None]
+        line = clearest_line(plane.as_vector(), base.as_vector(), near, edges, MARGIN)
+        if line is not None:
+            return replace(plane, offset=float(plane.normal @ line.mean(0)))
+    return None
+
+
 def _walls_on(
     floor: EnclosingPlane, others: Sequence[EnclosingPlane], edges: EdgeImages, seen: KnownPoints
 ) -> list[tuple[EnclosingPlane, int | None]]:
     """Walls on the four sides of the rectangle that holds a floor's own points, and which of the `others` each is."""
     lowest = LOWEST * float(np.median(seen.centers @ floor.normal - floor.offset))
     corners = [[find_corner(floor, np.array([x, y]), lowest, edges) for y in floor.own[:, 1]] for x in floor.own[:, 0]]
-    on_floor = seen.points.on(np.append(floor.normal, floor.offset)[None], CONFIRMED_DEPTH)[:, 0]
+    on_floor = seen.points.on(floor.as_vector()[None], CONFIRMED_DEPTH)[:, 0]
     places, margin = seen.points.position[on_floor] @ floor.axes.T, MARGIN * seen.distance[on_floor]
     found: dict[tuple[int, int], tuple[EnclosingPlane, int | None]] = {}
     meeting: dict[tuple[int, int], set[tuple[int, int]]] = {}
@@ -109,10 +129,10 @@ def _walls_on(
         if same is not None:
             sure.add((axis, end))
         if _ends_at(line, inward @ floor.axes.T, places, margin, REACH * _longer_side(floor)):
-            if same is not None or seen.is_before_all(np.append(wall.normal, wall.offset)):
+            if same is not None or seen.is_before_all(wall.as_vector()):
                 found[axis, end] = wall, same
                 meeting[axis, end] = {(1 - axis, k) for k in (0, 1) if ends[k]}
-                if all(ends):
+                if all(ends) or _is_shown(wall, floor, line, edges):
                     sure.add((axis, end))
     return [wall for side, wall in found.items() if side in sure or sure & meeting[side]]
 
@@ -204,6 +224,14 @@ def _wall(
     normal = normal if normal @ inward > 0 else -normal
     ends = np.array([[start @ direction, floor.offset], [end @ direction, floor.offset + height]])
     return EnclosingPlane(normal, float(normal @ start), np.stack([direction, floor.normal]), ends, ends)
+
+
+def _is_shown(
+    wall: EnclosingPlane, floor: EnclosingPlane, line: tuple[np.ndarray, np.ndarray], edges: EdgeImages
+) -> bool:
+    """Whether photographs show the line on a floor over which a wall is."""
+    near = floor.at(np.stack(line))
+    return clearest_line(wall.as_vector(), floor.as_vector(), near, edges, CONFIRMED_DEPTH) is not None
 
 
 def _is_seen_past(

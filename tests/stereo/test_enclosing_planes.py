@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from helpers.captures import look_at
 
-from linprim_geo.stereo.enclosing_planes import EnclosingPlane, enclosing_depths, enclosing_planes, known_on_planes
+from linprim_geo.stereo.enclosing_planes import (
+    EnclosingPlane,
+    enclosing_depths,
+    enclosing_planes,
+    known_on_planes,
+)
 from linprim_geo.stereo.plain_regions import in_camera
 from linprim_geo.stereo.point_planes import SurfacePoints
 
@@ -64,6 +69,8 @@ def test_of_a_wall_that_stands_on_a_line_few_points_are_enough():
 
     assert (0, 1, 0) not in normals(enclosing_planes(CAMERAS, planes, points))
     assert (0, 1, 0) in normals(enclosing_planes(CAMERAS, planes, points, np.array([False, True])))
+    none = points[~points.on(WALL[None])[:, 0]]
+    assert (0, 1, 0) not in normals(enclosing_planes(CAMERAS, planes, none, np.array([False, True])))
 
 
 def everything(place):

@@ -127,6 +127,30 @@ def test_photographs_have_to_be_upright():
     assert moved([FLOOR, turned(LEFT, 2.0, 0.03)], of=at_corner(roll=True)) == {}
 
 
+def test_a_wall_at_neither_a_right_angle_to_the_floor_nor_to_one_that_stands_stays():
+    """It leads through the corner of the room, where an edge shows."""
+    of = cameras()
+    across = np.array([np.sqrt(0.5), np.sqrt(0.5), 0, 0])
+    found = moved([FLOOR, turned(LEFT, -2.0, 0.02), across], of=of, known=cabinets(of))
+    assert list(found) == [1]
+
+
+def test_a_line_in_the_middle_of_a_floor_is_no_wall():
+    of = cameras()
+    maps = photographs(of)
+    for found, (depth, which) in zip(maps, map(seen, of), strict=True):
+        place = found.camera.center + found.camera.world_rays() * depth[..., None]
+        found.grey[(which == 0) & (place[..., 0] < 0.6)] += 60
+    up = np.broadcast_to(np.float32([0, 0, 1]), (of[0].height, of[0].width, 3))
+    planes = np.array([FLOOR, turned(LEFT, 0.0, 0.58)])
+    assert on_meeting_lines(planes, 1, [replace(found, normal=up) for found in maps], floors(of)) == {}
+
+
+def test_nothing_is_set_right_by_noise():
+    for seed in range(4):
+        assert moved([FLOOR, turned(LEFT, 2.0, 0.03)], greys=(120.0,) * 6, seed=seed) == {}
+
+
 def test_what_is_no_wall_stays():
     slope = np.array([np.sin(np.radians(70)), 0, np.cos(np.radians(70)), 0.0])
     inside = turned(LEFT, 0.0, 0.6)  # part of the floor is behind it

@@ -24,15 +24,15 @@ from linprim_geo.stereo.edge_images import EdgeImages, by_chance
 from linprim_geo.stereo.enclosing_planes import EnclosingPlane, enclosing_depths
 from linprim_geo.stereo.plain_regions import in_camera
 from linprim_geo.stereo.point_planes import SurfacePoints
-from linprim_geo.stereo.room_corners import find_corner, with_corner_walls
+from linprim_geo.stereo.room_corners import find_corner, set_on_edge, with_corner_walls
 
 FLOOR = EnclosingPlane(np.array([0.0, 0, 1]), 0.0, np.eye(3)[:2], *2 * [np.array([[-0.05, -0.04], [3.05, 2.04]])])
 
 
-def at_corner_walls(of: list[Camera], *others: EnclosingPlane, floor: EnclosingPlane = FLOOR):
-    known = floors(of)
+def at_corner_walls(of: list[Camera], *others: EnclosingPlane, floor: EnclosingPlane = FLOOR, known=None):
+    points = points_of(of, floors(of))
     near = EnclosingPlane(floor.normal, 0.0, floor.axes, floor.own * 0.5, floor.own * 0.5)
-    return corner_walls(photographs(of), known, no_background(of), [near, *others], points_of(of, known))
+    return corner_walls(photographs(of), known or floors(of), no_background(of), [near, *others], points)
 
 
 def corner_walls(maps, known, backgrounds, enclosing, points) -> list[EnclosingPlane]:
@@ -201,10 +201,49 @@ def test_walls_are_no_floors():
 KNOWN_WALL = EnclosingPlane(np.array([0.0, 1, 0]), 0.0, np.eye(3)[[0, 2]], *2 * [np.array([[0.0, 0.0], [3.0, 1.0]])])
 
 
+def hidden_feet(of: list[Camera]) -> list[np.ndarray]:
+    """Depth of the floor in every view, and of cabinets along all walls, a quarter of a metre high."""
+    known = floors(of)
+    for camera, depth in zip(of, known, strict=True):
+        place = camera.center + camera.world_rays() * seen(camera)[0][..., None]
+        beside = (place[..., :2] < 0.2).any(-1)
+        depth[beside & (place[..., 2] < 0.25)] = 0.5
+    return known
+
+
 def test_one_edge_alone_is_no_wall_but_one_at_a_known_wall():
     of = at_corner()
-    assert at_corner_walls(of) == []
-    assert directions(at_corner_walls(of, KNOWN_WALL)) == [(1, 0, 0)]
+    assert at_corner_walls(of, known=hidden_feet(of)) == []
+    assert directions(at_corner_walls(of, KNOWN_WALL, known=hidden_feet(of))) == [(1, 0, 0)]
+
+
+def test_one_edge_and_the_line_on_the_floor_are_a_wall():
+    assert directions(at_corner_walls(at_corner())) == [(0, 1, 0), (1, 0, 0)]
+
+
+def closing(x: float) -> EnclosingPlane:
+    ends = np.array([[0.0, 0.0], [2.0, 2.0]])
+    return EnclosingPlane(np.array([1.0, 0, 0]), x, np.eye(3)[1:], ends, ends, closes=True)
+
+
+def test_a_plane_that_closes_the_scene_is_shifted_to_its_edge():
+    of = cameras()
+    edges = EdgeImages(photographs(of), floors(of))
+    shifted = set_on_edge(closing(0.02), [FLOOR], edges)
+    assert shifted is not None and abs(shifted.offset) < 0.005 and (shifted.own == closing(0.02).own).all()
+    assert set_on_edge(closing(0.02), [closing(0.5)], edges) is None
+    # 2 % of the distance to the cameras in the middle is 0.04 m.
+    assert set_on_edge(closing(0.08), [FLOOR], edges) is None
+
+
+@pytest.mark.parametrize(("x", "stays"), [(0.02, True), (0.3, False)])
+def test_a_plane_that_closes_the_scene_without_an_edge_is_left_out(x, stays):
+    of = cameras()
+    known = floors(of)
+    enclosing = [FLOOR, closing(x)]
+    planes = with_corner_walls(photographs(of), known, no_background(of), enclosing, points_of(of, known))
+    assert any(plane.closes for plane in planes) == stays
+    assert not any(plane.offset == x for plane in planes)
 
 
 def test_photographs_have_to_be_upright():
