@@ -21,12 +21,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.points.view_pairs import SOURCES, visible_pixels
 from linprim_geo.stereo.common_surfaces import ON_IT
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
-from linprim_geo.stereo.plain_regions import in_camera, rays_of, to_world
+from linprim_geo.stereo.plain_regions import PlainRegion, in_camera, rays_of, to_world
 from linprim_geo.stereo.point_planes import LEAST_SHARE, SAME_NORMAL, SurfacePoints
 from linprim_geo.stereo.right_angles import NEARLY
 
@@ -47,6 +48,8 @@ CELLS, FILLED, DIRECTIONS = 8, 0.5, 45
 # A plane is level if its normal is as near to the mean direction that is up in photographs, whose camera may look far
 # down.
 UPRIGHT = np.cos(np.radians(60))
+# Stereo knows up to SURE_SHARE of a plain region by chance; of more depths, AGREEING are on a plane that it lies on.
+SURE_SHARE, AGREEING = 0.1, 0.7
 # So many views of each place are wanted for stereo: where no more look, it may know nothing of a surface.
 FEW_VIEWS = SOURCES
 
@@ -307,6 +310,32 @@ def _first_met(
         places = to_world(camera, rays[rows] / nearest[rows, None])
         own[rows], whole[rows] = plane.within(places, plane.own), plane.within(places, plane.whole)
     return nearest, own, whole
+
+
+def region_depths(
+    camera: Camera, enclosing: Sequence[EnclosingPlane], known: np.ndarray, regions: Sequence[PlainRegion]
+) -> np.ndarray:
+    """(H, W) float32 depth where rays end at enclosing planes, in those plain regions of a view that lie on these, NaN
+    elsewhere: a thing before a wall has an edge.
+
+    Of what is `known` (H, W) within a region, NaN elsewhere, AGREEING is on the planes, and it is more than chance. As
+    edges may have gaps, only pixels lie on planes whose nearest known one does.
+    """
+    depth = np.full(known.shape, np.nan, np.float32)
+    for region in regions if enclosing else ():
+        row, column = np.nonzero(region.mask)
+        at = row + region.top, column + region.left
+        nearest, own, whole = _first_met(camera, rays_of(camera, *at), enclosing)
+        met, is_known = own | whole, np.isfinite(known[at])
+        on = met & (np.abs(known[at] * nearest - 1) < MARGIN)
+        if np.count_nonzero(is_known) < SURE_SHARE * len(row) or on.sum() < AGREEING * np.count_nonzero(is_known):
+            continue
+        unknown, lying = np.ones(region.mask.shape, bool), np.zeros(region.mask.shape, bool)
+        unknown[row, column], lying[row, column] = ~is_known, on
+        _, (near_row, near_column) = distance_transform_edt(unknown, return_indices=True)
+        taken = met & lying[near_row, near_column][row, column]
+        depth[at[0][taken], at[1][taken]] = 1 / nearest[taken]
+    return depth
 
 
 def known_on_planes(

@@ -18,6 +18,7 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.common_surfaces import CommonSurfaces
 from linprim_geo.stereo.depth_maps import DepthMap
+from linprim_geo.stereo.enclosing_planes import AGREEING, SURE_SHARE
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.meeting_lines import is_same, on_meeting_lines
 from linprim_geo.stereo.plain_regions import (
@@ -64,8 +65,6 @@ MOST_LEFT, FLAT_SHARE = 1.3, 0.75
 CERTAIN = 2 * CONFIRMED_DEPTH
 # Planes of regions are taken together if they differ by no more than these: what the plane of one alone is off by.
 ALIKE_ANGLE, ALIKE_DEPTH = 4 * SAME_ANGLE, 5 * CONFIRMED_DEPTH
-# Stereo confirms up to SURE_SHARE of a plain region by chance; of more depths, AGREEING are on the plane.
-SURE_SHARE, AGREEING = 0.1, 0.7
 # Confirmed depths along the edges of regions hold a plane if they are as near as NEAR, and after some steps as
 # TOLERANCE. Half of TOLERANCE is their deviation; as their errors have common causes, they count as so many at most.
 NEAR, NARROWER, HOLDING_STEPS, INDEPENDENT = 2 * TOLERANCE, 0.8, 6, 200

@@ -18,10 +18,17 @@ from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.common_surfaces import ON_IT
 from linprim_geo.stereo.depth_maps import SURE, DepthMap, depth_maps
-from linprim_geo.stereo.enclosing_planes import enclosing_depths, enclosing_planes, known_on_planes
+from linprim_geo.stereo.enclosing_planes import enclosing_depths, enclosing_planes, known_on_planes, region_depths
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.lone_backgrounds import lone_backgrounds
-from linprim_geo.stereo.plain_regions import common_planes, edges_of, grown_alike, plane_depths, regions_of_views
+from linprim_geo.stereo.plain_regions import (
+    PlainRegion,
+    common_planes,
+    edges_of,
+    grown_alike,
+    plane_depths,
+    regions_of_views,
+)
 from linprim_geo.stereo.point_planes import SurfacePoints, planes_of_points, point_plane_depth
 from linprim_geo.stereo.room_corners import with_corner_walls
 from linprim_geo.stereo.shaded_planes import ShadedPlanes
@@ -79,22 +86,24 @@ class MergedFrames(Sequence):
             deviations.add(found, depth, frame)
         self.weight = deviations.weight()
         rendered_depths = [frame.depth for frame in rendered]
-        backgrounds = self._take_planes(maps, rendered_depths)
+        regions, backgrounds = self._take_planes(maps, rendered_depths)
         self.rendered = [_seen_past(*each) for each in zip(rendered, maps, backgrounds, strict=True)]
         self.shown = [frame.depth[::SAMPLED, ::SAMPLED] > 0 for frame in self.rendered]
         known = [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
         points = self._span_gaps(maps, known, rendered_depths, backgrounds)
         are_sharp = [depth > 0 for depth in rendered_depths] if sharp is None else list(sharp)
-        self._enclose(maps, points, known, measured, are_sharp, backgrounds)
+        self._enclose(maps, points, known, measured, are_sharp, regions, backgrounds)
         self._keep_thin_things(views, maps, rendered_depths, are_sharp)
         if not any(view.has_alpha for view in views):  # else masks say what is background
             self._end_backgrounds(maps)
 
-    def _take_planes(self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray]) -> list[np.ndarray]:
+    def _take_planes(
+        self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray]
+    ) -> tuple[list[list[PlainRegion]], list[np.ndarray]]:
         """Finds planes by points, by edges and by shading, of depths that are sure, and what lies on them; moves
         confirmed depths to them.
 
-        Returns (H, W) bool of every view: regions that are background by their shading.
+        Returns the plain regions of every view, and (H, W) bool: those that are background by their shading.
         """
         sure = [_depth_where(found, found.is_confirmed(SURE)) for found in maps]
         regions = regions_of_views(maps, sure)
@@ -115,7 +124,7 @@ class MergedFrames(Sequence):
             moved = np.where(np.isfinite(sure[view]), on_plane, self.on_planes[view])
             self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(moved), moved, depth)
         self.flat = _share_known(self.on_planes)
-        return backgrounds
+        return regions, backgrounds
 
     def _span_gaps(
         self,
@@ -147,18 +156,23 @@ class MergedFrames(Sequence):
         known: Sequence[np.ndarray],
         measured: Sequence[np.ndarray],
         sharp: Sequence[np.ndarray],
+        regions: Sequence[Sequence[PlainRegion]],
         backgrounds: Sequence[np.ndarray],
     ) -> None:
         """Adds depths of planes that enclose `points` of what is `known`, and of walls that meet at their corners, to
-        doubtful ones, where training has a depth that is not `sharp` (H, W) or is near them, but not in background. Of
-        doubtful depths those stay that are before a plane by more than these may be off. What stereo has `measured` on
-        planes with points is not background where hardly any view looks."""
+        doubtful ones, where training has a depth that is not `sharp` (H, W) or is near them, or in plain `regions` that
+        lie on them, but not in background. Of doubtful depths those stay that are before a plane by more than these may
+        be off, but not in such regions. What stereo has `measured` on planes with points is not background where hardly
+        any view looks."""
         planes = enclosing_planes(self.cameras, self.planes, points, self.standing)
         walled = with_corner_walls(maps, known, self._backgrounds(), planes, points)
         wanted, shown = [], []
-        for frame, depth, of_surface, background in zip(self.rendered, known, sharp, backgrounds, strict=True):
+        for view, (frame, depth, background) in enumerate(zip(self.rendered, known, backgrounds, strict=True)):
             wanted.append((frame.depth > 0) & ~(background | np.isfinite(depth)))
-            shown.append(np.where(of_surface, frame.depth, np.nan))
+            on_wall = region_depths(frame.camera, walled, depth, regions[view])
+            on_wall[background] = np.nan
+            shown.append(np.where(sharp[view] & ~np.isfinite(on_wall), frame.depth, np.nan))
+            self.doubtful_depths[view] = _first_known((on_wall, self.doubtful_depths[view]))
         enclosed = enclosing_depths(self.cameras, walled, known, wanted, shown, self.doubtful_depths)
         enclosed = [
             np.where(doubtful < (1 - ON_IT) * depth, np.nan, depth)

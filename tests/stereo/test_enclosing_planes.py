@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.captures import look_at
@@ -11,8 +13,9 @@ from linprim_geo.stereo.enclosing_planes import (
     enclosing_depths,
     enclosing_planes,
     known_on_planes,
+    region_depths,
 )
-from linprim_geo.stereo.plain_regions import in_camera
+from linprim_geo.stereo.plain_regions import PlainRegion, in_camera
 from linprim_geo.stereo.point_planes import SurfacePoints
 
 # The corner of a room at the origin: floor, and walls at x = 0 and y = 0; n . x = 0.
@@ -277,3 +280,62 @@ def test_without_points_or_planes_there_is_nothing():
     assert enclosing_planes(CAMERAS, np.zeros((0, 4)), points) == []
     filled = ending(CAMERAS, [], known, [np.ones(depth.shape, bool) for depth in known])
     assert all(np.isnan(depth).all() and depth.dtype == np.float32 for depth in filled)
+
+
+def plain_region(camera, mask: np.ndarray) -> PlainRegion:
+    """All of an image that is in a mask."""
+    return PlainRegion(0, 0, 0, mask, np.zeros((0, 3)), np.zeros(0), np.zeros((5, 3)))
+
+
+def wall_and_region():
+    """A camera, two enclosing planes, the true depth, and the upper part of the image, which lies on both."""
+    planes = [plane for plane in enclosing_planes(CAMERAS, np.array([FLOOR, WALL, SIDE]), points_of(room(everything)))]
+    camera = CAMERAS[0]
+    true = depth_of(camera, [FLOOR, WALL, SIDE])
+    mask = np.zeros(true.shape, bool)
+    mask[:12] = True
+    return camera, planes, true, mask
+
+
+@pytest.mark.parametrize(("known_share", "on_share", "lies"), [(0.5, 1.0, True), (0.5, 0.6, False), (0.05, 1.0, False)])
+def test_a_plain_region_lies_on_the_planes_that_most_of_what_is_known_in_it_lies_on(known_share, on_share, lies):
+    camera, planes, true, mask = wall_and_region()
+    number = np.random.default_rng(0).permutation(mask.size).reshape(mask.shape) / mask.size
+    known = np.where(number < known_share, true, np.nan)
+    known[number < known_share * (1 - on_share)] *= 0.9
+
+    depth = region_depths(camera, planes, known, [plain_region(camera, mask)])
+
+    assert np.isnan(depth[~mask]).all()
+    assert np.isfinite(depth[mask]).all() == lies
+    if lies:
+        assert depth[mask] == pytest.approx(true[mask], rel=1e-5)
+        assert np.isnan(region_depths(camera, [], known, [plain_region(camera, mask)])).all()
+
+
+def test_a_plain_region_goes_no_farther_than_its_planes():
+    camera, planes, true, mask = wall_and_region()
+    smaller = [plane.own.mean(0) + 0.4 * (plane.own - plane.own.mean(0)) for plane in planes]
+    low = [replace(plane, own=ends, whole=ends) for plane, ends in zip(planes, smaller, strict=True)]
+    place = places_of(camera, true)
+    points = place.reshape(-1, 3)
+    on = [(np.abs(points @ plane.normal - plane.offset) < 1e-6) & plane.within(points, plane.own) for plane in low]
+    within = np.any(on, axis=0).reshape(mask.shape)
+    assert 0.1 < within[mask].mean() < 0.9
+
+    depth = region_depths(camera, low, np.where(within, true, np.nan), [plain_region(camera, mask)])
+
+    assert (np.isfinite(depth) == (within & mask)).all()
+
+
+def test_what_a_gap_in_an_edge_joins_to_a_wall_does_not_lie_on_it():
+    """A bed before a wall: of what is known next to its unknown pixels nothing is on the wall."""
+    camera, planes, true, mask = wall_and_region()
+    bed = mask & (np.arange(mask.shape[1]) >= 36)
+    known = np.where(np.indices(mask.shape).sum(0) % 3 == 0, np.where(bed, 0.8, 1.0) * true, np.nan)
+
+    depth = region_depths(camera, planes, known, [plain_region(camera, mask)])
+
+    on_wall = np.isfinite(depth)
+    far = np.abs(np.arange(mask.shape[1]) - 36) > 2
+    assert on_wall[mask & ~bed & far].all() and not on_wall[bed & far].any()
