@@ -63,8 +63,9 @@ def on_meeting_lines(
     for floor in floors:
         for number in sorted(walls.keys() - found.keys()):
             wall = walls[number]
-            if _at_right_angles(wall, floor):
-                line = clearest_line(wall, floor, _foot(wall, floor, seen), edges, reach[number])
+            near = _foot(wall, floor, seen) if _at_right_angles(wall, floor) else None
+            if near is not None:
+                line = clearest_line(wall, floor, near, edges, reach[number])
                 if line is not None:
                     found[number] = _through(line, np.cross(line[1] - line[0], floor[:3]), wall)
     up = floors[0]
@@ -101,7 +102,7 @@ def _at_right_angles(first: np.ndarray, second: np.ndarray) -> bool:
     return bool(abs(first[:3] @ second[:3]) < np.sin(NEARLY))
 
 
-def _meeting(wall: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def meeting_of(wall: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A point (3,) of both planes, and the direction (3,) in which they meet."""
     along = np.cross(base[:3], wall[:3])
     along /= np.linalg.norm(along)
@@ -110,7 +111,7 @@ def _meeting(wall: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 def _foot(wall: np.ndarray, floor: np.ndarray, seen: KnownPoints) -> np.ndarray | None:
     """(2, 3) ends of the line along which a wall meets a floor, as far as there are points of the floor near it."""
-    meeting, along = _meeting(wall, floor)
+    meeting, along = meeting_of(wall, floor)
     on_floor = seen.points.position[seen.points.on(floor[None], CONFIRMED_DEPTH)[:, 0]]
     apart = np.abs((on_floor - meeting) @ np.cross(along, floor[:3]))
     beside = on_floor[apart < REACH * np.linalg.norm(seen.centers.mean(0) - meeting)]
@@ -121,7 +122,7 @@ def _foot(wall: np.ndarray, floor: np.ndarray, seen: KnownPoints) -> np.ndarray 
 
 def _corner(wall: np.ndarray, base: np.ndarray, floor: np.ndarray, seen: KnownPoints) -> np.ndarray:
     """(2, 3) ends of the line along which two walls meet, from the floor as high as cameras are."""
-    meeting, along = _meeting(wall, base)
+    meeting, along = meeting_of(wall, base)
     levels = np.array([floor[3], (seen.centers @ floor[:3]).max()])
     return meeting + along * ((levels - meeting @ floor[:3]) / (along @ floor[:3]))[:, None]
 
@@ -133,12 +134,10 @@ def _through(line: np.ndarray, normal: np.ndarray, wall: np.ndarray) -> np.ndarr
 
 
 def clearest_line(
-    wall: np.ndarray, base: np.ndarray, near: np.ndarray | None, edges: EdgeImages, reach: float = REACH
+    wall: np.ndarray, base: np.ndarray, near: np.ndarray, edges: EdgeImages, reach: float = REACH
 ) -> np.ndarray | None:
     """(2, 3) ends of the line on a base that photographs show most clearly around the line `near` (2, 3) along which a
     wall meets it; None where they show none, or where that is farther away than a share `reach` of its distance."""
-    if near is None:
-        return None
     inward = wall[:3] - base[:3] * (wall[:3] @ base[:3])
     inward /= np.linalg.norm(inward)
     middle = near.mean(0)

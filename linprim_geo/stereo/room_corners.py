@@ -20,7 +20,7 @@ from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.edge_images import BLUR, BY_CHANCE, SHOWN, EdgeImages, by_chance
 from linprim_geo.stereo.enclosing_planes import CELLS, FILLED, MARGIN, EnclosingPlane, KnownPoints
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
-from linprim_geo.stereo.meeting_lines import clearest_line
+from linprim_geo.stereo.meeting_lines import clearest_line, meeting_of
 from linprim_geo.stereo.plain_regions import SAME_ANGLE, seen_enough
 from linprim_geo.stereo.point_planes import SurfacePoints
 from linprim_geo.stereo.right_angles import NEARLY
@@ -62,10 +62,10 @@ def with_corner_walls(
 ) -> list[EnclosingPlane]:
     """The `enclosing` planes, and walls without one that rise from those of these planes that are floors.
 
-    A wall has an edge at either end, or one at which it meets such a wall or one that is known. It is as high as its
-    edges and goes from one to the other, or to the end of its floor. The floor is known along half of it at least and
-    ends there. A known wall on which all of it lies goes on as far. Of planes that close the scene those are left that
-    meet another one along an edge, and stand there.
+    A wall has an edge at either end, or one and another along the floor, or one at which it meets such a wall or one
+    that is known. It is as high as its edges and goes from one to the other, or to the end of its floor. The floor is
+    known along half of it at least and ends there. A known wall on which all of it lies goes on as far. Of planes that
+    close the scene those are left that meet another one along an edge, and stand there.
 
     Args:
         known: (H, W) depth of every view, NaN where nothing is known.
@@ -95,10 +95,7 @@ def set_on_edge(plane: EnclosingPlane, others: Sequence[EnclosingPlane], edges: 
     for base in others:
         if abs(plane.normal @ base.normal) > np.sin(NEARLY):
             continue
-        along = np.cross(base.normal, plane.normal)
-        along /= np.linalg.norm(along)
-        offsets = np.array([base.offset, plane.offset, 0.0])
-        meeting = np.linalg.solve(np.stack([base.normal, plane.normal, along]), offsets)
+        meeting, along = meeting_of(plane.as_vector(), base.as_vector())
         ends = base.corners() @ along
         near = meeting + along * np.array([ends.min(), ends.max()])[:, None]
         line = clearest_line(plane.as_vector(), base.as_vector(), near, edges, MARGIN)
