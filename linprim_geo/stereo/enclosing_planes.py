@@ -102,7 +102,7 @@ def enclosing_planes(
     """Those of (K, 4) planes n . x = d that enclose the scene, without copies, of those that meet no other at right
     angles only what points are all over, and planes at right angles to two of them where both end.
 
-    Of those `standing` (K,) on floors, which are walls, few points are enough."""
+    Of walls that are `standing` (K,) on the line that photographs show few points are enough."""
     if not len(points):
         return []
     known = KnownPoints(cameras, points)

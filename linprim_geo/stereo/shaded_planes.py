@@ -89,8 +89,8 @@ class FittedRegion:
 class ShadedPlanes:
     """`planes` (K, 4) of the world that carry the shading of plain regions in several views, the known ones first.
 
-    Those `standing` (K,) are walls set right by the line along which they meet a floor. Those `hanging` (K,) have their
-    points on what is before such a wall, which is among the others.
+    Those `standing` (K,) are walls set on the line along which they meet a floor or another wall. Those `hanging` (K,)
+    have their points on what is before such a wall, which is among the others.
 
     Args:
         maps: of all views.
