@@ -170,7 +170,6 @@ class MergedFrames(Sequence):
         for view, (frame, depth, background) in enumerate(zip(self.rendered, known, backgrounds, strict=True)):
             wanted.append((frame.depth > 0) & ~(background | np.isfinite(depth)))
             on_wall = region_depths(frame.camera, walled, depth, regions[view])
-            on_wall[background] = np.nan
             shown.append(np.where(sharp[view] & ~np.isfinite(on_wall), frame.depth, np.nan))
             self.doubtful_depths[view] = _first_known((on_wall, self.doubtful_depths[view]))
         enclosed = enclosing_depths(self.cameras, walled, known, wanted, shown, self.doubtful_depths)

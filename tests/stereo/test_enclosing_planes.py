@@ -307,7 +307,7 @@ def test_a_plain_region_lies_on_the_planes_that_most_of_what_is_known_in_it_lies
     depth = region_depths(camera, planes, known, [plain_region(camera, mask)])
 
     assert np.isnan(depth[~mask]).all()
-    assert np.isfinite(depth[mask]).all() == lies
+    assert (np.isfinite(depth[mask]) == lies).all()
     if lies:
         assert depth[mask] == pytest.approx(true[mask], rel=1e-5)
         assert np.isnan(region_depths(camera, [], known, [plain_region(camera, mask)])).all()

@@ -124,6 +124,28 @@ def test_rays_end_at_enclosing_planes_where_nothing_is_known_and_nothing_sharp_i
     assert uncertain.any() and (doubted[0][uncertain] == found[0].depth[uncertain]).all()
 
 
+def test_plain_regions_lie_on_walls_whatever_is_rendered_or_doubted_there_but_background(found, monkeypatch):
+    on_wall, background = np.full((30, 40), np.nan, np.float32), np.zeros((30, 40), bool)
+    on_wall[:2, :] = 3.4
+    background[:, 35:] = True
+    asked = {}
+
+    def enclosing(cameras, planes, known, wanted, shown, doubtful):
+        asked.update(shown=shown[0], doubtful=doubtful[0])
+        return [np.where(wanted[0] & (np.abs(doubtful[0] - 3.4) < 1e-3), doubtful[0], np.float32(np.nan))]
+
+    monkeypatch.setattr(stereo_frames.ShadedPlanes, "is_background", lambda *_: background)
+    monkeypatch.setattr(stereo_frames, "region_depths", lambda *_: on_wall.copy())
+    monkeypatch.setattr(stereo_frames, "enclosing_depths", enclosing)
+    frame = MergedFrames(rendered(0.01), [VIEW], 5.0)[0]
+
+    assert np.isnan(asked["shown"][:2, :35]).all() and np.isfinite(asked["shown"][2:, :35]).all()
+    assert (asked["doubtful"][:2, :35] == np.float32(3.4)).all()
+    assert np.allclose(frame.depth[:2, :35], 3.4), "of which the second row was doubtful"
+    assert (frame.depth[:, 35:] == 0).all()
+    assert (frame.depth[2:, :20] == 3).all() and np.allclose(frame.depth[2:, 20:35], 3.03)
+
+
 @pytest.mark.parametrize("plane, taken", [(2.5, 2.5), (3.1, 3.1), (3.2, 3)])
 def test_doubtful_depths_stay_where_they_are_well_before_an_enclosing_plane(found, monkeypatch, plane, taken):
     monkeypatch.setattr(
