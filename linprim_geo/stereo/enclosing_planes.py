@@ -29,7 +29,7 @@ from linprim_geo.stereo.common_surfaces import ON_IT
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.plain_regions import PlainRegion, in_camera, rays_of, to_world
 from linprim_geo.stereo.point_planes import LEAST_SHARE, SAME_NORMAL, SurfacePoints
-from linprim_geo.stereo.right_angles import NEARLY
+from linprim_geo.stereo.right_angles import at_right_angles
 
 # Of the known points so many are wrong, and may lie behind a plane or beyond an end of it.
 OUTLIERS = 0.01
@@ -113,7 +113,7 @@ def enclosing_planes(
         if known.is_enclosing(known.facing(plane), least=0 if stands else LEAST_SHARE)
     ]
     found = known.without_copies(sides)
-    corners = [plane for plane in found if any(_at_right_angles(plane, other) for other in found)]
+    corners = [plane for plane in found if any(at_right_angles(plane, other) for other in found)]
     own = [points.on(plane[None], CONFIRMED_DEPTH)[:, 0] for plane in found]
     enclosing = [
         known.with_ends(plane, corners, rows)
@@ -187,7 +187,7 @@ class KnownPoints:
         """Planes at right angles to two of those `found` where both end, on sides where there is none."""
         closing: list[np.ndarray] = []
         for number, first in enumerate(found):
-            for second in (other for other in found[:number] if _at_right_angles(first, other)):
+            for second in (other for other in found[:number] if at_right_angles(first, other)):
                 across = np.cross(first[:3], second[:3])
                 across /= np.linalg.norm(across)
                 sides = [self.on(plane) for plane in (first, second)]
@@ -215,7 +215,7 @@ class KnownPoints:
         """A plane with its ends by its `own` points, along the normal of the first of the `corners` that is at right
         angles to it, or else along the sides of the smallest rectangle. Without another one it ends with its points."""
         normal = plane[:3]
-        first = next((other[:3] for other in corners if _at_right_angles(other, plane)), None)
+        first = next((other[:3] for other in corners if at_right_angles(other, plane)), None)
         if first is None:
             axes, ends = self.smallest_rectangle(plane, own)
             return EnclosingPlane(normal, float(plane[3]), axes, ends, ends)
@@ -256,10 +256,6 @@ def _ends(along: np.ndarray) -> np.ndarray:
     """(2, 2) least and greatest of (P, 2) coordinates."""
     low, high = np.quantile(along, [BEYOND, 1 - BEYOND], axis=0)
     return np.stack([low, high]) + END_MARGIN * np.stack([low - high, high - low])
-
-
-def _at_right_angles(first: np.ndarray, second: np.ndarray) -> bool:
-    return bool(abs(first[:3] @ second[:3]) < np.sin(NEARLY))
 
 
 def enclosing_depths(

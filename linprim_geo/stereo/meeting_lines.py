@@ -17,8 +17,8 @@ from linprim_geo.stereo.edge_images import BLUR, BY_CHANCE, LEAST_PIXELS, SHOWN,
 from linprim_geo.stereo.enclosing_planes import BEYOND, KnownPoints
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.plain_regions import seen_enough
-from linprim_geo.stereo.point_planes import POINTS, SurfacePoints
-from linprim_geo.stereo.right_angles import NEARLY
+from linprim_geo.stereo.point_planes import confirmed_points
+from linprim_geo.stereo.right_angles import NEARLY, at_right_angles
 
 # A line is looked for up to this share of its distance away from where planes meet: what those of shading are off by.
 # One that has points all over is known to CONFIRMED_DEPTH, with what hangs on the wall behind.
@@ -44,11 +44,7 @@ def on_meeting_lines(
             not.
         known: (H, W) confirmed depth of every view, NaN elsewhere.
     """
-    rng, count = np.random.default_rng(0), -(-POINTS // len(maps))
-    points = SurfacePoints.together(
-        SurfacePoints.of_view(view, found.camera, depth, found.normal, count, rng)
-        for view, (found, depth) in enumerate(zip(maps, known, strict=True))
-    )
+    points, _ = confirmed_points(maps, known)
     seen = KnownPoints([found.camera for found in maps], points)
     floors = floors_of([seen.facing(plane) for plane in planes[:by_points]], seen) if len(points) else []
     if not floors:
@@ -63,7 +59,7 @@ def on_meeting_lines(
     for floor in floors:
         for number in sorted(walls.keys() - found.keys()):
             wall = walls[number]
-            near = _foot(wall, floor, seen) if _at_right_angles(wall, floor) else None
+            near = _foot(wall, floor, seen) if at_right_angles(wall, floor) else None
             if near is not None:
                 line = clearest_line(wall, floor, near, edges, reach[number])
                 if line is not None:
@@ -72,7 +68,7 @@ def on_meeting_lines(
     for base in list(found.values()):
         for number in sorted(walls.keys() - found.keys()):
             wall = walls[number]
-            if _at_right_angles(wall, base) and _at_right_angles(wall, up):
+            if at_right_angles(wall, base) and at_right_angles(wall, up):
                 line = clearest_line(wall, base, _corner(wall, base, up, seen), edges, reach[number])
                 if line is not None:
                     found[number] = _through(line, np.cross(up[:3], base[:3]), wall)
@@ -96,10 +92,6 @@ def floors_of(planes: Sequence[np.ndarray], seen: KnownPoints) -> list[np.ndarra
             own = seen.points.on(plane[None], CONFIRMED_DEPTH)[:, 0]
             floors.append(np.append(normal, np.median(seen.points.position[own] @ normal)))
     return floors
-
-
-def _at_right_angles(first: np.ndarray, second: np.ndarray) -> bool:
-    return bool(abs(first[:3] @ second[:3]) < np.sin(NEARLY))
 
 
 def meeting_of(wall: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

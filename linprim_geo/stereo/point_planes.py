@@ -81,18 +81,23 @@ class SurfacePoints:
         return near & (np.abs(self.normal @ normal) > SAME_NORMAL)
 
 
+def confirmed_points(
+    maps: Sequence[DepthMap], depths: Sequence[np.ndarray]
+) -> tuple[SurfacePoints, np.random.Generator]:
+    """About POINTS of the confirmed `depths` (H, W) of views, NaN elsewhere, and the generator that chose them."""
+    rng, count = np.random.default_rng(0), -(-POINTS // len(maps))
+    views = enumerate(zip(maps, depths, strict=True))
+    of_views = (SurfacePoints.of_view(k, found.camera, depth, found.normal, count, rng) for k, (found, depth) in views)
+    return SurfacePoints.together(of_views), rng
+
+
 def planes_of_points(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> np.ndarray:
     """(K, 4) planes n . x = d of the world with the most of the confirmed `depths` (H, W) of views, NaN elsewhere.
 
     Those come first that hold their points within the least of TOLERANCES: within a large one a plane may lie across
     two surfaces, such as a picture on a wall and the head of a bed before it, and on neither.
     """
-    rng = np.random.default_rng(0)
-    count = -(-POINTS // len(maps))
-    points = SurfacePoints.together(
-        SurfacePoints.of_view(view, found.camera, depth, found.normal, count, rng)
-        for view, (found, depth) in enumerate(zip(maps, depths, strict=True))
-    )
+    points, rng = confirmed_points(maps, depths)
     least, planes, free = max(LEAST_SHARE * len(points), 3), list[np.ndarray](), np.arange(len(points))
     for tolerance in TOLERANCES:
         left = free

@@ -18,6 +18,11 @@ NEARLY, RIGHT, ROUNDS = 2 * SAME_ANGLE, np.radians(0.2), 5
 WEIGHT = 1e4
 
 
+def at_right_angles(first: np.ndarray, second: np.ndarray) -> bool:
+    """Whether two planes (4,), or their normals (3,), are nearly at right angles."""
+    return bool(abs(first[:3] @ second[:3]) < np.sin(NEARLY))
+
+
 def squared(
     planes: np.ndarray,
     information: Sequence[np.ndarray | None],

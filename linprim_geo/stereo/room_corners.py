@@ -23,7 +23,7 @@ from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.meeting_lines import clearest_line, meeting_of
 from linprim_geo.stereo.plain_regions import SAME_ANGLE, seen_enough
 from linprim_geo.stereo.point_planes import SurfacePoints
-from linprim_geo.stereo.right_angles import NEARLY
+from linprim_geo.stereo.right_angles import at_right_angles
 
 # A corner is looked for as near to that of a floor's rectangle as this share of its longer side: its ends are known to
 # END_MARGIN, and windows of stereo reach beyond an edge.
@@ -73,7 +73,10 @@ def with_corner_walls(
         points: of what is known.
     """
     cameras = [found.camera for found in maps]
-    seen, edges = KnownPoints(cameras, points), EdgeImages(maps, known)
+    seen = KnownPoints(cameras, points)
+    if not any(plane.closes or seen.is_level(plane.normal) for plane in enclosing):
+        return list(enclosing)
+    edges = EdgeImages(maps, known)
     own = [plane for plane in enclosing if not plane.closes]
     shown = (set_on_edge(plane, own, edges) for plane in enclosing if plane.closes)
     planes = own + [plane for plane in shown if plane is not None]
@@ -93,7 +96,7 @@ def set_on_edge(plane: EnclosingPlane, others: Sequence[EnclosingPlane], edges: 
     """A plane that closes the scene, shifted to the edge along which photographs show that it meets one of others at
     right angles; None if they show none."""
     for base in others:
-        if abs(plane.normal @ base.normal) > np.sin(NEARLY):
+        if not at_right_angles(plane.normal, base.normal):
             continue
         meeting, along = meeting_of(plane.as_vector(), base.as_vector())
         ends = base.corners() @ along
