@@ -8,7 +8,7 @@ shading, and whatever is not flat, get none.
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,9 +20,9 @@ from linprim_geo.stereo.common_surfaces import CommonSurfaces
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.enclosing_planes import AGREEING, SURE_SHARE
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
+from linprim_geo.stereo.held_planes import ALIKE_DEPTH, HARDLY_MORE, MOST_BOXES, HeldPlanes
 from linprim_geo.stereo.meeting_lines import is_same, on_meeting_lines
 from linprim_geo.stereo.plain_regions import (
-    RING,
     SAME_ANGLE,
     TOLERANCE,
     in_camera,
@@ -31,7 +31,6 @@ from linprim_geo.stereo.plain_regions import (
     seen_enough,
     to_world,
 )
-from linprim_geo.stereo.right_angles import squared
 from linprim_geo.stereo.shading import (
     BOX,
     LEAST_BOXES,
@@ -44,7 +43,6 @@ from linprim_geo.stereo.shading import (
     depth_deviation,
     evaluate,
     fit_plane,
-    plane_moves,
     shaded_regions,
     starting_planes,
     unexplained,
@@ -53,23 +51,18 @@ from linprim_geo.stereo.vignetting import vignetting
 
 # Views that a region is compared with, at most and at least.
 MOST_VIEWS, LEAST_VIEWS = 8, 3
-# Boxes of a region that are compared: in the first steps from every start, and then.
-FIRST_BOXES, MOST_BOXES, FIRST_STEPS = 200, 800, 6
+# Boxes of a region that are compared in the first steps from every start (then MOST_BOXES), and how many steps.
+FIRST_BOXES, FIRST_STEPS = 200, 6
 # A plane carries a region's shading if no more than this share of its deviation is left, and one of other regions if
 # no more than OTHERS_SHARE and hardly more than the region's own plane leaves: paint that shines makes up as much.
-LEFT_SHARE, OTHERS_SHARE, HARDLY_MORE = 0.2, 0.25, 1.1
+LEFT_SHARE, OTHERS_SHARE = 0.2, 0.25
 # Noise leaves one deviation: where this is left, smoothed, another surface is. Most of a flat region is below: tone
 # curves and vignetting leave more at its ends (DECISIONS 57).
 MOST_LEFT, FLAT_SHARE = 1.3, 0.75
 # A region's own plane is known to this share of its depth, or better; several regions know theirs better together.
 CERTAIN = 2 * CONFIRMED_DEPTH
-# Planes of regions are taken together if they differ by no more than these: what the plane of one alone is off by.
-ALIKE_ANGLE, ALIKE_DEPTH = 4 * SAME_ANGLE, 5 * CONFIRMED_DEPTH
-# Confirmed depths along the edges of regions hold a plane if they are as near as NEAR, and after some steps as
-# TOLERANCE. Half of TOLERANCE is their deviation; as their errors have common causes, they count as so many at most.
-NEAR, NARROWER, HOLDING_STEPS, INDEPENDENT = 2 * TOLERANCE, 0.8, 6, 200
-# Planes at right angles leave so much more of the shading than planes that are free.
-NEARLY_AS_WELL = 1.03
+# Planes of regions are taken together if they differ by no more than this, and by ALIKE_DEPTH.
+ALIKE_ANGLE = 4 * SAME_ANGLE
 # A background is so many times as far as a region's other depths.
 FAR = 1e4
 # A plane carries a region if it does so around half of its boxes.
@@ -126,14 +119,15 @@ class ShadedPlanes:
             self.regions.append([one for one in fitted if one is not None])
         self.planes = self._common([one for own in self.regions for one in own if one.fit is not None])
         carried = self._take_originals(self._all_carriers())
-        planes = self._at_right_angles(self._held(carried), carried, range(self.by_points))
-        standing = self._standing(on_meeting_lines(planes, self.by_points, maps, depths), planes, carried)
+        held = HeldPlanes(self.shadings, self.depths, carried)
+        planes = held.at_right_angles(held.by_depths(self.planes, self.by_points), range(self.by_points))
+        standing = held.still_carrying(on_meeting_lines(planes, self.by_points, maps, depths), planes)
         self.standing = np.isin(np.arange(len(planes)), list(standing))
         self.hanging = np.array([any(is_same(plane, planes[k]) for k in standing) for plane in planes], bool)
         self.hanging[self.by_points :] = False
         for number, plane in standing.items():
             planes[number] = plane
-        self.planes = self._at_right_angles(planes, carried, {*range(self.by_points), *standing})
+        self.planes = held.at_right_angles(planes, {*range(self.by_points), *standing})
 
     def _camera(self, region: ShadedRegion) -> Camera:
         return self.small_cameras[region.view]
@@ -191,7 +185,7 @@ class ShadedPlanes:
                 continue
             fits = (evaluate(plane, [few], self.shadings) for plane in self.planes[self.by_points :])
             if all(fit is None or fit.left_share > HARDLY_MORE * far.left_share for fit in fits):
-                around = binary_dilation(self._inside(region), iterations=BOX)
+                around = binary_dilation(self.shadings[region.view].area_of(region), iterations=BOX)
                 row, column = np.nonzero(around.repeat(shading.factor, 0).repeat(shading.factor, 1))
                 background[row, column] = True
         return background
@@ -327,106 +321,6 @@ class ShadedPlanes:
         one, other = np.concatenate(inverse).T
         return bool(np.median(np.abs(one / other - 1)) < tolerance)
 
-    def _held(self, carried: Sequence[Sequence[ShadedRegion]]) -> np.ndarray:
-        """The planes, each held by the confirmed depths along the edges of those regions whose shading it carries."""
-        held = [self._held_plane(plane, carried[k]) for k, plane in enumerate(self.planes) if k >= self.by_points]
-        return np.concatenate([self.planes[: self.by_points], np.reshape(held, (-1, 4))])
-
-    def _at_right_angles(
-        self, planes: np.ndarray, carried: Sequence[Sequence[ShadedRegion]], staying: Container[int]
-    ) -> np.ndarray:
-        """The planes, turned to right angles with each other where that carries the shading of their regions nearly as
-        well, and then shifted to where most confirmed depths along the edges of these are; but those `staying` stay."""
-        few = [[region.some(MOST_BOXES) for region in regions] for regions in carried]
-        fits = [
-            evaluate(plane, few[k], self.shadings) if few[k] and k not in staying else None
-            for k, plane in enumerate(planes)
-        ]
-        # Planes by edges that carry no shading are no reference.
-        rows = [k for k, fit in enumerate(fits) if k in staying or fit is not None]
-        known = [None if (fit := fits[k]) is None else fit.information for k in rows]
-        turned = planes.copy()
-        turned[rows] = squared(planes[rows], known, lambda row, plane: plane_moves(plane, few[rows[row]]))
-        for k, fit in enumerate(fits):
-            if fit is None or (turned[k] == planes[k]).all():
-                continue
-            for plane in (self._shifted(turned[k], carried[k]), turned[k]):
-                if self._leaves_as_little(plane, few[k], fit):
-                    planes[k] = plane
-                    break
-        return planes
-
-    def _standing(
-        self, moved: dict[int, np.ndarray], planes: np.ndarray, carried: Sequence[Sequence[ShadedRegion]]
-    ) -> dict[int, np.ndarray]:
-        """Those of `moved` planes, by their number, that carry the shading of their regions nearly as well, if any."""
-        result = {}
-        for k, plane in moved.items():
-            few = [region.some(MOST_BOXES) for region in carried[k]]
-            fit = evaluate(planes[k], few, self.shadings) if few else None
-            if fit is None or self._leaves_as_little(plane, few, fit):
-                result[k] = plane
-        return result
-
-    def _leaves_as_little(self, plane: np.ndarray, regions: Sequence[ShadedRegion], fit: Fit) -> bool:
-        """Whether a plane leaves nearly as little of the shading of regions as a fit to them does."""
-        tried = evaluate(plane, regions, self.shadings)
-        return tried is not None and tried.left < NEARLY_AS_WELL * fit.left and tried.boxes > 0.7 * fit.boxes
-
-    def _shifted(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> np.ndarray:
-        """A plane moved along its normal to where most confirmed depths along the edges of regions are."""
-        points, centers = self._points_along(regions)
-        along = (points - centers) @ plane[:3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            off = (points @ plane[:3] - plane[3]) / along
-        near = np.abs(off) < ALIKE_DEPTH
-        if not near.any():
-            return plane
-        return plane + np.append(np.zeros(3), _commonest(off[near]) * np.median(along[near]))
-
-    def _held_plane(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> np.ndarray:
-        """A plane fitted to the shading of regions and to the confirmed depths along their edges that are near it: a
-        wall meets others there, and a floor. The plane as it was where the two contradict each other."""
-        few = [region.some(MOST_BOXES) for region in regions]
-        first = evaluate(plane, few, self.shadings) if few else None
-        if first is None:
-            return plane
-        fit = first
-        points, centers = self._points_along(regions)
-        for k in range(HOLDING_STEPS):
-            normal, moves = fit.plane[:3], plane_moves(fit.plane, few)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                along = (points - centers) @ normal
-                off = (points @ normal - fit.plane[3]) / along
-            near: np.ndarray = np.abs(off) < max(NEAR * NARROWER**k, TOLERANCE)
-            slope = (points[near] @ moves[:, :3].T - moves[:, 3]) / along[near, None]
-            weight = INDEPENDENT / max(INDEPENDENT, int(near.sum())) / (TOLERANCE / 2) ** 2
-            information = fit.information + weight * slope.T @ slope
-            step = np.linalg.pinv(information, hermitian=True) @ (fit.downhill - weight * slope.T @ off[near])
-            moved = fit.plane + step @ moves
-            tried = evaluate(moved / np.linalg.norm(moved[:3]), few, self.shadings)
-            if tried is None or tried.left > HARDLY_MORE * first.left or tried.boxes < 0.7 * first.boxes:
-                return plane
-            fit = tried
-        return fit.plane
-
-    def _points_along(self, regions: Sequence[ShadedRegion]) -> tuple[np.ndarray, np.ndarray]:
-        """(P, 3) points of the world at the confirmed depths along the edges of regions, and (P, 3) the centres of the
-        cameras that see them."""
-        points, centers = [np.zeros((0, 3))], [np.zeros((0, 3))]
-        for region in regions:
-            camera, depth = self._camera(region), self.depths[region.view]
-            around = binary_dilation(self._inside(region), iterations=BOX // 2 + RING)
-            row, column = np.nonzero(around & np.isfinite(depth))
-            points.append(to_world(camera, rays_of(camera, row, column) * depth[row, column, None]))
-            centers.append(np.broadcast_to(camera.center, points[-1].shape))
-        return np.concatenate(points), np.concatenate(centers)
-
-    def _inside(self, region: ShadedRegion) -> np.ndarray:
-        """(H, W) bool where the boxes of a region have their middles."""
-        labels = self.shadings[region.view].labels
-        return labels == labels[region.row[0], region.column[0]]
-
     def depth_maps(self) -> list[np.ndarray]:
         """(H, W) float32 depth of every view's regions, each by one plane where that carries its shading, else NaN.
 
@@ -489,7 +383,7 @@ class ShadedPlanes:
 
     def _number(self, one: FittedRegion, boxes: np.ndarray, number: int) -> np.ndarray:
         """(H, W) the number of a plane around those boxes of a region that it carries, -1 elsewhere."""
-        return np.where(around_boxes(self._inside(one.region), one.region, boxes), number, -1)
+        return np.where(around_boxes(self.shadings[one.region.view].area_of(one.region), one.region, boxes), number, -1)
 
     def _together(self, view: int, numbers: Sequence[np.ndarray]) -> np.ndarray:
         """(H, W) numbers of planes of all regions of a view."""
@@ -510,14 +404,6 @@ def _best_first(carriers: dict[int, np.ndarray], carried: np.ndarray) -> list[in
     most = max((np.count_nonzero(boxes) for boxes in carriers.values()), default=0)
     as_well = [k for k, boxes in carriers.items() if HARDLY_MORE * np.count_nonzero(boxes) >= most]
     return sorted(as_well, key=lambda k: carried[k], reverse=True)
-
-
-def _commonest(off: np.ndarray) -> float:
-    """Where most of (P,) values are within half of TOLERANCE."""
-    places = np.arange(-ALIKE_DEPTH, ALIKE_DEPTH, TOLERANCE / 10)
-    ordered = np.sort(off)
-    count = np.searchsorted(ordered, places + TOLERANCE / 2) - np.searchsorted(ordered, places - TOLERANCE / 2)
-    return float(places[np.argmax(count)])
 
 
 def _plane(one: FittedRegion) -> np.ndarray:

@@ -87,6 +87,10 @@ class Shading:
         """(H, W) the number of the plain area that a pixel is in, from 1, else 0."""
         return label(self.plain)[0]
 
+    def area_of(self, region: ShadedRegion) -> np.ndarray:
+        """(H, W) bool where the boxes of a region have their middles."""
+        return self.labels == self.labels[region.row[0], region.column[0]]
+
     def small(self, image: np.ndarray) -> np.ndarray:
         """Every `factor`-th pixel of an image of the photograph's size."""
         height, width = self.plain.shape

@@ -12,12 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from linprim_geo.stereo.depth_maps import SURE, DepthMap
+from linprim_geo.stereo.held_planes import HARDLY_MORE
 from linprim_geo.stereo.plain_regions import common_planes, in_world, regions_of_views
 from linprim_geo.stereo.point_planes import planes_of_points
 from linprim_geo.stereo.shaded_planes import (
     FAR,
     FIRST_BOXES,
-    HARDLY_MORE,
     LEAST_VIEWS,
     LEFT_SHARE,
     ShadedPlanes,

@@ -1,0 +1,144 @@
+"""Planes of shading, held by what else is known of them: confirmed depths along the edges of their regions, and right
+angles between walls, as far as their shading allows."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Sequence
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+
+from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
+from linprim_geo.stereo.plain_regions import RING, TOLERANCE, rays_of, to_world
+from linprim_geo.stereo.right_angles import squared
+from linprim_geo.stereo.shading import BOX, Fit, ShadedRegion, Shading, evaluate, plane_moves
+
+# Boxes of a region that are compared.
+MOST_BOXES = 800
+# A plane carries shading hardly worse than another one if it leaves no more than so many times as much.
+HARDLY_MORE = 1.1
+# What the plane of one region alone is off by, as a share of its distance.
+ALIKE_DEPTH = 5 * CONFIRMED_DEPTH
+# Confirmed depths along the edges of regions hold a plane if they are as near as NEAR, and after some steps as
+# TOLERANCE. Half of TOLERANCE is their deviation; as their errors have common causes, they count as so many at most.
+NEAR, NARROWER, HOLDING_STEPS, INDEPENDENT = 2 * TOLERANCE, 0.8, 6, 200
+# Planes at right angles leave so much more of the shading than planes that are free.
+NEARLY_AS_WELL = 1.03
+
+
+class HeldPlanes:
+    """How planes are held that carry the shading of regions.
+
+    Args:
+        shadings: of every view.
+        depths: (H, W) confirmed depth of every view as large as its shading, NaN elsewhere.
+        carried: the regions that each plane carries.
+    """
+
+    def __init__(
+        self,
+        shadings: Sequence[Shading],
+        depths: Sequence[np.ndarray],
+        carried: Sequence[Sequence[ShadedRegion]],
+    ):
+        self.shadings, self.depths, self.carried = shadings, depths, carried
+
+    def by_depths(self, planes: np.ndarray, first: int) -> np.ndarray:
+        """The planes, from the `first` on each held by the confirmed depths along the edges of its regions."""
+        held = [self._held_plane(plane, self.carried[k]) for k, plane in enumerate(planes) if k >= first]
+        return np.concatenate([planes[:first], np.reshape(held, (-1, 4))])
+
+    def at_right_angles(self, planes: np.ndarray, staying: Container[int]) -> np.ndarray:
+        """The planes, turned to right angles with each other where that carries the shading of their regions nearly as
+        well, and then shifted to where most confirmed depths along the edges of these are; but those `staying` stay."""
+        few = [[region.some(MOST_BOXES) for region in regions] for regions in self.carried]
+        fits = [
+            evaluate(plane, few[k], self.shadings) if few[k] and k not in staying else None
+            for k, plane in enumerate(planes)
+        ]
+        # Planes by edges that carry no shading are no reference.
+        rows = [k for k, fit in enumerate(fits) if k in staying or fit is not None]
+        known = [None if (fit := fits[k]) is None else fit.information for k in rows]
+        turned = planes.copy()
+        turned[rows] = squared(planes[rows], known, lambda row, plane: plane_moves(plane, few[rows[row]]))
+        for k, fit in enumerate(fits):
+            if fit is None or (turned[k] == planes[k]).all():
+                continue
+            for plane in (self._shifted(turned[k], self.carried[k]), turned[k]):
+                if self._leaves_as_little(plane, few[k], fit):
+                    planes[k] = plane
+                    break
+        return planes
+
+    def still_carrying(self, moved: dict[int, np.ndarray], planes: np.ndarray) -> dict[int, np.ndarray]:
+        """Those of `moved` planes, by their number, that carry the shading of their regions nearly as well as the
+        planes that they were do, or have no regions."""
+        result = {}
+        for k, plane in moved.items():
+            few = [region.some(MOST_BOXES) for region in self.carried[k]]
+            fit = evaluate(planes[k], few, self.shadings) if few else None
+            if fit is None or self._leaves_as_little(plane, few, fit):
+                result[k] = plane
+        return result
+
+    def _leaves_as_little(self, plane: np.ndarray, regions: Sequence[ShadedRegion], fit: Fit) -> bool:
+        """Whether a plane leaves nearly as little of the shading of regions as a fit to them does."""
+        tried = evaluate(plane, regions, self.shadings)
+        return tried is not None and tried.left < NEARLY_AS_WELL * fit.left and tried.boxes > 0.7 * fit.boxes
+
+    def _shifted(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> np.ndarray:
+        """A plane moved along its normal to where most confirmed depths along the edges of regions are."""
+        points, centers = self._points_along(regions)
+        along = (points - centers) @ plane[:3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            off = (points @ plane[:3] - plane[3]) / along
+        near = np.abs(off) < ALIKE_DEPTH
+        if not near.any():
+            return plane
+        return plane + np.append(np.zeros(3), _commonest(off[near]) * np.median(along[near]))
+
+    def _held_plane(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> np.ndarray:
+        """A plane fitted to the shading of regions and to the confirmed depths along their edges that are near it: a
+        wall meets others there, and a floor. The plane as it was where the two contradict each other."""
+        few = [region.some(MOST_BOXES) for region in regions]
+        first = evaluate(plane, few, self.shadings) if few else None
+        if first is None:
+            return plane
+        fit = first
+        points, centers = self._points_along(regions)
+        for k in range(HOLDING_STEPS):
+            normal, moves = fit.plane[:3], plane_moves(fit.plane, few)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                along = (points - centers) @ normal
+                off = (points @ normal - fit.plane[3]) / along
+            near: np.ndarray = np.abs(off) < max(NEAR * NARROWER**k, TOLERANCE)
+            slope = (points[near] @ moves[:, :3].T - moves[:, 3]) / along[near, None]
+            weight = INDEPENDENT / max(INDEPENDENT, int(near.sum())) / (TOLERANCE / 2) ** 2
+            information = fit.information + weight * slope.T @ slope
+            step = np.linalg.pinv(information, hermitian=True) @ (fit.downhill - weight * slope.T @ off[near])
+            moved = fit.plane + step @ moves
+            tried = evaluate(moved / np.linalg.norm(moved[:3]), few, self.shadings)
+            if tried is None or tried.left > HARDLY_MORE * first.left or tried.boxes < 0.7 * first.boxes:
+                return plane
+            fit = tried
+        return fit.plane
+
+    def _points_along(self, regions: Sequence[ShadedRegion]) -> tuple[np.ndarray, np.ndarray]:
+        """(P, 3) points of the world at the confirmed depths along the edges of regions, and (P, 3) the centres of the
+        cameras that see them."""
+        points, centers = [np.zeros((0, 3))], [np.zeros((0, 3))]
+        for region in regions:
+            camera, depth = self.shadings[region.view].camera, self.depths[region.view]
+            around = binary_dilation(self.shadings[region.view].area_of(region), iterations=BOX // 2 + RING)
+            row, column = np.nonzero(around & np.isfinite(depth))
+            points.append(to_world(camera, rays_of(camera, row, column) * depth[row, column, None]))
+            centers.append(np.broadcast_to(camera.center, points[-1].shape))
+        return np.concatenate(points), np.concatenate(centers)
+
+
+def _commonest(off: np.ndarray) -> float:
+    """Where most of (P,) values are within half of TOLERANCE."""
+    places = np.arange(-ALIKE_DEPTH, ALIKE_DEPTH, TOLERANCE / 10)
+    ordered = np.sort(off)
+    count = np.searchsorted(ordered, places + TOLERANCE / 2) - np.searchsorted(ordered, places - TOLERANCE / 2)
+    return float(places[np.argmax(count)])
