@@ -10,13 +10,13 @@ from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Stages
 from linprim_geo.geometry.mesh import Mesh, select_faces
 from linprim_geo.geometry.mesh_files import save_mesh
-from linprim_geo.geometry.mesh_process import process_mesh
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.creases import sharpened
 from linprim_geo.surface.denoise import denoised
 from linprim_geo.surface.depth_error import error_of_nearest
 from linprim_geo.surface.fairing import faired
+from linprim_geo.surface.mesh_process import process_mesh
 from linprim_geo.surface.photo_consistency import photo_gains, predicted_error, refine_surface
 from linprim_geo.surface.safe_moves import moved_safely
 from linprim_geo.surface.shaded_views import save_shaded, shaded_row

@@ -8,7 +8,7 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.mesh import Mesh, face_normals, validate_mesh
-from linprim_geo.geometry.mesh_process import paired_edges
+from linprim_geo.surface.mesh_process import paired_edges
 
 if TYPE_CHECKING:
     pass
