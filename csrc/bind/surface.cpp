@@ -23,6 +23,7 @@
 #include "surface/point_colors.h"
 #include "surface/points_within.h"
 #include "surface/segment_depth.h"
+#include "surface/simplify.h"
 
 namespace {
 
@@ -242,5 +243,23 @@ void bind_surface(nb::module_& m) {
     }
     return std::tuple(owned(std::move(found.end)), owned(std::move(found.plane)), owned(std::move(found.crosses)),
                       owned(std::move(found.length)));
+  });
+  // (3 V,) vertices, (3 F,) corners.
+  m.def("simplify", [](In<int64_t> corner, In<double> vertex, In<double> tolerance) {
+    const int64_t vertices = int64_t(vertex.shape(0)), faces = int64_t(corner.shape(0));
+    const int64_t* corners = checked(corner, {faces, 3}, "corner");
+    const double* at = checked(vertex, {vertices, 3}, "vertex");
+    const double* most = checked(tolerance, {vertices}, "tolerance");
+    if (std::any_of(corners, corners + 3 * faces, [&](int64_t row) { return row < 0 || row >= vertices; }))
+      throw std::invalid_argument("corners are outside of the vertices");
+    if (std::max(vertices, faces) > INT32_MAX) throw std::invalid_argument("more than 2^31 faces");
+    if (!std::all_of(most, most + vertices, [](double value) { return value > 0; }))
+      throw std::invalid_argument("tolerance has to be positive");
+    linprim::Triangles found;
+    {
+      nb::gil_scoped_release release;
+      found = linprim::simplify(vertices, faces, at, corners, most);
+    }
+    return std::tuple(owned(std::move(found.vertex)), owned(std::move(found.corner)));
   });
 }

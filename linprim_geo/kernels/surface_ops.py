@@ -137,3 +137,21 @@ def crease_edges(corner, vertex, rules) -> tuple[np.ndarray, np.ndarray, np.ndar
     """
     end, plane, crosses, length = _core.crease_edges(corner, vertex, rules)
     return end.reshape(-1, 2), plane.reshape(-1, 2, 4), crosses.astype(bool), length
+
+
+def simplify(corner, vertex, tolerance) -> tuple[np.ndarray, np.ndarray]:
+    """Fewer faces that pass every vertex of a mesh within its tolerance; borders stay within it of where they were.
+
+    Edges are collapsed by quadric error, as long as what is gone stays near enough; the topology stays. Source: Garland
+    and Heckbert 1997, Hoppe 1996.
+
+    Args:
+        corner: (M, 3) int64 faces.
+        vertex: (V, 3) float64.
+        tolerance: (V,) float64, positive.
+
+    Returns:
+        (W, 3) float64 vertices, (F, 3) int64 faces.
+    """
+    vertices, faces = _core.simplify(corner, vertex, tolerance)
+    return vertices.reshape(-1, 3), faces.reshape(-1, 3)
