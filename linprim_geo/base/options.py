@@ -414,6 +414,14 @@ class ExtractOptions:
     remesh: float = option(
         0.0, "even triangles with edges of this length, in the data set's unit; 0 keeps them", low=0, metavar="LENGTH"
     )
+    tolerance: float | str = option(
+        0.0,
+        "simplify, so that flat parts have few faces, as far as no vertex of the surface is farther from what is left, "
+        "in the data set's unit; auto: than half of its predicted error; 0 keeps all faces",
+        low=0,
+        metavar="LENGTH",
+        number_or="auto",
+    )
     target_faces: int = option(0, "simplify to N faces; 0 keeps all", low=0, high=10**9)
     texture: int = option(
         0,

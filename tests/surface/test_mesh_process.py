@@ -17,7 +17,7 @@ from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.geometry.topology import manifold_status, topology
 from linprim_geo.surface import mesh_process
 from linprim_geo.surface.extract import extract_mesh
-from linprim_geo.surface.mesh_process import close_holes, process_mesh, remesh, simplify, smooth
+from linprim_geo.surface.mesh_process import close_holes, process_mesh, remesh, simplify, smooth, within_tolerance
 
 STEPS = (
     lambda mesh: simplify(mesh, 200),
@@ -26,6 +26,7 @@ STEPS = (
     lambda mesh: close_holes(mesh, 20),
 )
 NAMES = ("simplify", "smooth", "remesh", "close_holes")
+ALL_STEPS = (*STEPS, lambda mesh: within_tolerance(mesh, 0.01))
 
 
 def painted(mesh):
@@ -156,13 +157,14 @@ def test_remeshed_triangles_are_even():
 
 def test_the_steps_are_reported_in_their_order(capsys):
     mesh, lines = painted(punctured(sphere(rounds=4), 300)), []
-    options = ExtractOptions(close_holes=10, smooth=3, remesh=0.2, target_faces=300)
+    options = ExtractOptions(close_holes=10, smooth=3, remesh=0.1, tolerance=0.002, target_faces=300)
     done, steps = process_mesh(mesh, options, lines.append)
-    assert [step["step"] for step in steps] == ["close_holes", "smooth", "remesh", "simplify"] and len(lines) == 4
+    names = ["close_holes", "smooth", "remesh", "simplify", "simplify"]
+    assert [step["step"] for step in steps] == names and len(lines) == len(names) and steps[3]["tolerance"] == 0.002
     assert steps[0]["faces_before"] == len(mesh.faces) and steps[-1]["faces_after"] == len(done.faces) == 300
     for one, other in zip(steps, steps[1:], strict=False):
         assert one["faces_after"] == other["faces_before"]
-    assert [step["topology_kept"] for step in steps] == [False, True, True, True]
+    assert [step["topology_kept"] for step in steps] == [False, True, True, True, True]
     assert all(step["watertight"] for step in steps) and topology(done)["genus"] == 0
     assert process_mesh(mesh, ExtractOptions()) == (mesh, [])
 
@@ -195,7 +197,7 @@ def test_a_closed_mesh_that_pymeshlab_opens_is_simplified_by_libigl(monkeypatch)
     assert simplify(mesh, 400) is mesh
 
 
-@pytest.mark.parametrize("step", STEPS, ids=NAMES)
+@pytest.mark.parametrize("step", ALL_STEPS, ids=(*NAMES, "within_tolerance"))
 def test_meshes_that_cannot_be_used_are_one_sentence(step):
     good = sphere(rounds=2)
     broken = good.vertices.copy()
@@ -220,6 +222,9 @@ def test_meshes_that_cannot_be_used_are_one_sentence(step):
         (lambda m: remesh(m, 9.0), "--remesh is 9"),
         (lambda m: remesh(m, 1e-5), "--remesh is 1e-05.*0.0012 or more"),
         (lambda m: remesh(m, float("nan")), "--remesh is nan"),
+        (lambda m: within_tolerance(m, 0.0), "--tolerance is 0.0"),
+        (lambda m: within_tolerance(m, float("nan")), "--tolerance is nan"),
+        (lambda m: within_tolerance(m, "auto"), "--tolerance is auto, but the mesh has no predicted errors"),
     ],
 )
 def test_parameters_that_cannot_be_used_are_one_sentence(call, match):
@@ -232,7 +237,7 @@ def test_edges_of_three_faces_and_faces_without_area_do_no_harm():
         [[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, -1, 0], [0, 0, 0.5]],
         [[0, 1, 2], [0, 1, 3], [0, 1, 4], [0, 5, 1]],
     )
-    for step in STEPS:
+    for step in ALL_STEPS:
         assert len(step(fan).faces) and np.isfinite(step(fan).vertices).all()
 
 
