@@ -35,6 +35,9 @@ from linprim_geo.stereo.right_angles import at_right_angles
 OUTLIERS = 0.01
 # A point is behind a plane by more than this share of its distance: twice what depths may be off by.
 MARGIN = 2 * CONFIRMED_DEPTH
+# Nothing is known through a wall but for a share of what is known in its direction: more than OUTLIERS, as a plain wall
+# has few points of its own. What is known in its direction counts for so many points at least.
+SEEN_THROUGH, LEAST_AIMED = 0.05, 100
 # So few of the points on a plane lie beyond its ends, and ends are known to this share of the distance between them.
 BEYOND, END_MARGIN = 0.002, 0.02
 # A plane whose points reach along this share of the scene one way bounds it, and may go on the other way. The front of
@@ -59,7 +62,8 @@ class EnclosingPlane:
     """A plane normal . x = offset, with (3,) `normal` towards the cameras.
 
     `axes` (2, 3) are unit vectors in it; `own` (2, 2) the least and greatest coordinates along them of its own known
-    points, and `whole` of all known points if its own reach as far along one of the axes, else the same.
+    points, and `whole` of all known points if its own reach as far along one of the axes, else the same. One that
+    `closes` the scene has no points. An `inner` one, of a room that is not convex, is nothing beyond its own rectangle.
     """
 
     normal: np.ndarray
@@ -68,6 +72,7 @@ class EnclosingPlane:
     own: np.ndarray
     whole: np.ndarray
     closes: bool = False
+    inner: bool = False
 
     def as_vector(self) -> np.ndarray:
         """(4,) normal and offset."""
@@ -151,6 +156,20 @@ class KnownPoints:
         behind = self.height(plane) < -MARGIN * self.distance
         return behind.mean() < OUTLIERS and bool((self.centers @ plane[:3] > plane[3]).all())
 
+    def is_passed(self, wall: EnclosingPlane) -> bool:
+        """Whether more than SEEN_THROUGH of the known points in the direction of a wall's own rectangle, but for a
+        margin, are behind it."""
+        center, towards = self.points.center, self.points.position - self.points.center
+        along = towards @ wall.normal
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = (wall.offset - center @ wall.normal) / along
+        aimed = np.isfinite(share) & (share > 0)
+        margin = self.margin_at(wall.at(wall.own.mean(0)))
+        ends = wall.own + np.array([[margin], [-margin]])
+        aimed[aimed] = wall.within(center[aimed] + share[aimed, None] * towards[aimed], ends)
+        passing = np.count_nonzero(share[aimed] < 1 - MARGIN)
+        return bool(passing > SEEN_THROUGH * max(LEAST_AIMED, int(aimed.sum())))
+
     def height(self, plane: np.ndarray) -> np.ndarray:
         """(P,) how far points are before a plane."""
         return self.points.position @ plane[:3] - plane[3]
@@ -180,8 +199,12 @@ class KnownPoints:
 
     def are_on(self, places: np.ndarray, plane: EnclosingPlane) -> bool:
         """Whether (P, 3) places are on a plane, for a camera as far from them as the one in the middle by that."""
-        near = MARGIN * float(np.median(np.linalg.norm(self.centers - places.mean(0), axis=1)))
+        near = self.margin_at(places.mean(0))
         return bool((np.abs(places @ plane.normal - plane.offset) < near).all())
+
+    def margin_at(self, place: np.ndarray) -> float:
+        """MARGIN of what is at a place (3,), for a camera as far from it as the one in the middle by that."""
+        return MARGIN * float(np.median(np.linalg.norm(self.centers - place, axis=1)))
 
     def closing(self, found: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Planes at right angles to two of those `found` where both end, on sides where there is none."""
@@ -299,6 +322,11 @@ def _first_met(
     meets none, and (N,) bool whether that is within the rectangle of its own points, and within that of all."""
     planes = np.array([plane.as_vector() for plane in enclosing])
     inverse = rays @ in_camera(camera, planes).T
+    for number, plane in enumerate(enclosing):
+        if plane.inner:
+            rows = np.flatnonzero(inverse[:, number] > 0)
+            places = to_world(camera, rays[rows] / inverse[rows, number, None])
+            inverse[rows[~plane.within(places, plane.own)], number] = 0
     first, nearest = inverse.argmax(1), inverse.max(1)
     own, whole = np.zeros(len(rays), bool), np.zeros(len(rays), bool)
     for number, plane in enumerate(enclosing):

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.edge_images import BLUR, BY_CHANCE, SHOWN, EdgeImages, by_chance
 from linprim_geo.stereo.enclosing_planes import CELLS, FILLED, MARGIN, EnclosingPlane, KnownPoints
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
+from linprim_geo.stereo.floor_sides import FloorSide, inner_sides, outer_sides
 from linprim_geo.stereo.meeting_lines import clearest_line, meeting_of
 from linprim_geo.stereo.plain_regions import SAME_ANGLE, seen_enough
 from linprim_geo.stereo.point_planes import SurfacePoints
@@ -62,10 +62,11 @@ def with_corner_walls(
 ) -> list[EnclosingPlane]:
     """The `enclosing` planes, and walls without one that rise from those of these planes that are floors.
 
-    A wall has an edge at either end, or one and another along the floor, or one at which it meets such a wall or one
-    that is known. It is as high as its edges and goes from one to the other, or to the end of its floor. The floor is
-    known along half of it at least and ends there. A known wall on which all of it lies goes on as far. Of planes that
-    close the scene those are left that meet another one along an edge, and stand there.
+    They rise on the sides of a floor's rectangle, and where the floor ends within it, as that of a room does that is
+    not convex. A wall has an edge at either end, or one and another along the floor, or one at which it meets such a
+    wall or one that is known. It is as high as its edges and goes from one to the other, or to the end of its floor.
+    The floor is known along half of it at least and ends there. A known wall on which all of it lies goes on as far. Of
+    planes that close the scene those are left that meet another one along an edge, and stand there.
 
     Args:
         known: (H, W) depth of every view, NaN where nothing is known.
@@ -107,34 +108,52 @@ def set_on_edge(plane: EnclosingPlane, others: Sequence[EnclosingPlane], edges: 
     return None
 
 
+@dataclass(frozen=True)
+class _Rising:
+    """A wall that may rise on a side of a floor, which of the known ones it is, the (2,) places of its corners, and
+    whether photographs show enough of it by itself."""
+
+    wall: EnclosingPlane
+    same: int | None
+    corners: list[np.ndarray]
+    sure: bool
+
+    def meets(self, places: Sequence[np.ndarray], near: float) -> bool:
+        return any(np.linalg.norm(own - other) < near for own in self.corners for other in places)
+
+
 def _walls_on(
     floor: EnclosingPlane, others: Sequence[EnclosingPlane], edges: EdgeImages, seen: KnownPoints
 ) -> list[tuple[EnclosingPlane, int | None]]:
-    """Walls on the four sides of the rectangle that holds a floor's own points, and which of the `others` each is."""
+    """Walls on the sides of the rectangle that holds a floor's own points, and where it ends within, and which of the
+    `others` each is."""
     lowest = LOWEST * float(np.median(seen.centers @ floor.normal - floor.offset))
-    corners = [[find_corner(floor, np.array([x, y]), lowest, edges) for y in floor.own[:, 1]] for x in floor.own[:, 0]]
     on_floor = seen.points.on(floor.as_vector()[None], CONFIRMED_DEPTH)[:, 0]
     places, margin = seen.points.position[on_floor] @ floor.axes.T, MARGIN * seen.distance[on_floor]
-    found: dict[tuple[int, int], tuple[EnclosingPlane, int | None]] = {}
-    meeting: dict[tuple[int, int], set[tuple[int, int]]] = {}
-    sure: set[tuple[int, int]] = set()
-    for axis, end in product((0, 1), (0, 1)):
-        ends = corners[end] if axis == 0 else [row[end] for row in corners]
-        line = _line(floor, 1 - axis, ends, edges)
+    near = REACH * _longer_side(floor)
+    corner_at: dict[tuple[float, ...], Corner | None] = {}
+    found, at_sure = list[_Rising](), list[np.ndarray]()
+    for side in [*outer_sides(floor.own), *inner_sides(floor.own, places)]:
+        for end in (side.low, side.high):
+            if tuple(end) not in corner_at:
+                corner_at[tuple(end)] = find_corner(floor, end, lowest, edges)
+        ends = [corner_at[tuple(end)] for end in (side.low, side.high)]
+        line = _line(floor, side, ends, edges)
         if line is None:
             continue
-        inward = floor.axes[axis] if end == 0 else -floor.axes[axis]
-        wall = _wall(floor, line, inward, max(corner.height for corner in ends if corner))
+        inward = floor.axes[side.across] if side.end == 0 else -floor.axes[side.across]
+        wall = _wall(floor, line, inward, max(corner.height for corner in ends if corner), side.inner)
         same = seen.which_is_there(wall, others)
+        corners = [corner.place for corner in ends if corner]
         if same is not None:
-            sure.add((axis, end))
-        if _ends_at(line, inward @ floor.axes.T, places, margin, REACH * _longer_side(floor)):
-            if same is not None or seen.is_before_all(wall.as_vector()):
-                found[axis, end] = wall, same
-                meeting[axis, end] = {(1 - axis, k) for k in (0, 1) if ends[k]}
-                if all(ends) or _is_shown(wall, floor, line, edges):
-                    sure.add((axis, end))
-    return [wall for side, wall in found.items() if side in sure or sure & meeting[side]]
+            at_sure += corners
+        if not _ends_at(line, inward @ floor.axes.T, places, margin, near):
+            continue
+        if same is not None or (not seen.is_passed(wall) if side.inner else seen.is_before_all(wall.as_vector())):
+            sure = same is not None or all(ends) or _is_shown(wall, floor, line, edges)
+            at_sure += corners if sure else []
+            found.append(_Rising(wall, same, corners, sure))
+    return [(each.wall, each.same) for each in found if each.sure or each.meets(at_sure, near)]
 
 
 def find_corner(floor: EnclosingPlane, near: np.ndarray, lowest: float, edges: EdgeImages) -> Corner | None:
@@ -171,14 +190,14 @@ def _grid(reach: float, apart: float) -> np.ndarray:
 
 
 def _line(
-    floor: EnclosingPlane, axis: int, ends: Sequence[Corner | None], edges: EdgeImages
+    floor: EnclosingPlane, side: FloorSide, ends: Sequence[Corner | None], edges: EdgeImages
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """(2,) ends of the wall along an axis of a floor, at the corners that are given for its lower and its upper end, or
-    where the floor ends; None without corners.
+    """(2,) ends of the wall on a side of a floor, at the corners that are given for its lower and its upper end, or
+    where the side ends; None without corners.
 
     From one corner alone it has the direction in which photographs show the strongest edge.
     """
-    low, high = ends
+    (low, high), axis = ends, 1 - side.across
     if low and high:
         run = high.place - low.place
         along_axis = run[axis] > np.cos(2 * SAME_ANGLE) * np.linalg.norm(run)
@@ -188,7 +207,7 @@ def _line(
         return None
     angles = np.linspace(-SAME_ANGLE, SAME_ANGLE, DIRECTIONS)
     runs = np.zeros((DIRECTIONS, 2))
-    runs[:, axis] = floor.own[1 if low else 0, axis] - corner.place[axis]
+    runs[:, axis] = (side.high if low else side.low)[axis] - corner.place[axis]
     runs[:, 1 - axis] = runs[:, axis] * np.tan(angles)
     starts = np.broadcast_to(floor.at(corner.place), (DIRECTIONS, 3))
     best = edges.strongest(starts, runs @ floor.axes, STEPS)
@@ -215,7 +234,7 @@ def _ends_at(
 
 
 def _wall(
-    floor: EnclosingPlane, line: tuple[np.ndarray, np.ndarray], inward: np.ndarray, height: float
+    floor: EnclosingPlane, line: tuple[np.ndarray, np.ndarray], inward: np.ndarray, height: float, inner: bool
 ) -> EnclosingPlane:
     """The wall over a line on a floor, seen from the side where `inward` (3,) points."""
     start, end = (floor.at(place) for place in line)
@@ -223,7 +242,8 @@ def _wall(
     normal = np.cross(direction, floor.normal)
     normal = normal if normal @ inward > 0 else -normal
     ends = np.array([[start @ direction, floor.offset], [end @ direction, floor.offset + height]])
-    return EnclosingPlane(normal, float(normal @ start), np.stack([direction, floor.normal]), ends, ends)
+    axes = np.stack([direction, floor.normal])
+    return EnclosingPlane(normal, float(normal @ start), axes, ends, ends, inner=inner)
 
 
 def _is_shown(
