@@ -107,7 +107,7 @@ double squared_distance_to_triangle(const Vector& p, const std::array<Vector, 3>
   return least;
 }
 
-// Sine of the least angle of a triangle without obtuse slivers: twice the area by the two longest edges.
+// Sine of the least angle of a triangle, which is that between its two longest edges.
 double least_sine(const std::array<Vector, 3>& t) {
   double length[3];
   for (int k = 0; k < 3; ++k) length[k] = std::sqrt(squared(minus(t[(k + 1) % 3], t[k])));

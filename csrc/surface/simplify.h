@@ -18,8 +18,7 @@ namespace linprim {
 // turned by less than 60 degrees in one step, and angles below 10 degrees do not become smaller. Around edges of more
 // than two faces, and where fans of faces touch in a vertex alone, everything stays.
 //
-// `corner` (faces, 3) are rows of `vertex` (vertices, 3), `tolerance` (vertices) is positive. One thread; the same on
-// every machine.
+// `corner` (faces, 3) are rows of `vertex` (vertices, 3), `tolerance` (vertices) is positive. One thread.
 Triangles simplify(int64_t vertices, int64_t faces, const double* vertex, const int64_t* corner,
                    const double* tolerance);
 

@@ -108,7 +108,7 @@ def within_tolerance(mesh: Mesh, tolerance: float | str) -> Mesh:
 
     Flat parts lose most of their faces, curved ones as many as the tolerance allows. The topology stays, and borders
     keep within the tolerance, too. Colours and quality are those of the nearest points of the old surface. Memory: some
-    600 bytes per vertex. The same to the last bit everywhere.
+    600 bytes per vertex. The same to the last bit every time.
 
     Raises:
         LinprimError: an empty mesh, coordinates that are not finite, a tolerance that is not positive, or `auto` of a
