@@ -18,6 +18,8 @@ from linprim_geo.surface.visibility import render_preview
 VIEWS, PIXELS = 3, 480
 # Of the surface, of 255, where it faces the light.
 GREY = 205
+# Cameras that are nearer to each other than this share of their coordinates are in one place, but for rounding.
+ROUNDING = 1e-9
 
 
 def shaded_file(target: Path) -> Path:
@@ -50,7 +52,9 @@ def most_different(cameras: Sequence[Camera]) -> list[int]:
     centers = np.array([camera.center for camera in cameras])
     spread = float(np.sqrt(centers.var(axis=0).sum()))
     looks = np.array([camera.rotation[2] for camera in cameras])  # the world's direction of the optical axis
-    places = np.concatenate([centers / spread if spread > 0 else 0 * centers, looks], axis=1)
+    if spread <= ROUNDING * np.abs(centers).max(initial=0):  # all in one place
+        centers, spread = 0 * centers, 1.0
+    places = np.concatenate([centers / spread, looks], axis=1)
     chosen = [int(np.argmin(np.linalg.norm(places - places.mean(axis=0), axis=1)))]
     while len(chosen) < min(VIEWS, len(cameras)):
         nearest = np.linalg.norm(places[:, None] - places[chosen], axis=2).min(axis=1)

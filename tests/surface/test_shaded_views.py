@@ -57,3 +57,7 @@ def test_the_most_different_cameras_are_so_by_place_and_by_look():
     assert most_different(line) == [2, 4, 0]
     turned = [facing(0.0, tilt) for tilt in (0.0, 0.1, 1.0, -0.9)]
     assert sorted(most_different(turned)[1:]) == [2, 3]
+    # What rounding leaves between cameras in one place says nothing.
+    for k, camera in enumerate(turned):
+        camera.world_to_camera[0, 3] += 1e-15 * (-1) ** k
+    assert sorted(most_different(turned)[1:]) == [2, 3]
