@@ -110,10 +110,11 @@ def error_at_stereo(run: Run) -> float:
     return float(np.mean(errors))
 
 
-def test_a_training_is_held_to_them(room, held, tmp_path):
-    free = trained(room, tmp_path / "free", stereo_depth=0.0)
+def test_a_training_is_held_to_them(room, tmp_path):
+    held = trained(room, tmp_path / "held", iterations=400)
+    free = trained(room, tmp_path / "free", iterations=400, stereo_depth=0.0)
     assert held.train_options.stereo_depth == 1 and free.train_options.stereo_depth == 0
-    # 0.42 to 0.55 of it in trainings of four seeds.
+    # 0.54 of it; 0.72 to 0.78 in 200 steps of three seeds.
     assert error_at_stereo(held) < 0.75 * error_at_stereo(free)
 
 
