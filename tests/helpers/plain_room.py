@@ -43,10 +43,15 @@ def seen(camera: Camera, planes: np.ndarray = PLANES) -> tuple[np.ndarray, np.nd
 
 
 def photographs(of: list[Camera], greys=GREYS, planes: np.ndarray = PLANES, seed: int = 0) -> list[DepthMap]:
+    return noisy_maps(of, [np.array(greys)[seen(camera, planes)[1]] for camera in of], seed)
+
+
+def noisy_maps(of: list[Camera], images: list[np.ndarray], seed: int) -> list[DepthMap]:
+    """Photographs with noise of images (H, W) of greys, without depths."""
     maps = []
-    for number, camera in enumerate(of):
-        noise = np.random.default_rng([seed, number]).normal(0, NOISE, (camera.height, camera.width))
-        grey = np.clip(np.array(greys)[seen(camera, planes)[1]] + noise, 0, 255).astype(np.uint8)
+    for number, (camera, image) in enumerate(zip(of, images, strict=True)):
+        noise = np.random.default_rng([seed, number]).normal(0, NOISE, image.shape)
+        grey = np.clip(image + noise, 0, 255).astype(np.uint8)
         unknown = np.full(grey.shape, np.nan, np.float32)
         normal = np.zeros((*grey.shape, 3), np.float32)
         maps.append(DepthMap(camera, unknown, normal, unknown, grey, unknown, grey, NOISE**2))

@@ -69,7 +69,7 @@ def test_what_stands_at_a_side_has_one_towards_the_floor():
 
 
 def test_narrow_and_shallow_places_are_none():
-    assert inner_sides(ENDS, floor((-1.0, 0.5, -0.2, 5.0))[:, :]) == []  # less than the rows that are asked for
+    assert inner_sides(ENDS, floor((-1.0, 0.5, -0.2, 5.0))) == []  # two and a half cells from the end
     assert inner_sides(ENDS, floor((0.8, 0.5, 3.2, 0.95))) == []  # 1.5 cells deep
     assert inner_sides(ENDS, floor((0.8, 0.5, 1.5, 1.7))) == []  # two cells wide
 

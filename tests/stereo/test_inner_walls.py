@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.captures import look_at
-from helpers.plain_room import NOISE, SIZE, no_background, points_of
+from helpers.plain_room import SIZE, no_background, noisy_maps, points_of
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.enclosing_planes import EnclosingPlane, KnownPoints, enclosing_depths
-from linprim_geo.stereo.plain_regions import to_world
 from linprim_geo.stereo.point_planes import SurfacePoints
 from linprim_geo.stereo.room_corners import with_corner_walls
 
@@ -60,13 +59,7 @@ def seen(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def photographs(of: list[Camera], seed: int = 0) -> list[DepthMap]:
-    maps = []
-    for number, camera in enumerate(of):
-        noise = np.random.default_rng([seed, number]).normal(0, NOISE, (camera.height, camera.width))
-        grey = np.clip(seen(camera)[1] + noise, 0, 255).astype(np.uint8)
-        unknown = np.full(grey.shape, np.nan, np.float32)
-        maps.append(DepthMap(camera, unknown, np.zeros((*grey.shape, 3), np.float32), unknown, grey, unknown, grey, 16))
-    return maps
+    return noisy_maps(of, [seen(camera)[1] for camera in of], seed)
 
 
 def floors(of: list[Camera]) -> list[np.ndarray]:
@@ -137,17 +130,17 @@ def test_what_is_known_behind_a_wall_refutes_it():
     assert room.is_passed(replace(wall, own=into_the_other_arm))
 
 
-def test_a_front_of_something_low_is_no_inner_wall():
-    """Photographs show an edge along the floor, but walls are seen past what stands there."""
+@pytest.mark.parametrize("behind", [1.0, 1.1])
+def test_a_front_that_views_see_past_is_no_inner_wall(behind):
+    """Photographs show its edges, but in place of the wall at x = 2 what is behind it is known."""
     of = cameras()
-    known = [np.where(grey != GREYS[0, 0.0], depth, np.nan) for depth, grey in map(seen, of)]
+    known = floors(of)
     up = np.broadcast_to([0.0, 0, 1], (SIZE[1], SIZE[0], 3))
     parts = []
-    for view, (camera, depth) in enumerate(zip(of, known, strict=True)):
-        place = to_world(camera, camera.ray_grid().reshape(-1, 3) * depth.reshape(-1, 1)).reshape(*depth.shape, 3)
-        # Of the floor nothing is known beside the wall at x = 0.
-        depth = np.where((place[..., 2] < 0.01) & (place[..., 0] < 0.9), np.nan, depth)
+    for view, (camera, floor) in enumerate(zip(of, known, strict=True)):
+        depth, grey = seen(camera)
+        depth = np.where(grey == GREYS[0, 2.0], behind * depth, floor)
         parts.append(SurfacePoints.of_view(view, camera, depth, up, 3000, np.random.default_rng(view)))
     walls = with_corner_walls(photographs(of), known, no_background(of), [FLOOR], SurfacePoints.together(parts))
 
-    assert not [wall for wall in walls if wall.inner and abs(wall.normal[0]) > 0.5 and wall.normal[0] > 0]
+    assert ((1, 0) in inner_walls(walls)) == (behind == 1)
