@@ -58,8 +58,9 @@ def finish_surface(
     before and after, to `shaded_views.shaded_file(target)`.
 
     Colours are those of photographs without the gains by which their brightness differs (`photo_gains`). By a `quality`
-    that it has, noise is smoothed away, and it is kept; else by that of photographs
-    (`predicted_error`). With `creases`, denoising also puts these where flat parts meet, as voxels cut them off."""
+    that it has, noise is smoothed away, and it is kept; else by that of photographs (`predicted_error`), which a
+    tolerance `auto` asks for, too. With `creases`, denoising also puts these where flat parts meet, as voxels cut them
+    off."""
     given = mesh
     views = run.scene().train
     cameras = [view.camera for view in views]
@@ -74,6 +75,9 @@ def finish_surface(
         mesh = denoised(mesh, views, gains) if mesh.quality is None else moved_safely(mesh, faired(mesh).vertices)
         mesh = sharpened(mesh) if creases else mesh
         stages.lap("denoise")
+    if options.tolerance == "auto" and mesh.quality is None:
+        mesh = replace(mesh, quality=predicted_error(mesh, cameras, (view.load() for view in views), gains))
+        stages.lap("quality")
     mesh, processing = process_mesh(mesh, options, stages.note)
     if processing:
         stages.lap("process")

@@ -204,10 +204,11 @@ def test_the_core_refuses_what_it_cannot_use(corner, tolerance, match):
         surface_ops.simplify(np.array(corner), np.eye(3), np.array(tolerance, float))
 
 
-def test_extraction_simplifies_within_its_predicted_error(solid):
-    plain = extract_mesh(solid, options=ExtractOptions(voxel_size=0.08), quiet=True)
-    fine = load_mesh(plain["mesh"])
-    stats = extract_mesh(solid, options=ExtractOptions(voxel_size=0.08, tolerance="auto"), quiet=True)
+@pytest.mark.parametrize("denoise", ["on", "off"])
+def test_extraction_simplifies_within_its_predicted_error(solid, denoise):
+    options = ExtractOptions(voxel_size=0.08, denoise=denoise)
+    fine = load_mesh(extract_mesh(solid, options=options, quiet=True)["mesh"])
+    stats = extract_mesh(solid, options=replace(options, tolerance="auto"), quiet=True)
     made = load_mesh(stats["mesh"])
     assert len(made.faces) < 0.7 * len(fine.faces) and made.quality is not None and made.colors is not None
     assert stats["options"]["tolerance"] == "auto"
