@@ -63,7 +63,8 @@ class EnclosingPlane:
 
     `axes` (2, 3) are unit vectors in it; `own` (2, 2) the least and greatest coordinates along them of its own known
     points, and `whole` of all known points if its own reach as far along one of the axes, else the same. One that
-    `closes` the scene has no points. An `inner` one, of a room that is not convex, is nothing beyond its own rectangle.
+    `closes` the scene stands where two others end. An `inner` one, of a room that is not convex, is nothing beyond its
+    own rectangle.
     """
 
     normal: np.ndarray
