@@ -123,7 +123,8 @@ struct Candidate {
 
   // Least cost first in a std::priority_queue, then the lowest rows.
   bool operator<(const Candidate& other) const {
-    return std::tie(other.cost, other.from, other.to) < std::tie(cost, from, to);
+    if (cost != other.cost) return cost > other.cost;
+    return std::tie(other.from, other.to) < std::tie(from, to);
   }
 };
 
