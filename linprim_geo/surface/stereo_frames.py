@@ -1,7 +1,7 @@
-"""Depth maps for fusing out of six sources: what stereo finds and its neighbours confirm, planes of regions without
+"""Depth maps for fusing out of seven sources: what stereo finds and its neighbours confirm, planes of regions without
 texture, the surface that spans gaps between these, floors and walls that enclose the scene, thin things that the
-primitives render before all these, and what they render everywhere else, with the weight that its deviation from the
-first deserves.
+primitives render before all these, things that are known by their outlines, and what the primitives render everywhere
+else, with the weight that its deviation from the first deserves.
 
 Of the surface that is fused from them, what stereo and planes of several views do not support is left out."""
 
@@ -21,6 +21,7 @@ from linprim_geo.stereo.depth_maps import SURE, DepthMap, depth_maps
 from linprim_geo.stereo.enclosing_planes import enclosing_depths, enclosing_planes, known_on_planes, region_depths
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.lone_backgrounds import lone_backgrounds
+from linprim_geo.stereo.outlined_things import outlined_things
 from linprim_geo.stereo.plain_regions import (
     PlainRegion,
     common_planes,
@@ -58,8 +59,9 @@ class MergedFrames(Sequence):
     confirmed depths, `doubtful` that of less probable ones, `flat` that of pixels on one of the `planes` (K, 4),
     `spanned` that of pixels without texture between all these, `enclosed` that of pixels whose rays end at a floor or
     wall because nothing else is known, or because what is doubtful is near it, `thin` that of thin things before what
-    is known. `sharp` (H, W) bool of every view says where rendered depths are those of a surface, and None everywhere:
-    they stay where nothing is known, and thin things are among them.
+    is known, `outlined` that of things that are known by their outlines. `sharp` (H, W) bool of every view says where
+    rendered depths are those of a surface, and None everywhere: they stay where nothing is known, and things of both
+    kinds are among them.
     """
 
     def __init__(
@@ -93,7 +95,7 @@ class MergedFrames(Sequence):
         points = self._span_gaps(maps, known, rendered_depths, backgrounds)
         are_sharp = [depth > 0 for depth in rendered_depths] if sharp is None else list(sharp)
         self._enclose(maps, points, known, measured, are_sharp, regions, backgrounds)
-        self._keep_thin_things(views, maps, rendered_depths, are_sharp)
+        self._keep_things(views, maps, rendered_depths, are_sharp)
         if not any(view.has_alpha for view in views):  # else masks say what is background
             self._end_backgrounds(maps)
 
@@ -181,26 +183,26 @@ class MergedFrames(Sequence):
         self.enclosed = _share_known(enclosed)
         self._end_at(known_on_planes(self.cameras, planes, measured))
 
-    def _keep_thin_things(
+    def _keep_things(
         self,
         views: Sequence[View],
         maps: Sequence[DepthMap],
         rendered: Sequence[np.ndarray],
         sharp: Sequence[np.ndarray],
     ) -> None:
-        """Takes rendered depths of thin things in place of those of the wall behind them, as if they were confirmed."""
+        """Takes rendered depths of thin things in place of those of the wall behind them, and those of things that are
+        known by their outlines, as if they were confirmed."""
         known = map(_first_known, zip(self.depths, self.on_planes, self.doubtful_depths, strict=True))
-        things = thin_things(
-            [
-                SeenDepths(found.camera, view.load().rgb, found.noise, depth, is_sharp, behind)
-                for view, found, depth, is_sharp, behind in zip(views, maps, rendered, sharp, known, strict=True)
-            ]
-        )
-        for view, thing in enumerate(things):
+        seen = [
+            SeenDepths(found.camera, view.load().rgb, found.noise, depth, is_sharp, behind)
+            for view, found, depth, is_sharp, behind in zip(views, maps, rendered, sharp, known, strict=True)
+        ]
+        thin, outlined = thin_things(seen), outlined_things(seen)
+        for view, thing in enumerate(map(np.logical_or, thin, outlined)):
             self.depths[view] = np.where(thing, rendered[view], self.depths[view])
             for others in (self.on_planes, self.doubtful_depths):
                 others[view] = np.where(thing, np.float32(np.nan), others[view])
-        self.thin = float(np.mean([thing.mean() for thing in things]))
+        self.thin, self.outlined = (float(np.mean([thing.mean() for thing in things])) for things in (thin, outlined))
 
     def _end_backgrounds(self, maps: Sequence[DepthMap]) -> None:
         """Lets rays end at confirmed surfaces that no other view looks past, and at those with texture."""
@@ -236,6 +238,7 @@ class MergedFrames(Sequence):
             "spanned": self.spanned,
             "enclosed": self.enclosed,
             "thin": self.thin,
+            "outlined": self.outlined,
             "planes": len(self.planes),
             "depth_limit": self.limit,
         }

@@ -252,6 +252,19 @@ def test_thin_things_stand_before_what_is_known(found, monkeypatch):
     assert merged.supporting(middle[None]) == [1]
 
 
+def test_things_that_are_known_by_their_outlines_are_as_rendered(found, monkeypatch):
+    thing = np.zeros((30, 40), bool)
+    thing[4:20, 15:25] = True
+    monkeypatch.setattr(stereo_frames, "outlined_things", lambda views: [thing])
+    monkeypatch.setattr(stereo_frames, "plane_depths", lambda *_: np.full((30, 40), 3.5, np.float32))
+    merged = MergedFrames(rendered(0.02), [VIEW], 5.0)
+    frame = merged[0]
+    # In place of confirmed depths of the left half and of a plane in the right one.
+    assert np.allclose(frame.depth[thing], 3.06) and (frame.confidence[thing] == 1).all()
+    assert (frame.depth[2:, :15] == 3).all() and (frame.depth[2:, 25:] == 3.5).all()
+    assert merged.outlined == merged.about()["outlined"] == pytest.approx(160 / 1200) and merged.thin == 0
+
+
 def test_frames_are_rendered_for_all_views_together(found):
     class Rendered(list):
         def __getitem__(self, index):
