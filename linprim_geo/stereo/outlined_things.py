@@ -37,7 +37,10 @@ POINTS_AT_A_TIME, CELLS = 1 << 15, 1 << 20
 
 
 def outlined_things(views: Sequence[SeenDepths]) -> list[np.ndarray]:
-    """(H, W) bool of every view: where its rendered depth is that of a thing that is known by its outlines."""
+    """(H, W) bool of every view: where its rendered depth is that of a thing that is known by its outlines.
+
+    What stereo knows (`SeenDepths.known`) has no part in it. Source of the bound: Laurentini 1994, the visual hull.
+    """
     outlined = [between_outlines(view) for view in views]
     places, pixels = [], []
     for view, between in zip(views, outlined, strict=True):
@@ -115,11 +118,11 @@ def _are_known(points: np.ndarray, views: Sequence[SeenDepths], outlined: Sequen
     known = np.zeros(len(points), bool)
     for first in range(0, len(points), POINTS_AT_A_TIME):
         some = slice(first, first + POINTS_AT_A_TIME)
-        known[some] = _are_some_known(points[some], views, outlined)
+        known[some] = _are_known_at_once(points[some], views, outlined)
     return known
 
 
-def _are_some_known(points: np.ndarray, views: Sequence[SeenDepths], outlined: Sequence[np.ndarray]) -> np.ndarray:
+def _are_known_at_once(points: np.ndarray, views: Sequence[SeenDepths], outlined: Sequence[np.ndarray]) -> np.ndarray:
     agree = np.zeros(len(points), int)
     between = np.zeros((len(views), len(points)), bool)
     towards = np.zeros((len(views), len(points), 3), np.float32)
