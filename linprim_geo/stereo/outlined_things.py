@@ -1,12 +1,12 @@
 """Things that are known by their outlines: where training is right and windows of stereo see nothing but an edge.
 
 Of a plain thing before something else, such as a bronze statue before houses, windows of stereo see the outlines alone.
-On a round thing these are another line of it in every photograph, so that depths that fit them are confirmed and too
-deep. Training explains all photographs at once, and has the thing by the space that its outlines leave to it. But
-training fills the space before plain walls as well. A rendered surface is known by its outlines if, in most of the
-views that render it, it ends at something farther on both sides, and the photograph has an edge at both ends that is
-stronger than what lies between; and if two of these views look at right angles to each other, so that the outlines of
-one bound how deep it may lie for the other.
+Every photograph sees a round thing end along another line of its surface, so depths that join these lines are too deep,
+and confirmed all the same. Training explains all photographs at once: what it renders fills the space that the outlines
+enclose. But it fills the space before plain walls as well. A rendered surface is known by its outlines if, in most of
+the views that render it, it ends at something farther on both sides, and the photograph has an edge at both ends that
+is stronger than what lies between; and if two of these views look at right angles to each other, so that the outlines
+of one bound how deep it may lie for the other.
 """
 
 from __future__ import annotations
@@ -42,25 +42,26 @@ def outlined_things(views: Sequence[SeenDepths]) -> list[np.ndarray]:
     What stereo knows (`SeenDepths.known`) has no part in it. Source of the bound: Laurentini 1994, the visual hull.
     """
     outlined = [between_outlines(view) for view in views]
+    seeds = [np.zeros(between.shape, bool) for between in outlined]
     places, pixels = [], []
-    for view, between in zip(views, outlined, strict=True):
-        row, column = np.nonzero(between)
-        points = _points(view, row, column)
-        known = _are_known(points, views, outlined)
+    for view, between, seed in zip(views, outlined, seeds, strict=True):
+        points = _points(view, *np.nonzero(between))
+        seed[between] = known = _are_known(points, views, outlined)
         places.append(points[known])
-        pixels.append(view.rendered[row, column][known] / view.camera.fx)
-    places = np.concatenate(places)
-    if not len(places):
-        return [np.zeros(view.rendered.shape, bool) for view in views]
-    cubes = _Cubes(places, CUBE * float(np.median(np.concatenate(pixels))))
+        pixels.append(view.rendered[seed] / view.camera.fx)
+    if not any(map(len, places)):
+        return seeds
+    cubes = _Cubes(np.concatenate(places), CUBE * float(np.median(np.concatenate(pixels))))
     known, count, within = np.zeros(len(cubes)), np.zeros(len(cubes)), []
-    for view in views:
+    for view, between, seed in zip(views, outlined, seeds, strict=True):
         row, column = np.nonzero(view.sharp & (view.rendered > 0))
         points = _points(view, row, column)
         cube = cubes.of(points)
         some = cube >= 0
         row, column, points, cube = row[some], column[some], points[some], cube[some]
-        known += np.bincount(cube, _are_known(points, views, outlined), minlength=len(cubes))
+        is_known, others = seed[row, column], ~between[row, column]
+        is_known[others] = _are_known(points[others], views, outlined)
+        known += np.bincount(cube, is_known, minlength=len(cubes))
         count += np.bincount(cube, minlength=len(cubes))
         within.append((row, column, cube))
     things = []
@@ -138,12 +139,11 @@ def _are_known_at_once(points: np.ndarray, views: Sequence[SeenDepths], outlined
     votes = between.sum(0)
     # The view farthest from any of those with outlines, and the one farthest from that.
     every = np.arange(len(points))
-    widest = np.ones(len(points))
     one = between.argmax(0)
     for _ in range(2):
         cosine = np.where(between, np.einsum("vpx,px->vp", towards, towards[one, every]), 1)
-        one, widest = cosine.argmin(0), cosine.min(0)
-    return (votes >= AGREEING) & (votes > MOST * agree) & (widest <= np.cos(np.radians(ANGLE)))
+        one = cosine.argmin(0)
+    return (votes >= AGREEING) & (votes > MOST * agree) & (cosine.min(0) <= np.cos(np.radians(ANGLE)))
 
 
 class _Cubes:
