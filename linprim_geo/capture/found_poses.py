@@ -16,8 +16,9 @@ from linprim_geo.capture.incremental_mapping import MIN_REGISTERED, SEED
 from linprim_geo.capture.readers.colmap import has_model
 from linprim_geo.imaging import photos
 
-# Changed whenever the poses come out differently, so that old cache entries are not found any more.
-_CACHE_VERSION = 2
+# Changed whenever the poses come out differently or are judged otherwise, so that old cache entries are not found
+# any more.
+_CACHE_VERSION = 3
 # Where photographs lie in a capture's folder; in the first that has any. Those in the folder itself are not looked for
 # any deeper.
 _PHOTO_FOLDERS = ("images", "image", "input", "rgb", ".")
@@ -37,8 +38,9 @@ _LISTED = 6
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of the photographs: how many have a pose, the mean reprojection error in pixels, the mean number of
-    photographs that see a point, the points, and the names of those without a pose."""
+    """What became of the photographs: how many have a pose, the points, the mean reprojection error in pixels, the mean
+    number of photographs that see a point, the names of those without a pose, and of those whose pose most of their
+    matches contradict."""
 
     photographs: int
     registered: int
@@ -46,6 +48,7 @@ class Verdict:
     error_px: float = 0.0
     track_length: float = 0.0
     left_out: tuple[str, ...] = ()
+    misplaced: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         return (
@@ -66,6 +69,13 @@ class Verdict:
             missing = self.photographs - self.registered
             count = f"{missing} photograph{' is' if missing == 1 else 's are'} left out{_listed(self.left_out)}"
             poor.append(f"{count}, so take some between these and the others, which overlap with both by two thirds")
+        if self.misplaced:
+            count = f"{len(self.misplaced)} photograph{'' if len(self.misplaced) == 1 else 's'}"
+            poor.append(
+                f"most matches of {count} contradict their poses{_listed(self.misplaced)}, as where one thing was taken"
+                " for another that looks the same, so take more there, which overlap by two thirds and show what is"
+                " there only once"
+            )
         if self.error_px > _GOOD_ERROR_PX:
             poor.append(f"points miss their keypoints by {self.error_px:.2f} px, so let nothing move, and do not zoom")
         if self.track_length < _GOOD_TRACK:
@@ -155,9 +165,10 @@ def _stored(kept: Path) -> Verdict | None:
     """What is said of the result in a folder; None if there is none, or one that is of no use and made again."""
     try:
         verdict = Verdict(**json.loads((kept / "verdict.json").read_text(encoding="utf-8")))
-        *numbers, names = astuple(verdict)
+        *numbers, left_out, misplaced = astuple(verdict)
         usable = all(type(value) in (int, float) and 0 <= value < _LARGEST for value in numbers)
-        usable = usable and isinstance(names, (list, tuple)) and all(isinstance(name, str) for name in names)
+        for names in (left_out, misplaced):
+            usable = usable and isinstance(names, (list, tuple)) and all(isinstance(name, str) for name in names)
         return verdict if usable and (not verdict.registered or has_model(kept / "model")) else None
     except (OSError, ValueError, TypeError, RecursionError):
         return None

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from linprim_geo.capture.pair_agreement import VerifiedPairs
+
 # Up to this many photographs every pair is matched; of more, each with those that share most of their largest
 # keypoints, and with the next ones by name, as they were taken one after the other.
 _MATCH_ALL = 60
@@ -89,7 +91,8 @@ def largest_model(
     threads: int,
     say: Callable[[str], None],
 ):
-    """The largest `pycolmap.Reconstruction` that the photographs give, None if they give none.
+    """The largest `pycolmap.Reconstruction` that the photographs give, and the numbers of those, counted from 1, whose
+    poses in it most of their matches contradict; None and [] if they give none.
 
     Keypoints and matches are kept in the folder `work`, and what is there already is not made again.
 
@@ -196,7 +199,8 @@ def _rename(database, names: Sequence[str]) -> None:
 
 
 def _map(database_path: Path, folder: Path, work: Path, threads: int, count: int, say: Callable[[str], None]):
-    """The largest of the models that incremental mapping makes; None if there is none."""
+    """The largest of the models that incremental mapping makes, and its misplaced photographs; None and [] if there is
+    none."""
     from linprim_geo.geometry.load_pycolmap import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions(random_seed=SEED, num_threads=threads, min_model_size=MIN_REGISTERED)
@@ -224,9 +228,10 @@ def _map(database_path: Path, folder: Path, work: Path, threads: int, count: int
             break
     shutil.rmtree(output, ignore_errors=True)
     largest = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
-    if largest is not None:
-        adjust_robustly(largest, options.mapper.filter_max_reproj_error, options.mapper.filter_min_tri_angle)
-    return largest
+    if largest is None:
+        return None, []
+    adjust_robustly(largest, options.mapper.filter_max_reproj_error, options.mapper.filter_min_tri_angle)
+    return largest, VerifiedPairs.read(database_path).misplaced(largest)
 
 
 def adjust_robustly(model, most_px: float, least_degrees: float) -> None:

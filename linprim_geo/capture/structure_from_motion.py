@@ -115,7 +115,7 @@ def _reconstruct(
 ) -> Verdict:
     """Goes on with what is in `kept`, and leaves the largest model and the verdict there."""
     try:
-        model = largest_model(_readable(folder, names, kept), names, sizes, kept, threads, say)
+        model, misplaced = largest_model(_readable(folder, names, kept), names, sizes, kept, threads, say)
     except (ValueError, RuntimeError, MemoryError) as error:
         reason = (str(error).splitlines() or ["out of memory"])[0]
         raise LinprimError(f"{folder}: poses cannot be found ({reason}); remove {kept} to begin anew") from error
@@ -130,7 +130,8 @@ def _reconstruct(
         errors = model.compute_mean_reprojection_error(), model.compute_mean_track_length()
         posed = {model.images[number].name for number in model.reg_image_ids()}
         left_out = tuple(name for name in names if name not in posed)
-        verdict = Verdict(len(names), model.num_reg_images(), model.num_points3D(), *errors, left_out)
+        doubted = tuple(model.images[number].name for number in misplaced)
+        verdict = Verdict(len(names), model.num_reg_images(), model.num_points3D(), *errors, left_out, doubted)
     write_json(kept / "verdict.json", asdict(verdict))
     remove_work(kept)
     shutil.rmtree(kept / _COPIES, ignore_errors=True)

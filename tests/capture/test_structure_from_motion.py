@@ -187,6 +187,8 @@ def test_verdicts():
     names = tuple(f"{k}.jpg" for k in range(8))
     assert Verdict(9, 8, 500, 0.5, 4.0, names[:1]).doubts.startswith("1 photograph is left out (0.jpg), so take some")
     assert "(0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg, 5.jpg and 2 more)" in Verdict(20, 12, 500, 0.5, 4.0, names).doubts
+    doubted = Verdict(20, 20, 500, 0.5, 4.0, (), names).doubts
+    assert doubted.startswith("most matches of 8 photographs contradict their poses (0.jpg") and "taken for" in doubted
     poor = Verdict(10, 10, 500, 1.5, 2.5).doubts
     assert "1.50 px" in poor and "2.5 photographs only" in poor and "left out" not in poor
 
@@ -354,6 +356,7 @@ def test_a_photograph_whose_suffix_is_wrong_is_copied_as_png(tmp_path):
         b'{"photographs": 9, "registered": NaN}',
         b'{"photographs": 1' + b"0" * 400 + b', "registered": 9}',
         b'{"photographs": 9, "registered": 9, "points": null}',
+        b'{"photographs": 9, "registered": 9, "misplaced": [1]}',
     ],
 )
 def test_a_result_that_is_damaged_is_not_taken(copied, posed, tmp_path, damaged):
