@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-# Fewer matches do not make a pair, as COLMAP has it.
-_LEAST_MATCHES = 15
-# Matches agree with poses in which the lines of sight of both keypoints pass each other this near, in pixels; what
-# COLMAP allows.
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.feature_points import sampson_px
+
+# Matches agree with poses whose epipolar geometry they miss by at most this much; the errors that COLMAP allows.
 _AGREE_PX = 4.0
 
 
@@ -38,21 +38,14 @@ class VerifiedPairs:
         """Those of a pycolmap database."""
         from linprim_geo.geometry.load_pycolmap import pycolmap
 
-        found = []
         with pycolmap.Database.open(database_path) as database:
-            numbers = [image.image_id for image in database.read_all_images()]
+            numbers, found = database.read_two_view_geometries()
+            pairs = np.array([pycolmap.pair_id_to_image_pair(number) for number in numbers], np.int64).reshape(-1, 2)
             keypoints = {
-                number: np.asarray(database.read_keypoints(number))[:, :2].astype(np.float64)
-                for number in numbers
-                if database.exists_keypoints(number)
+                int(number): np.asarray(database.read_keypoints(number))[:, :2].astype(np.float64)
+                for number in np.unique(pairs)
             }
-            for number, geometry in zip(*database.read_two_view_geometries(), strict=True):
-                matches = np.asarray(geometry.inlier_matches).reshape(-1, 2)
-                if len(matches) >= _LEAST_MATCHES:
-                    found.append((pycolmap.pair_id_to_image_pair(number), matches))
-        found.sort(key=lambda pair: pair[0])
-        pairs = np.array([pair for pair, _ in found], np.int64).reshape(-1, 2)
-        return cls(pairs, [matches for _, matches in found], keypoints)
+        return cls(pairs, [np.asarray(geometry.inlier_matches).reshape(-1, 2) for geometry in found], keypoints)
 
     @property
     def counts(self) -> np.ndarray:
@@ -60,53 +53,42 @@ class VerifiedPairs:
         return np.array([len(matches) for matches in self.matches], np.int64)
 
     def agreeing_matches(self, model) -> np.ndarray:
-        """(K,) how many matches of each pair agree with the poses of a `pycolmap.Reconstruction`; 0 where it leaves a
-        photograph out."""
-        sights, poses, focal = {}, {}, {}
-        for number in model.reg_image_ids():
+        """(K,) how many matches of each pair agree with the poses of a `pycolmap.Reconstruction`: within 4 pixels of
+        their epipolar geometry (Sampson's distance), with lines of sight that meet before both cameras. 0 where the
+        model leaves a photograph out."""
+        cameras, pixels = {}, {}
+        for number in set(model.reg_image_ids()) & set(self.keypoints):
             image = model.image(number)
-            camera = model.cameras[image.camera_id]
-            sights[number] = np.asarray(camera.cam_from_img(self.keypoints[number]))
-            poses[number] = np.asarray(image.cam_from_world().matrix())
-            focal[number] = camera.mean_focal_length()
+            lens = model.cameras[image.camera_id]
+            focal, pose = lens.mean_focal_length(), np.eye(4)
+            pose[:3] = image.cam_from_world().matrix()
+            cameras[number] = Camera(lens.width, lens.height, focal, focal, 0.0, 0.0, pose)
+            pixels[number] = focal * np.asarray(lens.cam_from_img(self.keypoints[number]))
         agreeing = np.zeros(len(self.pairs), np.int64)
         for index, ((first, second), matches) in enumerate(zip(self.pairs, self.matches, strict=True)):
-            if first in poses and second in poses:
-                agreeing[index] = _agreeing(
-                    sights[first][matches[:, 0]],
-                    sights[second][matches[:, 1]],
-                    poses[first],
-                    poses[second],
-                    _AGREE_PX / min(focal[first], focal[second]),
-                ).sum()
+            if first in cameras and second in cameras:
+                both = cameras[first], cameras[second], pixels[first][matches[:, 0]], pixels[second][matches[:, 1]]
+                agreeing[index] = ((sampson_px(*both) <= _AGREE_PX) & _meet_ahead(*both)).sum()
         return agreeing
 
     def misplaced(self, model) -> list[int]:
         """Numbers of the photographs whose poses in a model more than half of the matches with its other photographs
         contradict."""
-        agreeing = self.agreeing_matches(model)
         inside = np.isin(self.pairs, list(model.reg_image_ids())).all(1)
-        balance = np.zeros(1 + self.pairs.max(initial=0))
-        for side in self.pairs.T:
-            np.add.at(balance, side, np.where(inside, 2 * agreeing - self.counts, 0))
-        return np.flatnonzero(balance < 0).tolist()
+        balance = np.where(inside, 2 * self.agreeing_matches(model) - self.counts, 0)
+        return np.flatnonzero(np.bincount(self.pairs.ravel(), np.repeat(balance, 2)) < 0).tolist()
 
 
-def _agreeing(
-    first: np.ndarray, second: np.ndarray, pose: np.ndarray, other_pose: np.ndarray, most: float
-) -> np.ndarray:
-    """(M,) whether (M, 2) points of two views at depth 1 are within `most`, in that unit, of the epipolar geometry of
-    two (3, 4) poses (Sampson's distance), and their lines of sight meet before both."""
-    turn = other_pose[:, :3] @ pose[:, :3].T
-    shift = other_pose[:, 3] - turn @ pose[:, 3]
-    ones = np.ones((len(first), 1))
-    one, two = np.hstack([first, ones]) @ turn.T, np.hstack([second, ones])
-    # Sights turned alike: `two` lies in the plane of `one` and the shift.
-    line, line_back = np.cross(shift, one), np.cross(two, shift) @ turn
-    slope = np.sqrt((line[:, :2] ** 2).sum(1) + (line_back[:, :2] ** 2).sum(1))
-    near = np.abs((two * line).sum(1)) < most * slope
-    # Depths of the nearest points of both lines of sight, times the square of the sine of their angle.
-    same, ahead, ahead_back = (one * two).sum(1), one @ shift, two @ shift
-    depth = same * ahead_back - (two * two).sum(1) * ahead
-    depth_back = (one * one).sum(1) * ahead_back - same * ahead
-    return near & (depth > 0) & (depth_back > 0)
+def _meet_ahead(first: Camera, second: Camera, pixels_first: np.ndarray, pixels_second: np.ndarray) -> np.ndarray:
+    """(M,) whether the lines of sight of matched (M, 2) positions are nearest to each other before both cameras."""
+    rays = []
+    for camera, pixels in ((first, pixels_first), (second, pixels_second)):
+        local = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+        rays.append(np.column_stack([local, np.ones(len(local))]) @ camera.rotation)
+    one, two = rays
+    base = second.center - first.center
+    # Depths of the nearest points, times the square of the sine of the angle between the rays.
+    across, along, along_two = (one * two).sum(1), one @ base, two @ base
+    depth = (two * two).sum(1) * along - across * along_two
+    depth_two = across * along - (one * one).sum(1) * along_two
+    return (depth > 0) & (depth_two > 0)

@@ -68,7 +68,7 @@ def test_the_photograph_that_is_misplaced_is_found(seed, wrong):
     poses[3] = np.column_stack([rotation, -rotation @ center])
     model = model_of(poses)
     if wrong == "opposite":  # on the line of the others, but lines of sight meet behind those before it
-        assert pairs.agreeing_matches(model)[(pairs.pairs[:, 1] == 4)].max() < 0.1 * POINTS
+        assert pairs.agreeing_matches(model)[pairs.pairs[:, 1] == 4].max() < 0.1 * POINTS
     assert pairs.misplaced(model) == [4]
     assert pairs.misplaced(model_of(poses, left_out=(4,))) == []
 
@@ -106,11 +106,11 @@ def test_what_mapping_glues_together_wrongly_is_told(tmp_path):
     assert not any(misplaced for right, misplaced in results if right)
 
 
-def test_pairs_are_read_in_order_and_with_their_keypoints(tmp_path):
+def test_pairs_are_read_with_their_keypoints(tmp_path):
     write_matches(tmp_path / "database.db", 0, 0)
     pairs = VerifiedPairs.read(tmp_path / "database.db")
     assert len(pairs.pairs) == len(pairs.matches) > COUNT and pairs.counts.min() >= 15
-    assert (pairs.pairs[:, 0] < pairs.pairs[:, 1]).all() and pairs.pairs.tolist() == sorted(pairs.pairs.tolist())
+    assert (pairs.pairs[:, 0] < pairs.pairs[:, 1]).all()
     assert set(pairs.keypoints) == set(range(1, COUNT + 1))
     for (first, second), matches in zip(pairs.pairs, pairs.matches, strict=True):
         assert matches[:, 0].max() < len(pairs.keypoints[first]) and matches[:, 1].max() < len(pairs.keypoints[second])
