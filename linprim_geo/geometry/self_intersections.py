@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from linprim_geo.base.sorting import distinct
 from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.geometry.raycast import RayCaster
 
@@ -15,8 +16,7 @@ def edges_of(faces: np.ndarray) -> np.ndarray:
     """(E, 2) int64 vertices of the edges of (F, 3) faces, each once, the lower number first, in order."""
     start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel().astype(np.int64)
     count = int(faces.max(initial=0)) + 1
-    edges = np.sort(np.minimum(start, end) * count + np.maximum(start, end))
-    return np.stack(np.divmod(edges[np.diff(edges, prepend=-1) > 0], count), axis=1)
+    return np.stack(np.divmod(distinct(np.minimum(start, end) * count + np.maximum(start, end)), count), axis=1)
 
 
 def crossings(mesh: Mesh, edges: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
+from linprim_geo.base.sorting import distinct
 from linprim_geo.points.view_pairs import visible_pixels
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.thin_things import AGREEING, SeenDepths
@@ -153,7 +154,7 @@ class _Cubes:
     def __init__(self, points: np.ndarray, size: float):
         self.size = size
         self.middle = np.floor(np.median(points, axis=0) / size)
-        self.codes = np.unique(self._codes(points))
+        self.codes = distinct(self._codes(points))
 
     def __len__(self) -> int:
         return len(self.codes)

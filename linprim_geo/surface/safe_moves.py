@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from linprim_geo.base.sorting import distinct
 from linprim_geo.geometry.mesh import Mesh, face_normals, vertex_normals
 from linprim_geo.geometry.self_intersections import crossings, edges_of
 
@@ -69,6 +70,8 @@ def _near(vertices: np.ndarray, edges: np.ndarray, rows: np.ndarray) -> np.ndarr
     cells = np.floor((vertices - vertices.min(0)) / (REACH * max(length, 1e-300))).astype(np.int64) + 1
     size = cells.max(0) + 2
     beside = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    wanted = np.unique((cells[np.unique(rows)][:, None] + beside).reshape(-1, 3) @ [size[1] * size[2], size[2], 1])
+    wanted = distinct(
+        (cells[distinct(rows.ravel())][:, None] + beside).reshape(-1, 3) @ [size[1] * size[2], size[2], 1]
+    )
     near = np.isin(cells @ [size[1] * size[2], size[2], 1], wanted)
     return edges[near[edges].any(1)]

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.sorting import distinct
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh, merge_vertices
 from linprim_geo.kernels import surface_ops
@@ -204,9 +205,9 @@ class Grid:
         project[:, :3] = camera.K @ camera.rotation
         project[:, 3] = camera.K @ (camera.rotation @ self.origin + camera.world_to_camera[:3, 3])
         sums = (self.total, self.weight, self.free)
-        for level in np.unique(self.levels[seen]):
+        for level in distinct(self.levels[seen]):
             rows, voxel = seen[self.levels[seen] == level], self.voxel * 2.0**level
-            for reach in np.unique(np.append(self.reach[rows], level)):
+            for reach in distinct(np.append(self.reach[rows], level)):
                 table = surfels(frame, voxel, self.truncation * self.voxel * 2.0**reach, self.origin)
                 if reach > level:  # where nothing else votes
                     table[:, WEIGHT] *= GRAZED_WEIGHT

@@ -19,6 +19,7 @@ from linprim_geo.base.files import atomic_write
 from linprim_geo.base.memory import PROCESS_GIB
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Progress
+from linprim_geo.base.sorting import distinct
 from linprim_geo.geometry.boxes import split_space
 from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.jobs import worker
@@ -110,7 +111,7 @@ def halo(lattice: Lattice, own: np.ndarray) -> np.ndarray:
     inside = own.copy()
     for level in np.unique(lattice.levels[own]):
         # Blocks of the level as far as its own touch; larger ones hold one of them, smaller ones are in one.
-        near = np.unique(touching(lattice.blocks[own & (lattice.levels == level)]))
+        near = distinct(touching(lattice.blocks[own & (lattice.levels == level)]))
         for other in np.unique(lattice.levels):
             these = lattice.levels == other
             if other <= level:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.sorting import distinct
 from linprim_geo.surface.tsdf_field import DepthFrame, Grid
 
 BYTES_PER_VOXEL = 34
@@ -110,13 +111,13 @@ class NearBlocks:
                 "give bounds, or a larger voxel size"
             )
         new = self.new.setdefault(reach, [])
-        new.append(np.unique(block_keys(np.floor(index).astype(np.int64) >> 1)))
+        new.append(distinct(block_keys(np.floor(index).astype(np.int64) >> 1)))
         if sum(map(len, new)) > MOST_NEW:
             self._merge(reach)
 
     def _merge(self, reach: int) -> None:
         new = self.new.pop(reach, [])
-        self.pairs[reach] = np.unique(np.concatenate([self.pairs.get(reach, np.zeros(0, np.int64)), *new]))
+        self.pairs[reach] = distinct(np.concatenate([self.pairs.get(reach, np.zeros(0, np.int64)), *new]))
 
     def least(self) -> int:
         """There are at least so many blocks: none holds more pairs than these take."""
@@ -133,7 +134,7 @@ class NearBlocks:
             for first in range(0, len(pairs), CHUNK):
                 low = 2 * unpack_keys(pairs[first : first + CHUNK]) - reach
                 near = [block_keys((low + [x, y, z]) // self.resolution) for x in steps for y in steps for z in steps]
-                found = np.union1d(found, np.concatenate([np.unique(keys) for keys in near]))
+                found = distinct(np.concatenate([found, *(distinct(keys) for keys in near)]))
         return found
 
 
