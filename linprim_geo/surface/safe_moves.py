@@ -8,7 +8,7 @@ import numpy as np
 
 from linprim_geo.base.sorting import distinct
 from linprim_geo.geometry.mesh import Mesh, face_normals, vertex_normals
-from linprim_geo.geometry.self_intersections import crossings, edges_of
+from linprim_geo.surface.self_intersections import crossings, edges_of
 
 FOLD_ROUNDS, ROUNDS = 3, 8
 """In which vertices give moves back that fold a face over, and that push one through another."""

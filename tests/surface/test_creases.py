@@ -12,10 +12,10 @@ from helpers.textured_plane import sheet
 
 from linprim_geo.eval.surface_samples import SurfaceDistance
 from linprim_geo.geometry.mesh import Mesh, face_areas, face_normals
-from linprim_geo.geometry.self_intersections import crossings
 from linprim_geo.kernels import ops, surface_ops
 from linprim_geo.surface import creases
 from linprim_geo.surface.creases import sharpened
+from linprim_geo.surface.self_intersections import crossings
 
 VOXEL = 0.05
 # Turned, so that no plane lies along the voxels.

@@ -9,8 +9,8 @@ from helpers.surfaces import join, sphere
 from helpers.textured_plane import sheet
 
 from linprim_geo.geometry.mesh import Mesh, face_normals
-from linprim_geo.geometry.self_intersections import crossings
 from linprim_geo.surface.safe_moves import moved_safely
+from linprim_geo.surface.self_intersections import crossings
 
 
 def test_moves_that_do_no_harm_are_made():

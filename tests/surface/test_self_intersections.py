@@ -10,7 +10,7 @@ import pytest
 from helpers.surfaces import grid, join, sphere
 
 from linprim_geo.geometry.mesh import Mesh
-from linprim_geo.geometry.self_intersections import crossings
+from linprim_geo.surface.self_intersections import crossings
 
 
 def by_all_pairs(mesh: Mesh) -> list[int]:
