@@ -5,8 +5,10 @@
 
 #include <algorithm>
 #include <array>
+#include <initializer_list>
 #include <optional>
 #include <stdexcept>
+#include <string>
 #include <tuple>
 #include <utility>
 #include <vector>
@@ -15,6 +17,8 @@
 #include "bind/parts.h"
 #include "linprim.h"
 #include "surface/crease_sides.h"
+#include "surface/crossings.h"
+#include "surface/face_normals.h"
 #include "surface/face_samples.h"
 #include "surface/filter_normals.h"
 #include "surface/fuse.h"
@@ -34,6 +38,20 @@ nb::ndarray<nb::numpy, T, nb::ndim<1>> owned(std::vector<T>&& values) {
   return {kept->data(), {kept->size()}, nb::capsule(kept, [](void* p) noexcept {
             delete static_cast<std::vector<T>*>(p);
           })};
+}
+
+std::vector<double> flat(const std::vector<linprim::Vector>& vectors) {
+  std::vector<double> values(3 * vectors.size());
+  for (size_t i = 0; i < vectors.size(); ++i) std::copy_n(vectors[i].data(), 3, values.data() + 3 * i);
+  return values;
+}
+
+// The numbers of vertices in an array of `shape`, all of them below `vertices`.
+const int64_t* rows_of(In<int64_t> array, std::initializer_list<int64_t> shape, int64_t vertices, const char* name) {
+  const int64_t* rows = checked(array, shape, name);
+  if (std::any_of(rows, rows + array.size(), [&](int64_t row) { return row < 0 || row >= vertices; }))
+    throw std::invalid_argument(std::string(name) + "s are outside of the vertices");
+  return rows;
 }
 
 linprim::PhotoView photo_view(const Pose& pose, const std::array<double, 4>& lens, int width, int height,
@@ -134,10 +152,8 @@ void bind_surface(nb::module_& m) {
     if (samples > linprim::kMostFaceSamples) throw std::invalid_argument("too many samples");
     const linprim::PhotoView view =
         photo_view(pose, lens, int(depth.shape(1)), int(depth.shape(0)), nullptr, 0, depth.data());
-    const linprim::Faces faces{count, checked(vertex, {vertices, 3}, "vertex"), checked(corner, {count, 3}, "corner"),
-                               checked(skip, {count}, "skip")};
-    if (std::any_of(faces.corner, faces.corner + 3 * count, [&](int64_t row) { return row < 0 || row >= vertices; }))
-      throw std::invalid_argument("corners are outside of the vertices");
+    const linprim::Faces faces{count, checked(vertex, {vertices, 3}, "vertex"),
+                               rows_of(corner, {count, 3}, vertices, "corner"), checked(skip, {count}, "skip")};
     const double* weights = checked(bary, {samples, 3}, "bary");
     uint8_t* out = checked(found, {count}, "found");
     nb::gil_scoped_release release;
@@ -217,24 +233,20 @@ void bind_surface(nb::module_& m) {
   m.def("filter_normals", [](In<int64_t> corner, In<double> bound, double contrast, int normal_rounds,
                              int vertex_rounds, Out<double> vertex) {
     const int64_t vertices = int64_t(bound.size()), faces = int64_t(corner.shape(0));
-    const int64_t* corners = checked(corner, {faces, 3}, "corner");
     const double* most = checked(bound, {vertices}, "bound");
     double* moved = checked(vertex, {vertices, 3}, "vertex");
+    const int64_t* corners = rows_of(corner, {faces, 3}, vertices, "corner");
     if (!(contrast > 0)) throw std::invalid_argument("contrast has to be positive");
-    if (std::any_of(corners, corners + 3 * faces, [&](int64_t row) { return row < 0 || row >= vertices; }))
-      throw std::invalid_argument("corners are outside of the vertices");
     nb::gil_scoped_release release;
     linprim::filter_normals({contrast, normal_rounds, vertex_rounds}, vertices, faces, corners, most, moved);
   });
   // (2 N,) ends, (8 N,) planes, (N,) which cross a crease, and (N,) the length of edges around.
   m.def("crease_edges", [](In<int64_t> corner, In<double> vertex, std::array<double, 9> rules) {
     const int64_t vertices = int64_t(vertex.shape(0)), faces = int64_t(corner.shape(0));
-    const int64_t* corners = checked(corner, {faces, 3}, "corner");
     const double* at = checked(vertex, {vertices, 3}, "vertex");
+    const int64_t* corners = rows_of(corner, {faces, 3}, vertices, "corner");
     const auto [contrast, normal_rounds, flat, side, crease, even, rings, falloff, wide] = rules;
     if (!(contrast > 0 && falloff > 0)) throw std::invalid_argument("contrast and falloff have to be positive");
-    if (std::any_of(corners, corners + 3 * faces, [&](int64_t row) { return row < 0 || row >= vertices; }))
-      throw std::invalid_argument("corners are outside of the vertices");
     const linprim::CreaseRules how{contrast, int(normal_rounds), flat, side, crease, even, int(rings), falloff, wide};
     linprim::CreaseEdges found;
     {
@@ -244,14 +256,39 @@ void bind_surface(nb::module_& m) {
     return std::tuple(owned(std::move(found.end)), owned(std::move(found.plane)), owned(std::move(found.crosses)),
                       owned(std::move(found.length)));
   });
+  // (3 V,) of vertices, (3 F,) of faces.
+  m.def("normals", [](In<int64_t> corner, In<double> vertex) {
+    const int64_t vertices = int64_t(vertex.shape(0)), faces = int64_t(corner.shape(0));
+    const double* at = checked(vertex, {vertices, 3}, "vertex");
+    const int64_t* corners = rows_of(corner, {faces, 3}, vertices, "corner");
+    std::vector<double> of_vertices, of_faces;
+    {
+      nb::gil_scoped_release release;
+      const linprim::FaceFans fans(vertices, faces, corners);
+      const linprim::FaceNormals found = linprim::face_normals(fans, at);
+      of_faces = flat(found.normal), of_vertices = flat(linprim::vertex_normals(fans, found, at));
+    }
+    return std::tuple(owned(std::move(of_vertices)), owned(std::move(of_faces)));
+  });
+  // (N,) faces and (N,) numbers of edges.
+  m.def("crossings", [](In<int64_t> corner, In<double> vertex, In<int64_t> end) {
+    const int64_t vertices = int64_t(vertex.shape(0)), faces = int64_t(corner.shape(0)), edges = int64_t(end.shape(0));
+    const double* at = checked(vertex, {vertices, 3}, "vertex");
+    const int64_t *corners = rows_of(corner, {faces, 3}, vertices, "corner"),
+                  *ends = rows_of(end, {edges, 2}, vertices, "end");
+    linprim::Crossings found;
+    {
+      nb::gil_scoped_release release;
+      found = linprim::crossings(faces, corners, at, edges, ends);
+    }
+    return std::tuple(owned(std::move(found.face)), owned(std::move(found.edge)));
+  });
   // (3 V,) vertices, (3 F,) corners.
   m.def("simplify", [](In<int64_t> corner, In<double> vertex, In<double> tolerance) {
     const int64_t vertices = int64_t(vertex.shape(0)), faces = int64_t(corner.shape(0));
-    const int64_t* corners = checked(corner, {faces, 3}, "corner");
     const double* at = checked(vertex, {vertices, 3}, "vertex");
     const double* most = checked(tolerance, {vertices}, "tolerance");
-    if (std::any_of(corners, corners + 3 * faces, [&](int64_t row) { return row < 0 || row >= vertices; }))
-      throw std::invalid_argument("corners are outside of the vertices");
+    const int64_t* corners = rows_of(corner, {faces, 3}, vertices, "corner");
     if (std::max(vertices, faces) > INT32_MAX) throw std::invalid_argument("more than 2^31 faces");
     if (!std::all_of(most, most + vertices, [](double value) { return value > 0; }))
       throw std::invalid_argument("tolerance has to be positive");

@@ -19,11 +19,30 @@ FaceNormals face_normals(const FaceFans& fans, const double* vertex) {
   const auto at = [&](int64_t v) { return Vector{vertex[3 * v], vertex[3 * v + 1], vertex[3 * v + 2]}; };
   for_rows(fans.faces, [&](int64_t f) {
     const int64_t* corner = fans.corner + 3 * f;
-    const Vector a = at(corner[0]), u = minus(at(corner[1]), a), v = minus(at(corner[2]), a);
-    out.normal[f] = {u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]};
+    const Vector a = at(corner[0]);
+    out.normal[f] = cross(minus(at(corner[1]), a), minus(at(corner[2]), a));
     out.area[f] = 0.5 * normalize(out.normal[f]);
   });
   return out;
+}
+
+std::vector<Vector> vertex_normals(const FaceFans& fans, const FaceNormals& faces, const double* vertex) {
+  std::vector<Vector> normal(fans.vertices);
+  const auto at = [&](int64_t v) { return Vector{vertex[3 * v], vertex[3 * v + 1], vertex[3 * v + 2]}; };
+  for_rows(fans.vertices, [&](int64_t v) {
+    for (int64_t i = fans.first[v]; i < fans.first[v + 1]; ++i) {
+      const int64_t* corner = fans.corner + 3 * fans.face[i];
+      const int k = corner[0] == v ? 0 : corner[1] == v ? 1 : 2;
+      Vector there = minus(at(corner[(k + 1) % 3]), at(v)), back = minus(at(corner[(k + 2) % 3]), at(v));
+      normalize(there), normalize(back);
+      // Half-angle form: accurate for angles near 0 and pi, where the arc cosine is not.
+      Vector sum = there;
+      add(sum, 1, back), add(there, -1, back);
+      add(normal[v], std::atan2(std::sqrt(dot(there, there)), std::sqrt(dot(sum, sum))), faces.normal[fans.face[i]]);
+    }
+    normalize(normal[v]);
+  });
+  return normal;
 }
 
 std::vector<Vector> average_normals(const FaceFans& fans, const FaceNormals& faces, double contrast, int rounds) {

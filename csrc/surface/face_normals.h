@@ -14,6 +14,10 @@ inline double dot(const Vector& a, const Vector& b) { return a[0] * b[0] + a[1] 
 
 inline Vector minus(const Vector& a, const Vector& b) { return {a[0] - b[0], a[1] - b[1], a[2] - b[2]}; }
 
+inline Vector cross(const Vector& a, const Vector& b) {
+  return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
+}
+
 // Adds `factor` b to a.
 inline void add(Vector& a, double factor, const Vector& b) {
   for (int axis = 0; axis < 3; ++axis) a[axis] += factor * b[axis];
@@ -51,6 +55,10 @@ struct FaceNormals {
 };
 
 FaceNormals face_normals(const FaceFans& fans, const double* vertex);
+
+// Of each vertex the mean of the normals of its faces, weighted by their angles there, of length 1; 0 without faces.
+// Source: Thuermer and Wuethrich 1998.
+std::vector<Vector> vertex_normals(const FaceFans& fans, const FaceNormals& faces, const double* vertex);
 
 // The normals after `rounds` in which each becomes the mean of those of the faces around it, weighted by area and
 // Tukey's function of their difference: from the length `contrast` on one does not count for another. Source: Zheng et

@@ -244,28 +244,6 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
 
 
-def vertex_normals(mesh: Mesh) -> np.ndarray:
-    """(V, 3) unit normals: face normals averaged with the angle of the face at the vertex as weight.
-
-    The weight makes the normal independent of how flat parts are triangulated. Vertices of no face get zero.
-
-    Source: Thuermer and Wuethrich, Computing vertex normals from polygonal facets, 1998.
-    """
-    normals = face_normals(mesh)
-    corners = [mesh.vertices[mesh.faces[:, k]] for k in range(3)]
-    total = np.zeros_like(mesh.vertices)
-    for k in range(3):
-        there = _unit(corners[(k + 1) % 3] - corners[k])
-        back = _unit(corners[(k + 2) % 3] - corners[k])
-        # Half-angle form: accurate for angles near 0 and pi, where the arc cosine is not.
-        half = np.arctan2(np.linalg.norm(there - back, axis=1), np.linalg.norm(there + back, axis=1))
-        for axis in range(3):
-            total[:, axis] += np.bincount(
-                mesh.faces[:, k], weights=2.0 * half * normals[:, axis], minlength=len(mesh.vertices)
-            )
-    return _unit(total)
-
-
 def barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """(N, 2) coordinates (u, v) of points (N, 3) in triangles (N, 3, 3): point = (1-u-v) a + u b + v c."""
     b, c, p = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]

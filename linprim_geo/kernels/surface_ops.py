@@ -139,6 +139,27 @@ def crease_edges(corner, vertex, rules) -> tuple[np.ndarray, np.ndarray, np.ndar
     return end.reshape(-1, 2), plane.reshape(-1, 2, 4), crosses.astype(bool), length
 
 
+def normals(corner, vertex) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals of the (V, 3) float64 vertices of a mesh, those of its (M, 3) int64 faces averaged by the angles of
+    the faces there, and of the faces: (V, 3) and (M, 3). Zero for vertices of no face and faces without area."""
+    vertices, faces = _core.normals(corner, vertex)
+    return vertices.reshape(-1, 3), faces.reshape(-1, 3)
+
+
+def crossings(corner, vertex, end) -> tuple[np.ndarray, np.ndarray]:
+    """Faces of a mesh and edges that go through them without sharing a vertex, see csrc/surface/crossings.h.
+
+    Args:
+        corner: (M, 3) int64 faces.
+        vertex: (V, 3) float64.
+        end: (E, 2) int64 vertices of the edges.
+
+    Returns:
+        (N,) int64 faces and (N,) int64 edges, by edge and then by face.
+    """
+    return _core.crossings(corner, vertex, end)
+
+
 def simplify(corner, vertex, tolerance) -> tuple[np.ndarray, np.ndarray]:
     """Fewer faces that pass every vertex of a mesh within its tolerance; borders stay within it of where they were.
 

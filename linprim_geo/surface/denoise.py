@@ -14,9 +14,10 @@ from dataclasses import replace
 import numpy as np
 
 from linprim_geo.capture.types import View
-from linprim_geo.geometry.mesh import Mesh, vertex_normals
+from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.kernels import surface_ops
 from linprim_geo.surface.fairing import faired
+from linprim_geo.surface.normals import vertex_normals
 from linprim_geo.surface.photo_consistency import neighbour_average, predicted_error
 
 # Length of the difference of two unit normals: faces with 41 degrees or more between them are on two sides of an edge,

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from linprim_geo.geometry.mesh import Mesh, vertex_normals
+from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.points.initial_points import in_image
+from linprim_geo.surface.normals import vertex_normals
 from linprim_geo.surface.stereo_frames import SUPPORTING_VIEWS
 from linprim_geo.surface.tsdf_field import DepthFrame
 

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from linprim_geo.geometry.mesh import Mesh, vertex_normals
+from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.surface.normals import vertex_normals
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix

@@ -13,9 +13,10 @@ from functools import partial
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.geometry.mesh import Mesh, face_areas, face_components, vertex_normals
+from linprim_geo.geometry.mesh import Mesh, face_areas, face_components
 from linprim_geo.geometry.topology import manifold_status, topology
 from linprim_geo.kernels import surface_ops
+from linprim_geo.surface.normals import vertex_normals
 
 # Taubin's own two factors. A sphere of 2,000 vertices grows by 0.17 % of its volume in 10 iterations, one of 66 shrinks
 # by 1.4 %.

@@ -21,11 +21,12 @@ from linprim_geo.base.memory import available_memory
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Stages
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.mesh import Mesh, face_components, remove_small_components, select_faces, vertex_normals
+from linprim_geo.geometry.mesh import Mesh, face_components, remove_small_components, select_faces
 from linprim_geo.geometry.primitives import Primitives
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.march_tetrahedra import march_tetrahedra
 from linprim_geo.surface.method_tsdf import memory_left
+from linprim_geo.surface.normals import vertex_normals
 from linprim_geo.surface.visibility import visible_faces
 
 NEAR = 0.01

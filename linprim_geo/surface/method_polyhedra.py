@@ -13,10 +13,11 @@ from linprim_geo.base.kinds import KINDS
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Stages
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.mesh import Mesh, face_areas, select_faces, vertex_normals
+from linprim_geo.geometry.mesh import Mesh, face_areas, select_faces
 from linprim_geo.geometry.primitives import ARRAYS, Primitives
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.method_tsdf import SEEN_THROUGH, kept_bytes
+from linprim_geo.surface.normals import vertex_normals
 from linprim_geo.surface.polyhedra_planes import Planes, fit_planes, level_points
 from linprim_geo.surface.polyhedra_union import convex_piece, kept_shells, own_identity, shells, unite
 

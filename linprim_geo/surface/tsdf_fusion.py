@@ -9,7 +9,8 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.memory import available_memory
-from linprim_geo.geometry.mesh import Mesh, remove_small_components, select_faces, vertex_normals
+from linprim_geo.geometry.mesh import Mesh, remove_small_components, select_faces
+from linprim_geo.surface.normals import vertex_normals
 from linprim_geo.surface.tsdf_field import BEHIND_VOXELS, DepthFrame, vote_rules
 from linprim_geo.surface.voxel_blocks import Lattice, TooFine, estimate_memory, find_blocks
 from linprim_geo.surface.voxel_levels import COARSE, VoxelLevels

@@ -12,8 +12,9 @@ import numpy as np
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.capture.types import Photo
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.mesh import Mesh, vertex_normals
+from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.kernels import surface_ops
+from linprim_geo.surface.normals import vertex_normals
 
 if TYPE_CHECKING:
     from linprim_geo.geometry.raycast import RayCaster

@@ -262,14 +262,3 @@ def test_equal_vertices_are_merged():
     assert topology.topology(soup)["components"] == 12
     merged = lm.merge_vertices(soup)
     assert topology.topology(merged)["watertight"] and len(merged.vertices) == 8
-
-
-def test_vertex_normals_of_a_sphere_and_of_a_cube():
-    ball = sphere(4)
-    edge = np.linalg.norm(ball.vertices[ball.faces[:, 0]] - ball.vertices[ball.faces[:, 1]], axis=1).max()
-    # First-order errors of the faces around a vertex cancel; what is left goes with the square of the edge.
-    assert np.abs(lm.vertex_normals(ball) - ball.vertices).max() < edge**2
-    corners = (CUBE_VERTICES - 0.5) / np.sqrt(0.75)  # whichever way the squares are split
-    np.testing.assert_allclose(lm.vertex_normals(cube()), corners, atol=1e-12)
-    lonely = Mesh(np.concatenate([CUBE_VERTICES, [[5, 5, 5]]]), CUBE_FACES)
-    np.testing.assert_array_equal(lm.vertex_normals(lonely)[8], 0.0)

@@ -8,7 +8,8 @@ import numpy as np
 
 from linprim_geo.capture.types import Photo
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.mesh import Mesh, vertex_normals
+from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.surface.normals import vertex_normals
 from linprim_geo.synthetic.camera_paths import look_at
 
 SIZE, FOCAL, DISTANCE = 96, 90.0, 3.0

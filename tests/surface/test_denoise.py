@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from helpers.textured_plane import FOOTPRINT, Shown, inner, ring, sheet, texture
 
-from linprim_geo.geometry.mesh import Mesh, face_areas, face_normals, vertex_normals
+from linprim_geo.geometry.mesh import Mesh, face_areas, face_normals
 from linprim_geo.kernels import ops, surface_ops
 from linprim_geo.surface.denoise import CONTRAST, denoised, filtered
+from linprim_geo.surface.normals import vertex_normals
 
 
 def rough(mesh: Mesh, deviation: float, seed: int = 0) -> Mesh:

@@ -12,12 +12,13 @@ from helpers.surfaces import grid, join, sphere
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.eval.surface_samples import SurfaceDistance
-from linprim_geo.geometry.mesh import Mesh, select_faces, vertex_normals
+from linprim_geo.geometry.mesh import Mesh, select_faces
 from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.geometry.topology import manifold_status, topology
 from linprim_geo.surface import mesh_process
 from linprim_geo.surface.extract import extract_mesh
 from linprim_geo.surface.mesh_process import close_holes, process_mesh, remesh, simplify, smooth, within_tolerance
+from linprim_geo.surface.normals import vertex_normals
 
 STEPS = (
     lambda mesh: simplify(mesh, 200),

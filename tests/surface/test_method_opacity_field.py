@@ -17,7 +17,7 @@ from linprim_geo.base.options import ExtractOptions
 from linprim_geo.cli.main import main
 from linprim_geo.eval.mesh import score_mesh
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.mesh import Mesh, vertex_normals
+from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.geometry.primitives import Primitives, load_primitives, save_primitives
 from linprim_geo.geometry.topology import manifold_status, topology
@@ -25,6 +25,7 @@ from linprim_geo.kernels import ops
 from linprim_geo.surface import method_opacity_field as opacity
 from linprim_geo.surface.extract import extract_mesh
 from linprim_geo.surface.march_tetrahedra import march_tetrahedra
+from linprim_geo.surface.normals import vertex_normals
 
 METHOD = "opacity-field"
 

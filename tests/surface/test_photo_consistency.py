@@ -19,9 +19,10 @@ from helpers.textured_plane import (
     texture,
 )
 
-from linprim_geo.geometry.mesh import Mesh, vertex_normals
+from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.kernels import ops
 from linprim_geo.surface import photo_consistency
+from linprim_geo.surface.normals import vertex_normals
 from linprim_geo.surface.photo_consistency import best_agreement, photo_gains, predicted_error, refine_surface
 
 

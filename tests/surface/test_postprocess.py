@@ -14,7 +14,7 @@ from helpers.textured_plane import FOOTPRINT, Shown, inner, ring, sheet, texture
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Progress, Stages
 from linprim_geo.capture.types import Photo
-from linprim_geo.geometry.mesh import vertex_normals
+from linprim_geo.surface.normals import vertex_normals
 from linprim_geo.surface.postprocess import finish_surface
 
 

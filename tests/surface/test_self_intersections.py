@@ -10,7 +10,8 @@ import pytest
 from helpers.surfaces import grid, join, sphere
 
 from linprim_geo.geometry.mesh import Mesh
-from linprim_geo.surface.self_intersections import crossings
+from linprim_geo.kernels import ops
+from linprim_geo.surface.self_intersections import crossings, edges_of
 
 
 def by_all_pairs(mesh: Mesh) -> list[int]:
@@ -64,3 +65,41 @@ def test_a_fold_over_itself_is_found_though_neighbours_share_its_vertices():
 @pytest.mark.parametrize("mesh", [sphere(rounds=4), grid(30, 20), join(grid(), grid(height=1e-3))])
 def test_a_surface_that_is_simple_has_none(mesh):
     assert len(crossings(mesh)[0]) == 0
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e4])
+def test_faces_that_lie_over_each_other_in_one_plane_do_not_count(offset):
+    """In coordinates of float64 a tilted plane is none: what overlaps in it crosses by a rounding."""
+    rng = np.random.default_rng(5)
+    across = np.linalg.qr(rng.normal(size=(3, 3)))[0][:2]
+    mesh = Mesh(offset + rng.uniform(-1, 1, (300, 2)) @ across, np.arange(300).reshape(-1, 3))
+    assert len(crossings(mesh)[0]) == 0
+    lifted = mesh.vertices + np.outer(rng.uniform(-1e-9, 1e-9, 300), np.cross(*across))
+    assert len(crossings(replace(mesh, vertices=lifted))[0]) > 100
+
+
+def test_pairs_are_in_order_and_the_same_for_any_number_of_threads():
+    mesh = join(sphere(rounds=5), sphere(rounds=5, center=(0.9, 0.31, 0.17)))
+    edges, before = edges_of(mesh.faces), ops.threads()
+    try:
+        found = []
+        for count in (1, 3):
+            ops.set_threads(count)
+            found.append(crossings(mesh, edges))
+    finally:
+        ops.set_threads(before)
+    assert all(np.array_equal(one, other) for one, other in zip(*found, strict=True))
+    face, ends = found[0]
+    place = {tuple(end): row for row, end in enumerate(edges.tolist())}
+    pairs = [(place[tuple(end)], number) for end, number in zip(ends.tolist(), face.tolist(), strict=True)]
+    assert len(pairs) > 100 and pairs == sorted(set(pairs))
+
+
+def test_edges_that_are_asked_alone_count():
+    mesh = join(sphere(rounds=2), sphere(rounds=2, center=(0.9, 0.31, 0.17)))
+    face, ends = crossings(mesh)
+    some = np.unique(ends, axis=0)[::2]
+    asked = (ends[:, None] == some).all(2).any(1)
+    few = crossings(mesh, some)
+    assert asked.any() and np.array_equal(few[0], face[asked]) and np.array_equal(few[1], ends[asked])
+    assert len(crossings(mesh, some[:0])[0]) == 0

@@ -14,12 +14,13 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.types import Photo, Scene
-from linprim_geo.geometry.mesh import Mesh, vertex_normals
+from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.runs.run import Run
 from linprim_geo.stereo.depth_maps import CONFIDENT, SURE, DepthMap, depth_maps
 from linprim_geo.surface import method_tsdf, postprocess, stereo_frames
 from linprim_geo.surface.extract import extract_mesh
+from linprim_geo.surface.normals import vertex_normals
 from linprim_geo.surface.stereo_frames import MergedFrames
 from linprim_geo.surface.tsdf_field import DepthFrame
 from linprim_geo.surface.tsdf_parts import merge_parts

@@ -16,12 +16,13 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.types import Photo
-from linprim_geo.geometry.mesh import Mesh, select_faces, vertex_normals
+from linprim_geo.geometry.mesh import Mesh, select_faces
 from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.runs.run import Run
 from linprim_geo.surface import texture as texture_module
 from linprim_geo.surface import texture_charts, texture_raster
 from linprim_geo.surface.extract import extract_mesh
+from linprim_geo.surface.normals import vertex_normals
 from linprim_geo.surface.texture import make_texture
 from linprim_geo.surface.texture_charts import unwrap
 from linprim_geo.surface.texture_files import save_textured
