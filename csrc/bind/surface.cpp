@@ -247,6 +247,7 @@ void bind_surface(nb::module_& m) {
     const int64_t* corners = rows_of(corner, {faces, 3}, vertices, "corner");
     const auto [contrast, normal_rounds, flat, side, crease, even, rings, falloff, wide] = rules;
     if (!(contrast > 0 && falloff > 0)) throw std::invalid_argument("contrast and falloff have to be positive");
+    if (std::max(vertices, faces) > INT32_MAX) throw std::invalid_argument("more than 2^31 faces");
     const linprim::CreaseRules how{contrast, int(normal_rounds), flat, side, crease, even, int(rings), falloff, wide};
     linprim::CreaseEdges found;
     {

@@ -16,6 +16,33 @@ constexpr int64_t kEdgesPerTask = 512;
 // Squared sine below which two planes are too near to parallel to have a line.
 constexpr double kLeastSine = 0.05;
 
+// A list of rows for each of many.
+struct Lists {
+  std::vector<int64_t> first, end;
+  std::vector<int32_t> row;
+
+  // Of each of `count` what fill(i, next) writes to `next`, most(i) at most, each once and in order.
+  template <class Most, class Fill>
+  void make(int64_t count, const Most& most, const Fill& fill) {
+    first.resize(count), end.resize(count);
+    int64_t total = 0;
+    for (int64_t i = 0; i < count; ++i) first[i] = total, total += most(i);
+    row.resize(total);
+    for_rows(count, [&](int64_t i) {
+      int32_t* const begin = row.data() + first[i];
+      int32_t* const last = fill(i, begin);
+      std::sort(begin, last);
+      end[i] = std::unique(begin, last) - row.data();
+    });
+  }
+
+  // Calls body(row) for those of i.
+  template <class Body>
+  void each(int64_t i, const Body& body) const {
+    for (int64_t k = first[i]; k < end[i]; ++k) body(int64_t(row[k]));
+  }
+};
+
 struct Mesh {
   const FaceFans& fans;
   const double* vertex;
@@ -23,6 +50,9 @@ struct Mesh {
   std::vector<Vector> averaged, middle;
   std::vector<uint8_t> flat, inner;  // inner: so are all around it
   std::vector<double> edge;          // the second longest
+  Lists joined;  // of a face the inner ones before it that share a vertex with it and have normals as near as a side's
+  Lists beside;  // of a vertex those that it shares an edge with
+  Lists inside;  // of a vertex the inner faces around it
 
   Vector at(int64_t v) const { return {vertex[3 * v], vertex[3 * v + 1], vertex[3 * v + 2]}; }
 };
@@ -45,8 +75,41 @@ double middle_edge(const Mesh& mesh, int64_t face) {
   return std::max(std::min(length[0], length[1]), std::min(std::max(length[0], length[1]), length[2]));
 }
 
+void find_lists(const CreaseRules& how, Mesh& mesh) {
+  const FaceFans& fans = mesh.fans;
+  const auto around = [&](int64_t v) { return fans.first[v + 1] - fans.first[v]; };
+  mesh.joined.make(
+      fans.faces,
+      [&](int64_t f) {
+        const int64_t* corner = fans.corner + 3 * f;
+        return mesh.inner[f] ? around(corner[0]) + around(corner[1]) + around(corner[2]) : 0;
+      },
+      [&](int64_t f, int32_t* next) {
+        if (!mesh.inner[f]) return next;
+        fans.around(f, [&](int64_t g) {
+          if (g < f && mesh.inner[g] && dot(mesh.averaged[f], mesh.averaged[g]) >= how.flat) *next++ = int32_t(g);
+        });
+        return next;
+      });
+  mesh.beside.make(
+      fans.vertices, [&](int64_t v) { return 2 * around(v); },
+      [&](int64_t v, int32_t* next) {
+        for (int64_t i = fans.first[v]; i < fans.first[v + 1]; ++i)
+          for (int k = 0; k < 3; ++k) {
+            const int64_t other = fans.corner[3 * fans.face[i] + k];
+            if (other != v) *next++ = int32_t(other);
+          }
+        return next;
+      });
+  mesh.inside.make(fans.vertices, around, [&](int64_t v, int32_t* next) {
+    for (int64_t i = fans.first[v]; i < fans.first[v + 1]; ++i)
+      if (mesh.inner[fans.face[i]]) *next++ = int32_t(fans.face[i]);
+    return next;
+  });
+}
+
 Mesh prepared(const CreaseRules& how, const FaceFans& fans, const double* vertex) {
-  Mesh mesh{fans, vertex, face_normals(fans, vertex), {}, {}, {}, {}, {}};
+  Mesh mesh{fans, vertex, face_normals(fans, vertex), {}, {}, {}, {}, {}, {}, {}, {}};
   mesh.averaged = average_normals(fans, mesh.faces, how.contrast, how.normal_rounds);
   mesh.middle.resize(fans.faces), mesh.flat.resize(fans.faces), mesh.inner.resize(fans.faces);
   mesh.edge.resize(fans.faces);
@@ -64,18 +127,20 @@ Mesh prepared(const CreaseRules& how, const FaceFans& fans, const double* vertex
     fans.around(f, [&](int64_t g) { all &= mesh.flat[g]; });
     mesh.inner[f] = all;
   });
+  find_lists(how, mesh);
   return mesh;
 }
 
 // What lies around one edge after the other; one of these per thread.
 class Around {
  public:
-  Around(const CreaseRules& how, const Mesh& mesh) : how_(how), mesh_(mesh), stamp_(mesh.fans.faces), row_(stamp_) {}
+  Around(const CreaseRules& how, const Mesh& mesh)
+      : how_(how), mesh_(mesh), place_(mesh.fans.faces), reached_(mesh.fans.vertices) {}
 
   // False where an end has no side. Else the planes of the ends, whether they meet at a crease, and how long edges
   // around are.
   bool ask(const int64_t* ends, double* plane, uint8_t& crosses, double& length) {
-    gather(ends);
+    if (!gather(ends)) return false;
     measure();
     length = length_;
     const Vector end[2] = {mesh_.at(ends[0]), mesh_.at(ends[1])};
@@ -93,41 +158,44 @@ class Around {
   }
 
  private:
-  // The inner faces within the rings, and which of them hang together.
-  void gather(const int64_t* ends) {
+  // The inner faces within the rings, and which of them hang together. False if they are too few for a side.
+  bool gather(const int64_t* ends) {
     ++now_;
-    faces_.clear(), reached_.clear(), parent_.clear();
-    const FaceFans& fans = mesh_.fans;
-    const auto visit = [&](int64_t g) {
-      if (stamp_[g] == now_) return;
-      stamp_[g] = now_, row_[g] = -1;
-      reached_.push_back(g);
-      if (!mesh_.inner[g]) return;
-      row_[g] = int64_t(faces_.size());
-      parent_.push_back(int(faces_.size())), faces_.push_back(g);
+    vertices_.clear(), faces_.clear(), parent_.clear();
+    const auto visit = [&](int64_t v) {
+      if (reached_[v] == now_) return;
+      reached_[v] = now_, vertices_.push_back(v);
     };
-    for (int j = 0; j < 2; ++j)
-      for (int64_t i = fans.first[ends[j]]; i < fans.first[ends[j] + 1]; ++i) visit(fans.face[i]);
+    visit(ends[0]), visit(ends[1]);
     size_t begin = 0;
-    for (int ring = 0; ring <= how_.rings; ++ring) {
-      const size_t end = reached_.size();
-      for (size_t q = begin; q < end; ++q) {
-        const int64_t f = reached_[q];
-        fans.around(f, [&](int64_t g) {
-          if (ring < how_.rings) visit(g);
-          if (stamp_[g] == now_ && row_[f] >= 0 && row_[g] >= 0 &&
-              dot(mesh_.averaged[f], mesh_.averaged[g]) >= how_.flat)
-            parent_[root(int(row_[f]))] = root(int(row_[g]));
-        });
-      }
+    for (int ring = 0; ring < how_.rings; ++ring) {
+      const size_t end = vertices_.size();
+      for (size_t q = begin; q < end; ++q) mesh_.beside.each(vertices_[q], visit);
       begin = end;
     }
+    for (const int64_t v : vertices_)
+      mesh_.inside.each(v, [&](int64_t f) {
+        if (place_[f].reached == now_) return;
+        place_[f].reached = now_, place_[f].row = int(faces_.size());
+        parent_.push_back(int(faces_.size())), faces_.push_back(f);
+      });
+    if (faces_.size() < kLeastFaces) return false;
+    for (size_t i = 0; i < faces_.size(); ++i)
+      mesh_.joined.each(faces_[i], [&](int64_t g) {
+        if (place_[g].reached == now_) parent_[root(int(i))] = root(place_[g].row);
+      });
+    return true;
   }
 
   // The length of edges around.
   void measure() {
     lengths_.clear();
-    for (const int64_t f : reached_) lengths_.push_back(mesh_.edge[f]);
+    for (const int64_t v : vertices_)
+      for (int64_t i = mesh_.fans.first[v]; i < mesh_.fans.first[v + 1]; ++i) {
+        const int64_t f = mesh_.fans.face[i];
+        if (place_[f].measured == now_) continue;
+        place_[f].measured = now_, lengths_.push_back(mesh_.edge[f]);
+      }
     const auto middle = lengths_.begin() + int64_t(lengths_.size() / 2);
     std::nth_element(lengths_.begin(), middle, lengths_.end());
     length_ = *middle;
@@ -230,9 +298,15 @@ class Around {
 
   const CreaseRules& how_;
   const Mesh& mesh_;
-  std::vector<int64_t> stamp_, row_;  // per face of the mesh: when it was reached last, its row in `faces_`, or -1
-  int64_t now_ = 0;
-  std::vector<int64_t> reached_, faces_;
+  struct Place {
+    int reached = 0, row = 0, measured = 0;
+  };
+  // Of each face of the mesh when it was reached last, its row in `faces_` then, and when it was measured; of each
+  // vertex when it was reached.
+  std::vector<Place> place_;
+  std::vector<int> reached_;
+  int now_ = 0;
+  std::vector<int64_t> vertices_, faces_;
   std::vector<int> parent_, order_, side_;  // per row of `faces_`, as are weights
   std::vector<double> weight_, lengths_;
   double length_ = 0;
