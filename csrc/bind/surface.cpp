@@ -28,6 +28,7 @@
 #include "surface/points_within.h"
 #include "surface/segment_depth.h"
 #include "surface/simplify.h"
+#include "surface/surfels.h"
 
 namespace {
 
@@ -181,6 +182,30 @@ void bind_surface(nb::module_& m) {
       sizes.push_back(int64_t(rows.size())), all.insert(all.end(), rows.begin(), rows.end());
     return std::tuple(owned(std::move(sizes)), owned(std::move(all)));
   });
+  m.def("make_surfels",
+        [](Pose pose, std::array<double, 4> lens, In<double> depth, In<uint8_t> background, In<uint8_t> clamped,
+           In<double> confidence, std::array<double, 4> rules, Out<float> surfels) {
+          if (depth.ndim() != 2) throw std::invalid_argument("depth has to have shape (H, W)");
+          const int64_t height = int64_t(depth.shape(0)), width = int64_t(depth.shape(1));
+          if (std::max(height, width) > INT32_MAX) throw std::invalid_argument("too many pixels");
+          linprim::DepthMap map{{},
+                                lens[0],
+                                lens[1],
+                                lens[2],
+                                lens[3],
+                                int(width),
+                                int(height),
+                                depth.data(),
+                                checked(background, {height, width}, "background"),
+                                checked(clamped, {height, width}, "clamped"),
+                                checked(confidence, {height, width}, "confidence")};
+          std::copy_n(pose.data(), 12, map.pose);
+          float* table = checked(surfels, {height * width, linprim::kSurfelColumns}, "surfels");
+          const auto [voxel, truncation, slope_ratio, least_cosine] = rules;
+          nb::gil_scoped_release release;
+          linprim::make_surfels(map, {voxel, truncation, slope_ratio, least_cosine},
+                                reinterpret_cast<linprim::Surfel*>(table));
+        });
   m.def("add_votes", [](Pose project, int width, int height, In<float> surfels, std::array<float, 8> rules,
                         In<int64_t> rows, In<double> corner, double voxel, int resolution, Out<float> total,
                         Out<float> weight, Out<float> free) {

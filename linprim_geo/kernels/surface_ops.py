@@ -70,6 +70,21 @@ def points_within(center, normal, offset, point, enlarged: float, least: int) ->
     return _core.points_within(center, normal, offset, point, enlarged, least)
 
 
+def make_surfels(pose, lens, depth, background, clamped, confidence, rules) -> np.ndarray:
+    """(H W, 8) float32, a plane per pixel of a depth map, see csrc/surface/fuse.h and surfels.h.
+
+    Args:
+        depth: (H, W) float64; no surface where it is not positive and finite.
+        background, clamped: (H, W) uint8, where there is no surface and the ray is free, and where the depth is only a
+            least one.
+        confidence: (H, W) float64, not negative.
+        rules: voxel and truncation as lengths, and two numbers more, see csrc/surface/surfels.h.
+    """
+    table = np.empty((depth.size, 8), np.float32)
+    _core.make_surfels(pose, lens, depth, background, clamped, confidence, rules, table)
+    return table
+
+
 def add_votes(
     project, width: int, height: int, surfels, rules, rows, corner, voxel: float, resolution: int, total, weight, free
 ) -> None:

@@ -38,9 +38,6 @@ the others say "behind": a few wrong depths are overruled, and free space does n
 FAR_FRONT_WEIGHT = 0.15
 """Least weight of a vote in front of a surface, so that free space close to it stays free."""
 
-COSINE_POWER = 0.5
-"""A pixel counts by the cosine between its ray and its surface normal to this power."""
-
 GRAZED_WEIGHT = 1e-3
 GRAZED_VOXELS = 1.25
 GRAZED_REACH = 4.0
@@ -98,73 +95,29 @@ class DepthFrame:
         return self.camera.world_rays()[valid] * depth[:, None] + self.camera.center, depth
 
 
-# Columns of a frame's table, one row per pixel. The signed distance of a point x of the grid's frame, in
-# truncations, is table[:, OFFSET] - table[:, :3] . x.
-OFFSET, WEIGHT, COSINE, NEAREST, FREE = 3, 4, 5, 6, 7
-
-
-def _slope(inverse: np.ndarray, tolerance: np.ndarray, axis: int) -> np.ndarray:
-    """Derivative of the inverse depth along an axis, taken on the side that belongs to the same surface."""
-    step = np.diff(inverse, axis=axis)
-    gap = np.full_like(np.take(inverse, [0], axis=axis), np.nan)
-    after = np.concatenate([step, gap], axis=axis)
-    before = np.concatenate([gap, step], axis=axis)
-    size_after, size_before = np.abs(after), np.abs(before)
-    similar = np.fmax(size_after, size_before) <= SLOPE_RATIO * np.fmin(size_after, size_before) + tolerance
-    flatter = np.where((size_after <= size_before) | np.isnan(before), after, before)
-    slope = np.where(similar & np.isfinite(after + before), 0.5 * (after + before), flatter)
-    return np.nan_to_num(slope)
+# Columns of a frame's table, one row per pixel, see `Surfel` in csrc/surface/fuse.h.
+WEIGHT, FREE = 4, 7
 
 
 def surfels(frame: DepthFrame, voxel: float, truncation: float, origin: np.ndarray) -> np.ndarray:
     """(H*W, 8) float32 table of a frame: plane, weight, cosine, nearest 1/z around, weight of free votes.
 
-    A plane a X + b Y + c Z = 1 in camera space has the inverse depth a rx + b ry + c along the ray
-    (rx, ry, 1), so a and b are the slopes of the inverse depth times the focal lengths, and the signed
-    distance of a point is (1 - a X - b Y - c Z) / |(a, b, c)|, positive on the camera's side.
+    Lengths are in the unit of the frame, planes relative to the `origin`.
     """
-    from scipy.ndimage import maximum_filter
+    depth = np.ascontiguousarray(frame.depth, np.float64)
 
-    camera = frame.camera
-    depth = np.asarray(frame.depth, dtype=np.float64)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        valid = np.isfinite(depth) & (depth > 0)
-        inverse = np.where(valid, 1.0 / depth, np.nan)
-    rays = camera.ray_grid()
-    rx, ry = rays[..., 0], rays[..., 1]
-    square = rx * rx + ry * ry + 1.0
-    # Half a voxel of depth between neighbours is no sign of an edge.
-    tolerance = 0.5 * voxel * inverse * inverse
-    a = _slope(inverse, tolerance, 1) * camera.fx
-    b = _slope(inverse, tolerance, 0) * camera.fy
-    c = inverse - a * rx - b * ry
-    with np.errstate(invalid="ignore"):
-        cosine = inverse / np.sqrt((a * a + b * b + c * c) * square)
-        steep = valid & ~(cosine > LEAST_COSINE)
-    a = np.where(steep, inverse * rx / square, a)
-    b = np.where(steep, inverse * ry / square, b)
-    c = np.where(steep, inverse / square, c)
-    cosine = np.where(steep, LEAST_COSINE, cosine)
-    scale = 1.0 / (np.sqrt(a * a + b * b + c * c) * truncation)
-    plane = np.stack([a * scale, b * scale, c * scale], axis=-1)
-    offset = scale - plane @ (camera.rotation @ origin + camera.world_to_camera[:3, 3])
-    plane = plane @ camera.rotation
+    def marked(mask: np.ndarray | None) -> np.ndarray:
+        return np.zeros(depth.shape, np.uint8) if mask is None else np.ascontiguousarray(mask, bool).view(np.uint8)
 
-    background = ~valid & (False if frame.background is None else np.asarray(frame.background, dtype=bool))
-    confidence = 1.0
+    confidence = np.ones(depth.shape)
     if frame.confidence is not None:
-        confidence = np.nan_to_num(np.clip(frame.confidence, 0.0, None))
-    table = np.zeros((*depth.shape, 8), dtype=np.float32)
-    table[..., :3] = np.where(valid[..., None], plane, 0.0)
-    table[..., OFFSET] = np.where(valid, offset, np.float32(1e9))  # background: far in front of anything
-    surface = valid if frame.clamped is None else valid & ~frame.clamped
-    table[..., WEIGHT] = np.where(surface, cosine**COSINE_POWER, 0.0) * confidence
-    table[..., COSINE] = np.where(valid, cosine, 1.0)
-    # A pixel beside the outline of something nearer says nothing about what is level with that: its free
-    # votes hold only in front of all its neighbours.
-    table[..., NEAREST] = maximum_filter(np.nan_to_num(inverse), size=3, mode="nearest")
-    table[..., FREE] = (valid | background) * confidence
-    return table.reshape(-1, 8)
+        confidence = np.nan_to_num(np.clip(np.asarray(frame.confidence, np.float64), 0.0, None))
+    pose, lens = frame.camera.pinhole()
+    pose = np.column_stack([pose[:, :3], pose[:, :3] @ origin + pose[:, 3]])
+    rules = (voxel, truncation, SLOPE_RATIO, LEAST_COSINE)
+    return surface_ops.make_surfels(
+        pose, lens, depth, marked(frame.background), marked(frame.clamped), confidence, rules
+    )
 
 
 def vote_rules(truncation: float, behind: float, occluded: float) -> tuple[float, ...]:
