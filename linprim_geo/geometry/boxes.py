@@ -111,8 +111,7 @@ def point_work(xyz: np.ndarray, views: Iterable[tuple[Camera, np.ndarray, int]])
     work = np.zeros(len(xyz))
     for camera, depth, pixels in views:
         place, z = camera.project(xyz)
-        with np.errstate(invalid="ignore"):
-            inside = (z > 0) & (place >= 0).all(1) & (place[:, 0] < camera.width) & (place[:, 1] < camera.height)
+        inside = camera.shows(place, z)
         column, row = place[inside].astype(np.int64).T
         there = depth[row, column]
         seen = (there == 0) | (z[inside] <= (1 + HIDDEN) * there)

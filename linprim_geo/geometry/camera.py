@@ -64,12 +64,20 @@ class Camera:
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Projects (P, 3) world points to ((P, 2) pixel positions, (P,) depths); behind the camera gives NaN pixels."""
-        local = points @ self.rotation.T + self.world_to_camera[:3, 3]
-        depth = local[:, 2]
+        x, y, depth = self.rotation @ points.T + self.world_to_camera[:3, 3:]
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = np.where(depth > 0, 1.0 / depth, np.nan)
-        pixels = np.stack([local[:, 0] * scale * self.fx + self.cx, local[:, 1] * scale * self.fy + self.cy], 1)
+        pixels = np.empty((len(points), 2))
+        pixels[:, 0], pixels[:, 1] = x * scale * self.fx + self.cx, y * scale * self.fy + self.cy
         return pixels, depth
+
+    def shows(self, pixels: np.ndarray, depth: np.ndarray, margin: float = 0.0) -> np.ndarray:
+        """(P,) bool: which of (P, 2) pixel positions and their (P,) depths, as of `project`, are in front of the camera
+        and in the image, `margin` pixels from its border."""
+        x, y = pixels.T
+        with np.errstate(invalid="ignore"):
+            inside = (x >= margin) & (y >= margin) & (x < self.width - margin) & (y < self.height - margin)
+            return inside & (depth > 0)
 
     def pinhole(self) -> tuple[np.ndarray, tuple[float, float, float, float]]:
         """(3, 4) world to camera, and focal lengths and principal point, as the core takes them."""

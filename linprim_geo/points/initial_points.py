@@ -275,8 +275,7 @@ def in_image(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """((P,) whether in front and in the image, (P,) row, (P,) column; rows and columns mean nothing
     elsewhere)."""
     pixels, depth = camera.project(points)
-    with np.errstate(invalid="ignore"):
-        inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < [camera.width, camera.height]).all(axis=1)
+    inside = camera.shows(pixels, depth)
     cells = np.where(inside[:, None], pixels, 0.0).astype(np.int64)
     return inside, cells[:, 1], cells[:, 0]
 

@@ -92,6 +92,5 @@ def visible_pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.n
 def visible_places(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """As `visible_pixels`, with (Q, 2) positions in the image in place of pixels."""
     pixels, depth = camera.project(points)
-    with np.errstate(invalid="ignore"):
-        inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
+    inside = camera.shows(pixels, depth)
     return inside, pixels[inside], depth[inside]

@@ -108,8 +108,7 @@ def color_differences(
     for depth, other_depth in depths:
         reached = depth[rows, columns] > 0
         pixels, z = other.project(camera.center + rays * depth[rows, columns, None])
-        with np.errstate(invalid="ignore"):
-            inside = (z > 0) & (pixels >= 1).all(1) & (pixels < (other.width - 1, other.height - 1)).all(1)
+        inside = other.shows(pixels, z, margin=1)
         pixels = np.where(inside[:, None], pixels, 1.0)
         there = other_depth[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
         same = reached & inside & (there > 0) & (np.abs(there - z) < SAME_SURFACE * np.abs(z))

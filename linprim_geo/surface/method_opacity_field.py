@@ -270,8 +270,7 @@ def auto_spacing(mesh: Mesh, cameras: Sequence[Camera]) -> float:
     footprints = []
     for camera in cameras:
         pixels, depth = camera.project(mesh.vertices)
-        with np.errstate(invalid="ignore"):
-            seen = (depth > NEAR) & (pixels >= 0).all(1) & (pixels < [camera.width, camera.height]).all(1)
+        seen = (depth > NEAR) & camera.shows(pixels, depth)
         if seen.any():
             footprints.append(np.median(depth[seen]) / math.sqrt(camera.fx * camera.fy))
     size = SPACING_PIXELS * float(np.median(footprints)) if footprints else 0.0

@@ -178,8 +178,7 @@ def _depth_share(data: Data) -> float:
         depth = view.load_depth()
         assert depth is not None
         pixels, along = view.camera.project(points.xyz)
-        with np.errstate(invalid="ignore"):
-            inside = (along > 0) & (pixels >= 0).all(1) & (pixels < [view.camera.width, view.camera.height]).all(1)
+        inside = view.camera.shows(pixels, along)
         column, row = pixels[inside].astype(np.int64).T
         there = depth[row, column] > 0
         ratios.append(depth[row, column][there] / along[inside][there])
