@@ -1,146 +1,26 @@
 #include "stereo/fit_surfaces.h"
 
-#include <algorithm>
-#include <cmath>
-#include <numeric>
+#include <cstring>
+#include <vector>
 
-#include "stereo/cross.h"
+#include "base/parallel.h"
+#include "linprim.h"
 
 namespace linprim {
 namespace {
 
-constexpr int kAcross = 2 * kCrossReach + 1, kTerms = 6;
-// Powers of x and y of the terms of a surface of second order.
-constexpr int kX[kTerms] = {0, 1, 0, 2, 1, 0}, kY[kTerms] = {0, 0, 1, 0, 1, 2};
-// A term is dropped if earlier ones leave less than this share of its sum of squares: in two columns x * x equals x.
-constexpr double kLeft = 1e-6;
+constexpr int kMostWide = 16;  // of stereo/wide.h
 
-// Inverse depth around a pixel, by columns x and rows y from it.
-struct Surface {
-  float c[kTerms];
-};
-
-// How many pixels lie on a plane within the tolerance, and within 1/2, 1/4 and 1/8 of it.
-struct Counts {
-  int on[kScales] = {};
-  int sum() const { return std::accumulate(on, on + kScales, 0); }
-};
-
-// The cross of the pixel at `at` in an image of inverse depths.
-struct PixelCross {
-  const Crosses& crosses;
-  const float* inverse;
-  int64_t at;
-
-  int pixels() const {
-    int all = 0;
-    crosses.for_each_row(at, [&](int, int64_t, int left, int right) { all += left + right + 1; });
-    return all;
-  }
-
-  // How many of the `all` pixels lie on a plane, within the tolerance and 1/2, 1/4 and 1/8 of it. Not counted to the
-  // end where they cannot be more than `most` in all.
-  Counts count_on(const Surface& plane, float tolerance, int all, int most) const {
-    Counts counts;
-    int uncounted = all;
-    crosses.for_each_row(at, [&](int y, int64_t middle, int left, int right) {
-      if (counts.sum() + kScales * uncounted <= most) return;
-      uncounted -= left + right + 1;
-      const float base = plane.c[0] + plane.c[2] * float(y), *row = inverse + middle;
-      int on[kScales] = {};
-      for (int x = -left; x <= right; ++x) {
-        const float there = base + plane.c[1] * float(x), off = std::abs(row[x] - there), most_off = tolerance * there;
-        on[0] += off < most_off, on[1] += off < 0.5f * most_off;
-        on[2] += off < 0.25f * most_off, on[3] += off < 0.125f * most_off;
-      }
-      for (int k = 0; k < kScales; ++k) counts.on[k] += on[k];
-    });
-    return counts;
-  }
-
-  // The mean of another image over what lies on a plane.
-  float mean_on(const Surface& plane, float tolerance, const float* image) const {
-    double sum = 0;
-    int count = 0;
-    crosses.for_each_row(at, [&](int y, int64_t middle, int left, int right) {
-      for (int x = -left; x <= right; ++x) {
-        const float there = plane.c[0] + plane.c[2] * float(y) + plane.c[1] * float(x);
-        if (std::abs(inverse[middle + x] - there) < tolerance * there) sum += image[middle + x], ++count;
-      }
-    });
-    return float(sum / std::max(count, 1));
-  }
-};
-
-// Sums over the pixels around one that lie on a surface, column by column: of powers of y, and of what they differ by
-// times these.
-struct Columns {
-  float ones[5][kAcross] = {}, differences[3][kAcross] = {};
-};
-
-Columns sums(const float* inverse, int height, int width, int64_t at, const Surface& surface, float tolerance) {
-  Columns columns;
-  const float* c = surface.c;
-  const int row = int(at / width), column = int(at % width);
-  const int left = std::min(kCrossReach, column), right = std::min(kCrossReach, width - 1 - column);
-  for (int dy = -std::min(kCrossReach, row); dy <= std::min(kCrossReach, height - 1 - row); ++dy) {
-    const float y = float(dy), first = c[0] + c[2] * y + c[5] * y * y, slope = c[1] + c[4] * y;
-    const float* middle = inverse + at + int64_t(dy) * width;
-    for (int dx = -left; dx <= right; ++dx) {
-      const float x = float(dx), there = first + slope * x + c[3] * x * x, difference = middle[dx] - there;
-      const bool on = std::abs(difference) < tolerance * there;
-      const float one = on ? 1.0f : 0.0f, off = on ? difference : 0.0f;
-      const int k = dx + kCrossReach;
-      columns.ones[0][k] += one, columns.ones[1][k] += one * y, columns.ones[2][k] += one * (y * y);
-      columns.ones[3][k] += one * (y * y * y), columns.ones[4][k] += one * (y * y * y * y);
-      columns.differences[0][k] += off, columns.differences[1][k] += off * y,
-          columns.differences[2][k] += off * (y * y);
-    }
-  }
-  return columns;
-}
-
-// Solves the normal equations, s[i][j] for j >= i and s[i][kTerms], by elimination.
-void solve(double s[kTerms][kTerms + 1], double* solution) {
-  constexpr int n = kTerms;
-  double least[n];
-  for (int i = 0; i < n; ++i) least[i] = kLeft * s[i][i];
-  for (int i = 0; i < n; ++i) {
-    for (int k = 0; k < i; ++k) {
-      if (!(s[k][k] > 0)) continue;
-      const double factor = s[k][i] / s[k][k];
-      for (int j = i; j <= n; ++j) s[i][j] -= factor * s[k][j];
-    }
-    if (!(s[i][i] > least[i])) s[i][i] = 0;
-  }
-  for (int i = n - 1; i >= 0; --i) {
-    solution[i] = 0;
-    if (!(s[i][i] > 0)) continue;
-    double rest = s[i][n];
-    for (int j = i + 1; j < n; ++j) rest -= s[i][j] * solution[j];
-    solution[i] = rest / s[i][i];
-  }
-}
-
-// Moves a surface to the least squares of the pixels that lie on it. False if they are too few.
-bool improve(const Columns& columns, Surface& surface) {
-  double ones[5][5] = {}, differences[3][3] = {};  // by powers of x, then y
-  for (int k = 0; k < kAcross; ++k) {
-    double power = 1;
-    for (int a = 0; a < 5; ++a, power *= k - kCrossReach) {
-      for (int b = 0; a + b < 5; ++b) ones[a][b] += power * columns.ones[b][k];
-      for (int b = 0; a + b < 3; ++b) differences[a][b] += power * columns.differences[b][k];
-    }
-  }
-  if (ones[0][0] < kFewestFitted) return false;
-  double s[kTerms][kTerms + 1], change[kTerms];
-  for (int i = 0; i < kTerms; ++i) {
-    for (int j = i; j < kTerms; ++j) s[i][j] = ones[kX[i] + kX[j]][kY[i] + kY[j]];
-    s[i][kTerms] = differences[kX[i]][kY[i]];
-  }
-  solve(s, change);
-  for (int i = 0; i < kTerms; ++i) surface.c[i] += float(change[i]);
-  return true;
+SurfaceFitKernel kernel() {
+  const char* name = instruction_set();
+#if defined(__x86_64__) || defined(_M_X64)
+  if (std::strcmp(name, "v4") == 0) return surface_fit_kernel_v4();
+  if (std::strcmp(name, "v3") == 0) return surface_fit_kernel_v3();
+  if (std::strcmp(name, "v2") == 0) return surface_fit_kernel_v2();
+#else
+  if (std::strcmp(name, "neon") == 0) return surface_fit_kernel_neon();
+#endif
+  return surface_fit_kernel_scalar();
 }
 
 }  // namespace
@@ -149,39 +29,12 @@ void fit_surfaces(const uint8_t* grey, const float* plane, const float* cost, in
                   float* fitted, float* fitted_cost) {
   const Crosses crosses(grey, height, width);
   const int64_t pixels = int64_t(height) * width;
-  const float *right_slope = plane + pixels, *down_slope = plane + 2 * pixels;
-  crosses.for_each_pixel([&](int64_t at) {
-    const PixelCross cross{crosses, plane, at};
-    const int all = cross.pixels(), half = all / 2;
-    Surface start{{plane[at], right_slope[at], down_slope[at], 0, 0, 0}};
-    Counts best = cross.count_on(start, tolerance, all, 0);
-    bool found = best.on[0] > half, own = true;
-    int most = found ? best.sum() : 0;
-    crosses.for_each_row(at, [&](int y, int64_t middle, int left, int right) {
-      if (y % kCandidateStep) return;
-      for (int x = -(left - left % kCandidateStep); x <= right; x += kCandidateStep) {
-        const int64_t other = middle + x;
-        const float to_right = right_slope[other], to_bottom = down_slope[other];
-        const Surface tried{{plane[other] - to_right * float(x) - to_bottom * float(y), to_right, to_bottom}};
-        if (!(plane[other] > 0 && tried.c[0] > 0)) continue;
-        const Counts counts = cross.count_on(tried, tolerance, all, most);
-        if (counts.on[0] <= half || counts.sum() <= most) continue;
-        found = true, start = tried, best = counts, most = counts.sum();
-        own = std::abs(plane[at] - start.c[0]) < tolerance * start.c[0];
-      }
-    });
-    fitted_cost[at] = own ? cost[at] : cross.mean_on(start, tolerance, cost);
-    Surface surface = start;
-    if (found) {
-      float narrow = tolerance;
-      for (int k = 1; k < kScales && best.on[k] > half; ++k) narrow *= 0.5f;
-      bool enough = true;
-      for (int round = 0; enough && round < kFitRounds; ++round)
-        enough = improve(sums(plane, height, width, at, surface, narrow), surface);
-      if (!enough || !(std::abs(surface.c[0] - start.c[0]) < tolerance * start.c[0])) surface = start;
-    }
-    for (int k = 0; k < 3; ++k) fitted[at + k * pixels] = surface.c[k];
-  });
+  std::vector<float> inverse(plane, plane + pixels);
+  inverse.resize(pixels + kMostWide);
+  const SurfaceFit fit{crosses, height,    width,  inverse.data(), plane + pixels, plane + 2 * pixels,
+                       cost,    tolerance, fitted, fitted_cost};
+  const SurfaceFitKernel run = kernel();
+  parallel_for(height, [&](int64_t row, int) { run(fit, int(row)); });
 }
 
 }  // namespace linprim

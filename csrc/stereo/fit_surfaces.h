@@ -3,6 +3,8 @@
 
 #include <cstdint>
 
+#include "stereo/cross.h"
+
 namespace linprim {
 
 // Of a pixel's cross (stereo/cross.h) only the planes in every kCandidateStep-th row and column, counted from the
@@ -25,5 +27,25 @@ constexpr int kFewestFitted = 12, kFitRounds = 2;
 // have the mean `cost` of those of their cross on that plane, others their own. `tolerance` is between 0 and 1.
 void fit_surfaces(const uint8_t* grey, const float* plane, const float* cost, int height, int width, float tolerance,
                   float* fitted, float* fitted_cost);
+
+// What `fit_surfaces` is given, for the rows of the kernels in fit_surfaces_kernel.cpp.
+struct SurfaceFit {
+  const Crosses& crosses;
+  int height, width;
+  const float *inverse, *right_slope, *down_slope;  // with room for a vector of floats after `inverse`
+  const float* cost;
+  float tolerance;
+  float *fitted, *fitted_cost;
+};
+
+using SurfaceFitKernel = void (*)(const SurfaceFit& fit, int row);
+SurfaceFitKernel surface_fit_kernel_scalar();
+#if defined(__x86_64__) || defined(_M_X64)
+SurfaceFitKernel surface_fit_kernel_v2();
+SurfaceFitKernel surface_fit_kernel_v3();
+SurfaceFitKernel surface_fit_kernel_v4();
+#else
+SurfaceFitKernel surface_fit_kernel_neon();
+#endif
 
 }  // namespace linprim
