@@ -21,6 +21,7 @@
 #include "surface/face_normals.h"
 #include "surface/face_samples.h"
 #include "surface/filter_normals.h"
+#include "surface/first_hits.h"
 #include "surface/fuse.h"
 #include "surface/marching_cubes.h"
 #include "surface/photo_consistency.h"
@@ -181,6 +182,19 @@ void bind_surface(nb::module_& m) {
     for (const auto& rows : found)
       sizes.push_back(int64_t(rows.size())), all.insert(all.end(), rows.begin(), rows.end());
     return std::tuple(owned(std::move(sizes)), owned(std::move(all)));
+  });
+  m.def("first_hits", [](Pose pose, std::array<double, 4> lens, In<double> vertex, In<int64_t> corner, Out<float> depth,
+                         Out<int32_t> face) {
+    if (depth.ndim() != 2) throw std::invalid_argument("depth has to have shape (H, W)");
+    const int64_t height = int64_t(depth.shape(0)), width = int64_t(depth.shape(1));
+    const int64_t vertices = int64_t(vertex.shape(0)), faces = int64_t(corner.shape(0));
+    const double* at = checked(vertex, {vertices, 3}, "vertex");
+    const int64_t* corners = rows_of(corner, {faces, 3}, vertices, "corner");
+    int32_t* hit = checked(face, {height, width}, "face");
+    if (std::max({faces, height, width}) > INT32_MAX) throw std::invalid_argument("more than 2^31 faces or pixels");
+    const linprim::PhotoView view = photo_view(pose, lens, int(width), int(height), nullptr, 0, nullptr);
+    nb::gil_scoped_release release;
+    linprim::first_hits(view, vertices, at, faces, corners, depth.data(), hit);
   });
   m.def("make_surfels",
         [](Pose pose, std::array<double, 4> lens, In<double> depth, In<uint8_t> background, In<uint8_t> clamped,

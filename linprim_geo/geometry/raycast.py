@@ -30,9 +30,6 @@ NEARER = 2e-5
 """A surface counts as nearer only by more than this (half-diagonals): ten jitters, so that meeting the same
 surface with a shifted ray at up to 84 degrees is not taken for another surface."""
 
-KEPT_BYTES = 1 << 29
-"""First hits of cameras are kept up to this, so that what asks for them one after the other has them once."""
-
 SPHERE = 1.0 + 1e-5
 """Radius of the sphere that surely holds the scaled mesh (half-diagonal 1, rounded to float32)."""
 
@@ -72,9 +69,6 @@ class RayCaster:
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, *, threads: int = 0):
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-
         vertices, faces = _checked(vertices, faces)
         self.vertices, self.faces = vertices, faces
         self.threads = threads or usable_cores()
@@ -90,15 +84,21 @@ class RayCaster:
             raise LinprimError(f"mesh: all {len(faces)} faces lie in one point, a surface is wanted")
         self._scale = 1.0 / half
 
-        self._scene = EmbreeScene()
-        scaled = ((vertices - self._center) * self._scale).astype(np.float32)
-        TriangleMesh(self._scene, scaled, faces.astype(np.int32))
-        self._kept: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
-
     @property
     def diagonal(self) -> float:
         """Length of the diagonal of the bounding box of the faces."""
         return 2.0 / self._scale
+
+    @cached_property
+    def _scene(self):
+        """Embree's, made when the first ray is cast."""
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        scene = EmbreeScene()
+        scaled = ((self.vertices - self._center) * self._scale).astype(np.float32)
+        TriangleMesh(scene, scaled, self.faces.astype(np.int32))
+        return scene
 
     @cached_property
     def _triangles(self) -> Triangles:
@@ -204,24 +204,6 @@ class RayCaster:
         self._run(work, count)
         return distance, face, bary
 
-    def first_hits(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """What a camera sees at its pixel centres, by `cast_single`: to tell what is hidden, not for measuring.
-
-        Returns read-only depth (H, W) float32 along the optical axis, inf where nothing is hit, and face (H, W) int32,
-        there -1. Memory: 8 bytes per pixel are kept, at most KEPT_BYTES over all cameras.
-        """
-        lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        key = (*lens, camera.world_to_camera.tobytes())
-        if key in self._kept:
-            return self._kept[key]
-        depth, face, _ = self.cast_single(camera.center, camera.world_rays().reshape(-1, 3))
-        hits = (depth.reshape(camera.height, camera.width), face.reshape(camera.height, camera.width))
-        for array in hits:
-            array.flags.writeable = False
-        if sum(array.nbytes for kept in (*self._kept.values(), hits) for array in kept) <= KEPT_BYTES:
-            self._kept[key] = hits
-        return hits
-
     def occluded_single(self, origins: np.ndarray, directions: np.ndarray, tmax: np.ndarray) -> np.ndarray:
         """`occluded` in single precision, as `cast_single`: quick to tell most of what is hidden; the rest wants
         `occluded`."""
@@ -242,6 +224,7 @@ class RayCaster:
         return np.ascontiguousarray(np.broadcast_to(start, directions.shape)), directions
 
     def _run(self, work, count: int) -> list[int]:
+        self._scene  # noqa: B018 (before several threads make it)
         parts = [slice(start, min(start + CHUNK, count)) for start in range(0, count, CHUNK)]
         if self.threads < 2 or len(parts) < 2:
             return [work(part) for part in parts]

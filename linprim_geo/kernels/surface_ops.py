@@ -70,6 +70,14 @@ def points_within(center, normal, offset, point, enlarged: float, least: int) ->
     return _core.points_within(center, normal, offset, point, enlarged, least)
 
 
+def first_hits(pose, lens, width: int, height: int, vertex, corner) -> tuple[np.ndarray, np.ndarray]:
+    """What the rays through the pixel centres of a view hit first of a mesh with (V, 3) float64 vertices and (M, 3)
+    int64 faces: (H, W) float32 depth along the optical axis, infinite for nothing, and (H, W) int32 face, there -1."""
+    depth, face = np.empty((height, width), np.float32), np.empty((height, width), np.int32)
+    _core.first_hits(pose, lens, vertex, corner, depth, face)
+    return depth, face
+
+
 def make_surfels(pose, lens, depth, background, clamped, confidence, rules) -> np.ndarray:
     """(H W, 8) float32, a plane per pixel of a depth map, see csrc/surface/fuse.h and surfels.h.
 

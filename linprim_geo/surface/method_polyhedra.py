@@ -16,6 +16,7 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh, face_areas, select_faces
 from linprim_geo.geometry.primitives import ARRAYS, Primitives
 from linprim_geo.runs.run import Run
+from linprim_geo.surface.mesh_views import MeshViews
 from linprim_geo.surface.method_tsdf import SEEN_THROUGH, kept_bytes
 from linprim_geo.surface.normals import vertex_normals
 from linprim_geo.surface.polyhedra_planes import Planes, fit_planes, level_points
@@ -282,12 +283,11 @@ def _merged_cells(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _kept_faces(mesh: Mesh, cameras: list[Camera], smallest_part: float) -> np.ndarray:
     """(F,) bool: shells that the ray of some pixel meets first and that have the share `smallest_part` of the largest
     one's area, and what they need."""
-    from linprim_geo.geometry.raycast import RayCaster
     from linprim_geo.surface.visibility import faces_of_pixels
 
     count, label = shells(mesh)
     seen = np.zeros(count, dtype=bool)
-    seen[label[faces_of_pixels(RayCaster(mesh.vertices, mesh.faces), cameras)]] = True
+    seen[label[faces_of_pixels(MeshViews(mesh.vertices, mesh.faces), cameras)]] = True
     area = np.bincount(label, weights=face_areas(mesh), minlength=count)
     largest = area[seen].max() if seen.any() else 0.0
     return kept_shells(mesh, seen & (area >= smallest_part * largest))

@@ -17,13 +17,12 @@ from linprim_geo.capture.types import Photo, View
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.kernels import surface_ops
+from linprim_geo.surface.mesh_views import MeshViews
 from linprim_geo.surface.normals import vertex_normals
 from linprim_geo.surface.visibility import FAR
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
-
-    from linprim_geo.geometry.raycast import RayCaster
 
 
 OFFSETS = np.arange(-3.0, 3.5, 0.5)
@@ -95,7 +94,7 @@ def best_agreement(
     cameras: Sequence[Camera],
     photos: Iterable[Photo],
     gains: np.ndarray | None = None,
-    caster: RayCaster | None = None,
+    caster: MeshViews | None = None,
 ) -> Agreement:
     """Compares photographs along the normal of every vertex.
 
@@ -118,7 +117,7 @@ def best_agreement(
 
 
 def photo_gains(
-    mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo], caster: RayCaster | None = None
+    mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo], caster: MeshViews | None = None
 ) -> np.ndarray:
     """(K,) float64 brightness of each photograph relative to the others, of geometric mean 1, by what they show of the
     same vertices.
@@ -158,7 +157,7 @@ def predicted_error(
     cameras: Sequence[Camera],
     photos: Iterable[Photo],
     gains: np.ndarray | None = None,
-    caster: RayCaster | None = None,
+    caster: MeshViews | None = None,
 ) -> np.ndarray:
     """(V,) float32 predicted distance of each vertex from the true surface, in the mesh's unit; arguments as of
     `best_agreement`.
@@ -193,7 +192,7 @@ def predicted_error(
 
 
 def refine_surface(
-    mesh: Mesh, views: Sequence[View], rounds: int, gains: np.ndarray | None = None, caster: RayCaster | None = None
+    mesh: Mesh, views: Sequence[View], rounds: int, gains: np.ndarray | None = None, caster: MeshViews | None = None
 ) -> Mesh:
     """Moves vertices to where the photographs agree best, `rounds` times; faces stay as they are, normals are made
     anew.
@@ -219,7 +218,7 @@ def _compared(
     cameras: Sequence[Camera],
     photos: Iterable[Photo],
     gains: np.ndarray | None,
-    caster: RayCaster | None,
+    caster: MeshViews | None,
     places: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(V, 3) normals, (V,) whether at least two photographs see a vertex well, (V,) footprints, and of the P vertices
@@ -306,15 +305,13 @@ def _points(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _photographed(
-    mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo], caster: RayCaster | None
+    mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo], caster: MeshViews | None
 ) -> Iterator[tuple]:
     """Of each view the camera, the (H, W) brightness of its photograph, depth of the mesh, and largest less least depth
     of 3x3 pixels."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
-    from linprim_geo.geometry.raycast import RayCaster
-
-    caster = caster or RayCaster(mesh.vertices, mesh.faces)
+    caster = caster or MeshViews(mesh.vertices, mesh.faces)
     for camera, photo in zip(cameras, photos, strict=True):
         depth = np.minimum(caster.first_hits(camera)[0], FAR * caster.diagonal).astype(np.float32)
         jump = maximum_filter(depth, 3, mode="nearest") - minimum_filter(depth, 3, mode="nearest")

@@ -10,13 +10,13 @@ from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Stages
 from linprim_geo.geometry.mesh import Mesh, select_faces
 from linprim_geo.geometry.mesh_files import save_mesh
-from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.creases import sharpened
 from linprim_geo.surface.denoise import denoised
 from linprim_geo.surface.depth_error import error_of_nearest
 from linprim_geo.surface.fairing import faired
 from linprim_geo.surface.mesh_process import process_mesh
+from linprim_geo.surface.mesh_views import MeshViews
 from linprim_geo.surface.photo_consistency import photo_gains, predicted_error, refine_surface
 from linprim_geo.surface.safe_moves import moved_safely
 from linprim_geo.surface.shaded_views import save_shaded, shaded_row
@@ -64,7 +64,7 @@ def finish_surface(
     given = mesh
     views = run.scene().train
     cameras = [view.camera for view in views]
-    caster = RayCaster(mesh.vertices, mesh.faces)
+    caster = MeshViews(mesh.vertices, mesh.faces)
     pictures = [shaded_row(mesh, caster, cameras)]
     stages.lap("picture")
     gains = photo_gains(mesh, cameras, (view.load() for view in views), caster)
@@ -82,7 +82,7 @@ def finish_surface(
     if processing:
         stages.lap("process")
     if options.refine or options.denoise == "on" or processing:
-        caster = RayCaster(mesh.vertices, mesh.faces)
+        caster = MeshViews(mesh.vertices, mesh.faces)
         pictures.append(shaded_row(mesh, caster, cameras))
         stages.lap("picture")
     if given.quality is not None:

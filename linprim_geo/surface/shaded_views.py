@@ -11,7 +11,7 @@ from linprim_geo.base.files import atomic_write
 from linprim_geo.geometry.boxes import smaller
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh
-from linprim_geo.geometry.raycast import RayCaster
+from linprim_geo.surface.mesh_views import MeshViews
 from linprim_geo.surface.visibility import render_preview
 
 # Pictures next to each other, and pixels along the longer side of each at most.
@@ -35,7 +35,7 @@ def save_shaded(target: Path, rows: Sequence[np.ndarray]) -> None:
         Image.fromarray(np.concatenate(rows)).save(temporary)
 
 
-def shaded_row(mesh: Mesh, caster: RayCaster, cameras: Sequence[Camera]) -> np.ndarray:
+def shaded_row(mesh: Mesh, caster: MeshViews, cameras: Sequence[Camera]) -> np.ndarray:
     """(H, W, 3) uint8: the mesh from the cameras that `most_different` chooses, beside each other, lit from each."""
     chosen = [cameras[index] for index in most_different(cameras)]
     chosen = [smaller(camera, -(-max(camera.width, camera.height) // PIXELS)) for camera in chosen]

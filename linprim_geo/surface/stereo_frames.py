@@ -14,7 +14,6 @@ import numpy as np
 
 from linprim_geo.capture.types import View
 from linprim_geo.geometry.mesh import Mesh, face_areas, face_components, select_faces
-from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.common_surfaces import ON_IT
 from linprim_geo.stereo.depth_maps import SURE, DepthMap, depth_maps
@@ -36,6 +35,7 @@ from linprim_geo.stereo.shaded_planes import ShadedPlanes
 from linprim_geo.stereo.textured_backgrounds import textured_backgrounds
 from linprim_geo.stereo.thin_things import SeenDepths, thin_things
 from linprim_geo.stereo.visibility_cut import plane_normals, points_per_view, spanned_depths
+from linprim_geo.surface.mesh_views import MeshViews
 from linprim_geo.surface.single_view import mesh_is_closed
 from linprim_geo.surface.tsdf_field import DepthFrame
 
@@ -221,11 +221,11 @@ class MergedFrames(Sequence):
 
     def covered(self, mesh: Mesh) -> float:
         """Share of the pixels with a rendered depth whose rays hit a mesh, of one of SAMPLED rows and columns."""
-        caster, shown, hit = RayCaster(mesh.vertices, mesh.faces), 0, 0
+        caster, shown, hit = MeshViews(mesh.vertices, mesh.faces), 0, 0
         for camera, sampled in zip(self.cameras, self.shown, strict=True):
             row, column = (x * SAMPLED for x in np.nonzero(sampled))
             shown += len(row)
-            hit += np.count_nonzero(caster.cast_single(camera.center, camera.world_rays()[row, column])[1] >= 0)
+            hit += np.count_nonzero(caster.first_hits(camera)[1][row, column] >= 0)
         return hit / max(shown, 1)
 
     def about(self) -> dict:

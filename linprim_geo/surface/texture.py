@@ -15,6 +15,7 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.mesh import Mesh, face_areas, face_normals
+from linprim_geo.surface.mesh_views import MeshViews
 from linprim_geo.surface.visibility import POOR_RINGS, color_vertices, photographed, pixels_of, with_gain
 
 if TYPE_CHECKING:
@@ -142,10 +143,8 @@ def _bake(mesh, corners, owner, rows, size, photographs):
     from scipy.ndimage import distance_transform_edt
     from scipy.spatial import cKDTree
 
-    from linprim_geo.geometry.raycast import RayCaster
-
     cameras = photographs.cameras
-    caster = RayCaster(mesh.vertices, mesh.faces)
+    caster = MeshViews(mesh.vertices, mesh.faces)
     normals = face_normals(mesh)
     color = np.empty((len(rows), 3), dtype=np.float32)
     points = np.empty((len(rows), 3))

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,11 +13,8 @@ from linprim_geo.capture.types import Photo
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.kernels import surface_ops
+from linprim_geo.surface.mesh_views import MeshViews
 from linprim_geo.surface.normals import vertex_normals
-
-if TYPE_CHECKING:
-    from linprim_geo.geometry.raycast import RayCaster
-
 
 SAMPLES = np.array([[1 / 3, 1 / 3, 1 / 3], [0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8]])
 """Barycentric coordinates of the points of a face that are tested: the middle, and one near each corner."""
@@ -62,7 +58,7 @@ POOR_RINGS = 3
 Wires, which are nothing but outline, keep their own."""
 
 
-def visible_faces(mesh: Mesh, cameras: Sequence[Camera], caster: RayCaster | None = None) -> np.ndarray:
+def visible_faces(mesh: Mesh, cameras: Sequence[Camera], caster: MeshViews | None = None) -> np.ndarray:
     """Which faces any of the cameras sees, from either side.
 
     A face is seen if the ray through the centre of a pixel hits it first, or if one of four points on it lies
@@ -74,9 +70,7 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera], caster: RayCaster | Non
     Raises:
         LinprimError: the mesh is empty or not finite.
     """
-    from linprim_geo.geometry.raycast import RayCaster
-
-    caster = caster or RayCaster(mesh.vertices, mesh.faces)
+    caster = caster or MeshViews(mesh.vertices, mesh.faces)
     seen = faces_of_pixels(caster, cameras)
     gap, before = SURFACE_GAP * caster.diagonal, np.zeros(len(seen), np.uint8)
     for camera in cameras:
@@ -98,7 +92,7 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera], caster: RayCaster | Non
     return seen
 
 
-def faces_of_pixels(caster: RayCaster, cameras: Sequence[Camera]) -> np.ndarray:
+def faces_of_pixels(caster: MeshViews, cameras: Sequence[Camera]) -> np.ndarray:
     """(F,) bool: faces of the mesh that the ray through the centre of a pixel hits first.
 
     A ray that sees further than those of all four pixels around it has slipped through an edge, or looks through a gap
@@ -127,7 +121,7 @@ def with_gain(pixels: np.ndarray, gain: float) -> np.ndarray:
 
 
 def color_vertices(
-    mesh: Mesh, cameras: Sequence[Camera], images: Iterable[np.ndarray], caster: RayCaster | None = None
+    mesh: Mesh, cameras: Sequence[Camera], images: Iterable[np.ndarray], caster: MeshViews | None = None
 ) -> np.ndarray:
     """Vertex colours from the photographs that see each vertex.
 
@@ -145,9 +139,7 @@ def color_vertices(
     Raises:
         LinprimError: an image does not have the size of its camera.
     """
-    from linprim_geo.geometry.raycast import RayCaster
-
-    caster = caster or RayCaster(mesh.vertices, mesh.faces)
+    caster = caster or MeshViews(mesh.vertices, mesh.faces)
     normals = vertex_normals(mesh) if mesh.normals is None else mesh.normals
     edge = mesh.vertices[mesh.faces[:, 1]] - mesh.vertices[mesh.faces[:, 0]]
     slack = float(np.median(np.linalg.norm(edge, axis=1)))
@@ -156,7 +148,7 @@ def color_vertices(
 
 
 def photographed(
-    caster: RayCaster,
+    caster: MeshViews,
     points: np.ndarray,
     normals: np.ndarray,
     cameras: Sequence[Camera],
@@ -260,7 +252,7 @@ def render_preview(
     smooth: bool = False,
     supersample: int = 2,
     background: tuple[int, int, int] = (255, 255, 255),
-    caster: RayCaster | None = None,
+    caster: MeshViews | None = None,
 ) -> np.ndarray:
     """A picture of a mesh by rays, without a graphics library: Lambert shading with the light at the camera.
 
@@ -275,11 +267,9 @@ def render_preview(
     Returns:
         (H, W, 3) uint8.
     """
-    from linprim_geo.geometry.raycast import RayCaster
-
     k = supersample
     rays = camera.magnified(k).world_rays().reshape(-1, 3)
-    caster = caster or RayCaster(mesh.vertices, mesh.faces)
+    caster = caster or MeshViews(mesh.vertices, mesh.faces)
     _, face, bary = caster.cast(camera.center, rays)
     hit = face >= 0
     corners = mesh.faces[face[hit]]

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.geometry import raycast
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.synthetic.camera_paths import look_at
@@ -206,34 +205,6 @@ def test_single_precision_casts_agree_with_the_exact_ones():
     assert np.abs(t - exact).max() < 1e-5
     rows = face == same
     assert np.abs(bary[rows] - uv[rows]).max() < 1e-3
-
-
-def test_first_hits_of_a_camera_are_those_of_its_pixels_and_are_kept_within_a_limit(monkeypatch):
-    vertices, faces = sphere(0.1)
-    camera = Camera(
-        40, 30, 50.0, 55.0, 19.0, 16.0, np.array([[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1.0]])
-    )
-    other = Camera(
-        40, 30, 50.0, 55.0, 19.0, 16.0, np.array([[1, 0, 0, 0.2], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1.0]])
-    )
-    monkeypatch.setattr(raycast, "KEPT_BYTES", 8 * 40 * 30)
-    caster = RayCaster(vertices, faces)
-    depth, face = caster.first_hits(camera)
-    exact, same, _ = caster.render_depth(camera)
-    assert ((face >= 0) == (same >= 0)).mean() > 0.99 and (face == same).mean() > 0.98
-    both = (face >= 0) & (same >= 0)
-    assert np.abs(depth[both] - exact[both]).max() < 1e-5
-    assert np.isinf(depth[face < 0]).all()
-    assert caster.first_hits(camera)[0] is depth
-    with pytest.raises(ValueError, match="read-only"):
-        depth[0, 0] = 0
-    # No room is left for another one, which is cast again.
-    again = caster.first_hits(other)[0]
-    assert (
-        caster.first_hits(other)[0] is not again
-        and (caster.first_hits(other)[0] == again).all()
-        and (again != depth).any()
-    )
 
 
 def test_rays_without_meaning_and_degenerate_faces_hit_nothing():

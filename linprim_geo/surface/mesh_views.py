@@ -1,0 +1,39 @@
+"""A mesh that rays can be cast at, and that cameras see."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.raycast import RayCaster
+from linprim_geo.kernels import surface_ops
+
+KEPT_BYTES = 1 << 29
+"""What cameras see is kept up to this, so that what asks for it one after the other has it once."""
+
+
+class MeshViews(RayCaster):
+    """A ray caster that draws what cameras see, which takes no tree and, in large images, a third of the time."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, *, threads: int = 0):
+        super().__init__(vertices, faces, threads=threads)
+        self._kept: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
+
+    def first_hits(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """What a camera sees at its pixel centres; a ray through an edge sees one of its faces.
+
+        Returns read-only depth (H, W) float32 along the optical axis, inf where nothing is hit, and face (H, W) int32,
+        there -1. Accuracy: that of float32 for depths, 1e-12 of a pixel for what is seen. Memory: 8 bytes per pixel are
+        kept, at most KEPT_BYTES over all cameras.
+        """
+        pose, lens = camera.pinhole()
+        key = (camera.width, camera.height, *lens, pose.tobytes())
+        if key in self._kept:
+            return self._kept[key]
+        vertices, faces = np.ascontiguousarray(self.vertices), np.ascontiguousarray(self.faces)
+        hits = surface_ops.first_hits(pose, lens, camera.width, camera.height, vertices, faces)
+        for array in hits:
+            array.flags.writeable = False
+        if sum(array.nbytes for kept in (*self._kept.values(), hits) for array in kept) <= KEPT_BYTES:
+            self._kept[key] = hits
+        return hits
