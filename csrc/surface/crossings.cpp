@@ -11,7 +11,8 @@
 namespace linprim {
 namespace {
 
-constexpr int64_t kLeaf = 4;  // faces in a leaf at most
+constexpr int64_t kLeaf = 4;     // faces in a leaf at most
+constexpr int kLevelsApart = 4;  // levels below which parts of the tree are built at the same time
 constexpr int64_t kEdgesPerTask = 4096;
 
 struct Box {
@@ -27,6 +28,11 @@ struct Box {
   }
 };
 
+// Faces of the order.
+struct Range {
+  int64_t begin, end;
+};
+
 // Faces begin .. end - 1 of the order. Its first child is the next node, unless that is `after`, the next one that is
 // not below it: a leaf.
 struct FaceNode {
@@ -39,45 +45,82 @@ struct FaceTree {
   const int64_t* corner;
   const double* vertex;
   std::vector<int64_t> order;
+  std::vector<Vector> middle;  // of each face, three times
   std::vector<FaceNode> nodes;
 
-  FaceTree(int64_t faces, const int64_t* corner, const double* vertex) : corner(corner), vertex(vertex), order(faces) {
+  FaceTree(int64_t faces, const int64_t* corner, const double* vertex)
+      : corner(corner), vertex(vertex), order(faces), middle(faces) {
     std::iota(order.begin(), order.end(), int64_t(0));
-    if (faces) build(0, faces);
+    if (!faces) return;
+    for_rows(faces, [&](int64_t f) {
+      for (int k = 0; k < 3; ++k) add(middle[f], 1, at(corner[3 * f + k]));
+    });
+    std::vector<Range> parts;
+    divide({0, faces}, kLevelsApart, parts);
+    std::vector<std::vector<FaceNode>> below(parts.size());
+    parallel_for(int64_t(parts.size()), [&](int64_t part, int) { build(parts[part], below[part]); });
+    size_t next = 0;
+    join({0, faces}, kLevelsApart, below, next);
   }
 
   Vector at(int64_t v) const { return {vertex[3 * v], vertex[3 * v + 1], vertex[3 * v + 2]}; }
 
-  double middle(int64_t face, int axis) const {
-    const int64_t* c = corner + 3 * face;
-    return vertex[3 * c[0] + axis] + vertex[3 * c[1] + axis] + vertex[3 * c[2] + axis];
+  // Puts the faces of a range in two halves, and gives where the second begins.
+  int64_t halved(Range range) {
+    Box middles;
+    for (int64_t i = range.begin; i < range.end; ++i) middles.take(middle[order[i]]);
+    int axis = 0;
+    for (int k = 1; k < 3; ++k)
+      if (middles.high[k] - middles.low[k] > middles.high[axis] - middles.low[axis]) axis = k;
+    const int64_t half = range.begin + (range.end - range.begin) / 2;
+    std::nth_element(order.begin() + range.begin, order.begin() + half, order.begin() + range.end,
+                     [&](int64_t a, int64_t b) { return middle[a][axis] < middle[b][axis]; });
+    return half;
   }
 
-  void build(int64_t begin, int64_t end) {
-    const size_t at_node = nodes.size();
-    nodes.push_back({{}, begin, end, 0});
-    Box box;
-    if (end - begin > kLeaf) {
-      Box middles;
-      for (int64_t i = begin; i < end; ++i)
-        middles.take({middle(order[i], 0), middle(order[i], 1), middle(order[i], 2)});
-      int axis = 0;
-      for (int k = 1; k < 3; ++k)
-        if (middles.high[k] - middles.low[k] > middles.high[axis] - middles.low[axis]) axis = k;
-      const int64_t half = begin + (end - begin) / 2;
-      std::nth_element(order.begin() + begin, order.begin() + half, order.begin() + end,
-                       [&](int64_t a, int64_t b) { return middle(a, axis) < middle(b, axis); });
-      const size_t first = nodes.size();
-      build(begin, half);
-      const size_t second = nodes.size();
-      build(half, end);
-      for (const size_t child : {first, second}) box.take(nodes[child].box.low), box.take(nodes[child].box.high);
-    } else {
-      for (int64_t i = begin; i < end; ++i)
-        for (int k = 0; k < 3; ++k) box.take(at(corner[3 * order[i] + k]));
+  // The ranges that are built each on its own, so many levels below.
+  void divide(Range range, int levels, std::vector<Range>& parts) {
+    if (levels == 0 || range.end - range.begin <= kLeaf) return parts.push_back(range);
+    const int64_t half = halved(range);
+    divide({range.begin, half}, levels - 1, parts);
+    divide({half, range.end}, levels - 1, parts);
+  }
+
+  // Puts what was built on its own in its place in the tree, from the part `next` on.
+  void join(Range range, int levels, const std::vector<std::vector<FaceNode>>& below, size_t& next) {
+    const size_t first = nodes.size();
+    if (levels == 0 || range.end - range.begin <= kLeaf) {
+      for (FaceNode node : below[next++]) node.after += first, nodes.push_back(node);
+      return;
     }
-    nodes[at_node].box = box;
-    nodes[at_node].after = nodes.size();
+    nodes.push_back({{}, range.begin, range.end, 0});
+    const int64_t half = range.begin + (range.end - range.begin) / 2;
+    join({range.begin, half}, levels - 1, below, next);
+    const size_t second = nodes.size();
+    join({half, range.end}, levels - 1, below, next);
+    close(nodes, first, second);
+  }
+
+  void build(Range range, std::vector<FaceNode>& into) {
+    const size_t first = into.size();
+    into.push_back({{}, range.begin, range.end, first + 1});
+    if (range.end - range.begin <= kLeaf) {
+      for (int64_t i = range.begin; i < range.end; ++i)
+        for (int k = 0; k < 3; ++k) into[first].box.take(at(corner[3 * order[i] + k]));
+      return;
+    }
+    const int64_t half = halved(range);
+    build({range.begin, half}, into);
+    const size_t second = into.size();
+    build({half, range.end}, into);
+    close(into, first, second);
+  }
+
+  // Gives a node, whose children are the next one and `second`, their box; they are the end of `tree`.
+  static void close(std::vector<FaceNode>& tree, size_t node, size_t second) {
+    for (const size_t child : {node + 1, second})
+      tree[node].box.take(tree[child].box.low), tree[node].box.take(tree[child].box.high);
+    tree[node].after = tree.size();
   }
 };
 

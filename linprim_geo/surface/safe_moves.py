@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from linprim_geo.base.sorting import distinct
 from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.surface.normals import folded, vertex_normals
 from linprim_geo.surface.self_intersections import crossings, edges_of
@@ -33,15 +34,27 @@ def moved_safely(mesh: Mesh, vertices: np.ndarray) -> Mesh:
         if not share[faces[over]].any():
             break
         share[faces[over]] *= 0.5
-    edges = edges_of(faces)
+    edges, changed = edges_of(faces), np.ones(len(start), bool)
     for _ in range(ROUNDS):
-        pierced, piercing = crossings(moved(), edges)
-        at = np.union1d(faces[pierced], piercing)
+        at = _crossing(moved(), edges, changed)
         if not share[at].any():
             break
         touched = np.zeros(len(start), bool)
         touched[at] = True
-        share[faces[touched[faces].any(1)]] *= 0.5
+        changed = np.zeros(len(start), bool)
+        changed[faces[touched[faces].any(1)]] = True
+        share[changed] *= 0.5
         share[at] = 0
     mesh = moved()
     return replace(mesh, normals=vertex_normals(mesh))
+
+
+def _crossing(mesh: Mesh, edges: np.ndarray, changed: np.ndarray) -> np.ndarray:
+    """Vertices of faces that the (E, 2) edges of a mesh pierce, and of these edges, where one of them has `changed`
+    (V,)."""
+    of_changed, some = changed[edges].any(1), replace(mesh, faces=mesh.faces[changed[mesh.faces].any(1)])
+    at = [np.zeros(0, np.int64)]
+    for others, asked in ((mesh, edges[of_changed]), (some, edges[~of_changed])):
+        pierced, piercing = crossings(others, asked)
+        at += [others.faces[pierced].ravel(), piercing.ravel()]
+    return distinct(np.concatenate(at))
