@@ -18,7 +18,7 @@ from linprim_geo.surface.fairing import faired
 from linprim_geo.surface.mesh_process import process_mesh
 from linprim_geo.surface.mesh_views import MeshViews
 from linprim_geo.surface.photo_consistency import photo_gains, predicted_error, refine_surface
-from linprim_geo.surface.safe_moves import moved_safely
+from linprim_geo.surface.safe_moves import moved_safely, untangled
 from linprim_geo.surface.shaded_views import save_shaded, shaded_row
 from linprim_geo.surface.texture import make_texture
 from linprim_geo.surface.texture_files import save_textured
@@ -73,8 +73,13 @@ def finish_surface(
         stages.lap("refine")
     if options.denoise == "on":
         mesh = denoised(mesh, views, gains) if mesh.quality is None else moved_safely(mesh, faired(mesh).vertices)
-        mesh = sharpened(mesh) if creases else mesh
         stages.lap("denoise")
+    if given.quality is None and mesh is not given:
+        mesh = untangled(mesh)
+        stages.lap("untangle")
+    if options.denoise == "on" and creases:
+        mesh = sharpened(mesh)
+        stages.lap("creases")
     if options.tolerance == "auto" and mesh.quality is None:
         mesh = replace(mesh, quality=predicted_error(mesh, cameras, (view.load() for view in views), gains))
         stages.lap("quality")

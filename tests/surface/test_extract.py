@@ -75,6 +75,8 @@ def test_what_is_written(extracted, solid):
         "compare",
         "refine",
         "denoise",
+        "untangle",
+        "creases",
         "colours",
         "visibility",
         "picture",
