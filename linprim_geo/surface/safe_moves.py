@@ -14,11 +14,8 @@ from linprim_geo.surface.photo_consistency import neighbour_average
 from linprim_geo.surface.self_intersections import crossings, edges_of
 
 FOLD_ROUNDS, ROUNDS = 3, 8
-"""In which vertices give moves back that fold a face over, and that push one through another."""
-
-AVERAGE_ROUNDS, NARROW_ROUNDS = 20, 6
-"""In which vertices where a surface goes through itself take the mean of their neighbours, and after which the ones
-beside them go half of that way, too."""
+"""In which vertices give moves back that fold a face over, and that push one through another; in so many as the latter
+vertices where a surface goes through itself take the mean of their neighbours."""
 
 
 def moved_safely(mesh: Mesh, vertices: np.ndarray) -> Mesh:
@@ -58,23 +55,20 @@ def moved_safely(mesh: Mesh, vertices: np.ndarray) -> Mesh:
 def untangled(mesh: Mesh) -> Mesh:
     """The mesh, smoother where it goes through itself, until it does so in few places or none; normals are made anew.
 
-    The vertices of faces and edges that cross take the mean of their neighbours, AVERAGE_ROUNDS times at most. Memory:
-    some 400 bytes per vertex.
+    The vertices of faces and edges that cross take the mean of their neighbours, ROUNDS times at most: more of them
+    widen the holes that thin sheets have. Memory: some 400 bytes per vertex.
     """
-    faces, edges, average = mesh.faces, edges_of(mesh.faces), neighbour_average(mesh)
+    edges, average = edges_of(mesh.faces), neighbour_average(mesh)
     mesh = replace(mesh, vertices=mesh.vertices.astype(np.float64))
     changed = np.ones(len(mesh.vertices), bool)
-    for number in range(AVERAGE_ROUNDS):
+    for _ in range(ROUNDS):
         at = _crossing(mesh, edges, changed)
         if len(at) == 0:
             break
-        share = np.zeros(len(changed))
-        share[at] = 1
-        if number >= NARROW_ROUNDS:
-            share[distinct(faces[(share[faces] > 0).any(1)].ravel())] = 0.5
-            share[at] = 1
-        changed, place = share > 0, mesh.vertices.copy()
-        place[changed] += share[changed, None] * (average[changed] @ place - place[changed])
+        place = mesh.vertices.copy()
+        place[at] = average[at] @ place
+        changed = np.zeros(len(place), bool)
+        changed[at] = True
         mesh = replace(mesh, vertices=place)
     return replace(mesh, normals=vertex_normals(mesh))
 
