@@ -5,6 +5,7 @@
 
 #include <algorithm>
 #include <array>
+#include <cmath>
 #include <initializer_list>
 #include <optional>
 #include <stdexcept>
@@ -314,6 +315,8 @@ void bind_surface(nb::module_& m) {
   m.def("crossings", [](In<int64_t> corner, In<double> vertex, In<int64_t> end) {
     const int64_t vertices = int64_t(vertex.shape(0)), faces = int64_t(corner.shape(0)), edges = int64_t(end.shape(0));
     const double* at = checked(vertex, {vertices, 3}, "vertex");
+    if (!std::all_of(at, at + 3 * vertices, [](double x) { return std::isfinite(x); }))
+      throw std::invalid_argument("vertices are not finite");
     const int64_t *corners = rows_of(corner, {faces, 3}, vertices, "corner"),
                   *ends = rows_of(end, {edges, 2}, vertices, "end");
     linprim::Crossings found;

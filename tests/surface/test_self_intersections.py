@@ -103,3 +103,13 @@ def test_edges_that_are_asked_alone_count():
     few = crossings(mesh, some)
     assert asked.any() and np.array_equal(few[0], face[asked]) and np.array_equal(few[1], ends[asked])
     assert len(crossings(mesh, some[:0])[0]) == 0
+
+
+def test_wrong_arrays_are_refused():
+    ball = sphere()
+    with pytest.raises(ValueError, match="not finite"):
+        crossings(replace(ball, vertices=np.where(ball.vertices > 0.99, np.nan, ball.vertices)))
+    with pytest.raises(ValueError, match="corners are outside of the vertices"):
+        crossings(replace(ball, faces=ball.faces + 1))
+    with pytest.raises(ValueError, match="ends are outside of the vertices"):
+        crossings(ball, edges_of(ball.faces) - 1)
