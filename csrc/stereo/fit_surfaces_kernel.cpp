@@ -38,7 +38,7 @@ F lanes() {
   return numbers;
 }
 
-F absolute(F values) { return values < 0 ? -values : values; }
+F absolute(F values) { return values < F{} ? -values : values; }
 
 int total(I values) {
   int sum = 0;
@@ -72,7 +72,7 @@ struct PixelCross {
         std::memcpy(&there, inverse + middle + x, sizeof there);
         const F column = splat(float(x)) + lanes();
         const F expected = base + slope * column, off = absolute(there - expected), most_off = width * expected;
-        const I inside = column <= float(right);
+        const I inside = column <= splat(float(right));
         for (int k = 0; k < kScales; ++k) on[k] -= inside & (off < most_off * splat(1.0f / float(1 << k)));
       }
       uncounted -= left + right + 1;
@@ -112,7 +112,7 @@ Columns sums(const float* inverse, int height, int width, int64_t at, const Surf
   const int up = std::min(kCrossReach, row), down = std::min(kCrossReach, height - 1 - row);
   for (int dx = -left; dx <= right; dx += kWide) {
     const F x = splat(float(dx)) + lanes(), bent = splat(c[3]) * x * x;
-    const I inside = x <= float(right);
+    const I inside = x <= splat(float(right));
     F ones[5] = {}, differences[3] = {};
     for (int dy = -up; dy <= down; ++dy) {
       const float y = float(dy);
