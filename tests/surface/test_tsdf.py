@@ -10,12 +10,12 @@ import pytest
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh, face_components
-from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.geometry.topology import manifold_status, topology
 from linprim_geo.imaging.colors import error_colors
 from linprim_geo.kernels import ops, surface_ops
 from linprim_geo.surface import tsdf_fusion as fuse
 from linprim_geo.surface import visibility
+from linprim_geo.surface.mesh_views import MeshViews
 from linprim_geo.surface.tsdf_field import DepthFrame, Grid, vote_rules
 from linprim_geo.surface.tsdf_fusion import fuse_tsdf
 
@@ -383,7 +383,7 @@ def test_vertex_colours_are_those_of_the_photographs(ball):
     error = np.abs(colors.astype(int) - paint(ball.vertices))
     assert np.quantile(error, 0.99) <= 6 and error.mean() < 1.5
     floats = [picture / np.float32(255) for picture in pictures]
-    again = visibility.color_vertices(ball, cameras, floats, RayCaster(ball.vertices, ball.faces))
+    again = visibility.color_vertices(ball, cameras, floats, MeshViews(ball.vertices, ball.faces))
     assert np.abs(again.astype(int) - colors).max() <= 1
 
 
