@@ -121,9 +121,10 @@ Columns sums(const float* inverse, int height, int width, int64_t at, const Surf
       const F expected = splat(c[0] + c[2] * y + c[5] * y * y) + splat(c[1] + c[4] * y) * x + bent;
       const F difference = there - expected, most_off = splat(tolerance) * expected;
       const I on = inside & (absolute(difference) < most_off);
-      F one = on ? splat(1.0f) : F{}, off = on ? difference : F{};
-      for (int b = 0; b < 5; ++b, one *= splat(y)) ones[b] += one;
-      for (int b = 0; b < 3; ++b, off *= splat(y)) differences[b] += off;
+      const F one = on ? splat(1.0f) : F{}, off = on ? difference : F{};
+      const float power[5] = {1, y, y * y, y * y * y, y * y * y * y};
+      for (int b = 0; b < 5; ++b) ones[b] += one * splat(power[b]);
+      for (int b = 0; b < 3; ++b) differences[b] += off * splat(power[b]);
     }
     for (int b = 0; b < 5; ++b) std::memcpy(columns.ones[b] + dx + kCrossReach, &ones[b], sizeof ones[b]);
     for (int b = 0; b < 3; ++b)
