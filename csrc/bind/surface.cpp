@@ -322,7 +322,7 @@ void bind_surface(nb::module_& m) {
     linprim::Crossings found;
     {
       nb::gil_scoped_release release;
-      found = linprim::crossings(faces, corners, at, edges, ends);
+      found = linprim::crossings(vertices, at, faces, corners, edges, ends);
     }
     return std::tuple(owned(std::move(found.face)), owned(std::move(found.edge)));
   });

@@ -9,8 +9,6 @@
 namespace linprim {
 namespace {
 
-constexpr int kMostWide = 16;  // of stereo/wide.h
-
 SurfaceFitKernel kernel() {
   const char* name = instruction_set();
 #if defined(__x86_64__) || defined(_M_X64)
@@ -30,7 +28,7 @@ void fit_surfaces(const uint8_t* grey, const float* plane, const float* cost, in
   const Crosses crosses(grey, height, width);
   const int64_t pixels = int64_t(height) * width;
   std::vector<float> inverse(plane, plane + pixels);
-  inverse.resize(pixels + kMostWide);
+  inverse.resize(pixels + kRoomAfter);
   const SurfaceFit fit{crosses, height,    width,  inverse.data(), plane + pixels, plane + 2 * pixels,
                        cost,    tolerance, fitted, fitted_cost};
   const SurfaceFitKernel run = kernel();

@@ -28,11 +28,13 @@ constexpr int kFewestFitted = 12, kFitRounds = 2;
 void fit_surfaces(const uint8_t* grey, const float* plane, const float* cost, int height, int width, float tolerance,
                   float* fitted, float* fitted_cost);
 
+constexpr int kRoomAfter = 16;  // floats that a kernel may read after an image: its widest vector
+
 // What `fit_surfaces` is given, for the rows of the kernels in fit_surfaces_kernel.cpp.
 struct SurfaceFit {
   const Crosses& crosses;
   int height, width;
-  const float *inverse, *right_slope, *down_slope;  // with room for a vector of floats after `inverse`
+  const float *inverse, *right_slope, *down_slope;  // kRoomAfter floats more of `inverse`
   const float* cost;
   float tolerance;
   float *fitted, *fitted_cost;

@@ -16,6 +16,7 @@ namespace LINPRIM_ISA {
 namespace {
 
 constexpr int kAcross = 2 * kCrossReach + 1, kTerms = 6, kRowsAtOnce = 2;
+static_assert(kWide <= kRoomAfter);
 // Powers of x and y of the terms of a surface of second order.
 constexpr int kX[kTerms] = {0, 1, 0, 2, 1, 0}, kY[kTerms] = {0, 0, 1, 0, 1, 2};
 // A term is dropped if earlier ones leave less than this share of its sum of squares: in two columns x * x equals x.
@@ -46,7 +47,7 @@ int total(I values) {
   return sum;
 }
 
-// The cross of the pixel at `at` in an image of inverse depths, after which there is room for kWide more.
+// The cross of the pixel at `at` in an image of inverse depths, after which kRoomAfter more may be read.
 struct PixelCross {
   const Crosses& crosses;
   const float* inverse;

@@ -170,11 +170,11 @@ void find(const FaceTree& tree, const Sides& sides, const int64_t* end, int64_t 
 
 }  // namespace
 
-Crossings crossings(int64_t faces, const int64_t* corner, const double* vertex, int64_t edges, const int64_t* end) {
+Crossings crossings(int64_t vertices, const double* vertex, int64_t faces, const int64_t* corner, int64_t edges,
+                    const int64_t* end) {
   const FaceTree tree(faces, corner, vertex);
   Sides sides;
-  for (int64_t i = 0; i < 3 * faces; ++i)
-    for (const double x : tree.at(corner[i])) sides.largest = std::max(sides.largest, std::abs(x));
+  for (int64_t i = 0; i < 3 * vertices; ++i) sides.largest = std::max(sides.largest, std::abs(vertex[i]));
   const int64_t tasks = (edges + kEdgesPerTask - 1) / kEdgesPerTask;
   std::vector<Crossings> found(tasks);
   parallel_for(tasks, [&](int64_t task, int) {

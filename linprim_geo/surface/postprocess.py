@@ -59,8 +59,8 @@ def finish_surface(
 
     Colours are those of photographs without the gains by which their brightness differs (`photo_gains`). By a `quality`
     that it has, noise is smoothed away, and it is kept; else by that of photographs (`predicted_error`), which a
-    tolerance `auto` asks for, too. With `creases`, denoising also puts these where flat parts meet, as voxels cut them
-    off."""
+    tolerance `auto` asks for, too, and the surface is smoothed where it goes through itself by then. With `creases`,
+    denoising also puts these where flat parts meet, as voxels cut them off."""
     given = mesh
     views = run.scene().train
     cameras = [view.camera for view in views]
