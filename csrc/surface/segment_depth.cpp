@@ -9,7 +9,7 @@
 #include <limits>
 #include <numeric>
 
-#include "linprim.h"
+#include "base/copies.h"
 #include "base/parallel.h"
 
 namespace linprim {
@@ -85,18 +85,6 @@ struct Builder {
   }
 };
 
-SegmentKernel kernel_in_use() {
-  const char* name = instruction_set();
-#if defined(__x86_64__) || defined(_M_X64)
-  if (std::strcmp(name, "v4") == 0) return segment_kernel_v4();
-  if (std::strcmp(name, "v3") == 0) return segment_kernel_v3();
-  if (std::strcmp(name, "v2") == 0) return segment_kernel_v2();
-#else
-  if (std::strcmp(name, "neon") == 0) return segment_kernel_neon();
-#endif
-  return segment_kernel_scalar();
-}
-
 }  // namespace
 
 template <class Real>
@@ -152,7 +140,7 @@ void SolidTree::optical_depth(const double* origin, const double* ends, const do
     }
   }
   const SegmentParams params{seen.data(), nodes_.data(), origin, ends, begin, most, depth};
-  const SegmentKernel kernel = kernel_in_use();
+  const SegmentKernel kernel = kernel_in_force<SegmentKernel>(LINPRIM_COPIES(segment_kernel));
   parallel_for((count + kSegmentsPerTask - 1) / kSegmentsPerTask, [&](int64_t task, int) {
     kernel(params, task * kSegmentsPerTask, std::min(count, (task + 1) * kSegmentsPerTask));
   });

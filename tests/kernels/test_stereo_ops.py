@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.captures import look_at
+from helpers.octahedra import KERNELS
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels import ops
@@ -246,6 +247,20 @@ def blotched(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
     plane[0] *= np.where(wrong < 0.3, 1.1, 1).astype(np.float32)
     plane[:, wrong > 0.9] = 0
     return grey, plane, rng.random(grey.shape).astype(np.float32)
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+def test_fitted_surfaces_have_the_same_bits_by_every_instruction_set(kernels):
+    """A comparison that a last digit turns over has a plane of its own, and so a wall."""
+    scene, before = blotched(61, 83), ops.instruction_set()
+    try:
+        ops.set_instruction_set("scalar")
+        wanted = fitted(*scene)
+        ops.set_instruction_set(kernels)
+        found = fitted(*scene)
+    finally:
+        ops.set_instruction_set(before)
+    assert np.array_equal(found.plane, wanted.plane) and np.array_equal(found.cost, wanted.cost)
 
 
 def test_fitted_surfaces_agree_with_float64():

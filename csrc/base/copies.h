@@ -1,0 +1,38 @@
+// Files that are compiled once per instruction set give functions name_scalar, name_v2 and so on; the one in force.
+#pragma once
+
+#include <cstring>
+#include <initializer_list>
+
+#include "linprim.h"
+
+#if defined(__x86_64__) || defined(_M_X64)
+#define LINPRIM_COPIES(name)                                                             \
+  {                                                                                      \
+    {"scalar", name##_scalar}, {"v2", name##_v2}, {"v3", name##_v3}, { "v4", name##_v4 } \
+  }
+#else
+#define LINPRIM_COPIES(name)                           \
+  {                                                    \
+    {"scalar", name##_scalar}, { "neon", name##_neon } \
+  }
+#endif
+
+namespace linprim {
+
+// A function that gives a kernel, and the instruction set that it is compiled for.
+template <class Kernel>
+struct Copy {
+  const char* instruction_set;
+  Kernel (*kernel)();
+};
+
+// The kernel of `copies`, which are LINPRIM_COPIES(name), for the instruction set in force.
+template <class Kernel>
+Kernel kernel_in_force(std::initializer_list<Copy<Kernel>> copies) {
+  for (const Copy<Kernel>& copy : copies)
+    if (std::strcmp(copy.instruction_set, instruction_set()) == 0) return copy.kernel();
+  return copies.begin()->kernel();
+}
+
+}  // namespace linprim
