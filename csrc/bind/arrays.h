@@ -4,6 +4,7 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 
+#include <algorithm>
 #include <cstdint>
 #include <initializer_list>
 #include <stdexcept>
@@ -32,4 +33,14 @@ auto checked(const Array& array, std::initializer_list<int64_t> shape, const cha
     throw std::invalid_argument(std::string(name) + " has shape (" + found + "), wanted (" + wanted + ")");
   }
   return array.data();
+}
+
+// Rows of another array in one of `shape`, all of them from `least` to below `end`.
+template <class T>
+const T* rows_of(const In<T>& array, std::initializer_list<int64_t> shape, int64_t end, const char* name,
+                 int64_t least = 0) {
+  const T* rows = checked(array, shape, name);
+  if (std::any_of(rows, rows + array.size(), [&](T row) { return row < least || row >= end; }))
+    throw std::invalid_argument(std::string(name) + "s are outside of the rows");
+  return rows;
 }

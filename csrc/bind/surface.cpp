@@ -49,14 +49,6 @@ std::vector<double> flat(const std::vector<linprim::Vector>& vectors) {
   return values;
 }
 
-// The numbers of vertices in an array of `shape`, all of them below `vertices`.
-const int64_t* rows_of(In<int64_t> array, std::initializer_list<int64_t> shape, int64_t vertices, const char* name) {
-  const int64_t* rows = checked(array, shape, name);
-  if (std::any_of(rows, rows + array.size(), [&](int64_t row) { return row < 0 || row >= vertices; }))
-    throw std::invalid_argument(std::string(name) + "s are outside of the vertices");
-  return rows;
-}
-
 linprim::PhotoView photo_view(const Pose& pose, const std::array<double, 4>& lens, int width, int height,
                               const float* image, int channels, const float* depth) {
   linprim::PhotoView view{{}, lens[0], lens[1], lens[2], lens[3], width, height, image, channels, depth};
