@@ -102,7 +102,7 @@ def set_on_edge(plane: EnclosingPlane, others: Sequence[EnclosingPlane], edges: 
         meeting, along = meeting_of(plane.as_vector(), base.as_vector())
         ends = base.corners() @ along
         near = meeting + along * np.array([ends.min(), ends.max()])[:, None]
-        line = clearest_line(plane.as_vector(), base.as_vector(), near, edges, MARGIN)
+        line = clearest_line(plane.as_vector(), base.as_vector(), near, edges)
         if line is not None:
             return replace(plane, offset=float(plane.normal @ line.mean(0)))
     return None
