@@ -10,7 +10,7 @@ from scipy.ndimage import binary_dilation
 
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.plain_regions import RING, TOLERANCE, rays_of, to_world
-from linprim_geo.stereo.right_angles import squared
+from linprim_geo.stereo.right_angles import RIGHT, angles_to, frame_of, squared
 from linprim_geo.stereo.shading import BOX, Fit, ShadedRegion, Shading, evaluate, plane_moves
 
 # Boxes of a region that are compared.
@@ -22,8 +22,10 @@ ALIKE_DEPTH = 5 * CONFIRMED_DEPTH
 # Confirmed depths along the edges of regions hold a plane if they are as near as NEAR, and after some steps as
 # TOLERANCE. Half of TOLERANCE is their deviation; as their errors have common causes, they count as so many at most.
 NEAR, NARROWER, HOLDING_STEPS, INDEPENDENT = 2 * TOLERANCE, 0.8, 6, 200
-# Planes at right angles leave so much more of the shading than planes that are free.
-NEARLY_AS_WELL = 1.03
+# Planes along the frame of a room leave so much more of the shading than planes that are free: light is not what the
+# model says, and nine in ten true walls of a room leave as much more at most (DECISIONS 116). Planes that are at right
+# angles to others, or on lines, leave so much more than those that they were.
+AS_WELL, NEARLY_AS_WELL = 1.5, 1.03
 
 
 class HeldPlanes:
@@ -49,8 +51,9 @@ class HeldPlanes:
         return np.concatenate([planes[:first], np.reshape(held, (-1, 4))])
 
     def at_right_angles(self, planes: np.ndarray, staying: Container[int]) -> np.ndarray:
-        """The planes, turned to right angles with each other where that carries the shading of their regions nearly as
-        well, and then shifted to where most confirmed depths along the edges of these are; but those `staying` stay."""
+        """The planes, turned to right angles with each other, or along the frame of those `staying`, where that carries
+        the shading of their regions as well as true walls do, and then shifted to where most confirmed depths along the
+        edges of these are; but those `staying` stay."""
         few = [[region.some(MOST_BOXES) for region in regions] for regions in self.carried]
         fits = [
             evaluate(plane, few[k], self.shadings) if few[k] and k not in staying else None
@@ -59,13 +62,14 @@ class HeldPlanes:
         # Planes by edges that carry no shading are no reference.
         rows = [k for k, fit in enumerate(fits) if k in staying or fit is not None]
         known = [None if (fit := fits[k]) is None else fit.information for k in rows]
-        turned = planes.copy()
+        frame, turned = frame_of(planes[[k for k in rows if k in staying], :3]), planes.copy()
         turned[rows] = squared(planes[rows], known, lambda row, plane: plane_moves(plane, few[rows[row]]))
         for k, fit in enumerate(fits):
             if fit is None or (turned[k] == planes[k]).all():
                 continue
+            framed = frame is not None and angles_to(frame, turned[[k], :3])[0] < RIGHT
             for plane in (self._shifted(turned[k], self.carried[k]), turned[k]):
-                if self._leaves_as_little(plane, few[k], fit):
+                if self._leaves_as_little(plane, few[k], fit, AS_WELL if framed else NEARLY_AS_WELL):
                     planes[k] = plane
                     break
         return planes
@@ -77,14 +81,14 @@ class HeldPlanes:
         for k, plane in moved.items():
             few = [region.some(MOST_BOXES) for region in self.carried[k]]
             fit = evaluate(planes[k], few, self.shadings) if few else None
-            if fit is None or self._leaves_as_little(plane, few, fit):
+            if fit is None or self._leaves_as_little(plane, few, fit, NEARLY_AS_WELL):
                 result[k] = plane
         return result
 
-    def _leaves_as_little(self, plane: np.ndarray, regions: Sequence[ShadedRegion], fit: Fit) -> bool:
-        """Whether a plane leaves nearly as little of the shading of regions as a fit to them does."""
+    def _leaves_as_little(self, plane: np.ndarray, regions: Sequence[ShadedRegion], fit: Fit, times: float) -> bool:
+        """Whether a plane leaves no more than so many times as much of the shading of regions as a fit to them does."""
         tried = evaluate(plane, regions, self.shadings)
-        return tried is not None and tried.left < NEARLY_AS_WELL * fit.left and tried.boxes > 0.7 * fit.boxes
+        return tried is not None and tried.left < times * fit.left and tried.boxes > 0.7 * fit.boxes
 
     def _shifted(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> np.ndarray:
         """A plane moved along its normal to where most confirmed depths along the edges of regions are."""

@@ -20,7 +20,7 @@ from linprim_geo.stereo.common_surfaces import CommonSurfaces
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.enclosing_planes import AGREEING, SURE_SHARE
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
-from linprim_geo.stereo.held_planes import ALIKE_DEPTH, HARDLY_MORE, MOST_BOXES, HeldPlanes
+from linprim_geo.stereo.held_planes import ALIKE_DEPTH, AS_WELL, HARDLY_MORE, MOST_BOXES, HeldPlanes
 from linprim_geo.stereo.meeting_lines import is_same, on_meeting_lines
 from linprim_geo.stereo.plain_regions import (
     SAME_ANGLE,
@@ -31,6 +31,7 @@ from linprim_geo.stereo.plain_regions import (
     seen_enough,
     to_world,
 )
+from linprim_geo.stereo.right_angles import NEARLY, angles_to, frame_of
 from linprim_geo.stereo.shading import (
     BOX,
     LEAST_BOXES,
@@ -65,6 +66,8 @@ CERTAIN = 2 * CONFIRMED_DEPTH
 ALIKE_ANGLE = 4 * SAME_ANGLE
 # A background is so many times as far as a region's other depths.
 FAR = 1e4
+# A plane by points is off by no more if these are half as wide as they are far.
+ASKEW = 2 * TOLERANCE
 # A plane carries a region if it does so around half of its boxes.
 CARRIED_SHARE = 0.5
 
@@ -274,12 +277,21 @@ class ShadedPlanes:
             if (inverse <= 0).any() or self._contradicted(region, inverse):
                 continue
             fit = evaluate(self.planes[k], [region.some(MOST_BOXES)], self.shadings)
-            if fit is None or fit.views < LEAST_VIEWS or fit.left_share > one.most_left:
+            if fit is None or fit.views < LEAST_VIEWS or fit.left_share > self._may_leave(one, inverse):
                 continue
             carried = unexplained(region, plane, self.shadings) <= MOST_LEFT
             if carried.mean() >= CARRIED_SHARE:
                 carriers[k] = carried
         return carriers
+
+    def _may_leave(self, one: FittedRegion, inverse: np.ndarray) -> float:
+        """What share of a region's deviation a plane with (N,) `inverse` depths there may leave: as much as true planes
+        do if it is where the region's own plane is, as far as shading tells."""
+        if one.fit is None:
+            return one.most_left
+        own = one.region.rays @ in_camera(self._camera(one.region), one.fit.plane[None])[0]
+        near = np.median(np.abs(inverse / own - 1)) < ALIKE_DEPTH
+        return min(AS_WELL * one.fit.left_share, OTHERS_SHARE) if near else one.most_left
 
     def _all_carriers(self) -> list[list[dict[int, np.ndarray]]]:
         """`_carriers` of the regions of each view."""
@@ -289,7 +301,8 @@ class ShadedPlanes:
         """Keeps the planes but for copies, of whose boxes another one carries most; returns the regions that each
         carries.
 
-        A plane by edges that is one by points takes its place and stays as it is, as if it carried nothing.
+        A plane by edges that is one by points takes its place and stays as it is, as if it carried nothing, unless that
+        one is askew.
         """
         count = len(self.planes)
         shared, carried = np.zeros((count, count)), [list[ShadedRegion]() for _ in range(count)]
@@ -299,7 +312,7 @@ class ShadedPlanes:
                     carried[k].append(one.region)
                     for j, others in of_region.items():
                         shared[j, k] += np.count_nonzero(boxes & others)
-        by_points, kept = range(self.by_points), list[int]()
+        by_points, kept = [k for k in range(self.by_points) if not self._is_askew(k)], list[int]()
         for k in sorted(range(self.by_points, count), key=lambda k: -shared[k, k]):
             same = next((j for j in by_points if self._same(j, k, carried[k], TOLERANCE)), None)
             if same is not None:
@@ -308,9 +321,14 @@ class ShadedPlanes:
             copied = [j for j in kept if shared[j, k] > CARRIED_SHARE * shared[k, k]]
             if same is not None or not any(self._same(j, k, carried[k], ALIKE_DEPTH) for j in copied):
                 kept.append(k)
-        kept = sorted([*by_points, *kept])
+        kept = sorted([*range(self.by_points), *kept])
         self.planes, self.given_count = self.planes[kept], sum(k < self.given_count for k in kept)
         return [carried[k] for k in kept]
+
+    def _is_askew(self, number: int) -> bool:
+        """Whether a plane by points is nearly, but not quite along the frame of all of these."""
+        frame = frame_of(self.planes[: self.by_points, :3])
+        return frame is not None and ASKEW < angles_to(frame, self.planes[[number], :3])[0] < NEARLY
 
     def _same(self, first: int, second: int, regions: Sequence[ShadedRegion], tolerance: float) -> bool:
         """Whether two planes have nearly one direction, and over regions one inverse depth in the median."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from linprim_geo.stereo.right_angles import squared
+from linprim_geo.stereo.right_angles import angles_to, frame_of, squared
 
 
 def turned(normal, degrees, axis, distance=1.0) -> np.ndarray:
@@ -62,3 +62,30 @@ def test_of_planes_that_stay_and_are_nearly_parallel_the_first_counts():
     for stay in ([FLOOR, table], [table, FLOOR]):
         found = squared(np.array([*stay, wall]), [None, None, np.eye(3)], moves)
         assert (found[:2] == stay).all() and angle(found[2], stay[0]) == pytest.approx(90, abs=0.02)
+
+
+def test_the_frame_of_a_room_is_that_of_most_planes():
+    room = [turned([0, 0, 1], 0.3, [1, 0, 0]), turned([1, 0, 0], 0.2, [0, 0, 1]), turned([0, -1, 0], 0.3, [0, 0, 1])]
+    room += [turned([0, 0, -1], 0.2, [0, 1, 0]), turned([1, 0, 0], 0.3, [0, 1, 0])]
+    furniture = [turned([0.6, 0.8, 0], 2, [1, 0, 0]), turned([-0.8, 0.6, 0], 1, [0, 0, 1])]
+    leaning = [turned([1, 0, 0], 5, [0, 0, 1])]
+    for order in (room + furniture + leaning, leaning + furniture + room):
+        frame = frame_of(np.array(order)[:, :3])
+        assert frame is not None
+        np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-9)
+        assert np.degrees(angles_to(frame, np.eye(3))).max() < 0.4
+    assert frame_of(np.array([FLOOR, turned([0, 0, 1], 8, [0, 1, 0])])[:, :3]) is None
+    assert frame_of(np.zeros((0, 3))) is None
+
+
+@pytest.mark.parametrize("degrees", [3, 10])
+def test_walls_turn_along_the_frame_whatever_else_stands_about(degrees):
+    """A chair's back leans and a box stands askew: they come first, and a wall is nearly at right angles to both."""
+    chair, box = turned([1, 0, 0], 9, [0, 1, 0]), turned([1, 0, 0], 4.4, [0, 0, 1])
+    stay = [chair, box, FLOOR, turned([1, 0, 0], 0, [0, 0, 1], 3.0), turned([0, 1, 0], 0, [0, 0, 1], 4.0)]
+    wall, slope = turned([0, 1, 0], degrees, [0.6, 0, 0.8], 2.0), turned([0, 1, 0], 45, [1, 0, 0], 2.0)
+    found = squared(np.array([*stay, wall, slope]), [*[None] * 5, np.eye(3), np.eye(3)], moves)
+    assert (found[:5] == stay).all()
+    assert angle(found[5], stay[4]) < 0.15 and found[5, 3] == pytest.approx(2, abs=0.05)
+    # The slope is at right angles to one of the walls alone.
+    assert angle(found[6], slope) < 0.01
