@@ -1,4 +1,5 @@
-// PatchMatch stereo, what supports its planes, surfaces fitted to them, and planes of plain regions by their shading.
+// PatchMatch stereo, what supports its planes, surfaces fitted to them, planes of plain regions by their shading, and
+// votes of rays for tetrahedra.
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
@@ -13,6 +14,7 @@
 
 #include "bind/arrays.h"
 #include "bind/parts.h"
+#include "stereo/cell_votes.h"
 #include "stereo/fit_surfaces.h"
 #include "stereo/patch_match.h"
 #include "stereo/shading.h"
@@ -95,5 +97,20 @@ void bind_stereo(nb::module_& m) {
     const linprim::ShadedComparison found = linprim::compare_shading(pair, is_shown, rest);
     std::copy_n(found.information, 9, matrix), std::copy_n(found.downhill, 3, right);
     return std::tuple(found.boxes, found.left_variance, found.variance);
+  });
+
+  m.def("vote_for_cells", [](In<double> point, In<int32_t> corner, In<int32_t> neighbor, int32_t start,
+                             In<int32_t> around, In<double> ray, double empty, double full, Out<int64_t> votes) {
+    const int64_t points = int64_t(point.size()) / 3, cells = int64_t(corner.size()) / 4;
+    const int64_t rays = int64_t(ray.size()) / 3, count = int64_t(around.size());
+    const linprim::Cells mesh{cells, checked(point, {points, 3}, "point"),
+                              rows_of(corner, {cells, 4}, points, "corner"),
+                              rows_of(neighbor, {cells, 4}, cells, "neighbor", -1)};
+    if (start < 0 || start >= points) throw std::invalid_argument("there is no such point to start from");
+    const int32_t* first = rows_of(around, {count}, cells, "around");
+    const double* directions = checked(ray, {rays, 3}, "ray");
+    int64_t* counted = checked(votes, {cells + 1}, "votes");
+    nb::gil_scoped_release release;
+    linprim::vote_for_cells(mesh, start, count, first, rays, directions, empty, full, counted);
   });
 }

@@ -228,6 +228,38 @@ def compare_shading(
     return ShadedComparison(boxes, shown.view(bool), left, left_variance, variance, information, downhill)
 
 
+def vote_for_cells(
+    point: np.ndarray,
+    corner: np.ndarray,
+    neighbor: np.ndarray,
+    start: int,
+    rays: np.ndarray,
+    empty: float,
+    full: float,
+    votes: np.ndarray,
+) -> None:
+    """Adds the votes of rays from one of the points for the tetrahedra that they cross.
+
+    Every cell that has a part of a ray before the share `empty` of its length has one vote more, and the cell at the
+    share `full` one less, if `full` is not 0.
+
+    Args:
+        point: (P, 3) float64.
+        corner, neighbor: (C, 4) int32 of a Delaunay triangulation: rows of the corners of the cells, and the cells
+            behind the faces opposite to them, -1 outside.
+        start: the point where all rays start, a corner of a cell; else there are no votes.
+        rays: (R, 3) float64, from the start to their ends.
+        votes: (C + 1,) int64, of the cells and of the space outside.
+
+    Raises:
+        ValueError: shapes that do not fit, or rows that are not there.
+
+    Accuracy: float64; what a ray only touches has no vote of it. Cells without volume may end a ray's walk.
+    """
+    around = np.flatnonzero((corner == start).any(1)).astype(np.int32)
+    _core.vote_for_cells(point, corner, neighbor, start, around, rays, empty, full, votes)
+
+
 def _between(one: Camera, other: Camera) -> tuple[list[float], list[float]]:
     """The 9 numbers A and 3 numbers b with A (x, y, 1) + b w the homogeneous pixel in `other` of the pixel (x, y) of
     `one` at inverse depth w; the middle of the first pixel is (0, 0)."""

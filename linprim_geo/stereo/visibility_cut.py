@@ -18,6 +18,7 @@ import numpy as np
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.raycast import RayCaster
+from linprim_geo.kernels.stereo_ops import vote_for_cells
 from linprim_geo.points.view_pairs import visible_pixels
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.plain_regions import LEAST_VIEWS, rays_of
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
 
 # Of all views' pixels one in so many is a point, up to MOST_POINTS; rays of the most views that vote to a point.
 PIXELS_PER_POINT, MOST_POINTS, RAYS_PER_POINT = 200, 40_000, 4
-# Places along a ray that are looked at, and rays at a time.
-PLACES, RAYS_AT_A_TIME = 60, 4_000
 # Rays end so much before a point, as a share of its depth, and it is full so much behind it: twice what depths may be
 # off by.
 MARGIN = 2 * CONFIRMED_DEPTH
@@ -150,6 +149,10 @@ def cut_surface(
         cells = Delaunay(jittered)
     except (QhullError, ValueError):  # fewer than five, or all in one plane
         return SpanningSurface(vertices, np.zeros((0, 3), int), np.zeros(0, bool))
+    of_cells = cells.simplices.astype(np.int32), cells.neighbors.astype(np.int32)
+    start = np.arange(len(points), len(vertices))
+    for same, _, other in cells.coplanar:  # of cameras at one place, one is a corner
+        start[start == same] = other
     # The last one counts for all that lies outside of the hull.
     votes = np.zeros(len(cells.simplices) + 1, np.int64)
     times = np.zeros(len(points), int)
@@ -161,28 +164,16 @@ def cut_surface(
         rows = rows[times[rows] < RAYS_PER_POINT]
         times[rows] += 1
         to_points = points.position[rows] - camera.center
-        _vote_empty(votes, cells, camera.center, (1 - MARGIN) * to_points)
-        np.add.at(votes, cells.find_simplex(camera.center + (1 + MARGIN) * to_points), -1)
+        vote_for_cells(jittered, *of_cells, int(start[view]), to_points, 1 - MARGIN, 1 + MARGIN, votes)
         row, column = np.nonzero(~np.isfinite(depth) & (behind > 0))
         some = rng.permutation(len(row))[: points_per_view(cameras)]
         row, column = row[some], column[some]
         to_rendered = (rays_of(camera, row, column) @ camera.rotation) * behind[row, column, None]
-        _vote_empty(votes, cells, camera.center, (1 - RENDERED_MARGIN) * to_rendered)
+        vote_for_cells(jittered, *of_cells, int(start[view]), to_rendered, 1 - RENDERED_MARGIN, 0, votes)
     faces = cells.simplices[:, CORNERS]
     continued = _continued(vertices, normals, faces)
     empty_cells = _empty_cells(cells.neighbors, votes, FACE + CORNER * (3 - continued))
     return _boundary(vertices, len(points), cells, empty_cells, continued)
-
-
-def _vote_empty(votes: np.ndarray, cells: Delaunay, center: np.ndarray, rays: np.ndarray) -> None:
-    """One vote of every ray (R, 3), as long as it is empty, for each tetrahedron that it crosses."""
-    places = (np.arange(PLACES) + 0.5) / PLACES
-    for first in range(0, len(rays), RAYS_AT_A_TIME):
-        some = rays[first : first + RAYS_AT_A_TIME, None]
-        crossed = np.sort(cells.find_simplex(center + some * places[:, None]), axis=1)
-        new = crossed >= 0
-        new[:, 1:] &= crossed[:, 1:] != crossed[:, :-1]
-        np.add.at(votes, crossed[new], 1)
 
 
 def _continued(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:

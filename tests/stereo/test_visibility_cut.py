@@ -60,6 +60,18 @@ def test_a_gap_in_a_wall_is_spanned_by_the_wall():
         assert np.nanmax(np.abs(depth / depth_of(camera, WALL) - 1)[gap]) < 1e-3
 
 
+def test_cameras_at_one_place_are_both_asked():
+    """Only one of them is a corner of tetrahedra; the second knows nothing, or alone something."""
+    known, gaps = with_gap(-0.4, 0.4)
+    nothing = [np.full_like(depth, np.nan) for depth in known]
+    for order in ([*known, *nothing], [*nothing, *known]):
+        cameras, rendered = 2 * CAMERAS, 2 * [0.95 * depth_of(camera, WALL) for camera in CAMERAS]
+        depths = spanned_depths(cameras, order, points_of(cameras, order), rendered)
+        for gap, depth, own in zip(2 * gaps, depths, order, strict=True):
+            if np.isfinite(own).any():
+                assert np.isfinite(depth[8:-8][gap[8:-8]]).mean() > 0.95
+
+
 def test_a_step_is_not_spanned():
     known, gaps = with_gap(-0.2, 1.0, BACK)
     rendered = [depth_of(camera, WALL) for camera in CAMERAS]
