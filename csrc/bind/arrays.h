@@ -35,12 +35,12 @@ auto checked(const Array& array, std::initializer_list<int64_t> shape, const cha
   return array.data();
 }
 
-// Rows of another array in one of `shape`, all of them from `least` to below `end`.
+// Rows of another array, of what is called `of`, in an array of `shape`, all of them from `least` to below `end`.
 template <class T>
 const T* rows_of(const In<T>& array, std::initializer_list<int64_t> shape, int64_t end, const char* name,
-                 int64_t least = 0) {
+                 const char* of = "vertices", int64_t least = 0) {
   const T* rows = checked(array, shape, name);
   if (std::any_of(rows, rows + array.size(), [&](T row) { return row < least || row >= end; }))
-    throw std::invalid_argument(std::string(name) + "s are outside of the rows");
+    throw std::invalid_argument(std::string(name) + "s are outside of the " + of);
   return rows;
 }

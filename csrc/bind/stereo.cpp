@@ -104,10 +104,10 @@ void bind_stereo(nb::module_& m) {
     const int64_t points = int64_t(point.size()) / 3, cells = int64_t(corner.size()) / 4;
     const int64_t rays = int64_t(ray.size()) / 3, count = int64_t(around.size());
     const linprim::Cells mesh{cells, checked(point, {points, 3}, "point"),
-                              rows_of(corner, {cells, 4}, points, "corner"),
-                              rows_of(neighbor, {cells, 4}, cells, "neighbor", -1)};
+                              rows_of(corner, {cells, 4}, points, "corner", "points"),
+                              rows_of(neighbor, {cells, 4}, cells, "neighbor", "cells", -1)};
     if (start < 0 || start >= points) throw std::invalid_argument("there is no such point to start from");
-    const int32_t* first = rows_of(around, {count}, cells, "around");
+    const int32_t* first = rows_of(around, {count}, cells, "around", "cells");
     const double* directions = checked(ray, {rays, 3}, "ray");
     int64_t* counted = checked(votes, {cells + 1}, "votes");
     nb::gil_scoped_release release;

@@ -42,7 +42,7 @@ class Walk {
     int32_t before = -1;
     for (int64_t step = 0; step <= mesh_.cells && at <= end; ++step) {
       if (cell < 0) {
-        if (full > 0) vote(mesh_.cells, -1);
+        if (full > 0 && full >= at) vote(mesh_.cells, -1);
         return;
       }
       double leaving = kInfinity;
