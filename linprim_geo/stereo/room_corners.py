@@ -94,8 +94,9 @@ def with_corner_walls(
 
 
 def set_on_edge(plane: EnclosingPlane, others: Sequence[EnclosingPlane], edges: EdgeImages) -> EnclosingPlane | None:
-    """A plane that closes the scene, shifted to the edge along which photographs show that it meets one of others at
-    right angles; None if they show none."""
+    """A plane that closes the scene, shifted to an edge along which photographs show that it meets one of others at
+    right angles: of several the nearest; None if they show none."""
+    offsets = []
     for base in others:
         if not at_right_angles(plane.normal, base.normal):
             continue
@@ -104,8 +105,10 @@ def set_on_edge(plane: EnclosingPlane, others: Sequence[EnclosingPlane], edges: 
         near = meeting + along * np.array([ends.min(), ends.max()])[:, None]
         line = clearest_line(plane.as_vector(), base.as_vector(), near, edges)
         if line is not None:
-            return replace(plane, offset=float(plane.normal @ line.mean(0)))
-    return None
+            offsets.append(float(plane.normal @ line.mean(0)))
+    if not offsets:
+        return None
+    return replace(plane, offset=min(offsets, key=lambda offset: abs(offset - plane.offset)))
 
 
 @dataclass(frozen=True)
