@@ -1,7 +1,8 @@
 """Planes at right angles: most walls meet each other, floors and tables so.
 
-Shading alone leaves the angle of a wall open by degrees. Planes that are nearly at right angles are made so, together:
-each turns and shifts as little as what is known of it allows.
+Shading alone leaves the angle of a wall open by degrees. Where the planes of a room that are known better have a frame,
+three directions that most of them lie along, others turn along it. Else planes that are nearly at right angles are made
+so, together. Each turns and shifts as little as what is known of it allows.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from linprim_geo.stereo.plain_regions import SAME_ANGLE
 
 # Planes are nearly at right angles if they lack no more; they are so after the last of ROUNDS if they lack RIGHT.
 NEARLY, RIGHT, ROUNDS = 2 * SAME_ANGLE, np.radians(0.2), 5
-# What shading leaves open of the angle of a wall: several regions of one differ by as much.
+# What shading leaves open of the angle of a wall: planes of regions are alike if they differ by no more.
 LEFT_OPEN = 4 * SAME_ANGLE
 # By so much a right angle counts more than what is known of planes.
 WEIGHT = 1e4

@@ -15,7 +15,7 @@ from linprim_geo.stereo import plain_regions, shaded_planes, skies
 from linprim_geo.stereo.common_surfaces import CommonSurfaces
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.plain_regions import in_camera
-from linprim_geo.stereo.shaded_planes import LEAST_VIEWS, ShadedPlanes
+from linprim_geo.stereo.shaded_planes import LEAST_VIEWS, OTHERS_SHARE, ShadedPlanes
 from linprim_geo.stereo.shading import Shading, evaluate, fit_plane, shaded_regions
 from linprim_geo.stereo.skies import shows_sky
 from linprim_geo.stereo.vignetting import falloff
@@ -121,6 +121,38 @@ def test_a_floor_makes_a_wall_upright_unless_photographs_say_that_it_leans(seed)
     assert abs(upright[2]) < 1e-4 < abs(alone[2]) and abs(upright[0]) < 2 * abs(alone[0]) + 1e-3
     # By 4 degrees the shading of the wall would be off by more than noise is.
     np.testing.assert_allclose(planes["leaning"][-1], alone, atol=1e-6)
+
+
+def room(degrees: float) -> np.ndarray:
+    """(2, 4) a floor and a side wall that points give; with the wall they make a room whose floor leans by so much."""
+    angle = np.radians(degrees)
+    return np.array([[0.0, np.sin(angle), np.cos(angle), -0.9], [1.0, 0.0, 0.0, -1.5]])
+
+
+@pytest.mark.parametrize("seed", [0, 100, 200])
+def test_a_wall_is_along_the_frame_of_its_room_unless_photographs_say_otherwise(seed):
+    """Corners that are 4 % darker, which shading takes for a turned wall, do not say so; light alone does."""
+    row, column = np.mgrid[-1:1:180j, -1:1:240j]
+    darker = 1 - 0.02 * (row**2 + column**2)
+    maps, depths = photographs(lambda points, view: darker * light(points), seed=seed, noise=4.0)
+    free, framed = planes_of(maps, depths).planes[-1], planes_of(maps, depths, room(0)).planes[-1]
+    assert abs(framed[1]) > 1 - 1e-9 and abs(free[1]) < 1 - 1e-5
+    maps, depths = photographs(lambda points, view: light(points), seed=seed, noise=3.0)
+    free, framed = planes_of(maps, depths).planes[-1], planes_of(maps, depths, room(4)).planes[-1]
+    np.testing.assert_allclose(framed, free, atol=1e-6)
+
+
+@pytest.mark.parametrize(("degrees", "stays"), [(0.8, True), (2.0, False)])
+def test_a_plane_with_points_that_is_askew_leaves_plain_regions_to_the_wall(degrees, stays):
+    """Points on what hangs on a wall give a plane that is not along the frame; edges give it again."""
+    maps, depths = photographs(lambda points, view: light(points))
+    by_points = np.array([*room(0), tilted(degrees) + [0, 0, 0, 0.01]])
+    found = planes_of(maps, depths, by_points, by_edges=by_points[2:])
+    assert (found.planes[:3] == by_points).all()
+    assert (found.planes[3] == by_points[2]).all() == stays
+    if not stays:
+        share, off = errors(found, depths)
+        assert share > 0.7 and np.quantile(off, 0.95) < 0.005
 
 
 def tilted(degrees: float) -> np.ndarray:
@@ -377,3 +409,14 @@ def test_shading_refuses_a_line_that_it_contradicts(monkeypatch, degrees, stands
 
     assert list(found.standing) == [stands] and not found.hanging.any()
     assert (np.abs(found.planes[0] @ turned) > 1 - 1e-9) == stands
+
+
+def test_known_planes_near_a_regions_own_may_leave_more_of_its_shading():
+    maps, depths = photographs(lambda points, view: light(points))
+    found = planes_of(maps, depths)
+    one = next(one for own in found.regions for one in own if one.fit is not None)
+    own = one.region.rays @ in_camera(found.small_cameras[one.region.view], one.fit.plane[None])[0]
+    for nearer, least in ((1.0, 1.4 * one.fit.left_share), (1.04, 1.4 * one.fit.left_share), (1.07, 0.0)):
+        may_leave = found._may_leave(one, own * nearer)
+        assert (may_leave > one.most_left) == (nearer < 1.05) and least < may_leave <= OTHERS_SHARE
+    assert found._may_leave(replace(one, fit=None), own) == one.most_left
