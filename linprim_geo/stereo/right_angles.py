@@ -15,8 +15,8 @@ from linprim_geo.stereo.plain_regions import SAME_ANGLE
 
 # Planes are nearly at right angles if they lack no more; they are so after the last of ROUNDS if they lack RIGHT.
 NEARLY, RIGHT, ROUNDS = 2 * SAME_ANGLE, np.radians(0.2), 5
-# What shading leaves open of the angle of a wall: planes of regions are alike if they differ by no more.
-LEFT_OPEN = 4 * SAME_ANGLE
+# What shading leaves open of the angle of a wall: nine in ten planes of single regions are off by no more.
+LEFT_OPEN = np.radians(20)
 # By so much a right angle counts more than what is known of planes.
 WEIGHT = 1e4
 

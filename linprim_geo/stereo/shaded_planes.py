@@ -23,6 +23,7 @@ from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.held_planes import ALIKE_DEPTH, AS_WELL, HARDLY_MORE, MOST_BOXES, HeldPlanes
 from linprim_geo.stereo.meeting_lines import is_same, on_meeting_lines
 from linprim_geo.stereo.plain_regions import (
+    SAME_ANGLE,
     TOLERANCE,
     in_camera,
     in_world,
@@ -30,7 +31,7 @@ from linprim_geo.stereo.plain_regions import (
     seen_enough,
     to_world,
 )
-from linprim_geo.stereo.right_angles import LEFT_OPEN, NEARLY, angles_to, frame_of
+from linprim_geo.stereo.right_angles import NEARLY, angles_to, frame_of
 from linprim_geo.stereo.shading import (
     BOX,
     LEAST_BOXES,
@@ -61,6 +62,8 @@ LEFT_SHARE, OTHERS_SHARE = 0.2, 0.25
 MOST_LEFT, FLAT_SHARE = 1.3, 0.75
 # A region's own plane is known to this share of its depth, or better; several regions know theirs better together.
 CERTAIN = 2 * CONFIRMED_DEPTH
+# Planes of regions are taken together if they differ by no more than this, and by ALIKE_DEPTH.
+ALIKE_ANGLE = 4 * SAME_ANGLE
 # A background is so many times as far as a region's other depths.
 FAR = 1e4
 # A plane by points is off by no more if these are half as wide as they are far.
@@ -239,7 +242,7 @@ class ShadedPlanes:
     def _alike(self, fitted: list[FittedRegion]) -> np.ndarray:
         """(N, N) bool whose planes are alike: every one with itself."""
         planes = np.array([_plane(one) for one in fitted]).reshape(-1, 4)
-        alike = np.abs(planes[:, :3] @ planes[:, :3].T) > np.cos(LEFT_OPEN)
+        alike = np.abs(planes[:, :3] @ planes[:, :3].T) > np.cos(ALIKE_ANGLE)
         for k, one in enumerate(fitted):
             inverse = one.region.some(LEAST_BOXES).rays @ in_camera(self._camera(one.region), planes).T
             alike[k] &= np.median(np.abs(inverse / inverse[:, [k]] - 1), axis=0) < ALIKE_DEPTH
@@ -330,7 +333,7 @@ class ShadedPlanes:
     def _same(self, first: int, second: int, regions: Sequence[ShadedRegion], tolerance: float) -> bool:
         """Whether two planes have nearly one direction, and over regions one inverse depth in the median."""
         planes = self.planes[[first, second]]
-        if not regions or abs(planes[0, :3] @ planes[1, :3]) < np.cos(LEFT_OPEN):
+        if not regions or abs(planes[0, :3] @ planes[1, :3]) < np.cos(ALIKE_ANGLE):
             return False
         inverse = [region.some(LEAST_BOXES).rays @ in_camera(self._camera(region), planes).T for region in regions]
         one, other = np.concatenate(inverse).T

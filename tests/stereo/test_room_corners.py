@@ -19,6 +19,7 @@ from helpers.plain_room import (
 )
 
 from linprim_geo.geometry.camera import Camera
+from linprim_geo.stereo import room_corners
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.edge_images import EdgeImages, by_chance
 from linprim_geo.stereo.enclosing_planes import EnclosingPlane, enclosing_depths
@@ -235,6 +236,16 @@ def test_a_plane_that_closes_the_scene_is_shifted_to_its_edge():
     assert set_on_edge(closing(0.02), [closing(0.5)], edges) is None
     # 5 % of the distance to the cameras in the middle is 0.1 m.
     assert set_on_edge(closing(0.12), [FLOOR], edges) is None
+
+
+@pytest.mark.parametrize("order", [(0.09, -0.03, None), (None, -0.03, 0.09)])
+def test_of_several_edges_the_nearest_counts(monkeypatch, order):
+    """Where walls end the closing plane is; one of them has another edge near its upper end."""
+    lines = iter(None if x is None else np.array([[x, 0.0, 0.0], [x, 1.0, 0.0]]) for x in order)
+    monkeypatch.setattr(room_corners, "clearest_line", lambda *_: next(lines))
+    edges = EdgeImages(photographs(cameras()), floors(cameras()))
+    shifted = set_on_edge(closing(0.0), 3 * [FLOOR], edges)
+    assert shifted is not None and shifted.offset == -0.03
 
 
 @pytest.mark.parametrize(("x", "stays"), [(0.02, True), (0.3, False)])
