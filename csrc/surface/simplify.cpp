@@ -23,10 +23,6 @@ constexpr int kRounds = 3;
 // Whether a collapse is refused changes with what is around: the queue is made anew while this share of faces goes.
 constexpr double kWorthwhile = 0.01;
 
-Vector cross(const Vector& a, const Vector& b) {
-  return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
-}
-
 Vector plus(Vector a, double factor, const Vector& b) {
   add(a, factor, b);
   return a;

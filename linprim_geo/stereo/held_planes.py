@@ -63,7 +63,7 @@ class HeldPlanes:
         rows = [k for k, fit in enumerate(fits) if k in staying or fit is not None]
         known = [None if (fit := fits[k]) is None else fit.information for k in rows]
         frame, turned = frame_of(planes[[k for k in rows if k in staying], :3]), planes.copy()
-        turned[rows] = squared(planes[rows], known, lambda row, plane: plane_moves(plane, few[rows[row]]))
+        turned[rows] = squared(planes[rows], known, lambda row, plane: plane_moves(plane, few[rows[row]]), frame)
         for k, fit in enumerate(fits):
             if fit is None or (turned[k] == planes[k]).all():
                 continue

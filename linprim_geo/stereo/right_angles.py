@@ -68,23 +68,25 @@ def squared(
     planes: np.ndarray,
     information: Sequence[np.ndarray | None],
     moves: Callable[[int, np.ndarray], np.ndarray],
+    frame: np.ndarray | None = None,
 ) -> np.ndarray:
     """Planes (K, 4) n . x = d of which those that may turn are at right angles where they nearly were.
 
-    Where planes that stay have a frame (`frame_of`), those that may be along one of its axes are turned along it.
-    Others, and all where there is no frame, turn to right angles with what stays and with each other: one of which no
-    such solution is found, as right angles with some others exclude each other, stays as it is. Of planes that stay
-    and are nearly parallel, the one nearest to an axis counts, or else the first.
+    Where there is a `frame`, those that may be along one of its axes are turned along it. Others, and all without one,
+    turn to right angles with what stays and with each other: one of which no such solution is found, as right angles
+    with some others exclude each other, stays as it is. Of planes that stay and are nearly parallel, the one nearest to
+    an axis counts, or else the first.
 
     Args:
         information: (3, 3) about each plane's three `moves`; None for one that stays.
         moves: of a plane, by its number and what it is, (3, 4) how it changes by two turns and a shift.
+        frame: (3, 3) that of the planes that stay (`frame_of`).
     """
     free, staying = ([k for k, own in enumerate(information) if (own is None) == stays] for stays in (False, True))
-    frame = frame_of(planes[staying, :3])
     if frame is not None:
-        staying.sort(key=lambda k: angles_to(frame, planes[[k], :3])[0])
-        framed = [k for k in free if angles_to(frame, planes[[k], :3])[0] < LEFT_OPEN]
+        angle = angles_to(frame, planes[:, :3])
+        staying.sort(key=lambda k: angle[k])
+        framed = [k for k in free if angle[k] < LEFT_OPEN]
         planes = _along(planes, frame, framed, information, moves) if framed else planes
         free = [k for k in free if k not in framed]
     lacking = np.abs(planes[:, :3] @ planes[:, :3].T)

@@ -55,7 +55,8 @@ MOST_VIEWS, LEAST_VIEWS = 8, 3
 # Boxes of a region that are compared in the first steps from every start (then MOST_BOXES), and how many steps.
 FIRST_BOXES, FIRST_STEPS = 200, 6
 # A plane carries a region's shading if no more than this share of its deviation is left, and one of other regions if
-# no more than OTHERS_SHARE and hardly more than the region's own plane leaves: paint that shines makes up as much.
+# no more than OTHERS_SHARE and hardly more than the region's own plane leaves, or AS_WELL times as much where it is
+# near that one: paint that shines makes up as much.
 LEFT_SHARE, OTHERS_SHARE = 0.2, 0.25
 # Noise leaves one deviation: where this is left, smoothed, another surface is. Most of a flat region is below: tone
 # curves and vignetting leave more at its ends (DECISIONS 57).
@@ -312,7 +313,7 @@ class ShadedPlanes:
                     carried[k].append(one.region)
                     for j, others in of_region.items():
                         shared[j, k] += np.count_nonzero(boxes & others)
-        by_points, kept = [k for k in range(self.by_points) if not self._is_askew(k)], list[int]()
+        by_points, kept = np.flatnonzero(~self._are_askew()), list[int]()
         for k in sorted(range(self.by_points, count), key=lambda k: -shared[k, k]):
             same = next((j for j in by_points if self._same(j, k, carried[k], TOLERANCE)), None)
             if same is not None:
@@ -325,10 +326,14 @@ class ShadedPlanes:
         self.planes, self.given_count = self.planes[kept], sum(k < self.given_count for k in kept)
         return [carried[k] for k in kept]
 
-    def _is_askew(self, number: int) -> bool:
-        """Whether a plane by points is nearly, but not quite along the frame of all of these."""
-        frame = frame_of(self.planes[: self.by_points, :3])
-        return frame is not None and ASKEW < angles_to(frame, self.planes[[number], :3])[0] < NEARLY
+    def _are_askew(self) -> np.ndarray:
+        """(by_points,) bool which planes by points are nearly, but not quite along the frame of all of these."""
+        normals = self.planes[: self.by_points, :3]
+        frame = frame_of(normals)
+        if frame is None:
+            return np.zeros(len(normals), bool)
+        angle = angles_to(frame, normals)
+        return (angle > ASKEW) & (angle < NEARLY)
 
     def _same(self, first: int, second: int, regions: Sequence[ShadedRegion], tolerance: float) -> bool:
         """Whether two planes have nearly one direction, and over regions one inverse depth in the median."""

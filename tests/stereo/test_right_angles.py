@@ -84,7 +84,8 @@ def test_walls_turn_along_the_frame_whatever_else_stands_about(degrees):
     chair, box = turned([1, 0, 0], 9, [0, 1, 0]), turned([1, 0, 0], 4.4, [0, 0, 1])
     stay = [chair, box, FLOOR, turned([1, 0, 0], 0, [0, 0, 1], 3.0), turned([0, 1, 0], 0, [0, 0, 1], 4.0)]
     wall, slope = turned([0, 1, 0], degrees, [0.6, 0, 0.8], 2.0), turned([0, 1, 0], 45, [1, 0, 0], 2.0)
-    found = squared(np.array([*stay, wall, slope]), [*[None] * 5, np.eye(3), np.eye(3)], moves)
+    frame = frame_of(np.array(stay)[:, :3])
+    found = squared(np.array([*stay, wall, slope]), [*[None] * 5, np.eye(3), np.eye(3)], moves, frame)
     assert (found[:5] == stay).all()
     assert angle(found[5], stay[4]) < 0.15 and found[5, 3] == pytest.approx(2, abs=0.05)
     # The slope is at right angles to one of the walls alone.
