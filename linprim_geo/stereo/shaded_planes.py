@@ -313,7 +313,7 @@ class ShadedPlanes:
                     carried[k].append(one.region)
                     for j, others in of_region.items():
                         shared[j, k] += np.count_nonzero(boxes & others)
-        by_points, kept = np.flatnonzero(~self._are_askew()), list[int]()
+        by_points, kept = np.flatnonzero(~self._are_askew()).tolist(), list[int]()
         for k in sorted(range(self.by_points, count), key=lambda k: -shared[k, k]):
             same = next((j for j in by_points if self._same(j, k, carried[k], TOLERANCE)), None)
             if same is not None:
