@@ -17,6 +17,7 @@ from linprim_geo.surface.depth_error import error_of_nearest
 from linprim_geo.surface.fairing import faired
 from linprim_geo.surface.mesh_process import process_mesh
 from linprim_geo.surface.mesh_views import MeshViews
+from linprim_geo.surface.outlines import moved_to_outlines
 from linprim_geo.surface.photo_consistency import photo_gains, predicted_error, refine_surface
 from linprim_geo.surface.safe_moves import moved_safely, untangled
 from linprim_geo.surface.shaded_views import save_shaded, shaded_row
@@ -60,7 +61,8 @@ def finish_surface(
     Colours are those of photographs without the gains by which their brightness differs (`photo_gains`). By a `quality`
     that it has, noise is smoothed away, and it is kept; else by that of photographs (`predicted_error`), which a
     tolerance `auto` asks for, too, and the surface is smoothed where it goes through itself by then. With `creases`,
-    denoising also puts these where flat parts meet, as voxels cut them off."""
+    denoising also puts these where flat parts meet, as voxels cut them off. What photographs moved ends where
+    masks show its outlines (`moved_to_outlines`)."""
     given = mesh
     views = run.scene().train
     cameras = [view.camera for view in views]
@@ -80,6 +82,9 @@ def finish_surface(
     if options.denoise == "on" and creases:
         mesh = sharpened(mesh)
         stages.lap("creases")
+    if options.refine:
+        mesh = moved_to_outlines(mesh, views, int(options.refine))
+        stages.lap("outlines")
     if options.tolerance == "auto" and mesh.quality is None:
         mesh = replace(mesh, quality=predicted_error(mesh, cameras, (view.load() for view in views), gains))
         stages.lap("quality")

@@ -77,6 +77,7 @@ def test_what_is_written(extracted, solid):
         "denoise",
         "untangle",
         "creases",
+        "outlines",
         "colours",
         "visibility",
         "picture",

@@ -219,7 +219,7 @@ def test_what_is_written(extracted):
     assert json.loads((folder / "stats.json").read_text()) == json.loads(json.dumps(stats))
     assert stats["method"] == METHOD and stats["level"] == 0.75 and stats["spacing"] > 0
     steps = ("first round", "second round", "typical cameras", "refine", "denoise", "untangle", "creases")
-    last = ("colours", "visibility", "picture", "write")
+    last = ("outlines", "colours", "visibility", "picture", "write")
     assert stats["seconds"].keys() == {"level", *steps, *last, "total"}
     assert 0.97 * stats["faces"] <= stats["visible"]["faces"] <= stats["faces"]
 
