@@ -404,7 +404,8 @@ class ExtractOptions:
     denoise: str = option(
         "on",
         "on: smooth the surface, but for edges and where photographs are sure: no vertex moves farther than its "
-        "predicted error; then put creases where the flat parts beside them meet; off: leave it",
+        "predicted error; then put creases where the flat parts beside them meet, and outlines where masks show them; "
+        "off: leave it",
         choices=("on", "off"),
     )
     close_holes: int = option(0, "fill holes with at most N edges around them; 0 fills none", low=0, high=10**9)

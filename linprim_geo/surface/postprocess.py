@@ -61,8 +61,8 @@ def finish_surface(
     Colours are those of photographs without the gains by which their brightness differs (`photo_gains`). By a `quality`
     that it has, noise is smoothed away, and it is kept; else by that of photographs (`predicted_error`), which a
     tolerance `auto` asks for, too, and the surface is smoothed where it goes through itself by then. With `creases`,
-    denoising also puts these where flat parts meet, as voxels cut them off. What photographs moved ends where
-    masks show its outlines (`moved_to_outlines`)."""
+    denoising also puts these where flat parts meet, as voxels cut them off. With masks it puts outlines where
+    these show them (`moved_to_outlines`)."""
     given = mesh
     views = run.scene().train
     cameras = [view.camera for view in views]
@@ -82,8 +82,8 @@ def finish_surface(
     if options.denoise == "on" and creases:
         mesh = sharpened(mesh)
         stages.lap("creases")
-    if options.refine:
-        mesh = moved_to_outlines(mesh, views, int(options.refine))
+    if options.denoise == "on":
+        mesh = moved_to_outlines(mesh, views)
         stages.lap("outlines")
     if options.tolerance == "auto" and mesh.quality is None:
         mesh = replace(mesh, quality=predicted_error(mesh, cameras, (view.load() for view in views), gains))
