@@ -37,7 +37,8 @@ def moved_safely(mesh: Mesh, vertices: np.ndarray) -> Mesh:
         if not share[faces[over]].any():
             break
         share[faces[over]] *= 0.5
-    edges, changed = edges_of(faces), np.ones(len(start), bool)
+    edges = edges_of(faces)
+    changed: np.ndarray = np.any(moves, axis=1)
     for _ in range(ROUNDS):
         at = _crossing(moved(), edges, changed)
         if not share[at].any():
