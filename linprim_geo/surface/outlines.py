@@ -40,7 +40,7 @@ PARTLY = 0.5
 outline covers each pixel that it runs through partly. From this part of them on it is one; one of only 0 and 255 has
 none."""
 
-SAMPLES = 4
+SAMPLES = 3
 """Rays along each side of a pixel that say what share of it the mesh covers."""
 
 BEFORE = 1.5
