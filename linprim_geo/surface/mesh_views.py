@@ -15,8 +15,9 @@ KEPT_BYTES = 1 << 29
 class MeshViews(RayCaster):
     """A ray caster that draws what cameras see, which takes no tree and, in large images, a third of the time."""
 
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray, *, threads: int = 0):
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, *, threads: int = 0, kept_bytes: int = KEPT_BYTES):
         super().__init__(vertices, faces, threads=threads)
+        self._kept_bytes = kept_bytes
         self._kept: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
 
     def first_hits(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -24,7 +25,7 @@ class MeshViews(RayCaster):
 
         Returns read-only depth (H, W) float32 along the optical axis, inf where nothing is hit, and face (H, W) int32,
         there -1. Accuracy: that of float32 for depths, 1e-12 of a pixel for what is seen. Memory: 8 bytes per pixel are
-        kept, at most KEPT_BYTES over all cameras.
+        kept, at most `kept_bytes` over all cameras.
         """
         pose, lens = camera.pinhole()
         key = (camera.width, camera.height, *lens, pose.tobytes())
@@ -34,6 +35,6 @@ class MeshViews(RayCaster):
         hits = surface_ops.first_hits(pose, lens, camera.width, camera.height, vertices, faces)
         for array in hits:
             array.flags.writeable = False
-        if sum(array.nbytes for kept in (*self._kept.values(), hits) for array in kept) <= KEPT_BYTES:
+        if sum(array.nbytes for kept in (*self._kept.values(), hits) for array in kept) <= self._kept_bytes:
             self._kept[key] = hits
         return hits

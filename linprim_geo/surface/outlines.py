@@ -85,7 +85,7 @@ def _moves(mesh: Mesh, views: Sequence[View]) -> np.ndarray:
     from scipy.sparse import csr_matrix
 
     count, faces, vertices = len(mesh.vertices), mesh.faces, mesh.vertices.astype(np.float64)
-    caster, corners = MeshViews(vertices, faces), vertices[faces]
+    caster, corners = MeshViews(vertices, faces, kept_bytes=0), vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     heights = np.einsum("fk,fk->f", normals, corners[:, 0])
     rows, columns = faces.ravel(), np.repeat(np.arange(len(faces)), 3)

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.kernels import ops, surface_ops
-from linprim_geo.surface import mesh_views
 from linprim_geo.surface.mesh_views import MeshViews
 
 
@@ -106,10 +105,9 @@ def test_the_same_bits_for_any_number_of_threads():
     assert all(np.array_equal(one, other) for one, other in zip(*found, strict=True))
 
 
-def test_what_a_camera_sees_is_kept_within_a_limit(monkeypatch):
+def test_what_a_camera_sees_is_kept_within_a_limit():
     view, other, ball = camera(), camera(position=(0.2, 0.0, -3.0)), sphere()
-    monkeypatch.setattr(mesh_views, "KEPT_BYTES", 8 * 40 * 30)
-    views = MeshViews(ball.vertices, ball.faces)
+    views = MeshViews(ball.vertices, ball.faces, kept_bytes=8 * 40 * 30)
     depth, _ = views.first_hits(view)
     assert views.first_hits(view)[0] is depth
     with pytest.raises(ValueError, match="read-only"):
