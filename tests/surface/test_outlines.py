@@ -84,10 +84,10 @@ def test_a_ball_gets_the_size_that_masks_show(views, pixels):
     assert len(crossings(found)[0]) == 0
 
 
-def test_edges_of_a_block_come_back(views):
+def test_edges_of_a_block_come_back():
     true = block(0.7)
     views = [Masked(camera, of_mesh(true)) for camera in CAMERAS]
-    # Edges as voxels leave them: within 0.6 pixels of two sides rounded off.
+    # Edges as voxels leave them: half a pixel inside of both sides.
     worn = true.vertices.copy()
     edge = (np.abs(worn) > 0.7 - 1e-9).sum(1) >= 2
     worn[edge] *= 1 - 0.5 * FOOTPRINT / 0.7
@@ -96,8 +96,9 @@ def test_edges_of_a_block_come_back(views):
     assert moved.sum() > 0.3 * edge.sum()
     before, after = (np.linalg.norm((v - true.vertices)[moved], axis=1).mean() for v in (worn, found.vertices))
     assert after < 0.6 * before
-    flat = ~moved_of(replace(true, vertices=worn), found)
-    np.testing.assert_array_equal(found.vertices[flat], worn[flat])
+    flat = (np.abs(true.vertices) > 0.7 - 3 * FOOTPRINT).sum(1) < 2
+    assert flat.sum() > 1000
+    assert np.abs(found.vertices - worn)[flat].max() < 0.1 * FOOTPRINT
 
 
 def test_what_is_right_stays(views):
