@@ -300,7 +300,7 @@ class ShadedPlanes:
 
     def _take_originals(self, carriers: Sequence[Sequence[dict[int, np.ndarray]]]) -> list[list[ShadedRegion]]:
         """Keeps the planes but for copies, of whose boxes another one carries most; returns the regions that each
-        carries.
+        carries, none where they are of too few views.
 
         A plane by edges that is one by points takes its place and stays as it is, as if it carried nothing, unless that
         one is askew.
@@ -324,7 +324,7 @@ class ShadedPlanes:
                 kept.append(k)
         kept = sorted([*range(self.by_points), *kept])
         self.planes, self.given_count = self.planes[kept], sum(k < self.given_count for k in kept)
-        return [carried[k] for k in kept]
+        return [carried[k] if self._of_several_views(self.planes[at], carried[k]) else [] for at, k in enumerate(kept)]
 
     def _are_askew(self) -> np.ndarray:
         """(by_points,) bool which planes by points are nearly, but not quite along the frame of all of these."""

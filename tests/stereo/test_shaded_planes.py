@@ -369,6 +369,15 @@ def test_a_plane_of_edges_before_the_wall_goes_back_to_it():
     assert (kept.planes[0] == before).all()
 
 
+@pytest.mark.parametrize(("views", "stays"), [(2, True), (4, False)])
+def test_shading_of_too_few_views_does_not_move_a_plane_of_edges(views, stays):
+    maps, depths = photographs(lambda points, view: light(points))
+    # Stereo knows the wall in the other views, whose regions shading is not asked for.
+    confirmed = [depth if view >= views else np.full_like(depth, np.nan) for view, depth in enumerate(depths)]
+    edges = np.array([tilted(1.5)])
+    assert np.allclose(planes_of(maps, depths, by_edges=edges, confirmed=confirmed).planes[0], edges[0]) == stays
+
+
 def test_the_fit_goes_downhill_and_ends_at_the_truth_without_noise():
     maps, depths = photographs(lambda points, view: light(points), noise=0.0)
     shadings = [Shading.of(one) for one in maps]
