@@ -4,6 +4,7 @@ Shading leaves the angle of a plain wall open by degrees, and points on what han
 before it. A floor with texture is known exactly as a rule, and photographs show where it ends: of the lines on it near
 to where a wall meets it, views from directions that differ show one most clearly. The wall stands on that line, at
 right angles to the floor. A wall whose foot is hidden is set right by the line along which it meets one that stands.
+What leans, such as a slope under a roof, goes through the lines along which it meets several of these.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.edge_images import BLUR, BY_CHANCE, LEAST_PIXELS, SHOWN, EdgeImages, by_chance
 from linprim_geo.stereo.enclosing_planes import BEYOND, KnownPoints
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
-from linprim_geo.stereo.plain_regions import seen_enough
+from linprim_geo.stereo.plain_regions import SAME_ANGLE, seen_enough
 from linprim_geo.stereo.point_planes import confirmed_points
-from linprim_geo.stereo.right_angles import NEARLY, at_right_angles
+from linprim_geo.stereo.right_angles import LEFT_OPEN, NEARLY, at_right_angles
 
 # A line is looked for up to this share of its distance away from where planes meet: what those of shading are off by.
 # One that has points all over is known to CONFIRMED_DEPTH, with what hangs on the wall behind.
@@ -72,6 +73,13 @@ def on_meeting_lines(
                 line = clearest_line(wall, base, _corner(wall, base, up, seen), edges, reach[number])
                 if line is not None:
                     found[number] = _through(line, np.cross(up[:3], base[:3]), wall)
+    standing = [*floors, *found.values()]
+    for number in sorted(walls.keys() - found.keys()):
+        if any(is_same(walls[number], plane) for plane in planes[:by_points]):
+            continue
+        leaning = _leaning(walls[number], standing, seen, edges, reach[number])
+        if leaning is not None:
+            found[number] = leaning
     return {k: plane if plane[:3] @ planes[k, :3] > 0 else -plane for k, plane in found.items()}
 
 
@@ -123,6 +131,54 @@ def _through(line: np.ndarray, normal: np.ndarray, wall: np.ndarray) -> np.ndarr
     """The plane (4,) through the middle of (2, 3) ends of a line, its normal on the side of that of a wall."""
     normal = normal / (np.linalg.norm(normal) * np.sign(normal @ wall[:3]))
     return np.append(normal, normal @ line.mean(0))
+
+
+def _leaning(
+    wall: np.ndarray, standing: Sequence[np.ndarray], seen: KnownPoints, edges: EdgeImages, reach: float
+) -> np.ndarray | None:
+    """The plane (4,) through the lines along which a wall meets `standing` planes, but for those that others
+    contradict; None where the wall has them on it, or they do not tell its direction."""
+    lines = list[np.ndarray]()
+    for base in standing:
+        apart = np.arccos(min(1.0, abs(wall[:3] @ base[:3])))
+        near = _foot(wall, base, seen) if apart > LEFT_OPEN else None
+        line = clearest_line(wall, base, near, edges, reach) if near is not None else None
+        if line is not None:
+            lines.append(line)
+    if len(lines) < 2:
+        return None
+    steps = ((np.arange(SAMPLES) + 0.5) / SAMPLES)[:, None]
+    places = np.stack([line[0] + steps * (line[1] - line[0]) for line in lines])
+    away = np.linalg.norm(seen.centers.mean(0) - places.mean(1), axis=1)
+    length = np.linalg.norm([line[1] - line[0] for line in lines], axis=1)
+    plane, weight = wall, length
+    for _ in range(FITS):
+        middle, _, axes = _spread(places, weight)
+        normal = axes[:, 0] * np.sign(axes[:, 0] @ wall[:3])
+        plane = np.append(normal, normal @ middle)
+        weight = length / np.maximum(CONFIRMED_DEPTH / FINER, _off(plane, places) / away)
+    on_it = _off(plane, places) < CONFIRMED_DEPTH * away
+    if not on_it.any() or (_off(wall, places) < CONFIRMED_DEPTH * away)[on_it].all():
+        return None
+    # The normal's angle is as certain as the lines are wide across the narrower side.
+    middle, variance, _ = _spread(places[on_it], length[on_it])
+    wide = np.sqrt(max(variance[1], 0)) * np.tan(SAME_ANGLE) > BLUR * edges.pixel_at(middle)
+    return plane if wide and plane[:3] @ wall[:3] > np.cos(LEFT_OPEN) else None
+
+
+def _off(plane: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """(N,) mean distance of places (N, P, 3) from a plane."""
+    return np.abs(places @ plane[:3] - plane[3]).mean(1)
+
+
+def _spread(places: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The middle (3,) of N sets of places (N, P, 3) that count as `weight` (N,) says, and how they vary along which
+    axes: ascending variances (3,) and columns (3, 3)."""
+    share = (weight / weight.sum()).repeat(places.shape[1]) / places.shape[1]
+    points = places.reshape(-1, 3)
+    middle = share @ points
+    variance, axes = np.linalg.eigh((points - middle).T @ ((points - middle) * share[:, None]))
+    return middle, variance, axes
 
 
 def clearest_line(

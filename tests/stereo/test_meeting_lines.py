@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.plain_room import GREYS, PLANES, at_corner, cameras, floors, photographs, points_of, seen
+from helpers.captures import look_at
+from helpers.plain_room import GREYS, PLANES, SIZE, at_corner, cameras, floors, photographs, points_of, seen
 
+from linprim_geo.stereo import meeting_lines
 from linprim_geo.stereo.enclosing_planes import KnownPoints
-from linprim_geo.stereo.meeting_lines import floors_of, is_same, on_meeting_lines
+from linprim_geo.stereo.meeting_lines import clearest_line, floors_of, is_same, on_meeting_lines
 
 FLOOR, LEFT, RIGHT = PLANES[0], PLANES[1], PLANES[3]
 
@@ -176,3 +178,56 @@ def test_a_floor_that_is_askew_has_the_direction_of_a_table_with_more_points():
 
 def test_planes_are_the_same_whatever_side_their_normals_are_on():
     assert is_same(LEFT, LEFT) and is_same(RIGHT, -RIGHT) and not is_same(LEFT, RIGHT)
+
+
+# A slope under a roof: from 1.2 m high at y = 2 to the ceiling.
+SLOPE = np.array([0, -np.sqrt(0.5), -np.sqrt(0.5), -3.2 * np.sqrt(0.5)])
+ATTIC, ATTIC_GREYS = np.concatenate([PLANES, SLOPE[None]]), (*GREYS, 205.0)
+
+
+def leaning(degrees: float, shift: float) -> np.ndarray:
+    """The slope turned about the horizontal line in its middle, and shifted inwards."""
+    cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    normal = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]]) @ SLOPE[:3]
+    return np.append(normal, normal @ [1.5, 1.6, 1.6] + shift)
+
+
+def in_attic(slope: np.ndarray, seed: int = 0, walls: tuple[int, ...] = (1, 3)) -> dict[int, np.ndarray]:
+    """Those of a floor, of `walls` with points along their upper ends, and of a slope that have moved."""
+    known, maps = [], []
+    of = [look_at(camera.center, (1.5, 1.9, 1.3), size=SIZE, focal=220.0) for camera in cameras()]
+    for found in photographs(of, ATTIC_GREYS, ATTIC, seed):
+        depth, which = seen(found.camera, ATTIC)
+        place = found.camera.center + found.camera.world_rays() * depth[..., None]
+        known.append(np.where((which == 0) | (np.isin(which, walls) & (place[..., 2] > 1.0)), depth, np.nan))
+        maps.append(replace(found, normal=np.float32(ATTIC[which, :3])))
+    return on_meeting_lines(np.array([FLOOR, *ATTIC[list(walls)], slope]), 1, maps, known)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("degrees", "shift"), [(2.0, -0.04), (-2.0, -0.04)])
+def test_a_slope_goes_through_the_lines_along_which_it_meets_walls(seed, degrees, shift):
+    found = in_attic(leaning(degrees, shift), seed)[3]
+    assert np.degrees(np.arccos(found[:3] @ SLOPE[:3])) < 0.5
+    ends = np.array([[x, y, 3.2 - y] for x in (0, 3) for y in (1.2, 2)])
+    assert np.abs(ends @ found[:3] - found[3]).max() < 0.01
+    before = leaning(degrees, shift)
+    assert np.abs(ends @ before[:3] - before[3]).max() > 0.05
+
+
+def test_a_slope_that_has_these_lines_on_it_stays():
+    assert 3 not in in_attic(leaning(0.1, 0.002))
+
+
+def test_one_line_does_not_tell_where_a_slope_leans():
+    assert 3 not in in_attic(leaning(2.0, -0.04), walls=(1,))
+
+
+def test_a_line_that_others_contradict_does_not_move_a_slope(monkeypatch):
+    def shown(wall, base, near, edges, reach):
+        line = clearest_line(wall, base, near, edges, reach)
+        return line if line is None or base[1] > -0.5 else line + [0, 0, 0.15]
+
+    monkeypatch.setattr(meeting_lines, "clearest_line", shown)
+    found = in_attic(leaning(2.0, -0.04), walls=(1, 3, 4))[4]
+    assert np.degrees(np.arccos(found[:3] @ SLOPE[:3])) < 0.5
