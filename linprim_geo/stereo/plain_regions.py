@@ -1,9 +1,8 @@
 """Planes for regions without texture, such as painted walls.
 
 Stereo sees the edges of a plain region and not what is inside. Planes are fitted to the confirmed depths along its
-edges, of which those of occluders lie before it and none behind it. Planes that several views find from directions that
-differ are offered to every region; rendered depths, rough as they are, decide which of them it gets, or that it gets
-none. A silhouette of something round gives another plane to each view, and so none.
+edges, of which those of occluders lie before it and none behind it. Planes are those that several views find from
+directions that differ: a silhouette of something round gives another plane to each view, and so none.
 """
 
 from __future__ import annotations
@@ -47,19 +46,13 @@ LEAST_VIEWS, SPREAD = 3, np.radians(10)
 SAME_ANGLE = np.radians(3)
 # Rounds in which planes are chosen by regions and fitted to all points on them.
 ROUNDS = 3
-# Rendered depths that are off by MOST_OFF, a share of depth, say nothing; a plane is refused from REFUSED_OFF in the
-# mean over a window of one in WINDOW_PART of the larger side.
-MOST_OFF, REFUSED_OFF, WINDOW_PART = 0.1, 0.06, 10
-# One more plane in a region has to bring its rendered depths nearer by this share of MOST_OFF in the mean.
-LEAST_GAIN = 0.05
-# Planes that are compared with the rendered depths of a region: those with the most points on them.
-COMPARED = 8
 
 
 @dataclass(frozen=True)
 class PlainRegion:
     """A region of view `view` without texture: `mask` of a window whose first pixel is (`top`, `left`); along its edges
-    `rays` (N, 3) of depth 1 and `inverse` (N,) depths; `corners` (5, 3) rays to its ends and its middle."""
+    `rays` (N, 3) of depth 1 and `inverse` (N,) depths, of which those that are not `sure` (N,) are far and on no plane;
+    `corners` (5, 3) rays to its ends and its middle."""
 
     view: int
     top: int
@@ -67,11 +60,16 @@ class PlainRegion:
     mask: np.ndarray
     rays: np.ndarray
     inverse: np.ndarray
+    sure: np.ndarray
     corners: np.ndarray
 
     def off(self, planes: np.ndarray) -> np.ndarray:
         """(N, K) by what share of their inverse depth (K, 3) planes are before the edges' points."""
         return (self.rays @ planes.T) / self.inverse[:, None] - 1
+
+    def are_on(self, off: np.ndarray) -> np.ndarray:
+        """(N, K) bool which points are on planes, by what these are `off`."""
+        return (np.abs(off) < TOLERANCE) & self.sure[:, None]
 
 
 def edges_of(grey: np.ndarray, noise: float) -> np.ndarray:
@@ -106,8 +104,11 @@ def plainest(values: np.ndarray, grey: np.ndarray) -> float:
     return float(np.quantile(varying, PLAIN_SHARE)) if len(varying) else 0.0
 
 
-def plain_regions(view: int, camera: Camera, edge: np.ndarray, depth: np.ndarray) -> list[PlainRegion]:
-    """Regions between edges; `depth` (H, W) is NaN where it is not confirmed."""
+def plain_regions(
+    view: int, camera: Camera, edge: np.ndarray, depth: np.ndarray, sure: np.ndarray
+) -> list[PlainRegion]:
+    """Regions between edges; `depth` (H, W) is NaN where it is not known, and `sure` (H, W) where it is no far one that
+    may be wrong."""
     labels, _ = label(~edge)
     points, regions = np.isfinite(depth) & edge, []
     for number, (rows, columns) in enumerate(find_objects(labels), start=1):
@@ -124,7 +125,7 @@ def plain_regions(view: int, camera: Camera, edge: np.ndarray, depth: np.ndarray
         ends = np.array([(low[0], low[1]), (low[0], high[1]), (high[0], low[1]), (high[0], high[1]), tuple(middle)])
         inverse = 1 / depth[window][row, column].astype(np.float64)
         rays, corners = rays_of(camera, row + top, column + left), rays_of(camera, ends[:, 0] + top, ends[:, 1] + left)
-        regions.append(PlainRegion(view, top, left, mask, rays, inverse, corners))
+        regions.append(PlainRegion(view, top, left, mask, rays, inverse, sure[window][row, column], corners))
     return regions
 
 
@@ -138,7 +139,7 @@ def regions_of_views(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> 
         sure = np.isfinite(depth)
         if sure.any():
             depth = np.where(~sure & (found.depth > BEYOND * np.median(depth[sure])), found.depth, depth)
-        result.append(plain_regions(number, found.camera, edges_of(found.grey, found.noise), depth))
+        result.append(plain_regions(number, found.camera, edges_of(found.grey, found.noise), depth, sure))
     return result
 
 
@@ -150,7 +151,7 @@ def rays_of(camera: Camera, row: np.ndarray, column: np.ndarray) -> np.ndarray:
 
 def planes_of_region(region: PlainRegion, rng: np.random.Generator) -> list[tuple[int, np.ndarray]]:
     """Planes (3,) with ray . plane = inverse depth, and how many points are on them, by random triples of points."""
-    found, left = [], np.ones(len(region.inverse), bool)
+    found, left = [], region.sure.copy()
     for _ in range(PLANES_PER_REGION):
         rest = np.nonzero(left)[0]
         if len(rest) < LEAST_POINTS:
@@ -162,7 +163,7 @@ def planes_of_region(region: PlainRegion, rng: np.random.Generator) -> list[tupl
             break
         tried = np.linalg.solve(corners[proper], region.inverse[triples[proper]][..., None])[..., 0]
         off = region.off(tried)
-        on, behind = np.abs(off) < TOLERANCE, off > BEHIND * TOLERANCE
+        on, behind = region.are_on(off), off > BEHIND * TOLERANCE
         on = on[:, np.argmax((on & left[:, None]).sum(0) - 2 * behind.sum(0))]
         left &= ~on
         plane, on = _fitted(region, on)
@@ -180,7 +181,7 @@ def _fitted(region: PlainRegion, on: np.ndarray) -> tuple[np.ndarray, np.ndarray
             break
         scaled = region.rays[on] / region.inverse[on, None]
         plane = np.linalg.lstsq(scaled, np.ones(len(scaled)), rcond=None)[0]
-        on = np.abs(region.off(plane[None])[:, 0]) < TOLERANCE
+        on = region.are_on(region.off(plane[None]))[:, 0]
     return plane, on
 
 
@@ -246,9 +247,11 @@ def seen_enough(cameras: Sequence[Camera], views: np.ndarray, point: np.ndarray)
     return bool((towards @ towards.T).min() < np.cos(SPREAD))
 
 
-def _accepted(region: PlainRegion, off: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of (N, K) `PlainRegion.off`: (N, K) points on planes, and (K,) whether a plane may be the region's."""
-    on, count = np.abs(off) < TOLERANCE, len(region.inverse)
+def may_lie_on(region: PlainRegion, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of (K, 3) planes of the camera: which of a region's points are on them (N, K), and whether the region may lie on
+    them (K,): enough of its points do, and hardly any is behind."""
+    off, count = region.off(planes), len(region.inverse)
+    on = region.are_on(off)
     behind = (off > BEHIND * TOLERANCE).sum(0)
     return on, (on.sum(0) >= max(LEAST_POINTS, ON_SHARE * count)) & (behind <= BEHIND_SHARE * count)
 
@@ -258,7 +261,7 @@ def _refitted(cameras: Sequence[Camera], regions: Sequence[PlainRegion], planes:
     points: list[list] = [[] for _ in planes]
     for region in regions if len(planes) else ():
         camera = cameras[region.view]
-        on, fits = _accepted(region, region.off(in_camera(camera, planes)))
+        on, fits = may_lie_on(region, in_camera(camera, planes))
         left = np.ones(len(on), bool)
         while True:  # the one with the most points first, then by those that are left
             counts = (on & left[:, None]).sum(0) * fits
@@ -308,49 +311,3 @@ def in_camera(camera: Camera, planes: np.ndarray) -> np.ndarray:
     distance = planes[:, 3] + normals @ camera.world_to_camera[:3, 3]
     through = np.abs(distance) < 1e-9
     return np.where(through[:, None], 0, normals / np.where(through, 1, distance)[:, None])
-
-
-def plane_depths(
-    camera: Camera, regions: Sequence[PlainRegion], planes: np.ndarray, rendered: np.ndarray
-) -> np.ndarray:
-    """(H, W) float32 depth of plain regions of a view by the planes that fit them, NaN elsewhere.
-
-    `regions` are the view's own; `planes` (K, 4) of the world; `rendered` (H, W) depth, 0 where there is none.
-    """
-    depth = np.full(rendered.shape, np.nan, np.float32)
-    if not len(planes):
-        return depth
-    local = in_camera(camera, planes)
-    size = 2 * (max(rendered.shape) // (2 * WINDOW_PART)) + 1
-    for region in regions:
-        on, fits = _accepted(region, region.off(local))
-        order = np.argsort(-on.sum(0), kind="stable")
-        window = np.s_[region.top : region.top + region.mask.shape[0], region.left : region.left + region.mask.shape[1]]
-        inverse = _chosen(camera, region, local[[k for k in order if fits[k]][:COMPARED]], rendered[window], size)
-        known = inverse > 0
-        depth[window][known] = 1 / inverse[known]
-    return depth
-
-
-def _chosen(camera: Camera, region: PlainRegion, planes: np.ndarray, rendered: np.ndarray, size: int) -> np.ndarray:
-    """Inverse depth within the mask of a region by the planes nearest to the rendered depths, 0 where none is."""
-    mask = region.mask
-    inverse, least = np.zeros(mask.shape), np.full(mask.shape, MOST_OFF, np.float32)
-    known = mask & (rendered > 0)
-    if not len(planes) or np.count_nonzero(known) < 0.5 * np.count_nonzero(mask):
-        return inverse
-    rays = rays_of(camera, np.arange(mask.shape[0])[:, None] + region.top, np.arange(mask.shape[1]) + region.left)
-    share = np.maximum(uniform_filter(known.astype(np.float32), size, mode="constant"), 1e-6)
-    planes = rays @ planes.T
-    off = np.where(known[..., None], np.minimum(np.abs(rendered[..., None] * planes - 1), MOST_OFF), 0)
-    off = uniform_filter(off.astype(np.float32), (size, size, 0), mode="constant") / share[..., None]
-    off[planes <= 0] = MOST_OFF
-    while True:
-        gain = np.maximum(least[..., None] - off, 0)[mask].mean(0)
-        best = int(np.argmax(gain))
-        if gain[best] < LEAST_GAIN * MOST_OFF:
-            break
-        nearer = off[..., best] < least
-        least = np.where(nearer, off[..., best], least)
-        inverse = np.where(nearer, planes[..., best], inverse)
-    return np.where(mask & (least < REFUSED_OFF), inverse, 0)

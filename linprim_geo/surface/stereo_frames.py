@@ -26,10 +26,10 @@ from linprim_geo.stereo.plain_regions import (
     common_planes,
     edges_of,
     grown_alike,
-    plane_depths,
     regions_of_views,
 )
 from linprim_geo.stereo.point_planes import SurfacePoints, planes_of_points, point_plane_depth
+from linprim_geo.stereo.region_planes import region_plane_depths
 from linprim_geo.stereo.room_corners import with_corner_walls
 from linprim_geo.stereo.shaded_planes import ShadedPlanes
 from linprim_geo.stereo.textured_backgrounds import textured_backgrounds
@@ -114,12 +114,10 @@ class MergedFrames(Sequence):
         shaded = ShadedPlanes(maps, sure, rendered, by_points, by_edges)
         self.planes, self.standing = shaded.planes[~shaded.hanging], shaded.standing[~shaded.hanging]
         self.on_planes, backgrounds = [], []
-        # Planes with points all over have them in their plain regions, too.
-        for_regions = shaded.planes[len(by_points) :]
-        for view, by_shading in enumerate(shaded.depth_maps()):
-            camera, depth = maps[view].camera, self.depths[view]
+        by_edges_of = region_plane_depths(self.cameras, regions, shaded.planes)
+        for view, (by_shading, along_edges) in enumerate(zip(shaded.depth_maps(), by_edges_of, strict=True)):
+            depth = self.depths[view]
             on_plane = point_plane_depth(maps[view], sure[view], by_points)
-            along_edges = plane_depths(camera, regions[view], for_regions, rendered[view])
             backgrounds.append(shaded.is_background(view))
             along_edges[backgrounds[-1]] = np.nan
             self.on_planes.append(_first_known((on_plane, by_shading, along_edges)))

@@ -59,7 +59,7 @@ def test_confirmed_depths_take_the_place_of_rendered_ones(found):
 
 def test_planes_of_walls_stand_where_confirmed_depths_are_not_sure(found, monkeypatch):
     found[0].confidence[:, 5:] = CONFIDENT
-    monkeypatch.setattr(stereo_frames, "plane_depths", lambda *_: np.full((30, 40), 3.5, np.float32))
+    monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: [np.full((30, 40), 3.5, np.float32)])
     frame = MergedFrames(rendered(0.01), [VIEW], 5.0)[0]
     assert (frame.depth[2:, :5] == 3).all() and (frame.depth[2:, 5:20] == 3.5).all()
     assert (frame.confidence[2:, :20] == 1).all()
@@ -68,7 +68,7 @@ def test_planes_of_walls_stand_where_confirmed_depths_are_not_sure(found, monkey
 def test_planes_stand_where_nothing_is_confirmed(found, monkeypatch):
     on_plane = np.full((30, 40), np.nan, np.float32)
     on_plane[:, 10:30] = 3.5
-    monkeypatch.setattr(stereo_frames, "plane_depths", lambda *_: on_plane)
+    monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: [on_plane])
     merged = MergedFrames(rendered(0.01), [VIEW], 5.0)
     frame = merged[0]
     assert (frame.depth[2:, :20] == 3).all() and (frame.depth[:, 20:30] == 3.5).all() and merged.flat == 0.5
@@ -199,7 +199,7 @@ def test_what_few_views_know_on_a_plane_is_not_background(found, monkeypatch):
         asked.extend(known)
         return [on_plane]
 
-    monkeypatch.setattr(stereo_frames, "plane_depths", lambda *_: np.full((30, 40), 3.5, np.float32))
+    monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: [np.full((30, 40), 3.5, np.float32)])
     monkeypatch.setattr(stereo_frames, "known_on_planes", known_on_planes)
     merged = MergedFrames([replace(rendered(0.01)[0], background=background)], [VIEW], 5.0)
     frame = merged[0]
@@ -238,7 +238,7 @@ def test_thin_things_stand_before_what_is_known(found, monkeypatch):
         return [thing]
 
     monkeypatch.setattr(stereo_frames, "thin_things", thin)
-    monkeypatch.setattr(stereo_frames, "plane_depths", lambda *_: np.full((30, 40), 3.5, np.float32))
+    monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: [np.full((30, 40), 3.5, np.float32)])
     sharp = np.ones((30, 40), bool)
     merged = MergedFrames(rendered(-0.1), [VIEW], 5.0, sharp=[sharp])
     frame = merged[0]
@@ -257,7 +257,7 @@ def test_things_that_are_known_by_their_outlines_are_as_rendered(found, monkeypa
     thing = np.zeros((30, 40), bool)
     thing[4:20, 15:25] = True
     monkeypatch.setattr(stereo_frames, "outlined_things", lambda views: [thing])
-    monkeypatch.setattr(stereo_frames, "plane_depths", lambda *_: np.full((30, 40), 3.5, np.float32))
+    monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: [np.full((30, 40), 3.5, np.float32)])
     merged = MergedFrames(rendered(0.02), [VIEW], 5.0)
     frame = merged[0]
     # In place of confirmed depths of the left half and of a plane in the right one.
@@ -353,7 +353,7 @@ def test_a_closed_surface_stays_closed(found, monkeypatch):
 
 def test_a_view_supports_a_point_once_and_only_by_what_is_fused(found, monkeypatch):
     on_plane = np.full((30, 40), 3.0, np.float32)
-    monkeypatch.setattr(stereo_frames, "plane_depths", lambda *_: on_plane)
+    monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: [on_plane])
     point = np.array([[-0.4, 0.0, -0.2]])
     (frame,) = rendered(0.0)
     assert MergedFrames([frame], [VIEW], 5.0).supporting(point) == [1]

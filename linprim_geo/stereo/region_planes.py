@@ -1,0 +1,90 @@
+"""Which of several planes plain regions lie on: by what is known along their edges.
+
+A wall that a region shows has points along the region's edges, where it meets other walls and where things hang on it
+or stand at it; the others are those of occluders. Planes that happen to go through occluders have fewer. A plane is
+believed within the convex hull of its points alone: beyond, walls end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.stereo.plain_regions import PlainRegion, in_camera, may_lie_on, rays_of, to_world
+
+# Of one region and K planes: which of its N points are on which (N, K), and which it may lie on (K,).
+_Lying = tuple[np.ndarray, np.ndarray]
+
+
+def region_plane_depths(
+    cameras: Sequence[Camera], regions: Sequence[Sequence[PlainRegion]], planes: np.ndarray
+) -> list[np.ndarray]:
+    """(H, W) float32 depth of the plain `regions` of each view by the (K, 4) planes of the world on which they lie, NaN
+    elsewhere.
+
+    A pixel lies on the plane with the most points along the edges of its region, of those within whose hull it is.
+    """
+    local = [in_camera(camera, planes) for camera in cameras]
+    lying = [[may_lie_on(region, of_view) for region in own] for own, of_view in zip(regions, local, strict=True)]
+    hulls = _hulls(cameras, regions, lying, planes)
+    result = []
+    for camera, own, of_regions, of_view in zip(cameras, regions, lying, local, strict=True):
+        depth = np.full((camera.height, camera.width), np.nan, np.float32)
+        for region, (on, fits) in zip(own, of_regions, strict=True):
+            most_first = [k for k in np.argsort(-on.sum(0), kind="stable") if fits[k]]
+            _lay(depth, camera, region, of_view[most_first], [hulls[k] for k in most_first])
+        result.append(depth)
+    return result
+
+
+def _hulls(
+    cameras: Sequence[Camera],
+    regions: Sequence[Sequence[PlainRegion]],
+    lying: Sequence[Sequence[_Lying]],
+    planes: np.ndarray,
+) -> list[_Hull]:
+    """Of each plane, around its points along the edges of regions of all views that may lie on it."""
+    points = [[np.zeros((0, 3))] for _ in planes]
+    for camera, own, of_regions in zip(cameras, regions, lying, strict=True):
+        for region, (on, fits) in zip(own, of_regions, strict=True):
+            places = to_world(camera, region.rays / region.inverse[:, None])
+            for number in np.flatnonzero(fits):
+                points[number].append(places[on[:, number]])
+    return [_Hull(plane, np.concatenate(parts)) for plane, parts in zip(planes, points, strict=True)]
+
+
+def _lay(depth: np.ndarray, camera: Camera, region: PlainRegion, planes: np.ndarray, hulls: Sequence[_Hull]) -> None:
+    """Sets the depth (H, W) of each pixel of a region by the first of (K, 3) planes of the camera whose hull it is
+    in."""
+    row, column = np.nonzero(region.mask)
+    row, column = row + region.top, column + region.left
+    rays = rays_of(camera, row, column)
+    left = np.ones(len(row), bool)
+    for plane, hull in zip(planes, hulls, strict=True):
+        inverse = rays @ plane
+        rows = np.flatnonzero(left & (inverse > 0))
+        rows = rows[hull.holds(to_world(camera, rays[rows] / inverse[rows, None]))]
+        depth[row[rows], column[rows]] = 1 / inverse[rows]
+        left[rows] = False
+
+
+class _Hull:
+    """The convex hull of (P, 3) points on a plane (4,); it holds nothing if all of them are on one line."""
+
+    def __init__(self, plane: np.ndarray, points: np.ndarray):
+        self.axes = np.linalg.svd(plane[None, :3])[2][1:]
+        try:
+            self.sides = ConvexHull(points @ self.axes.T).equations
+        except (QhullError, ValueError):  # on one line, or fewer than three
+            self.sides = np.array([[0.0, 0.0, 1.0]])
+
+    def holds(self, places: np.ndarray) -> np.ndarray:
+        """(P,) whether (P, 3) places on the plane are within the hull."""
+        along = places @ self.axes.T
+        inside = np.ones(len(places), bool)
+        for x, y, offset in self.sides:
+            inside &= x * along[:, 0] + y * along[:, 1] + offset <= 0
+        return inside
