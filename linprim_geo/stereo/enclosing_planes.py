@@ -85,8 +85,8 @@ class EnclosingPlane:
 
     def within(self, points: np.ndarray, ends: np.ndarray) -> np.ndarray:
         """(P,) bool which of (P, 3) points on the plane lie within `own` or `whole`."""
-        along = points @ self.axes.T
-        return ((along >= ends[0]) & (along <= ends[1])).all(1)
+        first, second = (points @ self.axes.T).T
+        return (first >= ends[0, 0]) & (first <= ends[1, 0]) & (second >= ends[0, 1]) & (second <= ends[1, 1])
 
     def corners(self) -> np.ndarray:
         """(4, 3) of its own rectangle."""
@@ -375,7 +375,8 @@ def known_on_planes(
         least = CONFIRMED_DEPTH * np.linalg.norm(places - camera.center, axis=1)
         near = np.zeros(len(places), bool)
         for plane in enclosing:
-            near |= (np.abs(places @ plane.normal - plane.offset) < least) & plane.within(places, plane.own)
+            on_it = np.flatnonzero(np.abs(places @ plane.normal - plane.offset) < least)
+            near[on_it[plane.within(places[on_it], plane.own)]] = True
         looking, knowing = _looking(places[near], cameras, known)
         on[row[near], column[near]] = (looking <= FEW_VIEWS) & (knowing > MOST_KNOW * looking)
     return result
