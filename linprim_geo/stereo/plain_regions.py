@@ -8,7 +8,7 @@ directions that differ: a silhouette of something round gives another plane to e
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt, find_objects, label, uniform_filter
@@ -50,9 +50,10 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class PlainRegion:
-    """A region of view `view` without texture: `mask` of a window whose first pixel is (`top`, `left`); along its edges
-    `rays` (N, 3) of depth 1 and `inverse` (N,) depths, of which those that are not `sure` (N,) are far and on no plane;
-    `corners` (5, 3) rays to its ends and its middle."""
+    """A region of view `view` without texture: `mask` (`grown_alike`) of a window whose first pixel is (`top`, `left`);
+    along its edges `rays` (N, 3) of depth 1 and `inverse` (N,) depths, of which those that are not `sure` (N,) are far
+    and on no plane, and those that are `inner` (N,) within the mask; `corners` (5, 3) rays to its ends and its
+    middle."""
 
     view: int
     top: int
@@ -61,7 +62,18 @@ class PlainRegion:
     rays: np.ndarray
     inverse: np.ndarray
     sure: np.ndarray
+    inner: np.ndarray
     corners: np.ndarray
+
+    def within(self) -> PlainRegion:
+        """The region with its inner points alone."""
+        return replace(
+            self,
+            rays=self.rays[self.inner],
+            inverse=self.inverse[self.inner],
+            sure=self.sure[self.inner],
+            inner=self.inner[self.inner],
+        )
 
     def off(self, planes: np.ndarray) -> np.ndarray:
         """(N, K) by what share of their inverse depth (K, 3) planes are before the edges' points."""
@@ -105,10 +117,10 @@ def plainest(values: np.ndarray, grey: np.ndarray) -> float:
 
 
 def plain_regions(
-    view: int, camera: Camera, edge: np.ndarray, depth: np.ndarray, sure: np.ndarray
+    view: int, camera: Camera, grey: np.ndarray, edge: np.ndarray, depth: np.ndarray, sure: np.ndarray
 ) -> list[PlainRegion]:
-    """Regions between edges; `depth` (H, W) is NaN where it is not known, and `sure` (H, W) where it is no far one that
-    may be wrong."""
+    """Regions of (H, W) `grey` between edges; `depth` (H, W) is NaN where it is not known, and `sure` (H, W) where it
+    is no far one that may be wrong."""
     labels, _ = label(~edge)
     points, regions = np.isfinite(depth) & edge, []
     for number, (rows, columns) in enumerate(find_objects(labels), start=1):
@@ -125,7 +137,9 @@ def plain_regions(
         ends = np.array([(low[0], low[1]), (low[0], high[1]), (high[0], low[1]), (high[0], high[1]), tuple(middle)])
         inverse = 1 / depth[window][row, column].astype(np.float64)
         rays, corners = rays_of(camera, row + top, column + left), rays_of(camera, ends[:, 0] + top, ends[:, 1] + left)
-        regions.append(PlainRegion(view, top, left, mask, rays, inverse, sure[window][row, column], corners))
+        grown = grown_alike(mask, grey[window], edge[window])
+        at_edge = sure[window][row, column], grown[row, column]
+        regions.append(PlainRegion(view, top, left, grown, rays, inverse, *at_edge, corners))
     return regions
 
 
@@ -139,7 +153,8 @@ def regions_of_views(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> 
         sure = np.isfinite(depth)
         if sure.any():
             depth = np.where(~sure & (found.depth > BEYOND * np.median(depth[sure])), found.depth, depth)
-        result.append(plain_regions(number, found.camera, edges_of(found.grey, found.noise), depth, sure))
+        edge = edges_of(found.grey, found.noise)
+        result.append(plain_regions(number, found.camera, found.grey, edge, depth, sure))
     return result
 
 

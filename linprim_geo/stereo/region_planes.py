@@ -1,8 +1,9 @@
 """Which of several planes plain regions lie on: by what is known along their edges.
 
-A wall that a region shows has points along the region's edges, where it meets other walls and where things hang on it
-or stand at it; the others are those of occluders. Planes that happen to go through occluders have fewer. A plane is
-believed within the convex hull of its points alone: beyond, walls end.
+A wall that a region shows has points along the region's edges, where it meets other walls and where things hang on it;
+the others are those of occluders. Planes that happen to go through occluders have fewer. Only points on a region's own
+side of its edges count: beside a thing before a wall the others are on the wall. A plane is believed within the convex
+hull of its points alone: beyond, walls end.
 """
 
 from __future__ import annotations
@@ -13,29 +14,46 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.stereo.plain_regions import PlainRegion, in_camera, may_lie_on, rays_of, to_world
+from linprim_geo.stereo.enclosing_planes import SURE_SHARE
+from linprim_geo.stereo.plain_regions import (
+    BEHIND,
+    LEAST_POINTS,
+    TOLERANCE,
+    PlainRegion,
+    in_camera,
+    may_lie_on,
+    rays_of,
+    to_world,
+)
 
+# Of what stereo is sure of within a region so much is on its plane, if it is sure of enough.
+MOST_AGREE = 0.5
 # Of one region and K planes: which of its N points are on which (N, K), and which it may lie on (K,).
 _Lying = tuple[np.ndarray, np.ndarray]
 
 
 def region_plane_depths(
-    cameras: Sequence[Camera], regions: Sequence[Sequence[PlainRegion]], planes: np.ndarray
+    cameras: Sequence[Camera],
+    regions: Sequence[Sequence[PlainRegion]],
+    planes: np.ndarray,
+    known: Sequence[np.ndarray],
 ) -> list[np.ndarray]:
     """(H, W) float32 depth of the plain `regions` of each view by the (K, 4) planes of the world on which they lie, NaN
     elsewhere.
 
-    A pixel lies on the plane with the most points along the edges of its region, of those within whose hull it is.
+    A pixel lies on the plane with the most points along the edges of its region, of those within whose hull it is and
+    on which most `known` (H, W) depths there are, NaN elsewhere.
     """
     local = [in_camera(camera, planes) for camera in cameras]
+    regions = [[region.within() for region in own] for own in regions]
     lying = [[may_lie_on(region, of_view) for region in own] for own, of_view in zip(regions, local, strict=True)]
     hulls = _hulls(cameras, regions, lying, planes)
     result = []
-    for camera, own, of_regions, of_view in zip(cameras, regions, lying, local, strict=True):
+    for camera, own, of_regions, of_view, sure in zip(cameras, regions, lying, local, known, strict=True):
         depth = np.full((camera.height, camera.width), np.nan, np.float32)
         for region, (on, fits) in zip(own, of_regions, strict=True):
             most_first = [k for k in np.argsort(-on.sum(0), kind="stable") if fits[k]]
-            _lay(depth, camera, region, of_view[most_first], [hulls[k] for k in most_first])
+            _lay(depth, camera, region, of_view[most_first], [hulls[k] for k in most_first], sure)
         result.append(depth)
     return result
 
@@ -56,19 +74,29 @@ def _hulls(
     return [_Hull(plane, np.concatenate(parts)) for plane, parts in zip(planes, points, strict=True)]
 
 
-def _lay(depth: np.ndarray, camera: Camera, region: PlainRegion, planes: np.ndarray, hulls: Sequence[_Hull]) -> None:
-    """Sets the depth (H, W) of each pixel of a region by the first of (K, 3) planes of the camera whose hull it is
-    in."""
+def _lay(
+    depth: np.ndarray,
+    camera: Camera,
+    region: PlainRegion,
+    planes: np.ndarray,
+    hulls: Sequence[_Hull],
+    known: np.ndarray,
+) -> None:
+    """Sets the depth (H, W) of each pixel of a region by the first of (K, 3) planes of the camera whose hull it is in
+    and on which most (H, W) `known` depths are there."""
     row, column = np.nonzero(region.mask)
     row, column = row + region.top, column + region.left
-    rays = rays_of(camera, row, column)
-    left = np.ones(len(row), bool)
+    rays, left = rays_of(camera, row, column), np.ones(len(row), bool)
     for plane, hull in zip(planes, hulls, strict=True):
         inverse = rays @ plane
         rows = np.flatnonzero(left & (inverse > 0))
         rows = rows[hull.holds(to_world(camera, rays[rows] / inverse[rows, None]))]
-        depth[row[rows], column[rows]] = 1 / inverse[rows]
-        left[rows] = False
+        off = known[row[rows], column[rows]] * inverse[rows] - 1
+        off = off[np.isfinite(off)]
+        enough = len(off) >= max(LEAST_POINTS, SURE_SHARE * len(rows))
+        if not enough or (np.abs(off) < BEHIND * TOLERANCE).mean() >= MOST_AGREE:
+            depth[row[rows], column[rows]] = 1 / inverse[rows]
+            left[rows] = False
 
 
 class _Hull:

@@ -114,7 +114,7 @@ class MergedFrames(Sequence):
         shaded = ShadedPlanes(maps, sure, rendered, by_points, by_edges)
         self.planes, self.standing = shaded.planes[~shaded.hanging], shaded.standing[~shaded.hanging]
         self.on_planes, backgrounds = [], []
-        by_edges_of = region_plane_depths(self.cameras, regions, shaded.planes)
+        by_edges_of = region_plane_depths(self.cameras, regions, shaded.planes, sure)
         for view, (by_shading, along_edges) in enumerate(zip(shaded.depth_maps(), by_edges_of, strict=True)):
             depth = self.depths[view]
             on_plane = point_plane_depth(maps[view], sure[view], by_points)

@@ -14,50 +14,79 @@ from linprim_geo.stereo.region_planes import region_plane_depths
 
 @pytest.fixture(scope="module")
 def room():
-    """Cameras in a room, true depths, which wall is seen, and the regions of all views with exact depths along edges
-    alone."""
+    """Cameras in a room, true depths, which wall is seen, the regions of all views with exact depths along edges alone,
+    and these depths."""
     of = cameras()
     maps = photographs(of)
     depths, walls = zip(*(seen(camera) for camera in of), strict=True)
     edges = [edges_of(found.grey, NOISE**2) for found in maps]
     known = [np.where(edge, depth, np.nan).astype(np.float32) for edge, depth in zip(edges, depths, strict=True)]
-    return of, depths, walls, regions_of_views(maps, known)
+    return of, depths, walls, regions_of_views(maps, known), known
 
 
 def test_walls_lie_on_their_planes(room):
-    of, depths, walls, regions = room
+    of, depths, walls, regions, known = room
     # Others that go through the edges of some walls, and one that is 2 cm behind a wall.
     behind = [1, 0, 0, -0.02]
     across = np.array([[np.sqrt(0.5), np.sqrt(0.5), 0, 0], [0.0, np.sqrt(0.5), np.sqrt(0.5), 0], behind])
-    found = region_plane_depths(of, regions, np.concatenate([across, PLANES]))
-    known = [np.isfinite(depth) for depth in found]
-    assert np.mean(known) > 0.8
+    found = region_plane_depths(of, regions, np.concatenate([PLANES, across]), known)
+    laid = [np.isfinite(depth) for depth in found]
+    assert np.mean(laid) > 0.8
     error = np.concatenate(
-        [(own / depth - 1)[is_known] for own, depth, is_known in zip(found, depths, known, strict=True)]
+        [(own / depth - 1)[is_laid] for own, depth, is_laid in zip(found, depths, laid, strict=True)]
     )
     assert (np.abs(error) < 1e-4).mean() > 0.98
 
 
 def test_a_wall_ends_where_its_points_do(room):
     """Of all planes that of one wall alone: other walls have points on it where they meet it, and lie beside it."""
-    of, depths, walls, regions = room
-    found = region_plane_depths(of, regions, PLANES[[1]])
+    of, depths, walls, regions, known = room
+    found = region_plane_depths(of, regions, PLANES[[1]], known)
     on_it = np.concatenate([np.isfinite(depth)[wall == 1] for depth, wall in zip(found, walls, strict=True)])
     beside = np.concatenate([np.isfinite(depth)[wall != 1] for depth, wall in zip(found, walls, strict=True)])
     assert on_it.mean() > 0.8 and beside.mean() < 0.01
 
 
 def test_without_planes_nothing_is_known(room):
-    of, _, _, regions = room
-    assert not any(np.isfinite(depth).any() for depth in region_plane_depths(of, regions, np.zeros((0, 4))))
+    of, _, _, regions, known = room
+    assert not any(np.isfinite(depth).any() for depth in region_plane_depths(of, regions, np.zeros((0, 4)), known))
 
 
 def test_points_on_one_line_make_no_wall(room):
     """A plane through the line along which the floor meets a wall has points there alone."""
-    of, _, _, regions = room
+    of, _, _, regions, known = room
     leaning = np.array([[np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]])
-    depths = region_plane_depths(of, regions, leaning)
+    depths = region_plane_depths(of, regions, leaning, known)
     assert np.mean([np.isfinite(depth).mean() for depth in depths]) < 0.02
+
+
+@pytest.mark.parametrize(("share", "laid"), [(0.45, True), (0.55, False)])
+def test_what_stereo_is_sure_of_within_a_region_refuses_a_plane(room, share, laid):
+    of, depths, walls, regions, known = room
+    inside = []
+    for number, (depth, wall, edges) in enumerate(zip(depths, walls, known, strict=True)):
+        other = np.random.default_rng(number).uniform(size=depth.shape) < share
+        inside.append(np.where((wall == 1) & np.isnan(edges), np.where(other, 0.9, 1) * depth, edges))
+    found = region_plane_depths(of, regions, PLANES[[1]], inside)
+    on_it = np.concatenate([np.isfinite(depth)[wall == 1] for depth, wall in zip(found, walls, strict=True)])
+    assert (on_it.mean() > 0.8) == laid and (laid or on_it.mean() < 0.05)
+
+
+def test_a_thing_does_not_lie_on_the_wall_behind():
+    """A plain board before a wall with marks, which has points all around the board. Stereo knows both up to where they
+    end; the board is known along its upper edge alone."""
+    camera = look_at((4.0, 3.0, 2.0), target=(0.8, 0.8, 0.8), size=(160, 120), focal=110.0)
+    grey, board = np.full((120, 160), 120, np.uint8), np.zeros((120, 160), bool)
+    grey[::6, ::6] = 90
+    board[40:80, 50:110] = True
+    grey[board] = 60
+    true = np.where(board, 2.5, 3.0).astype(np.float32)
+    known = np.where(edges_of(grey, 1.0) & ~(board & (np.arange(120) > 44)[:, None]), true, np.nan)
+    none = np.zeros(grey.shape, np.uint8)
+    found = DepthMap(camera, known, np.zeros((*grey.shape, 3)), none, none, known, grey, 1.0)
+    behind = in_world(camera, np.array([0, 0, 1 / 3]))
+    (depth,) = region_plane_depths([camera], regions_of_views([found], [known]), behind[None], [known])
+    assert np.isnan(depth[42:78, 52:108]).all() and np.allclose(depth[:36][np.isfinite(depth[:36])], 3.0)
 
 
 def between_houses(edge_depth: float) -> np.ndarray:
@@ -77,7 +106,7 @@ def between_houses(edge_depth: float) -> np.ndarray:
     found = DepthMap(camera, depth, np.zeros((*grey.shape, 3)), none, none, depth, grey, 1.0)
     regions = regions_of_views([found], [np.where(houses, depth, np.nan)])
     front = in_world(camera, np.array([0, 0, 1 / 3]))
-    return region_plane_depths([camera], regions, front[None])[0][44:76, 70:100]
+    return region_plane_depths([camera], regions, front[None], [np.where(houses, depth, np.nan)])[0][44:76, 70:100]
 
 
 def test_a_plane_does_not_go_on_between_houses_before_what_is_far():
