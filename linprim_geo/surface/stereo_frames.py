@@ -17,7 +17,13 @@ from linprim_geo.geometry.mesh import Mesh, face_areas, face_components, select_
 from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.common_surfaces import ON_IT
 from linprim_geo.stereo.depth_maps import SURE, DepthMap, depth_maps
-from linprim_geo.stereo.enclosing_planes import enclosing_depths, enclosing_planes, known_on_planes, region_depths
+from linprim_geo.stereo.enclosing_planes import (
+    EnclosingPlane,
+    enclosing_depths,
+    enclosing_planes,
+    known_on_planes,
+    region_depths,
+)
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.lone_backgrounds import lone_backgrounds
 from linprim_geo.stereo.outlined_things import outlined_things
@@ -88,24 +94,30 @@ class MergedFrames(Sequence):
             deviations.add(found, depth, frame)
         self.weight = deviations.weight()
         rendered_depths = [frame.depth for frame in rendered]
-        regions, backgrounds = self._take_planes(maps, rendered_depths)
+        regions, backgrounds, flat = self._take_planes(maps, rendered_depths)
         self.rendered = [_seen_past(*each) for each in zip(rendered, maps, backgrounds, strict=True)]
         self.shown = [frame.depth[::SAMPLED, ::SAMPLED] > 0 for frame in self.rendered]
         known = [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
-        points = self._span_gaps(maps, known, rendered_depths, backgrounds)
+        self._span_gaps(maps, known, rendered_depths, backgrounds)
         are_sharp = [depth > 0 for depth in rendered_depths] if sharp is None else list(sharp)
-        self._enclose(maps, points, known, measured, are_sharp, regions, backgrounds)
+        # Where walls end is seen at their edges.
+        ending = [_first_known(pair) for pair in zip(self.depths, flat, strict=True)]
+        walls, planes = self._walls(maps, ending)
+        self._enclose(walls, known, are_sharp, regions, backgrounds)
+        # What stereo has measured on planes with points is not background where hardly any view looks.
+        self._end_at(known_on_planes(self.cameras, planes, measured))
         self._keep_things(views, maps, rendered_depths, are_sharp)
         if not any(view.has_alpha for view in views):  # else masks say what is background
             self._end_backgrounds(maps)
 
     def _take_planes(
         self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray]
-    ) -> tuple[list[list[PlainRegion]], list[np.ndarray]]:
+    ) -> tuple[list[list[PlainRegion]], list[np.ndarray], list[np.ndarray]]:
         """Finds planes by points, by edges and by shading, of depths that are sure, and what lies on them; moves
         confirmed depths to them.
 
-        Returns the plain regions of every view, and (H, W) bool: those that are background by their shading.
+        Returns the plain regions of every view, (H, W) bool: those that are background by their shading, and (H, W)
+        depth of planes that points or shading give there.
         """
         sure = [_depth_where(found, found.is_confirmed(SURE)) for found in maps]
         regions = regions_of_views(maps, sure)
@@ -113,18 +125,29 @@ class MergedFrames(Sequence):
         by_edges = common_planes(self.cameras, [region for own in regions for region in own])
         shaded = ShadedPlanes(maps, sure, rendered, by_points, by_edges)
         self.planes, self.standing = shaded.planes[~shaded.hanging], shaded.standing[~shaded.hanging]
-        self.on_planes, backgrounds = [], []
+        self.on_planes, backgrounds, flat = [], [], []
         by_edges_of = region_plane_depths(self.cameras, regions, shaded.planes, sure)
         for view, (by_shading, along_edges) in enumerate(zip(shaded.depth_maps(), by_edges_of, strict=True)):
             depth = self.depths[view]
             on_plane = point_plane_depth(maps[view], sure[view], by_points)
             backgrounds.append(shaded.is_background(view))
             along_edges[backgrounds[-1]] = np.nan
-            self.on_planes.append(_first_known((on_plane, by_shading, along_edges)))
+            flat.append(_first_known((on_plane, by_shading)))
+            self.on_planes.append(_first_known((flat[-1], along_edges)))
             moved = np.where(np.isfinite(sure[view]), on_plane, self.on_planes[view])
             self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(moved), moved, depth)
         self.flat = _share_known(self.on_planes)
-        return regions, backgrounds
+        return regions, backgrounds, flat
+
+    def _points(self, maps: Sequence[DepthMap], known: Sequence[np.ndarray]) -> SurfacePoints:
+        """Points of what is `known`, of every view as many."""
+        count, rng = points_per_view(self.cameras), np.random.default_rng(0)
+        points = []
+        for view, (found, depth) in enumerate(zip(maps, known, strict=True)):
+            confirmed = np.isfinite(self.depths[view])[..., None]
+            normal = np.where(confirmed, found.normal, plane_normals(found.camera, depth))
+            points.append(SurfacePoints.of_view(view, found.camera, depth, normal, count, rng))
+        return SurfacePoints.together(points)
 
     def _span_gaps(
         self,
@@ -132,54 +155,47 @@ class MergedFrames(Sequence):
         known: Sequence[np.ndarray],
         rendered: Sequence[np.ndarray],
         backgrounds: Sequence[np.ndarray],
-    ) -> SurfacePoints:
+    ) -> None:
         """Adds depths of the surface that spans what is `known` to doubtful ones, but not in background, and not at
-        edges of photographs, where rendered ones are finer. Returns points of what is known."""
-        count, rng = points_per_view(self.cameras), np.random.default_rng(0)
-        points = []
-        for view, (found, depth) in enumerate(zip(maps, known, strict=True)):
-            confirmed = np.isfinite(self.depths[view])[..., None]
-            normal = np.where(confirmed, found.normal, plane_normals(found.camera, depth))
-            points.append(SurfacePoints.of_view(view, found.camera, depth, normal, count, rng))
-        of_all = SurfacePoints.together(points)
-        spanned = spanned_depths(self.cameras, known, of_all, rendered)
+        edges of photographs, where rendered ones are finer."""
+        spanned = spanned_depths(self.cameras, known, self._points(maps, known), rendered)
         for view, (found, depth, background) in enumerate(zip(maps, spanned, backgrounds, strict=True)):
             depth[background | edges_of(found.grey, found.noise)] = np.nan
             self.doubtful_depths[view] = _first_known((self.doubtful_depths[view], depth))
         self.spanned = _share_known(spanned)
-        return of_all
+
+    def _walls(
+        self, maps: Sequence[DepthMap], known: Sequence[np.ndarray]
+    ) -> tuple[list[EnclosingPlane], list[EnclosingPlane]]:
+        """Planes that enclose what is `known`, with walls that meet at their corners, and without."""
+        points = self._points(maps, known)
+        planes = enclosing_planes(self.cameras, self.planes, points, self.standing)
+        return with_corner_walls(maps, known, self._backgrounds(), planes, points), planes
 
     def _enclose(
         self,
-        maps: Sequence[DepthMap],
-        points: SurfacePoints,
+        walls: Sequence[EnclosingPlane],
         known: Sequence[np.ndarray],
-        measured: Sequence[np.ndarray],
         sharp: Sequence[np.ndarray],
         regions: Sequence[Sequence[PlainRegion]],
         backgrounds: Sequence[np.ndarray],
     ) -> None:
-        """Adds depths of planes that enclose `points` of what is `known`, and of walls that meet at their corners, to
-        doubtful ones, where training has a depth that is not `sharp` (H, W) or is near them, or in plain `regions` that
-        lie on them, but not in background. Of doubtful depths those stay that are before a plane by more than these may
-        be off, but not in such regions. What stereo has `measured` on planes with points is not background where hardly
-        any view looks."""
-        planes = enclosing_planes(self.cameras, self.planes, points, self.standing)
-        walled = with_corner_walls(maps, known, self._backgrounds(), planes, points)
+        """Adds depths of `walls` that enclose what is `known` to doubtful ones, where training has a depth that is not
+        `sharp` (H, W) or is near them, or in plain `regions` that lie on them, but not in background. Of doubtful
+        depths those stay that are before a wall by more than these may be off, but not in such regions."""
         wanted, shown = [], []
         for view, (frame, depth, background) in enumerate(zip(self.rendered, known, backgrounds, strict=True)):
             wanted.append((frame.depth > 0) & ~(background | np.isfinite(depth)))
-            on_wall = region_depths(frame.camera, walled, depth, regions[view])
+            on_wall = region_depths(frame.camera, walls, depth, regions[view])
             shown.append(np.where(sharp[view] & ~np.isfinite(on_wall), frame.depth, np.nan))
             self.doubtful_depths[view] = _first_known((on_wall, self.doubtful_depths[view]))
-        enclosed = enclosing_depths(self.cameras, walled, known, wanted, shown, self.doubtful_depths)
+        enclosed = enclosing_depths(self.cameras, walls, known, wanted, shown, self.doubtful_depths)
         enclosed = [
             np.where(doubtful < (1 - ON_IT) * depth, np.nan, depth)
             for doubtful, depth in zip(self.doubtful_depths, enclosed, strict=True)
         ]
         self.doubtful_depths = [_first_known(pair) for pair in zip(enclosed, self.doubtful_depths, strict=True)]
         self.enclosed = _share_known(enclosed)
-        self._end_at(known_on_planes(self.cameras, planes, measured))
 
     def _keep_things(
         self,
