@@ -65,6 +65,21 @@ def test_planes_of_walls_stand_where_confirmed_depths_are_not_sure(found, monkey
     assert (frame.confidence[2:, :20] == 1).all()
 
 
+def test_walls_end_where_stereo_sees_it(found, monkeypatch):
+    """Not where planes of plain regions do, which reach to edges that may be others'."""
+    asked = []
+
+    def enclosing(cameras, planes, points, standing):
+        asked.append((points.position - CAMERA.center) @ CAMERA.rotation[2])
+        return []
+
+    monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: [np.full((30, 40), 3.5, np.float32)])
+    monkeypatch.setattr(stereo_frames, "enclosing_planes", enclosing)
+    MergedFrames(rendered(0.01), [VIEW], 5.0)
+    (depth,) = asked
+    assert len(depth) and np.allclose(depth, 3)
+
+
 def test_planes_stand_where_nothing_is_confirmed(found, monkeypatch):
     on_plane = np.full((30, 40), np.nan, np.float32)
     on_plane[:, 10:30] = 3.5
