@@ -94,14 +94,13 @@ class MergedFrames(Sequence):
             deviations.add(found, depth, frame)
         self.weight = deviations.weight()
         rendered_depths = [frame.depth for frame in rendered]
-        confirmed_depths = list(self.depths)
-        regions, backgrounds, by_points = self._take_planes(maps, rendered_depths)
+        seen = list(self.depths)
+        regions, backgrounds = self._take_planes(maps, rendered_depths)
         self.rendered = [_seen_past(*each) for each in zip(rendered, maps, backgrounds, strict=True)]
         self.shown = [frame.depth[::SAMPLED, ::SAMPLED] > 0 for frame in self.rendered]
         known = [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
         self._span_gaps(maps, known, rendered_depths, backgrounds)
         are_sharp = [depth > 0 for depth in rendered_depths] if sharp is None else list(sharp)
-        seen = [_first_known(pair) for pair in zip(confirmed_depths, by_points, strict=True)]
         walls, planes = self._walls(maps, seen)
         self._enclose(walls, known, are_sharp, regions, backgrounds)
         # What stereo has measured on planes with points is not background where hardly any view looks.
@@ -112,12 +111,11 @@ class MergedFrames(Sequence):
 
     def _take_planes(
         self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray]
-    ) -> tuple[list[list[PlainRegion]], list[np.ndarray], list[np.ndarray]]:
+    ) -> tuple[list[list[PlainRegion]], list[np.ndarray]]:
         """Finds planes by points, by edges and by shading, of depths that are sure, and what lies on them; moves
         confirmed depths to them.
 
-        Returns of every view its plain regions, (H, W) bool: those that are background by their shading, and (H, W)
-        depth of planes that have points all over, NaN elsewhere.
+        Returns the plain regions of every view, and (H, W) bool: those that are background by their shading.
         """
         sure = [_depth_where(found, found.is_confirmed(SURE)) for found in maps]
         regions = regions_of_views(maps, sure)
@@ -125,19 +123,18 @@ class MergedFrames(Sequence):
         by_edges = common_planes(self.cameras, [region for own in regions for region in own])
         shaded = ShadedPlanes(maps, sure, rendered, by_points, by_edges)
         self.planes, self.standing = shaded.planes[~shaded.hanging], shaded.standing[~shaded.hanging]
-        self.on_planes, backgrounds, on_points = [], [], []
+        self.on_planes, backgrounds = [], []
         by_edges_of = region_plane_depths(self.cameras, regions, shaded.planes, sure)
         for view, (by_shading, along_edges) in enumerate(zip(shaded.depth_maps(), by_edges_of, strict=True)):
             depth = self.depths[view]
             on_plane = point_plane_depth(maps[view], sure[view], by_points)
             backgrounds.append(shaded.is_background(view))
             along_edges[backgrounds[-1]] = np.nan
-            on_points.append(on_plane)
             self.on_planes.append(_first_known((on_plane, by_shading, along_edges)))
             moved = np.where(np.isfinite(sure[view]), on_plane, self.on_planes[view])
             self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(moved), moved, depth)
         self.flat = _share_known(self.on_planes)
-        return regions, backgrounds, on_points
+        return regions, backgrounds
 
     def _points(self, maps: Sequence[DepthMap], known: Sequence[np.ndarray]) -> SurfacePoints:
         """Points of what is `known`, of every view as many."""
@@ -168,7 +165,7 @@ class MergedFrames(Sequence):
         self, maps: Sequence[DepthMap], seen: Sequence[np.ndarray]
     ) -> tuple[list[EnclosingPlane], list[EnclosingPlane]]:
         """Planes that enclose what is `seen`, with walls that meet at their corners, and without: stereo sees where
-        walls end, planes of plain regions reach to edges that may be others'."""
+        walls end, of what lies on planes it is less certain."""
         points = self._points(maps, seen)
         planes = enclosing_planes(self.cameras, self.planes, points, self.standing)
         return with_corner_walls(maps, seen, self._backgrounds(), planes, points), planes
