@@ -103,30 +103,36 @@ class EnclosingPlane:
 
 
 def enclosing_planes(
-    cameras: Sequence[Camera], planes: np.ndarray, points: SurfacePoints, standing: np.ndarray | None = None
+    cameras: Sequence[Camera],
+    planes: np.ndarray,
+    points: SurfacePoints,
+    standing: np.ndarray | None = None,
+    known: SurfacePoints | None = None,
 ) -> list[EnclosingPlane]:
     """Those of (K, 4) planes n . x = d that enclose the scene, without copies, of those that meet no other at right
     angles only what points are all over, and planes at right angles to two of them where both end.
 
-    Of walls that are `standing` (K,) on the line that photographs show few points are enough."""
+    Of walls that are `standing` (K,) on the line that photographs show few points are enough. `points` tell where
+    planes end that others close, unless further `known` points go on there; planes reach as far as these do."""
     if not len(points):
         return []
-    known = KnownPoints(cameras, points)
+    seen = KnownPoints(cameras, points)
+    every = seen if known is None else KnownPoints(cameras, SurfacePoints.together([points, known]))
     standing = np.zeros(len(planes), bool) if standing is None else standing
     sides = [
-        known.facing(plane)
+        seen.facing(plane)
         for plane, stands in zip(planes, standing, strict=True)
-        if known.is_enclosing(known.facing(plane), least=0 if stands else LEAST_SHARE)
+        if seen.is_enclosing(seen.facing(plane), least=0 if stands else LEAST_SHARE)
     ]
-    found = known.without_copies(sides)
+    found = seen.without_copies(sides)
     corners = [plane for plane in found if any(at_right_angles(plane, other) for other in found)]
-    own = [points.on(plane[None], CONFIRMED_DEPTH)[:, 0] for plane in found]
     enclosing = [
-        known.with_ends(plane, corners, rows)
-        for plane, rows in zip(found, own, strict=True)
-        if any(plane is corner for corner in corners) or known.is_filled(plane, rows)
+        every.with_ends(plane, corners, every.points.on(plane[None], CONFIRMED_DEPTH)[:, 0])
+        for plane in found
+        if any(plane is corner for corner in corners)
+        or seen.is_filled(plane, points.on(plane[None], CONFIRMED_DEPTH)[:, 0])
     ]
-    closing = (known.with_ends(plane, corners, slice(None)) for plane in known.closing(corners))
+    closing = (every.with_ends(plane, corners, slice(None)) for plane in seen.closing(corners, every))
     return enclosing + [replace(plane, closes=True) for plane in closing]
 
 
@@ -207,8 +213,9 @@ class KnownPoints:
         """MARGIN of what is at a place (3,), for a camera as far from it as the one in the middle by that."""
         return MARGIN * float(np.median(np.linalg.norm(self.centers - place, axis=1)))
 
-    def closing(self, found: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Planes at right angles to two of those `found` where both end, on sides where there is none."""
+    def closing(self, found: Sequence[np.ndarray], every: KnownPoints) -> list[np.ndarray]:
+        """Planes at right angles to two of those `found` where both end, by `every` point, too, on sides where there is
+        none."""
         closing: list[np.ndarray] = []
         for number, first in enumerate(found):
             for second in (other for other in found[:number] if at_right_angles(first, other)):
@@ -220,11 +227,16 @@ class KnownPoints:
                     ends = [np.quantile(self.points.position[own] @ normal, OUTLIERS) for own in sides]
                     there = any(normal @ other[:3] > SAME_NORMAL for other in (*found, *closing))
                     plane = np.append(normal, np.mean(ends))
-                    if there or abs(ends[0] - ends[1]) > apart or not self.is_before_all(plane):
+                    if there or abs(ends[0] - ends[1]) > apart or not every.is_before_all(plane):
                         continue
-                    if all(self.ends_in_images(own, plane, apart) for own in sides):
+                    ending = all(every.ends_at(wall, plane, apart) for wall in (first, second))
+                    if ending and all(self.ends_in_images(own, plane, apart) for own in sides):
                         closing.append(plane)
         return closing
+
+    def ends_at(self, plane: np.ndarray, end: np.ndarray, near: float) -> bool:
+        """Whether hardly any point of a plane is farther than `near` beyond its end at another plane."""
+        return bool((self.height(end)[self.on(plane)] < -near).mean() < OUTLIERS)
 
     def ends_in_images(self, own: np.ndarray, end: np.ndarray, near: float) -> bool:
         """Whether most views of the points of a plane that are `near` its end at another plane show what lies beyond,

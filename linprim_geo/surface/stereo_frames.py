@@ -99,9 +99,10 @@ class MergedFrames(Sequence):
         self.rendered = [_seen_past(*each) for each in zip(rendered, maps, backgrounds, strict=True)]
         self.shown = [frame.depth[::SAMPLED, ::SAMPLED] > 0 for frame in self.rendered]
         known = [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
-        self._span_gaps(maps, known, rendered_depths, backgrounds)
+        points = self._points(maps, known)
+        self._span_gaps(maps, known, points, rendered_depths, backgrounds)
         are_sharp = [depth > 0 for depth in rendered_depths] if sharp is None else list(sharp)
-        walls, planes = self._walls(maps, seen)
+        walls, planes = self._walls(maps, seen, points)
         self._enclose(walls, known, are_sharp, regions, backgrounds)
         # What stereo has measured on planes with points is not background where hardly any view looks.
         self._end_at(known_on_planes(self.cameras, planes, measured))
@@ -150,24 +151,25 @@ class MergedFrames(Sequence):
         self,
         maps: Sequence[DepthMap],
         known: Sequence[np.ndarray],
+        points: SurfacePoints,
         rendered: Sequence[np.ndarray],
         backgrounds: Sequence[np.ndarray],
     ) -> None:
-        """Adds depths of the surface that spans what is `known` to doubtful ones, but not in background, and not at
-        edges of photographs, where rendered ones are finer."""
-        spanned = spanned_depths(self.cameras, known, self._points(maps, known), rendered)
+        """Adds depths of the surface that spans `points` of what is `known` to doubtful ones, but not in background,
+        and not at edges of photographs, where rendered ones are finer."""
+        spanned = spanned_depths(self.cameras, known, points, rendered)
         for view, (found, depth, background) in enumerate(zip(maps, spanned, backgrounds, strict=True)):
             depth[background | edges_of(found.grey, found.noise)] = np.nan
             self.doubtful_depths[view] = _first_known((self.doubtful_depths[view], depth))
         self.spanned = _share_known(spanned)
 
     def _walls(
-        self, maps: Sequence[DepthMap], seen: Sequence[np.ndarray]
+        self, maps: Sequence[DepthMap], seen: Sequence[np.ndarray], known: SurfacePoints
     ) -> tuple[list[EnclosingPlane], list[EnclosingPlane]]:
-        """Planes that enclose what is `seen`, with walls that meet at their corners, and without: stereo sees where
-        walls end, of what lies on planes it is less certain."""
+        """Planes that enclose what is `known`, with walls that meet at their corners, and without. What is `seen`
+        (H, W) tells which there are and where walls end: planes of plain regions reach to edges that may be others'."""
         points = self._points(maps, seen)
-        planes = enclosing_planes(self.cameras, self.planes, points, self.standing)
+        planes = enclosing_planes(self.cameras, self.planes, points, self.standing, known)
         return with_corner_walls(maps, seen, self._backgrounds(), planes, points), planes
 
     def _enclose(

@@ -191,6 +191,19 @@ def test_where_floor_and_wall_end_at_different_places_nothing_closes_the_room():
         assert len(found) >= 2 and not any(plane.normal[0] > 0.99 for plane in found)
 
 
+def test_nothing_closes_the_room_before_further_points():
+    """Stereo sees floor and wall up to 0.3 m before their corner; planes of plain regions go on."""
+    planes, seen = np.array([FLOOR, WALL]), points_of(room(lambda place: place[..., 0] < 0.3))
+    (side,) = [plane for plane in enclosing_planes(CAMERAS, planes, seen) if plane.closes]
+    assert side.normal[0] > 0.99 and side.offset == pytest.approx(0.3, abs=0.06)
+    known = points_of(room(lambda place: np.abs(place[..., 0]) < 1e-6))
+    found = enclosing_planes(CAMERAS, planes, seen, known=known)
+    assert len(found) == 2 and not any(plane.closes for plane in found)
+    for plane, before in zip(found, enclosing_planes(CAMERAS, planes, seen), strict=False):
+        corners = plane.corners()[:, 0].min(), before.corners()[:, 0].min()
+        assert corners[0] == pytest.approx(0, abs=0.1) and corners[1] == pytest.approx(0.3, abs=0.1)
+
+
 def test_a_gap_in_a_wall_is_filled_where_it_is_wanted_and_no_more():
     def gap(place):
         return (np.abs(place[..., 1]) < 1e-6) & (np.abs(place[..., :3:2] - (0.9, 0.6)) < 0.3).all(-1)

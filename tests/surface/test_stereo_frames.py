@@ -69,7 +69,7 @@ def test_walls_end_where_stereo_sees_it(found, monkeypatch):
     """Not where planes of plain regions do, which reach to edges that may be others'."""
     asked = []
 
-    def enclosing(cameras, planes, points, standing):
+    def enclosing(cameras, planes, points, standing, known):
         asked.append((points.position - CAMERA.center) @ CAMERA.rotation[2])
         return []
 
