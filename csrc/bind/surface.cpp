@@ -2,6 +2,7 @@
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
 
 #include <algorithm>
 #include <array>
@@ -24,6 +25,7 @@
 #include "surface/filter_normals.h"
 #include "surface/first_hits.h"
 #include "surface/fuse.h"
+#include "surface/looking_views.h"
 #include "surface/marching_cubes.h"
 #include "surface/photo_consistency.h"
 #include "surface/point_colors.h"
@@ -31,6 +33,7 @@
 #include "surface/segment_depth.h"
 #include "surface/simplify.h"
 #include "surface/surfels.h"
+#include "surface/visible_points.h"
 
 namespace {
 
@@ -138,6 +141,33 @@ void bind_surface(nb::module_& m) {
     double* out = checked(least, {count}, "least");
     nb::gil_scoped_release release;
     linprim::least_footprints(view, least_cosine, at, along, count, out);
+  });
+  // (2 Q,) places, (Q,) depths.
+  m.def("visible_points",
+        [](Pose pose, std::array<double, 4> lens, int width, int height, In<double> point, Out<uint8_t> inside) {
+          const int64_t count = int64_t(inside.size());
+          const linprim::PhotoView view = photo_view(pose, lens, width, height, nullptr, 0, nullptr);
+          const double* at = checked(point, {count, 3}, "point");
+          uint8_t* shown = checked(inside, {count}, "inside");
+          linprim::VisiblePoints found;
+          {
+            nb::gil_scoped_release release;
+            found = linprim::visible_points(view, at, count, shown);
+          }
+          return std::tuple(owned(std::move(found.place)), owned(std::move(found.depth)));
+        });
+  m.def("count_looking_views", [](const std::vector<std::tuple<Pose, std::array<double, 4>, In<float>>>& views,
+                                  In<double> point, double margin, Out<int32_t> looking, Out<int32_t> knowing) {
+    const int64_t count = int64_t(looking.size());
+    std::vector<linprim::PhotoView> seen;
+    for (const auto& [pose, lens, depth] : views) {
+      if (depth.ndim() != 2) throw std::invalid_argument("depth has to have shape (H, W)");
+      seen.push_back(photo_view(pose, lens, int(depth.shape(1)), int(depth.shape(0)), nullptr, 0, depth.data()));
+    }
+    const double* at = checked(point, {count, 3}, "point");
+    int32_t *looks = checked(looking, {count}, "looking"), *knows = checked(knowing, {count}, "knowing");
+    nb::gil_scoped_release release;
+    linprim::count_looking_views(seen, at, count, margin, looks, knows);
   });
   m.def("face_samples", [](Pose pose, std::array<double, 4> lens, In<float> depth, In<double> vertex,
                            In<int64_t> corner, In<double> bary, double behind, double slack, In<uint8_t> skip,

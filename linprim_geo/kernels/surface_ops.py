@@ -35,6 +35,33 @@ def least_footprints(pose, lens, width: int, height: int, least_cosine: float, p
     _core.least_footprints(pose, lens, width, height, least_cosine, point, normal, least)
 
 
+def visible_points(pose, lens, width: int, height: int, point) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where (P, 3) float64 points lie in an image.
+
+    Returns: (P,) bool whether each is in front of the camera and in the image; of these, in their order, (Q, 2) float64
+    columns and rows, 0.5 in the middle of the first pixel, and (Q,) float64 depths along the optical axis.
+    """
+    inside = np.empty(len(point), np.uint8)
+    place, depth = _core.visible_points(pose, lens, width, height, point, inside)
+    return inside.view(bool), place.reshape(-1, 2), depth
+
+
+def count_looking_views(views, point, margin: float) -> tuple[np.ndarray, np.ndarray]:
+    """How many views look at each of (P, 3) float64 points, and how many of these know a depth there.
+
+    A view looks at a point in its image unless its depth there is less than the point's by more than the share `margin`
+    of that, and knows it if it has one that differs by no more.
+
+    Args:
+        views: (pose, lens, depth) of each, with depth (H, W) float32, NaN where there is none.
+
+    Returns: (P,) int32 each.
+    """
+    looking, knowing = np.empty(len(point), np.int32), np.empty(len(point), np.int32)
+    _core.count_looking_views(list(views), point, margin, looking, knowing)
+    return looking, knowing
+
+
 def add_colors(pose, lens, image, depth, near, far, rules, point, normal, best, shade, good) -> None:
     """Offers a photograph's colours to P points, of which each keeps its best samples.
 

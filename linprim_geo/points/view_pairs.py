@@ -8,6 +8,7 @@ from itertools import repeat
 import numpy as np
 
 from linprim_geo.geometry.camera import Camera
+from linprim_geo.kernels import surface_ops
 
 # Views to compare with: so many for every point, whose rays to it make an angle between these, in degrees.
 SOURCES, LEAST_ANGLE, LARGEST_ANGLE = 4, 3.0, 30.0
@@ -91,6 +92,6 @@ def visible_pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.n
 
 def visible_places(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """As `visible_pixels`, with (Q, 2) positions in the image in place of pixels."""
-    pixels, depth = camera.project(points)
-    inside = camera.shows(pixels, depth)
-    return inside, pixels[inside], depth[inside]
+    pose, lens = camera.pinhole()
+    points = np.ascontiguousarray(points, np.float64)
+    return surface_ops.visible_points(pose, lens, camera.width, camera.height, points)

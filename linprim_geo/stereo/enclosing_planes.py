@@ -24,6 +24,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from linprim_geo.geometry.camera import Camera
+from linprim_geo.kernels import surface_ops
 from linprim_geo.points.view_pairs import SOURCES, visible_pixels
 from linprim_geo.stereo.common_surfaces import ON_IT
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
@@ -399,11 +400,5 @@ def _looking(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(N,) how many views look at (N, 3) points, which are in their images with nothing known before, and (N,) how many
     of these know a depth there."""
-    looking, knowing = np.zeros(len(points), int), np.zeros(len(points), int)
-    for camera, depth in zip(cameras, known, strict=True):
-        inside, pixels, along = visible_pixels(camera, points)
-        ratio = depth[pixels[:, 1], pixels[:, 0]] / along
-        rows = np.flatnonzero(inside)
-        looking[rows] += ~(ratio < 1 - MARGIN)
-        knowing[rows] += np.abs(ratio - 1) <= MARGIN
-    return looking, knowing
+    views = [(*camera.pinhole(), np.ascontiguousarray(depth)) for camera, depth in zip(cameras, known, strict=True)]
+    return surface_ops.count_looking_views(views, np.ascontiguousarray(points), MARGIN)
