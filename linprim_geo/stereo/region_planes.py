@@ -28,6 +28,9 @@ from linprim_geo.stereo.plain_regions import (
 
 # Of what stereo is sure of within a region so much is on its plane, if it is sure of enough.
 MOST_AGREE = 0.5
+# What stereo is sure of on a true plane is off by so much of the depth in the median, at most: the least of
+# `point_planes.TOLERANCES`.
+MEDIAN_OFF = TOLERANCE / 4
 # Of one region and K planes: which of its N points are on which (N, K), and which it may lie on (K,).
 _Lying = tuple[np.ndarray, np.ndarray]
 
@@ -37,25 +40,26 @@ def region_plane_depths(
     regions: Sequence[Sequence[PlainRegion]],
     planes: np.ndarray,
     known: Sequence[np.ndarray],
-) -> list[np.ndarray]:
-    """(H, W) float32 depth of the plain `regions` of each view by the (K, 4) planes of the world on which they lie, NaN
-    elsewhere.
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Of each view (H, W) float32 depth of its plain `regions` by the (K, 4) planes of the world on which they lie, NaN
+    elsewhere, and (H, W) bool where a `known` (H, W) depth, NaN elsewhere, is that of such a plane but for its error.
 
     A pixel lies on the plane with the most points along the edges of its region, of those within whose hull it is and
-    on which most `known` (H, W) depths there are, NaN elsewhere.
+    on which most known depths there are. Stereo errs beside edges, where it sees nothing else: a known depth within
+    TOLERANCE of the plane has its depth if all of these in the region are off by MEDIAN_OFF in the median at most.
     """
     local = [in_camera(camera, planes) for camera in cameras]
     regions = [[region.within() for region in own] for own in regions]
     lying = [[may_lie_on(region, of_view) for region in own] for own, of_view in zip(regions, local, strict=True)]
     hulls = _hulls(cameras, regions, lying, planes)
-    result = []
+    depths, moved = [], []
     for camera, own, of_regions, of_view, sure in zip(cameras, regions, lying, local, known, strict=True):
-        depth = np.full((camera.height, camera.width), np.nan, np.float32)
+        depths.append(np.full((camera.height, camera.width), np.nan, np.float32))
+        moved.append(np.zeros((camera.height, camera.width), bool))
         for region, (on, fits) in zip(own, of_regions, strict=True):
             most_first = [k for k in np.argsort(-on.sum(0), kind="stable") if fits[k]]
-            _lay(depth, camera, region, of_view[most_first], [hulls[k] for k in most_first], sure)
-        result.append(depth)
-    return result
+            _lay(depths[-1], moved[-1], camera, region, of_view[most_first], [hulls[k] for k in most_first], sure)
+    return depths, moved
 
 
 def _hulls(
@@ -76,6 +80,7 @@ def _hulls(
 
 def _lay(
     depth: np.ndarray,
+    moved: np.ndarray,
     camera: Camera,
     region: PlainRegion,
     planes: np.ndarray,
@@ -83,7 +88,7 @@ def _lay(
     known: np.ndarray,
 ) -> None:
     """Sets the depth (H, W) of each pixel of a region by the first of (K, 3) planes of the camera whose hull it is in
-    and on which most (H, W) `known` depths are there."""
+    and on which most (H, W) `known` depths are there, and where these are `moved` (H, W) to it."""
     row, column = np.nonzero(region.mask)
     row, column = row + region.top, column + region.left
     rays, left = rays_of(camera, row, column), np.ones(len(row), bool)
@@ -92,11 +97,14 @@ def _lay(
         rows = np.flatnonzero(left & (inverse > 0))
         rows = rows[hull.holds(to_world(camera, rays[rows] / inverse[rows, None]))]
         off = known[row[rows], column[rows]] * inverse[rows] - 1
-        off = off[np.isfinite(off)]
-        enough = len(off) >= max(LEAST_POINTS, SURE_SHARE * len(rows))
-        if not enough or (np.abs(off) < BEHIND * TOLERANCE).mean() >= MOST_AGREE:
+        count = np.count_nonzero(np.isfinite(off))
+        enough = count >= max(LEAST_POINTS, SURE_SHARE * len(rows))
+        if not enough or np.count_nonzero(np.abs(off) < BEHIND * TOLERANCE) >= MOST_AGREE * count:
             depth[row[rows], column[rows]] = 1 / inverse[rows]
             left[rows] = False
+            on = np.flatnonzero(np.abs(off) < TOLERANCE)
+            if len(on) >= LEAST_POINTS and abs(np.median(off[on])) <= MEDIAN_OFF:
+                moved[row[rows[on]], column[rows[on]]] = True
 
 
 class _Hull:

@@ -125,14 +125,17 @@ class MergedFrames(Sequence):
         shaded = ShadedPlanes(maps, sure, rendered, by_points, by_edges)
         self.planes, self.standing = shaded.planes[~shaded.hanging], shaded.standing[~shaded.hanging]
         self.on_planes, backgrounds = [], []
-        by_edges_of = region_plane_depths(self.cameras, regions, shaded.planes, sure)
-        for view, (by_shading, along_edges) in enumerate(zip(shaded.depth_maps(), by_edges_of, strict=True)):
+        of_regions = zip(
+            shaded.depth_maps(), *region_plane_depths(self.cameras, regions, shaded.planes, sure), strict=True
+        )
+        for view, (by_shading, along_edges, moves) in enumerate(of_regions):
             depth = self.depths[view]
             on_plane = point_plane_depth(maps[view], sure[view], by_points)
             backgrounds.append(shaded.is_background(view))
             along_edges[backgrounds[-1]] = np.nan
             self.on_planes.append(_first_known((on_plane, by_shading, along_edges)))
-            moved = np.where(np.isfinite(sure[view]), on_plane, self.on_planes[view])
+            of_sure = _first_known((on_plane, np.where(moves, along_edges, np.float32(np.nan))))
+            moved = np.where(np.isfinite(sure[view]), of_sure, self.on_planes[view])
             self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(moved), moved, depth)
         self.flat = _share_known(self.on_planes)
         return regions, backgrounds

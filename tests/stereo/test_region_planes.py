@@ -29,7 +29,8 @@ def test_walls_lie_on_their_planes(room):
     # Others that go through the edges of some walls, and one that is 2 cm behind a wall.
     behind = [1, 0, 0, -0.02]
     across = np.array([[np.sqrt(0.5), np.sqrt(0.5), 0, 0], [0.0, np.sqrt(0.5), np.sqrt(0.5), 0], behind])
-    found = region_plane_depths(of, regions, np.concatenate([PLANES, across]), known)
+    found, moved = region_plane_depths(of, regions, np.concatenate([PLANES, across]), known)
+    assert not any(is_moved[np.isnan(depth)].any() for is_moved, depth in zip(moved, known, strict=True))
     laid = [np.isfinite(depth) for depth in found]
     assert np.mean(laid) > 0.8
     error = np.concatenate(
@@ -41,7 +42,7 @@ def test_walls_lie_on_their_planes(room):
 def test_a_wall_ends_where_its_points_do(room):
     """Of all planes that of one wall alone: other walls have points on it where they meet it, and lie beside it."""
     of, depths, walls, regions, known = room
-    found = region_plane_depths(of, regions, PLANES[[1]], known)
+    found, _ = region_plane_depths(of, regions, PLANES[[1]], known)
     on_it = np.concatenate([np.isfinite(depth)[wall == 1] for depth, wall in zip(found, walls, strict=True)])
     beside = np.concatenate([np.isfinite(depth)[wall != 1] for depth, wall in zip(found, walls, strict=True)])
     assert on_it.mean() > 0.8 and beside.mean() < 0.01
@@ -49,14 +50,14 @@ def test_a_wall_ends_where_its_points_do(room):
 
 def test_without_planes_nothing_is_known(room):
     of, _, _, regions, known = room
-    assert not any(np.isfinite(depth).any() for depth in region_plane_depths(of, regions, np.zeros((0, 4)), known))
+    assert not any(np.isfinite(depth).any() for depth in region_plane_depths(of, regions, np.zeros((0, 4)), known)[0])
 
 
 def test_points_on_one_line_make_no_wall(room):
     """A plane through the line along which the floor meets a wall has points there alone."""
     of, _, _, regions, known = room
     leaning = np.array([[np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]])
-    depths = region_plane_depths(of, regions, leaning, known)
+    depths, _ = region_plane_depths(of, regions, leaning, known)
     assert np.mean([np.isfinite(depth).mean() for depth in depths]) < 0.02
 
 
@@ -67,9 +68,30 @@ def test_what_stereo_is_sure_of_within_a_region_refuses_a_plane(room, share, lai
     for number, (depth, wall, edges) in enumerate(zip(depths, walls, known, strict=True)):
         other = np.random.default_rng(number).uniform(size=depth.shape) < share
         inside.append(np.where((wall == 1) & np.isnan(edges), np.where(other, 0.9, 1) * depth, edges))
-    found = region_plane_depths(of, regions, PLANES[[1]], inside)
+    found, _ = region_plane_depths(of, regions, PLANES[[1]], inside)
     on_it = np.concatenate([np.isfinite(depth)[wall == 1] for depth, wall in zip(found, walls, strict=True)])
     assert (on_it.mean() > 0.8) == laid and (laid or on_it.mean() < 0.05)
+
+
+@pytest.mark.parametrize(("off", "are_moved"), [(0.0, True), (0.002, True), (0.003, False)])
+def test_sure_depths_on_a_wall_are_moved_to_it_if_most_are_not_off(room, off, are_moved):
+    """Beside edges a fifth is off by more; what is not on the wall is a thing before it, and stays."""
+    of, depths, walls, regions, known = room
+    inside, beside, before = [], [], []
+    for number, (depth, wall, edges) in enumerate(zip(depths, walls, known, strict=True)):
+        which = np.random.default_rng(number).uniform(size=depth.shape)
+        beside.append((which < 0.2) & (wall == 1) & np.isnan(edges))
+        before.append((which > 0.9) & (wall == 1) & np.isnan(edges))
+        share = np.where(beside[-1], 0.992, np.where(before[-1], 0.97, 1 + off))
+        inside.append(np.where(np.isnan(edges), np.where(wall == 1, share * depth, np.nan), edges))
+    found, moved = region_plane_depths(of, regions, PLANES[[1]], inside)
+    pixels = [np.isfinite(depth) for depth in found]
+    on_it, off_it = (
+        np.concatenate([own[which & laid] for own, which, laid in zip(moved, some, pixels, strict=True)])
+        for some in (beside, before)
+    )
+    assert len(on_it) > 1000 and len(off_it) > 500
+    assert on_it.mean() == are_moved and not off_it.any()
 
 
 def test_a_thing_does_not_lie_on_the_wall_behind():
@@ -85,7 +107,7 @@ def test_a_thing_does_not_lie_on_the_wall_behind():
     none = np.zeros(grey.shape, np.uint8)
     found = DepthMap(camera, known, np.zeros((*grey.shape, 3)), none, none, known, grey, 1.0)
     behind = in_world(camera, np.array([0, 0, 1 / 3]))
-    (depth,) = region_plane_depths([camera], regions_of_views([found], [known]), behind[None], [known])
+    (depth,), _ = region_plane_depths([camera], regions_of_views([found], [known]), behind[None], [known])
     assert np.isnan(depth[42:78, 52:108]).all() and np.allclose(depth[:36][np.isfinite(depth[:36])], 3.0)
 
 
@@ -106,7 +128,8 @@ def between_houses(edge_depth: float) -> np.ndarray:
     found = DepthMap(camera, depth, np.zeros((*grey.shape, 3)), none, none, depth, grey, 1.0)
     regions = regions_of_views([found], [np.where(houses, depth, np.nan)])
     front = in_world(camera, np.array([0, 0, 1 / 3]))
-    return region_plane_depths([camera], regions, front[None], [np.where(houses, depth, np.nan)])[0][44:76, 70:100]
+    (between,), _ = region_plane_depths([camera], regions, front[None], [np.where(houses, depth, np.nan)])
+    return between[44:76, 70:100]
 
 
 def test_a_plane_does_not_go_on_between_houses_before_what_is_far():

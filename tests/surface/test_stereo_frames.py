@@ -57,9 +57,15 @@ def test_confirmed_depths_take_the_place_of_rendered_ones(found):
     assert np.allclose(frame.confidence[1, :20], stereo_frames.DOUBTFUL_WEIGHT)
 
 
+def take_region_planes(monkeypatch, depth: np.ndarray, moved: np.ndarray | None = None) -> None:
+    """Gives the one view these depths by planes of its plain regions, and says which sure depths are moved to them."""
+    moved = np.zeros(depth.shape, bool) if moved is None else moved
+    monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: ([depth], [moved]))
+
+
 def test_planes_of_walls_stand_where_confirmed_depths_are_not_sure(found, monkeypatch):
     found[0].confidence[:, 5:] = CONFIDENT
-    monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: [np.full((30, 40), 3.5, np.float32)])
+    take_region_planes(monkeypatch, np.full((30, 40), 3.5, np.float32))
     frame = MergedFrames(rendered(0.01), [VIEW], 5.0)[0]
     assert (frame.depth[2:, :5] == 3).all() and (frame.depth[2:, 5:20] == 3.5).all()
     assert (frame.confidence[2:, :20] == 1).all()
@@ -73,7 +79,7 @@ def test_walls_end_where_stereo_sees_it(found, monkeypatch):
         asked.append((points.position - CAMERA.center) @ CAMERA.rotation[2])
         return []
 
-    monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: [np.full((30, 40), 3.5, np.float32)])
+    take_region_planes(monkeypatch, np.full((30, 40), 3.5, np.float32))
     monkeypatch.setattr(stereo_frames, "enclosing_planes", enclosing)
     MergedFrames(rendered(0.01), [VIEW], 5.0)
     (depth,) = asked
@@ -83,12 +89,21 @@ def test_walls_end_where_stereo_sees_it(found, monkeypatch):
 def test_planes_stand_where_nothing_is_confirmed(found, monkeypatch):
     on_plane = np.full((30, 40), np.nan, np.float32)
     on_plane[:, 10:30] = 3.5
-    monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: [on_plane])
+    take_region_planes(monkeypatch, on_plane)
     merged = MergedFrames(rendered(0.01), [VIEW], 5.0)
     frame = merged[0]
     assert (frame.depth[2:, :20] == 3).all() and (frame.depth[:, 20:30] == 3.5).all() and merged.flat == 0.5
     assert (frame.depth[:2, 10:20] == 3.5).all()
     assert (frame.confidence[:, 20:30] == 1).all() and np.allclose(frame.confidence[:, 30:], merged.weight)
+
+
+def test_sure_depths_are_moved_to_the_plane_of_their_region_where_it_says_so(found, monkeypatch):
+    moved = np.zeros((30, 40), bool)
+    moved[:, 5:10] = True
+    take_region_planes(monkeypatch, np.full((30, 40), 3.001, np.float32), moved)
+    frame = MergedFrames(rendered(0.01), [VIEW], 5.0)[0]
+    assert np.allclose(frame.depth[2:, 5:10], 3.001) and (frame.confidence[2:, 5:10] == 1).all()
+    assert (frame.depth[2:, :5] == 3).all() and (frame.depth[2:, 10:20] == 3).all()
 
 
 def test_confirmed_depths_that_stereo_cannot_tell_from_a_plane_are_on_it(found, monkeypatch):
@@ -214,7 +229,7 @@ def test_what_few_views_know_on_a_plane_is_not_background(found, monkeypatch):
         asked.extend(known)
         return [on_plane]
 
-    monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: [np.full((30, 40), 3.5, np.float32)])
+    take_region_planes(monkeypatch, np.full((30, 40), 3.5, np.float32))
     monkeypatch.setattr(stereo_frames, "known_on_planes", known_on_planes)
     merged = MergedFrames([replace(rendered(0.01)[0], background=background)], [VIEW], 5.0)
     frame = merged[0]
@@ -253,7 +268,7 @@ def test_thin_things_stand_before_what_is_known(found, monkeypatch):
         return [thing]
 
     monkeypatch.setattr(stereo_frames, "thin_things", thin)
-    monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: [np.full((30, 40), 3.5, np.float32)])
+    take_region_planes(monkeypatch, np.full((30, 40), 3.5, np.float32))
     sharp = np.ones((30, 40), bool)
     merged = MergedFrames(rendered(-0.1), [VIEW], 5.0, sharp=[sharp])
     frame = merged[0]
@@ -272,7 +287,7 @@ def test_things_that_are_known_by_their_outlines_are_as_rendered(found, monkeypa
     thing = np.zeros((30, 40), bool)
     thing[4:20, 15:25] = True
     monkeypatch.setattr(stereo_frames, "outlined_things", lambda views: [thing])
-    monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: [np.full((30, 40), 3.5, np.float32)])
+    take_region_planes(monkeypatch, np.full((30, 40), 3.5, np.float32))
     merged = MergedFrames(rendered(0.02), [VIEW], 5.0)
     frame = merged[0]
     # In place of confirmed depths of the left half and of a plane in the right one.
@@ -368,7 +383,7 @@ def test_a_closed_surface_stays_closed(found, monkeypatch):
 
 def test_a_view_supports_a_point_once_and_only_by_what_is_fused(found, monkeypatch):
     on_plane = np.full((30, 40), 3.0, np.float32)
-    monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: [on_plane])
+    take_region_planes(monkeypatch, on_plane)
     point = np.array([[-0.4, 0.0, -0.2]])
     (frame,) = rendered(0.0)
     assert MergedFrames([frame], [VIEW], 5.0).supporting(point) == [1]
