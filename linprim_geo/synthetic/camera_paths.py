@@ -1,5 +1,5 @@
-"""Camera poses for synthetic captures: rings, spheres and hand-held arcs around an object, and stations inside a
-room."""
+"""Camera poses for synthetic captures: rings, spheres and hand-held arcs around an object, walks through a room, and
+stations inside one."""
 
 from __future__ import annotations
 
@@ -29,6 +29,12 @@ from the object's middle (both in units of the mean distance), and of the horizo
 
 ARC_JITTER = 0.15
 """Share of those deviations that differs from view to view; the larger part changes slowly along the arc."""
+
+WALK_EYES = (1.2, 1.7)
+"""Lowest and highest camera of the path `walk` above the floor, metres."""
+
+WALK_STEP, WALK_TURN_DEG = 0.4, 20.0
+"""So many metres and so many degrees of turning are equally long on the way of `walk`."""
 
 CLEARANCE = 0.03
 NEAR = 0.08
@@ -106,20 +112,29 @@ def arc(
     wander slowly along the way within the limits above, and jitter from view to view. Every held-out view lies
     between two training views, at least a quarter of their spacing from both, and jitters independently.
     """
-    rng = np.random.default_rng([seed, 7])
-    # Elevation, distance, aim along x, y and z, roll: one to two and two to four waves along the way.
-    frequency = rng.uniform((1.0, 2.0), (2.0, 4.0), (6, 2))
-    phase = rng.uniform(0.0, 2.0 * np.pi, (6, 2))
-    step = (np.arange(test_views) + 0.5) / max(test_views, 1) * (views - 1)
-    between = np.floor(step) + 0.25 + 0.5 * (step - np.floor(step))
     poses = []
-    for place in (np.arange(views, dtype=float), between):
-        way = (place + 0.5) / views
-        waves = np.sin(2.0 * np.pi * way[:, None, None] * frequency + phase) @ (0.65, 0.35)
-        wander = (1.0 - ARC_JITTER) * waves + ARC_JITTER * rng.uniform(-1.0, 1.0, waves.shape)
+    # Elevation, distance, aim along x, y and z, roll.
+    for way, wander in _wandering(views, test_views, 6, np.random.default_rng([seed, 7])):
         azimuth = np.deg2rad(degrees * (way - 0.5))
         poses.append([_held(center, distance, *item) for item in zip(azimuth, wander, strict=True)])
     return poses[0], poses[1]
+
+
+def _wandering(
+    views: int, test_views: int, count: int, rng: np.random.Generator
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The training and the held-out views of a hand-held camera: where along the way, in (0, 1), and `count` values in
+    [-1, 1] of each that wander slowly, by one to two and two to four waves, and jitter from view to view."""
+    frequency = rng.uniform((1.0, 2.0), (2.0, 4.0), (count, 2))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (count, 2))
+    step = (np.arange(test_views) + 0.5) / max(test_views, 1) * (views - 1)
+    between = np.floor(step) + 0.25 + 0.5 * (step - np.floor(step))
+    both = []
+    for place in (np.arange(views, dtype=float), between):
+        way = (place + 0.5) / views
+        waves = np.sin(2.0 * np.pi * way[:, None, None] * frequency + phase) @ (0.65, 0.35)
+        both.append((way, (1.0 - ARC_JITTER) * waves + ARC_JITTER * rng.uniform(-1.0, 1.0, waves.shape)))
+    return both
 
 
 def _held(center: np.ndarray, distance: float, azimuth: float, wander: np.ndarray) -> np.ndarray:
@@ -129,11 +144,53 @@ def _held(center: np.ndarray, distance: float, azimuth: float, wander: np.ndarra
     direction = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     # The three axes together deviate by no more than ARC_AIM.
     target = center + ARC_AIM * distance / np.sqrt(3.0) * wander[2:5]
-    pose = look_at(center + distance * (1.0 + ARC_DISTANCE * wander[1]) * direction, target)
-    roll = np.deg2rad(ARC_ROLL_DEG) * wander[5]
+    return _rolled(look_at(center + distance * (1.0 + ARC_DISTANCE * wander[1]) * direction, target), wander[5])
+
+
+def _rolled(pose: np.ndarray, share: float) -> np.ndarray:
+    """The pose turned about its optical axis by a share of ARC_ROLL_DEG."""
+    roll = np.deg2rad(ARC_ROLL_DEG) * share
     turn = np.eye(4)
     turn[:2, :2] = [[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]]
     return turn @ pose
+
+
+def walk(
+    stations: np.ndarray, targets: np.ndarray, views: int, test_views: int, seed: int
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Training and held-out (4, 4) world-to-camera poses of somebody who walks through a room, camera in hand.
+
+    The feet go along the closed polyline `stations` (N, 3), metres; the camera looks at `targets` (N, 3), of which
+    there is one for each station and which are interpolated between them. To go round more than once, list the
+    stations again. The height above the feet (WALK_EYES), the aim and the roll wander and jitter as on an arc.
+    Training views are equally spaced, where WALK_STEP metres are as long as a turn by WALK_TURN_DEG and of both the
+    longer one counts; so neighbours are within both if the way is no longer than `views` such steps. Every held-out
+    view lies between two training views as on an arc.
+    """
+    share = np.linspace(0.0, 1.0, 64, endpoint=False)[None, :, None]
+    feet, aims = (
+        (points[:, None] + share * (np.roll(points, -1, axis=0) - points)[:, None]).reshape(-1, 3)
+        for points in (np.asarray(stations, dtype=np.float64), np.asarray(targets, dtype=np.float64))
+    )
+    feet, aims = np.concatenate([feet, feet[:1]]), np.concatenate([aims, aims[:1]])
+    low, high = WALK_EYES
+    ahead = aims - feet - (0.0, 0.0, 0.5 * (low + high))
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    step = np.linalg.norm(np.diff(feet, axis=0), axis=1) / WALK_STEP
+    turn = np.arccos(np.clip((ahead[1:] * ahead[:-1]).sum(1), -1.0, 1.0)) / np.deg2rad(WALK_TURN_DEG)
+    length = np.concatenate([[0.0], np.cumsum(np.maximum(step, turn))])
+    poses = []
+    # Height, aim along x, y and z, roll.
+    for way, wander in _wandering(views, test_views, 5, np.random.default_rng([seed, 8])):
+        eyes, looked = (
+            np.stack([np.interp(way * length[-1], length, points[:, axis]) for axis in range(3)], axis=1)
+            for points in (feet, aims)
+        )
+        eyes[:, 2] += 0.5 * (low + high) + 0.5 * (high - low) * wander[:, 0]
+        reach = np.linalg.norm(looked - eyes, axis=1, keepdims=True)
+        looked = looked + ARC_AIM / np.sqrt(3.0) * reach * wander[:, 1:4]
+        poses.append([_rolled(look_at(*pair), roll) for *pair, roll in zip(eyes, looked, wander[:, 4], strict=True)])
+    return poses[0], poses[1]
 
 
 def fitting_distance(path: str, vertices: np.ndarray, center: np.ndarray, views: int, camera: Camera) -> float:

@@ -11,10 +11,11 @@ from linprim_geo.capture.load import load_scene
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.geometry.raycast import RayCaster
-from linprim_geo.synthetic.camera_paths import look_at
+from linprim_geo.synthetic.camera_paths import WALK_EYES, WALK_STEP, WALK_TURN_DEG, fibonacci_directions, look_at, walk
 from linprim_geo.synthetic.options import SynthOptions
-from linprim_geo.synthetic.realism import parts, render, scenes, textures
+from linprim_geo.synthetic.realism import interiors, kitchen, parts, render, scenes, textures
 from linprim_geo.synthetic.realism.parts import Material, Part
+from linprim_geo.synthetic.shapes import smooth_body
 from linprim_geo.synthetic.synth import synthesize
 
 needs_mitsuba = pytest.mark.skipif(importlib.util.find_spec("mitsuba") is None, reason="the extra realism is missing")
@@ -76,6 +77,106 @@ def test_cameras_stand_in_free_space_and_see_the_scene(name):
         depth, face, _ = caster.render_depth(view)
         assert (face >= 0).mean() > 0.5
         assert np.quantile(depth[face >= 0], 0.01) > 0.2
+
+
+# A whole room
+
+
+def unit_normals(vertices, faces):
+    normal = np.cross(*(vertices[faces[:, i]] - vertices[faces[:, 0]] for i in (1, 2)))
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-15)
+
+
+@pytest.fixture(scope="module")
+def walked():
+    """The kitchen as it is photographed by 40 views, and its rays."""
+    traced = scenes.TracedScene("kitchen", None, SynthOptions(views=40, test_views=4, size=(64, 48), realism="kitchen"))
+    return traced, RayCaster(traced.surface.vertices, traced.surface.faces)
+
+
+def test_a_walk_takes_even_steps_and_its_held_out_views_lie_between():
+    corners = np.array([[1.0, 1, 0], [3, 1, 0], [3, 3, 0], [1, 3, 0]])
+    middle = np.tile([2.0, 2.0, 1.4], (4, 1))
+    train, test = walk(corners, middle, 40, 8, seed=3)
+    eyes, held = (np.array([np.linalg.inv(pose)[:3, 3] for pose in poses]) for poses in (train, test))
+    assert (WALK_EYES[0] <= eyes[:, 2]).all() and (eyes[:, 2] <= WALK_EYES[1]).all() and np.ptp(eyes[:, 2]) > 0.2
+    # On the square's edges, all the way round.
+    np.testing.assert_allclose(np.abs(eyes[:, :2] - 2.0).max(1), 1.0, atol=1e-9)
+    step = np.linalg.norm(np.diff(np.concatenate([eyes, eyes[:1]])[:, :2], axis=0), axis=1)
+    assert step.max() < WALK_STEP and step.min() > 0.5 * step.max()
+    ahead = np.array([pose[2, :3] for pose in train])
+    assert np.rad2deg(np.arccos((ahead[1:] * ahead[:-1]).sum(1))).max() < WALK_TURN_DEG
+    assert (((middle[0] - eyes) * ahead).sum(1) > 0.99 * np.linalg.norm(middle[0] - eyes, axis=1)).all()
+    nearest = np.linalg.norm(held[:, None, :2] - eyes[None, :, :2], axis=2).min(1)
+    assert (nearest > 0.15 * step.min()).all() and (nearest < 0.55 * step.max()).all()
+    assert np.array_equal(train, walk(corners, middle, 40, 8, seed=3)[0])
+    assert not np.array_equal(train, walk(corners, middle, 40, 8, seed=4)[0])
+
+
+def test_a_pierced_wall_faces_the_room_and_its_hole_is_open():
+    hole = interiors.pierced_wall((4.0, 2.5), Material(), (1.0, 2.0), (0.8, 1.8), 0.3)
+    surface = scenes.surface_of(render.Stage(interiors.on_wall("right", (5.0, 4.0, 2.5), hole)), "wall")
+    caster = RayCaster(surface.vertices, surface.faces)
+    # Straight through the hole, beside it, and to each of its sides.
+    eye, middle = np.array([2.0, -1.5, 1.3]), np.array([5.15, -1.5, 1.3])
+    ends = middle + [[0, 0, 0], [-0.15, 0.7, 0], [0, 0.5, 0], [0, -0.5, 0], [0, 0, 0.5], [0, 0, -0.5]]
+    starts = np.array([eye, eye, *np.tile(middle, (4, 1))])
+    distance, face, _ = caster.cast(starts, ends - starts)
+    assert np.isinf(distance[0])
+    np.testing.assert_allclose(distance[1:], 1.0, atol=1e-9)
+    facing = unit_normals(surface.vertices, surface.faces)[face[1:]]
+    np.testing.assert_allclose(facing, [[-1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], atol=1e-12)
+
+
+def test_the_kitchen_has_whole_faces_and_lies_within_its_walls():
+    stage = kitchen.kitchen_scene(smooth_body(), 0)
+    low, high = np.array([0.0, -kitchen.DEPTH, 0.0]), np.array([kitchen.WIDTH, 0.0, kitchen.HEIGHT])
+    for part in stage.parts:
+        a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
+        area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        # Flat are only triangles at the axes of turned pieces, and at the poles of the figure.
+        flat = area < 1e-12
+        assert not flat.any() or part.name == "face" or part.smooth, part.name
+        assert flat.mean() <= 0.5, part.name
+        # Only window, door and niche go into the walls.
+        assert (part.vertices > low - 0.25).all() and (part.vertices < high + 0.25).all(), part.name
+        assert (part.vertices[:, 2] > -1e-9).all() and (part.vertices[:, 2] < high[2] + 1e-9).all(), part.name
+
+
+def test_what_is_seen_of_the_kitchen_faces_the_camera_and_nothing_is_open(walked):
+    traced, caster = walked
+    normals = unit_normals(caster.vertices, caster.faces)
+    for view in traced.train[::4]:
+        _, face, _ = caster.render_depth(view)
+        assert (face >= 0).all()
+        y, x = np.mgrid[: view.height, : view.width] + 0.5
+        ray = np.stack([(x - view.cx) / view.fx, (y - view.cy) / view.fy, np.ones_like(x)], -1)
+        towards = (ray @ view.world_to_camera[:3, :3] * normals[face]).sum(-1)
+        assert (towards < 0).mean() > 0.999
+
+
+def test_the_walk_through_the_kitchen_is_free_and_sees_nearly_all_of_it(walked):
+    traced, caster = walked
+    probe = fibonacci_directions(500)
+    for view in traced.train + traced.test:
+        assert caster.cast(np.tile(view.center, (500, 1)), probe)[0].min() > 0.25
+    # The surface as rays from anywhere on the free floor meet it, each place as often as its area asks for.
+    rng = np.random.default_rng(0)
+    eyes = np.repeat(rng.uniform((1.4, -3.0, 1.0), (3.7, -0.9, 1.8), (60, 3)), len(probe), axis=0)
+    rays = np.tile(probe, (60, 1))
+    distance, face, _ = caster.cast(eyes, rays)
+    slant = np.abs((unit_normals(caster.vertices, caster.faces)[face] * rays).sum(1))
+    weight = distance**2 / np.maximum(slant, 0.05)
+    points = (eyes + rays * distance[:, None])[rng.choice(len(rays), 2000, p=weight / weight.sum())]
+    count = np.zeros(len(points), int)
+    for view in traced.train:
+        pixel, depth = view.project(points)
+        inside = (depth > 0) & (pixel > 0).all(1) & (pixel < (view.width, view.height)).all(1)
+        offset = points - view.center
+        count += inside & ~caster.occluded(view.center, offset, 1.0 - 2e-3 / np.linalg.norm(offset, axis=1))
+    assert (count >= 3).mean() > 0.92
+    ceiling, floor = points[:, 2] > kitchen.HEIGHT - 1e-3, points[:, 2] < 0.02
+    assert (count[ceiling] >= 3).mean() > 0.9 and (count[floor] >= 3).mean() > 0.85
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,10 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.synthetic import camera_paths
 from linprim_geo.synthetic.options import SynthOptions
+from linprim_geo.synthetic.realism.attic import attic_poses, attic_scene
 from linprim_geo.synthetic.realism.desk import desk_scene
 from linprim_geo.synthetic.realism.facade import facade_scene, street_poses
+from linprim_geo.synthetic.realism.kitchen import kitchen_poses, kitchen_scene
 from linprim_geo.synthetic.realism.parts import Material, quad
 from linprim_geo.synthetic.realism.render import PathTracer, Stage
 from linprim_geo.synthetic.realism.shelf import shelf_scene
@@ -27,7 +29,8 @@ METAL_COLOR = (0.6, 0.6, 0.6)
 
 METER_VIEWS, METER_SAMPLES = 5, 16
 METER_SHARE, METER_LEVEL = 0.9995, 0.85
-"""Exposure: of this many views, this share of the values stays below this linear intensity, white being 1."""
+"""Exposure: of this many views, this share of the values stays below this linear intensity, white being 1; a scene
+may have its own."""
 
 SEEN_BY, MIN_FACING = 2, 0.05
 """The reference holds what so many training views see, at more than 3 degrees from the surface."""
@@ -42,12 +45,15 @@ Poses = Callable[[int, int, int], tuple[list[np.ndarray], list[np.ndarray]]]
 
 @dataclass(frozen=True)
 class Scene:
-    """How a scene is built from its figure and a seed, how the camera goes, and its horizontal field of view."""
+    """How a scene is built from its figure and a seed, how the camera goes, its horizontal field of view, and its
+    exposure (METER_SHARE), which is by the walls where lamps and windows are in the picture."""
 
     build: Callable[[TexturedMesh, int], Stage]
     poses: Poses
     path: str
     fov_deg: float
+    meter_share: float = METER_SHARE
+    meter_level: float = METER_LEVEL
 
 
 def arc_poses(target: tuple[float, float, float], distance: float, degrees: float, azimuth: float) -> Poses:
@@ -65,8 +71,10 @@ def arc_poses(target: tuple[float, float, float], distance: float, degrees: floa
 
 
 SCENES = {
+    "attic": Scene(attic_scene, attic_poses, "walk", 68.0, meter_share=0.5, meter_level=0.15),
     "desk": Scene(desk_scene, arc_poses((0.60, -0.42, 0.80), 1.0, 80.0, -48.0), "arc", 55.0),
     "facade": Scene(lambda figure, seed: facade_scene(seed), street_poses, "street", 58.0),
+    "kitchen": Scene(kitchen_scene, kitchen_poses, "walk", 65.0, meter_share=0.9, meter_level=0.42),
     "shelf": Scene(
         lambda figure, seed: shelf_scene([figure, cad_part(), smooth_body()], seed),
         arc_poses((0.82, -0.25, 0.62), 1.4, 75.0, -68.0),
@@ -83,6 +91,7 @@ class TracedScene:
     def __init__(self, name: str, figure: TexturedMesh | None, options: SynthOptions):
         scene = SCENES[name]
         self.name, self.path, self.options = name, scene.path, options
+        self.meter_share, self.meter_level = scene.meter_share, scene.meter_level
         self.stage = scene.build(figure or smooth_body(), options.seed)
         self.surface = surface_of(self.stage, name)
         self.fov = options.fov or scene.fov_deg
@@ -106,8 +115,8 @@ class TracedScene:
         self.tracer = PathTracer(self.stage, self.options.tracer, self.options.threads)
         chosen = np.linspace(0, len(self.train) - 1, min(METER_VIEWS, len(self.train))).astype(int)
         lights = [self.tracer.render(self.train[i], METER_SAMPLES, self._seed(2, i))[0] for i in chosen]
-        self.exposure = METER_LEVEL / float(
-            np.quantile(np.concatenate([light.ravel() for light in lights]), METER_SHARE)
+        self.exposure = self.meter_level / float(
+            np.quantile(np.concatenate([light.ravel() for light in lights]), self.meter_share)
         )
 
     def picture(self, camera: Camera, split: str, number: int) -> np.ndarray:
