@@ -120,7 +120,7 @@ class Sweep:
         # The first time of all loads libraries, and is not counted.
         self.warm = self.warm_score = self.warm_train = False
         prepare(scene, threads=threads, log=self.progress.note)
-        self.scene = load_scene(scene)
+        self.scene = load_scene(scene, downscale=1)
         widest = max(view.camera.width for view in self.scene.train)
         self.scene_options = SceneOptions(downscale=-(-widest // (QUICK_WIDEST if quick else WIDEST)))
         self.options = TrainOptions(**size, threads=threads, evaluate_every=0, checkpoint_every=10**9)

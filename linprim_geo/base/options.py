@@ -12,6 +12,9 @@ from typing import Any, get_args, get_type_hints
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.kinds import KINDS
 
+LONGEST_SIDE = 1600
+"""Pixels along the longer side of photographs that `downscale` auto leaves at most."""
+
 
 def option(
     default,
@@ -193,7 +196,13 @@ class SceneOptions:
         0.0, "lenses that shift no ray by as many pixels count as pinholes and are not undistorted", low=0, metavar="PX"
     )
 
-    downscale: int = option(1, "average K by K pixels into one", low=1, metavar="K")
+    downscale: int | str = option(
+        "auto",
+        f"average K by K pixels into one; auto: the fewest that leave at most {LONGEST_SIDE} along the longer side",
+        low=1,
+        metavar="K",
+        number_or="auto",
+    )
     masks: str = option(
         "",
         "folder of foreground masks, if they are not where data sets usually keep them; none: no masks and no alpha",

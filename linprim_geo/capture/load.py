@@ -15,7 +15,7 @@ from typing import Any
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import is_file
-from linprim_geo.base.options import SceneOptions, flag_of, with_changes
+from linprim_geo.base.options import LONGEST_SIDE, SceneOptions, flag_of, with_changes
 from linprim_geo.capture import found_poses
 from linprim_geo.capture.types import PHOTOGRAPHS, Frame, Listing, Scene, View, check_pose
 from linprim_geo.geometry.camera import Camera
@@ -68,7 +68,7 @@ def load_scene(
     from linprim_geo.capture.readers import colmap as read_colmap
 
     options = with_changes(SceneOptions, options, changes)
-    downscale, pinhole_below = int(options.downscale), options.pinhole_below
+    pinhole_below = options.pinhole_below
     cache = Path(cache) if cache else None
     path = found_poses.frames_of(Path(path), options.frames, cache)
     root, json_file = _root(path)
@@ -95,9 +95,10 @@ def load_scene(
         posed = with_images(posed, images_folder)
     if not unmasked:
         posed = with_masks(posed, root, masks_folder)
+    factor = downscale = _downscale(options.downscale, posed)
     smaller = with_smaller_images(posed, root, downscale) if images_folder is None else None
     if smaller is not None:
-        posed, downscale = smaller, 1
+        posed, factor = smaller, 1
     names = _names(posed)
     alphas = _header_checks(posed)
     has_alpha = any(frame.mask_path for frame in posed) or _alpha_says_something(posed, alphas)
@@ -105,14 +106,27 @@ def load_scene(
     folder = photos.cache_folder(cache)
     pinholes: dict[Lens, Intrinsics] = {}
     if pinhole_below > 0:
-        straight = {lens: straightened(lens, pinhole_below * downscale) for lens in {frame.lens for frame in posed}}
+        straight = {lens: straightened(lens, pinhole_below * factor) for lens in {frame.lens for frame in posed}}
         posed = [replace(frame, lens=straight[frame.lens]) for frame in posed]
     views, decoded = [], DecodedPhotos() if decoded is None else decoded
     for frame, name in zip(posed, names, strict=True):
-        views.append(replace(_view(frame, name, downscale, has_alpha, folder, pinholes), decoded=decoded))
+        views.append(replace(_view(frame, name, factor, has_alpha, folder, pinholes), decoded=decoded))
     train, test = _split(posed, views, options.test_every)
-    scene = Scene(root, listing.kind, train, test, listing.points, listing.unit or "unit of the data set")
+    unit = listing.unit or "unit of the data set"
+    scene = Scene(root, listing.kind, train, test, listing.points, unit, downscale=downscale)
     return scene.with_training_views(options.views)
+
+
+def told_downscale(scene: Scene, options: SceneOptions, log: Callable[[str], None]) -> int:
+    """The `downscale` of a scene that was read with `options`; where these left it open and it is not 1, `log` is
+    called with a line that says so."""
+    if options.downscale == "auto" and scene.downscale > 1:
+        camera = scene.views[0].camera
+        log(
+            f"photographs averaged down {scene.downscale} by {scene.downscale}, to {camera.width}x{camera.height}: all "
+            "their pixels with --downscale 1"
+        )
+    return scene.downscale
 
 
 def has_poses(path: Path, sparse: str | os.PathLike | None = None) -> bool:
@@ -210,6 +224,13 @@ def _contents(root: Path) -> str:
         return "the folder is empty"
     shown = ", ".join(entries[:6]) + (", ..." if len(entries) > 6 else "")
     return f"{images} images; it holds {shown}" if images else f"it holds {shown}"
+
+
+def _downscale(wanted: int | str, frames: Sequence[Frame]) -> int:
+    """What is `wanted`, or for auto the fewest pixels a side that leave LONGEST_SIDE of the largest photograph."""
+    if wanted != "auto":
+        return int(wanted)
+    return -(-max(max(frame.lens.width, frame.lens.height) for frame in frames) // LONGEST_SIDE)
 
 
 def _names(frames: Sequence[Frame]) -> list[str]:

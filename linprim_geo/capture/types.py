@@ -156,7 +156,7 @@ class View:
 @dataclass(frozen=True)
 class Scene:
     """A capture in the data set's own frame and unit, split into training and held-out views; `adjusted` are the poses
-    that they have in place of the given ones."""
+    that they have in place of the given ones, `downscale` the number of pixels a side that were averaged into one."""
 
     root: Path
     kind: str
@@ -165,6 +165,7 @@ class Scene:
     points: PointCloud | None = None
     unit: str = "unit of the data set"
     adjusted: AdjustedPoses | None = None
+    downscale: int = 1
 
     @property
     def views(self) -> tuple[View, ...]:

@@ -19,7 +19,7 @@ from linprim_geo.base.files import is_leftover, locked, read_json, write_json
 from linprim_geo.base.options import SceneOptions, StereoOptions, TrainOptions, check, from_saved
 from linprim_geo.base.progress import Progress, Stages
 from linprim_geo.base.version import __version__
-from linprim_geo.capture.load import load_scene
+from linprim_geo.capture.load import load_scene, told_downscale
 from linprim_geo.capture.structure_from_motion import prepare
 from linprim_geo.capture.types import Scene, View
 from linprim_geo.kernels import ops
@@ -139,6 +139,7 @@ def _photographs(
     """The photographs to take, and the notes about them."""
     prepare(path, scene_options, threads=options.threads, log=log)
     scene = load_scene(path, scene_options)
+    scene_options = replace(scene_options, downscale=told_downscale(scene, scene_options, log))
     if scene_options.poses == "auto":
         scene = adjusted_scene(scene, options.seed, threads=options.threads, log=log)
 
@@ -163,7 +164,7 @@ def _photographs(
     if budget:
         plan = planned(views, seconds_per_pixel(photographs, budget), budget)
         log(_told(plan, views, budget))
-    downscale = scene_options.downscale * plan.downscale
+    downscale = scene.downscale * plan.downscale
     if plan.downscale > 1:
         views = reread(replace(scene_options, downscale=downscale))
     if plan.views < len(views):

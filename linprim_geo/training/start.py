@@ -20,7 +20,7 @@ from linprim_geo.base.options import (
     flag_of,
 )
 from linprim_geo.base.progress import Progress
-from linprim_geo.capture.load import load_scene, settled_folders
+from linprim_geo.capture.load import load_scene, settled_folders, told_downscale
 from linprim_geo.capture.structure_from_motion import prepare
 from linprim_geo.capture.types import PointCloud, Scene
 from linprim_geo.geometry.environment_map import texels_for
@@ -51,7 +51,8 @@ def decided_scene(
 ) -> tuple[list[Decision], Scene, SceneOptions, TrainOptions]:
     """Reads a scene, decides about its effects, and reads it again if that changes how.
 
-    Returns: the decisions, the scene with points to start from, and both options with what was decided put in.
+    Returns: the decisions, the scene with points to start from, and both options with what was decided put in, and
+        `downscale` as a number.
     """
 
     decoded = DecodedPhotos()
@@ -64,6 +65,7 @@ def decided_scene(
 
     prepare(path, scene_options, threads=options.threads, log=log)
     scene = read(scene_options)
+    scene_options = replace(scene_options, downscale=told_downscale(scene, scene_options, log))
     if choice.mode == "none" and not choice.asked:
         return [], scene, scene_options, options
     decisions = decide(scene, scene_options, options, choice)

@@ -12,6 +12,8 @@ from helpers.captures import OPENGL, edit, picture, ring, transforms, write_colm
 from PIL import Image
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import SceneOptions
+from linprim_geo.capture import load
 from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.types import check_pose
 
@@ -247,6 +249,39 @@ def test_a_photograph_turned_by_exif_is_turned_to_fit_its_camera(tmp_path):
 def test_one_image_is_refused(tmp_path):
     write_transforms(tmp_path, 1)
     assert "1 posed image found, wanted at least two" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize(("longest", "factor"), [(40, 1), (32, 1), (31, 2), (16, 2), (11, 3)])
+def test_large_photographs_are_averaged_down_unless_a_number_is_given(longest, factor, tmp_path, monkeypatch):
+    write_transforms(tmp_path, 3)  # 32 by 24 pixels
+    monkeypatch.setattr(load, "LONGEST_SIDE", longest)
+    scene = load_scene(tmp_path)
+    assert scene.downscale == factor == scene.train[0].downscale
+    assert scene.train[0].camera.width == 32 // factor
+    assert load_scene(tmp_path, downscale=1).train[0].camera.width == 32
+
+
+def test_the_longest_side_of_all_photographs_counts(tmp_path, monkeypatch):
+    write_transforms(tmp_path, 3)
+    tall = np.zeros((64, 48, 3), np.uint8)
+    Image.fromarray(tall).save(tmp_path / "images" / "tall.png")
+
+    def add_tall(content):
+        frame = content["frames"][0] | {"file_path": "images/tall.png", "w": 48, "h": 64}
+        content["frames"].append(frame | {"fl_x": 40.0, "fl_y": 40.0, "cx": 24.0, "cy": 32.0})
+
+    edit(tmp_path / "transforms.json", add_tall)
+    monkeypatch.setattr(load, "LONGEST_SIDE", 32)
+    assert {(view.camera.width, view.camera.height) for view in load_scene(tmp_path).views} == {(16, 12), (24, 32)}
+
+
+def test_what_was_averaged_down_is_told_if_nobody_asked_for_it(tmp_path, monkeypatch):
+    write_transforms(tmp_path, 3)
+    monkeypatch.setattr(load, "LONGEST_SIDE", 16)
+    for options, told in ((SceneOptions(), 1), (SceneOptions(downscale=2), 0), (SceneOptions(downscale=1), 0)):
+        lines: list[str] = []
+        assert load.told_downscale(load_scene(tmp_path, options), options, lines.append) == (options.downscale != 1) + 1
+        assert len(lines) == told and all("2 by 2, to 16x12" in line and "--downscale 1" in line for line in lines)
 
 
 @pytest.mark.parametrize("value", [0, -1, 1.5, True])

@@ -164,7 +164,7 @@ def test_options_of_3dgs_are_understood(recorded_train, tiny_scene):
         assert cli.main([*line, resolution]) == 0
     assert [call[0] for call in recorded_train] == ["data/lego", *[str(tiny_scene)] * 5]
     # Images are 48 wide; pixels are averaged, so a width is one that is at most what was asked for.
-    assert [call[2].downscale for call in recorded_train] == [2, 1, 1, 2, 3, 10]
+    assert [call[2].downscale for call in recorded_train] == [2, "auto", 1, 2, 3, 10]
     assert {call[1] for call in recorded_train} == {"out"}
 
 

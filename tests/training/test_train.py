@@ -228,6 +228,14 @@ def test_downscaled_photographs(tiny_scene, tmp_path):
     assert result["psnr"] > 18.8  # 19.87 to 20.49
 
 
+def test_a_run_keeps_how_large_photographs_were_averaged_down(tiny_scene, tmp_path, monkeypatch):
+    with monkeypatch.context() as patched:
+        patched.setattr("linprim_geo.capture.load.LONGEST_SIDE", 24)
+        train(tiny_scene, tmp_path / "run", options=replace(QUICK, iterations=3), quiet=True)
+    run = Run.open(tmp_path / "run")
+    assert run.scene_options.downscale == 2 and run.scene().train[0].camera.width == 24
+
+
 def test_the_population_never_exceeds_its_limit(tiny_scene, tmp_path):
     with pytest.raises(LinprimError, match="--initial-primitives"):
         train(tiny_scene, tmp_path / "no", options=replace(QUICK, initial_primitives=61), quiet=True)

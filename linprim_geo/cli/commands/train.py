@@ -9,7 +9,7 @@ from pathlib import Path
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import SceneOptions, TrainOptions
-from linprim_geo.cli.arguments import blocks_and_workers, effects_choice, from_args, log, time_budget
+from linprim_geo.cli.arguments import blocks_and_workers, effects_choice, from_args, given_options, log, time_budget
 from linprim_geo.cli.options import (
     AddCommand,
     add_effects,
@@ -21,9 +21,6 @@ from linprim_geo.cli.options import (
     seconds,
 )
 from linprim_geo.cli.output import Output
-
-# 3DGS's -r -1 leaves images up to this width as they are.
-WIDEST = 1600
 
 
 def add(command: AddCommand) -> None:
@@ -66,10 +63,9 @@ def run(parsed: argparse.Namespace) -> Output:
         raise LinprimError("train wants one scene: its folder, or -s and its folder")
     scene_options, options = from_args(SceneOptions, parsed), from_args(TrainOptions, parsed)
     if parsed.resolution is not None:
-        if scene_options.downscale != 1:
-            raise LinprimError(
-                f"-r {parsed.resolution} stands beside --downscale {scene_options.downscale}, wanted one of them"
-            )
+        if "downscale" in given_options(SceneOptions, parsed):
+            given = f"--downscale {scene_options.downscale}"
+            raise LinprimError(f"-r {parsed.resolution} stands beside {given}, wanted one of them")
         parsed.downscale = _downscale_of(parsed.resolution, scene, scene_options, options.threads, log(parsed))
         scene_options = from_args(SceneOptions, parsed)
     folder = parsed.run or Path("runs") / Path(os.path.abspath(scene)).name
@@ -95,17 +91,18 @@ def run(parsed: argparse.Namespace) -> Output:
         return Output(train(scene, folder, scene_options, options, resume=parsed.resume, **several, **settings))
 
 
-def _downscale_of(resolution: int, scene: str, options: SceneOptions, threads: int, log) -> int:
+def _downscale_of(resolution: int, scene: str, options: SceneOptions, threads: int, log) -> int | str:
     """3DGS's -r as --downscale. Where it names a width, the least whole divisor that does not exceed it: pixels are
     averaged."""
     if resolution in (1, 2, 4, 8):
         return resolution
-    width = WIDEST if resolution == -1 else resolution
-    if width < 1:
+    if resolution == -1:
+        return "auto"
+    if resolution < 1:
         raise LinprimError(f"-r is {resolution}, wanted 1, 2, 4, 8, a width in pixels, or -1")
     from linprim_geo.capture.load import load_scene
     from linprim_geo.capture.structure_from_motion import prepare
 
     prepare(scene, options, threads=threads, log=log)
-    views = load_scene(scene, options).train
-    return -(-max(view.camera.width for view in views) // width)
+    views = load_scene(scene, options, downscale=1).train
+    return -(-max(view.camera.width for view in views) // resolution)

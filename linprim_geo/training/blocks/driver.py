@@ -199,7 +199,7 @@ def _all(run: Run, scene: Scene, count: int, executor: Executor, progress: Progr
         f"{count} blocks on {executor.what}"
     )
     coarse_run = coarse_of(run, scene)
-    square = (coarse_run.scene_options.downscale // run.scene_options.downscale) ** 2
+    square = (int(coarse_run.scene_options.downscale) // scene.downscale) ** 2
     photos, largest = (
         photo_bytes(scene.train[:MOST_COARSE_VIEWS]),
         max(view.camera.width * view.camera.height for view in scene.train),

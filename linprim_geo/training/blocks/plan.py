@@ -153,7 +153,7 @@ def coarse_of(run: Run, scene: Scene) -> Run:
         samples=1,
         evaluate_every=0,
     )
-    seen = replace(scene_options, downscale=factor * scene_options.downscale, views=views)
+    seen = replace(scene_options, downscale=factor * scene.downscale, views=views)
     return replace(run, path=run.path / FOLDER / "coarse" / "run", scene_options=seen, train_options=coarse)
 
 
@@ -173,7 +173,7 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
     opened, scene = _opened(run)
     _prepared(opened.train_options)
     coarse = Run.open(opened.path / FOLDER / "coarse" / "run")
-    factor = coarse.scene_options.downscale // opened.scene_options.downscale
+    factor = int(coarse.scene_options.downscale) // scene.downscale
     assert scene.points is not None
     points = opened.similarity.apply(scene.points.xyz)
 
