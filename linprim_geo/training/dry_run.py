@@ -118,12 +118,13 @@ def dry_run(
         "iterations": options.iterations,
         "max_primitives": options.max_primitives,
         "minutes": seconds / 60,
-        **_memory(options, counts[0]),
+        **_memory(options, counts[0], loaded.downscale),
     }
 
 
-def _memory(options: TrainOptions, timed: int) -> dict:
-    """What is needed and available, after `timed` primitives were trained for a moment."""
+def _memory(options: TrainOptions, timed: int, downscale: int) -> dict:
+    """What is needed and available, after `timed` primitives were trained for a moment on photographs that are averaged
+    down by `downscale`."""
     per_primitive = bytes_per_primitive(options)
     used = peak_gib() - per_primitive * timed / 2**30  # without those that were timed
     available = available_memory() / 2**30 + memory_gib()
@@ -132,7 +133,7 @@ def _memory(options: TrainOptions, timed: int) -> dict:
         "memory_gib": needed,
         "available_gib": available,
         "fits": needed <= available,
-        "advice": "" if needed <= available else _advice(used, available, per_primitive, options),
+        "advice": "" if needed <= available else _advice(used, available, per_primitive, options, downscale),
     }
 
 
@@ -155,11 +156,13 @@ def describe(report: dict) -> str:
     return "\n".join([*lines, *([report["advice"]] if report["advice"] else []), "nothing was written"])
 
 
-def _advice(used: float, available: float, per_primitive: float, options: TrainOptions) -> str:
-    """What to change so that it fits: fewer primitives if these are what does not, else smaller images."""
+def _advice(used: float, available: float, per_primitive: float, options: TrainOptions, downscale: int) -> str:
+    """What to change so that it fits: fewer primitives if these are what does not, else smaller images than with
+    `downscale`."""
     most = int((available - used) * 2**30 / per_primitive) // 1000 * 1000
     if most >= min(10_000, options.max_primitives):
         return f"it would not fit: wanted --max-primitives {most} or less, or more memory"
     return (
-        "it would not fit: wanted --downscale 2 or more, or more memory, for the images alone take more than there is"
+        f"it would not fit: wanted --downscale {downscale + 1} or more, or more memory, for the images alone take more "
+        "than there is"
     )

@@ -168,9 +168,10 @@ def test_people_read_lines(tiny_scene, tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("available", "primitives", "advice"),
-    [(5.0, 100_000_000, r"--max-primitives \d+000 or less"), (0.0, 20_000, "--downscale 2 or more")],
+    [(5.0, 100_000_000, r"--max-primitives \d+000 or less"), (0.0, 20_000, "--downscale 3 or more")],
 )
 def test_what_does_not_fit_comes_with_what_to_change(available, primitives, advice, tiny_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("linprim_geo.capture.load.LONGEST_SIDE", 24)  # photographs are averaged down 2 by 2
     monkeypatch.setattr(dry_run, "available_memory", lambda: int(available * 2**30))
     if available == 0:  # what is taken already is all there is
         monkeypatch.setattr(dry_run, "memory_gib", lambda: 1.0)
