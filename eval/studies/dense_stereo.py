@@ -45,14 +45,13 @@ COLUMNS = {
     "coverage": "coverage",
     "within_1": "within 1 %",
     "within_2": "within 2 %",
-    "median": "median error, %",
     "predicted": "predicted 1 %",
     "calibration_error": "calibration error",
     "core_seconds": "core-s per photograph",
 }
 
 
-def measure(capture: Path, reference: Path, folder: Path, photographs: int, threads: int, downscale: int = 1) -> dict:
+def measure(capture: Path, reference: Path, folder: Path, photographs: int, threads: int) -> dict:
     """Stereo of a capture: (N, 6) `evidence` and (N,) `error` of sampled depths, and figures of all of them."""
     from linprim_geo.capture.load import load_scene
     from linprim_geo.geometry.mesh_files import load_mesh
@@ -61,7 +60,7 @@ def measure(capture: Path, reference: Path, folder: Path, photographs: int, thre
     from linprim_geo.points.start_points import with_points
 
     ops.set_threads(threads)
-    scene = with_points(load_scene(capture, downscale=downscale), TrainOptions(), lambda text: None)
+    scene = with_points(load_scene(capture), TrainOptions(), lambda text: None)
     assert scene.points is not None
     views = sorted(scene.views, key=lambda view: view.name)[:photographs]
     mesh = load_mesh(reference)
@@ -103,7 +102,6 @@ def row(name: str, measured: dict) -> dict:
         **{key: measured[key].item() for key in ("photographs", "size", "coverage", "core_seconds")},
         "within_1": float((error < RIGHT).mean()),
         "within_2": float((error < 2 * RIGHT).mean()),
-        "median": float(100 * np.median(error)),
         "predicted": float(predicted.mean()),
         "calibration_error": float(sum(r["share"] * r["off"] for r in reliability([measured]))),
     }
@@ -186,7 +184,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--fitted", nargs="*", default=[], metavar="NAME", help="captures that the law is fitted to")
     parser.add_argument("--fit", action="store_true", help="print the weights that fit these")
     parser.add_argument("--photographs", type=int, default=24, help="of each capture (default: %(default)s)")
-    parser.add_argument("--downscale", type=int, default=1, help="of the captures (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=0, help="0 uses every core (default: %(default)s)")
     given = parser.parse_args(arguments)
     try:
@@ -206,8 +203,7 @@ def run(given: argparse.Namespace) -> None:
     for capture, reference in zip(given.data, references, strict=True):
         saved = given.output / f"{capture.name}.npz"
         if not saved.exists():
-            how = given.photographs, given.threads, given.downscale
-            measured = measure(capture, reference, given.output / capture.name, *how)
+            measured = measure(capture, reference, given.output / capture.name, given.photographs, given.threads)
             with atomic_write(saved) as temporary:
                 np.savez(temporary, **measured)
         captures[capture.name] = dict(np.load(saved, allow_pickle=False))
