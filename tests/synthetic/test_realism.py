@@ -2,6 +2,7 @@
 
 import importlib.util
 import sys
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -66,6 +67,11 @@ def test_colors_of_the_reference_are_those_of_the_texture():
     caster = RayCaster(surface.vertices, surface.faces)
     _, face, bary = caster.cast(points - [0, 1, 0], np.tile([0.0, 1.0, 0.0], (2, 1)))
     np.testing.assert_allclose(surface.colors(points, face, bary), [[0, 0, 1], [1, 0, 0]], atol=1e-6)
+
+
+def test_every_scene_can_be_asked_for():
+    (option,) = (entry for entry in fields(SynthOptions) if entry.name == "realism")
+    assert sorted(option.metadata["choices"]) == sorted(scenes.SCENES)
 
 
 @pytest.mark.parametrize("name", scenes.SCENES)
