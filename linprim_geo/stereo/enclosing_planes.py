@@ -400,5 +400,6 @@ def _looking(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(N,) how many views look at (N, 3) points, which are in their images with nothing known before, and (N,) how many
     of these know a depth there."""
-    views = [(*camera.pinhole(), np.ascontiguousarray(depth)) for camera, depth in zip(cameras, known, strict=True)]
+    depths = (np.ascontiguousarray(depth, np.float32) for depth in known)
+    views = [(*camera.pinhole(), depth) for camera, depth in zip(cameras, depths, strict=True)]
     return surface_ops.count_looking_views(views, np.ascontiguousarray(points), MARGIN)
