@@ -8,7 +8,7 @@ shading, and whatever is not flat, get none.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -171,28 +171,65 @@ class ShadedPlanes:
         far = self._far(region.some(MOST_BOXES))
         return far is not None and far.left < HARDLY_MORE * fit.left
 
-    def _far(self, region: ShadedRegion) -> Fit | None:
+    def _far(self, region: ShadedRegion, least: int = LEAST_VIEWS) -> Fit | None:
         """How a background carries the shading of a region; None if too few views show it."""
         plane = in_world(self._camera(region), np.array([0, 0, 1 / (FAR * region.depth)]))
         far = evaluate(plane, [region], self.shadings)
-        return far if far is not None and far.views >= LEAST_VIEWS else None
+        return far if far is not None and far.views >= least else None
 
     def is_background(self, view: int) -> np.ndarray:
         """(H, W) bool: regions of a view whose shading a background carries better than any plane that may move."""
-        camera, shading = self.cameras[view], self.shadings[view]
-        background = np.zeros((camera.height, camera.width), bool)
+        background = self._nowhere(view)
         for region in self.shown[view]:
             few = region.some(FIRST_BOXES)
-            # All other views: those that show it at its depth may not show it far away.
-            far = self._far(replace(few, others=tuple(k for k in range(len(self.shadings)) if k != view)))
+            far = self._far(self._in_all_views(few))
             if far is None or far.left_share > LEFT_SHARE:
                 continue
             fits = (evaluate(plane, [few], self.shadings) for plane in self.planes[self.by_points :])
             if all(fit is None or fit.left_share > HARDLY_MORE * far.left_share for fit in fits):
-                around = binary_dilation(self.shadings[region.view].area_of(region), iterations=BOX)
-                row, column = np.nonzero(around.repeat(shading.factor, 0).repeat(shading.factor, 1))
-                background[row, column] = True
+                self._mark(background, region)
         return background
+
+    def is_wall(self, view: int, asked: np.ndarray) -> np.ndarray:
+        """(H, W) bool: regions of a view, of those with a pixel that is `asked` (H, W), whose shading one of the planes
+        carries, and a background does not as well, as another view tells: of what no other looks at from elsewhere the
+        direction may be all that matters."""
+        wall, small = self._nowhere(view), self.shadings[view].small(asked)
+        for region in self.shown[view]:
+            if not small[region.row, region.column].any():
+                continue
+            few = region.some(FIRST_BOXES)
+            least = min((fit.left_share for fit in self._before(few)), default=np.inf)
+            if least > LEFT_SHARE:
+                continue
+            far = self._far(self._in_all_views(few), least=1)
+            if far is not None and far.left_share > HARDLY_MORE * least:
+                self._mark(wall, region)
+        return wall
+
+    def _before(self, region: ShadedRegion) -> Iterator[Fit]:
+        """How planes that are before all of a region carry its shading, where enough views show it."""
+        for plane, local in zip(self.planes, in_camera(self._camera(region), self.planes), strict=True):
+            if (region.rays @ local > 0).all():
+                fit = evaluate(plane, [region], self.shadings)
+                if fit is not None and fit.views >= LEAST_VIEWS:
+                    yield fit
+
+    def _in_all_views(self, region: ShadedRegion) -> ShadedRegion:
+        """A region compared with all other views: those that show it at its depth may not show it far away."""
+        return replace(region, others=tuple(k for k in range(len(self.shadings)) if k != region.view))
+
+    def _nowhere(self, view: int) -> np.ndarray:
+        """(H, W) bool of a view, none of it."""
+        camera = self.cameras[view]
+        return np.zeros((camera.height, camera.width), bool)
+
+    def _mark(self, marked: np.ndarray, region: ShadedRegion) -> None:
+        """Marks the pixels of a region in (H, W) bool of its view."""
+        shading = self.shadings[region.view]
+        around = binary_dilation(shading.area_of(region), iterations=BOX)
+        row, column = np.nonzero(around.repeat(shading.factor, 0).repeat(shading.factor, 1))
+        marked[row, column] = True
 
     def _certain(self, region: ShadedRegion, fit: Fit) -> bool:
         """Whether a fit to a region carries its shading, is certain, and is not contradicted."""

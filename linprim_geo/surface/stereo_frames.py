@@ -93,10 +93,15 @@ class MergedFrames(Sequence):
         for found, depth, frame in zip(maps, self.depths, rendered, strict=True):
             deviations.add(found, depth, frame)
         self.weight = deviations.weight()
-        rendered_depths = [frame.depth for frame in rendered]
+        rendered_depths, free = map(
+            list, zip(*((frame.depth, _background_of(frame)) for frame in rendered), strict=True)
+        )
         seen = list(self.depths)
-        regions, backgrounds = self._take_planes(maps, rendered_depths)
+        masked = any(view.has_alpha for view in views)  # then masks say what is background
+        regions, backgrounds, plain_walls = self._take_planes(maps, rendered_depths, free)
         self.rendered = [_seen_past(*each) for each in zip(rendered, maps, backgrounds, strict=True)]
+        if not masked:
+            self._end_at(plain_walls)
         self.shown = [frame.depth[::SAMPLED, ::SAMPLED] > 0 for frame in self.rendered]
         known = [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
         points = self._points(maps, known)
@@ -107,16 +112,17 @@ class MergedFrames(Sequence):
         # What stereo has measured on planes with points is not background where hardly any view looks.
         self._end_at(known_on_planes(self.cameras, planes, measured))
         self._keep_things(views, maps, rendered_depths, are_sharp)
-        if not any(view.has_alpha for view in views):  # else masks say what is background
+        if not masked:
             self._end_backgrounds(maps)
 
     def _take_planes(
-        self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray]
-    ) -> tuple[list[list[PlainRegion]], list[np.ndarray]]:
+        self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray], free: Sequence[np.ndarray]
+    ) -> tuple[list[list[PlainRegion]], list[np.ndarray], list[np.ndarray]]:
         """Finds planes by points, by edges and by shading, of depths that are sure, and what lies on them; moves
         confirmed depths to them.
 
-        Returns the plain regions of every view, and (H, W) bool: those that are background by their shading.
+        Returns the plain regions of every view, and (H, W) bool: those that are background by their shading, and those
+        with `free` (H, W) rays that are walls by it.
         """
         sure = [_depth_where(found, found.is_confirmed(SURE)) for found in maps]
         regions = regions_of_views(maps, sure)
@@ -138,7 +144,7 @@ class MergedFrames(Sequence):
             moved = np.where(np.isfinite(sure[view]), of_sure, self.on_planes[view])
             self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(moved), moved, depth)
         self.flat = _share_known(self.on_planes)
-        return regions, backgrounds
+        return regions, backgrounds, [shaded.is_wall(view, asked) for view, asked in enumerate(free)]
 
     def _points(self, maps: Sequence[DepthMap], known: Sequence[np.ndarray]) -> SurfacePoints:
         """Points of what is `known`, of every view as many."""

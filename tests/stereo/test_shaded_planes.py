@@ -257,6 +257,18 @@ def test_a_plane_of_edges_does_not_reach_into_the_sky():
     assert any(found.shown) and not any(found.is_background(view).any() for view in range(len(maps)))
 
 
+def test_shading_tells_a_wall_from_what_is_far(monkeypatch):
+    maps, depths = photographs(lambda points, view: light(points))
+    found, everywhere = planes_of(maps, depths, by_edges=WALL[None]), np.ones(depths[0].shape, bool)
+    assert np.mean([found.is_wall(view, everywhere).mean() for view in range(len(maps))]) > 0.8
+    assert not found.is_wall(0, ~everywhere).any()
+    monkeypatch.setattr(found, "_far", lambda *_, **__: None)
+    assert not found.is_wall(0, everywhere).any(), "no other view shows what would be far"
+    for maps, depths in (sky(), unrelated()):
+        found = planes_of(maps, depths, by_edges=WALL[None])
+        assert any(found.shown) and not any(found.is_wall(view, everywhere).any() for view in range(len(maps)))
+
+
 def above_a_house(maps, depths):
     """Maps whose lowest rows show a house with texture, of which stereo is sure."""
     result = []

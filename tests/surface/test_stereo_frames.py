@@ -212,6 +212,25 @@ def test_rays_are_free_where_shading_says_background_whatever_stereo_and_trainin
     assert merged.covered(square) == 1 and len(merged.shown) == 1 and not merged.shown[0][:, 3:].any()
 
 
+@pytest.mark.parametrize("masked", [False, True])
+def test_no_ray_goes_on_where_shading_says_wall_unless_masks_say_so(found, monkeypatch, masked):
+    wall, background = np.zeros((30, 40), bool), np.zeros((30, 40), bool)
+    wall[:, :5], background[:, :10] = True, True
+    asked = []
+
+    def is_wall(planes, view, free):
+        asked.append(free)
+        return wall
+
+    monkeypatch.setattr(stereo_frames.ShadedPlanes, "is_wall", is_wall)
+    take_region_planes(monkeypatch, np.full((30, 40), 3.5, np.float32))
+    view = SimpleNamespace(load=VIEW.load, has_alpha=masked)
+    frame = MergedFrames([replace(rendered(0.01)[0], background=background)], [view], 5.0)[0]
+    assert (asked[0] == background).all()
+    assert (frame.background == (background if masked else background & ~wall)).all()
+    assert masked or ((frame.depth[2:, :5] == 3).all() and (frame.depth[0, :5] == 3.5).all())
+
+
 def test_what_few_views_know_on_a_plane_is_not_background(found, monkeypatch):
     on_plane, background = np.zeros((30, 40), bool), np.zeros((30, 40), bool)
     on_plane[:, :5], background[:, :10] = True, True
