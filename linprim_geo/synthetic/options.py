@@ -136,6 +136,11 @@ class SynthOptions:
         choices=("attic", "desk", "facade", "kitchen", "shelf", "statue"),
     )
     samples: int = option(128, "light paths a pixel of --realism", low=4, high=65536)
+    denoise: str = option(
+        "off",
+        "take the grain of these paths, which no camera has, away (Open Image Denoise)",
+        choices=("on", "off"),
+    )
     tracer: str = option(
         "scalar", "of --realism; llvm takes half the time and wants a libLLVM that fits", choices=("scalar", "llvm")
     )

@@ -20,6 +20,9 @@ from linprim_geo.synthetic.shapes import smooth_body
 from linprim_geo.synthetic.synth import synthesize
 
 needs_mitsuba = pytest.mark.skipif(importlib.util.find_spec("mitsuba") is None, reason="the extra realism is missing")
+needs_denoiser = pytest.mark.skipif(
+    any(importlib.util.find_spec(name) is None for name in ("mitsuba", "pyoidn")), reason="the extra realism is missing"
+)
 SMALL = {"views": 3, "test_views": 1, "size": (48, 36), "samples": 4, "points": 60}
 
 
@@ -228,6 +231,41 @@ def test_a_grey_wall_under_an_even_sky_reflects_its_share():
     albedo = float(render.to_linear(np.array(0.5)))
     assert light.mean() == pytest.approx(albedo, rel=0.02)
     assert 0.0 < np.median(error) < 0.2 * albedo
+
+
+@needs_denoiser
+def test_a_denoised_picture_has_no_grain_and_its_textures_and_edges():
+    bright, dark = Material(color=(0.9, 0.9, 0.9)), Material(color=(0.3, 0.3, 0.3))
+    stripes = np.where(np.arange(64) % 8 < 4, 230, 120).astype(np.uint8)
+    stripes = Material(color=np.broadcast_to(stripes[None, :, None], (64, 64, 3)))
+    walls = [
+        parts.quad("wall", (-9, 0, -9), (18, 0, 0), (0, 0, 18), bright),
+        parts.quad("stripes", (-0.5, -0.01, -0.5), (1, 0, 0), (0, 0, 1), stripes),
+        parts.quad("square", (0.6, -0.01, -0.2), (0.4, 0, 0), (0, 0, 0.4), dark),
+    ]
+    # A small bright part of the sky, which few paths meet.
+    sky = np.full((32, 64, 3), 0.05, np.float32)
+    sky[12, 30:33] = 40
+    stage, view = render.Stage(walls, sky=sky), camera((0, -3, 0), (0, 0, 0), focal=60.0)
+    truth = render.PathTracer(stage).render(view, 1024, 0)[0]
+    noisy, clean = (render.PathTracer(stage, denoise=denoise).render(view, 16, 1)[0] for denoise in (False, True))
+    assert clean.shape == truth.shape and clean.dtype == np.float32
+    off = np.abs([noisy, clean] - truth)
+    plain, shown = np.s_[:, :8], np.s_[:, 10:30]
+    assert off[1][plain].mean() < off[0][plain].mean() / 2
+    grain = [np.abs(np.diff(picture[plain], axis=1)).mean() for picture in (noisy, clean)]
+    assert grain[1] < grain[0] / 5
+    assert off[1][shown].mean() < off[0][shown].mean(), "stripes are not smoothed away"
+    again = render.PathTracer(stage, threads=1, denoise=True).render(view, 16, 1)[0]
+    assert np.array_equal(again, clean)
+
+
+@needs_mitsuba
+def test_without_the_denoiser_one_sentence_says_what_to_install(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    with pytest.raises(LinprimError, match=r"--denoise on .* pip install linprim-geo\[realism\]"):
+        synthesize(tmp_path / "out", realism="statue", denoise="on", **SMALL)
+    assert not (tmp_path / "out").exists()
 
 
 @needs_mitsuba

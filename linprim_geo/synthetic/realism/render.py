@@ -53,14 +53,16 @@ class Stage:
 
 
 class PathTracer:
-    """A stage ready to be rendered by one of the tracers of VARIANTS on so many threads, 0 for all cores.
+    """A stage ready to be rendered by one of the tracers of VARIANTS on so many threads, 0 for all cores; to `denoise`
+    takes the grain of the light paths away.
 
     Raises:
-        LinprimError: Mitsuba is not installed.
+        LinprimError: Mitsuba is not installed, or Open Image Denoise to denoise.
     """
 
-    def __init__(self, stage: Stage, tracer: str = "scalar", threads: int = 0):
+    def __init__(self, stage: Stage, tracer: str = "scalar", threads: int = 0, denoise: bool = False):
         self.mi = load_mitsuba(tracer, threads or usable_cores())
+        self.denoiser = load_denoiser() if denoise else None
         with tempfile.TemporaryDirectory(prefix="linprim-realism-") as name:
             description = self._describe(stage, Path(name))
             self.scene = self.mi.load_dict(description)
@@ -68,19 +70,21 @@ class PathTracer:
     def render(self, camera: Camera, samples: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """Linear radiance (H, W, 3) float32 and the standard error of each value, from `samples` paths a pixel.
 
-        Pixels are box-filtered and independent of each other. The same seed gives the same image.
+        Pixels are box-filtered and independent of each other, unless they are denoised; the error is that before. The
+        same seed gives the same image.
         """
         mi = self.mi
         sensor = mi.load_dict(self._sensor(camera))
         each = max(1, samples // PASSES)
         images = np.stack(
-            [
-                np.array(mi.render(self.scene, sensor=sensor, spp=each, seed=PASSES * seed + i))[..., :3]
-                for i in range(PASSES)
-            ]
+            [np.array(mi.render(self.scene, sensor=sensor, spp=each, seed=PASSES * seed + i)) for i in range(PASSES)]
         ).astype(np.float32)
-        images = without_outliers(images)
-        return images.mean(0), images.std(0, ddof=1) / np.float32(np.sqrt(PASSES))
+        images, surfaces = without_outliers(images[..., :3]), images[..., 3:]
+        light, error = images.mean(0), images.std(0, ddof=1) / np.float32(np.sqrt(PASSES))
+        if self.denoiser is not None:
+            albedo, normal = (np.ascontiguousarray(part) for part in np.split(surfaces.mean(0), 2, axis=-1))
+            light = self.denoiser.denoise(light, albedo.clip(0, 1), normal, hdr=True)
+        return light, error
 
     def _sensor(self, camera: Camera) -> dict[str, Any]:
         """Mitsuba's perspective camera looks along +z with x to the left and y up."""
@@ -111,7 +115,10 @@ class PathTracer:
 
     def _describe(self, stage: Stage, folder: Path) -> dict[str, Any]:
         mi = self.mi
-        scene: dict[str, Any] = {"type": "scene", "integrator": {"type": "path", "max_depth": MAX_DEPTH, "rr_depth": 3}}
+        integrator: dict[str, Any] = {"type": "path", "max_depth": MAX_DEPTH, "rr_depth": 3}
+        if self.denoiser is not None:
+            integrator = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal", "path": integrator}
+        scene: dict[str, Any] = {"type": "scene", "integrator": integrator}
         for number, part in enumerate(stage.parts):
             path = folder / f"{number}.ply"
             write_part(path, part)
@@ -199,6 +206,21 @@ def load_mitsuba(tracer: str, threads: int) -> Any:
     drjit.set_thread_count(threads)
     mitsuba.set_log_level(mitsuba.LogLevel.Error)  # the sampler warns when it rounds the number of paths up
     return mitsuba
+
+
+def load_denoiser() -> Any:
+    """Open Image Denoise.
+
+    Raises:
+        LinprimError: the extra is not installed.
+    """
+    try:
+        import pyoidn
+    except ImportError:
+        raise LinprimError(
+            "--denoise on wants Open Image Denoise, which is not installed: pip install linprim-geo[realism]"
+        ) from None
+    return pyoidn
 
 
 def write_part(path: Path, part: Part) -> None:

@@ -110,9 +110,10 @@ class TracedScene:
         """Loads the path tracer and meters the exposure by some of the training views.
 
         Raises:
-            LinprimError: Mitsuba is not installed.
+            LinprimError: Mitsuba is not installed, or Open Image Denoise where it is asked for.
         """
-        self.tracer = PathTracer(self.stage, self.options.tracer, self.options.threads)
+        denoise = self.options.denoise == "on"
+        self.tracer = PathTracer(self.stage, self.options.tracer, self.options.threads, denoise)
         chosen = np.linspace(0, len(self.train) - 1, min(METER_VIEWS, len(self.train))).astype(int)
         lights = [self.tracer.render(self.train[i], METER_SAMPLES, self._seed(2, i))[0] for i in chosen]
         self.exposure = self.meter_level / float(
