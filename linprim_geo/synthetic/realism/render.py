@@ -23,6 +23,9 @@ PASSES = 2
 """Renderings of a view that are averaged, after what is far brighter in one than in the others was cut. More of them
 would cut more, but the samples of each are stratified: one pass of 64 has the noise of four of 27."""
 
+SEEN_SAMPLES = 16
+"""Rays a pixel by which the denoiser knows what is seen: edges are blurred as those of the light."""
+
 FIREFLY = 3.0
 """A pixel of one pass may be this many times the mean of the others, plus FIREFLY_FLOOR of the mean of the image."""
 FIREFLY_FLOOR = 0.3
@@ -79,12 +82,17 @@ class PathTracer:
         images = np.stack(
             [np.array(mi.render(self.scene, sensor=sensor, spp=each, seed=PASSES * seed + i)) for i in range(PASSES)]
         ).astype(np.float32)
-        images, surfaces = without_outliers(images[..., :3]), images[..., 3:]
+        images = without_outliers(images)
         light, error = images.mean(0), images.std(0, ddof=1) / np.float32(np.sqrt(PASSES))
-        if self.denoiser is not None:
-            albedo, normal = (np.ascontiguousarray(part) for part in np.split(surfaces.mean(0), 2, axis=-1))
-            light = self.denoiser.denoise(light, albedo.clip(0, 1), normal, hdr=True)
-        return light, error
+        return (light if self.denoiser is None else self._denoised(light, sensor, seed)), error
+
+    def _denoised(self, light: np.ndarray, sensor: Any, seed: int) -> np.ndarray:
+        """Light (H, W, 3) as albedo and normal of what is seen tell noise from edges and textures."""
+        mi = self.mi
+        seen = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
+        found = np.array(mi.render(self.scene, sensor=sensor, integrator=seen, spp=SEEN_SAMPLES, seed=seed))
+        albedo, normal = (np.ascontiguousarray(part) for part in np.split(found[..., -6:].astype(np.float32), 2, -1))
+        return self.denoiser.denoise(light, albedo.clip(0, 1), normal, hdr=True)
 
     def _sensor(self, camera: Camera) -> dict[str, Any]:
         """Mitsuba's perspective camera looks along +z with x to the left and y up."""
@@ -115,10 +123,7 @@ class PathTracer:
 
     def _describe(self, stage: Stage, folder: Path) -> dict[str, Any]:
         mi = self.mi
-        integrator: dict[str, Any] = {"type": "path", "max_depth": MAX_DEPTH, "rr_depth": 3}
-        if self.denoiser is not None:
-            integrator = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal", "path": integrator}
-        scene: dict[str, Any] = {"type": "scene", "integrator": integrator}
+        scene: dict[str, Any] = {"type": "scene", "integrator": {"type": "path", "max_depth": MAX_DEPTH, "rr_depth": 3}}
         for number, part in enumerate(stage.parts):
             path = folder / f"{number}.ply"
             write_part(path, part)
