@@ -65,7 +65,7 @@ class PathTracer:
 
     def __init__(self, stage: Stage, tracer: str = "scalar", threads: int = 0, denoise: bool = False):
         self.mi = load_mitsuba(tracer, threads or usable_cores())
-        self.denoiser = load_denoiser() if denoise else None
+        self.denoiser: Any = load_denoiser() if denoise else None
         with tempfile.TemporaryDirectory(prefix="linprim-realism-") as name:
             description = self._describe(stage, Path(name))
             self.scene = self.mi.load_dict(description)
