@@ -199,7 +199,7 @@ class ShadedPlanes:
             if not small[region.row, region.column].any():
                 continue
             few = region.some(FIRST_BOXES)
-            least = min((fit.left_share for fit in self._before(few)), default=np.inf)
+            least = min((fit.left_share for fit in self._fits(few)), default=np.inf)
             if least > LEFT_SHARE:
                 continue
             far = self._far(self._in_all_views(few), least=1)
@@ -207,8 +207,8 @@ class ShadedPlanes:
                 self._mark(wall, region)
         return wall
 
-    def _before(self, region: ShadedRegion) -> Iterator[Fit]:
-        """How planes that are before all of a region carry its shading, where enough views show it."""
+    def _fits(self, region: ShadedRegion) -> Iterator[Fit]:
+        """How the planes that all rays of a region meet carry its shading, where enough views show it."""
         for plane, local in zip(self.planes, in_camera(self._camera(region), self.planes), strict=True):
             if (region.rays @ local > 0).all():
                 fit = evaluate(plane, [region], self.shadings)

@@ -98,9 +98,9 @@ class MergedFrames(Sequence):
         )
         seen = list(self.depths)
         masked = any(view.has_alpha for view in views)  # then masks say what is background
-        regions, backgrounds, plain_walls = self._take_planes(maps, rendered_depths, free)
+        regions, backgrounds, plain_walls = self._take_planes(maps, rendered_depths, () if masked else free)
         self.rendered = [_seen_past(*each) for each in zip(rendered, maps, backgrounds, strict=True)]
-        if not masked:
+        if plain_walls:
             self._end_at(plain_walls)
         self.shown = [frame.depth[::SAMPLED, ::SAMPLED] > 0 for frame in self.rendered]
         known = [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
@@ -122,7 +122,7 @@ class MergedFrames(Sequence):
         confirmed depths to them.
 
         Returns the plain regions of every view, and (H, W) bool: those that are background by their shading, and those
-        with `free` (H, W) rays that are walls by it.
+        with `free` (H, W) rays that are walls by it, if these are given.
         """
         sure = [_depth_where(found, found.is_confirmed(SURE)) for found in maps]
         regions = regions_of_views(maps, sure)
