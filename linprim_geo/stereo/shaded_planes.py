@@ -192,18 +192,15 @@ class ShadedPlanes:
 
     def is_wall(self, view: int, asked: np.ndarray) -> np.ndarray:
         """(H, W) bool: regions of a view, of those with a pixel that is `asked` (H, W), whose shading one of the planes
-        carries, and a background does not as well, as another view tells: of what no other looks at from elsewhere the
-        direction may be all that matters."""
+        carries clearly better than a background. Where no other view looks past the planes that way, nothing tells."""
         wall, small = self._nowhere(view), self.shadings[view].small(asked)
         for region in self.shown[view]:
             if not small[region.row, region.column].any():
                 continue
             few = region.some(FIRST_BOXES)
-            least = min((fit.left_share for fit in self._fits(few)), default=np.inf)
-            if least > LEFT_SHARE:
-                continue
             far = self._far(self._in_all_views(few), least=1)
-            if far is not None and far.left_share > HARDLY_MORE * least:
+            most = 0.0 if far is None else min(LEFT_SHARE, far.left_share / HARDLY_MORE)
+            if most > 0 and any(fit.left_share < most for fit in self._fits(few)):
                 self._mark(wall, region)
         return wall
 

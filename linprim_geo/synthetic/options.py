@@ -138,7 +138,7 @@ class SynthOptions:
     samples: int = option(128, "light paths a pixel of --realism", low=4, high=65536)
     denoise: str = option(
         "off",
-        "take the grain of these paths, which no camera has, away (Open Image Denoise)",
+        "on: remove the grain of these paths, which no camera has, by Open Image Denoise",
         choices=("on", "off"),
     )
     tracer: str = option(
