@@ -305,7 +305,7 @@ class RayCaster:
             u = np.einsum("ij,ij->i", triangles.edge2[index], across) / facing
             v = -np.einsum("ij,ij->i", triangles.edge1[index], across) / facing
             t = np.einsum("ij,ij->i", normal, to_origin) / facing
-        outside = ~((u >= 0.0) & (v >= 0.0) & (u + v <= 1.0)) & ~miss
+            outside = ~((u >= 0.0) & (v >= 0.0) & (u + v <= 1.0)) & ~miss
         if outside.any():
             rows = np.flatnonzero(outside)
             u_in, v_in = np.clip(np.nan_to_num(u[rows]), 0.0, 1.0), np.clip(np.nan_to_num(v[rows]), 0.0, 1.0)
