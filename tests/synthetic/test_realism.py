@@ -14,7 +14,7 @@ from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.synthetic.camera_paths import WALK_EYES, WALK_STEP, WALK_TURN_DEG, fibonacci_directions, look_at, walk
 from linprim_geo.synthetic.options import SynthOptions
-from linprim_geo.synthetic.realism import interiors, kitchen, parts, render, scenes, textures
+from linprim_geo.synthetic.realism import interiors, kitchen, outdoors, parts, render, scenes, terrace, textures
 from linprim_geo.synthetic.realism.parts import Material, Part
 from linprim_geo.synthetic.shapes import smooth_body
 from linprim_geo.synthetic.synth import synthesize
@@ -186,6 +186,86 @@ def test_the_walk_through_the_kitchen_is_free_and_sees_nearly_all_of_it(walked):
     assert (count >= 3).mean() > 0.92
     ceiling, floor = points[:, 2] > kitchen.HEIGHT - 1e-3, points[:, 2] < 0.02
     assert (count[ceiling] >= 3).mean() > 0.9 and (count[floor] >= 3).mean() > 0.85
+
+
+# A garden
+
+
+@pytest.fixture(scope="module")
+def terraced():
+    """The terrace as it is photographed by 40 views, and its rays."""
+    traced = scenes.TracedScene("terrace", None, SynthOptions(views=40, test_views=4, size=(64, 48), realism="terrace"))
+    return traced, RayCaster(traced.surface.vertices, traced.surface.faces)
+
+
+def test_a_hedge_and_a_crown_of_leaves_are_where_they_are_asked_for():
+    rng = np.random.default_rng(0)
+    hedge = outdoors.hedge((1.0, 2.0, 0.0), (1.0, 8.0, 0.0), 1.7, rng)
+    low, high = hedge.vertices.min(0), hedge.vertices.max(0)
+    np.testing.assert_allclose([*low, *high], [0.6, 2.0, 0.0, 1.4, 8.0, 1.7], atol=0.35)
+    assert np.median(hedge.vertices[:, 2]) > 1.0 and len(hedge.colors) == len(hedge.vertices)
+    leaves = outdoors.foliage("leaves", outdoors.crown(500, (3, 4, 5), (1, 2, 1), rng), 0.1, outdoors.GREEN, rng)
+    assert leaves.vertices.shape == (2000, 3) and leaves.faces.shape == (1000, 3) and leaves.faces.max() == 1999
+    assert (np.abs(leaves.vertices - [3, 4, 5]) < np.array([1, 2, 1]) * 1.16 + 0.1).all()
+    edge = leaves.vertices[leaves.faces[:, 0]] - leaves.vertices[leaves.faces[:, 1]]
+    assert np.linalg.norm(edge, axis=1).max() < 0.1
+
+
+def test_parts_that_are_painted_as_one_keep_their_shapes_and_colors():
+    red = parts.box("red", (0, 0, 0), (1, 1, 1), Material(color=(0.8, 0.1, 0.1)))
+    leaves = outdoors.foliage("leaves", np.zeros((3, 3)), 0.1, outdoors.GREEN, np.random.default_rng(0))
+    both = outdoors.painted("both", [red, leaves])
+    assert both.material == Material() and not both.smooth and both.uv is None
+    assert (both.colors[: len(red.vertices)] == (0.8, 0.1, 0.1)).all()
+    np.testing.assert_array_equal(both.colors[len(red.vertices) :], leaves.colors)
+    corners = np.concatenate([red.vertices[red.faces], leaves.vertices[leaves.faces]])
+    np.testing.assert_array_equal(both.vertices[both.faces], corners)
+
+
+def test_the_terrace_has_whole_faces_and_stands_on_its_lawn(terraced):
+    for part in terraced[0].stage.parts:
+        a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
+        flat = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1) < 1e-12
+        assert not flat.any() or part.smooth, part.name
+        assert flat.mean() <= 0.5, part.name
+        # Leaves and the roughness of the hedge reach a little into the ground.
+        assert (part.vertices[:, 2] > terrace.LAWN - 0.2).all(), part.name
+
+
+def test_the_walk_over_the_terrace_is_free(terraced):
+    traced, caster = terraced
+    probe = fibonacci_directions(500)
+    for view in traced.train + traced.test:
+        assert caster.cast(np.tile(view.center, (500, 1)), probe)[0].min() > 0.25
+
+
+def test_a_third_of_the_photographs_of_the_terrace_is_far_and_some_show_nothing_far(terraced):
+    traced, caster = terraced
+    far = []
+    for view in traced.train:
+        depth, face, _ = caster.render_depth(view)
+        y, x = np.mgrid[: view.height, : view.width] + 0.5
+        slant = np.sqrt(((x - view.cx) / view.fx) ** 2 + ((y - view.cy) / view.fy) ** 2 + 1.0)
+        far.append(((face < 0) | (depth * slant > 10.0)).mean())
+    assert 0.25 < np.mean(far) < 0.45
+    assert np.quantile(far, 0.2) < 0.02 and np.quantile(far, 0.6) > 0.4
+
+
+def test_the_backdrop_of_the_terrace_is_far_and_no_part_of_its_surface(terraced):
+    traced, caster = terraced
+    points = np.concatenate([part.vertices for part in traced.backdrop])
+    for view in traced.train + traced.test:
+        assert np.linalg.norm(points - view.center, axis=1).min() > 10.0
+    assert np.linalg.norm(points[:, :2], axis=1).max() > 300.0
+    assert len(caster.faces) == sum(len(part.faces) for part in traced.stage.parts)
+    assert caster.diagonal < 30.0
+
+
+def test_the_sun_of_the_day_is_where_it_is_asked_for():
+    sky = outdoors.day(0, (236.0, 50.0), 180)
+    row, column = np.unravel_index(sky.sum(-1).argmax(), sky.shape[:2])
+    assert abs(row + 0.5 - 40.0) <= 1.0 and abs(column - 236.0) <= 1.0
+    assert np.isfinite(sky).all() and (sky >= 0.0).all()
 
 
 @pytest.mark.parametrize(

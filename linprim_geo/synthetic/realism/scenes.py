@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -17,10 +17,11 @@ from linprim_geo.synthetic.realism.attic import attic_poses, attic_scene
 from linprim_geo.synthetic.realism.desk import desk_scene
 from linprim_geo.synthetic.realism.facade import facade_scene, street_poses
 from linprim_geo.synthetic.realism.kitchen import kitchen_poses, kitchen_scene
-from linprim_geo.synthetic.realism.parts import Material, quad
+from linprim_geo.synthetic.realism.parts import Material, Part, quad
 from linprim_geo.synthetic.realism.render import PathTracer, Stage
 from linprim_geo.synthetic.realism.shelf import shelf_scene
 from linprim_geo.synthetic.realism.statue import statue_scene
+from linprim_geo.synthetic.realism.terrace import terrace_backdrop, terrace_poses, terrace_scene
 from linprim_geo.synthetic.shapes import cad_part, smooth_body
 from linprim_geo.synthetic.textured import FileAlbedo, PieceColors, TexturedMesh
 
@@ -45,8 +46,9 @@ Poses = Callable[[int, int, int], tuple[list[np.ndarray], list[np.ndarray]]]
 
 @dataclass(frozen=True)
 class Scene:
-    """How a scene is built from its figure and a seed, how the camera goes, its horizontal field of view, and its
-    exposure (METER_SHARE), which is by the walls where lamps and windows are in the picture."""
+    """How a scene is built from its figure and a seed, how the camera goes, its horizontal field of view, its exposure
+    (METER_SHARE), which is by the walls where lamps and windows are in the picture, and by a seed what is far behind
+    it: that is in the pictures, but neither in the reference nor in depth maps and masks."""
 
     build: Callable[[TexturedMesh, int], Stage]
     poses: Poses
@@ -54,6 +56,7 @@ class Scene:
     fov_deg: float
     meter_share: float = METER_SHARE
     meter_level: float = METER_LEVEL
+    backdrop: Callable[[int], list[Part]] | None = None
 
 
 def arc_poses(target: tuple[float, float, float], distance: float, degrees: float, azimuth: float) -> Poses:
@@ -82,6 +85,9 @@ SCENES = {
         55.0,
     ),
     "statue": Scene(statue_scene, arc_poses((3.5, -3.5, 0.95), 1.2, 300.0, -90.0), "arc", 50.0),
+    "terrace": Scene(
+        terrace_scene, terrace_poses, "walk", 66.0, meter_share=0.9, meter_level=0.78, backdrop=terrace_backdrop
+    ),
 }
 
 
@@ -94,6 +100,7 @@ class TracedScene:
         self.meter_share, self.meter_level = scene.meter_share, scene.meter_level
         self.stage = scene.build(figure or smooth_body(), options.seed)
         self.surface = surface_of(self.stage, name)
+        self.backdrop = scene.backdrop(options.seed) if scene.backdrop else []
         self.fov = options.fov or scene.fov_deg
         train, test = scene.poses(options.views, options.test_views, options.seed)
         self.train, self.test = ([self._camera(pose) for pose in poses] for poses in (train, test))
@@ -113,7 +120,8 @@ class TracedScene:
             LinprimError: Mitsuba is not installed, or Open Image Denoise where it is asked for.
         """
         denoise = self.options.denoise == "on"
-        self.tracer = PathTracer(self.stage, self.options.tracer, self.options.threads, denoise)
+        stage = replace(self.stage, parts=[*self.stage.parts, *self.backdrop])
+        self.tracer = PathTracer(stage, self.options.tracer, self.options.threads, denoise)
         chosen = np.linspace(0, len(self.train) - 1, min(METER_VIEWS, len(self.train))).astype(int)
         lights = [self.tracer.render(self.train[i], METER_SAMPLES, self._seed(2, i))[0] for i in chosen]
         self.exposure = self.meter_level / float(
