@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from linprim_geo.capture.types import Scene
+from linprim_geo.capture.types import PointCloud, Scene
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.environment_map import filled, nearest_texel, texel_directions, texels_for
 from linprim_geo.kernels import ops
@@ -24,11 +24,11 @@ from linprim_geo.points.photo_evidence import VIEWS, Observations
 # The photographs' own colours at infinity are gathered with fewer, from views spread over the capture.
 SURVEY_TEXELS, SURVEY_VIEWS = 128, VIEWS
 # A scene is open where colours at infinity, as half of its photographs show them, explain this share of the textured
-# parts of the others (DECISIONS 96).
-OPEN_SHARE = 0.018
+# parts of the others, beyond chance (DECISIONS 125).
+OPEN_SHARE = 0.04
 # Where fewer of all patches are textured and known from the other half, as of few photographs, each is compared with
-# all, itself among them. It agrees with itself by chance, and what it explains counts so much less.
-LEAST_TEXTURED, BY_ITSELF = 0.02, 0.18
+# all, itself among them. It agrees with itself by chance, which varies, so what it explains counts half.
+LEAST_TEXTURED, BY_ITSELF = 0.03, 0.5
 # A patch is explained by the environment if its mean difference, of 255, is below this, or below this part of its
 # variation: noise of 12 averages to this over 4 by 4 pixels, and what is finer than a texel is filtered.
 SAME_COLOR, EXPLAINED = 3.0, 1 / 3
@@ -126,56 +126,81 @@ def far_colors(scene: Scene) -> FarColors:
 
 
 def far_share(scene: Scene, observations: Observations | None) -> float:
-    """Share of the textured patches of a scene's photographs that what they show at infinity explains; 0 where they do
-    not tell.
+    """Share of the textured patches of a scene's photographs that what they show at infinity explains, beyond what
+    agrees by chance; 0 where they do not tell.
 
     The colours of every second photograph are compared with the others and the other way round: one that is compared
-    with its own colours agrees by chance. Where halves know too little of each other it is, and counts less. Taken off
-    is the share at pixels that show the nearer half of the scene's points, which is large where the cameras are too
-    near to each other to tell.
+    with its own colours agrees by chance. Where halves know too little of each other it is, and counts less. Edges
+    along the motion of the camera agree at any distance, and everything does between cameras that hardly move: taken
+    off is the share that is explained with the parallax of the scene's points turned round, which nothing has.
 
     Args:
         observations: of SURVEY_VIEWS views, by which exposures are made alike; None if there are none.
     """
-    looks, points = evenly_spread_views(scene.train, SURVEY_VIEWS), scene.points
-    xyz = np.zeros((0, 3)) if points is None or isinstance(points, VolumePoints) else points.xyz
+    looks = evenly_spread_views(scene.train, SURVEY_VIEWS)
     if observations is not None:
         looks = [_brighter(look, 1 / gain) for look, gain in zip(looks, observations.gains, strict=True)]
-    halves = looks[::2], looks[1::2]
-    if all(halves):
-        pairs = [(FarColors(halves[1]), halves[0]), (FarColors(halves[0]), halves[1])]
-        share, known = _explained(pairs, xyz, LEAST_OTHERS)
-        if known >= LEAST_TEXTURED:
-            return share
-    share, known = _explained([(FarColors(looks), looks)], xyz, LEAST_VIEWS)
-    return BY_ITSELF * share if known else 0.0
+    turned = _turned_round(looks, scene.points)
+    share, known = _explained_by_halves(looks)
+    if known >= LEAST_TEXTURED:
+        return share - _explained_by_halves(turned)[0]
+    share, known = _explained([(FarColors(looks), looks)], LEAST_VIEWS)
+    by_chance = _explained([(FarColors(turned), turned)], LEAST_VIEWS)[0]
+    return BY_ITSELF * (share - by_chance) if known >= LEAST_TEXTURED else 0.0
 
 
-def _explained(
-    pairs: Sequence[tuple[FarColors, Sequence[SmallView]]], points: np.ndarray, least: int
-) -> tuple[float, float]:
+def _turned_round(small_views: Sequence[SmallView], points: PointCloud | None) -> list[SmallView]:
+    """The views, with cameras for which what is at infinity moves between them as the middle of the points does, but
+    the other way.
+
+    What a camera at c from the middle of all sees at (x, y, 1) in its own axes lies for it in the direction
+    depth (x, y, 1) - c, so its focal lengths are multiplied by 1 - c_z / depth and its principal point moves by
+    f c / depth. The depth is the median of those of the points, and twice the largest |c| at least.
+    """
+    centers = np.stack([small_view.camera.center for small_view in small_views])
+    centers = centers - centers.mean(0)
+    depths = [np.zeros(0)]
+    if points is not None and not isinstance(points, VolumePoints):
+        depths += [view.camera.project(points.xyz[in_image(view.camera, points.xyz)[0]])[1] for view in small_views]
+    seen = np.concatenate(depths)
+    depth = max(np.median(seen) if len(seen) else 0.0, 2 * np.linalg.norm(centers, axis=1).max(), 1e-12)
+    result = []
+    for small_view, center in zip(small_views, centers, strict=True):
+        camera, view = small_view.camera, copy(small_view)
+        x, y, z = camera.rotation @ center / depth
+        view.camera = replace(
+            camera,
+            fx=camera.fx * (1 - z),
+            fy=camera.fy * (1 - z),
+            cx=camera.cx + camera.fx * x,
+            cy=camera.cy + camera.fy * y,
+        )
+        result.append(view)
+    return result
+
+
+def _explained_by_halves(small_views: Sequence[SmallView]) -> tuple[float, float]:
+    """`_explained`, of every second view by the colours of the others and the other way round."""
+    halves = small_views[::2], small_views[1::2]
+    if not all(halves):
+        return 0.0, 0.0
+    return _explained([(FarColors(halves[1]), halves[0]), (FarColors(halves[0]), halves[1])], LEAST_OTHERS)
+
+
+def _explained(pairs: Sequence[tuple[FarColors, Sequence[SmallView]]], least: int) -> tuple[float, float]:
     """Of views, each with the colours at infinity that it is compared with: the share of the textured patches that
-    these explain, less that at the nearer half of (P, 3) points, and the share of all patches that are textured and
-    known from `least` views."""
-    everywhere, at_points, patches = [np.zeros(0, bool)], [np.zeros(0, bool)], 0
+    these explain, and the share of all patches that are textured and known from `least` views."""
+    good, patches = [np.zeros(0, bool)], 0
     for far, small_views in pairs:
         for small_view in small_views:
             difference, variation, views = far.compared(small_view)
             usable = (views >= least) & (variation > TEXTURED)
             if small_view.foreground is not None:
                 usable &= small_view.foreground[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
-            good = difference < EXPLAINED * variation
-            inside = in_image(small_view.camera, points)[0]
-            pixels, depth = small_view.camera.project(points[inside])
-            nearer = pixels[depth <= np.median(depth)] if len(depth) else pixels
-            row, column = (np.clip((nearer[:, 1 - k] / STRIDE).astype(np.int64), 0, views.shape[k] - 1) for k in (0, 1))
-            everywhere.append(good[usable])
-            at_points.append(good[row, column][usable[row, column]])
+            good.append((difference < EXPLAINED * variation)[usable])
             patches += usable.size
-    rest, chance = np.concatenate(everywhere), np.concatenate(at_points)
-    if not len(rest):
-        return 0.0, 0.0
-    return float(rest.mean() - (chance.mean() if len(chance) else 0.0)), len(rest) / patches
+    explained = np.concatenate(good)
+    return (float(explained.mean()), len(explained) / patches) if len(explained) else (0.0, 0.0)
 
 
 def _brighter(small_view: SmallView, factor: np.ndarray) -> SmallView:

@@ -289,7 +289,7 @@ _REGISTRY = (
     Effect(
         "environment",
         "what is far away stands at infinity behind everything, and in no mesh",
-        "textured parts of the photographs that colours at infinity explain",
+        "textured parts of the photographs that colours at infinity explain beyond chance",
         "%",
         100 * OPEN_SHARE,
         1.3,

@@ -28,18 +28,26 @@ def panorama(rays):
     return np.stack([value, 0.9 * value, 0.8 * value], -1)
 
 
-def scene_of(folder, pictures):
+def scene_of(folder, pictures, of_cameras=None):
     paths = []
     for number, picture in enumerate(pictures):
         paths.append(f"{number}.png")
         Image.fromarray(np.clip(np.rint(picture), 0, 255).astype(np.uint8)).save(folder / paths[-1])
-    (folder / "transforms.json").write_text(json.dumps(transforms(cameras(), paths)))
+    (folder / "transforms.json").write_text(json.dumps(transforms(of_cameras or cameras(), paths)))
     return load_scene(folder)
 
 
 def test_a_panorama_is_explained_by_half_of_the_photographs(tmp_path):
     scene = scene_of(tmp_path, [panorama(camera.world_rays()) for camera in cameras()])
     assert far_share(scene, None) > 0.5
+
+
+def test_edges_along_the_motion_agree_at_any_distance(tmp_path):
+    """A near wall with level stripes, passed by sideways: what is at infinity would look the same."""
+    passing = [look_at((x, -3.0, 0.0), (x, 0.0, 0.0), size=SIZE, focal=FOCAL) for x in np.linspace(-1, 1, VIEWS)]
+    height = passing[0].world_rays()[..., 2]
+    picture = np.repeat((120 + 60 * np.sin(25 * height))[..., None], 3, -1)
+    assert far_share(scene_of(tmp_path, [picture] * VIEWS, passing), None) < OPEN_SHARE
 
 
 def test_noise_agrees_with_itself_alone(tmp_path):

@@ -81,7 +81,7 @@ CASES = {
     "lens": bent_by,
     "exposure": observed("gain_spread", 0.05),
     "background": lambda part: data(found={"border": 0.8 * part}),
-    "environment": lambda part: data(found={"far": 0.018 * part}),
+    "environment": lambda part: data(found={"far": 0.04 * part}),
     "masks": share_of(has_alpha=True),
     "depth": share_of(depth_path="depth.png"),
     "normals": share_of(normal_path="normal.png"),
