@@ -96,9 +96,10 @@ class VoxelLevels:
             if not self.halvings.any():
                 self.lattice = coarse
                 return
-            if not (wanted > eighths / 8).any():  # what coarse voxels have lost stays lost
-                least = np.zeros_like(least)
-            eighths += 1
+            if (wanted > eighths / 8).any():
+                eighths += 1
+            else:  # what coarse voxels have lost stays lost, and what bends has its turn again
+                least, eighths = np.zeros_like(least), 0
 
     def mend(self, coarse: Mesh, fine: Mesh) -> bool:
         """Whether there were blocks where the `fine` surface, of the `lattice`, is torn; these have fewer levels then.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -154,6 +156,19 @@ def test_what_coarse_voxels_lose_has_the_usual_ones():
     assert on_rod(coarse.vertices) < on_rod(usual.vertices) / 20
     found = fused(rod, min_component=0)
     assert on_rod(found.vertices) > 0.8 * on_rod(usual.vertices)
+
+
+def test_where_the_usual_ones_are_too_many_faces_what_bends_is_divided_all_the_same(frames):
+    """Depths of the floor that its coarse surface does not explain ask for more faces than there may be."""
+    rng, off = np.random.default_rng(0), []
+    for frame in frames:
+        floor = np.abs(frame.depth * frame.camera.world_rays()[..., 2] + frame.camera.center[2]) < 1e-3
+        away = floor & (rng.random(floor.shape) < 0.15)
+        off.append(replace(frame, depth=np.where(away, 0.97 * frame.depth, frame.depth).astype(np.float32)))
+    lattice = coarse_lattice(frames)
+    surface = fuse_lattice(lattice, frames)
+    found = VoxelLevels(lattice, surface, off, 2.0 * len(surface.faces)).lattice
+    assert found is not lattice and (found.levels == 0).any() and (found.levels >= 2).any()
 
 
 def test_a_plane_alone_stays_coarse():
