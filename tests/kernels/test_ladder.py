@@ -11,6 +11,7 @@ import pytest
 import torch
 from helpers.octahedra import IMAGES, KERNELS, camera, fields, kernels, octahedra, random_scene
 
+from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels import ops
 from linprim_geo.kernels.reference import rasterize as reference
 
@@ -138,6 +139,31 @@ def test_single_precision_is_near_the_twin(variant, isa):
             assert_alike(leaves, view, options, False, 1e-4, 2e-3, rounded_twin_of(200 + seed, variant))
 
 
+@pytest.mark.parametrize("variant", VARIANTS, ids=NAMES)
+def test_largest_weights_and_counted_pixels_equal_the_twin(variant):
+    """Over several tiles and parts of blocks, and with rays that stop."""
+    most, stop = 0.0, 0.05
+    for seed in range(2):
+        leaves, view, options = scene_of(300 + seed, variant, size=(37, 29))
+        tensors = [p.detach() for p in leaves]
+        wanted = reference.rasterize(
+            *tensors,
+            world_to_camera=torch.from_numpy(view.world_to_camera),
+            fx=view.fx,
+            fy=view.fy,
+            cx=view.cx,
+            cy=view.cy,
+            width=view.width,
+            height=view.height,
+            **options | {"stop": stop},
+        )
+        out = ops.rasterize(*tensors, view, geometry=True, **options | {"stop": stop})
+        assert torch.equal(out.pixels.long(), wanted["pixels"])
+        torch.testing.assert_close(out.max_weight, wanted["max_weight"], rtol=0, atol=1e-12)
+        most = max(most, float(wanted["opacity"].max()))
+    assert most > 1 - stop  # some rays do stop
+
+
 def beside_the_view(primitive: str, count: int, least: float, size: float):
     """Primitives before the camera, `least` to 3 times `least` halves of the image from its middle, of `size` times
     their distance."""
@@ -202,3 +228,23 @@ def test_an_image_cut_out_of_another_shows_the_same(variant):
     images = [ops.rasterize(*tensors, view, **options).rgb for view in (whole, part)]
     assert float((images[1] - tensors[5][:, None, None]).abs().max()) > 0.05
     assert torch.allclose(images[0][..., 46:], images[1], atol=1e-10)
+
+
+@pytest.mark.parametrize("opacity", [1.0, 0.7])
+def test_an_alpha_at_its_limit_has_no_gradient(opacity):
+    """One Gaussian of standard deviation 1 over one pixel, 0.1 from its middle: alpha is min(0.99, opacity exp(-0.1^2 /
+    2)), and at 0.99 it moves with neither opacity nor place."""
+    view = Camera(1, 1, 10.0, 10.0, 0.5, 0.5, np.eye(4))
+    tensors = octahedra([[0.02, 0.0, 2.0]], [[0.2] * 3], [opacity], sh=[[[0.3] * 3]])
+    leaves = [p.requires_grad_() for p in tensors]
+    options = dict(primitive="gaussian", ray_model="affine", order="center", screen_filter=0.0)
+    shown = ops.rasterize(*leaves, view, **options).opacity
+    moved, _, _, faded, _, _ = gradients(shown.sum(), leaves)
+    shown = shown.detach()
+    # A focal length of 10 at a depth of 2: 5 pixels per unit. The ray leans by 0.01, which makes the variance 1.0001.
+    assert float(shown) == pytest.approx(min(0.99, opacity * np.exp(-(0.1**2) / 2)), rel=1e-5)
+    if opacity == 1:
+        assert not moved.any() and not faded.any()
+    else:
+        assert float(faded) == pytest.approx(float(shown) / opacity, rel=1e-12)
+        assert float(moved[0, 0]) == pytest.approx(-5 * 0.1 * float(shown), rel=1e-3)

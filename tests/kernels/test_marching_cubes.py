@@ -130,6 +130,17 @@ def test_parts_are_together_the_whole():
     assert len(found) == len(whole) and set(found) == whole
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_blocks_before_the_origin_are_like_those_behind_it(seed):
+    """Moved by two of the largest blocks, so that some lie on either side of it."""
+    index, level = blocks_of(random_levels(seed))
+    distance = np.random.default_rng(seed).standard_normal((len(index), RESOLUTION**3))
+    vertices, faces = marched(index, level, distance)
+    moved, same = marched(index - 2 * 2 ** (TOP - level[:, None]), level, distance)
+    assert np.array_equal(same, faces)
+    np.testing.assert_allclose(moved, vertices - 2 * RESOLUTION * 2**TOP, rtol=0, atol=1e-12)
+
+
 def test_there_is_no_surface_beside_unknown_voxels():
     index, level = blocks_of(random_levels(2))
     place = centers(index, level)

@@ -20,7 +20,7 @@ from helpers.textured_plane import (
 )
 
 from linprim_geo.geometry.mesh import Mesh
-from linprim_geo.kernels import ops
+from linprim_geo.kernels import ops, surface_ops
 from linprim_geo.surface import photo_consistency
 from linprim_geo.surface.normals import vertex_normals
 from linprim_geo.surface.photo_consistency import best_agreement, photo_gains, predicted_error, refine_surface
@@ -189,6 +189,44 @@ def test_the_core_adds_what_the_formulas_say(shown):
     assert same.sharpness[middle] == pytest.approx(rise[middle], abs=2e-3)
     assert (np.abs(same.offset / FOOTPRINT - best)[middle] <= 0.5 + 1e-6).all()
     assert np.abs(found.offset - same.offset)[middle].max() < FOOTPRINT
+
+
+@pytest.mark.parametrize("tilt", [0.0, 40.0, 70.0])
+def test_how_far_behind_the_surface_and_beside_a_jump_a_point_is_seen(tilt):
+    """At depth z, focal length f and a slope of t from one pixel to the next, up to z (1 + tan t) / f behind, and where
+    the depth jumps by up to 4 times as much."""
+    focal, size, outline = 100.0, 9, 4.0
+    angle, pose, lens = np.radians(tilt), np.eye(4)[:3], (focal, focal, size / 2, size / 2)
+    normal = np.array([[np.sin(angle), 0.0, -np.cos(angle)]])
+
+    def seen(depth, jump):
+        """Whether a point 2 before the camera is, with the surface `depth` before it."""
+        image, depths, jumps = (np.full((size, size), x, np.float32) for x in (0.5, depth, jump))
+        views, weight, sums = np.zeros(1, np.int32), np.zeros(1, np.float32), np.zeros((2, 1, 1), np.float32)
+        point, one, here = np.array([[0.0, 0.0, 2.0]]), np.ones(1), np.zeros(1)
+        rules = (photo_consistency.LEAST_COSINE, outline)
+        surface_ops.add_photo(pose, lens, image, depths, jumps, rules, here, point, normal, one, views, weight, *sums)
+        if views[0]:
+            assert weight[0] == pytest.approx(np.cos(angle), rel=1e-6)
+        return bool(views[0])
+
+    slope = 2 / focal * (1 + np.tan(angle))
+    assert seen(2 - 0.99 * slope, 0) and not seen(2 - 1.01 * slope, 0)
+    assert seen(2, 0.99 * outline * slope) and not seen(2, 1.01 * outline * slope)
+
+
+def test_a_footprint_is_what_a_pixel_covers_of_the_surface():
+    """z / (f cos t) for a surface that leans by t, f the geometric mean of both focal lengths; the least of all views
+    under less than 81 degrees."""
+    angle = np.radians([0.0, 30.0, 60.0, 85.0])
+    point, lens = np.tile([0.0, 0.0, 2.0], (4, 1)), (80.0, 125.0, 5.0, 5.0)
+    normal = np.stack([np.sin(angle), np.zeros(4), -np.cos(angle)], 1)
+    least = np.full(4, 9.0)
+    for away in (0.0, 1.0):
+        pose = np.eye(4)[:3]
+        pose[2, 3] = away  # the second view is one farther away
+        surface_ops.least_footprints(pose, lens, 10, 10, photo_consistency.LEAST_COSINE, point, normal, least)
+    assert least == pytest.approx([*(2 / (100 * np.cos(angle[:3]))), 9.0], rel=1e-12)
 
 
 def test_the_same_bytes_at_any_number_of_threads(shown, few_threads):
