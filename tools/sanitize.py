@@ -17,27 +17,28 @@ import sysconfig
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 from linprim_geo.base.cores import usable_cores
 
 ROOT = Path(__file__).resolve().parent.parent
 
 TESTS = (
-    "test_rasterize.py",
-    "test_rasterize_gradients.py",
-    "test_rasterize_interface.py",
-    "test_rasterize_invariants.py",
-    "test_level_depth.py",
-    "test_parallel.py",
-    "test_ladder.py",
-    "test_stability.py",
-    "test_photometric.py",
+    "kernels/test_rasterize.py",
+    "kernels/test_rasterize_gradients.py",
+    "kernels/test_rasterize_interface.py",
+    "kernels/test_rasterize_invariants.py",
+    "kernels/test_level_depth.py",
+    "kernels/test_parallel.py",
+    "kernels/test_ladder.py",
+    "eval/test_stability.py",
+    "kernels/test_photometric.py",
 )
 # `opcheck` traces through a compiler of its own, and a forked child has none of the sanitizers' threads.
 SKIPPED = "not registered_correctly and not forked"
 
-# The sanitized module under the installed one's name, before anything imports the package: an editable install's finder
-# comes before PYTHONPATH, sys.modules before both.
+# The module built here under the installed one's name, before anything imports the package: an editable install's
+# finder comes before PYTHONPATH, sys.modules before both.
 RUNNER = """
 import importlib.util, sys
 spec = importlib.util.spec_from_file_location("linprim_geo._core", sys.argv[1])
@@ -54,22 +55,23 @@ sys.exit(pytest.main(sys.argv[2:]))
 """
 
 
-def build(folder: Path, jobs: int) -> Path:
-    """Builds the sanitized core in `folder`; returns the module. Raises CalledProcessError where that fails."""
+def build(folder: Path, jobs: int, options: list[str], source: Path = ROOT, **how: Any) -> Path:
+    """Builds the core of `source` in `folder` with these options of CMake; returns the module. `how` goes to
+    subprocess.run. Raises CalledProcessError where that fails."""
     python = sys.executable
     nanobind = subprocess.run(
         [python, "-m", "nanobind", "--cmake_dir"], check=True, capture_output=True, text=True
     ).stdout.strip()
     tools = f"{Path(python).parent}{os.pathsep}{os.environ['PATH']}"
     cmake = shutil.which("cmake", path=tools) or "cmake"
-    options = ["-DLINPRIM_SANITIZE=ON", f"-Dnanobind_DIR={nanobind}", f"-DPython_EXECUTABLE={python}"]
+    options = [*options, f"-Dnanobind_DIR={nanobind}", f"-DPython_EXECUTABLE={python}"]
     if shutil.which("ninja", path=tools):
         options += ["-G", "Ninja", f"-DCMAKE_MAKE_PROGRAM={shutil.which('ninja', path=tools)}"]
-    subprocess.run([cmake, "-S", str(ROOT), "-B", str(folder), *options], check=True)
-    subprocess.run([cmake, "--build", str(folder), "--parallel", str(jobs)], check=True)
+    subprocess.run([cmake, "-S", str(source), "-B", str(folder), *options], check=True, **how)
+    subprocess.run([cmake, "--build", str(folder), "--parallel", str(jobs)], check=True, **how)
     found = sorted(folder.glob("_core*.so"))
     if len(found) != 1:
-        raise SystemExit(f"sanitize: expected one module _core*.so in {folder}, found {len(found)}")
+        raise SystemExit(f"{Path(sys.argv[0]).stem}: expected one module _core*.so in {folder}, found {len(found)}")
     return found[0]
 
 
@@ -93,19 +95,26 @@ def runtimes(folder: Path) -> str:
     return ":".join(paths)
 
 
+def run_pytest(module: Path, folder: Path, arguments: list[str], environment: dict[str, str], **how: Any) -> Any:
+    """Runs pytest with `module` in the place of the installed core; returns what subprocess.run does. Writes the
+    program that does so to `folder`."""
+    environment = os.environ | environment
+    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
+    environment.setdefault("OMP_NUM_THREADS", "1")
+    runner = folder / "run_tests.py"
+    runner.write_text(RUNNER)
+    return subprocess.run([sys.executable, str(runner), str(module), *arguments], env=environment, cwd=ROOT, **how)
+
+
 def test(module: Path, folder: Path, arguments: list[str]) -> int:
-    """Runs pytest on the module; returns its exit status."""
-    environment = os.environ | {
+    """Runs pytest on the module under the sanitizers; returns its exit status."""
+    environment = {
         "LD_PRELOAD": runtimes(folder),
         # Python leaves memory to the system at its end, so leaks say nothing; threads of torch outlive their stacks.
         "ASAN_OPTIONS": "detect_leaks=0:halt_on_error=1:abort_on_error=0:exitcode=99:detect_stack_use_after_return=0",
         "UBSAN_OPTIONS": "halt_on_error=1:print_stacktrace=1:exitcode=99",
-        "PYTHONPATH": os.pathsep.join([str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")]),
-        "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1"),
     }
-    runner = folder / "run_tests.py"
-    runner.write_text(RUNNER)
-    return subprocess.run([sys.executable, str(runner), str(module), *arguments], env=environment, cwd=ROOT).returncode
+    return run_pytest(module, folder, arguments, environment).returncode
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -120,7 +129,7 @@ def main(arguments: list[str] | None = None) -> int:
         print("sanitize: this preloads the sanitizers the way of Linux only", file=sys.stderr)
         return 1
     chosen = options.pytest or [
-        *(str(ROOT / "tests" / t) for t in TESTS if (ROOT / "tests" / t).exists()),
+        *(str(ROOT / "tests" / t) for t in TESTS),
         "-k",
         SKIPPED,
     ]
@@ -128,7 +137,7 @@ def main(arguments: list[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="linprim-sanitize-") as temporary:
         folder = options.keep.resolve() if options.keep else Path(temporary)
         try:
-            module = build(folder, options.jobs)
+            module = build(folder, options.jobs, ["-DLINPRIM_SANITIZE=ON"])
         except subprocess.CalledProcessError as error:
             print(f"sanitize: the build failed: {error}", file=sys.stderr)
             return 1
