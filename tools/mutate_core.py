@@ -220,7 +220,12 @@ MUTATIONS = {
     "surfel-row-below": _in("surface/surfels.cpp", "row = y - 1; row <= y + 1;", "row = y - 1; row < y + 1;", FUSING),
     # Marching cubes.
     "cubes-fan": _in("surface/marching_cubes.cpp", "while (crosses_a_face())", "if (crosses_a_face())", CUBES),
-    "cubes-negative-place": _in("surface/marching_cubes.cpp", "a >= 0 ? a / b : -((b - 1 - a) / b)", "a / b", CUBES),
+    "cubes-negative-parent": _in(
+        "surface/marching_cubes.cpp",
+        "return found->second;\n      for (int64_t& x : at) x >>= 1;",
+        "return found->second;\n      for (int64_t& x : at) x /= 2;",
+        CUBES,
+    ),
     # Photo-consistency.
     "photo-square-weight": _in(
         "surface/photo_consistency.cpp", "square[k] += weight * found * found", "square[k] += found * found", PHOTOS
