@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <array>
 #include <unordered_map>
-#include <unordered_set>
 #include <utility>
 
 #include "base/parallel.h"
@@ -90,23 +89,13 @@ uint64_t packed(const Index& at) {
   return uint64_t(at[0] + kHalf) << (2 * kIndexBits) | uint64_t(at[1] + kHalf) << kIndexBits | uint64_t(at[2] + kHalf);
 }
 
-int64_t floor_divide(int64_t a, int64_t b) { return a >= 0 ? a / b : -((b - 1 - a) / b); }
-
 // Which block is where.
 class BlockMap {
  public:
   explicit BlockMap(const VoxelBlocks& blocks) : blocks_(blocks) {
     for (int64_t row = 0; row < blocks.count; ++row) levels_ = std::max(levels_, int(blocks.level[row]) + 1);
-    rows_.resize(levels_), split_.resize(levels_);
-    for (int64_t row = 0; row < blocks.count; ++row) {
-      Index at = index(row);
-      int level = int(blocks.level[row]);
-      rows_[level].emplace(packed(at), row);
-      while (++level < levels_) {
-        for (int64_t& x : at) x >>= 1;
-        if (!split_[level].insert(packed(at)).second) break;
-      }
-    }
+    rows_.resize(levels_);
+    for (int64_t row = 0; row < blocks.count; ++row) rows_[blocks.level[row]].emplace(packed(index(row)), row);
   }
 
   Index index(int64_t row) const {
@@ -114,10 +103,8 @@ class BlockMap {
     return {at[0], at[1], at[2]};
   }
 
-  // The block of this level there, or the larger one that holds it; -1: none, kSmaller: there are smaller ones.
-  static constexpr int64_t kSmaller = -2;
+  // The block of this level there, or the larger one that holds it; -1: none, or smaller ones.
   int64_t find(Index at, int level) const {
-    if (split_[level].count(packed(at))) return kSmaller;
     for (; level < levels_; ++level) {
       const auto found = rows_[level].find(packed(at));
       if (found != rows_[level].end()) return found->second;
@@ -126,22 +113,10 @@ class BlockMap {
     return -1;
   }
 
-  // The block smaller than `level` that holds a place in finest voxels; -1: none.
-  int64_t find_smaller(const Index& place, int level) const {
-    while (level-- > 0) {
-      Index at;
-      for (int a = 0; a < 3; ++a) at[a] = floor_divide(place[a] >> level, blocks_.resolution);
-      const auto found = rows_[level].find(packed(at));
-      if (found != rows_[level].end()) return found->second;
-    }
-    return -1;
-  }
-
  private:
   const VoxelBlocks& blocks_;
   int levels_ = 1;
   std::vector<std::unordered_map<uint64_t, int64_t>> rows_;
-  std::vector<std::unordered_set<uint64_t>> split_;  // where there are blocks of smaller levels
 };
 
 // A vertex is named by the two voxels that it lies between, the first one in the upper half.
@@ -200,17 +175,17 @@ struct Marcher {
           bool mine = true;
           for (int c = 0; c < 8 && mine; ++c) {
             const int x = i - 1 + (c & 1), y = j - 1 + (c >> 1 & 1), z = k - 1 + (c >> 2);
-            int64_t found = around[side(x) + 3 * side(y) + 9 * side(z)];
+            const int64_t found = around[side(x) + 3 * side(y) + 9 * side(z)];
             if (found == row) {
               corner[c] = uint32_t(row * size + (int64_t(z) * n + y) * n + x);
               continue;
             }
+            mine = found >= 0 && (blocks.level[found] > level || found > row);
+            if (!mine) continue;
             // The voxel there that touches the cube's middle, by its finest part that does.
             Index place = {at[0] * n + i, at[1] * n + j, at[2] * n + k};
             for (int a = 0; a < 3; ++a) place[a] = (place[a] << level) - 1 + (c >> a & 1);
-            if (found == BlockMap::kSmaller) found = map.find_smaller(place, level);
-            mine = found >= 0 && (blocks.level[found] > level || (blocks.level[found] == level && found > row));
-            if (mine) corner[c] = voxel(found, place);
+            corner[c] = voxel(found, place);
           }
           if (mine) march(corner, out);
         }
