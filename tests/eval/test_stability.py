@@ -10,9 +10,9 @@ import mpmath
 import pytest
 import torch
 from helpers.hard_cases import CLASSES, generate, one_scene
+from helpers.octahedra import twin
 
 from linprim_geo.eval.hard_cases import compiled, many_scenes, rounding_bounds, stability
-from linprim_geo.kernels.reference import rasterize as reference
 
 pytestmark = pytest.mark.usefixtures("few_threads")
 
@@ -45,19 +45,7 @@ def test_the_reference_of_many_scenes_is_the_twin(name, ray_model):
                 parameters, view, options = one_scene(scenes, i)
                 if primitive == "octahedron" and not (parameters[2] > 0).all() or not parameters[1].any(dim=1).all():
                     continue  # what the twin does not take
-                wanted = reference.rasterize(
-                    *parameters,
-                    world_to_camera=torch.from_numpy(view.world_to_camera),
-                    fx=view.fx,
-                    fy=view.fy,
-                    cx=view.cx,
-                    cy=view.cy,
-                    width=view.width,
-                    height=view.height,
-                    order=order,
-                    geometry=False,
-                    **options,
-                )
+                wanted = twin(parameters, view, order=order, geometry=False, **options)
                 # The twin loses the digits of distance over thickness, and those that the kernel's own double set-up
                 # may lose.
                 off = rounding_bounds.rounding(scenes, many_scenes.chords(scenes), 2.0**-52, True)[i].sum()

@@ -9,11 +9,10 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from helpers.octahedra import IMAGES, KERNELS, camera, fields, kernels, octahedra, random_scene
+from helpers.octahedra import IMAGES, KERNELS, camera, fields, kernels, octahedra, random_scene, twin
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels import ops
-from linprim_geo.kernels.reference import rasterize as reference
 
 # What the core has: an order other than the centres' needs an entry, which a Gaussian has not.
 VARIANTS = [
@@ -74,18 +73,7 @@ def by_twin(leaves, view, options, geometry=(True,)):
     """{geometry: what `by_core` gives} of the twin in double precision, all from one of its images, which are the same
     with and without geometry."""
     inputs = [p.detach().double().requires_grad_() for p in leaves]
-    images = reference.rasterize(
-        *inputs,
-        world_to_camera=torch.from_numpy(view.world_to_camera),
-        fx=view.fx,
-        fy=view.fy,
-        cx=view.cx,
-        cy=view.cy,
-        width=view.width,
-        height=view.height,
-        geometry=any(geometry),
-        **options,
-    )
+    images = twin(inputs, view, geometry=any(geometry), **options)
     found = {}
     for each in geometry:
         names = IMAGES if each else IMAGES[:2]
@@ -146,17 +134,7 @@ def test_largest_weights_and_counted_pixels_equal_the_twin(variant):
     for seed in range(2):
         leaves, view, options = scene_of(300 + seed, variant, size=(37, 29))
         tensors = [p.detach() for p in leaves]
-        wanted = reference.rasterize(
-            *tensors,
-            world_to_camera=torch.from_numpy(view.world_to_camera),
-            fx=view.fx,
-            fy=view.fy,
-            cx=view.cx,
-            cy=view.cy,
-            width=view.width,
-            height=view.height,
-            **options | {"stop": stop},
-        )
+        wanted = twin(tensors, view, **options | {"stop": stop})
         out = ops.rasterize(*tensors, view, geometry=True, **options | {"stop": stop})
         assert torch.equal(out.pixels.long(), wanted["pixels"])
         torch.testing.assert_close(out.max_weight, wanted["max_weight"], rtol=0, atol=1e-12)

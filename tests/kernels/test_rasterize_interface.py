@@ -25,12 +25,12 @@ from helpers.octahedra import (
     leaves,
     octahedra,
     random_scene,
+    twin,
 )
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels import ops
-from linprim_geo.kernels.reference import rasterize as reference
 
 pytestmark = pytest.mark.usefixtures("few_threads")
 
@@ -136,18 +136,7 @@ def test_no_primitive_and_one_in_images_of_any_shape(variant, dtype):
         parameters = [p[:count] if i < 5 else p for i, p in enumerate(parameters)]
         assert assert_finite([p.to(dtype) for p in parameters], view, options) == (count == 1)
         if width == height == count == 1:
-            wanted = reference.rasterize(
-                *parameters,
-                world_to_camera=torch.from_numpy(view.world_to_camera),
-                fx=view.fx,
-                fy=view.fy,
-                cx=view.cx,
-                cy=view.cy,
-                width=1,
-                height=1,
-                geometry=False,
-                **options,
-            )
+            wanted = twin(parameters, view, geometry=False, **options)
             got = ops.rasterize(*[p.to(dtype) for p in parameters], view, **options).rgb.double()
             torch.testing.assert_close(got, wanted["rgb"], rtol=0, atol=1e3 * torch.finfo(dtype).eps)
 
