@@ -46,9 +46,11 @@ Poses = Callable[[int, int, int], tuple[list[np.ndarray], list[np.ndarray]]]
 
 @dataclass(frozen=True)
 class Scene:
-    """How a scene is built from its figure and a seed, how the camera goes, its horizontal field of view, its exposure
-    (METER_SHARE), which is by the walls where lamps and windows are in the picture, and by a seed what is far behind
-    it: that is in the pictures, but neither in the reference nor in depth maps and masks."""
+    """How a scene is built from its figure and a seed, how the camera goes, its horizontal field of view, and its
+    exposure (METER_SHARE), which is by the walls where lamps and windows are in the picture.
+
+    `backdrop` gives for a seed what is far behind it, which is in the pictures, but not in the reference, depth maps or
+    masks."""
 
     build: Callable[[TexturedMesh, int], Stage]
     poses: Poses
