@@ -1,9 +1,13 @@
 """Which of several planes plain regions lie on: by what is known along their edges.
 
 A wall that a region shows has points along the region's edges, where it meets other walls and where things hang on it;
-the others are those of occluders. Planes that happen to go through occluders have fewer. Only points on a region's own
-side of its edges count: beside a thing before a wall the others are on the wall. A plane is believed within the convex
-hull of its points alone: beyond, walls end.
+the others are those of occluders. Planes that happen to go through occluders have fewer, and those through the line in
+which two walls meet have points of both, but hold little of the region. Only points on a region's own side of its edges
+count: beside a thing before a wall the others are on the wall. A plane is believed within the convex hull of its points
+alone: beyond, walls end.
+
+Beside an edge stereo sees nothing but the edge, and its depth goes on into the region. There the plane is right; where
+a thing that no edge parts from the wall is before it, stereo is.
 """
 
 from __future__ import annotations
@@ -11,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.ndimage import label, uniform_filter
 from scipy.spatial import ConvexHull, QhullError
 
 from linprim_geo.geometry.camera import Camera
@@ -31,6 +36,11 @@ MOST_AGREE = 0.5
 # What stereo is sure of on a true plane is off by so much of the depth in the median, at most: the least of
 # `point_planes.TOLERANCES`.
 MEDIAN_OFF = TOLERANCE / 4
+# Of a region so many pixels, or up to twice as many, tell how much of it a plane's hull holds.
+SAMPLES = 1000
+# The side of the square around a pixel in which what is off its plane is a surface of its own if it is most of it.
+# Depths of an edge go on for up to ten pixels (`kCrossReach` of `csrc/stereo/cross.h`): twice as far each way.
+SURROUNDINGS = 41
 # Of one region and K planes: which of its N points are on which (N, K), and which it may lie on (K,).
 _Lying = tuple[np.ndarray, np.ndarray]
 
@@ -44,9 +54,10 @@ def region_plane_depths(
     """Of each view (H, W) float32 depth of its plain `regions` by the (K, 4) planes of the world on which they lie, NaN
     elsewhere, and (H, W) bool where a `known` (H, W) depth, NaN elsewhere, is that of such a plane but for its error.
 
-    A pixel lies on the plane with the most points along the edges of its region, of those within whose hull it is and
-    on which most known depths there are. Stereo errs beside edges, where it sees nothing else: a known depth within
-    TOLERANCE of the plane has its depth if all of these in the region are off by MEDIAN_OFF in the median at most.
+    A pixel lies on the plane with the most points along the edges of its region, times what its hull holds of it, of
+    those within whose hull it is and on which most known depths there are. Stereo errs beside edges: a known depth has
+    that of the plane if it is farther from it than TOLERANCE, but for surfaces of their own, which lie on no plane; one
+    within TOLERANCE if all of these in the region are off by MEDIAN_OFF in the median at most.
     """
     local = [in_camera(camera, planes) for camera in cameras]
     regions = [[region.within() for region in own] for own in regions]
@@ -57,9 +68,39 @@ def region_plane_depths(
         depths.append(np.full((camera.height, camera.width), np.nan, np.float32))
         moved.append(np.zeros((camera.height, camera.width), bool))
         for region, (on, fits) in zip(own, of_regions, strict=True):
-            most_first = [k for k in np.argsort(-on.sum(0), kind="stable") if fits[k]]
-            _lay(depths[-1], moved[-1], camera, region, of_view[most_first], [hulls[k] for k in most_first], sure)
+            numbers = np.flatnonzero(fits)
+            held = [_count_held(camera, region, of_view[number], hulls[number]) for number in numbers]
+            numbers = numbers[np.argsort(-on.sum(0)[numbers] * held, kind="stable")]
+            _lay(depths[-1], moved[-1], camera, region, of_view[numbers], [hulls[number] for number in numbers], sure)
+        laid = np.isfinite(depths[-1])
+        off = np.abs(sure / depths[-1] - 1) > TOLERANCE  # not where either is NaN
+        depths[-1][_are_surfaces(off, laid)] = np.nan
+        moved[-1] |= off & np.isfinite(depths[-1])
     return depths, moved
+
+
+def _are_surfaces(off: np.ndarray, laid: np.ndarray) -> np.ndarray:
+    """(H, W) bool: which depths that are `off` (H, W) the planes that are `laid` (H, W) are surfaces of their own, and
+    no bands along edges: pieces of which most have most of what is laid in their SURROUNDINGS off its plane, too."""
+    around, of_all = (uniform_filter(part.astype(np.float32), SURROUNDINGS) for part in (off, laid))
+    surrounded = off & (around > of_all / 2)
+    piece, count = label(off, np.ones((3, 3)))
+    sizes, inner = (np.bincount(piece[part], minlength=count + 1) for part in (off, surrounded))
+    return off & (inner > sizes / 2)[piece]
+
+
+def _count_held(camera: Camera, region: PlainRegion, plane: np.ndarray, hull: _Hull) -> int:
+    """How many of evenly sampled pixels of a region see a plane (3,) of the camera within its hull."""
+    row, column = np.nonzero(region.mask)
+    step = max(1, len(row) // SAMPLES)
+    rays = rays_of(camera, row[::step] + region.top, column[::step] + region.left)
+    return len(_held(camera, rays, rays @ plane, hull))
+
+
+def _held(camera: Camera, rays: np.ndarray, inverse: np.ndarray, hull: _Hull) -> np.ndarray:
+    """The numbers of (P, 3) rays that end within a plane's hull, by their `inverse` (P,) depths."""
+    before = np.flatnonzero(inverse > 0)
+    return before[hull.holds(to_world(camera, rays[before] / inverse[before, None]))]
 
 
 def _hulls(
@@ -93,9 +134,8 @@ def _lay(
     row, column = row + region.top, column + region.left
     rays, left = rays_of(camera, row, column), np.ones(len(row), bool)
     for plane, hull in zip(planes, hulls, strict=True):
-        inverse = rays @ plane
-        rows = np.flatnonzero(left & (inverse > 0))
-        rows = rows[hull.holds(to_world(camera, rays[rows] / inverse[rows, None]))]
+        inverse = np.where(left, rays @ plane, 0)
+        rows = _held(camera, rays, inverse, hull)
         off = known[row[rows], column[rows]] * inverse[rows] - 1
         count = np.count_nonzero(np.isfinite(off))
         enough = count >= max(LEAST_POINTS, SURE_SHARE * len(rows))

@@ -28,6 +28,7 @@ from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.lone_backgrounds import lone_backgrounds
 from linprim_geo.stereo.outlined_things import outlined_things
 from linprim_geo.stereo.plain_regions import (
+    TOLERANCE,
     PlainRegion,
     common_planes,
     edges_of,
@@ -119,7 +120,8 @@ class MergedFrames(Sequence):
         self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray], free: Sequence[np.ndarray]
     ) -> tuple[list[list[PlainRegion]], list[np.ndarray], list[np.ndarray]]:
         """Finds planes by points, by edges and by shading, of depths that are sure, and what lies on them; moves
-        confirmed depths to them.
+        confirmed depths to them. Planes by points are the most precise where those by edges are the same, and elsewhere
+        of points that err beside edges; of planes by edges and by shading the nearer one hides the other.
 
         Returns the plain regions of every view, and (H, W) bool: those that are background by their shading, and those
         with `free` (H, W) rays that are walls by it, if these are given.
@@ -139,7 +141,8 @@ class MergedFrames(Sequence):
             on_plane = point_plane_depth(maps[view], sure[view], by_points)
             backgrounds.append(shaded.is_background(view))
             along_edges[backgrounds[-1]] = np.nan
-            self.on_planes.append(_first_known((on_plane, by_shading, along_edges)))
+            on_plane = np.where(np.abs(on_plane / along_edges - 1) > TOLERANCE, along_edges, on_plane)
+            self.on_planes.append(_first_known((on_plane, np.fmin(along_edges, by_shading))))
             of_sure = _first_known((on_plane, np.where(moves, along_edges, np.float32(np.nan))))
             moved = np.where(np.isfinite(sure[view]), of_sure, self.on_planes[view])
             self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(moved), moved, depth)

@@ -107,6 +107,21 @@ def test_confirmed_depths_that_stereo_cannot_tell_from_a_plane_are_on_it(found, 
     assert (frame.depth[2:, :10] == 3).all() and (frame.depth[2:5, 10:20] == 3).all()
 
 
+def test_of_several_planes_that_of_a_regions_edges_stands_or_a_nearer_one_by_shading(found, monkeypatch):
+    """Planes by points, which are more precise, stand where those of edges are the same."""
+    found[0].confidence[:] = CONFIDENT
+    columns = np.arange(40)
+    by_points, along_edges, by_shading = (np.full((30, 40), np.nan, np.float32) for _ in range(3))
+    by_points[:, :20] = 3.001
+    along_edges[:] = np.where(columns < 10, 3.01, 3.2)
+    by_shading[:] = np.where(columns < 30, 3.4, 3.1)
+    monkeypatch.setattr(stereo_frames, "point_plane_depth", lambda *_: by_points)
+    monkeypatch.setattr(stereo_frames.ShadedPlanes, "depth_maps", lambda *_: [by_shading])
+    take_region_planes(monkeypatch, along_edges)
+    frame = MergedFrames(rendered(0.01), [VIEW], 5.0)[0]
+    assert np.allclose(frame.depth, np.select([columns < 10, columns < 30], [3.001, 3.2], 3.1))
+
+
 def test_spans_stand_where_nothing_is_known_and_photographs_have_no_edges(found, monkeypatch):
     edge = np.zeros((30, 40), bool)
     edge[:, 30:] = True
