@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from numbers import Integral
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.options import option
+from linprim_geo.base.options import changed_options, flag_of, option
 
 Color = tuple[float, float, float]
 
@@ -165,8 +165,14 @@ def check_together(options: SynthOptions, path: str, transparent: bool) -> None:
 
     Raises:
         LinprimError: a table that is no table or seen from below, an arc that is not walked, two backgrounds, JPEG or
-            motion blur with alpha, read noise of a sensor without electrons, points from distorted photographs.
+            motion blur with alpha, read noise of a sensor without electrons, points from distorted photographs, options
+            of path tracing for a scene without.
     """
+    for entry in changed_options(options):
+        if options.realism is None and entry.name in ("samples", "denoise", "tracer"):
+            raise LinprimError(
+                f"{flag_of(entry.name)} is {getattr(options, entry.name)}, but nothing is path-traced: wanted --realism"
+            )
     if 0 < options.table < 1:
         raise LinprimError(f"--table is {options.table}, wanted 0, or 1 to 100")
     if options.table and path not in ("arc", "hemisphere"):

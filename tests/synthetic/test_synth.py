@@ -362,6 +362,9 @@ def test_a_capture_of_a_mesh_file_far_from_the_origin(tmp_path):
         ({"point_noise": float("nan")}, "--point-noise"),
         ({"supersample": 0}, "supersample"),
         ({"depth_format": "exr"}, "npy"),
+        ({"samples": 64}, "--samples is 64, but nothing is path-traced"),
+        ({"denoise": "on"}, "--denoise is on, but nothing is path-traced"),
+        ({"tracer": "llvm"}, "--tracer is llvm, but nothing is path-traced"),
     ],
 )
 def test_options_without_meaning_are_refused_and_leave_nothing(tmp_path, options, words):

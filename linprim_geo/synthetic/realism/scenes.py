@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.options import changed_options, flag_of
 from linprim_geo.base.srgb import to_srgb
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.raycast import RayCaster
@@ -142,11 +143,12 @@ class TracedScene:
 
 def refuse_own(name: str, options: SynthOptions) -> None:
     """Raises LinprimError for options that a path-traced scene decides by itself."""
-    for entry in fields(SynthOptions):
-        value = getattr(options, entry.name)
-        if entry.name in OWN and value != entry.default:
-            flag = entry.name.replace("_", "-")
-            raise LinprimError(f"--{flag} is {value}, but the scene of --realism {name} has its own: leave it out")
+    for entry in changed_options(options):
+        if entry.name in OWN:
+            value = getattr(options, entry.name)
+            raise LinprimError(
+                f"{flag_of(entry.name)} is {value}, but the scene of --realism {name} has its own: leave it out"
+            )
 
 
 def surface_of(stage: Stage, name: str) -> TexturedMesh:
