@@ -26,6 +26,9 @@ PLAIN_SHARE, LEAST_OF_PLAIN = 0.1, 3.49 / 9
 DARKEST, BRIGHTEST = 3, 252
 # Regions have at least so many pixels (two windows of stereo) and so many confirmed depths within RING pixels.
 LEAST_PIXELS, LEAST_POINTS, RING = 200, 30, 4
+# Stereo gives the depth of an edge to pixels up to ten beside it (`kCrossReach` of `csrc/stereo/cross.h`): what has no
+# edge within twice as many is plain beyond doubt.
+WIDE = 20
 # Half of the grey values by which a cross parts two pixels (`csrc/stereo/cross.h`), and the side of the square
 # over which the grey of a region is taken.
 HALF_EDGE, AROUND = 12.5, 9
@@ -53,7 +56,7 @@ class PlainRegion:
     """A region of view `view` without texture: `mask` (`grown_alike`) of a window whose first pixel is (`top`, `left`);
     along its edges `rays` (N, 3) of depth 1 and `inverse` (N,) depths, of which those that are not `sure` (N,) are far
     and on no plane, and those that are `inner` (N,) within the mask; `corners` (5, 3) rays to its ends and its
-    middle."""
+    middle; `wide` of the mask what circles of WIDE pixels without an edge cover, and the edges beside these."""
 
     view: int
     top: int
@@ -64,6 +67,7 @@ class PlainRegion:
     sure: np.ndarray
     inner: np.ndarray
     corners: np.ndarray
+    wide: np.ndarray
 
     def within(self) -> PlainRegion:
         """The region with its inner points alone."""
@@ -122,6 +126,7 @@ def plain_regions(
     """Regions of (H, W) `grey` between edges; `depth` (H, W) is NaN where it is not known, and `sure` (H, W) where it
     is no far one that may be wrong."""
     labels, _ = label(~edge)
+    from_edge = distance_transform_edt(~edge)
     points, regions = np.isfinite(depth) & edge, []
     for number, (rows, columns) in enumerate(find_objects(labels), start=1):
         top, left = max(rows.start - RING, 0), max(columns.start - RING, 0)
@@ -139,8 +144,14 @@ def plain_regions(
         rays, corners = rays_of(camera, row + top, column + left), rays_of(camera, ends[:, 0] + top, ends[:, 1] + left)
         grown = grown_alike(mask, grey[window], edge[window])
         at_edge = sure[window][row, column], grown[row, column]
-        regions.append(PlainRegion(view, top, left, grown, rays, inverse, *at_edge, corners))
+        wide = grown & _near(mask & (from_edge[window] > WIDE), WIDE + RING)
+        regions.append(PlainRegion(view, top, left, grown, rays, inverse, *at_edge, corners, wide))
     return regions
+
+
+def _near(chosen: np.ndarray, reach: float) -> np.ndarray:
+    """(H, W) bool: what is no farther than so many pixels from those that are `chosen` (H, W)."""
+    return distance_transform_edt(~chosen) <= reach if chosen.any() else chosen
 
 
 def regions_of_views(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> list[list[PlainRegion]]:

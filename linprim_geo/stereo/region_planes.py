@@ -6,8 +6,8 @@ which two walls meet have points of both, but hold little of the region. Only po
 count: beside a thing before a wall the others are on the wall. A plane is believed within the convex hull of its points
 alone: beyond, walls end.
 
-Beside an edge stereo sees nothing but the edge, and its depth goes on into the region. There the plane is right; where
-a thing that no edge parts from the wall is before it, stereo is.
+Beside an edge stereo sees nothing but the edge, and its depth goes on into the region. There the plane is right, if the
+region is wide enough to tell; where a thing that no edge parts from the wall is before it, stereo is.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from linprim_geo.stereo.plain_regions import (
     BEHIND,
     LEAST_POINTS,
     TOLERANCE,
+    WIDE,
     PlainRegion,
     in_camera,
     may_lie_on,
@@ -39,8 +40,7 @@ MEDIAN_OFF = TOLERANCE / 4
 # Of a region so many pixels, or up to twice as many, tell how much of it a plane's hull holds.
 SAMPLES = 1000
 # The side of the square around a pixel in which what is off its plane is a surface of its own if it is most of it.
-# Depths of an edge go on for up to ten pixels (`kCrossReach` of `csrc/stereo/cross.h`): twice as far each way.
-SURROUNDINGS = 41
+SURROUNDINGS = 2 * WIDE + 1
 # Of one region and K planes: which of its N points are on which (N, K), and which it may lie on (K,).
 _Lying = tuple[np.ndarray, np.ndarray]
 
@@ -50,33 +50,37 @@ def region_plane_depths(
     regions: Sequence[Sequence[PlainRegion]],
     planes: np.ndarray,
     known: Sequence[np.ndarray],
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
+) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
     """Of each view (H, W) float32 depth of its plain `regions` by the (K, 4) planes of the world on which they lie, NaN
-    elsewhere, and (H, W) bool where a `known` (H, W) depth, NaN elsewhere, is that of such a plane but for its error.
+    elsewhere; (H, W) bool where a `known` (H, W) depth, NaN elsewhere, is that of such a plane but for its error; and
+    (H, W) bool where the plane stands against any other depth.
 
     A pixel lies on the plane with the most points along the edges of its region, times what its hull holds of it, of
-    those within whose hull it is and on which most known depths there are. Stereo errs beside edges: a known depth has
-    that of the plane if it is farther from it than TOLERANCE, but for surfaces of their own, which lie on no plane; one
-    within TOLERANCE if all of these in the region are off by MEDIAN_OFF in the median at most.
+    those within whose hull it is and on which most known depths there are. Stereo errs beside edges: in what is wide of
+    a region the plane stands, but for what is known of surfaces of their own. A known depth within TOLERANCE of a plane
+    has its depth if all of these in the region are off by MEDIAN_OFF in the median at most.
     """
     local = [in_camera(camera, planes) for camera in cameras]
     regions = [[region.within() for region in own] for own in regions]
     lying = [[may_lie_on(region, of_view) for region in own] for own, of_view in zip(regions, local, strict=True)]
     hulls = _hulls(cameras, regions, lying, planes)
-    depths, moved = [], []
+    depths, moved, stands = [], [], []
     for camera, own, of_regions, of_view, sure in zip(cameras, regions, lying, local, known, strict=True):
         depths.append(np.full((camera.height, camera.width), np.nan, np.float32))
         moved.append(np.zeros((camera.height, camera.width), bool))
+        wide = np.zeros((camera.height, camera.width), bool)
         for region, (on, fits) in zip(own, of_regions, strict=True):
             numbers = np.flatnonzero(fits)
             held = [_count_held(camera, region, of_view[number], hulls[number]) for number in numbers]
             numbers = numbers[np.argsort(-on.sum(0)[numbers] * held, kind="stable")]
             _lay(depths[-1], moved[-1], camera, region, of_view[numbers], [hulls[number] for number in numbers], sure)
-        laid = np.isfinite(depths[-1])
+            height, width = region.wide.shape
+            wide[region.top : region.top + height, region.left : region.left + width] |= region.wide
         off = np.abs(sure / depths[-1] - 1) > TOLERANCE  # not where either is NaN
-        depths[-1][_are_surfaces(off, laid)] = np.nan
-        moved[-1] |= off & np.isfinite(depths[-1])
-    return depths, moved
+        laid = np.isfinite(depths[-1])
+        stands.append(laid & wide & ~_are_surfaces(off, laid))
+        moved[-1] |= off & stands[-1]
+    return depths, moved, stands
 
 
 def _are_surfaces(off: np.ndarray, laid: np.ndarray) -> np.ndarray:

@@ -120,8 +120,8 @@ class MergedFrames(Sequence):
         self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray], free: Sequence[np.ndarray]
     ) -> tuple[list[list[PlainRegion]], list[np.ndarray], list[np.ndarray]]:
         """Finds planes by points, by edges and by shading, of depths that are sure, and what lies on them; moves
-        confirmed depths to them. Planes by points are the most precise where those by edges are the same, and elsewhere
-        of points that err beside edges; of planes by edges and by shading the nearer one hides the other.
+        confirmed depths to them. Planes by points are the most precise, but where another of a region's edges stands:
+        their points err beside edges. Of planes by edges and by shading the nearer one hides the other.
 
         Returns the plain regions of every view, and (H, W) bool: those that are background by their shading, and those
         with `free` (H, W) rays that are walls by it, if these are given.
@@ -136,12 +136,12 @@ class MergedFrames(Sequence):
         of_regions = zip(
             shaded.depth_maps(), *region_plane_depths(self.cameras, regions, shaded.planes, sure), strict=True
         )
-        for view, (by_shading, along_edges, moves) in enumerate(of_regions):
+        for view, (by_shading, along_edges, moves, stands) in enumerate(of_regions):
             depth = self.depths[view]
             on_plane = point_plane_depth(maps[view], sure[view], by_points)
             backgrounds.append(shaded.is_background(view))
             along_edges[backgrounds[-1]] = np.nan
-            on_plane = np.where(np.abs(on_plane / along_edges - 1) > TOLERANCE, along_edges, on_plane)
+            on_plane = np.where(stands & (np.abs(on_plane / along_edges - 1) > TOLERANCE), along_edges, on_plane)
             self.on_planes.append(_first_known((on_plane, np.fmin(along_edges, by_shading))))
             of_sure = _first_known((on_plane, np.where(moves, along_edges, np.float32(np.nan))))
             moved = np.where(np.isfinite(sure[view]), of_sure, self.on_planes[view])

@@ -297,7 +297,7 @@ def test_without_points_or_planes_there_is_nothing():
 
 def plain_region(camera, mask: np.ndarray) -> PlainRegion:
     """All of an image that is in a mask."""
-    return PlainRegion(0, 0, 0, mask, np.zeros((0, 3)), np.zeros(0), *np.zeros((2, 0), bool), np.zeros((5, 3)))
+    return PlainRegion(0, 0, 0, mask, np.zeros((0, 3)), np.zeros(0), *np.zeros((2, 0), bool), np.zeros((5, 3)), mask)
 
 
 def wall_and_region():

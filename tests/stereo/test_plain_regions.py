@@ -73,7 +73,9 @@ def test_far_points_that_are_not_sure_are_on_no_plane():
     rays = np.column_stack([rng.uniform(-1, 1, 100), rng.uniform(0.001, 0.5, 100), np.ones(100)])
     floor, sure = np.array([[0.0, 1.0, 0.0]]), np.arange(100) < 50
     for known, count in ((np.ones(100, bool), 100), (sure, 50)):
-        region = PlainRegion(0, 0, 0, np.ones((1, 1), bool), rays, rays @ floor[0], known, known, rays[:5])
+        region = PlainRegion(
+            0, 0, 0, *np.ones((1, 1, 1), bool), rays, rays @ floor[0], known, known, rays[:5], np.ones((1, 1), bool)
+        )
         on, fits = may_lie_on(region, floor)
         assert on.sum() == count and fits == [True] and not on[~known].any()
 

@@ -49,10 +49,13 @@ def test_confirmed_depths_take_the_place_of_rendered_ones(found):
     assert np.allclose(frame.confidence[1, :20], stereo_frames.DOUBTFUL_WEIGHT)
 
 
-def take_region_planes(monkeypatch, depth: np.ndarray, moved: np.ndarray | None = None) -> None:
-    """Gives the one view these depths by planes of its plain regions, and says which sure depths are moved to them."""
-    moved = np.zeros(depth.shape, bool) if moved is None else moved
-    monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: ([depth], [moved]))
+def take_region_planes(
+    monkeypatch, depth: np.ndarray, moved: np.ndarray | None = None, stands: np.ndarray | None = None
+) -> None:
+    """Gives the one view these depths by planes of its plain regions, and says which sure depths are moved to them and
+    where they stand against others."""
+    moved, stands = (np.zeros(depth.shape, bool) if given is None else given for given in (moved, stands))
+    monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: ([depth], [moved], [stands]))
 
 
 def test_planes_of_walls_stand_where_confirmed_depths_are_not_sure(found, monkeypatch):
@@ -108,16 +111,16 @@ def test_confirmed_depths_that_stereo_cannot_tell_from_a_plane_are_on_it(found, 
 
 
 def test_of_several_planes_that_of_a_regions_edges_stands_or_a_nearer_one_by_shading(found, monkeypatch):
-    """Planes by points, which are more precise, stand where those of edges are the same."""
+    """Planes by points, which are more precise, give way to another where that stands."""
     found[0].confidence[:] = CONFIDENT
     columns = np.arange(40)
     by_points, along_edges, by_shading = (np.full((30, 40), np.nan, np.float32) for _ in range(3))
     by_points[:, :20] = 3.001
-    along_edges[:] = np.where(columns < 10, 3.01, 3.2)
+    along_edges[:] = np.where(columns < 5, 3.01, 3.2)
     by_shading[:] = np.where(columns < 30, 3.4, 3.1)
     monkeypatch.setattr(stereo_frames, "point_plane_depth", lambda *_: by_points)
     monkeypatch.setattr(stereo_frames.ShadedPlanes, "depth_maps", lambda *_: [by_shading])
-    take_region_planes(monkeypatch, along_edges)
+    take_region_planes(monkeypatch, along_edges, stands=np.broadcast_to((columns < 5) | (columns >= 10), (30, 40)))
     frame = MergedFrames(rendered(0.01), [VIEW], 5.0)[0]
     assert np.allclose(frame.depth, np.select([columns < 10, columns < 30], [3.001, 3.2], 3.1))
 
