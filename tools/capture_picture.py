@@ -35,6 +35,8 @@ def picture(run_path: Path, views: list[int], height: int, turn: int, crop: list
     mesh = load_mesh(run.path / "mesh" / "tsdf" / "mesh.ply")
     grey = np.full(mesh.vertices.shape, GREY, np.uint8)
     held_out = run.scene().test
+    if not all(0 <= view < len(held_out) for view in views):
+        raise SystemExit(f"--views is {views}, wanted numbers from 0 to {len(held_out) - 1}: held-out views of the run")
     columns = []
     for view in (held_out[i] for i in views):
         cells = [
