@@ -26,8 +26,8 @@ PLAIN_SHARE, LEAST_OF_PLAIN = 0.1, 3.49 / 9
 DARKEST, BRIGHTEST = 3, 252
 # Regions have at least so many pixels (two windows of stereo) and so many confirmed depths within RING pixels.
 LEAST_PIXELS, LEAST_POINTS, RING = 200, 30, 4
-# Stereo gives the depth of an edge to pixels up to ten beside it (`kCrossReach` of `csrc/stereo/cross.h`): what has no
-# edge within twice as many is plain beyond doubt.
+# Stereo gives the depth of an edge to pixels up to ten beside it (DECISIONS 126): what has no edge within twice as many
+# is plain beyond doubt.
 WIDE = 20
 # Half of the grey values by which a cross parts two pixels (`csrc/stereo/cross.h`), and the side of the square
 # over which the grey of a region is taken.

@@ -70,8 +70,8 @@ def region_plane_depths(
         moved.append(np.zeros((camera.height, camera.width), bool))
         wide = np.zeros((camera.height, camera.width), bool)
         for region, (on, fits) in zip(own, of_regions, strict=True):
-            numbers = np.flatnonzero(fits)
-            held = [_count_held(camera, region, of_view[number], hulls[number]) for number in numbers]
+            numbers, rays = np.flatnonzero(fits), _sampled_rays(camera, region)
+            held = [len(_held(camera, rays, rays @ of_view[number], hulls[number])) for number in numbers]
             numbers = numbers[np.argsort(-on.sum(0)[numbers] * held, kind="stable")]
             _lay(depths[-1], moved[-1], camera, region, of_view[numbers], [hulls[number] for number in numbers], sure)
             height, width = region.wide.shape
@@ -93,12 +93,11 @@ def _are_surfaces(off: np.ndarray, laid: np.ndarray) -> np.ndarray:
     return off & (inner > sizes / 2)[piece]
 
 
-def _count_held(camera: Camera, region: PlainRegion, plane: np.ndarray, hull: _Hull) -> int:
-    """How many of evenly sampled pixels of a region see a plane (3,) of the camera within its hull."""
+def _sampled_rays(camera: Camera, region: PlainRegion) -> np.ndarray:
+    """(P, 3) rays of depth 1 of about SAMPLES pixels of a region, evenly taken."""
     row, column = np.nonzero(region.mask)
     step = max(1, len(row) // SAMPLES)
-    rays = rays_of(camera, row[::step] + region.top, column[::step] + region.left)
-    return len(_held(camera, rays, rays @ plane, hull))
+    return rays_of(camera, row[::step] + region.top, column[::step] + region.left)
 
 
 def _held(camera: Camera, rays: np.ndarray, inverse: np.ndarray, hull: _Hull) -> np.ndarray:
