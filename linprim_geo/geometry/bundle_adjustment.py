@@ -31,18 +31,27 @@ FOCAL_ERROR = 0.003
 @dataclass(frozen=True)
 class Adjusted:
     """Adjusted cameras; by how many pixels the given poses err, root mean square, by their rotations and by their
-    centres together; and the factor of all focal lengths."""
+    centres together; and the factor of all focal lengths and its deviation, as a share."""
 
     cameras: list[Camera]
     error_px: float
     focal_factor: float
+    focal_deviation: float
 
 
-def bundle_adjusted(cameras: Sequence[Camera], points: ObservedPoints, *, together: float = 1.0) -> Adjusted:
+def bundle_adjusted(
+    cameras: Sequence[Camera],
+    points: ObservedPoints,
+    *,
+    common: float = 0.0,
+    focal: tuple[float, float] = (1.0, FOCAL_ERROR),
+) -> Adjusted:
     """The most probable poses and focal lengths; `points` have two observations or more each.
 
     Args:
-        together: so many observations err alike and count as one.
+        common: the variance of an error that all observations of a photograph share, over that of each one's own: n of
+            them tell as much as n / (1 + n common) without it.
+        focal: the factor of all focal lengths that is known without the observations, and its deviation, as a share.
 
     Raises:
         numpy.linalg.LinAlgError: the observations determine nothing.
@@ -51,14 +60,15 @@ def bundle_adjusted(cameras: Sequence[Camera], points: ObservedPoints, *, togeth
 
     given, points = list(cameras), placed_points(cameras, points)
     depth = _median_depths(given, points)
-    focal = np.array([(camera.fx + camera.fy) / 2 for camera in given])
+    usual = np.median([(camera.fx + camera.fy) / 2 for camera in given])
     # Deviations of rotations about an axis, in radians, and of centres along one, in depths.
-    spread = np.full(2, FIRST_ERROR / 2 / np.median(focal))
-    moved, moves, log_factor = given, np.zeros((len(given), 6)), 0.0
+    spread = np.full(2, FIRST_ERROR / 2 / usual)
+    moves, log_factor, known = np.zeros((len(given), 6)), 0.0, np.log(focal[0])
+    moved = [_moved(camera, np.zeros(6), known) for camera in given]
     for _ in range(STEPS):
-        found = _Equations(moved, points, together)
+        found = _Equations(moved, points, common)
         variance = np.repeat(np.stack([np.full_like(depth, spread[0]), spread[1] * depth], 1) ** 2, 3, axis=1)
-        information = np.append(1 / variance, FOCAL_ERROR**-2)
+        information = np.append(1 / variance, focal[1] ** -2)
         reduced, right = found.reduced(information, np.append(moves, log_factor))
         if not np.isfinite(reduced).all():
             raise np.linalg.LinAlgError("observations behind all cameras, or at one of them")
@@ -67,12 +77,12 @@ def bundle_adjusted(cameras: Sequence[Camera], points: ObservedPoints, *, togeth
         points = replace(points, xyz=points.xyz + found.of_points(step))
         moves, log_factor = moves + step[:-1].reshape(-1, 6), log_factor + step[-1]
         moved = [_moved(camera, own, step[-1]) for camera, own in zip(moved, step[:-1].reshape(-1, 6), strict=True)]
-        covariance = np.diag(cho_solve(factor, np.eye(len(reduced)), check_finite=False))[:-1].reshape(-1, 6)
-        square = ((moves**2 + covariance) / np.repeat([np.ones_like(depth), depth**2], 3, axis=0).T).reshape(-1, 2, 3)
-        spread = np.sqrt(square.mean((0, 2)))
+        covariance = np.diag(cho_solve(factor, np.eye(len(reduced)), check_finite=False))
+        square = (moves**2 + covariance[:-1].reshape(-1, 6)) / np.repeat([np.ones_like(depth), depth**2], 3, axis=0).T
+        spread = np.sqrt(square.reshape(-1, 2, 3).mean((0, 2)))
     # Two axes of each move what is seen.
-    error = float(np.sqrt(2 * (spread**2).sum()) * np.median(focal))
-    return Adjusted(moved, error, float(np.exp(log_factor)))
+    error = float(np.sqrt(2 * (spread**2).sum()) * usual)
+    return Adjusted(moved, error, float(np.exp(known + log_factor)), float(np.sqrt(covariance[-1])))
 
 
 def placed_points(cameras: Sequence[Camera], points: ObservedPoints) -> ObservedPoints:
@@ -102,7 +112,7 @@ class _Equations:
     shifts by three along them. The last unknown is the logarithm of a factor of all focal lengths.
     """
 
-    def __init__(self, cameras: Sequence[Camera], points: ObservedPoints, together: float = 1.0):
+    def __init__(self, cameras: Sequence[Camera], points: ObservedPoints, common: float = 0.0):
         self.image, self.point = points.image, points.point
         self.cameras, self.points = len(cameras), len(points.xyz)
         turn = np.array([camera.rotation for camera in cameras])[self.image]
@@ -119,6 +129,7 @@ class _Equations:
             self.by_focal = np.einsum("nij,nj->ni", points.precision, self.by_focal)
         length = np.linalg.norm(miss, axis=1)
         noise = max(float(np.median(length[front])) / MEDIAN_LENGTH, LEAST_NOISE) if front.any() else 1.0
+        together = 1 + np.bincount(self.image, minlength=self.cameras)[self.image] * common
         weight = np.where(front, 1 / (1 + (length / (CAUCHY * noise)) ** 2) / (together * noise**2), 0)
         zero = np.zeros_like(z)
         by_local = np.stack([inner[0] / z, zero, -inner[0] * x / z**2, zero, inner[1] / z, -inner[1] * y / z**2], 1)

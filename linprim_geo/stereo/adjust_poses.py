@@ -4,7 +4,9 @@ Keypoints are matched and triangulated under the given poses. Poses are adjusted
 explain the other half better than the given ones do, they are adjusted to all. Exact poses fail this test: adjusted
 ones have errors of their own. Under the adjusted poses stereo of small copies finds surfaces, and the given ones are
 adjusted again, to where photographs show patches of these (`stereo.patch_tracks`), which are more exact than keypoints
-and are on walls, too. The half of the keypoints that took no part judges these, too.
+and are on walls, too. Photographs of plain walls have no keypoints and so no neighbours for stereo; what it has found
+in others says which of them show the same, and they join in another round. The half of the keypoints that took no part
+judges patches, too.
 """
 
 from __future__ import annotations
@@ -25,10 +27,11 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.feature_points import ObservedPoints, triangulate_features
 from linprim_geo.imaging.photos import cache_folder
 from linprim_geo.points.triangulate import digest_of, write_images
-from linprim_geo.stereo.patch_tracks import patch_tracks
+from linprim_geo.stereo.patch_tracks import patch_tracks, small_depth_maps
+from linprim_geo.stereo.point_planes import confirmed_points
 
 # Changed whenever poses come out differently.
-CACHE_VERSION = 3
+CACHE_VERSION = 4
 # Of more photographs so many, evenly spread, tell whether poses err. Adjusting needs all; the equations of all cameras
 # at once are dense, and with MOST_VIEWS take a minute.
 ASKED_VIEWS, MOST_VIEWS = 60, 500
@@ -46,9 +49,9 @@ LEFT_SHARE = 0.9
 # Exact poses of rendered scenes err by 0.04 pixels and less by keypoints, which have systematic errors of their own:
 # less than this is none.
 LEAST_ERROR_PX = 0.1
-# So many patches count as one: a highlight or a wrong slope moves all patches of a surface alike. The same for all, by
-# measurement: DECISIONS 86.
-TOGETHER = 36
+# The variance of an error that all patches of a photograph share, over that of each one's own: a highlight or a wrong
+# slope moves all patches of a surface alike. The same for all, by measurement: DECISIONS 127.
+COMMON_ERROR = 0.02
 # A photograph with patches in so many places goes by them: its pose has six unknowns, and a third of them may err.
 LEAST_PATCHES = 20
 
@@ -121,27 +124,39 @@ def _by_patches(
     views: Sequence[View], keypoints: Adjusted, points: ObservedPoints, seed: int, log: Callable[[str], None]
 ) -> Adjusted | None:
     """Poses by patches of surfaces that stereo finds under those by `keypoints`, which photographs with few keep; None
-    if there are none."""
-    nearly = [replace(view, camera=camera) for view, camera in zip(views, keypoints.cameras, strict=True)]
-    xyz = placed_points(keypoints.cameras, points).xyz
-    try:
-        tracks = patch_tracks(nearly, xyz, seed=seed)
-    except LinprimError as error:
-        log(f"poses: by keypoints alone: {error}")
-        return None
-    shown = np.bincount(tracks.image, minlength=len(views)) >= LEAST_PATCHES
-    if not shown.any():
-        return None
-    try:
-        done = bundle_adjusted([view.camera for view in views], tracks, together=TOGETHER)
-    except np.linalg.LinAlgError:  # patches do not determine them
-        return None
-    factor = done.focal_factor / keypoints.focal_factor
-    cameras = [
-        found if enough else replace(other, fx=factor * other.fx, fy=factor * other.fy)
-        for found, other, enough in zip(done.cameras, keypoints.cameras, shown, strict=True)
-    ]
-    return replace(done, cameras=cameras)
+    if there are none. Keypoints tell the focal length: highlights move patches as a wrong one does."""
+    known = placed_points(keypoints.cameras, points).xyz
+    cameras, done, shown = keypoints.cameras, None, np.zeros(len(views), bool)
+    while True:  # until all photographs have patches, or no more of them
+        nearly = [replace(view, camera=camera) for view, camera in zip(views, cameras, strict=True)]
+        try:
+            maps = small_depth_maps(nearly, known, seed=seed)
+        except LinprimError as error:
+            log(f"poses: by keypoints alone: {error}")
+            return None
+        tracks = patch_tracks(nearly, maps)
+        before, shown = np.count_nonzero(shown), np.bincount(tracks.image, minlength=len(views)) >= LEAST_PATCHES
+        if np.count_nonzero(shown) <= before:
+            return done
+        try:
+            done = bundle_adjusted(
+                [view.camera for view in views],
+                tracks,
+                common=COMMON_ERROR,
+                focal=(keypoints.focal_factor, keypoints.focal_deviation),
+            )
+        except np.linalg.LinAlgError:  # patches do not determine them
+            return None
+        factor = done.focal_factor / keypoints.focal_factor
+        cameras = [
+            found if enough else replace(other, fx=factor * other.fx, fy=factor * other.fy)
+            for found, other, enough in zip(done.cameras, keypoints.cameras, shown, strict=True)
+        ]
+        done = replace(done, cameras=cameras)
+        if shown.all():
+            return done
+        sure = [np.where(found.is_confirmed(), found.depth, np.float32(np.nan)) for found in maps]
+        known = np.concatenate([known, confirmed_points(maps, sure)[0].position])
 
 
 def _observed(views: Sequence[View], seed: int, threads: int) -> ObservedPoints:

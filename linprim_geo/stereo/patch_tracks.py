@@ -76,8 +76,8 @@ class _Patches:
     values: np.ndarray
 
 
-def patch_tracks(views: Sequence[View], points: np.ndarray, *, seed: int = 0) -> ObservedPoints:
-    """Where views see points of surfaces: `pixel` of the photographs in full size, and the `precision` of each.
+def small_depth_maps(views: Sequence[View], points: np.ndarray, *, seed: int = 0) -> list[DepthMap]:
+    """Depth maps of small copies of the photographs.
 
     Args:
         views: photographs whose poses are nearly right.
@@ -86,8 +86,17 @@ def patch_tracks(views: Sequence[View], points: np.ndarray, *, seed: int = 0) ->
     Raises:
         LinprimError: as `depth_maps`.
     """
+    return depth_maps([SmallCopy.within(view, LONGER_SIDE_OF_DEPTHS) for view in views], points, fit=False, seed=seed)
+
+
+def patch_tracks(views: Sequence[View], maps: Sequence[DepthMap]) -> ObservedPoints:
+    """Where views see points of surfaces: `pixel` of the photographs in full size, and the `precision` of each.
+
+    Args:
+        views: photographs whose poses are nearly right.
+        maps: their `small_depth_maps`.
+    """
     copies = [SmallCopy.within(view, LONGER_SIDE) for view in views]
-    maps = depth_maps([SmallCopy.within(view, LONGER_SIDE_OF_DEPTHS) for view in views], points, fit=False, seed=seed)
     image = lru_cache(IN_MEMORY)(lambda number: _Image.of(copies[number]))
     centers = np.array([view.camera.center for view in views])
     exact = np.eye(2) / LEAST_ERROR

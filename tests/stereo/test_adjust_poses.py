@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from linprim_geo.capture.adjusted_poses import AdjustedPoses
 from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.types import PHOTOGRAPHS
 from linprim_geo.geometry.camera import Camera
+from linprim_geo.points.view_pairs import visible_places
 from linprim_geo.runs.run import ADJUSTED_POSES, Run
 from linprim_geo.stereo import adjust_poses as module
 from linprim_geo.stereo.adjust_poses import adjusted_scene
@@ -28,9 +30,11 @@ from linprim_geo.training.train import train
 SIZE, FOCAL, COUNT, ERROR_PX = (240, 180), 200.0, 14, 1.0
 
 
-def true_cameras() -> list[Camera]:
+def true_cameras(turned: int = COUNT) -> list[Camera]:
+    """From the one numbered `turned` on each looks more to the left than the one before it."""
     places = [(-0.9 + 0.12 * i, -1.0 + 0.1 * (i % 4), 0.3 * np.sin(2.0 * i)) for i in range(COUNT)]
-    return [look_at(place, (1.5, 2.0, 0.2), SIZE, FOCAL) for place in places]
+    aims = [(1.5 - 0.3 * max(0, i + 1 - turned), 2.0, 0.2) for i in range(COUNT)]
+    return [look_at(place, aim, SIZE, FOCAL) for place, aim in zip(places, aims, strict=True)]
 
 
 def shaken(camera: Camera, rng: np.random.Generator) -> Camera:
@@ -42,19 +46,24 @@ def shaken(camera: Camera, rng: np.random.Generator) -> Camera:
     return replace(camera, world_to_camera=pose)
 
 
+def capture(root: Path, cameras: list[Camera], pictures: list[np.ndarray]) -> Path:
+    names = [f"{i:02d}.png" for i in range(COUNT)]
+    for name, picture in zip(names, pictures, strict=True):
+        Image.fromarray(picture).save(root / name)
+    (root / "transforms.json").write_text(json.dumps(transforms(cameras, names)))
+    return root
+
+
 @pytest.fixture(scope="module")
 def rooms(tmp_path_factory):
     """Two captures of one room, with exact poses and with wrong ones."""
     rng, true = np.random.default_rng(2), true_cameras()
-    names = [f"{i:02d}.png" for i in range(COUNT)]
-    pictures = [Image.fromarray(photograph(camera)) for camera in true]
-    roots = {}
-    for kind, cameras in (("exact", true), ("wrong", [shaken(camera, rng) for camera in true])):
-        roots[kind] = root = tmp_path_factory.mktemp(kind)
-        for name, picture in zip(names, pictures, strict=True):
-            picture.save(root / name)
-        (root / "transforms.json").write_text(json.dumps(transforms(cameras, names)))
-    return roots
+    pictures = list(map(photograph, true))
+    wrong = [shaken(camera, rng) for camera in true]
+    return {
+        kind: capture(tmp_path_factory.mktemp(kind), cameras, pictures)
+        for kind, cameras in (("exact", true), ("wrong", wrong))
+    }
 
 
 def off_px(scene) -> float:
@@ -68,14 +77,19 @@ def off_px(scene) -> float:
 
 def bent_px(scene) -> float:
     """The same after the best similarity of the world, which nothing in photographs tells."""
-    walls, true = np.random.default_rng(0).uniform(-1, 1, (300, 3)) * [0.6, 0.6, 0.4] + [1.4, 1.9, 0.2], true_cameras()
+    return float(np.sqrt(np.mean(bent_of_each(scene, true_cameras()) ** 2)))
+
+
+def bent_of_each(scene, true: list[Camera]) -> np.ndarray:
+    """(COUNT,) that of each view of the scene."""
+    walls = np.random.default_rng(0).uniform(-1, 1, (300, 3)) * [0.6, 0.6, 0.4] + [1.4, 1.9, 0.2]
     wanted = np.concatenate([true[int(view.name)].project(walls)[0] for view in scene.views])
 
     def off(moves: np.ndarray) -> np.ndarray:
         moved = (1 + moves[6]) * walls @ Rotation.from_rotvec(moves[:3]).as_matrix().T + moves[3:6]
         return (np.concatenate([view.camera.project(moved)[0] for view in scene.views]) - wanted).ravel()
 
-    return float(np.sqrt(2 * np.mean(np.square(least_squares(off, np.zeros(7)).fun))))
+    return np.sqrt(2 * np.square(least_squares(off, np.zeros(7)).fun).reshape(COUNT, -1).mean(1))
 
 
 def test_patches_are_more_exact_than_keypoints(rooms, tmp_path, monkeypatch):
@@ -83,13 +97,13 @@ def test_patches_are_more_exact_than_keypoints(rooms, tmp_path, monkeypatch):
     given, lines, counts = load_scene(rooms["wrong"]), [], []
     adjust = module.bundle_adjusted
 
-    def counted(*given, together=1, **how):
-        counts.append(together)
-        return adjust(*given, together=together, **how)
+    def counted(*given, common=0, **how):
+        counts.append(common)
+        return adjust(*given, common=common, **how)
 
     monkeypatch.setattr(module, "bundle_adjusted", counted)
     assert bent_px(adjusted_scene(given, cache=tmp_path / "patches", threads=1, log=lines.append)) < 0.006
-    assert counts == [1, 1, module.TOGETHER]  # half of the keypoints, all, patches
+    assert counts == [0, 0, module.COMMON_ERROR]  # half of the keypoints, all, patches
     monkeypatch.setattr(module, "LEAST_PATCHES", 10**6)
     keypoints = adjusted_scene(given, cache=tmp_path / "keypoints", threads=1, log=lines.append)
     assert 0.006 < bent_px(keypoints) < 0.02
@@ -97,7 +111,7 @@ def test_patches_are_more_exact_than_keypoints(rooms, tmp_path, monkeypatch):
     def fails(*given, **how):
         raise LinprimError("no room for stereo")
 
-    monkeypatch.setattr(module, "patch_tracks", fails)
+    monkeypatch.setattr(module, "small_depth_maps", fails)
     without = adjusted_scene(given, cache=tmp_path / "without", threads=1, log=lines.append)
     assert any("by keypoints alone: no room for stereo" in line for line in lines)
     for one, other in zip(keypoints.views, without.views, strict=True):
@@ -107,8 +121,8 @@ def test_patches_are_more_exact_than_keypoints(rooms, tmp_path, monkeypatch):
 def test_keypoints_judge_patches(rooms, tmp_path, monkeypatch):
     """Patches of one photograph in two move with it, as highlights would."""
 
-    def gliding(*given, **how):
-        tracks = patch_tracks(*given, **how)
+    def gliding(*given):
+        tracks = patch_tracks(*given)
         off = np.random.default_rng(1).normal(0, 3, (COUNT, 2))[tracks.image]
         return replace(tracks, pixel=tracks.pixel + off * (tracks.image % 2)[:, None])
 
@@ -117,6 +131,35 @@ def test_keypoints_judge_patches(rooms, tmp_path, monkeypatch):
     found = adjusted_scene(given, cache=tmp_path, threads=1, log=lines.append)
     assert any("contradict patches" in line for line in lines)
     assert bent_px(found) < 0.02
+
+
+@pytest.mark.parametrize("plain", [(), (COUNT - 1,)])
+def test_photographs_without_keypoints_join_by_what_stereo_finds_in_others(plain, tmp_path, monkeypatch):
+    """Four photographs turn away from all that has keypoints; of up to 1.3 pixels 0.008 at most are left of any. One
+    that is grey all over never joins, and keeps no others from it."""
+    true, turned, rng = true_cameras(COUNT - 4), np.arange(COUNT - 4, COUNT), np.random.default_rng(2)
+    pictures = [
+        np.full((SIZE[1], SIZE[0], 3), 90, np.uint8) if k in plain else photograph(c) for k, c in enumerate(true)
+    ]
+    given = load_scene(capture(tmp_path, [shaken(camera, rng) for camera in true], pictures))
+    find, rounds, number = module._observed, [], np.array([int(view.name) for view in given.views])
+
+    def without_keypoints(*asked):
+        points = find(*asked)
+        return points.chosen(~np.any([visible_places(true[k], points.xyz)[0] for k in turned], axis=0))
+
+    def counted(*asked):
+        tracks = patch_tracks(*asked)
+        rounds.append(np.bincount(number[tracks.image], minlength=COUNT) >= module.LEAST_PATCHES)
+        return tracks
+
+    monkeypatch.setattr(module, "_observed", without_keypoints)
+    monkeypatch.setattr(module, "patch_tracks", counted)
+    monkeypatch.setattr(module, "LEAST_POINTS", 50)
+    found = adjusted_scene(given, cache=tmp_path / "cache", threads=1, log=lambda line: None)
+    joining = ~np.isin(np.arange(COUNT), plain)
+    assert not rounds[0][turned].all() and (rounds[-1] == joining).all() and len(rounds) == 2 + len(plain)
+    assert bent_of_each(found, true)[joining[number]].max() < 0.03 < 0.1 < bent_of_each(given, true).min()
 
 
 def test_wrong_poses_are_adjusted_and_kept(rooms, tmp_path, monkeypatch):

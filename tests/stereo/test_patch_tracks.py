@@ -15,6 +15,7 @@ from linprim_geo.capture.small_copy import SmallCopy
 from linprim_geo.capture.types import Photo, View
 from linprim_geo.geometry.bundle_adjustment import placed_points, reprojection_px
 from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.feature_points import ObservedPoints
 from linprim_geo.stereo import patch_tracks as module
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.patch_tracks import (
@@ -25,6 +26,7 @@ from linprim_geo.stereo.patch_tracks import (
     _patches,
     _without_light,
     patch_tracks,
+    small_depth_maps,
 )
 
 SIZE, FOCAL, COUNT = (240, 180), 200.0, 7
@@ -67,6 +69,10 @@ def walls() -> np.ndarray:
     return points
 
 
+def tracks_of(views) -> ObservedPoints:
+    return patch_tracks(views, small_depth_maps(views, walls()))
+
+
 def off_px(tracks, views) -> np.ndarray:
     """Of each observation, from where its point would be seen, which is where true cameras see it together best."""
     cameras = [view.camera for view in views]
@@ -76,7 +82,7 @@ def off_px(tracks, views) -> np.ndarray:
 @pytest.mark.parametrize("deviation", [0.0, 0.7])
 def test_tracks_are_exact_whatever_the_poses(room, deviation):
     """Off by 0.018 and 0.021 pixels in the median, by 0.052 and 0.064 in the worst of ten."""
-    tracks = patch_tracks(shaken(room, deviation), walls())
+    tracks = tracks_of(shaken(room, deviation))
     assert len(tracks.xyz) > 300 and (np.bincount(tracks.image, minlength=COUNT) > 100).all()
     assert (tracks.track_length >= 3).all() and (np.diff(tracks.point) >= 0).all()
     off = off_px(tracks, room)
@@ -85,7 +91,7 @@ def test_tracks_are_exact_whatever_the_poses(room, deviation):
 
 def test_points_lie_on_the_walls(room):
     """Off by 0.0034 of a depth of 3 to 4 in the median; by 0.0094 where planes are half a pixel off."""
-    points = patch_tracks(room, walls()).xyz
+    points = tracks_of(room).xyz
     assert np.median(np.abs(np.abs(points).max(1) - HALF)) < 0.006
 
 
@@ -116,14 +122,14 @@ def test_light_moves_no_patch(room):
     """Off by 0.021 pixels in the median."""
     across = np.linspace(0.7, 1.0, SIZE[0])[:, None]
     lit = [replace(view, rgb=(view.rgb * (across if i % 2 else 0.8)).astype(np.uint8)) for i, view in enumerate(room)]
-    off = off_px(patch_tracks(lit, walls()), room)
+    off = off_px(tracks_of(lit), room)
     assert np.median(off) < 0.03
 
 
 def test_pixels_are_those_of_whole_photographs(room, monkeypatch):
     """Off by 0.028 pixels in the median, by 0.077 in the worst of ten."""
     monkeypatch.setattr(module, "LONGER_SIDE", 120)
-    tracks = patch_tracks(room, walls())
+    tracks = tracks_of(room)
     assert len(tracks.xyz) > 100 and tracks.pixel[:, 0].max() > 180
     off = off_px(tracks, room)
     assert np.median(off) < 0.04 and np.quantile(off, 0.9) < 0.12
@@ -133,7 +139,7 @@ def test_pixels_are_those_of_whole_photographs(room, monkeypatch):
 
 def test_without_texture_there_is_none(room):
     grey = [replace(view, rgb=np.full_like(view.rgb, 120)) for view in room]
-    tracks = patch_tracks(grey, walls())
+    tracks = tracks_of(grey)
     assert tracks.xyz.shape == (0, 3) and tracks.pixel.shape == (0, 2) and tracks.precision.shape == (0, 2, 2)
 
 
