@@ -23,6 +23,7 @@ from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.held_planes import ALIKE_DEPTH, AS_WELL, HARDLY_MORE, MOST_BOXES, HeldPlanes
 from linprim_geo.stereo.meeting_lines import is_same, on_meeting_lines
 from linprim_geo.stereo.plain_regions import (
+    BEHIND,
     SAME_ANGLE,
     TOLERANCE,
     in_camera,
@@ -337,7 +338,7 @@ class ShadedPlanes:
         carries, none where they are of too few views.
 
         A plane by edges that is one by points takes its place and stays as it is, as if it carried nothing, unless that
-        one is askew.
+        one is askew. Two by edges are told apart by their points, although faint shading may be carried by both.
         """
         count = len(self.planes)
         shared, carried = np.zeros((count, count)), [list[ShadedRegion]() for _ in range(count)]
@@ -354,11 +355,15 @@ class ShadedPlanes:
                 self.planes[k] = np.sign(self.planes[same, :3] @ self.planes[k, :3]) * self.planes[same]
                 carried[k] = []
             copied = [j for j in kept if shared[j, k] > CARRIED_SHARE * shared[k, k]]
-            if same is not None or not any(self._same(j, k, carried[k], ALIKE_DEPTH) for j in copied):
+            if same is not None or not any(self._same(j, k, carried[k], self._most_apart(j, k)) for j in copied):
                 kept.append(k)
         kept = sorted([*range(self.by_points), *kept])
         self.planes, self.given_count = self.planes[kept], sum(k < self.given_count for k in kept)
         return [carried[k] if self._of_several_views(self.planes[at], carried[k]) else [] for at, k in enumerate(kept)]
+
+    def _most_apart(self, first: int, second: int) -> float:
+        """The share of the depth by which copies of each other differ at most."""
+        return BEHIND * TOLERANCE if max(first, second) < self.given_count else ALIKE_DEPTH
 
     def _are_askew(self) -> np.ndarray:
         """(by_points,) bool which planes by points are nearly, but not quite along the frame of all of these."""

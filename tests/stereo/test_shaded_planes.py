@@ -169,6 +169,15 @@ def test_a_wall_that_edges_give_twice_is_one_plane():
     assert share > 0.7 and np.quantile(off, 0.95) < 0.005
 
 
+def test_planes_that_edges_tell_apart_stay_two_where_faint_light_does_not():
+    """A wall and one 4 % of the depth behind it, by light that deviates by 13 grey values."""
+    maps, depths = photographs(lambda points, view: 60 + 0.3 * light(points))
+    for apart, count in ((0.02, 1), (0.08, 2)):
+        found = planes_of(maps, depths, by_edges=np.array([WALL, WALL - [0, 0, 0, apart]]))
+        assert len(found.planes) == count
+    assert np.abs(found.planes[:, 3] - [0, -0.08]).max() < 0.005
+
+
 def test_a_plane_that_edges_give_is_the_one_that_points_give():
     maps, depths = photographs(lambda points, view: light(points))
     by_points = np.array([tilted(0.1)])
