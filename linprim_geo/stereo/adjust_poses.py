@@ -146,7 +146,7 @@ def _by_patches(
                 focal=(keypoints.focal_factor, keypoints.focal_deviation),
             )
         except np.linalg.LinAlgError:  # patches do not determine them
-            return None
+            return done
         factor = done.focal_factor / keypoints.focal_factor
         cameras = [
             found if enough else replace(other, fx=factor * other.fx, fy=factor * other.fy)
