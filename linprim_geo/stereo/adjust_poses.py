@@ -123,8 +123,9 @@ def _adjusted(views: Sequence[View], seed: int, threads: int, log: Callable[[str
 def _by_patches(
     views: Sequence[View], keypoints: Adjusted, points: ObservedPoints, seed: int, log: Callable[[str], None]
 ) -> Adjusted | None:
-    """Poses by patches of surfaces that stereo finds under those by `keypoints`, which photographs with few keep; None
-    if there are none. Keypoints tell the focal length: highlights move patches as a wrong one does."""
+    """Poses by patches of surfaces that stereo finds under those by `keypoints`, which photographs with few patches
+    keep; None if there are none. In rounds, as what one has found lets more photographs join. Keypoints tell the focal
+    length: highlights move patches as a wrong one does."""
     known = placed_points(keypoints.cameras, points).xyz
     cameras, done, shown = keypoints.cameras, None, np.zeros(len(views), bool)
     while True:  # until all photographs have patches, or no more of them

@@ -166,7 +166,8 @@ def test_few_observations_count_for_more_each_where_all_err_together():
 
 @pytest.mark.parametrize("factor", [0.995, 1.0])
 def test_a_known_focal_length_stays_as_far_as_it_is_known(factor):
-    """Cameras in a plane before a plane tell hardly any: what is known decides, and the deviation says how far."""
+    """Of 40 points: what is known to 0.00001 decides, what is known to 0.003 is told better by the points, and the
+    deviation says how far."""
     rng = np.random.default_rng(7)
     true = cameras_around()
     given = [replace(camera, fx=camera.fx / factor, fy=camera.fy / factor) for camera in shaken(true, rng, 0.5)]
