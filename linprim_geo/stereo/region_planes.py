@@ -4,7 +4,8 @@ A wall that a region shows has points along the region's edges, where it meets o
 the others are those of occluders. Planes that happen to go through occluders have fewer, and those through the line in
 which two walls meet have points of both, but hold little of the region. Only points on a region's own side of its edges
 count: beside a thing before a wall the others are on the wall. A plane is believed within the convex hull of its points
-alone: beyond, walls end.
+alone: beyond, walls end. One through the edges of several occluders hangs in the air, and photographs that see what is
+behind it refuse it.
 
 Beside an edge stereo sees nothing but the edge, and its depth goes on into the region. There the plane is right, if the
 region is wide enough to tell; where a thing that no edge parts from the wall is before it, stereo is.
@@ -15,14 +16,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import label, uniform_filter
+from scipy.ndimage import distance_transform_edt, label, uniform_filter
 from scipy.spatial import ConvexHull, QhullError
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.stereo.enclosing_planes import SURE_SHARE
 from linprim_geo.stereo.plain_regions import (
     BEHIND,
+    BEHIND_SHARE,
     LEAST_POINTS,
+    RING,
     TOLERANCE,
     WIDE,
     PlainRegion,
@@ -31,12 +34,15 @@ from linprim_geo.stereo.plain_regions import (
     rays_of,
     to_world,
 )
+from linprim_geo.stereo.seen_through import KnownDepths
 
 # Of what stereo is sure of within a region so much is on its plane, if it is sure of enough.
 MOST_AGREE = 0.5
 # What stereo is sure of on a true plane is off by so much of the depth in the median, at most: the least of
 # `point_planes.TOLERANCES`.
 MEDIAN_OFF = TOLERANCE / 4
+# Stereo gives the depth of an edge to pixels so far beside it; regions go on to the middle of edges (`grown_alike`).
+EDGE_REACH = WIDE // 2 + RING
 # Of a region so many pixels, or up to twice as many, tell how much of it a plane's hull holds.
 SAMPLES = 1000
 # The side of the square around a pixel in which what is off its plane is a surface of its own if it is most of it.
@@ -64,16 +70,17 @@ def region_plane_depths(
     regions = [[region.within() for region in own] for own in regions]
     lying = [[may_lie_on(region, of_view) for region in own] for own, of_view in zip(regions, local, strict=True)]
     hulls = _hulls(cameras, regions, lying, planes)
+    telling = [_without_bands(depth, own) for depth, own in zip(known, regions, strict=True)]
+    views = KnownDepths(cameras, telling)
     depths, moved, stands = [], [], []
-    for camera, own, of_regions, of_view, sure in zip(cameras, regions, lying, local, known, strict=True):
+    of_views = zip(cameras, regions, lying, local, known, telling, strict=True)
+    for camera, own, of_regions, of_view, sure, tell in of_views:
         depths.append(np.full((camera.height, camera.width), np.nan, np.float32))
         moved.append(np.zeros((camera.height, camera.width), bool))
         wide = np.zeros((camera.height, camera.width), bool)
         for region, (on, fits) in zip(own, of_regions, strict=True):
-            numbers, rays = np.flatnonzero(fits), _sampled_rays(camera, region)
-            held = [len(_held(camera, rays, rays @ of_view[number], hulls[number])) for number in numbers]
-            numbers = numbers[np.argsort(-on.sum(0)[numbers] * held, kind="stable")]
-            _lay(depths[-1], moved[-1], camera, region, of_view[numbers], [hulls[number] for number in numbers], sure)
+            best = _best_first(camera, region, of_view, hulls, on.sum(0) * fits, views)
+            _lay(depths[-1], moved[-1], camera, region, of_view[best], [hulls[k] for k in best], sure, tell)
             height, width = region.wide.shape
             wide[region.top : region.top + height, region.left : region.left + width] |= region.wide
         off = np.abs(sure / depths[-1] - 1) > TOLERANCE  # not where either is NaN
@@ -91,6 +98,39 @@ def _are_surfaces(off: np.ndarray, laid: np.ndarray) -> np.ndarray:
     piece, count = label(off, np.ones((3, 3)))
     sizes, inner = (np.bincount(piece[part], minlength=count + 1) for part in (off, surrounded))
     return off & (inner > sizes / 2)[piece]
+
+
+def _best_first(
+    camera: Camera,
+    region: PlainRegion,
+    planes: np.ndarray,
+    hulls: Sequence[_Hull],
+    counts: np.ndarray,
+    views: KnownDepths,
+) -> list[int]:
+    """The numbers of those (K, 3) planes of the camera that views do not see through in the region; first the one with
+    the most of `counts` (K,) points along its edges, times what the plane's hull holds of it."""
+    rays, held = _sampled_rays(camera, region), np.zeros(len(planes))
+    for number in np.flatnonzero(counts).tolist():
+        inverse = rays @ planes[number]
+        rows = _held(camera, rays, inverse, hulls[number])
+        through = views.see_through(to_world(camera, rays[rows] / inverse[rows, None]))
+        if np.count_nonzero(through) <= BEHIND_SHARE * len(rows):
+            held[number] = len(rows)
+    order = np.argsort(-counts * held, kind="stable")
+    return order[: np.count_nonzero(held)].tolist()
+
+
+def _without_bands(known: np.ndarray, regions: Sequence[PlainRegion]) -> np.ndarray:
+    """(H, W) `known` depths but for those that may be of an edge beside them, in regions of which most is wide: of
+    others these are all that tells."""
+    known = known.copy()
+    for region in regions:
+        if np.count_nonzero(region.wide) > np.count_nonzero(region.mask) / 2:
+            beside = region.mask & (distance_transform_edt(np.pad(region.mask, 1))[1:-1, 1:-1] <= EDGE_REACH)
+            row, column = np.nonzero(beside)
+            known[row + region.top, column + region.left] = np.nan
+    return known
 
 
 def _sampled_rays(camera: Camera, region: PlainRegion) -> np.ndarray:
@@ -130,9 +170,10 @@ def _lay(
     planes: np.ndarray,
     hulls: Sequence[_Hull],
     known: np.ndarray,
+    telling: np.ndarray,
 ) -> None:
     """Sets the depth (H, W) of each pixel of a region by the first of (K, 3) planes of the camera whose hull it is in
-    and on which most (H, W) `known` depths are there, and where these are `moved` (H, W) to it."""
+    and on which most (H, W) `telling` depths are there, and where `known` (H, W) ones are `moved` (H, W) to it."""
     row, column = np.nonzero(region.mask)
     row, column = row + region.top, column + region.left
     rays, left = rays_of(camera, row, column), np.ones(len(row), bool)
@@ -140,9 +181,10 @@ def _lay(
         inverse = np.where(left, rays @ plane, 0)
         rows = _held(camera, rays, inverse, hull)
         off = known[row[rows], column[rows]] * inverse[rows] - 1
-        count = np.count_nonzero(np.isfinite(off))
+        told = telling[row[rows], column[rows]] * inverse[rows] - 1
+        count = np.count_nonzero(np.isfinite(told))
         enough = count >= max(LEAST_POINTS, SURE_SHARE * len(rows))
-        if not enough or np.count_nonzero(np.abs(off) < BEHIND * TOLERANCE) >= MOST_AGREE * count:
+        if not enough or np.count_nonzero(np.abs(told) < BEHIND * TOLERANCE) >= MOST_AGREE * count:
             depth[row[rows], column[rows]] = 1 / inverse[rows]
             left[rows] = False
             on = np.flatnonzero(np.abs(off) < TOLERANCE)

@@ -38,6 +38,7 @@ from linprim_geo.stereo.plain_regions import (
 from linprim_geo.stereo.point_planes import SurfacePoints, planes_of_points, point_plane_depth
 from linprim_geo.stereo.region_planes import region_plane_depths
 from linprim_geo.stereo.room_corners import with_corner_walls
+from linprim_geo.stereo.seen_through import KnownDepths
 from linprim_geo.stereo.shaded_planes import ShadedPlanes
 from linprim_geo.stereo.textured_backgrounds import textured_backgrounds
 from linprim_geo.stereo.thin_things import SeenDepths, thin_things
@@ -53,6 +54,8 @@ DOUBTFUL_WEIGHT = 0.1
 SUPPORTING_VIEWS, SUPPORTED_SHARE = 2, 0.25
 # One of so many rows and columns is looked at to tell what a surface covers.
 SAMPLED = 4
+# So often planes are laid and depths in the air taken away. A third round changes hardly anything.
+ROUNDS = 2
 # Points of the rendered surface by which stereo finds pairs of views.
 POINTS = 20_000
 
@@ -104,7 +107,7 @@ class MergedFrames(Sequence):
         if plain_walls:
             self._end_at(plain_walls)
         self.shown = [frame.depth[::SAMPLED, ::SAMPLED] > 0 for frame in self.rendered]
-        known = [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
+        known = self._known()
         points = self._points(maps, known)
         self._span_gaps(maps, known, points, rendered_depths, backgrounds)
         are_sharp = [depth > 0 for depth in rendered_depths] if sharp is None else list(sharp)
@@ -132,22 +135,46 @@ class MergedFrames(Sequence):
         by_edges = common_planes(self.cameras, [region for own in regions for region in own])
         shaded = ShadedPlanes(maps, sure, rendered, by_points, by_edges)
         self.planes, self.standing = shaded.planes[~shaded.hanging], shaded.standing[~shaded.hanging]
-        self.on_planes, backgrounds = [], []
-        of_regions = zip(
-            shaded.depth_maps(), *region_plane_depths(self.cameras, regions, shaded.planes, sure), strict=True
-        )
-        for view, (by_shading, along_edges, moves, stands) in enumerate(of_regions):
-            depth = self.depths[view]
-            on_plane = point_plane_depth(maps[view], sure[view], by_points)
-            backgrounds.append(shaded.is_background(view))
-            along_edges[backgrounds[-1]] = np.nan
-            on_plane = np.where(stands & (np.abs(on_plane / along_edges - 1) > TOLERANCE), along_edges, on_plane)
-            self.on_planes.append(_first_known((on_plane, np.fmin(along_edges, by_shading))))
-            of_sure = _first_known((on_plane, np.where(moves, along_edges, np.float32(np.nan))))
-            moved = np.where(np.isfinite(sure[view]), of_sure, self.on_planes[view])
-            self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(moved), moved, depth)
+        on_points = [point_plane_depth(found, own, by_points) for found, own in zip(maps, sure, strict=True)]
+        by_shading, backgrounds = shaded.depth_maps(), [shaded.is_background(view) for view in range(len(maps))]
+        self.on_planes: list[np.ndarray] = []
+        # What is in the air beside a wall speaks against the wall's plane: when it is gone, more planes are laid.
+        for _ in range(ROUNDS):
+            along_edges, *others = region_plane_depths(self.cameras, regions, shaded.planes, sure)
+            along_edges = _without(along_edges, backgrounds)
+            self._lay_planes(sure, on_points, by_shading, along_edges, *others)
+            views = KnownDepths(self.cameras, self._known())
+            sure, on_points = views.without_air(sure), views.without_air(on_points)
+            self.depths, self.on_planes = views.without_air(self.depths), views.without_air(self.on_planes)
+            self.doubtful_depths = views.without_air(self.doubtful_depths)
         self.flat = _share_known(self.on_planes)
         return regions, backgrounds, [shaded.is_wall(view, asked) for view, asked in enumerate(free)]
+
+    def _lay_planes(
+        self,
+        sure: Sequence[np.ndarray],
+        on_points: Sequence[np.ndarray],
+        by_shading: Sequence[np.ndarray],
+        along_edges: Sequence[np.ndarray],
+        moves: Sequence[np.ndarray],
+        stands: Sequence[np.ndarray],
+    ) -> None:
+        """Takes (H, W) depths on planes with points all over, those of plain regions `along_edges` and those
+        `by_shading`, NaN elsewhere, and moves confirmed depths to them: `sure` ones to planes of regions where these
+        `moves` (H, W) or `stands` (H, W), see `region_plane_depths`."""
+        self.on_planes = []
+        of_views = zip(sure, on_points, by_shading, along_edges, moves, stands, strict=True)
+        for view, (known, on_plane, shaded, of_region, moved, stand) in enumerate(of_views):
+            depth = self.depths[view]
+            on_plane = np.where(stand & (np.abs(on_plane / of_region - 1) > TOLERANCE), of_region, on_plane)
+            self.on_planes.append(_first_known((on_plane, np.fmin(of_region, shaded))))
+            of_sure = _first_known((on_plane, np.where(moved, of_region, np.float32(np.nan))))
+            target = np.where(np.isfinite(known), of_sure, self.on_planes[view])
+            self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(target), target, depth)
+
+    def _known(self) -> list[np.ndarray]:
+        """(H, W) what is confirmed or on a plane, of every view."""
+        return [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
 
     def _points(self, maps: Sequence[DepthMap], known: Sequence[np.ndarray]) -> SurfacePoints:
         """Points of what is `known`, of every view as many."""
@@ -391,6 +418,11 @@ def _first_known(depths: Sequence[np.ndarray]) -> np.ndarray:
     for depth in depths[1:]:
         result = np.where(np.isfinite(result), result, depth)
     return result
+
+
+def _without(depths: Sequence[np.ndarray], taken: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """(H, W) depths, NaN where they are `taken` (H, W)."""
+    return [np.where(out, np.float32(np.nan), depth) for depth, out in zip(depths, taken, strict=True)]
 
 
 def _share_known(depths: Sequence[np.ndarray]) -> float:

@@ -114,6 +114,37 @@ def test_an_edges_depth_that_goes_on_into_a_wall_gives_way_to_the_wall(room, off
     assert np.concatenate([own[which] for own, which in zip(moved, wide, strict=True)]).all()
 
 
+def test_what_an_edge_gives_to_a_wall_beside_it_does_not_refuse_the_walls_plane(room):
+    """Where nothing else of the wall is known: before it by 10 %."""
+    of, depths, walls, regions, known = room
+    inside, beside = beside_edges(depths, walls, known, 0.9, 8)
+    inside = [
+        np.where(band | np.isfinite(edges), own, np.nan) for own, band, edges in zip(inside, beside, known, strict=True)
+    ]
+    found, *_ = region_plane_depths(of, regions, PLANES[[1]], inside)
+    on_it = np.concatenate([np.isfinite(depth)[wall == 1] for depth, wall in zip(found, walls, strict=True)])
+    assert on_it.mean() > 0.8
+
+
+@pytest.mark.parametrize("seen_through", [False, True])
+def test_a_plane_that_others_see_through_is_refused(room, seen_through):
+    """30 cm before a wall, along whose edges some views have points on it. The others know the wall or nothing."""
+    of, depths, walls, _, _ = room
+    before = PLANES[1] + [0, 0, 0, 0.3]
+    maps, known = photographs(of), []
+    for number, (camera, found, depth, wall) in enumerate(zip(of, maps, depths, walls, strict=True)):
+        edge, inverse = edges_of(found.grey, NOISE**2), camera.ray_grid() @ in_camera(camera, before[None])[0]
+        if number % 2:
+            known.append(np.where(seen_through, depth, np.nan).astype(np.float32))
+        else:
+            of_edge = np.where((wall == 1) & (inverse > 0.01), 1 / np.maximum(inverse, 0.01), depth)
+            known.append(np.where(edge, of_edge, np.nan).astype(np.float32))
+    found, *_ = region_plane_depths(of, regions_of_views(maps, known), before[None], known)
+    on_it = np.concatenate([np.isfinite(depth)[wall == 1] for depth, wall in list(zip(found, walls, strict=True))[::2]])
+    laid = on_it.mean()
+    assert laid < 0.02 if seen_through else laid > 0.2
+
+
 def test_between_edges_that_are_near_each_other_known_depths_stay(room):
     """Nothing tells there whether they are an edge's or a thing's before the wall: between lines 30 pixels apart."""
     of, depths, walls, _, _ = room
