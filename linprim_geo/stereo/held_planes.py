@@ -1,5 +1,8 @@
 """Planes of shading, held by what else is known of them: confirmed depths along the edges of their regions, and right
-angles between walls, as far as their shading allows."""
+angles between walls, as far as their shading allows.
+
+Light that is not what the model says turns planes by some degrees. Points along edges know the normal of a plane better
+than that: shading does not turn what they have told by more than SAME_ANGLE, and right angles by more than NEARLY."""
 
 from __future__ import annotations
 
@@ -9,8 +12,8 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
-from linprim_geo.stereo.plain_regions import RING, TOLERANCE, rays_of, to_world
-from linprim_geo.stereo.right_angles import RIGHT, angles_to, frame_of, squared
+from linprim_geo.stereo.plain_regions import RING, SAME_ANGLE, TOLERANCE, rays_of, to_world
+from linprim_geo.stereo.right_angles import NEARLY, RIGHT, angles_to, frame_of, squared
 from linprim_geo.stereo.shading import BOX, Fit, ShadedRegion, Shading, evaluate, plane_moves
 
 # Boxes of a region that are compared.
@@ -45,15 +48,21 @@ class HeldPlanes:
     ):
         self.shadings, self.depths, self.carried = shadings, depths, carried
 
-    def by_depths(self, planes: np.ndarray, first: int) -> np.ndarray:
-        """The planes, from the `first` on each held by the confirmed depths along the edges of its regions."""
+    def by_depths(self, planes: np.ndarray, first: int, told: Container[int] = ()) -> np.ndarray:
+        """The planes, from the `first` on each held by the confirmed depths along the edges of its regions; those that
+        points have `told` turn by SAME_ANGLE at most, or stay."""
         held = [self._held_plane(plane, self.carried[k]) for k, plane in enumerate(planes) if k >= first]
-        return np.concatenate([planes[:first], np.reshape(held, (-1, 4))])
+        result = np.concatenate([planes[:first], np.reshape(held, (-1, 4))])
+        for k, plane in enumerate(planes):
+            if k in told and _turns(result[k], plane) > SAME_ANGLE:
+                result[k] = plane
+        return result
 
-    def at_right_angles(self, planes: np.ndarray, staying: Container[int]) -> np.ndarray:
+    def at_right_angles(self, planes: np.ndarray, staying: Container[int], told: Container[int] = ()) -> np.ndarray:
         """The planes, turned to right angles with each other, or along the frame of those `staying`, where that carries
         the shading of their regions as well as true walls do, and then shifted to where most confirmed depths along the
-        edges of these are; but those `staying` stay."""
+        edges of these are; but those `staying` stay, and so do those that points have `told` if they would turn by more
+        than NEARLY."""
         few = [[region.some(MOST_BOXES) for region in regions] for regions in self.carried]
         fits = [
             evaluate(plane, few[k], self.shadings) if few[k] and k not in staying else None
@@ -66,6 +75,8 @@ class HeldPlanes:
         turned[rows] = squared(planes[rows], known, lambda row, plane: plane_moves(plane, few[rows[row]]), frame)
         for k, fit in enumerate(fits):
             if fit is None or (turned[k] == planes[k]).all():
+                continue
+            if k in told and _turns(turned[k], planes[k]) > NEARLY:
                 continue
             framed = frame is not None and angles_to(frame, turned[[k], :3])[0] < RIGHT
             for plane in (self._shifted(turned[k], self.carried[k]), turned[k]):
@@ -138,6 +149,11 @@ class HeldPlanes:
             points.append(to_world(camera, rays_of(camera, row, column) * depth[row, column, None]))
             centers.append(np.broadcast_to(camera.center, points[-1].shape))
         return np.concatenate(points), np.concatenate(centers)
+
+
+def _turns(plane: np.ndarray, before: np.ndarray) -> float:
+    """By what angle in radians a plane has turned."""
+    return float(np.arccos(min(1.0, abs(plane[:3] @ before[:3]))))
 
 
 def _commonest(off: np.ndarray) -> float:

@@ -45,6 +45,9 @@ TRIPLES, PLANES_PER_REGION, FITS = 300, 4, 3
 INDEPENDENT_POINTS = 20
 # A plane is one that so many views find, of which two see it from directions that differ by SPREAD.
 LEAST_VIEWS, SPREAD = 3, np.radians(10)
+# Fewer degrees are enough, but for LEAST_SPREAD, where the normals that views find turn by half as much as those of
+# silhouettes do: over a turn by t these have a standard deviation of t / sqrt 12.
+STEADY, LEAST_SPREAD = 2 * np.sqrt(12), np.radians(6)
 # Planes are the same if their normals differ by no more, and their distance by no more than TOLERANCE of the depth.
 SAME_ANGLE = np.radians(3)
 # Rounds in which planes are chosen by regions and fitted to all points on them.
@@ -237,7 +240,7 @@ def common_planes(cameras: Sequence[Camera], regions: Sequence[PlainRegion], see
     if not found:
         return np.zeros((0, 4))
     weight, view, depth, middle, plane = (np.array(column) for column in zip(*found, strict=True))
-    free, planes = np.ones(len(found), bool), []
+    free, planes, spreads = np.ones(len(found), bool), [], []
     for first in range(len(found)):
         if not free[first]:
             continue
@@ -249,12 +252,23 @@ def common_planes(cameras: Sequence[Camera], regions: Sequence[PlainRegion], see
         mean = np.append(normal, np.average(middle[same] @ normal, weights=weight[same]))
         same = (_same(mean, plane[:, :3], middle, depth) | same) & free
         free &= ~same
-        if seen_enough(cameras, view[same], np.average(middle[same], axis=0, weights=weight[same])):
+        spread = _least_spread(plane[same, :3], weight[same])
+        if seen_enough(cameras, view[same], np.average(middle[same], axis=0, weights=weight[same]), spread):
             planes.append(mean)
-    planes = np.array(planes).reshape(-1, 4)
+            spreads.append(spread)
+    result = np.array(planes).reshape(-1, 4), np.array(spreads)
     for _ in range(ROUNDS):
-        planes = _refitted(cameras, regions, planes)
-    return planes
+        result = _refitted(cameras, regions, *result)
+    return result[0]
+
+
+def _least_spread(normals: np.ndarray, weight: np.ndarray) -> float:
+    """How many radians apart two views have to look that have found (N, 3) normals of one plane, with (N,) weights: the
+    plane of a round thing's silhouette turns as much as they do."""
+    mean = weight @ normals
+    angle = np.arccos(np.clip(normals @ (mean / np.linalg.norm(mean)), -1, 1))
+    turning = STEADY * float(np.sqrt(np.average(angle**2, weights=weight)))
+    return float(np.clip(turning, LEAST_SPREAD, SPREAD))
 
 
 def _same(plane: np.ndarray, normals: np.ndarray, points: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -263,14 +277,15 @@ def _same(plane: np.ndarray, normals: np.ndarray, points: np.ndarray, depth: np.
     return near & (normals @ plane[:3] > np.cos(SAME_ANGLE))
 
 
-def seen_enough(cameras: Sequence[Camera], views: np.ndarray, point: np.ndarray) -> bool:
-    """Whether LEAST_VIEWS of `views`, numbers of cameras, differ, and two see a point from directions that do."""
+def seen_enough(cameras: Sequence[Camera], views: np.ndarray, point: np.ndarray, spread: float | None = None) -> bool:
+    """Whether LEAST_VIEWS of `views`, numbers of cameras, differ, and two see a point from directions that do, by
+    `spread` radians, SPREAD by default."""
     views = np.unique(views)
     if len(views) < LEAST_VIEWS:
         return False
     towards = np.array([cameras[view].center - point for view in views])
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    return bool((towards @ towards.T).min() < np.cos(SPREAD))
+    return bool((towards @ towards.T).min() < np.cos(SPREAD if spread is None else spread))
 
 
 def may_lie_on(region: PlainRegion, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -282,8 +297,11 @@ def may_lie_on(region: PlainRegion, planes: np.ndarray) -> tuple[np.ndarray, np.
     return on, (on.sum(0) >= max(LEAST_POINTS, ON_SHARE * count)) & (behind <= BEHIND_SHARE * count)
 
 
-def _refitted(cameras: Sequence[Camera], regions: Sequence[PlainRegion], planes: np.ndarray) -> np.ndarray:
-    """Planes fitted to all points on them in regions that they explain; those that are uncertain or double go."""
+def _refitted(
+    cameras: Sequence[Camera], regions: Sequence[PlainRegion], planes: np.ndarray, spreads: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Planes (K, 4) fitted to all points on them in regions that they explain, and the `spreads` (K,) of each; those
+    that are uncertain or double go, and those that are not seen from directions so far apart."""
     points: list[list] = [[] for _ in planes]
     for region in regions if len(planes) else ():
         camera = cameras[region.view]
@@ -299,25 +317,26 @@ def _refitted(cameras: Sequence[Camera], regions: Sequence[PlainRegion], planes:
             points[best].append((to_world(camera, region.rays[own] * depth[:, None]), depth, region.view))
             left &= ~own
     fitted = []
-    for plane, parts in zip(planes, points, strict=True):
+    for plane, spread, parts in zip(planes, spreads, points, strict=True):
         if not parts:
             continue
         place, depth = (np.concatenate(x) for x in list(zip(*parts, strict=True))[:2])
         views = np.array([view for *_, view in parts])
         middle = np.average(place, axis=0, weights=depth**-2)
-        spread = place - middle
-        variance, axes = np.linalg.eigh(spread.T @ (spread / depth[:, None] ** 2) / (depth**-2).sum())
+        around = place - middle
+        variance, axes = np.linalg.eigh(around.T @ (around / depth[:, None] ** 2) / (depth**-2).sum())
         # The normal's angle is as certain as the points are wide across the narrower side.
         wide = np.sqrt(max(variance[1], 0)) * np.tan(SAME_ANGLE) * np.sqrt(len(np.unique(views)))
-        if wide < TOLERANCE * np.median(depth) or not seen_enough(cameras, views, middle):
+        if wide < TOLERANCE * np.median(depth) or not seen_enough(cameras, views, middle, spread):
             continue
         normal = axes[:, 0] * (1 if axes[:, 0] @ plane[:3] > 0 else -1)
-        fitted.append((len(place), np.append(normal, normal @ middle), middle, float(np.median(depth))))
-    kept: list[np.ndarray] = []
-    for _, plane, middle, depth in sorted(fitted, key=lambda one: -one[0]):
+        fitted.append((len(place), np.append(normal, normal @ middle), middle, float(np.median(depth)), spread))
+    kept, least = list[np.ndarray](), list[float]()
+    for _, plane, middle, depth, spread in sorted(fitted, key=lambda one: -one[0]):
         if not any(_same(other, plane[None, :3], middle[None], np.array([depth]))[0] for other in kept):
             kept.append(plane)
-    return np.array(kept).reshape(-1, 4)
+            least.append(spread)
+    return np.array(kept).reshape(-1, 4), np.array(least)
 
 
 def to_world(camera: Camera, points: np.ndarray) -> np.ndarray:

@@ -125,14 +125,15 @@ class ShadedPlanes:
         self.planes = self._common([one for own in self.regions for one in own if one.fit is not None])
         carried = self._take_originals(self._all_carriers())
         held = HeldPlanes(self.shadings, self.depths, carried)
-        planes = held.at_right_angles(held.by_depths(self.planes, self.by_points), range(self.by_points))
+        told = range(self.by_points, self.given_count)
+        planes = held.at_right_angles(held.by_depths(self.planes, self.by_points, told), range(self.by_points), told)
         standing = held.still_carrying(on_meeting_lines(planes, self.by_points, maps, depths), planes)
         self.standing = np.isin(np.arange(len(planes)), list(standing))
         self.hanging = np.array([any(is_same(plane, planes[k]) for k in standing) for plane in planes], bool)
         self.hanging[self.by_points :] = False
         for number, plane in standing.items():
             planes[number] = plane
-        self.planes = held.at_right_angles(planes, {*range(self.by_points), *standing})
+        self.planes = held.at_right_angles(planes, {*range(self.by_points), *standing}, told)
 
     def _camera(self, region: ShadedRegion) -> Camera:
         return self.small_cameras[region.view]

@@ -41,9 +41,9 @@ def seen(camera, depth: np.ndarray, grey: np.ndarray, number: int):
     return plain_regions(number, camera, grey, edge, np.where(edge, depth, np.nan).astype(np.float32), edge)
 
 
-@pytest.fixture(scope="module")
-def corner():
-    cameras = [camera_at(center) for center in CENTERS]
+def corner_from(centers):
+    """Cameras, true depths, and regions of each view."""
+    cameras = [camera_at(center) for center in centers]
     depths, regions = [], []
     for number, camera in enumerate(cameras):
         depth, wall = corner_depth(camera)
@@ -57,8 +57,21 @@ def corner():
     return cameras, depths, regions
 
 
-def test_the_walls_of_a_corner_are_found_from_their_edges(corner):
-    cameras, _, regions = corner
+@pytest.fixture(scope="module")
+def corner():
+    return corner_from(CENTERS)
+
+
+def close_together(share: float) -> list[np.ndarray]:
+    """CENTERS at so much of their distances from their middle."""
+    middle = np.mean(CENTERS, axis=0)
+    return [middle + share * (center - middle) for center in np.array(CENTERS)]
+
+
+@pytest.mark.parametrize("share", [1.0, 0.3])
+def test_the_walls_of_a_corner_are_found_from_their_edges(share):
+    """From directions that differ by 30 degrees, or by 9: all views find the same normals."""
+    cameras, _, regions = corner_from(close_together(share))
     planes = common_planes(cameras, [region for own in regions for region in own])
     assert len(planes) >= 3
     for wall in WALLS:
@@ -90,9 +103,10 @@ def round_depth(camera, center: np.ndarray, radius: float, axis: np.ndarray) -> 
     return np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, np.inf)
 
 
+@pytest.mark.parametrize("share", [1.0, 0.5, 0.3, 0.2, 0.15])
 @pytest.mark.parametrize("axis", [(0, 0, 0), (0, 0, 1)], ids=["ball", "column"])
-def test_what_is_round_becomes_no_plane(axis):
-    center, cameras = np.array([0.8, 0.8, 0.8]), [camera_at(c) for c in CENTERS]
+def test_what_is_round_becomes_no_plane(axis, share):
+    center, cameras = np.array([0.8, 0.8, 0.8]), [camera_at(c) for c in close_together(share)]
     regions = []
     for number, camera in enumerate(cameras):
         depth = round_depth(camera, center, 0.9, np.array(axis, float))

@@ -4,6 +4,7 @@ that must not become planes."""
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,9 +12,10 @@ from helpers.captures import look_at
 from scipy.ndimage import gaussian_filter
 
 from linprim_geo.geometry.sampling import sample_bilinear
-from linprim_geo.stereo import plain_regions, shaded_planes, skies
+from linprim_geo.stereo import held_planes, plain_regions, shaded_planes, skies
 from linprim_geo.stereo.common_surfaces import CommonSurfaces
 from linprim_geo.stereo.depth_maps import DepthMap
+from linprim_geo.stereo.held_planes import HeldPlanes
 from linprim_geo.stereo.plain_regions import in_camera
 from linprim_geo.stereo.shaded_planes import LEAST_VIEWS, OTHERS_SHARE, ShadedPlanes
 from linprim_geo.stereo.shading import Shading, evaluate, fit_plane, shaded_regions
@@ -397,6 +399,24 @@ def test_shading_of_too_few_views_does_not_move_a_plane_of_edges(views, stays):
     confirmed = [depth if view >= views else np.full_like(depth, np.nan) for view, depth in enumerate(depths)]
     edges = np.array([tilted(1.5)])
     assert np.allclose(planes_of(maps, depths, by_edges=edges, confirmed=confirmed).planes[0], edges[0]) == stays
+
+
+@pytest.mark.parametrize(("degrees", "by_depths", "by_angles"), [(2, True, True), (4, False, True), (8, False, False)])
+def test_what_points_along_edges_have_told_of_a_plane_bounds_how_shading_turns_it(
+    monkeypatch, degrees, by_depths, by_angles
+):
+    """Of two planes at one place the second one is told so."""
+    planes, turned = np.array([WALL, WALL]), np.array([tilted(degrees), tilted(degrees)])
+    region = SimpleNamespace(some=lambda count: region)
+    held = HeldPlanes([], [], [[region], [region]])
+    monkeypatch.setattr(held, "_held_plane", lambda plane, regions: turned[0])
+    assert (held.by_depths(planes, 0, told=[1]) == [turned[0], turned[1] if by_depths else WALL]).all()
+    monkeypatch.setattr(held_planes, "evaluate", lambda *_: SimpleNamespace(information=np.eye(3)))
+    monkeypatch.setattr(held_planes, "squared", lambda *_: turned)
+    monkeypatch.setattr(held, "_shifted", lambda plane, regions: plane)
+    monkeypatch.setattr(held, "_leaves_as_little", lambda *_: True)
+    found = held.at_right_angles(planes.copy(), (), told=[1])
+    assert (found == [turned[0], turned[1] if by_angles else WALL]).all()
 
 
 def test_the_fit_goes_downhill_and_ends_at_the_truth_without_noise():
