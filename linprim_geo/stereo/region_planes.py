@@ -70,17 +70,15 @@ def region_plane_depths(
     regions = [[region.within() for region in own] for own in regions]
     lying = [[may_lie_on(region, of_view) for region in own] for own, of_view in zip(regions, local, strict=True)]
     hulls = _hulls(cameras, regions, lying, planes)
-    telling = [_without_bands(depth, own) for depth, own in zip(known, regions, strict=True)]
-    views = KnownDepths(cameras, telling)
+    views = KnownDepths(cameras, map(_without_bands, known, regions))
     depths, moved, stands = [], [], []
-    of_views = zip(cameras, regions, lying, local, known, telling, strict=True)
-    for camera, own, of_regions, of_view, sure, tell in of_views:
+    for camera, own, of_regions, of_view, sure in zip(cameras, regions, lying, local, known, strict=True):
         depths.append(np.full((camera.height, camera.width), np.nan, np.float32))
         moved.append(np.zeros((camera.height, camera.width), bool))
-        wide = np.zeros((camera.height, camera.width), bool)
+        wide, telling = np.zeros((camera.height, camera.width), bool), _without_bands(sure, own)
         for region, (on, fits) in zip(own, of_regions, strict=True):
             best = _best_first(camera, region, of_view, hulls, on.sum(0) * fits, views)
-            _lay(depths[-1], moved[-1], camera, region, of_view[best], [hulls[k] for k in best], sure, tell)
+            _lay(depths[-1], moved[-1], camera, region, of_view[best], [hulls[k] for k in best], sure, telling)
             height, width = region.wide.shape
             wide[region.top : region.top + height, region.left : region.left + width] |= region.wide
         off = np.abs(sure / depths[-1] - 1) > TOLERANCE  # not where either is NaN

@@ -7,7 +7,7 @@ photographs from elsewhere see through it what is behind.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from scipy.ndimage import minimum_filter
@@ -28,7 +28,7 @@ AROUND = 3
 class KnownDepths:
     """What views know: (H, W) `depths` of each of the `cameras`, NaN where they know nothing."""
 
-    def __init__(self, cameras: Sequence[Camera], depths: Sequence[np.ndarray]):
+    def __init__(self, cameras: Sequence[Camera], depths: Iterable[np.ndarray]):
         self.cameras = cameras
         self.views = [
             (*camera.pinhole(), _nearest_around(depth)) for camera, depth in zip(cameras, depths, strict=True)
@@ -40,16 +40,12 @@ class KnownDepths:
         through = looking - knowing
         return (through >= SEEING) & (through > SEEING_SHARE * knowing)
 
-    def without_air(self, depths: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """(H, W) `depths` of every view, NaN where there are none and where these are in the air."""
-        result = []
+    def clear(self, depths: Sequence[np.ndarray]) -> None:
+        """Makes (H, W) `depths` of every view, NaN where there are none, NaN where they are in the air, too."""
         for camera, depth in zip(self.cameras, depths, strict=True):
             row, column = np.nonzero(np.isfinite(depth))
-            points = to_world(camera, rays_of(camera, row, column) * depth[row, column, None])
-            air = self.see_through(points)
-            result.append(depth.copy())
-            result[-1][row[air], column[air]] = np.nan
-        return result
+            air = self.see_through(to_world(camera, rays_of(camera, row, column) * depth[row, column, None]))
+            depth[row[air], column[air]] = np.nan
 
 
 def _nearest_around(depth: np.ndarray) -> np.ndarray:

@@ -143,10 +143,7 @@ class MergedFrames(Sequence):
             along_edges, *others = region_plane_depths(self.cameras, regions, shaded.planes, sure)
             along_edges = _without(along_edges, backgrounds)
             self._lay_planes(sure, on_points, by_shading, along_edges, *others)
-            views = KnownDepths(self.cameras, self._known())
-            sure, on_points = views.without_air(sure), views.without_air(on_points)
-            self.depths, self.on_planes = views.without_air(self.depths), views.without_air(self.on_planes)
-            self.doubtful_depths = views.without_air(self.doubtful_depths)
+            self._clear_air(sure, on_points)
         self.flat = _share_known(self.on_planes)
         return regions, backgrounds, [shaded.is_wall(view, asked) for view, asked in enumerate(free)]
 
@@ -171,6 +168,12 @@ class MergedFrames(Sequence):
             of_sure = _first_known((on_plane, np.where(moved, of_region, np.float32(np.nan))))
             target = np.where(np.isfinite(known), of_sure, self.on_planes[view])
             self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(target), target, depth)
+
+    def _clear_air(self, *others: Sequence[np.ndarray]) -> None:
+        """Takes depths that are in the air by what is known away from all that there are, and from `others`."""
+        views = KnownDepths(self.cameras, self._known())
+        for depths in (self.depths, self.on_planes, self.doubtful_depths, *others):
+            views.clear(depths)
 
     def _known(self) -> list[np.ndarray]:
         """(H, W) what is confirmed or on a plane, of every view."""
