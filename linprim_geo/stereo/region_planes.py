@@ -119,16 +119,21 @@ def _best_first(
     return order[: np.count_nonzero(held)].tolist()
 
 
-def _without_bands(known: np.ndarray, regions: Sequence[PlainRegion]) -> np.ndarray:
-    """(H, W) `known` depths but for those that may be of an edge beside them, in regions of which most is wide: of
-    others these are all that tells."""
-    known = known.copy()
+def beside_edges(shape: tuple[int, int], regions: Sequence[PlainRegion]) -> np.ndarray:
+    """(H, W) bool: pixels of a view's plain regions that may have the depth of an edge beside them, in regions of which
+    most is wide: of others these are all that tells."""
+    result = np.zeros(shape, bool)
     for region in regions:
         if np.count_nonzero(region.wide) > np.count_nonzero(region.mask) / 2:
             beside = region.mask & (distance_transform_edt(np.pad(region.mask, 1))[1:-1, 1:-1] <= EDGE_REACH)
             row, column = np.nonzero(beside)
-            known[row + region.top, column + region.left] = np.nan
-    return known
+            result[row + region.top, column + region.left] = True
+    return result
+
+
+def _without_bands(known: np.ndarray, regions: Sequence[PlainRegion]) -> np.ndarray:
+    """(H, W) `known` depths but for those that may be of an edge beside them."""
+    return np.where(beside_edges(known.shape, regions), np.nan, known)
 
 
 def _sampled_rays(camera: Camera, region: PlainRegion) -> np.ndarray:

@@ -40,10 +40,11 @@ class KnownDepths:
         through = looking - knowing
         return (through >= SEEING) & (through > SEEING_SHARE * knowing)
 
-    def clear(self, depths: Sequence[np.ndarray]) -> None:
-        """Makes (H, W) `depths` of every view, NaN where there are none, NaN where they are in the air, too."""
-        for camera, depth in zip(self.cameras, depths, strict=True):
-            row, column = np.nonzero(np.isfinite(depth))
+    def clear(self, depths: Sequence[np.ndarray], asked: Sequence[np.ndarray]) -> None:
+        """Makes (H, W) `depths` of every view, NaN where there are none, NaN where they are in the air, too, of the
+        pixels that are `asked` (H, W) for."""
+        for camera, depth, where in zip(self.cameras, depths, asked, strict=True):
+            row, column = np.nonzero(where & np.isfinite(depth))
             air = self.see_through(to_world(camera, rays_of(camera, row, column) * depth[row, column, None]))
             depth[row[air], column[air]] = np.nan
 

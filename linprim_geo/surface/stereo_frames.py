@@ -36,7 +36,7 @@ from linprim_geo.stereo.plain_regions import (
     regions_of_views,
 )
 from linprim_geo.stereo.point_planes import SurfacePoints, planes_of_points, point_plane_depth
-from linprim_geo.stereo.region_planes import region_plane_depths
+from linprim_geo.stereo.region_planes import beside_edges, region_plane_depths
 from linprim_geo.stereo.room_corners import with_corner_walls
 from linprim_geo.stereo.seen_through import KnownDepths
 from linprim_geo.stereo.shaded_planes import ShadedPlanes
@@ -138,12 +138,13 @@ class MergedFrames(Sequence):
         on_points = [point_plane_depth(found, own, by_points) for found, own in zip(maps, sure, strict=True)]
         by_shading, backgrounds = shaded.depth_maps(), [shaded.is_background(view) for view in range(len(maps))]
         self.on_planes: list[np.ndarray] = []
+        beside = [beside_edges(found.grey.shape, own) for found, own in zip(maps, regions, strict=True)]
         # What is in the air beside a wall speaks against the wall's plane: when it is gone, more planes are laid.
         for _ in range(ROUNDS):
             along_edges, *others = region_plane_depths(self.cameras, regions, shaded.planes, sure)
             along_edges = _without(along_edges, backgrounds)
             self._lay_planes(sure, on_points, by_shading, along_edges, *others)
-            self._clear_air(sure, on_points)
+            self._clear_air(beside, sure, on_points)
         self.flat = _share_known(self.on_planes)
         return regions, backgrounds, [shaded.is_wall(view, asked) for view, asked in enumerate(free)]
 
@@ -169,11 +170,12 @@ class MergedFrames(Sequence):
             target = np.where(np.isfinite(known), of_sure, self.on_planes[view])
             self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(target), target, depth)
 
-    def _clear_air(self, *others: Sequence[np.ndarray]) -> None:
-        """Takes depths that are in the air by what is known away from all that there are, and from `others`."""
+    def _clear_air(self, beside: Sequence[np.ndarray], *others: Sequence[np.ndarray]) -> None:
+        """Takes depths that are in the air `beside` (H, W) edges of plain regions, by what is known, away from all that
+        there are, and from `others`."""
         views = KnownDepths(self.cameras, self._known())
         for depths in (self.depths, self.on_planes, self.doubtful_depths, *others):
-            views.clear(depths)
+            views.clear(depths, beside)
 
     def _known(self) -> list[np.ndarray]:
         """(H, W) what is confirmed or on a plane, of every view."""

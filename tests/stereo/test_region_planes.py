@@ -10,7 +10,7 @@ from scipy.ndimage import binary_dilation
 
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.plain_regions import edges_of, in_camera, in_world, regions_of_views
-from linprim_geo.stereo.region_planes import region_plane_depths
+from linprim_geo.stereo.region_planes import beside_edges, region_plane_depths
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def test_sure_depths_on_a_wall_are_moved_to_it_if_most_are_not_off(room, off, ar
     assert len(on_it) > 1000 and on_it.mean() == are_moved
 
 
-def beside_edges(depths, walls, known, off: float, reach: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def with_bands(depths, walls, known, off: float, reach: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """(H, W) depths that stereo knows, and where they are those of an edge that go on into wall 1, which are off by a
     factor. Of the rest of the wall it knows half."""
     inside, beside = [], []
@@ -106,7 +106,7 @@ def beside_edges(depths, walls, known, off: float, reach: int) -> tuple[list[np.
 def test_an_edges_depth_that_goes_on_into_a_wall_gives_way_to_the_wall(room, off):
     """Before it or behind it, for as far as stereo's windows reach. Of the rest of the wall half is known."""
     of, depths, walls, regions, known = room
-    inside, beside = beside_edges(depths, walls, known, off, 8)
+    inside, beside = with_bands(depths, walls, known, off, 8)
     found, moved, stands = region_plane_depths(of, regions, PLANES[[1]], inside)
     wide = [np.isfinite(depth) & which & stand for depth, which, stand in zip(found, beside, stands, strict=True)]
     error = np.concatenate([(own / depth - 1)[which] for own, depth, which in zip(found, depths, wide, strict=True)])
@@ -117,13 +117,24 @@ def test_an_edges_depth_that_goes_on_into_a_wall_gives_way_to_the_wall(room, off
 def test_what_an_edge_gives_to_a_wall_beside_it_does_not_refuse_the_walls_plane(room):
     """Where nothing else of the wall is known: before it by 10 %."""
     of, depths, walls, regions, known = room
-    inside, beside = beside_edges(depths, walls, known, 0.9, 8)
+    inside, beside = with_bands(depths, walls, known, 0.9, 8)
     inside = [
         np.where(band | np.isfinite(edges), own, np.nan) for own, band, edges in zip(inside, beside, known, strict=True)
     ]
     found, *_ = region_plane_depths(of, regions, PLANES[[1]], inside)
     on_it = np.concatenate([np.isfinite(depth)[wall == 1] for depth, wall in zip(found, walls, strict=True)])
     assert on_it.mean() > 0.8
+
+
+def test_what_may_be_an_edges_depth_lies_beside_edges_of_wide_regions():
+    camera, grey = cameras(1)[0], np.full((300, 400), 120.0)
+    grey[:, 200:] = 160
+    grey[:, 200::24] = 60  # what is between these lines is narrow
+    (found,) = noisy_maps([camera], [grey], 0)
+    edge = edges_of(found.grey, NOISE**2)
+    (regions,) = regions_of_views([found], [np.where(edge, 2.0, np.nan)])
+    beside = beside_edges(grey.shape, regions)
+    assert beside[50:250, 186:196].all() and not beside[50:250, 30:180].any() and not beside[:, 204:].any()
 
 
 @pytest.mark.parametrize("seen_through", [False, True])
@@ -154,7 +165,7 @@ def test_between_edges_that_are_near_each_other_known_depths_stay(room):
     maps = noisy_maps(of, images, 0)
     edges = [edges_of(found.grey, NOISE**2) for found in maps]
     known = [np.where(edge, depth, np.nan).astype(np.float32) for edge, depth in zip(edges, depths, strict=True)]
-    inside, beside = beside_edges(depths, walls, known, 0.95, 3)
+    inside, beside = with_bands(depths, walls, known, 0.95, 3)
     found, moved, stands = region_plane_depths(of, regions_of_views(maps, known), PLANES[[1]], inside)
     laid = [np.isfinite(depth) & which for depth, which in zip(found, beside, strict=True)]
     assert sum(which.sum() for which in laid) > 10_000

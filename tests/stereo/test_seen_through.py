@@ -31,7 +31,7 @@ def seen(camera, half: float = HALF) -> np.ndarray:
 def without_air(known: list[np.ndarray]) -> list[np.ndarray]:
     """(H, W) what is known of every view but for what is in the air."""
     left = [depth.copy() for depth in known]
-    KnownDepths(CAMERAS, known).clear(left)
+    KnownDepths(CAMERAS, known).clear(left, [np.ones(depth.shape, bool) for depth in known])
     return left
 
 
@@ -49,6 +49,15 @@ def test_a_flap_beside_a_board_goes_and_nothing_else(flap):
     # But for two pixels around the board, which may be of either side.
     assert not gone[~beside].any() and gone[beside & ~is_board(CAMERAS[0], HALF + 0.04)].all()
     assert all(np.array_equal(one, other) for one, other in zip(left[1:], known[1:], strict=True))
+
+
+def test_what_is_not_asked_for_stays(flap):
+    depth, beside = flap
+    known, left = [depth] + [seen(camera) for camera in CAMERAS[1:]], depth.copy()
+    half = np.zeros(depth.shape, bool)
+    half[:45] = True
+    KnownDepths(CAMERAS, known).clear([left] + known[1:], [half] + [np.zeros_like(half)] * (len(CAMERAS) - 1))
+    assert np.isfinite(left[45:]).all() and np.isnan(left[:45]).any()
 
 
 @pytest.mark.parametrize(("witnesses", "goes"), [(0, False), (1, False), (2, True), (8, True)])

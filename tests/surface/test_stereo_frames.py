@@ -327,15 +327,19 @@ def test_things_that_are_known_by_their_outlines_are_as_rendered(found, monkeypa
     assert merged.outlined == merged.about()["outlined"] == pytest.approx(160 / 1200) and merged.thin == 0
 
 
-@pytest.mark.parametrize(("confirming", "flap_stays"), [(2, False), (1, False), (2, True)])
-def test_depths_that_others_see_through_are_not_fused(monkeypatch, confirming, flap_stays):
-    """Beside a board 1 before a wall, 3 away, in the first of five views; confirmed or doubtful, alone or by all."""
+@pytest.mark.parametrize(
+    ("confirming", "of_all", "of_edge", "flap_stays"),
+    [(2, False, True, False), (1, False, True, False), (2, True, True, True), (2, False, False, True)],
+)
+def test_depths_of_edges_that_others_see_through_are_not_fused(monkeypatch, confirming, of_all, of_edge, flap_stays):
+    """Beside a board 1 before a wall, 3 away, in the first of five views or in all; confirmed or doubtful."""
+    monkeypatch.setattr(stereo_frames, "beside_edges", lambda shape, regions: np.full(shape, of_edge))
     cameras = [look_at((x, -3.0, 0.0), (0.0, 0.0, 0.0), size=(40, 30)) for x in (-0.8, -0.4, 0.0, 0.4, 0.8)]
     maps, frames = [], []
     for number, camera in enumerate(cameras):
         rays = camera.ray_grid() @ camera.rotation
         board = np.abs((camera.center + rays * (2 / rays[..., 1:2]))[..., [0, 2]]).max(-1)
-        depth = np.where(board < (0.7 if number == 0 or flap_stays else 0.4), 2.0, 3.0) / rays[..., 1]
+        depth = np.where(board < (0.7 if number == 0 or of_all else 0.4), 2.0, 3.0) / rays[..., 1]
         flap = (board > 0.5) & (board < 0.7)
         depth, ones = depth.astype(np.float32), np.ones(depth.shape, np.float32)
         count = np.where(flap & (number == 0), confirming, 2).astype(np.uint8)
