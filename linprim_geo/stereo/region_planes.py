@@ -70,12 +70,14 @@ def region_plane_depths(
     regions = [[region.within() for region in own] for own in regions]
     lying = [[may_lie_on(region, of_view) for region in own] for own, of_view in zip(regions, local, strict=True)]
     hulls = _hulls(cameras, regions, lying, planes)
-    views = KnownDepths(cameras, map(_without_bands, known, regions))
+    beside = [beside_edges(depth.shape, own) for depth, own in zip(known, regions, strict=True)]
+    views = KnownDepths(cameras, (np.where(at, np.nan, depth) for at, depth in zip(beside, known, strict=True)))
     depths, moved, stands = [], [], []
-    for camera, own, of_regions, of_view, sure in zip(cameras, regions, lying, local, known, strict=True):
+    of_views = zip(cameras, regions, lying, local, known, beside, strict=True)
+    for camera, own, of_regions, of_view, sure, of_edges in of_views:
         depths.append(np.full((camera.height, camera.width), np.nan, np.float32))
         moved.append(np.zeros((camera.height, camera.width), bool))
-        wide, telling = np.zeros((camera.height, camera.width), bool), _without_bands(sure, own)
+        wide, telling = np.zeros((camera.height, camera.width), bool), np.where(of_edges, np.nan, sure)
         for region, (on, fits) in zip(own, of_regions, strict=True):
             best = _best_first(camera, region, of_view, hulls, on.sum(0) * fits, views)
             _lay(depths[-1], moved[-1], camera, region, of_view[best], [hulls[k] for k in best], sure, telling)
@@ -129,11 +131,6 @@ def beside_edges(shape: tuple[int, int], regions: Sequence[PlainRegion]) -> np.n
             row, column = np.nonzero(beside)
             result[row + region.top, column + region.left] = True
     return result
-
-
-def _without_bands(known: np.ndarray, regions: Sequence[PlainRegion]) -> np.ndarray:
-    """(H, W) `known` depths but for those that may be of an edge beside them."""
-    return np.where(beside_edges(known.shape, regions), np.nan, known)
 
 
 def _sampled_rays(camera: Camera, region: PlainRegion) -> np.ndarray:

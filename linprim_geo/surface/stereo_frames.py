@@ -66,12 +66,12 @@ class MergedFrames(Sequence):
 
     `weight` is what rendered depths count elsewhere: the squared deviation of confirmed depths from those of their
     neighbours over that of rendered ones from confirmed ones, 1 at most. `confirmed` is the share of pixels with
-    confirmed depths, `doubtful` that of less probable ones, `flat` that of pixels on one of the `planes` (K, 4),
-    `spanned` that of pixels without texture between all these, `enclosed` that of pixels whose rays end at a floor or
-    wall because nothing else is known, or because what is doubtful is near it, `thin` that of thin things before what
-    is known, `outlined` that of things that are known by their outlines. `sharp` (H, W) bool of every view says where
-    rendered depths are those of a surface, and None everywhere: they stay where nothing is known, and things of both
-    kinds are among them.
+    confirmed depths, before those in the air go, `doubtful` that of less probable ones, `flat` that of pixels on one of
+    the `planes` (K, 4), `spanned` that of pixels without texture between all these, `enclosed` that of pixels whose
+    rays end at a floor or wall because nothing else is known, or because what is doubtful is near it, `thin` that of
+    thin things before what is known, `outlined` that of things that are known by their outlines. `sharp` (H, W) bool of
+    every view says where rendered depths are those of a surface, and None everywhere: they stay where nothing is known,
+    and things of both kinds are among them.
     """
 
     def __init__(

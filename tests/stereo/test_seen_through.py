@@ -46,7 +46,7 @@ def test_a_flap_beside_a_board_goes_and_nothing_else(flap):
     known = [depth] + [seen(camera) for camera in CAMERAS[1:]]
     left = without_air(known)
     gone = ~np.isfinite(left[0])
-    # But for two pixels around the board, which may be of either side.
+    # But for three pixels around the board, which may be of either side.
     assert not gone[~beside].any() and gone[beside & ~is_board(CAMERAS[0], HALF + 0.04)].all()
     assert all(np.array_equal(one, other) for one, other in zip(left[1:], known[1:], strict=True))
 
