@@ -1,0 +1,156 @@
+"""Three trainings whose results are kept, so that a test can tell when one comes out otherwise than it used to.
+
+    python -m linprim_geo.eval.studies.recorded_trainings -o tests/training/recorded_trainings.json --seeds 0 1 2 3
+
+photographs the built-in part, smooth body and room (40 views of 160x160, the exposure of part and room drifting),
+trains each by what `--effects auto` decides, extracts its mesh, and adds a row for each seed and the instruction set in
+use (LINPRIM_GEO_ISA). A row takes the place of an older one of the same scene, seed and instruction set.
+
+A row holds what was decided about effects, the PSNR in dB of the held-out photographs, of the part of the mesh that
+cameras see the Chamfer distance in % of the reference's diagonal and the mean angle of normals in degrees, and CPU
+seconds of a training step over those that the core's limits give its (pixel, primitive) pairs (`ops.machine_limits`,
+measured between the steps).
+
+Seeds and instruction sets scatter the results; `band` says where one more is to be expected.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.files import read_json, write_json
+from linprim_geo.base.options import ExtractOptions, SceneOptions, TrainOptions
+
+DRIFT = {"cad": 0.2, "smooth": 0.0, "room": 0.2}
+"""The scenes, and how much the exposure of each drifts, see `SynthOptions.exposure_drift`."""
+
+OPTIONS = TrainOptions(iterations=1500, max_primitives=2000, sh_degree=1, threads=1, evaluate_every=0)
+
+TIMED_FROM, TIMED_EVERY = 1300, 5
+"""From this step on every so many are timed."""
+
+SAMPLES = 50_000
+"""Points per surface: the standard error of a Chamfer distance is about 0.4 % of it."""
+
+FALSE_ALARMS = 1e-3
+"""Probability that a result lies outside its band though nothing has changed."""
+
+
+def measure(scene: str, seed: int, folder: Path) -> dict:
+    """The row of one training; the capture and the run are written to `folder`.
+
+    The capture is the same for every seed, and for every instruction set but for rounding.
+    """
+    from linprim_geo.eval.mesh import score_mesh
+    from linprim_geo.geometry.mesh_files import load_mesh
+    from linprim_geo.kernels import ops
+    from linprim_geo.runs.run import Run
+    from linprim_geo.surface.extract import extract_mesh
+    from linprim_geo.synthetic.synth import synthesize
+    from linprim_geo.training.effects import Choice
+    from linprim_geo.training.train import train
+
+    capture, run, timing = folder / scene, folder / f"{scene}_run", StepTiming()
+    synthesize(capture, shape=scene, views=40, test_views=6, size=160, points=2000, exposure_drift=DRIFT[scene])
+    options = TrainOptions(**{**vars(OPTIONS), "seed": seed})
+    trained = train(capture, run, SceneOptions(), options, quiet=True, effects=Choice("auto"), advance=timing.advance)
+    extract_mesh(run, "tsdf", folder / "mesh.ply", ExtractOptions(), quiet=True)
+    opened = Run.open(run)
+    seen = score_mesh(
+        load_mesh(folder / "mesh.ply"),
+        load_mesh(capture / "reference.ply"),
+        samples=SAMPLES,
+        cameras=[view.camera for view in opened.scene().train],
+    )["visible"]
+    return {
+        "scene": scene,
+        "seed": seed,
+        "instruction_set": ops.instruction_set(),
+        "effects": sorted(effect["name"] for effect in opened.notes["effects"] if effect["on"]),
+        "psnr": trained["psnr"],
+        "chamfer": seen["chamfer_percent_diagonal"],
+        "angle": seen["shape"]["normals"]["mean"],
+        "step_over_limit": timing.over_limit(),
+    }
+
+
+class StepTiming:
+    """Makes steps in place of `Trainer.advance`, and times some of those after TIMED_FROM."""
+
+    def __init__(self):
+        self.ratios: list[float] = []
+
+    def advance(self, trainer) -> None:
+        from linprim_geo.kernels import ops
+
+        timed = trainer.step >= TIMED_FROM and trainer.step % TIMED_EVERY == 0
+        began = time.process_time()
+        trainer.advance()
+        if timed:
+            seconds, limits = time.process_time() - began, ops.machine_limits()
+            pairs = ops.statistics()["hit_lanes"]
+            self.ratios.append(1e9 * seconds / (pairs * (limits["pair_forward_ns"] + limits["pair_backward_ns"])))
+
+    def over_limit(self) -> float:
+        """CPU seconds of a step over those that the core's limits give its pairs: what a tenth of the steps undercut,
+        as other work on the machine slows down most of them."""
+        return float(np.quantile(self.ratios, 0.1))
+
+
+def band(values: Sequence[float]) -> tuple[float, float]:
+    """Between which values one more of the same normal distribution lies, but for FALSE_ALARMS: the prediction interval
+    of Student's t. At least three values."""
+    from scipy.stats import t
+
+    if len(values) < 3:
+        raise LinprimError(f"{len(values)} values tell nothing of how they scatter, wanted at least 3")
+    reach = t.ppf(1 - FALSE_ALARMS / 2, len(values) - 1) * np.std(values, ddof=1) * np.sqrt(1 + 1 / len(values))
+    return float(np.mean(values) - reach), float(np.mean(values) + reach)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="JSON, made or added to")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N", help="default: 0")
+    parser.add_argument("--scenes", nargs="+", choices=DRIFT, default=list(DRIFT), help="default: all")
+    given = parser.parse_args(arguments)
+    try:
+        for seed in given.seeds:
+            for scene in given.scenes:
+                with tempfile.TemporaryDirectory() as folder:
+                    row = measure(scene, seed, Path(folder))
+                add_row(given.output, row)
+                print(row, flush=True)
+    except LinprimError as error:
+        print(f"recorded_trainings: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def read_rows(path: Path) -> list[dict]:
+    """The rows of a file that `add_row` wrote."""
+    rows = read_json(path, "rows of trainings")
+    assert isinstance(rows, list)
+    return rows
+
+
+def add_row(path: Path, row: dict) -> None:
+    """Writes a row into a file of rows, in the place of one of the same training."""
+    rows = read_rows(path) if path.exists() else []
+    same = ("scene", "instruction_set", "seed")
+    rows = [other for other in rows if any(other[name] != row[name] for name in same)] + [row]
+    write_json(
+        path, sorted(rows, key=lambda row: [list(DRIFT).index(row["scene"]), row["instruction_set"], row["seed"]])
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
