@@ -53,16 +53,13 @@ def on_meeting_lines(
     edges, found = EdgeImages(maps, known), dict[int, np.ndarray]()
     walls = {number: seen.facing(planes[number]) for number in range(by_points, len(planes))}
     walls = {number: wall for number, wall in walls.items() if seen.is_before_all(wall)}
-    reach = {
-        number: CONFIRMED_DEPTH if any(is_same(wall, plane) for plane in planes[:by_points]) else REACH
-        for number, wall in walls.items()
-    }
+    has_points = {k: any(is_same(wall, plane) for plane in planes[:by_points]) for k, wall in walls.items()}
     for floor in floors:
         for number in sorted(walls.keys() - found.keys()):
             wall = walls[number]
             near = _foot(wall, floor, seen) if at_right_angles(wall, floor) else None
             if near is not None:
-                line = clearest_line(wall, floor, near, edges, reach[number])
+                line = _line_of_wall(wall, floor, near, edges, has_points[number])
                 if line is not None:
                     found[number] = _through(line, np.cross(line[1] - line[0], floor[:3]), wall)
     up = floors[0]
@@ -70,14 +67,14 @@ def on_meeting_lines(
         for number in sorted(walls.keys() - found.keys()):
             wall = walls[number]
             if at_right_angles(wall, base) and at_right_angles(wall, up):
-                line = clearest_line(wall, base, _corner(wall, base, up, seen), edges, reach[number])
+                line = _line_of_wall(wall, base, _corner(wall, base, up, seen), edges, has_points[number])
                 if line is not None:
                     found[number] = _through(line, np.cross(up[:3], base[:3]), wall)
     standing = [*floors, *found.values()]
     for number in sorted(walls.keys() - found.keys()):
-        if any(is_same(walls[number], plane) for plane in planes[:by_points]):
+        if has_points[number]:
             continue
-        leaning = _leaning(walls[number], standing, seen, edges, reach[number])
+        leaning = _leaning(walls[number], standing, seen, edges, REACH)
         if leaning is not None:
             found[number] = leaning
     return {k: plane if plane[:3] @ planes[k, :3] > 0 else -plane for k, plane in found.items()}
@@ -125,6 +122,17 @@ def _corner(wall: np.ndarray, base: np.ndarray, floor: np.ndarray, seen: KnownPo
     meeting, along = meeting_of(wall, base)
     levels = np.array([floor[3], (seen.centers @ floor[:3]).max()])
     return meeting + along * ((levels - meeting @ floor[:3]) / (along @ floor[:3]))[:, None]
+
+
+def _line_of_wall(
+    wall: np.ndarray, base: np.ndarray, near: np.ndarray, edges: EdgeImages, has_points: bool
+) -> np.ndarray | None:
+    """`clearest_line`, of a wall that `has_points` all over only one that is not before these: they may be on what
+    hangs on the wall, but what is before them is a skirting board, or the edge of a rug."""
+    line = clearest_line(wall, base, near, edges, CONFIRMED_DEPTH if has_points else REACH)
+    if line is not None and has_points and line.mean(0) @ wall[:3] > wall[3]:
+        return None
+    return line
 
 
 def _through(line: np.ndarray, normal: np.ndarray, wall: np.ndarray) -> np.ndarray:

@@ -73,6 +73,13 @@ def test_what_has_points_all_over_and_stands_far_before_a_wall_stays():
     assert list(moved([FLOOR, before])) == [1]
 
 
+def test_a_line_before_what_has_points_all_over_is_not_that_of_the_wall():
+    """A skirting board, or a rug, ends there."""
+    behind = turned(LEFT, 0.0, -0.012)
+    assert moved([FLOOR, behind, behind], by_points=2) == {}
+    assert list(moved([FLOOR, behind])) == [1]
+
+
 def test_a_line_farther_away_than_planes_are_off_by_is_not_theirs():
     assert moved([FLOOR, turned(LEFT, 0.0, 0.14)]) == {}
 
