@@ -36,6 +36,8 @@ from linprim_geo.stereo.right_angles import at_right_angles
 OUTLIERS = 0.01
 # A point is behind a plane by more than this share of its distance: twice what depths may be off by.
 MARGIN = 2 * CONFIRMED_DEPTH
+# Two planes end at the same place if their ends, each of which is known to MARGIN, differ by so many times that.
+ENDS_APART = np.sqrt(2)
 # Nothing is known through a wall but for a share of what is known in its direction: more than OUTLIERS, as a plain wall
 # has few points of its own. What is known in its direction counts for so many points at least.
 SEEN_THROUGH, LEAST_AIMED = 0.05, 100
@@ -228,7 +230,7 @@ class KnownPoints:
                     ends = [np.quantile(self.points.position[own] @ normal, OUTLIERS) for own in sides]
                     there = any(normal @ other[:3] > SAME_NORMAL for other in (*found, *closing))
                     plane = np.append(normal, np.mean(ends))
-                    if there or abs(ends[0] - ends[1]) > apart or not every.is_before_all(plane):
+                    if there or abs(ends[0] - ends[1]) > ENDS_APART * apart or not every.is_before_all(plane):
                         continue
                     ending = all(every.ends_at(wall, plane, apart) for wall in (first, second))
                     if ending and all(self.ends_in_images(own, plane, apart) for own in sides):

@@ -9,7 +9,10 @@ import pytest
 from helpers.captures import look_at
 
 from linprim_geo.stereo.enclosing_planes import (
+    MARGIN,
+    OUTLIERS,
     EnclosingPlane,
+    KnownPoints,
     enclosing_depths,
     enclosing_planes,
     known_on_planes,
@@ -189,6 +192,20 @@ def test_where_floor_and_wall_end_at_different_places_nothing_closes_the_room():
         kept[on_floor[len(points) // 25 :] if few else []] = False
         found = enclosing_planes(CAMERAS, np.array([FLOOR, WALL]), points[kept])
         assert len(found) >= 2 and not any(plane.normal[0] > 0.99 for plane in found)
+
+
+@pytest.mark.parametrize(("gap", "apart", "closes"), [(0.075, 1.2, True), (0.091, 1.54, False)])
+def test_two_ends_that_are_each_known_to_a_margin_are_at_the_same_place(gap, apart, closes):
+    """The floor has no points up to a gap from the corner; the ends then differ by so many margins."""
+    points = points_of(room(lambda place: np.abs(place[..., 0]) < 1e-6))
+    points = points[(np.abs(points.position[:, 2]) > 1e-6) | (points.position[:, 0] > gap)]
+    seen = KnownPoints(CAMERAS, points)
+    sides = [seen.on(plane) for plane in (FLOOR, WALL)]
+    ends = [np.quantile(points.position[on, 0], OUTLIERS) for on in sides]
+    margin = MARGIN * min(np.median(seen.distance[on]) for on in sides)
+    assert ends[0] - ends[1] == pytest.approx(apart * margin, rel=0.05)
+    found = enclosing_planes(CAMERAS, np.array([FLOOR, WALL]), points)
+    assert [plane.closes for plane in found] == [False, False, True][: 2 + closes]
 
 
 def test_nothing_closes_the_room_before_further_points():
