@@ -36,8 +36,8 @@ from linprim_geo.stereo.right_angles import at_right_angles
 OUTLIERS = 0.01
 # A point is behind a plane by more than this share of its distance: twice what depths may be off by.
 MARGIN = 2 * CONFIRMED_DEPTH
-# Two planes end at the same place if their ends, each of which is known to MARGIN, differ by so many times that.
-ENDS_APART = np.sqrt(2)
+# A door or a window stands back from its wall by up to so much of its distance: 15 cm from 3 m.
+RECESS = 5 * CONFIRMED_DEPTH
 # Nothing is known through a wall but for a share of what is known in its direction: more than OUTLIERS, as a plain wall
 # has few points of its own. What is known in its direction counts for so many points at least.
 SEEN_THROUGH, LEAST_AIMED = 0.05, 100
@@ -158,13 +158,23 @@ class KnownPoints:
 
     def is_enclosing(self, plane: np.ndarray, least: float = LEAST_SHARE) -> bool:
         """Whether at least a share `least` of the points lies on the plane, with normals alike, and hardly any behind
-        it."""
+        it, but for a share SEEN_THROUGH in recesses."""
         on = self.points.on(plane[None], CONFIRMED_DEPTH)
-        return bool(on.any()) and on.mean() >= least and self.is_before_all(plane)
+        return (
+            bool(on.any())
+            and on.mean() >= least
+            and self.is_before_all(plane, RECESS)
+            and self.share_behind(plane, MARGIN) < SEEN_THROUGH
+        )
 
-    def is_before_all(self, plane: np.ndarray) -> bool:
-        behind = self.height(plane) < -MARGIN * self.distance
-        return behind.mean() < OUTLIERS and bool((self.centers @ plane[:3] > plane[3]).all())
+    def is_before_all(self, plane: np.ndarray, margin: float = MARGIN) -> bool:
+        """Whether all cameras are before a plane, and hardly any point is behind it by more than a share `margin` of
+        its distance."""
+        return self.share_behind(plane, margin) < OUTLIERS and bool((self.centers @ plane[:3] > plane[3]).all())
+
+    def share_behind(self, plane: np.ndarray, margin: float) -> float:
+        """The share of the points that are behind a plane by more than a share `margin` of their distance."""
+        return float((self.height(plane) < -margin * self.distance).mean())
 
     def is_passed(self, wall: EnclosingPlane) -> bool:
         """Whether more than SEEN_THROUGH of the known points in the direction of a wall's own rectangle, but for a
@@ -189,9 +199,10 @@ class KnownPoints:
         return np.abs(self.height(plane)) < CONFIRMED_DEPTH * self.distance
 
     def without_copies(self, planes: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Planes in the order of how many points are on them, each unless most of these are on one before, too."""
+        """Planes in the order of how many points are on them, those with points in recesses last, each unless most of
+        its points are on one before, too: a plane between a floor and a board above it has points of both."""
         kept: list[np.ndarray] = []
-        for plane in sorted(planes, key=lambda plane: -self.on(plane).sum()):
+        for plane in sorted(planes, key=lambda plane: (not self.is_before_all(plane), -self.on(plane).sum())):
             own = self.on(plane)
             alike = [other for other in kept if plane[:3] @ other[:3] > SAME_NORMAL]
             near = (np.abs(self.height(other)[own]) < MARGIN * self.distance[own] for other in alike)
@@ -230,7 +241,7 @@ class KnownPoints:
                     ends = [np.quantile(self.points.position[own] @ normal, OUTLIERS) for own in sides]
                     there = any(normal @ other[:3] > SAME_NORMAL for other in (*found, *closing))
                     plane = np.append(normal, np.mean(ends))
-                    if there or abs(ends[0] - ends[1]) > ENDS_APART * apart or not every.is_before_all(plane):
+                    if there or abs(ends[0] - ends[1]) > np.sqrt(2) * apart or not every.is_before_all(plane):
                         continue
                     ending = all(every.ends_at(wall, plane, apart) for wall in (first, second))
                     if ending and all(self.ends_in_images(own, plane, apart) for own in sides):

@@ -161,12 +161,37 @@ def test_a_camera_or_points_behind_a_plane_speak_against_it():
     planes = np.array([FLOOR, WALL, SIDE])
     below = [*CAMERAS, look_at((2.0, 2.0, -0.5), size=SIZE)]
     assert (0, 0, 1) not in normals(enclosing_planes(below, planes, points))
-    few, many = (int(share * len(points)) for share in (0.005, 0.02))
+    few, many = (int(share * len(points)) for share in (0.005, 0.03))
     for count, holds in ((few, True), (many, False)):
         moved = points.position.copy()
         moved[:count] = 2 * moved[:count] - points.center[:count]  # twice as far along their rays
         behind = SurfacePoints(moved, points.normal, points.center, points.view)
         assert (normals(enclosing_planes(CAMERAS, planes, behind)) != set()) == holds
+
+
+@pytest.mark.parametrize(("share", "back", "holds"), [(0.04, 1.04, True), (0.07, 1.04, False), (0.04, 1.1, False)])
+def test_a_door_in_a_recess_does_not_open_a_wall(share, back, holds):
+    """So many points lie that much farther along their rays."""
+    points = points_of(room(everything))
+    moved = points.position.copy()
+    door = np.flatnonzero(np.abs(moved[:, 1]) < 1e-6)[: int(share * len(points))]
+    moved[door] = points.center[door] + back * (moved[door] - points.center[door])
+    found = enclosing_planes(CAMERAS, np.array([FLOOR, WALL, SIDE]), replace(points, position=moved))
+    assert ((0, 1, 0) in normals(found)) == holds
+
+
+def test_a_plane_between_a_floor_and_a_board_above_is_a_copy_of_the_floor():
+    """More points are on it than on either, and those of a hole in the floor are behind it alone."""
+    rng, above = np.random.default_rng(0), look_at((0.3, 0.0, 3.2), (0.0, 0.0, 0.0), size=SIZE)
+    level = np.repeat([0.0, 0.06, -0.05], [400, 500, 30])
+    places = np.column_stack([rng.uniform(-0.3, 0.3, (len(level), 2)), level])
+    points = SurfacePoints(
+        places, np.tile(FLOOR[:3], (len(level), 1)), np.tile(above.center, (len(level), 1)), np.zeros(len(level), int)
+    )
+    seen, between = KnownPoints([above], points), FLOOR + [0, 0, 0, 0.03]
+    assert seen.on(between).sum() > seen.on(FLOOR).sum()
+    assert seen.is_enclosing(between) and not seen.is_before_all(between)
+    assert [plane.tolist() for plane in seen.without_copies([between, FLOOR])] == [FLOOR.tolist()]
 
 
 def test_a_wall_without_points_closes_the_room_where_the_others_end():
