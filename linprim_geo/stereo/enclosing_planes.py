@@ -1,12 +1,12 @@
 """Floors and walls where nothing is known of them: planes behind which nothing lies go on.
 
-A plane encloses the scene if all cameras and nearly all known points lie on one side of it, and another such plane
-meets it at a right angle, as the floor and the walls of a room do, or its points are all over it, as those of a table
-are. A ray of which nothing is known ends at the first of these, but only within the rectangle that holds the plane's
-own known points, as walls do not go on into the sky. Where hardly any view looks, as below a table, stereo can know
-nothing: there it ends within the rectangle that holds all known points, if the plane's own reach across that one way.
-Where most of the views that look at a place know it, one that does not has something before it, unless it has a
-doubtful depth there.
+A plane encloses the scene if all cameras and nearly all known points lie on one side of it, but for those in recesses
+such as doors, and another such plane meets it at a right angle, as the floor and the walls of a room do, or its points
+are all over it, as those of a table are. A ray of which nothing is known ends at the first of these, but only within
+the rectangle that holds the plane's own known points, as walls do not go on into the sky. Where hardly any view looks,
+as below a table, stereo can know nothing: there it ends within the rectangle that holds all known points, if the
+plane's own reach across that one way. Where most of the views that look at a place know it, one that does not has
+something before it, unless it has a doubtful depth there.
 
 Of few photographs training can explain much as background: what hardly any view shows agrees with any far background.
 There a depth of stereo on such a plane counts all the same (`known_on_planes`).
@@ -36,6 +36,8 @@ from linprim_geo.stereo.right_angles import at_right_angles
 OUTLIERS = 0.01
 # A point is behind a plane by more than this share of its distance: twice what depths may be off by.
 MARGIN = 2 * CONFIRMED_DEPTH
+# Two planes end at the same place if their ends, each of which is known to MARGIN, differ by so many times that.
+ENDS_APART = np.sqrt(2)
 # A door or a window stands back from its wall by up to so much of its distance: 15 cm from 3 m.
 RECESS = 5 * CONFIRMED_DEPTH
 # Nothing is known through a wall but for a share of what is known in its direction: more than OUTLIERS, as a plain wall
@@ -241,7 +243,7 @@ class KnownPoints:
                     ends = [np.quantile(self.points.position[own] @ normal, OUTLIERS) for own in sides]
                     there = any(normal @ other[:3] > SAME_NORMAL for other in (*found, *closing))
                     plane = np.append(normal, np.mean(ends))
-                    if there or abs(ends[0] - ends[1]) > np.sqrt(2) * apart or not every.is_before_all(plane):
+                    if there or abs(ends[0] - ends[1]) > ENDS_APART * apart or not every.is_before_all(plane):
                         continue
                     ending = all(every.ends_at(wall, plane, apart) for wall in (first, second))
                     if ending and all(self.ends_in_images(own, plane, apart) for own in sides):

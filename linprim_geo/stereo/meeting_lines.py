@@ -74,7 +74,7 @@ def on_meeting_lines(
     for number in sorted(walls.keys() - found.keys()):
         if has_points[number]:
             continue
-        leaning = _leaning(walls[number], standing, seen, edges, REACH)
+        leaning = _leaning(walls[number], standing, seen, edges)
         if leaning is not None:
             found[number] = leaning
     return {k: plane if plane[:3] @ planes[k, :3] > 0 else -plane for k, plane in found.items()}
@@ -142,7 +142,7 @@ def _through(line: np.ndarray, normal: np.ndarray, wall: np.ndarray) -> np.ndarr
 
 
 def _leaning(
-    wall: np.ndarray, standing: Sequence[np.ndarray], seen: KnownPoints, edges: EdgeImages, reach: float
+    wall: np.ndarray, standing: Sequence[np.ndarray], seen: KnownPoints, edges: EdgeImages
 ) -> np.ndarray | None:
     """The plane (4,) through the lines along which a wall meets `standing` planes, but for those that others
     contradict; None where the wall has them on it, or they do not tell its direction."""
@@ -150,7 +150,7 @@ def _leaning(
     for base in standing:
         apart = np.arccos(min(1.0, abs(wall[:3] @ base[:3])))
         near = _foot(wall, base, seen) if apart > LEFT_OPEN else None
-        line = clearest_line(wall, base, near, edges, reach) if near is not None else None
+        line = clearest_line(wall, base, near, edges) if near is not None else None
         if line is not None:
             lines.append(line)
     if len(lines) < 2:
