@@ -188,6 +188,14 @@ def test_the_walk_through_the_kitchen_is_free_and_sees_nearly_all_of_it(walked):
     assert (count[ceiling] >= 3).mean() > 0.9 and (count[floor] >= 3).mean() > 0.85
 
 
+def test_the_walk_through_the_bedroom_is_free():
+    traced = scenes.TracedScene("bedroom", None, SynthOptions(views=40, test_views=4, size=(64, 48), realism="bedroom"))
+    caster = RayCaster(traced.surface.vertices, traced.surface.faces)
+    probe = fibonacci_directions(500)
+    for view in traced.train + traced.test:
+        assert caster.cast(np.tile(view.center, (500, 1)), probe)[0].min() > 0.4
+
+
 # A garden
 
 

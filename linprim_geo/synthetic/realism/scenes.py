@@ -15,6 +15,7 @@ from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.synthetic import camera_paths
 from linprim_geo.synthetic.options import SynthOptions
 from linprim_geo.synthetic.realism.attic import attic_poses, attic_scene
+from linprim_geo.synthetic.realism.bedroom import bedroom_poses, bedroom_scene
 from linprim_geo.synthetic.realism.desk import desk_scene
 from linprim_geo.synthetic.realism.facade import facade_scene, street_poses
 from linprim_geo.synthetic.realism.kitchen import kitchen_poses, kitchen_scene
@@ -78,6 +79,9 @@ def arc_poses(target: tuple[float, float, float], distance: float, degrees: floa
 
 SCENES = {
     "attic": Scene(attic_scene, attic_poses, "walk", 68.0, meter_share=0.5, meter_level=0.15),
+    "bedroom": Scene(
+        lambda figure, seed: bedroom_scene(seed), bedroom_poses, "walk", 68.0, meter_share=0.9, meter_level=0.68
+    ),
     "desk": Scene(desk_scene, arc_poses((0.60, -0.42, 0.80), 1.0, 80.0, -48.0), "arc", 55.0),
     "facade": Scene(lambda figure, seed: facade_scene(seed), street_poses, "street", 58.0),
     "kitchen": Scene(kitchen_scene, kitchen_poses, "walk", 65.0, meter_share=0.9, meter_level=0.42),

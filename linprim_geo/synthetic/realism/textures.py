@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 
 def _smooth(rng: np.random.Generator, shape: tuple[int, int], sigma) -> np.ndarray:
@@ -14,7 +15,14 @@ def _smooth(rng: np.random.Generator, shape: tuple[int, int], sigma) -> np.ndarr
     return field / field.std()
 
 
-def _bytes(color: np.ndarray) -> np.ndarray:
+def noise(rng: np.random.Generator, shape: tuple[int, ...], sigma, mode: str = "wrap") -> np.ndarray:
+    """Gaussian noise of unit variance as `_smooth`, but of any number of axes and with other edges, as of a cloth."""
+    field = gaussian_filter(rng.standard_normal(shape), sigma, mode=mode)
+    return field / field.std()
+
+
+def to_bytes(color: np.ndarray) -> np.ndarray:
+    """A colour in [0, 1] as texels, neither quite black nor white."""
     return (np.clip(color, 0.02, 0.97) * 255.0 + 0.5).astype(np.uint8)
 
 
@@ -23,7 +31,7 @@ def speckled(color, shape: tuple[int, int], strength: float, seed: int, *, broad
     rng = np.random.default_rng([seed, 11])
     grain = sum(weight * _smooth(rng, shape, size) for size, weight in ((0.7, 0.5), (2.0, 0.6), (8.0, 0.6)))
     drift = broad * _smooth(rng, shape, min(shape) / 12.0)
-    return _bytes(np.asarray(color) * (1.0 + strength * (grain + drift))[..., None])
+    return to_bytes(np.asarray(color) * (1.0 + strength * (grain + drift))[..., None])
 
 
 def wood(shape: tuple[int, int], planks: int, seed: int, color=(0.56, 0.38, 0.24)) -> np.ndarray:
@@ -49,7 +57,7 @@ def wood(shape: tuple[int, int], planks: int, seed: int, color=(0.56, 0.38, 0.24
     seam = np.abs(v * planks - np.rint(v * planks)) * height / planks
     light -= 0.45 * np.exp(-((seam / 1.5) ** 2))
     tint = np.array([0.9, 1.0, 1.15])
-    return _bytes(np.asarray(color) * (1.0 + light[..., None] * tint))
+    return to_bytes(np.asarray(color) * (1.0 + light[..., None] * tint))
 
 
 def cover(shape: tuple[int, int], seed: int, color=(0.16, 0.28, 0.42)) -> np.ndarray:
@@ -88,7 +96,7 @@ def bands(shape: tuple[int, int], colors, edges) -> np.ndarray:
     """Stripes of constant v: color i reaches up to v = edges[i]."""
     v = 1.0 - (np.arange(shape[0]) + 0.5) / shape[0]
     row = np.asarray(colors)[np.minimum(np.searchsorted(edges, v), len(colors) - 1)]
-    return _bytes(np.repeat(row[:, None], shape[1], axis=1))
+    return to_bytes(np.repeat(row[:, None], shape[1], axis=1))
 
 
 def brick(texels: int, seed: int, courses: int = 16, per_course: int = 5) -> np.ndarray:
@@ -109,7 +117,7 @@ def brick(texels: int, seed: int, courses: int = 16, per_course: int = 5) -> np.
     grain = 0.08 * _smooth(rng, shape, 0.8) + 0.08 * _smooth(rng, shape, 3.0) + 0.05 * _smooth(rng, shape, 30.0)
     mortar = np.array([0.66, 0.63, 0.58])
     color = face * (1.0 - joint[..., None]) + mortar * joint[..., None]
-    return _bytes(color * (1.0 + grain[..., None]))
+    return to_bytes(color * (1.0 + grain[..., None]))
 
 
 def paving(texels: int, seed: int, rows: int = 6, per_row: int = 4) -> np.ndarray:
@@ -127,4 +135,4 @@ def paving(texels: int, seed: int, rows: int = 6, per_row: int = 4) -> np.ndarra
     joint = np.exp(-((edge / (0.006 * texels)) ** 2))
     tone = rng.uniform(-0.12, 0.12, (rows, per_row))[line, number]
     grit = 0.10 * _smooth(rng, shape, 0.8) + 0.07 * _smooth(rng, shape, 3.0) + 0.07 * _smooth(rng, shape, 25.0)
-    return _bytes(np.array([0.50, 0.49, 0.46]) * (1.0 + tone + grit - 0.5 * joint)[..., None])
+    return to_bytes(np.array([0.50, 0.49, 0.46]) * (1.0 + tone + grit - 0.5 * joint)[..., None])
