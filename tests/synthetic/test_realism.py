@@ -14,7 +14,7 @@ from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.synthetic.camera_paths import WALK_EYES, WALK_STEP, WALK_TURN_DEG, fibonacci_directions, look_at, walk
 from linprim_geo.synthetic.options import SynthOptions
-from linprim_geo.synthetic.realism import interiors, kitchen, outdoors, parts, render, scenes, terrace, textures
+from linprim_geo.synthetic.realism import garden, interiors, kitchen, outdoors, parts, render, scenes, terrace, textures
 from linprim_geo.synthetic.realism.parts import Material, Part
 from linprim_geo.synthetic.shapes import smooth_body
 from linprim_geo.synthetic.synth import synthesize
@@ -264,6 +264,32 @@ def test_the_backdrop_of_the_terrace_is_far_and_no_part_of_its_surface(terraced)
     points = np.concatenate([part.vertices for part in traced.backdrop])
     for view in traced.train + traced.test:
         assert np.linalg.norm(points - view.center, axis=1).min() > 10.0
+    assert np.linalg.norm(points[:, :2], axis=1).max() > 300.0
+    assert len(caster.faces) == sum(len(part.faces) for part in traced.stage.parts)
+    assert caster.diagonal < 30.0
+
+
+@pytest.fixture(scope="module")
+def round_table():
+    """The garden as it is photographed by 40 views, and its rays."""
+    traced = scenes.TracedScene("garden", None, SynthOptions(views=40, test_views=4, size=(64, 48), realism="garden"))
+    return traced, RayCaster(traced.surface.vertices, traced.surface.faces)
+
+
+def test_the_walk_round_the_table_is_free(round_table):
+    traced, caster = round_table
+    probe = fibonacci_directions(500)
+    for view in traced.train + traced.test:
+        assert caster.cast(np.tile(view.center, (500, 1)), probe)[0].min() > 0.4
+
+
+def test_the_backdrop_of_the_garden_is_far_and_no_part_of_its_surface(round_table):
+    traced, caster = round_table
+    points = np.concatenate([part.vertices for part in traced.backdrop])
+    # It begins where the lawn ends.
+    assert np.linalg.norm(points[:, :2], axis=1).min() > garden.LAWN_END - 1.0
+    for view in traced.train + traced.test:
+        assert np.linalg.norm(points - view.center, axis=1).min() > 4.0
     assert np.linalg.norm(points[:, :2], axis=1).max() > 300.0
     assert len(caster.faces) == sum(len(part.faces) for part in traced.stage.parts)
     assert caster.diagonal < 30.0

@@ -223,11 +223,16 @@ def poster(x: Span, z: Span, seed: int) -> list[Part]:
     return [frame, quad("poster", (x[0], -0.008, z[0]), (x[1] - x[0], 0, 0), (0, 0, z[1] - z[0]), sheet)]
 
 
-def turned(name: str, profile, material: Material) -> Part:
-    """`lathe` with edges that stay sharp, though normals are interpolated."""
+def sharp(profile, edge: float = 0.04) -> np.ndarray:
+    """A profile (N, 2) for `lathe` whose edges stay sharp, though normals are interpolated over `edge` of a piece."""
     points = np.asarray(profile, dtype=np.float64)
-    fine = points[:-1, None] + np.diff(points, axis=0)[:, None] * np.array([0.0, 0.04, 0.96])[:, None]
-    return lathe(name, np.concatenate([fine.reshape(-1, 2), points[-1:]]), material)
+    fine = points[:-1, None] + np.diff(points, axis=0)[:, None] * np.array([0.0, edge, 1.0 - edge])[:, None]
+    return np.concatenate([fine.reshape(-1, 2), points[-1:]])
+
+
+def turned(name: str, profile, material: Material) -> Part:
+    """`lathe` with edges that stay sharp."""
+    return lathe(name, sharp(profile), material)
 
 
 def pendant(place: tuple[float, float], ceiling: float) -> list[Part]:

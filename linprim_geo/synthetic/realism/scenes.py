@@ -18,6 +18,7 @@ from linprim_geo.synthetic.realism.attic import attic_poses, attic_scene
 from linprim_geo.synthetic.realism.bedroom import bedroom_poses, bedroom_scene
 from linprim_geo.synthetic.realism.desk import desk_scene
 from linprim_geo.synthetic.realism.facade import facade_scene, street_poses
+from linprim_geo.synthetic.realism.garden import garden_backdrop, garden_poses, garden_scene
 from linprim_geo.synthetic.realism.kitchen import kitchen_poses, kitchen_scene
 from linprim_geo.synthetic.realism.parts import Material, Part, quad
 from linprim_geo.synthetic.realism.render import PathTracer, Stage
@@ -84,6 +85,15 @@ SCENES = {
     ),
     "desk": Scene(desk_scene, arc_poses((0.60, -0.42, 0.80), 1.0, 80.0, -48.0), "arc", 55.0),
     "facade": Scene(lambda figure, seed: facade_scene(seed), street_poses, "street", 58.0),
+    "garden": Scene(
+        lambda figure, seed: garden_scene(seed),
+        garden_poses,
+        "walk",
+        66.0,
+        meter_share=0.9,
+        meter_level=0.72,
+        backdrop=garden_backdrop,
+    ),
     "kitchen": Scene(kitchen_scene, kitchen_poses, "walk", 65.0, meter_share=0.9, meter_level=0.42),
     "shelf": Scene(
         lambda figure, seed: shelf_scene([figure, cad_part(), smooth_body()], seed),
