@@ -231,9 +231,9 @@ def test_one_line_does_not_tell_where_a_slope_leans():
 
 
 def test_a_line_that_others_contradict_does_not_move_a_slope(monkeypatch):
-    def shown(*of):
-        line = clearest_line(*of)
-        return line if line is None or of[1][1] > -0.5 else line + [0, 0, 0.15]
+    def shown(wall, base, near, edges, reach=meeting_lines.REACH):
+        line = clearest_line(wall, base, near, edges, reach)
+        return line if line is None or base[1] > -0.5 else line + [0, 0, 0.15]
 
     monkeypatch.setattr(meeting_lines, "clearest_line", shown)
     found = in_attic(leaning(2.0, -0.04), walls=(1, 3, 4))[4]

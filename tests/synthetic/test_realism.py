@@ -30,6 +30,13 @@ def camera(position, target, size=(40, 30), focal=40.0):
     return Camera(*size, focal, focal, 0.5 * size[0], 0.5 * size[1], look_at(np.array(position), np.array(target)))
 
 
+def nearest_surface(traced: scenes.TracedScene, caster: RayCaster) -> float:
+    """How near a camera comes to a surface, metres."""
+    probe = fibonacci_directions(500)
+    views = traced.train + traced.test
+    return min(float(caster.cast(np.tile(view.center, (len(probe), 1)), probe)[0].min()) for view in views)
+
+
 # Shapes and textures
 
 
@@ -166,11 +173,9 @@ def test_what_is_seen_of_the_kitchen_faces_the_camera_and_nothing_is_open(walked
 
 def test_the_walk_through_the_kitchen_is_free_and_sees_nearly_all_of_it(walked):
     traced, caster = walked
-    probe = fibonacci_directions(500)
-    for view in traced.train + traced.test:
-        assert caster.cast(np.tile(view.center, (500, 1)), probe)[0].min() > 0.25
+    assert nearest_surface(traced, caster) > 0.25
     # The surface as rays from anywhere on the free floor meet it, each place as often as its area asks for.
-    rng = np.random.default_rng(0)
+    rng, probe = np.random.default_rng(0), fibonacci_directions(500)
     eyes = np.repeat(rng.uniform((1.4, -3.0, 1.0), (3.7, -0.9, 1.8), (60, 3)), len(probe), axis=0)
     rays = np.tile(probe, (60, 1))
     distance, face, _ = caster.cast(eyes, rays)
@@ -191,9 +196,7 @@ def test_the_walk_through_the_kitchen_is_free_and_sees_nearly_all_of_it(walked):
 def test_the_walk_through_the_bedroom_is_free():
     traced = scenes.TracedScene("bedroom", None, SynthOptions(views=40, test_views=4, size=(64, 48), realism="bedroom"))
     caster = RayCaster(traced.surface.vertices, traced.surface.faces)
-    probe = fibonacci_directions(500)
-    for view in traced.train + traced.test:
-        assert caster.cast(np.tile(view.center, (500, 1)), probe)[0].min() > 0.4
+    assert nearest_surface(traced, caster) > 0.4
 
 
 # A garden
@@ -242,9 +245,7 @@ def test_the_terrace_has_whole_faces_and_stands_on_its_lawn(terraced):
 
 def test_the_walk_over_the_terrace_is_free(terraced):
     traced, caster = terraced
-    probe = fibonacci_directions(500)
-    for view in traced.train + traced.test:
-        assert caster.cast(np.tile(view.center, (500, 1)), probe)[0].min() > 0.25
+    assert nearest_surface(traced, caster) > 0.25
 
 
 def test_a_third_of_the_photographs_of_the_terrace_is_far_and_some_show_nothing_far(terraced):
@@ -278,9 +279,7 @@ def round_table():
 
 def test_the_walk_round_the_table_is_free(round_table):
     traced, caster = round_table
-    probe = fibonacci_directions(500)
-    for view in traced.train + traced.test:
-        assert caster.cast(np.tile(view.center, (500, 1)), probe)[0].min() > 0.4
+    assert nearest_surface(traced, caster) > 0.4
 
 
 def test_the_backdrop_of_the_garden_is_far_and_no_part_of_its_surface(round_table):
