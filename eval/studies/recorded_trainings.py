@@ -21,6 +21,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -60,8 +61,15 @@ def measure(scene: str, seed: int, folder: Path) -> dict:
 
     capture, run, timing = folder / scene, folder / f"{scene}_run", StepTiming()
     synthesize(capture, shape=scene, views=40, test_views=6, size=160, points=2000, exposure_drift=DRIFT[scene])
-    options = TrainOptions(**{**vars(OPTIONS), "seed": seed})
-    trained = train(capture, run, SceneOptions(), options, quiet=True, effects=Choice("auto"), advance=timing.advance)
+    trained = train(
+        capture,
+        run,
+        SceneOptions(),
+        replace(OPTIONS, seed=seed),
+        quiet=True,
+        effects=Choice("auto"),
+        advance=timing.advance,
+    )
     extract_mesh(run, "tsdf", folder / "mesh.ply", ExtractOptions(), quiet=True)
     opened = Run.open(run)
     seen = score_mesh(
@@ -136,9 +144,14 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def read_rows(path: Path) -> list[dict]:
-    """The rows of a file that `add_row` wrote."""
+    """The rows of a file that `add_row` wrote.
+
+    Raises:
+        LinprimError: it cannot be read, or holds no list.
+    """
     rows = read_json(path, "rows of trainings")
-    assert isinstance(rows, list)
+    if not isinstance(rows, list):
+        raise LinprimError(f"{path}: holds no list, wanted rows of trainings")
     return rows
 
 

@@ -11,7 +11,8 @@ import pytest
 from linprim_geo.eval.studies.recorded_trainings import DRIFT, band, measure, read_rows
 
 RECORDED = read_rows(Path(__file__).with_name("recorded_trainings.json"))
-# A step may take so much longer, as a ratio to the core's limit: processors of one instruction set differ by a quarter.
+# A step may take so many times the median of those recorded, as a ratio to the core's limit: the slowest of these, on a
+# busy machine, took 1.4 times the fastest.
 SLOWER = 1.5
 
 
@@ -20,7 +21,7 @@ SLOWER = 1.5
 def test_a_training_comes_out_as_recorded(scene, tmp_path):
     rows = [row for row in RECORDED if row["scene"] == scene]
     found = measure(scene, 0, tmp_path)
-    assert [found["effects"]] == np.unique([row["effects"] for row in rows], axis=0).tolist()
+    assert all(row["effects"] == found["effects"] for row in rows)
     for name in ("psnr", "chamfer", "angle"):
         low, high = band([row[name] for row in rows])
         assert low < found[name] < high, name
