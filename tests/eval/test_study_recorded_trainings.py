@@ -42,6 +42,13 @@ def test_a_row_takes_the_place_of_the_same_training(tmp_path):
     assert [row["psnr"] for row in read_rows(path)] == [4.0, 5.0, 2.0, 1.0]
 
 
+def test_a_file_without_rows_is_one_sentence(tmp_path):
+    path = tmp_path / "rows.json"
+    path.write_text('{"scene": "cad"}')
+    with pytest.raises(LinprimError, match=r"rows\.json: holds no list, wanted rows"):
+        read_rows(path)
+
+
 def test_steps_are_timed_against_the_limits_of_their_pairs(monkeypatch):
     """Every fifth of the last steps; a step of 3 s whose pairs take 2 s at the limit is 1.5 times as slow, and most of
     them are disturbed."""
