@@ -31,12 +31,14 @@ FOCAL_ERROR = 0.003
 @dataclass(frozen=True)
 class Adjusted:
     """Adjusted cameras; by how many pixels the given poses err, root mean square, by their rotations and by their
-    centres together; and the factor of all focal lengths and its deviation, as a share."""
+    centres together; the factor of all focal lengths and its deviation, as a share; and by how much a radial distortion
+    is left in the photographs, k1 of COLMAP's models, which is 0 unless asked for."""
 
     cameras: list[Camera]
     error_px: float
     focal_factor: float
     focal_deviation: float
+    radial: float = 0.0
 
 
 def bundle_adjusted(
@@ -45,6 +47,8 @@ def bundle_adjusted(
     *,
     common: float = 0.0,
     focal: tuple[float, float] = (1.0, FOCAL_ERROR),
+    pose_error: float | None = None,
+    radial_error: float = 0.0,
 ) -> Adjusted:
     """The most probable poses and focal lengths; `points` have two observations or more each.
 
@@ -52,6 +56,8 @@ def bundle_adjusted(
         common: the variance of an error that all observations of a photograph share, over that of each one's own: n of
             them tell as much as n / (1 + n common) without it.
         focal: the factor of all focal lengths that is known without the observations, and its deviation, as a share.
+        pose_error: by how many pixels the given poses err, root mean square; None: the observations tell.
+        radial_error: the deviation of a radial distortion that is left in the photographs; 0: there is none.
 
     Raises:
         numpy.linalg.LinAlgError: the observations determine nothing.
@@ -62,27 +68,33 @@ def bundle_adjusted(
     depth = _median_depths(given, points)
     usual = np.median([(camera.fx + camera.fy) / 2 for camera in given])
     # Deviations of rotations about an axis, in radians, and of centres along one, in depths.
-    spread = np.full(2, FIRST_ERROR / 2 / usual)
-    moves, log_factor, known = np.zeros((len(given), 6)), 0.0, np.log(focal[0])
+    spread = np.full(2, (FIRST_ERROR if pose_error is None else pose_error) / 2 / usual)
+    known, lens_error = np.log(focal[0]), np.array([focal[1], radial_error][: 1 + (radial_error > 0)])
+    moves, lens = np.zeros((len(given), 6)), np.zeros(len(lens_error))
     moved = [_moved(camera, np.zeros(6), known) for camera in given]
     for _ in range(STEPS):
-        found = _Equations(moved, points, common)
+        found = _Equations(moved, points, common, *lens[1:])
         variance = np.repeat(np.stack([np.full_like(depth, spread[0]), spread[1] * depth], 1) ** 2, 3, axis=1)
-        information = np.append(1 / variance, focal[1] ** -2)
-        reduced, right = found.reduced(information, np.append(moves, log_factor))
+        information = np.append(1 / variance, lens_error**-2)
+        reduced, right = found.reduced(information, np.append(moves, lens))
         if not np.isfinite(reduced).all():
             raise np.linalg.LinAlgError("observations behind all cameras, or at one of them")
         factor = cho_factor(reduced, check_finite=False)
         step = cho_solve(factor, right, check_finite=False)
         points = replace(points, xyz=points.xyz + found.of_points(step))
-        moves, log_factor = moves + step[:-1].reshape(-1, 6), log_factor + step[-1]
-        moved = [_moved(camera, own, step[-1]) for camera, own in zip(moved, step[:-1].reshape(-1, 6), strict=True)]
+        of_lens = moves.size
+        own_steps = step[:of_lens].reshape(-1, 6)
+        moves, lens = moves + own_steps, lens + step[of_lens:]
+        moved = [_moved(camera, own, step[of_lens]) for camera, own in zip(moved, own_steps, strict=True)]
         covariance = np.diag(cho_solve(factor, np.eye(len(reduced)), check_finite=False))
-        square = (moves**2 + covariance[:-1].reshape(-1, 6)) / np.repeat([np.ones_like(depth), depth**2], 3, axis=0).T
-        spread = np.sqrt(square.reshape(-1, 2, 3).mean((0, 2)))
+        square = moves**2 + covariance[:of_lens].reshape(-1, 6)
+        square = square / np.repeat([np.ones_like(depth), depth**2], 3, axis=0).T
+        if pose_error is None:
+            spread = np.sqrt(square.reshape(-1, 2, 3).mean((0, 2)))
     # Two axes of each move what is seen.
     error = float(np.sqrt(2 * (spread**2).sum()) * usual)
-    return Adjusted(moved, error, float(np.exp(known + log_factor)), float(np.sqrt(covariance[-1])))
+    radial = float(lens[1]) if len(lens) > 1 else 0.0
+    return Adjusted(moved, error, float(np.exp(known + lens[0])), float(np.sqrt(covariance[of_lens])), radial)
 
 
 def placed_points(cameras: Sequence[Camera], points: ObservedPoints) -> ObservedPoints:
@@ -109,10 +121,13 @@ class _Equations:
     the noise, which their median tells.
 
     A camera moves by six numbers: it turns about its centre by three, in radians about its axes, and what it sees
-    shifts by three along them. The last unknown is the logarithm of a factor of all focal lengths.
+    shifts by three along them. Then comes the logarithm of a factor of all focal lengths and, where `radial` is given,
+    the radial distortion of all photographs, which `radial` is so far.
     """
 
-    def __init__(self, cameras: Sequence[Camera], points: ObservedPoints, common: float = 0.0):
+    def __init__(
+        self, cameras: Sequence[Camera], points: ObservedPoints, common: float = 0.0, radial: float | None = None
+    ):
         self.image, self.point = points.image, points.point
         self.cameras, self.points = len(cameras), len(points.xyz)
         turn = np.array([camera.rotation for camera in cameras])[self.image]
@@ -122,11 +137,15 @@ class _Equations:
         x, y, z = local.T
         front = z > 0
         z = np.where(front, z, 1)
-        self.by_focal = np.stack([inner[0] * x / z, inner[1] * y / z], 1)
-        miss = points.pixel - self.by_focal - inner[2:].T
+        by_lens = np.stack([inner[0] * x / z, inner[1] * y / z], 1)[..., None]
+        if radial is not None:
+            square = ((x**2 + y**2) / z**2)[:, None, None]
+            by_lens = np.concatenate([by_lens * (1 + radial * square), by_lens * square], 2)
+        self.by_lens = by_lens
+        miss = points.pixel - by_lens[..., 0] - inner[2:].T
         if points.precision is not None:
             miss = np.einsum("nij,nj->ni", points.precision, miss)
-            self.by_focal = np.einsum("nij,nj->ni", points.precision, self.by_focal)
+            self.by_lens = points.precision @ by_lens
         length = np.linalg.norm(miss, axis=1)
         noise = max(float(np.median(length[front])) / MEDIAN_LENGTH, LEAST_NOISE) if front.any() else 1.0
         together = 1 + np.bincount(self.image, minlength=self.cameras)[self.image] * common
@@ -150,14 +169,14 @@ class _Equations:
         self.point_inverse = np.linalg.inv(self.point_matrix + damping[:, None, None] * np.eye(3))
 
     def reduced(self, information: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The (6 K + 1, 6 K + 1) matrix and the right side for cameras and the factor alone, with the `information`
-        (6 K + 1,) about the `moves` (6 K + 1,) that they have made from what was given."""
+        """The (6 K + L, 6 K + L) matrix and the right side for cameras and the L numbers of the lens alone, with the
+        `information` (6 K + L,) about the `moves` (6 K + L,) that they have made from what was given."""
         from scipy.sparse import bsr_matrix
 
-        weighted, zoomed = self.weight[:, None, None] * self.by_camera, self.weight[:, None] * self.by_focal
-        own, by_focal = np.zeros((self.cameras, 6, 6)), np.zeros((self.cameras, 6))
+        weighted, of_lens = self.weight[:, None, None] * self.by_camera, self.weight[:, None, None] * self.by_lens
+        own, both_kinds = np.zeros((self.cameras, 6, 6)), np.zeros((self.cameras, 6, self.by_lens.shape[2]))
         np.add.at(own, self.image, np.einsum("nki,nkj->nij", weighted, self.by_camera))
-        np.add.at(by_focal, self.image, np.einsum("nki,nk->ni", self.by_camera, zoomed))
+        np.add.at(both_kinds, self.image, np.einsum("nki,nkj->nij", self.by_camera, of_lens))
         right = np.zeros((self.cameras, 6))
         np.add.at(right, self.image, np.einsum("nki,nk->ni", weighted, self.miss))
         # One row of blocks per observation: of its camera, times those of its point.
@@ -167,26 +186,28 @@ class _Equations:
         mixed = bsr_matrix((both[order], self.point[order], bounds), shape=shape)
         solved = np.einsum("nij,njk->nik", both, self.point_inverse[self.point])
         solved = bsr_matrix((solved[order], self.point[order], bounds), shape=shape)
-        mixed_focal = np.zeros((self.points, 3))
-        np.add.at(mixed_focal, self.point, np.einsum("nki,nk->ni", self.by_point, zoomed))
-        solved_focal = np.einsum("pij,pj->pi", self.point_inverse, mixed_focal).ravel()
-        matrix = np.diag(information)
-        matrix[:-1, :-1] -= (solved @ mixed.T).toarray()
+        mixed_lens = np.zeros((self.points, 3, self.by_lens.shape[2]))
+        np.add.at(mixed_lens, self.point, np.einsum("nki,nkj->nij", self.by_point, of_lens))
+        solved_lens = np.einsum("pij,pjl->pil", self.point_inverse, mixed_lens).reshape(shape[1], -1)
+        matrix, count = np.diag(information), shape[0]
+        matrix[:count, :count] -= (solved @ mixed.T).toarray()
         for k in range(self.cameras):
             matrix[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += own[k]
-        matrix[:-1, -1] = matrix[-1, :-1] = by_focal.ravel() - mixed @ solved_focal
-        matrix[-1, -1] += (zoomed * self.by_focal).sum() - mixed_focal.ravel() @ solved_focal
-        right = np.append(right - (solved @ self.point_right.ravel()).reshape(-1, 6), (zoomed * self.miss).sum())
-        right[-1] -= solved_focal @ self.point_right.ravel()
-        return matrix, right - information * moves
+        matrix[:count, count:] = both_kinds.reshape(count, -1) - mixed @ solved_lens
+        matrix[count:, :count] = matrix[:count, count:].T
+        mixed_lens = mixed_lens.reshape(shape[1], -1)
+        matrix[count:, count:] += np.einsum("nki,nkj->ij", of_lens, self.by_lens) - mixed_lens.T @ solved_lens
+        right = (right - (solved @ self.point_right.ravel()).reshape(-1, 6)).ravel()
+        lens_right = np.einsum("nki,nk->i", of_lens, self.miss) - solved_lens.T @ self.point_right.ravel()
+        return matrix, np.append(right, lens_right) - information * moves
 
     def of_points(self, step: np.ndarray | None) -> np.ndarray:
-        """(P, 3) the points' step where cameras and focal lengths step by (6 K + 1,), or stay."""
+        """(P, 3) the points' step where cameras and the lens step by (6 K + L,), or stay."""
         right = self.point_right
         if step is not None:
-            right = right.copy()
-            moved = np.einsum("nkj,nj->nk", self.by_camera, step[:-1].reshape(-1, 6)[self.image])
-            moved = (moved + self.by_focal * step[-1]) * self.weight[:, None]
+            right, count = right.copy(), 6 * self.cameras
+            moved = np.einsum("nkj,nj->nk", self.by_camera, step[:count].reshape(-1, 6)[self.image])
+            moved = (moved + self.by_lens @ step[count:]) * self.weight[:, None]
             np.subtract.at(right, self.point, np.einsum("nki,nk->ni", self.by_point, moved))
         return np.einsum("pij,pj->pi", self.point_inverse, right)
 
