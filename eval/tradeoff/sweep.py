@@ -108,7 +108,7 @@ class Sweep:
 
     def __init__(self, scene: Path, folder: Path, options: TradeoffOptions, quiet: bool):
         from linprim_geo.capture.load import load_scene
-        from linprim_geo.capture.structure_from_motion import prepare
+        from linprim_geo.stereo.refine_found_poses import prepare
 
         run, reference, quick, threads = options.run, options.reference, options.quick, options.threads
         self.scene_path, self.folder, self.given = Path(os.path.realpath(scene)), folder, run

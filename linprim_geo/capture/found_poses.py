@@ -40,7 +40,7 @@ _LISTED = 6
 class Verdict:
     """What became of the photographs: how many have a pose, the points, the mean reprojection error in pixels, the mean
     number of photographs that see a point, the names of those without a pose, and of those whose pose most of their
-    matches contradict."""
+    matches contradict; and whether it was tried to refine the poses."""
 
     photographs: int
     registered: int
@@ -49,6 +49,7 @@ class Verdict:
     track_length: float = 0.0
     left_out: tuple[str, ...] = ()
     misplaced: tuple[str, ...] = ()
+    refined: bool = False
 
     def __str__(self) -> str:
         return (
@@ -165,8 +166,10 @@ def _stored(kept: Path) -> Verdict | None:
     """What is said of the result in a folder; None if there is none, or one that is of no use and made again."""
     try:
         verdict = Verdict(**json.loads((kept / "verdict.json").read_text(encoding="utf-8")))
-        *numbers, left_out, misplaced = astuple(verdict)
-        usable = all(type(value) in (int, float) and 0 <= value < _LARGEST for value in numbers)
+        *numbers, left_out, misplaced, refined = astuple(verdict)
+        usable = isinstance(refined, bool) and all(
+            type(value) in (int, float) and 0 <= value < _LARGEST for value in numbers
+        )
         for names in (left_out, misplaced):
             usable = usable and isinstance(names, (list, tuple)) and all(isinstance(name, str) for name in names)
         return verdict if usable and (not verdict.registered or has_model(kept / "model")) else None

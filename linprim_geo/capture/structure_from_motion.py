@@ -11,7 +11,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,8 @@ from linprim_geo.capture.incremental_mapping import MIN_REGISTERED, largest_mode
 from linprim_geo.capture.load import has_poses
 from linprim_geo.imaging import photos
 
+Refine = Callable[[Path, Path, Path, Callable[[str], None]], bool]
+
 
 def prepare(
     path: str | os.PathLike,
@@ -42,6 +44,7 @@ def prepare(
     cache: Path | None = None,
     threads: int = 0,
     log: Callable[[str], None] | None = None,
+    refine: Refine | None = None,
     **changes: Any,
 ) -> None:
     """Makes a folder of photographs without poses, or a video, readable by `load_scene`, which may take minutes; leaves
@@ -49,7 +52,7 @@ def prepare(
 
     Args:
         path, options, cache, changes: as for `load_scene`.
-        threads, log: as for `find_poses`.
+        threads, log, refine: as for `find_poses`.
 
     Raises:
         LinprimError: as `video_frames.extract_frames` and `find_poses`, or there is nothing at `path`.
@@ -58,11 +61,16 @@ def prepare(
     if video_frames.is_video(path):
         path = video_frames.extract_frames(path, options.frames, cache, log)
     if not has_poses(path, options.sparse) and photographs(path)[1]:
-        find_poses(path, cache, threads=threads, log=log)
+        find_poses(path, cache, threads=threads, log=log, refine=refine)
 
 
 def find_poses(
-    root: Path, cache: Path | None = None, *, threads: int = 0, log: Callable[[str], None] | None = None
+    root: Path,
+    cache: Path | None = None,
+    *,
+    threads: int = 0,
+    log: Callable[[str], None] | None = None,
+    refine: Refine | None = None,
 ) -> Path:
     """Finds the poses of the photographs in `root`, unless that was done before; returns the folder of the COLMAP
     model.
@@ -76,6 +84,8 @@ def find_poses(
         cache: see `photos.cache_folder`.
         threads: 0 uses all cores.
         log: is called with lines of progress and with the verdict.
+        refine: is called once with `root`, the folder of the model, one that is made for the refined model, and `log`,
+            and returns whether it has written that; see `stereo.refine_found_poses`.
 
     Raises:
         LinprimError: no photographs, one that cannot be read, or too few of them that get a pose.
@@ -99,10 +109,25 @@ def find_poses(
             say(f"{verdict}; {time.monotonic() - start:.0f} s")
         else:
             say(f"{verdict}; from {kept}")
-    _refuse(root, verdict)
+        _refuse(root, verdict)
+        if refine is not None and not verdict.refined:
+            _refine(root, kept, verdict, refine, say)
     if verdict.doubts:
         say(f"warning: the poses are poor, and so may be the result: {verdict.doubts}")
     return kept / "model"
+
+
+def _refine(root: Path, kept: Path, verdict: Verdict, refine: Refine, say: Callable[[str], None]) -> None:
+    """Puts the refined model in the place of that in `kept`, if there is one, and notes that this was done."""
+    part, start = kept / "model.part", time.monotonic()
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir()
+    if refine(root, kept / "model", part, say):
+        shutil.rmtree(kept / "model")
+        part.rename(kept / "model")
+        say(f"poses refined in {time.monotonic() - start:.0f} s")
+    shutil.rmtree(part, ignore_errors=True)
+    write_json(kept / "verdict.json", asdict(replace(verdict, refined=True)))
 
 
 def _reconstruct(

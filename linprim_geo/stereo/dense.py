@@ -20,7 +20,6 @@ from linprim_geo.base.options import SceneOptions, StereoOptions, TrainOptions, 
 from linprim_geo.base.progress import Progress, Stages
 from linprim_geo.base.version import __version__
 from linprim_geo.capture.load import load_scene, told_downscale
-from linprim_geo.capture.structure_from_motion import prepare
 from linprim_geo.capture.types import Scene, View
 from linprim_geo.kernels import ops
 from linprim_geo.points.start_points import with_points
@@ -28,6 +27,7 @@ from linprim_geo.stereo.adjust_poses import adjusted_scene
 from linprim_geo.stereo.fused_points import PointFusion
 from linprim_geo.stereo.maps_from_disk import maps_of
 from linprim_geo.stereo.planes_on_disk import STAGES, Photographs, PlanesOnDisk
+from linprim_geo.stereo.refine_found_poses import prepare
 from linprim_geo.stereo.time_plan import LEAST_VIEWS, Plan, planned, seconds_per_pixel
 from linprim_geo.stereo.workspace import Workspace
 

@@ -21,7 +21,6 @@ from linprim_geo.base.options import (
 )
 from linprim_geo.base.progress import Progress
 from linprim_geo.capture.load import load_scene, settled_folders, told_downscale
-from linprim_geo.capture.structure_from_motion import prepare
 from linprim_geo.capture.types import PointCloud, Scene
 from linprim_geo.geometry.environment_map import texels_for
 from linprim_geo.imaging.decoded_photos import DecodedPhotos
@@ -36,6 +35,7 @@ from linprim_geo.points.photo_evidence import observe
 from linprim_geo.points.start_points import filled_points, initial_cloud, with_points
 from linprim_geo.runs.run import Run, refuse_used
 from linprim_geo.stereo.adjust_poses import adjusted_scene
+from linprim_geo.stereo.refine_found_poses import prepare
 from linprim_geo.training.background import chosen_background
 from linprim_geo.training.checkpoint import restore
 from linprim_geo.training.effects import Choice, Decision, decide, settle, summary

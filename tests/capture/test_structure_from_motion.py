@@ -107,6 +107,28 @@ def test_what_was_found_is_found_again_by_content(room, posed, copied, monkeypat
     assert found_model(copied, cache) is None
 
 
+@pytest.mark.parametrize("better", [True, False])
+def test_poses_are_refined_once(posed, copied, tmp_path, better):
+    """What is refined takes the place of the model; what could not be is not tried again."""
+    cache = Path(shutil.copytree(posed[0], tmp_path / "cache"))
+    asked, before = [], (found_model(copied, cache) / "points3D.bin").read_bytes()
+
+    def refine(root, model, refined, log):
+        asked.append((root, model == found_model(copied, cache)))
+        for file in model.iterdir():
+            shutil.copyfile(file, refined / file.name)
+        (refined / "points3D.bin").write_bytes(before + b"refined")
+        return better
+
+    with pytest.raises(KeyboardInterrupt):
+        find_poses(copied, cache, refine=lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    for _ in range(2):
+        model = find_poses(copied, cache, refine=refine)
+    assert asked == [(copied, True)]
+    assert (model / "points3D.bin").read_bytes() == (before + b"refined" if better else before)
+    assert [path.name for path in model.parent.iterdir() if path.is_dir()] == ["model"]
+
+
 def test_without_being_asked_no_poses_are_looked_for(copied, tmp_path):
     with pytest.raises(
         LinprimError,
