@@ -88,6 +88,26 @@ def joined(name: str, parts: Sequence[Part]) -> Part:
     )
 
 
+def merged(parts: Sequence[Part]) -> list[Part]:
+    """The same surface with one part for each material and shading, which the path tracer renders much faster: dull
+    parts of one colour get it at their vertices."""
+    groups: dict[tuple, list[Part]] = {}
+    for part in parts:
+        material, shape = part.material, part.vertices.shape
+        if not isinstance(material.color, np.ndarray):
+            part = replace(part, uv=None)
+            if material.kind == "diffuse" and part.colors is None:
+                part = replace(part, material=Material(), colors=np.broadcast_to(np.array(material.color), shape))
+        look = id(material.color) if isinstance(material.color, np.ndarray) else part.material.color
+        key = part.material.kind, part.material.roughness, look, part.smooth, part.colors is None, part.uv is None
+        groups.setdefault(key, []).append(part)
+    whole = []
+    for group in groups.values():
+        colors = [part.colors for part in group if part.colors is not None]
+        whole.append(replace(joined(group[0].name, group), colors=np.concatenate(colors) if colors else None))
+    return whole
+
+
 def lathe(name: str, profile, material: Material, *, segments: int = 96) -> Part:
     """A profile (N, 2) of radius and height turned about the z axis; its outside is to the right of the profile's
     way upwards."""
