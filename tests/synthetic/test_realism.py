@@ -6,6 +6,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
+from helpers.traced import nearest_surface, pixel_rays, unit_normals
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.capture.load import load_scene
@@ -28,13 +29,6 @@ SMALL = {"views": 3, "test_views": 1, "size": (48, 36), "samples": 4, "points": 
 
 def camera(position, target, size=(40, 30), focal=40.0):
     return Camera(*size, focal, focal, 0.5 * size[0], 0.5 * size[1], look_at(np.array(position), np.array(target)))
-
-
-def nearest_surface(traced: scenes.TracedScene, caster: RayCaster) -> float:
-    """How near a camera comes to a surface, metres."""
-    probe = fibonacci_directions(500)
-    views = traced.train + traced.test
-    return min(float(caster.cast(np.tile(view.center, (len(probe), 1)), probe)[0].min()) for view in views)
 
 
 # Shapes and textures
@@ -96,11 +90,6 @@ def test_cameras_stand_in_free_space_and_see_the_scene(name):
 
 
 # A whole room
-
-
-def unit_normals(vertices, faces):
-    normal = np.cross(*(vertices[faces[:, i]] - vertices[faces[:, 0]] for i in (1, 2)))
-    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-15)
 
 
 @pytest.fixture(scope="module")
@@ -165,9 +154,7 @@ def test_what_is_seen_of_the_kitchen_faces_the_camera_and_nothing_is_open(walked
     for view in traced.train[::4]:
         _, face, _ = caster.render_depth(view)
         assert (face >= 0).all()
-        y, x = np.mgrid[: view.height, : view.width] + 0.5
-        ray = np.stack([(x - view.cx) / view.fx, (y - view.cy) / view.fy, np.ones_like(x)], -1)
-        towards = (ray @ view.world_to_camera[:3, :3] * normals[face]).sum(-1)
+        towards = (pixel_rays(view) * normals[face]).sum(-1)
         assert (towards < 0).mean() > 0.999
 
 
