@@ -133,7 +133,7 @@ class SynthOptions:
     realism: str | None = option(
         None,
         "a scene with light and materials, by path tracing (extra realism); --mesh is its figure",
-        choices=("attic", "bedroom", "desk", "facade", "garden", "kitchen", "shelf", "statue", "terrace"),
+        choices=("attic", "bedroom", "courtyard", "desk", "facade", "garden", "kitchen", "shelf", "statue", "terrace"),
     )
     samples: int = option(128, "light paths a pixel of --realism", low=4, high=65536)
     denoise: str = option(

@@ -16,6 +16,7 @@ from linprim_geo.synthetic import camera_paths
 from linprim_geo.synthetic.options import SynthOptions
 from linprim_geo.synthetic.realism.attic import attic_poses, attic_scene
 from linprim_geo.synthetic.realism.bedroom import bedroom_poses, bedroom_scene
+from linprim_geo.synthetic.realism.courtyard import courtyard_backdrop, courtyard_poses, courtyard_scene
 from linprim_geo.synthetic.realism.desk import desk_scene
 from linprim_geo.synthetic.realism.facade import facade_scene, street_poses
 from linprim_geo.synthetic.realism.garden import garden_backdrop, garden_poses, garden_scene
@@ -82,6 +83,15 @@ SCENES = {
     "attic": Scene(attic_scene, attic_poses, "walk", 68.0, meter_share=0.5, meter_level=0.15),
     "bedroom": Scene(
         lambda figure, seed: bedroom_scene(seed), bedroom_poses, "walk", 68.0, meter_share=0.9, meter_level=0.68
+    ),
+    "courtyard": Scene(
+        lambda figure, seed: courtyard_scene(seed),
+        courtyard_poses,
+        "walk",
+        68.0,
+        meter_share=0.9,
+        meter_level=0.82,
+        backdrop=courtyard_backdrop,
     ),
     "desk": Scene(desk_scene, arc_poses((0.60, -0.42, 0.80), 1.0, 80.0, -48.0), "arc", 55.0),
     "facade": Scene(lambda figure, seed: facade_scene(seed), street_poses, "street", 58.0),
