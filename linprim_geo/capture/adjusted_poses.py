@@ -10,6 +10,7 @@ import numpy as np
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import read_json, write_json
 from linprim_geo.capture.types import Scene, View, check_pose
+from linprim_geo.geometry.lens import zoomed
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,8 @@ class AdjustedPoses:
         def moved(view: View) -> View:
             pose, own = self.poses.get(view.name, view.camera.world_to_camera), view.camera
             fx, fy = self.focal_factor * own.fx, self.focal_factor * own.fy
-            return replace(view, camera=replace(own, fx=fx, fy=fy, world_to_camera=pose))
+            lens = view.lens and zoomed(view.lens, self.focal_factor)
+            return replace(view, camera=replace(own, fx=fx, fy=fy, world_to_camera=pose), lens=lens)
 
         train, test = (tuple(map(moved, views)) for views in (scene.train, scene.test))
         return replace(scene, train=train, test=test, adjusted=self)

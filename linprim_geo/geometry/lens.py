@@ -160,6 +160,13 @@ def resized(lens: Lens, width: int, height: int) -> Lens:
     return Lens(lens.model, width, height, tuple(float(value) for value in camera.params))
 
 
+def zoomed(lens: Lens, factor: float) -> Lens:
+    """The lens with focal lengths that are longer by a factor."""
+    focal = set(_camera(lens).focal_length_idxs())
+    params = tuple(value * factor if k in focal else value for k, value in enumerate(lens.params))
+    return Lens(lens.model, lens.width, lens.height, params)
+
+
 @lru_cache(maxsize=64)
 def _undistorted(lens: Lens) -> Intrinsics:
     from linprim_geo.geometry.load_pycolmap import pycolmap

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -214,6 +215,27 @@ def test_a_run_keeps_its_poses(rooms, tmp_path, monkeypatch):
     train(rooms["wrong"], tmp_path / "as_given", SceneOptions(poses="given"), options, quiet=True)
     assert not (tmp_path / "as_given" / ADJUSTED_POSES).exists()
     assert off_px(Run.open(tmp_path / "as_given").scene()) == off_px(load_scene(rooms["wrong"]))
+
+
+def test_photographs_of_a_lens_with_distortion_stay_as_they_are(rooms, tmp_path):
+    """A focal length that is longer by 2 % is one of the lens, too: undistorted for it alone, photographs would be
+    enlarged, and show what they showed under the focal length before."""
+    saved = json.loads((rooms["exact"] / "transforms.json").read_text())
+    root = Path(shutil.copytree(rooms["exact"], tmp_path / "lens"))
+    (root / "transforms.json").write_text(json.dumps(saved | {"k1": 0.05}))
+    scene = load_scene(root, cache=tmp_path / "cache")
+    adjusted = AdjustedPoses({}, 1.02, 0.5).applied(scene)
+
+    def picture(view) -> np.ndarray:
+        return replace(view, decoded=None, cache=None).load().rgb.astype(int)
+
+    for before, after in zip(scene.views, adjusted.views, strict=True):
+        assert before.lens is not None and after.lens is not None
+        assert after.camera.fx == pytest.approx(1.02 * before.camera.fx)
+        assert after.lens.params[:2] == pytest.approx(1.02 * np.array(before.lens.params[:2]))
+        assert after.lens.params[2:] == before.lens.params[2:]
+        enlarged = picture(replace(after, lens=before.lens))
+        assert np.abs(picture(before) - picture(after)).mean() < 0.1 * np.abs(picture(before) - enlarged).mean()
 
 
 @pytest.mark.parametrize(
