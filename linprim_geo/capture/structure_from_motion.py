@@ -84,8 +84,8 @@ def find_poses(
         cache: see `photos.cache_folder`.
         threads: 0 uses all cores.
         log: is called with lines of progress and with the verdict.
-        refine: is called once with `root`, the folder of the model, one that is made for the refined model, and `log`,
-            and returns whether it has written that; see `stereo.refine_found_poses`.
+        refine: is called once for a model, with `root`, the model's folder, an empty one and `log`; returns whether it
+            has written a better model there, such as `stereo.refine_found_poses.refined_model`.
 
     Raises:
         LinprimError: no photographs, one that cannot be read, or too few of them that get a pose.

@@ -31,8 +31,8 @@ FOCAL_ERROR = 0.003
 @dataclass(frozen=True)
 class Adjusted:
     """Adjusted cameras; by how many pixels the given poses err, root mean square, by their rotations and by their
-    centres together; the factor of all focal lengths and its deviation, as a share; and by how much a radial distortion
-    is left in the photographs, k1 of COLMAP's models, which is 0 unless asked for."""
+    centres together; the factor of all focal lengths and its deviation, as a share; and the radial distortion that is
+    left in the photographs, k1 of COLMAP's models, which is 0 unless it is asked for."""
 
     cameras: list[Camera]
     error_px: float
@@ -69,11 +69,11 @@ def bundle_adjusted(
     usual = np.median([(camera.fx + camera.fy) / 2 for camera in given])
     # Deviations of rotations about an axis, in radians, and of centres along one, in depths.
     spread = np.full(2, (FIRST_ERROR if pose_error is None else pose_error) / 2 / usual)
-    known, lens_error = np.log(focal[0]), np.array([focal[1], radial_error][: 1 + (radial_error > 0)])
+    known, lens_error = np.log(focal[0]), np.array([focal[1], radial_error] if radial_error else [focal[1]])
     moves, lens = np.zeros((len(given), 6)), np.zeros(len(lens_error))
     moved = [_moved(camera, np.zeros(6), known) for camera in given]
     for _ in range(STEPS):
-        found = _Equations(moved, points, common, *lens[1:])
+        found = _Equations(moved, points, common, radial=lens[1] if radial_error else None)
         variance = np.repeat(np.stack([np.full_like(depth, spread[0]), spread[1] * depth], 1) ** 2, 3, axis=1)
         information = np.append(1 / variance, lens_error**-2)
         reduced, right = found.reduced(information, np.append(moves, lens))
@@ -93,7 +93,7 @@ def bundle_adjusted(
             spread = np.sqrt(square.reshape(-1, 2, 3).mean((0, 2)))
     # Two axes of each move what is seen.
     error = float(np.sqrt(2 * (spread**2).sum()) * usual)
-    radial = float(lens[1]) if len(lens) > 1 else 0.0
+    radial = float(lens[1]) if radial_error else 0.0
     return Adjusted(moved, error, float(np.exp(known + lens[0])), float(np.sqrt(covariance[of_lens])), radial)
 
 

@@ -12,6 +12,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -39,21 +40,11 @@ POSE_ERROR, FOCAL_ERROR, RADIAL_ERROR = 20.0, 0.1, 0.1
 # Where a photograph has moved by more pixels, its patches were looked for in wrong places: one more round, up to so
 # many.
 MOVED_FAR, MOST_ROUNDS = 1.0, 4
-# Of the model's points, as in mapping: observations that err by more pixels are left out, and points with less between
-# their rays.
-MOST_ERROR_PX, LEAST_DEGREES = 4.0, 1.5
 
 
-def prepare(
-    path: str | os.PathLike,
-    options: SceneOptions | None = None,
-    *,
-    cache: Path | None = None,
-    threads: int = 0,
-    log: Callable[[str], None] | None = None,
-) -> None:
+def prepare(path: str | os.PathLike, options: SceneOptions | None = None, **how: Any) -> None:
     """`structure_from_motion.prepare`, with poses that are refined once they are found."""
-    structure_from_motion.prepare(path, options, cache=cache, threads=threads, log=log, refine=refined_model)
+    structure_from_motion.prepare(path, options, refine=refined_model, **how)
 
 
 def refined_model(root: Path, found: Path, refined: Path, log: Callable[[str], None]) -> bool:
@@ -71,8 +62,8 @@ def refined_model(root: Path, found: Path, refined: Path, log: Callable[[str], N
         return False
     for number in range(1, MOST_ROUNDS + 1):
         views = [replace(view, cache=None) for view in load_scene(root, sparse=str(path)).views]
-        cameras = [view.camera for view in views]
-        keypoints = placed_points(cameras, _keypoints(model, views))
+        cameras, images = [view.camera for view in views], _images_of(model, views)
+        keypoints = placed_points(cameras, _keypoints(model, cameras, images))
         try:
             patches = patch_tracks(views, small_depth_maps(views, keypoints.xyz))
             both = _together(cameras, keypoints, patches)
@@ -84,7 +75,7 @@ def refined_model(root: Path, found: Path, refined: Path, log: Callable[[str], N
         except (LinprimError, np.linalg.LinAlgError) as error:
             log(f"poses: by keypoints alone: {error}")
             return False
-        _apply(model, views, done)
+        _apply(model, images, done)
         model.write_binary(str(refined))
         if last:
             break
@@ -93,31 +84,34 @@ def refined_model(root: Path, found: Path, refined: Path, log: Callable[[str], N
     return True
 
 
-def _keypoints(model, views: Sequence[View]) -> ObservedPoints:
-    """The points of a `pycolmap.Reconstruction`, where the views see them."""
-    image_of = {model.images[number].name: number for number in model.reg_image_ids()}
-    rows = {_number(image_of, view): k for k, view in enumerate(views)}
+def _images_of(model, views: Sequence[View]) -> list:
+    """The image of each view in a `pycolmap.Reconstruction`, named by its path in the folder of photographs."""
+    images = {model.images[number].name: model.images[number] for number in model.reg_image_ids()}
+
+    def image_of(view: View):
+        path = view.image_path.parts
+        ends = ("/".join(path[first:]) for first in range(len(path)))
+        return next(images[end] for end in ends if end in images)
+
+    return [image_of(view) for view in views]
+
+
+def _keypoints(model, cameras: Sequence[Camera], images: Sequence) -> ObservedPoints:
+    """The points of a `pycolmap.Reconstruction`, where the cameras see them, which stand for its images."""
+    rows = {image.image_id: k for k, image in enumerate(images)}
     point, image, pixel = [], [], []
     points = [model.points3D[number] for number in sorted(model.point3D_ids())]
     for row, found in enumerate(points):
         for element in found.track.elements:
             point.append(row)
             image.append(rows[element.image_id])
-            pixel.append(model.images[element.image_id].points2D[element.point2D_idx].xy)
+            pixel.append(images[image[-1]].points2D[element.point2D_idx].xy)
     xyz, rgb, error = (np.array([getattr(found, name) for found in points]) for name in ("xyz", "color", "error"))
     seen = ObservedPoints(xyz, rgb, error, np.array(point), np.array(image), np.array(pixel))
-    for k, view in enumerate(views):
-        own, mine = view.camera, seen.image == k
-        lens = model.images[_number(image_of, view)].camera
-        seen.pixel[mine] = np.asarray(lens.cam_from_img(seen.pixel[mine])) * [own.fx, own.fy] + [own.cx, own.cy]
+    for k, (own, one) in enumerate(zip(cameras, images, strict=True)):
+        mine = seen.image == k
+        seen.pixel[mine] = np.asarray(one.camera.cam_from_img(seen.pixel[mine])) * [own.fx, own.fy] + [own.cx, own.cy]
     return seen
-
-
-def _number(image_of: dict[str, int], view: View) -> int:
-    """A view's number among the images, whose names are their paths in the folder of photographs."""
-    path = view.image_path.parts
-    ends = ("/".join(path[first:]) for first in range(len(path)))
-    return next(image_of[end] for end in ends if end in image_of)
 
 
 def _together(cameras: Sequence[Camera], keypoints: ObservedPoints, patches: ObservedPoints) -> ObservedPoints:
@@ -166,8 +160,9 @@ def _agree(cameras: Sequence[Camera], keypoints: ObservedPoints, patches: Observ
     return found <= (1 + KNOWN_TO) * left
 
 
-def _apply(model, views: Sequence[View], done: Adjusted) -> None:
-    """Puts cameras into a `pycolmap.Reconstruction`, and its points where these see them; those that err are dropped.
+def _apply(model, images: Sequence, done: Adjusted) -> None:
+    """Puts cameras into a `pycolmap.Reconstruction`, and its points where these see them; those that err are dropped as
+    in mapping.
 
     Lenses are of one focal length and one distortion (COLMAP's SIMPLE_RADIAL)."""
     from linprim_geo.geometry.load_pycolmap import pycolmap
@@ -175,9 +170,7 @@ def _apply(model, views: Sequence[View], done: Adjusted) -> None:
     for lens in model.cameras.values():
         focal, *middle, radial = lens.params
         lens.params = [done.focal_factor * focal, *middle, done.focal_factor**2 * radial + done.radial]
-    image_of = {model.images[number].name: number for number in model.reg_image_ids()}
-    for view, camera in zip(views, done.cameras, strict=True):
-        image = model.images[_number(image_of, view)]
+    for image, camera in zip(images, done.cameras, strict=True):
         image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(camera.world_to_camera[:3]))
     options = pycolmap.BundleAdjustmentOptions(print_summary=False, refine_rig_from_world=False)
     options.refine_focal_length = options.refine_extra_params = False
@@ -186,5 +179,6 @@ def _apply(model, views: Sequence[View], done: Adjusted) -> None:
     for number in model.reg_image_ids():
         everything.add_image(number)
     pycolmap.create_default_bundle_adjuster(options, everything, model).solve()
-    pycolmap.ObservationManager(model).filter_all_points3D(MOST_ERROR_PX, LEAST_DEGREES)
+    mapper = pycolmap.IncrementalPipelineOptions().mapper
+    pycolmap.ObservationManager(model).filter_all_points3D(mapper.filter_max_reproj_error, mapper.filter_min_tri_angle)
     model.update_point_3d_errors()

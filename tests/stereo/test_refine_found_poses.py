@@ -154,4 +154,4 @@ def test_training_and_stereo_refine_what_they_find(tmp_path, monkeypatch):
     monkeypatch.setattr(structure_from_motion, "prepare", lambda *given, **how: asked.append(how))
     assert start.prepare is dense.prepare is prepare
     prepare(tmp_path, threads=1)
-    assert asked == [{"cache": None, "threads": 1, "log": None, "refine": refined_model}]
+    assert asked == [{"threads": 1, "refine": refined_model}]
