@@ -8,13 +8,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.captures import look_at
+from helpers.lit_wall import CENTERS, WALL, camera_at, light, map_of, photographs, wall_depth
 from scipy.ndimage import gaussian_filter
 
 from linprim_geo.geometry.sampling import sample_bilinear
 from linprim_geo.stereo import held_planes, plain_regions, shaded_planes, skies
 from linprim_geo.stereo.common_surfaces import CommonSurfaces
-from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.held_planes import HeldPlanes
 from linprim_geo.stereo.plain_regions import in_camera
 from linprim_geo.stereo.shaded_planes import LEAST_VIEWS, OTHERS_SHARE, ShadedPlanes
@@ -22,59 +21,7 @@ from linprim_geo.stereo.shading import Shading, evaluate, fit_plane, shaded_regi
 from linprim_geo.stereo.skies import shows_sky
 from linprim_geo.stereo.vignetting import falloff
 
-# A wall y = 0, seen from an arc before it; a lamp near its left upper corner.
-WALL, LAMP, NOISE = np.array([0.0, 1.0, 0.0, 0.0]), np.array([-0.9, 0.7, 0.8]), 2.0
-CENTERS = [(2 * np.sin(angle), 2 * np.cos(angle), 0.2) for angle in np.radians(np.linspace(-35, 35, 9))]
 NO_PLANES = np.zeros((0, 4))
-
-
-def camera_at(center):
-    return look_at(center, target=(0.0, 0.0, 0.0), size=(240, 180), focal=200.0)
-
-
-def wall_depth(camera, bulge: float = 0.0) -> np.ndarray:
-    """(H, W) depth of the wall, or of one that comes forward by `bulge` in the middle, as a parabola."""
-    rays = camera.world_rays()
-    depth = -camera.center[1] / rays[..., 1]
-    for _ in range(20 if bulge else 0):
-        x = camera.center[0] + depth * rays[..., 0]
-        depth = (bulge * np.maximum(1 - x**2, 0) - camera.center[1]) / rays[..., 1]
-    return depth
-
-
-def light(points: np.ndarray) -> np.ndarray:
-    """Grey values of a white wall by the lamp's light, as displays show it."""
-    towards = LAMP - points
-    square = (towards**2).sum(-1)
-    return 255 * np.clip(0.55 * towards[..., 1] / square**1.5, 0, 1) ** (1 / 2.2)
-
-
-def map_of(camera, grey: np.ndarray, seed: int, noise: float = NOISE) -> DepthMap:
-    noisy = grey + np.random.default_rng(seed).normal(0, noise, grey.shape)
-    nothing = np.full(grey.shape, np.nan, np.float32)
-    none = np.zeros(grey.shape, np.uint8)
-    return DepthMap(
-        camera=camera,
-        depth=nothing,
-        normal=np.full((*grey.shape, 3), np.nan, np.float32),
-        confidence=none.astype(np.float32),
-        confirming=none,
-        deviation=nothing,
-        grey=np.clip(np.rint(noisy), 0, 255).astype(np.uint8),
-        noise=noise**2 + 1 / 12,
-    )
-
-
-def photographs(value, bulge: float = 0.0, seed: int = 0, noise: float = NOISE):
-    """Maps of all cameras with the grey values `value`(points, view), and the true depths."""
-    maps, depths = [], []
-    for view, center in enumerate(CENTERS):
-        camera = camera_at(center)
-        depth = wall_depth(camera, bulge)
-        points = camera.center + camera.world_rays() * depth[..., None]
-        maps.append(map_of(camera, value(points, view), seed + view, noise))
-        depths.append(depth)
-    return maps, depths
 
 
 def planes_of(maps, depths, by_points=NO_PLANES, by_edges=NO_PLANES, confirmed=None):
