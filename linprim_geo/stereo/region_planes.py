@@ -14,6 +14,7 @@ region is wide enough to tell; where a thing that no edge parts from the wall is
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, label, uniform_filter
@@ -51,15 +52,42 @@ SURROUNDINGS = 2 * WIDE + 1
 _Lying = tuple[np.ndarray, np.ndarray]
 
 
+@dataclass(frozen=True)
+class RegionDepths:
+    """On which plane each pixel of a view's plain regions lies: its `number` (H, W), -1 elsewhere, and float32 `depth`
+    (H, W), NaN elsewhere; (H, W) bool where a known depth is that of the plane but for its error, so that it is to be
+    `moved` to it, and where the plane `stands` against any other depth."""
+
+    number: np.ndarray
+    depth: np.ndarray
+    moved: np.ndarray
+    stands: np.ndarray
+
+    @classmethod
+    def nothing(cls, camera: Camera) -> RegionDepths:
+        """Of a view before any plane is laid."""
+        shape = (camera.height, camera.width)
+        none = np.zeros(shape, bool)
+        return cls(np.full(shape, -1), np.full(shape, np.nan, np.float32), none, none.copy())
+
+    def without(self, taken: np.ndarray) -> RegionDepths:
+        """Nothing where pixels are `taken` (H, W)."""
+        return RegionDepths(
+            np.where(taken, -1, self.number),
+            np.where(taken, np.float32(np.nan), self.depth),
+            self.moved & ~taken,
+            self.stands & ~taken,
+        )
+
+
 def region_plane_depths(
     cameras: Sequence[Camera],
     regions: Sequence[Sequence[PlainRegion]],
     planes: np.ndarray,
     known: Sequence[np.ndarray],
-) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
-    """Of each view (H, W) float32 depth of its plain `regions` by the (K, 4) planes of the world on which they lie, NaN
-    elsewhere; (H, W) bool where a `known` (H, W) depth, NaN elsewhere, is that of such a plane but for its error; and
-    (H, W) bool where the plane stands against any other depth.
+) -> list[RegionDepths]:
+    """Of each view, of its plain `regions` by the (K, 4) planes of the world on which they lie, with the `known` (H, W)
+    depths, NaN elsewhere.
 
     A pixel lies on the plane with the most points along the edges of its region, times what its hull holds of it, of
     those within whose hull it is and on which most known depths there are. Stereo errs beside edges: in what is wide of
@@ -72,22 +100,21 @@ def region_plane_depths(
     hulls = _hulls(cameras, regions, lying, planes)
     beside = [beside_edges(depth.shape, own) for depth, own in zip(known, regions, strict=True)]
     views = KnownDepths(cameras, (np.where(at, np.nan, depth) for at, depth in zip(beside, known, strict=True)))
-    depths, moved, stands = [], [], []
+    result = []
     of_views = zip(cameras, regions, lying, local, known, beside, strict=True)
     for camera, own, of_regions, of_view, sure, of_edges in of_views:
-        depths.append(np.full((camera.height, camera.width), np.nan, np.float32))
-        moved.append(np.zeros((camera.height, camera.width), bool))
-        wide, telling = np.zeros((camera.height, camera.width), bool), np.where(of_edges, np.nan, sure)
+        laid = RegionDepths.nothing(camera)
+        wide, telling = np.zeros_like(laid.moved), np.where(of_edges, np.nan, sure)
         for region, (on, fits) in zip(own, of_regions, strict=True):
             best = _best_first(camera, region, of_view, hulls, on.sum(0) * fits, views)
-            _lay(depths[-1], moved[-1], camera, region, of_view[best], [hulls[k] for k in best], sure, telling)
+            _lay(laid, camera, region, of_view, best, hulls, sure, telling)
             height, width = region.wide.shape
             wide[region.top : region.top + height, region.left : region.left + width] |= region.wide
-        off = np.abs(sure / depths[-1] - 1) > TOLERANCE  # not where either is NaN
-        laid = np.isfinite(depths[-1])
-        stands.append(laid & wide & ~_are_surfaces(off, laid))
-        moved[-1] |= off & stands[-1]
-    return depths, moved, stands
+        off = np.abs(sure / laid.depth - 1) > TOLERANCE  # not where either is NaN
+        known_here = np.isfinite(laid.depth)
+        stands = known_here & wide & ~_are_surfaces(off, known_here)
+        result.append(replace(laid, moved=laid.moved | (off & stands), stands=stands))
+    return result
 
 
 def _are_surfaces(off: np.ndarray, laid: np.ndarray) -> np.ndarray:
@@ -163,33 +190,34 @@ def _hulls(
 
 
 def _lay(
-    depth: np.ndarray,
-    moved: np.ndarray,
+    laid: RegionDepths,
     camera: Camera,
     region: PlainRegion,
     planes: np.ndarray,
+    best: Sequence[int],
     hulls: Sequence[_Hull],
     known: np.ndarray,
     telling: np.ndarray,
 ) -> None:
-    """Sets the depth (H, W) of each pixel of a region by the first of (K, 3) planes of the camera whose hull it is in
-    and on which most (H, W) `telling` depths are there, and where `known` (H, W) ones are `moved` (H, W) to it."""
+    """Lays each pixel of a region on the first of the `best` of (K, 3) planes of the camera whose hull it is in and on
+    which most (H, W) `telling` depths are there, and says where `known` (H, W) ones are moved to it."""
     row, column = np.nonzero(region.mask)
     row, column = row + region.top, column + region.left
     rays, left = rays_of(camera, row, column), np.ones(len(row), bool)
-    for plane, hull in zip(planes, hulls, strict=True):
-        inverse = np.where(left, rays @ plane, 0)
-        rows = _held(camera, rays, inverse, hull)
+    for number in best:
+        inverse = np.where(left, rays @ planes[number], 0)
+        rows = _held(camera, rays, inverse, hulls[number])
         off = known[row[rows], column[rows]] * inverse[rows] - 1
         told = telling[row[rows], column[rows]] * inverse[rows] - 1
         count = np.count_nonzero(np.isfinite(told))
         enough = count >= max(LEAST_POINTS, SURE_SHARE * len(rows))
         if not enough or np.count_nonzero(np.abs(told) < BEHIND * TOLERANCE) >= MOST_AGREE * count:
-            depth[row[rows], column[rows]] = 1 / inverse[rows]
+            laid.number[row[rows], column[rows]] = number
+            laid.depth[row[rows], column[rows]] = 1 / inverse[rows]
             left[rows] = False
             on = np.flatnonzero(np.abs(off) < TOLERANCE)
             if len(on) >= LEAST_POINTS and abs(np.median(off[on])) <= MEDIAN_OFF:
-                moved[row[rows[on]], column[rows[on]]] = True
+                laid.moved[row[rows[on]], column[rows[on]]] = True
 
 
 class _Hull:

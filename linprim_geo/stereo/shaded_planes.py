@@ -33,6 +33,7 @@ from linprim_geo.stereo.plain_regions import (
     to_world,
 )
 from linprim_geo.stereo.right_angles import NEARLY, angles_to, frame_of
+from linprim_geo.stereo.shaded_areas import ShadedArea
 from linprim_geo.stereo.shading import (
     BOX,
     LEAST_BOXES,
@@ -384,8 +385,8 @@ class ShadedPlanes:
         one, other = np.concatenate(inverse).T
         return bool(np.median(np.abs(one / other - 1)) < tolerance)
 
-    def depth_maps(self) -> list[np.ndarray]:
-        """(H, W) float32 depth of every view's regions, each by one plane where that carries its shading, else NaN.
+    def areas(self) -> list[list[ShadedArea]]:
+        """Of every view, each of its regions on one plane where that carries its shading.
 
         Of planes that do so as well, such as those of one wall, the one is taken that carries most in all views, but
         none where fewer than LEAST_VIEWS, with this one, know a surface on it, or from one direction only: floors go on
@@ -399,58 +400,58 @@ class ShadedPlanes:
                 for k, boxes in of_region.items():
                     carried[k] += np.count_nonzero(boxes)
         carried[: self.given_count] *= HARDLY_MORE
-        ordered = [[_best_first(of_region, carried) for of_region in own] for own in carriers]
-        surfaces = self._surfaces(ordered, carriers)
-        result = []
-        for view, (own, of_view) in enumerate(zip(self.regions, carriers, strict=True)):
-            numbers = [
-                [self._number(one, boxes[k], k) for k in order]
-                for one, boxes, order in zip(own, of_view, ordered[view], strict=True)
+        areas = [
+            [
+                [self._area(one.region, boxes[k], k) for k in _best_first(boxes, carried)]
+                for one, boxes in zip(own, of_view, strict=True)
             ]
-            supposed = [self._depth(self.small_cameras[view], number) for each in numbers for number in each]
-            planes = [k for order in ordered[view] for k in order]
-            known = iter(self._known(view, planes, supposed, surfaces))
-            left = [number for each in numbers for number in [n for n in each if next(known)][:1]]
-            factor = self.shadings[view].factor
-            number = self._together(view, left).repeat(factor, 0).repeat(factor, 1)
-            result.append(self._depth(self.cameras[view], number))
+            for own, of_view in zip(self.regions, carriers, strict=True)
+        ]
+        surfaces = self._surfaces(areas)
+        return [self._known(view, own, surfaces) for view, own in enumerate(areas)]
+
+    def depth_maps(self, areas: Sequence[Sequence[ShadedArea]]) -> list[np.ndarray]:
+        """(H, W) float32 depth of every view's `areas`, NaN elsewhere."""
+        result = []
+        for camera, shading, own in zip(self.cameras, self.shadings, areas, strict=True):
+            number = self._numbers(shading, own).repeat(shading.factor, 0).repeat(shading.factor, 1)
+            result.append(self._depth(camera, number))
         return result
 
-    def _known(
-        self, view: int, planes: Sequence[int], depths: Sequence[np.ndarray], surfaces: CommonSurfaces
-    ) -> list[bool]:
-        """Whether enough views know a surface at each of several (H, W) depths of a view, each on one of the planes."""
-        camera, result = self.small_cameras[view], []
-        known_by = surfaces.known_by(view, depths, [plane < self.by_points for plane in planes])
+    def _known(self, view: int, areas: Sequence[Sequence[ShadedArea]], surfaces: CommonSurfaces) -> list[ShadedArea]:
+        """Of the areas of each of a view's regions the first one where enough views know a surface."""
+        camera, shading = self.small_cameras[view], self.shadings[view]
+        every = [area for of_region in areas for area in of_region]
+        depths = [self._depth(camera, self._numbers(shading, [area])) for area in every]
+        known_by = surfaces.known_by(view, depths, [area.number < self.by_points for area in every])
+        known = []
         for depth, others in zip(depths, known_by, strict=True):
             row, column = np.nonzero(np.isfinite(depth))
             points = to_world(camera, rays_of(camera, row, column) * depth[row, column, None])
-            enough = len(points) > 0 and seen_enough(
-                self.small_cameras, np.append(others, view), np.median(points, axis=0)
-            )
-            result.append(enough)
-        return result
+            views = np.append(others, view)
+            known.append(len(points) > 0 and seen_enough(self.small_cameras, views, np.median(points, axis=0)))
+        is_known = iter(known)
+        of_regions = ([area for area in of_region if next(is_known)] for of_region in areas)
+        return [area for of_region in of_regions for area in of_region[:1]]
 
-    def _surfaces(
-        self, ordered: Sequence[Sequence[list[int]]], carriers: Sequence[Sequence[dict[int, np.ndarray]]]
-    ) -> CommonSurfaces:
-        """What all views know: confirmed depths, and the first of the planes of each region."""
+    def _surfaces(self, areas: Sequence[Sequence[Sequence[ShadedArea]]]) -> CommonSurfaces:
+        """What all views know: confirmed depths, and the first of the areas of each region."""
         supposed = []
-        for view, own in enumerate(self.regions):
-            each = zip(own, carriers[view], ordered[view], strict=True)
-            number = self._together(
-                view, [self._number(one, boxes[k], k) for one, boxes, order in each for k in order[:1]]
-            )
-            supposed.append(self._depth(self.small_cameras[view], number))
+        for camera, shading, own in zip(self.small_cameras, self.shadings, areas, strict=True):
+            first = [area for of_region in own for area in of_region[:1]]
+            supposed.append(self._depth(camera, self._numbers(shading, first)))
         return CommonSurfaces(self.small_cameras, self.depths, supposed)
 
-    def _number(self, one: FittedRegion, boxes: np.ndarray, number: int) -> np.ndarray:
-        """(H, W) the number of a plane around those boxes of a region that it carries, -1 elsewhere."""
-        return np.where(around_boxes(self.shadings[one.region.view].area_of(one.region), one.region, boxes), number, -1)
+    def _area(self, region: ShadedRegion, boxes: np.ndarray, number: int) -> ShadedArea:
+        """Around those boxes of a region that a plane carries."""
+        return ShadedArea(region, number, around_boxes(self.shadings[region.view].area_of(region), region, boxes))
 
-    def _together(self, view: int, numbers: Sequence[np.ndarray]) -> np.ndarray:
-        """(H, W) numbers of planes of all regions of a view."""
-        return np.max([np.full(self.shadings[view].plain.shape, -1), *numbers], axis=0)
+    def _numbers(self, shading: Shading, areas: Sequence[ShadedArea]) -> np.ndarray:
+        """(H, W) numbers of the planes of a view's areas, -1 elsewhere."""
+        number = np.full(shading.plain.shape, -1)
+        for area in areas:
+            number[area.where] = np.maximum(number[area.where], area.number)
+        return number
 
     def _depth(self, camera: Camera, number: np.ndarray) -> np.ndarray:
         """(H, W) float32 depth of the planes that `number` names, NaN for -1."""

@@ -36,7 +36,7 @@ from linprim_geo.stereo.plain_regions import (
     regions_of_views,
 )
 from linprim_geo.stereo.point_planes import SurfacePoints, planes_of_points, point_plane_depth
-from linprim_geo.stereo.region_planes import beside_edges, region_plane_depths
+from linprim_geo.stereo.region_planes import RegionDepths, beside_edges, region_plane_depths
 from linprim_geo.stereo.room_corners import with_corner_walls
 from linprim_geo.stereo.seen_through import KnownDepths
 from linprim_geo.stereo.shaded_planes import ShadedPlanes
@@ -136,14 +136,15 @@ class MergedFrames(Sequence):
         shaded = ShadedPlanes(maps, sure, rendered, by_points, by_edges)
         self.planes, self.standing = shaded.planes[~shaded.hanging], shaded.standing[~shaded.hanging]
         on_points = [point_plane_depth(found, own, by_points) for found, own in zip(maps, sure, strict=True)]
-        by_shading, backgrounds = shaded.depth_maps(), [shaded.is_background(view) for view in range(len(maps))]
+        by_shading = shaded.depth_maps(shaded.areas())
+        backgrounds = [shaded.is_background(view) for view in range(len(maps))]
         self.on_planes: list[np.ndarray] = []
         beside = [beside_edges(found.grey.shape, own) for found, own in zip(maps, regions, strict=True)]
         # What is in the air beside a wall speaks against the wall's plane: when it is gone, more planes are laid.
         for _ in range(ROUNDS):
-            along_edges, *others = region_plane_depths(self.cameras, regions, shaded.planes, sure)
-            along_edges = _without(along_edges, backgrounds)
-            self._lay_planes(sure, on_points, by_shading, along_edges, *others)
+            along_edges = region_plane_depths(self.cameras, regions, shaded.planes, sure)
+            along_edges = [found.without(taken) for found, taken in zip(along_edges, backgrounds, strict=True)]
+            self._lay_planes(sure, on_points, by_shading, along_edges)
             self._clear_air(beside, sure, on_points)
         self.flat = _share_known(self.on_planes)
         return regions, backgrounds, [shaded.is_wall(view, asked) for view, asked in enumerate(free)]
@@ -153,20 +154,18 @@ class MergedFrames(Sequence):
         sure: Sequence[np.ndarray],
         on_points: Sequence[np.ndarray],
         by_shading: Sequence[np.ndarray],
-        along_edges: Sequence[np.ndarray],
-        moves: Sequence[np.ndarray],
-        stands: Sequence[np.ndarray],
+        along_edges: Sequence[RegionDepths],
     ) -> None:
-        """Takes (H, W) depths on planes with points all over, those of plain regions `along_edges` and those
-        `by_shading`, NaN elsewhere, and moves confirmed depths to them: `sure` ones to planes of regions where these
-        `moves` (H, W) or `stands` (H, W), see `region_plane_depths`."""
+        """Takes (H, W) depths on planes with points all over and those `by_shading`, NaN elsewhere, and those of plain
+        regions `along_edges`, and moves confirmed depths to them: `sure` ones to planes of regions as these say."""
         self.on_planes = []
-        of_views = zip(sure, on_points, by_shading, along_edges, moves, stands, strict=True)
-        for view, (known, on_plane, shaded, of_region, moved, stand) in enumerate(of_views):
+        of_views = zip(sure, on_points, by_shading, along_edges, strict=True)
+        for view, (known, on_plane, shaded, region) in enumerate(of_views):
             depth = self.depths[view]
-            on_plane = np.where(stand & (np.abs(on_plane / of_region - 1) > TOLERANCE), of_region, on_plane)
-            self.on_planes.append(_first_known((on_plane, np.fmin(of_region, shaded))))
-            of_sure = _first_known((on_plane, np.where(moved, of_region, np.float32(np.nan))))
+            other = np.abs(on_plane / region.depth - 1) > TOLERANCE
+            on_plane = np.where(region.stands & other, region.depth, on_plane)
+            self.on_planes.append(_first_known((on_plane, np.fmin(region.depth, shaded))))
+            of_sure = _first_known((on_plane, np.where(region.moved, region.depth, np.float32(np.nan))))
             target = np.where(np.isfinite(known), of_sure, self.on_planes[view])
             self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(target), target, depth)
 
@@ -423,11 +422,6 @@ def _first_known(depths: Sequence[np.ndarray]) -> np.ndarray:
     for depth in depths[1:]:
         result = np.where(np.isfinite(result), result, depth)
     return result
-
-
-def _without(depths: Sequence[np.ndarray], taken: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """(H, W) depths, NaN where they are `taken` (H, W)."""
-    return [np.where(out, np.float32(np.nan), depth) for depth, out in zip(depths, taken, strict=True)]
 
 
 def _share_known(depths: Sequence[np.ndarray]) -> float:

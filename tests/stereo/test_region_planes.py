@@ -13,6 +13,12 @@ from linprim_geo.stereo.plain_regions import edges_of, in_camera, in_world, regi
 from linprim_geo.stereo.region_planes import beside_edges, region_plane_depths
 
 
+def laid_planes(*given) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+    """Of every view: the depth that planes give, where known ones are moved to it, and where the plane stands."""
+    found = region_plane_depths(*given)
+    return [one.depth for one in found], [one.moved for one in found], [one.stands for one in found]
+
+
 @pytest.fixture(scope="module")
 def room():
     """Cameras in a room, true depths, which wall is seen, the regions of all views with exact depths along edges alone,
@@ -30,7 +36,7 @@ def test_walls_lie_on_their_planes(room):
     # Others that go through the edges of some walls, and one that is 2 cm behind a wall.
     behind = [1, 0, 0, -0.02]
     across = np.array([[np.sqrt(0.5), np.sqrt(0.5), 0, 0], [0.0, np.sqrt(0.5), np.sqrt(0.5), 0], behind])
-    found, moved, _ = region_plane_depths(of, regions, np.concatenate([PLANES, across]), known)
+    found, moved, _ = laid_planes(of, regions, np.concatenate([PLANES, across]), known)
     assert not any(is_moved[np.isnan(depth)].any() for is_moved, depth in zip(moved, known, strict=True))
     laid = [np.isfinite(depth) for depth in found]
     assert np.mean(laid) > 0.8
@@ -40,10 +46,20 @@ def test_walls_lie_on_their_planes(room):
     assert (np.abs(error) < 1e-4).mean() > 0.98
 
 
+def test_pixels_have_the_numbers_of_their_planes(room):
+    of, depths, walls, regions, known = room
+    for laid, wall in zip(region_plane_depths(of, regions, PLANES, known), walls, strict=True):
+        is_laid = np.isfinite(laid.depth)
+        assert (laid.number[~is_laid] == -1).all() and (laid.number == wall)[is_laid].mean() > 0.98
+        without = laid.without(wall == 1)
+        assert not (without.number == 1).any() and (without.number == laid.number)[wall != 1].all()
+        assert np.isnan(without.depth[wall == 1]).all() and not (without.moved | without.stands)[wall == 1].any()
+
+
 def test_a_wall_ends_where_its_points_do(room):
     """Of all planes that of one wall alone: other walls have points on it where they meet it, and lie beside it."""
     of, depths, walls, regions, known = room
-    found, *_ = region_plane_depths(of, regions, PLANES[[1]], known)
+    found, *_ = laid_planes(of, regions, PLANES[[1]], known)
     on_it = np.concatenate([np.isfinite(depth)[wall == 1] for depth, wall in zip(found, walls, strict=True)])
     beside = np.concatenate([np.isfinite(depth)[wall != 1] for depth, wall in zip(found, walls, strict=True)])
     assert on_it.mean() > 0.8 and beside.mean() < 0.01
@@ -51,14 +67,14 @@ def test_a_wall_ends_where_its_points_do(room):
 
 def test_without_planes_nothing_is_known(room):
     of, _, _, regions, known = room
-    assert not any(np.isfinite(depth).any() for depth in region_plane_depths(of, regions, np.zeros((0, 4)), known)[0])
+    assert not any(np.isfinite(depth).any() for depth in laid_planes(of, regions, np.zeros((0, 4)), known)[0])
 
 
 def test_points_on_one_line_make_no_wall(room):
     """A plane through the line along which the floor meets a wall has points there alone."""
     of, _, _, regions, known = room
     leaning = np.array([[np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]])
-    depths, *_ = region_plane_depths(of, regions, leaning, known)
+    depths, *_ = laid_planes(of, regions, leaning, known)
     assert np.mean([np.isfinite(depth).mean() for depth in depths]) < 0.02
 
 
@@ -69,7 +85,7 @@ def test_what_stereo_is_sure_of_within_a_region_refuses_a_plane(room, share, lai
     for number, (depth, wall, edges) in enumerate(zip(depths, walls, known, strict=True)):
         other = np.random.default_rng(number).uniform(size=depth.shape) < share
         inside.append(np.where((wall == 1) & np.isnan(edges), np.where(other, 0.9, 1) * depth, edges))
-    found, *_ = region_plane_depths(of, regions, PLANES[[1]], inside)
+    found, *_ = laid_planes(of, regions, PLANES[[1]], inside)
     on_it = np.concatenate([np.isfinite(depth)[wall == 1] for depth, wall in zip(found, walls, strict=True)])
     assert (on_it.mean() > 0.8) == laid and (laid or on_it.mean() < 0.05)
 
@@ -83,7 +99,7 @@ def test_sure_depths_on_a_wall_are_moved_to_it_if_most_are_not_off(room, off, ar
         beside.append((np.random.default_rng(number).uniform(size=depth.shape) < 0.2) & (wall == 1) & np.isnan(edges))
         share = np.where(beside[-1], 0.992, 1 + off)
         inside.append(np.where(np.isnan(edges), np.where(wall == 1, share * depth, np.nan), edges))
-    found, moved, _ = region_plane_depths(of, regions, PLANES[[1]], inside)
+    found, moved, _ = laid_planes(of, regions, PLANES[[1]], inside)
     on_it = np.concatenate(
         [own[which & np.isfinite(depth)] for own, which, depth in zip(moved, beside, found, strict=True)]
     )
@@ -107,7 +123,7 @@ def test_an_edges_depth_that_goes_on_into_a_wall_gives_way_to_the_wall(room, off
     """Before it or behind it, for as far as stereo's windows reach. Of the rest of the wall half is known."""
     of, depths, walls, regions, known = room
     inside, beside = with_bands(depths, walls, known, off, 8)
-    found, moved, stands = region_plane_depths(of, regions, PLANES[[1]], inside)
+    found, moved, stands = laid_planes(of, regions, PLANES[[1]], inside)
     wide = [np.isfinite(depth) & which & stand for depth, which, stand in zip(found, beside, stands, strict=True)]
     error = np.concatenate([(own / depth - 1)[which] for own, depth, which in zip(found, depths, wide, strict=True)])
     assert len(error) > 0.8 * sum(which.sum() for which in beside) > 10_000 and np.abs(error).max() < 1e-3
@@ -121,7 +137,7 @@ def test_what_an_edge_gives_to_a_wall_beside_it_does_not_refuse_the_walls_plane(
     inside = [
         np.where(band | np.isfinite(edges), own, np.nan) for own, band, edges in zip(inside, beside, known, strict=True)
     ]
-    found, *_ = region_plane_depths(of, regions, PLANES[[1]], inside)
+    found, *_ = laid_planes(of, regions, PLANES[[1]], inside)
     on_it = np.concatenate([np.isfinite(depth)[wall == 1] for depth, wall in zip(found, walls, strict=True)])
     assert on_it.mean() > 0.8
 
@@ -150,7 +166,7 @@ def test_a_plane_that_others_see_through_is_refused(room, seen_through):
         else:
             of_edge = np.where((wall == 1) & (inverse > 0.01), 1 / np.maximum(inverse, 0.01), depth)
             known.append(np.where(edge, of_edge, np.nan).astype(np.float32))
-    found, *_ = region_plane_depths(of, regions_of_views(maps, known), before[None], known)
+    found, *_ = laid_planes(of, regions_of_views(maps, known), before[None], known)
     on_it = np.concatenate([np.isfinite(depth)[wall == 1] for depth, wall in list(zip(found, walls, strict=True))[::2]])
     laid = on_it.mean()
     assert laid < 0.02 if seen_through else laid > 0.2
@@ -166,7 +182,7 @@ def test_between_edges_that_are_near_each_other_known_depths_stay(room):
     edges = [edges_of(found.grey, NOISE**2) for found in maps]
     known = [np.where(edge, depth, np.nan).astype(np.float32) for edge, depth in zip(edges, depths, strict=True)]
     inside, beside = with_bands(depths, walls, known, 0.95, 3)
-    found, moved, stands = region_plane_depths(of, regions_of_views(maps, known), PLANES[[1]], inside)
+    found, moved, stands = laid_planes(of, regions_of_views(maps, known), PLANES[[1]], inside)
     laid = [np.isfinite(depth) & which for depth, which in zip(found, beside, strict=True)]
     assert sum(which.sum() for which in laid) > 10_000
     assert not any((own | stand)[which].any() for own, stand, which in zip(moved, stands, laid, strict=True))
@@ -182,7 +198,7 @@ def test_a_thing_that_no_edge_parts_from_a_wall_stays_before_it(room):
         if thing[-1].sum() < 1000:  # cut off by the border, a strip that is no wider than a band along an edge
             thing[-1][:] = False
         inside.append(np.where(wall == 1, np.where(thing[-1], 0.9, 1) * depth, edges))
-    _, moved, stands = region_plane_depths(of, regions, PLANES[[1]], inside)
+    _, moved, stands = laid_planes(of, regions, PLANES[[1]], inside)
     beside = np.concatenate(
         [stand[(wall == 1) & ~which] for stand, wall, which in zip(stands, walls, thing, strict=True)]
     )
@@ -202,7 +218,7 @@ def test_of_planes_through_the_line_of_two_walls_the_one_that_holds_the_region_i
         on_it = 1 / (camera.ray_grid() @ in_camera(camera, between)[0])
         rounded.append(np.where(x + z < 0.05, np.where(np.isfinite(edges), on_it, np.nan), half).astype(np.float32))
     regions = regions_of_views(photographs(of), rounded)
-    found, *_ = region_plane_depths(of, regions, np.concatenate([between, PLANES[[1]]]), rounded)
+    found, *_ = laid_planes(of, regions, np.concatenate([between, PLANES[[1]]]), rounded)
     error = np.concatenate(
         [(own / depth - 1)[wall == 1] for own, depth, wall in zip(found, depths, walls, strict=True)]
     )
@@ -223,7 +239,7 @@ def test_a_thing_does_not_lie_on_the_wall_behind():
     none = np.zeros(grey.shape, np.uint8)
     found = DepthMap(camera, known, np.zeros((*grey.shape, 3)), none, none, known, grey, 1.0)
     behind = in_world(camera, np.array([0, 0, 1 / 3]))
-    (depth,), *_ = region_plane_depths([camera], regions_of_views([found], [known]), behind[None], [known])
+    (depth,), *_ = laid_planes([camera], regions_of_views([found], [known]), behind[None], [known])
     assert np.isnan(depth[42:78, 52:108]).all() and np.allclose(depth[:36][np.isfinite(depth[:36])], 3.0)
 
 
@@ -244,7 +260,7 @@ def between_houses(edge_depth: float) -> np.ndarray:
     found = DepthMap(camera, depth, np.zeros((*grey.shape, 3)), none, none, depth, grey, 1.0)
     regions = regions_of_views([found], [np.where(houses, depth, np.nan)])
     front = in_world(camera, np.array([0, 0, 1 / 3]))
-    (between,), *_ = region_plane_depths([camera], regions, front[None], [np.where(houses, depth, np.nan)])
+    (between,), *_ = laid_planes([camera], regions, front[None], [np.where(houses, depth, np.nan)])
     return between[44:76, 70:100]
 
 

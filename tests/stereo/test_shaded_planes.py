@@ -41,7 +41,7 @@ def in_the_middle(depth) -> np.ndarray:
 
 def errors(found: ShadedPlanes, depths) -> tuple[float, np.ndarray]:
     """The share of pixels that have depths, and how far these are off."""
-    own = found.depth_maps()
+    own = found.depth_maps(found.areas())
     off = np.concatenate([np.abs(one / depth - 1)[np.isfinite(one)] for one, depth in zip(own, depths, strict=True)])
     return float(np.mean([np.isfinite(one).mean() for one in own])), off
 
@@ -263,7 +263,7 @@ def test_a_sky_is_told_from_a_wall_before_anything_is_rendered(monkeypatch):
 def test_a_sky_gets_no_plane():
     maps, depths = sky()
     found = planes_of(maps, depths)
-    own = np.concatenate([one.ravel() for one in found.depth_maps()])
+    own = np.concatenate([one.ravel() for one in found.depth_maps(found.areas())])
     assert np.isnan(own).mean() > 0.95
 
 
@@ -294,7 +294,7 @@ def test_a_plane_that_too_few_views_know_gives_no_depth(monkeypatch, others, kep
     found = planes_of(maps, depths)
     monkeypatch.setattr(CommonSurfaces, "known_by", lambda self, view, depths, _: [np.array(others)] * len(depths))
     monkeypatch.setattr(found, "regions", [found.regions[0], *[[] for _ in CENTERS[1:]]])
-    assert np.isfinite(found.depth_maps()[0]).any() == kept
+    assert np.isfinite(found.depth_maps(found.areas())[0]).any() == kept
 
 
 @pytest.mark.parametrize("others, kept", [(LEAST_VIEWS - 2, False), (LEAST_VIEWS - 1, True)])
@@ -304,7 +304,7 @@ def test_a_plane_with_points_all_over_gives_a_depth_where_others_confirm_it(othe
     confirmed = [np.full_like(depth, np.nan) for depth in depths]
     confirmed[1 : 1 + others] = [in_the_middle(depth) for depth in depths[1 : 1 + others]]
     found = planes_of(maps, depths, by_points=WALL[None], confirmed=confirmed)
-    assert np.isfinite(found.depth_maps()[0]).any() == kept
+    assert np.isfinite(found.depth_maps(found.areas())[0]).any() == kept
 
 
 def edge_points(depths, noise: float = 0.004, seed: int = 0):

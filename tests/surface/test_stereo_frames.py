@@ -12,6 +12,7 @@ from helpers.captures import look_at
 from linprim_geo.capture.types import Photo
 from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.stereo.depth_maps import CONFIDENT, SURE, DepthMap
+from linprim_geo.stereo.region_planes import RegionDepths
 from linprim_geo.surface import stereo_frames
 from linprim_geo.surface.stereo_frames import MergedFrames
 from linprim_geo.surface.tsdf_field import DepthFrame
@@ -55,7 +56,8 @@ def take_region_planes(
     """Gives the one view these depths by planes of its plain regions, and says which sure depths are moved to them and
     where they stand against others."""
     moved, stands = (np.zeros(depth.shape, bool) if given is None else given for given in (moved, stands))
-    monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: ([depth], [moved], [stands]))
+    laid = RegionDepths(np.where(np.isfinite(depth), 0, -1), depth, moved, stands)
+    monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: [laid])
 
 
 def test_planes_of_walls_stand_where_confirmed_depths_are_not_sure(found, monkeypatch):
