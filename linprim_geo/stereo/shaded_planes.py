@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import binary_dilation
@@ -33,7 +34,7 @@ from linprim_geo.stereo.plain_regions import (
     to_world,
 )
 from linprim_geo.stereo.right_angles import NEARLY, angles_to, frame_of
-from linprim_geo.stereo.shaded_areas import ShadedArea
+from linprim_geo.stereo.shaded_areas import ShadedArea, told_by_edges
 from linprim_geo.stereo.shading import (
     BOX,
     LEAST_BOXES,
@@ -385,30 +386,58 @@ class ShadedPlanes:
         one, other = np.concatenate(inverse).T
         return bool(np.median(np.abs(one / other - 1)) < tolerance)
 
-    def areas(self) -> list[list[ShadedArea]]:
+    def areas(self, along_edges: Sequence[np.ndarray]) -> list[list[ShadedArea]]:
         """Of every view, each of its regions on one plane where that carries its shading.
 
-        Of planes that do so as well, such as those of one wall, the one is taken that carries most in all views, but
-        none where fewer than LEAST_VIEWS, with this one, know a surface on it, or from one direction only: floors go on
-        behind walls. Of planes with points all over that has to be a confirmed one, not one that a region of another
-        view supposes.
+        Of planes that do so as well, such as those of one wall, the one is taken on which a region lies by points
+        `along_edges` ((H, W) numbers of planes, -1 elsewhere), or that carries most in all views, but none where fewer
+        than LEAST_VIEWS, with this one, know a surface on it, or from one direction only: floors go on behind walls. Of
+        planes with points all over that has to be a confirmed one, not one that a region of another view supposes.
         """
-        carriers = self._all_carriers()
         carried = np.zeros(len(self.planes))
-        for own in carriers:
+        for own in self.carriers:
             for of_region in own:
                 for k, boxes in of_region.items():
                     carried[k] += np.count_nonzero(boxes)
         carried[: self.given_count] *= HARDLY_MORE
         areas = [
             [
-                [self._area(one.region, boxes[k], k) for k in _best_first(boxes, carried)]
+                self._best_first(one.region, boxes, carried, along)
                 for one, boxes in zip(own, of_view, strict=True)
+                if boxes
             ]
-            for own, of_view in zip(self.regions, carriers, strict=True)
+            for own, of_view, along in zip(self.regions, self.carriers, along_edges, strict=True)
         ]
-        surfaces = self._surfaces(areas)
-        return [self._known(view, own, surfaces) for view, own in enumerate(areas)]
+        supposed = [[of_region[0] for of_region in own] for own in areas]
+        # What a view has supposed that no other knows is no support for these, if it knows something else.
+        for _ in range(2):
+            surfaces = self._surfaces(supposed)
+            known = [self._known(view, own, surfaces) for view, own in enumerate(areas)]
+            supposed = [
+                [of_region[0] if found is None else found for of_region, found in zip(own, of_view, strict=True)]
+                for own, of_view in zip(areas, known, strict=True)
+            ]
+        return [[found for found in of_view if found is not None] for of_view in known]
+
+    @cached_property
+    def carriers(self) -> list[list[dict[int, np.ndarray]]]:
+        """`_carriers` of the regions of each view."""
+        return self._all_carriers()
+
+    def _best_first(
+        self, region: ShadedRegion, carriers: dict[int, np.ndarray], carried: np.ndarray, along_edges: np.ndarray
+    ) -> list[ShadedArea]:
+        """Areas of a region on the planes that carry about as many of its boxes as any does; first the one that has
+        `carried` most, but before it the one that points `along_edges` tell."""
+        most = max(np.count_nonzero(boxes) for boxes in carriers.values())
+        as_well = [k for k, boxes in carriers.items() if HARDLY_MORE * np.count_nonzero(boxes) >= most]
+        area_of = self.shadings[region.view].area_of(region)
+        areas = [
+            ShadedArea(region, k, around_boxes(area_of, region, carriers[k]))
+            for k in sorted(as_well, key=lambda k: carried[k], reverse=True)
+        ]
+        told = told_by_edges(areas[0], along_edges, self.planes, self.shadings)
+        return areas if told is areas[0] else [told, *areas]
 
     def depth_maps(self, areas: Sequence[Sequence[ShadedArea]]) -> list[np.ndarray]:
         """(H, W) float32 depth of every view's `areas`, NaN elsewhere."""
@@ -418,7 +447,9 @@ class ShadedPlanes:
             result.append(self._depth(camera, number))
         return result
 
-    def _known(self, view: int, areas: Sequence[Sequence[ShadedArea]], surfaces: CommonSurfaces) -> list[ShadedArea]:
+    def _known(
+        self, view: int, areas: Sequence[Sequence[ShadedArea]], surfaces: CommonSurfaces
+    ) -> list[ShadedArea | None]:
         """Of the areas of each of a view's regions the first one where enough views know a surface."""
         camera, shading = self.small_cameras[view], self.shadings[view]
         every = [area for of_region in areas for area in of_region]
@@ -432,19 +463,13 @@ class ShadedPlanes:
             known.append(len(points) > 0 and seen_enough(self.small_cameras, views, np.median(points, axis=0)))
         is_known = iter(known)
         of_regions = ([area for area in of_region if next(is_known)] for of_region in areas)
-        return [area for of_region in of_regions for area in of_region[:1]]
+        return [next(iter(of_region), None) for of_region in of_regions]
 
-    def _surfaces(self, areas: Sequence[Sequence[Sequence[ShadedArea]]]) -> CommonSurfaces:
-        """What all views know: confirmed depths, and the first of the areas of each region."""
-        supposed = []
-        for camera, shading, own in zip(self.small_cameras, self.shadings, areas, strict=True):
-            first = [area for of_region in own for area in of_region[:1]]
-            supposed.append(self._depth(camera, self._numbers(shading, first)))
-        return CommonSurfaces(self.small_cameras, self.depths, supposed)
-
-    def _area(self, region: ShadedRegion, boxes: np.ndarray, number: int) -> ShadedArea:
-        """Around those boxes of a region that a plane carries."""
-        return ShadedArea(region, number, around_boxes(self.shadings[region.view].area_of(region), region, boxes))
+    def _surfaces(self, supposed: Sequence[Sequence[ShadedArea]]) -> CommonSurfaces:
+        """What all views know: confirmed depths, and those of the areas that each one has `supposed`."""
+        views = zip(self.small_cameras, self.shadings, supposed, strict=True)
+        depths = [self._depth(camera, self._numbers(shading, own)) for camera, shading, own in views]
+        return CommonSurfaces(self.small_cameras, self.depths, depths)
 
     def _numbers(self, shading: Shading, areas: Sequence[ShadedArea]) -> np.ndarray:
         """(H, W) numbers of the planes of a view's areas, -1 elsewhere."""
@@ -461,13 +486,6 @@ class ShadedPlanes:
         inverse = np.einsum("nc,nc->n", rays_of(camera, row, column), planes)
         depth[row, column] = 1 / np.where(inverse > 0, inverse, np.nan)
         return depth
-
-
-def _best_first(carriers: dict[int, np.ndarray], carried: np.ndarray) -> list[int]:
-    """The planes that carry about as many boxes of a region as any does; first the one that has `carried` most."""
-    most = max((np.count_nonzero(boxes) for boxes in carriers.values()), default=0)
-    as_well = [k for k, boxes in carriers.items() if HARDLY_MORE * np.count_nonzero(boxes) >= most]
-    return sorted(as_well, key=lambda k: carried[k], reverse=True)
 
 
 def _plane(one: FittedRegion) -> np.ndarray:

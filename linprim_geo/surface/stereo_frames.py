@@ -124,7 +124,8 @@ class MergedFrames(Sequence):
     ) -> tuple[list[list[PlainRegion]], list[np.ndarray], list[np.ndarray]]:
         """Finds planes by points, by edges and by shading, of depths that are sure, and what lies on them; moves
         confirmed depths to them. Planes by points are the most precise, but where another of a region's edges stands:
-        their points err beside edges. Of planes by edges and by shading the nearer one hides the other.
+        their points err beside edges. Planes by edges take the place of those by shading where they carry it as well,
+        else the nearer one hides the other.
 
         Returns the plain regions of every view, and (H, W) bool: those that are background by their shading, and those
         with `free` (H, W) rays that are walls by it, if these are given.
@@ -136,7 +137,6 @@ class MergedFrames(Sequence):
         shaded = ShadedPlanes(maps, sure, rendered, by_points, by_edges)
         self.planes, self.standing = shaded.planes[~shaded.hanging], shaded.standing[~shaded.hanging]
         on_points = [point_plane_depth(found, own, by_points) for found, own in zip(maps, sure, strict=True)]
-        by_shading = shaded.depth_maps(shaded.areas())
         backgrounds = [shaded.is_background(view) for view in range(len(maps))]
         self.on_planes: list[np.ndarray] = []
         beside = [beside_edges(found.grey.shape, own) for found, own in zip(maps, regions, strict=True)]
@@ -144,6 +144,7 @@ class MergedFrames(Sequence):
         for _ in range(ROUNDS):
             along_edges = region_plane_depths(self.cameras, regions, shaded.planes, sure)
             along_edges = [found.without(taken) for found, taken in zip(along_edges, backgrounds, strict=True)]
+            by_shading = shaded.depth_maps(shaded.areas([found.number for found in along_edges]))
             self._lay_planes(sure, on_points, by_shading, along_edges)
             self._clear_air(beside, sure, on_points)
         self.flat = _share_known(self.on_planes)

@@ -39,9 +39,15 @@ def in_the_middle(depth) -> np.ndarray:
     return known
 
 
+def laid(found: ShadedPlanes, along_edges: int | None = None) -> list[np.ndarray]:
+    """Depth maps of all views, of which points along edges say nothing or that all of them lies on one plane."""
+    number = -1 if along_edges is None else along_edges
+    return found.depth_maps(found.areas([np.full((c.height, c.width), number) for c in found.cameras]))
+
+
 def errors(found: ShadedPlanes, depths) -> tuple[float, np.ndarray]:
     """The share of pixels that have depths, and how far these are off."""
-    own = found.depth_maps(found.areas())
+    own = laid(found)
     off = np.concatenate([np.abs(one / depth - 1)[np.isfinite(one)] for one, depth in zip(own, depths, strict=True)])
     return float(np.mean([np.isfinite(one).mean() for one in own])), off
 
@@ -263,7 +269,7 @@ def test_a_sky_is_told_from_a_wall_before_anything_is_rendered(monkeypatch):
 def test_a_sky_gets_no_plane():
     maps, depths = sky()
     found = planes_of(maps, depths)
-    own = np.concatenate([one.ravel() for one in found.depth_maps(found.areas())])
+    own = np.concatenate([one.ravel() for one in laid(found)])
     assert np.isnan(own).mean() > 0.95
 
 
@@ -294,7 +300,7 @@ def test_a_plane_that_too_few_views_know_gives_no_depth(monkeypatch, others, kep
     found = planes_of(maps, depths)
     monkeypatch.setattr(CommonSurfaces, "known_by", lambda self, view, depths, _: [np.array(others)] * len(depths))
     monkeypatch.setattr(found, "regions", [found.regions[0], *[[] for _ in CENTERS[1:]]])
-    assert np.isfinite(found.depth_maps(found.areas())[0]).any() == kept
+    assert np.isfinite(laid(found)[0]).any() == kept
 
 
 @pytest.mark.parametrize("others, kept", [(LEAST_VIEWS - 2, False), (LEAST_VIEWS - 1, True)])
@@ -304,7 +310,24 @@ def test_a_plane_with_points_all_over_gives_a_depth_where_others_confirm_it(othe
     confirmed = [np.full_like(depth, np.nan) for depth in depths]
     confirmed[1 : 1 + others] = [in_the_middle(depth) for depth in depths[1 : 1 + others]]
     found = planes_of(maps, depths, by_points=WALL[None], confirmed=confirmed)
-    assert np.isfinite(found.depth_maps(found.areas())[0]).any() == kept
+    assert np.isfinite(laid(found)[0]).any() == kept
+
+
+@pytest.mark.parametrize("others", [False, True])
+def test_the_plane_that_points_along_edges_tell_is_taken_where_other_views_know_it(monkeypatch, others):
+    """A plane 2 % behind a wall leaves 1.1 to 1.5 times as much of its faint light."""
+    maps, depths = photographs(lambda points, view: 60 + 0.3 * light(points))
+    found = planes_of(maps, depths, by_edges=np.array([WALL, WALL - [0, 0, 0, 0.08]]))
+    monkeypatch.setattr(found, "planes", np.array([WALL, WALL - [0, 0, 0, 0.04]]))
+
+    def known_by(_, view, supposed, __):
+        """All know the wall, and the plane behind it or not."""
+        behind = [np.nanmedian(depth / depths[view]) > 1.01 for depth in supposed]
+        return [np.arange(9) if others or not is_behind else np.zeros(0, int) for is_behind in behind]
+
+    monkeypatch.setattr(CommonSurfaces, "known_by", known_by)
+    behind = np.concatenate([own / depth - 1 for own, depth in zip(laid(found, 1), depths, strict=True)])
+    assert np.isfinite(behind).mean() > 0.5 and (np.nanmedian(behind) > 0.015) == others
 
 
 def edge_points(depths, noise: float = 0.004, seed: int = 0):

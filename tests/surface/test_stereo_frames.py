@@ -127,6 +127,20 @@ def test_of_several_planes_that_of_a_regions_edges_stands_or_a_nearer_one_by_sha
     assert np.allclose(frame.depth, np.select([columns < 10, columns < 30], [3.001, 3.2], 3.1))
 
 
+def test_areas_of_shading_lie_on_the_planes_that_edges_tell(found, monkeypatch):
+    """But not in a background."""
+    along_edges, background = np.full((30, 40), np.nan, np.float32), np.zeros((30, 40), bool)
+    along_edges[:, :20] = 3.2
+    background[:, :5] = True
+    told = []
+    take_region_planes(monkeypatch, along_edges)
+    monkeypatch.setattr(stereo_frames.ShadedPlanes, "is_background", lambda *_: background)
+    monkeypatch.setattr(stereo_frames.ShadedPlanes, "areas", lambda _, numbers: told.extend(numbers) or [[]])
+    MergedFrames(rendered(0.01), [VIEW], 5.0)
+    assert len(told) == stereo_frames.ROUNDS
+    assert all((number[:, 5:20] == 0).all() and (np.delete(number, np.s_[5:20], 1) == -1).all() for number in told)
+
+
 def test_spans_stand_where_nothing_is_known_and_photographs_have_no_edges(found, monkeypatch):
     edge = np.zeros((30, 40), bool)
     edge[:, 30:] = True
