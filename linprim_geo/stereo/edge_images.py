@@ -51,19 +51,23 @@ class EdgeImages:
         every = most[:, 0] > 0
         return int((strength[every] / most[every]).sum(0).argmax()) if every.any() else None
 
-    def shares(self, starts: np.ndarray, directions: np.ndarray, along: np.ndarray, parts: int) -> np.ndarray:
+    def shares(
+        self, starts: np.ndarray, directions: np.ndarray, along: np.ndarray, parts: int, least: float = 0.0
+    ) -> np.ndarray:
         """(V, N, parts) how many of the lines of `strengths` have as strong an edge in a view as each of them, as a
         share of those that it shows; NaN where it does not."""
-        result = self.strengths(starts, directions, along, parts)
+        result = self.strengths(starts, directions, along, parts, least)
         for view, part in np.ndindex(len(result), parts):
             strength = result[view, :, part]
             shown = np.isfinite(strength)
             strength[shown] = rankdata(-strength[shown], method="max") / max(np.count_nonzero(shown), 1)
         return result
 
-    def strengths(self, starts: np.ndarray, directions: np.ndarray, along: np.ndarray, parts: int) -> np.ndarray:
+    def strengths(
+        self, starts: np.ndarray, directions: np.ndarray, along: np.ndarray, parts: int, least: float = 0.0
+    ) -> np.ndarray:
         """(V, N, parts) by how much grey changes per pixel across lines of the world; NaN where a view shows fewer than
-        LEAST_PIXELS.
+        LEAST_PIXELS, or less than the share `least` of the line of which it shows most.
 
         It is the median along them: lines that stand before a wall cross the end of the floor, which is the stronger
         edge as a rule.
@@ -80,7 +84,8 @@ class EdgeImages:
                 continue
             slope, length = changes
             slope, length = slope.reshape(len(starts), parts, -1), length.reshape(len(starts), parts, -1).sum(2)
-            enough = length.cumsum(1) >= LEAST_PIXELS
+            shown = length.cumsum(1)
+            enough = shown >= np.maximum(LEAST_PIXELS, least * shown.max(0))
             for part in range(parts):
                 if part and not length[:, part].any():
                     strength[:, part] = strength[:, part - 1]

@@ -27,6 +27,9 @@ REACH = 5 * CONFIRMED_DEPTH
 # Lines that are tried are as far from each other, at their ends, as photographs are blurred, MOST_STEPS to either side
 # at most, and are looked at in so many samples.
 MOST_STEPS, SAMPLES = 20, 128
+# A line of which a view shows less than so much of what it shows of another one is behind what is known there: what
+# shows through gaps is the upper edge of a skirting board, or the like.
+LEAST_SHOWN = 0.5
 # Around the line that is found the strongest edges are looked for up to so many of these steps away, in quarters of a
 # pixel, and a line is fitted to them; once more around that line, as what the first is off by cuts edges off.
 AROUND, FINER, ROUNDS = 2, 4, 2
@@ -72,7 +75,8 @@ def on_meeting_lines(
                     found[number] = _through(line, np.cross(up[:3], base[:3]), wall)
     standing = [*floors, *found.values()]
     for number in sorted(walls.keys() - found.keys()):
-        if has_points[number]:
+        # What is nearly upright or level does not lean.
+        if has_points[number] or at_right_angles(walls[number], up) or abs(walls[number][:3] @ up[:3]) > np.cos(NEARLY):
             continue
         leaning = _leaning(walls[number], standing, seen, edges)
         if leaning is not None:
@@ -203,7 +207,7 @@ def clearest_line(
     steps = np.arange(-REACH * distance, REACH * distance + apart / 2, apart)
     moved = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
     starts, ends = (end + moved[:, [k]] * inward for k, end in enumerate(near))
-    shares = edges.shares(starts, ends - starts, (np.arange(SAMPLES) + 0.5) / SAMPLES, 1)
+    shares = edges.shares(starts, ends - starts, (np.arange(SAMPLES) + 0.5) / SAMPLES, 1, LEAST_SHOWN)
     chance = by_chance(shares)[:, 0]
     best = int(chance.argmin())
     if chance[best] + np.log(len(chance)) > np.log(BY_CHANCE):

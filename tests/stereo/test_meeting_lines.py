@@ -98,6 +98,18 @@ def test_what_hides_the_line_says_nothing_of_it():
     assert moved([FLOOR, turned(LEFT, 2.0, 0.03)], of=of, known=known) == {}
 
 
+@pytest.mark.parametrize(("reach", "found"), [(0.08, False), (0.25, True)])
+def test_a_line_that_gaps_alone_show_says_nothing_where_all_of_others_is_seen(reach, found):
+    """What is known up to so far before a wall hides four fifths of the line at the wall, and of lines beside it."""
+    of = cameras()
+    known = floors(of)
+    for camera, depth in zip(of, known, strict=True):
+        true, _ = seen(camera)
+        place = camera.center + camera.world_rays() * true[..., None]
+        depth[(place[..., 0] < reach) & (place[..., 1] % 0.5 > 0.1)] = 0.5
+    assert (moved([FLOOR, turned(LEFT, 0.0, 0.02)], of=of, known=known) != {}) == found
+
+
 def cabinets(of) -> list[np.ndarray]:
     """Depth of the floor in every view, and of cabinets 0.4 m high along the wall at y = 0."""
     known = floors(of)
@@ -220,6 +232,16 @@ def test_a_slope_goes_through_the_lines_along_which_it_meets_walls(seed, degrees
     assert np.abs(ends @ found[:3] - found[3]).max() < 0.01
     before = leaning(degrees, shift)
     assert np.abs(ends @ before[:3] - before[3]).max() > 0.05
+
+
+@pytest.mark.parametrize("normal", [[0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
+def test_what_is_level_or_upright_does_not_lean(monkeypatch, normal):
+    """Not even where two lines say so: of a ceiling or a wall they are those of things before it."""
+    leaning = {}
+    monkeypatch.setattr(meeting_lines, "_leaning", lambda wall, *_: leaning.setdefault(tuple(wall)))
+    in_attic(np.array([*normal, -3.0]))
+    in_attic(SLOPE)
+    assert list(leaning) == [tuple(SLOPE)]
 
 
 def test_a_slope_that_has_these_lines_on_it_stays():
