@@ -341,7 +341,8 @@ class ShadedPlanes:
         carries, none where they are of too few views.
 
         A plane by edges that is one by points takes its place and stays as it is, as if it carried nothing, unless that
-        one is askew. Two by edges are told apart by their points, although faint shading may be carried by both.
+        one is askew. Two by edges are told apart by their points, although faint shading may be carried by both; these
+        tell more than shading does of planes that shading alone has given, too.
         """
         count = len(self.planes)
         shared, carried = np.zeros((count, count)), [list[ShadedRegion]() for _ in range(count)]
@@ -352,7 +353,7 @@ class ShadedPlanes:
                     for j, others in of_region.items():
                         shared[j, k] += np.count_nonzero(boxes & others)
         by_points, kept = np.flatnonzero(~self._are_askew()).tolist(), list[int]()
-        for k in sorted(range(self.by_points, count), key=lambda k: -shared[k, k]):
+        for k in sorted(range(self.by_points, count), key=lambda k: (k >= self.given_count, -shared[k, k])):
             same = next((j for j in by_points if self._same(j, k, carried[k], TOLERANCE)), None)
             if same is not None:
                 self.planes[k] = np.sign(self.planes[same, :3] @ self.planes[k, :3]) * self.planes[same]

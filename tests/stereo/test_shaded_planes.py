@@ -133,6 +133,16 @@ def test_planes_that_edges_tell_apart_stay_two_where_faint_light_does_not():
     assert np.abs(found.planes[:, 3] - [0, -0.08]).max() < 0.005
 
 
+def test_of_copies_the_plane_that_edges_give_is_kept(monkeypatch):
+    """Not that of shading, although this one carries as many regions."""
+    maps, depths = photographs(lambda points, view: 60 + 0.3 * light(points))
+    monkeypatch.setattr(ShadedPlanes, "_common", lambda self, fitted: np.array([WALL - [0, 0, 0, 0.06], WALL]))
+    monkeypatch.setattr(HeldPlanes, "by_depths", lambda self, planes, *_: planes)
+    monkeypatch.setattr(HeldPlanes, "at_right_angles", lambda self, planes, *_: planes)
+    found = planes_of(maps, depths, by_edges=(WALL - [0, 0, 0, 0.06])[None])
+    np.testing.assert_array_equal(found.planes, [WALL - [0, 0, 0, 0.06]])
+
+
 def test_a_plane_that_edges_give_is_the_one_that_points_give():
     maps, depths = photographs(lambda points, view: light(points))
     by_points = np.array([tilted(0.1)])
