@@ -111,8 +111,8 @@ def region_plane_depths(
             height, width = region.wide.shape
             wide[region.top : region.top + height, region.left : region.left + width] |= region.wide
         off = np.abs(sure / laid.depth - 1) > TOLERANCE  # not where either is NaN
-        known_here = np.isfinite(laid.depth)
-        stands = known_here & wide & ~_are_surfaces(off, known_here)
+        is_laid = np.isfinite(laid.depth)
+        stands = is_laid & wide & ~_are_surfaces(off, is_laid)
         result.append(replace(laid, moved=laid.moved | (off & stands), stands=stands))
     return result
 

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from linprim_geo.stereo.enclosing_planes import SURE_SHARE
-from linprim_geo.stereo.held_planes import AS_WELL, MOST_BOXES
+from linprim_geo.stereo.held_planes import AS_WELL, HARDLY_MORE, MOST_BOXES
 from linprim_geo.stereo.plain_regions import TOLERANCE, in_camera
 from linprim_geo.stereo.shading import ShadedRegion, Shading, evaluate
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ShadedArea:
     """The `number` of the plane that carries the shading of a region, in the pixels `where` (H, W) bool of its view's
     shading."""
@@ -27,11 +27,23 @@ class ShadedArea:
     where: np.ndarray
 
 
+def best_first(carriers: dict[int, np.ndarray], carried: np.ndarray) -> list[int]:
+    """The numbers of those `carriers` that carry about as many boxes of a region as any does, by (N,) bool which of
+    these: first the one with most of `carried` (K,)."""
+    most = max(np.count_nonzero(boxes) for boxes in carriers.values())
+    as_well = [k for k, boxes in carriers.items() if HARDLY_MORE * np.count_nonzero(boxes) >= most]
+    return sorted(as_well, key=lambda k: carried[k], reverse=True)
+
+
 def told_by_edges(
     area: ShadedArea, along_edges: np.ndarray, planes: np.ndarray, shadings: Sequence[Shading]
 ) -> ShadedArea:
-    """The area, on the plane of (K, 4) ones of the world on which the most of it lies by points `along_edges` ((H, W)
-    numbers of a view, -1 elsewhere), if that one is elsewhere by more than TOLERANCE and carries its shading as well.
+    """The area on the plane that points along edges tell, if it carries the region's shading as well as the area's own;
+    the area itself if it does not, or if both are the same within TOLERANCE.
+
+    Args:
+        along_edges: (H, W) numbers of the planes on which pixels of the view lie by points along edges, -1 elsewhere.
+        planes: (K, 4) of the world, n . x = d.
     """
     shading, few = shadings[area.region.view], [area.region.some(MOST_BOXES)]
     numbers = shading.small(along_edges)[area.where]

@@ -34,7 +34,7 @@ from linprim_geo.stereo.plain_regions import (
     to_world,
 )
 from linprim_geo.stereo.right_angles import NEARLY, angles_to, frame_of
-from linprim_geo.stereo.shaded_areas import ShadedArea, told_by_edges
+from linprim_geo.stereo.shaded_areas import ShadedArea, best_first, told_by_edges
 from linprim_geo.stereo.shading import (
     BOX,
     LEAST_BOXES,
@@ -395,50 +395,50 @@ class ShadedPlanes:
         than LEAST_VIEWS, with this one, know a surface on it, or from one direction only: floors go on behind walls. Of
         planes with points all over that has to be a confirmed one, not one that a region of another view supposes.
         """
-        carried = np.zeros(len(self.planes))
-        for own in self.carriers:
-            for of_region in own:
-                for k, boxes in of_region.items():
-                    carried[k] += np.count_nonzero(boxes)
-        carried[: self.given_count] *= HARDLY_MORE
         areas = [
-            [
-                self._best_first(one.region, boxes, carried, along)
-                for one, boxes in zip(own, of_view, strict=True)
-                if boxes
-            ]
-            for own, of_view, along in zip(self.regions, self.carriers, along_edges, strict=True)
+            [self._told_first(of_region, along) for of_region in own]
+            for own, along in zip(self.candidates, along_edges, strict=True)
         ]
         supposed = [[of_region[0] for of_region in own] for own in areas]
         # What a view has supposed that no other knows is no support for these, if it knows something else.
         for _ in range(2):
-            surfaces = self._surfaces(supposed)
+            surfaces, before = self._surfaces(supposed), supposed
             known = [self._known(view, own, surfaces) for view, own in enumerate(areas)]
             supposed = [
                 [of_region[0] if found is None else found for of_region, found in zip(own, of_view, strict=True)]
                 for own, of_view in zip(areas, known, strict=True)
             ]
+            if supposed == before:
+                break
         return [[found for found in of_view if found is not None] for of_view in known]
 
     @cached_property
-    def carriers(self) -> list[list[dict[int, np.ndarray]]]:
-        """`_carriers` of the regions of each view."""
-        return self._all_carriers()
-
-    def _best_first(
-        self, region: ShadedRegion, carriers: dict[int, np.ndarray], carried: np.ndarray, along_edges: np.ndarray
-    ) -> list[ShadedArea]:
-        """Areas of a region on the planes that carry about as many of its boxes as any does; first the one that has
-        `carried` most, but before it the one that points `along_edges` tell."""
-        most = max(np.count_nonzero(boxes) for boxes in carriers.values())
-        as_well = [k for k, boxes in carriers.items() if HARDLY_MORE * np.count_nonzero(boxes) >= most]
-        area_of = self.shadings[region.view].area_of(region)
-        areas = [
-            ShadedArea(region, k, around_boxes(area_of, region, carriers[k]))
-            for k in sorted(as_well, key=lambda k: carried[k], reverse=True)
+    def candidates(self) -> list[list[list[ShadedArea]]]:
+        """Of every view, for each region that a plane carries: the areas on the planes that carry about as many of its
+        boxes as any does, first the one that carries most in all views."""
+        carriers, carried = self._all_carriers(), np.zeros(len(self.planes))
+        for own in carriers:
+            for of_region in own:
+                for k, boxes in of_region.items():
+                    carried[k] += np.count_nonzero(boxes)
+        carried[: self.given_count] *= HARDLY_MORE
+        return [
+            [
+                [self._area(one.region, boxes[k], k) for k in best_first(boxes, carried)]
+                for one, boxes in zip(own, of_view, strict=True)
+                if boxes
+            ]
+            for own, of_view in zip(self.regions, carriers, strict=True)
         ]
+
+    def _told_first(self, areas: list[ShadedArea], along_edges: np.ndarray) -> list[ShadedArea]:
+        """The areas of a region, before them the one that points `along_edges` tell if that is another."""
         told = told_by_edges(areas[0], along_edges, self.planes, self.shadings)
         return areas if told is areas[0] else [told, *areas]
+
+    def _area(self, region: ShadedRegion, boxes: np.ndarray, number: int) -> ShadedArea:
+        """Around those boxes of a region that a plane carries."""
+        return ShadedArea(region, number, around_boxes(self.shadings[region.view].area_of(region), region, boxes))
 
     def depth_maps(self, areas: Sequence[Sequence[ShadedArea]]) -> list[np.ndarray]:
         """(H, W) float32 depth of every view's `areas`, NaN elsewhere."""

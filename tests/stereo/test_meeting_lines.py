@@ -236,7 +236,7 @@ def test_a_slope_goes_through_the_lines_along_which_it_meets_walls(seed, degrees
 
 @pytest.mark.parametrize("normal", [[0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
 def test_what_is_level_or_upright_does_not_lean(monkeypatch, normal):
-    """Not even where two lines say so: of a ceiling or a wall they are those of things before it."""
+    """Such planes are not asked for lines that others have on them, a slope is."""
     leaning = {}
     monkeypatch.setattr(meeting_lines, "_leaning", lambda wall, *_: leaning.setdefault(tuple(wall)))
     in_attic(np.array([*normal, -3.0]))

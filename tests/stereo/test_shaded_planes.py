@@ -340,6 +340,26 @@ def test_the_plane_that_points_along_edges_tell_is_taken_where_other_views_know_
     assert np.isfinite(behind).mean() > 0.5 and (np.nanmedian(behind) > 0.015) == others
 
 
+@pytest.mark.parametrize(("told_of", "times"), [((), 1), ((3, 4), 2)])
+def test_what_no_other_view_knows_supports_none(monkeypatch, told_of, times):
+    """Edges tell two views of a plane 2 % behind the wall, which no view knows: these suppose the wall after all."""
+    maps, depths = photographs(lambda points, view: 60 + 0.3 * light(points))
+    found = planes_of(maps, depths, by_edges=np.array([WALL, WALL - [0, 0, 0, 0.08]]))
+    monkeypatch.setattr(found, "planes", np.array([WALL, WALL - [0, 0, 0, 0.04]]))
+    supposed, surfaces = [], found._surfaces
+
+    def known_by(_, view, depths_of_areas, __):
+        behind = [np.nanmedian(depth / depths[view]) > 1.01 for depth in depths_of_areas]
+        return [np.zeros(0, int) if is_behind else np.arange(9) for is_behind in behind]
+
+    monkeypatch.setattr(CommonSurfaces, "known_by", known_by)
+    monkeypatch.setattr(found, "_surfaces", lambda areas: supposed.append(areas) or surfaces(areas))
+    shape = depths[0].shape
+    areas = found.areas([np.full(shape, 1 if view in told_of else -1) for view in range(len(CENTERS))])
+    numbers = [{area.number for own in of_views for area in own} for of_views in (*supposed, areas)]
+    assert numbers == [{0, 1}, {0}, {0}][-times - 1 :]
+
+
 def edge_points(depths, noise: float = 0.004, seed: int = 0):
     """Confirmed depths of the wall where a floor and another wall would meet it: along two sides of the pictures."""
     rng, confirmed = np.random.default_rng(seed), []
