@@ -35,6 +35,7 @@ from linprim_geo.stereo.plain_regions import (
     rays_of,
     to_world,
 )
+from linprim_geo.stereo.point_planes import CENTRAL_SHARE
 from linprim_geo.stereo.seen_through import KnownDepths
 
 # Of what stereo is sure of within a region so much is on its plane, if it is sure of enough.
@@ -46,8 +47,9 @@ MEDIAN_OFF = TOLERANCE / 4
 EDGE_REACH = WIDE // 2 + RING
 # Of a region so many pixels, or up to twice as many, tell how much of it a plane's hull holds.
 SAMPLES = 1000
-# The side of the square around a pixel in which what is off its plane is a surface of its own if it is most of it.
-SURROUNDINGS = 2 * WIDE + 1
+# The side of the square around a pixel in which what is off its plane is a surface of its own if it is most of it, and
+# in which a plane is shown by confirmed depths on it on this share of what is laid.
+SURROUNDINGS, SHOWN = 2 * WIDE + 1, 0.1
 # Of one region and K planes: which of its N points are on which (N, K), and which it may lie on (K,).
 _Lying = tuple[np.ndarray, np.ndarray]
 
@@ -56,19 +58,21 @@ _Lying = tuple[np.ndarray, np.ndarray]
 class RegionDepths:
     """On which plane each pixel of a view's plain regions lies: its `number` (H, W), -1 elsewhere, and float32 `depth`
     (H, W), NaN elsewhere; (H, W) bool where a known depth is that of the plane but for its error, so that it is to be
-    `moved` to it, and where the plane `stands` against any other depth."""
+    `moved` to it, where the plane `stands` against any other depth, and where it is `doubted`, as nothing confirms it
+    although stereo knows the rest of the region."""
 
     number: np.ndarray
     depth: np.ndarray
     moved: np.ndarray
     stands: np.ndarray
+    doubted: np.ndarray
 
     @classmethod
     def nothing(cls, camera: Camera) -> RegionDepths:
         """Of a view before any plane is laid."""
         shape = (camera.height, camera.width)
-        none = np.zeros(shape, bool)
-        return cls(np.full(shape, -1), np.full(shape, np.nan, np.float32), none, none.copy())
+        none = (np.zeros(shape, bool) for _ in range(3))
+        return cls(np.full(shape, -1), np.full(shape, np.nan, np.float32), *none)
 
     def without(self, taken: np.ndarray) -> RegionDepths:
         """Nothing where pixels are `taken` (H, W)."""
@@ -77,6 +81,7 @@ class RegionDepths:
             np.where(taken, np.float32(np.nan), self.depth),
             self.moved & ~taken,
             self.stands & ~taken,
+            self.doubted & ~taken,
         )
 
 
@@ -85,14 +90,18 @@ def region_plane_depths(
     regions: Sequence[Sequence[PlainRegion]],
     planes: np.ndarray,
     known: Sequence[np.ndarray],
+    confirmed: Sequence[np.ndarray],
 ) -> list[RegionDepths]:
     """Of each view, of its plain `regions` by the (K, 4) planes of the world on which they lie, with the `known` (H, W)
-    depths, NaN elsewhere.
+    depths and all that are `confirmed` (H, W), NaN elsewhere.
 
     A pixel lies on the plane with the most points along the edges of its region, times what its hull holds of it, of
     those within whose hull it is and on which most known depths there are. Stereo errs beside edges: in what is wide of
     a region the plane stands, but for what is known of surfaces of their own. A known depth within TOLERANCE of a plane
-    has its depth if all of these in the region are off by MEDIAN_OFF in the median at most.
+    has its depth if all of these in the region are off by MEDIAN_OFF in the median at most, and CENTRAL_SHARE of them
+    are within half of TOLERANCE: across a curved surface a half is. Nothing is laid where most of it has confirmed
+    depths off its plane in the SURROUNDINGS: a thing in front that no edge parts from the plane. Of a region of which
+    stereo knows most what has no confirmed depth on the plane around is doubted.
     """
     local = [in_camera(camera, planes) for camera in cameras]
     regions = [[region.within() for region in own] for own in regions]
@@ -101,8 +110,8 @@ def region_plane_depths(
     beside = [beside_edges(depth.shape, own) for depth, own in zip(known, regions, strict=True)]
     views = KnownDepths(cameras, (np.where(at, np.nan, depth) for at, depth in zip(beside, known, strict=True)))
     result = []
-    of_views = zip(cameras, regions, lying, local, known, beside, strict=True)
-    for camera, own, of_regions, of_view, sure, of_edges in of_views:
+    of_views = zip(cameras, regions, lying, local, known, confirmed, beside, strict=True)
+    for camera, own, of_regions, of_view, sure, seen, of_edges in of_views:
         laid = RegionDepths.nothing(camera)
         wide, telling = np.zeros_like(laid.moved), np.where(of_edges, np.nan, sure)
         for region, (on, fits) in zip(own, of_regions, strict=True):
@@ -110,21 +119,49 @@ def region_plane_depths(
             _lay(laid, camera, region, of_view, best, hulls, sure, telling)
             height, width = region.wide.shape
             wide[region.top : region.top + height, region.left : region.left + width] |= region.wide
-        off = np.abs(sure / laid.depth - 1) > TOLERANCE  # not where either is NaN
-        is_laid = np.isfinite(laid.depth)
-        stands = is_laid & wide & ~_are_surfaces(off, is_laid)
-        result.append(replace(laid, moved=laid.moved | (off & stands), stands=stands))
+        seen = np.where(of_edges, np.nan, seen)
+        result.append(_limited(laid, wide, sure, seen, _well_known(sure, own)))
     return result
+
+
+def _limited(
+    laid: RegionDepths, wide: np.ndarray, sure: np.ndarray, confirmed: np.ndarray, well_known: np.ndarray
+) -> RegionDepths:
+    """What is laid on planes, by what stereo is `sure` of and has `confirmed` (H, W), NaN elsewhere: moved to planes
+    that stand in what is `wide` (H, W), doubted in what is `well_known` (H, W), and nothing where most is off."""
+    is_laid = np.isfinite(laid.depth)
+    of_sure, of_confirmed = (depth / laid.depth - 1 for depth in (sure, confirmed))
+    off, confirmed_off = np.abs(of_sure) > TOLERANCE, np.abs(of_confirmed) > TOLERANCE  # not where it is NaN
+    stands = is_laid & wide & ~_are_surfaces(off, is_laid)
+    doubted = is_laid & well_known & ~_fills(np.abs(of_confirmed) <= TOLERANCE, is_laid, SHOWN)
+    laid = replace(laid, moved=laid.moved | (off & stands), stands=stands, doubted=doubted)
+    return laid.without(_fills(confirmed_off, is_laid))
 
 
 def _are_surfaces(off: np.ndarray, laid: np.ndarray) -> np.ndarray:
     """(H, W) bool: which depths that are `off` (H, W) the planes that are `laid` (H, W) are surfaces of their own, and
     no bands along edges: pieces of which most have most of what is laid in their SURROUNDINGS off its plane, too."""
-    around, of_all = (uniform_filter(part.astype(np.float32), SURROUNDINGS) for part in (off, laid))
-    surrounded = off & (around > of_all / 2)
+    surrounded = off & _fills(off, laid)
     piece, count = label(off, np.ones((3, 3)))
     sizes, inner = (np.bincount(piece[part], minlength=count + 1) for part in (off, surrounded))
     return off & (inner > sizes / 2)[piece]
+
+
+def _fills(part: np.ndarray, laid: np.ndarray, share: float = 0.5) -> np.ndarray:
+    """(H, W) bool: where a `part` (H, W) is more than this share of what is `laid` (H, W) in the SURROUNDINGS."""
+    around, of_all = (uniform_filter(which.astype(np.float32), SURROUNDINGS) for which in (part, laid))
+    return around > share * of_all
+
+
+def _well_known(sure: np.ndarray, regions: Sequence[PlainRegion]) -> np.ndarray:
+    """(H, W) bool: the regions of which stereo is `sure` (H, W) of more than half, so that they are not plain."""
+    result = np.zeros(sure.shape, bool)
+    for region in regions:
+        row, column = np.nonzero(region.mask)
+        row, column = row + region.top, column + region.left
+        if np.isfinite(sure[row, column]).mean() > 0.5:
+            result[row, column] = True
+    return result
 
 
 def _best_first(
@@ -216,7 +253,9 @@ def _lay(
             laid.depth[row[rows], column[rows]] = 1 / inverse[rows]
             left[rows] = False
             on = np.flatnonzero(np.abs(off) < TOLERANCE)
-            if len(on) >= LEAST_POINTS and abs(np.median(off[on])) <= MEDIAN_OFF:
+            central = np.count_nonzero(np.abs(off[on]) < TOLERANCE / 2)
+            flat = len(on) >= LEAST_POINTS and central >= CENTRAL_SHARE * len(on)
+            if flat and abs(np.median(off[on])) <= MEDIAN_OFF:
                 laid.moved[row[rows[on]], column[rows[on]]] = True
 
 

@@ -142,11 +142,14 @@ class MergedFrames(Sequence):
         beside = [beside_edges(found.grey.shape, own) for found, own in zip(maps, regions, strict=True)]
         # What is in the air beside a wall speaks against the wall's plane: when it is gone, more planes are laid.
         for _ in range(ROUNDS):
-            along_edges = region_plane_depths(self.cameras, regions, shaded.planes, sure)
+            along_edges = region_plane_depths(self.cameras, regions, shaded.planes, sure, self.depths)
             along_edges = [found.without(taken) for found, taken in zip(along_edges, backgrounds, strict=True)]
             by_shading = shaded.depth_maps(shaded.areas([found.number for found in along_edges]))
             self._lay_planes(sure, on_points, by_shading, along_edges)
             self._clear_air(beside, sure, on_points)
+        for view, found in enumerate(along_edges):
+            doubted = np.where(found.doubted, found.depth, np.float32(np.nan))
+            self.doubtful_depths[view] = _first_known((self.doubtful_depths[view], doubted))
         self.flat = _share_known(self.on_planes)
         return regions, backgrounds, [shaded.is_wall(view, asked) for view, asked in enumerate(free)]
 
@@ -165,7 +168,8 @@ class MergedFrames(Sequence):
             depth = self.depths[view]
             other = np.abs(on_plane / region.depth - 1) > TOLERANCE
             on_plane = np.where(region.stands & other, region.depth, on_plane)
-            self.on_planes.append(_first_known((on_plane, np.fmin(region.depth, shaded))))
+            laid = np.where(region.doubted, np.float32(np.nan), region.depth)
+            self.on_planes.append(_first_known((on_plane, np.fmin(laid, shaded))))
             of_sure = _first_known((on_plane, np.where(region.moved, region.depth, np.float32(np.nan))))
             target = np.where(np.isfinite(known), of_sure, self.on_planes[view])
             self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(target), target, depth)

@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 from helpers.captures import look_at
 from helpers.plain_room import GREYS, NOISE, PLANES, cameras, noisy_maps, photographs, seen
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.plain_regions import edges_of, in_camera, in_world, regions_of_views
 from linprim_geo.stereo.region_planes import beside_edges, region_plane_depths
 
 
-def laid_planes(*given) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
-    """Of every view: the depth that planes give, where known ones are moved to it, and where the plane stands."""
-    found = region_plane_depths(*given)
+def laid_planes(of, regions, planes, known) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+    """Of every view: the depth that planes give, where known ones are moved to it, and where the plane stands; stereo
+    is sure of all that it confirms."""
+    found = region_plane_depths(of, regions, planes, known, known)
     return [one.depth for one in found], [one.moved for one in found], [one.stands for one in found]
 
 
@@ -48,7 +49,7 @@ def test_walls_lie_on_their_planes(room):
 
 def test_pixels_have_the_numbers_of_their_planes(room):
     of, depths, walls, regions, known = room
-    for laid, wall in zip(region_plane_depths(of, regions, PLANES, known), walls, strict=True):
+    for laid, wall in zip(region_plane_depths(of, regions, PLANES, known, known), walls, strict=True):
         is_laid = np.isfinite(laid.depth)
         assert (laid.number[~is_laid] == -1).all() and (laid.number == wall)[is_laid].mean() > 0.98
         without = laid.without(wall == 1)
@@ -104,6 +105,65 @@ def test_sure_depths_on_a_wall_are_moved_to_it_if_most_are_not_off(room, off, ar
         [own[which & np.isfinite(depth)] for own, which, depth in zip(moved, beside, found, strict=True)]
     )
     assert len(on_it) > 1000 and on_it.mean() == are_moved
+
+
+@pytest.mark.parametrize(("most", "are_moved"), [(0.006, True), (0.0098, False)])
+def test_sure_depths_that_go_through_a_wall_are_not_moved_to_it(room, most, are_moved):
+    """As evenly before it as behind it, by so much at most: of those within 1 % a half is within 0.5 % then."""
+    of, depths, walls, regions, known = room
+    inside = []
+    for depth, wall, edges in zip(depths, walls, known, strict=True):
+        plain = (wall == 1) & np.isnan(edges)
+        off = np.zeros(depth.shape)
+        off[plain] = np.linspace(-most, most, np.count_nonzero(plain))
+        inside.append(np.where(plain, (1 + off) * depth, edges))
+    found, moved, _ = laid_planes(of, regions, PLANES[[1]], inside)
+    off_it = [np.abs(depth / plane - 1) > 1e-4 for depth, plane in zip(inside, found, strict=True)]
+    moved = np.concatenate([own[which] for own, which in zip(moved, off_it, strict=True)])
+    assert len(moved) > 100_000 and moved.mean() == are_moved
+
+
+def from_middle(region: np.ndarray) -> tuple[np.ndarray, float]:
+    """(H, W) pixels from the middle of the largest circle in a region (H, W), and its radius."""
+    inner = distance_transform_edt(np.pad(region, 1))[1:-1, 1:-1]
+    middle = np.unravel_index(np.argmax(inner), inner.shape)
+    places = zip(np.indices(region.shape), middle, strict=True)
+    return np.hypot(*(index - at for index, at in places)), inner.max()
+
+
+@pytest.mark.parametrize(("share", "laid"), [(0.45, True), (0.55, False)])
+def test_a_thing_that_no_edge_parts_from_a_wall_is_not_laid_on_it(room, share, laid):
+    """Stereo confirms so much of a disc before the wall, and is not sure of it, and of nothing else inside."""
+    of, depths, walls, regions, known = room
+    confirmed, discs = [], []
+    for number, (depth, wall, edges) in enumerate(zip(depths, walls, known, strict=True)):
+        away, inner = from_middle(wall == 1)
+        thing = (away < 50) & (inner > 70)
+        seen_of_it = thing & (np.random.default_rng(number).uniform(size=depth.shape) < share)
+        confirmed.append(np.where(seen_of_it, 0.9 * depth, edges))
+        discs.append(thing & (away < 15))
+    found = region_plane_depths(of, regions, PLANES[[1]], known, confirmed)
+    in_discs = np.concatenate([np.isfinite(one.depth)[disc] for one, disc in zip(found, discs, strict=True)])
+    others = np.concatenate([np.isfinite(one.depth)[wall == 1] for one, wall in zip(found, walls, strict=True)])
+    assert len(in_discs) > 3000 and in_discs.mean() == laid and others.mean() > 0.7
+
+
+@pytest.mark.parametrize(("share", "are_doubted"), [(0.45, False), (0.95, True)])
+def test_what_nothing_shows_in_a_wall_that_stereo_knows_is_doubted(room, share, are_doubted):
+    """Of the wall it knows so much, and of a disc nothing."""
+    of, depths, walls, regions, known = room
+    inside, discs = [], []
+    for number, (depth, wall, edges) in enumerate(zip(depths, walls, known, strict=True)):
+        away, inner = from_middle(wall == 1)
+        sure = (wall == 1) & (np.random.default_rng(number).uniform(size=depth.shape) < share)
+        inside.append(np.where((away < 50) & np.isnan(edges), np.nan, np.where(sure, depth, edges)))
+        discs.append((away < 15) & (inner > 70))
+    found = region_plane_depths(of, regions, PLANES[[1]], inside, inside)
+    doubted = np.concatenate(
+        [(one.doubted & np.isfinite(one.depth))[disc] for one, disc in zip(found, discs, strict=True)]
+    )
+    beside = np.concatenate([one.doubted[np.isfinite(depth)] for one, depth in zip(found, inside, strict=True)])
+    assert len(doubted) > 3000 and doubted.mean() == are_doubted and beside.mean() < 0.01
 
 
 def with_bands(depths, walls, known, off: float, reach: int) -> tuple[list[np.ndarray], list[np.ndarray]]:

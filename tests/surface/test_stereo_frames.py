@@ -50,13 +50,11 @@ def test_confirmed_depths_take_the_place_of_rendered_ones(found):
     assert np.allclose(frame.confidence[1, :20], stereo_frames.DOUBTFUL_WEIGHT)
 
 
-def take_region_planes(
-    monkeypatch, depth: np.ndarray, moved: np.ndarray | None = None, stands: np.ndarray | None = None
-) -> None:
-    """Gives the one view these depths by planes of its plain regions, and says which sure depths are moved to them and
-    where they stand against others."""
-    moved, stands = (np.zeros(depth.shape, bool) if given is None else given for given in (moved, stands))
-    laid = RegionDepths(np.where(np.isfinite(depth), 0, -1), depth, moved, stands)
+def take_region_planes(monkeypatch, depth: np.ndarray, **where: np.ndarray) -> None:
+    """Gives the one view these depths by planes of its plain regions, and says which sure depths are `moved` to them,
+    `where` they `stand` against others and where they are `doubted`: nowhere by default."""
+    laid = RegionDepths.nothing(CAMERA)
+    laid = replace(laid, number=np.where(np.isfinite(depth), 0, -1), depth=depth, **where)
     monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: [laid])
 
 
@@ -97,7 +95,7 @@ def test_planes_stand_where_nothing_is_confirmed(found, monkeypatch):
 def test_sure_depths_are_moved_to_the_plane_of_their_region_where_it_says_so(found, monkeypatch):
     moved = np.zeros((30, 40), bool)
     moved[:, 5:10] = True
-    take_region_planes(monkeypatch, np.full((30, 40), 3.001, np.float32), moved)
+    take_region_planes(monkeypatch, np.full((30, 40), 3.001, np.float32), moved=moved)
     frame = MergedFrames(rendered(0.01), [VIEW], 5.0)[0]
     assert np.allclose(frame.depth[2:, 5:10], 3.001) and (frame.confidence[2:, 5:10] == 1).all()
     assert (frame.depth[2:, :5] == 3).all() and (frame.depth[2:, 10:20] == 3).all()
@@ -341,6 +339,17 @@ def test_things_that_are_known_by_their_outlines_are_as_rendered(found, monkeypa
     assert np.allclose(frame.depth[thing], 3.06) and (frame.confidence[thing] == 1).all()
     assert (frame.depth[2:, :15] == 3).all() and (frame.depth[2:, 25:] == 3.5).all()
     assert merged.outlined == merged.about()["outlined"] == pytest.approx(160 / 1200) and merged.thin == 0
+
+
+def test_planes_that_nothing_shows_count_as_doubtful(found, monkeypatch):
+    doubted = np.zeros((30, 40), bool)
+    doubted[:, 15:25] = True
+    take_region_planes(monkeypatch, np.full((30, 40), 3.5, np.float32), doubted=doubted)
+    frame = MergedFrames(rendered(0.02), [VIEW], 5.0)[0]
+    assert (frame.depth[2:, :20] == 3).all() and (frame.depth[:, 20:] == 3.5).all()
+    assert (
+        np.allclose(frame.confidence[:, 20:25], stereo_frames.DOUBTFUL_WEIGHT) and (frame.confidence[:, 25:] == 1).all()
+    )
 
 
 @pytest.mark.parametrize(
