@@ -253,7 +253,7 @@ class MergedFrames(Sequence):
         sharp: Sequence[np.ndarray],
     ) -> None:
         """Takes rendered depths of thin things in place of those of the wall behind them, and those of things that are
-        known by their outlines, as if they were confirmed."""
+        known by their outlines, as if they were confirmed, but not where a depth that is says the same: it is finer."""
         known = map(_first_known, zip(self.depths, self.on_planes, self.doubtful_depths, strict=True))
         seen = [
             SeenDepths(found.camera, view.load().rgb, found.noise, depth, is_sharp, behind)
@@ -261,6 +261,7 @@ class MergedFrames(Sequence):
         ]
         thin, outlined = thin_things(seen), outlined_things(seen)
         for view, thing in enumerate(map(np.logical_or, thin, outlined)):
+            thing &= ~(np.abs(rendered[view] / self.depths[view] - 1) < CONFIRMED_DEPTH)
             self.depths[view] = np.where(thing, rendered[view], self.depths[view])
             for others in (self.on_planes, self.doubtful_depths):
                 others[view] = np.where(thing, np.float32(np.nan), others[view])

@@ -339,6 +339,9 @@ def test_things_that_are_known_by_their_outlines_are_as_rendered(found, monkeypa
     assert np.allclose(frame.depth[thing], 3.06) and (frame.confidence[thing] == 1).all()
     assert (frame.depth[2:, :15] == 3).all() and (frame.depth[2:, 25:] == 3.5).all()
     assert merged.outlined == merged.about()["outlined"] == pytest.approx(160 / 1200) and merged.thin == 0
+    # Confirmed depths that say the same stay.
+    frame = MergedFrames(rendered(0.005), [VIEW], 5.0)[0]
+    assert (frame.depth[4:20, 15:20] == 3).all() and np.allclose(frame.depth[4:20, 20:25], 3.015)
 
 
 def test_planes_that_nothing_shows_count_as_doubtful(found, monkeypatch):
