@@ -130,37 +130,37 @@ def _limited(
     """What is laid on planes, by what stereo is `sure` of and has `confirmed` (H, W), NaN elsewhere: moved to planes
     that stand in what is `wide` (H, W), doubted in what is `well_known` (H, W), and nothing where most is off."""
     is_laid = np.isfinite(laid.depth)
+    of_all = _around(is_laid)
     of_sure, of_confirmed = (depth / laid.depth - 1 for depth in (sure, confirmed))
     off, confirmed_off = np.abs(of_sure) > TOLERANCE, np.abs(of_confirmed) > TOLERANCE  # not where it is NaN
-    stands = is_laid & wide & ~_are_surfaces(off, is_laid)
-    doubted = is_laid & well_known & ~_fills(np.abs(of_confirmed) <= TOLERANCE, is_laid, SHOWN)
+    stands = is_laid & wide & ~_are_surfaces(off, of_all)
+    doubted = is_laid & well_known & (_around(np.abs(of_confirmed) <= TOLERANCE) <= SHOWN * of_all)
     laid = replace(laid, moved=laid.moved | (off & stands), stands=stands, doubted=doubted)
-    return laid.without(_fills(confirmed_off, is_laid))
+    return laid.without(_around(confirmed_off) > of_all / 2)
 
 
-def _are_surfaces(off: np.ndarray, laid: np.ndarray) -> np.ndarray:
-    """(H, W) bool: which depths that are `off` (H, W) the planes that are `laid` (H, W) are surfaces of their own, and
-    no bands along edges: pieces of which most have most of what is laid in their SURROUNDINGS off its plane, too."""
-    surrounded = off & _fills(off, laid)
+def _are_surfaces(off: np.ndarray, of_all: np.ndarray) -> np.ndarray:
+    """(H, W) bool: which depths that are `off` (H, W) the planes are surfaces of their own, and no bands along edges:
+    pieces of which most have most of what is laid in their SURROUNDINGS (`of_all`, its share) off its plane, too."""
+    surrounded = off & (_around(off) > of_all / 2)
     piece, count = label(off, np.ones((3, 3)))
     sizes, inner = (np.bincount(piece[part], minlength=count + 1) for part in (off, surrounded))
     return off & (inner > sizes / 2)[piece]
 
 
-def _fills(part: np.ndarray, laid: np.ndarray, share: float = 0.5) -> np.ndarray:
-    """(H, W) bool: where a `part` (H, W) is more than this share of what is `laid` (H, W) in the SURROUNDINGS."""
-    around, of_all = (uniform_filter(which.astype(np.float32), SURROUNDINGS) for which in (part, laid))
-    return around > share * of_all
+def _around(part: np.ndarray) -> np.ndarray:
+    """(H, W) float32 share of a `part` (H, W) bool in the SURROUNDINGS."""
+    return uniform_filter(part.astype(np.float32), SURROUNDINGS)
 
 
 def _well_known(sure: np.ndarray, regions: Sequence[PlainRegion]) -> np.ndarray:
     """(H, W) bool: the regions of which stereo is `sure` (H, W) of more than half, so that they are not plain."""
     result = np.zeros(sure.shape, bool)
     for region in regions:
-        row, column = np.nonzero(region.mask)
-        row, column = row + region.top, column + region.left
-        if np.isfinite(sure[row, column]).mean() > 0.5:
-            result[row, column] = True
+        height, width = region.mask.shape
+        window = np.s_[region.top : region.top + height, region.left : region.left + width]
+        if np.isfinite(sure[window][region.mask]).mean() > 0.5:
+            result[window] |= region.mask
     return result
 
 

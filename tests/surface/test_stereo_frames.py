@@ -51,8 +51,8 @@ def test_confirmed_depths_take_the_place_of_rendered_ones(found):
 
 
 def take_region_planes(monkeypatch, depth: np.ndarray, **where: np.ndarray) -> None:
-    """Gives the one view these depths by planes of its plain regions, and says which sure depths are `moved` to them,
-    `where` they `stand` against others and where they are `doubted`: nowhere by default."""
+    """Gives the one view these depths by planes of its plain regions, with the other columns of
+    `RegionDepths` that are given: `moved`, `stands` and `doubted` are nowhere by default."""
     laid = RegionDepths.nothing(CAMERA)
     laid = replace(laid, number=np.where(np.isfinite(depth), 0, -1), depth=depth, **where)
     monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: [laid])
