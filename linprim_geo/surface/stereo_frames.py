@@ -167,7 +167,7 @@ class MergedFrames(Sequence):
         for view, (known, on_plane, shaded, region) in enumerate(of_views):
             depth = self.depths[view]
             other = np.abs(on_plane / region.depth - 1) > TOLERANCE
-            on_plane = np.where(region.stands & other, region.depth, on_plane)
+            on_plane = np.where(region.stands & ~region.doubted & other, region.depth, on_plane)
             laid = np.where(region.doubted, np.float32(np.nan), region.depth)
             self.on_planes.append(_first_known((on_plane, np.fmin(laid, shaded))))
             of_sure = _first_known((on_plane, np.where(region.moved, region.depth, np.float32(np.nan))))

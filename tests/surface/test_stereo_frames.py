@@ -111,7 +111,7 @@ def test_confirmed_depths_that_stereo_cannot_tell_from_a_plane_are_on_it(found, 
 
 
 def test_of_several_planes_that_of_a_regions_edges_stands_or_a_nearer_one_by_shading(found, monkeypatch):
-    """Planes by points, which are more precise, give way to another where that stands."""
+    """Planes by points, which are more precise, give way to another where that stands and is not doubted."""
     found[0].confidence[:] = CONFIDENT
     columns = np.arange(40)
     by_points, along_edges, by_shading = (np.full((30, 40), np.nan, np.float32) for _ in range(3))
@@ -120,9 +120,11 @@ def test_of_several_planes_that_of_a_regions_edges_stands_or_a_nearer_one_by_sha
     by_shading[:] = np.where(columns < 30, 3.4, 3.1)
     monkeypatch.setattr(stereo_frames, "point_plane_depth", lambda *_: by_points)
     monkeypatch.setattr(stereo_frames.ShadedPlanes, "depth_maps", lambda *_: [by_shading])
-    take_region_planes(monkeypatch, along_edges, stands=np.broadcast_to((columns < 5) | (columns >= 10), (30, 40)))
+    stands = np.broadcast_to((columns < 5) | (columns >= 10), (30, 40))
+    doubted = np.broadcast_to((columns >= 15) & (columns < 20), (30, 40))
+    take_region_planes(monkeypatch, along_edges, stands=stands, doubted=doubted)
     frame = MergedFrames(rendered(0.01), [VIEW], 5.0)[0]
-    assert np.allclose(frame.depth, np.select([columns < 10, columns < 30], [3.001, 3.2], 3.1))
+    assert np.allclose(frame.depth, np.select([(columns < 10) | doubted, columns < 30], [3.001, 3.2], 3.1))
 
 
 def test_areas_of_shading_lie_on_the_planes_that_edges_tell(found, monkeypatch):
@@ -350,9 +352,8 @@ def test_planes_that_nothing_shows_count_as_doubtful(found, monkeypatch):
     take_region_planes(monkeypatch, np.full((30, 40), 3.5, np.float32), doubted=doubted)
     frame = MergedFrames(rendered(0.02), [VIEW], 5.0)[0]
     assert (frame.depth[2:, :20] == 3).all() and (frame.depth[:, 20:] == 3.5).all()
-    assert (
-        np.allclose(frame.confidence[:, 20:25], stereo_frames.DOUBTFUL_WEIGHT) and (frame.confidence[:, 25:] == 1).all()
-    )
+    assert np.allclose(frame.confidence[:, 20:25], stereo_frames.DOUBTFUL_WEIGHT)
+    assert (frame.confidence[:, 25:] == 1).all()
 
 
 @pytest.mark.parametrize(
