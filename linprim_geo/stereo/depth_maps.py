@@ -22,6 +22,7 @@ from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, fit_surface
 from linprim_geo.points.view_pairs import CONFIRMING, source_views, visible_pixels
 from linprim_geo.stereo.confidence import MATCHED_WEIGHTS, MOST_COST, RIGHT, WEIGHTS, evidence, probability
 from linprim_geo.stereo.evidence import Glance, glance
+from linprim_geo.stereo.noise import noise_of, shared_noise
 
 # Photographs that one is matched with, at most: as many as the core takes.
 MOST_SOURCES = 8
@@ -29,8 +30,6 @@ MOST_SOURCES = 8
 COARSE_SWEEPS, FINE_SWEEPS, GEOMETRIC_SWEEPS = 3, 1, (1, 1)
 # The nearest depth is that of the nearest points that a view shows, but for this share, divided by NEARER.
 NEAREST_SHARE, NEARER = 0.01, 1.5
-# Variance of grey values that rounding them causes, at least.
-LEAST_NOISE = 1.0
 # Bytes per pixel of all views that are in memory at once: planes 17, images 7, depths of the last turn 4, maps 25.
 PIXEL_BYTES = 53
 # Of the memory that is free, no more than this share is taken.
@@ -52,7 +51,7 @@ class DepthMap:
     the world, towards the camera; `confidence` (H, W) float32 the probability that the depth is right within 1 %, 0
     where it is unknown; `confirming` (H, W) uint8 how many other views have the same depth; `deviation` (H, W) float32
     the least share of the depth by which that of another view differs, infinite where none has one. `grey` (H, W) uint8
-    is what was matched, `noise` the variance of its noise.
+    is what was matched, `noise` the variance of its noise and `most_noise` what others tell of it (`shared_noise`).
     """
 
     camera: Camera
@@ -63,6 +62,7 @@ class DepthMap:
     deviation: np.ndarray
     grey: np.ndarray
     noise: float
+    most_noise: float = np.inf
 
     def is_confirmed(self, probability: float = CONFIDENT) -> np.ndarray:
         """(H, W) bool."""
@@ -118,6 +118,9 @@ def depth_maps(
         images, halves = ([each[j] for j in (k, *sources)] for each in (full, half))
         planes = photometric_planes(images, halves, ranges[k], noises[k], seed * len(views) + k)
         found.append(planes)
+    depths = [_known_depth(image, planes) for image, planes in zip(full, found, strict=True)]
+    most = shared_noise(cameras, [image.grey for image in full], depths, pairs)
+    noises = [min(each) for each in zip(noises, most, strict=True)]
     for turn in range(len(GEOMETRIC_SWEEPS)):
         # What the neighbours have found before this turn, whichever of them come first in it.
         depths = {k: planes.plane[..., 0].copy() for k, planes in enumerate(found) if planes is not None}
@@ -133,7 +136,7 @@ def depth_maps(
             fit_within_edges(image, planes)
     weights = WEIGHTS if fit else MATCHED_WEIGHTS
     return [
-        _depth_map(full[k], noises[k], planes, [(cameras[j], found[j]) for j in pairs[k]], weights)
+        _depth_map(full[k], noises[k], most[k], planes, [(cameras[j], found[j]) for j in pairs[k]], weights)
         for k, planes in enumerate(found)
     ]
 
@@ -201,16 +204,6 @@ def grey_of(view: View) -> np.ndarray:
     return np.rint(view.load().rgb @ np.array([0.299, 0.587, 0.114], np.float32)).astype(np.uint8)
 
 
-def noise_of(grey: np.ndarray) -> float:
-    """Variance of the noise of (H, W) grey values, LEAST_NOISE at least: by what a second difference across both
-    directions, which planes and edges along either cancel from, is in the median. Source: Immerkaer 1996, with the
-    median in place of the mean."""
-    g = grey.astype(np.float32)
-    across = g[:, :-2] - 2 * g[:, 1:-1] + g[:, 2:]
-    both = across[:-2] - 2 * across[1:-1] + across[2:]
-    return max(LEAST_NOISE, float(np.median(np.abs(both)) / 0.6745) ** 2 / 36)
-
-
 def halved(image: StereoImage) -> StereoImage:
     """Means of 2 by 2 pixels."""
     return StereoImage.of(smaller(image.camera, 2), np.rint(block_means(image.grey, 2)).astype(np.uint8))
@@ -269,9 +262,19 @@ def inverse_planes(camera: Camera, depth: np.ndarray, normal: np.ndarray) -> np.
     return np.stack([1 / depth, *slopes]).astype(np.float32)
 
 
+def _known_depth(image: StereoImage, planes: DepthPlanes | None) -> np.ndarray:
+    """(H, W) depth of an image, NaN where it is unknown."""
+    if planes is None:
+        return np.full(image.grey.shape, np.nan, np.float32)
+    inverse = planes.plane[..., 0]
+    with np.errstate(divide="ignore"):
+        return np.where(are_known(inverse, planes.cost), 1 / inverse, np.float32(np.nan))
+
+
 def _depth_map(
     image: StereoImage,
     noise: float,
+    most_noise: float,
     planes: DepthPlanes | None,
     others: list[tuple[Camera, DepthPlanes | None]],
     weights: np.ndarray,
@@ -280,7 +283,7 @@ def _depth_map(
     if planes is None:
         unknown, infinite = np.full(shape, np.nan, np.float32), np.full(shape, np.inf, np.float32)
         normal, none = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
-        return DepthMap(camera, unknown, normal, none, none.astype(np.uint8), infinite, image.grey, noise)
+        return DepthMap(camera, unknown, normal, none, none.astype(np.uint8), infinite, image.grey, noise, most_noise)
     depth, normal = depth_and_normal(camera, planes.plane)
     known = are_known(planes.plane[..., 0], planes.cost)
     depth = np.where(known, depth, np.nan)
@@ -305,4 +308,5 @@ def _depth_map(
         deviation,
         image.grey,
         noise,
+        most_noise,
     )

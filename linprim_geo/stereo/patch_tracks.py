@@ -22,7 +22,8 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.feature_points import ObservedPoints
 from linprim_geo.geometry.sampling import sample_bilinear
 from linprim_geo.points.view_pairs import visible_pixels
-from linprim_geo.stereo.depth_maps import DepthMap, depth_maps, grey_of, inverse_planes, noise_of
+from linprim_geo.stereo.depth_maps import DepthMap, depth_maps, grey_of, inverse_planes
+from linprim_geo.stereo.noise import noise_of
 from linprim_geo.stereo.surface_points import LONGER_SIDE as LONGER_SIDE_OF_DEPTHS
 
 # Photographs are averaged down to this many pixels along the longer side; so many of them, decoded, are in memory.

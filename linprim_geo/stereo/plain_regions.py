@@ -16,14 +16,11 @@ from scipy.ndimage import binary_dilation, distance_transform_edt, find_objects,
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
+from linprim_geo.stereo.noise import LEAST_OF_PLAIN, plainest
 
 # An edge runs through 3 by 3 pixels whose variance is so many times that of the noise; fewer edge pixels than SPECK
 # together are noise.
 EDGE_VARIANCE, SPECK = 4.0, 9
-# At least a tenth of a photograph is taken to be plain, or as good as that. There the variance of 3 by 3 pixels is that
-# of the noise times chi-square of 8 degrees of freedom over 9, whose tenth percentile is 3.49.
-PLAIN_SHARE, LEAST_OF_PLAIN = 0.1, 3.49 / 9
-DARKEST, BRIGHTEST = 3, 252
 # Regions have at least so many pixels (two windows of stereo) and so many confirmed depths within RING pixels.
 LEAST_PIXELS, LEAST_POINTS, RING = 200, 30, 4
 # Stereo gives the depth of an edge to pixels up to ten beside it (DECISIONS 126): what has no edge within twice as many
@@ -91,16 +88,17 @@ class PlainRegion:
         return (np.abs(off) < TOLERANCE) & self.sure[:, None]
 
 
-def edges_of(grey: np.ndarray, noise: float) -> np.ndarray:
+def edges_of(grey: np.ndarray, noise: float, most: float = np.inf) -> np.ndarray:
     """(H, W) bool: where an edge runs through a pixel or beside it.
 
     `noise` is the variance that differences of pixels tell. Blur, demosaicing and JPEG make it equal in neighbours,
-    whose differences tell less: where the plainest parts vary more, their variance counts.
+    whose differences tell less: where the plainest parts vary more, their variance counts, up to the `most` that noise
+    may have (`noise.shared_noise`).
     """
     values = grey.astype(np.float64)
     mean = uniform_filter(values, 3, mode="nearest")
     variance = uniform_filter(values * values, 3, mode="nearest") - mean * mean
-    edge = variance > EDGE_VARIANCE * max(noise, plainest(variance, values) / LEAST_OF_PLAIN)
+    edge = variance > EDGE_VARIANCE * min(most, max(noise, plainest(variance, values) / LEAST_OF_PLAIN))
     parts, _ = label(edge, np.ones((3, 3)))
     return edge & (np.bincount(parts.ravel())[parts] >= SPECK)
 
@@ -115,12 +113,6 @@ def grown_alike(region: np.ndarray, grey: np.ndarray, edge: np.ndarray) -> np.nd
     mean = uniform_filter(np.where(inside, grey, 0.0), AROUND) / np.maximum(share, 1e-9)
     distance, nearest = distance_transform_edt(~inside, return_indices=True)
     return inside | (edge & (distance <= RING) & (np.abs(grey - mean[tuple(nearest)]) < HALF_EDGE))
-
-
-def plainest(values: np.ndarray, grey: np.ndarray) -> float:
-    """The quantile of values at PLAIN_SHARE, without pixels that are black or white: clipped ones have no noise."""
-    varying = values[(grey > DARKEST) & (grey < BRIGHTEST)]
-    return float(np.quantile(varying, PLAIN_SHARE)) if len(varying) else 0.0
 
 
 def plain_regions(
@@ -167,7 +159,7 @@ def regions_of_views(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> 
         sure = np.isfinite(depth)
         if sure.any():
             depth = np.where(~sure & (found.depth > BEYOND * np.median(depth[sure])), found.depth, depth)
-        edge = edges_of(found.grey, found.noise)
+        edge = edges_of(found.grey, found.noise, found.most_noise)
         result.append(plain_regions(number, found.camera, found.grey, edge, depth, sure))
     return result
 

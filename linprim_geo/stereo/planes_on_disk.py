@@ -25,9 +25,9 @@ from linprim_geo.stereo.depth_maps import (
     grey_of,
     halved,
     inverse_range,
-    noise_of,
     photometric_planes,
 )
+from linprim_geo.stereo.noise import noise_of
 
 # By photographs alone, then in turns with the depths of neighbours.
 STAGES = 1 + len(GEOMETRIC_SWEEPS)

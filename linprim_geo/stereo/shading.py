@@ -19,7 +19,8 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.stereo_ops import ShadedComparison, compare_shading
 from linprim_geo.stereo.depth_maps import DepthMap, block_means
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
-from linprim_geo.stereo.plain_regions import edges_of, in_camera, plainest, rays_of
+from linprim_geo.stereo.noise import plainest
+from linprim_geo.stereo.plain_regions import edges_of, in_camera, rays_of
 from linprim_geo.stereo.vignetting import falloff
 
 # Larger photographs are averaged down.
@@ -72,7 +73,7 @@ class Shading:
         # The variance of the derivative of white noise behind a Gaussian is that of the noise over 8 pi sigma^4. Where
         # neighbours have noise in common the plainest parts tell more, see `edges_of`.
         deviation = max(np.sqrt(noise / (8 * np.pi * EDGE_SIGMA**4)), plainest(slope, grey) / LEAST_SLOPE)
-        edge = edges_of(grey, noise) | (slope > EDGE_SLOPE * deviation)
+        edge = edges_of(grey, noise, found.most_noise) | (slope > EDGE_SLOPE * deviation)
         plain = uniform_filter((~edge).astype(np.float32), BOX, mode="constant") > 1 - 0.5 / BOX**2
         mean = uniform_filter(grey, BOX, mode="nearest")
         # Of plain pixels far around: noise of the slopes would make the steps of a fit too small.

@@ -207,7 +207,7 @@ class MergedFrames(Sequence):
         and not at edges of photographs, where rendered ones are finer."""
         spanned = spanned_depths(self.cameras, known, points, rendered)
         for view, (found, depth, background) in enumerate(zip(maps, spanned, backgrounds, strict=True)):
-            depth[background | edges_of(found.grey, found.noise)] = np.nan
+            depth[background | edges_of(found.grey, found.noise, found.most_noise)] = np.nan
             self.doubtful_depths[view] = _first_known((self.doubtful_depths[view], depth))
         self.spanned = _share_known(spanned)
 
@@ -403,7 +403,7 @@ def _seen_past(frame: DepthFrame, found: DepthMap, background: np.ndarray) -> De
     their grey: training fills a plain sky with fog."""
     if frame.background is None or not background.any():
         return frame
-    background = grown_alike(background, found.grey, edges_of(found.grey, found.noise))
+    background = grown_alike(background, found.grey, edges_of(found.grey, found.noise, found.most_noise))
     return replace(
         frame,
         depth=np.where(background, np.float32(0), frame.depth),

@@ -1,0 +1,89 @@
+"""How much noise photographs have: by their own pixels, and by what others of the same surfaces differ from them.
+
+One photograph does not tell noise from fine texture: a carpet all over it passes for noise. Two have texture in common,
+and no noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.sampling import sample_bilinear
+from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
+
+# Variance of grey values that rounding them causes, at least.
+LEAST_NOISE = 1.0
+# At least a tenth of a photograph is taken to be plain, or as good as that. There the variance of 3 by 3 pixels is that
+# of the noise times chi-square of 8 degrees of freedom over 9, whose tenth percentile is 3.49.
+PLAIN_SHARE, LEAST_OF_PLAIN = 0.1, 3.49 / 9
+DARKEST, BRIGHTEST = 3, 252
+# Windows of a photograph that are compared with another, and so many of these tell something: a tenth of 300 variances
+# with 8 degrees of freedom is known within a tenth.
+WINDOWS, LEAST_WINDOWS = 4000, 300
+# Rows and columns of the pixels of a window from its middle.
+WINDOW = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def noise_of(grey: np.ndarray) -> float:
+    """Variance of the noise of (H, W) grey values, LEAST_NOISE at least: by what a second difference across both
+    directions, which planes and edges along either cancel from, is in the median. Source: Immerkaer 1996, with the
+    median in place of the mean."""
+    g = grey.astype(np.float32)
+    across = g[:, :-2] - 2 * g[:, 1:-1] + g[:, 2:]
+    both = across[:-2] - 2 * across[1:-1] + across[2:]
+    return max(LEAST_NOISE, float(np.median(np.abs(both)) / 0.6745) ** 2 / 36)
+
+
+def plainest(values: np.ndarray, grey: np.ndarray) -> float:
+    """The quantile of values at PLAIN_SHARE, without pixels that are black or white: clipped ones have no noise."""
+    varying = values[(grey > DARKEST) & (grey < BRIGHTEST)]
+    return float(np.quantile(varying, PLAIN_SHARE)) if len(varying) else 0.0
+
+
+def shared_noise(
+    cameras: Sequence[Camera],
+    greys: Sequence[np.ndarray],
+    depths: Sequence[np.ndarray],
+    sources: Sequence[Sequence[int]],
+) -> list[float]:
+    """Of each photograph a variance that its noise does not exceed, LEAST_NOISE at least; infinite where none of its
+    `sources`, numbers of photographs, shows enough of the same.
+
+    `greys` (H, W) uint8, `depths` (H, W) that are known, NaN elsewhere. It is the variance of what 3 by 3 pixels differ
+    by from the other photograph at the same surface, in the plainest tenth of windows, of the source that differs
+    least: the noise of both, but of the other's less as it is interpolated, and what errors of depth make of texture.
+    """
+    rng, result = np.random.default_rng(0), []
+    for camera, grey, depth, others in zip(cameras, greys, depths, sources, strict=True):
+        windows, points = _windows(camera, grey, depth, rng)
+        least = min((_difference(windows, points, cameras[k], greys[k], depths[k]) for k in others), default=np.inf)
+        result.append(max(LEAST_NOISE, least))
+    return result
+
+
+def _windows(camera: Camera, grey: np.ndarray, depth: np.ndarray, rng) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 9) grey values of random windows whose depths are known, and (N, 9, 3) their points."""
+    known = np.isfinite(depth)
+    known[[0, -1]] = known[:, [0, -1]] = False
+    middles = rng.permutation(np.argwhere(known))[:WINDOWS]
+    row, column = np.moveaxis(middles[:, None] + WINDOW, 2, 0)
+    whole = np.isfinite(depth[row, column]).all(1)
+    row, column = row[whole], column[whole]
+    return grey[row, column], camera.center + camera.world_rays()[row, column] * depth[row, column][..., None]
+
+
+def _difference(windows: np.ndarray, points: np.ndarray, other: Camera, grey: np.ndarray, depth: np.ndarray) -> float:
+    """See `shared_noise`; infinite where few (N, 9) windows with their (N, 9, 3) points are in `other`."""
+    pixels, away = other.project(points.reshape(-1, 3))
+    seen = other.shows(pixels, away)
+    column, row = np.where(seen, pixels.T, 0).astype(np.int64)
+    with np.errstate(invalid="ignore"):
+        seen &= np.abs(depth[row, column] / away - 1) < CONFIRMED_DEPTH
+    seen = seen.reshape(windows.shape).all(1)
+    if np.count_nonzero(seen) < LEAST_WINDOWS:
+        return np.inf
+    there = sample_bilinear(grey.astype(np.float32), pixels.reshape(*windows.shape, 2)[seen])[..., 0]
+    return plainest((windows[seen] - there).var(1), windows[seen][:, len(WINDOW) // 2]) / LEAST_OF_PLAIN
