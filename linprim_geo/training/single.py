@@ -106,8 +106,9 @@ def train_run(
         + (f", held-out PSNR {score:.2f} dB over {len(held_out)} views" if held_out else "")
         + (f", {score_gain:.2f} dB with the best gain of each" if held_out and score_gain is not None else "")
     )
-    if score is not None:
-        result |= _beside_training_views(trainer, run, images, score, progress)
+    compared = score if score_gain is None else score_gain
+    if compared is not None:
+        result |= _beside_training_views(trainer, run, images, compared, progress)
     if pace:
         result["time_budget"] = pace.close(run, progress)
     return result
@@ -153,8 +154,10 @@ def _planned(
 def _beside_training_views(
     trainer: Trainer, run: Run, images: Sequence[TrainingImage], score: float, progress: Progress
 ) -> dict:
-    """The mean PSNR of some training views, and advice where the held-out `score` is far behind."""
-    train_score = evaluate(trainer, list(images[:: max(1, len(images) // QUICK_VIEWS)]))
+    """The mean PSNR of some training views, and advice where the held-out `score` is far behind: with the best gain of
+    each, where photographs have gains."""
+    some = list(images[:: max(1, len(images) // QUICK_VIEWS)])
+    train_score = evaluate(trainer, some, gains=trainer.exposure is not None)
     assert train_score is not None
     found: dict = {"train_psnr": train_score}
     effects = run.notes.get("effects")

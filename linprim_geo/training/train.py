@@ -65,7 +65,7 @@ def train(
     Returns: `run`, `iterations`, `seconds` (of training steps alone), `primitives`, `psnr` (mean over held-out views),
     `views`; with held-out views also `train_psnr`, the mean over at most 31 training views, and `advice` where these
     are far ahead (`held_out_gap.gap_advice`), which is in config.json, too; with `--exposure gain` also `psnr_gain`,
-    each render times the gain per channel that brings it nearest to its photograph.
+    each render times the gain per channel that brings it nearest to its photograph, as it is for `train_psnr` then.
 
     Raises:
         LinprimError: the scene or an option cannot be used, or the folder exists already.
