@@ -42,6 +42,12 @@ class Progress:
         pace = f"{rate:.0f}/s" if rate >= 10 else f"{rate:.2g}/s"
         self._show(f"{self.name} {done}/{self.total}  {pace}  {left} left  {text}")
 
+    def stage(self, done: int, text: str) -> None:
+        """Says at once that step `done`, counted from 0, begins: of a few long ones that differ, so without a rate."""
+        if not self.quiet:
+            self.last = time.monotonic()
+            self._show(f"{self.name} {done + 1}/{self.total}  {text}")
+
     def note(self, text: str) -> None:
         """Prints a line that stays."""
         if self.quiet:

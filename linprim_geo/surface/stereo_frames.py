@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from linprim_geo.base.progress import Progress
 from linprim_geo.capture.types import View
 from linprim_geo.geometry.mesh import Mesh, face_areas, face_components, select_faces
 from linprim_geo.points.initial_points import in_image
@@ -85,6 +86,8 @@ class MergedFrames(Sequence):
     ):
         self.limit = limit
         maps = depth_maps(views, pairing_points(rendered), hiding=(frame.depth for frame in rendered), quiet=quiet)
+        progress = Progress("merging", 5, quiet=quiet)
+        progress.stage(0, "planes")
         self.cameras = [found.camera for found in maps]
         confirmed = [found.is_confirmed() for found in maps]
         self.depths = [_depth_where(found, own) for found, own in zip(maps, confirmed, strict=True)]
@@ -106,18 +109,23 @@ class MergedFrames(Sequence):
         self.rendered = [_seen_past(*each) for each in zip(rendered, maps, backgrounds, strict=True)]
         if plain_walls:
             self._end_at(plain_walls)
+        progress.stage(1, "gaps between planes")
         self.shown = [frame.depth[::SAMPLED, ::SAMPLED] > 0 for frame in self.rendered]
         known = self._known()
         points = self._points(maps, known)
         self._span_gaps(maps, known, points, rendered_depths, backgrounds)
         are_sharp = [depth > 0 for depth in rendered_depths] if sharp is None else list(sharp)
+        progress.stage(2, "floors and walls")
         walls, planes = self._walls(maps, seen, points)
         self._enclose(walls, known, are_sharp, regions, backgrounds)
         # What stereo has measured on planes with points is not background where hardly any view looks.
         self._end_at(known_on_planes(self.cameras, planes, measured))
+        progress.stage(3, "thin things")
         self._keep_things(views, maps, rendered_depths, are_sharp)
+        progress.stage(4, "backgrounds")
         if not masked:
             self._end_backgrounds(maps)
+        progress.clear()
 
     def _take_planes(
         self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray], free: Sequence[np.ndarray]

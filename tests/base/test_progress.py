@@ -1,0 +1,32 @@
+"""Progress of long jobs, as a log and a terminal show it."""
+
+from __future__ import annotations
+
+import pytest
+
+from linprim_geo.base.progress import Progress, duration
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(0.4, "0 s"), (59.4, "59 s"), (184, "3:04"), (3723, "1:02:03")])
+def test_durations_are_short(seconds, text):
+    assert duration(seconds) == text
+
+
+def test_long_stages_are_told_when_they_begin(capsys):
+    progress = Progress("merging", 2)
+    progress.stage(0, "planes")
+    progress.update(1)  # too soon after the line before
+    progress.stage(1, "walls")
+    Progress("merging", 2, quiet=True).stage(0, "planes")
+    assert capsys.readouterr().err.splitlines() == ["merging 1/2  planes", "merging 2/2  walls"]
+
+
+def test_a_terminal_has_one_line_that_is_cleared(capsys, monkeypatch):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    progress = Progress("merging", 2)
+    progress.stage(0, "gaps between planes")
+    progress.stage(1, "walls")
+    progress.note("done")
+    shown = capsys.readouterr().err
+    assert shown.endswith("\r" + " " * len("merging 2/2  walls") + "\rdone\n")
+    assert "\r" + "merging 2/2  walls".ljust(len("merging 1/2  gaps between planes")) + "\r" in shown
