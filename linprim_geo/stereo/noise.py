@@ -39,8 +39,13 @@ def noise_of(grey: np.ndarray) -> float:
 
 def plainest(values: np.ndarray, grey: np.ndarray) -> float:
     """The quantile of values at PLAIN_SHARE, without pixels that are black or white: clipped ones have no noise."""
-    varying = values[(grey > DARKEST) & (grey < BRIGHTEST)]
+    varying = values[_may_vary(grey)]
     return float(np.quantile(varying, PLAIN_SHARE)) if len(varying) else 0.0
+
+
+def _may_vary(grey: np.ndarray) -> np.ndarray:
+    """(H, W) bool: what is not black or white."""
+    return (grey > DARKEST) & (grey < BRIGHTEST)
 
 
 def shared_noise(
@@ -65,11 +70,12 @@ def shared_noise(
 
 
 def _windows(camera: Camera, grey: np.ndarray, depth: np.ndarray, rng) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 9) grey values of random windows whose depths are known, and (N, 9, 3) their points."""
-    known = np.isfinite(depth)
+    """(N, 9) grey values of random windows whose depths are known and whose middles are not clipped, and (N, 9, 3)
+    their points."""
+    known = np.isfinite(depth) & _may_vary(grey)
     known[[0, -1]] = known[:, [0, -1]] = False
-    middles = rng.permutation(np.argwhere(known))[:WINDOWS]
-    row, column = np.moveaxis(middles[:, None] + WINDOW, 2, 0)
+    middles = np.unravel_index(rng.permutation(np.flatnonzero(known))[:WINDOWS], known.shape)
+    row, column = (middle[:, None] + steps for middle, steps in zip(middles, WINDOW.T, strict=True))
     whole = np.isfinite(depth[row, column]).all(1)
     row, column = row[whole], column[whole]
     return grey[row, column], camera.center + camera.world_rays()[row, column] * depth[row, column][..., None]
@@ -86,4 +92,4 @@ def _difference(windows: np.ndarray, points: np.ndarray, other: Camera, grey: np
     if np.count_nonzero(seen) < LEAST_WINDOWS:
         return np.inf
     there = sample_bilinear(grey.astype(np.float32), pixels.reshape(*windows.shape, 2)[seen])[..., 0]
-    return plainest((windows[seen] - there).var(1), windows[seen][:, len(WINDOW) // 2]) / LEAST_OF_PLAIN
+    return float(np.quantile((windows[seen] - there).var(1), PLAIN_SHARE)) / LEAST_OF_PLAIN

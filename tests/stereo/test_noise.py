@@ -41,6 +41,9 @@ def test_noise_has_no_bound_where_nothing_is_shared():
     unknown = [depths[0], np.full_like(depths[1], np.nan), depths[2]]
     assert np.isfinite(shared_noise(CAMERAS, shots, unknown, OTHERS)).tolist() == [True, False, True]
     assert shared_noise(CAMERAS, shots, depths, [[], [], []]) == [np.inf] * 3
+    # What is clipped has no noise, and tells of none.
+    white = [np.full_like(shot, 255) for shot in shots]
+    assert shared_noise(CAMERAS, white, depths, OTHERS) == [np.inf] * 3
     # Where the other photograph shows something nearer.
     before = [depths[0], 0.9 * depths[1], 0.8 * depths[2]]
     assert shared_noise(CAMERAS, shots, before, OTHERS) == [np.inf] * 3
