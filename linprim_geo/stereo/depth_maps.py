@@ -118,8 +118,7 @@ def depth_maps(
         images, halves = ([each[j] for j in (k, *sources)] for each in (full, half))
         planes = photometric_planes(images, halves, ranges[k], noises[k], seed * len(views) + k)
         found.append(planes)
-    depths = [_known_depth(image, planes) for image, planes in zip(full, found, strict=True)]
-    most = shared_noise(cameras, [image.grey for image in full], depths, pairs)
+    most = _most_noise(full, found, pairs)
     noises = [min(each) for each in zip(noises, most, strict=True)]
     for turn in range(len(GEOMETRIC_SWEEPS)):
         # What the neighbours have found before this turn, whichever of them come first in it.
@@ -260,6 +259,14 @@ def inverse_planes(camera: Camera, depth: np.ndarray, normal: np.ndarray) -> np.
     distance = depth * (normal * camera.ray_grid()).sum(-1)  # n . X = distance: inverse depth = n . ray / distance
     slopes = [normal[..., 0] / (camera.fx * distance), normal[..., 1] / (camera.fy * distance)]
     return np.stack([1 / depth, *slopes]).astype(np.float32)
+
+
+def _most_noise(
+    images: Sequence[StereoImage], found: Sequence[DepthPlanes | None], pairs: Sequence[Sequence[int]]
+) -> list[float]:
+    """`shared_noise` of images by the depths that are found, with those that each is matched with."""
+    depths = [_known_depth(image, planes) for image, planes in zip(images, found, strict=True)]
+    return shared_noise([image.camera for image in images], [image.grey for image in images], depths, pairs)
 
 
 def _known_depth(image: StereoImage, planes: DepthPlanes | None) -> np.ndarray:
