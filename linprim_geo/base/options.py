@@ -417,7 +417,15 @@ class ExtractOptions:
         "off: leave it",
         choices=("on", "off"),
     )
-    close_holes: int = option(0, "fill holes with at most N edges around them; 0 fills none", low=0, high=10**9)
+    close_holes: int | str = option(
+        "auto",
+        "fill holes with at most N edges around them; 0 fills none; auto: after stereo those that are no wider than a "
+        "window of stereo and that no photograph sees through",
+        low=0,
+        high=10**9,
+        metavar="N",
+        number_or="auto",
+    )
     smooth: int = option(
         0, "iterations of smoothing that keeps the volume; 0 leaves the surface as it is", low=0, high=10_000
     )

@@ -33,7 +33,7 @@ SHARE_OF_ERROR = 0.5
 
 def process_mesh(mesh: Mesh, options, note: Callable[[str], None] | None = None) -> tuple[Mesh, list[dict]]:
     """Applies what the options ask for in this order: `close_holes`, `smooth`, `remesh`, `tolerance`, `target_faces`; 0
-    is off for each.
+    is off for each, and `close_holes` auto has been done before.
 
     Args:
         options: has these five attributes, as `ExtractOptions`.
@@ -48,7 +48,7 @@ def process_mesh(mesh: Mesh, options, note: Callable[[str], None] | None = None)
     """
     steps: list[tuple[str, str, float | str, Callable[[Mesh], tuple[Mesh, str | None]]]] = []
     entries = []
-    if options.close_holes:
+    if options.close_holes != "auto" and options.close_holes:
         steps.append(
             ("close_holes", "max_edges", options.close_holes, partial(_close_holes, max_edges=options.close_holes))
         )
@@ -225,7 +225,7 @@ def _close_holes(mesh: Mesh, max_edges: int) -> tuple[Mesh, str | None]:
     for refuse in (True, False):
         # PyMeshLab takes no edges of three faces, so faces come apart there; what would close those cuts is not sound.
         # It fills holes of fewer edges than it is told.
-        vertex, fans = _cut_apart(faces)
+        vertex, fans = cut_apart(faces)
         cut = Mesh(mesh.vertices[vertex], fans)
         if topology(cut)["non_manifold_edges"]:
             left = len(faces)
@@ -242,7 +242,7 @@ def _close_holes(mesh: Mesh, max_edges: int) -> tuple[Mesh, str | None]:
     return replace(result, normals=None if mesh.normals is None else vertex_normals(result)), remark
 
 
-def _cut_apart(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def cut_apart(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Gives every fan (faces around a vertex, joined by edges of two faces) a vertex of its own.
 
     Returns the old vertex of each new one, and the faces (F, 3) with new vertices.
@@ -278,12 +278,17 @@ def paired_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _sound_patches(faces: np.ndarray, added: np.ndarray) -> np.ndarray:
     """Which of the `added` faces (N, 3) are in a patch that has no edge of more than two faces."""
+    bad = has_crowded_edge(faces, added)
+    _, patch = face_components(Mesh(np.zeros((int(added.max(initial=-1)) + 1, 3)), added))
+    return ~np.isin(patch, patch[bad])
+
+
+def has_crowded_edge(faces: np.ndarray, added: np.ndarray) -> np.ndarray:
+    """Which of the `added` faces (N, 3) have an edge that more than two faces of (F, 3) and these share."""
     count = int(max(faces.max(), added.max(initial=0))) + 1
     ends = np.sort(np.concatenate([faces, added])[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     _, edge, uses = np.unique(ends[:, 0] * np.int64(count) + ends[:, 1], return_inverse=True, return_counts=True)
-    bad = np.any((uses[edge] > 2).reshape(-1, 3), axis=1)[len(faces) :]
-    _, patch = face_components(Mesh(np.zeros((count, 3)), added))
-    return ~np.isin(patch, patch[bad])
+    return np.any((uses[edge] > 2).reshape(-1, 3), axis=1)[len(faces) :]
 
 
 def _remesh(mesh: Mesh, length: float) -> tuple[Mesh, str | None]:

@@ -152,9 +152,14 @@ def tsdf_surface(
             return merged.supported(surface, options.smallest_part, 2 * options.truncation * voxel)
 
         mesh, left_out = supported(fused(merged, 0, lambda surface: supported(surface)[0]))
+        mesh, holes = merged.without_small_holes(mesh) if options.close_holes == "auto" else (mesh, 0)
         reach = options.truncation * voxel
         mesh = replace(mesh, quality=error_by_depths(mesh, merged, reach))
-        return mesh, merged.about() | {"unsupported": left_out, "largest_error": largest_error(reach)}
+        return mesh, merged.about() | {
+            "unsupported": left_out,
+            "holes_closed": holes,
+            "largest_error": largest_error(reach),
+        }
 
     def with_stereo() -> MergedFrames:
         if merged is not None:
@@ -189,6 +194,8 @@ def tsdf_surface(
         )
         if about["taken"] and about["unsupported"]:
             stages.note(f"left out: {about['unsupported']:.1%} of the surface, which no two photographs support")
+        if about["taken"] and about["holes_closed"]:
+            stages.note(f"closed: {about['holes_closed']} small holes that no photograph sees through")
         about = {"stereo": about}
     return mesh, {
         "level": options.level,

@@ -46,6 +46,7 @@ from linprim_geo.stereo.thin_things import SeenDepths, thin_things
 from linprim_geo.stereo.visibility_cut import plane_normals, points_per_view, spanned_depths
 from linprim_geo.surface.mesh_views import MeshViews
 from linprim_geo.surface.single_view import mesh_is_closed
+from linprim_geo.surface.small_holes import without_small_holes
 from linprim_geo.surface.tsdf_field import DepthFrame
 
 # A depth that other views have, but that is not confirmed (`DepthMap.is_confirmed`), counts so much.
@@ -375,6 +376,11 @@ class MergedFrames(Sequence):
         left = mesh if mesh_is_closed(mesh) else _near(mesh, views >= SUPPORTING_VIEWS, band / 2)
         left = self._supported_pieces(left, share, band**2)
         return left, float(1 - face_areas(left).sum() / area) if area else 0.0
+
+    def without_small_holes(self, mesh: Mesh) -> tuple[Mesh, int]:
+        """The mesh with small holes closed that no view sees through, by what is confirmed or on a plane and by free
+        rays, and how many."""
+        return without_small_holes(mesh, self.cameras, self._known(), self._backgrounds())
 
     def _supported_pieces(self, mesh: Mesh, share: float, least_area: float) -> Mesh:
         count, label = face_components(mesh)

@@ -12,7 +12,7 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.types import Scene
-from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.geometry.mesh import Mesh, select_faces
 from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.runs.run import Run
 from linprim_geo.stereo.depth_maps import depth_maps
@@ -97,6 +97,23 @@ def test_a_surface_takes_stereo_into_account_where_it_is_asked_to(many_views, st
     assert (predicted > 0).all() and (predicted <= reach).all() and np.median(predicted) < reach / 5
     with pytest.raises(LinprimError, match="without --blocks"):
         extract_mesh(many_views, options=ExtractOptions(stereo="on"), blocks=2, quiet=True)
+
+
+def test_small_holes_are_closed_after_stereo_unless_edges_are_counted(many_views, stereo_once, monkeypatch):
+    whole = MergedFrames.supported
+
+    def pierced(frames, mesh, *rules):
+        mesh, left_out = whole(frames, mesh, *rules)
+        away = np.linalg.norm(mesh.vertices[mesh.faces].mean(1) - frames.cameras[0].center, axis=1)
+        return select_faces(mesh, np.arange(len(away)) != np.argmin(away)), left_out
+
+    monkeypatch.setattr(MergedFrames, "supported", pierced)
+    closing, leaving = (
+        extract_mesh(many_views, options=replace(COARSE, stereo="on", close_holes=asked), quiet=True)
+        for asked in ("auto", 0)
+    )
+    assert (closing["stereo"]["holes_closed"], leaving["stereo"]["holes_closed"]) == (1, 0)
+    assert closing["boundary_edges"] == leaving["boundary_edges"] - 3 and closing["faces"] == leaving["faces"] + 1
 
 
 def test_where_nothing_is_supported_the_rendered_surface_stays(many_views, stereo_once, monkeypatch):
