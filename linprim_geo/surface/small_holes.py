@@ -1,4 +1,4 @@
-"""Small holes of a fused surface, closed where nothing speaks for them.
+"""Closes small holes of a fused surface, unless photographs speak for them.
 
 Depths that disagree leave pinholes along edges, in folds and on what few photographs show. A hole that is narrower than
 a window of stereo is in the windows of all that is around it: these were matched as one surface across it. It is closed
