@@ -134,7 +134,8 @@ class MergedFrames(Sequence):
         """Finds planes by points, by edges and by shading, of depths that are sure, and what lies on them; moves
         confirmed depths to them. Planes by points are the most precise, but where another of a region's edges stands:
         their points err beside edges. Planes by edges take the place of those by shading where they carry it as well,
-        else the nearer one hides the other.
+        else the nearer one hides the other. Confirmed depths beside edges of plain regions are doubtful where no plane
+        has them.
 
         Returns the plain regions of every view, and (H, W) bool: those that are background by their shading, and those
         with `free` (H, W) rays that are walls by it, if these are given.
@@ -158,7 +159,10 @@ class MergedFrames(Sequence):
             self._clear_air(beside, sure, on_points)
         for view, found in enumerate(along_edges):
             doubted = np.where(found.doubted, found.depth, np.float32(np.nan))
-            self.doubtful_depths[view] = _first_known((self.doubtful_depths[view], doubted))
+            # Nothing but the edge was matched beside it, and what it is an edge of may be another surface.
+            lone = np.where(beside[view] & np.isnan(self.on_planes[view]), self.depths[view], np.float32(np.nan))
+            self.doubtful_depths[view] = _first_known((lone, self.doubtful_depths[view], doubted))
+            self.depths[view] = np.where(np.isfinite(lone), np.float32(np.nan), self.depths[view])
         self.flat = _share_known(self.on_planes)
         return regions, backgrounds, [shaded.is_wall(view, asked) for view, asked in enumerate(free)]
 

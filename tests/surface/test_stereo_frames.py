@@ -381,6 +381,8 @@ def test_depths_of_edges_that_others_see_through_are_not_fused(monkeypatch, conf
     frame = MergedFrames(frames, [VIEW] * 5, 5.0)[0]
     assert at_flap.sum() > 50
     assert (np.abs(frame.depth[at_flap] / maps[0].depth[at_flap] - 1) < 0.01).mean() == flap_stays
+    if flap_stays:  # what no plane has beside an edge is doubtful
+        assert np.allclose(frame.confidence[at_flap], stereo_frames.DOUBTFUL_WEIGHT if of_edge else 1)
 
 
 def test_frames_are_rendered_for_all_views_together(found):
