@@ -16,7 +16,7 @@ from linprim_geo.kernels import ops, surface_ops
 from linprim_geo.surface import tsdf_fusion as fuse
 from linprim_geo.surface import visibility
 from linprim_geo.surface.mesh_views import MeshViews
-from linprim_geo.surface.small_holes import _rims
+from linprim_geo.surface.small_holes import rims_of
 from linprim_geo.surface.tsdf_field import DepthFrame, Grid, vote_rules
 from linprim_geo.surface.tsdf_fusion import fuse_tsdf
 
@@ -132,7 +132,7 @@ def test_a_plane_that_is_seen_at_a_low_angle_alone_has_no_holes(normal, height):
     # What all three see, as seen from above: each place is covered once.
     inner = select_faces(mesh, np.linalg.norm(middle, axis=1) < 0.5)
     largest = select_faces(inner, face_components(inner)[1] == 0)
-    assert len(_rims(largest.faces)) == 1
+    assert len(rims_of(largest.faces)) == 1
 
 
 def test_edges_and_faces_of_a_box():
