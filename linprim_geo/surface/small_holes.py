@@ -74,7 +74,7 @@ def _crossing(mesh: Mesh, added: np.ndarray) -> np.ndarray:
 
 def _small_rims(mesh: Mesh, cameras: Sequence[Camera]) -> list[np.ndarray]:
     """The vertices around each hole no wider than WINDOW pixels, in the order in which a patch goes round."""
-    rims = rims_of(mesh.faces)
+    rims = _rims(mesh.faces)
     if not rims:
         return []
     rim = np.repeat(np.arange(len(rims)), [len(one) for one in rims])
@@ -85,7 +85,7 @@ def _small_rims(mesh: Mesh, cameras: Sequence[Camera]) -> list[np.ndarray]:
     return [rims[k] for k in np.flatnonzero(width <= WINDOW * _pixels(middle, cameras))]
 
 
-def rims_of(faces: np.ndarray) -> list[np.ndarray]:
+def _rims(faces: np.ndarray) -> list[np.ndarray]:
     """The vertices round the open edges of (F, 3) faces, against the faces, no vertex twice in one rim."""
     if not len(faces):
         return []

@@ -39,13 +39,11 @@ FAR_FRONT_WEIGHT = 0.15
 """Least weight of a vote in front of a surface, so that free space close to it stays free."""
 
 GRAZED_WEIGHT = 1e-3
-GRAZED_VOXELS = float(np.sqrt(3))
+GRAZED_VOXELS = 1.25
 GRAZED_REACH = 4.0
 """A surface that is only ever seen at a low angle has no voxel within a truncation behind it along the ray.
 So votes hold up to this many truncations along the ray, as long as the plane is within so many voxels, with a
-weight that loses against anything that any view says. So many: all corners of a cell through which a surface goes
-are within the cell's diagonal of it, and a corner that nobody votes for leaves a hole. At the usual truncation of 3
-voxels that reaches down to 8 degrees; farther along the ray a round surface has come to its other side."""
+weight that loses against anything that any view says."""
 
 LEAST_COSINE = 0.05
 """Planes tilted further than this (87 degrees) are jumps between surfaces; such a pixel is made to face its

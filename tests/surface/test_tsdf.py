@@ -9,14 +9,13 @@ import pytest
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.geometry.mesh import Mesh, face_components, select_faces
+from linprim_geo.geometry.mesh import Mesh, face_components
 from linprim_geo.geometry.topology import manifold_status, topology
 from linprim_geo.imaging.colors import error_colors
 from linprim_geo.kernels import ops, surface_ops
 from linprim_geo.surface import tsdf_fusion as fuse
 from linprim_geo.surface import visibility
 from linprim_geo.surface.mesh_views import MeshViews
-from linprim_geo.surface.small_holes import rims_of
 from linprim_geo.surface.tsdf_field import DepthFrame, Grid, vote_rules
 from linprim_geo.surface.tsdf_fusion import fuse_tsdf
 
@@ -112,27 +111,6 @@ def test_a_slanted_plane_is_exact_whatever_the_pixels():
     assert len(mesh.faces) > 1000
     assert np.abs(distance).max() < 0.02 * 0.02
     assert (mesh.normals @ normal > 0.99).mean() > 0.99  # towards the camera
-
-
-@pytest.mark.parametrize("height", [0.5, 0.7, 1.0])  # 9 to 18 degrees
-@pytest.mark.parametrize("normal", [(0.3, 0.5, 0.8), (0.62, 0.59, 0.52), (0.0, 0.0, 1.0)])
-def test_a_plane_that_is_seen_at_a_low_angle_alone_has_no_holes(normal, height):
-    normal = np.array(normal) / np.linalg.norm(normal)
-    along = np.cross(normal, (0.0, 1.0, 0.0))
-    frames = []
-    for angle in (0.0, 0.2, 0.4):
-        away = np.cos(angle) * along + np.sin(angle) * np.cross(normal, along)
-        camera = look_at(3 * away / np.linalg.norm(away) + height * normal)
-        rays = camera.world_rays() @ normal
-        depth = np.where(rays < 0, -height / np.where(rays < 0, rays, -1), 0)
-        frames.append(DepthFrame(camera, np.where(depth < 5, depth, 0).astype(np.float32)))
-    mesh = fuse_tsdf(frames, voxel_size=0.05)
-    middle = mesh.vertices[mesh.faces].mean(1)
-    np.testing.assert_allclose(mesh.vertices @ normal, 0, atol=1e-3)
-    # What all three see, as seen from above: each place is covered once.
-    inner = select_faces(mesh, np.linalg.norm(middle, axis=1) < 0.5)
-    largest = select_faces(inner, face_components(inner)[1] == 0)
-    assert len(rims_of(largest.faces)) == 1
 
 
 def test_edges_and_faces_of_a_box():
@@ -237,13 +215,12 @@ def test_invalid_depths_of_every_kind_are_no_surface(ball):
 
 
 def test_pixels_without_confidence_do_not_count():
-    frames = [replace(f, background=None) for f in with_phantom(sphere_frames(around(10)), 3.0)]
+    frames = with_phantom(sphere_frames(around(10)), 3.0)
     confidence = np.ones((SIZE, SIZE))
     confidence[:32, :32] = 0.0
-    without = [replace(frames[0], confidence=confidence), *frames[1:]]
-    found, counted = (fuse_tsdf(each, voxel_size=0.05, min_component=0) for each in (without, frames))
-    truncation = 3 * 0.05
-    assert np.abs(radial_error(found)).max() < truncation < np.abs(radial_error(counted)).max()
+    frames = [replace(f, background=None) for f in frames]
+    frames[0] = replace(frames[0], confidence=confidence)
+    assert pieces(fuse_tsdf(frames, voxel_size=0.05, min_component=0)) == 1
 
 
 def test_occluded_votes_close_tunnels():
