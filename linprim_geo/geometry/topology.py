@@ -75,6 +75,36 @@ def _fans_and_bodies(faces: np.ndarray) -> tuple[int, int]:
     return count(rows, columns, faces.size), count(one // 3, other // 3, len(faces))
 
 
+def border_loops(faces: np.ndarray) -> list[np.ndarray]:
+    """Closed ways along the border of a surface, as rows of vertices in the direction of its faces, each vertex once.
+
+    Where borders touch in a vertex they are parted into loops without it twice.
+    """
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    width = int(faces.max(initial=0)) + 1
+    key, back = edges[:, 0] * width + edges[:, 1], edges[:, 1] * width + edges[:, 0]
+    alone = edges[~np.isin(key, back)]
+    following: dict[int, list[int]] = {}
+    for a, b in alone.tolist():
+        following.setdefault(a, []).append(b)
+    loops = []
+    for start in list(following):
+        while following.get(start):
+            way, place = [start], {start: 0}
+            while following.get(way[-1]):
+                step = following[way[-1]].pop()
+                if step in place:  # a loop is complete; what led to it goes on from here
+                    begun = place[step]
+                    loops.append(np.array(way[begun:]))
+                    for left in way[begun + 1 :]:
+                        del place[left]
+                    way = way[: begun + 1]
+                else:
+                    place[step] = len(way)
+                    way.append(step)
+    return [loop for loop in loops if len(loop) > 2]
+
+
 def manifold_status(mesh: Mesh) -> str:
     """What manifold3d says of a mesh that should be closed: `NoError`, or why it is no manifold."""
     import manifold3d

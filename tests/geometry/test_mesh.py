@@ -246,6 +246,16 @@ def test_holes_and_fins_are_counted():
 # --- editing ---------------------------------------------------------------------------------------------
 
 
+def test_borders_that_touch_in_a_vertex_are_two_loops():
+    # Two triangles that share vertex 2, and a square of two faces.
+    faces = np.array([[0, 1, 2], [2, 3, 4], [5, 6, 7], [5, 7, 8]])
+    loops = sorted(tuple(sorted(loop.tolist())) for loop in topology.border_loops(faces))
+    assert loops == [(0, 1, 2), (2, 3, 4), (5, 6, 7, 8)]
+    directed = {(a, b) for face in faces.tolist() for a, b in zip(face, face[1:] + face[:1], strict=True)}
+    for loop in topology.border_loops(faces):
+        assert all((int(a), int(b)) in directed for a, b in zip(loop, np.roll(loop, -1), strict=True))
+
+
 def test_specks_go_and_attributes_follow():
     big, small = painted(), cube(offset=3.0, scale=0.01)
     mesh = joined(big, small)

@@ -14,7 +14,7 @@ from linprim_geo.base.options import ExtractOptions
 from linprim_geo.geometry.mesh import Mesh, face_areas
 from linprim_geo.geometry.topology import topology
 from linprim_geo.surface.extract import extract_mesh
-from linprim_geo.surface.object_alone import border_loops, closed_by, object_alone, supporting_plane
+from linprim_geo.surface.object_alone import closed_by, object_alone, supporting_plane
 
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 CAMERAS = ring(12, radius=3.0)
@@ -161,16 +161,6 @@ def test_what_no_camera_saw_stays_open():
     alone, about = object_alone(shown(together(upper, sheet(1.5))), CAMERAS, BOX)
     assert about["closed"] == 0 and topology(alone)["boundary_edges"] > 0
     assert face_areas(alone).sum() == pytest.approx(upper.area, rel=0.01)
-
-
-def test_borders_that_touch_in_a_vertex_are_two_loops():
-    # Two triangles that share vertex 2, and a square of two faces.
-    faces = np.array([[0, 1, 2], [2, 3, 4], [5, 6, 7], [5, 7, 8]])
-    loops = sorted(tuple(sorted(loop.tolist())) for loop in border_loops(faces))
-    assert loops == [(0, 1, 2), (2, 3, 4), (5, 6, 7, 8)]
-    directed = {(a, b) for face in faces.tolist() for a, b in zip(face, face[1:] + face[:1], strict=True)}
-    for loop in border_loops(faces):
-        assert all((int(a), int(b)) in directed for a, b in zip(loop, np.roll(loop, -1), strict=True))
 
 
 def test_extraction_takes_the_object_in_the_box_that_the_cameras_look_at(solid, tmp_path):
