@@ -225,7 +225,7 @@ def _close_holes(mesh: Mesh, max_edges: int) -> tuple[Mesh, str | None]:
     for refuse in (True, False):
         # PyMeshLab takes no edges of three faces, so faces come apart there; what would close those cuts is not sound.
         # It fills holes of fewer edges than it is told.
-        vertex, fans = cut_apart(faces)
+        vertex, fans = _cut_apart(faces)
         cut = Mesh(mesh.vertices[vertex], fans)
         if topology(cut)["non_manifold_edges"]:
             left = len(faces)
@@ -242,7 +242,7 @@ def _close_holes(mesh: Mesh, max_edges: int) -> tuple[Mesh, str | None]:
     return replace(result, normals=None if mesh.normals is None else vertex_normals(result)), remark
 
 
-def cut_apart(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _cut_apart(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Gives every fan (faces around a vertex, joined by edges of two faces) a vertex of its own.
 
     Returns the old vertex of each new one, and the faces (F, 3) with new vertices.

@@ -15,15 +15,16 @@ import numpy as np
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.geometry.topology import border_loops
 from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.seen_through import KnownDepths
-from linprim_geo.surface.mesh_process import cut_apart, has_crowded_edge
+from linprim_geo.surface.mesh_process import has_crowded_edge
 from linprim_geo.surface.normals import vertex_normals
 from linprim_geo.surface.self_intersections import crossings, edges_of
 
 # The side of a window of stereo in pixels (kWindowSide * kWindowStep in csrc/stereo/patch_match.h).
 WINDOW = 12.0
-# Depth of a ray that is known to be free, as a share of the scene's diagonal: behind everything.
+# Depth of a ray that is known to be free, in diagonals of the mesh: behind everything.
 FREE_DEPTH = 1e3
 
 
@@ -35,7 +36,7 @@ def without_small_holes(
     Vertices and faces that there are stay as they are, faces are added behind them, no edge gets a third face, and no
     face crosses another that did not before. A hole stays open where views look through any triangle of its patch at
     something behind it (`KnownDepths`), where most of the patch faces away from the faces around it, and where other
-    faces are in the way. Memory: some 300 bytes per face.
+    faces are in the way.
 
     Args:
         known: (H, W) depths of each view, NaN where nothing is known.
@@ -74,7 +75,7 @@ def _crossing(mesh: Mesh, added: np.ndarray) -> np.ndarray:
 
 def _small_rims(mesh: Mesh, cameras: Sequence[Camera]) -> list[np.ndarray]:
     """The vertices around each hole no wider than WINDOW pixels, in the order in which a patch goes round."""
-    rims = _rims(mesh.faces)
+    rims = [loop[::-1] for loop in border_loops(mesh.faces)]
     if not rims:
         return []
     rim = np.repeat(np.arange(len(rims)), [len(one) for one in rims])
@@ -83,49 +84,6 @@ def _small_rims(mesh: Mesh, cameras: Sequence[Camera]) -> list[np.ndarray]:
     width = np.zeros(len(rims))
     np.maximum.at(width, rim, 2 * np.linalg.norm(place - middle[rim], axis=1))
     return [rims[k] for k in np.flatnonzero(width <= WINDOW * _pixels(middle, cameras))]
-
-
-def _rims(faces: np.ndarray) -> list[np.ndarray]:
-    """The vertices round the open edges of (F, 3) faces, against the faces, no vertex twice in one rim."""
-    if not len(faces):
-        return []
-    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    keys = np.minimum(start, end) * np.int64(faces.max() + 1) + np.maximum(start, end)
-    order = np.argsort(keys, kind="stable")
-    differs = np.append(True, keys[order][1:] != keys[order][:-1])
-    is_open = np.zeros(len(keys), bool)
-    is_open[order[differs & np.append(differs[1:], True)]] = True
-    at_rim = np.zeros(int(faces.max()) + 1, bool)
-    at_rim[start[is_open]] = at_rim[end[is_open]] = True
-    # Each fan of faces at a vertex gets a vertex of its own: then one open edge comes and one goes.
-    rows = np.flatnonzero(at_rim[faces].any(1))
-    vertex, fans = cut_apart(faces[rows])
-    edge = is_open.reshape(-1, 3)[rows]
-    after = dict(zip(np.roll(fans, -1, axis=1)[edge].tolist(), fans[edge].tolist(), strict=True))
-    found = []
-    while after:
-        at, round_trip = next(iter(after)), []
-        while at in after:
-            round_trip.append(int(vertex[at]))
-            at = after.pop(at)
-        found += _without_repeats(round_trip)
-    return found
-
-
-def _without_repeats(round_trip: list[int]) -> list[np.ndarray]:
-    """The rounds of vertices of which one is made that comes to some of them several times."""
-    found, way, place = [], list[int](), dict[int, int]()
-    for vertex in round_trip:
-        if vertex in place:
-            since = place[vertex] + 1
-            found.append(np.array([vertex, *way[since:]]))
-            for passed in way[since:]:
-                del place[passed]
-            del way[since:]
-        else:
-            place[vertex] = len(way)
-            way.append(vertex)
-    return [*found, np.array(way)]
 
 
 def _pixels(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
@@ -141,7 +99,6 @@ def _pixels(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
 def _patches(vertices: np.ndarray, rims: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """(N, 3) triangles that fill rims, and (N,) which of these: in each round of all the ear is cut whose base is the
     shortest, of those that face as the rim does if there are any."""
-    rims = [rim for rim in rims if len(rim) > 2]
     if not rims:
         return np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
     corner, hole = np.concatenate(rims), np.repeat(np.arange(len(rims)), [len(one) for one in rims])
