@@ -47,7 +47,7 @@ def without_small_holes(
         return mesh, 0
     corners = mesh.vertices.astype(np.float64)[added]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    around = vertex_normals(replace(mesh, normals=None)).astype(np.float64)[added].sum(1)
+    around = (vertex_normals(mesh) if mesh.normals is None else mesh.normals).astype(np.float64)[added].sum(1)
     facing = (np.bincount(hole, (normal * around).sum(1)) > 0)[hole]
     added, hole, corners = added[facing], hole[facing], corners[facing]
     if not len(added):
@@ -55,7 +55,9 @@ def without_small_holes(
     far = np.float32(FREE_DEPTH * mesh.diagonal)
     depths = (np.where(no_end & ~np.isfinite(depth), far, depth) for depth, no_end in zip(known, free, strict=True))
     through = KnownDepths(cameras, depths).see_through(corners.mean(1))
-    wrong = through | has_crowded_edge(mesh.faces, added) | _crossing(mesh, added)
+    at_rim = np.zeros(len(mesh.vertices), bool)
+    at_rim[added] = True
+    wrong = through | has_crowded_edge(mesh.faces[at_rim[mesh.faces].any(1)], added) | _crossing(mesh, added)
     added, hole = (each[np.bincount(hole, wrong)[hole] == 0] for each in (added, hole))
     faces = np.concatenate([mesh.faces, added])
     normals = None if mesh.normals is None else vertex_normals(replace(mesh, faces=faces))
@@ -97,30 +99,17 @@ def _pixels(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def _patches(vertices: np.ndarray, rims: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) triangles that fill rims, and (N,) which of these: in each round of all the ear is cut whose base is the
-    shortest, of those that face as the rim does if there are any."""
-    if not rims:
-        return np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
-    corner, hole = np.concatenate(rims), np.repeat(np.arange(len(rims)), [len(one) for one in rims])
-    place, found = vertices.astype(np.float64), []
-    normal = np.zeros((len(rims), 3))
-    np.add.at(normal, hole, np.cross(place[corner], place[corner[_beside(hole)[1]]]))
-    while len(corner):
-        before, after = _beside(hole)
-        a, b, c = place[corner[before]], place[corner], place[corner[after]]
-        facing = (np.cross(b - a, c - a) * normal[hole]).sum(1) > 0
-        order = np.lexsort((np.linalg.norm(c - a, axis=1), ~facing, hole))
-        ear = order[np.append(True, hole[order][1:] != hole[order][:-1])]
-        found.append((np.stack([corner[before[ear]], corner[ear], corner[after[ear]]], 1), hole[ear]))
-        left = (np.bincount(hole) > 3)[hole]
-        left[ear] = False
-        corner, hole = corner[left], hole[left]
-    triangles, hole = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return triangles, hole
+    """(N, 3) triangles between the vertices of rims, as these lie on the plane of each, and (N,) which rim's."""
+    from manifold3d import triangulate
 
-
-def _beside(hole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The numbers of the corners before and after each one, of corners that are sorted by their `hole`."""
-    number = np.arange(len(hole))
-    first, last = (np.searchsorted(hole, hole, side) for side in ("left", "right"))
-    return np.where(number > first, number - 1, last - 1), np.where(number + 1 < last, number + 1, first)
+    triangles, hole = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
+    for number, rim in enumerate(rims):
+        place = vertices[rim].astype(np.float64)
+        place -= place.mean(0)
+        normal = np.cross(place, np.roll(place, -1, axis=0)).sum(0)
+        across = np.linalg.svd(normal[None])[2][1:]
+        if np.cross(*across) @ normal < 0:
+            across = across[::-1]
+        triangles.append(rim[triangulate([place @ across.T])])
+        hole.append(np.full(len(triangles[-1]), number))
+    return np.concatenate(triangles), np.concatenate(hole)
