@@ -48,14 +48,14 @@ class HeldPlanes:
     ):
         self.shadings, self.depths, self.carried = shadings, depths, carried
 
-    def by_depths(self, planes: np.ndarray, first: int, told: Container[int] = ()) -> np.ndarray:
-        """The planes, from the `first` on each held by the confirmed depths along the edges of its regions; those that
-        points have `told` turn by SAME_ANGLE at most, or stay."""
-        held = [self._held_plane(plane, self.carried[k]) for k, plane in enumerate(planes) if k >= first]
-        result = np.concatenate([planes[:first], np.reshape(held, (-1, 4))])
+    def by_depths(self, planes: np.ndarray, staying: Container[int], told: Container[int] = ()) -> np.ndarray:
+        """The planes, but for those `staying` each held by the confirmed depths along the edges of its regions; those
+        that points have `told` turn by SAME_ANGLE at most, or stay."""
+        result = planes.copy()
         for k, plane in enumerate(planes):
-            if k in told and _turns(result[k], plane) > SAME_ANGLE:
-                result[k] = plane
+            held = plane if k in staying else self._held_plane(plane, self.carried[k])
+            if k not in told or _turns(held, plane) <= SAME_ANGLE:
+                result[k] = held
         return result
 
     def at_right_angles(self, planes: np.ndarray, staying: Container[int], told: Container[int] = ()) -> np.ndarray:
@@ -110,7 +110,7 @@ class HeldPlanes:
         near = np.abs(off) < ALIKE_DEPTH
         if not near.any():
             return plane
-        return plane + np.append(np.zeros(3), _commonest(off[near]) * np.median(along[near]))
+        return plane + np.append(np.zeros(3), commonest_offset(off[near]) * np.median(along[near]))
 
     def _held_plane(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> np.ndarray:
         """A plane fitted to the shading of regions and to the confirmed depths along their edges that are near it: a
@@ -151,14 +151,14 @@ class HeldPlanes:
         return np.concatenate(points), np.concatenate(centers)
 
 
-def _turns(plane: np.ndarray, before: np.ndarray) -> float:
-    """By what angle in radians a plane has turned."""
-    return float(np.arccos(min(1.0, abs(plane[:3] @ before[:3]))))
-
-
-def _commonest(off: np.ndarray) -> float:
+def commonest_offset(off: np.ndarray) -> float:
     """Where most of (P,) values are within half of TOLERANCE."""
     places = np.arange(-ALIKE_DEPTH, ALIKE_DEPTH, TOLERANCE / 10)
     ordered = np.sort(off)
     count = np.searchsorted(ordered, places + TOLERANCE / 2) - np.searchsorted(ordered, places - TOLERANCE / 2)
     return float(places[np.argmax(count)])
+
+
+def _turns(plane: np.ndarray, before: np.ndarray) -> float:
+    """By what angle in radians a plane has turned."""
+    return float(np.arccos(min(1.0, abs(plane[:3] @ before[:3]))))

@@ -33,7 +33,7 @@ from linprim_geo.stereo.plain_regions import (
     seen_enough,
     to_world,
 )
-from linprim_geo.stereo.right_angles import NEARLY, angles_to, frame_of
+from linprim_geo.stereo.right_angles import NEARLY, RIGHT, angles_to, frame_of
 from linprim_geo.stereo.shaded_areas import ShadedArea, best_first, told_by_edges
 from linprim_geo.stereo.shading import (
     BOX,
@@ -127,15 +127,22 @@ class ShadedPlanes:
         self.planes = self._common([one for own in self.regions for one in own if one.fit is not None])
         carried = self._take_originals(self._all_carriers())
         held = HeldPlanes(self.shadings, self.depths, carried)
-        told = range(self.by_points, self.given_count)
-        planes = held.at_right_angles(held.by_depths(self.planes, self.by_points, told), range(self.by_points), told)
+        told = set(range(self.by_points, self.given_count))
+        along = {k for k in told if self._off_frame()[k] < RIGHT}
+        # Edges along the frame say well where a plane is, but it may be one that is nearly flush with another.
+        for k in filter(carried.__getitem__, sorted(along)):
+            told.add(len(self.planes))
+            self.planes = np.append(self.planes, self.planes[[k]], axis=0)
+            carried.append(carried[k])
+        staying = along.union(range(self.by_points))
+        planes = held.at_right_angles(held.by_depths(self.planes, staying, told), staying, told)
         standing = held.still_carrying(on_meeting_lines(planes, self.by_points, maps, depths), planes)
         self.standing = np.isin(np.arange(len(planes)), list(standing))
         self.hanging = np.array([any(is_same(plane, planes[k]) for k in standing) for plane in planes], bool)
         self.hanging[self.by_points :] = False
         for number, plane in standing.items():
             planes[number] = plane
-        self.planes = held.at_right_angles(planes, {*range(self.by_points), *standing}, told)
+        self.planes = held.at_right_angles(planes, {*staying, *standing}, told)
 
     def _camera(self, region: ShadedRegion) -> Camera:
         return self.small_cameras[region.view]
@@ -352,31 +359,29 @@ class ShadedPlanes:
                     carried[k].append(one.region)
                     for j, others in of_region.items():
                         shared[j, k] += np.count_nonzero(boxes & others)
-        by_points, kept = np.flatnonzero(~self._are_askew()).tolist(), list[int]()
+        off, kept = self._off_frame(), list[int]()
+        by_points = [k for k in range(self.by_points) if not ASKEW < off[k] < NEARLY]
         for k in sorted(range(self.by_points, count), key=lambda k: (k >= self.given_count, -shared[k, k])):
             same = next((j for j in by_points if self._same(j, k, carried[k], TOLERANCE)), None)
             if same is not None:
                 self.planes[k] = np.sign(self.planes[same, :3] @ self.planes[k, :3]) * self.planes[same]
                 carried[k] = []
             copied = [j for j in kept if shared[j, k] > CARRIED_SHARE * shared[k, k]]
-            if same is not None or not any(self._same(j, k, carried[k], self._most_apart(j, k)) for j in copied):
+            if same is not None or not any(self._same(j, k, carried[k], self._most_apart(j, k, off)) for j in copied):
                 kept.append(k)
         kept = sorted([*range(self.by_points), *kept])
         self.planes, self.given_count = self.planes[kept], sum(k < self.given_count for k in kept)
         return [carried[k] if self._of_several_views(self.planes[at], carried[k]) else [] for at, k in enumerate(kept)]
 
-    def _most_apart(self, first: int, second: int) -> float:
-        """The share of the depth by which copies of each other differ at most."""
-        return BEHIND * TOLERANCE if max(first, second) < self.given_count else ALIKE_DEPTH
+    def _most_apart(self, first: int, second: int, off_frame: np.ndarray) -> float:
+        """The share of the depth by which copies of each other differ at most, by how far planes are `off_frame`."""
+        by_edges = TOLERANCE if off_frame[[first, second]].max() < RIGHT else BEHIND * TOLERANCE
+        return by_edges if max(first, second) < self.given_count else ALIKE_DEPTH
 
-    def _are_askew(self) -> np.ndarray:
-        """(by_points,) bool which planes by points are nearly, but not quite along the frame of all of these."""
-        normals = self.planes[: self.by_points, :3]
-        frame = frame_of(normals)
-        if frame is None:
-            return np.zeros(len(normals), bool)
-        angle = angles_to(frame, normals)
-        return (angle > ASKEW) & (angle < NEARLY)
+    def _off_frame(self) -> np.ndarray:
+        """(K,) by what angle planes are off the frame of those by points; infinite where these have none."""
+        frame = frame_of(self.planes[: self.by_points, :3])
+        return np.full(len(self.planes), np.inf) if frame is None else angles_to(frame, self.planes[:, :3])
 
     def _same(self, first: int, second: int, regions: Sequence[ShadedRegion], tolerance: float) -> bool:
         """Whether two planes have nearly one direction, and over regions one inverse depth in the median."""

@@ -26,6 +26,7 @@ from linprim_geo.stereo.enclosing_planes import (
     region_depths,
 )
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
+from linprim_geo.stereo.framed_planes import along_frame
 from linprim_geo.stereo.lone_backgrounds import lone_backgrounds
 from linprim_geo.stereo.outlined_things import outlined_things
 from linprim_geo.stereo.plain_regions import (
@@ -143,7 +144,8 @@ class MergedFrames(Sequence):
         sure = [_depth_where(found, found.is_confirmed(SURE)) for found in maps]
         regions = regions_of_views(maps, sure)
         by_points = planes_of_points(maps, sure)
-        by_edges = common_planes(self.cameras, [region for own in regions for region in own])
+        every = [region for own in regions for region in own]
+        by_edges = along_frame(self.cameras, every, common_planes(self.cameras, every), by_points)
         shaded = ShadedPlanes(maps, sure, rendered, by_points, by_edges)
         self.planes, self.standing = shaded.planes[~shaded.hanging], shaded.standing[~shaded.hanging]
         on_points = [point_plane_depth(found, own, by_points) for found, own in zip(maps, sure, strict=True)]

@@ -110,6 +110,16 @@ def test_a_plane_with_points_that_is_askew_leaves_plain_regions_to_the_wall(degr
         assert share > 0.7 and np.quantile(off, 0.95) < 0.005
 
 
+def test_a_plane_of_edges_along_the_frame_stays_beside_the_one_that_light_makes_of_it():
+    """Edges of a cupboard before the wall have given it: its place is theirs, and where the wall is the light says."""
+    maps, depths = photographs(lambda points, view: light(points))
+    cupboard = WALL + [0, 0, 0, 0.1]
+    found = planes_of(maps, depths, room(0), by_edges=cupboard[None])
+    assert (found.planes[:2] == room(0)).all() and (found.planes == cupboard).all(1).any()
+    share, off = errors(found, depths)
+    assert share > 0.7 and np.quantile(off, 0.95) < 0.005
+
+
 def tilted(degrees: float) -> np.ndarray:
     """The wall, leaning to its left by so much."""
     angle = np.radians(degrees)
@@ -410,7 +420,7 @@ def test_what_points_along_edges_have_told_of_a_plane_bounds_how_shading_turns_i
     region = SimpleNamespace(some=lambda count: region)
     held = HeldPlanes([], [], [[region], [region]])
     monkeypatch.setattr(held, "_held_plane", lambda plane, regions: turned[0])
-    assert (held.by_depths(planes, 0, told=[1]) == [turned[0], turned[1] if by_depths else WALL]).all()
+    assert (held.by_depths(planes, (), told=[1]) == [turned[0], turned[1] if by_depths else WALL]).all()
     monkeypatch.setattr(held_planes, "evaluate", lambda *_: SimpleNamespace(information=np.eye(3)))
     monkeypatch.setattr(held_planes, "squared", lambda *_: turned)
     monkeypatch.setattr(held, "_shifted", lambda plane, regions: plane)
