@@ -95,13 +95,14 @@ def region_plane_depths(
     """Of each view, of its plain `regions` by the (K, 4) planes of the world on which they lie, with the `known` (H, W)
     depths and all that are `confirmed` (H, W), NaN elsewhere.
 
-    A pixel lies on the plane with the most points along the edges of its region, times what its hull holds of it, of
-    those within whose hull it is and on which most known depths there are. Stereo errs beside edges: in what is wide of
-    a region the plane stands, but for what is known of surfaces of their own. A known depth within TOLERANCE of a plane
-    has its depth if all of these in the region are off by MEDIAN_OFF in the median at most, and CENTRAL_SHARE of them
-    are within half of TOLERANCE: across a curved surface a half is. Nothing is laid where most of it has confirmed
-    depths off its plane in the SURROUNDINGS: a thing in front that no edge parts from the plane. Of a region of which
-    stereo knows most what has no confirmed depth on the plane around is doubted.
+    A pixel lies on the plane with the most points along the edges of its region, which count more the nearer they are
+    (Tukey's weight), times what its hull holds of it, of those within whose hull it is and on which most known depths
+    there are. Stereo errs beside edges: in what is wide of a region the plane stands, but for what is known of surfaces
+    of their own. A known depth within TOLERANCE of a plane has its depth if all of these in the region are off by
+    MEDIAN_OFF in the median at most, and CENTRAL_SHARE of them are within half of TOLERANCE: across a curved surface a
+    half is. Nothing is laid where most of it has confirmed depths off its plane in the SURROUNDINGS: a thing in front
+    that no edge parts from the plane. Of a region of which stereo knows most what has no confirmed depth on the plane
+    around is doubted.
     """
     local = [in_camera(camera, planes) for camera in cameras]
     regions = [[region.within() for region in own] for own in regions]
@@ -115,7 +116,8 @@ def region_plane_depths(
         laid = RegionDepths.nothing(camera)
         wide, telling = np.zeros_like(laid.moved), np.where(of_edges, np.nan, sure)
         for region, (on, fits) in zip(own, of_regions, strict=True):
-            best = _best_first(camera, region, of_view, hulls, on.sum(0) * fits, views)
+            near = np.where(on, 1 - (region.off(of_view) / TOLERANCE) ** 2, 0) ** 2
+            best = _best_first(camera, region, of_view, hulls, near.sum(0) * fits, views)
             _lay(laid, camera, region, of_view, best, hulls, sure, telling)
             height, width = region.wide.shape
             wide[region.top : region.top + height, region.left : region.left + width] |= region.wide
@@ -173,7 +175,7 @@ def _best_first(
     views: KnownDepths,
 ) -> list[int]:
     """The numbers of those (K, 3) planes of the camera that views do not see through in the region; first the one with
-    the most of `counts` (K,) points along its edges, times what the plane's hull holds of it."""
+    the most of `counts` (K,) of points along its edges, times what the plane's hull holds of it."""
     rays, held = _sampled_rays(camera, region), np.zeros(len(planes))
     for number in np.flatnonzero(counts).tolist():
         inverse = rays @ planes[number]

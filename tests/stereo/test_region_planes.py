@@ -47,6 +47,16 @@ def test_walls_lie_on_their_planes(room):
     assert (np.abs(error) < 1e-4).mean() > 0.98
 
 
+def test_of_two_planes_with_as_many_points_the_one_that_is_nearer_to_them_is_taken(room):
+    """A wall, and one that is 1 cm before it, which is within the error of depths."""
+    of, depths, walls, regions, known = room
+    before = PLANES[1] + [0, 0, 0, 0.01]
+    found, *_ = laid_planes(of, regions, np.array([before, PLANES[1]]), known)
+    views = zip(found, depths, walls, strict=True)
+    error = np.concatenate([(own / depth - 1)[wall == 1] for own, depth, wall in views])
+    assert np.isfinite(error).mean() > 0.8 and np.nanmedian(np.abs(error)) < 1e-4
+
+
 def test_pixels_have_the_numbers_of_their_planes(room):
     of, depths, walls, regions, known = room
     for laid, wall in zip(region_plane_depths(of, regions, PLANES, known, known), walls, strict=True):
