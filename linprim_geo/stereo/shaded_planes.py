@@ -97,7 +97,8 @@ class ShadedPlanes:
         depths: (H, W) confirmed depth of each view, NaN elsewhere.
         rendered: (H, W) rendered depth of each view, 0 where there is none.
         by_points: (K, 4) planes with confirmed points all over; they stay as they are.
-        by_edges: (K, 4) planes that points along edges have given; shading makes them more exact.
+        by_edges: (K, 4) planes that points along edges have given; shading makes them more exact, but those along the
+            frame of the planes `by_points` stay beside what it makes of them.
     """
 
     def __init__(
@@ -129,11 +130,11 @@ class ShadedPlanes:
         held = HeldPlanes(self.shadings, self.depths, carried)
         told = set(range(self.by_points, self.given_count))
         along = {k for k in told if self._off_frame()[k] < RIGHT}
-        # Edges along the frame say well where a plane is, but it may be one that is nearly flush with another.
-        for k in filter(carried.__getitem__, sorted(along)):
-            told.add(len(self.planes))
-            self.planes = np.append(self.planes, self.planes[[k]], axis=0)
-            carried.append(carried[k])
+        # Edges say well where a plane along the frame is, but the region may be of one that is nearly flush with it.
+        twice = [k for k in sorted(along) if carried[k]]
+        told.update(range(len(self.planes), len(self.planes) + len(twice)))
+        self.planes = np.concatenate([self.planes, self.planes[twice]])
+        carried += [carried[k] for k in twice]
         staying = along.union(range(self.by_points))
         planes = held.at_right_angles(held.by_depths(self.planes, staying, told), staying, told)
         standing = held.still_carrying(on_meeting_lines(planes, self.by_points, maps, depths), planes)
