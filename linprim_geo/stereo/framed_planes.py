@@ -63,9 +63,11 @@ class _Along:
         turned = np.append(axis, np.median(self.points @ axis))
         off = self._off(turned)
         near = np.abs(off) < ALIKE_DEPTH
+        if not near.any():
+            return self.plane
         turned[3] += commonest_offset(off[near]) * np.median(self.vectors[near] @ axis)
         on = np.abs(self._off(turned)) < TOLERANCE / 2
-        if np.count_nonzero(on) < KEPT_SHARE * np.count_nonzero(np.abs(self._off(self.plane)) < TOLERANCE / 2):
+        if np.count_nonzero(on) <= KEPT_SHARE * np.count_nonzero(np.abs(self._off(self.plane)) < TOLERANCE / 2):
             return self.plane
         turned[3] = np.average(self.points[on] @ axis, weights=(self.vectors[on] @ axis) ** -2)
         return turned
@@ -76,4 +78,5 @@ class _Along:
 
     def _off(self, plane: np.ndarray) -> np.ndarray:
         """(P,) how far points are beyond a plane, as shares of their distance along its normal."""
-        return (self.points @ plane[:3] - plane[3]) / (self.vectors @ plane[:3])
+        with np.errstate(divide="ignore", invalid="ignore"):  # rays along the plane
+            return (self.points @ plane[:3] - plane[3]) / (self.vectors @ plane[:3])

@@ -68,6 +68,16 @@ def test_a_plane_that_leans_by_itself_stays(degrees):
     assert (along_frame(CAMERAS, edges_of(points), leaning[None], ROOM) == leaning).all()
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_plane_whose_points_are_all_far_from_it_once_it_is_turned_stays():
+    """Two posts that stand askew to the room."""
+    places = np.repeat([[-1.0, 0.0], [1.0, 0.0]], 60, axis=0)
+    places[:, 1] = np.tile(np.linspace(0.2, 1.8, 60), 2)
+    points = facing(places, np.tan(np.radians(18)) * places[:, 0], noise=0.0)
+    leaning = plane_through(points)
+    assert (along_frame(CAMERAS, edges_of(points), leaning[None], ROOM) == leaning).all()
+
+
 def test_of_copies_the_first_is_left():
     """Planes that lean to both sides of one door, and one of a wall behind it."""
     door, wall = facing(outline(-1.2, 0.0, 300), 0.0), facing(outline(-1.2, 0.8, 300), -0.3)
