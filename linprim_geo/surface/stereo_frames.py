@@ -11,7 +11,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import label
 
 from linprim_geo.base.progress import Progress
 from linprim_geo.capture.types import View
@@ -60,8 +59,6 @@ SUPPORTING_VIEWS, SUPPORTED_SHARE = 2, 0.25
 SAMPLED = 4
 # So often planes are laid and depths in the air taken away. A third round changes hardly anything.
 ROUNDS = 2
-# Of a background so much is known by stereo at most: beside the outlines of things.
-KNOWN_SHARE = 0.1
 # Points of the rendered surface by which stereo finds pairs of views.
 POINTS = 20_000
 
@@ -111,8 +108,7 @@ class MergedFrames(Sequence):
         seen = list(self.depths)
         masked = any(view.has_alpha for view in views)  # then masks say what is background
         regions, backgrounds, plain_walls = self._take_planes(maps, rendered_depths, () if masked else free)
-        unknown = [np.isnan(depth) & (not masked) for depth in self._known()]
-        self.rendered = [_seen_past(*each) for each in zip(rendered, maps, backgrounds, unknown, strict=True)]
+        self.rendered = [_seen_past(*each) for each in zip(rendered, maps, backgrounds, strict=True)]
         if plain_walls:
             self._end_at(plain_walls)
         progress.stage(1, "gaps between planes")
@@ -422,19 +418,12 @@ def pairing_points(rendered: Sequence[DepthFrame]) -> np.ndarray:
     return np.concatenate([points[:: max(1, len(points) // max(1, POINTS // len(rendered)))] for points in surfaces])
 
 
-def _seen_past(frame: DepthFrame, found: DepthMap, background: np.ndarray, unknown: np.ndarray) -> DepthFrame:
-    """The frame with rays that are free where (H, W) regions are `background`, in parts between edges of which nearly
-    all is `unknown` (H, W) and most of that free, and beside these where pixels are of their grey: training fills a sky
-    beside things with fog, and stereo gives it the depth of their outlines."""
-    if frame.background is None:
+def _seen_past(frame: DepthFrame, found: DepthMap, background: np.ndarray) -> DepthFrame:
+    """The frame with rays that are free where (H, W) regions are `background`, and beside these where pixels are of
+    their grey: training fills a plain sky with fog."""
+    if frame.background is None or not background.any():
         return frame
-    edge = edges_of(found.grey, found.noise, found.most_noise)
-    part, count = label(~edge)
-    sizes, of_unknown, of_free = (
-        np.bincount(part[where], minlength=count + 1) for where in (~edge, unknown, unknown & frame.background)
-    )
-    is_free = (of_unknown > (1 - KNOWN_SHARE) * sizes) & (of_free > of_unknown / 2)
-    background = grown_alike(background | (is_free[part] & ~edge), found.grey, edge)
+    background = grown_alike(background, found.grey, edges_of(found.grey, found.noise, found.most_noise))
     return replace(
         frame,
         depth=np.where(background, np.float32(0), frame.depth),
