@@ -128,8 +128,8 @@ class ShadedPlanes:
         self.planes = self._common([one for own in self.regions for one in own if one.fit is not None])
         carried = self._take_originals(self._all_carriers())
         held = HeldPlanes(self.shadings, self.depths, carried)
-        told = set(range(self.by_points, self.given_count))
-        along = {k for k in told if self._off_frame()[k] < RIGHT}
+        off_frame, told = self._off_frame(), set(range(self.by_points, self.given_count))
+        along = {k for k in told if off_frame[k] < RIGHT}
         # Edges say well where a plane along the frame is, but the region may be of one that is nearly flush with it.
         twice = [k for k in sorted(along) if carried[k]]
         told.update(range(len(self.planes), len(self.planes) + len(twice)))
