@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.stereo.held_planes import ALIKE_DEPTH, commonest_offset
+from linprim_geo.stereo.held_planes import off_plane, shifted
 from linprim_geo.stereo.plain_regions import BEHIND, TOLERANCE, PlainRegion, in_camera, may_lie_on, to_world
 from linprim_geo.stereo.right_angles import LEFT_OPEN, angles_to, frame_of
 
@@ -31,44 +31,31 @@ def along_frame(
     if frame is None:
         return planes
     kept = list[np.ndarray]()
-    for plane, angle in zip(planes, angles_to(frame, planes[:, :3]), strict=True):
-        along = _Along(cameras, regions, plane)
-        if angle < LEFT_OPEN and len(along.points):
-            plane = along.turned(frame)
-        if not any(along.has(other) for other in kept if abs(other[:3] @ plane[:3]) > 1 - 1e-9):
+    of_planes = zip(planes, angles_to(frame, planes[:, :3]), _edge_points(cameras, regions, planes), strict=True)
+    for plane, angle, points in of_planes:
+        if angle < LEFT_OPEN and len(points.points):
+            plane = points.turned(plane, frame)
+        if not any(points.has(other) for other in kept if abs(other[:3] @ plane[:3]) > 1 - 1e-9):
             kept.append(plane)
     return np.array(kept).reshape(-1, 4)
 
 
-class _Along:
-    """The `points` (P, 3) of the world along edges of `regions` that may lie on a plane, near it, and the vectors
-    (P, 3) to them from the `cameras` that see them."""
+class _EdgePoints:
+    """The `points` (P, 3) of the world along edges of regions that may lie on a plane, near it, and the vectors (P, 3)
+    to them from the cameras that see them."""
 
-    def __init__(self, cameras: Sequence[Camera], regions: Sequence[PlainRegion], plane: np.ndarray):
-        points, vectors = [np.zeros((0, 3))], [np.zeros((0, 3))]
-        for region in regions:
-            camera = cameras[region.view]
-            local = in_camera(camera, plane[None])
-            if may_lie_on(region, local)[1][0]:
-                near = region.sure & (np.abs(region.off(local)[:, 0]) < BEHIND * TOLERANCE)
-                points.append(to_world(camera, region.rays[near] / region.inverse[near, None]))
-                vectors.append(points[-1] - camera.center)
-        self.plane, self.points, self.vectors = plane, np.concatenate(points), np.concatenate(vectors)
+    def __init__(self, points: np.ndarray, vectors: np.ndarray):
+        self.points, self.vectors = points, vectors
 
-    def turned(self, frame: np.ndarray) -> np.ndarray:
+    def turned(self, plane: np.ndarray, frame: np.ndarray) -> np.ndarray:
         """The plane along the nearest axis of a frame that most of the points are on; the plane as it was where it
         loses too many."""
-        axis = frame[np.abs(frame @ self.plane[:3]).argmax()]
-        axis = axis * np.sign(axis @ self.plane[:3])
-        turned = np.append(axis, np.median(self.points @ axis))
-        off = self._off(turned)
-        near = np.abs(off) < ALIKE_DEPTH
-        if not near.any():
-            return self.plane
-        turned[3] += commonest_offset(off[near]) * np.median(self.vectors[near] @ axis)
-        on = np.abs(self._off(turned)) < TOLERANCE / 2
-        if np.count_nonzero(on) <= KEPT_SHARE * np.count_nonzero(np.abs(self._off(self.plane)) < TOLERANCE / 2):
-            return self.plane
+        axis = frame[np.abs(frame @ plane[:3]).argmax()]
+        axis = axis * np.sign(axis @ plane[:3])
+        turned = shifted(np.append(axis, np.median(self.points @ axis)), self.points, self.vectors)
+        on, before = (np.abs(self._off(each)) < TOLERANCE / 2 for each in (turned, plane))
+        if np.count_nonzero(on) <= KEPT_SHARE * np.count_nonzero(before):
+            return plane
         turned[3] = np.average(self.points[on] @ axis, weights=(self.vectors[on] @ axis) ** -2)
         return turned
 
@@ -77,6 +64,19 @@ class _Along:
         return len(self.points) > 0 and float(np.median(np.abs(self._off(other)))) < TOLERANCE
 
     def _off(self, plane: np.ndarray) -> np.ndarray:
-        """(P,) how far points are beyond a plane, as shares of their distance along its normal."""
-        with np.errstate(divide="ignore", invalid="ignore"):  # rays along the plane
-            return (self.points @ plane[:3] - plane[3]) / (self.vectors @ plane[:3])
+        return off_plane(plane, self.points, self.vectors)
+
+
+def _edge_points(cameras: Sequence[Camera], regions: Sequence[PlainRegion], planes: np.ndarray) -> list[_EdgePoints]:
+    """Of each of (K, 4) planes."""
+    none = np.zeros((0, 3))
+    points, vectors = [[none] for _ in planes], [[none] for _ in planes]
+    for region in regions:
+        camera = cameras[region.view]
+        local = in_camera(camera, planes)
+        near = region.sure[:, None] & (np.abs(region.off(local)) < BEHIND * TOLERANCE)
+        for k in np.flatnonzero(may_lie_on(region, local)[1]):
+            own = near[:, k]
+            points[k].append(to_world(camera, region.rays[own] / region.inverse[own, None]))
+            vectors[k].append(points[k][-1] - camera.center)
+    return [_EdgePoints(*map(np.concatenate, own)) for own in zip(points, vectors, strict=True)]

@@ -104,13 +104,7 @@ class HeldPlanes:
     def _shifted(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> np.ndarray:
         """A plane moved along its normal to where most confirmed depths along the edges of regions are."""
         points, centers = self._points_along(regions)
-        along = (points - centers) @ plane[:3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            off = (points @ plane[:3] - plane[3]) / along
-        near = np.abs(off) < ALIKE_DEPTH
-        if not near.any():
-            return plane
-        return plane + np.append(np.zeros(3), commonest_offset(off[near]) * np.median(along[near]))
+        return shifted(plane, points, points - centers)
 
     def _held_plane(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> np.ndarray:
         """A plane fitted to the shading of regions and to the confirmed depths along their edges that are near it: a
@@ -151,14 +145,30 @@ class HeldPlanes:
         return np.concatenate(points), np.concatenate(centers)
 
 
-def commonest_offset(off: np.ndarray) -> float:
-    """Where most of (P,) values are within half of TOLERANCE."""
-    places = np.arange(-ALIKE_DEPTH, ALIKE_DEPTH, TOLERANCE / 10)
-    ordered = np.sort(off)
-    count = np.searchsorted(ordered, places + TOLERANCE / 2) - np.searchsorted(ordered, places - TOLERANCE / 2)
-    return float(places[np.argmax(count)])
+def shifted(plane: np.ndarray, points: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """A plane moved along its normal to where most of (P, 3) points are, with the vectors (P, 3) to them from cameras
+    that see them; as it was where none is near."""
+    off = off_plane(plane, points, vectors)
+    near = np.abs(off) < ALIKE_DEPTH
+    if not near.any():
+        return plane
+    return plane + np.append(np.zeros(3), _commonest(off[near]) * np.median(vectors[near] @ plane[:3]))
+
+
+def off_plane(plane: np.ndarray, points: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """(P,) how far (P, 3) points are beyond a plane, as shares of the vectors (P, 3) to them along its normal."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # rays along the plane
+        return (points @ plane[:3] - plane[3]) / (vectors @ plane[:3])
 
 
 def _turns(plane: np.ndarray, before: np.ndarray) -> float:
     """By what angle in radians a plane has turned."""
     return float(np.arccos(min(1.0, abs(plane[:3] @ before[:3]))))
+
+
+def _commonest(off: np.ndarray) -> float:
+    """Where most of (P,) values are within half of TOLERANCE."""
+    places = np.arange(-ALIKE_DEPTH, ALIKE_DEPTH, TOLERANCE / 10)
+    ordered = np.sort(off)
+    count = np.searchsorted(ordered, places + TOLERANCE / 2) - np.searchsorted(ordered, places - TOLERANCE / 2)
+    return float(places[np.argmax(count)])
