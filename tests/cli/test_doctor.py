@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import types
 
 from linprim_geo.base import system
 from linprim_geo.cli import doctor
@@ -35,6 +36,21 @@ def test_doctor_names_what_is_missing(monkeypatch, capsys):
     assert report["cores"] >= 1 and report["memory_bytes"] > 0
     cli.main(["doctor"])
     assert "no_such_module MISSING" in capsys.readouterr().out
+
+
+def test_doctor_says_what_is_short(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(doctor, "LIBRARIES", (("numpy", ("numpy",)),))
+    monkeypatch.setattr(doctor, "_memory", lambda: (8 * 2**30, 3 * 2**30, 8 * 2**30))
+    usage = types.SimpleNamespace(free=3 * 2**29)
+    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda folder: usage)
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["doctor"]) == 1
+    shown = capsys.readouterr().out
+    assert "only 3.0 GiB of memory are free" in shown and f"only 1.5 GiB are free on the disk of {tmp_path}" in shown
+    monkeypatch.setattr(doctor, "_memory", lambda: (8 * 2**30, 4 * 2**30, 8 * 2**30))
+    usage.free = 2 * 2**30
+    assert cli.main(["doctor"]) == 0
+    assert "are free on the disk" not in capsys.readouterr().out
 
 
 def test_missing_system_libraries_come_with_the_line_that_installs_them(monkeypatch):

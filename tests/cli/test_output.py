@@ -11,6 +11,7 @@ import types
 import pytest
 
 from linprim_geo.base import progress
+from linprim_geo.cli import doctor
 from linprim_geo.cli import main as cli
 
 
@@ -67,6 +68,9 @@ def test_every_command_prints_one_object_and_does_what_it_says(result, tmp_path,
     assert result("convert r p.ply")["count"] == trained["primitives"]
     assert result("convert p.ply p.glb")["faces"] == 8 * trained["primitives"]
     assert result("convert m.obj m.ply")["wrote"] == "mesh"
+    # Tests also run where memory or disk is short.
+    monkeypatch.setattr(doctor, "LITTLE_MEMORY", 0)
+    monkeypatch.setattr(doctor, "LITTLE_DISK", 0)
     assert {"problems", "cache", "instruction_set"} <= result("doctor").keys()
     assert result("report r")["views"] == 2 and os.path.getsize("r/report.html") > 10_000
     assert result("completion zsh")["script"].startswith("#compdef")

@@ -99,4 +99,6 @@ def test_a_command_at_work_imports_nothing_planted(line, capture):
     (capture / "imported").unlink(missing_ok=True)
     done = called(line.split(), capture)
     found = (capture / "imported").read_text() if (capture / "imported").exists() else ""
-    assert (done.returncode, found) == (0, ""), done.stderr
+    # The doctor of a machine that is short of memory or disk ends with 1, after its report.
+    status = 1 if line == "doctor" and "what to do:" in done.stdout else 0
+    assert (done.returncode, found) == (status, ""), done.stderr
