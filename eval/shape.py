@@ -14,8 +14,8 @@ import numpy as np
 
 from linprim_geo.eval.surface_samples import NAN, Comparison, SurfaceDistance, mean, with_percent
 from linprim_geo.geometry.mesh import Mesh, face_areas, face_normals, merge_vertices
-from linprim_geo.surface.mesh_process import paired_edges
-from linprim_geo.surface.self_intersections import crossings
+from linprim_geo.surface.finish.mesh_process import paired_edges
+from linprim_geo.surface.finish.self_intersections import crossings
 
 CREASE = 30.0
 """Degrees between the normals of two faces from which on the edge between them is a crease."""

@@ -71,10 +71,10 @@ CENTER = tuple(
     for name in ("rasterize_gradients", "rasterize", "rasterize_invariants", "rasterize_interface", "ladder")
 )
 LADDER = (CENTER[-1], *CENTER[:-1])
-SEGMENTS = ("kernels/test_solid_tree.py", "surface/test_method_polyhedra.py")
-FUSING = ("surface/test_surfels.py", "surface/test_tsdf.py", "surface/test_stereo_frames.py")
+SEGMENTS = ("kernels/test_solid_tree.py", "surface/methods/test_method_polyhedra.py")
+FUSING = ("surface/fusion/test_surfels.py", "surface/fusion/test_tsdf.py", "surface/fusion/test_stereo_frames.py")
 CUBES = ("kernels/test_marching_cubes.py",)
-PHOTOS = ("surface/test_photo_consistency.py",)
+PHOTOS = ("surface/finish/test_photo_consistency.py",)
 LOSS = ("kernels/test_photometric.py",)
 ADAM = ("kernels/test_optimize.py",)
 

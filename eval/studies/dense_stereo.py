@@ -28,8 +28,8 @@ from linprim_geo.base.files import atomic_write, write_json
 from linprim_geo.base.options import TrainOptions
 from linprim_geo.base.progress import Progress
 from linprim_geo.stereo.confidence import RIGHT, probability
-from linprim_geo.stereo.maps_from_disk import seen_depths
-from linprim_geo.stereo.planes_on_disk import STAGES, Photographs, PlanesOnDisk
+from linprim_geo.stereo.dense.maps_from_disk import seen_depths
+from linprim_geo.stereo.dense.planes_on_disk import STAGES, Photographs, PlanesOnDisk
 
 # Pixels of each photograph that are kept for fitting and scoring: errors of neighbouring ones are nearly the same.
 PIXELS = 8000

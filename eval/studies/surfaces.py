@@ -137,8 +137,8 @@ def score_true_depth(capture: Path, reference: Path, options: SceneOptions, targ
     from linprim_geo.capture.load import load_scene
     from linprim_geo.geometry.mesh_files import load_mesh, save_mesh
     from linprim_geo.geometry.raycast import RayCaster
-    from linprim_geo.surface.tsdf_field import DepthFrame
-    from linprim_geo.surface.tsdf_fusion import auto_voxel_size, fuse_tsdf
+    from linprim_geo.surface.fusion.tsdf_field import DepthFrame
+    from linprim_geo.surface.fusion.tsdf_fusion import auto_voxel_size, fuse_tsdf
 
     began, truth = time.process_time(), load_mesh(reference)
     caster, frames = RayCaster(truth.vertices, truth.faces), []

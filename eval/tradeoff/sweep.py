@@ -108,7 +108,7 @@ class Sweep:
 
     def __init__(self, scene: Path, folder: Path, options: TradeoffOptions, quiet: bool):
         from linprim_geo.capture.load import load_scene
-        from linprim_geo.stereo.refine_found_poses import prepare
+        from linprim_geo.stereo.poses.refine_found_poses import prepare
 
         run, reference, quick, threads = options.run, options.reference, options.quick, options.threads
         self.scene_path, self.folder, self.given = Path(os.path.realpath(scene)), folder, run
@@ -369,8 +369,8 @@ class Sweep:
     @cached_property
     def supported_voxel(self) -> float:
         """The voxel size that the run's views support."""
-        from linprim_geo.surface.method_tsdf import DepthFrames
-        from linprim_geo.surface.tsdf_fusion import auto_voxel_size
+        from linprim_geo.surface.fusion.tsdf_fusion import auto_voxel_size
+        from linprim_geo.surface.methods.method_tsdf import DepthFrames
 
         return auto_voxel_size(DepthFrames(self.run, 0.5))
 

@@ -15,7 +15,7 @@ from linprim_geo.base.options import SceneOptions, StereoOptions, flags, from_sa
 from linprim_geo.display.report_data import embedded_png
 from linprim_geo.display.report_page import Table, rendered
 from linprim_geo.imaging.colors import depth_preview, error_colors
-from linprim_geo.stereo.dense import NOTES, Dense, run_stereo
+from linprim_geo.stereo.dense.dense import NOTES, Dense, run_stereo
 
 # Photographs that the page shows, evenly over the capture.
 SHOWN = 8

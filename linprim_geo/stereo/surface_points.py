@@ -13,7 +13,7 @@ from linprim_geo.capture.types import PointCloud, View
 from linprim_geo.kernels.stereo_ops import support
 from linprim_geo.stereo.confidence import RIGHT
 from linprim_geo.stereo.depth_maps import FOREGROUND, depth_maps, inverse_planes
-from linprim_geo.stereo.skies import shows_sky
+from linprim_geo.stereo.planes.skies import shows_sky
 
 # Photographs are averaged down until their longer side has no more pixels, and no more of them are taken: a training
 # starts with some ten thousand primitives, and a view of this size has 30,000 pixels.

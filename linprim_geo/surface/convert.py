@@ -94,8 +94,8 @@ def convert(source: str | os.PathLike, target: str | os.PathLike, write_as: str 
 def _convert_mesh(source: Path, target: Path) -> dict:
     """Writes the mesh `source` as `target`; what `convert` says of it."""
     from linprim_geo.geometry.mesh_files import load_mesh, save_mesh
-    from linprim_geo.surface.texture import TEXTURED_SUFFIXES
-    from linprim_geo.surface.texture_files import load_texture, save_textured
+    from linprim_geo.surface.texture.texture import TEXTURED_SUFFIXES
+    from linprim_geo.surface.texture.texture_files import load_texture, save_textured
 
     suffix = target.suffix.lower()
     textured = load_texture(source) if source.suffix.lower() in TEXTURED_SUFFIXES else None

@@ -30,15 +30,15 @@ from linprim_geo.surface.object_alone import object_alone
 from linprim_geo.surface.postprocess import Finished, finish_surface, visible_file, with_rounds
 from linprim_geo.surface.shaded_views import shaded_file
 from linprim_geo.surface.single_view import without_single_views
-from linprim_geo.surface.texture import check_texture
+from linprim_geo.surface.texture.texture import check_texture
 from linprim_geo.surface.voxel_budget import choose_voxel
 
 # Each is a function (run, options, stages) -> (mesh, statistics of its own), found when it is wanted: their libraries
 # are large.
 METHODS = {
-    "tsdf": "method_tsdf.tsdf_surface",
-    "polyhedra": "method_polyhedra.polyhedra_surface",
-    "opacity-field": "method_opacity_field.opacity_surface",
+    "tsdf": "methods.method_tsdf.tsdf_surface",
+    "polyhedra": "methods.method_polyhedra.polyhedra_surface",
+    "opacity-field": "methods.method_opacity_field.opacity_surface",
 }
 
 # Options that a method chooses where they are 0; what it took is in its statistics.
@@ -175,14 +175,14 @@ def _extract(
         said = "the photographs do not tell" if level == USUAL_LEVEL else "the nearest at which the photographs agree"
         stages.note(f"level {level:g}: {said}")
         stages.lap("level")
-    module, function = METHODS[method].split(".")
+    module, function = METHODS[method].rsplit(".", 1)
     surface = getattr(import_module(f".{module}", __package__), function)
     kept: dict = {}
     chosen: dict = {}
     if budget:
         options, kept, chosen = choose_voxel(opened, options, target, stages, budget)
     if executor is not None:
-        from linprim_geo.surface.tsdf_parts import PartFusion
+        from linprim_geo.surface.methods.tsdf_parts import PartFusion
 
         fuse = PartFusion(opened, options, blocks, executor(), folder / PARTS, progress.quiet)
         mesh, about = surface(opened, options, stages, **kept, fuse=fuse)

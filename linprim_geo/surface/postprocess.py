@@ -11,18 +11,18 @@ from linprim_geo.base.progress import Stages
 from linprim_geo.geometry.mesh import Mesh, select_faces
 from linprim_geo.geometry.mesh_files import save_mesh
 from linprim_geo.runs.run import Run
-from linprim_geo.surface.creases import sharpened
-from linprim_geo.surface.denoise import denoised
-from linprim_geo.surface.depth_error import error_of_nearest
-from linprim_geo.surface.fairing import faired
-from linprim_geo.surface.mesh_process import process_mesh
+from linprim_geo.surface.finish.creases import sharpened
+from linprim_geo.surface.finish.denoise import denoised
+from linprim_geo.surface.finish.fairing import faired
+from linprim_geo.surface.finish.mesh_process import process_mesh
+from linprim_geo.surface.finish.outlines import moved_to_outlines
+from linprim_geo.surface.finish.photo_consistency import photo_gains, predicted_error, refine_surface
+from linprim_geo.surface.finish.safe_moves import moved_safely, untangled
+from linprim_geo.surface.fusion.depth_error import error_of_nearest
 from linprim_geo.surface.mesh_views import MeshViews
-from linprim_geo.surface.outlines import moved_to_outlines
-from linprim_geo.surface.photo_consistency import photo_gains, predicted_error, refine_surface
-from linprim_geo.surface.safe_moves import moved_safely, untangled
 from linprim_geo.surface.shaded_views import save_shaded, shaded_row
-from linprim_geo.surface.texture import make_texture
-from linprim_geo.surface.texture_files import save_textured
+from linprim_geo.surface.texture.texture import make_texture
+from linprim_geo.surface.texture.texture_files import save_textured
 from linprim_geo.surface.visibility import color_vertices, pixels_of, visible_faces, with_gain
 
 # Rounds of refinement with `refine` auto, where stereo has no part in the surface.

@@ -10,11 +10,11 @@ from linprim_geo.base.options import ExtractOptions
 from linprim_geo.base.progress import Stages
 from linprim_geo.capture.small_copy import SmallCopy
 from linprim_geo.runs.run import Run
-from linprim_geo.stereo.planes_on_disk import Photographs
-from linprim_geo.stereo.time_plan import seconds_per_pixel
-from linprim_geo.surface.method_tsdf import SMALLEST_SIDE, DepthFrames, with_far_depths
-from linprim_geo.surface.stereo_frames import MergedFrames, pairing_points
-from linprim_geo.surface.tsdf_fusion import auto_voxel_size
+from linprim_geo.stereo.dense.planes_on_disk import Photographs
+from linprim_geo.stereo.dense.time_plan import seconds_per_pixel
+from linprim_geo.surface.fusion.stereo_frames import MergedFrames, pairing_points
+from linprim_geo.surface.fusion.tsdf_fusion import auto_voxel_size
+from linprim_geo.surface.methods.method_tsdf import SMALLEST_SIDE, DepthFrames, with_far_depths
 
 # Of the time that is left stereo takes at most this share: the rest is for smaller voxels.
 SHARE = 0.5

@@ -73,9 +73,9 @@ def choose_voxel(run, options, target, stages, budget: Budget):
     Raises:
         LinprimError: not even the coarsest voxel fits; no ray crosses the level.
     """
-    from linprim_geo.surface.method_tsdf import DepthFrames
+    from linprim_geo.surface.fusion.tsdf_fusion import auto_voxel_size
+    from linprim_geo.surface.methods.method_tsdf import DepthFrames
     from linprim_geo.surface.stereo_budget import stereo_in_time
-    from linprim_geo.surface.tsdf_fusion import auto_voxel_size
 
     begin = time.monotonic()
     frames = DepthFrames(run, options.level, options.depth_limit)
@@ -144,7 +144,7 @@ def choose_voxel(run, options, target, stages, budget: Budget):
 
 def _timed_pass(run, options, kept, target) -> float:
     """Seconds of everything that follows the depth maps that are `kept`, written to a folder that is thrown away."""
-    from linprim_geo.surface.method_tsdf import tsdf_surface
+    from linprim_geo.surface.methods.method_tsdf import tsdf_surface
 
     quiet = Stages(Progress("coarse pass", 1, quiet=True))
     with tempfile.TemporaryDirectory(prefix="linprim_geo_") as folder:

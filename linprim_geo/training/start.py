@@ -34,8 +34,8 @@ from linprim_geo.points.initial_points import (
 from linprim_geo.points.photo_evidence import observe
 from linprim_geo.points.start_points import filled_points, initial_cloud, with_points
 from linprim_geo.runs.run import Run, refuse_used
-from linprim_geo.stereo.adjust_poses import adjusted_scene
-from linprim_geo.stereo.refine_found_poses import prepare
+from linprim_geo.stereo.poses.adjust_poses import adjusted_scene
+from linprim_geo.stereo.poses.refine_found_poses import prepare
 from linprim_geo.training.background import chosen_background
 from linprim_geo.training.checkpoint import restore
 from linprim_geo.training.effects import Choice, Decision, decide, settle, summary

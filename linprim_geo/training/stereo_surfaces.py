@@ -16,10 +16,10 @@ from linprim_geo.capture.types import PointCloud, Scene, View
 from linprim_geo.points.initial_points import VolumePoints
 from linprim_geo.points.start_points import SFM_START
 from linprim_geo.points.view_pairs import visible_pixels
+from linprim_geo.stereo.dense.planes_on_disk import Photographs
+from linprim_geo.stereo.dense.time_plan import seconds_per_pixel
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
-from linprim_geo.stereo.planes_on_disk import Photographs
 from linprim_geo.stereo.surface_points import SurfaceMap, small_copies, surface_maps, surface_points
-from linprim_geo.stereo.time_plan import seconds_per_pixel
 
 # Depths of small copies and points of the capture agree up to this share of the depth.
 AGREE = 2 * CONFIRMED_DEPTH

@@ -32,8 +32,8 @@ from linprim_geo.geometry.primitives import load_primitives
 from linprim_geo.imaging import photos
 from linprim_geo.points import triangulate
 from linprim_geo.runs.run import Run
-from linprim_geo.surface.tsdf_parts import load_lattice, load_part, save_lattice
-from linprim_geo.surface.voxel_blocks import Lattice
+from linprim_geo.surface.fusion.voxel_blocks import Lattice
+from linprim_geo.surface.methods.tsdf_parts import load_lattice, load_part, save_lattice
 from linprim_geo.synthetic.textured import load_textured
 from linprim_geo.training.blocks.plan import load_points, save_points
 from linprim_geo.training.checkpoint import read_checkpoint

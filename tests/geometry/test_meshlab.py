@@ -16,7 +16,7 @@ from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.convert import convert
 from linprim_geo.surface.extract import extract_mesh
-from linprim_geo.surface.texture_files import load_texture
+from linprim_geo.surface.texture.texture_files import load_texture
 
 SUFFIXES = (".ply", ".obj", ".glb", ".stl")
 TEXTURED = (".obj", ".glb")

@@ -109,8 +109,8 @@ def _serve() -> None:
 
     import linprim_geo.points.triangulate
     import linprim_geo.surface.extract
-    import linprim_geo.surface.method_tsdf
-    import linprim_geo.surface.tsdf_fusion
+    import linprim_geo.surface.fusion.tsdf_fusion
+    import linprim_geo.surface.methods.method_tsdf
     import linprim_geo.training.train  # noqa: F401
 
     answers = os.dup(1)

@@ -7,8 +7,8 @@ from helpers.captures import look_at
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.stereo.depth_maps import DepthMap
-from linprim_geo.stereo.plain_regions import in_camera
-from linprim_geo.stereo.point_planes import SurfacePoints
+from linprim_geo.stereo.planes.plain_regions import in_camera
+from linprim_geo.stereo.planes.point_planes import SurfacePoints
 
 # A room of 3 by 2 m and 2 m high with its floor at z = 0: n . x = d of what is inside; the last is the ceiling.
 PLANES = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [-1, 0, 0, -3], [0, -1, 0, -2], [0, 0, -1, -2]])

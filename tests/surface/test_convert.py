@@ -23,9 +23,9 @@ from linprim_geo.geometry.mesh_files import load_mesh, save_mesh
 from linprim_geo.geometry.primitive_files import read_primitive_ply, write_primitive_ply
 from linprim_geo.geometry.primitives import Primitives, load_primitives, save_primitives
 from linprim_geo.surface.convert import HELD, convert, find_scene_file, save_primitive_mesh
-from linprim_geo.surface.texture import Texture
-from linprim_geo.surface.texture_charts import unwrap
-from linprim_geo.surface.texture_files import load_texture, save_textured
+from linprim_geo.surface.texture.texture import Texture
+from linprim_geo.surface.texture.texture_charts import unwrap
+from linprim_geo.surface.texture.texture_files import load_texture, save_textured
 
 # --- meshes ----------------------------------------------------------------------------------------------
 

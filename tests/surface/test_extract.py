@@ -19,10 +19,16 @@ from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.geometry.topology import topology
 from linprim_geo.runs.run import Run
-from linprim_geo.surface import method_tsdf
 from linprim_geo.surface.extract import error_summary, extract_mesh
-from linprim_geo.surface.method_tsdf import FAR_TRIES, SMALLEST_DISPARITY, DepthFrames, depth_limit, with_far_depths
-from linprim_geo.surface.tsdf_fusion import auto_voxel_size
+from linprim_geo.surface.fusion.tsdf_fusion import auto_voxel_size
+from linprim_geo.surface.methods import method_tsdf
+from linprim_geo.surface.methods.method_tsdf import (
+    FAR_TRIES,
+    SMALLEST_DISPARITY,
+    DepthFrames,
+    depth_limit,
+    with_far_depths,
+)
 
 STATS = {
     "mesh",
@@ -341,6 +347,6 @@ def _shifted(x: float) -> np.ndarray:
 
 def test_frames_that_are_rendered_on_demand_give_the_same_mesh(tiny_run, tmp_path, monkeypatch):
     extract_mesh(tiny_run, output=tmp_path / "kept.ply", quiet=True)
-    monkeypatch.setattr("linprim_geo.surface.method_tsdf.KEPT_BYTES", 0)
+    monkeypatch.setattr("linprim_geo.surface.methods.method_tsdf.KEPT_BYTES", 0)
     extract_mesh(tiny_run, output=tmp_path / "rendered.ply", quiet=True)
     assert (tmp_path / "kept.ply").read_bytes() == (tmp_path / "rendered.ply").read_bytes()

@@ -16,11 +16,13 @@ from linprim_geo.capture.small_copy import SmallCopy
 from linprim_geo.capture.types import Scene
 from linprim_geo.runs.run import Run
 from linprim_geo.stereo.depth_maps import MEMORY_SHARE, memory_of
-from linprim_geo.surface import method_tsdf, stereo_budget, stereo_frames
+from linprim_geo.surface import stereo_budget
 from linprim_geo.surface.extract import extract_mesh
-from linprim_geo.surface.method_tsdf import DepthFrames, stereo_factor, tsdf_surface, with_far_depths
+from linprim_geo.surface.fusion import stereo_frames
+from linprim_geo.surface.fusion.tsdf_fusion import auto_voxel_size
+from linprim_geo.surface.methods import method_tsdf
+from linprim_geo.surface.methods.method_tsdf import DepthFrames, stereo_factor, tsdf_surface, with_far_depths
 from linprim_geo.surface.stereo_budget import SHARE, WITH_PLANES, stereo_in_time
-from linprim_geo.surface.tsdf_fusion import auto_voxel_size
 
 VIEWS, SIZE, SECONDS = 60, 64, 1000.0
 PIXELS = (VIEWS - 2) * SIZE**2

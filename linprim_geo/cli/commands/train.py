@@ -101,7 +101,7 @@ def _downscale_of(resolution: int, scene: str, options: SceneOptions, threads: i
     if resolution < 1:
         raise LinprimError(f"-r is {resolution}, wanted 1, 2, 4, 8, a width in pixels, or -1")
     from linprim_geo.capture.load import load_scene
-    from linprim_geo.stereo.refine_found_poses import prepare
+    from linprim_geo.stereo.poses.refine_found_poses import prepare
 
     prepare(scene, options, threads=threads, log=log)
     views = load_scene(scene, options, downscale=1).train

@@ -1,0 +1,150 @@
+"""One cloud of points out of the maps of all photographs.
+
+A depth that is probable enough becomes a point if so many other photographs confirm it. Of the photographs that confirm
+each other one gives the point: that with the finest pixels, in steps of two, the first of these. Its depth, normal and
+colour are the means over all of them, so that every surface is there about once.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from linprim_geo.base.files import atomic_write
+from linprim_geo.base.progress import Progress
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.ply import color_columns, write_ply, xyz_columns
+from linprim_geo.points.view_pairs import CONFIRMING
+from linprim_geo.stereo.dense.workspace import ModelPoint, Workspace
+from linprim_geo.stereo.depth_maps import MOST_SOURCES, inverse_planes
+from linprim_geo.stereo.evidence import glance
+
+# Views whose maps are in memory: one, and those that it is compared with.
+KEPT = 1 + MOST_SOURCES
+# Points of the model from each view, and the most in all.
+VIEW_POINTS, MODEL_POINTS = 200, 20_000
+COLUMNS = np.dtype(
+    [
+        ("xyz", "<f8", 3),
+        ("normal", "<f4", 3),
+        ("rgb", "u1", 3),
+        ("confidence", "<f4"),
+    ]
+)
+
+
+@dataclass(frozen=True)
+class _Side:
+    """The probable depths of a view: `depth` (H, W), NaN where there are none, `plane` (3, H, W) inverse depth and its
+    slopes, `values` (H, W, 7) normal in the world, colour and confidence, `level` (H, W) the power of two that the size
+    of a pixel has at its depth, infinite where there is none, and `weight` (H, W) of a mean."""
+
+    camera: Camera
+    depth: np.ndarray
+    plane: np.ndarray
+    values: np.ndarray
+    level: np.ndarray
+    weight: np.ndarray
+
+
+class PointFusion:
+    """Fuses the maps of a workspace, view by view; the maps of the last KEPT are in memory."""
+
+    def __init__(self, workspace: Workspace, pairs: list[list[int]], least: float):
+        """`least` is the confidence from which on depths count."""
+        self.workspace, self.pairs, self.least = workspace, pairs, least
+        self._kept: OrderedDict[int, _Side] = OrderedDict()
+
+    def write(self, path: Path, progress: Progress) -> tuple[int, list[ModelPoint]]:
+        """Writes the points as PLY; how many, and some of them with the views that see them."""
+        views = len(self.pairs)
+        some, count, raw = [], 0, path.with_suffix(".raw")
+        each = max(1, min(VIEW_POINTS, MODEL_POINTS // views))
+        try:
+            with open(raw, "wb") as file:
+                for k in range(views):
+                    progress.update(k, self.workspace.views[k].name)
+                    points, seen = self._points(k)
+                    file.write(points.tobytes())
+                    count += len(points)
+                    some += _model_points(points, seen, each)
+            table = np.memmap(raw, COLUMNS, mode="r") if count else np.zeros(0, COLUMNS)
+            with atomic_write(path) as temporary:
+                write_ply(temporary, _columns(table))
+        finally:
+            raw.unlink(missing_ok=True)
+        return count, some
+
+    def _points(self, k: int) -> tuple[np.ndarray, list[tuple[int, np.ndarray]]]:
+        """(N,) COLUMNS of what view k gives, and for it and each of its sources (N, 2) pixels (x, y) where they are
+        seen, NaN where not."""
+        own = self._side(k)
+        sides = [self._side(j) for j in self.pairs[k]]
+        found = [glance(own.camera, own.depth, side.camera, side.plane) for side in sides]
+        confirms = [each.confirms for each in found]
+        gives = np.isfinite(own.depth) & (np.sum(confirms, axis=0) >= max(1, min(CONFIRMING, len(sides))))
+        for j, side, each, confirmed in zip(self.pairs[k], sides, found, confirms, strict=True):
+            theirs = side.level.ravel()[each.pixel]
+            gives &= ~(confirmed & ((theirs < own.level) | ((theirs == own.level) & (j < k))))
+        rows, columns = np.nonzero(gives)
+        total = own.weight[gives].astype(np.float64)
+        relative, values = np.zeros(len(rows)), total[:, None] * own.values[gives]
+        seen = [(k, np.stack([columns, rows], 1) + 0.5)]
+        for j, side, each, confirmed in zip(self.pairs[k], sides, found, confirms, strict=True):
+            pixel, own_relative = each.pixel[gives], each.relative[gives]
+            weight = np.where(confirmed[gives], side.weight.ravel()[pixel], 0).astype(np.float64)
+            total += weight
+            relative += weight * np.where(weight > 0, own_relative, 0)
+            values += weight[:, None] * side.values.reshape(-1, 7)[pixel]
+            place = np.stack([pixel % side.camera.width, pixel // side.camera.width], 1) + 0.5
+            seen.append((j, np.where(weight[:, None] > 0, place, np.nan)))
+        values /= total[:, None]
+        points = np.zeros(len(rows), COLUMNS)
+        depth = own.depth[gives] * (1 + relative / total)
+        points["xyz"] = own.camera.center + own.camera.world_rays()[gives] * depth[:, None]
+        points["normal"] = values[:, :3] / np.maximum(np.linalg.norm(values[:, :3], axis=1, keepdims=True), 1e-12)
+        points["rgb"], points["confidence"] = np.rint(values[:, 3:6]), values[:, 6]
+        return points, seen
+
+    def _side(self, k: int) -> _Side:
+        if k in self._kept:
+            self._kept.move_to_end(k)
+            return self._kept[k]
+        maps, camera = self.workspace.read_maps(k), self.workspace.views[k].camera
+        kept = (maps.depth > 0) & (maps.confidence >= self.least)
+        depth = np.where(kept, maps.depth, np.float32(np.nan))
+        footprint = depth / np.float32(camera.fx)
+        values = np.concatenate(
+            [maps.normal @ camera.rotation.astype(np.float32), self.workspace.colors(k), maps.confidence[..., None]],
+            axis=2,
+            dtype=np.float32,
+        )
+        # Errors grow with the size of pixels.
+        weight = np.where(kept, maps.confidence / footprint**2, 0)
+        level = np.where(kept, np.floor(np.log2(footprint)), np.inf)
+        self._kept[k] = side = _Side(camera, depth, inverse_planes(camera, depth, maps.normal), values, level, weight)
+        if len(self._kept) > KEPT:
+            self._kept.popitem(last=False)
+        return side
+
+
+def _model_points(points: np.ndarray, seen: list[tuple[int, np.ndarray]], count: int) -> list[ModelPoint]:
+    """About `count` of the points, evenly over their order."""
+    chosen = range(0, len(points), max(1, len(points) // count))
+    return [
+        ModelPoint(
+            points["xyz"][i],
+            points["rgb"][i],
+            [(k, float(place[i, 0]), float(place[i, 1])) for k, place in seen if np.isfinite(place[i, 0])],
+        )
+        for i in chosen
+    ]
+
+
+def _columns(table: np.ndarray) -> dict[str, np.ndarray]:
+    """The columns of the PLY file; coordinates are double, which is enough for a frame far from its origin."""
+    normal = xyz_columns(table["normal"], "nx ny nz")
+    return xyz_columns(table["xyz"]) | normal | color_columns(table["rgb"]) | {"confidence": table["confidence"]}

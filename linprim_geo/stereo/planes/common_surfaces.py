@@ -1,0 +1,47 @@
+"""Which views know a surface that one of them supposes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.points.view_pairs import visible_pixels
+from linprim_geo.stereo.planes.plain_regions import rays_of, to_world
+
+# Depths of one of so many rows and columns are looked at, and a view knows a surface by so many points at least: half
+# of those on the smallest region that has a plane (`shading.LEAST_BOXES`).
+STRIDE, LEAST_POINTS = 4, 30
+# Points are on a surface if their depths differ by no more than this share, which is what planes may be off by.
+ON_IT = 0.05
+
+
+class CommonSurfaces:
+    """Points on the surfaces that views know: `confirmed` (H, W) depths of each camera, NaN where unknown, and where
+    these are, `supposed` ones."""
+
+    def __init__(self, cameras: Sequence[Camera], confirmed: Sequence[np.ndarray], supposed: Sequence[np.ndarray]):
+        self.cameras = cameras
+        points, views, sure = [np.zeros((0, 3))], [np.zeros(0, int)], [np.zeros(0, bool)]
+        for view, (camera, own, others) in enumerate(zip(cameras, confirmed, supposed, strict=True)):
+            depth = np.where(np.isfinite(own), own, others)
+            row, column = (STRIDE * x for x in np.nonzero(np.isfinite(depth[::STRIDE, ::STRIDE])))
+            points.append(to_world(camera, rays_of(camera, row, column) * depth[row, column, None]))
+            views.append(np.full(len(row), view))
+            sure.append(np.isfinite(own[row, column]))
+        self.points, self.views, self.sure = (np.concatenate(parts) for parts in (points, views, sure))
+
+    def known_by(self, view: int, depths: Sequence[np.ndarray], only_confirmed: Sequence[bool]) -> list[np.ndarray]:
+        """The numbers of other views with points, or `only_confirmed` ones, on each of several (H, W) depths of a view,
+        NaN where there are none."""
+        if not depths:
+            return []
+        others = self.views != view
+        inside, pixels, along = visible_pixels(self.cameras[view], self.points[others])
+        views, sure, (column, row) = self.views[others][inside], self.sure[others][inside], pixels.T
+        result = []
+        for depth, only_sure in zip(depths, only_confirmed, strict=True):
+            on_it = np.abs(along / depth[row, column] - 1) <= ON_IT
+            result.append(np.flatnonzero(np.bincount(views[on_it & (sure | (not only_sure))]) >= LEAST_POINTS))
+        return result

@@ -1,0 +1,82 @@
+"""Planes of edges, turned along the frame of their room.
+
+Depths along an edge are known to a hundredth, and what is nearly flush with a wall is before it by as much: a door and
+its frame, a row of cupboards and the refrigerator beside them. The plane with the most points on it leans from the one
+to the other. Planes with points all over know the directions of the room, and of planes along these the one with the
+most points is one of the two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.stereo.planes.held_planes import off_plane, shifted
+from linprim_geo.stereo.planes.plain_regions import BEHIND, TOLERANCE, PlainRegion, in_camera, may_lie_on, to_world
+from linprim_geo.stereo.planes.right_angles import LEFT_OPEN, angles_to, frame_of
+
+# Of the points within half of TOLERANCE of a plane at least such a share is there once it is turned: of planes that
+# lean by themselves, as a sloping street does, fewer stay (DECISIONS 141).
+KEPT_SHARE = 0.75
+
+
+def along_frame(
+    cameras: Sequence[Camera], regions: Sequence[PlainRegion], planes: np.ndarray, by_points: np.ndarray
+) -> np.ndarray:
+    """(K, 4) planes n . x = d of the world that edges of plain `regions` have given, those with more points first, of
+    which those nearly along the frame of the planes `by_points` (N, 4) are turned along it; of copies the first."""
+    frame = frame_of(by_points[:, :3])
+    if frame is None:
+        return planes
+    kept = list[np.ndarray]()
+    of_planes = zip(planes, angles_to(frame, planes[:, :3]), _edge_points(cameras, regions, planes), strict=True)
+    for plane, angle, points in of_planes:
+        if angle < LEFT_OPEN and len(points.points):
+            plane = points.turned(plane, frame)
+        if not any(points.has(other) for other in kept if abs(other[:3] @ plane[:3]) > 1 - 1e-9):
+            kept.append(plane)
+    return np.array(kept).reshape(-1, 4)
+
+
+class _EdgePoints:
+    """The `points` (P, 3) of the world along edges of regions that may lie on a plane, near it, and the vectors (P, 3)
+    to them from the cameras that see them."""
+
+    def __init__(self, points: np.ndarray, vectors: np.ndarray):
+        self.points, self.vectors = points, vectors
+
+    def turned(self, plane: np.ndarray, frame: np.ndarray) -> np.ndarray:
+        """The plane along the nearest axis of a frame that most of the points are on; the plane as it was where it
+        loses too many."""
+        axis = frame[np.abs(frame @ plane[:3]).argmax()]
+        axis = axis * np.sign(axis @ plane[:3])
+        turned = shifted(np.append(axis, np.median(self.points @ axis)), self.points, self.vectors)
+        on, before = (np.abs(self._off(each)) < TOLERANCE / 2 for each in (turned, plane))
+        if np.count_nonzero(on) <= KEPT_SHARE * np.count_nonzero(before):
+            return plane
+        turned[3] = np.average(self.points[on] @ axis, weights=(self.vectors[on] @ axis) ** -2)
+        return turned
+
+    def has(self, other: np.ndarray) -> bool:
+        """Whether the points lie on another plane as well, in the median."""
+        return len(self.points) > 0 and float(np.median(np.abs(self._off(other)))) < TOLERANCE
+
+    def _off(self, plane: np.ndarray) -> np.ndarray:
+        return off_plane(plane, self.points, self.vectors)
+
+
+def _edge_points(cameras: Sequence[Camera], regions: Sequence[PlainRegion], planes: np.ndarray) -> list[_EdgePoints]:
+    """Of each of (K, 4) planes."""
+    none = np.zeros((0, 3))
+    points, vectors = [[none] for _ in planes], [[none] for _ in planes]
+    for region in regions:
+        camera = cameras[region.view]
+        local = in_camera(camera, planes)
+        near = region.sure[:, None] & (np.abs(region.off(local)) < BEHIND * TOLERANCE)
+        for k in np.flatnonzero(may_lie_on(region, local)[1]):
+            own = near[:, k]
+            points[k].append(to_world(camera, region.rays[own] / region.inverse[own, None]))
+            vectors[k].append(points[k][-1] - camera.center)
+    return [_EdgePoints(*map(np.concatenate, own)) for own in zip(points, vectors, strict=True)]

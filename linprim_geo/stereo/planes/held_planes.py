@@ -1,0 +1,174 @@
+"""Planes of shading, held by what else is known of them: confirmed depths along the edges of their regions, and right
+angles between walls, as far as their shading allows.
+
+Light that is not what the model says turns planes by some degrees. Points along edges know the normal of a plane better
+than that: shading does not turn what they have told by more than SAME_ANGLE, and right angles by more than NEARLY."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Sequence
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+
+from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
+from linprim_geo.stereo.planes.plain_regions import RING, SAME_ANGLE, TOLERANCE, rays_of, to_world
+from linprim_geo.stereo.planes.right_angles import NEARLY, RIGHT, angles_to, frame_of, squared
+from linprim_geo.stereo.planes.shading import BOX, Fit, ShadedRegion, Shading, evaluate, plane_moves
+
+# Boxes of a region that are compared.
+MOST_BOXES = 800
+# A plane carries shading hardly worse than another one if it leaves no more than so many times as much.
+HARDLY_MORE = 1.1
+# What the plane of one region alone is off by, as a share of its distance.
+ALIKE_DEPTH = 5 * CONFIRMED_DEPTH
+# Confirmed depths along the edges of regions hold a plane if they are as near as NEAR, and after some steps as
+# TOLERANCE. Half of TOLERANCE is their deviation; as their errors have common causes, they count as so many at most.
+NEAR, NARROWER, HOLDING_STEPS, INDEPENDENT = 2 * TOLERANCE, 0.8, 6, 200
+# Planes along the frame of a room leave so much more of the shading than planes that are free: light is not what the
+# model says, and nine in ten true walls of a room leave as much more at most (DECISIONS 116). Planes that are at right
+# angles to others, or on lines, leave so much more than those that they were.
+AS_WELL, NEARLY_AS_WELL = 1.5, 1.03
+
+
+class HeldPlanes:
+    """How planes are held that carry the shading of regions.
+
+    Args:
+        shadings: of every view.
+        depths: (H, W) confirmed depth of every view as large as its shading, NaN elsewhere.
+        carried: the regions that each plane carries.
+    """
+
+    def __init__(
+        self,
+        shadings: Sequence[Shading],
+        depths: Sequence[np.ndarray],
+        carried: Sequence[Sequence[ShadedRegion]],
+    ):
+        self.shadings, self.depths, self.carried = shadings, depths, carried
+
+    def by_depths(self, planes: np.ndarray, staying: Container[int], told: Container[int] = ()) -> np.ndarray:
+        """The planes, but for those `staying` each held by the confirmed depths along the edges of its regions; those
+        that points have `told` turn by SAME_ANGLE at most, or stay."""
+        result = planes.copy()
+        for k, plane in enumerate(planes):
+            held = plane if k in staying else self._held_plane(plane, self.carried[k])
+            if k not in told or _turns(held, plane) <= SAME_ANGLE:
+                result[k] = held
+        return result
+
+    def at_right_angles(self, planes: np.ndarray, staying: Container[int], told: Container[int] = ()) -> np.ndarray:
+        """The planes, turned to right angles with each other, or along the frame of those `staying`, where that carries
+        the shading of their regions as well as true walls do, and then shifted to where most confirmed depths along the
+        edges of these are; but those `staying` stay, and so do those that points have `told` if they would turn by more
+        than NEARLY."""
+        few = [[region.some(MOST_BOXES) for region in regions] for regions in self.carried]
+        fits = [
+            evaluate(plane, few[k], self.shadings) if few[k] and k not in staying else None
+            for k, plane in enumerate(planes)
+        ]
+        # Planes by edges that carry no shading are no reference.
+        rows = [k for k, fit in enumerate(fits) if k in staying or fit is not None]
+        known = [None if (fit := fits[k]) is None else fit.information for k in rows]
+        frame, turned = frame_of(planes[[k for k in rows if k in staying], :3]), planes.copy()
+        turned[rows] = squared(planes[rows], known, lambda row, plane: plane_moves(plane, few[rows[row]]), frame)
+        for k, fit in enumerate(fits):
+            if fit is None or (turned[k] == planes[k]).all():
+                continue
+            if k in told and _turns(turned[k], planes[k]) > NEARLY:
+                continue
+            framed = frame is not None and angles_to(frame, turned[[k], :3])[0] < RIGHT
+            for plane in (self._shifted(turned[k], self.carried[k]), turned[k]):
+                if self._leaves_as_little(plane, few[k], fit, AS_WELL if framed else NEARLY_AS_WELL):
+                    planes[k] = plane
+                    break
+        return planes
+
+    def still_carrying(self, moved: dict[int, np.ndarray], planes: np.ndarray) -> dict[int, np.ndarray]:
+        """Those of `moved` planes, by their number, that carry the shading of their regions nearly as well as the
+        planes that they were do, or have no regions."""
+        result = {}
+        for k, plane in moved.items():
+            few = [region.some(MOST_BOXES) for region in self.carried[k]]
+            fit = evaluate(planes[k], few, self.shadings) if few else None
+            if fit is None or self._leaves_as_little(plane, few, fit, NEARLY_AS_WELL):
+                result[k] = plane
+        return result
+
+    def _leaves_as_little(self, plane: np.ndarray, regions: Sequence[ShadedRegion], fit: Fit, times: float) -> bool:
+        """Whether a plane leaves no more than so many times as much of the shading of regions as a fit to them does."""
+        tried = evaluate(plane, regions, self.shadings)
+        return tried is not None and tried.left < times * fit.left and tried.boxes > 0.7 * fit.boxes
+
+    def _shifted(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> np.ndarray:
+        """A plane moved along its normal to where most confirmed depths along the edges of regions are."""
+        points, centers = self._points_along(regions)
+        return shifted(plane, points, points - centers)
+
+    def _held_plane(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> np.ndarray:
+        """A plane fitted to the shading of regions and to the confirmed depths along their edges that are near it: a
+        wall meets others there, and a floor. The plane as it was where the two contradict each other."""
+        few = [region.some(MOST_BOXES) for region in regions]
+        first = evaluate(plane, few, self.shadings) if few else None
+        if first is None:
+            return plane
+        fit = first
+        points, centers = self._points_along(regions)
+        for k in range(HOLDING_STEPS):
+            normal, moves = fit.plane[:3], plane_moves(fit.plane, few)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                along = (points - centers) @ normal
+                off = (points @ normal - fit.plane[3]) / along
+            near: np.ndarray = np.abs(off) < max(NEAR * NARROWER**k, TOLERANCE)
+            slope = (points[near] @ moves[:, :3].T - moves[:, 3]) / along[near, None]
+            weight = INDEPENDENT / max(INDEPENDENT, int(near.sum())) / (TOLERANCE / 2) ** 2
+            information = fit.information + weight * slope.T @ slope
+            step = np.linalg.pinv(information, hermitian=True) @ (fit.downhill - weight * slope.T @ off[near])
+            moved = fit.plane + step @ moves
+            tried = evaluate(moved / np.linalg.norm(moved[:3]), few, self.shadings)
+            if tried is None or tried.left > HARDLY_MORE * first.left or tried.boxes < 0.7 * first.boxes:
+                return plane
+            fit = tried
+        return fit.plane
+
+    def _points_along(self, regions: Sequence[ShadedRegion]) -> tuple[np.ndarray, np.ndarray]:
+        """(P, 3) points of the world at the confirmed depths along the edges of regions, and (P, 3) the centres of the
+        cameras that see them."""
+        points, centers = [np.zeros((0, 3))], [np.zeros((0, 3))]
+        for region in regions:
+            camera, depth = self.shadings[region.view].camera, self.depths[region.view]
+            around = binary_dilation(self.shadings[region.view].area_of(region), iterations=BOX // 2 + RING)
+            row, column = np.nonzero(around & np.isfinite(depth))
+            points.append(to_world(camera, rays_of(camera, row, column) * depth[row, column, None]))
+            centers.append(np.broadcast_to(camera.center, points[-1].shape))
+        return np.concatenate(points), np.concatenate(centers)
+
+
+def shifted(plane: np.ndarray, points: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """A plane moved along its normal to where most of (P, 3) points are, with the vectors (P, 3) to them from cameras
+    that see them; as it was where none is near."""
+    off = off_plane(plane, points, vectors)
+    near = np.abs(off) < ALIKE_DEPTH
+    if not near.any():
+        return plane
+    return plane + np.append(np.zeros(3), _commonest(off[near]) * np.median(vectors[near] @ plane[:3]))
+
+
+def off_plane(plane: np.ndarray, points: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """(P,) how far (P, 3) points are beyond a plane, as shares of the vectors (P, 3) to them along its normal."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # rays along the plane
+        return (points @ plane[:3] - plane[3]) / (vectors @ plane[:3])
+
+
+def _turns(plane: np.ndarray, before: np.ndarray) -> float:
+    """By what angle in radians a plane has turned."""
+    return float(np.arccos(min(1.0, abs(plane[:3] @ before[:3]))))
+
+
+def _commonest(off: np.ndarray) -> float:
+    """Where most of (P,) values are within half of TOLERANCE."""
+    places = np.arange(-ALIKE_DEPTH, ALIKE_DEPTH, TOLERANCE / 10)
+    ordered = np.sort(off)
+    count = np.searchsorted(ordered, places + TOLERANCE / 2) - np.searchsorted(ordered, places - TOLERANCE / 2)
+    return float(places[np.argmax(count)])

@@ -1,0 +1,1 @@
+"""Poses and lenses, adjusted and refined by what photographs show of surfaces."""

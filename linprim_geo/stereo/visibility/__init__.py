@@ -1,0 +1,1 @@
+"""What other views see and see through: thin things, outlines, backgrounds and gaps."""

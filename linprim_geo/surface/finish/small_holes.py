@@ -1,0 +1,115 @@
+"""Closes small holes of a fused surface, unless photographs speak for them.
+
+Depths that disagree leave pinholes along edges, in folds and on what few photographs show. A hole that is narrower than
+a window of stereo is in the windows of all that is around it: these were matched as one surface across it. It is closed
+with triangles between its own vertices, unless photographs see through it, or the patch would turn its back to what is
+around it: the rim of a piece is no hole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.geometry.topology import border_loops
+from linprim_geo.points.initial_points import in_image
+from linprim_geo.stereo.planes.seen_through import KnownDepths
+from linprim_geo.surface.finish.mesh_process import has_crowded_edge
+from linprim_geo.surface.finish.self_intersections import crossings, edges_of
+from linprim_geo.surface.normals import vertex_normals
+
+# The side of a window of stereo in pixels (kWindowSide * kWindowStep in csrc/stereo/patch_match.h).
+WINDOW = 12.0
+# Depth of a ray that is known to be free, in diagonals of the mesh: behind everything.
+FREE_DEPTH = 1e3
+
+
+def without_small_holes(
+    mesh: Mesh, cameras: Sequence[Camera], known: Sequence[np.ndarray], free: Sequence[np.ndarray]
+) -> tuple[Mesh, int]:
+    """The mesh with holes closed that are no wider than WINDOW pixels of the nearest camera, and how many these are.
+
+    Vertices and faces that there are stay as they are, faces are added behind them, no edge gets a third face, and no
+    face crosses another that did not before. A hole stays open where views look through any triangle of its patch at
+    something behind it (`KnownDepths`), where most of the patch faces away from the faces around it, and where other
+    faces are in the way.
+
+    Args:
+        known: (H, W) depths of each view, NaN where nothing is known.
+        free: (H, W) bool of each view, rays that end nowhere.
+    """
+    added, hole = _patches(mesh.vertices, _small_rims(mesh, cameras))
+    if not len(added):
+        return mesh, 0
+    corners = mesh.vertices.astype(np.float64)[added]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    around = (vertex_normals(mesh) if mesh.normals is None else mesh.normals).astype(np.float64)[added].sum(1)
+    facing = (np.bincount(hole, (normal * around).sum(1)) > 0)[hole]
+    added, hole, corners = added[facing], hole[facing], corners[facing]
+    if not len(added):
+        return mesh, 0
+    far = np.float32(FREE_DEPTH * mesh.diagonal)
+    depths = (np.where(no_end & ~np.isfinite(depth), far, depth) for depth, no_end in zip(known, free, strict=True))
+    through = KnownDepths(cameras, depths).see_through(corners.mean(1))
+    at_rim = np.zeros(len(mesh.vertices), bool)
+    at_rim[added] = True
+    wrong = through | has_crowded_edge(mesh.faces[at_rim[mesh.faces].any(1)], added) | _crossing(mesh, added)
+    added, hole = (each[np.bincount(hole, wrong)[hole] == 0] for each in (added, hole))
+    faces = np.concatenate([mesh.faces, added])
+    normals = None if mesh.normals is None else vertex_normals(replace(mesh, faces=faces))
+    return replace(mesh, faces=faces, normals=normals, primitive=None), len(np.unique(hole))
+
+
+def _crossing(mesh: Mesh, added: np.ndarray) -> np.ndarray:
+    """(N,) bool: which of the `added` faces (N, 3) cross any other."""
+    faces, count = np.concatenate([mesh.faces, added]), np.int64(len(mesh.vertices))
+    crossed, _ = crossings(Mesh(mesh.vertices, added), edges_of(faces))
+    _, ends = crossings(Mesh(mesh.vertices, faces), edges_of(added))
+    of_added = np.sort(added[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1) @ np.array([count, 1])
+    result = np.any(np.isin(of_added, ends @ np.array([count, 1])).reshape(-1, 3), axis=1)
+    result[crossed] = True
+    return result
+
+
+def _small_rims(mesh: Mesh, cameras: Sequence[Camera]) -> list[np.ndarray]:
+    """The vertices around each hole no wider than WINDOW pixels, in the order in which a patch goes round."""
+    rims = [loop[::-1] for loop in border_loops(mesh.faces)]
+    if not rims:
+        return []
+    rim = np.repeat(np.arange(len(rims)), [len(one) for one in rims])
+    place = mesh.vertices.astype(np.float64)[np.concatenate(rims)]
+    middle = np.stack([np.bincount(rim, place[:, a]) for a in range(3)], 1) / np.bincount(rim)[:, None]
+    width = np.zeros(len(rims))
+    np.maximum.at(width, rim, 2 * np.linalg.norm(place - middle[rim], axis=1))
+    return [rims[k] for k in np.flatnonzero(width <= WINDOW * _pixels(middle, cameras))]
+
+
+def _pixels(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """(P,) what a pixel of the nearest camera covers at (P, 3) points in its image, 0 where they are in none."""
+    least = np.full(len(points), np.inf)
+    for camera in cameras:
+        inside, _, _ = in_image(camera, points)
+        pixel = camera.project(points)[1] / max(camera.fx, camera.fy)
+        least = np.where(inside, np.fmin(least, pixel), least)
+    return np.where(np.isfinite(least), least, 0)
+
+
+def _patches(vertices: np.ndarray, rims: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) triangles between the vertices of rims, as these lie on the plane of each, and (N,) which rim's."""
+    from manifold3d import triangulate
+
+    triangles, hole = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
+    for number, rim in enumerate(rims):
+        place = vertices[rim].astype(np.float64)
+        place -= place.mean(0)
+        normal = np.cross(place, np.roll(place, -1, axis=0)).sum(0)
+        across = np.linalg.svd(normal[None])[2][1:]
+        if np.cross(*across) @ normal < 0:
+            across = across[::-1]
+        triangles.append(rim[triangulate([place @ across.T])])
+        hole.append(np.full(len(triangles[-1]), number))
+    return np.concatenate(triangles), np.concatenate(hole)

@@ -1,0 +1,1 @@
+"""Depth maps, and the signed distance field that they are fused into."""

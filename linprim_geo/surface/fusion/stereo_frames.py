@@ -1,0 +1,477 @@
+"""Depth maps for fusing out of seven sources: what stereo finds and its neighbours confirm, planes of regions without
+texture, the surface that spans gaps between these, floors and walls that enclose the scene, thin things that the
+primitives render before all these, things that are known by their outlines, and what the primitives render everywhere
+else, with the weight that its deviation from the first deserves.
+
+Of the surface that is fused from them, what stereo and planes of several views do not support is left out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from linprim_geo.base.progress import Progress
+from linprim_geo.capture.types import View
+from linprim_geo.geometry.mesh import Mesh, face_areas, face_components, select_faces
+from linprim_geo.points.initial_points import in_image
+from linprim_geo.stereo.depth_maps import SURE, DepthMap, depth_maps
+from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
+from linprim_geo.stereo.planes.common_surfaces import ON_IT
+from linprim_geo.stereo.planes.enclosing_planes import (
+    EnclosingPlane,
+    enclosing_depths,
+    enclosing_planes,
+    known_on_planes,
+    region_depths,
+)
+from linprim_geo.stereo.planes.framed_planes import along_frame
+from linprim_geo.stereo.planes.plain_regions import (
+    TOLERANCE,
+    PlainRegion,
+    common_planes,
+    edges_of,
+    grown_alike,
+    regions_of_views,
+)
+from linprim_geo.stereo.planes.point_planes import SurfacePoints, planes_of_points, point_plane_depth
+from linprim_geo.stereo.planes.region_planes import RegionDepths, beside_edges, region_plane_depths
+from linprim_geo.stereo.planes.room_corners import with_corner_walls
+from linprim_geo.stereo.planes.seen_through import KnownDepths
+from linprim_geo.stereo.planes.shaded_planes import ShadedPlanes
+from linprim_geo.stereo.visibility.lone_backgrounds import lone_backgrounds
+from linprim_geo.stereo.visibility.outlined_things import outlined_things
+from linprim_geo.stereo.visibility.textured_backgrounds import textured_backgrounds
+from linprim_geo.stereo.visibility.thin_things import SeenDepths, thin_things
+from linprim_geo.stereo.visibility.visibility_cut import plane_normals, points_per_view, spanned_depths
+from linprim_geo.surface.finish.small_holes import without_small_holes
+from linprim_geo.surface.fusion.tsdf_field import DepthFrame
+from linprim_geo.surface.mesh_views import MeshViews
+from linprim_geo.surface.single_view import mesh_is_closed
+
+# A depth that other views have, but that is not confirmed (`DepthMap.is_confirmed`), counts so much.
+DOUBTFUL_WEIGHT = 0.1
+# A piece of surface is supported if so many views have depths on this share of it. What is true has 0.3 to 0.9 of it
+# so, what is not 0.1 at most.
+SUPPORTING_VIEWS, SUPPORTED_SHARE = 2, 0.25
+# One of so many rows and columns is looked at to tell what a surface covers.
+SAMPLED = 4
+# So often planes are laid and depths in the air taken away. A third round changes hardly anything.
+ROUNDS = 2
+# Points of the rendered surface by which stereo finds pairs of views.
+POINTS = 20_000
+
+
+class MergedFrames(Sequence):
+    """The `rendered` frames of views, each with the depths of stereo up to `limit` where these are confirmed, and those
+    of planes where there is no texture.
+
+    `weight` is what rendered depths count elsewhere: the squared deviation of confirmed depths from those of their
+    neighbours over that of rendered ones from confirmed ones, 1 at most. `confirmed` is the share of pixels with
+    confirmed depths, before those in the air go, `doubtful` that of less probable ones, `flat` that of pixels on one of
+    the `planes` (K, 4), `spanned` that of pixels without texture between all these, `enclosed` that of pixels whose
+    rays end at a floor or wall because nothing else is known, or because what is doubtful is near it, `thin` that of
+    thin things before what is known, `outlined` that of things that are known by their outlines. `sharp` (H, W) bool of
+    every view says where rendered depths are those of a surface, and None everywhere: they stay where nothing is known,
+    and things of both kinds are among them.
+    """
+
+    def __init__(
+        self,
+        rendered: Sequence[DepthFrame],
+        views: Sequence[View],
+        limit: float,
+        *,
+        sharp: Iterable[np.ndarray] | None = None,
+        quiet: bool = True,
+    ):
+        self.limit = limit
+        maps = depth_maps(views, pairing_points(rendered), hiding=(frame.depth for frame in rendered), quiet=quiet)
+        progress = Progress("merging", 5, quiet=quiet)
+        progress.stage(0, "planes")
+        self.cameras = [found.camera for found in maps]
+        confirmed = [found.is_confirmed() for found in maps]
+        self.depths = [_depth_where(found, own) for found, own in zip(maps, confirmed, strict=True)]
+        self.doubtful_depths = [
+            _depth_where(found, ~own & (found.confirming > 0)) for found, own in zip(maps, confirmed, strict=True)
+        ]
+        measured = [_first_known(pair) for pair in zip(self.depths, self.doubtful_depths, strict=True)]
+        self.confirmed, self.doubtful = _share_known(self.depths), _share_known(self.doubtful_depths)
+        deviations = Deviations()
+        for found, depth, frame in zip(maps, self.depths, rendered, strict=True):
+            deviations.add(found, depth, frame)
+        self.weight = deviations.weight()
+        rendered_depths, free = map(
+            list, zip(*((frame.depth, _background_of(frame)) for frame in rendered), strict=True)
+        )
+        seen = list(self.depths)
+        masked = any(view.has_alpha for view in views)  # then masks say what is background
+        regions, backgrounds, plain_walls = self._take_planes(maps, rendered_depths, () if masked else free)
+        self.rendered = [_seen_past(*each) for each in zip(rendered, maps, backgrounds, strict=True)]
+        if plain_walls:
+            self._end_at(plain_walls)
+        progress.stage(1, "gaps between planes")
+        self.shown = [frame.depth[::SAMPLED, ::SAMPLED] > 0 for frame in self.rendered]
+        known = self._known()
+        points = self._points(maps, known)
+        self._span_gaps(maps, known, points, rendered_depths, backgrounds)
+        are_sharp = [depth > 0 for depth in rendered_depths] if sharp is None else list(sharp)
+        progress.stage(2, "floors and walls")
+        walls, planes = self._walls(maps, seen, points)
+        self._enclose(walls, known, are_sharp, regions, backgrounds)
+        # What stereo has measured on planes with points is not background where hardly any view looks.
+        self._end_at(known_on_planes(self.cameras, planes, measured))
+        progress.stage(3, "thin things")
+        self._keep_things(views, maps, rendered_depths, are_sharp)
+        progress.stage(4, "backgrounds")
+        if not masked:
+            self._end_backgrounds(maps)
+        progress.clear()
+
+    def _take_planes(
+        self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray], free: Sequence[np.ndarray]
+    ) -> tuple[list[list[PlainRegion]], list[np.ndarray], list[np.ndarray]]:
+        """Finds planes by points, by edges and by shading, of depths that are sure, and what lies on them; moves
+        confirmed depths to them. Planes by points are the most precise, but where another of a region's edges stands:
+        their points err beside edges. Planes by edges take the place of those by shading where they carry it as well,
+        else the nearer one hides the other. Confirmed depths beside edges of plain regions are doubtful where no plane
+        has them.
+
+        Returns the plain regions of every view, and (H, W) bool: those that are background by their shading, and those
+        with `free` (H, W) rays that are walls by it, if these are given.
+        """
+        sure = [_depth_where(found, found.is_confirmed(SURE)) for found in maps]
+        regions = regions_of_views(maps, sure)
+        by_points = planes_of_points(maps, sure)
+        every = [region for own in regions for region in own]
+        by_edges = along_frame(self.cameras, every, common_planes(self.cameras, every), by_points)
+        shaded = ShadedPlanes(maps, sure, rendered, by_points, by_edges)
+        self.planes, self.standing = shaded.planes[~shaded.hanging], shaded.standing[~shaded.hanging]
+        on_points = [point_plane_depth(found, own, by_points) for found, own in zip(maps, sure, strict=True)]
+        backgrounds = [shaded.is_background(view) for view in range(len(maps))]
+        self.on_planes: list[np.ndarray] = []
+        beside = [beside_edges(found.grey.shape, own) for found, own in zip(maps, regions, strict=True)]
+        # What is in the air beside a wall speaks against the wall's plane: when it is gone, more planes are laid.
+        for _ in range(ROUNDS):
+            along_edges = region_plane_depths(self.cameras, regions, shaded.planes, sure, self.depths)
+            along_edges = [found.without(taken) for found, taken in zip(along_edges, backgrounds, strict=True)]
+            by_shading = shaded.depth_maps(shaded.areas([found.number for found in along_edges]))
+            self._lay_planes(sure, on_points, by_shading, along_edges)
+            self._clear_air(beside, sure, on_points)
+        for view, found in enumerate(along_edges):
+            doubted = np.where(found.doubted, found.depth, np.float32(np.nan))
+            # Nothing but the edge was matched beside it, and what it is an edge of may be another surface.
+            lone = np.where(beside[view] & np.isnan(self.on_planes[view]), self.depths[view], np.float32(np.nan))
+            self.doubtful_depths[view] = _first_known((lone, self.doubtful_depths[view], doubted))
+            self.depths[view] = np.where(np.isfinite(lone), np.float32(np.nan), self.depths[view])
+        self.flat = _share_known(self.on_planes)
+        return regions, backgrounds, [shaded.is_wall(view, asked) for view, asked in enumerate(free)]
+
+    def _lay_planes(
+        self,
+        sure: Sequence[np.ndarray],
+        on_points: Sequence[np.ndarray],
+        by_shading: Sequence[np.ndarray],
+        along_edges: Sequence[RegionDepths],
+    ) -> None:
+        """Takes (H, W) depths on planes with points all over and those `by_shading`, NaN elsewhere, and those of plain
+        regions `along_edges`, and moves confirmed depths to them: `sure` ones to planes of regions as these say."""
+        self.on_planes = []
+        of_views = zip(sure, on_points, by_shading, along_edges, strict=True)
+        for view, (known, on_plane, shaded, region) in enumerate(of_views):
+            depth = self.depths[view]
+            other = np.abs(on_plane / region.depth - 1) > TOLERANCE
+            on_plane = np.where(region.stands & ~region.doubted & other, region.depth, on_plane)
+            laid = np.where(region.doubted, np.float32(np.nan), region.depth)
+            self.on_planes.append(_first_known((on_plane, np.fmin(laid, shaded))))
+            of_sure = _first_known((on_plane, np.where(region.moved, region.depth, np.float32(np.nan))))
+            target = np.where(np.isfinite(known), of_sure, self.on_planes[view])
+            self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(target), target, depth)
+
+    def _clear_air(self, beside: Sequence[np.ndarray], *others: Sequence[np.ndarray]) -> None:
+        """Takes depths that are in the air `beside` (H, W) edges of plain regions, by what is known, away from all that
+        there are, and from `others`."""
+        views = KnownDepths(self.cameras, self._known())
+        for depths in (self.depths, self.on_planes, self.doubtful_depths, *others):
+            views.clear(depths, beside)
+
+    def _known(self) -> list[np.ndarray]:
+        """(H, W) what is confirmed or on a plane, of every view."""
+        return [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
+
+    def _points(self, maps: Sequence[DepthMap], known: Sequence[np.ndarray]) -> SurfacePoints:
+        """Points of what is `known`, of every view as many."""
+        count, rng = points_per_view(self.cameras), np.random.default_rng(0)
+        points = []
+        for view, (found, depth) in enumerate(zip(maps, known, strict=True)):
+            confirmed = np.isfinite(self.depths[view])[..., None]
+            normal = np.where(confirmed, found.normal, plane_normals(found.camera, depth))
+            points.append(SurfacePoints.of_view(view, found.camera, depth, normal, count, rng))
+        return SurfacePoints.together(points)
+
+    def _span_gaps(
+        self,
+        maps: Sequence[DepthMap],
+        known: Sequence[np.ndarray],
+        points: SurfacePoints,
+        rendered: Sequence[np.ndarray],
+        backgrounds: Sequence[np.ndarray],
+    ) -> None:
+        """Adds depths of the surface that spans `points` of what is `known` to doubtful ones, but not in background,
+        and not at edges of photographs, where rendered ones are finer."""
+        spanned = spanned_depths(self.cameras, known, points, rendered)
+        for view, (found, depth, background) in enumerate(zip(maps, spanned, backgrounds, strict=True)):
+            depth[background | edges_of(found.grey, found.noise, found.most_noise)] = np.nan
+            self.doubtful_depths[view] = _first_known((self.doubtful_depths[view], depth))
+        self.spanned = _share_known(spanned)
+
+    def _walls(
+        self, maps: Sequence[DepthMap], seen: Sequence[np.ndarray], known: SurfacePoints
+    ) -> tuple[list[EnclosingPlane], list[EnclosingPlane]]:
+        """Planes that enclose what is `known`, with walls that meet at their corners, and without. What is `seen`
+        (H, W) tells which there are and where walls end: planes of plain regions reach to edges that may be others'."""
+        points = self._points(maps, seen)
+        planes = enclosing_planes(self.cameras, self.planes, points, self.standing, known)
+        return with_corner_walls(maps, seen, self._backgrounds(), planes, points), planes
+
+    def _enclose(
+        self,
+        walls: Sequence[EnclosingPlane],
+        known: Sequence[np.ndarray],
+        sharp: Sequence[np.ndarray],
+        regions: Sequence[Sequence[PlainRegion]],
+        backgrounds: Sequence[np.ndarray],
+    ) -> None:
+        """Adds depths of `walls` that enclose what is `known` to doubtful ones, where training has a depth that is not
+        `sharp` (H, W) or is near them, or in plain `regions` that lie on them, but not in background. Of doubtful
+        depths those stay that are before a wall by more than these may be off, but not in such regions."""
+        wanted, shown = [], []
+        for view, (frame, depth, background) in enumerate(zip(self.rendered, known, backgrounds, strict=True)):
+            wanted.append((frame.depth > 0) & ~(background | np.isfinite(depth)))
+            on_wall = region_depths(frame.camera, walls, depth, regions[view])
+            shown.append(np.where(sharp[view] & ~np.isfinite(on_wall), frame.depth, np.nan))
+            self.doubtful_depths[view] = _first_known((on_wall, self.doubtful_depths[view]))
+        enclosed = enclosing_depths(self.cameras, walls, known, wanted, shown, self.doubtful_depths)
+        enclosed = [
+            np.where(doubtful < (1 - ON_IT) * depth, np.nan, depth)
+            for doubtful, depth in zip(self.doubtful_depths, enclosed, strict=True)
+        ]
+        self.doubtful_depths = [_first_known(pair) for pair in zip(enclosed, self.doubtful_depths, strict=True)]
+        self.enclosed = _share_known(enclosed)
+
+    def _keep_things(
+        self,
+        views: Sequence[View],
+        maps: Sequence[DepthMap],
+        rendered: Sequence[np.ndarray],
+        sharp: Sequence[np.ndarray],
+    ) -> None:
+        """Takes rendered depths of thin things in place of those of the wall behind them, and those of things that are
+        known by their outlines, as if they were confirmed, but not where a depth that is says the same: it is finer."""
+        known = map(_first_known, zip(self.depths, self.on_planes, self.doubtful_depths, strict=True))
+        seen = [
+            SeenDepths(found.camera, view.load().rgb, found.noise, depth, is_sharp, behind)
+            for view, found, depth, is_sharp, behind in zip(views, maps, rendered, sharp, known, strict=True)
+        ]
+        thin, outlined = thin_things(seen), outlined_things(seen)
+        for view, thing in enumerate(map(np.logical_or, thin, outlined)):
+            thing &= ~(np.abs(rendered[view] / self.depths[view] - 1) < CONFIRMED_DEPTH)
+            self.depths[view] = np.where(thing, rendered[view], self.depths[view])
+            for others in (self.on_planes, self.doubtful_depths):
+                others[view] = np.where(thing, np.float32(np.nan), others[view])
+        self.thin, self.outlined = (float(np.mean([thing.mean() for thing in things])) for things in (thin, outlined))
+
+    def _end_backgrounds(self, maps: Sequence[DepthMap]) -> None:
+        """Lets rays end at confirmed surfaces that no other view looks past, and at those with texture."""
+        self._end_at(lone_backgrounds(self.cameras, self._backgrounds(), self.depths))
+        self._end_at(textured_backgrounds(maps, self._backgrounds(), self.depths))
+
+    def _backgrounds(self) -> list[np.ndarray]:
+        return [_background_of(frame) for frame in self.rendered]
+
+    def _end_at(self, surfaces: Sequence[np.ndarray]) -> None:
+        """Lets rays end in these pixels (H, W) of every view."""
+        self.rendered = [
+            frame if frame.background is None else replace(frame, background=frame.background & ~surface)
+            for frame, surface in zip(self.rendered, surfaces, strict=True)
+        ]
+
+    def covered(self, mesh: Mesh) -> float:
+        """Share of the pixels with a rendered depth whose rays hit a mesh, of one of SAMPLED rows and columns."""
+        caster, shown, hit = MeshViews(mesh.vertices, mesh.faces), 0, 0
+        for camera, sampled in zip(self.cameras, self.shown, strict=True):
+            row, column = (x * SAMPLED for x in np.nonzero(sampled))
+            shown += len(row)
+            hit += np.count_nonzero(caster.first_hits(camera)[1][row, column] >= 0)
+        return hit / max(shown, 1)
+
+    def about(self) -> dict:
+        """For the statistics."""
+        return {
+            "confirmed": self.confirmed,
+            "doubtful": self.doubtful,
+            "rendered_weight": self.weight,
+            "flat": self.flat,
+            "spanned": self.spanned,
+            "enclosed": self.enclosed,
+            "thin": self.thin,
+            "outlined": self.outlined,
+            "planes": len(self.planes),
+            "depth_limit": self.limit,
+        }
+
+    def __len__(self) -> int:
+        return len(self.rendered)
+
+    def __getitem__(self, index):
+        return self._merged(
+            self.rendered[index], self.doubtful_depths[index], self.on_planes[index], self.depths[index]
+        )
+
+    def __iter__(self) -> Iterator[DepthFrame]:
+        return map(self._merged, self.rendered, self.doubtful_depths, self.on_planes, self.depths)
+
+    def _merged(
+        self, frame: DepthFrame, doubtful: np.ndarray, on_plane: np.ndarray, confirmed: np.ndarray
+    ) -> DepthFrame:
+        depth, weight = frame.depth, np.full(frame.depth.shape, self.weight, np.float32)
+        known = np.zeros(depth.shape, bool)
+        for source, own_weight in ((doubtful, DOUBTFUL_WEIGHT), (on_plane, 1), (confirmed, 1)):
+            better = self._fused(frame, source)
+            depth, weight = np.where(better, source, depth), np.where(better, np.float32(own_weight), weight)
+            known |= better
+        clamped = None if frame.clamped is None else frame.clamped & ~known
+        return DepthFrame(
+            frame.camera,
+            depth.astype(np.float32),
+            background=frame.background,
+            confidence=weight,
+            clamped=clamped,
+        )
+
+    def _fused(self, frame: DepthFrame, source: np.ndarray) -> np.ndarray:
+        """(H, W) bool, where depths of a source are fused."""
+        known = source <= self.limit  # not where it is NaN
+        # Beside an outline the windows of stereo take the background for a part of what is in front of it.
+        return known if frame.background is None else known & ~frame.background
+
+    def supporting(self, points: np.ndarray, *, doubtful: bool = False) -> np.ndarray:
+        """(P,) how many views fuse a confirmed depth, or one on a plane, at these points of the world; or a `doubtful`
+        one, too."""
+        views = np.zeros(len(points), int)
+        for frame, *sources in zip(self.rendered, self.depths, self.on_planes, self.doubtful_depths, strict=True):
+            depth = _first_known(sources if doubtful else sources[:2])
+            depth = np.where(self._fused(frame, depth), depth, np.nan)
+            inside, row, column = in_image(frame.camera, points)
+            along = frame.camera.project(points)[1]
+            views += inside & (np.abs(depth[row, column] / along - 1) < CONFIRMED_DEPTH)
+        return views
+
+    def supported(self, mesh: Mesh, share: float, band: float) -> tuple[Mesh, float]:
+        """The mesh without what views do not support, and what share of its area is left out.
+
+        What stays has depths of SUPPORTING_VIEWS, even doubtful ones, within half the `band` in which depths vote:
+        elsewhere rendered depths alone say where a surface is, and without texture they do not know. A piece with less
+        than `share` of the largest one's area stays if SUPPORTED_SHARE of it has depths without doubt, and if it is
+        larger than the square of the `band`: noise of depths makes pieces as wide. A closed surface loses whole pieces
+        alone.
+        """
+        area = face_areas(mesh).sum()
+        views = self.supporting(mesh.vertices, doubtful=True)
+        left = mesh if mesh_is_closed(mesh) else _near(mesh, views >= SUPPORTING_VIEWS, band / 2)
+        left = self._supported_pieces(left, share, band**2)
+        return left, float(1 - face_areas(left).sum() / area) if area else 0.0
+
+    def without_small_holes(self, mesh: Mesh) -> tuple[Mesh, int]:
+        """The mesh with small holes closed that no view sees through, by what is confirmed or on a plane and by free
+        rays, and how many."""
+        return without_small_holes(mesh, self.cameras, self._known(), self._backgrounds())
+
+    def _supported_pieces(self, mesh: Mesh, share: float, least_area: float) -> Mesh:
+        count, label = face_components(mesh)
+        area = face_areas(mesh)
+        of_piece = np.bincount(label, weights=area, minlength=count)
+        keep = of_piece >= share * of_piece.max(initial=0)
+        rows = np.flatnonzero((~keep & (of_piece >= least_area))[label])
+        corners, faces = np.unique(mesh.faces[rows], return_inverse=True)
+        supported = (self.supporting(mesh.vertices[corners]) >= SUPPORTING_VIEWS)[faces.reshape(-1, 3)].mean(1)
+        of_supported = np.bincount(label[rows], weights=area[rows] * supported, minlength=count)
+        return select_faces(mesh, (keep | (of_supported > SUPPORTED_SHARE * of_piece))[label])
+
+
+def _near(mesh: Mesh, supported: np.ndarray, reach: float) -> Mesh:
+    """Faces with a vertex that is no farther than `reach` from one of those (V,) that are `supported`."""
+    from scipy.spatial import cKDTree
+
+    if not supported.any():
+        return select_faces(mesh, np.zeros(len(mesh.faces), bool))
+    distance = cKDTree(mesh.vertices[supported]).query(mesh.vertices[~supported], distance_upper_bound=reach)[0]
+    near = supported.copy()
+    near[~supported] = np.isfinite(distance)
+    return select_faces(mesh, near[mesh.faces].any(1))
+
+
+def pairing_points(rendered: Sequence[DepthFrame]) -> np.ndarray:
+    """(P, 3) points of rendered surfaces by which stereo finds pairs of views, about POINTS evenly over the frames."""
+    surfaces = (frame.surface()[0] for frame in rendered)
+    return np.concatenate([points[:: max(1, len(points) // max(1, POINTS // len(rendered)))] for points in surfaces])
+
+
+def _seen_past(frame: DepthFrame, found: DepthMap, background: np.ndarray) -> DepthFrame:
+    """The frame with rays that are free where (H, W) regions are `background`, and beside these where pixels are of
+    their grey: training fills a plain sky with fog."""
+    if frame.background is None or not background.any():
+        return frame
+    background = grown_alike(background, found.grey, edges_of(found.grey, found.noise, found.most_noise))
+    return replace(
+        frame,
+        depth=np.where(background, np.float32(0), frame.depth),
+        background=frame.background | background,
+        clamped=None if frame.clamped is None else frame.clamped & ~background,
+    )
+
+
+def _background_of(frame: DepthFrame) -> np.ndarray:
+    """(H, W) bool."""
+    return np.zeros(frame.depth.shape, bool) if frame.background is None else frame.background
+
+
+def _depth_where(found: DepthMap, taken: np.ndarray) -> np.ndarray:
+    """(H, W) depth, NaN elsewhere."""
+    return np.where(taken, found.depth, np.float32(np.nan))
+
+
+def _first_known(depths: Sequence[np.ndarray]) -> np.ndarray:
+    """(H, W) the first of several depths that is not NaN."""
+    result = depths[0]
+    for depth in depths[1:]:
+        result = np.where(np.isfinite(result), result, depth)
+    return result
+
+
+def _share_known(depths: Sequence[np.ndarray]) -> float:
+    return float(np.mean([np.isfinite(depth).mean() for depth in depths]))
+
+
+class Deviations:
+    """How far confirmed depths are from those of their neighbours, and rendered ones from confirmed ones, as shares of
+    the depth."""
+
+    def __init__(self) -> None:
+        self.stereo, self.rendered = [np.zeros(0, np.float32)], [np.zeros(0, np.float32)]
+
+    def add(self, found: DepthMap, depth: np.ndarray, frame: DepthFrame) -> None:
+        """Those of a view, whose confirmed `depth` is NaN elsewhere."""
+        both = np.isfinite(depth) & (frame.depth > 0)
+        self.stereo.append(found.deviation[both])
+        self.rendered.append(np.abs(frame.depth[both] / depth[both] - 1))
+
+    def weight(self) -> float:
+        """See `MergedFrames`."""
+        stereo, rendered = np.concatenate(self.stereo), np.concatenate(self.rendered)
+        if not len(stereo):
+            return 1.0
+        # A difference of two depths of the same accuracy is larger than the error of one by sqrt(2).
+        ratio = np.median(stereo) / np.sqrt(2) / max(float(np.median(rendered)), 1e-15)
+        return float(min(1.0, ratio**2))

@@ -1,0 +1,173 @@
+"""Depth maps to a mesh: the steps of fusing them into a signed distance field, and its voxel size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.memory import available_memory
+from linprim_geo.geometry.mesh import Mesh, remove_small_components, select_faces
+from linprim_geo.surface.fusion.tsdf_field import BEHIND_VOXELS, DepthFrame, vote_rules
+from linprim_geo.surface.fusion.voxel_blocks import Lattice, TooFine, estimate_memory, find_blocks
+from linprim_geo.surface.fusion.voxel_levels import COARSE, VoxelLevels
+from linprim_geo.surface.normals import vertex_normals
+
+MOST_FACES, CELLS_PER_AREA, AREA_CELLS = 1e6, 1.5, 64
+"""Without a voxel size given a mesh has about so many faces at most. A plane crosses so many cubes per area of a side
+of one, in the mean over its directions, and marching cubes makes two faces in each. The area is measured with so many
+cubes along the diagonal."""
+
+
+def fuse_tsdf(
+    frames: Iterable[DepthFrame],
+    *,
+    voxel_size: float,
+    truncation_voxels: float = 3.0,
+    bounds: np.ndarray | None = None,
+    memory_limit: int | None = None,
+    block_resolution: int = 4,
+    min_component: float = 1e-3,
+    behind_voxels: float = BEHIND_VOXELS,
+    occluded_vote: float = 0.0,
+    log: Callable[[str], None] | None = None,
+    fuse: Callable[[Lattice, Iterable[DepthFrame]], Mesh] | None = None,
+    counts: Callable[[Mesh], Mesh] | None = None,
+) -> Mesh:
+    """Fuses depth maps into a triangle mesh with normals.
+
+    `frames` is iterated several times (blocks, field, sizes of voxels), so it must be re-iterable; a
+    sequence that renders on demand keeps only one frame in memory. Blocks around every depth sample are
+    allocated, then every frame votes in all blocks inside its frustum, so background and far depths carve
+    what other views put there. The mesh is oriented with its front towards the cameras. The same input gives
+    the same mesh to the last bit, whatever the number of threads.
+
+    Args:
+        voxel_size: edge of a voxel, in scene units.
+        truncation_voxels: reach of the field on both sides of a surface; below 2 the surface gets holes,
+            above 4 thin parts swell.
+        bounds: (2, 3) box; samples and faces outside are dropped.
+        memory_limit: bytes the field may take; default 60 % of what is available.
+        block_resolution: voxels along the edge of a block.
+        min_component: pieces with less than this share of the largest piece's area are dropped; 0 keeps all.
+        behind_voxels: see `tsdf_field.BEHIND_VOXELS`; 1.5 makes a sheet without thickness a closed shell, at the
+            price of swollen thin parts.
+        occluded_vote: weight of a vote "inside" from every view in which a voxel lies further behind the
+            surface than the truncation; 0.01 to 0.02 closes tunnels that too deep pixels dig into solids.
+        log: called with lines such as the memory that will be taken.
+        fuse: makes the surface of a lattice in place of `fuse_lattice`; then `memory_limit` is its own affair.
+        counts: with it voxels have several sizes: twice `voxel_size` where the surface is flat, smaller ones where it
+            bends, see `voxel_levels`. Gives what counts of the surface that voxels of the first size make.
+
+    Returns:
+        The mesh in the frame of the cameras.
+    Raises:
+        LinprimError: no frame has a depth, the field would not fit in memory (TooFine), or nothing comes out.
+    Accuracy: Chamfer of 60 exact depth maps of 320x320 with a voxel of 1/200 of the diagonal, against what
+        `VoxelBlockGrid.integrate` makes of them, in % of the diagonal: smooth body 0.003 (0.045), part with
+        thin ribs and sharp edges 0.015 (0.046); a room, 80 maps of 400x300: 0.031 (0.050).
+    """
+    if iter(frames) is frames:
+        raise TypeError("frames can be iterated only once, but fusing goes over them several times")
+    _check_options(voxel_size, truncation_voxels, block_resolution, bounds)
+    bounds = None if bounds is None else np.asarray(bounds, dtype=np.float64)
+    limit = memory_limit or int(0.6 * available_memory())
+    say = log or (lambda line: None)
+
+    allowed, make = limit if fuse is None else np.inf, fuse or fuse_lattice
+
+    first_size = voxel_size if counts is None else COARSE * voxel_size
+    try:
+        found = find_blocks(frames, first_size, truncation_voxels, bounds, block_resolution, allowed)
+    except TooFine as error:
+        raise TooFine(str(error), error.fits * voxel_size / first_size) from None
+    blocks, origin, largest = found
+    rules = vote_rules(truncation_voxels, behind_voxels, occluded_vote)
+    levels = np.zeros(len(blocks), dtype=np.int64)
+    lattice = Lattice(blocks, levels, levels, origin, first_size, block_resolution, truncation_voxels, rules)
+    surface = make(lattice, frames)
+    if counts is not None:
+        coarse, sizes = surface, VoxelLevels(lattice, counts(surface), frames, MOST_FACES, allowed)
+        if sizes.lattice is not lattice:
+            surface = make(sizes.lattice, frames)
+            if sizes.mend(coarse, surface):
+                surface = make(sizes.lattice, frames)
+            lattice = sizes.lattice
+    need, voxels = estimate_memory(len(lattice.blocks), block_resolution, largest), lattice.voxel_sizes()
+    say(
+        f"fusing: {len(lattice.blocks)} blocks of {block_resolution}^3 voxels of "
+        f"{' to '.join(f'{size:.4g}' for size in dict.fromkeys((voxels.min(), voxels.max())))}, "
+        f"{need / 2**20:.0f} MiB of {limit / 2**20:.0f} MiB"
+    )
+    mesh = _trimmed(surface, bounds, min_component)
+    if len(mesh.faces) == 0:
+        raise LinprimError(
+            f"fusing {len(lattice.blocks)} blocks at voxel size {voxel_size:.4g} gave no surface: the views' "
+            "depths disagree by more than the truncation, or all of it lies outside the bounds; "
+            "try a larger voxel size"
+        )
+    return replace(mesh, normals=vertex_normals(mesh))
+
+
+def fuse_lattice(lattice: Lattice, frames: Iterable[DepthFrame]) -> Mesh:
+    """The surface of all frames on a lattice."""
+    grid = lattice.grid()
+    for frame in frames:
+        grid.integrate(frame, lattice.rules)
+    return grid.extract()
+
+
+def auto_voxel_size(frames: Iterable[DepthFrame]) -> float:
+    """A voxel size that the views can support: their median pixel footprint; larger where the surface would have more
+    than MOST_FACES faces, at most 1/100 of the diagonal.
+
+    The diagonal is that of the box between the 1 and 99 % quantiles of the depth samples, widened by the share that
+    quantiles cut off a uniform distribution. Rounded to two digits.
+
+    Raises:
+        LinprimError: no frame has a depth.
+    """
+    footprints, samples = [], []
+    for frame in frames:
+        points, depth = frame.surface()
+        if len(depth) == 0:
+            continue
+        camera = frame.camera
+        footprints.append(np.median(depth) / np.sqrt(camera.fx * camera.fy))
+        samples.append(points[:: max(1, len(points) // 4096)])
+    if not samples:
+        raise LinprimError("no depth map holds a surface, so no voxel size can be chosen")
+    points = np.concatenate(samples)
+    low, high = np.quantile(points, [0.01, 0.99], axis=0)
+    diagonal = float(np.linalg.norm(high - low)) / 0.98
+    finest = np.sqrt(2 * CELLS_PER_AREA * _area(points, diagonal / AREA_CELLS) / MOST_FACES)
+    size = float(min(max(np.median(footprints), finest), diagonal / 100))
+    return float(f"{size:.2g}")
+
+
+def _area(points: np.ndarray, cell: float) -> float:
+    """Area of a surface that (P, 3) points lie densely on, by how many cubes they are in."""
+    cells = np.unique(np.floor(points / cell).astype(np.int64), axis=0)
+    return len(cells) * cell * cell / CELLS_PER_AREA
+
+
+def _trimmed(mesh: Mesh, bounds: np.ndarray | None, min_component: float) -> Mesh:
+    if bounds is not None and len(mesh.faces):
+        centers = mesh.vertices[mesh.faces].mean(1)
+        mesh = select_faces(mesh, ((centers >= bounds[0]) & (centers <= bounds[1])).all(1))
+    return remove_small_components(mesh, min_component)
+
+
+def _check_options(voxel_size, truncation_voxels, block_resolution, bounds):
+    if not (np.isfinite(voxel_size) and voxel_size > 0):
+        raise LinprimError(f"voxel size is {voxel_size}, wanted a positive length in scene units")
+    if not 1.0 <= truncation_voxels <= 32.0:
+        raise LinprimError(f"truncation is {truncation_voxels} voxels, wanted 1 to 32")
+    if not 2 <= block_resolution <= 32:
+        raise LinprimError(f"block resolution is {block_resolution}, wanted 2 to 32 voxels")
+    if bounds is not None:
+        box = np.asarray(bounds, dtype=np.float64)
+        if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
+            raise LinprimError(f"bounds are {box.tolist()}, wanted [low, high] corners of a box")

@@ -1,0 +1,1 @@
+"""The surface of a run by one of three methods."""

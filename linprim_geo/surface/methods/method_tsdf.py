@@ -1,0 +1,452 @@
+"""The surface of a run by fusing depth maps: depth of the training views at a transmittance level, into a signed
+distance field."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.memory import PROCESS_GIB, available_memory
+from linprim_geo.base.options import ExtractOptions
+from linprim_geo.base.progress import Stages
+from linprim_geo.capture.small_copy import SmallCopy
+from linprim_geo.capture.types import View
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.mesh import Mesh
+from linprim_geo.geometry.region import read_box
+from linprim_geo.runs.run import Run
+from linprim_geo.stereo.depth_maps import MEMORY_SHARE, memory_of
+from linprim_geo.stereo.visibility.visibility_cut import RENDERED_MARGIN
+from linprim_geo.surface.finish.photo_consistency import best_agreement, photo_gains
+from linprim_geo.surface.fusion.depth_error import error_by_depths, largest_error
+from linprim_geo.surface.fusion.stereo_frames import MergedFrames
+from linprim_geo.surface.fusion.tsdf_field import DepthFrame
+from linprim_geo.surface.fusion.tsdf_fusion import auto_voxel_size, fuse_tsdf
+from linprim_geo.surface.fusion.voxel_blocks import TooFine, estimate_memory
+from linprim_geo.surface.fusion.voxel_levels import COARSE
+
+# A ray with less opacity than this has seen through the scene: it votes for free space.
+SEEN_THROUGH = 0.5
+# Depth, background and whether it is clamped, of a pixel; frames of more than this in all are not kept.
+BYTES_PER_PIXEL, KEPT_BYTES = 6, 2**30
+# How often voxels are made larger until they fit into memory; once, but for what is only known when all is fused.
+TRIES = 4
+
+LEAST_CONFIRMED = 0.01
+"""Stereo that confirms less than this share of the pixels has nothing to say of a scene."""
+
+MOST_PIXELS = 0.5
+"""A surface of stereo that shows in this share of the pixels with a rendered depth is taken."""
+
+CLEARLY_LESS = 0.01
+"""Where one shows in fewer, and photographs agree at a share of its vertices that is smaller by this, they speak
+against it. Where they agree anywhere, as on plain walls, the shares are the same but for chance."""
+
+ENOUGH_AGREE = 0.95
+"""Objects with masks have no stereo where photographs agree at this share of the vertices without it: masks say where
+an object ends better than windows do (DECISIONS 76)."""
+
+SHARP_LEVELS = (0.9, 0.3)
+"""A rendered depth is sharp if the transmittance falls from the first to the second within RENDERED_MARGIN of it. A
+surface takes 0.3 to 4 % of its depth, what training makes of a wall that nothing tells it about 5 to 50 %."""
+
+SMALLEST_SIDE = 120
+"""Photographs are not averaged down to fewer pixels along the longer side for stereo."""
+
+SMALLEST_DISPARITY = 0.25
+"""Depths are trusted as far as this many pixels between the two cameras that are furthest apart move a point by a
+truncation."""
+
+SAMPLED = 2
+"""One of so many rows and columns of a depth map is looked at to choose the limit."""
+
+NEAREST_LIMIT = 4.0
+"""And at least this many median depths: cameras that are close together fuse what they see all the same."""
+
+FAR_TRIES = 5
+"""So many limits are tried, from the farthest that stereo tells to that of rendered depths."""
+
+
+ByStereo = Callable[[], tuple[Mesh | None, dict]]
+"""Gives the surface of stereo, see `_surface_of_stereo`."""
+
+
+def tsdf_surface(
+    run: Run,
+    options: ExtractOptions,
+    stages: Stages,
+    frames: DepthFrames | None = None,
+    fuse: Callable | None = None,
+    merged: MergedFrames | None = None,
+) -> tuple[Mesh, dict]:
+    """Returns the fused mesh and `level`, `voxel_size` and `truncation_voxels` for the statistics. With stereo it has a
+    `quality`, see `error_by_depths`.
+
+    `frames` of the same level, and what is `merged` of them and stereo, are taken in place of new ones if there are any
+    already. `fuse`: see `fuse_tsdf`.
+
+    Raises:
+        LinprimError: no ray crosses the level, or the grid would not fit into memory, with voxels of the size that is
+            given or any size.
+    """
+    whole = run.scene().train
+    most = kept_bytes(options, [view.camera for view in whole])
+    shrunk = frames is None and (factor := stereo_factor(run, options)) > 1
+    if shrunk:
+        stages.note(f"stereo of means of {factor} by {factor} pixels, for which there is memory")
+    if frames is None:
+        views = [SmallCopy.of(view, factor) for view in whole] if shrunk else whole
+        frames = DepthFrames(run, float(options.level), options.depth_limit, most=most, views=views)
+    about: dict = {}
+    if not any((frame.depth > 0).any() for frame in frames):
+        raise LinprimError(
+            f"{run.path}: no ray of any training view crosses transmittance {options.level}, so there is no surface"
+        )
+    stages.lap("render")
+    if frames.clamped_share:
+        stages.note(
+            f"{frames.clamped_share:.1%} of the depths lie beyond {frames.limit:.4g} and only clear the space before it"
+        )
+    voxel = options.voxel_size if options.voxel_size > 0 else auto_voxel_size(frames)
+    memory = memory_left(options, frames.bytes)
+
+    def fused(source: Sequence[DepthFrame], smallest_part: float, supported: Callable[[Mesh], Mesh]) -> Mesh:
+        nonlocal voxel
+        for left in reversed(range(TRIES)):
+            try:
+                return fuse_tsdf(
+                    source,
+                    voxel_size=voxel,
+                    truncation_voxels=options.truncation,
+                    bounds=read_box(options.box),
+                    memory_limit=memory,
+                    min_component=smallest_part,
+                    log=stages.note,
+                    fuse=fuse,
+                    counts=None if options.voxel_size > 0 else supported,
+                )
+            except TooFine as error:
+                if options.voxel_size > 0 or not left:
+                    raise
+                stages.note(f"voxels of {voxel:.4g} would not fit into memory: {error.fits:.4g} in their place")
+                voxel = error.fits
+        raise AssertionError  # the last try has raised
+
+    def rendered() -> Mesh:
+        nonlocal frames, voxel, memory
+        if shrunk:  # whole photographs are rendered finer
+            frames = DepthFrames(run, float(options.level), options.depth_limit, most=most)
+            voxel = options.voxel_size if options.voxel_size > 0 else auto_voxel_size(frames)
+            memory = memory_left(options, frames.bytes)
+        surface = fused(frames, options.smallest_part, lambda surface: surface)
+        stages.lap("fuse")
+        return surface
+
+    def fused_with_stereo(merged: MergedFrames) -> tuple[Mesh, dict]:
+        def supported(surface: Mesh) -> tuple[Mesh, float]:
+            return merged.supported(surface, options.smallest_part, 2 * options.truncation * voxel)
+
+        mesh, left_out = supported(fused(merged, 0, lambda surface: supported(surface)[0]))
+        mesh, holes = merged.without_small_holes(mesh) if options.close_holes == "auto" else (mesh, 0)
+        reach = options.truncation * voxel
+        mesh = replace(mesh, quality=error_by_depths(mesh, merged, reach))
+        return mesh, merged.about() | {
+            "unsupported": left_out,
+            "holes_closed": holes,
+            "largest_error": largest_error(reach),
+        }
+
+    def with_stereo() -> MergedFrames:
+        if merged is not None:
+            return merged
+        return with_far_depths(frames, options, voxel).merged(quiet=stages.progress.quiet)
+
+    by_stereo = partial(_surface_of_stereo, fused_with_stereo, with_stereo, stages)
+    if options.stereo == "on":
+        found = with_stereo()
+        stages.lap("stereo")
+        mesh, about = fused_with_stereo(found)
+        if not len(mesh.faces):
+            raise LinprimError(f"{run.path}: no two photographs support any surface; use --stereo auto or off")
+        about |= {"taken": True}
+        stages.lap("fuse")
+    elif options.stereo == "auto" and run.scene().has_alpha:
+        if memory_of([view.camera for view in whole]) <= stereo_room(options):
+            mesh, about = _better_for_object(rendered, by_stereo, whole, stages)
+        else:
+            stages.note("no stereo: there is no memory for it")
+            mesh = rendered()
+    elif options.stereo == "auto":
+        mesh, about = _better_by_stereo(rendered, by_stereo, whole, frames.views is not whole, stages)
+    else:
+        mesh = rendered()
+    limit = about["depth_limit"] if about.get("taken") else frames.limit
+    if about:
+        stages.note(
+            f"stereo: {about['confirmed']:.0%} of the pixels have a depth that other views confirm, "
+            f"{about['flat']:.0%} lie on one of {about['planes']} planes; elsewhere rendered depths "
+            f"count {about['rendered_weight']:.2g}"
+        )
+        if about["taken"] and about["unsupported"]:
+            stages.note(f"left out: {about['unsupported']:.1%} of the surface, which no two photographs support")
+        if about["taken"] and about["holes_closed"]:
+            stages.note(f"closed: {about['holes_closed']} small holes that no photograph sees through")
+        about = {"stereo": about}
+    return mesh, {
+        "level": options.level,
+        "voxel_size": voxel,
+        "truncation_voxels": options.truncation,
+        "depth_limit": limit,
+        **about,
+    }
+
+
+def _better_by_stereo(
+    rendered: Callable[[], Mesh], by_stereo: ByStereo, views: Sequence[View], small: bool, stages: Stages
+) -> tuple[Mesh, dict]:
+    """The surface of stereo, or the `rendered` one where there is hardly any stereo, or where the surface of stereo is
+    missing in most pixels and photographs of `views` agree at clearly more of the rendered one's vertices; with what
+    there is to say of it. Stereo of `small` photographs is taken in any case: within pixels as large as theirs
+    photographs agree with walls of fog."""
+    mesh, about = by_stereo()
+    if mesh is None:
+        return rendered(), about
+    said = f"the surface of stereo shows in {about['covered']:.0%} of the pixels with a rendered depth"
+    if about["covered"] >= MOST_PIXELS:
+        stages.note(f"{said}: it is taken")
+        return mesh, about | {"taken": True}
+    if small:
+        stages.note(f"{said}, and is taken, as photographs of this size do not compare surfaces")
+        return mesh, about | {"taken": True}
+    stages.note(said)
+    without_stereo = rendered()
+    vote = Vote(without_stereo, views)
+    about |= vote.on(mesh, vote.without - CLEARLY_LESS, stages)
+    return mesh if about["taken"] else without_stereo, about
+
+
+def _better_for_object(
+    rendered: Callable[[], Mesh], by_stereo: ByStereo, views: Sequence[View], stages: Stages
+) -> tuple[Mesh, dict]:
+    """The `rendered` surface of an object with masks, unless photographs of `views` agree at few of its vertices, and
+    at more of those of stereo's; with what there is to say of it."""
+    without_stereo = rendered()
+    vote = Vote(without_stereo, views)
+    stages.lap("compare")
+    if vote.without >= ENOUGH_AGREE:
+        stages.note(f"no stereo: photographs agree at {vote.without:.1%} of the vertices without it")
+        return without_stereo, {}
+    mesh, about = by_stereo()
+    if mesh is None:
+        return without_stereo, about
+    about |= vote.on(mesh, vote.without, stages)
+    return mesh if about["taken"] else without_stereo, about
+
+
+def _surface_of_stereo(
+    fused: Callable[[MergedFrames], tuple[Mesh, dict]],
+    with_stereo: Callable[[], MergedFrames],
+    stages: Stages,
+) -> tuple[Mesh | None, dict]:
+    """The surface of stereo, None where there is hardly any, and what there is to say of it."""
+    try:
+        merged = with_stereo()
+    except LinprimError as error:
+        stages.note(f"no stereo: {error}")
+        return None, {}
+    stages.lap("stereo")
+    if merged.confirmed < LEAST_CONFIRMED:
+        return None, merged.about() | {"taken": False}
+    mesh, about = fused(merged)
+    stages.lap("fuse")
+    if not len(mesh.faces):
+        return None, about | {"taken": False}
+    return mesh, about | {"covered": merged.covered(mesh)}
+
+
+class Vote:
+    """Photographs between the surface without stereo and that with it. `without`: at what share of the vertices of the
+    first they agree; differences of their exposure are those that it tells."""
+
+    def __init__(self, without_stereo: Mesh, views: Sequence[View]):
+        self.views = views
+        self.gains = photo_gains(without_stereo, [view.camera for view in views], (view.load() for view in views))
+        self.without = _agreeing(without_stereo, views, self.gains)
+
+    def on(self, mesh: Mesh, least: float, stages: Stages) -> dict:
+        """For the statistics: whether stereo's surface is taken, as photographs agree at a share of its vertices above
+        `least`, and both shares."""
+        agreeing = _agreeing(mesh, self.views, self.gains)
+        stages.lap("compare")
+        taken = agreeing > least
+        stages.note(
+            f"photographs agree at {self.without:.1%} of the vertices without stereo and at {agreeing:.1%} with it: it "
+            f"is{'' if taken else ' not'} taken"
+        )
+        return {"taken": taken, "agreeing": agreeing, "agreeing_without": self.without}
+
+
+def _agreeing(mesh: Mesh, views: Sequence[View], gains: np.ndarray) -> float:
+    """Share of the vertices that two photographs see at which these agree best within reach of the surface: where
+    something is missing or stands too far out, they do so beyond it. `gains`: see `best_agreement`."""
+    found = best_agreement(mesh, [view.camera for view in views], (view.load() for view in views), gains)
+    return float(found.inside[found.seen_by_two].mean()) if found.seen_by_two.any() else 0.0
+
+
+def stereo_room(options: ExtractOptions) -> float:
+    """Bytes that depth maps of stereo may take: half of the memory that is free, and of what --memory-limit leaves."""
+    return MEMORY_SHARE * min(available_memory(), memory_left(options) or np.inf)
+
+
+def stereo_factor(run: Run, options: ExtractOptions) -> int:
+    """The least K with which stereo of means of K by K pixels fits into `stereo_room`, with SMALLEST_SIDE pixels at
+    least; 1 where none fits, and for objects with masks, whose rendered surface wants whole photographs."""
+    if options.stereo == "off" or (options.stereo == "auto" and run.scene().has_alpha):
+        return 1
+    cameras = [view.camera for view in run.scene().train]
+    room = stereo_room(options)
+    largest = min(max(camera.width, camera.height) for camera in cameras) // SMALLEST_SIDE
+    fitting = (k for k in range(1, largest + 1) if memory_of(cameras) <= room * k**2)
+    return next(fitting, 1)
+
+
+def memory_left(options: ExtractOptions, taken: int = 0) -> int | None:
+    """Bytes of --memory-limit that are left beside what this process takes in any case and `taken` bytes; None without
+    a limit.
+
+    Raises:
+        LinprimError: none are.
+    """
+    if options.memory_limit <= 0:
+        return None
+    left = int((options.memory_limit - PROCESS_GIB) * 2**30) - taken
+    if left <= 0:
+        least = PROCESS_GIB + taken / 2**30
+        raise LinprimError(f"--memory-limit is {options.memory_limit:g} GiB, wanted more than {least:.2g} GiB")
+    return left
+
+
+def kept_bytes(options: ExtractOptions, cameras: Sequence[Camera]) -> int:
+    """Bytes that depth maps may take which stay in memory: KEPT_BYTES, or if that is less a quarter of what the process
+    and a depth map at work leave of --memory-limit."""
+    if options.memory_limit <= 0:
+        return KEPT_BYTES
+    largest = max((camera.width * camera.height for camera in cameras), default=0)
+    left = (options.memory_limit - PROCESS_GIB) * 2**30 - estimate_memory(0, frame_pixels=largest)
+    return int(min(max(left / 4, 0), KEPT_BYTES))
+
+
+class DepthFrames(Sequence):
+    """`tsdf_field.DepthFrame`s of the training views, or of `views`: depth at transmittance `level`, free background.
+
+    Depths beyond `limit` are clamped to it; 0 chooses one by `depth_limit`. `clamped_share` is their share. Frames are
+    kept in memory if they take at most `most` bytes in all (default KEPT_BYTES), else, and without `keep`, rendered
+    whenever they are asked for.
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        level: float,
+        limit: float = 0.0,
+        keep: bool = True,
+        most: int | None = None,
+        views: Sequence[View] | None = None,
+    ):
+        self.run, self.level, self.limit, self.clamped_share = run, level, limit or np.inf, 0.0
+        self.views = run.scene().train if views is None else views
+        most = KEPT_BYTES if most is None else most
+        keep = keep and sum(view.camera.width * view.camera.height * BYTES_PER_PIXEL for view in self.views) <= most
+        self.kept, sample = [], [np.zeros(0, np.float32)]
+        for frame in self._render(self.views) if keep or not limit else ():
+            sample.append(frame.depth[::SAMPLED, ::SAMPLED].ravel())
+            if keep:
+                self.kept.append(frame)
+        depths = np.concatenate(sample)
+        depths = depths[depths > 0]
+        if len(depths):
+            self.limit = limit or depth_limit([view.camera for view in self.views], float(np.median(depths)))
+            self.clamped_share = float((depths > self.limit).mean())
+
+    @property
+    def bytes(self) -> int:
+        """Memory that the kept frames take."""
+        return sum(frame.depth.size for frame in self.kept) * BYTES_PER_PIXEL
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __getitem__(self, index):
+        return self._clamp(self.kept[index] if self.kept else next(self._render([self.views[index]])))
+
+    def __iter__(self):
+        return map(self._clamp, self.kept or self._render(self.views))
+
+    def up_to(self, limit: float) -> DepthFrames:
+        """The same with depths up to another limit; `clamped_share` stays as it is."""
+        frames = copy.copy(self)
+        frames.limit = limit
+        return frames
+
+    def merged(self, *, quiet: bool = True) -> MergedFrames:
+        """These frames with the depths of stereo."""
+        return MergedFrames(self, self.views, self.limit, sharp=self.sharp(), quiet=quiet)
+
+    def sharp(self) -> Iterator[np.ndarray]:
+        """(H, W) bool of every view, which depths are those of a surface, and not of fog: see SHARP_LEVELS."""
+        first, last = (self.run.surface_depths(self.views, level) for level in SHARP_LEVELS)
+        for (_, begin, _), (_, end, _) in zip(first, last, strict=True):
+            yield (begin > 0) & (end > 0) & (end - begin <= RENDERED_MARGIN * begin)
+
+    def _render(self, views):
+        for view, depth, opacity in self.run.surface_depths(views, self.level):
+            free = opacity < SEEN_THROUGH
+            yield DepthFrame(view.camera, np.where(free, np.float32(0), depth), background=free)
+
+    def _clamp(self, frame: DepthFrame) -> DepthFrame:
+        too_far = frame.depth > self.limit
+        if not too_far.any():
+            return frame
+        return replace(frame, depth=np.where(too_far, np.float32(self.limit), frame.depth), clamped=too_far)
+
+
+def with_far_depths(frames: DepthFrames, options: ExtractOptions, voxel: float) -> DepthFrames:
+    """The frames as far as disparity tells depths within the truncation of the largest voxels, those of what is flat;
+    less far where such voxels would give the surface more than half of the faces that it may have.
+
+    Frames stay as they are with a limit, or a size of voxels, that is asked for."""
+    limit = _told_by_disparity([view.camera for view in frames.views], options.truncation * COARSE * voxel)
+    if options.depth_limit > 0 or options.voxel_size > 0 or limit <= frames.limit:
+        return frames
+    tries = FAR_TRIES if frames.kept else 1  # else each try renders all of them
+    for farther in np.geomspace(limit, frames.limit, tries, endpoint=False):
+        far = frames.up_to(float(farther))
+        if auto_voxel_size(far) <= COARSE * np.sqrt(0.5) * voxel:
+            return far
+    return frames
+
+
+def depth_limit(cameras: Sequence[Camera], median: float, truncation: float = 3.0) -> float:
+    """How far rendered depths are worth fusing, from the median depth that the cameras see, in their unit: at least
+    NEAREST_LIMIT times that, and as far as disparity tells them with voxels as large as the median's pixel."""
+    pixel = median / _focal_length(cameras)
+    return max(NEAREST_LIMIT * median, _told_by_disparity(cameras, truncation * pixel))
+
+
+def _told_by_disparity(cameras: Sequence[Camera], reach: float) -> float:
+    """The depth beyond which SMALLEST_DISPARITY moves a point by more than `reach`.
+
+    A disparity of d pixels between cameras that are b apart moves a point at depth z by d z^2 / (b f), a derivative of
+    z = b f / d."""
+    centers = np.array([camera.center for camera in cameras])
+    baseline = float(np.linalg.norm(np.ptp(centers, axis=0)))
+    return float(np.sqrt(reach * baseline * _focal_length(cameras) / SMALLEST_DISPARITY))
+
+
+def _focal_length(cameras: Sequence[Camera]) -> float:
+    return float(np.median([np.sqrt(camera.fx * camera.fy) for camera in cameras]))

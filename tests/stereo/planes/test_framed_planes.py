@@ -1,0 +1,95 @@
+"""Planes by edges in a room whose floor and side wall have points: of a cupboard and a door nearly flush with it, and
+of what leans by itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.captures import look_at
+
+from linprim_geo.stereo.planes.framed_planes import along_frame
+from linprim_geo.stereo.planes.plain_regions import PlainRegion, rays_of
+
+FLOOR, SIDE = np.array([0.0, 0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0, -1.5])
+ROOM = np.array([FLOOR, SIDE])
+CAMERAS = [look_at((x, 2.5, 1.0), target=(0, 0, 1), size=(64, 48), focal=50.0) for x in (-1.0, 0.0, 1.0)]
+
+
+def edges_of(points: np.ndarray) -> list[PlainRegion]:
+    """A region of every view with these (P, 3) points along its edges."""
+    regions, one = [], np.ones((1, 1), bool)
+    for view, camera in enumerate(CAMERAS):
+        pixels, depth = camera.project(points)
+        rays, sure = rays_of(camera, pixels[:, 1] - 0.5, pixels[:, 0] - 0.5), np.ones(len(points), bool)
+        regions.append(PlainRegion(view, 0, 0, one, rays, 1 / depth, sure, sure, rays[:5], one))
+    return regions
+
+
+def outline(low: float, high: float, count: int) -> np.ndarray:
+    """(count, 2) places of x and z along the outline of something between these x, 2 high."""
+    rng = np.random.default_rng(0)
+    x, z = rng.uniform(low, high, count), rng.uniform(0, 2, count)
+    side = rng.integers(0, 4, count)
+    return np.column_stack(
+        [np.select([side == 0, side == 1], [low, high], x), np.select([side == 2, side == 3], [0.0, 2.0], z)]
+    )
+
+
+def facing(places: np.ndarray, y: np.ndarray | float, noise: float = 0.004) -> np.ndarray:
+    """(P, 3) points at places of x and z whose y is known but for noise."""
+    y = y + np.random.default_rng(1).normal(scale=noise, size=len(places))
+    return np.column_stack([places[:, 0], y, places[:, 1]])
+
+
+def plane_through(points: np.ndarray) -> np.ndarray:
+    middle = points.mean(0)
+    normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
+    normal *= np.sign(normal[1])
+    return np.append(normal, normal @ middle)
+
+
+def test_of_two_faces_that_are_nearly_flush_a_plane_takes_the_one_with_more_points():
+    """The plane with the most points leans by 2 degrees, from the door to a cupboard that is 3 cm before it."""
+    door, cupboard = facing(outline(-1.2, 0.0, 300), 0.0), facing(outline(0.0, 0.8, 120), 0.03)
+    points = np.concatenate([door, cupboard])
+    leaning = plane_through(points)
+    assert 0.5 < np.degrees(np.arccos(leaning[1])) < 3
+    found = along_frame(CAMERAS, edges_of(points), leaning[None], ROOM)
+    assert found.shape == (1, 4)
+    np.testing.assert_allclose(found[0, :3], [0, 1, 0], atol=1e-9)
+    assert abs(found[0, 3]) < 0.002
+
+
+@pytest.mark.parametrize("degrees", [3.0, 15.0])
+def test_a_plane_that_leans_by_itself_stays(degrees):
+    places = outline(-1.2, 0.8, 300)
+    points = facing(places, np.tan(np.radians(degrees)) * (places[:, 1] - 1))
+    leaning = plane_through(points)
+    assert (along_frame(CAMERAS, edges_of(points), leaning[None], ROOM) == leaning).all()
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_plane_whose_points_are_all_far_from_it_once_it_is_turned_stays():
+    """Two posts that stand askew to the room."""
+    places = np.repeat([[-1.0, 0.0], [1.0, 0.0]], 60, axis=0)
+    places[:, 1] = np.tile(np.linspace(0.2, 1.8, 60), 2)
+    points = facing(places, np.tan(np.radians(18)) * places[:, 0], noise=0.0)
+    leaning = plane_through(points)
+    assert (along_frame(CAMERAS, edges_of(points), leaning[None], ROOM) == leaning).all()
+
+
+def test_of_copies_the_first_is_left():
+    """Planes that lean to both sides of one door, and one of a wall behind it."""
+    door, wall = facing(outline(-1.2, 0.0, 300), 0.0), facing(outline(-1.2, 0.8, 300), -0.3)
+    lean = np.radians(1)
+    sides = np.array([[s * np.sin(lean), np.cos(lean), 0.0, -0.6 * s * np.sin(lean)] for s in (1, -1)])
+    regions = edges_of(door) + edges_of(wall)
+    found = along_frame(CAMERAS, regions, np.array([*sides, plane_through(wall)]), ROOM)
+    np.testing.assert_allclose(found, [[0, 1, 0, 0], [0, 1, 0, -0.3]], atol=0.002)
+
+
+def test_without_a_frame_nothing_turns():
+    points = facing(outline(-1.2, 0.0, 300), 0.0)
+    planes = np.array([[0.01, np.sqrt(1 - 1e-4), 0.0, 0.0]])
+    for by_points in (ROOM[:1], np.zeros((0, 4))):
+        assert along_frame(CAMERAS, edges_of(points), planes, by_points) is planes

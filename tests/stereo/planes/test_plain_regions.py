@@ -1,0 +1,147 @@
+"""Planes of regions without texture: of a box with plain walls, whose confirmed depths are exact along its edges; and
+things that must not become planes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.captures import look_at
+
+from linprim_geo.stereo.planes.plain_regions import (
+    PlainRegion,
+    common_planes,
+    edges_of,
+    grown_alike,
+    may_lie_on,
+    plain_regions,
+)
+
+# A corner of a room: floor z = 0 and two walls x = 0 and y = 0, from the air where all are positive.
+WALLS = np.eye(3)
+CENTERS = [(4.0, 3.0, 2.0), (3.0, 4.0, 2.2), (3.6, 3.6, 1.5), (4.4, 2.6, 1.8), (2.8, 4.4, 1.6)]
+GREYS = np.array([80, 120, 160])
+
+
+def camera_at(center):
+    return look_at(center, target=(0.8, 0.8, 0.8), size=(160, 120), focal=110.0)
+
+
+def corner_depth(camera) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W) depth of the corner, and which wall it is."""
+    rays = camera.world_rays()
+    with np.errstate(divide="ignore"):
+        along = np.stack([-(camera.center @ n) / (rays @ n) for n in WALLS], axis=-1)
+    along[along <= 0] = np.inf
+    return along.min(-1), along.argmin(-1)
+
+
+def seen(camera, depth: np.ndarray, grey: np.ndarray, number: int):
+    """The regions of a view whose edges have exact depths, and nothing else has one."""
+    edge = edges_of(grey, 1.0)
+    return plain_regions(number, camera, grey, edge, np.where(edge, depth, np.nan).astype(np.float32), edge)
+
+
+def corner_from(centers):
+    """Cameras, true depths, and regions of each view."""
+    cameras = [camera_at(center) for center in centers]
+    depths, regions = [], []
+    for number, camera in enumerate(cameras):
+        depth, wall = corner_depth(camera)
+        grey = GREYS[wall]
+        # Marks on the walls, as pictures and sockets are, in the planes of these.
+        rng = np.random.default_rng(0)
+        for row, column in zip(rng.integers(5, 110, 60), rng.integers(5, 150, 60), strict=True):
+            grey[row : row + 3, column : column + 3] += 60
+        depths.append(depth)
+        regions.append(seen(camera, depth, grey.astype(np.uint8), number))
+    return cameras, depths, regions
+
+
+@pytest.fixture(scope="module")
+def corner():
+    return corner_from(CENTERS)
+
+
+def close_together(share: float) -> list[np.ndarray]:
+    """CENTERS at so much of their distances from their middle."""
+    middle = np.mean(CENTERS, axis=0)
+    return [middle + share * (center - middle) for center in np.array(CENTERS)]
+
+
+@pytest.mark.parametrize("share", [1.0, 0.3])
+def test_the_walls_of_a_corner_are_found_from_their_edges(share):
+    """From directions that differ by 30 degrees, or by 9: all views find the same normals."""
+    cameras, _, regions = corner_from(close_together(share))
+    planes = common_planes(cameras, [region for own in regions for region in own])
+    assert len(planes) >= 3
+    for wall in WALLS:
+        # Exact depths: what is left is the mixture of two walls within a pixel of their edge.
+        near = np.abs(planes[:, :3] @ wall) > np.cos(np.radians(1))
+        assert near.any() and np.abs(planes[near, 3]).min() < 0.02
+
+
+def test_far_points_that_are_not_sure_are_on_no_plane():
+    """A floor that goes on to the horizon has some on it by chance."""
+    rng = np.random.default_rng(0)
+    rays = np.column_stack([rng.uniform(-1, 1, 100), rng.uniform(0.001, 0.5, 100), np.ones(100)])
+    floor, sure = np.array([[0.0, 1.0, 0.0]]), np.arange(100) < 50
+    for known, count in ((np.ones(100, bool), 100), (sure, 50)):
+        region = PlainRegion(
+            0, 0, 0, *np.ones((1, 1, 1), bool), rays, rays @ floor[0], known, known, rays[:5], np.ones((1, 1), bool)
+        )
+        on, fits = may_lie_on(region, floor)
+        assert on.sum() == count and fits == [True] and not on[~known].any()
+
+
+def round_depth(camera, center: np.ndarray, radius: float, axis: np.ndarray) -> np.ndarray:
+    """(H, W) depth of the nearest point of a cylinder, infinite beside it; a ball without an axis."""
+    rays = camera.world_rays()
+    start = camera.center - center
+    across, begin = rays - (rays @ axis)[..., None] * axis, start - (start @ axis) * axis
+    a, b, c = (across**2).sum(-1), across @ begin, begin @ begin - radius**2
+    root = b * b - a * c
+    return np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, np.inf)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5, 0.3, 0.2, 0.15])
+@pytest.mark.parametrize("axis", [(0, 0, 0), (0, 0, 1)], ids=["ball", "column"])
+def test_what_is_round_becomes_no_plane(axis, share):
+    center, cameras = np.array([0.8, 0.8, 0.8]), [camera_at(c) for c in close_together(share)]
+    regions = []
+    for number, camera in enumerate(cameras):
+        depth = round_depth(camera, center, 0.9, np.array(axis, float))
+        regions += seen(
+            camera, np.where(np.isfinite(depth), depth, np.nan), np.where(np.isfinite(depth), 150, 60), number
+        )
+    assert regions and not len(common_planes(cameras, regions))
+
+
+def test_a_wall_that_is_slightly_bent_becomes_no_plane():
+    """A plain cylinder of radius 12, seen from inside, between an edge at the floor and one at a height of 1.6."""
+    center, axis = np.array([-9.0, -9.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    cameras, regions = [camera_at(c) for c in CENTERS], []
+    for number, camera in enumerate(cameras):
+        rays = camera.world_rays()
+        start = camera.center - center
+        across, begin = rays - (rays @ axis)[..., None] * axis, start - (start @ axis) * axis
+        a, b, c = (across**2).sum(-1), across @ begin, begin @ begin - 12.0**2
+        depth = (-b - np.sqrt(np.maximum(b * b - a * c, 0))) / a
+        depth = np.where((b * b > a * c) & (depth > 0), depth, np.nan)
+        height = camera.center[2] + rays[..., 2] * depth
+        band = (height > 0) & (height < 1.6)
+        regions.append(seen(camera, depth, np.where(band, 150, 60), number))
+    assert all(regions) and not len(common_planes(cameras, [region for own in regions for region in own]))
+
+
+def test_a_plain_region_reaches_to_where_pixels_are_half_of_it():
+    grey = np.full((40, 60), 200.0)
+    grey[:, 30:] = 100
+    grey[:, 29], grey[:, 30] = 190, 150  # blur
+    grey[:5, 40:] = 200  # as bright, but nowhere near
+    edge = np.zeros(grey.shape, bool)
+    edge[:, 28:32] = True
+    region = np.zeros(grey.shape, bool)
+    region[:, :32] = True
+    found = grown_alike(region, grey, edge)
+    assert found[:, :30].all() and not found[:, 30:].any()
+    assert not grown_alike(np.zeros_like(region), grey, edge).any() and not grown_alike(edge, grey, edge).any()

@@ -1,0 +1,92 @@
+"""Planes that are nearly at right angles become so, and no others."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from linprim_geo.stereo.planes.right_angles import angles_to, frame_of, squared
+
+
+def turned(normal, degrees, axis, distance=1.0) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return np.append(Rotation.from_rotvec(np.radians(degrees) * np.asarray(axis, float)).apply(normal), distance)
+
+
+def moves(number: int, plane: np.ndarray) -> np.ndarray:
+    first = np.cross(plane[:3], np.eye(3)[np.argmin(np.abs(plane[:3]))])
+    first /= np.linalg.norm(first)
+    return np.array([[*first, 0], [*np.cross(plane[:3], first), 0], [0, 0, 0, 1]])
+
+
+def angle(one, other) -> float:
+    return float(np.degrees(np.arccos(abs(one[:3] @ other[:3]))))
+
+
+FLOOR = np.array([0.0, 0, 1, 0])
+
+
+def test_walls_turn_to_a_floor_that_stays_and_to_each_other_by_what_is_known_of_them():
+    one, other = turned([1, 0, 0], 3, [0, 0.6, 0.8]), turned([0, 1, 0], 2, [0, 0, -1], 2.0)
+    planes = np.array([FLOOR, one, other])
+    found = squared(planes, [None, np.eye(3), 100 * np.eye(3)], moves)
+    assert (found[0] == FLOOR).all()
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        assert angle(found[i], found[j]) == pytest.approx(90, abs=0.02)
+    # What more is known of turns less.
+    assert angle(found[2], other) < 0.1 < 3 < angle(found[1], one) < 6
+    assert found[1:, 3] == pytest.approx([1, 2], abs=0.01)
+    np.testing.assert_allclose(np.linalg.norm(found[:, :3], axis=1), 1)
+
+
+def test_other_angles_stay():
+    for leaning in (turned([1, 0, 0], 8, [0, 1, 0]), turned([0, 1, 0], 45, [1, 0, 0]), turned([0, 0, 1], 3, [0, 1, 0])):
+        planes = np.array([FLOOR, leaning])
+        assert (squared(planes, [None, np.eye(3)], moves) == planes).all()
+    assert (squared(planes[:1], [None], moves) == planes[:1]).all()
+    assert squared(np.zeros((0, 4)), [], moves).shape == (0, 4)
+
+
+def test_angles_that_exclude_each_other_leave_a_plane_as_it_is():
+    ramp = turned([0, 0, 1], 8, [0, 1, 0])
+    between, clear = turned([1, 0, 0], 4, [0, 1, 0]), turned([0, 1, 0], 2, [1, 0, 0])
+    found = squared(np.array([FLOOR, ramp, between, clear]), [None, None, np.eye(3), np.eye(3)], moves)
+    assert (found[:3] == [FLOOR, ramp, between]).all()
+    # It is at right angles to the floor and the ramp at once.
+    assert angle(found[3], FLOOR) == pytest.approx(90, abs=0.02) and angle(found[3], clear) > 1.5
+
+
+def test_of_planes_that_stay_and_are_nearly_parallel_the_first_counts():
+    table, wall = turned([0, 0, 1], 2, [0, 1, 0]), turned([1, 0, 0], 3, [0, 1, 0])
+    for stay in ([FLOOR, table], [table, FLOOR]):
+        found = squared(np.array([*stay, wall]), [None, None, np.eye(3)], moves)
+        assert (found[:2] == stay).all() and angle(found[2], stay[0]) == pytest.approx(90, abs=0.02)
+
+
+def test_the_frame_of_a_room_is_that_of_most_planes():
+    room = [turned([0, 0, 1], 0.3, [1, 0, 0]), turned([1, 0, 0], 0.2, [0, 0, 1]), turned([0, -1, 0], 0.3, [0, 0, 1])]
+    room += [turned([0, 0, -1], 0.2, [0, 1, 0]), turned([1, 0, 0], 0.3, [0, 1, 0])]
+    furniture = [turned([0.6, 0.8, 0], 2, [1, 0, 0]), turned([-0.8, 0.6, 0], 1, [0, 0, 1])]
+    leaning = [turned([1, 0, 0], 5, [0, 0, 1])]
+    for order in (room + furniture + leaning, leaning + furniture + room):
+        frame = frame_of(np.array(order)[:, :3])
+        assert frame is not None
+        np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-9)
+        assert np.degrees(angles_to(frame, np.eye(3))).max() < 0.4
+    assert frame_of(np.array([FLOOR, turned([0, 0, 1], 8, [0, 1, 0])])[:, :3]) is None
+    assert frame_of(np.zeros((0, 3))) is None
+
+
+@pytest.mark.parametrize("degrees", [3, 10])
+def test_walls_turn_along_the_frame_whatever_else_stands_about(degrees):
+    """A chair's back leans and a box stands askew: they come first, and a wall is nearly at right angles to both."""
+    chair, box = turned([1, 0, 0], 9, [0, 1, 0]), turned([1, 0, 0], 4.4, [0, 0, 1])
+    stay = [chair, box, FLOOR, turned([1, 0, 0], 0, [0, 0, 1], 3.0), turned([0, 1, 0], 0, [0, 0, 1], 4.0)]
+    wall, slope = turned([0, 1, 0], degrees, [0.6, 0, 0.8], 2.0), turned([0, 1, 0], 45, [1, 0, 0], 2.0)
+    frame = frame_of(np.array(stay)[:, :3])
+    found = squared(np.array([*stay, wall, slope]), [*[None] * 5, np.eye(3), np.eye(3)], moves, frame)
+    assert (found[:5] == stay).all()
+    assert angle(found[5], stay[4]) < 0.15 and found[5, 3] == pytest.approx(2, abs=0.05)
+    # The slope is at right angles to one of the walls alone.
+    assert angle(found[6], slope) < 0.01

@@ -1,0 +1,482 @@
+"""Planes of walls without texture, by how light falls off along them: of analytic photographs with noise, and things
+that must not become planes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.lit_wall import CENTERS, WALL, camera_at, light, map_of, photographs, wall_depth
+from scipy.ndimage import gaussian_filter
+
+from linprim_geo.geometry.sampling import sample_bilinear
+from linprim_geo.stereo.planes import held_planes, plain_regions, shaded_planes, skies
+from linprim_geo.stereo.planes.common_surfaces import CommonSurfaces
+from linprim_geo.stereo.planes.held_planes import HeldPlanes
+from linprim_geo.stereo.planes.plain_regions import in_camera
+from linprim_geo.stereo.planes.shaded_planes import LEAST_VIEWS, OTHERS_SHARE, ShadedPlanes
+from linprim_geo.stereo.planes.shading import Shading, evaluate, fit_plane, shaded_regions
+from linprim_geo.stereo.planes.skies import shows_sky
+from linprim_geo.stereo.vignetting import falloff
+
+NO_PLANES = np.zeros((0, 4))
+
+
+def planes_of(maps, depths, by_points=NO_PLANES, by_edges=NO_PLANES, confirmed=None):
+    """From rendered depths that are a tenth too near and tilted, as those of plain walls are."""
+    width = depths[0].shape[1]
+    rendered = [(depth * np.linspace(0.86, 0.94, width)).astype(np.float32) for depth in depths]
+    confirmed = confirmed or [np.full(depth.shape, np.nan, np.float32) for depth in depths]
+    return ShadedPlanes(maps, confirmed, rendered, by_points, by_edges)
+
+
+def in_the_middle(depth) -> np.ndarray:
+    """A depth map, NaN but for a ninth."""
+    known = np.full_like(depth, np.nan)
+    known[60:120, 80:160] = depth[60:120, 80:160]
+    return known
+
+
+def laid(found: ShadedPlanes, along_edges: int | None = None) -> list[np.ndarray]:
+    """Depth maps of all views, of which points along edges say nothing or that all of them lies on one plane."""
+    number = -1 if along_edges is None else along_edges
+    return found.depth_maps(found.areas([np.full((c.height, c.width), number) for c in found.cameras]))
+
+
+def errors(found: ShadedPlanes, depths) -> tuple[float, np.ndarray]:
+    """The share of pixels that have depths, and how far these are off."""
+    own = laid(found)
+    off = np.concatenate([np.abs(one / depth - 1)[np.isfinite(one)] for one, depth in zip(own, depths, strict=True)])
+    return float(np.mean([np.isfinite(one).mean() for one in own])), off
+
+
+@pytest.mark.parametrize("seed", [0, 100, 200])
+def test_a_lit_wall_without_texture_is_where_it_is(seed):
+    maps, depths = photographs(lambda points, view: light(points), seed=seed)
+    found = planes_of(maps, depths)
+    assert len(found.planes) == 1
+    share, off = errors(found, depths)
+    assert share > 0.7
+    # Rendered depths are off by 6 to 14 %. By noise alone one region knows its depth to 0.06 to 0.09 %
+    # (`depth_deviation`).
+    assert np.quantile(off, 0.95) < 0.005
+
+
+@pytest.mark.parametrize("seed", [0, 100, 200])
+def test_a_floor_makes_a_wall_upright_unless_photographs_say_that_it_leans(seed):
+    maps, depths = photographs(lambda points, view: light(points), seed=seed, noise=3.0)
+    lean = np.radians(4)
+    floors = {"level": [0.0, 0.0, 1.0, -0.9], "leaning": [0.0, np.sin(lean), np.cos(lean), -0.9]}
+    planes = {name: planes_of(maps, depths, np.array([floor])).planes for name, floor in floors.items()}
+    alone = planes_of(maps, depths).planes[-1]
+    # Upright to the last digits; what is left is the turn about the vertical, as without a floor.
+    upright = planes["level"][-1]
+    assert abs(upright[2]) < 1e-4 < abs(alone[2]) and abs(upright[0]) < 2 * abs(alone[0]) + 1e-3
+    # By 4 degrees the shading of the wall would be off by more than noise is.
+    np.testing.assert_allclose(planes["leaning"][-1], alone, atol=1e-6)
+
+
+def room(degrees: float) -> np.ndarray:
+    """(2, 4) a floor and a side wall that points give; with the wall they make a room whose floor leans by so much."""
+    angle = np.radians(degrees)
+    return np.array([[0.0, np.sin(angle), np.cos(angle), -0.9], [1.0, 0.0, 0.0, -1.5]])
+
+
+@pytest.mark.parametrize("seed", [0, 100, 200])
+def test_a_wall_is_along_the_frame_of_its_room_unless_photographs_say_otherwise(seed):
+    """Corners that are 4 % darker, which shading takes for a turned wall, do not say so; light alone does."""
+    row, column = np.mgrid[-1:1:180j, -1:1:240j]
+    darker = 1 - 0.02 * (row**2 + column**2)
+    maps, depths = photographs(lambda points, view: darker * light(points), seed=seed, noise=4.0)
+    free, framed = planes_of(maps, depths).planes[-1], planes_of(maps, depths, room(0)).planes[-1]
+    assert abs(framed[1]) > 1 - 1e-9 and abs(free[1]) < 1 - 1e-5
+    maps, depths = photographs(lambda points, view: light(points), seed=seed, noise=3.0)
+    free, framed = planes_of(maps, depths).planes[-1], planes_of(maps, depths, room(4)).planes[-1]
+    np.testing.assert_allclose(framed, free, atol=1e-6)
+
+
+@pytest.mark.parametrize(("degrees", "stays"), [(0.8, True), (2.0, False)])
+def test_a_plane_with_points_that_is_askew_leaves_plain_regions_to_the_wall(degrees, stays):
+    """Points on what hangs on a wall give a plane that is not along the frame; edges give it again."""
+    maps, depths = photographs(lambda points, view: light(points))
+    by_points = np.array([*room(0), tilted(degrees) + [0, 0, 0, 0.01]])
+    found = planes_of(maps, depths, by_points, by_edges=by_points[2:])
+    assert (found.planes[:3] == by_points).all()
+    assert (found.planes[3] == by_points[2]).all() == stays
+    if not stays:
+        share, off = errors(found, depths)
+        assert share > 0.7 and np.quantile(off, 0.95) < 0.005
+
+
+def test_a_plane_of_edges_along_the_frame_stays_beside_the_one_that_light_makes_of_it():
+    """Edges of a cupboard before the wall have given it: its place is theirs, and where the wall is the light says."""
+    maps, depths = photographs(lambda points, view: light(points))
+    cupboard = WALL + [0, 0, 0, 0.1]
+    found = planes_of(maps, depths, room(0), by_edges=cupboard[None])
+    assert (found.planes[:2] == room(0)).all() and (found.planes == cupboard).all(1).any()
+    share, off = errors(found, depths)
+    assert share > 0.7 and np.quantile(off, 0.95) < 0.005
+
+
+def tilted(degrees: float) -> np.ndarray:
+    """The wall, leaning to its left by so much."""
+    angle = np.radians(degrees)
+    return np.array([np.sin(angle), np.cos(angle), 0.0, 0.0])
+
+
+def test_a_wall_that_edges_give_twice_is_one_plane():
+    maps, depths = photographs(lambda points, view: light(points))
+    found = planes_of(maps, depths, by_edges=np.array([tilted(-0.3), tilted(0.3)]))
+    assert len(found.planes) == 1
+    share, off = errors(found, depths)
+    assert share > 0.7 and np.quantile(off, 0.95) < 0.005
+
+
+def test_planes_that_edges_tell_apart_stay_two_where_faint_light_does_not():
+    """A wall and one 4 % of the depth behind it, by light that deviates by 13 grey values."""
+    maps, depths = photographs(lambda points, view: 60 + 0.3 * light(points))
+    for apart, count in ((0.02, 1), (0.08, 2)):
+        found = planes_of(maps, depths, by_edges=np.array([WALL, WALL - [0, 0, 0, apart]]))
+        assert len(found.planes) == count
+    assert np.abs(found.planes[:, 3] - [0, -0.08]).max() < 0.005
+
+
+def test_of_copies_the_plane_that_edges_give_is_kept(monkeypatch):
+    """Not that of shading, although this one carries as many regions."""
+    maps, depths = photographs(lambda points, view: 60 + 0.3 * light(points))
+    monkeypatch.setattr(ShadedPlanes, "_common", lambda self, fitted: np.array([WALL - [0, 0, 0, 0.06], WALL]))
+    monkeypatch.setattr(HeldPlanes, "by_depths", lambda self, planes, *_: planes)
+    monkeypatch.setattr(HeldPlanes, "at_right_angles", lambda self, planes, *_: planes)
+    found = planes_of(maps, depths, by_edges=(WALL - [0, 0, 0, 0.06])[None])
+    np.testing.assert_array_equal(found.planes, [WALL - [0, 0, 0, 0.06]])
+
+
+def test_a_plane_that_edges_give_is_the_one_that_points_give():
+    maps, depths = photographs(lambda points, view: light(points))
+    by_points = np.array([tilted(0.1)])
+    found = planes_of(maps, depths, by_points, by_edges=-np.array([tilted(-0.4)]))
+    np.testing.assert_array_equal(found.planes, [by_points[0], -by_points[0]])
+    # Two that differ by more than depths are certain stay two.
+    found = planes_of(maps, depths, by_points, by_edges=np.array([tilted(0) + [0, 0, 0, 0.1]]))
+    assert (found.planes[1] != by_points[0]).any()
+
+
+def test_exposures_that_differ_change_nothing():
+    rng = np.random.default_rng(5)
+    gains, offsets = rng.uniform(0.85, 1.15, len(CENTERS)), rng.uniform(-8, 8, len(CENTERS))
+    maps, depths = photographs(lambda points, view: gains[view] * light(points) + offsets[view])
+    share, off = errors(planes_of(maps, depths), depths)
+    assert share > 0.7 and np.quantile(off, 0.95) < 0.005
+
+
+@pytest.mark.parametrize("corners", [0.85, 0.7])
+def test_corners_that_are_darker_change_nothing(corners):
+    """The wall's ends are painted with a pattern that stereo confirms."""
+    pattern = gaussian_filter(np.random.default_rng(1).normal(size=(300, 300)), 3)[..., None]
+    law = np.array([np.log(corners), 0.0])
+
+    def painted(points):
+        return np.abs(points[..., 0]) > 0.9
+
+    def value(points, view):
+        at = 60 * points[..., [0, 2]] + 150
+        texture = 1 + 0.3 * sample_bilinear(pattern / pattern.std(), at)[..., 0]
+        return light(points) * np.where(painted(points), texture, 1) * falloff(camera_at(CENTERS[view]), law)
+
+    maps, depths = photographs(value)
+    points = [
+        found.camera.center + found.camera.world_rays() * d[..., None] for found, d in zip(maps, depths, strict=True)
+    ]
+    confirmed = [np.where(painted(at), depth, np.nan) for at, depth in zip(points, depths, strict=True)]
+    share, off = errors(planes_of(maps, depths, confirmed=confirmed), depths)
+    assert share > 0.3 and np.quantile(off, 0.95) < 0.005
+
+
+def test_larger_photographs_are_halved(monkeypatch):
+    monkeypatch.setattr("linprim_geo.stereo.planes.shading.MOST_SIDE", 120)
+    maps, depths = photographs(lambda points, view: light(points))
+    found = planes_of(maps, depths)
+    assert {shading.factor for shading in found.shadings} == {2}
+    share, off = errors(found, depths)
+    assert share > 0.5 and np.quantile(off, 0.95) < 0.01
+
+
+def test_a_bent_wall_gets_no_plane():
+    # It comes forward by 4 % of its depth; by 1 % it is within the tolerance of a plane.
+    maps, depths = photographs(lambda points, view: light(points), bulge=0.08)
+    assert errors(planes_of(maps, depths), depths)[0] < 0.05
+    maps, depths = photographs(lambda points, view: light(points), bulge=0.02)
+    assert np.quantile(errors(planes_of(maps, depths), depths)[1], 0.95) < 0.02
+
+
+def test_a_wall_in_even_light_gets_no_plane():
+    maps, depths = photographs(lambda points, view: np.full(points.shape[:-1], 140.0))
+    assert errors(planes_of(maps, depths), depths)[0] == 0
+
+
+def sky(clouds: float = 0.0):
+    """Maps and depths that are no depths: grey values depend on the direction alone."""
+    maps, depths = [], []
+    for view, center in enumerate(CENTERS):
+        camera = camera_at(center)
+        rays = camera.world_rays()
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        grey = 120 + 60 * rays[..., 0] ** 2 + 50 * rays[..., 2] + clouds * np.sin(9 * rays[..., 0]) * rays[..., 2]
+        maps.append(map_of(camera, grey, view))
+        depths.append(wall_depth(camera))
+    return maps, depths
+
+
+def test_a_plane_of_edges_does_not_reach_into_the_sky():
+    maps, depths = sky()
+    found = planes_of(maps, depths, by_edges=WALL[None])
+    assert np.mean([found.is_background(view).mean() for view in range(len(maps))]) > 0.8
+    maps, depths = photographs(lambda points, view: light(points))
+    found = planes_of(maps, depths, by_edges=WALL[None])
+    assert not any(found.is_background(view).any() for view in range(len(maps)))
+    maps, depths = unrelated()
+    found = planes_of(maps, depths)
+    assert any(found.shown) and not any(found.is_background(view).any() for view in range(len(maps)))
+
+
+def test_shading_tells_a_wall_from_what_is_far(monkeypatch):
+    maps, depths = photographs(lambda points, view: light(points))
+    found, everywhere = planes_of(maps, depths, by_edges=WALL[None]), np.ones(depths[0].shape, bool)
+    assert np.mean([found.is_wall(view, everywhere).mean() for view in range(len(maps))]) > 0.8
+    assert not found.is_wall(0, ~everywhere).any()
+    monkeypatch.setattr(found, "_far", lambda *_, **__: None)
+    assert not found.is_wall(0, everywhere).any(), "no other view shows what would be far"
+    for maps, depths in (sky(), unrelated()):
+        found = planes_of(maps, depths, by_edges=WALL[None])
+        assert any(found.shown) and not any(found.is_wall(view, everywhere).any() for view in range(len(maps)))
+
+
+def above_a_house(maps, depths):
+    """Maps whose lowest rows show a house with texture, of which stereo is sure."""
+    result = []
+    for found, depth in zip(maps, depths, strict=True):
+        points = found.camera.center + found.camera.world_rays() * depth[..., None]
+        texture = 60 + 30 * np.sin(40 * points[..., 0]) * np.sin(40 * points[..., 2])
+        grey, own, seen = found.grey.copy(), found.depth.copy(), found.confirming.copy()
+        grey[140:], own[140:], seen[140:] = texture[140:], depth[140:], 2
+        result.append(replace(found, grey=grey, depth=own, confirming=seen, confidence=(seen > 0).astype(np.float32)))
+    return result
+
+
+def unrelated():
+    """Maps whose shading has nothing to do with each other's, and depths."""
+    fields = np.random.default_rng(0).normal(0, 1, (len(CENTERS), 180, 240))
+    return photographs(lambda points, view: 120 + 400 * gaussian_filter(fields[view], 14))
+
+
+def test_a_sky_is_told_from_a_wall_before_anything_is_rendered(monkeypatch):
+    above, before_wall = (
+        above_a_house(*sky(clouds=100.0)),
+        above_a_house(*photographs(lambda points, view: light(points))),
+    )
+    assert np.mean(shows_sky(above)) > 0.5 and not any(shows_sky(before_wall))
+    even = above_a_house(*photographs(lambda points, view: np.full(points.shape[:-1], 140.0)))
+    assert not any(shows_sky(even)) and not any(shows_sky(sky(clouds=100.0)[0])), "without shading, and without a depth"
+    assert not any(shows_sky(above_a_house(*sky()))), "a plane explains so smooth a sky as well"
+    moving = unrelated()
+    monkeypatch.setattr(skies, "fit_plane", lambda *_: None)
+    assert any(shows_sky(above)), "no plane is seen by other views"
+    assert not any(shows_sky(above_a_house(*moving))), "a direction does not explain it either"
+
+
+def test_a_sky_gets_no_plane():
+    maps, depths = sky()
+    found = planes_of(maps, depths)
+    own = np.concatenate([one.ravel() for one in laid(found)])
+    assert np.isnan(own).mean() > 0.95
+
+
+def test_stereo_that_is_sure_of_something_else_refuses_a_plane():
+    maps, depths = photographs(lambda points, view: light(points))
+    confirmed = [np.full(depth.shape, np.nan, np.float32) for depth in depths]
+    for own, depth in zip(confirmed, depths, strict=True):
+        own[60:140:2, 60:200:2] = 0.8 * depth[60:140:2, 60:200:2]
+    assert errors(planes_of(maps, depths, confirmed=confirmed), depths)[0] == 0
+
+
+def test_a_known_plane_is_taken_where_it_carries_the_shading_as_well():
+    maps, depths = photographs(lambda points, view: light(points))
+    found = planes_of(
+        maps, depths, np.array([WALL, [0.0, 1.0, 0.0, 0.2]]), confirmed=[in_the_middle(d) for d in depths]
+    )
+    assert len(found.planes) == 2
+    share, off = errors(found, depths)
+    assert share > 0.7 and off.max() < 1e-5
+
+
+@pytest.mark.parametrize("others, kept", [((1,), False), ((1, 8), True), ((0, 1, 2), False), ((0, 1, 2, 3), True)])
+def test_a_plane_that_too_few_views_know_gives_no_depth(monkeypatch, others, kept):
+    """A floor goes on behind walls: two views alone may suppose it there, or some side by side. Neighbours see the
+    wall's middle from directions 9 degrees apart."""
+    monkeypatch.setattr(plain_regions, "SPREAD", np.radians(22))
+    maps, depths = photographs(lambda points, view: light(points))
+    found = planes_of(maps, depths)
+    monkeypatch.setattr(CommonSurfaces, "known_by", lambda self, view, depths, _: [np.array(others)] * len(depths))
+    monkeypatch.setattr(found, "regions", [found.regions[0], *[[] for _ in CENTERS[1:]]])
+    assert np.isfinite(laid(found)[0]).any() == kept
+
+
+@pytest.mark.parametrize("others, kept", [(LEAST_VIEWS - 2, False), (LEAST_VIEWS - 1, True)])
+def test_a_plane_with_points_all_over_gives_a_depth_where_others_confirm_it(others, kept):
+    """That their regions suppose it, too, is not enough: a floor may carry their shading as well as this one's."""
+    maps, depths = photographs(lambda points, view: light(points))
+    confirmed = [np.full_like(depth, np.nan) for depth in depths]
+    confirmed[1 : 1 + others] = [in_the_middle(depth) for depth in depths[1 : 1 + others]]
+    found = planes_of(maps, depths, by_points=WALL[None], confirmed=confirmed)
+    assert np.isfinite(laid(found)[0]).any() == kept
+
+
+@pytest.mark.parametrize("others", [False, True])
+def test_the_plane_that_points_along_edges_tell_is_taken_where_other_views_know_it(monkeypatch, others):
+    """A plane 2 % behind a wall leaves 1.1 to 1.5 times as much of its faint light."""
+    maps, depths = photographs(lambda points, view: 60 + 0.3 * light(points))
+    found = planes_of(maps, depths, by_edges=np.array([WALL, WALL - [0, 0, 0, 0.08]]))
+    monkeypatch.setattr(found, "planes", np.array([WALL, WALL - [0, 0, 0, 0.04]]))
+
+    def known_by(_, view, supposed, __):
+        """All know the wall, and the plane behind it or not."""
+        behind = [np.nanmedian(depth / depths[view]) > 1.01 for depth in supposed]
+        return [np.arange(9) if others or not is_behind else np.zeros(0, int) for is_behind in behind]
+
+    monkeypatch.setattr(CommonSurfaces, "known_by", known_by)
+    behind = np.concatenate([own / depth - 1 for own, depth in zip(laid(found, 1), depths, strict=True)])
+    assert np.isfinite(behind).mean() > 0.5 and (np.nanmedian(behind) > 0.015) == others
+
+
+@pytest.mark.parametrize(("told_of", "times"), [((), 1), ((3, 4), 2)])
+def test_what_no_other_view_knows_supports_none(monkeypatch, told_of, times):
+    """Edges tell two views of a plane 2 % behind the wall, which no view knows: these suppose the wall after all."""
+    maps, depths = photographs(lambda points, view: 60 + 0.3 * light(points))
+    found = planes_of(maps, depths, by_edges=np.array([WALL, WALL - [0, 0, 0, 0.08]]))
+    monkeypatch.setattr(found, "planes", np.array([WALL, WALL - [0, 0, 0, 0.04]]))
+    supposed, surfaces = [], found._surfaces
+
+    def known_by(_, view, depths_of_areas, __):
+        behind = [np.nanmedian(depth / depths[view]) > 1.01 for depth in depths_of_areas]
+        return [np.zeros(0, int) if is_behind else np.arange(9) for is_behind in behind]
+
+    monkeypatch.setattr(CommonSurfaces, "known_by", known_by)
+    monkeypatch.setattr(found, "_surfaces", lambda areas: supposed.append(areas) or surfaces(areas))
+    shape = depths[0].shape
+    areas = found.areas([np.full(shape, 1 if view in told_of else -1) for view in range(len(CENTERS))])
+    numbers = [{area.number for own in of_views for area in own} for of_views in (*supposed, areas)]
+    assert numbers == [{0, 1}, {0}, {0}][-times - 1 :]
+
+
+def edge_points(depths, noise: float = 0.004, seed: int = 0):
+    """Confirmed depths of the wall where a floor and another wall would meet it: along two sides of the pictures."""
+    rng, confirmed = np.random.default_rng(seed), []
+    for depth in depths:
+        own = np.full(depth.shape, np.nan, np.float32)
+        noisy = depth * (1 + rng.normal(0, noise, depth.shape))
+        own[-6:], own[:, :6] = noisy[-6:], noisy[:, :6]
+        confirmed.append(own)
+    return confirmed
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_confirmed_depths_along_the_edges_hold_a_plane(seed):
+    """Of photographs whose corners are 4 % darker, as lenses make them, which shading takes for a turned wall."""
+    row, column = np.mgrid[-1:1:180j, -1:1:240j]
+    darker = 1 - 0.02 * (row**2 + column**2)
+    maps, depths = photographs(lambda points, view: darker * light(points), seed=100 * seed, noise=4.0)
+    free = errors(planes_of(maps, depths), depths)[1]
+    held = errors(planes_of(maps, depths, confirmed=edge_points(depths, seed=seed)), depths)[1]
+    assert len(held) and np.quantile(held, 0.9) < 0.75 * np.quantile(free, 0.9)
+
+
+def test_a_plane_of_edges_before_the_wall_goes_back_to_it():
+    """As that of the back edges of a shelf which stands 2 % before a wall."""
+    maps, depths = photographs(lambda points, view: light(points))
+    before = np.array([0.0, 1.0, 0.0, 0.04])
+    found = planes_of(maps, depths, by_edges=before[None])
+    assert np.quantile(errors(found, depths)[1], 0.95) < 0.005
+    kept = planes_of(maps, depths, by_points=before[None])
+    assert (kept.planes[0] == before).all()
+
+
+@pytest.mark.parametrize(("views", "stays"), [(2, True), (4, False)])
+def test_shading_of_too_few_views_does_not_move_a_plane_of_edges(views, stays):
+    maps, depths = photographs(lambda points, view: light(points))
+    # Stereo knows the wall in the other views, whose regions shading is not asked for.
+    confirmed = [depth if view >= views else np.full_like(depth, np.nan) for view, depth in enumerate(depths)]
+    edges = np.array([tilted(1.5)])
+    assert np.allclose(planes_of(maps, depths, by_edges=edges, confirmed=confirmed).planes[0], edges[0]) == stays
+
+
+@pytest.mark.parametrize(("degrees", "by_depths", "by_angles"), [(2, True, True), (4, False, True), (8, False, False)])
+def test_what_points_along_edges_have_told_of_a_plane_bounds_how_shading_turns_it(
+    monkeypatch, degrees, by_depths, by_angles
+):
+    """Of two planes at one place the second one is told so."""
+    planes, turned = np.array([WALL, WALL]), np.array([tilted(degrees), tilted(degrees)])
+    region = SimpleNamespace(some=lambda count: region)
+    held = HeldPlanes([], [], [[region], [region]])
+    monkeypatch.setattr(held, "_held_plane", lambda plane, regions: turned[0])
+    assert (held.by_depths(planes, (), told=[1]) == [turned[0], turned[1] if by_depths else WALL]).all()
+    monkeypatch.setattr(held_planes, "evaluate", lambda *_: SimpleNamespace(information=np.eye(3)))
+    monkeypatch.setattr(held_planes, "squared", lambda *_: turned)
+    monkeypatch.setattr(held, "_shifted", lambda plane, regions: plane)
+    monkeypatch.setattr(held, "_leaves_as_little", lambda *_: True)
+    found = held.at_right_angles(planes.copy(), (), told=[1])
+    assert (found == [turned[0], turned[1] if by_angles else WALL]).all()
+
+
+def test_the_fit_goes_downhill_and_ends_at_the_truth_without_noise():
+    maps, depths = photographs(lambda points, view: light(points), noise=0.0)
+    shadings = [Shading.of(one) for one in maps]
+    region = max(shaded_regions(4, shadings[4], np.zeros(depths[4].shape, bool)), key=lambda one: len(one.row))
+    region = replace(region, depth=2.0, others=(1, 2, 6, 7))
+    start = np.array([0.08, 1.0, -0.05, 0.15])
+    start /= np.linalg.norm(start[:3])
+    first, last = evaluate(start, [region], shadings), fit_plane(start, [region], shadings)
+    assert first is not None and last is not None and last.left < 0.2 * first.left
+    inverse = region.rays @ in_camera(shadings[4].camera, last.plane[None])[0]
+    assert np.abs(inverse * depths[4][region.row, region.column] - 1).max() < 0.005
+
+
+def lines_at(monkeypatch, moved):
+    monkeypatch.setattr(shaded_planes, "on_meeting_lines", lambda *_: moved)
+
+
+def test_a_wall_behind_a_plane_with_points_takes_its_place_in_plain_regions(monkeypatch):
+    maps, depths = photographs(lambda points, view: light(points))
+    before = WALL + [0, 0, 0, 0.004]
+    lines_at(monkeypatch, {1: WALL})
+
+    found = planes_of(maps, depths, by_points=before[None], by_edges=before[None])
+
+    assert list(found.standing) == [False, True] and list(found.hanging) == [True, False]
+    assert found.planes == pytest.approx(np.array([before, WALL]))
+    share, off = errors(found, depths)
+    assert share > 0.7 and np.quantile(off, 0.95) < 1e-6
+
+
+@pytest.mark.parametrize(("degrees", "stands"), [(0.1, True), (12.0, False)])
+def test_shading_refuses_a_line_that_it_contradicts(monkeypatch, degrees, stands):
+    maps, depths = photographs(lambda points, view: light(points))
+    turned = np.array([np.sin(np.radians(degrees)), np.cos(np.radians(degrees)), 0, 0])
+    lines_at(monkeypatch, {0: turned})
+
+    found = planes_of(maps, depths)
+
+    assert list(found.standing) == [stands] and not found.hanging.any()
+    assert (np.abs(found.planes[0] @ turned) > 1 - 1e-9) == stands
+
+
+def test_known_planes_near_a_regions_own_may_leave_more_of_its_shading():
+    maps, depths = photographs(lambda points, view: light(points))
+    found = planes_of(maps, depths)
+    one = next(one for own in found.regions for one in own if one.fit is not None)
+    own = one.region.rays @ in_camera(found.small_cameras[one.region.view], one.fit.plane[None])[0]
+    for nearer, least in ((1.0, 1.4 * one.fit.left_share), (1.04, 1.4 * one.fit.left_share), (1.07, 0.0)):
+        may_leave = found._may_leave(one, own * nearer)
+        assert (may_leave > one.most_left) == (nearer < 1.05) and least < may_leave <= OTHERS_SHARE
+    assert found._may_leave(replace(one, fit=None), own) == one.most_left

@@ -1,0 +1,149 @@
+"""Thin things before a wall: a wire that training has is kept, and fog is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.captures import look_at
+
+from linprim_geo.stereo.visibility.thin_things import DEVIATIONS, SeenDepths, channel_gains, thin_things
+
+# A wall at z = 0, seen from z = -3, and an upright wire of about four pixels 0.4 before it.
+WIRE, HALF_WIDTH = 0.4, 0.055
+CAMERAS = [
+    look_at((x, y, -3.0), (0.3 * x, 0.3 * y, 0.0), size=(96, 64), focal=110.0, up=(0.0, 1.0, 0.0))
+    for x, y in [(0, 0), (0.5, 0.1), (-0.5, 0), (0.25, -0.3), (-0.25, 0.3), (0.8, 0), (-0.8, -0.1), (0, 0.4)]
+]
+
+
+def wall_colors(points):
+    """A texture as fine as stereo wants, (..., 3) grey values."""
+    x, y = points[..., 0], points[..., 1]
+    value = 110 + 30 * np.sin(9 * x + 2 * y) * np.cos(7 * y - x) + 20 * np.sin(23 * x) * np.sin(19 * y)
+    return np.stack([value, 0.8 * value, 0.7 * value], -1)
+
+
+def depth_at(camera, z):
+    """(H, W) depth of the plane at z."""
+    return (z - camera.center[2]) / camera.world_rays()[..., 2]
+
+
+def view_of(camera, noise=0.0, seed=0, wire=(20, 30, 140)):
+    """What a view knows: the wire is rendered, and stereo knows the wall alone."""
+    wall, front = depth_at(camera, 0.0), depth_at(camera, -WIRE)
+    rays = camera.world_rays()
+    on_wire = np.abs((camera.center + rays * front[..., None])[..., 0]) < HALF_WIDTH
+    colors = wall_colors(camera.center + rays * wall[..., None])
+    colors[on_wire] = np.asarray(wire)
+    colors += noise * np.random.default_rng(seed).standard_normal(colors.shape)
+    rgb = np.clip(np.rint(colors), 0, 255).astype(np.uint8)
+    rendered = np.where(on_wire, front, wall).astype(np.float32)
+    sharp = np.ones(wall.shape, bool)
+    return SeenDepths(camera, rgb, max(1.0, noise**2 / 2), rendered, sharp, wall.astype(np.float32)), on_wire
+
+
+@pytest.fixture(scope="module")
+def scene():
+    pairs = [view_of(camera, seed=k) for k, camera in enumerate(CAMERAS)]
+    return [view for view, _ in pairs], [wire for _, wire in pairs]
+
+
+def found_share(views, wires):
+    """Share of the wire that is found, and of what is found that is no wire."""
+    found, wires = np.stack(thin_things(views)), np.stack(wires)
+    return (found & wires).sum() / wires.sum(), (found & ~wires).sum() / max(found.sum(), 1)
+
+
+def test_a_wire_before_a_wall_is_found(scene):
+    found, wrong = found_share(*scene)
+    assert found > 0.7 and wrong == 0
+
+
+def test_noise_and_drifting_exposure_change_little(scene):
+    pairs = [view_of(camera, 3.0, k, wire=(160, 130, 50)) for k, camera in enumerate(CAMERAS)]
+    gains = np.exp(np.linspace(-0.2, 0.2, len(CAMERAS)))
+    dimmed = [
+        replace(v, rgb=np.clip(v.rgb * g, 0, 255).astype(np.uint8)) for (v, _), g in zip(pairs, gains, strict=True)
+    ]
+    np.testing.assert_allclose(channel_gains(dimmed), np.repeat(gains[:, None], 3, 1), rtol=0.03)
+    found, wrong = found_share(dimmed, [wire for _, wire in pairs])
+    assert found > 0.6 and wrong == 0
+
+
+def test_fog_that_photographs_show_the_wall_at_is_none():
+    """Every view renders the same surface there, but the photographs are those of the wall alone."""
+    views = []
+    for camera in CAMERAS:
+        view, _ = view_of(camera)
+        seen = wall_colors(camera.center + camera.world_rays() * depth_at(camera, 0.0)[..., None])
+        views.append(replace(view, rgb=np.rint(seen).astype(np.uint8)))
+    assert not np.stack(thin_things(views)).any()
+
+
+def test_what_two_views_render_alone_is_none(scene):
+    views, _ = scene
+
+    def rendered_by(count):
+        nothing = [replace(view, rendered=np.zeros_like(view.rendered)) for view in views]
+        return np.stack(thin_things([*views[:count], *nothing[count:]]))
+
+    # Three views render it, so two others than each; the rest renders nothing.
+    assert not rendered_by(3).any() and rendered_by(4).any()
+
+
+def test_what_many_see_through_is_none(scene):
+    views, wires = scene
+    # Four of eight views render it: of the others of each three agree, and four see through it.
+    half = [view if k % 2 else replace(view, rendered=view.known) for k, view in enumerate(views)]
+    assert np.stack(thin_things(half)).sum() < 0.05 * np.stack(wires)[1::2].sum()
+    most = [view if k < 7 else replace(view, rendered=view.known) for k, view in enumerate(views)]
+    assert np.stack(thin_things(most)).sum() > 0.5 * np.stack(wires)[:7].sum()
+
+
+def test_what_is_not_sharp_is_none(scene):
+    views, _ = scene
+    fog = [replace(view, sharp=~view.sharp) for view in views]
+    first, *others = thin_things([fog[0], *views[1:]])
+    assert not first.any() and all(other.any() for other in others)
+    assert not np.stack(thin_things([views[0], *fog[1:]])).any()
+
+
+@pytest.mark.parametrize(("part", "found"), [(0.5, False), (2.0, True)])
+def test_a_wire_that_noise_could_be_is_none(part, found):
+    """Differences of means of nine pixels of channels with twice the noise of grey values have a deviation of 2/3 of
+    it."""
+    views, noise = [], 8.0
+    for camera in CAMERAS:
+        view, on_wire = view_of(camera)
+        colors = np.full((*on_wire.shape, 3), 100.0)
+        colors[on_wire] += part * DEVIATIONS * np.sqrt(noise) * 2 / 3
+        views.append(replace(view, rgb=np.rint(colors).astype(np.uint8), noise=noise))
+    assert np.stack(thin_things(views)).any() == found
+
+
+def test_pixels_that_pass_by_chance_are_none(scene):
+    """A region that is rendered before the wall, of which photographs agree at one row in twelve alone."""
+    views, _ = scene
+    changed, lone = [], 0
+    for view in views:
+        wall = depth_at(view.camera, 0.0)
+        front = depth_at(view.camera, -WIRE)
+        colors = wall_colors(view.camera.center + view.camera.world_rays() * wall[..., None])
+        place = view.camera.center + view.camera.world_rays() * front[..., None]
+        stripes = (np.abs(place[..., 0]) < 0.3) & (np.floor(place[..., 1] / 0.025) % 12 == 0)
+        colors[stripes] = (20, 30, 140)
+        lone += stripes.sum()
+        rendered = np.where(np.abs(place[..., 0]) < 0.3, front, wall).astype(np.float32)
+        changed.append(replace(view, rgb=np.rint(colors).astype(np.uint8), rendered=rendered))
+    assert np.stack(thin_things(changed)).sum() < 0.1 * lone
+
+
+def test_without_known_depths_or_light_nothing_is_found(scene):
+    views, _ = scene
+    unknown = [replace(view, known=np.full_like(view.known, np.nan)) for view in views]
+    assert not np.stack(thin_things(unknown)).any()
+    np.testing.assert_array_equal(channel_gains(unknown), 1.0)
+    dark = [replace(view, rgb=np.zeros_like(view.rgb)) for view in views]
+    assert not np.stack(thin_things(dark)).any()

@@ -1,0 +1,122 @@
+"""Holes that a window of stereo covers are closed, but for those that photographs see through."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.captures import look_at
+from helpers.surfaces import join
+from helpers.textured_plane import sheet
+
+from linprim_geo.geometry.mesh import Mesh, select_faces
+from linprim_geo.geometry.topology import topology
+from linprim_geo.surface.finish.self_intersections import crossings
+from linprim_geo.surface.finish.small_holes import WINDOW, without_small_holes
+
+# From 2 above a sheet of side 1 a pixel is 0.01, and a window 0.12.
+CAMERAS = [look_at((x, y, 2.0), (x, y, 0.0), (100, 100), 200.0, (0.0, 1.0, 0.0)) for x in (0, 0.1) for y in (0, 0.1)]
+UNKNOWN = [np.full((100, 100), np.nan) for _ in CAMERAS]
+NOT_FREE = [np.zeros((100, 100), bool) for _ in CAMERAS]
+
+
+def flat(steps: int = 101) -> Mesh:
+    """With edges of a pixel."""
+    return sheet(lambda x, y: 0 * x, steps=steps)
+
+
+def pierced(mesh: Mesh, radius: float, middle=(0.0, 0.0)) -> Mesh:
+    """Without the faces whose middles are that near to a point."""
+    away = np.linalg.norm(mesh.vertices[mesh.faces].mean(1)[:, :2] - middle, axis=1)
+    return select_faces(mesh, away > radius)
+
+
+def closed(mesh: Mesh, known=UNKNOWN, free=NOT_FREE) -> tuple[Mesh, int]:
+    return without_small_holes(mesh, CAMERAS, known, free)
+
+
+def outer_edges() -> int:
+    return topology(flat())["boundary_edges"]
+
+
+def test_a_hole_as_wide_as_a_window_is_closed_and_nothing_else_changes():
+    holed = replace(pierced(flat(), 0.04), quality=np.linspace(1, 2, len(pierced(flat(), 0.04).vertices)))
+    found, holes = closed(holed)
+    assert holes == 1 and topology(holed)["boundary_edges"] > outer_edges() == topology(found)["boundary_edges"]
+    np.testing.assert_array_equal(found.vertices, holed.vertices)
+    np.testing.assert_array_equal(found.quality, holed.quality)
+    np.testing.assert_array_equal(found.faces[: len(holed.faces)], holed.faces)
+    assert topology(found)["area"] == pytest.approx(topology(flat())["area"])  # every patch faces up: none overlaps
+    assert topology(found)["non_manifold_edges"] == 0
+
+
+@pytest.mark.parametrize("seed", range(1, 7))  # of 0 a triangle hangs into the hole by one corner
+def test_patches_of_holes_of_any_shape_do_not_overlap(seed):
+    middle = flat().vertices[flat().faces].mean(1)
+    away, angle = np.linalg.norm(middle[:, :2], axis=1), np.arctan2(middle[:, 1], middle[:, 0])
+    knots = np.random.default_rng(seed).uniform(0.01, 0.045, 12)
+    reach = np.interp(angle, np.linspace(-np.pi, np.pi, 12, endpoint=False), knots, period=2 * np.pi)
+    hook = (away > 0.02) & (away < 0.045) & (np.abs(angle) < 2.5)
+    for lost in (away < reach, hook):
+        holed = select_faces(flat(), ~lost)
+        found, holes = closed(holed)
+        assert holes >= 1 and topology(found)["boundary_edges"] == outer_edges()
+        normal = np.cross(*(found.vertices[found.faces[:, k]] - found.vertices[found.faces[:, 0]] for k in (1, 2)))
+        assert topology(found)["area"] == pytest.approx(1) and normal[:, 2].min() > -1e-12
+
+
+def test_a_wider_hole_stays():
+    radius = WINDOW * 0.01 / 2
+    assert closed(pierced(flat(), radius - 0.015))[1] == 1
+    wide = pierced(flat(), radius + 0.015)
+    found, holes = closed(wide)
+    assert holes == 0 and found is wide
+    # Nor where no camera tells how wide it is.
+    away = [look_at((0, 0, -2.0), (0, 0, -4.0), (100, 100), 200.0, (0.0, 1.0, 0.0))]
+    assert without_small_holes(pierced(flat(), 0.02), away, UNKNOWN[:1], NOT_FREE[:1])[1] == 0
+
+
+@pytest.mark.parametrize("views, holes", [(1, 1), (2, 0), (4, 0)])
+@pytest.mark.parametrize("is_free", [False, True])
+def test_two_views_that_see_through_a_hole_keep_it_open(views, holes, is_free):
+    looking = [k < views for k in range(len(CAMERAS))]
+    behind = [np.full((100, 100), 2.5 if looks and not is_free else np.nan) for looks in looking]
+    free = [np.full((100, 100), looks and is_free) for looks in looking]
+    assert closed(pierced(flat(), 0.04), behind, free)[1] == holes
+
+
+def test_what_views_know_before_or_at_a_hole_does_not_keep_it_open():
+    for depth in (1.5, 2.0):
+        assert closed(pierced(flat(), 0.04), [np.full((100, 100), depth) for _ in CAMERAS])[1] == 1
+
+
+def test_the_rim_of_a_small_piece_is_no_hole():
+    away = np.linalg.norm(flat().vertices[flat().faces].mean(1)[:, :2], axis=1)
+    piece = select_faces(flat(), away < 0.04)
+    found, holes = closed(join(piece, pierced(flat(), 0.2)))
+    assert holes == 0 and len(found.faces) == len(piece.faces) + len(pierced(flat(), 0.2).faces)
+
+
+def test_holes_that_touch_in_a_vertex_are_closed():
+    mesh = flat()
+    middle = mesh.vertices[mesh.faces].mean(1)
+    square = (np.abs(middle[:, :2]) < 0.02).all(1)
+    holed = select_faces(mesh, ~(square & (middle[:, 0] * middle[:, 1] > 0)))
+    found, holes = closed(holed)
+    assert holes >= 1 and topology(found)["boundary_edges"] == outer_edges()
+
+
+def test_a_hole_with_something_in_the_way_stays():
+    thorn = Mesh(np.array([[0.0, 0, -0.1], [0.005, 0, 0.1], [-0.005, 0, 0.1]]), np.array([[0, 1, 2]]))
+    holed = join(pierced(flat(), 0.04), thorn)
+    found, holes = closed(holed)
+    assert holes == 0 and len(crossings(found)[0]) == 0
+
+
+def test_a_closed_surface_and_an_empty_one_stay():
+    corners = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
+    solid = Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
+    nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), int))
+    for mesh in (solid, nothing):
+        assert closed(mesh) == (mesh, 0)
