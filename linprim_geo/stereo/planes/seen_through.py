@@ -40,6 +40,11 @@ class KnownDepths:
         through = looking - knowing
         return (through >= SEEING) & (through > SEEING_SHARE * knowing)
 
+    def know(self, points: np.ndarray) -> np.ndarray:
+        """(P,) bool which of (P, 3) points of the world more views know a surface at than see through."""
+        looking, knowing = surface_ops.count_looking_views(self.views, np.ascontiguousarray(points), MARGIN)
+        return 2 * knowing > looking
+
     def clear(self, depths: Sequence[np.ndarray], asked: Sequence[np.ndarray]) -> None:
         """Makes (H, W) `depths` of every view, NaN where there are none, NaN where they are in the air, too, of the
         pixels that are `asked` (H, W) for."""

@@ -211,7 +211,7 @@ class ShadedPlanes:
                 continue
             few = region.some(FIRST_BOXES)
             far = self._far(self._in_all_views(few), least=1)
-            most = 0.0 if far is None else min(LEFT_SHARE, far.left_share / HARDLY_MORE)
+            most = 0.0 if far is None else min(LEFT_SHARE, far.left_share / AS_WELL)
             if most > 0 and any(fit.left_share < most for fit in self._fits(few)):
                 self._mark(wall, region)
         return wall

@@ -32,7 +32,6 @@ from linprim_geo.stereo.planes.plain_regions import (
     PlainRegion,
     common_planes,
     edges_of,
-    grown_alike,
     regions_of_views,
 )
 from linprim_geo.stereo.planes.point_planes import SurfacePoints, planes_of_points, point_plane_depth
@@ -40,6 +39,7 @@ from linprim_geo.stereo.planes.region_planes import RegionDepths, beside_edges, 
 from linprim_geo.stereo.planes.room_corners import with_corner_walls
 from linprim_geo.stereo.planes.seen_through import KnownDepths
 from linprim_geo.stereo.planes.shaded_planes import ShadedPlanes
+from linprim_geo.stereo.visibility.far_parts import far_parts
 from linprim_geo.stereo.visibility.lone_backgrounds import lone_backgrounds
 from linprim_geo.stereo.visibility.outlined_things import outlined_things
 from linprim_geo.stereo.visibility.textured_backgrounds import textured_backgrounds
@@ -108,8 +108,11 @@ class MergedFrames(Sequence):
         seen = list(self.depths)
         masked = any(view.has_alpha for view in views)  # then masks say what is background
         regions, backgrounds, plain_walls = self._take_planes(maps, rendered_depths, () if masked else free)
-        self.rendered = [_seen_past(*each) for each in zip(rendered, maps, backgrounds, strict=True)]
-        if plain_walls:
+        walls = [np.ones_like(own) for own in free] if masked else plain_walls
+        no_walls = [own & ~wall for own, wall in zip(free, walls, strict=True)]
+        backgrounds = far_parts(maps, no_walls, self._known(), rendered_depths, backgrounds)
+        self.rendered = [_seen_past(*each) for each in zip(rendered, backgrounds, strict=True)]
+        if not masked:
             self._end_at(plain_walls)
         progress.stage(1, "gaps between planes")
         self.shown = [frame.depth[::SAMPLED, ::SAMPLED] > 0 for frame in self.rendered]
@@ -418,12 +421,10 @@ def pairing_points(rendered: Sequence[DepthFrame]) -> np.ndarray:
     return np.concatenate([points[:: max(1, len(points) // max(1, POINTS // len(rendered)))] for points in surfaces])
 
 
-def _seen_past(frame: DepthFrame, found: DepthMap, background: np.ndarray) -> DepthFrame:
-    """The frame with rays that are free where (H, W) regions are `background`, and beside these where pixels are of
-    their grey: training fills a plain sky with fog."""
+def _seen_past(frame: DepthFrame, background: np.ndarray) -> DepthFrame:
+    """The frame with rays that are free in (H, W) `background`."""
     if frame.background is None or not background.any():
         return frame
-    background = grown_alike(background, found.grey, edges_of(found.grey, found.noise, found.most_noise))
     return replace(
         frame,
         depth=np.where(background, np.float32(0), frame.depth),

@@ -253,6 +253,16 @@ def test_shading_tells_a_wall_from_what_is_far(monkeypatch):
         assert any(found.shown) and not any(found.is_wall(view, everywhere).any() for view in range(len(maps)))
 
 
+@pytest.mark.parametrize(("left", "is_wall"), [(0.14, False), (0.16, True)])
+def test_a_background_that_carries_shading_as_well_as_a_plane_is_no_wall(monkeypatch, left, is_wall):
+    """Of clouds planes leave less by chance: there are several, and one background."""
+    maps, depths = photographs(lambda points, view: light(points))
+    found = planes_of(maps, depths, by_edges=WALL[None])
+    monkeypatch.setattr(found, "_fits", lambda region: [SimpleNamespace(left_share=0.1)])
+    monkeypatch.setattr(found, "_far", lambda *_, **__: SimpleNamespace(left_share=left))
+    assert found.is_wall(0, np.ones(depths[0].shape, bool)).any() == is_wall
+
+
 def above_a_house(maps, depths):
     """Maps whose lowest rows show a house with texture, of which stereo is sure."""
     result = []

@@ -1,0 +1,97 @@
+"""Parts of photographs that are far away: other photographs show them in the same direction.
+
+Training fills a sky beside things with fog, as few photographs look past them, and windows of stereo hold their
+outlines. What lies between edges of a photograph is of one thing: where training sees background in most of it, nothing
+is known of it, and other photographs show the same grey where they look that way past everything, all of it is far. The
+side of a table, which an environment can explain as well, shows in none of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.ndimage import label
+
+from linprim_geo.points.view_pairs import visible_pixels
+from linprim_geo.stereo.depth_maps import DepthMap
+from linprim_geo.stereo.planes.plain_regions import HALF_EDGE, edges_of, grown_alike, rays_of, to_world
+from linprim_geo.stereo.planes.seen_through import KnownDepths
+from linprim_geo.stereo.visibility.lone_backgrounds import FAR
+
+# Of a part that is far at most such a share is known: beside the outlines of things.
+KNOWN_SHARE = 0.1
+# More than this share of what is not known has to be background, and of its pixels another photograph has to show.
+MOST = 0.5
+# So many pixels of a part are looked at in other photographs.
+LOOKED_AT = 100
+
+
+def far_parts(
+    maps: Sequence[DepthMap],
+    backgrounds: Sequence[np.ndarray],
+    known: Sequence[np.ndarray],
+    rendered: Sequence[np.ndarray],
+    far: Sequence[np.ndarray],
+) -> list[np.ndarray]:
+    """(H, W) bool of every view: what is `far` (H, W), parts that are, and pixels beside both of their grey. Pixels
+    are not whose rendered surface more views know than look past it: edges have gaps.
+
+    Args:
+        backgrounds: (H, W) bool of every view, what training sees nothing in.
+        known: (H, W) depths of every view, NaN where there is none.
+        rendered: (H, W) depths of every view, 0 where there is none.
+    """
+    cameras = [found.camera for found in maps]
+    unknown = [np.isnan(depth) for depth in known]
+    free = [background & where for background, where in zip(backgrounds, unknown, strict=True)]
+    distance = FAR * float(np.ptp([camera.center for camera in cameras], axis=0).max())
+    result = []
+    for view, (found, told) in enumerate(zip(maps, far, strict=True)):
+        edge = edges_of(found.grey, found.noise, found.most_noise)
+        part, parts = label(~edge)
+        size, of_unknown, of_free = (
+            np.bincount(part[where], minlength=parts + 1) for where in (~edge, unknown[view], free[view])
+        )
+        asked = (of_unknown >= (1 - KNOWN_SHARE) * size) & (of_free > MOST * of_unknown)
+        row, column = _some_of_each(np.where(asked[part] & ~edge, part, 0))
+        shown, number = _shown_by_others(maps, free, view, row, column, distance), part[row, column]
+        is_far = np.bincount(number[shown], minlength=parts + 1) > MOST * np.bincount(number, minlength=parts + 1)
+        result.append(grown_alike(told | (is_far[part] & ~edge), found.grey, edge))
+    looking = KnownDepths(
+        cameras, [np.where(np.isnan(depth) & past, distance, depth) for depth, past in zip(known, result, strict=True)]
+    )
+    for camera, depth, told, past in zip(cameras, rendered, far, result, strict=True):
+        row, column = np.nonzero(past & ~told & (depth > 0))
+        is_surface = looking.know(to_world(camera, rays_of(camera, row, column) * depth[row, column, None]))
+        past[row[is_surface], column[is_surface]] = False
+    return result
+
+
+def _some_of_each(part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of LOOKED_AT pixels at most of each part of (H, W) numbers, where these are not 0."""
+    row, column = np.nonzero(part)
+    order = np.argsort(part[row, column], kind="stable")
+    row, column = row[order], column[order]
+    _, first, size = np.unique(part[row, column], return_index=True, return_counts=True)
+    rank = np.arange(len(row)) - np.repeat(first, size)
+    some = rank % np.repeat(-(-size // LOOKED_AT), size) == 0
+    return row[some], column[some]
+
+
+def _shown_by_others(
+    maps: Sequence[DepthMap],
+    free: Sequence[np.ndarray],
+    view: int,
+    row: np.ndarray,
+    column: np.ndarray,
+    distance: float,
+) -> np.ndarray:
+    """(P,) bool: which pixels of a view another photograph shows as grey, at a distance, where it is `free` (H, W)."""
+    camera, grey = maps[view].camera, maps[view].grey[row, column].astype(int)
+    points, shown = camera.center + camera.world_rays()[row, column] * distance, np.zeros(len(row), bool)
+    for other, found in enumerate(maps):
+        if other != view:
+            inside, (x, y), _ = (np.asarray(each).T for each in visible_pixels(found.camera, points))
+            shown[inside] |= free[other][y, x] & (np.abs(found.grey[y, x] - grey[inside]) < 2 * HALF_EDGE)
+    return shown
