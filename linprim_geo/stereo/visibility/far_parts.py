@@ -21,9 +21,10 @@ from linprim_geo.stereo.visibility.lone_backgrounds import FAR
 
 # Of a part that is far at most such a share is known: beside the outlines of things.
 KNOWN_SHARE = 0.1
-# More than this share of what is not known has to be background, and of its pixels another photograph has to show.
+# More than this share of what is not known is background, and of the pixels that are looked at other photographs show
+# more than this share as well.
 MOST = 0.5
-# So many pixels of a part are looked at in other photographs.
+# Pixels of a part that are looked at in other photographs, at most.
 LOOKED_AT = 100
 
 
@@ -34,14 +35,17 @@ def far_parts(
     rendered: Sequence[np.ndarray],
     far: Sequence[np.ndarray],
 ) -> list[np.ndarray]:
-    """(H, W) bool of every view: what is `far` (H, W), parts that are, and pixels beside both of their grey. Pixels
-    are not whose rendered surface more views know than look past it: edges have gaps.
+    """(H, W) bool of every view: what is `far`, parts between edges that are, and pixels beside both of their grey. Not
+    those whose rendered surface more views know than look past it: edges have gaps.
 
     Args:
-        backgrounds: (H, W) bool of every view, what training sees nothing in.
+        backgrounds: (H, W) bool of every view, where training has nothing.
         known: (H, W) depths of every view, NaN where there is none.
         rendered: (H, W) depths of every view, 0 where there is none.
+        far: (H, W) bool of every view, regions that are known to be far.
     """
+    if not any(some.any() for some in (*backgrounds, *far)):
+        return list(far)
     cameras = [found.camera for found in maps]
     unknown = [np.isnan(depth) for depth in known]
     free = [background & where for background, where in zip(backgrounds, unknown, strict=True)]

@@ -84,6 +84,11 @@ def test_what_is_far_by_its_shading_stays_so():
     assert far[told].all() and not far[24:].any()
 
 
+def test_nothing_is_far_without_a_background():
+    maps, _, known, rendered = scene()
+    assert not np.any(far_parts(maps, NONE, known, rendered, NONE))
+
+
 def test_large_parts_are_judged_by_pixels_all_over_them():
     """A sky of 2,800 pixels, of which others show the left 30 of 80 columns, or 50."""
     assert ROOF * 80 > 20 * LOOKED_AT
