@@ -47,24 +47,22 @@ def far_parts(
     if not any(some.any() for some in (*backgrounds, *far)):
         return list(far)
     cameras = [found.camera for found in maps]
-    unknown = [np.isnan(depth) for depth in known]
-    free = [background & where for background, where in zip(backgrounds, unknown, strict=True)]
+    free = [background & np.isnan(depth) for background, depth in zip(backgrounds, known, strict=True)]
     distance = FAR * float(np.ptp([camera.center for camera in cameras], axis=0).max())
     result = []
-    for view, (found, told) in enumerate(zip(maps, far, strict=True)):
+    for view, (found, depth, told) in enumerate(zip(maps, known, far, strict=True)):
         edge = edges_of(found.grey, found.noise, found.most_noise)
         part, parts = label(~edge)
         size, of_unknown, of_free = (
-            np.bincount(part[where], minlength=parts + 1) for where in (~edge, unknown[view], free[view])
+            np.bincount(part[where], minlength=parts + 1) for where in (~edge, np.isnan(depth), free[view])
         )
         asked = (of_unknown >= (1 - KNOWN_SHARE) * size) & (of_free > MOST * of_unknown)
         row, column = _some_of_each(np.where(asked[part] & ~edge, part, 0))
         shown, number = _shown_by_others(maps, free, view, row, column, distance), part[row, column]
         is_far = np.bincount(number[shown], minlength=parts + 1) > MOST * np.bincount(number, minlength=parts + 1)
         result.append(grown_alike(told | (is_far[part] & ~edge), found.grey, edge))
-    looking = KnownDepths(
-        cameras, [np.where(np.isnan(depth) & past, distance, depth) for depth, past in zip(known, result, strict=True)]
-    )
+    seen = (np.where(np.isnan(depth) & past, distance, depth) for depth, past in zip(known, result, strict=True))
+    looking = KnownDepths(cameras, seen)
     for camera, depth, told, past in zip(cameras, rendered, far, result, strict=True):
         row, column = np.nonzero(past & ~told & (depth > 0))
         is_surface = looking.know(to_world(camera, rays_of(camera, row, column) * depth[row, column, None]))
