@@ -1,8 +1,9 @@
-"""Closes small holes of a fused surface, unless photographs speak for them.
+"""Closes small holes and slits of a fused surface, unless photographs speak for them.
 
-Depths that disagree leave pinholes along edges, in folds and on what few photographs show. A hole that is narrower than
-a window of stereo is in the windows of all that is around it: these were matched as one surface across it. It is closed
-with triangles between its own vertices, unless photographs see through it, or the patch would turn its back to what is
+Depths that disagree leave pinholes along edges, in folds and on what few photographs show, and where photographs look
+along a surface it has slits between their rows of pixels. A hole that is narrower than a window of stereo, however
+long, is in the windows of all that is around it: these were matched as one surface across it. It is closed with
+triangles between its own vertices, unless photographs see through it, or the patch would turn its back to what is
 around it: the rim of a piece is no hole.
 """
 
@@ -83,9 +84,15 @@ def _small_rims(mesh: Mesh, cameras: Sequence[Camera]) -> list[np.ndarray]:
     rim = np.repeat(np.arange(len(rims)), [len(one) for one in rims])
     place = mesh.vertices.astype(np.float64)[np.concatenate(rims)]
     middle = np.stack([np.bincount(rim, place[:, a]) for a in range(3)], 1) / np.bincount(rim)[:, None]
-    width = np.zeros(len(rims))
-    np.maximum.at(width, rim, 2 * np.linalg.norm(place - middle[rim], axis=1))
+    width = np.array([_width(mesh.vertices[one]) for one in rims])
     return [rims[k] for k in np.flatnonzero(width <= WINDOW * _pixels(middle, cameras))]
+
+
+def _width(rim: np.ndarray) -> float:
+    """Of (P, 3) places on the rim of a hole how far they are apart across the line along which they are farthest."""
+    place = rim.astype(np.float64) - rim.mean(0, dtype=np.float64)
+    across = place @ np.linalg.eigh(place.T @ place)[1][:, 1]
+    return float(across.max() - across.min())
 
 
 def _pixels(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:

@@ -77,6 +77,19 @@ def test_a_wider_hole_stays():
     assert without_small_holes(pierced(flat(), 0.02), away, UNKNOWN[:1], NOT_FREE[:1])[1] == 0
 
 
+@pytest.mark.parametrize("angle", [0, 30, 45])
+def test_a_slit_is_as_wide_as_it_is_across(angle):
+    mesh, turned = flat(), np.radians(angle)
+    middle = mesh.vertices[mesh.faces].mean(1)[:, :2]
+    along = middle @ np.array([np.cos(turned), np.sin(turned)])
+    across = middle @ np.array([-np.sin(turned), np.cos(turned)])
+    for width, holes in ((WINDOW - 3, 1), (WINDOW + 3, 0)):
+        slit = select_faces(mesh, ~((np.abs(along) < 0.3) & (np.abs(across) < width * 0.01 / 2)))
+        found, count = closed(slit)
+        assert count == holes
+        assert (topology(found)["boundary_edges"] == outer_edges()) == bool(holes)
+
+
 @pytest.mark.parametrize("views, holes", [(1, 1), (2, 0), (4, 0)])
 @pytest.mark.parametrize("is_free", [False, True])
 def test_two_views_that_see_through_a_hole_keep_it_open(views, holes, is_free):
