@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, fit_surfaces, patch_match
 from linprim_geo.points.view_pairs import CONFIRMING, source_views, visible_pixels
 from linprim_geo.stereo.confidence import MATCHED_WEIGHTS, MOST_COST, RIGHT, WEIGHTS, evidence, probability
+from linprim_geo.stereo.edges import edges_of
 from linprim_geo.stereo.evidence import Glance, glance
 from linprim_geo.stereo.noise import noise_of, shared_noise
 
@@ -63,6 +65,11 @@ class DepthMap:
     grey: np.ndarray
     noise: float
     most_noise: float = np.inf
+
+    @cached_property
+    def edges(self) -> np.ndarray:
+        """(H, W) bool: where an edge of grey runs through a pixel or beside it."""
+        return edges_of(self.grey, self.noise, self.most_noise)
 
     def is_confirmed(self, probability: float = CONFIDENT) -> np.ndarray:
         """(H, W) bool."""

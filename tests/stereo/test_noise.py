@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from helpers.textured_plane import camera, photograph, texture
 
+from linprim_geo.stereo.edges import edges_of
 from linprim_geo.stereo.noise import LEAST_NOISE, noise_of, shared_noise
-from linprim_geo.stereo.planes.plain_regions import edges_of
 
 CAMERAS = [camera(eye) for eye in ((0, 0, 3), (0.3, 0, 3), (0, 0.35, 2.9))]
 OTHERS = [[1, 2], [0, 2], [0, 1]]

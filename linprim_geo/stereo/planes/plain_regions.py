@@ -16,11 +16,7 @@ from scipy.ndimage import binary_dilation, distance_transform_edt, find_objects,
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
-from linprim_geo.stereo.noise import LEAST_OF_PLAIN, plainest
 
-# An edge runs through 3 by 3 pixels whose variance is so many times that of the noise; fewer edge pixels than SPECK
-# together are noise.
-EDGE_VARIANCE, SPECK = 4.0, 9
 # Regions have at least so many pixels (two windows of stereo) and so many confirmed depths within RING pixels.
 LEAST_PIXELS, LEAST_POINTS, RING = 200, 30, 4
 # Stereo gives the depth of an edge to pixels up to ten beside it (DECISIONS 126): what has no edge within twice as many
@@ -88,21 +84,6 @@ class PlainRegion:
         return (np.abs(off) < TOLERANCE) & self.sure[:, None]
 
 
-def edges_of(grey: np.ndarray, noise: float, most: float = np.inf) -> np.ndarray:
-    """(H, W) bool: where an edge runs through a pixel or beside it.
-
-    `noise` is the variance that differences of pixels tell. Blur, demosaicing and JPEG make it equal in neighbours,
-    whose differences tell less: where the plainest parts vary more, their variance counts, up to the `most` that noise
-    may have (`noise.shared_noise`).
-    """
-    values = grey.astype(np.float64)
-    mean = uniform_filter(values, 3, mode="nearest")
-    variance = uniform_filter(values * values, 3, mode="nearest") - mean * mean
-    edge = variance > EDGE_VARIANCE * min(most, max(noise, plainest(variance, values) / LEAST_OF_PLAIN))
-    parts, _ = label(edge, np.ones((3, 3)))
-    return edge & (np.bincount(parts.ravel())[parts] >= SPECK)
-
-
 def grown_alike(region: np.ndarray, grey: np.ndarray, edge: np.ndarray) -> np.ndarray:
     """(H, W) bool: of a plain region what no `edge` runs through, and of edges what is no farther from that than RING
     pixels and of the same grey, up to HALF_EDGE: blur mixes pixels on an edge out of both sides."""
@@ -159,8 +140,7 @@ def regions_of_views(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> 
         sure = np.isfinite(depth)
         if sure.any():
             depth = np.where(~sure & (found.depth > BEYOND * np.median(depth[sure])), found.depth, depth)
-        edge = edges_of(found.grey, found.noise, found.most_noise)
-        result.append(plain_regions(number, found.camera, found.grey, edge, depth, sure))
+        result.append(plain_regions(number, found.camera, found.grey, found.edges, depth, sure))
     return result
 
 

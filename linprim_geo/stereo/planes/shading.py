@@ -18,9 +18,10 @@ from linprim_geo.geometry.boxes import smaller
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.stereo_ops import ShadedComparison, compare_shading
 from linprim_geo.stereo.depth_maps import DepthMap, block_means
+from linprim_geo.stereo.edges import edges_of
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.noise import plainest
-from linprim_geo.stereo.planes.plain_regions import edges_of, in_camera, rays_of
+from linprim_geo.stereo.planes.plain_regions import in_camera, rays_of
 from linprim_geo.stereo.vignetting import falloff
 
 # Larger photographs are averaged down.

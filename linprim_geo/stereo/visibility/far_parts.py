@@ -15,7 +15,7 @@ from scipy.ndimage import label
 
 from linprim_geo.points.view_pairs import visible_pixels
 from linprim_geo.stereo.depth_maps import DepthMap
-from linprim_geo.stereo.planes.plain_regions import HALF_EDGE, edges_of, grown_alike, rays_of, to_world
+from linprim_geo.stereo.planes.plain_regions import HALF_EDGE, grown_alike, rays_of, to_world
 from linprim_geo.stereo.planes.seen_through import KnownDepths
 from linprim_geo.stereo.visibility.lone_backgrounds import FAR
 
@@ -51,7 +51,7 @@ def far_parts(
     distance = FAR * float(np.ptp([camera.center for camera in cameras], axis=0).max())
     result = []
     for view, (found, depth, told) in enumerate(zip(maps, known, far, strict=True)):
-        edge = edges_of(found.grey, found.noise, found.most_noise)
+        edge = found.edges
         part, parts = label(~edge)
         size, of_unknown, of_free = (
             np.bincount(part[where], minlength=parts + 1) for where in (~edge, np.isnan(depth), free[view])

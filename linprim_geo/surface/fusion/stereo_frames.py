@@ -31,7 +31,6 @@ from linprim_geo.stereo.planes.plain_regions import (
     TOLERANCE,
     PlainRegion,
     common_planes,
-    edges_of,
     regions_of_views,
 )
 from linprim_geo.stereo.planes.point_planes import SurfacePoints, planes_of_points, point_plane_depth
@@ -225,7 +224,7 @@ class MergedFrames(Sequence):
         and not at edges of photographs, where rendered ones are finer."""
         spanned = spanned_depths(self.cameras, known, points, rendered)
         for view, (found, depth, background) in enumerate(zip(maps, spanned, backgrounds, strict=True)):
-            depth[background | edges_of(found.grey, found.noise, found.most_noise)] = np.nan
+            depth[background | found.edges] = np.nan
             self.doubtful_depths[view] = _first_known((self.doubtful_depths[view], depth))
         self.spanned = _share_known(spanned)
 

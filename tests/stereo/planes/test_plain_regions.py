@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from helpers.captures import look_at
 
+from linprim_geo.stereo.edges import edges_of
 from linprim_geo.stereo.planes.plain_regions import (
     PlainRegion,
     common_planes,
-    edges_of,
     grown_alike,
     may_lie_on,
     plain_regions,

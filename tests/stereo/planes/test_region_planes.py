@@ -9,7 +9,8 @@ from helpers.plain_room import GREYS, NOISE, PLANES, cameras, noisy_maps, photog
 from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from linprim_geo.stereo.depth_maps import DepthMap
-from linprim_geo.stereo.planes.plain_regions import edges_of, in_camera, in_world, regions_of_views
+from linprim_geo.stereo.edges import edges_of
+from linprim_geo.stereo.planes.plain_regions import in_camera, in_world, regions_of_views
 from linprim_geo.stereo.planes.region_planes import beside_edges, region_plane_depths
 
 

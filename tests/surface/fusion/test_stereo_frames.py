@@ -145,7 +145,7 @@ def test_spans_stand_where_nothing_is_known_and_photographs_have_no_edges(found,
     edge = np.zeros((30, 40), bool)
     edge[:, 30:] = True
     monkeypatch.setattr(stereo_frames, "spanned_depths", lambda *_: [np.full((30, 40), 3.2, np.float32)])
-    monkeypatch.setattr(stereo_frames, "edges_of", lambda *_: edge)
+    monkeypatch.setattr(DepthMap, "edges", edge)
     merged = MergedFrames(rendered(0.01), [VIEW], 5.0)
     frame = merged[0]
     assert (frame.depth[1:, :20] == 3).all(), "confirmed and doubtful depths stay"
