@@ -8,7 +8,7 @@ around each pixel, within the edges of the photograph. A depth counts where neig
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,7 +22,7 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, fit_surfaces, patch_match
 from linprim_geo.points.view_pairs import CONFIRMING, source_views, visible_pixels
 from linprim_geo.stereo.confidence import MATCHED_WEIGHTS, MOST_COST, RIGHT, WEIGHTS, evidence, probability
-from linprim_geo.stereo.edges import edges_of
+from linprim_geo.stereo.edges import colour_edges, colours_of, edges_of
 from linprim_geo.stereo.evidence import Glance, glance
 from linprim_geo.stereo.noise import noise_of, shared_noise
 
@@ -32,8 +32,8 @@ MOST_SOURCES = 8
 COARSE_SWEEPS, FINE_SWEEPS, GEOMETRIC_SWEEPS = 3, 1, (1, 1)
 # The nearest depth is that of the nearest points that a view shows, but for this share, divided by NEARER.
 NEAREST_SHARE, NEARER = 0.01, 1.5
-# Bytes per pixel of all views that are in memory at once: planes 17, images 7, depths of the last turn 4, maps 25.
-PIXEL_BYTES = 53
+# Bytes per pixel of all views that are in memory at once: planes 17, images 7, depths of the last turn 4, maps 27.
+PIXEL_BYTES = 55
 # Of the memory that is free, no more than this share is taken.
 MEMORY_SHARE = 0.5
 # Of masks, pixels below this alpha are background, whose depth is not asked for.
@@ -53,7 +53,8 @@ class DepthMap:
     the world, towards the camera; `confidence` (H, W) float32 the probability that the depth is right within 1 %, 0
     where it is unknown; `confirming` (H, W) uint8 how many other views have the same depth; `deviation` (H, W) float32
     the least share of the depth by which that of another view differs, infinite where none has one. `grey` (H, W) uint8
-    is what was matched, `noise` the variance of its noise and `most_noise` what others tell of it (`shared_noise`).
+    is what was matched, `noise` the variance of its noise and `most_noise` what others tell of it (`shared_noise`);
+    `colours` (2, H // 2, W // 2) are those of the photograph (`edges.colours_of`), None where they are not known.
     """
 
     camera: Camera
@@ -65,11 +66,16 @@ class DepthMap:
     grey: np.ndarray
     noise: float
     most_noise: float = np.inf
+    colours: np.ndarray | None = None
 
     @cached_property
     def edges(self) -> np.ndarray:
         """(H, W) bool: where an edge of grey runs through a pixel or beside it."""
         return edges_of(self.grey, self.noise, self.most_noise)
+
+    def all_edges(self) -> np.ndarray:
+        """(H, W) bool: where one of grey or colour does. Those of colour alone are as wide as JPEG makes them."""
+        return self.edges if self.colours is None else self.edges | colour_edges(self.colours, self.grey.shape)
 
     def is_confirmed(self, probability: float = CONFIDENT) -> np.ndarray:
         """(H, W) bool."""
@@ -141,10 +147,11 @@ def depth_maps(
         if fit and planes is not None:
             fit_within_edges(image, planes)
     weights = WEIGHTS if fit else MATCHED_WEIGHTS
-    return [
-        _depth_map(full[k], noises[k], most[k], planes, [(cameras[j], found[j]) for j in pairs[k]], weights)
-        for k, planes in enumerate(found)
-    ]
+    result = []
+    for k, (view, planes) in enumerate(zip(views, found, strict=True)):
+        of_view = _depth_map(full[k], noises[k], most[k], planes, [(cameras[j], found[j]) for j in pairs[k]], weights)
+        result.append(replace(of_view, colours=colours_of(view.load().rgb)))
+    return result
 
 
 def memory_of(cameras: Sequence[Camera]) -> int:

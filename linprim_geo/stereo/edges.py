@@ -1,11 +1,11 @@
-"""Where photographs have edges."""
+"""Where photographs have edges: in their grey, and in their colour, where two surfaces are as bright as each other."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.ndimage import label, uniform_filter
 
-from linprim_geo.stereo.noise import LEAST_OF_PLAIN, plainest
+from linprim_geo.stereo.noise import LEAST_OF_PLAIN, noise_of, plainest
 
 # An edge runs through 3 by 3 pixels whose variance is so many times that of the noise; fewer edge pixels than SPECK
 # together are noise.
@@ -25,3 +25,23 @@ def edges_of(grey: np.ndarray, noise: float, most: float = np.inf) -> np.ndarray
     edge = variance > EDGE_VARIANCE * min(most, max(noise, plainest(variance, values) / LEAST_OF_PLAIN))
     parts, _ = label(edge, np.ones((3, 3)))
     return edge & (np.bincount(parts.ravel())[parts] >= SPECK)
+
+
+def colours_of(rgb: np.ndarray) -> np.ndarray:
+    """(2, H // 2, W // 2) float32: how much redder than blue, and greener than both, (H, W, 3) pixels are, in the mean
+    of 2 by 2: as JPEG keeps colours."""
+    height, width = (size // 2 for size in rgb.shape[:2])
+    means = rgb[: 2 * height, : 2 * width].reshape(height, 2, width, 2, 3).mean((1, 3), dtype=np.float32)
+    red, green, blue = np.moveaxis(means, 2, 0)
+    return np.stack([(red - blue) / 2, green - (red + blue) / 2])
+
+
+def colour_edges(colours: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """(H, W) bool of a photograph of this shape: where an edge of either of its `colours` runs."""
+    result = np.zeros(shape, bool)
+    height, width = colours.shape[1:]
+    for colour in colours:
+        # Middle grey stands for every value: colours are not clipped where they are none.
+        edge = edges_of(colour + 128, noise_of(colour))
+        result[: 2 * height, : 2 * width] |= edge.repeat(2, 0).repeat(2, 1)
+    return result

@@ -13,6 +13,7 @@ from linprim_geo.capture.types import Photo
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage
 from linprim_geo.stereo.depth_maps import _doubled, depth_maps, fit_within_edges, halved
+from linprim_geo.stereo.edges import colours_of
 from linprim_geo.stereo.noise import noise_of
 
 NORMAL = np.array([0.3, -0.25, 1.0]) / np.linalg.norm([0.3, -0.25, 1.0])
@@ -65,6 +66,8 @@ def test_a_wall_is_where_it_is_and_neighbours_confirm_it(views, wall_points):
     # Towards the camera, and the wall's: a window's depth changes by a tenth of a pixel within 5 of them.
     angle = np.degrees(np.arccos(np.clip(-first.normal[inside] @ NORMAL, -1, 1)))
     assert np.median(angle) < 5
+    for found, view in zip(maps, views, strict=True):
+        np.testing.assert_array_equal(found.colours, colours_of(view.load().rgb))
 
 
 def test_texture_that_noise_nearly_hides_is_known_and_confirmed(wall_points):

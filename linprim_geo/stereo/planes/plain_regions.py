@@ -140,7 +140,7 @@ def regions_of_views(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> 
         sure = np.isfinite(depth)
         if sure.any():
             depth = np.where(~sure & (found.depth > BEYOND * np.median(depth[sure])), found.depth, depth)
-        result.append(plain_regions(number, found.camera, found.grey, found.edges, depth, sure))
+        result.append(plain_regions(number, found.camera, found.grey, found.all_edges(), depth, sure))
     return result
 
 
