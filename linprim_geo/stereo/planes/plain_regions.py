@@ -43,6 +43,8 @@ LEAST_VIEWS, SPREAD = 3, np.radians(10)
 STEADY, LEAST_SPREAD = 2 * np.sqrt(12), np.radians(6)
 # Planes are the same if their normals differ by no more, and their distance by no more than TOLERANCE of the depth.
 SAME_ANGLE = np.radians(3)
+# Regions lie on a plane with all that they have if so many of their points do.
+ALL_POINTS = 0.9
 # Rounds in which planes are chosen by regions and fitted to all points on them.
 ROUNDS = 3
 
@@ -286,20 +288,24 @@ def _refitted(
                 break
             own = on[:, best]
             depth = 1 / region.inverse[own]
-            points[best].append((to_world(camera, region.rays[own] * depth[:, None]), depth, region.view))
+            place = to_world(camera, region.rays[own] * depth[:, None])
+            points[best].append((place, depth, region.view, len(own)))
             left &= ~own
     fitted = []
     for plane, spread, parts in zip(planes, spreads, points, strict=True):
         if not parts:
             continue
-        place, depth = (np.concatenate(x) for x in list(zip(*parts, strict=True))[:2])
-        views = np.array([view for *_, view in parts])
+        places, depths, views, counts = zip(*parts, strict=True)
+        place, depth, views = np.concatenate(places), np.concatenate(depths), np.array(views)
         middle = np.average(place, axis=0, weights=depth**-2)
         around = place - middle
         variance, axes = np.linalg.eigh(around.T @ (around / depth[:, None] ** 2) / (depth**-2).sum())
-        # The normal's angle is as certain as the points are wide across the narrower side.
+        # The normal's angle is as certain as the points are wide across the narrower side, and as near to the plane:
+        # within TOLERANCE, or by what they scatter if they are all that there is, and not chosen by being near.
         wide = np.sqrt(max(variance[1], 0)) * np.tan(SAME_ANGLE) * np.sqrt(len(np.unique(views)))
-        if wide < TOLERANCE * np.median(depth) or not seen_enough(cameras, views, middle, spread):
+        scatter = 2 * float(np.sqrt(np.mean((around @ axes[:, 0] / depth) ** 2)))
+        off = min(scatter, TOLERANCE) if len(place) > ALL_POINTS * sum(counts) else TOLERANCE
+        if wide < off * np.median(depth) or not seen_enough(cameras, views, middle, spread):
             continue
         normal = axes[:, 0] * (1 if axes[:, 0] @ plane[:3] > 0 else -1)
         fitted.append((len(place), np.append(normal, normal @ middle), middle, float(np.median(depth)), spread))

@@ -3,6 +3,8 @@ things that must not become planes."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.captures import look_at
@@ -114,6 +116,37 @@ def test_what_is_round_becomes_no_plane(axis, share):
             camera, np.where(np.isfinite(depth), depth, np.nan), np.where(np.isfinite(depth), 150, 60), number
         )
     assert regions and not len(common_planes(cameras, regions))
+
+
+def front_of_a_pillar(noise: float):
+    """Cameras, and regions of the front of a pillar, 0.6 wide and 1.5 high, that looks at them from 4 away."""
+    normal, middle = np.array([1.0, 1.0, 0.0]) / np.sqrt(2), np.array([0.8, 0.8, 0.8])
+    cameras, regions = [camera_at(center) for center in CENTERS], []
+    for number, camera in enumerate(cameras):
+        rays, rng = camera.world_rays(), np.random.default_rng(number)
+        depth = (middle - camera.center) @ normal / (rays @ normal)
+        place = camera.center + rays * depth[..., None] - middle
+        front = (np.abs(place @ [normal[1], -normal[0], 0]) < 0.3) & (np.abs(place[..., 2]) < 0.75)
+        depth = depth * (1 + rng.normal(0, noise, depth.shape))
+        regions += seen(camera, np.where(front, depth, np.nan), np.where(front, 150, 60), number)
+    return cameras, regions
+
+
+def test_a_narrow_plane_is_as_certain_as_its_points_scatter():
+    """0.3 % of the depth tell where the front of a pillar is, and 1 % do not."""
+    (plane,) = common_planes(*front_of_a_pillar(0.003))
+    assert abs(plane[:2].sum()) > np.sqrt(2) * np.cos(np.radians(1)) and abs(plane[3]) == pytest.approx(1.131, rel=0.01)
+    assert not len(common_planes(*front_of_a_pillar(0.01)))
+
+
+def test_points_that_are_chosen_by_being_near_do_not_tell_how_they_scatter():
+    """A quarter of the points along the edges of the front are before it, as those of things before a wall are."""
+    cameras, regions = front_of_a_pillar(0.003)
+    mixed = []
+    for region in regions:
+        before = region.inverse * np.where(np.arange(len(region.inverse)) % 4, 1, 1.1)
+        mixed.append(replace(region, inverse=before))
+    assert len(common_planes(cameras, regions)) and not len(common_planes(cameras, mixed))
 
 
 def test_a_wall_that_is_slightly_bent_becomes_no_plane():
