@@ -41,7 +41,7 @@ def colour_edges(colours: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     result = np.zeros(shape, bool)
     height, width = colours.shape[1:]
     for colour in colours:
-        # Middle grey stands for every value: colours are not clipped where they are none.
+        # Around 128, as `edges_of` asks values near black and white nothing about noise.
         edge = edges_of(colour + 128, noise_of(colour))
         result[: 2 * height, : 2 * width] |= edge.repeat(2, 0).repeat(2, 1)
     return result
