@@ -54,7 +54,7 @@ class DepthMap:
     where it is unknown; `confirming` (H, W) uint8 how many other views have the same depth; `deviation` (H, W) float32
     the least share of the depth by which that of another view differs, infinite where none has one. `grey` (H, W) uint8
     is what was matched, `noise` the variance of its noise and `most_noise` what others tell of it (`shared_noise`);
-    `colours` (2, H // 2, W // 2) are those of the photograph (`edges.colours_of`), None where they are not known.
+    `colours` (2, H // 2, W // 2) float32 its colour differences (`edges.colours_of`), None where they are not known.
     """
 
     camera: Camera
@@ -74,7 +74,7 @@ class DepthMap:
         return edges_of(self.grey, self.noise, self.most_noise)
 
     def all_edges(self) -> np.ndarray:
-        """(H, W) bool: where one of grey or colour does. Those of colour alone are as wide as JPEG makes them."""
+        """(H, W) bool: where an edge of grey or colour runs; those of colour alone are as wide as JPEG makes them."""
         return self.edges if self.colours is None else self.edges | colour_edges(self.colours, self.grey.shape)
 
     def is_confirmed(self, probability: float = CONFIDENT) -> np.ndarray:
@@ -117,7 +117,11 @@ def depth_maps(
         raise LinprimError(
             "no two photographs show the same points from directions that differ: stereo needs such pairs"
         )
-    full = [StereoImage.of(view.camera, grey_of(view)) for view in views]
+    full, colours = [], []
+    for view in views:
+        rgb = view.load().rgb
+        full.append(StereoImage.of(view.camera, grey_of(rgb)))
+        colours.append(colours_of(rgb))
     half = [halved(image) for image in full]
     noises = [noise_of(image.grey) for image in full]
     ranges = [inverse_range(camera, points) for camera in cameras]
@@ -147,11 +151,11 @@ def depth_maps(
         if fit and planes is not None:
             fit_within_edges(image, planes)
     weights = WEIGHTS if fit else MATCHED_WEIGHTS
-    result = []
-    for k, (view, planes) in enumerate(zip(views, found, strict=True)):
-        of_view = _depth_map(full[k], noises[k], most[k], planes, [(cameras[j], found[j]) for j in pairs[k]], weights)
-        result.append(replace(of_view, colours=colours_of(view.load().rgb)))
-    return result
+    result = (
+        _depth_map(full[k], noises[k], most[k], planes, [(cameras[j], found[j]) for j in pairs[k]], weights)
+        for k, planes in enumerate(found)
+    )
+    return [replace(of_view, colours=own) for of_view, own in zip(result, colours, strict=True)]
 
 
 def memory_of(cameras: Sequence[Camera]) -> int:
@@ -212,9 +216,9 @@ def are_known(inverse: np.ndarray, cost: np.ndarray) -> np.ndarray:
     return (inverse > 0) & (cost < MOST_COST)
 
 
-def grey_of(view: View) -> np.ndarray:
-    """(H, W) uint8 luminance of a photograph."""
-    return np.rint(view.load().rgb @ np.array([0.299, 0.587, 0.114], np.float32)).astype(np.uint8)
+def grey_of(rgb: np.ndarray) -> np.ndarray:
+    """(H, W) uint8 luminance of a photograph (H, W, 3)."""
+    return np.rint(rgb @ np.array([0.299, 0.587, 0.114], np.float32)).astype(np.uint8)
 
 
 def halved(image: StereoImage) -> StereoImage:

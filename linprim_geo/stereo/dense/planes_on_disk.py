@@ -82,7 +82,7 @@ class Photographs:
         if k in self._kept:
             self._kept.move_to_end(k)
         else:
-            image = StereoImage.of(self.cameras[k], grey_of(self.views[k]))
+            image = StereoImage.of(self.cameras[k], grey_of(self.views[k].load().rgb))
             self._kept[k] = image, halved(image), noise_of(image.grey)
             if len(self._kept) > KEPT:
                 self._kept.popitem(last=False)

@@ -62,7 +62,7 @@ class _Image:
 
     @staticmethod
     def of(view: View) -> _Image:
-        grey = grey_of(view)
+        grey = grey_of(view.load().rgb)
         smooth = gaussian_filter(grey.astype(np.float32), SMOOTHED)
         return _Image(smooth, sobel(smooth, 1) / 8, sobel(smooth, 0) / 8, noise_of(grey))
 
