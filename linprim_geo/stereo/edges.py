@@ -28,8 +28,8 @@ def edges_of(grey: np.ndarray, noise: float, most: float = np.inf) -> np.ndarray
 
 
 def colours_of(rgb: np.ndarray) -> np.ndarray:
-    """(2, H // 2, W // 2) float32: how much redder than blue, and greener than both, (H, W, 3) pixels are, in the mean
-    of 2 by 2: as JPEG keeps colours."""
+    """(2, H // 2, W // 2) float32: the colour differences (R - B) / 2 and G - (R + B) / 2 of (H, W, 3) pixels, in means
+    of 2 by 2 pixels, as JPEG keeps them."""
     height, width = (size // 2 for size in rgb.shape[:2])
     means = rgb[: 2 * height, : 2 * width].reshape(height, 2, width, 2, 3).mean((1, 3), dtype=np.float32)
     red, green, blue = np.moveaxis(means, 2, 0)
@@ -37,11 +37,11 @@ def colours_of(rgb: np.ndarray) -> np.ndarray:
 
 
 def colour_edges(colours: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """(H, W) bool of a photograph of this shape: where an edge of either of its `colours` runs."""
+    """(H, W) bool of a photograph of this shape: where either of its colour differences (`colours_of`) has an edge."""
     result = np.zeros(shape, bool)
     height, width = colours.shape[1:]
     for colour in colours:
-        # Around 128, as `edges_of` asks values near black and white nothing about noise.
+        # Around 128: `edges_of` does not learn the noise from values that are nearly black or white.
         edge = edges_of(colour + 128, noise_of(colour))
         result[: 2 * height, : 2 * width] |= edge.repeat(2, 0).repeat(2, 1)
     return result

@@ -43,7 +43,8 @@ LEAST_VIEWS, SPREAD = 3, np.radians(10)
 STEADY, LEAST_SPREAD = 2 * np.sqrt(12), np.radians(6)
 # Planes are the same if their normals differ by no more, and their distance by no more than TOLERANCE of the depth.
 SAME_ANGLE = np.radians(3)
-# Regions lie on a plane with all that they have if so many of their points do.
+# A plane is as certain as its points scatter if they are more than this share of all points of its regions: of fewer,
+# those near the plane were chosen, and their scatter is that of the choice.
 ALL_POINTS = 0.9
 # Rounds in which planes are chosen by regions and fitted to all points on them.
 ROUNDS = 3
@@ -300,12 +301,11 @@ def _refitted(
         middle = np.average(place, axis=0, weights=depth**-2)
         around = place - middle
         variance, axes = np.linalg.eigh(around.T @ (around / depth[:, None] ** 2) / (depth**-2).sum())
-        # The normal's angle is as certain as the points are wide across the narrower side, and as near to the plane:
-        # within TOLERANCE, or by what they scatter if they are all that there is, and not chosen by being near.
+        # The normal is as certain as the points are wide across the narrower side, and near to the plane.
         wide = np.sqrt(max(variance[1], 0)) * np.tan(SAME_ANGLE) * np.sqrt(len(np.unique(views)))
         scatter = 2 * float(np.sqrt(np.mean((around @ axes[:, 0] / depth) ** 2)))
-        off = min(scatter, TOLERANCE) if len(place) > ALL_POINTS * sum(counts) else TOLERANCE
-        if wide < off * np.median(depth) or not seen_enough(cameras, views, middle, spread):
+        error = min(scatter, TOLERANCE) if len(place) > ALL_POINTS * sum(counts) else TOLERANCE
+        if wide < error * np.median(depth) or not seen_enough(cameras, views, middle, spread):
             continue
         normal = axes[:, 0] * (1 if axes[:, 0] @ plane[:3] > 0 else -1)
         fitted.append((len(place), np.append(normal, normal @ middle), middle, float(np.median(depth)), spread))

@@ -84,15 +84,15 @@ def _small_rims(mesh: Mesh, cameras: Sequence[Camera]) -> list[np.ndarray]:
     rim = np.repeat(np.arange(len(rims)), [len(one) for one in rims])
     place = mesh.vertices.astype(np.float64)[np.concatenate(rims)]
     middle = np.stack([np.bincount(rim, place[:, a]) for a in range(3)], 1) / np.bincount(rim)[:, None]
-    width = np.array([_width(mesh.vertices[one]) for one in rims])
+    width = np.array([_width(mesh.vertices[one].astype(np.float64)) for one in rims])
     return [rims[k] for k in np.flatnonzero(width <= WINDOW * _pixels(middle, cameras))]
 
 
 def _width(rim: np.ndarray) -> float:
-    """Of (P, 3) places on the rim of a hole how far they are apart across the line along which they are farthest."""
-    place = rim.astype(np.float64) - rim.mean(0, dtype=np.float64)
-    across = place @ np.linalg.eigh(place.T @ place)[1][:, 1]
-    return float(across.max() - across.min())
+    """How wide the rim (P, 3) of a hole is across its longest direction: along its second principal axis."""
+    place = rim - rim.mean(0)
+    along = place @ np.linalg.eigh(place.T @ place)[1][:, 1]
+    return float(np.ptp(along))
 
 
 def _pixels(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
