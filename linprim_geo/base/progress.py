@@ -26,10 +26,15 @@ class Progress:
     """
 
     def __init__(self, name: str, total: int, start: int = 0, quiet: bool = False):
-        self.name, self.total, self.start, self.quiet = name, total, start, quiet
+        self.name, self.quiet = name, quiet
         self.terminal = sys.stderr.isatty()
-        self.begin = self.last = time.monotonic()
         self.width = 0
+        self.restart(total, start)
+
+    def restart(self, total: int, start: int = 0) -> None:
+        """The clock begins again: what the rate and the time left are of is steps after `start`, from now on."""
+        self.total, self.start = total, start
+        self.begin = self.last = time.monotonic()
 
     def update(self, done: int, text: str = "") -> None:
         """Says that `done` steps are finished; `text` goes at the end of the line."""

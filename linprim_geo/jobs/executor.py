@@ -80,7 +80,7 @@ class Executor:
         deaths = [0] * len(tasks)
         waiting = [k for k in range(len(tasks)) if k not in results]
         running: dict[object, int] = {}
-        progress.total, progress.start = len(tasks), len(tasks) - len(waiting)
+        progress.restart(len(tasks), len(tasks) - len(waiting))
         if waiting and len(waiting) < len(tasks):
             progress.note(f"  {len(tasks) - len(waiting)} of {len(tasks)} done before")
         while waiting or running:

@@ -82,7 +82,6 @@ def train_run(
         pace = Pace.resumed(run, trainer)
     for torn in [*run.path.glob(".*.tmp*"), *run.path.glob("checkpoints/.*.tmp*")]:  # what a kill left half-written
         torn.unlink()
-    progress.start = trainer.step
     progress.note(
         f"{scene.root}: {scene.kind}, {len(scene.train)} training and {len(scene.test)} held-out views of "
         f"{images[0].camera.width}x{images[0].camera.height}; {len(trainer)} primitives, {ops.instruction_set()}, "
@@ -90,6 +89,7 @@ def train_run(
     )
     held_out = load_training_images(scene.test, run.similarity) if held_out is None else held_out
     scene.release_photos()
+    progress.restart(progress.total, trainer.step)
     seconds, score, score_gain = run_steps(trainer, run, held_out, progress, pace, advance=advance)
     result = {
         "run": str(run.path),

@@ -30,3 +30,14 @@ def test_a_terminal_has_one_line_that_is_cleared(capsys, monkeypatch):
     shown = capsys.readouterr().err
     assert shown.endswith("\r" + " " * len("merging 2/2  walls") + "\rdone\n")
     assert "\r" + "merging 2/2  walls".ljust(len("merging 1/2  gaps between planes")) + "\r" in shown
+
+
+def test_what_came_before_the_first_step_is_not_in_the_time_left(capsys, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("linprim_geo.base.progress.time.monotonic", lambda: now[0])
+    progress = Progress("train", 100)
+    now[0] = 500.0  # stereo
+    progress.restart(100, 50)
+    now[0] = 525.0
+    progress.update(75)
+    assert capsys.readouterr().err == "train 75/100  1/s  25 s left  \n"
