@@ -32,7 +32,7 @@ class Progress:
         self.restart(total, start)
 
     def restart(self, total: int, start: int = 0) -> None:
-        """The clock begins again: what the rate and the time left are of is steps after `start`, from now on."""
+        """Begins the clock again: rate and time left are those of the steps after `start`, from now on."""
         self.total, self.start = total, start
         self.begin = self.last = time.monotonic()
 
