@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import is_file
+from linprim_geo.base.files import is_file, is_folder
 from linprim_geo.capture.types import Frame
 from linprim_geo.geometry.lens import resized
 from linprim_geo.imaging import photos
@@ -59,7 +59,7 @@ def with_smaller_images(frames: Sequence[Frame], root: Path, factor: int) -> lis
     for frame in frames:
         folders = [folder for folder in frame.image_path.parents if root in folder.parents]
         pairs = [(folder, folder.with_name(f"{folder.name}_{factor}")) for folder in folders]
-        pair = next((pair for pair in pairs if pair[1].is_dir()), None)
+        pair = next((pair for pair in pairs if is_folder(pair[1])), None)
         if pair is None:
             return None
         image, lens = _same(pair[1] / frame.image_path.relative_to(pair[0])), frame.lens

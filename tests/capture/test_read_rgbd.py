@@ -234,3 +234,12 @@ def test_tanks_and_temples_by_its_trajectory(tmp_path, folder):
     for view in scene.views:
         np.testing.assert_allclose(view.camera.world_to_camera, cameras[int(view.name) - 1].world_to_camera, atol=1e-8)
         assert (view.camera.fx, view.camera.cx) == (30, 16)
+
+
+def test_a_camera_wider_than_a_name_of_a_folder_is_long_is_one_sentence(tmp_path):
+    (tmp_path / "images").mkdir()
+    for i in range(8):
+        picture(i).save(tmp_path / "images" / f"{i + 1:06d}.jpg")
+    (tmp_path / "Barn_COLMAP_SfM.log").write_text(log(ring(8)))
+    (tmp_path / "intrinsics.json").write_text(json.dumps({**JSON, "width": 10**300}))
+    assert "the image is 32x24, wanted 1000" in refusal(tmp_path)
