@@ -4,7 +4,7 @@ Depths that disagree leave pinholes along edges, in folds and on what few photog
 along a surface it has slits between their rows of pixels. A hole that is narrower than a window of stereo, however
 long, is in the windows of all that is around it: these were matched as one surface across it. It is closed with
 triangles between its own vertices, unless photographs see through it, or the patch would turn its back to what is
-around it: the rim of a piece is no hole.
+around it: the rim of a piece is no hole. So are slits that run into a border, or round a corner (slits.py).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.planes.seen_through import KnownDepths
 from linprim_geo.surface.finish.mesh_process import has_crowded_edge
 from linprim_geo.surface.finish.self_intersections import crossings, edges_of
+from linprim_geo.surface.finish.slits import Slits
 from linprim_geo.surface.normals import vertex_normals
 
 # The side of a window of stereo in pixels (kWindowSide * kWindowStep in csrc/stereo/patch_match.h).
@@ -43,26 +44,63 @@ def without_small_holes(
         known: (H, W) depths of each view, NaN where nothing is known.
         free: (H, W) bool of each view, rays that end nowhere.
     """
+    if not len(mesh.faces):
+        return mesh, 0
+    far = np.float32(FREE_DEPTH * mesh.diagonal)
+    depths = (np.where(no_end & ~np.isfinite(depth), far, depth) for depth, no_end in zip(known, free, strict=True))
+    views = KnownDepths(cameras, depths)
+    closed, holes = _without_holes(mesh, cameras, views)
+    return _without_slits(closed, cameras, views), holes
+
+
+def _without_holes(mesh: Mesh, cameras: Sequence[Camera], views: KnownDepths) -> tuple[Mesh, int]:
+    """With patches of holes that are narrow as a whole, and how many these are."""
     added, hole = _patches(mesh.vertices, _small_rims(mesh, cameras))
     if not len(added):
         return mesh, 0
     corners = mesh.vertices.astype(np.float64)[added]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    around = (vertex_normals(mesh) if mesh.normals is None else mesh.normals).astype(np.float64)[added].sum(1)
-    facing = (np.bincount(hole, (normal * around).sum(1)) > 0)[hole]
-    added, hole, corners = added[facing], hole[facing], corners[facing]
+    facing = (np.bincount(hole, (normal * _normals(mesh)[added].sum(1)).sum(1)) > 0)[hole]
+    added, hole = added[facing], hole[facing]
     if not len(added):
         return mesh, 0
-    far = np.float32(FREE_DEPTH * mesh.diagonal)
-    depths = (np.where(no_end & ~np.isfinite(depth), far, depth) for depth, no_end in zip(known, free, strict=True))
-    through = KnownDepths(cameras, depths).see_through(corners.mean(1))
+    added, hole = (each[np.bincount(hole, _wrong(mesh, added, views))[hole] == 0] for each in (added, hole))
+    return _with_faces(mesh, added), len(np.unique(hole))
+
+
+def _without_slits(mesh: Mesh, cameras: Sequence[Camera], views: KnownDepths) -> Mesh:
+    """With triangles in slits that are a part of a border. Where one is wrong its corners stay as they are."""
+    rims = [loop[::-1] for loop in border_loops(mesh.faces)]
+    if not rims:
+        return mesh
+    at_rim, widest = np.unique(np.concatenate(rims)), np.zeros(len(mesh.vertices))
+    vertices, normals = mesh.vertices.astype(np.float64), _normals(mesh)
+    widest[at_rim] = WINDOW * _pixels(vertices[at_rim], cameras)
+    while True:
+        added = Slits(rims, vertices, normals, widest).closed()
+        wrong = _wrong(mesh, added, views) if len(added) else np.zeros(0, bool)
+        if not wrong.any():
+            return _with_faces(mesh, added) if len(added) else mesh
+        widest[added[wrong]] = 0
+
+
+def _wrong(mesh: Mesh, added: np.ndarray, views: KnownDepths) -> np.ndarray:
+    """(N,) bool: which of the `added` faces (N, 3) views see through, share an edge with two others, or cross any."""
     at_rim = np.zeros(len(mesh.vertices), bool)
     at_rim[added] = True
-    wrong = through | has_crowded_edge(mesh.faces[at_rim[mesh.faces].any(1)], added) | _crossing(mesh, added)
-    added, hole = (each[np.bincount(hole, wrong)[hole] == 0] for each in (added, hole))
+    through = views.see_through(mesh.vertices.astype(np.float64)[added].mean(1))
+    return through | has_crowded_edge(mesh.faces[at_rim[mesh.faces].any(1)], added) | _crossing(mesh, added)
+
+
+def _normals(mesh: Mesh) -> np.ndarray:
+    """(V, 3) float64 normals of the vertices."""
+    return (vertex_normals(mesh) if mesh.normals is None else mesh.normals).astype(np.float64)
+
+
+def _with_faces(mesh: Mesh, added: np.ndarray) -> Mesh:
     faces = np.concatenate([mesh.faces, added])
     normals = None if mesh.normals is None else vertex_normals(replace(mesh, faces=faces))
-    return replace(mesh, faces=faces, normals=normals, primitive=None), len(np.unique(hole))
+    return replace(mesh, faces=faces, normals=normals, primitive=None)
 
 
 def _crossing(mesh: Mesh, added: np.ndarray) -> np.ndarray:

@@ -90,6 +90,53 @@ def test_a_slit_is_as_wide_as_it_is_across(angle):
         assert (topology(found)["boundary_edges"] == outer_edges()) == bool(holes)
 
 
+def slit_from_the_border(width: float, depth: float) -> Mesh:
+    """A sheet with a slit of so many pixels that begins at its border, turns by a right angle and ends inside."""
+    x, y = (flat().vertices[flat().faces].mean(1)[:, k] for k in (0, 1))
+    half = width * 0.01 / 2
+    down = (np.abs(x) < half) & (y > 0.5 - depth * 0.01 - half)
+    aside = (np.abs(y - 0.5 + depth * 0.01) < half) & (x > 0) & (x < depth * 0.01)
+    return select_faces(flat(), ~(down | aside))
+
+
+def area(mesh: Mesh) -> float:
+    return topology(mesh)["area"]
+
+
+def test_a_slit_that_runs_into_the_border_and_turns_is_closed():
+    slit = slit_from_the_border(WINDOW - 4, 40)
+    found, holes = closed(slit)
+    assert holes == 0 and area(slit) < 0.95 < area(found) == pytest.approx(1)
+    assert topology(found)["boundary_edges"] < outer_edges() and topology(found)["non_manifold_edges"] == 0
+    np.testing.assert_array_equal(found.faces[: len(slit.faces)], slit.faces)
+    normal = np.cross(*(found.vertices[found.faces[:, k]] - found.vertices[found.faces[:, 0]] for k in (1, 2)))
+    assert normal[:, 2].min() > -1e-12 and len(crossings(found)[0]) == 0
+
+
+@pytest.mark.parametrize("width, depth", [(WINDOW + 4, 40), (WINDOW - 4, 3)])
+def test_a_wide_slit_and_a_shallow_notch_of_the_border_stay(width, depth):
+    x, y = (flat().vertices[flat().faces].mean(1)[:, k] for k in (0, 1))
+    notched = select_faces(flat(), ~((np.abs(x) < width * 0.01 / 2) & (y > 0.5 - depth * 0.01)))
+    assert closed(notched)[0] is notched
+
+
+def test_a_crack_between_a_floor_and_a_slope_is_closed():
+    whole = sheet(lambda x, y: 0.4 * np.maximum(x, 0), steps=101)
+    x, y = (whole.vertices[whole.faces].mean(1)[:, k] for k in (0, 1))
+    crack = select_faces(whole, ~((np.abs(x) < 0.03) & (y > -0.4)))
+    assert area(crack) < 0.96 * area(whole) and area(closed(crack)[0]) == pytest.approx(area(whole), rel=2e-3)
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_a_slit_that_two_views_see_through_stays(views):
+    slit = slit_from_the_border(WINDOW - 4, 40)
+    behind = [np.full((100, 100), np.nan) for _ in CAMERAS]
+    for depth in behind[:views]:
+        depth[:] = 2.5
+    found, _ = closed(slit, behind)
+    assert (found is slit) == (views == 2)
+
+
 @pytest.mark.parametrize("views, holes", [(1, 1), (2, 0), (4, 0)])
 @pytest.mark.parametrize("is_free", [False, True])
 def test_two_views_that_see_through_a_hole_keep_it_open(views, holes, is_free):
