@@ -64,7 +64,7 @@ def initial_cloud(cloud: PointCloud, options: TrainOptions, box: np.ndarray | No
     inside = np.ones(len(cloud.xyz), bool) if box is None else within(cloud.xyz, box)
     if box is not None and not inside.any():
         raise LinprimError(f"--box is {options.box}, and none of {len(inside)} points is in it: wanted a larger one")
-    around = min(round(AROUND_BOX * count), np.count_nonzero(~inside))
+    around = min(round(AROUND_BOX * count), int(np.count_nonzero(~inside)))
     drawn = [_drawn(rng, np.flatnonzero(rows), most) for rows, most in ((inside, count - around), (~inside, around))]
     keep = np.sort(np.concatenate(drawn))
     return PointCloud(cloud.xyz[keep], cloud.rgb[keep])
