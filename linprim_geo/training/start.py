@@ -23,7 +23,7 @@ from linprim_geo.base.progress import Progress
 from linprim_geo.capture.load import load_scene, settled_folders, told_downscale
 from linprim_geo.capture.types import PointCloud, Scene
 from linprim_geo.geometry.environment_map import texels_for
-from linprim_geo.geometry.region import as_text, read_box, within
+from linprim_geo.geometry.region import as_text, looked_at, read_box, within
 from linprim_geo.imaging.decoded_photos import DecodedPhotos
 from linprim_geo.kernels import ops
 from linprim_geo.points.initial_points import (
@@ -102,8 +102,8 @@ def begin_run(
     decisions, loaded, scene_options, options = decided_scene(scene, scene_options, options, effects, progress.note)
     if decisions:
         progress.note(summary(decisions))
-    if (box := read_box(options.box, [view.camera for view in loaded.train])) is not None:
-        options = replace(options, box=as_text(box))
+    if options.box == "auto":
+        options = replace(options, box=as_text(looked_at([view.camera for view in loaded.train])))
     scene_options = settled_folders(scene_options, loaded.root)
     run = Run(run_path, scene, scene_options, options, scene_normalization(loaded), loaded.unit)
     return run, loaded, decisions
@@ -183,7 +183,7 @@ def start_trainer(
     focal = float(np.median([max(s.camera.fx, s.camera.fy) for s in images]))
     centers = np.stack([s.camera.center for s in images])
     begun = None if state is None else "environment" in state.get("parameters", {})
-    box = read_box(options.box, [view.camera for view in scene.train])
+    box = read_box(options.box)
     behind = chosen_background(options.background, scene, images, begun, surfaces.sky)
     surface = state is None and not isinstance(scene.points, VolumePoints)
     if state is not None:
