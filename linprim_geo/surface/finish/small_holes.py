@@ -33,12 +33,13 @@ FREE_DEPTH = 1e3
 def without_small_holes(
     mesh: Mesh, cameras: Sequence[Camera], known: Sequence[np.ndarray], free: Sequence[np.ndarray]
 ) -> tuple[Mesh, int]:
-    """The mesh with holes closed that are no wider than WINDOW pixels of the nearest camera, and how many these are.
+    """The mesh with holes closed that are no wider than WINDOW pixels of the nearest camera, and slits of its borders
+    that are as narrow (`Slits`); and how many holes.
 
     Vertices and faces that there are stay as they are, faces are added behind them, no edge gets a third face, and no
     face crosses another that did not before. A hole stays open where views look through any triangle of its patch at
     something behind it (`KnownDepths`), where most of the patch faces away from the faces around it, and where other
-    faces are in the way.
+    faces are in the way; a slit as far as it has such triangles.
 
     Args:
         known: (H, W) depths of each view, NaN where nothing is known.
