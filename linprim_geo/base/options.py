@@ -158,11 +158,6 @@ def check_train_options(options: TrainOptions) -> None:
             f"--initial-primitives is {options.initial_primitives}, wanted at most --max-primitives, "
             f"{options.max_primitives}"
         )
-    if options.box and options.population != "gradient":
-        raise LinprimError(
-            f"--box limits where primitives are added, and --population {options.population} has rules of its own: "
-            "wanted --population gradient"
-        )
 
 
 def initial_count(options: TrainOptions, share: float) -> int:
@@ -266,12 +261,6 @@ class TrainOptions:
         choices=("gradient", "3dgs", "mcmc"),
     )
     max_primitives: int = option(20_000, "the population never grows past this", low=1, high=2**30)
-    box: str = option(
-        "",
-        "what the primitives are for, within these corners in the data set's frame, written --box=...: they are added "
-        "there alone, and around it are as few as explain the photographs; auto: within what the cameras look at",
-        metavar="auto|X0,Y0,Z0,X1,Y1,Z1",
-    )
     initial_primitives: int = option(
         0, "primitives at the start; 0 chooses from the points and --max-primitives", low=0, high=2**30
     )

@@ -45,11 +45,6 @@ def as_text(corners: np.ndarray) -> str:
     return ",".join(f"{value:.17g}" for value in corners.ravel())
 
 
-def within(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """(N,) bool: which of (N, 3) points are in the box with (2, 3) corners."""
-    return ((points >= corners[0]) & (points <= corners[1])).all(1)
-
-
 def looked_at(cameras: Sequence[Camera]) -> np.ndarray:
     """(2, 3) corners of the cube around the `focus_point` of the cameras, half as wide as the median of them shows
     there, from the middle of its image to the nearer border.

@@ -10,7 +10,6 @@ import numpy as np
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import TrainOptions, initial_count
 from linprim_geo.capture.types import PointCloud, Scene
-from linprim_geo.geometry.region import within
 from linprim_geo.points.densify import densify
 from linprim_geo.points.far_colors import FarColors
 from linprim_geo.points.initial_points import (
@@ -23,8 +22,6 @@ from linprim_geo.points.initial_points import (
 SFM_START, RANDOM_START = 0.8, 0.25
 # Triangulated points fewer than this leave too much of a scene empty.
 FEW_POINTS = 500
-# Of the primitives at the start at most this share lies around the box of a training.
-AROUND_BOX = 0.25
 # Points on surfaces by which gaps are found: cells of the image to be filled are 1,400, see `densify`.
 FILLED_BY = 4000
 
@@ -53,25 +50,13 @@ def with_points(scene: Scene, options: TrainOptions, log: Callable[[str], None])
     return replace(scene, points=cloud)
 
 
-def initial_cloud(cloud: PointCloud, options: TrainOptions, box: np.ndarray | None = None) -> PointCloud:
-    """At most as many of the points as the population starts with, drawn without replacement; with the (2, 3) corners
-    of a box at most AROUND_BOX of these are outside of it.
-
-    Raises:
-        LinprimError: no point is in the box.
-    """
-    count, rng = initial_count(options, SFM_START), np.random.default_rng([options.seed, 1])
-    inside = np.ones(len(cloud.xyz), bool) if box is None else within(cloud.xyz, box)
-    if box is not None and not inside.any():
-        raise LinprimError(f"--box is {options.box}, and none of {len(inside)} points is in it: wanted a larger one")
-    around = min(round(AROUND_BOX * count), int(np.count_nonzero(~inside)))
-    drawn = [_drawn(rng, np.flatnonzero(rows), most) for rows, most in ((inside, count - around), (~inside, around))]
-    keep = np.sort(np.concatenate(drawn))
+def initial_cloud(cloud: PointCloud, options: TrainOptions) -> PointCloud:
+    """At most as many of the points as the population starts with, drawn without replacement."""
+    count = initial_count(options, SFM_START)
+    if len(cloud.xyz) <= count:
+        return cloud
+    keep = np.sort(np.random.default_rng([options.seed, 1]).choice(len(cloud.xyz), count, replace=False))
     return PointCloud(cloud.xyz[keep], cloud.rgb[keep])
-
-
-def _drawn(rng: np.random.Generator, rows: np.ndarray, most: int) -> np.ndarray:
-    return rows if len(rows) <= most else rng.choice(rows, most, replace=False)
 
 
 def filled_points(

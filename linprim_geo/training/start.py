@@ -23,7 +23,6 @@ from linprim_geo.base.progress import Progress
 from linprim_geo.capture.load import load_scene, settled_folders, told_downscale
 from linprim_geo.capture.types import PointCloud, Scene
 from linprim_geo.geometry.environment_map import texels_for
-from linprim_geo.geometry.region import as_text, looked_at, read_box, within
 from linprim_geo.imaging.decoded_photos import DecodedPhotos
 from linprim_geo.kernels import ops
 from linprim_geo.points.initial_points import (
@@ -97,13 +96,9 @@ def begin_run(
         LinprimError: something is at `run_path` already, or the scene or an option cannot be used.
     """
     refuse_used(run_path)
-    if options.box != "auto":
-        read_box(options.box)  # before anything takes time
     decisions, loaded, scene_options, options = decided_scene(scene, scene_options, options, effects, progress.note)
     if decisions:
         progress.note(summary(decisions))
-    if options.box == "auto":
-        options = replace(options, box=as_text(looked_at([view.camera for view in loaded.train])))
     scene_options = settled_folders(scene_options, loaded.root)
     run = Run(run_path, scene, scene_options, options, scene_normalization(loaded), loaded.unit)
     return run, loaded, decisions
@@ -178,12 +173,11 @@ def start_trainer(
         largest: extent that a primitive may have, in the training frame; default: by what the points reach.
 
     Raises:
-        LinprimError: the background is none, no point is in the box, or the checkpoint does not fit the options.
+        LinprimError: the background is none, or the checkpoint does not fit the options.
     """
     focal = float(np.median([max(s.camera.fx, s.camera.fy) for s in images]))
     centers = np.stack([s.camera.center for s in images])
     begun = None if state is None else "environment" in state.get("parameters", {})
-    box = read_box(options.box)
     behind = chosen_background(options.background, scene, images, begun, surfaces.sky)
     surface = state is None and not isinstance(scene.points, VolumePoints)
     if state is not None:
@@ -192,7 +186,7 @@ def start_trainer(
         if cloud is None:
             backdrop = behind.color.numpy() if behind.fitted else None
             cloud = filled_points(scene, options.seed, backdrop, behind.far, surfaces.points)
-        cloud = initial_cloud(cloud, options, box)
+        cloud = initial_cloud(cloud, options)
         xyz, rgb = run.similarity.apply(cloud.xyz), cloud.rgb
         middle = np.median(xyz, 0)
         reach = np.linalg.norm(xyz - middle, axis=1)
@@ -225,9 +219,6 @@ def start_trainer(
         log_gain=log_gain,
         environment=environment,
     )
-    if box is not None:
-        to_data_set = run.similarity.inverse()
-        trainer.control.grow_within(lambda center: within(to_data_set.apply(center), box))
     if state is not None:
         restore(trainer, state, run.path / "checkpoints")
     return trainer

@@ -76,8 +76,6 @@ def train(
 
         if time_budget:
             raise LinprimError("--time-budget plans one training: wanted without --blocks")
-        if options is not None and options.box:
-            raise LinprimError("--box is of one training: wanted without --blocks")
         trained = train_blocks(
             scene,
             run,

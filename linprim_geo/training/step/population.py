@@ -124,10 +124,6 @@ class DensityControl:
         To be called with the parameters and the step that a training, or its resumption, begins with.
         """
 
-    def grow_within(self, holds: Callable[[np.ndarray], np.ndarray]) -> None:
-        """Adds primitives only where `holds` says (N,) True of their centres (N, 3)."""
-        raise NotImplementedError
-
     def state(self) -> list[float]:
         """Numbers that follow from the run's start and not from its options."""
         return []
@@ -146,7 +142,6 @@ class GradientControl(DensityControl):
         super().__init__(options, count, cameras, bounds)
         self.growth = Growth.plan(options.iterations, count, options.max_primitives)
         self.counts: Callable[[np.ndarray], np.ndarray] | None = None
-        self.holds: Callable[[np.ndarray], np.ndarray] | None = None
 
     def limit_only(self, counts, most, parameters, step):
         self.counts = counts
@@ -154,9 +149,6 @@ class GradientControl(DensityControl):
             self.growth = Growth.plan(
                 self.options.iterations, int(counts(parameters["center"].detach().numpy()).sum()), most
             )
-
-    def grow_within(self, holds):
-        self.holds = holds
 
     def accumulate(self, parameters, camera, size, screen_grad):
         # In units of the image's size, so that views of different resolution count alike.
@@ -166,19 +158,16 @@ class GradientControl(DensityControl):
         return self.growth.is_due(step)
 
     def grow(self, parameters, step):
-        gradient, center = self.accumulated["screen_gradient"], parameters["center"].detach().numpy()
-        if self.holds is not None:
-            gradient = gradient * torch.from_numpy(self.holds(center))
         parents, children, halves = grow(
             parameters,
-            gradient,
+            self.accumulated["screen_gradient"],
             self.growth,
             math.log(self.bounds[0]),
             self.rng(5, step),
             self.kind,
-            None if self.counts is None else int(self.counts(center).sum()),
+            None if self.counts is None else int(self.counts(parameters["center"].detach().numpy()).sum()),
         )
-        count = len(gradient)
+        count = len(self.accumulated["screen_gradient"])
         source = np.arange(max(count, int(children.max(initial=-1)) + 1))
         source[children] = parents
         rows = np.concatenate([parents, children])
