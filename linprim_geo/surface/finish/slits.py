@@ -28,14 +28,24 @@ class _Edge(NamedTuple):
     behind: tuple[_Edge, ...] = ()
 
 
-class Slits:
-    """Closes slits between the vertices around borders.
+def slit_triangles(
+    rims: Sequence[np.ndarray], vertices: np.ndarray, normals: np.ndarray, widest: np.ndarray
+) -> np.ndarray:
+    """(N, 3) triangles between the vertices of borders in slits that are narrow, and deeper than wide or closed all
+    around.
 
     Args:
-        rims: the vertices around each border, in the order in which a patch goes round.
+        rims: the vertices around each border, in the order in which a patch goes round; at least one.
         vertices, normals: (V, 3) of the surface; triangles face as the normals of their corners do.
-        widest: (V,) how far apart the two sides of a slit at a vertex are at most; 0 leaves it as it is.
+        widest: (V,) how far apart the two sides of a slit at a vertex are at most; at 0 nothing is added.
     """
+    border = _Border(rims, vertices, normals, widest)
+    border.close()
+    return border.triangles()
+
+
+class _Border:
+    """The borders of a surface, while triangles make them shorter; see `slit_triangles`."""
 
     def __init__(self, rims: Sequence[np.ndarray], vertices: np.ndarray, normals: np.ndarray, widest: np.ndarray):
         rows, sizes = np.concatenate(rims), [len(rim) for rim in rims]
@@ -51,14 +61,13 @@ class Slits:
         self.complete: list[_Edge] = []
         self.waiting: list[tuple[float, int, int, int]] = []
 
-    def closed(self) -> np.ndarray:
-        """(N, 3) triangles of what is narrow and deeper than wide, or has no mouth. To be called once."""
+    def close(self) -> None:
+        """Adds triangles, those with the narrowest mouths first, until none is left that is narrow."""
         for place in range(len(self.vertex)):
             self._offer(place)
         while self.waiting:
             width, *three = heappop(self.waiting)
             self._close(width, *three)
-        return self._triangles_behind([edge for edge in self.edge if edge is not None])
 
     def _offer(self, place: int) -> None:
         """The triangle of a place with its neighbours waits for its turn, if it is narrow and faces as they do."""
@@ -88,9 +97,9 @@ class Slits:
         self._offer(before)
         self._offer(after)
 
-    def _triangles_behind(self, mouths: list[_Edge]) -> np.ndarray:
-        """(N, 3) triangles behind the widest mouths that are narrow for what is behind them."""
-        deep, triangles = list(self.complete), []
+    def triangles(self) -> np.ndarray:
+        """(N, 3) of those added, what is behind the widest mouths that are narrow for the length of their sides."""
+        mouths, deep, triangles = [edge for edge in self.edge if edge is not None], list(self.complete), []
         while mouths:
             mouth = mouths.pop()
             if mouth.sides >= DEEPER * mouth.width:

@@ -21,7 +21,7 @@ from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.planes.seen_through import KnownDepths
 from linprim_geo.surface.finish.mesh_process import has_crowded_edge
 from linprim_geo.surface.finish.self_intersections import crossings, edges_of
-from linprim_geo.surface.finish.slits import Slits
+from linprim_geo.surface.finish.slits import slit_triangles
 from linprim_geo.surface.normals import vertex_normals
 
 # The side of a window of stereo in pixels (kWindowSide * kWindowStep in csrc/stereo/patch_match.h).
@@ -34,7 +34,7 @@ def without_small_holes(
     mesh: Mesh, cameras: Sequence[Camera], known: Sequence[np.ndarray], free: Sequence[np.ndarray]
 ) -> tuple[Mesh, int]:
     """The mesh with holes closed that are no wider than WINDOW pixels of the nearest camera, and slits of its borders
-    that are as narrow (`Slits`); and how many holes.
+    that are as narrow (`slit_triangles`); and how many holes.
 
     Vertices and faces that there are stay as they are, faces are added behind them, no edge gets a third face, and no
     face crosses another that did not before. A hole stays open where views look through any triangle of its patch at
@@ -55,7 +55,7 @@ def without_small_holes(
 
 
 def _without_holes(mesh: Mesh, cameras: Sequence[Camera], views: KnownDepths) -> tuple[Mesh, int]:
-    """With patches of holes that are narrow as a whole, and how many these are."""
+    """The mesh with holes closed that are narrow as a whole, and how many these are."""
     added, hole = _patches(mesh.vertices, _small_rims(mesh, cameras))
     if not len(added):
         return mesh, 0
@@ -65,12 +65,12 @@ def _without_holes(mesh: Mesh, cameras: Sequence[Camera], views: KnownDepths) ->
     added, hole = added[facing], hole[facing]
     if not len(added):
         return mesh, 0
-    added, hole = (each[np.bincount(hole, _wrong(mesh, added, views))[hole] == 0] for each in (added, hole))
-    return _with_faces(mesh, added), len(np.unique(hole))
+    right = np.bincount(hole, _wrong(mesh, added, views))[hole] == 0
+    return _with_faces(mesh, added[right]), len(np.unique(hole[right]))
 
 
 def _without_slits(mesh: Mesh, cameras: Sequence[Camera], views: KnownDepths) -> Mesh:
-    """With triangles in slits that are a part of a border. Where one is wrong its corners stay as they are."""
+    """The mesh with slits of its borders closed; where a triangle is wrong nothing is added at its corners."""
     rims = [loop[::-1] for loop in border_loops(mesh.faces)]
     if not rims:
         return mesh
@@ -78,7 +78,7 @@ def _without_slits(mesh: Mesh, cameras: Sequence[Camera], views: KnownDepths) ->
     vertices, normals = mesh.vertices.astype(np.float64), _normals(mesh)
     widest[at_rim] = WINDOW * _pixels(vertices[at_rim], cameras)
     while True:
-        added = Slits(rims, vertices, normals, widest).closed()
+        added = slit_triangles(rims, vertices, normals, widest)
         wrong = _wrong(mesh, added, views) if len(added) else np.zeros(0, bool)
         if not wrong.any():
             return _with_faces(mesh, added) if len(added) else mesh
@@ -99,6 +99,7 @@ def _normals(mesh: Mesh) -> np.ndarray:
 
 
 def _with_faces(mesh: Mesh, added: np.ndarray) -> Mesh:
+    """The mesh with the `added` faces (N, 3) behind its own."""
     faces = np.concatenate([mesh.faces, added])
     normals = None if mesh.normals is None else vertex_normals(replace(mesh, faces=faces))
     return replace(mesh, faces=faces, normals=normals, primitive=None)
