@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 from dataclasses import replace
@@ -22,6 +23,8 @@ from linprim_geo.jobs import worker
 from linprim_geo.jobs.processes import Processes
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.extract import extract_mesh
+from linprim_geo.synthetic.synth import synthesize
+from linprim_geo.training import loop as training_loop
 from linprim_geo.training.blocks import driver as block_training
 from linprim_geo.training.blocks import plan
 from linprim_geo.training.blocks import tasks as block_tasks
@@ -124,6 +127,32 @@ def run_alone(blocks_run):
     """`blocks_run`, which no other process of the tests resumes in the meantime."""
     with locked(blocks_run[0].parent, "resumed", "resumed", wait=lambda: None):
         yield blocks_run
+
+
+def test_a_coarse_scene_of_few_photographs_goes_on_as_it_began(tmp_path, monkeypatch):
+    """What is chosen by their number when it starts is kept when it is resumed."""
+    options = replace(OPTIONS, checkpoint_every=10)
+    synthesize(tmp_path / "few", shape="cad", views=8, test_views=2, size=64, points=400, supersample=1)
+    monkeypatch.setattr(block_training, "open_executor", Here)
+    for name in ("whole", "stopped"):
+        with monkeypatch.context() as patch:
+            if name == "stopped":
+                saved, saves = training_loop.save_training, []
+
+                def stopping(trainer, run, saves=saves, saved=saved):
+                    if len(saves) == 2:
+                        raise OSError(errno.ENOSPC, "No space left on device")
+                    saves.append(trainer.step)
+                    return saved(trainer, run)
+
+                patch.setattr(training_loop, "save_training", stopping)
+                with pytest.raises(LinprimError, match="no space left"):
+                    train_blocks(tmp_path / "few", tmp_path / name, options=options, blocks=COUNT, quiet=True)
+                assert saves == [10, 20]
+            else:
+                train_blocks(tmp_path / "few", tmp_path / name, options=options, blocks=COUNT, quiet=True)
+    train(tmp_path / "few", tmp_path / "stopped", resume=True, quiet=True)
+    assert_same(tmp_path / "stopped", tmp_path / "whole")
 
 
 def test_a_run_begun_by_another_version_is_one_sentence(run_alone, tiny_scene, monkeypatch):

@@ -54,6 +54,9 @@ def coarse_task(folder: Path, run: str) -> dict:
             coarse.train_options.background, small, load_training_images(small.train, coarse.similarity)
         )
         state = read_checkpoint(coarse.path) if (coarse.path / "config.json").exists() else None
+        if state is not None:  # with what has been chosen at its start
+            begun = replace(Run.open(coarse.path).train_options, threads=coarse.train_options.threads)
+            coarse = replace(coarse, train_options=begun)
         done = train_run(coarse, small, state, Progress("coarse scene", 1, quiet=True))
     shown_color = [float(x) for x in (Run.open(coarse.path).background if behind.fitted else behind.color)]
     # What the coarse environment shows is transparent in the windows of blocks.
