@@ -58,20 +58,30 @@ class Progress:
         if self.quiet:
             return
         self.clear()
-        print(printable(text), file=sys.stderr, flush=True)
+        _print(printable(text) + "\n")
 
     def clear(self) -> None:
         """Removes the line that is being rewritten."""
         if self.terminal and self.width and not self.quiet:
-            print("\r" + " " * self.width + "\r", end="", file=sys.stderr, flush=True)
+            _print("\r" + " " * self.width + "\r")
             self.width = 0
 
     def _show(self, line: str) -> None:
         if self.terminal:
-            print("\r" + line.ljust(self.width), end="", file=sys.stderr, flush=True)
+            _print("\r" + line.ljust(self.width))
             self.width = len(line)
         else:
-            print(line, file=sys.stderr, flush=True)
+            _print(line + "\n")
+
+
+def _print(text: str) -> None:
+    """A log on a disk that is full ends no job; a pipe that nobody reads does."""
+    try:
+        print(text, end="", file=sys.stderr, flush=True)
+    except BrokenPipeError:
+        raise
+    except OSError:
+        pass
 
 
 class Stages:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+
 import pytest
 
 from linprim_geo.base.progress import Progress, duration
@@ -30,6 +32,23 @@ def test_a_terminal_has_one_line_that_is_cleared(capsys, monkeypatch):
     shown = capsys.readouterr().err
     assert shown.endswith("\r" + " " * len("merging 2/2  walls") + "\rdone\n")
     assert "\r" + "merging 2/2  walls".ljust(len("merging 1/2  gaps between planes")) + "\r" in shown
+
+
+def test_a_log_on_a_full_disk_ends_no_job_and_a_closed_pipe_does(monkeypatch):
+    def failing(error):
+        def write(*_):
+            raise error
+
+        return write
+
+    progress = Progress("train", 2)
+    for error in (OSError(errno.ENOSPC, "No space left on device"), OSError(errno.EIO, "Input/output error")):
+        monkeypatch.setattr("sys.stderr.write", failing(error))
+        progress.note("a line")
+        progress.stage(0, "another")
+    monkeypatch.setattr("sys.stderr.write", failing(BrokenPipeError()))
+    with pytest.raises(BrokenPipeError):
+        progress.note("a line")
 
 
 def test_what_came_before_the_first_step_is_not_in_the_time_left(capsys, monkeypatch):
