@@ -24,3 +24,7 @@ class LinprimError(Exception):
         if len(sentence) > self.LONGEST:
             sentence = f"{sentence[:600]} ... {sentence[-(self.LONGEST - 605) :]}"
         super().__init__(sentence)
+
+
+class DiskFull(LinprimError):
+    """There is no space left on a device: nothing that could be done in another way."""

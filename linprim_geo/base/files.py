@@ -14,7 +14,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.errors import DiskFull, LinprimError
 
 
 def _read_umask() -> int:
@@ -45,7 +45,8 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
     has left.
 
     Raises:
-        LinprimError: the folder cannot be written, or the disk is full.
+        LinprimError: the folder cannot be written.
+        DiskFull: there is no space left.
     """
     path = Path(path)
     temporary = None
@@ -157,8 +158,14 @@ def _sync_folder(folder: Path) -> None:
             os.close(handle)
 
 
-def _full(path: Path) -> LinprimError:
-    return LinprimError(f"{path}: no space left on the device; the previous file is untouched")
+def check_room(folder: Path, size: int) -> None:
+    """Raises DiskFull unless so many bytes are free in a folder that there is."""
+    if shutil.disk_usage(folder).free < size:
+        raise DiskFull(f"{folder}: no space left on the device, wanted {size / 2**20:.0f} MiB")
+
+
+def _full(path: Path) -> DiskFull:
+    return DiskFull(f"{path}: no space left on the device; nothing that was saved is lost")
 
 
 def _sentence(path: Path, error: OSError) -> LinprimError | None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.files import locked, write_json
+from linprim_geo.base.files import check_room, locked, readable_write_errors, write_json
 from linprim_geo.base.options import SceneOptions, with_changes
 from linprim_geo.capture import video_frames
 from linprim_geo.capture.found_poses import (
@@ -32,7 +32,12 @@ from linprim_geo.capture.found_poses import (
 )
 from linprim_geo.capture.incremental_mapping import MIN_REGISTERED, largest_model, remove_work
 from linprim_geo.capture.load import has_poses
+from linprim_geo.geometry.pycolmap_files import write_model
 from linprim_geo.imaging import photos
+
+# Bytes of keypoints and matches in pycolmap's database, twice as many as a photograph has (4,096 keypoints of 150
+# bytes, and matches), as SQLite writes all of it a second time. On a full disk SQLite ends the process.
+ROOM, ROOM_PER_PHOTOGRAPH = 8 * 2**20, 2 * 2**20
 
 Refine = Callable[[Path, Path, Path, Callable[[str], None]], bool]
 
@@ -139,8 +144,10 @@ def _reconstruct(
     say: Callable[[str], None],
 ) -> Verdict:
     """Goes on with what is in `kept`, and leaves the largest model and the verdict there."""
+    check_room(kept, ROOM + ROOM_PER_PHOTOGRAPH * len(names))
     try:
-        model, misplaced = largest_model(_readable(folder, names, kept), names, sizes, kept, threads, say)
+        with readable_write_errors(kept / "database.db"):
+            model, misplaced = largest_model(_readable(folder, names, kept), names, sizes, kept, threads, say)
     except (ValueError, RuntimeError, MemoryError) as error:
         reason = (str(error).splitlines() or ["out of memory"])[0]
         raise LinprimError(f"{folder}: poses cannot be found ({reason}); remove {kept} to begin anew") from error
@@ -150,7 +157,7 @@ def _reconstruct(
         for place in (part, kept / "model"):
             shutil.rmtree(place, ignore_errors=True)
         part.mkdir()
-        model.write_binary(str(part))
+        write_model(model, part)
         part.rename(kept / "model")
         errors = model.compute_mean_reprojection_error(), model.compute_mean_track_length()
         posed = {model.images[number].name for number in model.reg_image_ids()}

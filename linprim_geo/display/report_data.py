@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.errors import DiskFull, LinprimError
 from linprim_geo.base.options import ExtractOptions, flags, from_saved
 from linprim_geo.capture.types import Scene, View
 from linprim_geo.display.report_mesh import HEADLINE, ShownMesh, find_meshes, read_json
@@ -164,6 +164,8 @@ def _score_views(report: Report, reference: str | os.PathLike | None) -> None:
             if report.depth is None:
                 missing.append("The data set has no depth, and no --reference mesh was given, so depth is not scored")
             report.views = _pictures(report, _chosen(scene.test, ranking))
+        except DiskFull:
+            raise
         except LinprimError as error:
             missing.append(f"Held-out views could not be shown: {error}")
 

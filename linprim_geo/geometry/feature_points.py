@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from linprim_geo.base.files import readable_write_errors
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.feature_matching import mutual_matches
 
@@ -93,7 +94,10 @@ def triangulate_features(
 
     pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, 2)  # progress of every image and pair otherwise
     pycolmap.set_random_seed(seed)
-    with tempfile.TemporaryDirectory(prefix="linprim-points-") as name:
+    with (
+        tempfile.TemporaryDirectory(prefix="linprim-points-") as name,
+        readable_write_errors(Path(name) / "database.db"),
+    ):
         folder = Path(name)
         images, database_path = folder / "images", folder / "database.db"
         images.mkdir()

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.errors import DiskFull, LinprimError
 from linprim_geo.base.options import TrainOptions, initial_count
 from linprim_geo.capture.types import PointCloud, Scene
 from linprim_geo.points.densify import densify
@@ -41,6 +41,8 @@ def with_points(scene: Scene, options: TrainOptions, log: Callable[[str], None])
         return replace(scene, points=visual_hull_points(scene, count, options.seed))
     try:
         cloud = triangulate_points(scene, seed=options.seed, log=log)
+    except DiskFull:
+        raise
     except LinprimError as error:
         log(f"no points could be triangulated ({error}); starting from random ones")
         return replace(scene, points=frusta_points(scene, count, options.seed))

@@ -3,7 +3,6 @@ errors."""
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.feature_points import ObservedPoints
 from linprim_geo.geometry.ply import color_columns, write_ply, xyz_columns
+from linprim_geo.geometry.pycolmap_files import write_model
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.synthetic.camera_paths import surface_samples
 from linprim_geo.synthetic.photos import photo_name
@@ -200,15 +200,7 @@ def write_colmap(
             track.add_element(int(cloud.image[k]) + 1, int(slot[k]))
         key = model.add_point3D(cloud.xyz[row], track, cloud.rgb[row])
         model.point3D(key).error = float(cloud.error_px[row])
-    model.write_binary(str(folder))
-    # pycolmap does not say so when the disk is full.
-    sizes = {
-        "points3D.bin": 8 + 51 * len(cloud.xyz) + 8 * len(cloud.point),
-        "images.bin": 8 + sum(73 + len(image.name) + 24 * image.num_points2D() for image in model.images.values()),
-    }
-    for name, size in sizes.items():
-        if (folder / name).stat().st_size != size:
-            raise OSError(errno.ENOSPC, "No space left on device")
+    write_model(model, folder)
 
 
 def write_points(path: Path, cloud: ObservedPoints) -> None:

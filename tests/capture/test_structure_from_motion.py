@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from helpers.captures import look_at, picture, write_transforms
 from helpers.textured_room import photograph
 from PIL import Image
 
-from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.errors import DiskFull, LinprimError
 from linprim_geo.base.files import locked
 from linprim_geo.capture import found_poses, incremental_mapping, structure_from_motion
 from linprim_geo.capture import incremental_mapping as image_pairs
@@ -127,6 +128,30 @@ def test_poses_are_refined_once(posed, copied, tmp_path, better):
     assert asked == [(copied, True)]
     assert (model / "points3D.bin").read_bytes() == (before + b"refined" if better else before)
     assert [path.name for path in model.parent.iterdir() if path.is_dir()] == ["model"]
+
+
+def test_a_full_disk_is_told_and_the_model_there_was_stays(posed, copied, tmp_path, monkeypatch):
+    cache = Path(shutil.copytree(posed[0], tmp_path / "cache"))
+    before = {file: file.read_bytes() for file in found_model(copied, cache).iterdir()}
+
+    def refine(root, model, refined, log):
+        raise DiskFull(f"{refined}: no space left on the device")
+
+    with pytest.raises(DiskFull):
+        find_poses(copied, cache, refine=refine)
+    assert {file: file.read_bytes() for file in found_model(copied, cache).iterdir()} == before
+    with monkeypatch.context() as patch:
+        patch.setattr("linprim_geo.base.files.shutil.disk_usage", lambda _: SimpleNamespace(free=10 * 2**20))
+        with pytest.raises(DiskFull, match=r"no space left on the device, wanted \d+ MiB"):
+            find_poses(copied, tmp_path / "empty")
+
+    def full(*_):
+        monkeypatch.setattr("linprim_geo.base.files._disk_is_full", lambda _: True)
+        raise RuntimeError("database or disk is full")
+
+    monkeypatch.setattr("linprim_geo.capture.structure_from_motion.largest_model", full)
+    with pytest.raises(DiskFull, match=r"database\.db: no space left"):
+        find_poses(copied, tmp_path / "empty")
 
 
 def test_without_being_asked_no_poses_are_looked_for(copied, tmp_path):

@@ -19,7 +19,7 @@ from conftest import MESHES
 from markupsafe import escape
 from PIL import Image
 
-from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.errors import DiskFull, LinprimError
 from linprim_geo.base.options import ExtractOptions, SceneOptions, TrainOptions
 from linprim_geo.cli import arguments
 from linprim_geo.cli import main as cli
@@ -286,6 +286,17 @@ def test_a_reference_is_scored_against_without_leaving_results(run_copy, tiny_sc
     assert "Chamfer of tsdf" in text and "true error" in text and "seen by cameras" in text
     with pytest.raises(LinprimError, match="no such mesh file"):
         report_run(run_copy, reference=run_copy / "gone.ply")
+
+
+def test_a_full_disk_replaces_no_page(run_copy, tmp_path, monkeypatch):
+    page = tmp_path / "r.html"
+    page.write_text("before")
+    monkeypatch.setattr(
+        "linprim_geo.display.report_data._pictures", lambda *_: (_ for _ in ()).throw(DiskFull("no space left"))
+    )
+    with pytest.raises(DiskFull):
+        report_run(run_copy, output=page)
+    assert page.read_text() == "before"
 
 
 def test_the_command_prints_one_object(run_copy, capfd, tmp_path):

@@ -10,7 +10,8 @@ from helpers.captures import OPENGL, look_at
 from helpers.textured_room import HALF, photograph, wall_texture
 from PIL import Image
 
-from linprim_geo.base.errors import LinprimError
+from linprim_geo.base.errors import DiskFull, LinprimError
+from linprim_geo.base.options import TrainOptions
 from linprim_geo.capture.load import load_scene
 from linprim_geo.geometry.feature_points import (
     ObservedPoints,
@@ -21,6 +22,7 @@ from linprim_geo.geometry.feature_points import (
     sampson_px,
     verify_matches,
 )
+from linprim_geo.points.start_points import with_points
 from linprim_geo.points.triangulate import triangulate_points
 
 SIZE, FOCAL = (200, 150), 170.0
@@ -159,3 +161,26 @@ def test_matches_that_the_poses_forbid_are_dropped(room, tmp_path):
         kept = database.read_two_view_geometry(1, 5).inlier_matches
         assert not database.exists_two_view_geometry(2, 3)
     assert kept[:, 0].tolist() == kept[:, 1].tolist() == [0, 1, 2, 3]
+
+
+def test_a_full_disk_is_no_reason_to_start_from_random_points(room, monkeypatch):
+    scene, options = load_scene(room), TrainOptions(max_primitives=100)
+
+    def failing(error):
+        return lambda *_, **__: (_ for _ in ()).throw(error)
+
+    monkeypatch.setattr("linprim_geo.points.triangulate.triangulate_points", failing(LinprimError("too few matches")))
+    assert len(with_points(scene, options, lambda _: None).points.xyz) > 0
+    monkeypatch.setattr("linprim_geo.points.triangulate.triangulate_points", failing(DiskFull("no space left")))
+    with pytest.raises(DiskFull):
+        with_points(scene, options, lambda _: None)
+
+
+def test_a_full_disk_for_keypoints_is_told(room, monkeypatch, tmp_path):
+    monkeypatch.setattr("linprim_geo.base.files._disk_is_full", lambda _: True)
+    monkeypatch.setattr(
+        "linprim_geo.geometry.feature_points._match",
+        lambda *_: (_ for _ in ()).throw(RuntimeError("database or disk is full")),
+    )
+    with pytest.raises(DiskFull, match=r"database\.db: no space left"):
+        triangulate_points(load_scene(room), cache=tmp_path)

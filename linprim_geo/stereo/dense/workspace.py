@@ -21,6 +21,7 @@ import numpy as np
 from linprim_geo.base.files import atomic_write
 from linprim_geo.capture.types import View
 from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.pycolmap_files import write_model
 from linprim_geo.imaging.photos import image_format, image_header, read_photo
 from linprim_geo.stereo.dense.map_files import read_map, write_map
 
@@ -131,7 +132,7 @@ class Workspace:
             model.add_point3D(point.xyz.astype(np.float64), elements, point.rgb.astype(np.uint8))
         folder = self.root / "sparse"
         folder.mkdir(parents=True, exist_ok=True)
-        model.write_binary(str(folder))
+        write_model(model, folder)
 
 
 def image_name(view: View) -> str:

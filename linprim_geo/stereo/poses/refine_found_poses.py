@@ -31,6 +31,7 @@ from linprim_geo.geometry.bundle_adjustment import (
 )
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.feature_points import ObservedPoints
+from linprim_geo.geometry.pycolmap_files import write_model
 from linprim_geo.stereo.poses.adjust_poses import KNOWN_TO, LEAST_POINTS, MOST_VIEWS
 from linprim_geo.stereo.poses.patch_tracks import patch_tracks, small_depth_maps
 
@@ -76,7 +77,7 @@ def refined_model(root: Path, found: Path, refined: Path, log: Callable[[str], N
             log(f"poses: by keypoints alone: {error}")
             return False
         _apply(model, images, done)
-        model.write_binary(str(refined))
+        write_model(model, refined)
         if last:
             break
         path = refined

@@ -1,0 +1,27 @@
+"""Writing models of pycolmap, which does not say so when the disk is full."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from linprim_geo.base.files import readable_write_errors
+
+if TYPE_CHECKING:
+    from linprim_geo.geometry.load_pycolmap import pycolmap
+
+
+def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Writes a model into a folder that there is, in COLMAP's binary format.
+
+    Raises:
+        DiskFull: a file is not as long as COLMAP's format makes it.
+    """
+    with readable_write_errors(folder / "points3D.bin"):
+        model.write_binary(str(folder))
+        images = (73 + len(image.name.encode()) + 24 * image.num_points2D() for image in model.images.values())
+        points = (51 + 8 * point.track.length() for point in model.points3D.values())
+        for name, sizes in (("images.bin", images), ("points3D.bin", points)):
+            if (folder / name).stat().st_size != 8 + sum(sizes):
+                raise OSError(errno.ENOSPC, "No space left on device")
