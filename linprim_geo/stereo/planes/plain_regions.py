@@ -68,6 +68,11 @@ class PlainRegion:
     corners: np.ndarray
     wide: np.ndarray
 
+    def pixels(self) -> tuple[np.ndarray, np.ndarray]:
+        """(P,) rows and columns of its mask in the image."""
+        row, column = np.nonzero(self.mask)
+        return row + self.top, column + self.left
+
     def within(self) -> PlainRegion:
         """The region with its inner points alone."""
         return replace(

@@ -5,7 +5,8 @@ the others are those of occluders. Planes that happen to go through occluders ha
 which two walls meet have points of both, but hold little of the region. Only points on a region's own side of its edges
 count: beside a thing before a wall the others are on the wall. A plane is believed within the convex hull of its points
 alone: beyond, walls end. One through the edges of several occluders hangs in the air, and photographs that see what is
-behind it refuse it.
+behind it refuse it, or that show different colours of what is behind it: the plane of balusters in the gaps between
+them.
 
 Beside an edge stereo sees nothing but the edge, and its depth goes on into the region. There the plane is right, if the
 region is wide enough to tell; where a thing that no edge parts from the wall is before it, stereo is.
@@ -13,8 +14,9 @@ region is wide enough to tell; where a thing that no edge parts from the wall is
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, label, uniform_filter
@@ -37,6 +39,7 @@ from linprim_geo.stereo.planes.plain_regions import (
 )
 from linprim_geo.stereo.planes.point_planes import CENTRAL_SHARE
 from linprim_geo.stereo.planes.seen_through import KnownDepths
+from linprim_geo.stereo.planes.shown_colours import ShownColours
 
 # Of what stereo is sure of within a region so much is on its plane, if it is sure of enough.
 MOST_AGREE = 0.5
@@ -50,6 +53,9 @@ SAMPLES = 1000
 # The side of the square around a pixel in which what is off its plane is a surface of its own if it is most of it, and
 # in which a plane is shown by confirmed depths on it on this share of what is laid.
 SURROUNDINGS, SHOWN = 2 * WIDE + 1, 0.1
+# Photographs refuse a plane by their colours if so many of a region's points are on it: before others there may be
+# things that hide it.
+MOSTLY_ON = 0.7
 # Of one region and K planes: which of its N points are on which (N, K), and which it may lie on (K,).
 _Lying = tuple[np.ndarray, np.ndarray]
 
@@ -59,20 +65,31 @@ class RegionDepths:
     """On which plane each pixel of a view's plain regions lies: its `number` (H, W), -1 elsewhere, and float32 `depth`
     (H, W), NaN elsewhere; (H, W) bool where a known depth is that of the plane but for its error, so that it is to be
     `moved` to it, where the plane `stands` against any other depth, and where it is `doubted`, as nothing confirms it
-    although stereo knows the rest of the region."""
+    although stereo knows the rest of the region; and planes (3,) of the camera that are `refused` in regions which
+    stereo does not know, as photographs show different colours there."""
 
     number: np.ndarray
     depth: np.ndarray
     moved: np.ndarray
     stands: np.ndarray
     doubted: np.ndarray
+    refused: list[tuple[PlainRegion, np.ndarray]]
 
     @classmethod
     def nothing(cls, camera: Camera) -> RegionDepths:
         """Of a view before any plane is laid."""
         shape = (camera.height, camera.width)
-        none = (np.zeros(shape, bool) for _ in range(3))
-        return cls(np.full(shape, -1), np.full(shape, np.nan, np.float32), *none)
+        moved, stands, doubted = (np.zeros(shape, bool) for _ in range(3))
+        return cls(np.full(shape, -1), np.full(shape, np.nan, np.float32), moved, stands, doubted, [])
+
+    def refuses(self, camera: Camera, depth: np.ndarray) -> np.ndarray:
+        """(H, W) bool: which depths of the view, NaN where unknown, are those of planes that are `refused` there."""
+        result = np.zeros(depth.shape, bool)
+        for region, plane in self.refused:
+            row, column = region.pixels()
+            off = depth[row, column] * (rays_of(camera, row, column) @ plane) - 1
+            result[row, column] |= np.abs(off) < BEHIND * TOLERANCE
+        return result
 
     def without(self, taken: np.ndarray) -> RegionDepths:
         """Nothing where pixels are `taken` (H, W)."""
@@ -82,6 +99,7 @@ class RegionDepths:
             self.moved & ~taken,
             self.stands & ~taken,
             self.doubted & ~taken,
+            self.refused,
         )
 
 
@@ -91,9 +109,10 @@ def region_plane_depths(
     planes: np.ndarray,
     known: Sequence[np.ndarray],
     confirmed: Sequence[np.ndarray],
+    colours: ShownColours,
 ) -> list[RegionDepths]:
     """Of each view, of its plain `regions` by the (K, 4) planes of the world on which they lie, with the `known` (H, W)
-    depths and all that are `confirmed` (H, W), NaN elsewhere.
+    depths and all that are `confirmed` (H, W), NaN elsewhere, and the `colours` that views show.
 
     A pixel lies on the plane with the most points along the edges of its region, which count more the nearer they are
     (Tukey's weight), times what its hull holds of it, of those within whose hull it is and on which most known depths
@@ -102,7 +121,7 @@ def region_plane_depths(
     MEDIAN_OFF in the median at most, and CENTRAL_SHARE of them are within half of TOLERANCE: across a curved surface a
     half is. Nothing is laid where most of it has confirmed depths off its plane in the SURROUNDINGS: a thing in front
     that no edge parts from the plane. Of a region of which stereo knows most what has no confirmed depth on the plane
-    around is doubted.
+    around is doubted. On a plane on which most photographs show other colours of a narrow region nothing is laid.
     """
     local = [in_camera(camera, planes) for camera in cameras]
     regions = [[region.within() for region in own] for own in regions]
@@ -118,7 +137,9 @@ def region_plane_depths(
         for region, (on, fits) in zip(own, of_regions, strict=True):
             near = np.where(on, 1 - (region.off(of_view) / TOLERANCE) ** 2, 0) ** 2
             best = _best_first(camera, region, of_view, hulls, near.sum(0) * fits, views)
-            _lay(laid, camera, region, of_view, best, hulls, sure, telling)
+            refused = [] if _is_well_known(sure, region) else _refused(region, on, best, planes, colours)
+            laid.refused.extend((region, of_view[number]) for number in refused)
+            _lay(laid, camera, region, of_view, [*best][len(refused) :], hulls, sure, telling)
             height, width = region.wide.shape
             wide[region.top : region.top + height, region.left : region.left + width] |= region.wide
         seen = np.where(of_edges, np.nan, seen)
@@ -159,11 +180,14 @@ def _well_known(sure: np.ndarray, regions: Sequence[PlainRegion]) -> np.ndarray:
     """(H, W) bool: the regions of which stereo is `sure` (H, W) of more than half, so that they are not plain."""
     result = np.zeros(sure.shape, bool)
     for region in regions:
-        height, width = region.mask.shape
-        window = np.s_[region.top : region.top + height, region.left : region.left + width]
-        if np.isfinite(sure[window][region.mask]).mean() > 0.5:
-            result[window] |= region.mask
+        if _is_well_known(sure, region):
+            result[region.pixels()] = True
     return result
+
+
+def _is_well_known(sure: np.ndarray, region: PlainRegion) -> bool:
+    """Whether stereo is `sure` (H, W) of more than half of a region."""
+    return bool(np.isfinite(sure[region.pixels()]).mean() > 0.5)
 
 
 def _best_first(
@@ -173,18 +197,34 @@ def _best_first(
     hulls: Sequence[_Hull],
     counts: np.ndarray,
     views: KnownDepths,
-) -> list[int]:
-    """The numbers of those (K, 3) planes of the camera that views do not see through in the region; first the one with
-    the most of `counts` (K,) of points along its edges, times what the plane's hull holds of it."""
-    rays, held = _sampled_rays(camera, region), np.zeros(len(planes))
+) -> dict[int, np.ndarray]:
+    """Of those (K, 3) planes of the camera that views do not see through in the region, by their numbers: (P, 3) points
+    of the region within the plane's hull; first of the one with the most of `counts` (K,) of points along its edges,
+    times what its hull holds of the region."""
+    rays, held = _sampled_rays(camera, region), dict[int, np.ndarray]()
     for number in np.flatnonzero(counts).tolist():
         inverse = rays @ planes[number]
         rows = _held(camera, rays, inverse, hulls[number])
-        through = views.see_through(to_world(camera, rays[rows] / inverse[rows, None]))
-        if np.count_nonzero(through) <= BEHIND_SHARE * len(rows):
-            held[number] = len(rows)
-    order = np.argsort(-counts * held, kind="stable")
-    return order[: np.count_nonzero(held)].tolist()
+        points = to_world(camera, rays[rows] / inverse[rows, None])
+        if len(rows) and np.count_nonzero(views.see_through(points)) <= BEHIND_SHARE * len(rows):
+            held[number] = points
+    order = sorted(held, key=lambda number: -counts[number] * len(held[number]))
+    return {number: held[number] for number in order}
+
+
+def _refused(
+    region: PlainRegion, on: np.ndarray, held: Mapping[int, np.ndarray], planes: np.ndarray, colours: ShownColours
+) -> list[int]:
+    """The numbers of the first of those (K, 4) planes of the world that most of a region's (N,) points are `on` (N, K),
+    and on which photographs show different colours of what is `held` (P, 3) of the region: of a narrow one, as a wide
+    one, such as a door, may shine."""
+    if region.wide.any():
+        return []
+
+    def is_refused(number: int) -> bool:
+        return on[:, number].mean() > MOSTLY_ON and colours.differ(region.view, held[number], planes[number, :3])
+
+    return list(takewhile(is_refused, held))
 
 
 def beside_edges(shape: tuple[int, int], regions: Sequence[PlainRegion]) -> np.ndarray:
@@ -201,9 +241,9 @@ def beside_edges(shape: tuple[int, int], regions: Sequence[PlainRegion]) -> np.n
 
 def _sampled_rays(camera: Camera, region: PlainRegion) -> np.ndarray:
     """(P, 3) rays of depth 1 of about SAMPLES pixels of a region, evenly taken."""
-    row, column = np.nonzero(region.mask)
+    row, column = region.pixels()
     step = max(1, len(row) // SAMPLES)
-    return rays_of(camera, row[::step] + region.top, column[::step] + region.left)
+    return rays_of(camera, row[::step], column[::step])
 
 
 def _held(camera: Camera, rays: np.ndarray, inverse: np.ndarray, hull: _Hull) -> np.ndarray:
@@ -240,8 +280,7 @@ def _lay(
 ) -> None:
     """Lays each pixel of a region on the first of the `best` of (K, 3) planes of the camera whose hull it is in and on
     which most (H, W) `telling` depths are there, and says where `known` (H, W) ones are moved to it."""
-    row, column = np.nonzero(region.mask)
-    row, column = row + region.top, column + region.left
+    row, column = region.pixels()
     rays, left = rays_of(camera, row, column), np.ones(len(row), bool)
     for number in best:
         inverse = np.where(left, rays @ planes[number], 0)

@@ -38,6 +38,7 @@ from linprim_geo.stereo.planes.region_planes import RegionDepths, beside_edges, 
 from linprim_geo.stereo.planes.room_corners import with_corner_walls
 from linprim_geo.stereo.planes.seen_through import KnownDepths
 from linprim_geo.stereo.planes.shaded_planes import ShadedPlanes
+from linprim_geo.stereo.planes.shown_colours import ShownColours
 from linprim_geo.stereo.visibility.far_parts import far_parts
 from linprim_geo.stereo.visibility.lone_backgrounds import lone_backgrounds
 from linprim_geo.stereo.visibility.outlined_things import outlined_things
@@ -155,8 +156,10 @@ class MergedFrames(Sequence):
         self.on_planes: list[np.ndarray] = []
         beside = [beside_edges(found.grey.shape, own) for found, own in zip(maps, regions, strict=True)]
         # What is in the air beside a wall speaks against the wall's plane: when it is gone, more planes are laid.
+        colours = ShownColours(maps, sure)
         for _ in range(ROUNDS):
-            along_edges = region_plane_depths(self.cameras, regions, shaded.planes, sure, self.depths)
+            along_edges = region_plane_depths(self.cameras, regions, shaded.planes, sure, self.depths, colours)
+            self._clear_refused(along_edges, sure, on_points)
             along_edges = [found.without(taken) for found, taken in zip(along_edges, backgrounds, strict=True)]
             by_shading = shaded.depth_maps(shaded.areas([found.number for found in along_edges]))
             self._lay_planes(sure, on_points, by_shading, along_edges)
@@ -197,6 +200,13 @@ class MergedFrames(Sequence):
         views = KnownDepths(self.cameras, self._known())
         for depths in (self.depths, self.on_planes, self.doubtful_depths, *others):
             views.clear(depths, beside)
+
+    def _clear_refused(self, along_edges: Sequence[RegionDepths], *others: Sequence[np.ndarray]) -> None:
+        """Takes depths on planes that photographs refuse in plain regions away from all that are measured, and from
+        `others`: they are those of edges beside."""
+        for depths in (self.depths, self.doubtful_depths, *others):
+            for camera, found, depth in zip(self.cameras, along_edges, depths, strict=True):
+                depth[found.refuses(camera, depth)] = np.nan
 
     def _known(self) -> list[np.ndarray]:
         """(H, W) what is confirmed or on a plane, of every view."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from helpers.captures import look_at
@@ -13,11 +15,14 @@ from linprim_geo.stereo.edges import edges_of
 from linprim_geo.stereo.planes.plain_regions import in_camera, in_world, regions_of_views
 from linprim_geo.stereo.planes.region_planes import beside_edges, region_plane_depths
 
+# Photographs that show one colour of everything, and others of everything.
+ALIKE, OTHERS = (SimpleNamespace(differ=lambda *_, answer=answer: answer) for answer in (False, True))
+
 
 def laid_planes(of, regions, planes, known) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
     """Of every view: the depth that planes give, where known ones are moved to it, and where the plane stands; stereo
     is sure of all that it confirms."""
-    found = region_plane_depths(of, regions, planes, known, known)
+    found = region_plane_depths(of, regions, planes, known, known, ALIKE)
     return [one.depth for one in found], [one.moved for one in found], [one.stands for one in found]
 
 
@@ -60,7 +65,7 @@ def test_of_two_planes_with_as_many_points_the_one_that_is_nearer_to_them_is_tak
 
 def test_pixels_have_the_numbers_of_their_planes(room):
     of, depths, walls, regions, known = room
-    for laid, wall in zip(region_plane_depths(of, regions, PLANES, known, known), walls, strict=True):
+    for laid, wall in zip(region_plane_depths(of, regions, PLANES, known, known, ALIKE), walls, strict=True):
         is_laid = np.isfinite(laid.depth)
         assert (laid.number[~is_laid] == -1).all() and (laid.number == wall)[is_laid].mean() > 0.98
         without = laid.without(wall == 1)
@@ -153,7 +158,7 @@ def test_a_thing_that_no_edge_parts_from_a_wall_is_not_laid_on_it(room, share, l
         seen_of_it = thing & (np.random.default_rng(number).uniform(size=depth.shape) < share)
         confirmed.append(np.where(seen_of_it, 0.9 * depth, edges))
         discs.append(thing & (away < 15))
-    found = region_plane_depths(of, regions, PLANES[[1]], known, confirmed)
+    found = region_plane_depths(of, regions, PLANES[[1]], known, confirmed, ALIKE)
     in_discs = np.concatenate([np.isfinite(one.depth)[disc] for one, disc in zip(found, discs, strict=True)])
     others = np.concatenate([np.isfinite(one.depth)[wall == 1] for one, wall in zip(found, walls, strict=True)])
     assert len(in_discs) > 3000 and in_discs.mean() == laid and others.mean() > 0.7
@@ -169,7 +174,7 @@ def test_what_nothing_shows_in_a_wall_that_stereo_knows_is_doubted(room, share, 
         sure = (wall == 1) & (np.random.default_rng(number).uniform(size=depth.shape) < share)
         inside.append(np.where((away < 50) & np.isnan(edges), np.nan, np.where(sure, depth, edges)))
         discs.append((away < 15) & (inner > 70))
-    found = region_plane_depths(of, regions, PLANES[[1]], inside, inside)
+    found = region_plane_depths(of, regions, PLANES[[1]], inside, inside, ALIKE)
     doubted = np.concatenate(
         [(one.doubted & np.isfinite(one.depth))[disc] for one, disc in zip(found, discs, strict=True)]
     )
@@ -339,3 +344,53 @@ def test_a_plane_does_not_go_on_between_houses_before_what_is_far():
     assert np.allclose(between_houses(np.nan), 3.0), "nothing contradicts it"
     assert np.allclose(between_houses(9.0), 3.0), "depths that are not sure do not"
     assert np.isnan(between_houses(300.0)).all()
+
+
+def with_lines(walls, apart: int) -> list[np.ndarray]:
+    """(H, W) greys of walls with dark lines so many pixels apart."""
+    lines = np.zeros(walls[0].shape, bool)
+    lines[:, ::apart] = True
+    return [np.array(GREYS)[wall] - 60.0 * lines for wall in walls]
+
+
+@pytest.mark.parametrize(
+    ("apart", "share", "laid", "is_refused"), [(30, 0.0, False, True), (30, 0.9, True, False), (400, 0.0, True, False)]
+)
+def test_between_edges_a_plane_on_which_photographs_show_other_colours_is_refused(room, apart, share, laid, is_refused):
+    """But not in what is wide, nor in a region of which stereo knows most."""
+    of, depths, walls, _, _ = room
+    maps = noisy_maps(of, with_lines(walls, apart), 0)
+    known = []
+    for number, (found, depth) in enumerate(zip(maps, depths, strict=True)):
+        sure = np.random.default_rng(number).uniform(size=depth.shape) < share
+        known.append(np.where(edges_of(found.grey, NOISE**2) | sure, depth, np.nan).astype(np.float32))
+    regions = regions_of_views(maps, known)
+    for colours in (ALIKE, OTHERS):
+        found = region_plane_depths(of, regions, PLANES[[1]], known, known, colours)
+        on_it = np.concatenate([np.isfinite(one.depth)[wall == 1] for one, wall in zip(found, walls, strict=True)])
+        assert on_it.mean() > 0.6 if laid or colours is ALIKE else on_it.mean() < 0.05
+    for camera, one, depth, wall, own in zip(of, found, depths, walls, regions, strict=True):
+        there = np.zeros(depth.shape, bool)
+        for region in own:
+            there[region.pixels()] = True
+        cleared = one.refuses(camera, np.where(there, depth, np.nan).astype(np.float32))
+        assert not cleared[~there].any()
+        if ((wall == 1) & there).sum() > 10_000:
+            share_cleared = cleared[(wall == 1) & there].mean()
+            assert share_cleared > 0.7 if is_refused else share_cleared < 0.1
+            assert not one.refuses(camera, (1.04 * depth).astype(np.float32))[wall == 1].any()
+
+
+@pytest.mark.parametrize(("share", "laid"), [(0.4, True), (0.2, False)])
+def test_things_before_a_plane_may_show_other_colours(room, share, laid):
+    """A wall behind lines of which so many are before it."""
+    of, depths, walls, _, _ = room
+    maps, known = noisy_maps(of, with_lines(walls, 30), 0), []
+    for number, (found, depth) in enumerate(zip(maps, depths, strict=True)):
+        nearer = np.random.default_rng(number).uniform(size=depth.shape) < share
+        of_edges = np.where(nearer, 0.98 * depth, depth)
+        known.append(np.where(edges_of(found.grey, NOISE**2), of_edges, np.nan).astype(np.float32))
+    nothing = [np.full_like(depth, np.nan) for depth in known]
+    found = region_plane_depths(of, regions_of_views(maps, known), PLANES[[1]], known, nothing, OTHERS)
+    on_it = np.concatenate([np.isfinite(one.depth)[wall == 1] for one, wall in zip(found, walls, strict=True)])
+    assert on_it.mean() > 0.5 if laid else on_it.mean() < 0.05
