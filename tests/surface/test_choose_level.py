@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from linprim_geo.capture.load import load_scene
+from linprim_geo.geometry.camera import Similarity
 from linprim_geo.surface.choose_level import (
     LEVELS,
     PIXEL_BYTES,
@@ -79,7 +80,7 @@ def test_beyond_the_levels_the_nearest_is_taken(scene):
 
 def test_photographs_that_do_not_say_leave_the_usual_level(scene):
     few = replace(scene, train=scene.train[:1])
-    assert choose_level(run_of(few, 0.6)) == (USUAL_LEVEL, {})
+    assert choose_level(run_of(few, 0.6)) == (USUAL_LEVEL, {}) and LEVELS[0] < USUAL_LEVEL < LEVELS[-1]
     level, differences = choose_level(run_of(scene, 0.6, share=0.0))  # the same surface at all levels
     assert level == USUAL_LEVEL and len(set(differences.values())) == 1
 
@@ -92,6 +93,18 @@ def test_pixels_that_are_hidden_in_the_other_view_do_not_count(scene):
     hidden = color_differences(one.camera, photos[0], other.camera, photos[1], [(depth, 0.5 * other_depth)])
     assert seen.shape[1] > 200 and hidden.shape == (1, 0)
     assert seen.mean() < 8  # of 255: the same places have the same colours
+
+
+def test_the_unit_of_length_does_not_matter(scene):
+    one, other = scene.train[:2]
+
+    def differences(scale):
+        cameras = [view.camera.transformed(Similarity(scale)) for view in (one, other)]
+        depths = [view.load_depth() * scale for view in (one, other)]
+        return color_differences(cameras[0], one.load(), cameras[1], other.load(), [tuple(depths)])
+
+    small, usual = differences(2.0**-10), differences(1.0)
+    assert small.shape == usual.shape and np.allclose(small, usual)
 
 
 def test_of_levels_that_are_as_good_the_nearest_is_taken():

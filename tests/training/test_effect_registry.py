@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.capture.types import PointCloud
 from linprim_geo.geometry.camera import Camera, Similarity
-from linprim_geo.geometry.lens import Lens
+from linprim_geo.geometry.lens import Lens, straightened
 from linprim_geo.training import effect_registry
 from linprim_geo.training.effect_registry import EFFECTS
 from linprim_geo.training.effects import Choice, _decide, chosen_options
@@ -141,6 +142,26 @@ def test_no_sky_is_looked_for_where_a_background_is_not_wanted(asked, photograph
     assert background(Choice("auto", {asked: False})) == ("random" if asked == "background" else "fitted")
 
 
+def test_primitives_that_a_view_does_not_show_are_not_shifted_in_it():
+    beside = (9.0, 0.0, 0.0)
+    one, both = (data(views=[view()], xyz=xyz) for xyz in ([(0.0, 0.0, 0.0)], [(0.0, 0.0, 0.0), beside]))
+    measure = EFFECTS["exact-rays"].measure
+    assert measure(both) == measure(one) > 0 and measure(data(views=[view()], xyz=[beside])) is None
+
+
+def test_the_smallest_primitive_is_that_of_the_longer_focal_length():
+    usual, longer = reaches(1.0), reaches(1.0)
+    longer.scene.train[0].camera = replace(longer.scene.train[0].camera, fy=2 * FOCAL)
+    measure = EFFECTS["double"].measure
+    assert measure(longer) == pytest.approx(2 * measure(usual))
+
+
+def test_a_lens_that_is_to_be_undistorted_is_taken_for_no_pinhole():
+    effect, lens = EFFECTS["lens"], bent_by(1.01).scene.views[0].lens
+    assert straightened(lens, effect.on["pinhole_below"]) is lens
+    assert straightened(lens, effect.off["pinhole_below"]).model == "PINHOLE"
+
+
 def depths_of(factors: np.ndarray):
     """A view whose depth map has these factors (N, N) of the depth of a point in each pixel."""
     side = len(factors)
@@ -167,3 +188,8 @@ def depths_of(factors: np.ndarray):
 def test_depths_within_a_tenth_for_a_fifth_of_the_points_have_their_unit(factor, agreeing, share):
     factors = np.where(np.arange(100) < agreeing, factor, 0.3).reshape(10, 10)
     assert effect_registry._depth_share(depths_of(factors)) == share
+
+
+def test_pixels_without_depth_say_nothing_of_its_unit():
+    factors = np.where(np.arange(100) < 5, 1.0, 0.0).reshape(10, 10)
+    assert effect_registry._depth_share(depths_of(factors)) == 100

@@ -15,6 +15,7 @@ from linprim_geo.capture.load import load_scene
 from linprim_geo.cli import main as cli
 from linprim_geo.geometry.lens import Lens, largest_displacement, straightened
 from linprim_geo.points.photo_evidence import Observations
+from linprim_geo.points.start_points import SFM_START
 from linprim_geo.runs.run import Run
 from linprim_geo.synthetic.synth import synthesize
 from linprim_geo.training.effect_registry import EFFECTS, Data
@@ -188,6 +189,12 @@ def test_a_gaussian_has_no_overlap(scenes):
     assert (found["overlap"].on, found["overlap"].reason) == (False, "impossible")
 
 
+def test_evidence_is_taken_of_as_many_primitives_as_training_begins_with(scenes):
+    """At points of the scene, none of them twice."""
+    xyz, spacing = Data(load_scene(scenes("plain")), replace(OPTIONS, max_primitives=1000)).start
+    assert len(np.unique(xyz, axis=0)) == len(spacing) == SFM_START * 1000
+
+
 def test_the_affine_bound_bounds(scenes):
     """A point that far from a centre is off by no more than the formula says, but for third order."""
     rng = np.random.default_rng(0)
@@ -312,6 +319,10 @@ def test_an_effect_that_makes_no_sense_is_refused(word, sentence, capsys, tmp_pa
     assert cli.main(["train", str(tmp_path), "--effect", word]) == 1
     error = capsys.readouterr().err
     assert sentence in error and error.count("\n") == 1
+
+
+def test_effects_are_asked_for_by_name():
+    assert parse_asked(["exposure=on", "lens=off"]) == {"exposure": True, "lens": False} and parse_asked([]) == {}
 
 
 def test_every_effect_names_options_that_exist():

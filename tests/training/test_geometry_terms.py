@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from conftest import octahedron_run
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import GEOMETRY_WEIGHTS, TrainOptions, check_train_options
 from linprim_geo.geometry.boxes import smaller
-from linprim_geo.geometry.camera import Camera
+from linprim_geo.geometry.camera import Camera, Similarity
 from linprim_geo.kernels import ops
 from linprim_geo.kernels.ops import Rendering
 from linprim_geo.training.step import geometry_terms as terms
@@ -131,6 +132,48 @@ def test_normal_error_counts_pixels_that_have_a_normal():
     assert float(terms.normal_error(found, 0 * wanted, depth)) == 0
 
 
+def test_terms_add_up_by_their_weights_where_there_is_evidence_for_them():
+    depth = plane_depth(camera(), NORMAL, OFFSET)
+    normal, seen = constant_normals(NORMAL, depth), torch.tensor([[3, 10], [20, 40]])
+    whole = terms.Evidence(
+        depth=depth / 1.02,
+        normal=constant_normals([0.0, 0.0, -1.0], depth),
+        pixels=seen,
+        point_depth=depth[seen[:, 1], seen[:, 0]] / 1.05,
+        point_weight=torch.ones(2),
+    )
+    found = terms.GeometryTerms(TrainOptions(), [SimpleNamespace(camera=camera())] * 2, [whole, terms.Evidence()])
+    out = replace(rendering(depth, normal), distortion=torch.full_like(depth, 0.1))
+    always = {"binarisation": math.log(2), "distortion": 0.1, "normal_consistency": 0.0}
+    evident = {"sensor_depth": 0.02, "sensor_normals": 1 + NORMAL[2], "point_depth": 0.05}
+    weights = {name: float(2**k) for k, name in enumerate(GEOMETRY_WEIGHTS)}
+    for view, there in enumerate((always | evident, always)):
+        assert set(there) <= set(weights) == set(always | evident)
+        wanted = sum(weights[name] * value for name, value in there.items())
+        assert float(found.loss(weights, out, view, 0, torch.zeros(4))) == pytest.approx(wanted, rel=1e-6)
+
+
+def test_a_surface_of_stereo_is_evidence_as_soon_as_a_part_of_it_is_known():
+    nowhere, somewhere = np.zeros((2, 3, 2, 2), np.float32)
+    somewhere[:, 1, 0] = [0.5, 0.1, -0.2]
+    surfaces = [
+        SimpleNamespace(view=SimpleNamespace(name=name, factor=2), planes=planes, known=planes[0] > 0)
+        for name, planes in (("a", nowhere), ("b", somewhere))
+    ]
+    scene = SimpleNamespace(train=[SimpleNamespace(name=name) for name in "abc"], points=None)
+    options = TrainOptions(stereo_depth=1.0)
+    found = terms.gather_evidence(scene, options, Similarity(4.0), lambda line: None, surfaces)
+    assert found[0].planes is None and found[2].planes is None
+    assert torch.equal(found[1].planes, torch.from_numpy(somewhere / 4)) and found[1].factor == 2
+
+
+def test_surfaces_of_stereo_have_their_weight_in_the_mean_over_steps():
+    evidence = [terms.Evidence(planes=torch.ones(3, 2, 2)), terms.Evidence()]
+    found = terms.GeometryTerms(TrainOptions(stereo_depth=0.3), [None, None], evidence)
+    weights = [[found.weights(view, step, False).get("stereo_depth", 0.0) for step in range(10)] for view in (0, 1)]
+    assert np.mean(weights, axis=1) == pytest.approx([0.3, 0.0])
+
+
 @pytest.fixture(scope="module")
 def options(tiny_options):
     return replace(tiny_options, iterations=120, checkpoint_every=60, evaluate_every=0, geometry_from=0.5)
@@ -225,7 +268,6 @@ def test_normals_of_the_data_set_are_those_of_its_surface(tiny_scene):
 
 def test_a_term_without_evidence_says_so(tmp_path):
     from linprim_geo.capture.load import load_scene
-    from linprim_geo.geometry.camera import Similarity
 
     run = octahedron_run(tmp_path, views=4, size=24)
     scene = load_scene(run.parent / "scene")

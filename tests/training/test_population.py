@@ -64,6 +64,13 @@ def test_the_plan_reaches_the_cap_before_growth_ends(iterations, start, cap):
     assert steps[0] >= 0.03 * iterations and steps[-1] <= 0.6 * iterations
 
 
+@pytest.mark.parametrize(("iterations", "every"), [(30_000, 100), (6000, 100), (3000, 50), (300, 10)])
+def test_events_are_a_hundred_steps_apart_and_closer_in_shorter_runs(iterations, every):
+    growth = Growth.plan(iterations, 100, 1000)
+    due = [step for step in range(1, iterations + 1) if growth.is_due(step)]
+    assert set(np.diff(due)) == {every}
+
+
 @pytest.mark.parametrize(
     ("iterations", "start", "cap"), [(1, 1, 1), (5, 10, 10), (20, 1, 1000), (10**6, 1, 10**6), (100, 50, 20)]
 )
@@ -113,11 +120,12 @@ def test_long_axes_are_cut_in_proportion_to_their_square():
     assert np.abs(share - np.array([1, 4, 9]) / 14).max() < 0.024
 
 
-def test_parents_are_drawn_in_proportion_to_the_pull():
+@pytest.mark.parametrize("unit", [1.0, 1e-6])
+def test_parents_are_drawn_in_proportion_to_the_pull(unit):
     table = parameters(400)
     screen_gradient = torch.zeros(400)
-    screen_gradient[100:300] = 1
-    screen_gradient[200:300] = 3
+    screen_gradient[100:300] = unit
+    screen_gradient[200:300] = 3 * unit
     counts = np.zeros(400)
     for seed in range(300):
         parents, *_ = event(table, screen_gradient, rate=0.01, seed=seed)
@@ -170,7 +178,9 @@ def test_a_population_of_one_can_be_cut():
 
 
 def test_nothing_is_cut_where_nothing_pulls():
-    assert len(event(parameters(50), torch.zeros(50))[0]) == 0
+    parents, children, halves = event(parameters(50), torch.zeros(50))
+    assert len(parents) == len(children) == 0
+    assert halves["center"].shape == halves["log_extent"].shape == (2, 0, 3)
     # No more parents than are pulled at, however large the rate.
     screen_gradient = torch.zeros(50)
     screen_gradient[3] = 1
@@ -261,6 +271,14 @@ def test_halves_of_a_gaussian_keep_its_moments_and_its_thickness():
     np.testing.assert_allclose((both * size).sum(0), thickness, rtol=1e-5)
 
 
+def test_views_of_different_resolution_count_alike():
+    control = GradientControl(TrainOptions(iterations=100, max_primitives=60), 1, [], (1e-3, 1.0))
+    for size, pull in (((100, 50), 0.02), ((25, 50), 0.04)):  # per pixel: of twice as large ones it is twice as much
+        control.accumulate({}, None, size, torch.tensor([[9.0, 9.0, pull]]))
+        assert control.accumulated["screen_gradient"].item() == pytest.approx(2)
+        control.reset(1)
+
+
 def test_an_event_copies_rows_and_moments():
     options = TrainOptions(iterations=100, max_primitives=60)
     control = GradientControl(options, 50, [], (1e-3, 1.0))
@@ -271,6 +289,9 @@ def test_an_event_copies_rows_and_moments():
     assert 0 < len(new) <= 10 and (event.source[:50] == np.arange(50)).all()
     rows, values = event.values["center"]
     assert set(new) < set(rows) and set(event.source[new]) < set(rows) and len(values) == len(rows)
+    # Halves lie on both sides of the middle of their parent.
+    both = values.reshape(2, len(new), 3) - table["center"].numpy()[event.source[new]]
+    assert np.allclose(both[0], -both[1], atol=1e-6) and (np.linalg.norm(both, axis=2) > 1e-3).all()
     assert (np.sort(event.reset_momentum) == np.sort(rows)).all() and event.reset_state is None
     again = GradientControl(options, 7, [], (1e-3, 1.0))
     again.restore(control.state())

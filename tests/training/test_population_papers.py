@@ -245,6 +245,24 @@ def test_fifty_copies_lose_no_digits():
     assert factor[0] == pytest.approx(float(mpf(opacity) / total), rel=1e-6)
 
 
+def test_the_steps_of_relocation():
+    control = mcmc(5)
+    due = [step for step in range(1, 30_001) if control.is_due(step)]
+    assert due == list(range(600, 25_000, 100))
+
+
+def test_those_that_share_an_opacity_have_the_size_that_relocation_gives_them():
+    control, parameters = mcmc(50, max_primitives=50), table(50)
+    parameters["raw_opacity"][:20] = -6.0
+    event = control.grow(parameters, 600)
+    extent, before = np.exp(after(event, parameters, "log_extent")), np.exp(parameters["log_extent"].numpy())
+    opacity = opacity_of(parameters["raw_opacity"].numpy())
+    for row in range(20, 50):
+        family = np.flatnonzero(event.source == row)
+        _, factor = relocated(opacity[[row]], np.array([len(family)]))
+        assert np.allclose(extent[family], factor * before[row], rtol=1e-5)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_dead_ones_move_onto_living_ones_and_five_percent_join(kind):
     control, parameters = mcmc(200, kind), table(200, kind)

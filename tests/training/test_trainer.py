@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -9,13 +11,14 @@ import pytest
 import torch
 
 from linprim_geo.base.kinds import KINDS
-from linprim_geo.base.options import TrainOptions
+from linprim_geo.base.options import TrainOptions, raster_options
 from linprim_geo.capture.load import load_scene
+from linprim_geo.geometry.environment_map import texel_directions
 from linprim_geo.geometry.primitives import SH_Y0, Primitives
 from linprim_geo.kernels import ops
 from linprim_geo.training.step.parameters import activate, filter_lengths, initial_parameters
 from linprim_geo.training.step.trainer import CONTROLS, Trainer
-from linprim_geo.training.step.training_images import load_training_images
+from linprim_geo.training.step.training_images import TrainingImage, load_training_images
 
 
 def test_activation_gives_the_opacity_of_the_raw_value():
@@ -166,6 +169,100 @@ def test_a_child_has_its_parents_state_but_no_momentum(trainer):
         assert all(len(value) == len(trainer) for value in table.values())
 
 
+def before_environment(trainer, texels, count=None):
+    """The same training before an environment, of its first `count` views."""
+    parameters = {name: value.detach().clone() for name, value in trainer.parameters.items()}
+    images, black = trainer.images[:count], torch.zeros(3)
+    return Trainer(images, parameters, trainer.options, trainer.bounds, black, False, False, environment=texels)
+
+
+def test_views_are_looked_at_together_at_parts_of_the_run(trainer, monkeypatch):
+    looked = []
+    monkeypatch.setattr(Trainer, "_check_support", lambda self: looked.append(self.step))
+    for step in (0, 9, 10, 19, 34, 40, 49, 69, 98):
+        trainer.step = step
+        trainer.advance()
+    assert looked == [10, 20, 35, 50, 70]  # of 100 steps
+
+
+def test_texels_that_views_see_are_trained_and_shown(trainer):
+    texels = torch.full((6, 4, 4, 3), 0.3)
+    trained = before_environment(trainer, texels.clone())
+    trained.parameters["raw_opacity"][:] = -30.0
+    camera = trained.images[0].camera
+    assert torch.allclose(trained.render(camera, torch.zeros(3)), torch.tensor(0.3), atol=1e-6)
+    trained.advance()
+    change = (trained.environment - texels).abs()
+    assert 0 < change.max() < 0.01 and (change == 0).any()
+
+
+def test_texels_that_no_view_sees_take_the_colours_round_them(trainer):
+    trained = before_environment(trainer, torch.full((6, 8, 8, 3), 0.2), count=1)
+    away = texel_directions(8) @ trained.images[0].camera.rotation[2] < 0
+    trained.environment[torch.from_numpy(away)] = 0.9
+    trained._check_support()
+    assert away.any() and torch.allclose(trained.environment, torch.tensor(0.2), atol=1e-6)
+
+
+def test_a_fitted_background_is_trained_and_goes_on_where_it_was(trainer):
+    images = [TrainingImage(image.name, image.camera, image.rgb, None) for image in trainer.images]
+
+    def begun():
+        parameters = {name: value.detach().clone() for name, value in trainer.parameters.items()}
+        begin = torch.full((3,), 0.6)
+        return Trainer(images, parameters, trainer.options, trainer.bounds, begin, True, False)
+
+    one, other = begun(), begun()
+    one.advance()
+    assert ((one.shown_background() - 0.6).abs() > 1e-3).all()
+    other.restore(copy.deepcopy(one.state()))
+    for each in (one, other):
+        each.advance()
+    assert torch.equal(one.shown_background(), other.shown_background())
+
+
+def test_primitives_are_blended_by_their_centres_until_the_last_part_of_the_run(trainer):
+    options = replace(trainer.options, order="overlap", order_from=0.7)
+    parameters = {name: value.detach().clone() for name, value in trainer.parameters.items()}
+    late = Trainer(trainer.images, parameters, options, trainer.bounds, torch.ones(3), False, True)
+    for step, order in ((0, "center"), (69, "center"), (70, "overlap"), (99, "overlap")):
+        late.step = step
+        assert late.raster_options_now() == raster_options(options) | {"order": order}
+
+
+@pytest.mark.parametrize("drawn", [False, True])
+def test_what_stands_behind_masks_has_no_gain(trainer, drawn):
+    """Grey primitives, and two photographs of them, twice and half as bright: these fit over any background."""
+    parameters = {name: value.detach().clone() for name, value in trainer.parameters.items()}
+    parameters["sh_dc"][:] = (0.3 - 0.5) / SH_Y0
+    grey = Trainer(trainer.images[:2], parameters, trainer.options, trainer.bounds, torch.ones(3), False, drawn)
+    images = []
+    for image, value in zip(grey.images, (153, 38), strict=True):
+        black, white = (grey.render(image.camera, torch.full((3,), float(x)))[0] for x in (0, 1))
+        alpha = (255 * (1 - white + black)).round().to(torch.uint8)
+        images.append(TrainingImage(image.name, image.camera, torch.full((3, *alpha.shape), value).byte(), alpha))
+    options, gains = replace(trainer.options, exposure="gain"), np.log([[2.0] * 3, [0.5] * 3])
+    fits = Trainer(images, parameters, options, trainer.bounds, torch.ones(3), False, drawn, log_gain=gains)
+    fits.advance()
+    assert fits.psnr > 50
+
+
+def test_the_state_of_another_training_is_refused(trainer):
+    state = trainer.state()
+    for name in ("parameters", "first", "second"):
+        fewer = {key: value for key, value in state[name].items() if key != "sh_rest"}
+        with pytest.raises(ValueError, match=f"{name} has"):
+            trainer.restore(state | {name: fewer})
+
+
+def test_the_seconds_of_a_training_are_those_of_its_steps(trainer):
+    begin = time.perf_counter()
+    trainer.advance()
+    one = trainer.seconds
+    trainer.advance()
+    assert 0 < one < trainer.seconds <= time.perf_counter() - begin
+
+
 def test_the_start_follows_the_points():
     xyz = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 1.5]])
     rgb = np.array([[255, 0, 128]] * 5, dtype=np.uint8)
@@ -239,6 +336,18 @@ def test_the_length_of_the_3d_filter_is_that_of_the_nearest_view_that_sees(train
         depth = min(depths or [np.linalg.norm(point - c.center) for c in cameras])
         assert length == pytest.approx(np.sqrt(0.2) * depth / focal, rel=1e-5)
     assert 50 < seen < 300
+
+
+def test_the_3d_filter_is_made_again_for_where_primitives_have_moved(trainer, monkeypatch):
+    monkeypatch.setattr("linprim_geo.training.step.trainer.FILTER_EVERY", 2)
+    trainer.options = replace(trainer.options, filter="3d")
+    trainer._refilter()
+    before = trainer.filter_3d
+    trainer.advance()
+    assert trainer.filter_3d is before
+    trainer.advance()
+    wanted = filter_lengths(trainer.parameters["center"], [image.camera for image in trainer.images])
+    assert torch.equal(trainer.filter_3d, wanted) and not torch.equal(wanted, before)
 
 
 def test_the_exponential_is_rounded_once_and_is_its_own_gradient():

@@ -11,6 +11,7 @@ from helpers.textured_plane import FOOTPRINT, Shown, inner, ring, sheet, texture
 from linprim_geo.geometry.mesh import Mesh, face_areas, face_normals
 from linprim_geo.kernels import ops, surface_ops
 from linprim_geo.surface.finish.denoise import CONTRAST, denoised, filtered
+from linprim_geo.surface.finish.photo_consistency import predicted_error
 from linprim_geo.surface.normals import vertex_normals
 
 
@@ -132,8 +133,10 @@ def test_what_photographs_agree_on_stays(monkeypatch):
     monkeypatch.setattr(
         "linprim_geo.surface.finish.denoise.filtered", lambda mesh, bound: mesh.vertices + [0, 0, 0.5 * FOOTPRINT]
     )
-    middle = inner(mesh, 0.3)
-    assert np.abs(denoised(mesh, shown).vertices[middle, 2]).max() < 0.05 * FOOTPRINT
+    middle, stays = inner(mesh, 0.3), denoised(mesh, shown)
+    assert np.abs(stays.vertices[middle, 2]).max() < 0.05 * FOOTPRINT
+    told = predicted_error(mesh, [s.camera for s in shown], (s.load() for s in shown))
+    np.testing.assert_allclose(stays.quality[middle], told[middle], rtol=0.05)
     low = replace(mesh, vertices=mesh.vertices - [0, 0, 0.5 * FOOTPRINT])
     assert np.abs(denoised(low, shown).vertices[middle, 2]).max() < 0.05 * FOOTPRINT
 

@@ -13,8 +13,9 @@ from linprim_geo.capture.types import Photo
 from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.kernels import ops
-from linprim_geo.surface.finish.outlines import moved_to_outlines
+from linprim_geo.surface.finish.outlines import _covered, moved_to_outlines
 from linprim_geo.surface.finish.self_intersections import crossings
+from linprim_geo.surface.mesh_views import MeshViews
 
 RADIUS, FINE = 1.0, 5
 CAMERAS = ring(16, size=(112, 112), focal=130.0)
@@ -104,6 +105,14 @@ def test_edges_of_a_block_come_back():
 def test_what_is_right_stays(views):
     off = np.abs(off_by(moved_to_outlines(ball(RADIUS), views)))
     assert off.max() < 0.1 and off.mean() < 0.01
+
+
+def test_the_share_of_a_pixel_that_one_face_covers():
+    face = Mesh(np.array([[-0.8, -0.5, 0.0], [0.9, -0.4, 0.1], [0.1, 0.8, -0.2]]), np.array([[0, 1, 2]]))
+    for camera in CAMERAS[:3]:
+        covered, _, near = _covered(camera, MeshViews(face.vertices, face.faces))
+        wanted = Masked(camera, of_mesh(face)).photo.alpha / 255
+        assert near.sum() > 50 and np.abs(covered - wanted)[near].mean() < 0.08
 
 
 def test_masks_that_do_not_tell_shares_have_no_say():

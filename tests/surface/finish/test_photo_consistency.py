@@ -218,15 +218,35 @@ def test_how_far_behind_the_surface_and_beside_a_jump_a_point_is_seen(tilt):
 def test_a_footprint_is_what_a_pixel_covers_of_the_surface():
     """z / (f cos t) for a surface that leans by t, f the geometric mean of both focal lengths; the least of all views
     under less than 81 degrees."""
-    angle = np.radians([0.0, 30.0, 60.0, 85.0])
-    point, lens = np.tile([0.0, 0.0, 2.0], (4, 1)), (80.0, 125.0, 5.0, 5.0)
-    normal = np.stack([np.sin(angle), np.zeros(4), -np.cos(angle)], 1)
-    least = np.full(4, 9.0)
+    angle = np.radians([0.0, 30.0, 60.0, 81.0, 82.0])
+    point, lens = np.tile([0.0, 0.0, 2.0], (5, 1)), (80.0, 125.0, 5.0, 5.0)
+    normal = np.stack([np.sin(angle), np.zeros(5), -np.cos(angle)], 1)
+    least = np.full(5, 9.0)
     for away in (0.0, 1.0):
         pose = np.eye(4)[:3]
         pose[2, 3] = away  # the second view is one farther away
         surface_ops.least_footprints(pose, lens, 10, 10, photo_consistency.LEAST_COSINE, point, normal, least)
-    assert least == pytest.approx([*(2 / (100 * np.cos(angle[:3]))), 9.0], rel=1e-12)
+    assert least == pytest.approx([*(2 / (100 * np.cos(angle[:4]))), 9.0], rel=1e-12)
+
+
+def test_the_largest_footprints_are_cut_though_some_vertices_are_not_seen():
+    """Of a sheet before one camera: one vertex leans away by 80 degrees, one faces away."""
+    mesh, view = sheet(lambda x, y: np.zeros_like(x), steps=9), camera((0.0, 0.0, DISTANCE))
+    normals = np.tile([0.0, 0.0, 1.0], (len(mesh.vertices), 1))
+    normals[40], normals[41] = [np.sin(np.radians(80)), 0, np.cos(np.radians(80))], [0, 0, -1]
+    found = photo_consistency._footprints(mesh.vertices, normals, [view])
+    others = np.delete(found, [40, 41])
+    assert found[[40, 41]] == pytest.approx(photo_consistency.LARGEST_FOOTPRINT * np.median(others), rel=0.05)
+    assert others == pytest.approx(np.full(len(others), FOOTPRINT), rel=0.05)
+
+
+def test_a_mean_over_neighbours_counts_each_of_them_once():
+    mesh = sheet(lambda x, y: np.zeros_like(x), steps=4)
+    values = np.random.default_rng(0).normal(size=len(mesh.vertices))
+    found = photo_consistency.neighbour_average(mesh) @ values
+    for vertex in range(len(values)):
+        around = np.unique(mesh.faces[(mesh.faces == vertex).any(1)])
+        assert found[vertex] == pytest.approx(values[around].mean(), abs=1e-12)
 
 
 def test_the_same_bytes_at_any_number_of_threads(shown, few_threads):

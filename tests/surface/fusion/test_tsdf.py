@@ -291,6 +291,20 @@ def test_votes_are_those_of_the_rules(occluded):
     assert not grid.weight[3].any() and (grid.weight[:3] > 0).any(1).all()
 
 
+@pytest.mark.parametrize("voxel", [0.01, 10.0])
+def test_blocks_that_a_camera_may_show_are_in_view_whatever_the_unit(voxel):
+    camera = Camera(40, 30, 50.0, 50.0, 20.0, 15.0, np.eye(4))
+    blocks = np.stack([axis.ravel() for axis in np.meshgrid(*[np.arange(-8, 8)] * 3)], axis=1)
+    levels = np.zeros(len(blocks), np.int64)
+    grid = Grid(blocks, levels, levels, np.zeros(3), voxel, 3.0, 4)
+    voxels = np.stack([axis.ravel() for axis in np.meshgrid(*[np.arange(4)] * 3)], axis=1)
+    pixels, depth = camera.project((voxel * (4 * blocks[:, None] + voxels + 0.5)).reshape(-1, 3))
+    shown = camera.shows(pixels, depth).reshape(len(blocks), -1).any(1)
+    seen = np.isin(np.arange(len(blocks)), grid.in_view(camera))
+    assert shown.sum() > 100 and seen[shown].all()
+    assert seen.sum() < 3 * shown.sum()  # spheres around blocks reach into view before these do
+
+
 # --- contract --------------------------------------------------------------------------------------------
 
 
