@@ -20,6 +20,7 @@ from linprim_geo.geometry.lens import largest_displacement
 from linprim_geo.points.far_colors import OPEN_SHARE, far_share
 from linprim_geo.points.initial_points import CAMERA_DISTANCE, VolumePoints, scene_normalization
 from linprim_geo.points.photo_evidence import Observations, observe
+from linprim_geo.points.start_points import SFM_START
 from linprim_geo.training.background import BACKDROP_SHARE, plain_border
 from linprim_geo.training.step.trainer import SMALLEST_PX
 
@@ -54,7 +55,7 @@ class Data:
 
         assert self.scene.points is not None
         xyz = self.scene.points.xyz
-        count = initial_count(self.options, 0.8)
+        count = initial_count(self.options, SFM_START)
         if len(xyz) > count:
             rng = np.random.default_rng([self.options.seed, 1])
             xyz = xyz[np.sort(rng.choice(len(xyz), count, replace=False))]
