@@ -14,13 +14,13 @@ from functools import cached_property
 import numpy as np
 
 from linprim_geo.base.kinds import KINDS
-from linprim_geo.base.options import TrainOptions, initial_count
+from linprim_geo.base.options import TrainOptions
 from linprim_geo.capture.types import Scene
 from linprim_geo.geometry.lens import largest_displacement
 from linprim_geo.points.far_colors import OPEN_SHARE, far_share
 from linprim_geo.points.initial_points import CAMERA_DISTANCE, VolumePoints, scene_normalization
 from linprim_geo.points.photo_evidence import Observations, observe
-from linprim_geo.points.start_points import SFM_START
+from linprim_geo.points.start_points import initial_cloud
 from linprim_geo.training.background import BACKDROP_SHARE, plain_border
 from linprim_geo.training.step.trainer import SMALLEST_PX
 
@@ -54,11 +54,7 @@ class Data:
         from scipy.spatial import cKDTree
 
         assert self.scene.points is not None
-        xyz = self.scene.points.xyz
-        count = initial_count(self.options, SFM_START)
-        if len(xyz) > count:
-            rng = np.random.default_rng([self.options.seed, 1])
-            xyz = xyz[np.sort(rng.choice(len(xyz), count, replace=False))]
+        xyz = initial_cloud(self.scene.points, self.options).xyz
         xyz = self.similarity.apply(xyz)
         near = cKDTree(xyz).query(xyz, k=min(4, len(xyz)))[0].reshape(len(xyz), -1)[:, 1:]
         return xyz, near.mean(1) if near.shape[1] else np.full(len(xyz), CAMERA_DISTANCE)
