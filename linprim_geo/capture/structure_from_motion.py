@@ -144,9 +144,11 @@ def _reconstruct(
     say: Callable[[str], None],
 ) -> Verdict:
     """Goes on with what is in `kept`, and leaves the largest model and the verdict there."""
-    check_room(kept, ROOM + ROOM_PER_PHOTOGRAPH * len(names))
+    database = kept / "database.db"  # of a run that was stopped
+    there = database.stat().st_size if database.exists() else 0
+    check_room(kept, ROOM + ROOM_PER_PHOTOGRAPH * len(names) - there)
     try:
-        with readable_write_errors(kept / "database.db"):
+        with readable_write_errors(database):
             model, misplaced = largest_model(_readable(folder, names, kept), names, sizes, kept, threads, say)
     except (ValueError, RuntimeError, MemoryError) as error:
         reason = (str(error).splitlines() or ["out of memory"])[0]
