@@ -117,7 +117,7 @@ def test_a_driver_that_is_asked_to_end_lets_its_workers_save(tiny_scene, tmp_pat
 @pytest.mark.parametrize("arguments", [[], ["--cluster", "local"]], ids=["processes", "ray"])
 def test_twenty_kills_end_in_the_same_bits(arguments, blocks_run, tiny_scene, tmp_path):
     if arguments:
-        pytest.importorskip("ray")
+        pytest.importorskip("ray", reason="the extra cluster is missing")
     rng, kills = random.Random(11), 0
     while kills < 20:
         run = tmp_path / f"run_{kills}"
