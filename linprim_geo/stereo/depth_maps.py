@@ -22,7 +22,7 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, fit_surfaces, patch_match
 from linprim_geo.points.view_pairs import CONFIRMING, source_views, visible_pixels
 from linprim_geo.stereo.confidence import MATCHED_WEIGHTS, MOST_COST, RIGHT, WEIGHTS, evidence, probability
-from linprim_geo.stereo.edges import colour_edges, colours_of, edges_of
+from linprim_geo.stereo.edges import GREY, colour_edges, colours_of, edges_of
 from linprim_geo.stereo.evidence import Glance, glance
 from linprim_geo.stereo.noise import noise_of, shared_noise
 
@@ -218,7 +218,7 @@ def are_known(inverse: np.ndarray, cost: np.ndarray) -> np.ndarray:
 
 def grey_of(rgb: np.ndarray) -> np.ndarray:
     """(H, W) uint8 luminance of a photograph (H, W, 3)."""
-    return np.rint(rgb @ np.array([0.299, 0.587, 0.114], np.float32)).astype(np.uint8)
+    return np.rint(rgb @ np.array(GREY, np.float32)).astype(np.uint8)
 
 
 def halved(image: StereoImage) -> StereoImage:

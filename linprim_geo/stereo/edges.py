@@ -7,6 +7,8 @@ from scipy.ndimage import label, uniform_filter
 
 from linprim_geo.stereo.noise import LEAST_OF_PLAIN, noise_of, plainest
 
+# What red, green and blue are of grey (ITU-R BT.601).
+GREY = (0.299, 0.587, 0.114)
 # An edge runs through 3 by 3 pixels whose variance is so many times that of the noise; fewer edge pixels than SPECK
 # together are noise.
 EDGE_VARIANCE, SPECK = 4.0, 9
@@ -34,6 +36,13 @@ def colours_of(rgb: np.ndarray) -> np.ndarray:
     means = rgb[: 2 * height, : 2 * width].reshape(height, 2, width, 2, 3).mean((1, 3), dtype=np.float32)
     red, green, blue = np.moveaxis(means, 2, 0)
     return np.stack([(red - blue) / 2, green - (red + blue) / 2])
+
+
+def rgb_of(grey: np.ndarray, colours: np.ndarray) -> np.ndarray:
+    """(H // 2, W // 2, 3) of means of 2 by 2 pixels: their grey by GREY, and colour differences by `colours_of`."""
+    apart, green = colours
+    middle = grey - (GREY[0] - GREY[2]) * apart - GREY[1] * green  # (R + B) / 2
+    return np.stack([middle + apart, middle + green, middle - apart], axis=-1)
 
 
 def colour_edges(colours: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

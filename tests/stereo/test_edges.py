@@ -9,8 +9,9 @@ import pytest
 from helpers.captures import look_at
 from PIL import Image
 
+from linprim_geo.stereo import edges
 from linprim_geo.stereo.depth_maps import DepthMap
-from linprim_geo.stereo.edges import colour_edges, colours_of, edges_of
+from linprim_geo.stereo.edges import colour_edges, colours_of, edges_of, rgb_of
 from linprim_geo.stereo.noise import noise_of
 from linprim_geo.stereo.planes.plain_regions import regions_of_views
 
@@ -73,3 +74,9 @@ def test_colours_are_means_of_two_by_two_pixels(shape):
     red, green, blue = rgb[2:4, 4:6].reshape(4, 3).astype(float).mean(0)
     np.testing.assert_allclose(colours[:, 1, 2], [(red - blue) / 2, green - (red + blue) / 2], atol=1e-4)
     assert colour_edges(colours, shape).shape == shape
+
+
+def test_colours_come_back_from_grey_and_their_differences():
+    rgb = np.random.default_rng(0).uniform(0, 255, (7, 9, 3))  # the last row and column have no block
+    means = rgb[:6, :8].reshape(3, 2, 4, 2, 3).mean((1, 3))
+    np.testing.assert_allclose(rgb_of(means @ edges.GREY, colours_of(rgb)), means, atol=1e-3)

@@ -12,12 +12,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from linprim_geo.stereo.depth_maps import DepthMap
+from linprim_geo.stereo.edges import rgb_of
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.planes.plain_regions import LEAST_POINTS, LEAST_VIEWS, rays_of, to_world
 from linprim_geo.stereo.planes.seen_through import MARGIN
 
-# The exposures of two photographs are compared by so many points of surfaces that both know at least, of so many.
-COMMON_POINTS, TRIED_POINTS = 2 * LEAST_POINTS, 1000
+# Points of a view by which its exposure is compared with those of others, and the fewest that another has to know.
+TRIED_POINTS, COMMON_POINTS = 1000, 2 * LEAST_POINTS
 # A point has another colour if red, green or blue differs by more than this share, exposure aside, and a surface if
 # most of its points have in most views. Gloss changes dark things by less (DECISIONS 147).
 OTHER = 0.15
@@ -92,12 +93,7 @@ def _log_colours(found: DepthMap) -> np.ndarray:
     clipped."""
     height, width = (size // 2 for size in found.grey.shape)
     grey = found.grey[: 2 * height, : 2 * width].reshape(height, 2, width, 2).mean((1, 3), dtype=np.float32)
-    if found.colours is None:
-        values = np.repeat(grey[..., None], 3, axis=2)
-    else:
-        apart, green = found.colours  # (R - B) / 2 and G - (R + B) / 2
-        middle = grey - (0.299 - 0.114) * apart - 0.587 * green
-        values = np.stack([middle + apart, middle + green, middle - apart], axis=-1)
+    values = np.repeat(grey[..., None], 3, axis=2) if found.colours is None else rgb_of(grey, found.colours)
     return np.log(np.where((values < CLIPPED).all(-1, keepdims=True), np.maximum(values, 0) + DARK, np.nan))
 
 

@@ -155,8 +155,8 @@ class MergedFrames(Sequence):
         backgrounds = [shaded.is_background(view) for view in range(len(maps))]
         self.on_planes: list[np.ndarray] = []
         beside = [beside_edges(found.grey.shape, own) for found, own in zip(maps, regions, strict=True)]
-        # What is in the air beside a wall speaks against the wall's plane: when it is gone, more planes are laid.
         colours = ShownColours(maps, sure)
+        # What is in the air beside a wall speaks against the wall's plane: when it is gone, more planes are laid.
         for _ in range(ROUNDS):
             along_edges = region_plane_depths(self.cameras, regions, shaded.planes, sure, self.depths, colours)
             self._clear_refused(along_edges, sure, on_points)
