@@ -1,4 +1,5 @@
 // Boxes around the faces, halved along the longest side of their middles; an edge goes down those that its box touches.
+// Faces that are near none of few edges have no part in it.
 #include "surface/crossings.h"
 
 #include <algorithm>
@@ -11,9 +12,10 @@
 namespace linprim {
 namespace {
 
-constexpr int64_t kLeaf = 4;     // faces in a leaf at most
+constexpr int64_t kLeaf = 4;     // boxes in a leaf at most
 constexpr int kLevelsApart = 4;  // levels below which parts of the tree are built at the same time
 constexpr int64_t kEdgesPerTask = 4096;
+constexpr int64_t kFew = 8;  // edges are few if there are so many times as many faces
 
 struct Box {
   Vector low{INFINITY, INFINITY, INFINITY}, high{-INFINITY, -INFINITY, -INFINITY};
@@ -21,6 +23,7 @@ struct Box {
   void take(const Vector& point) {
     for (int k = 0; k < 3; ++k) low[k] = std::min(low[k], point[k]), high[k] = std::max(high[k], point[k]);
   }
+  void take(const Box& other) { take(other.low), take(other.high); }
   bool touches(const Box& other) const {
     bool all = true;
     for (int k = 0; k < 3; ++k) all &= low[k] <= other.high[k] && other.low[k] <= high[k];
@@ -28,53 +31,69 @@ struct Box {
   }
 };
 
-// Faces of the order.
+// Boxes of the order.
 struct Range {
   int64_t begin, end;
 };
 
-// Faces begin .. end - 1 of the order. Its first child is the next node, unless that is `after`, the next one that is
-// not below it: a leaf.
-struct FaceNode {
+// The boxes begin .. end - 1 of the order. Its first child is the next node, unless that is `after`, the next one that
+// is not below it: a leaf.
+struct Node {
   Box box;
   int64_t begin, end;
   size_t after;
 };
 
-struct FaceTree {
-  const int64_t* corner;
-  const double* vertex;
+struct BoxTree {
+  const std::vector<Box>& boxes;
   std::vector<int64_t> order;
-  std::vector<Vector> middle;  // of each face, three times
-  std::vector<FaceNode> nodes;
+  std::vector<Node> nodes;
 
-  FaceTree(int64_t faces, const int64_t* corner, const double* vertex)
-      : corner(corner), vertex(vertex), order(faces), middle(faces) {
+  explicit BoxTree(const std::vector<Box>& boxes) : boxes(boxes), order(boxes.size()) {
     std::iota(order.begin(), order.end(), int64_t(0));
-    if (!faces) return;
-    for_rows(faces, [&](int64_t f) {
-      for (int k = 0; k < 3; ++k) add(middle[f], 1, at(corner[3 * f + k]));
-    });
+    if (boxes.empty()) return;
+    const Range all{0, int64_t(boxes.size())};
     std::vector<Range> parts;
-    divide({0, faces}, kLevelsApart, parts);
-    std::vector<std::vector<FaceNode>> below(parts.size());
+    divide(all, kLevelsApart, parts);
+    std::vector<std::vector<Node>> below(parts.size());
     parallel_for(int64_t(parts.size()), [&](int64_t part, int) { build(parts[part], below[part]); });
     size_t next = 0;
-    join({0, faces}, kLevelsApart, below, next);
+    join(all, kLevelsApart, below, next);
   }
 
-  Vector at(int64_t v) const { return {vertex[3 * v], vertex[3 * v + 1], vertex[3 * v + 2]}; }
+  // Calls body(i) for boxes near `box`, until it is true; whether it was.
+  template <class Body>
+  bool any(const Box& box, const Body& body) const {
+    for (size_t n = 0; n < nodes.size();) {
+      const Node& node = nodes[n];
+      if (!node.box.touches(box)) {
+        n = node.after;
+        continue;
+      }
+      if (++n < node.after) continue;
+      for (int64_t i = node.begin; i < node.end; ++i)
+        if (body(order[i])) return true;
+    }
+    return false;
+  }
 
-  // Puts the faces of a range in two halves, and gives where the second begins.
+ private:
+  double middle(int64_t i, int axis) const { return boxes[i].low[axis] + boxes[i].high[axis]; }
+
+  // Puts the boxes of a range in two halves, and gives where the second begins.
   int64_t halved(Range range) {
-    Box middles;
-    for (int64_t i = range.begin; i < range.end; ++i) middles.take(middle[order[i]]);
+    Vector low{INFINITY, INFINITY, INFINITY}, high{-INFINITY, -INFINITY, -INFINITY};
+    for (int64_t i = range.begin; i < range.end; ++i)
+      for (int k = 0; k < 3; ++k) {
+        const double at = middle(order[i], k);
+        low[k] = std::min(low[k], at), high[k] = std::max(high[k], at);
+      }
     int axis = 0;
     for (int k = 1; k < 3; ++k)
-      if (middles.high[k] - middles.low[k] > middles.high[axis] - middles.low[axis]) axis = k;
+      if (high[k] - low[k] > high[axis] - low[axis]) axis = k;
     const int64_t half = range.begin + (range.end - range.begin) / 2;
     std::nth_element(order.begin() + range.begin, order.begin() + half, order.begin() + range.end,
-                     [&](int64_t a, int64_t b) { return middle[a][axis] < middle[b][axis]; });
+                     [&](int64_t a, int64_t b) { return middle(a, axis) < middle(b, axis); });
     return half;
   }
 
@@ -87,10 +106,10 @@ struct FaceTree {
   }
 
   // Puts what was built on its own in its place in the tree, from the part `next` on.
-  void join(Range range, int levels, const std::vector<std::vector<FaceNode>>& below, size_t& next) {
+  void join(Range range, int levels, const std::vector<std::vector<Node>>& below, size_t& next) {
     const size_t first = nodes.size();
     if (levels == 0 || range.end - range.begin <= kLeaf) {
-      for (FaceNode node : below[next++]) node.after += first, nodes.push_back(node);
+      for (Node node : below[next++]) node.after += first, nodes.push_back(node);
       return;
     }
     nodes.push_back({{}, range.begin, range.end, 0});
@@ -101,12 +120,11 @@ struct FaceTree {
     close(nodes, first, second);
   }
 
-  void build(Range range, std::vector<FaceNode>& into) {
+  void build(Range range, std::vector<Node>& into) {
     const size_t first = into.size();
     into.push_back({{}, range.begin, range.end, first + 1});
     if (range.end - range.begin <= kLeaf) {
-      for (int64_t i = range.begin; i < range.end; ++i)
-        for (int k = 0; k < 3; ++k) into[first].box.take(at(corner[3 * order[i] + k]));
+      for (int64_t i = range.begin; i < range.end; ++i) into[first].box.take(boxes[order[i]]);
       return;
     }
     const int64_t half = halved(range);
@@ -117,9 +135,8 @@ struct FaceTree {
   }
 
   // Gives a node, whose children are the next one and `second`, their box; they are the end of `tree`.
-  static void close(std::vector<FaceNode>& tree, size_t node, size_t second) {
-    for (const size_t child : {node + 1, second})
-      tree[node].box.take(tree[child].box.low), tree[node].box.take(tree[child].box.high);
+  static void close(std::vector<Node>& tree, size_t node, size_t second) {
+    for (const size_t child : {node + 1, second}) tree[node].box.take(tree[child].box);
     tree[node].after = tree.size();
   }
 };
@@ -146,24 +163,50 @@ struct Sides {
   }
 };
 
-void find(const FaceTree& tree, const Sides& sides, const int64_t* end, int64_t edge, Crossings& found) {
-  const Vector p = tree.at(end[0]), q = tree.at(end[1]);
-  Box box;
-  box.take(p), box.take(q);
-  const size_t before = found.face.size();
-  for (size_t n = 0; n < tree.nodes.size();) {
-    const FaceNode& node = tree.nodes[n];
-    if (!node.box.touches(box)) {
-      n = node.after;
-      continue;
-    }
-    if (++n < node.after) continue;
-    for (int64_t i = node.begin; i < node.end; ++i) {
-      const int64_t* c = tree.corner + 3 * tree.order[i];
-      if (std::any_of(c, c + 3, [&](int64_t v) { return v == end[0] || v == end[1]; })) continue;
-      if (sides.goes_through(p, q, tree.at(c[0]), tree.at(c[1]), tree.at(c[2]))) found.face.push_back(tree.order[i]);
-    }
+struct Triangles {
+  const int64_t* corner;
+  const double* vertex;
+
+  Vector at(int64_t v) const { return {vertex[3 * v], vertex[3 * v + 1], vertex[3 * v + 2]}; }
+
+  // Around `count` vertices.
+  Box around(const int64_t* v, int count) const {
+    Box box;
+    for (int k = 0; k < count; ++k) box.take(at(v[k]));
+    return box;
   }
+};
+
+std::vector<Box> boxes_around(const Triangles& mesh, int64_t count, const int64_t* corner, int corners) {
+  std::vector<Box> boxes(count);
+  for_rows(count, [&](int64_t i) { boxes[i] = mesh.around(corner + corners * i, corners); });
+  return boxes;
+}
+
+// The faces whose boxes are near an edge's, and their boxes.
+std::vector<int64_t> near_edges(std::vector<Box>& boxes, const std::vector<Box>& edges) {
+  const BoxTree tree(edges);
+  std::vector<uint8_t> near(boxes.size());
+  for_rows(int64_t(boxes.size()),
+           [&](int64_t f) { near[f] = tree.any(boxes[f], [&](int64_t e) { return edges[e].touches(boxes[f]); }); });
+  std::vector<int64_t> kept;
+  for (size_t f = 0; f < boxes.size(); ++f)
+    if (near[f]) boxes[kept.size()] = boxes[f], kept.push_back(int64_t(f));
+  boxes.resize(kept.size());
+  return kept;
+}
+
+void find(const Triangles& mesh, const std::vector<int64_t>& faces, const BoxTree& tree, const Sides& sides,
+          const int64_t* end, int64_t edge, Crossings& found) {
+  const Vector p = mesh.at(end[0]), q = mesh.at(end[1]);
+  const size_t before = found.face.size();
+  tree.any(mesh.around(end, 2), [&](int64_t i) {
+    const int64_t* c = mesh.corner + 3 * faces[i];
+    if (std::none_of(c, c + 3, [&](int64_t v) { return v == end[0] || v == end[1]; }) &&
+        sides.goes_through(p, q, mesh.at(c[0]), mesh.at(c[1]), mesh.at(c[2])))
+      found.face.push_back(faces[i]);
+    return false;
+  });
   std::sort(found.face.begin() + int64_t(before), found.face.end());
   found.edge.resize(found.face.size(), edge);
 }
@@ -172,14 +215,22 @@ void find(const FaceTree& tree, const Sides& sides, const int64_t* end, int64_t 
 
 Crossings crossings(int64_t vertices, const double* vertex, int64_t faces, const int64_t* corner, int64_t edges,
                     const int64_t* end) {
-  const FaceTree tree(faces, corner, vertex);
+  const Triangles mesh{corner, vertex};
+  std::vector<Box> boxes = boxes_around(mesh, faces, corner, 3);
+  std::vector<int64_t> kept;
+  if (kFew * edges <= faces) {
+    kept = near_edges(boxes, boxes_around(mesh, edges, end, 2));
+  } else {
+    kept.resize(faces), std::iota(kept.begin(), kept.end(), int64_t(0));
+  }
+  const BoxTree tree(boxes);
   Sides sides;
   for (int64_t i = 0; i < 3 * vertices; ++i) sides.largest = std::max(sides.largest, std::abs(vertex[i]));
   const int64_t tasks = (edges + kEdgesPerTask - 1) / kEdgesPerTask;
   std::vector<Crossings> found(tasks);
   parallel_for(tasks, [&](int64_t task, int) {
     for (int64_t e = task * kEdgesPerTask; e < std::min((task + 1) * kEdgesPerTask, edges); ++e)
-      find(tree, sides, end + 2 * e, e, found[task]);
+      find(mesh, kept, tree, sides, end + 2 * e, e, found[task]);
   });
   Crossings all;
   for (const Crossings& part : found) {

@@ -22,7 +22,7 @@ def crossings(mesh: Mesh, edges: np.ndarray | None = None) -> tuple[np.ndarray, 
 
     Faces that only touch or lie in one plane, up to the rounding of float64, do not count; those without area are
     crossed by nothing.
-    Memory: some 100 bytes per face.
+    Memory: some 150 bytes per face.
 
     Args:
         edges: (E, 2) of `edges_of` that are looked along; None for all.
