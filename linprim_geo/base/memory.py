@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import sys
 from pathlib import Path
 
@@ -65,6 +66,13 @@ def forget_peak() -> None:
     """Sets the peak that Linux keeps to what is resident now; elsewhere the peak stays the one since the start."""
     with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as file:
         file.write("5")
+
+
+def give_back() -> None:
+    """Returns freed memory to the system. glibc keeps it: after the first large array that is freed, others of up to
+    32 MiB come from its heap, which only shrinks from its end. Other allocators are left alone."""
+    with contextlib.suppress(OSError, TypeError, AttributeError):  # Windows has no CDLL(None)
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _group_memory(root: Path) -> list[tuple[int, int]]:

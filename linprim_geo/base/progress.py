@@ -6,7 +6,7 @@ import sys
 import time
 
 from linprim_geo.base.errors import printable
-from linprim_geo.base.memory import forget_peak, peak_gib
+from linprim_geo.base.memory import forget_peak, give_back, peak_gib
 
 
 def duration(seconds: float) -> str:
@@ -100,11 +100,12 @@ class Stages:
 
     def lap(self, name: str) -> None:
         """Ends the stage `name`: its seconds, and the largest resident memory of this process during it (0 where
-        unknown)."""
+        unknown). What it has freed goes back to the system."""
         now = time.perf_counter()
         self.seconds[name] = round(self.seconds.get(name, 0.0) + now - self._begin, 3)
         self.peak_gib[name] = round(max(self.peak_gib.get(name, 0.0), peak_gib()), 3)
         self._begin = now
+        give_back()
         forget_peak()
 
     def line(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import subprocess
 import sys
 
@@ -146,3 +147,25 @@ def test_the_peak_is_of_what_came_after_the_last_one():
     assert peak_gib() == pytest.approx(with_array, abs=0.1)
     forget_peak()
     assert peak_gib() < with_array - 0.3
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators are left alone")
+def test_memory_that_is_freed_is_given_back():
+    """Arrays of 1 MiB, with small ones between that stay, come from the heap once a larger one was freed."""
+    program = """
+import numpy as np
+from linprim_geo.base.memory import give_back, memory_gib
+np.ones(20 << 20, np.uint8)
+small, large = [], []
+for _ in range(300):
+    large.append(np.ones(1 << 20, np.uint8))
+    small.append(np.ones(1000, np.uint8))
+held = memory_gib()
+del large
+freed = memory_gib()
+give_back()
+print(held, freed, memory_gib())
+"""
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    held, freed, given_back = map(float, said.split())
+    assert freed > held - 0.1 and given_back < held - 0.25
