@@ -56,8 +56,8 @@ SURROUNDINGS, SHOWN = 2 * WIDE + 1, 0.1
 # Photographs refuse a plane by their colours if so many of a region's points are on it: before others there may be
 # things that hide it.
 MOSTLY_ON = 0.7
-# Of one region and K planes: which of its N points are on which (N, K), and which it may lie on (K,).
-_Lying = tuple[np.ndarray, np.ndarray]
+# Of one region, by the numbers of the planes that it may lie on: which of its N points are on it (N,) bool.
+_Lying = dict[int, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class RegionDepths:
         """Of a view before any plane is laid."""
         shape = (camera.height, camera.width)
         moved, stands, doubted = (np.zeros(shape, bool) for _ in range(3))
-        return cls(np.full(shape, -1), np.full(shape, np.nan, np.float32), moved, stands, doubted, [])
+        return cls(np.full(shape, -1, np.int32), np.full(shape, np.nan, np.float32), moved, stands, doubted, [])
 
     def refuses(self, camera: Camera, depth: np.ndarray) -> np.ndarray:
         """(H, W) bool: which depths of the view, NaN where unknown, are those of planes that are `refused` there."""
@@ -94,7 +94,7 @@ class RegionDepths:
     def without(self, taken: np.ndarray) -> RegionDepths:
         """Nothing where pixels are `taken` (H, W)."""
         return RegionDepths(
-            np.where(taken, -1, self.number),
+            np.where(taken, np.int32(-1), self.number),
             np.where(taken, np.float32(np.nan), self.depth),
             self.moved & ~taken,
             self.stands & ~taken,
@@ -125,7 +125,7 @@ def region_plane_depths(
     """
     local = [in_camera(camera, planes) for camera in cameras]
     regions = [[region.within() for region in own] for own in regions]
-    lying = [[may_lie_on(region, of_view) for region in own] for own, of_view in zip(regions, local, strict=True)]
+    lying = [[_lying(region, of_view) for region in own] for own, of_view in zip(regions, local, strict=True)]
     hulls = _hulls(cameras, regions, lying, planes)
     beside = [beside_edges(depth.shape, own) for depth, own in zip(known, regions, strict=True)]
     views = KnownDepths(cameras, (np.where(at, np.nan, depth) for at, depth in zip(beside, known, strict=True)))
@@ -134,9 +134,9 @@ def region_plane_depths(
     for camera, own, of_regions, of_view, sure, seen, of_edges in of_views:
         laid = RegionDepths.nothing(camera)
         wide, telling = np.zeros_like(laid.moved), np.where(of_edges, np.nan, sure)
-        for region, (on, fits) in zip(own, of_regions, strict=True):
-            near = np.where(on, 1 - (region.off(of_view) / TOLERANCE) ** 2, 0) ** 2
-            best = _best_first(camera, region, of_view, hulls, near.sum(0) * fits, views)
+        for region, on in zip(own, of_regions, strict=True):
+            counts = {number: _tukey_sum(region.off(of_view[[number]])[points, 0]) for number, points in on.items()}
+            best = _best_first(camera, region, of_view, hulls, counts, views)
             refused = [] if _is_well_known(sure, region) else _refused(region, on, best, planes, colours)
             laid.refused.extend((region, of_view[number]) for number in refused)
             _lay(laid, camera, region, of_view, [*best][len(refused) :], hulls, sure, telling)
@@ -145,6 +145,17 @@ def region_plane_depths(
         seen = np.where(of_edges, np.nan, seen)
         result.append(_limited(laid, wide, sure, seen, _well_known(sure, own)))
     return result
+
+
+def _lying(region: PlainRegion, planes: np.ndarray) -> _Lying:
+    """On which of (K, 3) planes of the camera a region may lie."""
+    on, fits = may_lie_on(region, planes)
+    return {number: on[:, number].copy() for number in np.flatnonzero(fits).tolist()}
+
+
+def _tukey_sum(off: np.ndarray) -> float:
+    """Tukey's weights of (N,) points that are `off` a plane by less than TOLERANCE, added up."""
+    return float(((1 - (off / TOLERANCE) ** 2) ** 2).sum())
 
 
 def _limited(
@@ -195,14 +206,14 @@ def _best_first(
     region: PlainRegion,
     planes: np.ndarray,
     hulls: Sequence[_Hull],
-    counts: np.ndarray,
+    counts: Mapping[int, float],
     views: KnownDepths,
 ) -> dict[int, np.ndarray]:
     """Of those (K, 3) planes of the camera that views do not see through in the region, by their numbers: (P, 3) points
-    of the region within the plane's hull; first of the one with the most of `counts` (K,) of points along its edges,
-    times what its hull holds of the region."""
+    of the region within the plane's hull; first of the one with the most of `counts` of points along its edges, times
+    what its hull holds of the region."""
     rays, held = _sampled_rays(camera, region), dict[int, np.ndarray]()
-    for number in np.flatnonzero(counts).tolist():
+    for number in counts:
         inverse = rays @ planes[number]
         rows = _held(camera, rays, inverse, hulls[number])
         points = to_world(camera, rays[rows] / inverse[rows, None])
@@ -213,16 +224,16 @@ def _best_first(
 
 
 def _refused(
-    region: PlainRegion, on: np.ndarray, held: Mapping[int, np.ndarray], planes: np.ndarray, colours: ShownColours
+    region: PlainRegion, on: _Lying, held: Mapping[int, np.ndarray], planes: np.ndarray, colours: ShownColours
 ) -> list[int]:
-    """The numbers of the first of those (K, 4) planes of the world that most of a region's (N,) points are `on` (N, K),
-    and on which photographs show different colours of what is `held` (P, 3) of the region: of a narrow one, as a wide
+    """The numbers of the first of those (K, 4) planes of the world that most of a region's (N,) points are `on`, and on
+    which photographs show different colours of what is `held` (P, 3) of the region: of a narrow one, as a wide
     one, such as a door, may shine."""
     if region.wide.any():
         return []
 
     def is_refused(number: int) -> bool:
-        return on[:, number].mean() > MOSTLY_ON and colours.differ(region.view, held[number], planes[number, :3])
+        return on[number].mean() > MOSTLY_ON and colours.differ(region.view, held[number], planes[number, :3])
 
     return list(takewhile(is_refused, held))
 
@@ -261,10 +272,10 @@ def _hulls(
     """Of each plane, around its points along the edges of regions of all views that may lie on it."""
     points = [[np.zeros((0, 3))] for _ in planes]
     for camera, own, of_regions in zip(cameras, regions, lying, strict=True):
-        for region, (on, fits) in zip(own, of_regions, strict=True):
+        for region, of_region in zip(own, of_regions, strict=True):
             places = to_world(camera, region.rays / region.inverse[:, None])
-            for number in np.flatnonzero(fits):
-                points[number].append(places[on[:, number]])
+            for number, on in of_region.items():
+                points[number].append(places[on])
     return [_Hull(plane, np.concatenate(parts)) for plane, parts in zip(planes, points, strict=True)]
 
 
