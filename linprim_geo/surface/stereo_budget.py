@@ -14,7 +14,14 @@ from linprim_geo.stereo.dense.planes_on_disk import Photographs
 from linprim_geo.stereo.dense.time_plan import seconds_per_pixel
 from linprim_geo.surface.fusion.stereo_frames import MergedFrames, pairing_points
 from linprim_geo.surface.fusion.tsdf_fusion import auto_voxel_size
-from linprim_geo.surface.methods.method_tsdf import SMALLEST_SIDE, DepthFrames, with_far_depths
+from linprim_geo.surface.methods.method_tsdf import (
+    SMALLEST_SIDE,
+    DepthFrames,
+    check_stereo_memory,
+    stereo_bytes,
+    stereo_room,
+    with_far_depths,
+)
 
 # Of the time that is left stereo takes at most this share: the rest is for smaller voxels.
 SHARE = 0.5
@@ -26,7 +33,7 @@ WITH_PLANES = 1.2
 def stereo_in_time(
     run: Run, options: ExtractOptions, frames: DepthFrames, stages: Stages, budget: Budget, reserve: float
 ) -> tuple[DepthFrames, MergedFrames | None, dict]:
-    """Depth frames of a run and what is merged of them and stereo, of views as large as the time allows.
+    """Depth frames of a run and what is merged of them and stereo, of views as large as time and memory allow.
 
     Views have means of K by K pixels, with the least K that fits, and leaves SMALLEST_SIDE pixels at least. Without the
     time for any, or where stereo is impossible, there are the `frames` that are given and None. `reserve` seconds are
@@ -43,13 +50,17 @@ def stereo_in_time(
         cameras = [view.camera for view in frames.views]
         pixels = sum(camera.width * camera.height for camera in cameras)
         largest = max(1, min(max(camera.width, camera.height) for camera in cameras) // SMALLEST_SIDE)
-        planned = {factor: rate * pixels / factor**2 for factor in range(1, largest + 1)}
+        room = stereo_room(options)
+        factors = [factor for factor in range(1, largest + 1) if stereo_bytes(cameras) <= room * factor**2]
+        if not factors:
+            check_stereo_memory(cameras, options)
+        planned = {factor: rate * pixels / factor**2 for factor in factors}
         most = min(SHARE * budget.left(), budget.left() - reserve)
         fitting = [factor for factor, seconds in planned.items() if seconds <= most]
         if not fitting:
             raise LinprimError(
                 f"--time-budget is {budget.seconds:.3g} s, which leaves {max(most, 0):.0f} s for stereo, and the least "
-                f"that is of any use takes {planned[largest]:.0f} s"
+                f"that is of any use takes {planned[factors[-1]]:.0f} s"
             )
         factor, own = fitting[0], frames
         if factor > 1:

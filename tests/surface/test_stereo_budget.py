@@ -15,13 +15,18 @@ from linprim_geo.base.progress import Progress, Stages
 from linprim_geo.capture.small_copy import SmallCopy
 from linprim_geo.capture.types import Scene
 from linprim_geo.runs.run import Run
-from linprim_geo.stereo.depth_maps import MEMORY_SHARE, memory_of
 from linprim_geo.surface import stereo_budget
 from linprim_geo.surface.extract import extract_mesh
 from linprim_geo.surface.fusion import stereo_frames
 from linprim_geo.surface.fusion.tsdf_fusion import auto_voxel_size
 from linprim_geo.surface.methods import method_tsdf
-from linprim_geo.surface.methods.method_tsdf import DepthFrames, stereo_factor, tsdf_surface, with_far_depths
+from linprim_geo.surface.methods.method_tsdf import (
+    DepthFrames,
+    stereo_bytes,
+    stereo_factor,
+    tsdf_surface,
+    with_far_depths,
+)
 from linprim_geo.surface.stereo_budget import SHARE, WITH_PLANES, stereo_in_time
 
 VIEWS, SIZE, SECONDS = 60, 64, 1000.0
@@ -66,6 +71,17 @@ def test_photographs_are_as_large_as_the_time_allows(in_time, frames, seconds, f
     assert (camera.width, taken[0].depth.shape) == (SIZE // factor, (SIZE // factor, SIZE // factor))
     assert camera.fx == pytest.approx(full.fx / factor) and taken.limit == frames.limit
     assert taken.views[0].load().rgb.shape == (SIZE // factor, SIZE // factor, 3)
+
+
+def test_photographs_are_no_larger_than_the_memory_allows(in_time, frames, monkeypatch):
+    most = stereo_bytes([view.camera for view in frames.views])
+    seconds = 0.9 * SHARE * AIM * SECONDS  # for whole ones
+    monkeypatch.setattr(method_tsdf, "available_memory", lambda: most / 4)
+    assert in_time(seconds)[2]["downscale"] == 2
+    monkeypatch.setattr(method_tsdf, "available_memory", lambda: most / 9.1)  # 20 pixels are the least
+    assert in_time(seconds) == (frames, None, {})
+    with pytest.raises(LinprimError, match="GiB are allowed"):
+        in_time(seconds, stereo="on")
 
 
 def test_without_the_time_there_is_none_and_who_asks_for_it_is_told(in_time, frames, monkeypatch):
@@ -120,7 +136,7 @@ def little_memory(many_views, monkeypatch):
     monkeypatch.setattr(Scene, "has_alpha", False)
     monkeypatch.setattr(method_tsdf, "SMALLEST_SIDE", 12)
     monkeypatch.setattr(method_tsdf, "LEAST_CONFIRMED", 0.0)
-    monkeypatch.setattr(method_tsdf, "available_memory", lambda: memory_of(cameras) / 3 / MEMORY_SHARE)
+    monkeypatch.setattr(method_tsdf, "available_memory", lambda: stereo_bytes(cameras) / 3)
     return many_views
 
 
@@ -128,9 +144,9 @@ def test_stereo_takes_smaller_photographs_where_memory_is_short(little_memory, m
     options = ExtractOptions(level=0.5)
     assert stereo_factor(little_memory, options) == 2
     assert stereo_factor(little_memory, replace(options, stereo="off")) == 1
-    # Half of what --memory-limit leaves beside what the program takes itself.
+    # What --memory-limit leaves beside what the program takes itself.
     cameras = [view.camera for view in little_memory.scene().train]
-    limit = PROCESS_GIB + memory_of(cameras) / 8 / MEMORY_SHARE / 2**30
+    limit = PROCESS_GIB + stereo_bytes(cameras) / 8 / 2**30
     assert stereo_factor(little_memory, replace(options, memory_limit=limit)) == 3
     monkeypatch.setattr(method_tsdf, "SMALLEST_SIDE", 48)
     assert stereo_factor(little_memory, options) == 1
@@ -151,6 +167,16 @@ def test_without_stereo_a_surface_is_of_whole_photographs_all_the_same(little_me
     with_small, about = tsdf_surface(little_memory, options, stages)
     whole, wanted = tsdf_surface(little_memory, replace(options, stereo="off"), stages)
     assert about == wanted and (with_small.vertices == whole.vertices).all()
+
+
+def test_stereo_that_does_not_fit_by_any_means_is_none(little_memory, monkeypatch):
+    monkeypatch.setattr(method_tsdf, "SMALLEST_SIDE", 48)
+    monkeypatch.setattr(method_tsdf, "MergedFrames", lambda *_, **__: pytest.fail("it does not fit"))
+    options, stages = ExtractOptions(level=0.5, voxel_size=0.1), Stages(Progress("test", 1, quiet=True))
+    mesh, about = tsdf_surface(little_memory, options, stages)
+    assert len(mesh.faces) and "stereo" not in about
+    with pytest.raises(LinprimError, match="photographs takes .* GiB are allowed: wanted a larger --memory-limit"):
+        tsdf_surface(little_memory, replace(options, stereo="on"), stages)
 
 
 def test_an_object_with_masks_has_no_stereo_that_does_not_fit(little_memory, monkeypatch):

@@ -20,7 +20,6 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.geometry.region import read_box
 from linprim_geo.runs.run import Run
-from linprim_geo.stereo.depth_maps import MEMORY_SHARE, memory_of
 from linprim_geo.stereo.visibility.visibility_cut import RENDERED_MARGIN
 from linprim_geo.surface.finish.photo_consistency import best_agreement, photo_gains
 from linprim_geo.surface.fusion.depth_error import error_by_depths, largest_error
@@ -54,6 +53,10 @@ an object ends better than windows do (DECISIONS 76)."""
 SHARP_LEVELS = (0.9, 0.3)
 """A rendered depth is sharp if the transmittance falls from the first to the second within RENDERED_MARGIN of it. A
 surface takes 0.3 to 4 % of its depth, what training makes of a wall that nothing tells it about 5 to 50 %."""
+
+STEREO_BYTES = 150
+"""Bytes per pixel of all photographs that stereo takes with its planes and what it merges, at the peak: 97 to 148 on
+ten captures, most where there are most planes."""
 
 SMALLEST_SIDE = 120
 """Photographs are not averaged down to fewer pixels along the longer side for stereo."""
@@ -164,6 +167,7 @@ def tsdf_surface(
     def with_stereo() -> MergedFrames:
         if merged is not None:
             return merged
+        check_stereo_memory([view.camera for view in frames.views], options)
         return with_far_depths(frames, options, voxel).merged(quiet=stages.progress.quiet)
 
     by_stereo = partial(_surface_of_stereo, fused_with_stereo, with_stereo, stages)
@@ -176,11 +180,7 @@ def tsdf_surface(
         about |= {"taken": True}
         stages.lap("fuse")
     elif options.stereo == "auto" and run.scene().has_alpha:
-        if memory_of([view.camera for view in whole]) <= stereo_room(options):
-            mesh, about = _better_for_object(rendered, by_stereo, whole, stages)
-        else:
-            stages.note("no stereo: there is no memory for it")
-            mesh = rendered()
+        mesh, about = _better_for_object(rendered, by_stereo, whole, stages)
     elif options.stereo == "auto":
         mesh, about = _better_by_stereo(rendered, by_stereo, whole, frames.views is not whole, stages)
     else:
@@ -298,9 +298,28 @@ def _agreeing(mesh: Mesh, views: Sequence[View], gains: np.ndarray) -> float:
     return float(found.inside[found.seen_by_two].mean()) if found.seen_by_two.any() else 0.0
 
 
+def stereo_bytes(cameras: Sequence[Camera]) -> int:
+    """Bytes that stereo of all views takes at its peak."""
+    return STEREO_BYTES * sum(camera.width * camera.height for camera in cameras)
+
+
 def stereo_room(options: ExtractOptions) -> float:
-    """Bytes that depth maps of stereo may take: half of the memory that is free, and of what --memory-limit leaves."""
-    return MEMORY_SHARE * min(available_memory(), memory_left(options) or np.inf)
+    """Bytes that stereo may take: the memory that is free, and what --memory-limit leaves."""
+    return min(available_memory(), memory_left(options) or np.inf)
+
+
+def check_stereo_memory(cameras: Sequence[Camera], options: ExtractOptions) -> None:
+    """Refuses stereo of all views that takes more than `stereo_room`.
+
+    Raises:
+        LinprimError: it does.
+    """
+    wanted, room = stereo_bytes(cameras), stereo_room(options)
+    if wanted > room:
+        raise LinprimError(
+            f"stereo of {len(cameras)} photographs takes {wanted / 2**30:.2g} GiB, {room / 2**30:.2g} GiB are allowed: "
+            "wanted a larger --memory-limit, a training with --downscale, or fewer photographs"
+        )
 
 
 def stereo_factor(run: Run, options: ExtractOptions) -> int:
@@ -311,7 +330,7 @@ def stereo_factor(run: Run, options: ExtractOptions) -> int:
     cameras = [view.camera for view in run.scene().train]
     room = stereo_room(options)
     largest = min(max(camera.width, camera.height) for camera in cameras) // SMALLEST_SIDE
-    fitting = (k for k in range(1, largest + 1) if memory_of(cameras) <= room * k**2)
+    fitting = (k for k in range(1, largest + 1) if stereo_bytes(cameras) <= room * k**2)
     return next(fitting, 1)
 
 
