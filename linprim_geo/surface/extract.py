@@ -97,7 +97,34 @@ def extract_mesh(
         LinprimError: nothing was trained, no ray crosses the level, the grid would not fit into memory, or the time is
             too little for the coarsest surface.
     """
-    options, budget = options or ExtractOptions(), Budget.of(time_budget)
+    budget = Budget.of(time_budget)
+    opened, options = opened_with(run, method, options or ExtractOptions(), budget, blocks)
+    folder = opened.path / "mesh" / method
+    target = Path(output) if output else folder / "mesh.ply"
+    if target.suffix.lower() not in SUFFIXES:
+        raise LinprimError(f"{target}: the suffix is {target.suffix!r}, wanted .ply, .obj, .glb or .stl")
+    if options.texture:
+        check_texture(options.texture, target)
+    with ExitStack() as held:
+        held.enter_context(locked(folder, "extracted into"))
+        if output:
+            held.enter_context(locked(target.parent, "written", target.name))
+        several = None
+        if blocks > 1:
+            several = lambda: held.enter_context(open_executor(cluster, folder / PARTS, workers))  # noqa: E731
+        progress = Progress("extract", 1, quiet=quiet)
+        return _extract(opened, method, folder, target, options, budget, progress, blocks, several)
+
+
+def opened_with(
+    run: str | os.PathLike, method: str, options: ExtractOptions, budget: Budget | None = None, blocks: int = 1
+) -> tuple[Run, ExtractOptions]:
+    """The run with the views that count, and the options with their box in numbers, and without stereo where there is
+    none.
+
+    Raises:
+        LinprimError: options are not for the method, or contradict each other.
+    """
     if method not in METHODS:
         raise LinprimError(f"--method is {method!r}, wanted {' or '.join(METHODS)}")
     check(options)
@@ -131,21 +158,7 @@ def extract_mesh(
     elif options.stereo == "auto" and opened.scene().has_alpha and budget:
         # Masks say where an object ends better than windows do: stereo is seldom worth its time.
         options = replace(options, stereo="off")
-    folder = opened.path / "mesh" / method
-    target = Path(output) if output else folder / "mesh.ply"
-    if target.suffix.lower() not in SUFFIXES:
-        raise LinprimError(f"{target}: the suffix is {target.suffix!r}, wanted .ply, .obj, .glb or .stl")
-    if options.texture:
-        check_texture(options.texture, target)
-    with ExitStack() as held:
-        held.enter_context(locked(folder, "extracted into"))
-        if output:
-            held.enter_context(locked(target.parent, "written", target.name))
-        several = None
-        if blocks > 1:
-            several = lambda: held.enter_context(open_executor(cluster, folder / PARTS, workers))  # noqa: E731
-        progress = Progress("extract", 1, quiet=quiet)
-        return _extract(opened, method, folder, target, options, budget, progress, blocks, several)
+    return opened, options
 
 
 def _extract(
