@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from linprim_geo.runs.render import render_run as render
     from linprim_geo.runs.run import Run as Run
     from linprim_geo.surface.convert import convert as convert
+    from linprim_geo.surface.dry_run import extraction_memory as extraction_memory
     from linprim_geo.surface.extract import extract_mesh as extract_mesh
     from linprim_geo.synthetic.options import SynthOptions as SynthOptions
     from linprim_geo.synthetic.synth import synthesize as synth
@@ -59,6 +60,7 @@ _PUBLIC = {
     "train": ("training.train", "train"),
     "render": ("runs.render", "render_run"),
     "extract_mesh": ("surface.extract", "extract_mesh"),
+    "extraction_memory": ("surface.dry_run", "extraction_memory"),
     "dense_stereo": ("display.stereo_report", "dense_stereo"),
     "eval_depth": ("eval.depth", "eval_depth_run"),
     "eval_images": ("eval.images", "eval_images_run"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.cli.arguments import blocks_and_workers, from_args, time_budget
 from linprim_geo.cli.options import (
@@ -30,6 +31,8 @@ def add(command: AddCommand) -> None:
     sub.add_argument("-o", "--output", metavar="FILE", help=".ply .obj .glb .stl (default RUN/mesh/METHOD/mesh.ply)")
     text = "choose the size of photographs for stereo, and of voxels, so that everything takes this long"
     sub.add_argument("--time-budget", type=seconds, metavar="TIME", help=text)
+    text = "print the memory that each stage would take, for --method tsdf, and write nothing"
+    sub.add_argument("--dry-run", action="store_true", help=text)
     add_threads(sub)
     add_quiet(sub)
     text = "fuse in so many parts of one grid, each by a worker of its own, with the same result (default 1)"
@@ -39,8 +42,15 @@ def add(command: AddCommand) -> None:
 
 def run(parsed: argparse.Namespace) -> Output:
     budget = time_budget(parsed)
+    options, several = from_args(ExtractOptions, parsed), blocks_and_workers(parsed)
+    if parsed.dry_run:
+        from linprim_geo.surface.dry_run import describe, extraction_memory
+
+        if budget or parsed.blocks != 1 or parsed.method != "tsdf":
+            raise LinprimError("--dry-run is of --method tsdf, without --blocks and --time-budget")
+        report = extraction_memory(parsed.run, options, quiet=parsed.quiet)
+        return Output(report, describe(report))
     from linprim_geo.surface.extract import extract_mesh
 
-    options, several = from_args(ExtractOptions, parsed), blocks_and_workers(parsed)
     settings = {"quiet": parsed.quiet, **several, **budget}
     return Output(extract_mesh(parsed.run, parsed.method, parsed.output, options, **settings))

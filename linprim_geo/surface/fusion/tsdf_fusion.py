@@ -120,8 +120,13 @@ def fuse_lattice(lattice: Lattice, frames: Iterable[DepthFrame]) -> Mesh:
 
 
 def auto_voxel_size(frames: Iterable[DepthFrame]) -> float:
-    """A voxel size that the views can support: their median pixel footprint; larger where the surface would have more
-    than MOST_FACES faces, at most 1/100 of the diagonal.
+    """A voxel size that the views can support, see `voxel_size_and_area`."""
+    return voxel_size_and_area(frames)[0]
+
+
+def voxel_size_and_area(frames: Iterable[DepthFrame]) -> tuple[float, float]:
+    """A voxel size that the views can support, and about the area that they see: the size is their median pixel
+    footprint; larger where the surface would have more than MOST_FACES faces, at most 1/100 of the diagonal.
 
     The diagonal is that of the box between the 1 and 99 % quantiles of the depth samples, widened by the share that
     quantiles cut off a uniform distribution. Rounded to two digits.
@@ -142,9 +147,10 @@ def auto_voxel_size(frames: Iterable[DepthFrame]) -> float:
     points = np.concatenate(samples)
     low, high = np.quantile(points, [0.01, 0.99], axis=0)
     diagonal = float(np.linalg.norm(high - low)) / 0.98
-    finest = np.sqrt(2 * CELLS_PER_AREA * _area(points, diagonal / AREA_CELLS) / MOST_FACES)
+    area = _area(points, diagonal / AREA_CELLS)
+    finest = np.sqrt(2 * CELLS_PER_AREA * area / MOST_FACES)
     size = float(min(max(np.median(footprints), finest), diagonal / 100))
-    return float(f"{size:.2g}")
+    return float(f"{size:.2g}"), area
 
 
 def _area(points: np.ndarray, cell: float) -> float:
