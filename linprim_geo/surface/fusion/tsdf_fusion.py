@@ -82,7 +82,7 @@ def fuse_tsdf(
     try:
         found = find_blocks(frames, first_size, truncation_voxels, bounds, block_resolution, allowed)
     except TooFine as error:
-        raise TooFine(str(error), error.fits * voxel_size / first_size) from None
+        raise error.of_smaller(first_size / voxel_size) from None
     blocks, origin, largest = found
     rules = vote_rules(truncation_voxels, behind_voxels, occluded_vote)
     levels = np.zeros(len(blocks), dtype=np.int64)

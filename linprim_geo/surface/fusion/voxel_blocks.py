@@ -26,11 +26,19 @@ MOST_NEW, CHUNK = 2**21, 2**18
 
 
 class TooFine(LinprimError):
-    """A field that would not fit into memory; one with the voxel size `fits` would."""
+    """A field of voxels of the size `voxel` that would take `need` bytes, more than `limit`; one with the voxel size
+    `fits` would not."""
 
-    def __init__(self, sentence: str, fits: float):
-        super().__init__(sentence)
-        self.fits = fits
+    def __init__(self, voxel: float, need: float, limit: float, fits: float):
+        super().__init__(
+            f"voxel size {voxel:.4g} needs {need / 2**30:.2g} GiB, {limit / 2**30:.2g} GiB are allowed: "
+            f"a voxel size of {fits:.2g} fits"
+        )
+        self.voxel, self.need, self.limit, self.fits = voxel, need, limit, fits
+
+    def of_smaller(self, times: float) -> TooFine:
+        """The same with sizes of voxels that are so many times smaller."""
+        return TooFine(self.voxel / times, self.need, self.limit, self.fits / times)
 
 
 @dataclass(frozen=True)
@@ -206,8 +214,4 @@ def check_memory(blocks: int, resolution: int, pixels: int, limit: float, voxel:
     fits = voxel * np.sqrt(1.05 * (need - frame) / (limit - frame))
     digits = 10.0 ** (np.floor(np.log10(fits)) - 1)
     fits = np.ceil(fits / digits) * digits
-    raise TooFine(
-        f"voxel size {voxel:.4g} needs {need / 2**30:.2g} GiB, {limit / 2**30:.2g} GiB are allowed: "
-        f"a voxel size of {fits:.2g} fits",
-        float(fits),
-    )
+    raise TooFine(voxel, need, limit, float(fits))

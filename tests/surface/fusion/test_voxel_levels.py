@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -220,6 +221,8 @@ def test_a_coarse_field_that_does_not_fit_is_refused_with_a_size_that_does(frame
         fused(frames, memory_limit=9_000_000)
     found = fuse_tsdf(frames, voxel_size=caught.value.fits, counts=lambda surface: surface, memory_limit=9_000_000)
     assert caught.value.fits > USUAL and len(found.faces) > 1000
+    sizes = f"voxel size {USUAL:.4g} needs .* allowed: a voxel size of {caught.value.fits:.2g} fits"
+    assert re.fullmatch(sizes, str(caught.value))
 
 
 def test_points_far_from_each_other_are_in_blocks_of_their_own():
