@@ -4,6 +4,9 @@ Depths along an edge are known to a hundredth, and what is nearly flush with a w
 its frame, a row of cupboards and the refrigerator beside them. The plane with the most points on it leans from the one
 to the other. Planes with points all over know the directions of the room, and of planes along these the one with the
 most points is one of the two.
+
+Where a wall has only one edge that is known well, as the skirting along its floor goes where the camera went, the
+planes of single photographs lean by ten degrees to all sides, and no two agree. Turned along the frame they do.
 """
 
 from __future__ import annotations
@@ -14,12 +17,50 @@ import numpy as np
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.stereo.planes.held_planes import off_plane, shifted
-from linprim_geo.stereo.planes.plain_regions import BEHIND, TOLERANCE, PlainRegion, in_camera, may_lie_on, to_world
+from linprim_geo.stereo.planes.plain_regions import (
+    BEHIND,
+    SAME_ANGLE,
+    TOLERANCE,
+    FoundPlane,
+    PlainRegion,
+    agreeing,
+    common_planes,
+    found_planes,
+    in_camera,
+    may_lie_on,
+    to_world,
+)
 from linprim_geo.stereo.planes.right_angles import LEFT_OPEN, angles_to, frame_of
 
 # Of the points within half of TOLERANCE of a plane at least such a share is there once it is turned: of planes that
 # lean by themselves, as a sloping street does, fewer stay (DECISIONS 141).
 KEPT_SHARE = 0.75
+# Two of the views that find a plane along the frame look from directions that differ by so much: its normal is known.
+FRAMED_SPREAD = SAME_ANGLE
+
+
+def planes_by_edges(cameras: Sequence[Camera], regions: Sequence[PlainRegion], by_points: np.ndarray) -> np.ndarray:
+    """(K, 4) planes n . x = d of the world that points along edges of plain `regions` give: those that several views
+    find, as they are or once each is turned along the frame of the planes `by_points` (N, 4), along that frame if they
+    nearly are (`along_frame`)."""
+    found = found_planes(cameras, regions)
+    planes, frame = common_planes(cameras, regions, found), frame_of(by_points[:, :3])
+    if frame is None:
+        return planes
+    turned = [other for one in found if (other := _turned(cameras, one, frame)) is not None]
+    return along_frame(
+        cameras, regions, np.concatenate([planes, agreeing(cameras, turned, FRAMED_SPREAD)[0]]), by_points
+    )
+
+
+def _turned(cameras: Sequence[Camera], one: FoundPlane, frame: np.ndarray) -> FoundPlane | None:
+    """The plane of a region along the nearest axis of a frame, None where it is not nearly along it, or loses too many
+    points."""
+    points = _edge_points(cameras, [one.region], one.plane[None])[0]
+    if angles_to(frame, one.plane[None, :3])[0] >= LEFT_OPEN or not len(points.points):
+        return None
+    plane = points.turned(one.plane, frame)
+    return None if plane is one.plane else FoundPlane.on(cameras[one.region.view], one.region, one.points, plane)
 
 
 def along_frame(

@@ -207,20 +207,56 @@ def _certain(region: PlainRegion, plane: np.ndarray, on: np.ndarray) -> bool:
     return bool((inverse > 0).all() and (deviation < 2 * TOLERANCE * inverse).all())
 
 
-def common_planes(cameras: Sequence[Camera], regions: Sequence[PlainRegion], seed: int = 0) -> np.ndarray:
-    """(K, 4) planes (n, d) of the world, n . x = d, that several views find."""
+@dataclass(frozen=True)
+class FoundPlane:
+    """A plane (4,) n . x = d of the world that a `region` has so many `points` on, and the `depth` and place in the
+    world of the region's `middle` (3,) on it."""
+
+    region: PlainRegion
+    points: int
+    plane: np.ndarray
+    depth: float
+    middle: np.ndarray
+
+    @classmethod
+    def on(cls, camera: Camera, region: PlainRegion, points: int, plane: np.ndarray) -> FoundPlane:
+        """Of a plane of the world and the camera of the region."""
+        ray = region.corners[4]
+        depth = 1 / float(ray @ in_camera(camera, plane[None])[0])
+        return cls(region, points, plane, depth, to_world(camera, ray[None] * depth)[0])
+
+
+def found_planes(cameras: Sequence[Camera], regions: Sequence[PlainRegion], seed: int = 0) -> list[FoundPlane]:
+    """Planes of single regions, those with the most points first."""
     rng, found = np.random.default_rng(seed), []
     for region in regions:
         camera = cameras[region.view]
         for count, plane in planes_of_region(region, rng):
-            depth = 1 / (region.corners[4] @ plane)
-            middle = to_world(camera, region.corners[4][None] * depth)[0]
-            found.append((count, region.view, depth, middle, in_world(camera, plane)))
-    found.sort(key=lambda one: -one[0])
-    if not found:
-        return np.zeros((0, 4))
-    weight, view, depth, middle, plane = (np.array(column) for column in zip(*found, strict=True))
-    free, planes, spreads = np.ones(len(found), bool), [], []
+            found.append(FoundPlane.on(camera, region, count, in_world(camera, plane)))
+    return sorted(found, key=lambda one: -one.points)
+
+
+def common_planes(
+    cameras: Sequence[Camera], regions: Sequence[PlainRegion], found: Sequence[FoundPlane] | None = None
+) -> np.ndarray:
+    """(K, 4) planes (n, d) of the world, n . x = d, that are found in several views, fitted to the points of all
+    regions on them. `found`: those of single regions, if they are known."""
+    result = agreeing(cameras, found_planes(cameras, regions) if found is None else found)
+    for _ in range(ROUNDS):
+        result = _refitted(cameras, regions, *result)
+    return result[0]
+
+
+def agreeing(
+    cameras: Sequence[Camera], found: Sequence[FoundPlane], spread: float | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The means (K, 4) of planes that are `found` in LEAST_VIEWS views and more, and how many radians apart two of
+    these have to look (K,): `spread`, or by how the normals turn (`_least_spread`)."""
+    weight, view = np.array([one.points for one in found]), np.array([one.region.view for one in found])
+    depth, middle = np.array([one.depth for one in found]), np.array([one.middle for one in found])
+    plane = np.array([one.plane for one in found])
+    planes, spreads = list[np.ndarray](), list[float]()
+    free = np.ones(len(found), bool)
     for first in range(len(found)):
         if not free[first]:
             continue
@@ -232,14 +268,11 @@ def common_planes(cameras: Sequence[Camera], regions: Sequence[PlainRegion], see
         mean = np.append(normal, np.average(middle[same] @ normal, weights=weight[same]))
         same = (_same(mean, plane[:, :3], middle, depth) | same) & free
         free &= ~same
-        spread = _least_spread(plane[same, :3], weight[same])
-        if seen_enough(cameras, view[same], np.average(middle[same], axis=0, weights=weight[same]), spread):
+        least = _least_spread(plane[same, :3], weight[same]) if spread is None else spread
+        if seen_enough(cameras, view[same], np.average(middle[same], axis=0, weights=weight[same]), least):
             planes.append(mean)
-            spreads.append(spread)
-    result = np.array(planes).reshape(-1, 4), np.array(spreads)
-    for _ in range(ROUNDS):
-        result = _refitted(cameras, regions, *result)
-    return result[0]
+            spreads.append(least)
+    return np.array(planes).reshape(-1, 4), np.array(spreads)
 
 
 def _least_spread(normals: np.ndarray, weight: np.ndarray) -> float:

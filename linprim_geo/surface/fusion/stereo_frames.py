@@ -26,11 +26,10 @@ from linprim_geo.stereo.planes.enclosing_planes import (
     known_on_planes,
     region_depths,
 )
-from linprim_geo.stereo.planes.framed_planes import along_frame
+from linprim_geo.stereo.planes.framed_planes import planes_by_edges
 from linprim_geo.stereo.planes.plain_regions import (
     TOLERANCE,
     PlainRegion,
-    common_planes,
     regions_of_views,
 )
 from linprim_geo.stereo.planes.point_planes import SurfacePoints, planes_of_points, point_plane_depth
@@ -148,7 +147,7 @@ class MergedFrames(Sequence):
         regions = regions_of_views(maps, sure)
         by_points = planes_of_points(maps, sure)
         every = [region for own in regions for region in own]
-        by_edges = along_frame(self.cameras, every, common_planes(self.cameras, every), by_points)
+        by_edges = planes_by_edges(self.cameras, every, by_points)
         shaded = ShadedPlanes(maps, sure, rendered, by_points, by_edges)
         self.planes, self.standing = shaded.planes[~shaded.hanging], shaded.standing[~shaded.hanging]
         on_points = [point_plane_depth(found, own, by_points) for found, own in zip(maps, sure, strict=True)]

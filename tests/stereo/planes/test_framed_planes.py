@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from helpers.captures import look_at
 
-from linprim_geo.stereo.planes.framed_planes import along_frame
-from linprim_geo.stereo.planes.plain_regions import PlainRegion, rays_of
+from linprim_geo.geometry.camera import Camera
+from linprim_geo.stereo.planes.framed_planes import along_frame, planes_by_edges
+from linprim_geo.stereo.planes.plain_regions import PlainRegion, common_planes, rays_of
 
 FLOOR, SIDE = np.array([0.0, 0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0, -1.5])
 ROOM = np.array([FLOOR, SIDE])
@@ -17,12 +18,14 @@ CAMERAS = [look_at((x, 2.5, 1.0), target=(0, 0, 1), size=(64, 48), focal=50.0) f
 
 def edges_of(points: np.ndarray) -> list[PlainRegion]:
     """A region of every view with these (P, 3) points along its edges."""
-    regions, one = [], np.ones((1, 1), bool)
-    for view, camera in enumerate(CAMERAS):
-        pixels, depth = camera.project(points)
-        rays, sure = rays_of(camera, pixels[:, 1] - 0.5, pixels[:, 0] - 0.5), np.ones(len(points), bool)
-        regions.append(PlainRegion(view, 0, 0, one, rays, 1 / depth, sure, sure, rays[:5], one))
-    return regions
+    return [region_of(view, camera, points) for view, camera in enumerate(CAMERAS)]
+
+
+def region_of(view: int, camera: Camera, points: np.ndarray) -> PlainRegion:
+    """With these (P, 3) points along its edges."""
+    one, (pixels, depth) = np.ones((1, 1), bool), camera.project(points)
+    rays, sure = rays_of(camera, pixels[:, 1] - 0.5, pixels[:, 0] - 0.5), np.ones(len(points), bool)
+    return PlainRegion(view, 0, 0, one, rays, 1 / depth, sure, sure, rays[:5], one)
 
 
 def outline(low: float, high: float, count: int) -> np.ndarray:
@@ -93,3 +96,30 @@ def test_without_a_frame_nothing_turns():
     planes = np.array([[0.01, np.sqrt(1 - 1e-4), 0.0, 0.0]])
     for by_points in (ROOM[:1], np.zeros((0, 4))):
         assert along_frame(CAMERAS, edges_of(points), planes, by_points) is planes
+
+
+def seen_askew(apart: float) -> tuple[list[Camera], list[PlainRegion]]:
+    """Cameras so far apart, and a wall y = 0 in each: its corner is known, the skirting from there on leans by 9
+    degrees, to one side or the other."""
+    cameras = [look_at((x * apart, 2.5, 1.0), target=(0, 0, 1), size=(64, 48), focal=50.0) for x in (-1, 0, 1)]
+    corner = np.column_stack([np.full(150, -0.5), np.linspace(0, 2, 150)])
+    skirting = np.column_stack([np.linspace(-0.5, 0.0, 40), np.zeros(40)])
+    regions = []
+    for view, (camera, degrees) in enumerate(zip(cameras, (9, -9, 9), strict=True)):
+        lean = np.tan(np.radians(degrees)) * (skirting[:, 0] + 0.5)
+        points = np.concatenate([facing(corner, 0.0, 0.002), facing(skirting, lean, 0.002)])
+        regions.append(region_of(view, camera, points))
+    return cameras, regions
+
+
+def test_planes_that_lean_to_all_sides_agree_along_the_frame():
+    cameras, regions = seen_askew(1.0)
+    assert not len(common_planes(cameras, regions))
+    (plane,) = planes_by_edges(cameras, regions, ROOM)
+    np.testing.assert_allclose(np.abs(plane), [0, 1, 0, 0], atol=0.003)
+    assert not len(planes_by_edges(cameras, regions, ROOM[:1]))  # no frame
+
+
+def test_views_from_one_direction_are_one():
+    """Of 2 degrees."""
+    assert not len(planes_by_edges(*seen_askew(0.04), ROOM))
