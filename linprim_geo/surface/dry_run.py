@@ -20,6 +20,7 @@ from linprim_geo.surface.methods.method_tsdf import (
     DepthFrames,
     check_stereo_memory,
     kept_bytes,
+    memory_left,
     stereo_factor,
 )
 
@@ -48,16 +49,19 @@ def extraction_memory(run: str | os.PathLike, options: ExtractOptions | None = N
         level = choose_level(opened, int(options.memory_limit * 2**30))[0]
         stages.lap("level")
     cameras, factor = _for_stereo(opened, options)
-    views = opened.scene().train
-    if factor > 1:
-        views = [SmallCopy.of(view, factor) for view in views]
-    frames = DepthFrames(opened, float(level), options.depth_limit, most=kept_bytes(options, cameras), views=views)
+    whole = opened.scene().train
+    most = kept_bytes(options, [view.camera for view in whole])
+    views = [SmallCopy.of(view, factor) for view in whole] if factor > 1 else whole
+    frames = DepthFrames(opened, float(level), options.depth_limit, most=most, views=views)
     stages.lap("render")
     voxel, area = voxel_size_and_area(frames)
     if options.voxel_size > 0:
         voxel, faces = options.voxel_size, _faces(area, options.voxel_size)
     else:
         faces = min(_faces(area, voxel), int(MOST_FACES))
+        room = memory_left(options, frames.bytes)
+        if room is not None:  # voxels are larger where the grid would not fit
+            faces = min(faces, room // RENDERED_FACE)
     now, pixels = memory_gib(), sum(camera.width * camera.height for camera in cameras)
     fused = RENDERED_FACE * faces
     if factor and (options.stereo == "on" or not opened.scene().has_alpha):
@@ -100,7 +104,10 @@ def describe(report: dict) -> str:
 def _for_stereo(run: Run, options: ExtractOptions) -> tuple[list[Camera], int]:
     """The cameras of the photographs that stereo takes, and K of `stereo_factor`; 0 without stereo, with all cameras as
     they are."""
-    cameras, factor = [view.camera for view in run.scene().train], stereo_factor(run, options)
+    cameras = [view.camera for view in run.scene().train]
+    if options.stereo == "off":
+        return cameras, 0
+    factor = stereo_factor(run, options)
     if factor > 1:
         cameras = [smaller(camera, factor) for camera in cameras]
     try:
@@ -108,8 +115,8 @@ def _for_stereo(run: Run, options: ExtractOptions) -> tuple[list[Camera], int]:
     except LinprimError:
         if options.stereo == "on":
             raise
-        factor = 0
-    return cameras, 0 if options.stereo == "off" else factor
+        return cameras, 0
+    return cameras, factor
 
 
 def _faces(area: float, voxel: float) -> int:

@@ -80,6 +80,14 @@ def test_stereo_counts_with_the_size_of_photographs_that_fits(run, monkeypatch):
         extraction_memory(run, replace(with_none, stereo="on"), quiet=True)
 
 
+def test_a_grid_that_does_not_fit_has_fewer_faces(run):
+    options = ExtractOptions(level=0.5, stereo="off")
+    whole = extraction_memory(run, options, quiet=True)
+    limited = extraction_memory(run, replace(options, memory_limit=PROCESS_GIB + 1.5e6 / 2**30), quiet=True)
+    assert 0 < limited["faces"] < 1.5e6 / dry_run.RENDERED_FACE < whole["faces"]
+    assert limited["peak_gib"]["finish"] < whole["peak_gib"]["finish"]
+
+
 def test_what_does_not_fit_is_said(run, monkeypatch):
     monkeypatch.setattr(dry_run, "available_memory", lambda: 0)
     monkeypatch.setattr(dry_run, "memory_gib", lambda: 0.01)
