@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <cmath>
 #include <memory>
-#include <numeric>
 
 #include "base/parallel.h"
 #include "surface/face_normals.h"
@@ -15,6 +14,8 @@ constexpr int kMostSides = 6, kLeastFaces = 3, kSideRounds = 3;
 constexpr int64_t kEdgesPerTask = 512;
 // Squared sine below which two planes are too near to parallel to have a line.
 constexpr double kLeastSine = 0.05;
+// What rounding may change of a squared distance of normals.
+constexpr double kRounding = 1e-9;
 
 // A list of rows for each of many.
 struct Lists {
@@ -131,6 +132,41 @@ Mesh prepared(const CreaseRules& how, const FaceFans& fans, const double* vertex
   return mesh;
 }
 
+// Between which values the coordinates of some normals are.
+struct Box {
+  Vector low{INFINITY, INFINITY, INFINITY}, high{-INFINITY, -INFINITY, -INFINITY};
+
+  void take(const Box& other) {
+    for (int axis = 0; axis < 3; ++axis) {
+      low[axis] = std::min(low[axis], other.low[axis]);
+      high[axis] = std::max(high[axis], other.high[axis]);
+    }
+  }
+};
+
+// Of each vertex the box of the averaged normals of all inner faces within the rings around it.
+std::vector<Box> boxes_of_normals(const CreaseRules& how, const Mesh& mesh) {
+  std::vector<Box> box(mesh.fans.vertices), wider(mesh.fans.vertices);
+  for_rows(mesh.fans.vertices, [&](int64_t v) {
+    mesh.inside.each(v, [&](int64_t f) { box[v].take({mesh.averaged[f], mesh.averaged[f]}); });
+  });
+  for (int ring = 0; ring < how.rings; ++ring) {
+    for_rows(mesh.fans.vertices, [&](int64_t v) {
+      wider[v] = box[v];
+      mesh.beside.each(v, [&](int64_t other) { wider[v].take(box[other]); });
+    });
+    box.swap(wider);
+  }
+  return box;
+}
+
+// Whether two of the normals in a box may be of sides that meet at a crease: none of unit vectors in it, and so none of
+// their means, differ by more than it is wide.
+bool may_differ(const CreaseRules& how, const Box& box) {
+  const Vector wide = minus(box.high, box.low);
+  return box.low[0] <= box.high[0] && dot(wide, wide) >= (1 - kRounding) * (2 - 2 * how.crease);
+}
+
 // What lies around one edge after the other; one of these per thread.
 class Around {
  public:
@@ -184,6 +220,8 @@ class Around {
       mesh_.joined.each(faces_[i], [&](int64_t g) {
         if (place_[g].reached == now_) parent_[root(int(i))] = root(place_[g].row);
       });
+    part_.resize(faces_.size());
+    for (size_t i = 0; i < faces_.size(); ++i) part_[i] = root(int(i));
     return true;
   }
 
@@ -209,33 +247,27 @@ class Around {
   // The parts that hang together, split where normals differ. False if there are too many.
   bool find_sides() {
     const int count = int(faces_.size());
-    weight_.resize(count), order_.resize(count), side_.resize(count);
+    weight_.resize(count), side_.resize(count), claimed_.assign(count, 0);
     for (int i = 0; i < count; ++i) {
       const Vector away = minus(mesh_.middle[faces_[i]], here_);
       const double far = std::max(0.0, std::sqrt(dot(away, away)) / length_ - 1) / how_.falloff;
       weight_[i] = mesh_.faces.area[faces_[i]] * std::exp(-0.5 * far * far);
     }
-    std::iota(order_.begin(), order_.end(), 0);
-    std::sort(order_.begin(), order_.end(),
-              [&](int a, int b) { return weight_[a] != weight_[b] ? weight_[a] > weight_[b] : a < b; });
     sides_.clear();
-    for (const int i : order_) {
-      const int part = root(i);
-      const Vector& normal = mesh_.averaged[faces_[i]];
-      if (std::any_of(sides_.begin(), sides_.end(),
-                      [&](const Side& s) { return s.part == part && dot(s.normal, normal) > how_.side; }))
-        continue;
+    for (int next; (next = heaviest()) >= 0;) {
       if (sides_.size() == kMostSides) return false;
-      sides_.push_back({part, normal, {}});
+      const Side side{part_[next], mesh_.averaged[faces_[next]], {}};
+      sides_.push_back(side);
+      for (int i = 0; i < count; ++i)
+        claimed_[i] |= i == next || (part_[i] == side.part && dot(side.normal, mesh_.averaged[faces_[i]]) > how_.side);
     }
     for (int round = 0; round < kSideRounds; ++round) {
       std::vector<Side> sums(sides_.size());
       for (int i = 0; i < count; ++i) {
         const Vector& normal = mesh_.averaged[faces_[i]];
-        const int part = root(i);
         double most = -2;
         for (size_t k = 0; k < sides_.size(); ++k)
-          if (sides_[k].part == part && dot(sides_[k].normal, normal) > most)
+          if (sides_[k].part == part_[i] && dot(sides_[k].normal, normal) > most)
             most = dot(sides_[k].normal, normal), side_[i] = int(k);
         Side& sum = sums[side_[i]];
         add(sum.normal, weight_[i], normal), add(sum.middle, weight_[i], mesh_.middle[faces_[i]]);
@@ -249,6 +281,14 @@ class Around {
       }
     }
     return true;
+  }
+
+  // The face with the most weight, the first of several, that no side has claimed; -1 if there is none.
+  int heaviest() const {
+    int best = -1;
+    for (int i = 0; i < int(weight_.size()); ++i)
+      if (!claimed_[i] && (best < 0 || weight_[i] > weight_[best])) best = i;
+    return best;
   }
 
   const Side* nearest(const Vector& point) const {
@@ -307,12 +347,49 @@ class Around {
   std::vector<int> reached_;
   int now_ = 0;
   std::vector<int64_t> vertices_, faces_;
-  std::vector<int> parent_, order_, side_;  // per row of `faces_`, as are weights
+  std::vector<int> parent_, part_, side_;  // per row of `faces_`, as are the next two
+  std::vector<uint8_t> claimed_;
   std::vector<double> weight_, lengths_;
   double length_ = 0;
   std::vector<Side> sides_;
   Vector here_;
 };
+
+using Ends = std::array<int64_t, 2>;
+
+// The edges of faces that are not flat, each once and in order.
+std::vector<Ends> edges_to_ask(const Mesh& mesh) {
+  std::vector<Ends> edges;
+  for (int64_t f = 0; f < mesh.fans.faces; ++f)
+    for (int k = 0; k < 3 && !mesh.flat[f]; ++k) {
+      const int64_t a = mesh.fans.corner[3 * f + k], b = mesh.fans.corner[3 * f + (k + 1) % 3];
+      edges.push_back({std::min(a, b), std::max(a, b)});
+    }
+  std::sort(edges.begin(), edges.end());
+  edges.erase(std::unique(edges.begin(), edges.end()), edges.end());
+  return edges;
+}
+
+// What is known of each of some edges.
+struct Answers {
+  std::vector<std::array<double, 8>> plane;
+  std::vector<uint8_t> known, crosses, asked;
+  std::vector<double> length;
+
+  explicit Answers(size_t count) : plane(count), known(count), crosses(count), asked(count), length(count) {}
+};
+
+// The vertices of faces of which a vertex is the end of an edge across a crease.
+std::vector<uint8_t> beside_creases(const Mesh& mesh, const std::vector<Ends>& edges, const Answers& answers) {
+  std::vector<uint8_t> end(mesh.fans.vertices), beside(mesh.fans.vertices);
+  for (size_t e = 0; e < edges.size(); ++e)
+    if (answers.known[e] && answers.crosses[e]) end[edges[e][0]] = end[edges[e][1]] = 1;
+  for_rows(mesh.fans.vertices, [&](int64_t v) {
+    beside[v] = end[v];
+    mesh.beside.each(v, [&](int64_t other) { beside[v] |= end[other]; });
+  });
+  return beside;
+}
 
 }  // namespace
 
@@ -320,31 +397,36 @@ CreaseEdges crease_edges(const CreaseRules& how, int64_t vertices, int64_t faces
                          const double* vertex) {
   const FaceFans fans(vertices, faces, corner);
   const Mesh mesh = prepared(how, fans, vertex);
-  std::vector<std::array<int64_t, 2>> edges;
-  for (int64_t f = 0; f < faces; ++f)
-    for (int k = 0; k < 3 && !mesh.flat[f]; ++k) {
-      const int64_t a = corner[3 * f + k], b = corner[3 * f + (k + 1) % 3];
-      edges.push_back({std::min(a, b), std::max(a, b)});
-    }
-  std::sort(edges.begin(), edges.end());
-  edges.erase(std::unique(edges.begin(), edges.end()), edges.end());
+  const std::vector<Ends> edges = edges_to_ask(mesh);
   const int64_t count = int64_t(edges.size());
-  std::vector<std::array<double, 8>> planes(count);
-  std::vector<uint8_t> known(count), crosses(count);
-  std::vector<double> length(count);
+  Answers answers(edges.size());
   std::vector<std::unique_ptr<Around>> around(threads());
-  parallel_for((count + kEdgesPerTask - 1) / kEdgesPerTask, [&](int64_t task, int thread) {
-    if (!around[thread]) around[thread] = std::make_unique<Around>(how, mesh);
-    for (int64_t e = task * kEdgesPerTask; e < std::min((task + 1) * kEdgesPerTask, count); ++e)
-      known[e] = around[thread]->ask(edges[e].data(), planes[e].data(), crosses[e], length[e]);
+  const auto ask_where = [&](const auto& wanted) {
+    parallel_for((count + kEdgesPerTask - 1) / kEdgesPerTask, [&](int64_t task, int thread) {
+      if (!around[thread]) around[thread] = std::make_unique<Around>(how, mesh);
+      for (int64_t e = task * kEdgesPerTask; e < std::min((task + 1) * kEdgesPerTask, count); ++e) {
+        if (answers.asked[e] || !wanted(edges[e])) continue;
+        answers.asked[e] = 1;
+        answers.known[e] =
+            around[thread]->ask(edges[e].data(), answers.plane[e].data(), answers.crosses[e], answers.length[e]);
+      }
+    });
+  };
+  const std::vector<Box> boxes = boxes_of_normals(how, mesh);
+  ask_where([&](const Ends& end) {
+    Box box = boxes[end[0]];
+    box.take(boxes[end[1]]);
+    return may_differ(how, box);
   });
+  const std::vector<uint8_t> beside = beside_creases(mesh, edges, answers);
+  ask_where([&](const Ends& end) { return beside[end[0]] || beside[end[1]]; });
   CreaseEdges out;
   for (int64_t e = 0; e < count; ++e) {
-    if (!known[e]) continue;
+    if (!answers.known[e] || !(beside[edges[e][0]] || beside[edges[e][1]])) continue;
     out.end.insert(out.end.end(), edges[e].begin(), edges[e].end());
-    out.plane.insert(out.plane.end(), planes[e].begin(), planes[e].end());
-    out.crosses.push_back(crosses[e]);
-    out.length.push_back(length[e]);
+    out.plane.insert(out.plane.end(), answers.plane[e].begin(), answers.plane[e].end());
+    out.crosses.push_back(answers.crosses[e]);
+    out.length.push_back(answers.length[e]);
   }
   return out;
 }

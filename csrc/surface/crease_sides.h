@@ -22,7 +22,7 @@ struct CreaseRules {
   double wide;     // what a side reaches over, across the crease, at least, in edges
 };
 
-// Edges whose ends lie on known sides, by numbers of their ends in order.
+// Edges across creases, and those beside them, whose ends lie on known sides, by numbers of their ends in order.
 struct CreaseEdges {
   std::vector<int64_t> end;      // (N, 2)
   std::vector<double> plane;     // (N, 2, 4) unit normal n and offset n . x of the side of each end
@@ -30,12 +30,14 @@ struct CreaseEdges {
   std::vector<double> length;    // (N,) of the edges around, in the median
 };
 
-// `corner` (faces, 3) are rows of `vertex` (vertices, 3). Asked are the edges of faces that are not flat, once their
-// normals are averaged within flat parts. Around each, flat faces that hang together, with normals as near as those of
-// one side, are a side; its plane is the weighted mean of its faces, and an end lies on the side whose plane is
-// nearest. Two sides make a crease if their normals, as they are on average and as they go on to the edge by the linear
-// fit to those of the mesh, differ: what bends all the way is round. Memory: 310 bytes per face and 14 for each thread,
-// 100 per edge that is asked. Vertices and faces are fewer than 2^31. The same bits for any number of threads.
+// `corner` (faces, 3) are rows of `vertex` (vertices, 3). Of edges of faces that are not flat, once their normals are
+// averaged within flat parts, flat faces around that hang together, with normals as near as those of one side, are a
+// side; its plane is the weighted mean of its faces, and an end lies on the side whose plane is nearest. Two sides make
+// a crease if their normals, as they are on average and as they go on to the edge by the linear fit to those of the
+// mesh, differ: what bends all the way is round. Asked are edges around which normals differ by as much, and then those
+// beside edges across a crease: of which an end shares a face with one of their ends. Memory: 360 bytes per face and 14
+// for each thread, 100 per edge of a face that is not flat. Vertices and faces are fewer than 2^31. The same bits for
+// any number of threads.
 CreaseEdges crease_edges(const CreaseRules& how, int64_t vertices, int64_t faces, const int64_t* corner,
                          const double* vertex);
 

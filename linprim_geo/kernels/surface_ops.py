@@ -174,7 +174,7 @@ def filter_normals(corner, bound, contrast: float, normal_rounds: int, vertex_ro
 
 
 def crease_edges(corner, vertex, rules) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The planes on which the ends of edges lie that are not on flat parts of a mesh, and which meet at a crease.
+    """The planes on which the ends of edges of a mesh lie that go across creases, or are beside such edges.
 
     Args:
         corner: (M, 3) int64 faces.
@@ -183,7 +183,8 @@ def crease_edges(corner, vertex, rules) -> tuple[np.ndarray, np.ndarray, np.ndar
 
     Returns:
         (E, 2) int64 ends, the lower one first, in order; (E, 2, 4) the plane n . x = d of each as n, d; (E,) bool
-        whether the two meet at a crease between the ends; (E,) the length of edges around.
+        whether the two meet at a crease between the ends; (E,) the length of edges around. Those that do not cross
+        share a face with an end of one that does, and edges of flat faces are none of them.
     """
     end, plane, crosses, length = _core.crease_edges(corner, vertex, rules)
     return end.reshape(-1, 2), plane.reshape(-1, 2, 4), crosses.astype(bool), length

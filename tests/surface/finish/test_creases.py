@@ -18,6 +18,8 @@ from linprim_geo.surface.finish.creases import sharpened
 from linprim_geo.surface.finish.self_intersections import crossings
 
 VOXEL = 0.05
+# As `crease_edges` takes them.
+RULES = [0.7, 5, *np.cos(np.radians([20, 15, 30, 5.7])), 4, 1.5, 1.0]
 # Turned, so that no plane lies along the voxels.
 TURN = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
 
@@ -89,6 +91,19 @@ def test_edges_and_corners_of_a_block_are_where_they_belong():
     assert len(np.unique(directed, axis=0)) == len(directed) and np.array_equal(
         np.unique(directed, axis=0), np.unique(directed[:, ::-1], axis=0)
     )
+
+
+def test_only_edges_across_creases_and_beside_such_ones_are_told():
+    # Noise makes faces that are not flat all over the block, and edges that are asked.
+    mesh = rough(voxels(box(*BLOCK)), 0.1)
+    faces = np.ascontiguousarray(mesh.faces, np.int64)
+    ends, _, crosses, _ = surface_ops.crease_edges(faces, np.array(mesh.vertices, np.float64), RULES)
+    across = np.zeros(len(mesh.vertices), bool)
+    across[ends[crosses]] = True
+    beside = np.zeros_like(across)
+    beside[faces[across[faces].any(1)]] = True
+    assert 0 < np.count_nonzero(crosses) < len(ends) < 3 * len(faces) / 2
+    assert beside[ends].any(1).all() and not beside.all()
 
 
 def voxels_of_two_sizes(distance, blocks: int = 3, resolution: int = 8) -> Mesh:
@@ -250,10 +265,10 @@ def test_nothing_to_do_is_no_trouble(faces):
 
 
 def test_wrong_arrays_are_refused():
-    corners, vertices, rules = np.array([[0, 1, 3]]), np.zeros((3, 3)), [0.7, 5, 0.9, 0.9, 0.9, 0.9, 4, 1.5, 1]
+    corners, vertices = np.array([[0, 1, 3]]), np.zeros((3, 3))
     with pytest.raises(ValueError, match="outside of the vertices"):
-        surface_ops.crease_edges(corners, vertices, rules)
+        surface_ops.crease_edges(corners, vertices, RULES)
     with pytest.raises(ValueError, match="vertex"):
-        surface_ops.crease_edges(corners, np.zeros((3, 2)), rules)
+        surface_ops.crease_edges(corners, np.zeros((3, 2)), RULES)
     with pytest.raises(ValueError, match="positive"):
-        surface_ops.crease_edges(corners[:0], vertices, [0.0, *rules[1:]])
+        surface_ops.crease_edges(corners[:0], vertices, [0.0, *RULES[1:]])
