@@ -1,1 +1,1 @@
-"""What makes a surface better once it is found: its places, creases, outlines, holes and number of faces."""
+"""Improves an extracted surface: vertex positions, creases, outlines, holes and number of faces."""

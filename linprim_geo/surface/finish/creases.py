@@ -1,10 +1,10 @@
-"""Puts the vertices along creases where the flat parts on both sides of them meet.
+"""Restores sharp creases: moves vertices to where the flat parts on both sides of a crease meet.
 
-Voxels cut creases off, and photographs agree best a little inside of them, as every pixel on an edge mixes what both
-sides show. The sides themselves are known well. So of each edge of the mesh that crosses a crease the nearer end goes
-to the line of the two planes; where three meet, to the corner; and what lies beside goes to the plane of its side.
-Source: Attene et al. 2005 (Sharpen & Bend), with planes in place of their normals of vertices, and moves in place of
-new vertices.
+Voxels chamfer creases, and photographs agree best slightly inside of them, as a pixel on an edge mixes both sides. The
+flat sides themselves are accurate. So planes are fitted to both sides; of each mesh edge that crosses a crease the
+nearer end moves to the line of the two planes, or to the corner where three meet, and the vertices beside the crease
+move to the plane of their side. Source: Attene et al. 2005 (Sharpen & Bend), with planes in place of their vertex
+normals, and moved vertices in place of new ones.
 """
 
 from __future__ import annotations
@@ -19,33 +19,38 @@ from linprim_geo.surface.finish.denoise import CONTRAST
 from linprim_geo.surface.finish.safe_moves import moved_safely
 
 FLAT, SIDE, CREASE, EVEN = 20.0, 15.0, 30.0, 5.7
-"""Degrees: what averaged normals of flat parts change by from face to face, at most; what there is between the sides of
-a crease, at least, as `eval-mesh` counts them; what normals of a side deviate by, in the mean."""
+"""Degrees: largest change of averaged normals from a face of a flat part to the faces around it; angle from which on
+normals belong to another side; least angle between the sides of a crease, as `eval-mesh` counts them; largest mean
+deviation of the normals of a side."""
 
 NORMAL_ROUNDS, RINGS, FALLOFF, WIDE = 5, 4, 1.5, 1.0
-"""Rounds in which normals are averaged; how far away, in faces, sides are looked for; how fast these count less, in
-edges; and how wide a side has to be. What is narrower cannot be told from something round."""
+"""Rounds of averaging normals; rings of faces within which sides are searched for; standard deviation of their weights
+with distance, in edge lengths; and least width of a side across the crease, in edge lengths. A narrower side cannot be
+distinguished from a rounded one."""
 
 PASSES = 2
-"""The second knows sides better, as what lies beside creases is on their planes then."""
+"""Passes over the mesh. The second has better planes, as the vertices beside creases are on their planes by then."""
 
 FARTHEST, CORNER_FARTHEST, BESIDE = 1.0, 1.5, 0.5
-"""Edges around: how far away the line of a crease, a corner, and the plane of what lies beside a crease may be."""
+"""Local edge lengths: largest distance of a vertex from the line of a crease, from a corner, and of one beside a crease
+from the plane of its side."""
 
 CORNER = 0.1
-"""Eigenvalue of the sum of n n^T over the planes of a vertex, by its number of edges across creases, below which a
-direction is not known: two planes that are CREASE degrees apart have 0.13."""
+"""Least eigenvalue of the sum of n n^T over the planes of a vertex, divided by its number of edges across creases, for
+a direction to be determined. Two planes that are CREASE degrees apart have 0.13."""
 
 SLIVER = 10.0
-"""Degrees: faces between three vertices of a crease with less are flipped over, as they lie along its line."""
+"""Degrees: a face between three crease vertices with a smaller angle than this has its longest edge flipped, as it lies
+along the crease."""
 
 
 def sharpened(mesh: Mesh) -> Mesh:
-    """The mesh with creases where its flat parts meet, in as many vertices and faces; normals are made anew.
+    """Return the mesh with sharp creases where its flat parts meet, with the same numbers of vertices and faces and new
+    normals.
 
-    Vertices go back where the surface would go through itself. Memory: some 700 bytes per vertex. The same to the last
-    bit for any number of threads. Accuracy: edges of a block, 0.28 of a voxel off before, are off by 0.04 at most in
-    the mean afterwards (tests/surface/finish/test_creases.py).
+    Vertices go back where the surface would intersect itself. Memory: some 700 bytes per vertex. The result is
+    identical to the last bit for any number of threads. Accuracy: edges of a block, 0.28 of a voxel off before, are off
+    by 0.04 at most in the mean afterwards (tests/surface/finish/test_creases.py).
     """
     if len(mesh.faces) == 0:
         return mesh
@@ -58,7 +63,7 @@ def sharpened(mesh: Mesh) -> Mesh:
 
 
 def _to_creases(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The (V, 3) vertices after one pass, and (V,) bool which of them are on a crease."""
+    """Return the (V, 3) vertices after one pass, and (V,) bool: which of them are on a crease."""
     limits = np.cos(np.radians([FLAT, SIDE, CREASE, EVEN]))
     rules = [CONTRAST, NORMAL_ROUNDS, *limits, RINGS, FALLOFF, WIDE]
     ends, planes, crosses, length = surface_ops.crease_edges(faces, vertices, rules)
@@ -83,10 +88,12 @@ def _to_creases(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _nearer_ends(vertices: np.ndarray, ends: np.ndarray, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of (E, 2) edges across creases the end nearer to the line of their (E, 2, 4) planes, and how near it is."""
+    """Return for (E, 2) edges across creases the end nearer to the line of their (E, 2, 4) planes, and its distance
+    from the line."""
     normals = planes[..., :3]
     cosine = np.einsum("ek,ek->e", normals[:, 0], normals[:, 1])[:, None]
-    # Both (E, ends, planes): how far an end is behind the planes, and what has to be gone along their normals.
+    # Both (E, ends, planes): how far an end lies behind the planes, and the steps along their normals that lead to the
+    # line.
     behind = planes[:, None, :, 3] - np.einsum("eik,ejk->eij", vertices[ends], normals)
     along = (behind - cosine[..., None] * behind[..., ::-1]) / (1 - cosine**2)[..., None]
     far = np.linalg.norm(np.einsum("eij,ejk->eik", along, normals), axis=2)
@@ -94,8 +101,8 @@ def _nearer_ends(vertices: np.ndarray, ends: np.ndarray, planes: np.ndarray) -> 
 
 
 def _to_planes(vertices: np.ndarray, rows: np.ndarray, planes: np.ndarray, farthest: np.ndarray) -> np.ndarray:
-    """(V, 3) least moves of vertices to planes, at most `farthest` (V,): of `rows` (N,) to their (N, 2, 4) planes, each
-    vertex as often as it occurs. Least squares, where planes disagree; directions that few of them know are left."""
+    """Return (V, 3) least-squares moves of vertices to planes, at most `farthest` (V,) long: of vertex `rows` (N,) to
+    their (N, 2, 4) planes; a vertex occurs once per edge. Directions with an eigenvalue up to CORNER are left out."""
     count = len(vertices)
     normals = planes[..., :3]
     behind = planes[..., 3] - np.einsum("njk,nk->nj", normals, vertices[rows])
@@ -110,13 +117,13 @@ def _to_planes(vertices: np.ndarray, rows: np.ndarray, planes: np.ndarray, farth
 
 
 def _sums(rows: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """(count, K) sums of (N, K) values by row."""
+    """Return (count, K) sums of (N, K) values by row."""
     return np.stack([np.bincount(rows, column, count) for column in values.T], axis=1)
 
 
 def _flipped(vertices: np.ndarray, faces: np.ndarray, on_crease: np.ndarray) -> np.ndarray:
-    """The (F, 3) faces, of which slivers along creases have given their longest edge for the other one between them and
-    their neighbour, where the least angle grows by it."""
+    """Return the (F, 3) faces, with the longest edge of slivers along creases flipped where this raises the least angle
+    of the sliver and its neighbour."""
     faces = faces.copy()
     slivers = np.flatnonzero(on_crease[faces].all(1) & (_least_angle(vertices[faces]) < np.radians(SLIVER)))
     near = np.zeros(len(vertices), bool)
@@ -147,7 +154,7 @@ def _flipped(vertices: np.ndarray, faces: np.ndarray, on_crease: np.ndarray) -> 
 
 
 def _least_angle(corners: np.ndarray) -> np.ndarray:
-    """(F,) least angles of (F, 3, 3) triangles, in radians."""
+    """Return the (F,) least angles of (F, 3, 3) triangles, in radians."""
     lengths = np.sort(np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2), axis=1)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     return np.arcsin(np.clip(area / np.maximum(lengths[:, 2] * lengths[:, 1], 1e-300), 0, 1))

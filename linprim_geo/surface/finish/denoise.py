@@ -1,9 +1,9 @@
-"""Smooths a surface where photographs have nothing against it.
+"""Smooths a surface within its predicted error, where the photographs do not contradict it.
 
-Photographs tell where a vertex is up to its predicted error; what the surface does within it is noise, and wrinkles in
-the shading. Normals of faces are averaged within flat parts, vertices follow them by no more than their predicted
-error, and then bend as little as that allows (`fairing`). They stay where they were where photographs agree less
-afterwards: on thin and strongly curved parts.
+The photographs fix the position of a vertex only up to its predicted error; deviations smaller than that are noise and
+show as wrinkles in the shading. Face normals are averaged within flat parts, vertices follow the normals by at most
+their predicted error, and the result is made as smooth as that bound allows (`fairing`). Vertices whose predicted error
+would grow, on thin and strongly curved parts, stay where they were.
 """
 
 from __future__ import annotations
@@ -20,20 +20,21 @@ from linprim_geo.surface.finish.fairing import faired
 from linprim_geo.surface.finish.photo_consistency import neighbour_average, predicted_error
 from linprim_geo.surface.normals import vertex_normals
 
-# Length of the difference of two unit normals: faces with 41 degrees or more between them are on two sides of an edge,
-# so that 45 degree chamfers stay.
+# Length of the difference of two unit normals from which on faces are not averaged with each other: 41 degrees, so that
+# 45 degree chamfers stay sharp.
 CONTRAST = 0.7
-# Rounds of averaging, and of moving vertices: as far as 30 rings of faces.
+# Rounds of averaging normals, and of moving vertices. Normals spread over at most 30 rings of faces.
 NORMAL_ROUNDS, VERTEX_ROUNDS = 30, 20
-# Rings of neighbours over which predicted errors are compared.
+# Rings of neighbours over which predicted errors are averaged before they are compared.
 RINGS = 2
 
 
 def denoised(mesh: Mesh, views: Sequence[View], gains: np.ndarray | None = None) -> Mesh:
-    """The mesh with vertices moved, and the predicted error of each as `quality`, in the mesh's unit.
+    """Return the mesh with smoothed vertices, new normals, and the predicted error of each vertex as `quality`, in the
+    mesh's unit.
 
-    Faces stay as they are, normals are made anew. Memory: some 600 bytes per vertex. The same to the last bit for any
-    number of threads.
+    Faces stay as they are. Where no photograph predicts an error, only the (NaN) `quality` is set. Memory: some 600
+    bytes per vertex. The result is identical to the last bit for any number of threads.
 
     Args:
         views: with photographs, that see the surface.
@@ -54,7 +55,7 @@ def denoised(mesh: Mesh, views: Sequence[View], gains: np.ndarray | None = None)
     for _ in range(RINGS):
         means, means_then = average @ means, average @ means_then
     share = (means_then <= means).astype(float)
-    for _ in range(RINGS):  # no steps between what is taken and what is not
+    for _ in range(RINGS):  # blend between smoothed and unchanged vertices without steps
         share = average @ share
     mesh = replace(
         mesh,
@@ -65,7 +66,8 @@ def denoised(mesh: Mesh, views: Sequence[View], gains: np.ndarray | None = None)
 
 
 def filtered(mesh: Mesh, bound: np.ndarray) -> np.ndarray:
-    """(V, 3) float64 vertices of a mesh whose normals are smoothed but for edges, each at most `bound` (V,) away."""
+    """Return the (V, 3) float64 vertices after edge-preserving smoothing of the face normals; each vertex moves at most
+    `bound` (V,)."""
     vertices = np.array(mesh.vertices, np.float64, order="C")
     corners, bound = np.ascontiguousarray(mesh.faces, np.int64), np.ascontiguousarray(bound, np.float64)
     surface_ops.filter_normals(corners, bound, CONTRAST, NORMAL_ROUNDS, VERTEX_ROUNDS, vertices)

@@ -1,8 +1,9 @@
-"""A surface that is as smooth as its predicted error allows.
+"""Makes a surface as smooth as its predicted error allows.
 
-Where depths are exact they decide. Where they are not, as on a column of one colour between two outlines, the fused
-surface is a crumpled sheet within its predicted error, and any smooth one in there is as likely, and nearer as a rule.
-One energy weighs both for all vertices at once:
+Where depths are exact they fix the surface. Where they are not, as on a column of one colour between two outlines, the
+fused surface is a crumpled sheet within its predicted error; any smooth surface within that error is as likely, and as
+a rule nearer to the true one. One energy weighs data and smoothness for all vertices x at once, with v the given
+positions:
 
     sum over vertices of  |x - v|^2 / error^2  +  |mean of x at the neighbours - x|^2 / bend^2
 """
@@ -21,19 +22,20 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 BEND = 0.1
-"""What a vertex may be off the mean of its neighbours, in edges, for the price of being off by its predicted error:
-that of a radius of curvature of five edges."""
+"""Distance of a vertex from the mean of its neighbours, in edge lengths, that costs as much as being off by its
+predicted error: that of a radius of curvature of five edges."""
 
 ROUNDS, PRECISION = 300, 1e-3
-"""Of conjugate gradients: most rounds, and what they leave of the right side."""
+"""Most iterations of conjugate gradients, and the relative residual at which they stop."""
 
 
 def faired(mesh: Mesh) -> Mesh:
-    """The mesh with vertices of the least energy, each at most its `quality` from where it was, and normals anew.
+    """Return the mesh with the vertices of least energy, each at most its `quality` from where it was, with new
+    normals.
 
-    A vertex on a border has its two neighbours along the border, and moves along its normal alone, so that holes do not
-    grow. Edges are weighed alike, as suits a surface of voxels; those of slivers pull too hard. Memory: some 500 bytes
-    per vertex. The same to the last bit for any number of threads.
+    A boundary vertex has only its two neighbours along the boundary, and moves only along its normal, so that holes do
+    not grow. All edges have equal weight, which suits meshes from voxels; the edges of slivers pull too hard. Memory:
+    some 500 bytes per vertex. The result is identical to the last bit for any number of threads.
 
     Args:
         mesh: with a positive `quality`, the predicted error in the mesh's unit.
@@ -51,7 +53,7 @@ def faired(mesh: Mesh) -> Mesh:
 
 
 def _least(mesh: Mesh, vertices: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(V, 3) moves to the least energy, and (V,) bool which vertices are on a border."""
+    """Return (V, 3) moves to the least energy, and (V,) bool: which vertices are on a boundary."""
     from scipy.sparse.linalg import LinearOperator, cg
 
     bending, border = _off_the_mean(mesh)
@@ -74,13 +76,16 @@ def _least(mesh: Mesh, vertices: np.ndarray, error: np.ndarray) -> tuple[np.ndar
 
 
 def _off_the_mean(mesh: Mesh) -> tuple[csr_matrix, np.ndarray]:
-    """(V, V) that takes the mean of the neighbours of a vertex less its own value, of those along the border for one on
-    a border, nothing for one where borders meet; (V,) bool which are on a border."""
+    """Return the (V, V) matrix of the mean of a vertex's neighbours less its own value, and (V,) bool: which vertices
+    are on a boundary.
+
+    A boundary vertex has only its neighbours along the boundary. Where boundaries meet in a vertex its row is zero.
+    """
     from scipy.sparse import coo_matrix, diags
 
     first, second = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
     ends, count = (np.concatenate([first, second]), np.concatenate([second, first])), len(mesh.vertices)
-    faces = coo_matrix((np.ones(len(ends[0])), ends), shape=(count, count)).tocsr()  # at each edge
+    faces = coo_matrix((np.ones(len(ends[0])), ends), shape=(count, count)).tocsr()  # number of faces at each edge
     row = np.repeat(np.arange(count), np.diff(faces.indptr))
     along = faces.data == 1
     border = np.bincount(row[along], minlength=count) > 0

@@ -1,7 +1,8 @@
-"""Finishing of extracted meshes: close holes, smooth, remesh, simplify, with what each does to the topology.
+"""Finishes extracted meshes: closes holes, smooths, remeshes and simplifies, and records what each step does to the
+topology.
 
-PyMeshLab does the work, but for simplification within a tolerance, of which no library bounds the error. It is under
-the GPL, so it is imported where a mesh is finished and nowhere else.
+PyMeshLab does the work, except for simplification within a tolerance, whose error no library bounds. PyMeshLab is
+under the GPL, so it is imported only where a mesh is finished.
 """
 
 from __future__ import annotations
@@ -18,31 +19,32 @@ from linprim_geo.geometry.topology import manifold_status, topology
 from linprim_geo.kernels import surface_ops
 from linprim_geo.surface.normals import vertex_normals
 
-# Taubin's own two factors. A sphere of 2,000 vertices grows by 0.17 % of its volume in 10 iterations, one of 66 shrinks
-# by 1.4 %.
+# Taubin's own two factors. A sphere of 2,000 vertices grows by 0.17 % of its volume in 10 iterations, one of 66
+# vertices shrinks by 1.4 %.
 TAUBIN = {"lambda_": 0.33, "mu": -0.34}
 REMESH_ROUNDS = 5
-# Angle in degrees from which an edge is a feature that remeshing keeps, as MeshLab has it.
+# Dihedral angle in degrees from which remeshing keeps an edge as a feature, as in MeshLab.
 FEATURE_DEGREES = 30.0
 # A remeshing that would give more faces than this is refused.
 MOST_FACES = 20_000_000
 FEWEST_FACES = 4
-# Tolerance `auto`, as a share of predicted errors: added as independent errors are, it makes 1.12 of them.
+# Tolerance `auto`, as a share of the predicted errors. Added as independent errors, the total is 1.12 times the
+# predicted error.
 SHARE_OF_ERROR = 0.5
 
 
 def process_mesh(mesh: Mesh, options, note: Callable[[str], None] | None = None) -> tuple[Mesh, list[dict]]:
-    """Applies what the options ask for in this order: `close_holes`, `smooth`, `remesh`, `tolerance`, `target_faces`; 0
-    is off for each, and `close_holes` auto has been done before.
+    """Apply the steps that the options ask for, in this order: `close_holes`, `smooth`, `remesh`, `tolerance`,
+    `target_faces`. 0 turns a step off; `close_holes` auto has been done before.
 
     Args:
         options: has these five attributes, as `ExtractOptions`.
         note: called with one line per step.
     Returns:
         The mesh and one entry per step, as `stats.json` holds them: `step`, its parameter, `faces_before`,
-        `faces_after`, `boundary_edges`, `non_manifold_edges`, `watertight` (of the result), `topology_kept` (as many
-        components, as many edges with too many faces and the same Euler characteristic as before; closing holes changes
-        the latter on purpose) and, where something was not done or was done another way, `note`.
+        `faces_after`, `boundary_edges`, `non_manifold_edges`, `watertight` (of the result), `topology_kept` (same
+        number of components, of edges with too many faces, and same Euler characteristic as before; closing holes
+        changes the latter on purpose) and, where a step was not done or done differently, `note`.
     Raises:
         LinprimError: an empty mesh, coordinates that are not finite, or a parameter that no mesh can be made with.
     """
@@ -90,11 +92,11 @@ def process_mesh(mesh: Mesh, options, note: Callable[[str], None] | None = None)
 
 
 def simplify(mesh: Mesh, target_faces: int) -> Mesh:
-    """Collapses edges by quadric error until `target_faces` are left; flat parts lose their faces first.
+    """Collapse edges by quadric error until `target_faces` are left; flat parts lose their faces first.
 
     The topology and every boundary edge stay, so more faces can be left than asked for (close holes before); a closed
-    mesh stays closed. Colours and quality are those of the nearest points of the old surface. With as few faces as that
-    already, the mesh itself comes back.
+    mesh stays closed. Colours and quality are taken from the nearest points of the old surface. If the mesh has no more
+    than that many faces, it is returned unchanged.
 
     Raises:
         LinprimError: an empty mesh, coordinates that are not finite, or fewer than 4 faces wanted.
@@ -104,12 +106,12 @@ def simplify(mesh: Mesh, target_faces: int) -> Mesh:
 
 
 def within_tolerance(mesh: Mesh, tolerance: float | str) -> Mesh:
-    """Fewer faces, which pass each vertex of the mesh no farther away than `tolerance`, in its unit, or `auto`:
-    SHARE_OF_ERROR of its predicted error (`quality`; the median where it is not known).
+    """Simplify the mesh so that each old vertex is at most `tolerance` from the new surface, in its unit, or with
+    `auto` at most SHARE_OF_ERROR of its predicted error (`quality`; the median where it is unknown).
 
-    Flat parts lose most of their faces, curved ones as many as the tolerance allows. The topology stays, and borders
-    keep within the tolerance, too. Colours and quality are those of the nearest points of the old surface. Memory: some
-    600 bytes per vertex. The same to the last bit every time.
+    Flat parts lose most of their faces, curved ones as many as the tolerance allows. The topology stays, and boundaries
+    keep within the tolerance, too. Colours and quality are taken from the nearest points of the old surface. Memory:
+    some 600 bytes per vertex. The result is identical to the last bit every time.
 
     Raises:
         LinprimError: an empty mesh, coordinates that are not finite, a tolerance that is not positive, or `auto` of a
@@ -120,7 +122,8 @@ def within_tolerance(mesh: Mesh, tolerance: float | str) -> Mesh:
 
 
 def smooth(mesh: Mesh, iterations: int) -> Mesh:
-    """Moves vertices to where their neighbours are and back by a little more, so that noise goes and the volume stays.
+    """Smooth the mesh by Taubin's method: move vertices towards the mean of their neighbours, and back by slightly
+    more, which removes noise and keeps the volume.
 
     Faces, colours and quality stay.
 
@@ -132,7 +135,7 @@ def smooth(mesh: Mesh, iterations: int) -> Mesh:
 
 
 def close_holes(mesh: Mesh, max_edges: int) -> Mesh:
-    """Fills every hole whose boundary has at most `max_edges` edges with triangles between its vertices.
+    """Fill every hole whose boundary has at most `max_edges` edges with triangles between its vertices.
 
     Raises:
         LinprimError: an empty mesh, coordinates that are not finite, or a negative number.
@@ -141,10 +144,11 @@ def close_holes(mesh: Mesh, max_edges: int) -> Mesh:
 
 
 def remesh(mesh: Mesh, edge_length: float) -> Mesh:
-    """Even triangles with edges of about `edge_length`, on the same surface; creases of more than 30 degrees stay.
+    """Remesh the same surface with even triangles whose edges are about `edge_length` long; creases of more than 30
+    degrees stay.
 
-    Colours and quality are those of the nearest points of the old surface. A closed mesh stays closed: where remeshing
-    would break it, the mesh itself comes back.
+    Colours and quality are taken from the nearest points of the old surface. A closed mesh stays closed: where
+    remeshing would open it, the mesh is returned unchanged.
 
     Raises:
         LinprimError: an empty mesh, coordinates that are not finite, or a length that gives no faces or millions of
@@ -221,10 +225,10 @@ def _close_holes(mesh: Mesh, max_edges: int) -> tuple[Mesh, str | None]:
     if max_edges == 0 or shape["boundary_edges"] == 0:
         return mesh, "there are no holes" if max_edges else None
     faces, left = mesh.faces, 0
-    # Faces that would cross others are not made in the first round, which leaves some holes open.
+    # The first round refuses self-intersecting patches, which leaves some holes open; the second accepts them.
     for refuse in (True, False):
-        # PyMeshLab takes no edges of three faces, so faces come apart there; what would close those cuts is not sound.
-        # It fills holes of fewer edges than it is told.
+        # PyMeshLab refuses edges of three faces, so the mesh is cut apart there; patches that would close those cuts
+        # are dropped as not sound. It fills holes with fewer edges than `maxholesize`.
         vertex, fans = _cut_apart(faces)
         cut = Mesh(mesh.vertices[vertex], fans)
         if topology(cut)["non_manifold_edges"]:
@@ -243,7 +247,7 @@ def _close_holes(mesh: Mesh, max_edges: int) -> tuple[Mesh, str | None]:
 
 
 def _cut_apart(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gives every fan (faces around a vertex, joined by edges of two faces) a vertex of its own.
+    """Give every fan (faces around a vertex, joined by edges of two faces) a vertex of its own.
 
     Returns the old vertex of each new one, and the faces (F, 3) with new vertices.
     """
@@ -262,8 +266,8 @@ def _cut_apart(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def paired_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges of faces (F, 3) that exactly two faces share, running along it in opposite directions: (E,) and (E,)
-    numbers 3f+k of the edge of face f from its corner k to the next."""
+    """Find the edges of faces (F, 3) that exactly two faces share, in opposite directions: (E,) and (E,) numbers 3f+k
+    of the edge of face f from its corner k to the next."""
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     low, high = np.minimum(start, end), np.maximum(start, end)
     order = np.lexsort((high, low))
@@ -277,14 +281,15 @@ def paired_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sound_patches(faces: np.ndarray, added: np.ndarray) -> np.ndarray:
-    """Which of the `added` faces (N, 3) are in a patch that has no edge of more than two faces."""
+    """Return (N,) bool: which of the `added` faces (N, 3) are in a patch without an edge of more than two faces."""
     bad = has_crowded_edge(faces, added)
     _, patch = face_components(Mesh(np.zeros((int(added.max(initial=-1)) + 1, 3)), added))
     return ~np.isin(patch, patch[bad])
 
 
 def has_crowded_edge(faces: np.ndarray, added: np.ndarray) -> np.ndarray:
-    """Which of the `added` faces (N, 3) have an edge that more than two faces of (F, 3) and these share."""
+    """Return (N,) bool: which of the `added` faces (N, 3) have an edge that more than two faces share, of (F, 3)
+    `faces` and the added ones together."""
     count = int(max(faces.max(), added.max(initial=0))) + 1
     ends = np.sort(np.concatenate([faces, added])[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     _, edge, uses = np.unique(ends[:, 0] * np.int64(count) + ends[:, 1], return_inverse=True, return_counts=True)
@@ -322,7 +327,7 @@ def _remesh(mesh: Mesh, length: float) -> tuple[Mesh, str | None]:
 
 
 def _check(mesh: Mesh) -> None:
-    """What pymeshlab or igl would crash on."""
+    """Raise LinprimError for meshes that pymeshlab or igl would crash on."""
     if len(mesh.vertices) == 0 or len(mesh.faces) == 0:
         raise LinprimError(
             f"the mesh is empty ({len(mesh.vertices)} vertices, {len(mesh.faces)} faces), wanted a surface to finish"
@@ -339,7 +344,8 @@ def _check(mesh: Mesh) -> None:
 
 
 def _filtered(mesh: Mesh, name: str, **parameters) -> Mesh:
-    """Vertices and faces of the mesh after one filter; the filter sees it at the origin, with a diagonal of 1."""
+    """Return vertices and faces of the mesh after one filter, to which the mesh is given centred at the origin with a
+    diagonal of 1."""
     import pymeshlab
 
     center, scale = mesh.bounds.mean(0), mesh.diagonal
@@ -354,8 +360,8 @@ def _filtered(mesh: Mesh, name: str, **parameters) -> Mesh:
 
 
 def _decimated(mesh: Mesh, target: int) -> Mesh:
-    """libigl's simplification, which only takes closed meshes (or edge-manifold ones) and collapses no edge that would
-    open them."""
+    """Simplify with libigl, which takes only closed (or edge-manifold) meshes and collapses no edge that would open
+    them."""
     import igl
 
     center, scale = mesh.bounds.mean(0), mesh.diagonal
@@ -365,8 +371,8 @@ def _decimated(mesh: Mesh, target: int) -> Mesh:
 
 
 def _with_attributes(made: Mesh, source: Mesh) -> Mesh:
-    """`made` with the colours and quality of `source` at the nearest points of its surface, and normals if that has
-    them."""
+    """Return `made` with the colours and quality of the nearest points of `source`, and with normals if
+    that has them."""
     colors = quality = None
     if source.colors is not None or source.quality is not None:
         corners, weights = _nearest(source, made.vertices)
@@ -380,8 +386,8 @@ def _with_attributes(made: Mesh, source: Mesh) -> Mesh:
 
 
 def _nearest(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (P, 3) of the faces nearest to points (P, 3), and the (P, 3) barycentric weights of the nearest points in
-    them."""
+    """Return the corners (P, 3) of the faces nearest to points (P, 3), and the (P, 3) barycentric weights of the
+    nearest points in them."""
     import igl
 
     from linprim_geo.geometry.mesh import barycentric
@@ -402,7 +408,7 @@ def _is_closed(mesh: Mesh) -> bool:
 
 
 def _shape(mesh: Mesh) -> dict:
-    """`topology` and the Euler characteristic."""
+    """Return `topology` with the Euler characteristic as `euler`."""
     shape = topology(mesh)
     ends = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     edges = len(np.unique(ends[:, 0] * np.int64(len(mesh.vertices)) + ends[:, 1]))

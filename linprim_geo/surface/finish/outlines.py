@@ -1,9 +1,9 @@
-"""Puts the outlines of a mesh where masks show them.
+"""Moves the outlines of a mesh to where masks show them.
 
-Photographs agree best a little inside of an outline, as each pixel on it mixes what both sides show: the outlines of a
-surface that they refined are too far inside, those of the built-in part by 0.15 pixels. A mask whose pixels say what
-share of them an object covers tells where its outline is to a fraction of a pixel: along a line across it, the shares
-add up to how far the object reaches.
+A pixel on an outline mixes foreground and background, so photographs agree best slightly inside of it: vertices that
+they have refined lie too far inside, by 0.15 pixels on the built-in part. A mask whose pixels hold the share that the
+object covers locates the outline to a fraction of a pixel: summed along a line across it, the shares give how far the
+object reaches. Only vertices on an outline move, and their neighbours.
 """
 
 from __future__ import annotations
@@ -22,44 +22,47 @@ from linprim_geo.surface.finish.safe_moves import moved_safely
 from linprim_geo.surface.mesh_views import MeshViews
 
 REACH, STEP = 2.0, 0.25
-"""Pixels: how far on both sides an outline is looked for, and the spacing of samples. What is narrower than REACH has
-another outline there, and is left."""
+"""Pixels: how far on both sides an outline is searched for, and the spacing of samples. Parts narrower than REACH have
+a second outline within it, and are left alone."""
 
 NEAR = 0.5
-"""Pixels that the mesh ends from its vertex, at most, if that is on the outline."""
+"""Pixels: a vertex is on the outline if the mesh, as it is drawn, ends at most this far from it."""
 
 BLUR, STEEPEST = 1.0, 0.4
-"""Pixels over which a mask is averaged where its direction is taken, and the slope that a straight outline has then:
-the largest of a normal distribution. One with less than half of it is no outline, or bends within a pixel."""
+"""Standard deviation in pixels of the Gaussian filter with which the mask's gradient is taken, and the slope of a
+straight outline after a filter of 1 pixel: the peak of a normal density. A slope below half of it is no outline, or one
+that bends within a pixel."""
 
 UNEVEN = 0.05
-"""Shares are 1 and 0 at the ends, and fall in between, up to this."""
+"""Tolerance on coverage: it has to be 1 at the inner end, 0 at the outer end, and may rise by no more than this in
+between."""
 
 PARTLY = 0.5
-"""Of a mask that tells shares, as many pixels are covered partly as neighbours differ in whether half of them is: an
-outline covers each pixel that it runs through partly. From this part of them on it is one; one of only 0 and 255 has
-none."""
+"""Least number of partly covered pixels, as a share of the neighbouring pixel pairs of which one is at least half
+covered and the other is not, for a mask to hold coverage: an outline partly covers every pixel that it runs through. A
+mask of only 0 and 255 has no such pixels."""
 
 SAMPLES = 3
-"""Rays along each side of a pixel that say what share of it the mesh covers."""
+"""Rays along each side of a pixel with which the mesh's coverage of the pixel is sampled."""
 
 BEFORE = 1.5
-"""So many pixels inside of an outline the mesh is as far away as its vertex there, up to how far a sphere falls off
-that the mesh fits into. Else something else ends before or behind it."""
+"""Pixels inside of an outline at which the depth of the mesh is checked. It may differ from that of the vertex by what
+a sphere as large as the mesh's diagonal falls off there; if it differs by more, the outline is that of something else
+in front or behind."""
 
 PRIOR_VIEWS, RINGS, ROUNDS = 1.0, 1, 2
-"""So many views say that a vertex is where it is, over so many rings of neighbours moves are averaged, and so often
-vertices move."""
+"""Weight of the present position of a vertex, in views; rings of neighbours over which moves are averaged; and how
+often vertices move."""
 
 
 def moved_to_outlines(mesh: Mesh, views: Sequence[View]) -> Mesh:
-    """The mesh with the vertices on its outlines moved across these to where masks show them, by least squares over
-    the views, ROUNDS times; normals are made anew.
+    """Return the mesh with the vertices on its outlines moved across these to the outlines of the masks, by least
+    squares over the views, ROUNDS times, with new normals.
 
-    Vertices go back where the surface would go through itself. Views without a mask, or whose mask does not tell shares
-    of pixels, have no say. Memory: some 400 bytes per vertex. The same to the last bit for any number of threads.
-    Accuracy: the vertices on the outlines of a ball that is 0.3 pixels too small before 16 cameras are off by 0.15
-    pixels in the mean afterwards (tests/surface/finish/test_outlines.py).
+    Vertices go back where the surface would intersect itself. Views without a mask, or whose mask holds no coverage
+    (PARTLY), are ignored. Memory: some 400 bytes per vertex. The result is identical to the last bit for any number of
+    threads. Accuracy: the vertices on the outlines of a ball that is 0.3 pixels too small before 16 cameras are off by
+    0.15 pixels in the mean afterwards (tests/surface/finish/test_outlines.py).
     """
     if len(mesh.faces) == 0 or not views or views[0].load().alpha is None:  # all views have masks, or none has
         return mesh
@@ -72,7 +75,7 @@ def moved_to_outlines(mesh: Mesh, views: Sequence[View]) -> Mesh:
 
 
 def _tells_shares(view: View) -> bool:
-    """Whether a view has a mask whose outlines run through pixels, see PARTLY."""
+    """Return whether a view has a mask whose pixels hold coverage, see PARTLY."""
     if (alpha := view.load().alpha) is None:
         return False
     half = alpha >= 128
@@ -81,7 +84,7 @@ def _tells_shares(view: View) -> bool:
 
 
 def _moves(mesh: Mesh, views: Sequence[View]) -> np.ndarray:
-    """(V, 3) moves of the vertices, 0 of those that are on no outline nor beside one that is."""
+    """Return (V, 3) moves of the vertices, 0 for those neither on an outline nor beside one that is."""
     from scipy.sparse import csr_matrix
 
     count, faces, vertices = len(mesh.vertices), mesh.faces, mesh.vertices.astype(np.float64)
@@ -90,7 +93,8 @@ def _moves(mesh: Mesh, views: Sequence[View]) -> np.ndarray:
     heights = np.einsum("fk,fk->f", normals, corners[:, 0])
     rows, columns = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
     faces_of = csr_matrix((np.ones(len(rows), np.int32), (rows, columns)), (count, len(faces)))
-    # Of each vertex the sums over the views of o o^T and of o s: the outline lies s further in the direction o.
+    # Normal equations per vertex, summed over the views: o o^T and o s, where the outline lies s further in direction
+    # o.
     squares, sums = np.zeros((count, 9)), np.zeros((count, 3))
     for view in views:
         camera = view.camera
@@ -119,15 +123,15 @@ def _moves(mesh: Mesh, views: Sequence[View]) -> np.ndarray:
 
 
 def _shares(view: View) -> np.ndarray:
-    """(H, W) float32 share of each pixel that the mask of a view covers."""
+    """Return (H, W) float32: the share of each pixel that the mask of a view covers."""
     alpha = view.load().alpha
     assert alpha is not None
     return alpha / np.float32(255)
 
 
 def _covered(camera: Camera, caster: MeshViews) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(H, W) float32 share of each pixel that a mesh covers, by SAMPLES squared rays where an outline is near, its
-    depth at pixel centres, and bool: where an outline is near."""
+    """Return (H, W) float32 coverage of each pixel by the mesh (by SAMPLES squared rays near outlines), its depth at
+    pixel centres, and bool: where an outline is near."""
     depths, face = caster.first_hits(camera)
     hit = face >= 0
     mixed = maximum_filter(hit, 3) & ~minimum_filter(hit, 3)
@@ -145,9 +149,11 @@ def _covered(camera: Camera, caster: MeshViews) -> tuple[np.ndarray, np.ndarray,
 def _outlines_ahead(
     shares: np.ndarray, covered: np.ndarray, depths: np.ndarray, pixels: np.ndarray, depth: np.ndarray, fall: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of vertices at (P, 2) `pixels` and (P,) `depth`: (P,) bool which are on an outline both of the mesh and of the
-    mask; of the N of these the (N, 2) unit directions across it, outwards, and by how many pixels the mask's is further
-    out than the mesh's."""
+    """Compare the outlines of mesh and mask at vertices at (P, 2) `pixels` with (P,) `depth`.
+
+    Returns: (P,) bool, which vertices are on an outline of both; for these N the (N, 2) unit directions across the
+        outline, outwards, and by how many pixels the mask's outline lies further out than the mesh's.
+    """
     told = np.zeros(len(pixels), bool)
     slopes = -np.stack(np.gradient(gaussian_filter(shares, BLUR))[::-1], axis=-1)
     slope = sample_bilinear(slopes, pixels)
@@ -168,6 +174,7 @@ def _outlines_ahead(
 
 
 def _ends(profile: np.ndarray) -> np.ndarray:
-    """(N,) bool: whether shares are 1 at the first of (N, K) places and 0 at the last, and fall in between."""
+    """Return (N,) bool: whether coverage is 1 at the first of (N, K) places, 0 at the last, and does not rise in
+    between."""
     rises = np.maximum(np.diff(profile, axis=1), 0).sum(1)
     return (profile[:, 0] > 1 - UNEVEN) & (profile[:, -1] < UNEVEN) & (rises < UNEVEN)

@@ -1,8 +1,8 @@
-"""Where along its normal each vertex of a mesh agrees best with the photographs: how far it is probably off, and a mesh
-that is nearer.
+"""Measures how well photographs agree along the normal of each vertex: predicts its error, and refines its position.
 
-A vertex is moved along its normal, and the photographs that see it are compared at each place. Where the surface really
-is they show the same colour; before or behind it each shows another place. No reference is looked at.
+Every vertex is moved along its normal, and the brightness of the photographs that see it is compared at each offset. On
+the true surface they show the same colour; in front of it or behind it each shows a different point. Only the
+photographs are used, no reference surface.
 """
 
 from __future__ import annotations
@@ -26,60 +26,62 @@ if TYPE_CHECKING:
 
 
 OFFSETS = np.arange(-3.0, 3.5, 0.5)
-"""Places along the normal at which photographs are compared, in footprints: what a pixel of the nearest view covers."""
+"""Offsets along the normal at which photographs are compared, in footprints: the size of a pixel of the nearest view on
+the surface."""
 
 LEAST_COSINE = 0.15
-"""Views flatter than this (81 degrees) onto a vertex are not asked."""
+"""Views that see a vertex at a flatter angle than this cosine (81 degrees) are ignored."""
 
 OUTLINE_SLOPES = 4.0
-"""Nor those in which it lies on an outline, whose colours are mixtures: where the depth jumps by more than this many
-times what the slope of the surface explains."""
+"""Views are also ignored where the vertex lies on an outline, whose colours are mixtures: where the depth jumps by more
+than this many times what the slope of the surface explains."""
 
 LARGEST_FOOTPRINT = 4.0
-"""Footprints above so many medians count as these."""
+"""Upper limit of footprints, in medians of all footprints; larger ones are clamped to it."""
 
 SMOOTHING = 2
-"""Rings of neighbours over which moves are averaged, weighted by how clearly the photographs speak."""
+"""Rings of neighbours over which moves are averaged, weighted by sharpness (`Agreement`)."""
 
 GAIN_POINTS, GAIN_ROUNDS, DARKEST = 20_000, 10, 0.03
-"""Vertices that exposures are told from, rounds of medians that do, and the brightness below which a vertex says
-nothing."""
+"""Most vertices from which exposures are estimated, rounds of medians that estimate them, and the brightness (of white)
+below which a vertex is ignored."""
 
 LEAST_SHARPNESS = 0.002
-"""Where the disagreement of the photographs rises by less than this, of white, beside its least, vertices hardly
-move."""
+"""Sharpness (`Agreement`), as a share of white, below which vertices hardly move: it is added to the weight that moves
+are divided by."""
 
 DENSE_OFFSETS, FINEST_OFFSET = np.arange(-3.0, 3.25, 0.25), 1 / 16
-"""Of the predicted error: places at which photographs are compared, and the spacing to which these are interpolated, in
-footprints."""
+"""For the predicted error: offsets at which photographs are compared, and the spacing to which these are interpolated,
+in footprints."""
 
 LEAST_DEVIATION = 0.5 / (255 * np.sqrt(12))
-"""Disagreement that is always there, of white: half of what rounding brightness to 255 steps causes."""
+"""Standard deviation of brightness that is always present, as a share of white: half of that of rounding to
+255 steps."""
 
 INDEPENDENT_PHOTOS = 4
-"""Photographs of a vertex count as so many independent ones. There are more, but neighbouring views err alike, and
-refinement has put vertices where photographs agree, right or wrong. Chosen by how large the true errors of four
-surfaces were (DECISIONS 103)."""
+"""The photographs of a vertex count as this many independent ones. There are more, but neighbouring views have
+correlated errors, and refinement has put vertices where photographs agree, right or wrong. Chosen by the true errors of
+four surfaces (DECISIONS 103)."""
 
 PRIOR_SCALE, PRIOR_ROUNDS = 1.0, 2
-"""Mean distance of vertices from the surface before photographs are asked, in footprints, and how often they are: from
-the second time on the mean is that of the time before."""
+"""Scale of the prior on a vertex's distance from the surface: its mean in footprints in the first round, and the number
+of rounds. Later rounds use the mean distance that the round before has found."""
 
 NEIGHBOURS = 64
-"""Vertices that photographs do not tell of take the mean of so many nearest ones that they do."""
+"""A vertex whose error cannot be measured takes the mean of this many nearest vertices whose error can."""
 
 ROWS_AT_ONCE = 2**14
-"""Vertices whose distances are weighed at once, to limit memory."""
+"""Vertices that are processed at a time, to limit memory."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """What photographs say of the (V,) vertices of a mesh.
+    """How well the photographs agree at the (V,) vertices of a mesh.
 
-    `offset` is the signed distance along the (V, 3) `normals`, in the unit of the mesh, to where they agree best;
-    `sharpness` how much their disagreement rises within a footprint on either side of it, as a share of white: 0 for a
-    plain surface; `seen_by_two` whether at least two of them see a vertex well, `inside` whether the best place lies
-    within the OFFSETS and not at their end.
+    `offset` is the signed distance along the (V, 3) `normals`, in the unit of the mesh, to the offset of best
+    agreement. `sharpness` is the rise of their disagreement within a footprint on either side of it, as a share of
+    white: 0 for a surface without texture. `seen_by_two` says whether at least two of them see a vertex well, `inside`
+    whether the best offset lies within OFFSETS and not at their end.
     """
 
     normals: np.ndarray
@@ -96,11 +98,11 @@ def best_agreement(
     gains: np.ndarray | None = None,
     caster: MeshViews | None = None,
 ) -> Agreement:
-    """Compares photographs along the normal of every vertex.
+    """Compare the photographs along the normal of every vertex.
 
-    The disagreement at a place is the standard deviation of brightness over the photographs, weighted by the cosine of
-    the angle under which they see the vertex; a parabola through the least and its two neighbours gives the best place.
-    Memory: some 150 bytes per vertex. The same to the last bit for any number of threads.
+    The disagreement at an offset is the standard deviation of brightness over the photographs, weighted by the cosine
+    of the viewing angle. A parabola through its least value and the two neighbours gives the best offset. Memory: some
+    150 bytes per vertex. The result is identical to the last bit for any number of threads.
 
     Args:
         mesh: not empty.
@@ -119,13 +121,13 @@ def best_agreement(
 def photo_gains(
     mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo], caster: MeshViews | None = None
 ) -> np.ndarray:
-    """(K,) float64 brightness of each photograph relative to the others, of geometric mean 1, by what they show of the
-    same vertices.
+    """Estimate the (K,) float64 brightness of each photograph relative to the others, with geometric mean 1, from the
+    vertices that they share.
 
-    Medians over the vertices of a photograph and over the photographs of a vertex in turn, so highlights and places
-    where the mesh is wrong do not count. 1 for a photograph that shares no vertex with others. Of GAIN_POINTS vertices,
-    evenly over their order. Memory: 12 bytes per photograph and such vertex. `caster`: of the mesh, if there is one
-    already.
+    Medians over the vertices of a photograph and over the photographs of a vertex are taken in turn, so that highlights
+    and wrong parts of the mesh do not count. A photograph that shares no vertex with others gets 1. Uses at most
+    GAIN_POINTS vertices, evenly spaced in their order. Memory: 12 bytes per photograph and such vertex. `caster`: of
+    the mesh, if there is one already.
     """
     points, normals = (array[:: -(-len(array) // GAIN_POINTS)] for array in _points(mesh))
     points, normals = np.ascontiguousarray(points), np.ascontiguousarray(normals)
@@ -159,17 +161,17 @@ def predicted_error(
     gains: np.ndarray | None = None,
     caster: MeshViews | None = None,
 ) -> np.ndarray:
-    """(V,) float32 predicted distance of each vertex from the true surface, in the mesh's unit; arguments as of
+    """Predict the (V,) float32 distance of each vertex from the true surface, in the mesh's unit; arguments as of
     `best_agreement`.
 
-    It is the expected distance along the normal to where the surface is, given the photographs. At a wrong place their
+    It is the expected distance along the normal to the surface, given the photographs. At a wrong offset their
     brightness has the variance v that is measured, at the right one the least; m photographs of unknown brightness and
-    variance make a place as likely as v^(-m/2) (Jeffreys' prior), here with m = INDEPENDENT_PHOTOS. Distances are
-    expected to fall off exponentially, at first with PRIOR_SCALE, then with the mean that comes out. So a vertex is
-    uncertain where photographs agree elsewhere, where they agree in many places, and where nothing agrees. One that is
-    not known takes the mean of the nearest NEIGHBOURS that are; where none is, all are NaN. Memory: some 600 bytes per
-    vertex. The same to the last bit for any number of threads. Accuracy: `python -m linprim_geo.eval.studies.surfaces`
-    prints its rank correlation with the exact error, and the ratio of their means.
+    variance give an offset the likelihood v^(-m/2) (Jeffreys' prior), here with m = INDEPENDENT_PHOTOS. The prior on
+    the distance is exponential, at first with PRIOR_SCALE, then with the mean that results. So a vertex is uncertain
+    where photographs agree at another offset, at many offsets, or at none. A vertex that fewer than two photographs see
+    well takes the mean of the NEIGHBOURS nearest ones that two do see; if there are none, all are NaN. Memory: some 600
+    bytes per vertex. The result is identical to the last bit for any number of threads. Accuracy: `python -m
+    linprim_geo.eval.studies.surfaces` prints its rank correlation with the exact error, and the ratio of their means.
     """
     from scipy.spatial import cKDTree
 
@@ -194,11 +196,11 @@ def predicted_error(
 def refine_surface(
     mesh: Mesh, views: Sequence[View], rounds: int, gains: np.ndarray | None = None, caster: MeshViews | None = None
 ) -> Mesh:
-    """Moves vertices to where the photographs agree best, `rounds` times; faces stay as they are, normals are made
-    anew.
+    """Move vertices to where the photographs agree best, `rounds` times. Faces stay as they are, normals are
+    recomputed.
 
-    Moves are averaged over neighbours and fade out where the photographs say nothing. Colours and quality are kept as
-    they are. `caster`: of the mesh as it is given, if there is one already.
+    Moves are averaged over neighbours and fade out where the photographs do not locate the surface. Colours and quality
+    are kept. `caster`: of the given mesh, if there is one already.
     """
     cameras, average = [view.camera for view in views], neighbour_average(mesh)
     for _ in range(rounds):
@@ -221,9 +223,11 @@ def _compared(
     caster: MeshViews | None,
     places: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(V, 3) normals, (V,) whether at least two photographs see a vertex well, (V,) footprints, and of the P vertices
-    that they do see the (P, K) variance of brightness over them at each of K places along the normal, weighted by
-    cosines. Arguments as of `best_agreement`."""
+    """Compare the photographs at each of K offsets `places` along the normals. Arguments as of `best_agreement`.
+
+    Returns: (V, 3) normals; (V,) whether at least two photographs see a vertex well; (V,) footprints; and for the P
+        vertices that two do see the (P, K) variance of brightness over the photographs, weighted by cosines.
+    """
     points, normals = _points(mesh)
     footprint, count = _footprints(points, normals, cameras), len(points)
     views, weight = np.zeros(count, np.int32), np.zeros(count, np.float32)
@@ -256,8 +260,8 @@ def _compared(
 
 
 def _expected_distance(variance: np.ndarray, scale: float) -> np.ndarray:
-    """(P,) expected distance from the surface, in footprints, given (P, K) variances at DENSE_OFFSETS and that of all
-    vertices, `scale`."""
+    """Return the (P,) expected distance from the surface, in footprints, given (P, K) variances at DENSE_OFFSETS and
+    the mean distance `scale` of the prior."""
     from scipy.interpolate import CubicSpline
 
     places = np.arange(DENSE_OFFSETS[0], DENSE_OFFSETS[-1] + FINEST_OFFSET / 2, FINEST_OFFSET)
@@ -274,7 +278,7 @@ def _expected_distance(variance: np.ndarray, scale: float) -> np.ndarray:
 
 
 def _neighbours(mesh: Mesh) -> csr_matrix:
-    """(V, V) 1 where two vertices share an edge, and on the diagonal."""
+    """Return the (V, V) matrix with 1 where two vertices share an edge, and on the diagonal."""
     from scipy.sparse import coo_matrix, identity
 
     first, second = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
@@ -285,7 +289,7 @@ def _neighbours(mesh: Mesh) -> csr_matrix:
 
 
 def neighbour_average(mesh: Mesh) -> csr_matrix:
-    """(V, V) that takes the mean over a vertex and its neighbours."""
+    """Return the (V, V) matrix that takes the mean over a vertex and its neighbours."""
     from scipy.sparse import diags
 
     graph = _neighbours(mesh)
@@ -293,9 +297,9 @@ def neighbour_average(mesh: Mesh) -> csr_matrix:
 
 
 def _points(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """(V, 3) float64 vertices, and the unit normals along which they are swept: the mean by area over the faces of a
-    vertex and of its neighbours. Those of a vertex alone are noise where faces are slivers, as on a union of
-    polyhedra."""
+    """Return the (V, 3) float64 vertices and the unit normals along which they are moved: the area-weighted mean over
+    the faces of a vertex and of its neighbours. The normal of a vertex's own faces alone is noisy where these are
+    slivers, as on a union of polyhedra."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     own = np.stack(
@@ -309,8 +313,8 @@ def _points(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 def _photographed(
     mesh: Mesh, cameras: Sequence[Camera], photos: Iterable[Photo], caster: MeshViews | None
 ) -> Iterator[tuple]:
-    """Of each view the camera, the (H, W) brightness of its photograph, depth of the mesh, and largest less least depth
-    of 3x3 pixels."""
+    """Yield for each view the camera, the (H, W) brightness of its photograph, the depth of the mesh, and the
+    difference of the largest and least depth of 3x3 pixels."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     caster = caster or MeshViews(mesh.vertices, mesh.faces)
@@ -321,7 +325,8 @@ def _photographed(
 
 
 def _footprints(points: np.ndarray, normals: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """(V,) what a pixel of the nearest view that a vertex faces covers there, at most LARGEST_FOOTPRINT medians."""
+    """Return (V,) the footprint of a pixel of the nearest view that a vertex faces, at most
+    LARGEST_FOOTPRINT medians."""
     least = np.full(len(points), np.inf)
     for camera in cameras:
         pose, lens = camera.pinhole()
@@ -332,7 +337,7 @@ def _footprints(points: np.ndarray, normals: np.ndarray, cameras: Sequence[Camer
 
 
 def _brightness(photo: Photo) -> np.ndarray:
-    """(H, W) float32 mean of the channels, 0 to 1, over mid-grey."""
+    """Return (H, W) float32: the mean of the channels, 0 to 1, blended over mid-grey."""
     value = photo.rgb.astype(np.float32) @ np.full(3, 1 / 765, np.float32)
     if photo.alpha is None:
         return value
@@ -341,8 +346,8 @@ def _brightness(photo: Photo) -> np.ndarray:
 
 
 def _least(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(P,) where the parabola through the least of (P, K) values and its neighbours has its vertex, within OFFSETS, and
-    how much higher the lower of the values two places before and two after it is."""
+    """Return (P,) the offset of the vertex of the parabola through the least of (P, K) values and its neighbours, and
+    (P,) the rise from the least value to the lower of those two offsets before and two after it."""
     rows, step = np.arange(len(values)), OFFSETS[1] - OFFSETS[0]
     k = np.clip(values.argmin(1), 1, len(OFFSETS) - 2)
     before, least, after = values[rows, k - 1], values[rows, k], values[rows, k + 1]

@@ -1,5 +1,5 @@
-"""Moves of vertices that fold no face over and push none through another, and surfaces that have gone through
-themselves."""
+"""Moves vertices without folding faces over or pushing faces through each other, and smooths existing
+self-intersections away."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from linprim_geo.surface.finish.self_intersections import crossings, edges_of
 from linprim_geo.surface.normals import folded, vertex_normals
 
 FOLD_ROUNDS, ROUNDS = 3, 8
-"""In which vertices give moves back that fold a face over, and that push one through another; in so many as the latter
-vertices where a surface goes through itself take the mean of their neighbours."""
+"""Rounds in which vertices give back moves that fold a face over, and rounds in which they give back moves that push a
+face through another. ROUNDS also limits the smoothing of `untangled`."""
 
 
 def moved_safely(mesh: Mesh, vertices: np.ndarray) -> Mesh:
-    """The mesh with its vertices moved towards (V, 3) `vertices`, as far as it does no harm, and normals anew.
+    """Return the mesh with its vertices moved towards (V, 3) `vertices` as far as this does no harm, with new normals.
 
-    Where a face faces away from what is around it, its vertices give half of their move back, FOLD_ROUNDS times. Where
-    an edge pierces a face with which it shares no vertex, the vertices of both give all of it back, and their
-    neighbours half, ROUNDS times: then no face is pierced that was not before, as a rule. Memory: some 300 bytes per
-    vertex.
+    Where a face flips against the surface around it, its vertices give back half of their move, FOLD_ROUNDS times.
+    Where an edge pierces a face with which it shares no vertex, the vertices of both give back their whole move and
+    their neighbours half, ROUNDS times. After that, as a rule, no face is pierced that was not before. Memory: some 300
+    bytes per vertex.
     """
     start, faces = mesh.vertices.astype(np.float64), mesh.faces
     moves, share = vertices - start, np.ones(len(start))
@@ -54,10 +54,11 @@ def moved_safely(mesh: Mesh, vertices: np.ndarray) -> Mesh:
 
 
 def untangled(mesh: Mesh) -> Mesh:
-    """The mesh, smoother where it goes through itself, until it does so in few places or none; normals are made anew.
+    """Return the mesh, smoothed where it intersects itself, until few or no self-intersections are left, with new
+    normals.
 
-    The vertices of faces and edges that cross take the mean of their neighbours, ROUNDS times at most: more of them
-    widen the holes that thin sheets have. Memory: some 400 bytes per vertex.
+    Vertices of crossing faces and edges take the mean of themselves and their neighbours, at most ROUNDS times; more
+    rounds would widen the holes of thin sheets. Memory: some 400 bytes per vertex.
     """
     edges, average = edges_of(mesh.faces), neighbour_average(mesh)
     mesh = replace(mesh, vertices=mesh.vertices.astype(np.float64))
@@ -75,8 +76,8 @@ def untangled(mesh: Mesh) -> Mesh:
 
 
 def _crossing(mesh: Mesh, edges: np.ndarray, changed: np.ndarray) -> np.ndarray:
-    """Vertices of faces that the (E, 2) edges of a mesh pierce, and of these edges, where one of them has `changed`
-    (V,)."""
+    """Return the vertices of the faces that the (E, 2) `edges` of a mesh pierce, and of these edges, as far as the face
+    or the edge has a vertex that has `changed` (V,)."""
     of_changed, some = changed[edges].any(1), Mesh(mesh.vertices, mesh.faces[changed[mesh.faces].any(1)])
     at = [np.zeros(0, np.int64)]
     for others, asked in ((mesh, edges[of_changed]), (some, edges[~of_changed])):

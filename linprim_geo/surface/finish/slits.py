@@ -1,8 +1,9 @@
-"""Triangles in slits of a surface that run into its borders or round a corner.
+"""Fills narrow slits along the boundary of a surface with triangles.
 
-A crack between a wall and a ceiling is a part of the border all around a room: it is no hole that is narrow as a whole,
-but its two sides are near to each other. Such a slit is closed like a zip, from its ends: the vertex of the border
-whose two neighbours are nearest to each other gets a triangle with them, and the border leaves it out.
+A crack between a wall and a ceiling belongs to a boundary loop that runs around a whole room. As a hole this loop is
+not narrow, but its two sides lie close to each other. Such a slit is zipped up from its ends: of all boundary vertices
+the one whose two neighbours are closest to each other gets a triangle with them, and leaves the boundary. `small_holes`
+decides which triangles stay.
 """
 
 from __future__ import annotations
@@ -14,13 +15,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-# A slit is closed as far as its sides are so many times as long as its mouth is wide: deeper than wide.
+# A slit is closed only as far as the boundary along its sides is at least this many times as long as its mouth is wide,
+# so only slits that are deeper than wide are closed.
 DEEPER = 3.0
 
 
 class _Edge(NamedTuple):
-    """An edge of a border: one of the surface, or the mouth of a slit, a side of a `triangle` whose other two sides are
-    `behind` it. `sides` is how long the border of the surface there is."""
+    """An edge of a boundary loop: an edge of the surface, or the mouth of a slit, which is the open side of an added
+    `triangle` whose other two sides are `behind` it. `width` is its length, `sides` the length of the surface's
+    boundary that it spans."""
 
     width: float
     sides: float
@@ -31,13 +34,13 @@ class _Edge(NamedTuple):
 def slit_triangles(
     rims: Sequence[np.ndarray], vertices: np.ndarray, normals: np.ndarray, widest: np.ndarray
 ) -> np.ndarray:
-    """(N, 3) triangles between the vertices of borders in slits that are narrow, and deeper than wide or closed all
-    around.
+    """Return (N, 3) triangles between boundary vertices that fill slits which are narrow, and either deeper than wide
+    or closed all around.
 
     Args:
-        rims: the vertices around each border, in the order in which a patch goes round; at least one.
-        vertices, normals: (V, 3) of the surface; triangles face as the normals of their corners do.
-        widest: (V,) how far apart the two sides of a slit at a vertex are at most; at 0 nothing is added.
+        rims: the vertices of each boundary loop, in the order in which a patch goes round; at least one loop.
+        vertices, normals: (V, 3) of the surface. A triangle must face the same way as the normals of its corners.
+        widest: (V,) largest distance between the two sides of a slit at each vertex; 0 adds nothing there.
     """
     border = _Border(rims, vertices, normals, widest)
     border.close()
@@ -45,11 +48,12 @@ def slit_triangles(
 
 
 class _Border:
-    """The borders of a surface, while triangles make them shorter; see `slit_triangles`."""
+    """The boundary loops of a surface, which shrink as triangles are added; see `slit_triangles`."""
 
     def __init__(self, rims: Sequence[np.ndarray], vertices: np.ndarray, normals: np.ndarray, widest: np.ndarray):
         rows, sizes = np.concatenate(rims), [len(rim) for rim in rims]
-        # A place is a vertex of one rim, for borders touch; the edge of a place leads to the next.
+        # A place is one vertex of one loop, as loops may touch in a vertex. The edge of a place leads to the next
+        # place.
         first, size = np.repeat(np.cumsum([0, *sizes[:-1]]), sizes), np.repeat(sizes, sizes)
         step = np.arange(len(rows)) - first
         self.next: list[int] = (first + (step + 1) % size).tolist()
@@ -62,7 +66,7 @@ class _Border:
         self.waiting: list[tuple[float, int, int, int]] = []
 
     def close(self) -> None:
-        """Adds triangles, those with the narrowest mouths first, until none is left that is narrow."""
+        """Add triangles, narrowest mouth first, until no narrow one is left."""
         for place in range(len(self.vertex)):
             self._offer(place)
         while self.waiting:
@@ -70,7 +74,8 @@ class _Border:
             self._close(width, *three)
 
     def _offer(self, place: int) -> None:
-        """The triangle of a place with its neighbours waits for its turn, if it is narrow and faces as they do."""
+        """Queue the triangle of a place and its two neighbours, if it is narrow enough and faces as its corners'
+        normals do."""
         three = before, _, after = self.previous[place], place, self.next[place]
         width = dist(self.where[before], self.where[after])
         if width > self.widest[place] or not all(self.widest[each] for each in three):
@@ -82,7 +87,7 @@ class _Border:
             heappush(self.waiting, (width, place, before, after))
 
     def _close(self, width: float, place: int, before: int, after: int) -> None:
-        """Adds the triangle of a place, unless the border has changed there since."""
+        """Add the queued triangle of a place, unless the boundary has changed there since."""
         one, other, last = self.edge[before], self.edge[place], self.edge[after]
         if one is None or other is None or (self.previous[place], self.next[place]) != (before, after):
             return
@@ -98,7 +103,8 @@ class _Border:
         self._offer(after)
 
     def triangles(self) -> np.ndarray:
-        """(N, 3) of those added, what is behind the widest mouths that are narrow for the length of their sides."""
+        """Return the (N, 3) added triangles that stay: those behind the outermost mouths that are narrow for the length
+        of their sides, and those of loops that closed completely."""
         mouths, deep, triangles = [edge for edge in self.edge if edge is not None], list(self.complete), []
         while mouths:
             mouth = mouths.pop()

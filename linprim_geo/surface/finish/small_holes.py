@@ -1,10 +1,10 @@
-"""Closes small holes and slits of a fused surface, unless photographs speak for them.
+"""Closes small holes and narrow slits of a fused surface, unless photographs see through them.
 
-Depths that disagree leave pinholes along edges, in folds and on what few photographs show, and where photographs look
-along a surface it has slits between their rows of pixels. A hole that is narrower than a window of stereo, however
-long, is in the windows of all that is around it: these were matched as one surface across it. It is closed with
-triangles between its own vertices, unless photographs see through it, or the patch would turn its back to what is
-around it: the rim of a piece is no hole. So are slits that run into a border, or round a corner (slits.py).
+Depths that disagree leave pinholes along edges, in folds and where few photographs look; where photographs look along a
+surface, slits remain between their rows of pixels. If a hole is narrower than a stereo window, however long it is, the
+windows around it have matched both sides as one surface across it. It is filled with triangles between its own
+vertices, unless photographs see through it, or the patch would face away from its surroundings: then it is the outer
+boundary of a piece. Slits that run into a boundary or round a corner are closed, too (`slits`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from linprim_geo.surface.finish.self_intersections import crossings, edges_of
 from linprim_geo.surface.finish.slits import slit_triangles
 from linprim_geo.surface.normals import vertex_normals
 
-# The side of a window of stereo in pixels (kWindowSide * kWindowStep in csrc/stereo/patch_match.h).
+# Side of a stereo window in pixels (kWindowSide * kWindowStep in csrc/stereo/patch_match.h): the widest hole that is
+# closed.
 WINDOW = 12.0
 # Depth of a ray that is known to be free, in diagonals of the mesh: behind everything.
 FREE_DEPTH = 1e3
@@ -33,17 +34,17 @@ FREE_DEPTH = 1e3
 def without_small_holes(
     mesh: Mesh, cameras: Sequence[Camera], known: Sequence[np.ndarray], free: Sequence[np.ndarray]
 ) -> tuple[Mesh, int]:
-    """The mesh with holes closed that are no wider than WINDOW pixels of the nearest camera, and slits of its borders
-    that are as narrow (`slit_triangles`); and how many holes.
+    """Return the mesh with holes closed that are at most WINDOW pixels of the nearest camera wide, and slits of its
+    boundary that are as narrow (`slit_triangles`); and the number of holes closed.
 
-    Vertices and faces that there are stay as they are, faces are added behind them, no edge gets a third face, and no
-    face crosses another that did not before. A hole stays open where views look through any triangle of its patch at
-    something behind it (`KnownDepths`), where most of the patch faces away from the faces around it, and where other
-    faces are in the way; a slit as far as it has such triangles.
+    Existing vertices and faces stay as they are; new faces are appended. No edge gets a third face, and no face crosses
+    another that did not before. A hole stays open if views look through any triangle of its patch at something behind
+    it (`KnownDepths`), if most of the patch faces away from the faces around it, or if other faces are in the way. A
+    slit stays open where its triangles are like that.
 
     Args:
-        known: (H, W) depths of each view, NaN where nothing is known.
-        free: (H, W) bool of each view, rays that end nowhere.
+        known: (H, W) depths of each view, NaN where the depth is unknown.
+        free: (H, W) bool of each view, rays that hit nothing.
     """
     if not len(mesh.faces):
         return mesh, 0
@@ -55,7 +56,7 @@ def without_small_holes(
 
 
 def _without_holes(mesh: Mesh, cameras: Sequence[Camera], views: KnownDepths) -> tuple[Mesh, int]:
-    """The mesh with holes closed that are narrow as a whole, and how many these are."""
+    """Return the mesh with the holes closed that are narrow as a whole, and their number."""
     added, hole = _patches(mesh.vertices, _small_rims(mesh, cameras))
     if not len(added):
         return mesh, 0
@@ -70,7 +71,8 @@ def _without_holes(mesh: Mesh, cameras: Sequence[Camera], views: KnownDepths) ->
 
 
 def _without_slits(mesh: Mesh, cameras: Sequence[Camera], views: KnownDepths) -> Mesh:
-    """The mesh with slits of its borders closed; where a triangle is wrong nothing is added at its corners."""
+    """Return the mesh with slits of its boundary closed. Where a triangle is wrong (`_wrong`), nothing is added at its
+    corners."""
     rims = [loop[::-1] for loop in border_loops(mesh.faces)]
     if not rims:
         return mesh
@@ -86,7 +88,8 @@ def _without_slits(mesh: Mesh, cameras: Sequence[Camera], views: KnownDepths) ->
 
 
 def _wrong(mesh: Mesh, added: np.ndarray, views: KnownDepths) -> np.ndarray:
-    """(N,) bool: which of the `added` faces (N, 3) views see through, share an edge with two others, or cross any."""
+    """Return (N,) bool: which of the `added` faces (N, 3) must not stay, as views see through them, an edge would have
+    more than two faces, or they cross another face."""
     at_rim = np.zeros(len(mesh.vertices), bool)
     at_rim[added] = True
     through = views.see_through(mesh.vertices.astype(np.float64)[added].mean(1))
@@ -99,14 +102,14 @@ def _normals(mesh: Mesh) -> np.ndarray:
 
 
 def _with_faces(mesh: Mesh, added: np.ndarray) -> Mesh:
-    """The mesh with the `added` faces (N, 3) behind its own."""
+    """Return the mesh with the `added` faces (N, 3) appended."""
     faces = np.concatenate([mesh.faces, added])
     normals = None if mesh.normals is None else vertex_normals(replace(mesh, faces=faces))
     return replace(mesh, faces=faces, normals=normals, primitive=None)
 
 
 def _crossing(mesh: Mesh, added: np.ndarray) -> np.ndarray:
-    """(N,) bool: which of the `added` faces (N, 3) cross any other."""
+    """Return (N,) bool: which of the `added` faces (N, 3) cross any other face."""
     faces, count = np.concatenate([mesh.faces, added]), np.int64(len(mesh.vertices))
     crossed, _ = crossings(Mesh(mesh.vertices, added), edges_of(faces))
     _, ends = crossings(Mesh(mesh.vertices, faces), edges_of(added))
@@ -117,7 +120,8 @@ def _crossing(mesh: Mesh, added: np.ndarray) -> np.ndarray:
 
 
 def _small_rims(mesh: Mesh, cameras: Sequence[Camera]) -> list[np.ndarray]:
-    """The vertices around each hole no wider than WINDOW pixels, in the order in which a patch goes round."""
+    """Return the vertices around each hole that is at most WINDOW pixels wide, in the order in which a patch goes
+    round."""
     rims = [loop[::-1] for loop in border_loops(mesh.faces)]
     if not rims:
         return []
@@ -129,14 +133,16 @@ def _small_rims(mesh: Mesh, cameras: Sequence[Camera]) -> list[np.ndarray]:
 
 
 def _width(rim: np.ndarray) -> float:
-    """How wide the rim (P, 3) of a hole is across its longest direction: along its second principal axis."""
+    """Return the width of the boundary (P, 3) of a hole across its longest direction: its extent along the second
+    principal axis."""
     place = rim - rim.mean(0)
     along = place @ np.linalg.eigh(place.T @ place)[1][:, 1]
     return float(np.ptp(along))
 
 
 def _pixels(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """(P,) what a pixel of the nearest camera covers at (P, 3) points in its image, 0 where they are in none."""
+    """Return (P,) the footprint of a pixel of the nearest camera that has the (P, 3) points in its image; 0 where none
+    has."""
     least = np.full(len(points), np.inf)
     for camera in cameras:
         inside, _, _ = in_image(camera, points)
@@ -146,7 +152,8 @@ def _pixels(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def _patches(vertices: np.ndarray, rims: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) triangles between the vertices of rims, as these lie on the plane of each, and (N,) which rim's."""
+    """Return (N, 3) triangles that fill boundary loops, triangulated in the plane of each loop, and (N,) the number of
+    the loop."""
     from manifold3d import triangulate
 
     triangles, hole = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
