@@ -1,1 +1,1 @@
-"""Depth maps, and the signed distance field that they are fused into."""
+"""Fuses depth maps into a signed distance field on a sparse voxel grid."""

@@ -1,4 +1,5 @@
-"""The predicted error of a surface that is fused from depth maps: by how well these agree where it is."""
+"""Predicts the error of a surface that is fused from depth maps, by how well these agree with each other at its
+vertices."""
 
 from __future__ import annotations
 
@@ -13,26 +14,27 @@ from linprim_geo.surface.fusion.tsdf_field import DepthFrame
 from linprim_geo.surface.normals import vertex_normals
 
 FINEST = 1 / 10
-"""Depths are taken for no better than this part of a pixel: windows of all views see the same, and err alike. Chosen by
-how the true errors of eleven captures compare (DECISIONS 91)."""
+"""Least error of a depth, as a share of a pixel's footprint: the windows of all views see the same texture, so their
+errors are correlated. Chosen by the true errors of eleven captures (DECISIONS 91)."""
 
 
 def largest_error(reach: float) -> float:
-    """The root mean square distance of a surface that may lie anywhere within `reach`."""
+    """Return the root mean square distance of a surface that may lie anywhere within `reach`."""
     return reach / np.sqrt(3)
 
 
 def error_by_depths(mesh: Mesh, frames: Sequence[DepthFrame], reach: float) -> np.ndarray:
-    """(V,) float32 predicted distance of each vertex from the true surface, in the mesh's unit.
+    """Predict the (V,) float32 distance of each vertex from the true surface, in the mesh's unit.
 
-    The root of the mean square distance of the depths that it was fused from, and of FINEST pixels of the nearest view.
-    It is not divided by the number of views, as their errors are alike. Where depths count for less than
-    SUPPORTING_VIEWS confirmed ones, it is the `largest_error`, and nowhere more. Accuracy: `python -m
-    linprim_geo.eval.studies.surfaces` prints its rank correlation with the exact error, and the ratio of their means.
+    It is the root mean square distance of the depths that the vertex was fused from, combined with FINEST pixels of the
+    nearest view. It is not divided by the number of views, as their errors are correlated. Where the depths weigh less
+    than SUPPORTING_VIEWS confirmed ones it is `largest_error`, which is also the upper limit elsewhere. Accuracy:
+    `python -m linprim_geo.eval.studies.surfaces` prints its rank correlation with the exact error, and the ratio of
+    their means.
 
     Args:
-        frames: with the `confidence` by which depths were fused, 1 of a confirmed one.
-        reach: how far from the surface depths had a part in it.
+        frames: with the `confidence` by which depths were fused, 1 for a confirmed depth.
+        reach: largest distance from the surface at which depths were fused into it.
     """
     weight, spread, pixel = _spread(mesh, frames, reach)
     largest = largest_error(reach)
@@ -41,8 +43,8 @@ def error_by_depths(mesh: Mesh, frames: Sequence[DepthFrame], reach: float) -> n
 
 
 def error_of_nearest(mesh: Mesh, points: np.ndarray) -> np.ndarray:
-    """(P,) `quality` of the vertex that is nearest to each of (P, 3) points, or its distance where that exceeds all
-    predicted errors: there a hole was closed."""
+    """Return for each of (P, 3) points the `quality` of the nearest vertex, or the distance to that vertex if it
+    exceeds all predicted errors: such a point lies in a hole that was closed."""
     from scipy.spatial import cKDTree
 
     assert mesh.quality is not None
@@ -51,8 +53,11 @@ def error_of_nearest(mesh: Mesh, points: np.ndarray) -> np.ndarray:
 
 
 def _spread(mesh: Mesh, frames: Sequence[DepthFrame], reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(V,) weight of the depths no farther than `reach` from a vertex, along its normal; (V,) their root mean square
-    distance from it, NaN where there are none; (V,) what a pixel of the nearest view covers there."""
+    """Measure how depths scatter around each vertex along its normal.
+
+    Returns: (V,) weight of the depths at most `reach` from a vertex; (V,) their root mean square distance, NaN where
+        there are none; (V,) the footprint of a pixel of the nearest view there.
+    """
     points = mesh.vertices.astype(np.float64)
     normals = (vertex_normals(mesh) if mesh.normals is None else mesh.normals).astype(np.float64)
     weight, square, pixel = np.zeros(len(points)), np.zeros(len(points)), np.full(len(points), np.inf)
@@ -63,7 +68,7 @@ def _spread(mesh: Mesh, frames: Sequence[DepthFrame], reach: float) -> tuple[np.
         row, column, own, normal = row[rows], column[rows], points[rows], normals[rows]
         depth = frame.depth[row, column].astype(np.float64)
         ray = camera.world_rays()[row, column]
-        # To the plane of the vertex: the pixel's own ray passes beside it.
+        # Distance to the tangent plane of the vertex, as the pixel's own ray passes beside the vertex.
         off = ((camera.center + depth[:, None] * ray - own) * normal).sum(1)
         near = (depth > 0) & ((ray * normal).sum(1) < 0) & (np.abs(off) <= reach)
         if frame.clamped is not None:

@@ -1,9 +1,10 @@
-"""Depth maps for fusing out of seven sources: what stereo finds and its neighbours confirm, planes of regions without
-texture, the surface that spans gaps between these, floors and walls that enclose the scene, thin things that the
-primitives render before all these, things that are known by their outlines, and what the primitives render everywhere
-else, with the weight that its deviation from the first deserves.
+"""Merges seven sources of depth into the depth maps that are fused, with a weight each.
 
-Of the surface that is fused from them, what stereo and planes of several views do not support is left out."""
+The sources are: stereo depths that neighbouring views confirm; planes of textureless regions; a surface that spans the
+gaps between these; floors and walls that enclose the scene; thin things, and things known by their outlines, as the
+primitives render them; and everywhere else the rendered depths, weighted down by how much they deviate from confirmed
+ones. Parts of the fused surface that stereo and planes of several views do not support are removed.
+"""
 
 from __future__ import annotations
 
@@ -49,31 +50,32 @@ from linprim_geo.surface.fusion.tsdf_field import DepthFrame
 from linprim_geo.surface.mesh_views import MeshViews
 from linprim_geo.surface.single_view import mesh_is_closed
 
-# A depth that other views have, but that is not confirmed (`DepthMap.is_confirmed`), counts so much.
+# Weight of a depth that other views have, too, but that is not confirmed (`DepthMap.is_confirmed`); a confirmed one has
+# 1.
 DOUBTFUL_WEIGHT = 0.1
-# A piece of surface is supported if so many views have depths on this share of it. What is true has 0.3 to 0.9 of it
-# so, what is not 0.1 at most.
+# A piece of surface is supported if at least this many views have depths on this share of its area. True pieces have
+# 0.3 to 0.9, false ones 0.1 at most.
 SUPPORTING_VIEWS, SUPPORTED_SHARE = 2, 0.25
-# One of so many rows and columns is looked at to tell what a surface covers.
+# Every how many rows and columns the coverage of pixels by a surface is sampled.
 SAMPLED = 4
-# So often planes are laid and depths in the air taken away. A third round changes hardly anything.
+# Rounds of assigning planes and removing depths that other views see through. A third changes hardly anything.
 ROUNDS = 2
 # Points of the rendered surface by which stereo finds pairs of views.
 POINTS = 20_000
 
 
 class MergedFrames(Sequence):
-    """The `rendered` frames of views, each with the depths of stereo up to `limit` where these are confirmed, and those
-    of planes where there is no texture.
+    """The `rendered` frames of views, in which confirmed stereo depths up to `limit`, and depths of planes where there
+    is no texture, replace the rendered ones.
 
-    `weight` is what rendered depths count elsewhere: the squared deviation of confirmed depths from those of their
-    neighbours over that of rendered ones from confirmed ones, 1 at most. `confirmed` is the share of pixels with
-    confirmed depths, before those in the air go, `doubtful` that of less probable ones, `flat` that of pixels on one of
-    the `planes` (K, 4), `spanned` that of pixels without texture between all these, `enclosed` that of pixels whose
-    rays end at a floor or wall because nothing else is known, or because what is doubtful is near it, `thin` that of
-    thin things before what is known, `outlined` that of things that are known by their outlines. `sharp` (H, W) bool of
-    every view says where rendered depths are those of a surface, and None everywhere: they stay where nothing is known,
-    and things of both kinds are among them.
+    `weight` is the weight of the remaining rendered depths: the squared deviation of confirmed depths from those of
+    their neighbours over that of rendered ones from confirmed ones, 1 at most. Shares of pixels, for the statistics:
+    `confirmed` with confirmed depths, before those that other views see through are removed; `doubtful` with less
+    probable depths; `flat` on one of the `planes` (K, 4); `spanned` without texture between all these; `enclosed` whose
+    rays end at a floor or wall, because nothing else is known or a doubtful depth is near it; `thin` on thin things in
+    front of what is known; `outlined` on things known by their outlines. `sharp` (H, W) bool of every view marks
+    rendered depths of a surface rather than fog; None: all. Sharp ones stay where nothing is known, and thin and
+    outlined things are among them.
     """
 
     def __init__(
@@ -122,7 +124,8 @@ class MergedFrames(Sequence):
         progress.stage(2, "floors and walls")
         walls, planes = self._walls(maps, seen, points)
         self._enclose(walls, known, are_sharp, regions, backgrounds)
-        # What stereo has measured on planes with points is not background where hardly any view looks.
+        # Depths that stereo has measured on enclosing planes, among their points, are not background where hardly any
+        # view looks.
         self._end_at(known_on_planes(self.cameras, planes, measured))
         progress.stage(3, "thin things")
         self._keep_things(views, maps, rendered_depths, are_sharp)
@@ -134,14 +137,16 @@ class MergedFrames(Sequence):
     def _take_planes(
         self, maps: Sequence[DepthMap], rendered: Sequence[np.ndarray], free: Sequence[np.ndarray]
     ) -> tuple[list[list[PlainRegion]], list[np.ndarray], list[np.ndarray]]:
-        """Finds planes by points, by edges and by shading, of depths that are sure, and what lies on them; moves
-        confirmed depths to them. Planes by points are the most precise, but where another of a region's edges stands:
-        their points err beside edges. Planes by edges take the place of those by shading where they carry it as well,
-        else the nearer one hides the other. Confirmed depths beside edges of plain regions are doubtful where no plane
-        has them.
+        """Find planes by points, by edges and by shading, from confident depths, and assign pixels to them; snap
+        confirmed depths to their plane.
 
-        Returns the plain regions of every view, and (H, W) bool: those that are background by their shading, and those
-        with `free` (H, W) rays that are walls by it, if these are given.
+        Planes by points are the most accurate, except where another plane of a region's edges stands: points err beside
+        edges. Planes by edges replace those by shading where they explain the shading as well; else the nearer plane
+        hides the other. Confirmed depths beside edges of textureless regions become doubtful where they are on no
+        plane.
+
+        Returns: the textureless regions of every view, and (H, W) bool per view: those that are background by their
+            shading, and those with `free` (H, W) rays that are walls by it, if `free` is given.
         """
         sure = [_depth_where(found, found.is_confirmed(SURE)) for found in maps]
         regions = regions_of_views(maps, sure)
@@ -155,7 +160,7 @@ class MergedFrames(Sequence):
         self.on_planes: list[np.ndarray] = []
         beside = [beside_edges(found.grey.shape, own) for found, own in zip(maps, regions, strict=True)]
         colours = ShownColours(maps, sure)
-        # What is in the air beside a wall speaks against the wall's plane: when it is gone, more planes are laid.
+        # False depths in front of a wall contradict the wall's plane: once they are removed, more pixels get planes.
         for _ in range(ROUNDS):
             along_edges = region_plane_depths(self.cameras, regions, shaded.planes, sure, self.depths, colours)
             self._clear_refused(along_edges, sure, on_points)
@@ -165,7 +170,7 @@ class MergedFrames(Sequence):
             self._clear_air(beside, sure, on_points)
         for view, found in enumerate(along_edges):
             doubted = np.where(found.doubted, found.depth, np.float32(np.nan))
-            # Nothing but the edge was matched beside it, and what it is an edge of may be another surface.
+            # Beside it stereo has matched only the edge, which may be the edge of another surface.
             lone = np.where(beside[view] & np.isnan(self.on_planes[view]), self.depths[view], np.float32(np.nan))
             self.doubtful_depths[view] = _first_known((lone, self.doubtful_depths[view], doubted))
             self.depths[view] = np.where(np.isfinite(lone), np.float32(np.nan), self.depths[view])
@@ -179,8 +184,9 @@ class MergedFrames(Sequence):
         by_shading: Sequence[np.ndarray],
         along_edges: Sequence[RegionDepths],
     ) -> None:
-        """Takes (H, W) depths on planes with points all over and those `by_shading`, NaN elsewhere, and those of plain
-        regions `along_edges`, and moves confirmed depths to them: `sure` ones to planes of regions as these say."""
+        """Set the depths on planes of every view, from (H, W) depths `on_points` and `by_shading`, NaN elsewhere, and
+        `along_edges` of textureless regions; snap confirmed depths to them. `sure` depths snap to planes of regions
+        only where these say so."""
         self.on_planes = []
         of_views = zip(sure, on_points, by_shading, along_edges, strict=True)
         for view, (known, on_plane, shaded, region) in enumerate(of_views):
@@ -194,25 +200,25 @@ class MergedFrames(Sequence):
             self.depths[view] = np.where(np.isfinite(depth) & np.isfinite(target), target, depth)
 
     def _clear_air(self, beside: Sequence[np.ndarray], *others: Sequence[np.ndarray]) -> None:
-        """Takes depths that are in the air `beside` (H, W) edges of plain regions, by what is known, away from all that
-        there are, and from `others`."""
+        """Remove depths `beside` (H, W) edges of textureless regions that other views see through, from confirmed,
+        planar and doubtful depths and from `others`."""
         views = KnownDepths(self.cameras, self._known())
         for depths in (self.depths, self.on_planes, self.doubtful_depths, *others):
             views.clear(depths, beside)
 
     def _clear_refused(self, along_edges: Sequence[RegionDepths], *others: Sequence[np.ndarray]) -> None:
-        """Takes depths on planes that photographs refuse in plain regions away from all that are measured, and from
-        `others`: they are those of edges beside."""
+        """Remove measured depths, and those in `others`, on planes that the photographs contradict in textureless
+        regions: they are those of edges beside."""
         for depths in (self.depths, self.doubtful_depths, *others):
             for camera, found, depth in zip(self.cameras, along_edges, depths, strict=True):
                 depth[found.refuses(camera, depth)] = np.nan
 
     def _known(self) -> list[np.ndarray]:
-        """(H, W) what is confirmed or on a plane, of every view."""
+        """Return (H, W) the depths that are confirmed or on a plane, of every view, NaN elsewhere."""
         return [_first_known(pair) for pair in zip(self.depths, self.on_planes, strict=True)]
 
     def _points(self, maps: Sequence[DepthMap], known: Sequence[np.ndarray]) -> SurfacePoints:
-        """Points of what is `known`, of every view as many."""
+        """Sample equally many points of the `known` depths of every view."""
         count, rng = points_per_view(self.cameras), np.random.default_rng(0)
         points = []
         for view, (found, depth) in enumerate(zip(maps, known, strict=True)):
@@ -229,8 +235,8 @@ class MergedFrames(Sequence):
         rendered: Sequence[np.ndarray],
         backgrounds: Sequence[np.ndarray],
     ) -> None:
-        """Adds depths of the surface that spans `points` of what is `known` to doubtful ones, but not in background,
-        and not at edges of photographs, where rendered ones are finer."""
+        """Add depths of the surface that spans the `points` of `known` depths to the doubtful ones, except in
+        background and at edges of the photographs, where rendered depths are finer."""
         spanned = spanned_depths(self.cameras, known, points, rendered)
         for view, (found, depth, background) in enumerate(zip(maps, spanned, backgrounds, strict=True)):
             depth[background | found.edges] = np.nan
@@ -240,8 +246,9 @@ class MergedFrames(Sequence):
     def _walls(
         self, maps: Sequence[DepthMap], seen: Sequence[np.ndarray], known: SurfacePoints
     ) -> tuple[list[EnclosingPlane], list[EnclosingPlane]]:
-        """Planes that enclose what is `known`, with walls that meet at their corners, and without. What is `seen`
-        (H, W) tells which there are and where walls end: planes of plain regions reach to edges that may be others'."""
+        """Return the planes that enclose what is `known`, with walls added that meet them in corners, and without
+        these. The planes and the ends of walls are found from the `seen` (H, W) depths, as planes of textureless
+        regions reach to edges that may belong to other things."""
         points = self._points(maps, seen)
         planes = enclosing_planes(self.cameras, self.planes, points, self.standing, known)
         return with_corner_walls(maps, seen, self._backgrounds(), planes, points), planes
@@ -254,9 +261,9 @@ class MergedFrames(Sequence):
         regions: Sequence[Sequence[PlainRegion]],
         backgrounds: Sequence[np.ndarray],
     ) -> None:
-        """Adds depths of `walls` that enclose what is `known` to doubtful ones, where training has a depth that is not
-        `sharp` (H, W) or is near them, or in plain `regions` that lie on them, but not in background. Of doubtful
-        depths those stay that are before a wall by more than these may be off, but not in such regions."""
+        """Add depths of the `walls` that enclose what is `known` to the doubtful ones: where the rendered depth is not
+        `sharp` (H, W), or is near a wall, or in textureless `regions` that lie on walls, but not in background.
+        Doubtful depths stay if they are in front of a wall by more than their error, except in such regions."""
         wanted, shown = [], []
         for view, (frame, depth, background) in enumerate(zip(self.rendered, known, backgrounds, strict=True)):
             wanted.append((frame.depth > 0) & ~(background | np.isfinite(depth)))
@@ -278,8 +285,8 @@ class MergedFrames(Sequence):
         rendered: Sequence[np.ndarray],
         sharp: Sequence[np.ndarray],
     ) -> None:
-        """Takes rendered depths of thin things in place of those of the wall behind them, and those of things that are
-        known by their outlines, as if they were confirmed, but not where a depth that is says the same: it is finer."""
+        """Replace depths by the rendered ones of thin things in front of a wall, and of things known by their outlines,
+        and treat these as confirmed. Where a confirmed depth is the same within its error it stays, as it is finer."""
         known = map(_first_known, zip(self.depths, self.on_planes, self.doubtful_depths, strict=True))
         seen = [
             SeenDepths(found.camera, view.load().rgb, found.noise, depth, is_sharp, behind)
@@ -294,7 +301,7 @@ class MergedFrames(Sequence):
         self.thin, self.outlined = (float(np.mean([thing.mean() for thing in things])) for things in (thin, outlined))
 
     def _end_backgrounds(self, maps: Sequence[DepthMap]) -> None:
-        """Lets rays end at confirmed surfaces that no other view looks past, and at those with texture."""
+        """Remove background at confirmed surfaces that no other view looks past, and at those with texture."""
         self._end_at(lone_backgrounds(self.cameras, self._backgrounds(), self.depths))
         self._end_at(textured_backgrounds(maps, self._backgrounds(), self.depths))
 
@@ -302,14 +309,15 @@ class MergedFrames(Sequence):
         return [_background_of(frame) for frame in self.rendered]
 
     def _end_at(self, surfaces: Sequence[np.ndarray]) -> None:
-        """Lets rays end in these pixels (H, W) of every view."""
+        """Remove these pixels (H, W) of every view from the background: their rays end at a surface."""
         self.rendered = [
             frame if frame.background is None else replace(frame, background=frame.background & ~surface)
             for frame, surface in zip(self.rendered, surfaces, strict=True)
         ]
 
     def covered(self, mesh: Mesh) -> float:
-        """Share of the pixels with a rendered depth whose rays hit a mesh, of one of SAMPLED rows and columns."""
+        """Return the share of pixels with a rendered depth whose rays hit a mesh, of every SAMPLED-th row
+        and column."""
         caster, shown, hit = MeshViews(mesh.vertices, mesh.faces), 0, 0
         for camera, sampled in zip(self.cameras, self.shown, strict=True):
             row, column = (x * SAMPLED for x in np.nonzero(sampled))
@@ -318,7 +326,7 @@ class MergedFrames(Sequence):
         return hit / max(shown, 1)
 
     def about(self) -> dict:
-        """For the statistics."""
+        """Return the numbers for the statistics."""
         return {
             "confirmed": self.confirmed,
             "doubtful": self.doubtful,
@@ -362,14 +370,14 @@ class MergedFrames(Sequence):
         )
 
     def _fused(self, frame: DepthFrame, source: np.ndarray) -> np.ndarray:
-        """(H, W) bool, where depths of a source are fused."""
+        """Return (H, W) bool: where depths of a source are fused."""
         known = source <= self.limit  # not where it is NaN
-        # Beside an outline the windows of stereo take the background for a part of what is in front of it.
+        # Beside an outline stereo windows match background as a part of the foreground.
         return known if frame.background is None else known & ~frame.background
 
     def supporting(self, points: np.ndarray, *, doubtful: bool = False) -> np.ndarray:
-        """(P,) how many views fuse a confirmed depth, or one on a plane, at these points of the world; or a `doubtful`
-        one, too."""
+        """Return (P,) how many views fuse a depth that is confirmed or on a plane at these world points; with
+        `doubtful`, doubtful depths count, too."""
         views = np.zeros(len(points), int)
         for frame, *sources in zip(self.rendered, self.depths, self.on_planes, self.doubtful_depths, strict=True):
             depth = _first_known(sources if doubtful else sources[:2])
@@ -380,13 +388,13 @@ class MergedFrames(Sequence):
         return views
 
     def supported(self, mesh: Mesh, share: float, band: float) -> tuple[Mesh, float]:
-        """The mesh without what views do not support, and what share of its area is left out.
+        """Return the mesh without parts that views do not support, and the share of its area that is removed.
 
-        What stays has depths of SUPPORTING_VIEWS, even doubtful ones, within half the `band` in which depths vote:
-        elsewhere rendered depths alone say where a surface is, and without texture they do not know. A piece with less
-        than `share` of the largest one's area stays if SUPPORTED_SHARE of it has depths without doubt, and if it is
-        larger than the square of the `band`: noise of depths makes pieces as wide. A closed surface loses whole pieces
-        alone.
+        Parts stay within half the `band`, in which depths vote, of vertices at which SUPPORTING_VIEWS have depths, even
+        doubtful ones: elsewhere only rendered depths locate the surface, which without texture they cannot. A piece
+        with less than `share` of the largest one's area stays only if SUPPORTED_SHARE of it has depths that are not
+        doubtful, and if it is larger than the square of the `band`, as noise in the depths makes pieces that wide. A
+        closed surface loses only whole pieces.
         """
         area = face_areas(mesh).sum()
         views = self.supporting(mesh.vertices, doubtful=True)
@@ -395,8 +403,8 @@ class MergedFrames(Sequence):
         return left, float(1 - face_areas(left).sum() / area) if area else 0.0
 
     def without_small_holes(self, mesh: Mesh) -> tuple[Mesh, int]:
-        """The mesh with small holes closed that no view sees through, by what is confirmed or on a plane and by free
-        rays, and how many."""
+        """Return the mesh with small holes closed that no view sees through, by depths that are confirmed or on a plane
+        and by free rays, and the number of holes."""
         return without_small_holes(mesh, self.cameras, self._known(), self._backgrounds())
 
     def _supported_pieces(self, mesh: Mesh, share: float, least_area: float) -> Mesh:
@@ -412,7 +420,7 @@ class MergedFrames(Sequence):
 
 
 def _near(mesh: Mesh, supported: np.ndarray, reach: float) -> Mesh:
-    """Faces with a vertex that is no farther than `reach` from one of those (V,) that are `supported`."""
+    """Return the faces with a vertex at most `reach` from one of the `supported` (V,) vertices."""
     from scipy.spatial import cKDTree
 
     if not supported.any():
@@ -424,13 +432,14 @@ def _near(mesh: Mesh, supported: np.ndarray, reach: float) -> Mesh:
 
 
 def pairing_points(rendered: Sequence[DepthFrame]) -> np.ndarray:
-    """(P, 3) points of rendered surfaces by which stereo finds pairs of views, about POINTS evenly over the frames."""
+    """Return (P, 3) points of rendered surfaces by which stereo finds pairs of views, about POINTS, evenly over the
+    frames."""
     surfaces = (frame.surface()[0] for frame in rendered)
     return np.concatenate([points[:: max(1, len(points) // max(1, POINTS // len(rendered)))] for points in surfaces])
 
 
 def _seen_past(frame: DepthFrame, background: np.ndarray) -> DepthFrame:
-    """The frame with rays that are free in (H, W) `background`."""
+    """Return the frame with free rays in (H, W) `background`."""
     if frame.background is None or not background.any():
         return frame
     return replace(
@@ -442,17 +451,17 @@ def _seen_past(frame: DepthFrame, background: np.ndarray) -> DepthFrame:
 
 
 def _background_of(frame: DepthFrame) -> np.ndarray:
-    """(H, W) bool."""
+    """Return the (H, W) bool background, False everywhere if the frame has none."""
     return np.zeros(frame.depth.shape, bool) if frame.background is None else frame.background
 
 
 def _depth_where(found: DepthMap, taken: np.ndarray) -> np.ndarray:
-    """(H, W) depth, NaN elsewhere."""
+    """Return the (H, W) depth where `taken`, NaN elsewhere."""
     return np.where(taken, found.depth, np.float32(np.nan))
 
 
 def _first_known(depths: Sequence[np.ndarray]) -> np.ndarray:
-    """(H, W) the first of several depths that is not NaN."""
+    """Return (H, W) the first of several depths that is not NaN."""
     result = depths[0]
     for depth in depths[1:]:
         result = np.where(np.isfinite(result), result, depth)
@@ -464,23 +473,23 @@ def _share_known(depths: Sequence[np.ndarray]) -> float:
 
 
 class Deviations:
-    """How far confirmed depths are from those of their neighbours, and rendered ones from confirmed ones, as shares of
-    the depth."""
+    """Relative deviations of confirmed depths from those of their neighbours, and of rendered depths from confirmed
+    ones."""
 
     def __init__(self) -> None:
         self.stereo, self.rendered = [np.zeros(0, np.float32)], [np.zeros(0, np.float32)]
 
     def add(self, found: DepthMap, depth: np.ndarray, frame: DepthFrame) -> None:
-        """Those of a view, whose confirmed `depth` is NaN elsewhere."""
+        """Add those of a view, whose `depth` is NaN where it is not confirmed."""
         both = np.isfinite(depth) & (frame.depth > 0)
         self.stereo.append(found.deviation[both])
         self.rendered.append(np.abs(frame.depth[both] / depth[both] - 1))
 
     def weight(self) -> float:
-        """See `MergedFrames`."""
+        """Return the weight of rendered depths, see `MergedFrames`."""
         stereo, rendered = np.concatenate(self.stereo), np.concatenate(self.rendered)
         if not len(stereo):
             return 1.0
-        # A difference of two depths of the same accuracy is larger than the error of one by sqrt(2).
+        # The difference of two equally accurate depths is larger than the error of one by sqrt(2).
         ratio = np.median(stereo) / np.sqrt(2) / max(float(np.median(rendered)), 1e-15)
         return float(min(1.0, ratio**2))

@@ -1,11 +1,10 @@
-"""A block-sparse truncated signed distance field: pixels become planes, planes vote, a mesh comes out.
+"""A truncated signed distance field on sparse voxel blocks: integrates depth maps by weighted votes, extracts a mesh.
 
-Every pixel is a small plane (a surfel): for a plane, 1/z is linear in the pixel, so position and tilt
-follow in closed form from the inverse depths around it. A voxel takes its distance from the plane of the
-pixel it falls on, which is exact on flat surfaces at any angle and resolution; `VoxelBlockGrid.integrate`
-takes the difference of depths at the nearest pixel instead, a staircase across the pixels that grows with
-the angle. Votes weigh what they are worth: a distance in front of a surface bounds the true one from above,
-so near ones count more, and a view knows nothing of what lies far behind the surface it sees.
+Every pixel is a surfel, a small plane: for a plane 1/z is linear in the pixel, so its position and tilt follow in
+closed form from the inverse depths around the pixel. A voxel takes its distance from the plane of the pixel that it
+projects to, which is exact on flat surfaces at any angle and resolution. `VoxelBlockGrid.integrate` takes the
+difference of depths at the nearest pixel instead, a staircase that grows with the angle. A distance in front of a
+surface is an upper bound on the true one, so near votes weigh more; far behind its surface a view knows nothing.
 """
 
 from __future__ import annotations
@@ -21,19 +20,19 @@ from linprim_geo.geometry.mesh import Mesh, merge_vertices
 from linprim_geo.kernels import surface_ops
 
 NEAR_VOXELS = 1.5
-"""Votes in front of a surface weigh 1 / (1 + (distance / this)^2): the surface that is close decides."""
+"""Votes in front of a surface weigh 1 / (1 + (distance / this)^2): the nearest surface decides."""
 
 BEHIND_VOXELS = 0.75
-"""Votes behind a surface keep their weight this far along the ray and lose it over as much again. Sheets
-thinner than this many voxels still come out with two sides; noise in the depths above it roughens the
-surface."""
+"""Votes behind a surface keep their full weight up to this distance along the ray, and lose it linearly over the same
+distance again. Sheets thinner than this many voxels still come out with two sides; if the noise of the depths is
+larger, it roughens the surface."""
 
 BEHIND_WEIGHT = 0.05
-"""What is left of their weight up to the truncation: decides only where no view says anything better."""
+"""Weight that remains from there up to the truncation. It decides only where no view has a better vote."""
 
 FREE_WEIGHT = 0.3
-"""Weight of "this ray passes here and goes on" against 1 for a surface right here. It speaks up only where
-the others say "behind": a few wrong depths are overruled, and free space does not push surfaces away."""
+"""Weight of the vote "free space: this ray passes on", against 1 for a vote on the surface. It counts only where the
+other votes say "behind": so it overrules a few wrong depths, but does not push surfaces away."""
 
 FAR_FRONT_WEIGHT = 0.15
 """Least weight of a vote in front of a surface, so that free space close to it stays free."""
@@ -41,35 +40,34 @@ FAR_FRONT_WEIGHT = 0.15
 GRAZED_WEIGHT = 1e-3
 GRAZED_VOXELS = 1.25
 GRAZED_REACH = 4.0
-"""A surface that is only ever seen at a low angle has no voxel within a truncation behind it along the ray.
-So votes hold up to this many truncations along the ray, as long as the plane is within so many voxels, with a
-weight that loses against anything that any view says."""
+"""Votes behind surfaces seen at grazing angles. Such a surface may have no voxel within a truncation behind it along
+the ray. So votes hold up to GRAZED_REACH truncations along the ray, as long as the plane is within GRAZED_VOXELS
+voxels, with a weight so small that any other vote wins."""
 
 LEAST_COSINE = 0.05
-"""Planes tilted further than this (87 degrees) are jumps between surfaces; such a pixel is made to face its
-ray."""
+"""Least cosine between a pixel's ray and its plane's normal (87 degrees). Planes tilted further are depth
+discontinuities; such a pixel gets a plane that faces its ray."""
 
 SLOPE_RATIO = 3.0
-"""The slopes towards two neighbours are averaged if they differ by no more than this; else the flatter one
-holds."""
+"""The slopes towards two opposite neighbours are averaged if they differ by at most this factor; else the flatter one
+is taken."""
 
 ZERO_GAP = 2e-3
-"""Field values are kept this far from 0 (in truncations), so no vertex falls onto a voxel corner where
+"""Field values are kept at least this far from 0 (in truncations), so that no vertex falls onto a voxel corner, where
 several would coincide. Moves the surface by at most 0.006 voxel at a truncation of 3."""
 
 LEAST_SUPPORT = 1e-6
-"""Voxels with less weight than this were seen by no view; far below the smallest weight a vote can have."""
+"""Voxels with less weight than this count as unseen; it is far below the smallest weight that a vote can have."""
 
 
 @dataclass(frozen=True)
 class DepthFrame:
     """One view's depth map.
 
-    `depth` (H, W) float is z along the optical axis at the pixel centres, in scene units; 0, negative, NaN
-    and inf mean that there is no surface. `background` (H, W) bool marks those of them through which the ray
-    is known to be free; the others are unknown. `confidence` (H, W) multiplies the
-    weight of each pixel. `clamped` (H, W) bool marks depths that are only a least one: the ray is free up to there, and
-    where its surface is is not known.
+    `depth` (H, W) float is z along the optical axis at the pixel centres, in scene units; 0, negative, NaN and inf mean
+    no surface. `background` (H, W) bool marks pixels without surface whose ray is known to be free; the others without
+    surface are unknown. `confidence` (H, W) multiplies the weight of each pixel. `clamped` (H, W) bool marks depths
+    that are only lower bounds: the ray is free up to there, and the surface lies at an unknown depth beyond.
     """
 
     camera: Camera
@@ -86,7 +84,7 @@ class DepthFrame:
                 raise LinprimError(f"depth frame: {name} is {np.shape(value)}, but its camera has {wanted} pixels")
 
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
-        """(P, 3) float64 world points of the pixels that see a surface, and their (P,) depths."""
+        """Return (P, 3) float64 world points of the pixels that see a surface, and their (P,) depths."""
         depth = np.asarray(self.depth, dtype=np.float64)
         valid = np.isfinite(depth) & (depth > 0)
         if self.clamped is not None:
@@ -100,7 +98,7 @@ WEIGHT, FREE = 4, 7
 
 
 def surfels(frame: DepthFrame, voxel: float, truncation: float, origin: np.ndarray) -> np.ndarray:
-    """(H*W, 8) float32 table of a frame: plane, weight, cosine, nearest 1/z around, weight of free votes.
+    """Return the (H*W, 8) float32 table of a frame: plane, weight, cosine, nearest 1/z around, weight of free votes.
 
     Lengths are in the unit of the frame, planes relative to the `origin`.
     """
@@ -121,7 +119,7 @@ def surfels(frame: DepthFrame, voxel: float, truncation: float, origin: np.ndarr
 
 
 def vote_rules(truncation: float, behind: float, occluded: float) -> tuple[float, ...]:
-    """The numbers of `VoteRules` in csrc/surface/fuse.h; `truncation` and `behind` are in voxels."""
+    """Return the numbers of `VoteRules` in csrc/surface/fuse.h; `truncation` and `behind` are in voxels."""
     return (
         NEAR_VOXELS / truncation,
         FAR_FRONT_WEIGHT,
@@ -135,9 +133,9 @@ def vote_rules(truncation: float, behind: float, occluded: float) -> tuple[float
 
 
 class Grid:
-    """The field in its blocks: `blocks` (B, 3) int64 of `resolution`^3 voxels, of which `levels` (B,) says how large
-    they are: 2^level times `voxel`. `truncation` is in voxels of the block; where nothing votes within it, in those of
-    the level `reach` (B,). Coordinates are relative to `origin`, where block (0, 0, 0) of every level starts."""
+    """The field on its blocks: `blocks` (B, 3) int64 of `resolution`^3 voxels that are 2^level times `voxel` long, by
+    `levels` (B,). `truncation` is in voxels of the block, or, where no view votes otherwise, in those of level `reach`
+    (B,). Coordinates are relative to `origin`, where block (0, 0, 0) of every level starts."""
 
     def __init__(self, blocks, levels, reach, origin, voxel, truncation, resolution):
         self.blocks, self.levels, self.reach = np.ascontiguousarray(blocks), levels, reach
@@ -151,7 +149,7 @@ class Grid:
         self.corner = (blocks * resolution + 0.5) * self.edge[:, None]
 
     def integrate(self, frame: DepthFrame, rules: tuple[float, ...]) -> None:
-        """Adds the votes of one frame to every block in its frustum; `rules` are `vote_rules`."""
+        """Add the votes of one frame to every block in its frustum; `rules` are `vote_rules`."""
         camera = frame.camera
         seen = self.in_view(camera)
         project = np.empty((3, 4))
@@ -162,7 +160,7 @@ class Grid:
             rows, voxel = seen[self.levels[seen] == level], self.voxel * 2.0**level
             for reach in distinct(np.append(self.reach[rows], level)):
                 table = surfels(frame, voxel, self.truncation * self.voxel * 2.0**reach, self.origin)
-                if reach > level:  # where nothing else votes
+                if reach > level:  # weak votes, which decide only where there are no others
                     table[:, WEIGHT] *= GRAZED_WEIGHT
                     table[:, FREE] = 0
                 these = rows if reach == level else rows[self.reach[rows] == reach]
@@ -170,7 +168,7 @@ class Grid:
                 surface_ops.add_votes(project, camera.width, camera.height, table, *grid, *sums)
 
     def in_view(self, camera: Camera) -> np.ndarray:
-        """Blocks whose bounding sphere meets the frustum."""
+        """Return the blocks whose bounding sphere meets the frustum."""
         middle = 0.5 * (self.resolution - 1) * self.edge
         centers = (self.corner + middle[:, None] + self.origin) @ camera.rotation.T + camera.world_to_camera[:3, 3]
         radius = np.sqrt(3.0) * middle
@@ -186,19 +184,19 @@ class Grid:
         return np.flatnonzero(seen)
 
     def extract(self) -> Mesh:
-        """The surface in the order of its coordinates; empty if the field never changes sign. Uses the field up."""
+        """Return the surface in canonical order (`placed`); empty if the field never changes sign. Frees the field."""
         return placed(self.surface(np.ones(len(self.blocks), bool)), self.origin)
 
     def surface(self, owned: np.ndarray) -> Mesh:
-        """Marching cubes between voxels that any view has voted on, relative to `origin`: the part that belongs to the
-        `owned` (B,) bool blocks, see `surface_ops.marching_cubes`.
+        """Run marching cubes between voxels that any view has voted on, and return the part of the surface that belongs
+        to the `owned` (B,) bool blocks (`surface_ops.marching_cubes`), relative to `origin`.
 
-        Uses the field up, to have its memory for the mesh.
+        Frees the field, to have its memory for the mesh.
         """
         field, weight, free = self.total, self.weight, self.free
         self.total = self.weight = self.free = None
         known = weight + free > LEAST_SUPPORT
-        # Free votes say on which side a voxel is, not how far: they only speak up against "behind".
+        # Free votes tell the side of a voxel, not its distance: they count only against "behind".
         free *= np.float32(FREE_WEIGHT)
         free[field >= 0] = 0.0
         field += free
@@ -217,8 +215,8 @@ class Grid:
 
 
 def placed(surface: Mesh, origin: np.ndarray) -> Mesh:
-    """A surface that `Grid.surface` gave, or several together, in the order of its coordinates and the frame of the
-    cameras."""
+    """Return surfaces of `Grid.surface`, one or several merged, in canonical order (`_canonical`) and in the frame of
+    the cameras."""
     if len(surface.faces) == 0:
         return surface
     mesh = _canonical(surface)
@@ -226,7 +224,7 @@ def placed(surface: Mesh, origin: np.ndarray) -> Mesh:
 
 
 def _canonical(mesh: Mesh) -> Mesh:
-    """Vertices in the order of their coordinates, faces in the order of their vertices, coincident ones merged."""
+    """Sort vertices by their coordinates and faces by their vertices, and merge coincident vertices."""
     order = np.lexsort(mesh.vertices.T[::-1])
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))

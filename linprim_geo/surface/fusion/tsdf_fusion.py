@@ -1,4 +1,5 @@
-"""Depth maps to a mesh: the steps of fusing them into a signed distance field, and its voxel size."""
+"""Turns depth maps into a mesh: runs the steps of fusing them into a signed distance field, and chooses its
+voxel size."""
 
 from __future__ import annotations
 
@@ -16,9 +17,9 @@ from linprim_geo.surface.fusion.voxel_levels import COARSE, VoxelLevels
 from linprim_geo.surface.normals import vertex_normals
 
 MOST_FACES, CELLS_PER_AREA, AREA_CELLS = 1e6, 1.5, 64
-"""Without a voxel size given a mesh has about so many faces at most. A plane crosses so many cubes per area of a side
-of one, in the mean over its directions, and marching cubes makes two faces in each. The area is measured with so many
-cubes along the diagonal."""
+"""Faces that a mesh has at most, about, if no voxel size is given. Cubes that a plane crosses per area of a cube's
+side, in the mean over its directions; marching cubes makes two faces in each. Cubes along the diagonal with which the
+area is measured."""
 
 
 def fuse_tsdf(
@@ -36,38 +37,38 @@ def fuse_tsdf(
     fuse: Callable[[Lattice, Iterable[DepthFrame]], Mesh] | None = None,
     counts: Callable[[Mesh], Mesh] | None = None,
 ) -> Mesh:
-    """Fuses depth maps into a triangle mesh with normals.
+    """Fuse depth maps into a triangle mesh with normals.
 
-    `frames` is iterated several times (blocks, field, sizes of voxels), so it must be re-iterable; a
-    sequence that renders on demand keeps only one frame in memory. Blocks around every depth sample are
-    allocated, then every frame votes in all blocks inside its frustum, so background and far depths carve
-    what other views put there. The mesh is oriented with its front towards the cameras. The same input gives
-    the same mesh to the last bit, whatever the number of threads.
+    `frames` is iterated several times (blocks, field, sizes of voxels), so it must be re-iterable; a sequence that
+    renders on demand keeps only one frame in memory. Blocks around every depth sample are allocated, then every frame
+    votes in all blocks inside its frustum, so that background and far depths carve away wrong surface of other views.
+    Faces are oriented towards the cameras. The same input gives the same mesh to the last bit, whatever the number of
+    threads.
 
     Args:
         voxel_size: edge of a voxel, in scene units.
-        truncation_voxels: reach of the field on both sides of a surface; below 2 the surface gets holes,
-            above 4 thin parts swell.
+        truncation_voxels: truncation distance on both sides of a surface; below 2 the surface gets holes, above 4 thin
+            parts swell.
         bounds: (2, 3) box; samples and faces outside are dropped.
         memory_limit: bytes the field may take; default 60 % of what is available.
         block_resolution: voxels along the edge of a block.
         min_component: pieces with less than this share of the largest piece's area are dropped; 0 keeps all.
-        behind_voxels: see `tsdf_field.BEHIND_VOXELS`; 1.5 makes a sheet without thickness a closed shell, at the
-            price of swollen thin parts.
-        occluded_vote: weight of a vote "inside" from every view in which a voxel lies further behind the
-            surface than the truncation; 0.01 to 0.02 closes tunnels that too deep pixels dig into solids.
+        behind_voxels: see `tsdf_field.BEHIND_VOXELS`; 1.5 makes a sheet without thickness a closed shell, at the price
+            of swollen thin parts.
+        occluded_vote: weight of a vote "inside" from every view in which a voxel lies behind the surface by more than
+            the truncation; 0.01 to 0.02 closes tunnels that too deep pixels dig into solids.
         log: called with lines such as the memory that will be taken.
-        fuse: makes the surface of a lattice in place of `fuse_lattice`; then `memory_limit` is its own affair.
-        counts: with it voxels have several sizes: twice `voxel_size` where the surface is flat, smaller ones where it
-            bends, see `voxel_levels`. Gives what counts of the surface that voxels of the first size make.
+        fuse: makes the surface of a grid in place of `fuse_lattice`; then `memory_limit` is not applied here.
+        counts: if given, voxels have several sizes: twice `voxel_size` where the surface is flat, smaller ones where it
+            bends, see `voxel_levels`. Returns the part of the coarse surface that counts for the choice.
 
     Returns:
         The mesh in the frame of the cameras.
     Raises:
-        LinprimError: no frame has a depth, the field would not fit in memory (TooFine), or nothing comes out.
+        LinprimError: no frame has a depth, the field would not fit in memory (TooFine), or there is no surface.
     Accuracy: Chamfer of 60 exact depth maps of 320x320 with a voxel of 1/200 of the diagonal, against what
-        `VoxelBlockGrid.integrate` makes of them, in % of the diagonal: smooth body 0.003 (0.045), part with
-        thin ribs and sharp edges 0.015 (0.046); a room, 80 maps of 400x300: 0.031 (0.050).
+        `VoxelBlockGrid.integrate` makes of them, in % of the diagonal: smooth body 0.003 (0.045), part with thin ribs
+        and sharp edges 0.015 (0.046); a room, 80 maps of 400x300: 0.031 (0.050).
     """
     if iter(frames) is frames:
         raise TypeError("frames can be iterated only once, but fusing goes over them several times")
@@ -112,7 +113,7 @@ def fuse_tsdf(
 
 
 def fuse_lattice(lattice: Lattice, frames: Iterable[DepthFrame]) -> Mesh:
-    """The surface of all frames on a lattice."""
+    """Fuse all frames on a grid and return its surface."""
     grid = lattice.grid()
     for frame in frames:
         grid.integrate(frame, lattice.rules)
@@ -120,16 +121,16 @@ def fuse_lattice(lattice: Lattice, frames: Iterable[DepthFrame]) -> Mesh:
 
 
 def auto_voxel_size(frames: Iterable[DepthFrame]) -> float:
-    """A voxel size that the views can support, see `voxel_size_and_area`."""
+    """Return a voxel size that the views can support, see `voxel_size_and_area`."""
     return voxel_size_and_area(frames)[0]
 
 
 def voxel_size_and_area(frames: Iterable[DepthFrame]) -> tuple[float, float]:
-    """A voxel size that the views can support, and about the area that they see: the size is their median pixel
-    footprint; larger where the surface would have more than MOST_FACES faces, at most 1/100 of the diagonal.
+    """Return a voxel size that the views can support, and about the area that they see.
 
-    The diagonal is that of the box between the 1 and 99 % quantiles of the depth samples, widened by the share that
-    quantiles cut off a uniform distribution. Rounded to two digits.
+    The size is the views' median pixel footprint; larger where the surface would have more than MOST_FACES faces, at
+    most 1/100 of the diagonal, and rounded to two digits. The diagonal is that of the box between the 1 and 99 %
+    quantiles of the depth samples, widened by the share that quantiles cut off a uniform distribution.
 
     Raises:
         LinprimError: no frame has a depth.
@@ -154,7 +155,7 @@ def voxel_size_and_area(frames: Iterable[DepthFrame]) -> tuple[float, float]:
 
 
 def _area(points: np.ndarray, cell: float) -> float:
-    """Area of a surface that (P, 3) points lie densely on, by how many cubes they are in."""
+    """Estimate the area of a surface densely sampled by (P, 3) points from the number of cubes that hold points."""
     cells = np.unique(np.floor(points / cell).astype(np.int64), axis=0)
     return len(cells) * cell * cell / CELLS_PER_AREA
 

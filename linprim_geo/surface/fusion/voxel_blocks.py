@@ -1,4 +1,5 @@
-"""Where a signed distance field is kept: blocks of voxels around what depth maps see, and the memory they take."""
+"""Allocates the sparse voxel blocks of a signed distance field around the samples of depth maps, and estimates their
+memory."""
 
 from __future__ import annotations
 
@@ -12,22 +13,24 @@ from linprim_geo.base.sorting import distinct
 from linprim_geo.surface.fusion.tsdf_field import DepthFrame, Grid
 
 BYTES_PER_VOXEL = 34
-"""12 for the votes; when they are done, 5 for the field, what it is made with, and marching cubes: 25 and 26 measured
-on an office of 192,000 and 742,000 blocks of 4^3 that gave 0.8 and 3.4 million faces."""
+"""Peak memory per voxel: 12 bytes for the votes; afterwards 5 for the field, what it is made with, and marching cubes.
+25 and 26 were measured on an office of 192,000 and 742,000 blocks of 4^3 that gave 0.8 and 3.4 million faces."""
 
 FINEST_PART = 8
-"""A voxel smaller than this part of a pixel's footprint holds nothing that a pixel has seen."""
+"""Voxels may be at most this many times smaller than a pixel's footprint; in smaller ones no pixel has measured
+anything."""
 
 KEY_BITS = 21
-"""Bits per axis of the key of a block or voxel: three fit into an int64."""
+"""Bits per axis of the key of a block or voxel: three axes fit into an int64."""
 
 MOST_NEW, CHUNK = 2**21, 2**18
-"""Keys of `NearBlocks` that wait for being merged, and of how many the blocks around are sought at once."""
+"""Keys that `NearBlocks` buffers before it merges them, and keys whose surrounding blocks are searched at a time; both
+limit memory."""
 
 
 class TooFine(LinprimError):
-    """A field of voxels of the size `voxel` that would take `need` bytes, more than `limit`; one with the voxel size
-    `fits` would not."""
+    """A field with voxels of size `voxel` would take `need` bytes, more than `limit`; with voxels of size `fits` it
+    would not."""
 
     def __init__(self, voxel: float, need: float, limit: float, fits: float):
         super().__init__(
@@ -37,17 +40,20 @@ class TooFine(LinprimError):
         self.voxel, self.need, self.limit, self.fits = voxel, need, limit, fits
 
     def of_smaller(self, times: float) -> TooFine:
-        """The same with sizes of voxels that are so many times smaller."""
+        """Return the same error for voxel sizes that are this many times smaller."""
         return TooFine(self.voxel / times, self.need, self.limit, self.fits / times)
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Where a field is kept: `blocks` (B, 3) int64 of `resolution`^3 voxels. Those of `levels` (B,) int64 are 2^level
-    times as long as `voxel`, and so are their blocks; block (0, 0, 0) of every level starts at `origin` (3,). Blocks do
-    not overlap. `truncation` is in voxels; where nothing votes within it, it is in those of the level `reach` (B,),
-    which is above that of the block where it touches a larger one: else votes behind a surface would not get as far as
-    the cubes between both. `rules` are `tsdf_field.vote_rules`."""
+    """The sparse voxel grid of a field: `blocks` (B, 3) int64 of `resolution`^3 voxels.
+
+    Blocks of `levels` (B,) int64 have voxels, and blocks, 2^level times as long as those of level 0, whose voxels are
+    `voxel` long. Block (0, 0, 0) of every level starts at `origin` (3,). Blocks do not overlap. `truncation` is in
+    voxels of the block. `reach` (B,) is the level by whose voxels it is measured where no view votes otherwise: above
+    the level of a block that touches a larger one, as votes behind a surface would else not get as far as the cubes
+    between the two. `rules` are `tsdf_field.vote_rules`.
+    """
 
     blocks: np.ndarray
     levels: np.ndarray
@@ -59,16 +65,17 @@ class Lattice:
     rules: tuple[float, ...]
 
     def voxel_sizes(self) -> np.ndarray:
-        """(B,) edge of the voxels of each block."""
+        """Return (B,) edge lengths of the voxels of each block."""
         return self.voxel * 2.0**self.levels
 
     def grid(self) -> Grid:
-        """An empty field on it."""
+        """Return an empty field on this grid."""
         return Grid(self.blocks, self.levels, self.reach, self.origin, self.voxel, self.truncation, self.resolution)
 
 
 def estimate_memory(blocks: int, block_resolution: int = 4, frame_pixels: int = 0) -> int:
-    """Bytes that fusing takes at its peak: blocks of voxels, and one frame of `frame_pixels` with its tables.
+    """Estimate the peak memory of fusion in bytes: that of the voxel blocks, and of one frame of `frame_pixels` with
+    its tables.
 
     Accuracy: an upper estimate, 1.1 to 1.5 times the growth measured.
     """
@@ -76,36 +83,37 @@ def estimate_memory(blocks: int, block_resolution: int = 4, frame_pixels: int = 
 
 
 def block_keys(index: np.ndarray) -> np.ndarray:
-    """(B,) int64 keys of blocks (B, 3) of a lattice, in the order of x, then y, then z."""
+    """Return (B,) int64 keys of blocks (B, 3), which sort by x, then y, then z."""
     half = 1 << (KEY_BITS - 1)
     x, y, z = (index + half).T
     return (x << (2 * KEY_BITS)) | (y << KEY_BITS) | z
 
 
 def unpack_keys(key: np.ndarray) -> np.ndarray:
-    """(B, 3) the blocks that have these keys."""
+    """Return the (B, 3) blocks that have these keys."""
     half, mask = 1 << (KEY_BITS - 1), (1 << KEY_BITS) - 1
     return np.stack([key >> (2 * KEY_BITS), (key >> KEY_BITS) & mask, key & mask], axis=1) - half
 
 
 def touching(index: np.ndarray) -> np.ndarray:
-    """(27 B,) keys of blocks (B, 3) and of those that touch them, in 27 runs."""
+    """Return (27 B,) keys of blocks (B, 3) and of those that touch them, in 27 runs of B."""
     steps = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
     return np.concatenate([block_keys(index + step) for step in steps])
 
 
 class NearBlocks:
-    """Collects the blocks within a `truncation` of points, in voxels, of a lattice of one size. Points are relative to
-    its origin."""
+    """Collects the blocks of a grid of one voxel size that lie within `truncation` voxels of points. Points are
+    relative to the origin of the grid."""
 
     def __init__(self, voxel: float, truncation: float, resolution: int):
         self.voxel, self.truncation, self.resolution = voxel, truncation, resolution
-        # Keys of pairs of voxels, which are far fewer than points, by how far blocks around them reach.
+        # Keys of cells of 2^3 voxels that hold points, which are far fewer than points, by how many voxels away blocks
+        # count as near.
         self.pairs: dict[int, np.ndarray] = {}
         self.new: dict[int, list[np.ndarray]] = {}
 
     def add(self, points: np.ndarray, footprint: float = 0.0) -> None:
-        """Adds (P, 3) points, between neighbours of which there are gaps of `footprint`.
+        """Add (P, 3) points that are `footprint` apart from their neighbours, a gap that the blocks have to cover.
 
         Raises:
             LinprimError: one is too far from the origin.
@@ -128,11 +136,12 @@ class NearBlocks:
         self.pairs[reach] = distinct(np.concatenate([self.pairs.get(reach, np.zeros(0, np.int64)), *new]))
 
     def least(self) -> int:
-        """There are at least so many blocks: none holds more pairs than these take."""
+        """Return a lower bound on the number of blocks: the number of cells over the most cells that a
+        block touches."""
         return max(map(len, self.pairs.values()), default=0) // (self.resolution // 2 + 1) ** 3
 
     def keys(self) -> np.ndarray:
-        """(B,) sorted keys of the blocks."""
+        """Return (B,) sorted keys of the blocks."""
         for reach in list(self.new):
             self._merge(reach)
         found = np.zeros(0, np.int64)
@@ -154,10 +163,11 @@ def find_blocks(
     resolution: int,
     limit: float,
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Blocks within a truncation of any depth sample in the `bounds`, of voxels whose middles are at multiples of their
-    size.
+    """Find the blocks within a truncation of any depth sample in the `bounds`. Voxel centres lie at multiples of the
+    voxel size.
 
-    Returns: sorted (B, 3) indices, the world point that block (0, 0, 0) starts at, and the pixels of the largest frame.
+    Returns: sorted (B, 3) indices, the world point at which block (0, 0, 0) starts, and the pixels of the largest
+        frame.
 
     Raises:
         LinprimError: there are no samples, or they are too far apart, or the voxels are too small for any pixel.
@@ -190,17 +200,17 @@ def find_blocks(
     keys = near.keys()
     check_memory(len(keys), resolution, largest, limit, voxel)
     blocks = unpack_keys(keys)
-    # Coordinates are float32 from here on, so they are counted from the middle.
+    # Coordinates are float32 from here on, so they are counted from the middle, where they are small.
     middle = (blocks.min(0) + blocks.max(0)) // 2
     return blocks - middle, origin + middle * (resolution * voxel), largest
 
 
 def check_memory(blocks: int, resolution: int, pixels: int, limit: float, voxel: float) -> None:
-    """Refuses a field that takes more than `limit` bytes, with voxels of about `voxel`, of frames of at most `pixels`.
+    """Refuse a field that takes more than `limit` bytes, with voxels of about `voxel` and frames of at most `pixels`.
 
     Raises:
         TooFine: with the voxel size that fits.
-        LinprimError: a frame at work takes more at any voxel size.
+        LinprimError: a frame in work takes more at any voxel size.
     """
     need, frame = estimate_memory(blocks, resolution, pixels), estimate_memory(0, resolution, pixels)
     if need <= limit:
@@ -210,7 +220,7 @@ def check_memory(blocks: int, resolution: int, pixels: int, limit: float, voxel:
             f"a depth map takes {frame / 2**30:.2g} GiB while it is fused, {limit / 2**30:.2g} GiB are allowed: wanted "
             "more memory, or a training with --downscale"
         )
-    # Blocks around a surface go with the inverse square of the voxel; 5 % are left as room.
+    # The number of blocks around a surface grows with the inverse square of the voxel size; 5 % are left as room.
     fits = voxel * np.sqrt(1.05 * (need - frame) / (limit - frame))
     digits = 10.0 ** (np.floor(np.log10(fits)) - 1)
     fits = np.ceil(fits / digits) * digits

@@ -1,8 +1,8 @@
-"""Voxels of several sizes: large where a surface is flat, small where it bends.
+"""Chooses voxels of several sizes: large where a surface is flat, small where it bends.
 
-Depth maps are fused with coarse voxels first. A block of these is divided where the coarse surface in it is off a plane
-by more than depths can tell, and no further than pixels and the noise of depths allow: a wall is as exact with large
-voxels, and smoother, and the triangles that it saves go to what is small and near.
+Depth maps are first fused with coarse voxels. A block of these is subdivided where its coarse surface deviates from a
+plane by more than depths can resolve, but no further than pixel footprints and the noise of depths allow. On a wall
+large voxels are as accurate and smoother, and the triangles that they save go to details and to near parts.
 """
 
 from __future__ import annotations
@@ -25,43 +25,46 @@ from linprim_geo.surface.fusion.voxel_blocks import (
 )
 
 COARSE = 2.0
-"""Voxels of the coarse surface, and of what is flat, are so many times as long as all would be of one size."""
+"""Size of the voxels of the coarse surface, which flat parts keep, in voxels of a grid of one size (`voxel_size`)."""
 
 MOST_HALVINGS = 4
-"""Voxels are halved so often at most, to an eighth of what all would be of one size."""
+"""Most times that a coarse voxel is halved: to an eighth of the voxel of a grid of one size."""
 
 TOLERANCE = 1 / 10
-"""How far a surface may be off that of small voxels, in pixels: what depths cannot tell (`depth_error.FINEST`)."""
+"""Largest deviation of a surface from that of small voxels, in pixels: what depths cannot resolve
+(`depth_error.FINEST`)."""
 
 FINER_SHARE = 0.25
-"""Voxels are as small as a pixel covers in this share of the depths of a block: few views are near."""
+"""Quantile of the pixel footprints of a block's depths down to which voxels may shrink, as only few views are near."""
 
 NOISE_VOXELS = 2 / BEHIND_VOXELS
-"""And as long as so many times the noise of depths, at least. Votes keep their weight BEHIND_VOXELS behind a surface;
-where more than one in 20 depths is off by that, they tear holes."""
+"""Least voxel size, in units of the noise of depths. Votes keep their weight BEHIND_VOXELS behind a surface; if more
+than one in 20 depths is off by that, they tear holes."""
 
 UNEXPLAINED = 0.05
-"""A block in which this share of the depths is further than a coarse voxel off the plane of the coarse surface, if
-there is any, has something that this has lost, and gets the voxels that all would have."""
+"""Share of a block's depths that may lie more than a coarse voxel off the plane of the coarse surface. From this share
+on, or if a block with depths has no coarse surface, the coarse surface has lost something there, and the block gets
+voxels of the usual size or smaller."""
 
 SURE, LEAST_SAMPLES = 0.5, 6
-"""Depths with at least this confidence tell of pixels and noise; of noise, so many in one voxel, and of tears, so many
-in a block."""
+"""Least confidence of depths from which pixel footprints and noise are measured; and fewest depths in a voxel for its
+noise, and in a block for its share of deviating depths, or for it to count as torn."""
 
 MOST_SAMPLES, BYTES_PER_SAMPLE = 2**21, 200
-"""About so many depths are looked at, or as many as fit into a quarter of the memory that the field may take."""
+"""About the most depths that are sampled, or as many as fit into a quarter of the memory that the field may take, and
+bytes for each."""
 
 
 class VoxelLevels:
-    """Which blocks of a lattice of one level are divided, and how often.
+    """Decides how often each block of a grid of one level is subdivided.
 
-    What is fused on the `lattice` then has about `most_faces` at most, and takes `limit` bytes: voxels are as small as
-    these leave. Levels of blocks that touch differ by one at most.
+    The surface fused on the resulting `lattice` has about `most_faces` at most, and takes at most `limit` bytes: voxels
+    are as small as these leave. Levels of blocks that touch differ by at most one.
 
     Args:
         coarse: of one level.
-        surface: what counts of the surface that was fused on it, in the frame of the cameras.
-        frames: that it was fused from, re-iterable.
+        surface: the part that counts of the surface fused on it, in the frame of the cameras.
+        frames: from which it was fused, re-iterable.
     """
 
     def __init__(
@@ -76,7 +79,7 @@ class VoxelLevels:
         self.samples = samples = _Samples(blocks, frames, most_samples)
         pixel, noise = samples.pixels(), samples.noise()
         least = samples.share_off(planes, coarse.voxel) >= UNEXPLAINED
-        finest = np.fmin(np.maximum(pixel, NOISE_VOXELS * noise), usual)  # the usual ones where too little is known
+        finest = np.fmin(np.maximum(pixel, NOISE_VOXELS * noise), usual)  # the usual size where depths are too few
         pixel = np.where(np.isnan(pixel), usual, pixel)
         most = np.clip(np.floor(np.log2(coarse.voxel / finest) + 0.5), 1, MOST_HALVINGS)
         with np.errstate(divide="ignore"):
@@ -88,7 +91,7 @@ class VoxelLevels:
         eighths = 0
         while True:
             self.halvings = blocks.graded(np.clip(np.ceil(wanted - eighths / 8), least, most).astype(np.int64))
-            parts = 4.0**self.halvings  # in which a block is divided, along the surface
+            parts = 4.0**self.halvings  # smaller blocks along the surface, per block
             if (faces * parts).sum() <= most_faces and fits(parts.sum()):
                 self.lattice = blocks.divided(self.halvings, frames)
                 if fits(len(self.lattice.blocks)):
@@ -98,14 +101,15 @@ class VoxelLevels:
                 return
             if (wanted > eighths / 8).any():
                 eighths += 1
-            else:  # what coarse voxels have lost stays lost, and what bends has its turn again
+            else:  # give up the least halvings of blocks that have lost something, and start again with those that bend
                 least, eighths = np.zeros_like(least), 0
 
     def mend(self, coarse: Mesh, fine: Mesh) -> bool:
-        """Whether there were blocks where the `fine` surface, of the `lattice`, is torn; these have fewer levels then.
+        """Coarsen blocks where the `fine` surface, of the `lattice`, is torn. Return whether there were any.
 
-        A surface is torn where depths lie on the `coarse` one and the fine one is missing: there different views agree
-        within large voxels and not within small ones. Such blocks get the voxels that all would have."""
+        A surface is torn where depths lie on the `coarse` one and the fine one is missing: there the depths of
+        different views agree within large voxels but not within small ones. Such blocks get voxels of the usual size.
+        """
         from scipy.spatial import cKDTree
 
         asked = self.halvings[self.samples.row] > 1
@@ -124,19 +128,19 @@ class VoxelLevels:
 
 
 class _Blocks:
-    """The blocks of a lattice of one level in the order of their keys."""
+    """The blocks of a grid of one level, sorted by their keys."""
 
     def __init__(self, lattice: Lattice):
         self.lattice, self.count = lattice, len(lattice.blocks)
         self.keys = np.sort(block_keys(lattice.blocks))
 
     def find(self, keys: np.ndarray) -> np.ndarray:
-        """The row of each key, -1 where there is none."""
+        """Return the row of each key, -1 where there is none."""
         row = np.minimum(np.searchsorted(self.keys, keys), self.count - 1)
         return np.where(self.keys[row] == keys, row, -1)
 
     def rows(self, points: np.ndarray) -> np.ndarray:
-        """The row of the block that each of (P, 3) points is in, -1 where there is none."""
+        """Return the row of the block that each of (P, 3) points lies in, -1 where there is none."""
         length = self.lattice.voxel * self.lattice.resolution
         return self.find(block_keys(np.floor((points - self.lattice.origin) / length).astype(np.int64)))
 
@@ -147,7 +151,7 @@ class _Blocks:
         return np.where(rows < 0, self.count, rows)
 
     def graded(self, halvings: np.ndarray) -> np.ndarray:
-        """Halvings (B,) that are raised until those of blocks that touch differ by one at most."""
+        """Return halvings (B,), raised until those of blocks that touch differ by at most one."""
         while True:
             raised = np.maximum(halvings, np.append(halvings, 0)[self.around].max(0) - 1)
             if np.array_equal(raised, halvings):
@@ -155,7 +159,7 @@ class _Blocks:
             halvings = raised
 
     def lowered(self, halvings: np.ndarray) -> np.ndarray:
-        """Halvings (B,) that are lowered until those of blocks that touch differ by one at most."""
+        """Return halvings (B,), lowered until those of blocks that touch differ by at most one."""
         while True:
             lower = np.minimum(halvings, np.append(halvings, MOST_HALVINGS)[self.around].min(0) + 1)
             if np.array_equal(lower, halvings):
@@ -163,8 +167,8 @@ class _Blocks:
             halvings = lower
 
     def divided(self, halvings: np.ndarray, frames: Iterable[DepthFrame]) -> Lattice:
-        """The lattice with voxels halved so often in each block; of smaller blocks, those within the truncation of the
-        depths."""
+        """Return the grid with the voxels of each block halved this often; of the smaller blocks only those within a
+        truncation of the depths."""
         lattice, top = self.lattice, int(halvings.max(initial=0))
         if not top:
             return lattice
@@ -203,12 +207,14 @@ class _Blocks:
 
 
 def _shapes(blocks: _Blocks, vertices: np.ndarray) -> tuple[_Planes, np.ndarray]:
-    """Of each block the plane of the surface of (V, 3) vertices, and (B,) how much of its shape that loses by voxels.
+    """Return the plane fitted to the surface vertices (V, 3) of each block, and (B,) how much of the shape coarse
+    voxels lose.
 
-    An edge through the middle of a cube is off the plane of least squares by about a third of the cube's length, and
-    voxels cut off about a third of their length. So it is the share of one voxel in what a surface is off its plane in
-    a cube. Of a curved surface this is more than it loses. Cubes are twice as long as blocks: what only touches one
-    looks flat in it."""
+    An edge through the middle of a cube deviates from the least-squares plane by about a third of the cube's length,
+    and voxels cut off about a third of their own length. So the loss is the largest deviation in a cube times the ratio
+    of the voxel to the cube. Of a curved surface less is lost than this. Cubes are twice as long as blocks, because a
+    detail that just touches a cube looks flat in it.
+    """
     points, rows = [], []
     beyond = blocks.lattice.voxel * blocks.lattice.resolution / 2
     for side in np.ndindex(2, 2, 2):
@@ -222,7 +228,7 @@ def _shapes(blocks: _Blocks, vertices: np.ndarray) -> tuple[_Planes, np.ndarray]
 
 
 class _Planes:
-    """The planes of least squares of points (P, 3) with the same `row` (P,), of which there are `count`."""
+    """Least-squares planes of the points (P, 3) with the same `row` (P,); there are `count` rows."""
 
     def __init__(self, points: np.ndarray, row: np.ndarray, count: int):
         self.number = np.bincount(row, minlength=count)
@@ -236,13 +242,15 @@ class _Planes:
         self.normal = np.linalg.eigh(square)[1][:, :, 0]
 
     def off(self, points: np.ndarray, row: np.ndarray) -> np.ndarray:
-        """(P,) how far points are off the plane of their row, infinite where it has no points."""
+        """Return the (P,) signed distances of points from the plane of their row, infinite where a row has
+        no points."""
         off = ((points - self.middle[row]) * self.normal[row]).sum(1)
         return np.where(self.number[row] > 0, off, np.inf)
 
 
 class _Samples:
-    """Depths of frames in the blocks of a lattice: sure ones, about `most` of them, evenly over the images."""
+    """Depths of the frames within the blocks of a grid: about `most` of the confident ones, evenly spread over the
+    images."""
 
     def __init__(self, blocks: _Blocks, frames: Iterable[DepthFrame], most: int):
         self.blocks = blocks
@@ -261,12 +269,12 @@ class _Samples:
         self.points, self.row, self.pixel = points[row >= 0], row[row >= 0], np.concatenate(pixels)[row >= 0]
 
     def pixels(self) -> np.ndarray:
-        """(B,) what a pixel covers in the nearest views of a block, NaN where there are no depths."""
+        """Return (B,) the pixel footprint in the nearest views of a block, NaN where it has no depths."""
         return _quantiles(self.pixel, self.row, self.blocks.count, FINER_SHARE)
 
     def noise(self) -> np.ndarray:
-        """(B,) how far depths are off the plane of those in the same voxel, in the median of a block's; NaN where too
-        few tell."""
+        """Return (B,) the noise of depths in a block: the median over its depths of their deviation from a plane fitted
+        per voxel; NaN where there are too few."""
         lattice = self.blocks.lattice
         voxel = block_keys(np.floor((self.points - lattice.origin) / lattice.voxel).astype(np.int64))
         keys, voxel = np.unique(voxel, return_inverse=True)
@@ -277,14 +285,15 @@ class _Samples:
         return _quantiles(noise[voxel[told]], self.row[told], self.blocks.count, 0.5)
 
     def share_off(self, planes: _Planes, farthest: float) -> np.ndarray:
-        """(B,) share of a block's depths that are further off its plane than that, 0 where there are too few."""
+        """Return (B,) the share of a block's depths that lie farther than `farthest` from its plane, 0 where there are
+        too few."""
         number = np.bincount(self.row, minlength=self.blocks.count)
         far = np.bincount(self.row, np.abs(planes.off(self.points, self.row)) > farthest, self.blocks.count)
         return np.where(number >= LEAST_SAMPLES, far / np.maximum(number, 1), 0)
 
 
 def _quantiles(values: np.ndarray, row: np.ndarray, count: int, share: float) -> np.ndarray:
-    """(count,) quantile of the values of each row, NaN where it has none."""
+    """Return the (count,) quantile `share` of the values of each row, NaN where a row has none."""
     found, number = np.full(count, np.nan), np.bincount(row, minlength=count)
     there = number > 0
     first = np.cumsum(number) - number
