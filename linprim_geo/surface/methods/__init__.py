@@ -1,1 +1,1 @@
-"""The surface of a run by one of three methods."""
+"""Extracts the surface of a run by one of three methods."""

@@ -1,4 +1,4 @@
-"""Triangles between the inner and outer vertices of tetrahedra."""
+"""Marching tetrahedra: triangulates the boundary between inner and outer vertices of tetrahedra."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import numpy as np
 
 
 def march_tetrahedra(points: np.ndarray, cells: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Surface between the corners of tetrahedra that are `inside` and those that are not.
+    """Return the surface between the tetrahedra's corners that are `inside` and those that are not.
 
-    One vertex per edge with one end inside; a triangle where a tetrahedron has one or three such corners, two where it
-    has two. If the cells fill a body whose corners at the border are outside, the surface is a closed manifold.
+    There is one vertex per edge with one end inside, one triangle in a tetrahedron with one or three inner corners, and
+    two in one with two. If the cells fill a body whose corners at the border are outside, the surface is a closed
+    manifold.
 
     Args:
         points: (P, 3) corners.
@@ -17,14 +18,14 @@ def march_tetrahedra(points: np.ndarray, cells: np.ndarray, inside: np.ndarray) 
         inside: (P,) bool.
 
     Returns:
-        (E, 2) ends of the edges, the inner one first, sorted; (F, 3) faces of the rows of that, counter-clockwise seen
+        (E, 2) ends of the edges, inner one first, sorted; (F, 3) faces as rows of these edges, counter-clockwise seen
         from outside.
 
     Source: Doi and Koide, An efficient method of triangulating equi-valued surfaces by using tetrahedral cells, 1991.
     """
     flags = inside[cells]
     mixed = flags.any(1) & ~flags.all(1)
-    # Inner corners first; then two of the same sort change places wherever that left a tetrahedron mirrored.
+    # Sort inner corners first; where that mirrored a tetrahedron, swap two corners of the same kind.
     cells = np.take_along_axis(cells[mixed], np.argsort(~flags[mixed], axis=1, kind="stable"), axis=1)
     count = flags[mixed].sum(1)
     a, b, c, d = (points[cells[:, k]] for k in range(4))

@@ -1,10 +1,9 @@
-"""The surface of a run as a level of its opacity field: of how much light gets from a point to the cameras, in closed
-form.
+"""Method `opacity-field`: a level set of the opacity field, evaluated in closed form from the primitives.
 
-O(x) = 1 - T(x), where T(x) is a robust largest of the transmittances between x and the cameras that have it in view.
-What no camera sees into is solid, what none has in view is free. No grid and no depth maps: the field is sampled at the
-primitives' own points and around the surface that these give, the points are joined to tetrahedra, and the level is
-found on their edges.
+O(x) = 1 - T(x), where T(x) is a robust maximum of the transmittances between x and the cameras that have it in view.
+Space that no camera sees into is solid, space that none has in view is free. There is no grid and there are no depth
+maps: the field is sampled at the primitives' own points and around the surface that these give, the points are joined
+to Delaunay tetrahedra, and the level is located on their edges.
 """
 
 from __future__ import annotations
@@ -30,74 +29,77 @@ from linprim_geo.surface.normals import vertex_normals
 from linprim_geo.surface.visibility import visible_faces
 
 NEAR = 0.01
-"""Depth at which light begins to be absorbed, training frame: where the renderer's rays begin."""
+"""Depth at which absorption begins, training frame: where the renderer's rays begin."""
 
 RANK_SHARE = 0.02
-"""The largest transmittance of a point is that of rank 1 + this share of its other cameras: of 60 about the second, so
-a leak that a single camera looks through carves nothing."""
+"""The robust maximum of a point's transmittances is that of rank 1 + this share of its other cameras: of 60 cameras
+about the second, so that a leak which a single camera looks through carves nothing."""
 
 TYPICAL_SHARE = 0.2
-"""The rank of a camera that is typical of those that look onto a surface: the best decide what is open, these where the
-surface lies."""
+"""Rank, as a share, of a camera that is typical of those that look onto a surface. The best cameras decide which space
+is free, typical ones where the surface lies."""
 
 LARGEST_MOVE = 1 / 8
-"""Vertices are moved towards where a typical camera's light falls to the level, by at most this share of the spacing,
-half a pixel by default: further away, as in holes that few cameras look into, the best ones are all there is."""
+"""Largest move of a vertex towards where a typical camera's transmittance falls to the level, as a share of the
+spacing: half a pixel by default. Where they are further apart, as in holes that few cameras look into, only the best
+cameras see the surface."""
 
 LADDER = (0.0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
-"""Heights above the surface at which the light of a typical camera is looked at, as shares of the spacing."""
+"""Heights above the surface at which a typical camera's transmittance is sampled, as shares of the spacing."""
 
 FADE_SHARE = 0.03
-"""A camera's say goes from nothing at the border of its image to the whole this share of the image's smaller side
-further in."""
+"""Width of the border of an image, as a share of the image's smaller side, over which a camera's weight rises from 0 to
+1."""
 
 DARK = 0.02
-"""Transmittance below which nothing depends on how small it is: walks through the primitives end there."""
+"""Transmittance below which the exact value does not matter: traversals of the primitives end there."""
 
 CLEAR = 0.98
-"""A primitive of whose points all have a larger transmittance, or all a smaller one than DARK, bounds nothing."""
+"""A primitive bounds no surface if the transmittance is above this at all of its points, or below DARK at
+all of them."""
 
 LIVE = 0.1
-"""Cameras that have the free end and the middle of an edge in view and see less light than this from both are left out
-while the level is sought on it."""
+"""Cameras that have the free end and the middle of an edge in view, and see a lower transmittance than this at both,
+are left out of the search on that edge."""
 
 SPACING_PIXELS, COARSEST, FINEST = 4.0, 1 / 50, 1 / 400
-"""Distance between the points of the second round: pixels of the median view, and its bounds as shares of the scene's
-diagonal."""
+"""Distance between the points of the second round, in pixels of the median view, and its upper and lower bounds as
+shares of the scene's diagonal."""
 
 ROUGH, RESOLUTION = 2e-3, 5e-5
-"""Places on edges are found to these shares of the diagonal, in the first round and in the second, or in STEPS."""
+"""Accuracy of crossings on edges in the first and the second round, as shares of the diagonal; the search also ends
+after STEPS."""
 
 STEPS = 12
 
 JITTER = 1e-6
-"""Points are moved by this share of the diagonal at random: vertices of regular shapes lie on common spheres, where
-tetrahedra are flat."""
+"""Random offset of points, as a share of the diagonal: vertices of regular shapes lie on common spheres, which makes
+tetrahedra flat."""
 
 MARGIN, GRID = 0.1, 9
-"""A box this share of the diagonal larger than that of all points is free by definition, at GRID x GRID points per
-side: the surface is closed."""
+"""A box around all points, larger than theirs by this share of the diagonal on each side, is free by definition, with
+GRID x GRID points per side: this closes the surface."""
 
 LONG = 4.0
-"""Edges longer than this many median ones are searched from their inner end, at PROBES of their length: beyond the
+"""Edges longer than this many median edges are searched from their inner end, at PROBES of their length: beyond the
 first free place may lie the shadow of the scene in the few cameras that look there, which counts as solid."""
 
 PROBES = (1 / 16, 1 / 8, 1 / 4)
 
 BYTES_PER_SITE = 3500
-"""Of Qhull and of marching over its tetrahedra, per point; 2500 measured with 150,000 points."""
+"""Memory per point of Qhull and of marching over its tetrahedra; 2500 measured with 150,000 points."""
 
 VALUES_AT_ONCE = 1 << 22
-"""Points times cameras that are held at a time, some 40 bytes each."""
+"""Points times cameras that are processed at a time, at some 40 bytes each."""
 
 
 def opacity_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[Mesh, dict]:
-    """Returns the closed mesh and `level`, `spacing` and the numbers of points for the statistics.
+    """Return the closed mesh, and `level`, `spacing` and the numbers of points for the statistics.
 
-    The surface is where the transmittance towards the cameras falls to `options.level`; `options.voxel_size`, if any,
-    is the distance between its sample points, and `options.smallest_part` the share of the largest component's area
-    that others need. Components that no camera sees are dropped. Vertices are moved from where the light of the best
-    camera falls to the level towards where that of the typical cameras does.
+    The surface is where the transmittance towards the cameras falls to `options.level`. `options.voxel_size`, if given,
+    is the distance between the sample points; `options.smallest_part` is the least area of a component as a share of
+    the largest one's. Components that no camera sees are dropped. Vertices move from where the transmittance of the
+    best cameras falls to the level towards where that of typical cameras does.
 
     Raises:
         LinprimError: Gaussians, which have no inside; nothing crosses the level, or the tetrahedra would not fit into
@@ -160,10 +162,10 @@ def opacity_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[
 
 
 class OpacityField:
-    """How much light gets from points to cameras, all in the training frame.
+    """Transmittance between points and cameras, all in the training frame.
 
-    A camera's transmittance is exp of minus the sum of density times length inside over all primitives, on the straight
-    segment from its near plane to the point: the order does not matter, and overlaps are exact.
+    A camera's transmittance is exp of minus the sum over all primitives of density times length inside, on the straight
+    segment from its near plane to the point. The order of the primitives does not matter, and overlaps are exact.
     """
 
     def __init__(self, primitives: Primitives, cameras: Sequence[Camera]):
@@ -176,22 +178,23 @@ class OpacityField:
         self._cameras = cameras
 
     def transmittance(self, points: np.ndarray) -> np.ndarray:
-        """(P,) `robust_largest` of the transmittances from (P, 3) points; quicker if neighbours lie near each other."""
+        """Return (P,) the `robust_largest` of the transmittances from (P, 3) points; faster if neighbours in the array
+        are close."""
         light = np.empty(len(points))
         for part in self.parts(len(points)):
             light[part] = robust_largest(*self.per_camera(points[part]))
         return light
 
     def parts(self, count: int) -> list[slice]:
-        """Cuts `count` points into parts that fit into memory for all cameras."""
+        """Split `count` points into parts that fit into memory for all cameras."""
         step = max(1, VALUES_AT_ONCE // len(self._cameras))
         return [slice(start, start + step) for start in range(0, count, step)]
 
     def per_camera(self, points: np.ndarray, among: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """(V, P) float32 transmittances, no less than DARK or 0 where not in view, and (V, P) weights: 1 in view, less
-        near the border.
+        """Return (V, P) float32 transmittances, at least DARK, or 0 where a point is not in view, and (V, P) weights: 1
+        in view, less near the border of the image.
 
-        `among` (V, P): where it is False the transmittance is not computed and taken as 0.
+        `among` (V, P): where it is False, the transmittance is not computed and taken as 0.
         """
         import torch
 
@@ -217,10 +220,10 @@ class OpacityField:
         return light, weight
 
     def spread(self, mesh: Mesh, level: float, reach: float) -> np.ndarray:
-        """(V,) how far before each vertex, along the normal, the light of rank TYPICAL_SHARE falls to `level`, at most
-        `reach`.
+        """Return (V,) how far in front of each vertex, along the normal, the transmittance of rank TYPICAL_SHARE falls
+        to `level`, at most `reach`.
 
-        That is how much further the best of the cameras, which make the surface, see than what many of them agree on.
+        The surface is made by the best cameras; this is how much further they see than what many cameras agree on.
         """
         ladder = reach * np.array(LADDER)
         out = np.full(len(mesh.vertices), reach)
@@ -249,11 +252,11 @@ class OpacityField:
 
 
 def robust_largest(light: np.ndarray, weight: np.ndarray, rank_share: float = RANK_SHARE) -> np.ndarray:
-    """(P,) transmittance of the k-th best camera, k = 1 + rank_share (n - 1) of the n that have a point in view;
-    continuous in all of them.
+    """Return (P,) the transmittance of the k-th best camera, k = 1 + rank_share (n - 1) of the n that have a point in
+    view; it is continuous in all of them.
 
-    The (V, P) transmittances are put in descending order, each as wide as its weight, and averaged over the ranks k - 1
-    to k. Where the weights sum to less than 1 the rest is free space.
+    The (V, P) transmittances are sorted in descending order, each as wide as its weight, and averaged over the ranks k
+    - 1 to k. Where the weights sum to less than 1, the rest counts as free space.
     """
     order = np.argsort(np.where(weight > 0, -light, np.float32(1)), axis=0)
     light, weight = np.take_along_axis(light, order, 0), np.take_along_axis(weight, order, 0)
@@ -266,7 +269,7 @@ def robust_largest(light: np.ndarray, weight: np.ndarray, rank_share: float = RA
 
 
 def auto_spacing(mesh: Mesh, cameras: Sequence[Camera]) -> float:
-    """SPACING_PIXELS median pixel footprints on the surface, within COARSEST and FINEST of its diagonal."""
+    """Return SPACING_PIXELS median pixel footprints on the surface, within COARSEST and FINEST of its diagonal."""
     footprints = []
     for camera in cameras:
         pixels, depth = camera.project(mesh.vertices)
@@ -281,7 +284,7 @@ def auto_spacing(mesh: Mesh, cameras: Sequence[Camera]) -> float:
 
 
 def _primitive_points(primitives: Primitives, field: OpacityField) -> tuple[np.ndarray, np.ndarray]:
-    """(P, 3) centres and vertices of the primitives that bound something, and (P,) transmittances there."""
+    """Return (P, 3) centres and vertices of the primitives that bound a surface, and (P,) transmittances there."""
     corners = np.concatenate([primitives.vertices, primitives.center[:, None].astype(np.float64)], axis=1)
     corners = corners[_near_each_other(corners[:, -1])]
     each = corners.shape[1]
@@ -291,13 +294,14 @@ def _primitive_points(primitives: Primitives, field: OpacityField) -> tuple[np.n
 
 
 def _around(mesh: Mesh, spacing: float) -> np.ndarray:
-    """Pairs of points half a `spacing` before and behind the surface, about one pair per cube of that size."""
+    """Return pairs of points half a `spacing` in front of and behind the surface, about one pair per cube
+    of that size."""
     corners = mesh.vertices[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
-    # The points of a triangle with whole barycentric coordinates that sum to `parts`, edges and corners left out.
+    # Points of a triangle with integer barycentric coordinates that sum to `parts`, without edges and corners.
     parts = np.minimum(np.ceil(longest / spacing).astype(np.int64), 1 << 10) + 2
     places, across = [mesh.vertices], [vertex_normals(mesh)]
     for count in np.unique(parts):
@@ -315,7 +319,7 @@ def _around(mesh: Mesh, spacing: float) -> np.ndarray:
 
 
 def _near_each_other(points: np.ndarray) -> np.ndarray:
-    """(P,) order along a Morton curve with 1024 cells per axis."""
+    """Return the (P,) order of points along a Morton curve with 1024 cells per axis."""
     low, high = points.min(0), points.max(0)
     cell = ((points - low) / np.maximum(high - low, np.finfo(np.float64).tiny) * 1023).astype(np.int64)
     key = np.zeros(len(points), dtype=np.int64)
@@ -326,7 +330,7 @@ def _near_each_other(points: np.ndarray) -> np.ndarray:
 
 
 def _memory_line(count: int, limit: int, run: Run) -> str:
-    """What the tetrahedra of so many points will take.
+    """Return a line with the memory that the tetrahedra of this many points will take.
 
     Raises:
         LinprimError: more than `limit`.
@@ -345,8 +349,8 @@ def _memory_line(count: int, limit: int, run: Run) -> str:
 
 
 def _level_set(field: OpacityField, points: np.ndarray, light: np.ndarray, level: float, resolution: float) -> Mesh:
-    """The closed surface that parts the points with less light than `level` from the others; empty if there are
-    none."""
+    """Return the closed surface that separates the points with less transmittance than `level` from the others; empty
+    if there are none."""
     from scipy.spatial import Delaunay
 
     low, high = points.min(0), points.max(0)
@@ -378,12 +382,12 @@ def _level_set(field: OpacityField, points: np.ndarray, light: np.ndarray, level
 
 
 def _crossings(field, inner, outer, inner_light, outer_light, level, resolution) -> np.ndarray:
-    """(E, 3) points between `inner` and `outer` where the field crosses the level: halving, and lines through its
-    logarithm.
+    """Return (E, 3) points between `inner` and `outer` where the field crosses the level, by bisection and linear
+    interpolation of its logarithm.
 
-    The logarithm is piecewise linear along a ray, up to DARK. Brackets with an end as dark as that are halved, and so
-    are all in every third step: they shrink however the field bends. The place is the line's in what is left of the
-    bracket.
+    The logarithm is piecewise linear along a ray, down to DARK. Brackets with an end as dark as that are bisected, and
+    so are all brackets in every third step, so that they shrink however the field bends. The result is interpolated
+    linearly in the final bracket.
     """
 
     def excess(light):
@@ -424,7 +428,8 @@ def _crossings(field, inner, outer, inner_light, outer_light, level, resolution)
 
 
 def _seen_components(mesh: Mesh, cameras: Sequence[Camera]) -> Mesh:
-    """The components of which a camera sees a face: all of it, so they stay closed. All of them if none is seen."""
+    """Return the whole components of which a camera sees a face, so that they stay closed; all of them if
+    none is seen."""
     count, label = face_components(mesh)
     if count == 1:
         return mesh

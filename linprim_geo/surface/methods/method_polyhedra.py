@@ -1,5 +1,5 @@
-"""The direct polyhedral surface of a run: its opaque primitives, cut back to where light ends in them, united
-exactly."""
+"""Method `polyhedra`: the exact union of a run's opaque primitives, each cut back by planes to where its light is
+absorbed."""
 
 from __future__ import annotations
 
@@ -23,40 +23,40 @@ from linprim_geo.surface.methods.polyhedra_union import convex_piece, kept_shell
 from linprim_geo.surface.normals import vertex_normals
 
 LEAST_WEIGHT = 0.5
-"""A primitive belongs to the surface if it takes more than this share of the light of a pixel of some training view."""
+"""Least share of the light of a pixel, in some training view, that a primitive of the surface takes."""
 
 CUT_DEPTH = 0.5
-"""Share of the light lost at the level of depth maps that is lost where primitives are cut. Depth maps are averaged; a
-union keeps the outermost of all overlapping pieces, but what is cut too deep of a thin part is gone."""
+"""Where primitives are cut: this share of the light lost at the level of the depth maps is lost there. Fusion averages
+depth maps, a union keeps the outermost of all overlapping pieces; but what is cut too deep of a thin part is gone."""
 
 POINTS_PER_PRIMITIVE, LEAST_POINTS_IN_ALL = 40, 20_000
-"""About so many points where light ends are wanted per primitive; pixels are left out in a regular pattern to get
-there."""
+"""About how many surface points are wanted per primitive, and fewest in all; pixels are subsampled in a regular pattern
+to get there."""
 
 CORE_CELLS = 200
-"""Most cells along the longest side of the grid that tells what is inside; they have to be smaller than primitives are
-thick."""
+"""Most cells along the longest side of the grid that finds the core, the inside of the body. Cells have to be smaller
+than primitives are thick."""
 
 CORE_MARGIN = np.sqrt(3.0) / 2
-"""Cells by which the middle of a cell of the core lies behind the depth of every view, so that all of the cell does."""
+"""Cells by which the centre of a core cell lies behind the depth of every view: half a cell's diagonal, so that the
+whole cell does."""
 
 NO_PRIMITIVE = -1
 """Owner of the faces of the core, which no camera sees."""
 
 
 def polyhedra_surface(run: Run, options: ExtractOptions, stages: Stages) -> tuple[Mesh, dict]:
-    """The closed surface, with normals and, as `primitive`, the row in `run.primitives()` of each face (NO_PRIMITIVE
-    for the core), and counts for the statistics.
+    """Return the closed surface with normals and counts for the statistics. Its `primitive` holds the row in
+    `run.primitives()` of each face, NO_PRIMITIVE for the core.
 
-    1. Primitives that dominate a pixel of a training view are candidates.
-    2. Where the transmittance of the views' rays falls to 1 - CUT_DEPTH (1 - `options.level`), overlaps counted
-       exactly, light ends: points on the surface.
-    3. Planes are fitted to the points around each candidate, and it is cut by them; one without points inside is
-       dropped.
-    4. What lies behind the depth of every view that looks there is inside: boxes fill it.
-    5. All are united. Shells that no view sees and small ones are dropped, so cavities fill up.
+    1. Candidates are primitives that take most of the light of a pixel of a training view.
+    2. Surface points are where the transmittance of the views' rays, overlaps counted exactly, falls to 1 - CUT_DEPTH
+    (1 - `options.level`).
+    3. Planes are fitted to the points around each candidate and cut it; a candidate without points inside is dropped.
+    4. The core lies behind the depth of every view that looks there; boxes fill it.
+    5. All pieces are united. Shells that no view sees and small ones are dropped, which fills cavities.
 
-    Neither the order of the primitives nor the number of threads matters, to the last bit.
+    The result is identical to the last bit for any order of the primitives and any number of threads.
 
     Raises:
         LinprimError: the primitives are Gaussians, none is opaque enough, or no ray crosses the level.
@@ -130,7 +130,8 @@ def polyhedra_surface(run: Run, options: ExtractOptions, stages: Stages) -> tupl
 
 
 def canonical_order(primitives: Primitives) -> np.ndarray:
-    """(N,) rows in lexicographic order of all that shapes and renders them; equal rows keep theirs."""
+    """Return (N,) rows in lexicographic order of everything that shapes and renders the primitives; equal rows keep
+    theirs."""
     table = np.concatenate([getattr(primitives, name).reshape(len(primitives), -1) for name in ARRAYS], axis=1)
     return np.lexsort(table.T[::-1])
 
@@ -140,12 +141,12 @@ def _take(primitives: Primitives, rows: np.ndarray) -> Primitives:
 
 
 class LevelDepths:
-    """Each view's (H, W) float32 depth at a level, 0 where it sees through, in the order of the cameras; iterated as
-    often as one likes. They are kept if they take at most `most` bytes in all, else rendered whenever they are asked
-    for.
+    """Each view's (H, W) float32 depth at a level of transmittance, 0 where it sees through, in the order of the
+    cameras; can be iterated many times. Depth maps are kept if they take at most `most` bytes in all, else rendered at
+    each iteration.
 
-    `weight` (N,) is the largest weight of each primitive (training frame) in any view, `hits` how many pixels have a
-    depth.
+    `weight` (N,) is the largest weight of each primitive (training frame) in any view, `hits` the number of pixels with
+    a depth.
     """
 
     def __init__(self, run: Run, primitives: Primitives, cameras: Sequence[Camera], level: float, most: int):
@@ -194,9 +195,10 @@ class LevelDepths:
 
 
 def cut(primitives: Primitives, planes: Planes, met: np.ndarray, least: float) -> tuple[list, np.ndarray]:
-    """Convex pieces of the primitives that points `met`, as manifolds, and the (M,) row of each; equal pieces once.
+    """Return convex pieces of the primitives that points `met`, as manifolds, and the (M,) primitive of each; equal
+    pieces once.
 
-    A plane that takes off no more than a layer `least` thick does not cut, so an opaque primitive stays what it is.
+    A plane that would remove a layer at most `least` thick does not cut, so an opaque primitive keeps its shape.
     """
     import manifold3d
 
@@ -224,11 +226,11 @@ def cut(primitives: Primitives, planes: Planes, met: np.ndarray, least: float) -
 
 
 def core_boxes(depths: Iterable[np.ndarray], cameras: list[Camera], bounds: np.ndarray, least: float) -> np.ndarray:
-    """(B, 8, 3) corners of boxes that fill what lies behind the depth of every view that looks there.
+    """Return (B, 8, 3) corners of boxes that fill the space behind the depth of every view that looks there.
 
-    Cells of a grid over `bounds` (2, 3), as large as `least` but at most CORE_CELLS along its longest side. A cell is
-    inside if at least one view has it in its frustum, and all that do find its middle further than CORE_MARGIN cells
-    behind the deepest of the pixel there and its eight neighbours; pixels without depth see through.
+    A grid over `bounds` (2, 3) has cells as large as `least`, but at most CORE_CELLS along its longest side. A cell is
+    inside if at least one view has it in its frustum, and if for all of these its centre lies farther than CORE_MARGIN
+    cells behind the largest depth of the pixel there and its eight neighbours; pixels without depth see through.
     """
     from scipy.ndimage import maximum_filter
 
@@ -250,15 +252,15 @@ def core_boxes(depths: Iterable[np.ndarray], cameras: list[Camera], bounds: np.n
         flat[left] = z > deepest[v[within].astype(np.int64), u[within].astype(np.int64)] + CORE_MARGIN * cell
         flat_looked[left] = True
     low, high = _merged_cells(np.argwhere(inside & looked))
-    # A little more than the cells, so that neighbours overlap in place of touching.
+    # Slightly larger than the cells, so that neighbours overlap rather than touch.
     low, high = bounds[0] + (low - 0.01) * cell, bounds[0] + (high + 0.01) * cell
     corner = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=bool)
     return np.where(corner, high[:, None], low[:, None])
 
 
 def _merged_cells(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(B, 3) lower and upper corners of boxes that hold exactly the given (C, 3) cells: runs, then equal runs side by
-    side."""
+    """Merge (C, 3) cells into boxes that cover exactly these: runs along one axis, then equal runs side by side. Return
+    their (B, 3) lower and upper corners."""
     low, high = cells, cells + 1
     for axis in (2, 1, 0):
         if not len(low):
@@ -281,8 +283,8 @@ def _merged_cells(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _kept_faces(mesh: Mesh, cameras: list[Camera], smallest_part: float) -> np.ndarray:
-    """(F,) bool: shells that the ray of some pixel meets first and that have the share `smallest_part` of the largest
-    one's area, and what they need."""
+    """Return (F,) bool: the faces of shells that some pixel's ray hits first and that have at least the share
+    `smallest_part` of the largest one's area, and of the shells that enclose them."""
     from linprim_geo.surface.visibility import faces_of_pixels
 
     count, label = shells(mesh)

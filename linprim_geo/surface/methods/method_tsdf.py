@@ -1,5 +1,9 @@
-"""The surface of a run by fusing depth maps: depth of the training views at a transmittance level, into a signed
-distance field."""
+"""Method `tsdf`: fuses depth maps of the training views into a signed distance field, and returns its surface.
+
+Rendered depth is that at which transmittance falls to a level. Stereo of the photographs replaces it where other views
+confirm the stereo depth (`stereo_frames`). With stereo auto, the coverage of pixels and the agreement of the
+photographs decide between the surfaces with and without stereo.
+"""
 
 from __future__ import annotations
 
@@ -29,54 +33,58 @@ from linprim_geo.surface.fusion.tsdf_fusion import auto_voxel_size, fuse_tsdf
 from linprim_geo.surface.fusion.voxel_blocks import TooFine, estimate_memory
 from linprim_geo.surface.fusion.voxel_levels import COARSE
 
-# A ray with less opacity than this has seen through the scene: it votes for free space.
+# A ray with less opacity than this sees through the scene: it votes for free space.
 SEEN_THROUGH = 0.5
-# Depth, background and whether it is clamped, of a pixel; frames of more than this in all are not kept.
+# Bytes per pixel of a depth map: depth, background and `clamped`. Depth maps that take more than KEPT_BYTES in all are
+# not kept in memory.
 BYTES_PER_PIXEL, KEPT_BYTES = 6, 2**30
-# How often voxels are made larger until they fit into memory; once, but for what is only known when all is fused.
+# How often fusion is tried with larger voxels until it fits into memory. One retry is enough, except for what is known
+# only once everything is fused.
 TRIES = 4
 
 LEAST_CONFIRMED = 0.01
-"""Stereo that confirms less than this share of the pixels has nothing to say of a scene."""
+"""Least share of pixels that stereo has to confirm for its surface to be used."""
 
 MOST_PIXELS = 0.5
-"""A surface of stereo that shows in this share of the pixels with a rendered depth is taken."""
+"""Share of the pixels with a rendered depth from which on, if the surface of stereo shows in them, it is taken without
+a comparison."""
 
 CLEARLY_LESS = 0.01
-"""Where one shows in fewer, and photographs agree at a share of its vertices that is smaller by this, they speak
-against it. Where they agree anywhere, as on plain walls, the shares are the same but for chance."""
+"""The surface of stereo is rejected if it shows in fewer pixels and photographs agree at a share of its vertices that
+is smaller by this. Where photographs agree anywhere, as on plain walls, the shares differ only by chance."""
 
 ENOUGH_AGREE = 0.95
-"""Objects with masks have no stereo where photographs agree at this share of the vertices without it: masks say where
-an object ends better than windows do (DECISIONS 76)."""
+"""For objects with masks stereo is skipped if photographs agree at this share of the vertices without it: masks locate
+the outlines of an object better than stereo windows do (DECISIONS 76)."""
 
 SHARP_LEVELS = (0.9, 0.3)
-"""A rendered depth is sharp if the transmittance falls from the first to the second within RENDERED_MARGIN of it. A
-surface takes 0.3 to 4 % of its depth, what training makes of a wall that nothing tells it about 5 to 50 %."""
+"""A rendered depth is sharp if the transmittance falls from the first to the second level within RENDERED_MARGIN of it.
+On a surface this takes 0.3 to 4 % of the depth; on a wall without texture, which nothing in training locates, 5 to 50
+%."""
 
 STEREO_BYTES = 150
-"""Bytes per pixel of all photographs that stereo takes with its planes and what it merges, at the peak: 97 to 148 on
-ten captures, most where there are most planes."""
+"""Peak bytes per pixel of all photographs of stereo with its planes and merged depths: 97 to 148 on ten captures, most
+where there are most planes."""
 
 SMALLEST_SIDE = 120
-"""Photographs are not averaged down to fewer pixels along the longer side for stereo."""
+"""Least pixels along the longer side of photographs that are downscaled for stereo."""
 
 SMALLEST_DISPARITY = 0.25
-"""Depths are trusted as far as this many pixels between the two cameras that are furthest apart move a point by a
-truncation."""
+"""Error of a disparity in pixels. Depths are used up to where this error, between the two cameras that are furthest
+apart, moves a point by a truncation."""
 
 SAMPLED = 2
-"""One of so many rows and columns of a depth map is looked at to choose the limit."""
+"""Every how many rows and columns of a depth map are sampled to choose the limit."""
 
 NEAREST_LIMIT = 4.0
-"""And at least this many median depths: cameras that are close together fuse what they see all the same."""
+"""Least limit of depths, in median depths, so that cameras close together still fuse what they see."""
 
 FAR_TRIES = 5
-"""So many limits are tried, from the farthest that stereo tells to that of rendered depths."""
+"""Limits that are tried, from the farthest that disparity supports to that of rendered depths."""
 
 
 ByStereo = Callable[[], tuple[Mesh | None, dict]]
-"""Gives the surface of stereo, see `_surface_of_stereo`."""
+"""Returns the surface of stereo, see `_surface_of_stereo`."""
 
 
 def tsdf_surface(
@@ -87,15 +95,15 @@ def tsdf_surface(
     fuse: Callable | None = None,
     merged: MergedFrames | None = None,
 ) -> tuple[Mesh, dict]:
-    """Returns the fused mesh and `level`, `voxel_size` and `truncation_voxels` for the statistics. With stereo it has a
-    `quality`, see `error_by_depths`.
+    """Return the fused mesh, and `level`, `voxel_size` and `truncation_voxels` for the statistics. With stereo the mesh
+    has a `quality`, see `error_by_depths`.
 
-    `frames` of the same level, and what is `merged` of them and stereo, are taken in place of new ones if there are any
-    already. `fuse`: see `fuse_tsdf`.
+    `frames` of the same level, and their depths `merged` with stereo, are used in place of new ones if given. `fuse`:
+    see `fuse_tsdf`.
 
     Raises:
-        LinprimError: no ray crosses the level, or the grid would not fit into memory, with voxels of the size that is
-            given or any size.
+        LinprimError: no ray crosses the level, or the grid would not fit into memory, with voxels of the given size or,
+            if none is given, any size.
     """
     whole = run.scene().train
     most = kept_bytes(options, [view.camera for view in whole])
@@ -142,7 +150,7 @@ def tsdf_surface(
 
     def rendered() -> Mesh:
         nonlocal frames, voxel, memory
-        if shrunk:  # whole photographs are rendered finer
+        if shrunk:  # the rendered surface uses views of full resolution
             frames = DepthFrames(run, float(options.level), options.depth_limit, most=most)
             voxel = options.voxel_size if options.voxel_size > 0 else auto_voxel_size(frames)
             memory = memory_left(options, frames.bytes)
@@ -209,10 +217,12 @@ def tsdf_surface(
 def _better_by_stereo(
     rendered: Callable[[], Mesh], by_stereo: ByStereo, views: Sequence[View], small: bool, stages: Stages
 ) -> tuple[Mesh, dict]:
-    """The surface of stereo, or the `rendered` one where there is hardly any stereo, or where the surface of stereo is
-    missing in most pixels and photographs of `views` agree at clearly more of the rendered one's vertices; with what
-    there is to say of it. Stereo of `small` photographs is taken in any case: within pixels as large as theirs
-    photographs agree with walls of fog."""
+    """Choose between the surface of stereo and the `rendered` one. Return it, and numbers for the statistics.
+
+    The rendered one is taken if there is hardly any stereo, or if the surface of stereo is missing in most pixels and
+    photographs of `views` agree at clearly more of the rendered one's vertices. Stereo of `small`, downscaled
+    photographs is always taken: within pixels as large as theirs, photographs also agree with walls of fog.
+    """
     mesh, about = by_stereo()
     if mesh is None:
         return rendered(), about
@@ -233,8 +243,11 @@ def _better_by_stereo(
 def _better_for_object(
     rendered: Callable[[], Mesh], by_stereo: ByStereo, views: Sequence[View], stages: Stages
 ) -> tuple[Mesh, dict]:
-    """The `rendered` surface of an object with masks, unless photographs of `views` agree at few of its vertices, and
-    at more of those of stereo's; with what there is to say of it."""
+    """Choose the surface of an object with masks. Return it, and numbers for the statistics.
+
+    It is the `rendered` surface, unless photographs of `views` agree at too few of its vertices and at more of those of
+    the surface of stereo.
+    """
     without_stereo = rendered()
     vote = Vote(without_stereo, views)
     stages.lap("compare")
@@ -253,7 +266,7 @@ def _surface_of_stereo(
     with_stereo: Callable[[], MergedFrames],
     stages: Stages,
 ) -> tuple[Mesh | None, dict]:
-    """The surface of stereo, None where there is hardly any, and what there is to say of it."""
+    """Return the surface of stereo, or None if there is hardly any, and numbers for the statistics."""
     try:
         merged = with_stereo()
     except LinprimError as error:
@@ -270,8 +283,8 @@ def _surface_of_stereo(
 
 
 class Vote:
-    """Photographs between the surface without stereo and that with it. `without`: at what share of the vertices of the
-    first they agree; differences of their exposure are those that it tells."""
+    """Lets the photographs decide between the surfaces without and with stereo. `without` is the share of the first
+    one's vertices at which they agree; their exposures are estimated on that surface."""
 
     def __init__(self, without_stereo: Mesh, views: Sequence[View]):
         self.views = views
@@ -279,8 +292,8 @@ class Vote:
         self.without = _agreeing(without_stereo, views, self.gains)
 
     def on(self, mesh: Mesh, least: float, stages: Stages) -> dict:
-        """For the statistics: whether stereo's surface is taken, as photographs agree at a share of its vertices above
-        `least`, and both shares."""
+        """Return for the statistics whether the surface of stereo is taken, which it is if photographs agree at a share
+        of its vertices above `least`, and both shares."""
         agreeing = _agreeing(mesh, self.views, self.gains)
         stages.lap("compare")
         taken = agreeing > least
@@ -292,24 +305,24 @@ class Vote:
 
 
 def _agreeing(mesh: Mesh, views: Sequence[View], gains: np.ndarray) -> float:
-    """Share of the vertices that two photographs see at which these agree best within reach of the surface: where
-    something is missing or stands too far out, they do so beyond it. `gains`: see `best_agreement`."""
+    """Return the share of the vertices seen by two photographs at which these agree best within reach of the surface.
+    Where a part is missing or stands out too far, they agree best beyond that reach. `gains`: see `best_agreement`."""
     found = best_agreement(mesh, [view.camera for view in views], (view.load() for view in views), gains)
     return float(found.inside[found.seen_by_two].mean()) if found.seen_by_two.any() else 0.0
 
 
 def stereo_bytes(cameras: Sequence[Camera]) -> int:
-    """Bytes that stereo of all views takes at its peak."""
+    """Return the peak memory in bytes of stereo of all views."""
     return STEREO_BYTES * sum(camera.width * camera.height for camera in cameras)
 
 
 def stereo_room(options: ExtractOptions) -> float:
-    """Bytes that stereo may take: the memory that is free, and what --memory-limit leaves."""
+    """Return the bytes that stereo may take: the free memory, or less if --memory-limit leaves less."""
     return min(available_memory(), memory_left(options) or np.inf)
 
 
 def check_stereo_memory(cameras: Sequence[Camera], options: ExtractOptions) -> None:
-    """Refuses stereo of all views that takes more than `stereo_room`.
+    """Refuse stereo of all views if it takes more than `stereo_room`.
 
     Raises:
         LinprimError: it does.
@@ -323,8 +336,12 @@ def check_stereo_memory(cameras: Sequence[Camera], options: ExtractOptions) -> N
 
 
 def stereo_factor(run: Run, options: ExtractOptions) -> int:
-    """The least K with which stereo of means of K by K pixels fits into `stereo_room`, with SMALLEST_SIDE pixels at
-    least; 1 where none fits, and for objects with masks, whose rendered surface wants whole photographs."""
+    """Return the least K for which stereo of means of K by K pixels fits into `stereo_room`, with at least
+    SMALLEST_SIDE pixels.
+
+    It is 1 where none fits, without stereo, and with stereo auto for objects with masks, whose rendered surface needs
+    full resolution.
+    """
     if options.stereo == "off" or (options.stereo == "auto" and run.scene().has_alpha):
         return 1
     cameras = [view.camera for view in run.scene().train]
@@ -335,11 +352,11 @@ def stereo_factor(run: Run, options: ExtractOptions) -> int:
 
 
 def memory_left(options: ExtractOptions, taken: int = 0) -> int | None:
-    """Bytes of --memory-limit that are left beside what this process takes in any case and `taken` bytes; None without
-    a limit.
+    """Return the bytes that --memory-limit leaves beside those that this process takes in any case and `taken` ones;
+    None without a limit.
 
     Raises:
-        LinprimError: none are.
+        LinprimError: none are left.
     """
     if options.memory_limit <= 0:
         return None
@@ -351,8 +368,8 @@ def memory_left(options: ExtractOptions, taken: int = 0) -> int | None:
 
 
 def kept_bytes(options: ExtractOptions, cameras: Sequence[Camera]) -> int:
-    """Bytes that depth maps may take which stay in memory: KEPT_BYTES, or if that is less a quarter of what the process
-    and a depth map at work leave of --memory-limit."""
+    """Return the bytes that depth maps kept in memory may take: KEPT_BYTES, or a quarter of what the process and a
+    depth map in work leave of --memory-limit, if that is less."""
     if options.memory_limit <= 0:
         return KEPT_BYTES
     largest = max((camera.width * camera.height for camera in cameras), default=0)
@@ -361,11 +378,12 @@ def kept_bytes(options: ExtractOptions, cameras: Sequence[Camera]) -> int:
 
 
 class DepthFrames(Sequence):
-    """`tsdf_field.DepthFrame`s of the training views, or of `views`: depth at transmittance `level`, free background.
+    """`tsdf_field.DepthFrame`s of the training views, or of `views`: depth at transmittance `level`, with free
+    background.
 
-    Depths beyond `limit` are clamped to it; 0 chooses one by `depth_limit`. `clamped_share` is their share. Frames are
-    kept in memory if they take at most `most` bytes in all (default KEPT_BYTES), else, and without `keep`, rendered
-    whenever they are asked for.
+    Depths beyond `limit` are clamped to it; 0 chooses a limit by `depth_limit`. `clamped_share` is their share. Frames
+    are kept in memory if they take at most `most` bytes in all (default KEPT_BYTES). Otherwise, and without `keep`,
+    they are rendered at every access.
     """
 
     def __init__(
@@ -407,17 +425,17 @@ class DepthFrames(Sequence):
         return map(self._clamp, self.kept or self._render(self.views))
 
     def up_to(self, limit: float) -> DepthFrames:
-        """The same with depths up to another limit; `clamped_share` stays as it is."""
+        """Return the same frames with another depth limit; `clamped_share` stays as it is."""
         frames = copy.copy(self)
         frames.limit = limit
         return frames
 
     def merged(self, *, quiet: bool = True) -> MergedFrames:
-        """These frames with the depths of stereo."""
+        """Return these frames merged with the depths of stereo."""
         return MergedFrames(self, self.views, self.limit, sharp=self.sharp(), quiet=quiet)
 
     def sharp(self) -> Iterator[np.ndarray]:
-        """(H, W) bool of every view, which depths are those of a surface, and not of fog: see SHARP_LEVELS."""
+        """Yield (H, W) bool of every view: which depths are those of a surface and not of fog, see SHARP_LEVELS."""
         first, last = (self.run.surface_depths(self.views, level) for level in SHARP_LEVELS)
         for (_, begin, _), (_, end, _) in zip(first, last, strict=True):
             yield (begin > 0) & (end > 0) & (end - begin <= RENDERED_MARGIN * begin)
@@ -435,10 +453,11 @@ class DepthFrames(Sequence):
 
 
 def with_far_depths(frames: DepthFrames, options: ExtractOptions, voxel: float) -> DepthFrames:
-    """The frames as far as disparity tells depths within the truncation of the largest voxels, those of what is flat;
-    less far where such voxels would give the surface more than half of the faces that it may have.
+    """Return the frames with a limit as far as disparity locates depths within the truncation of the largest voxels,
+    those of flat parts; less far where such voxels would give the surface more than half of the faces that it may have.
 
-    Frames stay as they are with a limit, or a size of voxels, that is asked for."""
+    Frames stay as they are if a limit or a voxel size is given in the options.
+    """
     limit = _told_by_disparity([view.camera for view in frames.views], options.truncation * COARSE * voxel)
     if options.depth_limit > 0 or options.voxel_size > 0 or limit <= frames.limit:
         return frames
@@ -451,17 +470,21 @@ def with_far_depths(frames: DepthFrames, options: ExtractOptions, voxel: float) 
 
 
 def depth_limit(cameras: Sequence[Camera], median: float, truncation: float = 3.0) -> float:
-    """How far rendered depths are worth fusing, from the median depth that the cameras see, in their unit: at least
-    NEAREST_LIMIT times that, and as far as disparity tells them with voxels as large as the median's pixel."""
+    """Return how far rendered depths are worth fusing, given the median depth that the cameras see, in their unit.
+
+    It is at least NEAREST_LIMIT times that depth, and as far as disparity locates depths within the truncation of
+    voxels as large as a pixel at the median depth.
+    """
     pixel = median / _focal_length(cameras)
     return max(NEAREST_LIMIT * median, _told_by_disparity(cameras, truncation * pixel))
 
 
 def _told_by_disparity(cameras: Sequence[Camera], reach: float) -> float:
-    """The depth beyond which SMALLEST_DISPARITY moves a point by more than `reach`.
+    """Return the depth beyond which SMALLEST_DISPARITY moves a point by more than `reach`.
 
-    A disparity of d pixels between cameras that are b apart moves a point at depth z by d z^2 / (b f), a derivative of
-    z = b f / d."""
+    A disparity of d pixels between cameras b apart moves a point at depth z by d z^2 / (b f), a derivative of z = b f /
+    d.
+    """
     centers = np.array([camera.center for camera in cameras])
     baseline = float(np.linalg.norm(np.ptp(centers, axis=0)))
     return float(np.sqrt(reach * baseline * _focal_length(cameras) / SMALLEST_DISPARITY))

@@ -1,4 +1,7 @@
-"""Planes fitted to the points where light ends, that primitives are cut by."""
+"""Fits planes to surface points, which cut back the primitives around them.
+
+Surface points are where the transmittance of training rays falls to a level (`level_points`).
+"""
 
 from __future__ import annotations
 
@@ -13,36 +16,38 @@ from linprim_geo.geometry.primitives import Primitives
 from linprim_geo.kernels import surface_ops
 
 NEIGHBOURHOOD = 1.5
-"""Planes are fitted to the points within a primitive enlarged by this, so that those of neighbours agree."""
+"""Factor by which a primitive is enlarged to collect the points for its planes, so that planes of neighbours agree."""
 
 PLANES = 8
-"""Most planes that cut one primitive: so many faces has an octahedron that is seen from all around."""
+"""Most planes that cut one primitive: an octahedron that is seen from all around has this many faces."""
 
 SAME_PLANE = np.cos(np.radians(35.0))
-"""Points whose normals are closer than this to a direction belong to one plane: less than half of a right angle, which
-parts sides of a body, and more than the unevenness of a side."""
+"""Least cosine (35 degrees) between a point's normal and the direction of a plane that it belongs to. The angle is less
+than half of the right angle between sides of a body, and more than the unevenness of one side."""
 
 DIRECTION_CELLS = 3
-"""Cells per unit of a coordinate of a normal, 19 degrees wide, the fullest of which a direction is looked for in."""
+"""Cells per unit of a normal's coordinates, 19 degrees wide. The search for a direction starts in the fullest cell."""
 
 SAME_DIRECTION = np.cos(np.radians(20.0))
-"""Window of the mean shift that finds a direction: less than half of what parts two planes."""
+"""Window of the mean shift that finds a direction, as a cosine (20 degrees): less than half of the angle between two
+planes."""
 
 LEAST_POINTS, LEAST_SHARE = 6, 0.06
-"""A plane needs so many points, and this share of those around its primitive."""
+"""Fewest points of a plane, and their least share of the points around its primitive."""
 
 ROUNDS = 4
-"""Reweighted rounds of a fit; the normal moves by less than its own uncertainty after three."""
+"""Rounds of reweighted fits, and of mean shift; in a fit, the normal moves by less than its own uncertainty after
+three."""
 
 LEAST_SHARE_OF_PIXEL = 0.1
-"""Share of a pixel's footprint that the surface may move by to lose slivers: what the robust mean of many pixels still
-resolves."""
+"""Distance, as a share of a pixel's footprint, by which the surface may move to remove slivers: what the robust mean of
+many pixels still resolves."""
 
 
 @dataclass(frozen=True)
 class LevelPoints:
-    """(P, 3) points where light ends, their (P, 3) unit normals towards the cameras, and the median footprint of a
-    pixel there."""
+    """(P, 3) surface points, at a level of transmittance, their (P, 3) unit normals towards the cameras, and the median
+    footprint of a pixel there."""
 
     position: np.ndarray
     normal: np.ndarray
@@ -50,19 +55,19 @@ class LevelPoints:
 
     @property
     def noise(self) -> float:
-        """Length below which the views tell nothing."""
+        """Length below which the views resolve nothing."""
         return LEAST_SHARE_OF_PIXEL * self.footprint
 
 
 def level_points(
     depths: Iterable[np.ndarray], cameras: list[Camera], wanted: int, hits: int | None = None
 ) -> LevelPoints:
-    """Points of about `wanted` pixels of all depth maps, in a regular pattern that moves from view to view.
+    """Return points of about `wanted` pixels of all depth maps, in a regular pattern that shifts from view to view.
 
-    Normals are those of the surface through a pixel's four neighbours; pixels at the border, and beside one without
-    depth, have none.
+    Normals are those of the surface through a pixel's four neighbours. Pixels at the border of the image, and those
+    with a neighbour without depth, give no point.
 
-    `hits`: how many pixels have a depth, if that is counted already.
+    `hits`: the number of pixels with a depth, if it is known already.
     """
     hits = sum(int((depth > 0).sum()) for depth in depths) if hits is None else hits
     stride = max(1, round(np.sqrt(hits / max(wanted, 1))))
@@ -93,7 +98,7 @@ def level_points(
 
 
 def _local(camera: Camera, depth: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """(P, 3) points in the camera's axes that (P,) pixels show."""
+    """Return (P, 3) points in the camera's axes that (P,) pixels show."""
     z = depth[row, column].astype(np.float64)
     x, y = (column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy
     return np.stack([x * z, y * z, z], axis=1)
@@ -101,8 +106,9 @@ def _local(camera: Camera, depth: np.ndarray, row: np.ndarray, column: np.ndarra
 
 @dataclass(frozen=True)
 class Planes:
-    """Fitted planes { x : normal x = offset }, the body on the negative side; `row` of the primitive that each belongs
-    to, and `cuts` (K, PLANES) bool: which planes of its primitive bound the body where this one does."""
+    """Fitted planes { x : normal x = offset } with the body on the negative side; the `row` of each plane's primitive
+    and its `slot`, its number among that primitive's planes; and `cuts` (K, PLANES) bool: which planes of its primitive
+    bound the body together with this one."""
 
     row: np.ndarray
     slot: np.ndarray
@@ -112,13 +118,13 @@ class Planes:
 
 
 def fit_planes(primitives: Primitives, points: LevelPoints) -> tuple[Planes, np.ndarray]:
-    """Planes through the points around each primitive, at most PLANES each, and (N,) bool: whether it holds
-    LEAST_POINTS of them; one that does not gets no plane.
+    """Fit at most PLANES planes to the points around each primitive. Return them and (N,) bool: whether a primitive
+    contains LEAST_POINTS points; one that does not gets no plane.
 
-    Points are parted by their normals: the strongest direction first, by mean shift, then the next among what is left.
-    Each part gets a plane by least squares, reweighted by a Cauchy weight of its own spread. Two planes of a primitive
-    bound the body together if the points of the one lie behind the other (a convex edge), else each for itself (a
-    concave one).
+    Points are clustered by their normals: the strongest direction first, by mean shift, then the next one among the
+    remaining points. Each cluster gets a least-squares plane, reweighted with Cauchy weights by its own spread. Two
+    planes of a primitive bound the body together if the points of the one lie behind the other (a convex edge), else
+    each on its own (a concave one).
     """
     center, position = primitives.center.astype(np.float64), np.ascontiguousarray(points.position)
     total, point = surface_ops.points_within(center, *face_planes(primitives), position, NEIGHBOURHOOD, LEAST_POINTS)
@@ -153,7 +159,7 @@ def fit_planes(primitives: Primitives, points: LevelPoints) -> tuple[Planes, np.
 
 
 def face_planes(primitives: Primitives) -> tuple[np.ndarray, np.ndarray]:
-    """(N, F, 3) outward unit normals of the faces and (N, F) their distances from the centre."""
+    """Return (N, F, 3) outward unit normals of the faces and (N, F) their distances from the centre."""
     local = primitives.vertices - primitives.center.astype(np.float64)[:, None]
     a, b, c = (local[:, KINDS[primitives.kind].faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
@@ -162,14 +168,14 @@ def face_planes(primitives: Primitives) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sums(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
-    """(count, ...) sums of (M, ...) values by group."""
+    """Return (count, ...) sums of (M, ...) values by group."""
     flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
     out = [np.bincount(group, weights=column, minlength=count).astype(np.float64) for column in flat.T]
     return np.stack(out, axis=-1).reshape((count,) + values.shape[1:])
 
 
 def _medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
-    """(count,) lower medians by group; every group has a value."""
+    """Return (count,) lower medians by group; every group has a value."""
     from scipy.sparse import coo_matrix
 
     # By value, then by group: the conversion to rows keeps the order within each, and is faster than sorting again.
@@ -180,8 +186,8 @@ def _medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
 
 
 def _strongest_direction(group: np.ndarray, normal: np.ndarray, count: int) -> np.ndarray:
-    """(count, 3) direction where most normals of each group are: the fullest of the cells of 1 / DIRECTION_CELLS, then
-    mean shift. Zero for a group without normals."""
+    """Return the (count, 3) direction in which most normals of each group point: the mean of the fullest cell of 1 /
+    DIRECTION_CELLS, refined by mean shift. Zero for a group without normals."""
     side = 2 * DIRECTION_CELLS + 1
     x, y, z = np.rint(normal * DIRECTION_CELLS).astype(np.int64).T + DIRECTION_CELLS
     cells, cell, size = np.unique(((group * side + x) * side + y) * side + z, return_inverse=True, return_counts=True)
@@ -200,10 +206,10 @@ def _strongest_direction(group: np.ndarray, normal: np.ndarray, count: int) -> n
 
 
 def _robust_planes(position: np.ndarray, normal: np.ndarray, group: np.ndarray, count: int):
-    """(count, 3) normals, (count,) offsets and (count,) spreads (1.4826 median |residual|) of planes by group.
+    """Fit planes by group. Return (count, 3) normals, (count,) offsets and (count,) spreads (1.4826 median |residual|).
 
-    The normal is that of the points where they tell one (their flattest direction holds less than a tenth of the
-    variance of the next), else the mean of theirs.
+    The normal is the flattest principal direction of the points if it holds less than a tenth of the variance of the
+    next one, else the mean of the points' normals.
     """
     tiny = np.finfo(np.float64).tiny
     across = _sums(normal, group, count)

@@ -1,5 +1,5 @@
-"""Union of many convex polyhedra as one closed surface whose faces know where they come from, and its connected
-shells."""
+"""Unites many convex polyhedra into one closed surface that records the owner of each face, and selects its shells
+(connected components)."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.mesh import Mesh
 
 GROUP = 64
-"""Neighbours that are united at a time; then as many of these, and so on: one call for all takes four times as long."""
+"""Neighbouring bodies that are united at a time; then as many of the results, and so on. One call for all takes four
+times as long."""
 
 MORTON_BITS = 16
-"""Bits per axis of the cell that decides which polyhedra are neighbours."""
+"""Bits per axis of the cell of a Morton code, by which polyhedra are ordered so that neighbours are united first."""
 
 
 def convex_piece(points: np.ndarray):
-    """The convex hull of (P, 3) points as a `manifold3d.Manifold` of its own identity, or None if it has no volume."""
+    """Return the convex hull of (P, 3) points as a `manifold3d.Manifold` with its own identity, or None if it has no
+    volume."""
     import manifold3d
 
     body = manifold3d.Manifold.hull_points(np.ascontiguousarray(points, dtype=np.float64))
@@ -26,28 +28,30 @@ def convex_piece(points: np.ndarray):
 
 
 def own_identity(body):
-    """`body` as an original, by whose `original_id` its faces are found in a union, or None if it has no volume."""
+    """Return `body` as an original, whose faces can be found in a union by its `original_id`, or None if it has no
+    volume."""
     if body.status().name != "NoError" or body.is_empty() or not body.volume() > 0:
         return None
     return body.as_original()
 
 
 def unite(pieces: Sequence, owners: Sequence[int], simplify: float = 0.0) -> tuple[Mesh, np.ndarray]:
-    """The union of pieces, closed and oriented outward, and the owner of each of its faces.
+    """Return the union of the pieces, closed and oriented outwards, and the owner of each of its faces.
 
-    Pieces are united in Morton order of the middles of their boxes, neighbours first; equal places keep their order.
+    Pieces are united in Morton order of the centres of their bounding boxes, neighbours first; equal ones keep their
+    order.
 
     Args:
         pieces: M manifolds made by `own_identity`.
         owners: (M,) integers that the faces of each piece get.
-        simplify: the surface may move by this to get rid of slivers; 0 keeps all.
+        simplify: distance by which the surface may move to remove slivers; 0 keeps all.
 
     Returns: the mesh and (F,) owners.
 
     Raises:
         LinprimError: there are no pieces, or manifold3d reports that the union is not closed.
 
-    Accuracy: vertices to about 1e-12 of the bounding box; a piece further away than that times 1e6 spoils it for all.
+    Accuracy: vertices to about 1e-12 of the bounding box; a piece farther away than that times 1e6 spoils it for all.
     """
     import manifold3d
 
@@ -73,7 +77,7 @@ def unite(pieces: Sequence, owners: Sequence[int], simplify: float = 0.0) -> tup
 
 
 def morton_keys(points: np.ndarray) -> np.ndarray:
-    """(P,) uint64 place of each of (P, 3) finite points along a Morton curve through their bounding cube."""
+    """Return the (P,) uint64 Morton codes of (P, 3) finite points in their bounding cube."""
     low, high = points.min(0), points.max(0)
     size = float((high - low).max()) or 1.0
     cell = ((points - low) / size * ((1 << MORTON_BITS) - 1)).astype(np.uint64)
@@ -85,10 +89,10 @@ def morton_keys(points: np.ndarray) -> np.ndarray:
 
 
 def kept_shells(mesh: Mesh, wanted: np.ndarray) -> np.ndarray:
-    """Which faces stay so that every wanted shell does and the surface still bounds a body.
+    """Choose the faces to keep, so that every wanted shell stays and the surface still bounds a body.
 
-    A shell is a connected piece of a closed surface: the outside of a body, or a cavity of one. A shell that is not
-    wanted is dropped (a cavity is filled by that) unless a wanted one lies within it.
+    A shell is a connected component of a closed surface: the outside of a body, or a cavity in one. An unwanted shell
+    is dropped (which fills a cavity) unless a wanted one lies within it.
 
     Args:
         mesh: closed, of disjoint shells.
@@ -113,7 +117,8 @@ def kept_shells(mesh: Mesh, wanted: np.ndarray) -> np.ndarray:
 
 
 def shells(mesh: Mesh) -> tuple[int, np.ndarray]:
-    """Number of connected pieces and the (F,) piece of each face, numbered in order of their first face."""
+    """Return the number of connected components and the (F,) component of each face, numbered in order of their first
+    face."""
     from linprim_geo.geometry.mesh import face_components
 
     count, label = face_components(mesh)
@@ -124,7 +129,7 @@ def shells(mesh: Mesh) -> tuple[int, np.ndarray]:
 
 
 def _encloses(corners: np.ndarray, point: np.ndarray) -> bool:
-    """Whether a closed surface of (F, 3, 3) triangles winds around a point.
+    """Return whether a closed surface of (F, 3, 3) triangles winds around a point, by its solid angle.
 
     Source: van Oosterom and Strackee, The solid angle of a plane triangle, 1983.
     """

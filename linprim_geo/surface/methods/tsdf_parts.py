@@ -1,8 +1,9 @@
-"""The fused surface in parts: workers have parts of one lattice of voxels; their surfaces together are the whole one's
-to the last bit.
+"""Fuses a TSDF in parts by several workers, each with a part of one voxel grid. Merged, the parts are identical to the
+surface of the whole grid, to the last bit.
 
-A part's field is that of the blocks that it owns and of their neighbours. It votes there in the order of the views, as
-the whole does, and hands on the triangles of the cubes that belong to its blocks (`surface_ops.marching_cubes`).
+A worker holds the field of the blocks that its part owns and of their neighbours. It integrates the views in their
+order, as the whole does, and returns the triangles of the cubes that belong to the owned blocks
+(`surface_ops.marching_cubes`).
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from linprim_geo.surface.fusion.tsdf_field import placed
 from linprim_geo.surface.fusion.voxel_blocks import Lattice, block_keys, estimate_memory, touching, unpack_keys
 from linprim_geo.surface.methods.method_tsdf import DepthFrames
 
-# What `save_lattice` writes: shapes and kinds.
+# Arrays that `save_lattice` writes, with their shapes and kinds.
 _LATTICE: dict[str, tuple[tuple[int | None, ...], str]] = {
     "blocks": ((None, 3), "i"),
     "levels": ((None,), "i"),
@@ -46,8 +47,8 @@ REMEDY = "more --blocks, a larger --voxel-size, fewer --workers, or more memory"
 
 
 class PartFusion:
-    """Fuses lattices in `count` parts each, for `tsdf_fusion.fuse_tsdf`. What is done stays in `folder`, which whoever
-    extracts removes in the end."""
+    """Fuses grids in `count` parts each; the `fuse` of `tsdf_fusion.fuse_tsdf`. Finished parts stay in `folder`, which
+    the caller removes in the end."""
 
     def __init__(
         self, run: Run, options: ExtractOptions, count: int, executor: Executor, folder: Path, quiet: bool = False
@@ -98,7 +99,8 @@ class PartFusion:
 
 
 def owners(lattice: Lattice, count: int) -> np.ndarray:
-    """(B,) which of `count` parts each block belongs to; as many in each, near each other."""
+    """Return (B,) the part, of `count`, that each block belongs to: equally many blocks per part, close to
+    each other."""
     middle = (lattice.blocks + 0.5) * 2.0 ** lattice.levels[:, None]
     owner = np.zeros(len(middle), dtype=np.int64)
     for part, box in enumerate(split_space(middle, np.ones(len(middle)), count)):
@@ -107,10 +109,11 @@ def owners(lattice: Lattice, count: int) -> np.ndarray:
 
 
 def halo(lattice: Lattice, own: np.ndarray) -> np.ndarray:
-    """(B,) bool: the blocks that are `own` (B,) or touch one that is."""
+    """Return (B,) bool: the blocks that are `own` (B,), or touch one that is."""
     inside = own.copy()
     for level in np.unique(lattice.levels[own]):
-        # Blocks of the level as far as its own touch; larger ones hold one of them, smaller ones are in one.
+        # Blocks of this level that its own ones touch. Larger blocks touch if they contain one of these, smaller ones
+        # if they lie in one.
         near = distinct(touching(lattice.blocks[own & (lattice.levels == level)]))
         for other in np.unique(lattice.levels):
             these = lattice.levels == other
@@ -123,7 +126,7 @@ def halo(lattice: Lattice, own: np.ndarray) -> np.ndarray:
 
 
 def part_task(folder: Path, run: str, level: float, limit: float, part: int, held_out: bool = False) -> dict:
-    """Fuses what a part owns and writes it to part.npz."""
+    """Fuse the blocks that a part owns, and write its surface to part.npz."""
     import torch
 
     torch.set_num_threads(1)
@@ -147,7 +150,7 @@ def part_task(folder: Path, run: str, level: float, limit: float, part: int, hel
 
 
 def merge_parts(parts: Iterable[Mesh]) -> Mesh:
-    """All parts as one mesh; vertices on seams are there more than once."""
+    """Return all parts as one mesh, in which vertices on seams occur more than once."""
     vertices, faces, first = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
     for part in parts:
         vertices.append(part.vertices)
@@ -157,7 +160,7 @@ def merge_parts(parts: Iterable[Mesh]) -> Mesh:
 
 
 def save_lattice(path: Path, lattice: Lattice, owner: np.ndarray) -> None:
-    """Writes a lattice and who owns its blocks."""
+    """Write a grid and the owners of its blocks."""
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         np.savez(
             file,
@@ -174,7 +177,7 @@ def save_lattice(path: Path, lattice: Lattice, owner: np.ndarray) -> None:
 
 
 def load_lattice(path: Path) -> tuple[Lattice, np.ndarray]:
-    """Reads what `save_lattice` wrote.
+    """Read what `save_lattice` wrote.
 
     Raises:
         LinprimError: it is damaged.
@@ -185,7 +188,7 @@ def load_lattice(path: Path) -> tuple[Lattice, np.ndarray]:
 
 
 def load_part(path: Path) -> Mesh:
-    """Reads what `part_task` wrote.
+    """Read what `part_task` wrote.
 
     Raises:
         LinprimError: it is damaged.
