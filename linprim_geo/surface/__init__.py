@@ -1,1 +1,1 @@
-"""From trained primitives to a mesh with colours, texture and predicted error."""
+"""Extracts a mesh with colours, texture and predicted error from trained primitives."""

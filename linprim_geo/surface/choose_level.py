@@ -1,9 +1,9 @@
-"""The transmittance level of a run's surface, chosen by the photographs' agreement with each other: no reference is
-looked at.
+"""Chooses the transmittance level of a run's surface by how well the photographs agree with each other; no reference
+surface is used.
 
-At the right level a place of one photograph, sent to where the surface has it in another one, finds its own colour and
-its own depth there; at a level too near to the cameras, or too far from them, it lands beside it, the more so the
-larger the angle between the views.
+At the right level a pixel of one photograph, reprojected by its depth into another one, finds its own colour and its
+own depth there. At a level too close to the cameras, or too far from them, it lands beside that point, by more the
+larger the angle between the views is.
 """
 
 from __future__ import annotations
@@ -19,33 +19,33 @@ from linprim_geo.points.view_pairs import LARGEST_ANGLE, source_views
 from linprim_geo.runs.run import Run
 
 LEVELS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
-# What is taken where photographs do not say: plain ones, or too few views of the same places. The middle of what is
-# best over scenes.
+# Level without a decision by the photographs, as they are plain or too few views share the same places: the middle of
+# what is best over scenes.
 USUAL_LEVEL = 0.75
-# Views that are looked at, each in so many others, and pixels of each pair; fewer pixels in all than the least decide
-# nothing.
+# Views that are compared, other views for each, and pixels of each pair; with fewer than LEAST_PIXELS in all there is
+# no decision.
 VIEWS, SOURCES, PIXELS, LEAST_PIXELS = 10, 3, 20_000, 2000
-# Bytes that the photographs and depth maps may take which are kept until other views need them again, and those of a
-# pixel: colour, alpha, and a depth at each level.
+# Bytes of the photographs and depth maps that are cached for later pairs, and bytes per pixel: colour, alpha, and a
+# depth at each level.
 KEPT_BYTES, PIXEL_BYTES = 2**30, 4 + 4 * len(LEVELS)
-# Colours that differ by more than this, of 255, count as much as this, and so do depths that contradict each other.
+# Upper limit of colour differences (of 255); depths that contradict each other count as this.
 LARGEST_DIFFERENCE = 40.0
-# Two views contradict each other where the depth of the other differs from what it should be by more than this share.
+# Two views contradict each other where the other view's depth differs from the reprojected one by more than this share.
 SAME_SURFACE = 0.03
-# Of levels whose difference is within this share of the least the one nearest to the cameras is taken: a surface too
-# far from them has lost its thin parts for good, one too near is still refined.
+# Of levels whose difference is within this share of the least, the one closest to the cameras is taken: a surface too
+# far from them has lost its thin parts for good, one too close can still be refined.
 EQUALLY_GOOD = 0.05
-# The best level has to be better than the worst by this part, or the photographs are too plain to tell.
+# Least share by which the best level has to beat the worst; else the photographs have too little texture to decide.
 LEAST_CONTRAST = 0.02
 
 
 def choose_level(run: Run, memory_limit: int = 0) -> tuple[float, dict[float, float]]:
-    """Returns the level, between the first and the last of LEVELS, and the mean colour difference (of 255) at each
+    """Return the level, between the first and the last of LEVELS, and the mean colour difference (of 255) at each
     level.
 
-    The differences are those of the same pixels at every level, so that none is favoured by what it leaves out. The
-    level is the one nearest to the cameras that is as good as the best (EQUALLY_GOOD); without enough to compare,
-    USUAL_LEVEL and no differences.
+    The differences are those of the same pixels at every level, so that no level is favoured by the pixels that it
+    leaves out. The level is the one closest to the cameras that is as good as the best (EQUALLY_GOOD); if there is too
+    little to compare, USUAL_LEVEL and no differences.
 
     Memory: photographs and depth maps of as many views as fit into KEPT_BYTES and `memory_limit` bytes (0: no limit of
     its own), at least of one view and its SOURCES.
@@ -88,11 +88,11 @@ def choose_level(run: Run, memory_limit: int = 0) -> tuple[float, dict[float, fl
 def color_differences(
     camera: Camera, photo: Photo, other: Camera, other_photo: Photo, depths: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> np.ndarray:
-    """(L, P) mean absolute colour difference, at most LARGEST_DIFFERENCE, of the pixels that both views see at one of L
-    levels at least.
+    """Return (L, P) mean absolute colour differences, at most LARGEST_DIFFERENCE, at L levels, of the pixels that both
+    views see at one level at least.
 
-    Where their depths contradict each other, or a ray does not reach the level, it is LARGEST_DIFFERENCE. Pixels that
-    contradict each other at every level are hidden in the other view, and left out.
+    Where the depths of the two views contradict each other, or a ray does not reach the level, the difference is
+    LARGEST_DIFFERENCE. Pixels that contradict each other at every level are occluded in the other view, and left out.
 
     Args:
         depths: per level the (H, W) z-depths of the two views, 0 where there is none.
@@ -124,7 +124,8 @@ def color_differences(
 
 
 def nearest_good(places: Sequence[float], values: np.ndarray) -> float:
-    """The largest place whose value, linear between the given ones, is at most 1 + EQUALLY_GOOD times the least."""
+    """Return the largest place whose value, linear between the given ones, is at most 1 + EQUALLY_GOOD
+    times the least."""
     limit = (1 + EQUALLY_GOOD) * values.min()
     k = int(np.flatnonzero(values <= limit)[-1])
     if k == len(places) - 1:

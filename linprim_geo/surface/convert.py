@@ -1,4 +1,4 @@
-"""Files of primitives and of meshes, each into the other formats of its kind, and primitives into meshes."""
+"""Converts files of primitives and of meshes into other formats of their kind, and primitives into meshes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb", ".stl")
-# What a format holds beside coordinates and faces.
+# Vertex attributes that a format holds besides coordinates and faces.
 HELD = {
     ".ply": ("normals", "colors", "quality"),
     ".obj": ("normals", "colors"),
@@ -28,28 +28,27 @@ HELD = {
     ".stl": (),
 }
 AS_CHOICES = ("auto", "primitives", "mesh", "gaussians")
-# A Gaussian in a mesh is the ellipsoid one standard deviation large, where its opacity is 61 % of that of its middle:
-# beyond it neighbours would hide each other.
+# In a mesh, a Gaussian is the ellipsoid of this many standard deviations. At one, its opacity is 61 % of that at its
+# centre; larger ellipsoids of neighbours would hide each other.
 MESH_SIGMAS = 1.0
 
 
 def convert(source: str | os.PathLike, target: str | os.PathLike, write_as: str = "auto") -> dict:
-    """Reads `source`, writes `target`; the formats follow from the files.
+    """Read `source` and write `target`; the formats follow from the files.
 
-    Primitives are read from a run's folder (its scene.npz), the model folder of LinPrim or 3DGS (its latest
-    iteration), .npz or .ply (LinPrim's octahedra and tetrahedra, 3DGS's Gaussians), and written as .npz, as .ply in the
-    layout of their kind, or as a triangle mesh: .obj, .glb and .stl always, .ply with `write_as="mesh"`. No kind
-    becomes
-    another unless asked for: `write_as="gaussians"` writes octahedra as Gaussians for a 3DGS viewer (half-axes / 2.6).
-    In a mesh every vertex has its primitive's colour without the view-dependent part, and in .ply and .glb its alpha:
-    the share of light taken along the reference length, a Gaussian's opacity. Gaussians become ellipsoids one standard
-    deviation large. Meshes are read and written as .ply, .obj, .glb and .stl; a texture goes from .obj or .glb to .obj
-    or .glb, elsewhere the vertices get its colours.
+    Primitives are read from a run's folder (its scene.npz), the model folder of LinPrim or 3DGS (its latest iteration),
+    .npz or .ply (LinPrim's octahedra and tetrahedra, 3DGS's Gaussians), and written as .npz, as .ply in the layout of
+    their kind, or as a triangle mesh: .obj, .glb and .stl always, .ply with `write_as="mesh"`. No kind becomes another
+    unless asked for: `write_as="gaussians"` writes octahedra as Gaussians for a 3DGS viewer (half-axes / 2.6). In a
+    mesh every vertex has its primitive's colour without the view-dependent part, and in .ply and .glb its alpha: the
+    share of light absorbed along the reference length, or a Gaussian's opacity. Gaussians become ellipsoids of one
+    standard deviation. Meshes are read and written as .ply, .obj, .glb and .stl; a texture goes from .obj or .glb to
+    .obj or .glb, elsewhere the vertices get its colours.
 
     Returns:
-        What was read and written: `source`, `target`, `read`, `wrote`, `count`; for primitives also `dropped`
-        (rows without volume) and `clamped` (rows thicker than LinPrim's file can hold), for meshes `left_out` (what
-        OUT's format cannot hold: normals, colors, quality, texture), where there are any.
+        What was read and written: `source`, `target`, `read`, `wrote`, `count`; for primitives also `dropped` (rows
+        without volume) and `clamped` (rows thicker than LinPrim's file can hold), for meshes `left_out` (what the
+        target's format cannot hold: normals, colors, quality, texture), where there are any.
 
     Raises:
         LinprimError: the input cannot be read, or the formats do not fit.
@@ -92,7 +91,7 @@ def convert(source: str | os.PathLike, target: str | os.PathLike, write_as: str 
 
 
 def _convert_mesh(source: Path, target: Path) -> dict:
-    """Writes the mesh `source` as `target`; what `convert` says of it."""
+    """Write the mesh `source` as `target`; return its part of the report of `convert`."""
     from linprim_geo.geometry.mesh_files import load_mesh, save_mesh
     from linprim_geo.surface.texture.texture import TEXTURED_SUFFIXES
     from linprim_geo.surface.texture.texture_files import load_texture, save_textured
@@ -115,7 +114,7 @@ def _convert_mesh(source: Path, target: Path) -> dict:
 
 
 def describe(report: dict) -> str:
-    """The report of `convert` as one sentence for a person."""
+    """Return the report of `convert` as one sentence."""
     unit = "faces" if report["read"] == "mesh" else "primitives"
     text = f"{report['target']}: {report['wrote']}, {report['count']} {unit}"
     if report.get("dropped"):
@@ -128,8 +127,8 @@ def describe(report: dict) -> str:
 
 
 def find_scene_file(source: str | os.PathLike) -> Path:
-    """The file to read: `source`, a run's scene.npz, or the latest point_cloud.ply of LinPrim's or
-    3DGS's folder."""
+    """Return the file to read: `source`, a run's scene.npz, or the latest point_cloud.ply of LinPrim's or 3DGS's
+    folder."""
     source = Path(source)
     if not source.exists():
         raise LinprimError(f"{source}: no such file or folder")
@@ -148,7 +147,7 @@ def find_scene_file(source: str | os.PathLike) -> Path:
 
 
 def holds_primitives(path: Path) -> bool:
-    """Whether a file holds primitives rather than a mesh, by its suffix and, for .ply, its header.
+    """Return whether a file holds primitives rather than a mesh, by its suffix and, for .ply, its header.
 
     Raises:
         LinprimError: it is neither.
@@ -169,7 +168,7 @@ def holds_primitives(path: Path) -> bool:
 
 
 def read_primitives(path: str | os.PathLike) -> tuple[Primitives, dict]:
-    """Primitives from .npz or .ply, and what was found on the way (see `read_primitive_ply`)."""
+    """Read primitives from .npz or .ply; also return findings such as dropped rows (see `read_primitive_ply`)."""
     path = Path(path)
     if path.suffix.lower() == ".npz":
         return load_primitives(path), {}
@@ -177,8 +176,8 @@ def read_primitives(path: str | os.PathLike) -> tuple[Primitives, dict]:
 
 
 def save_primitive_mesh(path: str | os.PathLike, primitives: Primitives) -> int:
-    """Writes `primitives` as triangles with vertex colours; .ply and .glb carry alpha too, .obj cannot, .stl
-    has none. Gaussians become ellipsoids of MESH_SIGMAS standard deviations. Returns the number of faces."""
+    """Write `primitives` as triangles with vertex colours; .ply and .glb carry alpha too, .obj cannot, .stl has none.
+    Gaussians become ellipsoids of MESH_SIGMAS standard deviations. Return the number of faces."""
     from linprim_geo.geometry.mesh_files import save_mesh
 
     path = Path(path)
@@ -204,7 +203,7 @@ def _save_glb(path: Path, mesh: Mesh, alpha: np.ndarray) -> None:
     assert mesh.colors is not None
     colors = np.column_stack([mesh.colors, alpha])
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    # A material says that the alpha of the vertices is meant; the exporter takes it from a texture's visuals.
+    # A material marks the alpha of the vertices as transparency; the exporter takes it from texture visuals.
     body.visual = trimesh.visual.TextureVisuals(material=PBRMaterial(alphaMode="BLEND", doubleSided=False))
     body.visual.vertex_attributes["color"] = colors
     with atomic_write(path) as temporary:

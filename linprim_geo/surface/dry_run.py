@@ -1,5 +1,5 @@
-"""The memory that an extraction would take, stage by stage, before it is begun: depths are rendered, and the rest is
-estimated from the pixels of the photographs and the area that depths show."""
+"""Estimates the memory of an extraction, stage by stage, before it is run. Depths are rendered; the rest is estimated
+from the number of pixels of the photographs and the surface area that the depths show."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from linprim_geo.surface.methods.method_tsdf import (
     stereo_factor,
 )
 
-# Bytes per pixel of all photographs: what stereo takes at its peak (the most is `STEREO_BYTES`), and what its merged
-# depths keep. Bytes per face: while these are fused, while rendered ones are, and while the surface is finished.
+# Bytes per pixel of all photographs: stereo at its peak (at most `STEREO_BYTES`), and its merged depths afterwards.
+# Bytes per face: while merged depths are fused, while rendered ones are fused, and while the surface is finished.
 STEREO_PIXEL, MERGED_PIXEL, MERGED_FACE, RENDERED_FACE, FINISHED_FACE = 120, 45, 540, 270, 800
 
 
 def extraction_memory(run: str | os.PathLike, options: ExtractOptions | None = None, *, quiet: bool = False) -> dict:
-    """What `extract_mesh` by method tsdf with the same options would take. Nothing is written.
+    """Estimate what `extract_mesh` by method tsdf would take with the same options. Nothing is written.
 
-    Returns: `views`; `level`; `stereo_downscale`, K of the means of K by K pixels that stereo takes, 0 without stereo;
-        `voxel_size` in the data set's unit; `faces`, about; `peak_gib` of the stages `level`, `render`, `stereo` (of
-        objects with masks, where photographs ask for it), `fuse` and `finish`; `memory_gib`, the largest of these;
-        `available_gib`, what is free or --memory-limit; and whether it `fits`.
+    Returns: `views`; `level`; `stereo_downscale`, the K of the means of K by K pixels that stereo uses, 0 without
+        stereo; `voxel_size` in the data set's unit; `faces`, about; `peak_gib` of the stages `level`, `render`,
+        `stereo` (for objects with masks only if the photographs ask for it), `fuse` and `finish`; `memory_gib`, the
+        largest of these; `available_gib`, what is free or --memory-limit; and whether it `fits`.
 
     Accuracy: the peak of each stage within a quarter (measured: docs/surfaces.md).
 
@@ -60,7 +60,7 @@ def extraction_memory(run: str | os.PathLike, options: ExtractOptions | None = N
     else:
         faces = min(_faces(area, voxel), int(MOST_FACES))
         room = memory_left(options, frames.bytes)
-        if room is not None:  # voxels are larger where the grid would not fit
+        if room is not None:  # a grid that would not fit gets larger voxels
             faces = min(faces, room // RENDERED_FACE)
     now, pixels = memory_gib(), sum(camera.width * camera.height for camera in cameras)
     fused = RENDERED_FACE * faces
@@ -87,7 +87,7 @@ def extraction_memory(run: str | os.PathLike, options: ExtractOptions | None = N
 
 
 def describe(report: dict) -> str:
-    """The report of `extraction_memory` as lines for a person."""
+    """Return the report of `extraction_memory` as lines of text."""
     factor = report["stereo_downscale"]
     of_means = f" of means of {factor} by {factor} pixels" if factor > 1 else ""
     stereo = f"stereo{of_means}" if factor else "no stereo"
@@ -102,8 +102,8 @@ def describe(report: dict) -> str:
 
 
 def _for_stereo(run: Run, options: ExtractOptions) -> tuple[list[Camera], int]:
-    """The cameras of the photographs that stereo takes, and K of `stereo_factor`; 0 without stereo, with all cameras as
-    they are."""
+    """Return the cameras of the photographs that stereo uses, and the K of `stereo_factor`; 0 without stereo, with all
+    cameras unchanged."""
     cameras = [view.camera for view in run.scene().train]
     if options.stereo == "off":
         return cameras, 0
@@ -120,5 +120,5 @@ def _for_stereo(run: Run, options: ExtractOptions) -> tuple[list[Camera], int]:
 
 
 def _faces(area: float, voxel: float) -> int:
-    """About so many faces come of an area with voxels of one size."""
+    """Return about how many faces a surface of this area gets with voxels of one size."""
     return int(2 * CELLS_PER_AREA * area / voxel**2)

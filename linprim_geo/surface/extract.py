@@ -1,5 +1,5 @@
-"""From a trained run to triangle meshes: take a surface by one of several methods, finish it, write it with its
-statistics."""
+"""Extracts triangle meshes from a trained run: computes the surface by one of several methods, finishes it, and writes
+it with statistics."""
 
 from __future__ import annotations
 
@@ -33,24 +33,24 @@ from linprim_geo.surface.single_view import without_single_views
 from linprim_geo.surface.texture.texture import check_texture
 from linprim_geo.surface.voxel_budget import choose_voxel
 
-# Each is a function (run, options, stages) -> (mesh, statistics of its own), found when it is wanted: their libraries
-# are large.
+# Functions (run, options, stages) -> (mesh, statistics of its own), imported only when needed, as their libraries are
+# large.
 METHODS = {
     "tsdf": "methods.method_tsdf.tsdf_surface",
     "polyhedra": "methods.method_polyhedra.polyhedra_surface",
     "opacity-field": "methods.method_opacity_field.opacity_surface",
 }
 
-# Options that a method chooses where they are 0; what it took is in its statistics.
+# Options that a method chooses where they are 0; its choice is in its statistics.
 CHOSEN = ("voxel_size", "depth_limit")
-# Where more vertices than this share have no depth that two photographs confirm, predicted errors say which vertices to
-# trust more, and not by how much: true ones were 0.6 to 7 times as large in the mean, else 0.7 to 1.3 times, but 2 to 4
-# of facades (DECISIONS 91).
+# Share of vertices without a depth that two photographs confirm from which on predicted errors only rank the vertices,
+# and do not give the size of their errors: true errors were 0.6 to 7 times as large in the mean, else 0.7 to 1.3 times,
+# but 2 to 4 of facades (DECISIONS 91).
 MOST_UNCONFIRMED = 1 / 8
-# Options that not every method has a use for.
+# Options that only some methods use.
 METHODS_WITH = {"voxel_size": ("tsdf", "opacity-field"), "truncation": ("tsdf",), "depth_limit": ("tsdf",)}
 
-# Folder of what workers have done, in that of the method.
+# Folder for the results of workers, within that of the method.
 PARTS = "parts"
 
 
@@ -66,32 +66,32 @@ def extract_mesh(
     cluster: str | None = None,
     workers: int = 0,
 ) -> dict:
-    """Extracts the surface of a run and writes it, the part that cameras see, and statistics.
+    """Extract the surface of a run, and write it, the part that cameras see, and statistics.
 
-    RUN/mesh/METHOD holds mesh.ply, mesh_visible.ply, mesh_shaded.png and stats.json; with `output` the two meshes go
-    to OUTPUT and its sibling *_visible, in the format of the suffix (.ply, .obj, .glb, .stl), and the picture to
+    RUN/mesh/METHOD holds mesh.ply, mesh_visible.ply, mesh_shaded.png and stats.json; with `output` the two meshes go to
+    OUTPUT and its sibling *_visible, in the format of the suffix (.ply, .obj, .glb, .stl), and the picture to
     *_shaded.png. Vertices have normals, colours and, as `quality`, the predicted error
-    (`photo_consistency.predicted_error`); everything is in the data set's frame and unit. The photographs move the
-    vertices to where they agree best (`photo_consistency.refine_surface`), noise is smoothed away (`denoise.denoised`,
-    after stereo `fairing.faired`), then holes are closed, the surface smoothed, remeshed and simplified as the options
-    ask (`mesh_process`); with `texture` .obj and .glb have a texture out of the photographs in place of vertex colours.
+    (`photo_consistency.predicted_error`); everything is in the data set's frame and unit. The vertices move to where
+    the photographs agree best (`photo_consistency.refine_surface`), noise is smoothed (`denoise.denoised`, after stereo
+    `fairing.faired`), then holes are closed, and the surface is smoothed, remeshed and simplified as the options ask
+    (`mesh_process`); with `texture` .obj and .glb have a texture from the photographs in place of vertex colours.
 
     With `held_out` the held-out views take part in all of it. With `box` only the faces in it are kept; --method tsdf
-    fuses nothing else. With `object` only the object in the box is kept (`object_alone`), which is auto unless it is
-    given.
+    fuses nothing else. With `object` only the object in the box is kept (`object_alone`); the box is then auto unless
+    it is given.
 
-    With `time_budget`, in seconds, stereo takes photographs that are averaged down until it has time enough
-    (`stereo_budget.stereo_in_time`), and the voxel size is the smallest with which everything takes that time at most,
-    by what coarse passes take (`voxel_budget.choose_voxel`); stats.json has `time_budget`: what was chosen and why, and
-    the seconds that it took.
+    With `time_budget`, in seconds, stereo uses photographs that are downscaled until the time suffices
+    (`stereo_budget.stereo_in_time`), and the voxel size is the smallest for which the whole extraction stays within
+    that time, as estimated from coarse passes (`voxel_budget.choose_voxel`); stats.json has `time_budget`: what was
+    chosen and why, and the seconds that it took.
 
-    With `blocks` other than 1 the depth maps are fused in so many parts of one lattice by several workers, with the
-    same result to the last bit; `cluster` and `workers` say where, see `jobs.open.open_executor`.
+    With `blocks` other than 1 the depth maps are fused in this many parts of one voxel grid by several workers, with
+    the same result to the last bit; `cluster` and `workers` say where, see `jobs.open.open_executor`.
 
-    Returns: what stats.json holds: topology of both meshes, `options` with what was chosen in them, before an
-        environment `seen_by_one_view` (`single_view.without_single_views`), `processing` step by step, `texture`, what
-        manifold3d says of a watertight mesh (`manifold_status`), `predicted_error` (median and 90 % quantile) of the
-        vertices that cameras see, seconds and peak memory per stage, and the paths.
+    Returns: the contents of stats.json: topology of both meshes, `options` with what was chosen in them, if the run has
+        an environment `seen_by_one_view` (`single_view.without_single_views`), `processing` step by step, `texture`,
+        manifold3d's verdict on a watertight mesh (`manifold_status`), `predicted_error` (median and 90 % quantile) of
+        the vertices that cameras see, seconds and peak memory per stage, and the paths.
 
     Raises:
         LinprimError: nothing was trained, no ray crosses the level, the grid would not fit into memory, or the time is
@@ -119,8 +119,8 @@ def extract_mesh(
 def opened_with(
     run: str | os.PathLike, method: str, options: ExtractOptions, budget: Budget | None = None, blocks: int = 1
 ) -> tuple[Run, ExtractOptions]:
-    """The run with the views that count, and the options with their box in numbers, and without stereo where there is
-    none.
+    """Return the run with the views to use, and the options with their box in numbers, and with stereo off where the
+    method has none.
 
     Raises:
         LinprimError: options are not for the method, or contradict each other.
@@ -156,7 +156,7 @@ def opened_with(
             raise LinprimError("--stereo on is for --method tsdf, without --blocks")
         options = replace(options, stereo="off")
     elif options.stereo == "auto" and opened.scene().has_alpha and budget:
-        # Masks say where an object ends better than windows do: stereo is seldom worth its time.
+        # Masks locate the outlines of an object better than stereo windows do: stereo is seldom worth its time.
         options = replace(options, stereo="off")
     return opened, options
 
@@ -172,7 +172,7 @@ def _extract(
     blocks: int = 1,
     executor: Callable[[], Executor] | None = None,
 ) -> dict:
-    """What `extract_mesh` does when everything is in order and its folder is held."""
+    """Do what `extract_mesh` says, once its arguments are checked and its folder is locked."""
     visible_target = visible_file(target)
     written = [target, visible_target, shaded_file(target), folder / "stats.json"]
     if options.texture:
@@ -268,7 +268,7 @@ def _object(mesh: Mesh, opened: Run, options: ExtractOptions, stages: Stages) ->
 
 
 def _cropped(mesh: Mesh, options: ExtractOptions) -> Mesh:
-    """The faces whose middle lies in the box of the options."""
+    """Return the faces whose centroid lies in the box of the options."""
     box = read_box(options.box)
     assert box is not None
     left = select_faces(mesh, inside(mesh.vertices[mesh.faces].mean(1), box))
@@ -279,7 +279,7 @@ def _cropped(mesh: Mesh, options: ExtractOptions) -> Mesh:
 
 
 def _statistics(done: Finished, opened: Run, largest_error: float | None) -> dict:
-    """What stats.json says of a mesh and its run; `largest_error` as for `error_summary`."""
+    """Return what stats.json says of a mesh and its run; `largest_error` as for `error_summary`."""
     shape = topology(done.mesh)
     return {
         "unit": opened.unit,
@@ -295,8 +295,11 @@ def _statistics(done: Finished, opened: Run, largest_error: float | None) -> dic
 
 
 def error_summary(quality: np.ndarray | None, largest: float | None = None) -> dict[str, float] | None:
-    """Median and 90 % quantile of the (V,) predicted errors of vertices, None where none is known. With `largest`, the
-    error of vertices that no two photographs confirm (`depth_error.py`), their share, too, as `unconfirmed`."""
+    """Return median and 90 % quantile of the (V,) predicted errors of vertices, None where none is known.
+
+    With `largest`, the error of vertices that no two photographs confirm (`depth_error.py`), also the share of these,
+    as `unconfirmed`.
+    """
     known = np.zeros(0) if quality is None else quality[np.isfinite(quality)]
     if not len(known):
         return None

@@ -1,4 +1,4 @@
-"""A mesh that rays can be cast at, and that cameras see."""
+"""A mesh for ray casting, with cached depth and face images of cameras."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.kernels import surface_ops
 
 KEPT_BYTES = 1 << 29
-"""What cameras see is kept up to this, so that what asks for it one after the other has it once."""
+"""Most bytes of cached images, so that successive steps that need the same camera compute its image once."""
 
 
 class MeshViews(RayCaster):
-    """A ray caster that draws what cameras see, which takes no tree and, in large images, a third of the time."""
+    """A ray caster that also rasterizes depth and face images of cameras, which needs no tree and, for large images, a
+    third of the time."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, *, threads: int = 0, kept_bytes: int = KEPT_BYTES):
         super().__init__(vertices, faces, threads=threads)
@@ -21,10 +22,10 @@ class MeshViews(RayCaster):
         self._kept: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
 
     def first_hits(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """What a camera sees at its pixel centres; a ray through an edge sees one of its faces.
+        """Return what a camera sees at its pixel centres; a ray through an edge sees one of its faces.
 
         Returns read-only depth (H, W) float32 along the optical axis, inf where nothing is hit, and face (H, W) int32,
-        there -1. Accuracy: that of float32 for depths, 1e-12 of a pixel for what is seen. Memory: 8 bytes per pixel are
+        -1 there. Accuracy: that of float32 for depths, 1e-12 of a pixel for what is seen. Memory: 8 bytes per pixel are
         kept, at most `kept_bytes` over all cameras.
         """
         pose, lens = camera.pinhole()

@@ -1,4 +1,4 @@
-"""Normals of the vertices of a mesh, and faces that are folded over."""
+"""Vertex normals of a mesh, and faces that are folded over."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from linprim_geo.kernels import surface_ops
 
 
 def vertex_normals(mesh: Mesh) -> np.ndarray:
-    """(V, 3) float64 unit normals: face normals averaged with the angle of the face at the vertex as weight.
+    """Return (V, 3) float64 unit normals: face normals averaged with the angle of the face at the vertex as weight.
 
     The weight makes the normal independent of how flat parts are triangulated. Vertices of no face get zero.
 
@@ -19,7 +19,7 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
 
 
 def folded(mesh: Mesh) -> np.ndarray:
-    """(F,) bool: faces whose normals are opposite to those of the surface around them."""
+    """Return (F,) bool: faces whose normals are opposite to those of the surface around them."""
     around, own = _normals(mesh)
     a, b, c = (around[mesh.faces[:, k]] for k in range(3))
     return np.einsum("ij,ij->i", own, a + b + c) < 0

@@ -1,8 +1,8 @@
-"""The object that the cameras look at, without what it stands on and what is around it.
+"""Isolates the object that the cameras look at from the plane that it stands on and from its surroundings.
 
-What lies in the box around the place where the cameras' axes meet is the object and what it stands on. The latter is a
-plane: it is found and cut off. Of what is left, pieces that reach out of the box are surroundings. Where the object
-stood on the plane it is closed by it.
+The box around the place where the cameras' axes meet contains the object and its supporting plane. The plane is found
+and cut off. Of the remaining pieces, those that reach out of the box are surroundings. The opening where the object
+stood on the plane is closed by the plane.
 """
 
 from __future__ import annotations
@@ -17,42 +17,43 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh, face_areas, face_components, face_normals, select_faces
 from linprim_geo.geometry.topology import border_loops
 
-# Faces that planes are tried by and on, drawn by their area.
+# Faces, drawn with probability by area: SEEDS that give candidate planes, and TRIED_ON on which candidates are scored.
 SEEDS, TRIED_ON = 300, 6000
-# A face is on a plane up to this share of the box's shortest side, if their normals differ by 30 degrees at most.
+# A face lies on a plane if it is closer than this share of the box's shortest side, and their normals differ by 30
+# degrees at most.
 TOLERANCE, SAME_NORMAL = 0.005, float(np.cos(np.radians(30)))
-# A plane that something stands on has this share of the area in the box at least, all but a few cameras above it, and
-# looks up within 45 degrees, or has cameras all around that look down on it by no more.
+# A supporting plane has at least this share of the area in the box, and this share of the cameras above it. It faces up
+# within 45 degrees, or has cameras all around that look down on it at no more than that angle.
 LEAST_SHARE, CAMERAS_ABOVE, STEEP = 0.05, 0.95, float(np.radians(45))
-# How often a plane is fitted to what lies on it.
+# How often a plane is fitted to its inliers.
 FITS = 3
-# What stands out from the plane by so many deviations of its own surface is not a part of it.
+# Parts that stand out from the plane by more than this many deviations of its own surface do not belong to it.
 DEVIATIONS = 4.0
-# An opening is at the plane if MOSTLY of its border is lower than so many margins.
+# An opening is at the plane if MOSTLY of its boundary is lower than this many margins.
 CLOSED_BELOW, MOSTLY = 4.0, 0.9
-# Pieces of the object have this share of the largest one's area.
+# Least area of pieces of the object, as a share of the largest one's.
 LEAST_PIECE = 0.1
 
 
 @dataclass(frozen=True)
 class SupportingPlane:
-    """Points with n . x = `offset`, the unit `normal` (3,) towards the cameras; what is nearer than `margin` is a part
-    of it."""
+    """The points with n . x = `offset`, the unit `normal` (3,) towards the cameras. Parts closer than `margin` belong
+    to it."""
 
     normal: np.ndarray
     offset: float
     margin: float
 
     def height(self, points: np.ndarray) -> np.ndarray:
-        """(...) of (..., 3) points."""
+        """Return the heights (...) of (..., 3) points above the plane."""
         return points @ self.normal - self.offset
 
 
 def object_alone(mesh: Mesh, cameras: Sequence[Camera], box: np.ndarray) -> tuple[Mesh, dict]:
-    """The object out of the surface within a (2, 3) box, and what was done: `stands_on`, the plane (4,) n . x = d or
-    None, `cut`, the share of the area that was left out, and `closed`, how many openings the plane has closed.
+    """Return the object within a (2, 3) box of the surface, and what was done: `stands_on`, the plane (4,) n . x = d or
+    None, `cut`, the share of the area that was removed, and `closed`, how many openings the plane has closed.
 
-    New vertices have the margin of the plane as `quality`, if there is one.
+    New vertices have the margin of the plane as `quality`, if the mesh has one.
 
     Raises:
         LinprimError: nothing is left.
@@ -73,7 +74,8 @@ def object_alone(mesh: Mesh, cameras: Sequence[Camera], box: np.ndarray) -> tupl
 
 
 def supporting_plane(mesh: Mesh, cameras: Sequence[Camera], box: np.ndarray) -> SupportingPlane | None:
-    """The plane that most of the surface lies on, of those that something may stand on; None where there is none."""
+    """Return, of the planes that something may stand on, the one with most of the surface on it; None if
+    there is none."""
     rng = np.random.default_rng(0)
     area, middle, normal = face_areas(mesh), mesh.vertices[mesh.faces].mean(1), face_normals(mesh)
     drawn = rng.choice(len(area), TRIED_ON, p=area / area.sum())
@@ -96,13 +98,14 @@ def supporting_plane(mesh: Mesh, cameras: Sequence[Camera], box: np.ndarray) -> 
         plane = np.append(fitted, fitted @ center)
     height = middle[on(plane)] @ plane[:3] - plane[3]
     deviation = 1.4826 * float(np.median(np.abs(height)))
-    edge = float(np.sqrt(np.median(area)))  # a voxel, which fillets at the object's foot are as large as
+    edge = float(np.sqrt(np.median(area)))  # about a voxel, the size of fillets at the foot of the object
     return SupportingPlane(plane[:3], float(plane[3]), max(DEVIATIONS * deviation, 2 * edge))
 
 
 def is_below(plane: np.ndarray, cameras: Sequence[Camera], middle: np.ndarray) -> bool:
-    """Whether something that cameras look at, at `middle` (3,), may stand on a plane (4,): nearly all are above it, and
-    it looks up as their photographs do, or, should these be turned, they stand all around and not too high."""
+    """Return whether an object that cameras look at, at `middle` (3,), may stand on a plane (4,): nearly all cameras
+    are above it, and it faces up in their photographs or, in case these are rotated, the cameras stand all around and
+    not too high."""
     normal = plane[:3]
     centers = np.array([camera.center for camera in cameras])
     if (centers @ normal > plane[3]).mean() < CAMERAS_ABOVE:
@@ -119,12 +122,13 @@ def is_below(plane: np.ndarray, cameras: Sequence[Camera], middle: np.ndarray) -
 
 
 def _across(normal: np.ndarray) -> np.ndarray:
-    """(2, 3) unit vectors at right angles to a (3,) one and to each other."""
+    """Return (2, 3) unit vectors orthogonal to a (3,) unit vector and to each other."""
     return np.linalg.svd(normal[None])[2][1:]
 
 
 def _within(mesh: Mesh, box: np.ndarray) -> Mesh:
-    """The pieces that end within a box, or all if these are little of them, but for small ones."""
+    """Return the pieces that do not reach out of a box, or all pieces if those have little of the area; without small
+    ones."""
     count, label = face_components(mesh)
     if not count:
         return mesh
@@ -137,8 +141,8 @@ def _within(mesh: Mesh, box: np.ndarray) -> Mesh:
 
 
 def closed_by(mesh: Mesh, plane: SupportingPlane) -> tuple[Mesh, int]:
-    """The mesh with the openings at the plane closed, by walls straight down from their borders and the plane between
-    these; others stay open, as what no camera saw. Returns how many were closed, too."""
+    """Close the openings at the plane by walls straight down from their boundaries to the plane, and by the plane
+    between these. Other openings stay, as no camera saw what is there. Also return how many were closed."""
     from manifold3d import triangulate
 
     low = CLOSED_BELOW * plane.margin
@@ -158,7 +162,7 @@ def closed_by(mesh: Mesh, plane: SupportingPlane) -> tuple[Mesh, int]:
         vertices.append(feet)
         polygons.append((feet @ across.T)[::-1])
         count += len(loop)
-    # Corners of polygons are numbered one polygon after the other, each backwards.
+    # Corners of polygons are numbered through all polygons in turn, each backwards.
     order = np.concatenate([part[::-1] for part in np.split(np.arange(len(mesh.vertices), count), _ends(loops))])
     faces.append(order[triangulate(polygons)])
     added = count - len(mesh.vertices)
@@ -173,5 +177,5 @@ def closed_by(mesh: Mesh, plane: SupportingPlane) -> tuple[Mesh, int]:
 
 
 def _ends(loops: Sequence[np.ndarray]) -> np.ndarray:
-    """Where one loop ends and the next begins, of all of them in a row."""
+    """Return where one loop ends and the next begins when all loops are concatenated."""
     return np.cumsum([len(loop) for loop in loops])[:-1]

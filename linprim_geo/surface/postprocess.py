@@ -1,5 +1,5 @@
-"""What follows the extraction of any surface: refinement, denoising, holes and simplification, quality, colours, what
-cameras see, texture, files."""
+"""Finishes a surface of any method: refinement, denoising, holes and simplification, quality, colours, the visible
+part, texture and files."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from linprim_geo.surface.texture.texture import make_texture
 from linprim_geo.surface.texture.texture_files import save_textured
 from linprim_geo.surface.visibility import color_vertices, pixels_of, visible_faces, with_gain
 
-# Rounds of refinement with `refine` auto, where stereo has no part in the surface.
+# Rounds of refinement with `refine` auto, if the surface was made without stereo.
 REFINE_ROUNDS = 2
 
 
 @dataclass(frozen=True)
 class Finished:
-    """The mesh and the part that cameras see, as written; what was done step by step; what the texture says of itself,
-    if there is one."""
+    """The mesh and the part of it that cameras see, as written; the processing step by step; and what the texture
+    reports of itself, if there is one."""
 
     mesh: Mesh
     visible: Mesh
@@ -41,12 +41,12 @@ class Finished:
 
 
 def visible_file(target: Path) -> Path:
-    """Where the part of a mesh goes that cameras see."""
+    """Return the path for the part of a mesh that cameras see."""
     return target.with_name(f"{target.stem}_visible{target.suffix}")
 
 
 def with_rounds(options: ExtractOptions, about: dict) -> ExtractOptions:
-    """The options with the rounds of refinement that a surface gets, by the statistics of its method."""
+    """Return the options with the rounds of refinement that a surface gets, by the statistics of its method."""
     if options.refine != "auto":
         return options
     return replace(options, refine=0 if about.get("stereo", {}).get("taken") else REFINE_ROUNDS)
@@ -55,14 +55,15 @@ def with_rounds(options: ExtractOptions, about: dict) -> ExtractOptions:
 def finish_surface(
     mesh: Mesh, run: Run, options: ExtractOptions, target: Path, stages: Stages, *, creases: bool = True
 ) -> Finished:
-    """Finishes a surface as the options ask, and writes it to `target` and `visible_file(target)`, and how it looks,
-    before and after, to `shaded_views.shaded_file(target)`.
+    """Finish a surface as the options ask; write it to `target` and its visible part to `visible_file(target)`, and
+    pictures from before and after to `shaded_views.shaded_file(target)`.
 
-    Colours are those of photographs without the gains by which their brightness differs (`photo_gains`). By a `quality`
-    that it has, noise is smoothed away, and it is kept; else by that of photographs (`predicted_error`), which a
-    tolerance `auto` asks for, too, and the surface is smoothed where it goes through itself by then. With `creases`,
-    denoising also puts these where flat parts meet, as voxels cut them off. With masks it puts outlines where
-    these show them (`moved_to_outlines`)."""
+    The gains by which the brightness of photographs differs (`photo_gains`) are removed from the colours. A surface
+    that has a `quality` is denoised by it, and keeps it. Any other is denoised by the error that photographs predict
+    (`predicted_error`), which a tolerance `auto` needs, too; if it was moved, self-intersections are smoothed away
+    afterwards. With `creases`, denoising also restores creases between flat parts, which voxels chamfer. With masks it
+    moves outlines to where these show them (`moved_to_outlines`).
+    """
     given = mesh
     views = run.scene().train
     cameras = [view.camera for view in views]

@@ -1,4 +1,4 @@
-"""A mesh as a person judges it: shaded, from three of its photographs' cameras, before and after it was smoothed."""
+"""Renders a mesh for visual inspection: shaded, from three of its photographs' cameras, before and after smoothing."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.surface.mesh_views import MeshViews
 from linprim_geo.surface.visibility import render_preview
 
-# Pictures next to each other, and pixels along the longer side of each at most.
+# Number of pictures next to each other, and the most pixels along the longer side of each.
 VIEWS, PIXELS = 3, 480
-# Of the surface, of 255, where it faces the light.
+# Grey value (of 255) of the surface where it faces the light.
 GREY = 205
-# Cameras that are nearer to each other than this share of their coordinates are in one place, but for rounding.
+# Cameras closer to each other than this share of their coordinates count as in one place, as they differ only by
+# rounding.
 ROUNDING = 1e-9
 
 
 def shaded_file(target: Path) -> Path:
-    """Where the picture of a mesh goes."""
+    """Return the path of the picture of a mesh."""
     return target.with_name(f"{target.stem}_shaded.png")
 
 
 def save_shaded(target: Path, rows: Sequence[np.ndarray]) -> None:
-    """Writes `shaded_file(target)` of rows by `shaded_row`, one below the other."""
+    """Write rows by `shaded_row`, one below the other, to `shaded_file(target)`."""
     from PIL import Image
 
     with atomic_write(shaded_file(target)) as temporary:
@@ -36,7 +37,8 @@ def save_shaded(target: Path, rows: Sequence[np.ndarray]) -> None:
 
 
 def shaded_row(mesh: Mesh, caster: MeshViews, cameras: Sequence[Camera]) -> np.ndarray:
-    """(H, W, 3) uint8: the mesh from the cameras that `most_different` chooses, beside each other, lit from each."""
+    """Return (H, W, 3) uint8: the mesh from the cameras that `most_different` chooses, next to each other, each lit
+    from its camera."""
     chosen = [cameras[index] for index in most_different(cameras)]
     chosen = [smaller(camera, -(-max(camera.width, camera.height) // PIXELS)) for camera in chosen]
     height = max(camera.height for camera in chosen)
@@ -47,8 +49,11 @@ def shaded_row(mesh: Mesh, caster: MeshViews, cameras: Sequence[Camera]) -> np.n
 
 
 def most_different(cameras: Sequence[Camera]) -> list[int]:
-    """Indices of VIEWS cameras, or of all if there are fewer: the one most like all of them by where it stands and
-    looks, and then those that are least like the ones before."""
+    """Return the indices of VIEWS cameras, or of all if there are fewer.
+
+    The first is the closest to the mean position and viewing direction, each further one the farthest from those chosen
+    before.
+    """
     centers = np.array([camera.center for camera in cameras])
     spread = float(np.sqrt(centers.var(axis=0).sum()))
     looks = np.array([camera.rotation[2] for camera in cameras])  # the world's direction of the optical axis

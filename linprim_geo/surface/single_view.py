@@ -1,5 +1,4 @@
-"""Parts of a mesh that one camera alone sees: before an open background their depth is a guess, so they are left
-out."""
+"""Removes parts of a mesh that only one camera sees: in front of an open background their depth is a guess."""
 
 from __future__ import annotations
 
@@ -13,12 +12,13 @@ from linprim_geo.geometry.mesh import Mesh, face_areas, face_components, select_
 from linprim_geo.geometry.view_support import Support
 from linprim_geo.points.initial_points import in_image
 
-# A vertex is seen where it lies no deeper than this part behind the surface of its pixel: what slopes explain.
+# A vertex counts as seen if it lies at most this share of the depth behind the surface of its pixel, which slopes
+# explain.
 BEHIND = 0.02
 
 
 def seen_alone(vertices: np.ndarray, depths: Iterable[tuple[Camera, np.ndarray]]) -> np.ndarray:
-    """(V,) bool, whether one camera alone sees a vertex (`view_support.Support`), by the (H, W) z-depths of the
+    """Return (V,) bool: whether only one camera sees a vertex (`view_support.Support`), by the (H, W) z-depths of the
     cameras' surface."""
     support = Support(torch.from_numpy(vertices))
     for camera, depth in depths:
@@ -31,11 +31,13 @@ def seen_alone(vertices: np.ndarray, depths: Iterable[tuple[Camera, np.ndarray]]
 
 
 def without_single_views(mesh: Mesh, depths: Iterable[tuple[Camera, np.ndarray]], smallest: float) -> tuple[Mesh, dict]:
-    """The mesh without what one camera alone sees, and for the statistics `pieces` and their `area`.
+    """Return the mesh without the parts that only one camera sees, and for the statistics the number of these `pieces`
+    and their `area`.
 
-    Of an open surface every connected patch of such faces is left out that has at least the share `smallest` of the
-    area; of a closed one whole components, if most of their area is so: it stays closed. What this cuts off from the
-    rest goes too if it is smaller than the share `smallest` of the largest component.
+    Of an open surface, every connected patch of such faces is removed that has at least the share `smallest` of the
+    area. Of a closed one whole components are removed, if most of their area is seen by one camera, so that it stays
+    closed. Remains that this cuts off are removed, too, if they are smaller than the share `smallest` of the largest
+    component.
     """
     alone = seen_alone(mesh.vertices, depths)[mesh.faces].all(1)
     area = face_areas(mesh)
@@ -61,6 +63,6 @@ def without_single_views(mesh: Mesh, depths: Iterable[tuple[Camera, np.ndarray]]
 
 
 def mesh_is_closed(mesh: Mesh) -> bool:
-    """Whether every edge has two faces."""
+    """Return whether every edge has two faces."""
     edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).astype(np.int64)
     return bool((np.unique(edges[:, 0] * len(mesh.vertices) + edges[:, 1], return_counts=True)[1] == 2).all())

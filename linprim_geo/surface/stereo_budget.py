@@ -1,4 +1,4 @@
-"""Stereo in a given time: of photographs that are averaged down until it fits."""
+"""Runs stereo in a given time, on photographs that are downscaled until it fits."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from linprim_geo.surface.methods.method_tsdf import (
     with_far_depths,
 )
 
-# Of the time that is left stereo takes at most this share: the rest is for smaller voxels.
+# Largest share of the remaining time for stereo: the rest is for smaller voxels.
 SHARE = 0.5
-# Stereo with its planes takes so many times as long as depth maps alone, by which it is estimated: 1.1 and 1.3 times on
+# Time of stereo with its planes, relative to its depth maps alone, from which it is estimated: 1.1 and 1.3 times on
 # `temple_ring`.
 WITH_PLANES = 1.2
 
@@ -33,14 +33,14 @@ WITH_PLANES = 1.2
 def stereo_in_time(
     run: Run, options: ExtractOptions, frames: DepthFrames, stages: Stages, budget: Budget, reserve: float
 ) -> tuple[DepthFrames, MergedFrames | None, dict]:
-    """Depth frames of a run and what is merged of them and stereo, of views as large as time and memory allow.
+    """Return depth frames of a run, and these merged with stereo, of views as large as time and memory allow.
 
-    Views have means of K by K pixels, with the least K that fits, and leaves SMALLEST_SIDE pixels at least. Without the
-    time for any, or where stereo is impossible, there are the `frames` that are given and None. `reserve` seconds are
-    not stereo's in any case.
+    Views have means of K by K pixels, with the least K that fits and leaves at least SMALLEST_SIDE pixels. If there is
+    no time for any, or stereo is impossible, the given `frames` and None are returned. `reserve` seconds are kept from
+    stereo in any case.
 
-    Returns: the frames, the merged ones, and for the statistics K as `downscale` and seconds that stereo was planned to
-    take and took.
+    Returns: the frames, the merged ones, and for the statistics K as `downscale`, and the seconds that stereo was
+        planned to take and took.
 
     Raises:
         LinprimError: `options.stereo` is on, and there is no stereo.

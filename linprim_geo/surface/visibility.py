@@ -1,5 +1,5 @@
-"""What cameras see of a mesh: visible faces, vertex colours out of photographs, and a picture of the mesh
-itself."""
+"""Finds what cameras see of a mesh: visible faces, vertex colours from photographs, and a rendered preview
+of the mesh."""
 
 from __future__ import annotations
 
@@ -17,53 +17,54 @@ from linprim_geo.surface.mesh_views import MeshViews
 from linprim_geo.surface.normals import vertex_normals
 
 SAMPLES = np.array([[1 / 3, 1 / 3, 1 / 3], [0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8]])
-"""Barycentric coordinates of the points of a face that are tested: the middle, and one near each corner."""
+"""Barycentric coordinates of the points of a face that are tested: the centroid, and one near each corner."""
 
 SURFACE_GAP = 1e-5
-"""Rays towards a point of the mesh end this share of the diagonal before it: ten times Embree's rounding."""
+"""Rays towards a point of the mesh end this share of the diagonal in front of it: ten times Embree's rounding."""
 
 KEPT_SAMPLES = 8
-"""Views a vertex takes its colour from: the best ones, enough for a median that three bad ones cannot
-move."""
+"""Most views from which a vertex takes its colour: the best ones, enough for a median that three bad ones
+cannot move."""
 
 COLOR_SPREAD = 24.0
-"""Samples further than this from the median in any channel (of 255) are left out of the average: highlights,
-things in the way, misaligned views."""
+"""Samples farther than this from the median in any channel (of 255) are left out of the average: highlights, occluders,
+misaligned views."""
 
 LEAST_FACING = 0.1
-"""Views flatter than this (cosine, 84 degrees) onto a vertex are used only if there is no other."""
+"""Views that see a vertex at a flatter angle than this (cosine, 84 degrees) are used only if there is no other."""
 
 AROUND = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], bool)
 """The four neighbours of a pixel."""
 
 BEHIND_SHARE = 1e-3
-"""Points this share of their depth, and of the diagonal, behind all that the pixels around them see may still be
-seen."""
+"""Points that are this share of their depth, and of the diagonal, behind the farthest surface in the pixels around them
+may still be visible."""
 
 FAR = 1e3
 """Depth of a ray that hits nothing, in diagonals: finite, so that differences stay numbers."""
 
 POOR_SHARE = 1e-3
-"""Factor on the weight of a sample in a pixel on the outline of something, whose colour is a mixture, and of
-one seen too flatly."""
+"""Factor on the weight of poor samples: in a pixel on an outline, whose colour is a mixture, or seen at too flat an
+angle."""
 
 OPAQUE = 0.98
-"""Pixels with less alpha than this show some of what is behind."""
+"""Pixels with less alpha than this show some of the background."""
 
 POINTS_PER_TASK = 32_768
-"""Points that are reduced to one colour at a time: their temporaries stay in cache. Results do not depend on it."""
+"""Points whose samples are reduced to one colour at a time, so that temporaries stay in cache. Results do not depend on
+it."""
 
 POOR_RINGS = 3
-"""Vertices with poor samples only take the colour of well seen ones up to so many edges away: a pixel or two.
-Wires, which are nothing but outline, keep their own."""
+"""Edges over which vertices with only poor samples take the colour of well seen ones: a pixel or two. Wires, which
+consist of nothing but outline, keep their own colour."""
 
 
 def visible_faces(mesh: Mesh, cameras: Sequence[Camera], caster: MeshViews | None = None) -> np.ndarray:
-    """Which faces any of the cameras sees, from either side.
+    """Return which faces any of the cameras sees, from either side.
 
-    A face is seen if the ray through the centre of a pixel hits it first, or if one of four points on it lies
-    in the image of a camera with nothing in between. A point farther than what the four pixel centres around it see is
-    taken to be hidden, so a gap narrower than a pixel shows nothing. `caster`: of the mesh, if there is one already.
+    A face is visible if the ray through the centre of a pixel hits it first, or if one of four points on it lies in the
+    image of a camera with nothing in between. A point farther away than what the four pixel centres around it see
+    counts as hidden, so a gap narrower than a pixel shows nothing. `caster`: of the mesh, if there is one already.
 
     Returns:
         (F,) bool.
@@ -84,7 +85,7 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera], caster: MeshViews | Non
         face = face[row]
         ray = np.einsum("rk,rkd->rd", SAMPLES[sample], caster.vertices[caster.faces[face]]) - camera.center
         reach = 1.0 - gap / np.maximum(np.linalg.norm(ray, axis=1), 2.0 * gap)
-        # Single precision tells most of them apart; what it lets through is asked again.
+        # Single precision rejects most occluded points; those that pass are tested again by `occluded`.
         for occluded in (caster.occluded_single, caster.occluded):
             left = ~occluded(camera.center, ray, reach)
             face, ray, reach = face[left], ray[left], reach[left]
@@ -93,10 +94,10 @@ def visible_faces(mesh: Mesh, cameras: Sequence[Camera], caster: MeshViews | Non
 
 
 def faces_of_pixels(caster: MeshViews, cameras: Sequence[Camera]) -> np.ndarray:
-    """(F,) bool: faces of the mesh that the ray through the centre of a pixel hits first.
+    """Return (F,) bool: faces that the ray through the centre of a pixel hits first.
 
-    A ray that sees further than those of all four pixels around it has slipped through an edge, or looks through a gap
-    narrower than a pixel, and is not believed.
+    A ray that ends farther away than those of all four pixels around it has slipped through an edge, or looks through a
+    gap narrower than a pixel, and is ignored.
     """
     from scipy.ndimage import maximum_filter
 
@@ -109,12 +110,13 @@ def faces_of_pixels(caster: MeshViews, cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def pixels_of(photo: Photo) -> np.ndarray:
-    """(H, W, 3) uint8 of a photograph, or with alpha (H, W, 4): an image as `photographed` takes it."""
+    """Return (H, W, 3) uint8 of a photograph, or with alpha (H, W, 4), as `photographed` takes images."""
     return photo.rgb if photo.alpha is None else np.dstack([photo.rgb, photo.alpha])
 
 
 def with_gain(pixels: np.ndarray, gain: float) -> np.ndarray:
-    """(H, W, 3 or 4) float32 in units of white, as `pixels_of` a photograph are without its `gain`."""
+    """Return (H, W, 3 or 4) float32 in units of white: `pixels_of` a photograph with the `gain` divided out of its
+    colours."""
     image = pixels.astype(np.float32) / 255
     image[..., :3] /= gain
     return image
@@ -123,12 +125,12 @@ def with_gain(pixels: np.ndarray, gain: float) -> np.ndarray:
 def color_vertices(
     mesh: Mesh, cameras: Sequence[Camera], images: Iterable[np.ndarray], caster: MeshViews | None = None
 ) -> np.ndarray:
-    """Vertex colours from the photographs that see each vertex.
+    """Colour vertices from the photographs that see them.
 
-    Each view that looks onto a vertex with nothing in front gives its bilinear colour there, weighted by the
-    cosine of the angle and by the resolution; the eight best per vertex are reduced to the average of those
-    near their weighted median, so a highlight or a misaligned view does not show. Vertices that no view sees
-    take the colour of their neighbours; if no vertex is seen, all are mid-grey.
+    Each view that sees a vertex unoccluded gives its bilinear colour there, weighted by the cosine of the angle and by
+    the resolution. The eight best samples per vertex are reduced to the average of those near their weighted median, so
+    that a highlight or a misaligned view does not show. Vertices that no view sees take the colour of their neighbours;
+    if no vertex is seen, all are mid-grey.
 
     Args:
         images: one (H, W, 3), or with alpha (H, W, 4), uint8, or float in [0, 1], per camera; iterated once, one in
@@ -155,16 +157,16 @@ def photographed(
     images: Iterable[np.ndarray],
     slack: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Colours of surface points (P, 3) with normals (P, 3), as `color_vertices` takes them from photographs.
+    """Return colours of surface points (P, 3) with normals (P, 3), as `color_vertices` takes them from photographs.
 
     Memory: some 400 bytes per point.
 
     Args:
-        caster: of the mesh that hides points.
+        caster: of the mesh that occludes points.
         images: one (H, W, 3 or 4) uint8, or float in [0, 1], per camera; iterated once. With a fourth channel, alpha,
-            pixels of less than one half show what is behind, and those between are taken for an outline.
-        slack: a point this far behind the surface of a pixel is not hidden, beside what the slope explains; at least a
-            pixel's footprint.
+            pixels of less than one half show the background, and those in between count as an outline.
+        slack: a point this far behind the surface of a pixel is not occluded, in addition to what the slope explains;
+            at least a pixel's footprint.
     Returns:
         colors (P, 3) float32 from 0 to 255, good (P,) bool: some view sees it well, seen (P,) bool: some view sees it
         at all.
@@ -186,9 +188,9 @@ def photographed(
             )
         image = image.astype(np.float32) * np.float32(1 if image.dtype == np.uint8 else 255)
         if image.shape[2] == 4:
-            # Premultiplied, so that transparent pixels have no colour in a sample beside them.
+            # Premultiplied, so that transparent pixels do not bleed into a sample beside them.
             image[..., :3] *= image[..., 3:] / 255
-        # Single precision is plenty here: what is hidden is told with a slack.
+        # Single precision suffices here, as occlusion is tested with a slack.
         depth = np.minimum(caster.first_hits(camera)[0], np.float32(FAR * caster.diagonal))
         near, far = (extreme(depth, size=3, mode="nearest") for extreme in (minimum_filter, maximum_filter))
         surface_ops.add_colors(*camera.pinhole(), image, depth, near, far, rules, points, normals, best, shade, good)
@@ -200,7 +202,7 @@ def photographed(
 
 
 def _robust_mean(best: np.ndarray, shade: np.ndarray) -> np.ndarray:
-    """(V, 3) float32: weighted mean of the samples near the weighted median of each channel."""
+    """Return (V, 3) float32: the weighted mean of the samples near the weighted median of each channel."""
     total = best.sum(1)
     median = np.empty((len(best), 3), dtype=np.float32)
     for channel in range(3):
@@ -217,9 +219,9 @@ def _robust_mean(best: np.ndarray, shade: np.ndarray) -> np.ndarray:
 
 
 def _fill_unseen(mesh: Mesh, colors: np.ndarray, good: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Spreads colours along edges: from well seen vertices a little way, then into those that nobody sees.
+    """Spread colours along edges: from well seen vertices a few edges far, then into those that no view sees.
 
-    Pieces that nobody sees get the mean of all.
+    Components without a seen vertex get the mean colour of all seen ones.
     """
     from scipy.sparse import coo_matrix
 
@@ -254,13 +256,12 @@ def render_preview(
     background: tuple[int, int, int] = (255, 255, 255),
     caster: MeshViews | None = None,
 ) -> np.ndarray:
-    """A picture of a mesh by rays, without a graphics library: Lambert shading with the light at the camera.
+    """Render a mesh by ray casting, without a graphics library: Lambert shading with the light at the camera.
 
     Args:
         colors: (V, 3) uint8 vertex colours; the mesh's own by default, light grey if it has none.
-        smooth: interpolate vertex normals; else each face is flat, which shows the triangulation. Faces seen
-        from
-            behind are drawn bluish, so holes and inverted parts can be told.
+        smooth: interpolate vertex normals; else each face is flat, which shows the triangulation. Faces seen from
+            behind are bluish, which reveals holes and inverted parts.
         supersample: rays per pixel along each axis.
         caster: of the mesh, if there is one.
 

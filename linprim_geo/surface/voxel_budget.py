@@ -1,4 +1,4 @@
-"""The voxel size that a time budget allows, by what coarse passes take."""
+"""Chooses the voxel size that a time budget allows, from the measured time of coarse passes."""
 
 from __future__ import annotations
 
@@ -15,20 +15,19 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.progress import Progress, Stages
 from linprim_geo.surface.postprocess import finish_surface, with_rounds
 
-# Coarse passes of extraction take these multiples of the voxel that the views support, which is the finest that is
-# chosen: half of it has 2 % more Chamfer distance and 17 times the open edges on the built-in part, for four times the
-# time.
+# Voxel sizes of the coarse passes, and the finest that is chosen, as multiples of the one that the views support. Half
+# of that one has 2 % more Chamfer distance and 17 times the open edges on the built-in part, for four times the time.
 COARSE, FINEST = (4.0, 2.0), 1.0
-# A pass before these, of the least that a surface takes, loads libraries and is not counted.
+# Voxel size, as a multiple, of a first pass with the cheapest options, which loads libraries and is not counted.
 WARM_UP = 8.0
-# So many times what this takes is kept from stereo: with it a pass takes three times as long, as two surfaces are fused
-# and compared and one is denoised, and there is a coarse one and that of the result.
+# Time that is kept from stereo, in times of that first pass. With stereo a pass takes three times as long, as two
+# surfaces are fused and compared and one is denoised, and there are two: a coarse one and that of the result.
 RESERVED = 6
 
 
 @dataclass(frozen=True)
 class VoxelCost:
-    """Seconds of fusing and finishing with a voxel of size v: `base` + `per_area` / v^2, for what lies along a
+    """Seconds of fusing and finishing with a voxel of size v: `base` + `per_area` / v^2, as the voxels lie along a
     surface."""
 
     base: float
@@ -36,8 +35,8 @@ class VoxelCost:
 
     @staticmethod
     def fit(passes: Sequence[tuple[float, float]]) -> VoxelCost:
-        """Through one or two (voxel size, seconds), from coarse to fine. One alone counts as area in full, which is the
-        more expensive guess; so do two of which the finer was not slower."""
+        """Fit the cost to one or two (voxel size, seconds), from coarse to fine. One alone counts as area in full,
+        which is the more expensive guess; so do two of which the finer was not slower."""
         v, t = passes[-1]
         if len(passes) > 1:
             (u, s), (v, t) = passes[-2:]
@@ -47,12 +46,12 @@ class VoxelCost:
         return VoxelCost(0.0, t * v**2)
 
     def seconds(self, voxel: float) -> float:
-        """Of fusing and finishing."""
+        """Return the seconds of fusing and finishing."""
         return self.base + self.per_area / voxel**2
 
 
 def plan_voxel(seconds: float, cost: VoxelCost, finest: float, coarsest: float) -> float | None:
-    """The smallest voxel size in [finest, coarsest] that takes at most `seconds`, to three digits; None if none
+    """Return the smallest voxel size in [finest, coarsest] that takes at most `seconds`, to three digits; None if none
     does."""
     if cost.seconds(coarsest) > seconds:
         return None
@@ -62,13 +61,13 @@ def plan_voxel(seconds: float, cost: VoxelCost, finest: float, coarsest: float) 
 
 
 def choose_voxel(run, options, target, stages, budget: Budget):
-    """Measures coarse passes of the TSDF surface and chooses the voxel size that fills the budget.
+    """Measure coarse passes of the TSDF surface, and choose the voxel size that fills the budget.
 
     Args:
         run: an open run. options: ExtractOptions with a level that is a number. target: the file that will be written.
 
     Returns: (ExtractOptions with the voxel size and whether there is stereo, depth maps as keywords of
-    `method_tsdf.tsdf_surface`, what was chosen and why for the statistics).
+        `method_tsdf.tsdf_surface`, what was chosen and why for the statistics).
 
     Raises:
         LinprimError: not even the coarsest voxel fits; no ray crosses the level.
@@ -143,7 +142,7 @@ def choose_voxel(run, options, target, stages, budget: Budget):
 
 
 def _timed_pass(run, options, kept, target) -> float:
-    """Seconds of everything that follows the depth maps that are `kept`, written to a folder that is thrown away."""
+    """Return the seconds of everything that follows the `kept` depth maps; the result goes to a temporary folder."""
     from linprim_geo.surface.methods.method_tsdf import tsdf_surface
 
     quiet = Stages(Progress("coarse pass", 1, quiet=True))
