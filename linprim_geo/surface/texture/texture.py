@@ -1,7 +1,8 @@
-"""Textures of extracted meshes: flat charts packed into a square image, baked from the photographs that see each texel.
+"""Bakes textures of extracted meshes: flat charts packed into a square image, coloured from the photographs that see
+each texel.
 
-Charts are grown over faces that look along the same axis and are projected onto a plane, so that any mesh has them, in
-seconds: open, closed, or with edges of many faces.
+A chart is a connected set of faces that look along the same axis, projected onto a plane. So any mesh gets charts in
+seconds, whether open, closed, or with edges of many faces.
 """
 
 from __future__ import annotations
@@ -25,28 +26,28 @@ from linprim_geo.surface.texture.texture_raster import TEXELS_PER_PASS, _nearest
 
 TEXTURED_SUFFIXES = (".obj", ".glb")
 SMALLEST, LARGEST = 16, 8192
-# Photographs that are kept decoded between passes.
+# Most bytes of decoded photographs that are kept between passes.
 KEPT_BYTES = 2**30
-# With fewer texels per face than this, `make_texture` says so.
+# Texels per face below which `make_texture` notes that the texture shows little more than vertex colours.
 FEWEST_TEXELS = 4
 
 
 @dataclass(frozen=True)
 class Texture:
     """An image over a mesh. `image` (S, S, 3) uint8 sRGB, row 0 on top; `uv` (F, 3, 2) float64 per face and corner in
-    [0, 1], v up from the lower edge of the image, as in OBJ. `about` holds what `stats.json` says of it."""
+    [0, 1], v up from the lower edge of the image, as in OBJ. `about` holds its numbers for `stats.json`."""
 
     image: np.ndarray
     uv: np.ndarray
     about: dict
 
     def select(self, faces: np.ndarray) -> Texture:
-        """The same image over some of the faces (a mask or indices), as `select_faces` of the mesh."""
+        """Return the same image over some of the faces (a mask or indices), as `select_faces` of the mesh."""
         return Texture(self.image, self.uv[faces], self.about)
 
 
 def check_texture(size: int, path: Path) -> None:
-    """Raises LinprimError for a size or a file format that cannot be used."""
+    """Raise LinprimError for a size or a file format that cannot be used."""
     if not SMALLEST <= size <= LARGEST:
         raise LinprimError(f"--texture is {size}, wanted {SMALLEST} to {LARGEST} texels, or 0 for none")
     _check_suffix(path)
@@ -66,10 +67,10 @@ def make_texture(
     gains: np.ndarray | None = None,
     note: Callable[[str], None] | None = None,
 ) -> Texture:
-    """Charts of a mesh and their colours out of photographs.
+    """Return the charts of a mesh and their colours from photographs.
 
     Each texel has a point of the surface; its colour is the robust mean of the views that see it
-    (`visibility.photographed`), so that highlights, exposure and things in the way do not show. What no view sees has
+    (`visibility.photographed`), so that highlights, exposure and occluders do not show. Texels that no view sees have
     the colours of the mesh's vertices, which are taken from the photographs if it has none. Texels between charts have
     the colour of the nearest one in a chart, so that mip-maps do not bleed. The same input gives the same texture to
     the last bit, whatever the number of threads.
@@ -79,8 +80,8 @@ def make_texture(
         views: `capture.types.View`s, or anything with a `camera` and a `load()` that gives `rgb` (H, W, 3) uint8 and
             `alpha` (H, W) uint8 or None. They are decoded once if they take at most KEPT_BYTES in all, else again for
             every TEXELS_PER_PASS texels.
-        gains: (K,) brightness of each photograph (`photo_consistency.photo_gains`), which colours are without; default
-            1.
+        gains: (K,) brightness of each photograph (`photo_consistency.photo_gains`), which is divided out of the
+            colours; default 1.
         note: called with lines for the user.
     Raises:
         LinprimError: an empty mesh or one that is not finite, or so many charts that they do not fit.
@@ -110,8 +111,8 @@ def make_texture(
 
 
 class _Photographs:
-    """The photographs of views without their gains, (H, W, 3) in units of white or with alpha (H, W, 4), in order;
-    decoded once if they fit into KEPT_BYTES."""
+    """The photographs of views in order, with their gains divided out: (H, W, 3) in units of white, or with alpha (H,
+    W, 4). They are decoded once if they fit into KEPT_BYTES."""
 
     def __init__(self, views: Sequence[View], gains: np.ndarray | None):
         self.views, self.cameras = views, [view.camera for view in views]
@@ -129,7 +130,7 @@ class _Photographs:
 
 
 def _texel_size(mesh: Mesh, corners: np.ndarray) -> float:
-    """Edge of a texel on the surface, in the mesh's unit."""
+    """Return the edge length of a texel on the surface, in the mesh's unit."""
     one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     covered = 0.5 * np.abs(one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]).sum()
     return float(np.sqrt(face_areas(mesh).sum() / covered))
@@ -139,7 +140,7 @@ def _texel_size(mesh: Mesh, corners: np.ndarray) -> float:
 
 
 def _bake(mesh, corners, owner, rows, size, photographs):
-    """The image, and the shares of its texels that some view sees, and sees well."""
+    """Return the image, and the shares of its texels that some view sees, and sees well."""
     from scipy.ndimage import distance_transform_edt
     from scipy.spatial import cKDTree
 
@@ -164,8 +165,7 @@ def _bake(mesh, corners, owner, rows, size, photographs):
                 behind = color_vertices(mesh, cameras, photographs)
             shades = behind[mesh.faces[face[hidden]]].astype(np.float64)
             color[np.arange(len(rows))[part][hidden]] = np.einsum("pk,pkc->pc", weights[hidden], shades)
-    # The colour of a texel that is only ever seen on an outline is a mixture: the next one that is seen well has a
-    # better one.
+    # A texel that is only seen on outlines has a mixed colour; the nearest texel that is seen well has a better one.
     poor = np.flatnonzero(seen & ~good)
     if len(poor) and good.any():
         middle = mesh.bounds.mean(0)

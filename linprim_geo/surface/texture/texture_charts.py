@@ -14,11 +14,12 @@ if TYPE_CHECKING:
     pass
 from linprim_geo.surface.texture.texture_raster import INSIDE, _candidates, _weights
 
-# Free texels on each side of a chart; with those of its neighbour twice as many lie between two charts.
+# Free texels on each side of a chart; between two charts lie twice as many.
 PADDING = 2
-# A face is projected along an axis only if the cosine between it and the axis is at least this.
+# Least cosine between the normal of a face and the axis along which it is projected.
 LEAST_COSINE = 0.4
-# What a neighbour in the same chart is worth against the cosine, and how often faces choose again.
+# Weight of the three neighbours' agreement against the cosine in the choice of a face's axis, and most rounds of
+# choosing.
 COHERENCE, ROUNDS = 1.0, 24
 
 
@@ -26,7 +27,7 @@ COHERENCE, ROUNDS = 1.0, 24
 
 
 def unwrap(mesh: Mesh, size: int) -> tuple[np.ndarray, int]:
-    """Flattens a mesh into the square.
+    """Flatten a mesh into the square.
 
     Returns:
         (F, 3, 2) float64 place of each corner in texels, x right and y down, no texel centre inside two faces; and the
@@ -55,7 +56,7 @@ def unwrap(mesh: Mesh, size: int) -> tuple[np.ndarray, int]:
 
 
 def _facing_axes(normals: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """(F,) axis of each face: 0 to 2 for +x, +y, +z and 3 to 5 for the opposite ones, mostly the same among
+    """Return (F,) the axis of each face, 0 to 2 for +x, +y, +z and 3 to 5 for the opposite ones, preferably that of its
     neighbours."""
     cosine = np.concatenate([normals, -normals], axis=1)
     # The best of six is at least 1 / sqrt(3), so a face with a normal always has a choice.
@@ -72,7 +73,7 @@ def _facing_axes(normals: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 
 def _components(label: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """(F,) number of the chart of each face: neighbours with the same label are in one."""
+    """Return (F,) the number of the chart of each face: neighbours with the same label share a chart."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -84,10 +85,10 @@ def _components(label: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 def _split(
     centers: np.ndarray, axis: np.ndarray, chart: np.ndarray, crossing: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Labels that take the `crossing` faces, which hide each other, out of their charts; and which faces are in such a
-    chart.
+    """Return labels that separate the `crossing` faces, whose projections overlap, from their charts; and which faces
+    are in such a chart.
 
-    A chart that is nothing else is cut in two at the middle of its faces by height.
+    A chart of crossing faces only is cut in two at the median height of its faces.
     """
     count = int(chart.max()) + 1
     inside = np.zeros(len(chart), dtype=bool)
@@ -106,10 +107,9 @@ def _split(
 
 
 def _flatten(corners: np.ndarray, normals: np.ndarray, axis: np.ndarray, chart: np.ndarray) -> np.ndarray:
-    """(F, 3, 2) corners of each face in the plane of its chart, least coordinates of a chart 0, turned to lie in a
-    small box.
+    """Return (F, 3, 2) corners of each face in the plane of its chart, rotated to lie in a small box that starts at 0.
 
-    The plane is across the mean normal of the chart if all its faces look along that, else across its axis.
+    The plane is orthogonal to the mean normal of the chart if all its faces look along that, else to its axis.
     """
     count = int(chart.max()) + 1
     edge, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -130,7 +130,7 @@ def _flatten(corners: np.ndarray, normals: np.ndarray, axis: np.ndarray, chart: 
     down = np.cross(direction, right)
     flat = np.stack([np.einsum("fkc,fc->fk", corners, side[chart]) for side in (right, down)], axis=2)
 
-    # Along the principal axes of the corners, if that box is smaller.
+    # Rotate to the principal axes of the corners, if that box is smaller.
     owner = np.repeat(chart, 3)
     size = np.maximum(np.bincount(owner, minlength=count), 1)
     x, y = (flat[..., k].ravel() for k in range(2))
@@ -159,10 +159,10 @@ def _boxes(points: np.ndarray, owner: np.ndarray, count: int) -> tuple[np.ndarra
 
 
 def _pack(flat: np.ndarray, chart: np.ndarray, size: int) -> np.ndarray:
-    """Places charts on shelves, at the largest scale at which they fit: (F, 3, 2) corners in texels.
+    """Pack charts on shelves at the largest scale at which they fit. Return (F, 3, 2) corners in texels.
 
     Raises:
-        LinprimError: they do not fit however small.
+        LinprimError: they do not fit at any scale.
     """
     count = int(chart.max()) + 1
     extent = _boxes(flat.reshape(-1, 2), np.repeat(chart, 3), count)[1]
@@ -185,7 +185,7 @@ def _pack(flat: np.ndarray, chart: np.ndarray, size: int) -> np.ndarray:
 
 
 def _shelves(extent: np.ndarray, size: int) -> np.ndarray | None:
-    """(C, 2) whole texels at which boxes with a padding start, tallest first from left to right; None if they do not
+    """Return (C, 2) whole texels at which padded boxes start, tallest first from left to right; None if they do not
     fit."""
     boxes = np.ceil(extent).astype(np.int64) + 1 + 2 * PADDING
     if boxes.max() > size or boxes.prod(1).sum() > size**2:
@@ -208,7 +208,7 @@ def _shelves(extent: np.ndarray, size: int) -> np.ndarray | None:
 
 
 def _crossing(corners: np.ndarray, size: int) -> np.ndarray:
-    """Faces that have a texel centre inside which lies inside another face too."""
+    """Return the faces that contain a texel centre which lies inside another face, too."""
     owner = np.full(size * size, -1, dtype=np.int64)
     found = []
     for texel, face, points in _candidates(corners, size, 0.0):
@@ -216,7 +216,7 @@ def _crossing(corners: np.ndarray, size: int) -> np.ndarray:
         texel, face = texel[inner], face[inner]
         before = owner[texel]
         owner[texel] = face
-        # Where a face is not the last one of this run to be written it has met another.
+        # A face that is not the last one written to a texel in this run overlaps another one there.
         found += [
             face[before >= 0],
             before[before >= 0],

@@ -1,4 +1,4 @@
-"""Textured meshes from and to files: OBJ with its material and picture, GLB."""
+"""Writes and reads textured meshes: OBJ with its material and image, and GLB."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from linprim_geo.surface.texture.texture import Texture, _check_suffix
 
 
 def save_textured(path: str | Path, mesh: Mesh, texture: Texture) -> None:
-    """Writes a mesh with its texture: .obj with an .mtl and a .png of the same name beside it, or .glb with the image
+    """Write a mesh with its texture: .obj with an .mtl and a .png of the same name beside it, or .glb with the image
     inside.
 
     Coordinates are as `save_mesh` writes them; colours and quality of the vertices are left out.
@@ -57,7 +57,7 @@ def save_textured(path: str | Path, mesh: Mesh, texture: Texture) -> None:
 
 
 def _seams(mesh: Mesh, texture: Texture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertex and uv of each different (vertex, uv), and the (F, 3) of them that each face uses."""
+    """Return vertex and uv of each distinct (vertex, uv) pair, and the (F, 3) pairs that each face uses."""
     uv = np.ascontiguousarray(texture.uv.reshape(-1, 2))
     key = np.column_stack([mesh.faces.ravel(), uv.view(np.int64)])
     _, first, index = np.unique(key, axis=0, return_index=True, return_inverse=True)
@@ -101,10 +101,10 @@ def _glb(mesh: Mesh, texture: Texture, picture) -> bytes:
 
 
 def load_texture(path: str | os.PathLike) -> tuple[Mesh, Texture] | None:
-    """A mesh and the one texture over all of it, or None where the file has none, or several.
+    """Read a mesh and the one texture over all of it; None where the file has no texture, or several.
 
-    Vertices that the file splits along seams are merged where their coordinates are equal to the last bit; the colour
-    of a material, which multiplies its image, is put into the image.
+    Vertices that the file splits along seams are merged where their coordinates are equal to the last bit. The colour
+    of a material, which multiplies its image, is multiplied into the image.
 
     Raises:
         LinprimError: the file cannot be read as a mesh.
@@ -123,5 +123,5 @@ def load_texture(path: str | os.PathLike) -> tuple[Mesh, Texture] | None:
         image = np.rint(image * (np.asarray(factor)[:3] / 255.0)).astype(np.uint8)
     corners = np.asarray(uv, dtype=np.float64)[mesh.faces]
     merged = merge_vertices(mesh)
-    # Merging drops slivers that close, and the corners in the texture would be those of other faces.
+    # Merging drops faces that become degenerate; the corners in the texture would then belong to other faces.
     return (merged if len(merged.faces) == len(mesh.faces) else mesh), Texture(image, corners, {})

@@ -1,4 +1,4 @@
-"""Which texels of a texture a triangle covers, and where in it each lies."""
+"""Rasterizes triangles into a texture: which texels each covers, and where in the triangle they lie."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ if TYPE_CHECKING:
     pass
 
 
-# Texels up to this far from a face belong to it: all that bilinear sampling of a point of the face can touch.
+# Distance in texels up to which texels belong to a face: all that bilinear sampling of a point of the face can touch.
 RING = 1.5
-# A texel is covered by two faces of a chart if it lies inside both by more than rounding (barycentric coordinates).
+# Least barycentric coordinate of a texel inside a face, when overlaps of faces are sought: above rounding.
 INSIDE = 1e-6
-# Candidates of (texel, face) that are looked at, and texels that are baked, at a time: some 0.4 GB.
+# Candidate pairs (texel, face) that are tested, and texels that are baked, at a time: some 0.4 GB.
 CANDIDATES, TEXELS_PER_PASS = 2**21, 2**20
 
 
 def _rasterize(corners: np.ndarray, size: int) -> np.ndarray:
-    """(size * size,) int32 face that each texel centre belongs to: one that it lies in, else the nearest within RING,
+    """Return (size * size,) int32 the face of each texel centre: one that contains it, else the nearest within RING,
     else -1."""
     owner = np.full(size * size, -1, dtype=np.int32)
     for texel, face, points in _candidates(corners, size, 0.0):
         inner = _weights(points, corners[face]).min(1) >= 0
-        # The last of equal indices is what stays, so the order of faces decides on an edge that two share.
+        # Of equal indices the last write stays; reversed, the first face wins on an edge that two share.
         owner[texel[inner][::-1]] = face[inner][::-1]
     taken = owner >= 0
     gap = np.full(size * size, np.inf, dtype=np.float32)
@@ -43,8 +43,8 @@ def _rasterize(corners: np.ndarray, size: int) -> np.ndarray:
 
 
 def _candidates(corners: np.ndarray, size: int, margin: float):
-    """Texels whose centres are in the boxes around faces, widened by `margin`, some at a time: texel, face, and centre
-    (N, 2)."""
+    """Yield, some at a time, the texels whose centres are in the bounding boxes of faces, widened by `margin`: texel,
+    face, and centre (N, 2)."""
     low = np.maximum(np.ceil(corners.min(1) - margin - 0.5).astype(np.int64), 0)
     high = np.minimum(np.floor(corners.max(1) + margin - 0.5).astype(np.int64), size - 1)
     wide, tall = np.maximum(high - low + 1, 0).T
@@ -57,7 +57,7 @@ def _candidates(corners: np.ndarray, size: int, margin: float):
 
 
 def _runs(weights: np.ndarray, limit: int) -> list[slice]:
-    """Consecutive rows that weigh no more than `limit` together, or are one row."""
+    """Split consecutive rows into runs that weigh at most `limit` together, or are one row."""
     ends, total = [], np.cumsum(weights)
     start = 0
     while start < len(weights):
@@ -73,7 +73,7 @@ def _cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _weights(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Barycentric weights (N, 3) of points (N, 2) in triangles (N, 3, 2); all -1 in one without area."""
+    """Return barycentric weights (N, 3) of points (N, 2) in triangles (N, 3, 2); all -1 in a triangle without area."""
     a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = _cross(ab, ac)
     safe = np.where(area != 0, area, 1.0)
@@ -84,8 +84,8 @@ def _weights(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def _nearest_in(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Barycentric weights (N, 3) of the points of triangles (N, 3, 2) nearest to points (N, 2), and the distances
-    (N,)."""
+    """Return the barycentric weights (N, 3) of the points of triangles (N, 3, 2) nearest to points (N, 2), and the
+    distances (N,)."""
     weights = _weights(points, corners)
     distance = np.zeros(len(points))
     rows = np.flatnonzero(weights.min(1) < 0)
