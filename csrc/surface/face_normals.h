@@ -1,4 +1,4 @@
-// The faces of a triangle mesh: which share a vertex, and their normals, as they are and averaged but for edges.
+// Face adjacency and normals of a triangle mesh: face normals, vertex normals, and edge-preserving averages.
 #pragma once
 
 #include <cstdint>
@@ -16,7 +16,7 @@ struct FaceFans {
 
   FaceFans(int64_t vertices, int64_t faces, const int64_t* corner);
 
-  // Calls body(g) for the faces that share a vertex with f, once per vertex that they share, f among them.
+  // Calls body(g) for all faces that share a vertex with f, once per shared vertex, f included.
   template <class Body>
   void around(int64_t f, const Body& body) const {
     for (int k = 0; k < 3; ++k) {
@@ -27,19 +27,19 @@ struct FaceFans {
 };
 
 struct FaceNormals {
-  std::vector<Vector> normal;  // of length 1, 0 of faces without area
+  std::vector<Vector> normal;  // unit length; 0 for faces without area
   std::vector<double> area;
 };
 
 FaceNormals face_normals(const FaceFans& fans, const double* vertex);
 
-// Of each vertex the mean of the normals of its faces, weighted by their angles there, of length 1; 0 without faces.
+// Returns per vertex the unit mean of its face normals, weighted by the faces' angles at the vertex; 0 without faces.
 // Source: Thuermer and Wuethrich 1998.
 std::vector<Vector> vertex_normals(const FaceFans& fans, const FaceNormals& faces, const double* vertex);
 
-// The normals after `rounds` in which each becomes the mean of those of the faces around it, weighted by area and
-// Tukey's function of their difference: from the length `contrast` on one does not count for another. Source: Zheng et
-// al. 2011, with another weight.
+// Returns face normals after `rounds` of averaging over the faces that share a vertex, weighted by area and Tukey's
+// function of the normals' difference, which is 0 from the length `contrast` on. Source: Zheng et al. 2011, with
+// another weight.
 std::vector<Vector> average_normals(const FaceFans& fans, const FaceNormals& faces, double contrast, int rounds);
 
 }  // namespace linprim

@@ -1,19 +1,19 @@
-// Votes of one depth map for the voxels of a sparse grid of blocks.
+// Integrates one depth map into the signed distance field of a sparse voxel grid, by a vote per voxel.
 #pragma once
 
 #include <cstdint>
 
 namespace linprim {
 
-// A depth map as planes, one row of kSurfelColumns per pixel. With x in the grid's frame, the signed distance to the
-// pixel's surface in truncations, positive on the camera's side, is offset - plane . x.
+// A surfel: the plane of one pixel of a depth map, a row of kSurfelColumns numbers. For x in the grid's frame, the
+// signed distance to the pixel's surface in truncations, positive on the camera's side, is offset - plane . x.
 constexpr int kSurfelColumns = 8;
 struct Surfel {
   float plane[3], offset;
-  float weight;   // 0: no surface, or one at an unknown place
+  float weight;   // 0: no surface, or one at an unknown depth
   float cosine;   // between the pixel's ray and the surface's normal
   float nearest;  // largest 1/z of the pixels around
-  float free;     // weight of "the ray passes here"
+  float free;     // weight of a vote for free space
 };
 
 struct SurfelView {
@@ -22,16 +22,16 @@ struct SurfelView {
   const Surfel* surfels;  // (height, width)
 };
 
-// How much a vote weighs by its distance from the surfel; lengths in truncations.
+// Weight of a vote by the voxel's distance from the surfel; lengths in truncations.
 struct VoteRules {
-  float near;           // before a surface: 1 / (1 + (distance / near)^2),
+  float near;           // in front of the surface: 1 / (1 + (distance / near)^2),
   float far_front;      // at least this
-  float behind;         // behind it: whole this far along the ray, fading over as much again
-  float behind_weight;  // what is left of it
+  float behind;         // behind it: full up to this distance along the ray, fades over as much again
+  float behind_weight;  // least weight behind it, up to the truncation
   float grazed,
-      grazed_reach;     // within the first of the plane and the second along the ray votes hold beyond a truncation,
-  float grazed_weight;  // with this weight
-  float occluded;       // weight of the vote "inside" of what is further behind
+      grazed_reach;     // behind it beyond a truncation, within the first of the plane and the second along the ray:
+  float grazed_weight;  // this weight
+  float occluded;       // weight of the vote "inside" farther behind
 };
 
 // Blocks of resolution^3 voxels, x fastest. Sums are (blocks, resolution^3).
@@ -44,7 +44,8 @@ struct VoxelSums {
   float* free;
 };
 
-// Adds the votes of a view to `count` blocks, `rows` of the sums. The same whatever the number of threads.
+// Adds the votes of a view to the `count` blocks that are `rows` of the sums. The result is the same for any number of
+// threads.
 void add_votes(const SurfelView& view, const VoteRules& rules, const int64_t* rows, int64_t count,
                const VoxelSums& sums);
 

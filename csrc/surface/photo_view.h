@@ -1,4 +1,4 @@
-// A pinhole photograph of a surface, and how it sees points of it.
+// A pinhole photograph of a surface, and projection of surface points into it.
 #pragma once
 
 #include <algorithm>
@@ -17,7 +17,7 @@ struct PhotoView {
   const float* depth;  // z of the surface
 };
 
-// Camera coordinates of a point.
+// Writes the camera coordinates of a point.
 inline void to_camera(const PhotoView& view, const double* point, double* at) {
   for (int r = 0; r < 3; ++r) {
     const double* row = view.pose + 4 * r;
@@ -25,15 +25,16 @@ inline void to_camera(const PhotoView& view, const double* point, double* at) {
   }
 }
 
-// A point and its normal in camera coordinates, the cosine between the normal and the direction to the camera, and its
-// pixel.
+// A point and its normal in camera coordinates, the cosine between the normal and the direction to the camera, and the
+// point's pixel coordinates.
 struct SeenPoint {
   double at[3], normal[3], facing, u, v;
 
   int64_t pixel(int width) const { return int64_t(v) * width + int64_t(u); }
 };
 
-// False where the point is behind the camera, flatter than `least_cosine`, or outside of the image.
+// Projects a point. Returns false if it is behind the camera, seen at a flatter angle than `least_cosine`, or outside
+// of the image.
 inline bool look(const PhotoView& view, double least_cosine, const double* point, const double* normal,
                  SeenPoint& out) {
   to_camera(view, point, out.at);
@@ -50,14 +51,14 @@ inline bool look(const PhotoView& view, double least_cosine, const double* point
   return out.u >= 0 && out.u < view.width && out.v >= 0 && out.v < view.height;
 }
 
-// How much the depth of a plane changes from one pixel to the next: a pixel's footprint times the tangent. Flatter ones
-// than `least_facing` slope no more than that.
+// Returns the change of a plane's depth from one pixel to the next: a pixel's footprint times the tangent of the
+// viewing angle, whose cosine is taken as at least `least_facing`.
 inline double slope_across(double footprint, double facing, double least_facing) {
   const double cosine = std::max(facing, least_facing);
   return footprint * std::sqrt(1 / (cosine * cosine) - 1);
 }
 
-// Writes the channels at (u, v), interpolated bilinearly; beyond the outermost pixel centres they are theirs.
+// Writes the channels at (u, v), bilinearly interpolated, and clamped beyond the outermost pixel centres.
 inline void bilinear(const PhotoView& view, double u, double v, float* out) {
   const double x = std::clamp(u - 0.5, 0.0, double(view.width - 1)),
                y = std::clamp(v - 0.5, 0.0, double(view.height - 1));

@@ -1,4 +1,4 @@
-// The best samples that photographs have of the colours of surface points.
+// Collects the best colour samples of surface points from photographs.
 #pragma once
 
 #include <cstdint>
@@ -11,9 +11,9 @@ constexpr int kKeptSamples = 8;  // per point
 
 struct ColorRules {
   double slack;         // a point may lie this far behind the surface of its pixel, at least a footprint
-  double least_facing;  // flatter samples are poor
+  double least_facing;  // samples at a flatter angle (cosine) are poor
   double poor_share;    // factor on the weight of poor samples
-  double opaque;        // samples with less alpha are poor
+  double opaque;        // samples with less alpha than this are poor
 };
 
 struct ColorSamples {
@@ -25,12 +25,12 @@ struct ColorSamples {
   uint8_t* good;         // (count) whether a sample is not poor
 };
 
-// Adds one photograph of three channels, or of four: alpha from 0 to 255, by which the others are multiplied already;
-// samples with less than half of it are none. `near` and `far` (height, width) are the least and the largest depth of
-// 3x3 pixels.
+// Adds one photograph of three channels, or of four with alpha from 0 to 255, by which the others are premultiplied;
+// samples with less than half of full alpha are dropped. `near` and `far` (height, width) are the least and the largest
+// depth of 3x3 pixels.
 //
-// A sample weighs the cosine over the square of what a pixel covers there. It is poor on an outline, or where it is too
-// flat.
+// The weight of a sample is the cosine over the square of the pixel's footprint there. A sample is poor on an outline,
+// or at too flat an angle.
 void add_colors(const PhotoView& view, const float* near, const float* far, const ColorRules& rules,
                 const ColorSamples& samples);
 

@@ -1,5 +1,5 @@
-// Optical depth of straight segments through homogeneous polyhedra: closed form, overlaps included, from one point to
-// many.
+// Optical depth along straight segments from one point to many, through homogeneous polyhedra, in closed form with
+// overlaps included.
 #pragma once
 
 #include <cstdint>
@@ -15,13 +15,13 @@ struct SlabSolid {
   double density;
 };
 
-// The same seen from a point: x is inside where |at + normal . (x - point)| <= 1 for all four.
+// The same relative to a point: x is inside where |at + normal . (x - point)| <= 1 for all four slabs.
 struct SeenSolid {
   double normal[4][3], at[4], density;
 };
 
-// A box of the hierarchy. Inner (count 0): the one child is the next node, the other is `first`, and the next one's
-// solids lie below `split` along `axis`. Leaf: solids first .. first + count - 1.
+// A node of the bounding box hierarchy. Inner node (count 0): one child is the next node, the other is `first`, and the
+// solids of the next node lie below `split` along `axis`. Leaf: solids first .. first + count - 1.
 struct SolidNode {
   double low[3], high[3], split;
   int32_t first, count, axis;
@@ -32,13 +32,13 @@ struct SegmentParams {
   const SolidNode* nodes;  // the root first
   const double* origin;    // 3
   const double* ends;      // (count, 3)
-  const double* begin;     // (count) share of the way from the origin at which a segment begins, or null for 0
-  double most;             // sums are cut off here
+  const double* begin;     // (count) fraction of the way from the origin at which a segment begins, or null for 0
+  double most;             // upper limit of the sums
   double* depth;           // (count)
 };
 
-// Bounding boxes around the primitives that absorb, for optical depths along many segments. Primitives with an extent
-// or a density that is not positive are left out; other extreme ones are held within the bounds of primitive_pose.h. No
+// Bounding box hierarchy of the absorbing primitives, for optical depths along many segments. Primitives whose extent
+// or density is not positive are left out; other extreme ones are clamped to the bounds of primitive_pose.h. No
 // Gaussians.
 class SolidTree {
  public:
@@ -46,9 +46,9 @@ class SolidTree {
   SolidTree(PrimitiveKind kind, int64_t n, const Real* center, const Real* rotation, const Real* extent,
             const Real* density);
 
-  // depth[i] = min(most, sum over solids of density times the length of the segment inside), the segment running from
-  // origin + begin[i] (ends[i] - origin) to ends[i]. Ends whose neighbours lie near them are many times faster. A value
-  // depends neither on the other ends nor on threads.
+  // depth[i] = min(most, sum over solids of density times the length of the segment inside). The segment runs from
+  // origin + begin[i] (ends[i] - origin) to ends[i]. It is many times faster if neighbours in `ends` are close. A value
+  // depends neither on the other ends nor on the number of threads.
   void optical_depth(const double* origin, const double* ends, const double* begin, int64_t count, double most,
                      double* depth) const;
 

@@ -1,4 +1,4 @@
-// Where points lie in the image of a pinhole camera.
+// Projects points into the image of a pinhole camera.
 #pragma once
 
 #include <cstdint>
@@ -8,7 +8,7 @@
 
 namespace linprim {
 
-// Column and row, the middle of the first pixel being (0.5, 0.5), and depth along the optical axis.
+// Column and row, with the centre of the first pixel at (0.5, 0.5), and depth along the optical axis.
 struct ImagePlace {
   double column, row, depth;
 };
@@ -20,7 +20,7 @@ inline ImagePlace place_of(const PhotoView& view, const double* point) {
   return {at[0] * scale * view.fx + view.cx, at[1] * scale * view.fy + view.cy, at[2]};
 }
 
-// Whether a place is in front of the camera and in the image; not where it is no number.
+// Returns whether a place is in front of the camera and in the image; false if it is not a number.
 inline bool is_visible(const PhotoView& view, const ImagePlace& at) {
   return at.depth > 0 && at.column >= 0 && at.row >= 0 && at.column < view.width && at.row < view.height;
 }
@@ -30,8 +30,8 @@ struct VisiblePoints {
   std::vector<double> depth;
 };
 
-// The visible ones of `point` (count, 3), in their order; sets inside[count] to whether each is. Float64. Of the view
-// image and depth are not looked at. The same for any number of threads.
+// Returns the visible ones of `point` (count, 3), in their order; sets inside[count] to whether each is visible.
+// Float64. The image and depth of the view are not used. The result is the same for any number of threads.
 VisiblePoints visible_points(const PhotoView& view, const double* point, int64_t count, uint8_t* inside);
 
 }  // namespace linprim
