@@ -1,4 +1,4 @@
-"""Which views know a surface that one of them supposes."""
+"""Count which other views know a surface that one view supposes."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.points.view_pairs import visible_pixels
 from linprim_geo.stereo.planes.plain_regions import rays_of, to_world
 
-# Depths of one of so many rows and columns are looked at, and a view knows a surface by so many points at least: half
-# of those on the smallest region that has a plane (`shading.LEAST_BOXES`).
+# Depths are sampled at every STRIDE-th row and column. A view knows a surface if at least LEAST_POINTS of its points
+# lie on it: half of the boxes of the smallest region with a plane (`shading.LEAST_BOXES`).
 STRIDE, LEAST_POINTS = 4, 30
-# Points are on a surface if their depths differ by no more than this share, which is what planes may be off by.
+# A point is on a surface if its depth differs by at most this share, the error of planes.
 ON_IT = 0.05
 
 
 class CommonSurfaces:
-    """Points on the surfaces that views know: `confirmed` (H, W) depths of each camera, NaN where unknown, and where
-    these are, `supposed` ones."""
+    """Sampled points on the surfaces that views know: at `confirmed` depths (H, W) of each camera, NaN where unknown,
+    and at `supposed` ones where those are unknown."""
 
     def __init__(self, cameras: Sequence[Camera], confirmed: Sequence[np.ndarray], supposed: Sequence[np.ndarray]):
         self.cameras = cameras
@@ -33,8 +33,8 @@ class CommonSurfaces:
         self.points, self.views, self.sure = (np.concatenate(parts) for parts in (points, views, sure))
 
     def known_by(self, view: int, depths: Sequence[np.ndarray], only_confirmed: Sequence[bool]) -> list[np.ndarray]:
-        """The numbers of other views with points, or `only_confirmed` ones, on each of several (H, W) depths of a view,
-        NaN where there are none."""
+        """Return for each of several depths (H, W) of a view, NaN where none, the numbers of the other views with
+        enough points on it; only confirmed points where `only_confirmed` is true."""
         if not depths:
             return []
         others = self.views != view

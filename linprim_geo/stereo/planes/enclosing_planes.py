@@ -1,18 +1,11 @@
-"""Floors and walls where nothing is known of them: planes behind which nothing lies go on.
+"""Extend floors and walls into pixels of unknown depth: planes behind which nothing lies.
 
-A plane encloses the scene if all cameras and nearly all known points lie on one side of it, but for those in recesses
-such as doors, and another such plane meets it at a right angle, as the floor and the walls of a room do, or its points
-are all over it, as those of a table are. A ray of which nothing is known ends at the first of these, but only within
-the rectangle that holds the plane's own known points, as walls do not go on into the sky. Where hardly any view looks,
-as below a table, stereo can know nothing: there it ends within the rectangle that holds all known points, if the
-plane's own reach across that one way. Where most of the views that look at a place know it, one that does not has
-something before it, unless it has a doubtful depth there.
-
-Of few photographs training can explain much as background: what hardly any view shows agrees with any far background.
-There a depth of stereo on such a plane counts all the same (`known_on_planes`).
-
-A plain wall in even light has no points. Where two planes that enclose the scene end at the same place, as a floor and
-a wall do at the next wall, a plane at right angles to both closes the room there.
+A plane encloses the scene if all cameras and nearly all known points (except those in recesses such as doors) lie on
+one side of it, and either another such plane is at a right angle to it or its points are all over it, as on a table. A
+ray of unknown depth ends at the first of these planes, within the rectangle around the plane's own points: walls do not
+reach into the sky. Where hardly any view looks, as below a table, a rectangle around all known points counts, if the
+plane's points span that in one direction. Where most views that look at a place know its depth and one does not, an
+object is assumed in front of it. Where two enclosing planes end together, a third closes the room: a plain wall.
 """
 
 from __future__ import annotations
@@ -32,44 +25,48 @@ from linprim_geo.stereo.planes.plain_regions import PlainRegion, in_camera, rays
 from linprim_geo.stereo.planes.point_planes import LEAST_SHARE, SAME_NORMAL, SurfacePoints
 from linprim_geo.stereo.planes.right_angles import at_right_angles
 
-# Of the known points so many are wrong, and may lie behind a plane or beyond an end of it.
+# This share of the known points may be wrong, and lie behind a plane or beyond its end.
 OUTLIERS = 0.01
-# A point is behind a plane by more than this share of its distance: twice what depths may be off by.
+# A point is behind a plane if it is by more than this share of its distance: twice the error of confirmed depths.
 MARGIN = 2 * CONFIRMED_DEPTH
-# Two planes end at the same place if their ends, each of which is known to MARGIN, differ by so many times that.
+# Two planes end at the same place if their ends, each known to MARGIN, differ by at most so many times MARGIN.
 ENDS_APART = np.sqrt(2)
-# A door or a window stands back from its wall by up to so much of its distance: 15 cm from 3 m.
+# A door or a window is set back from its wall by at most this share of its distance: 15 cm at 3 m.
 RECESS = 5 * CONFIRMED_DEPTH
-# Nothing is known through a wall but for a share of what is known in its direction: more than OUTLIERS, as a plain wall
-# has few points of its own. What is known in its direction counts for so many points at least.
+# At most this share of the known points in the direction of a wall may lie behind it. It is more than OUTLIERS, as a
+# plain wall has few points of its own. The points in its direction count as LEAST_AIMED at least.
 SEEN_THROUGH, LEAST_AIMED = 0.05, 100
-# So few of the points on a plane lie beyond its ends, and ends are known to this share of the distance between them.
+# The share of a plane's points that may lie beyond either end, and the error of the ends, as a share of the distance
+# between them.
 BEYOND, END_MARGIN = 0.002, 0.02
-# A plane whose points reach along this share of the scene one way bounds it, and may go on the other way. The front of
-# a sideboard does not.
+# A plane whose points reach along this share of the scene in one direction bounds it, and may be extended in the other.
+# The front of a sideboard does not reach as far.
 SPANNING = 0.9
-# A place that more of the views looking at it know is not what a view sees that knows nothing: something is before it.
+# If more than this share of the views that look at a place know its depth, a view that knows none there has an object
+# in front of it.
 MOST_KNOW = 0.5
-# The points of a plane are all over it if they are in a share FILLED of CELLS by CELLS parts of their rectangle, whose
-# sides run along one of so many DIRECTIONS. On a plane through a row of eaves and the sky they are in a few.
+# Points are all over a plane if they fill the share FILLED of CELLS by CELLS cells of their rectangle, the smallest
+# over DIRECTIONS orientations. On a false plane, through a row of eaves and the sky, they fill few.
 CELLS, FILLED, DIRECTIONS = 8, 0.5, 45
-# A plane is level if its normal is as near to the mean direction that is up in photographs, whose camera may look far
-# down.
+# A plane is level if its normal is within 60 degrees of the mean up direction of the photographs, whose cameras may
+# look far down.
 UPRIGHT = np.cos(np.radians(60))
-# Stereo knows up to SURE_SHARE of a plain region by chance; of more depths, AGREEING are on a plane that it lies on.
+# Stereo knows up to SURE_SHARE of a plain region by chance. If it knows more, AGREEING of these depths have to be
+# inliers of the plane of the region.
 SURE_SHARE, AGREEING = 0.1, 0.7
-# So many views of each place are wanted for stereo: where no more look, it may know nothing of a surface.
+# Stereo compares each view with so many others. Where no more than that look at a place, stereo may know nothing of a
+# surface there.
 FEW_VIEWS = SOURCES
 
 
 @dataclass(frozen=True)
 class EnclosingPlane:
-    """A plane normal . x = offset, with (3,) `normal` towards the cameras.
+    """A plane normal . x = offset; its `normal` (3,) points towards the cameras.
 
-    `axes` (2, 3) are unit vectors in it; `own` (2, 2) the least and greatest coordinates along them of its own known
-    points, and `whole` of all known points if its own reach as far along one of the axes, else the same. One that
-    `closes` the scene stands where two others end. An `inner` one, of a room that is not convex, is nothing beyond its
-    own rectangle.
+    `axes` (2, 3) are unit vectors within the plane. `own` (2, 2) are the least and greatest coordinates along them of
+    the plane's own points; `whole` (2, 2) those of all known points if its own span one axis as far, else the same as
+    `own`. A plane that `closes` the scene stands where two others end. An `inner` one, a wall of a room that is not
+    convex, does not reach beyond its own rectangle.
     """
 
     normal: np.ndarray
@@ -81,24 +78,24 @@ class EnclosingPlane:
     inner: bool = False
 
     def as_vector(self) -> np.ndarray:
-        """(4,) normal and offset."""
+        """Return (4,) normal and offset."""
         return np.append(self.normal, self.offset)
 
     def at(self, along: np.ndarray) -> np.ndarray:
-        """(..., 3) points of the plane at (..., 2) coordinates along its axes."""
+        """Return (..., 3) points of the plane at (..., 2) coordinates along its axes."""
         return along @ self.axes + self.normal * self.offset
 
     def within(self, points: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """(P,) bool which of (P, 3) points on the plane lie within `own` or `whole`."""
+        """Return (P,) bool: which of (P, 3) points on the plane lie within the rectangle `ends`, `own` or `whole`."""
         first, second = (points @ self.axes.T).T
         return (first >= ends[0, 0]) & (first <= ends[1, 0]) & (second >= ends[0, 1]) & (second <= ends[1, 1])
 
     def corners(self) -> np.ndarray:
-        """(4, 3) of its own rectangle."""
+        """Return the (4, 3) corners of its own rectangle."""
         return self.at(np.array([[x, y] for x in self.own[:, 0] for y in self.own[:, 1]]))
 
     def with_place_for(self, points: np.ndarray) -> EnclosingPlane:
-        """The plane with rectangles that hold (P, 3) points, too, projected onto it."""
+        """Return the plane with both rectangles enlarged to hold the projections of (P, 3) points."""
         along = points @ self.axes.T
         own, whole = (
             np.stack([np.minimum(ends[0], along.min(0)), np.maximum(ends[1], along.max(0))])
@@ -114,11 +111,13 @@ def enclosing_planes(
     standing: np.ndarray | None = None,
     known: SurfacePoints | None = None,
 ) -> list[EnclosingPlane]:
-    """Those of (K, 4) planes n . x = d that enclose the scene, without copies, of those that meet no other at right
-    angles only what points are all over, and planes at right angles to two of them where both end.
+    """Return those of (K, 4) planes n . x = d that enclose the scene, without duplicates, and closing planes at right
+    angles to two of them where both end. A plane that is at a right angle to no other is kept only if points are all
+    over it.
 
-    Of walls that are `standing` (K,) on the line that photographs show few points are enough. `points` tell where
-    planes end that others close, unless further `known` points go on there; planes reach as far as these do."""
+    Walls that are `standing` (K,), on a line which photographs show, need only few points. `points` tell where planes
+    end and another closes, unless further `known` points continue there; the planes' rectangles hold these as well.
+    """
     if not len(points):
         return []
     seen = KnownPoints(cameras, points)
@@ -142,7 +141,7 @@ def enclosing_planes(
 
 
 class KnownPoints:
-    """Known points, by which planes (4,) n . x = d are judged whose normals are towards the cameras."""
+    """Known points of the scene, to judge planes (4,) n . x = d with normals towards the cameras."""
 
     def __init__(self, cameras: Sequence[Camera], points: SurfacePoints):
         self.cameras, self.points = cameras, points
@@ -150,17 +149,17 @@ class KnownPoints:
         self.distance = np.linalg.norm(points.position - points.center, axis=1)
 
     def is_level(self, plane: np.ndarray) -> bool:
-        """Whether a plane (4,), or its normal (3,), is that of a floor, or of a table."""
+        """Return whether a plane (4,), or its normal (3,), is that of a floor or a table top."""
         upward = -np.mean([camera.rotation[1] for camera in self.cameras], axis=0)
         return bool(plane[:3] @ upward > UPRIGHT * np.linalg.norm(upward))
 
     def facing(self, plane: np.ndarray) -> np.ndarray:
-        """The plane with its normal towards the cameras."""
+        """Return the plane with its normal towards the cameras."""
         return plane if (self.centers @ plane[:3]).mean() > plane[3] else -plane
 
     def is_enclosing(self, plane: np.ndarray, least: float = LEAST_SHARE) -> bool:
-        """Whether at least a share `least` of the points lies on the plane, with normals alike, and hardly any behind
-        it, but for a share SEEN_THROUGH in recesses."""
+        """Return whether at least the share `least` of the points are inliers of the plane with similar normals, and
+        hardly any lies behind it, except a share of up to SEEN_THROUGH in recesses."""
         on = self.points.on(plane[None], CONFIRMED_DEPTH)
         return (
             bool(on.any())
@@ -170,17 +169,17 @@ class KnownPoints:
         )
 
     def is_before_all(self, plane: np.ndarray, margin: float = MARGIN) -> bool:
-        """Whether all cameras are before a plane, and hardly any point is behind it by more than a share `margin` of
-        its distance."""
+        """Return whether all cameras are in front of a plane, and hardly any point is behind it by more than the share
+        `margin` of its distance."""
         return self.share_behind(plane, margin) < OUTLIERS and bool((self.centers @ plane[:3] > plane[3]).all())
 
     def share_behind(self, plane: np.ndarray, margin: float) -> float:
-        """The share of the points that are behind a plane by more than a share `margin` of their distance."""
+        """Return the share of the points that are behind a plane by more than the share `margin` of their distance."""
         return float((self.height(plane) < -margin * self.distance).mean())
 
     def is_passed(self, wall: EnclosingPlane) -> bool:
-        """Whether more than SEEN_THROUGH of the known points in the direction of a wall's own rectangle, but for a
-        margin, are behind it."""
+        """Return whether more than SEEN_THROUGH of the known points seen through a wall's own rectangle, reduced by a
+        margin, are behind the wall."""
         center, towards = self.points.center, self.points.position - self.points.center
         along = towards @ wall.normal
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -193,16 +192,18 @@ class KnownPoints:
         return bool(passing > SEEN_THROUGH * max(LEAST_AIMED, int(aimed.sum())))
 
     def height(self, plane: np.ndarray) -> np.ndarray:
-        """(P,) how far points are before a plane."""
+        """Return (P,) signed distances of the points from a plane, positive in front."""
         return self.points.position @ plane[:3] - plane[3]
 
     def on(self, plane: np.ndarray) -> np.ndarray:
-        """(P,) bool which points are on a plane, whatever their normals, which are bent in corners."""
+        """Return (P,) bool: which points are inliers of a plane, regardless of their normals, which are bent in
+        corners."""
         return np.abs(self.height(plane)) < CONFIRMED_DEPTH * self.distance
 
     def without_copies(self, planes: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Planes in the order of how many points are on them, those with points in recesses last, each unless most of
-        its points are on one before, too: a plane between a floor and a board above it has points of both."""
+        """Return the planes without duplicates, sorted by descending inlier count, those with points in recesses last.
+        A plane is a duplicate if most of its inliers are also near an earlier, similar one: between a floor and a board
+        above it, for example."""
         kept: list[np.ndarray] = []
         for plane in sorted(planes, key=lambda plane: (not self.is_before_all(plane), -self.on(plane).sum())):
             own = self.on(plane)
@@ -213,7 +214,8 @@ class KnownPoints:
         return kept
 
     def which_is_there(self, plane: EnclosingPlane, others: Sequence[EnclosingPlane]) -> int | None:
-        """The number of the first of others that faces the same way and on which the middle of a plane is."""
+        """Return the index of the first of `others` that faces the same way as the plane and holds its middle, or
+        None."""
         middle = plane.at(plane.own.mean(0))[None]
         for number, other in enumerate(others):
             if plane.normal @ other.normal > SAME_NORMAL and self.are_on(middle, other):
@@ -221,17 +223,17 @@ class KnownPoints:
         return None
 
     def are_on(self, places: np.ndarray, plane: EnclosingPlane) -> bool:
-        """Whether (P, 3) places are on a plane, for a camera as far from them as the one in the middle by that."""
+        """Return whether (P, 3) points are all on a plane, within MARGIN of the median distance of the cameras."""
         near = self.margin_at(places.mean(0))
         return bool((np.abs(places @ plane.normal - plane.offset) < near).all())
 
     def margin_at(self, place: np.ndarray) -> float:
-        """MARGIN of what is at a place (3,), for a camera as far from it as the one in the middle by that."""
+        """Return MARGIN in the unit of the scene, at a point (3,) seen from the median distance of the cameras."""
         return MARGIN * float(np.median(np.linalg.norm(self.centers - place, axis=1)))
 
     def closing(self, found: Sequence[np.ndarray], every: KnownPoints) -> list[np.ndarray]:
-        """Planes at right angles to two of those `found` where both end, by `every` point, too, on sides where there is
-        none."""
+        """Return planes at right angles to two of those `found`, where both end, on sides without a plane. `every`
+        point counts for where they end, not only these."""
         closing: list[np.ndarray] = []
         for number, first in enumerate(found):
             for second in (other for other in found[:number] if at_right_angles(first, other)):
@@ -251,12 +253,12 @@ class KnownPoints:
         return closing
 
     def ends_at(self, plane: np.ndarray, end: np.ndarray, near: float) -> bool:
-        """Whether hardly any point of a plane is farther than `near` beyond its end at another plane."""
+        """Return whether hardly any inlier of a plane is more than `near` beyond its end at another plane."""
         return bool((self.height(end)[self.on(plane)] < -near).mean() < OUTLIERS)
 
     def ends_in_images(self, own: np.ndarray, end: np.ndarray, near: float) -> bool:
-        """Whether most views of the points of a plane that are `near` its end at another plane show what lies beyond,
-        so that it does not end where photographs do."""
+        """Return whether most views of a plane's points within `near` of its end at another plane show what is beyond,
+        so that the plane does not just end at the borders of photographs."""
         rows = np.flatnonzero(own & (self.height(end) < near))
         beyond = self.points.position[rows] - 2 * near * end[:3]
         views = self.points.view[rows]
@@ -264,8 +266,8 @@ class KnownPoints:
         return bool(np.concatenate(inside).mean() > 0.5)
 
     def with_ends(self, plane: np.ndarray, corners: Sequence[np.ndarray], own: np.ndarray | slice) -> EnclosingPlane:
-        """A plane with its ends by its `own` points, along the normal of the first of the `corners` that is at right
-        angles to it, or else along the sides of the smallest rectangle. Without another one it ends with its points."""
+        """Return a plane with the rectangle around its `own` points: along the normal of the first of the `corners` at
+        a right angle to it, else the smallest rectangle, which is then not extended to other points."""
         normal = plane[:3]
         first = next((other[:3] for other in corners if at_right_angles(other, plane)), None)
         if first is None:
@@ -278,7 +280,7 @@ class KnownPoints:
         return EnclosingPlane(normal, float(plane[3]), axes, ends, whole if spans else ends)
 
     def smallest_rectangle(self, plane: np.ndarray, own: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray]:
-        """Axes and ends of the rectangle in a plane that holds its `own` points on the least area."""
+        """Return axes (2, 3) and ends (2, 2) of the smallest rectangle within a plane that holds its `own` points."""
         one, other = _axes(plane[:3], np.eye(3)[np.abs(plane[:3]).argmin()])
         points, tried = self.points.position[own], []
         for angle in np.linspace(0, np.pi / 2, DIRECTIONS, endpoint=False):
@@ -289,7 +291,7 @@ class KnownPoints:
         return axes, ends
 
     def is_filled(self, plane: np.ndarray, own: np.ndarray) -> bool:
-        """Whether a plane's `own` points are all over it."""
+        """Return whether a plane's `own` points are all over their rectangle."""
         axes, ends = self.smallest_rectangle(plane, own)
         along = (self.points.position[own] @ axes.T - ends[0]) / np.diff(ends, axis=0)
         cells = np.floor(CELLS * along[(along >= 0).all(1) & (along < 1).all(1)]).astype(int)
@@ -297,15 +299,15 @@ class KnownPoints:
 
 
 def _axes(normal: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """(2, 3) unit vectors at right angles to a `normal` and to each other, the first as `near` to another as can
-    be."""
+    """Return (2, 3) unit vectors orthogonal to a `normal` and to each other, the first as close as possible to
+    `near`."""
     first = near - normal * (near @ normal)
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(normal, first)])
 
 
 def _ends(along: np.ndarray) -> np.ndarray:
-    """(2, 2) least and greatest of (P, 2) coordinates."""
+    """Return the (2, 2) least and greatest of (P, 2) coordinates, without outliers and with a margin."""
     low, high = np.quantile(along, [BEYOND, 1 - BEYOND], axis=0)
     return np.stack([low, high]) + END_MARGIN * np.stack([low - high, high - low])
 
@@ -318,15 +320,16 @@ def enclosing_depths(
     shown: Sequence[np.ndarray],
     doubtful: Sequence[np.ndarray],
 ) -> list[np.ndarray]:
-    """(H, W) float32 depth of every view at its `wanted` pixels where their rays end at an enclosing plane, else NaN.
+    """Return the (H, W) float32 depth of every view at `wanted` pixels whose rays end at an enclosing plane, NaN
+    elsewhere.
 
     Args:
-        known: (H, W) depth of every view, NaN where nothing is known.
-        wanted: (H, W) bool.
-        shown: (H, W) depth of every view that a pixel probably has, NaN where none is more probable than others: a
-            plane has to be near it.
-        doubtful: (H, W) depth of every view that is on a plane if it is near one, NaN where there is none; elsewhere a
-            place that MOST_KNOW is not what a pixel shows of which nothing is known.
+        known: (H, W) depth of every view, NaN where unknown.
+        wanted: (H, W) bool of every view: pixels that need a depth.
+        shown: (H, W) probable depth of every view, NaN where none is more probable than others; a plane has to be near
+            it.
+        doubtful: (H, W) depth of every view, NaN where none, that confirms a plane near it. Without that, a place whose
+            depth more than MOST_KNOW of the views know is not taken for a pixel of unknown depth.
     """
     result = [np.full(depth.shape, np.nan, np.float32) for depth in known]
     for camera, depth, pixels, probable, supposed in zip(cameras, result, wanted, shown, doubtful, strict=True):
@@ -347,8 +350,8 @@ def enclosing_depths(
 def _first_met(
     camera: Camera, rays: np.ndarray, enclosing: Sequence[EnclosingPlane]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(N,) inverse depth of the first enclosing plane that each of (N, 3) rays of a camera meets, not positive where it
-    meets none, and (N,) bool whether that is within the rectangle of its own points, and within that of all."""
+    """Intersect (N, 3) rays of a camera with the enclosing planes. Return (N,) inverse depths of the first plane met,
+    not positive where none, and (N,) bool whether the point is within its `own` rectangle, and within `whole`."""
     planes = np.array([plane.as_vector() for plane in enclosing])
     inverse = rays @ in_camera(camera, planes).T
     for number, plane in enumerate(enclosing):
@@ -368,11 +371,12 @@ def _first_met(
 def region_depths(
     camera: Camera, enclosing: Sequence[EnclosingPlane], known: np.ndarray, regions: Sequence[PlainRegion]
 ) -> np.ndarray:
-    """(H, W) float32 depth where rays end at enclosing planes, in those plain regions of a view that lie on these, NaN
-    elsewhere: a thing before a wall has an edge.
+    """Return the (H, W) float32 depth of enclosing planes in those plain regions of a view that lie on them, NaN
+    elsewhere. An object in front of a wall would have an edge.
 
-    Of what is `known` (H, W) within a region, NaN elsewhere, AGREEING is on the planes, and it is more than chance. As
-    edges may have gaps, only pixels lie on planes whose nearest known one does.
+    Of the `known` depths (H, W) within a region, NaN elsewhere, the share AGREEING has to be inliers, and there have to
+    be more than chance gives. As edges may have gaps, a pixel takes the plane only if the nearest known pixel is an
+    inlier.
     """
     depth = np.full(known.shape, np.nan, np.float32)
     for region in regions if enclosing else ():
@@ -394,8 +398,9 @@ def region_depths(
 def known_on_planes(
     cameras: Sequence[Camera], enclosing: Sequence[EnclosingPlane], known: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
-    """(H, W) bool of every view: where a `known` (H, W) depth, NaN where there is none, lies on an enclosing plane
-    within the rectangle of its own points, and hardly any view looks there, but most of these know it."""
+    """Return (H, W) bool of every view: where a `known` depth (H, W), NaN where none, lies on an enclosing plane within
+    its own rectangle, at a place at which few views look, most of which know it. With few photographs training explains
+    such places by any background, so that depths of stereo count there all the same."""
     result = [np.zeros(depth.shape, bool) for depth in known]
     for camera, depth, on in zip(cameras, known, result, strict=True):
         row, column = np.nonzero(np.isfinite(depth))
@@ -413,8 +418,8 @@ def known_on_planes(
 def _looking(
     points: np.ndarray, cameras: Sequence[Camera], known: Sequence[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) how many views look at (N, 3) points, which are in their images with nothing known before, and (N,) how many
-    of these know a depth there."""
+    """Return (N,) how many views look at (N, 3) points, which are in the image with no known depth in front, and (N,)
+    how many of these know a depth at the point."""
     depths = (np.ascontiguousarray(depth, np.float32) for depth in known)
     views = [(*camera.pinhole(), depth) for camera, depth in zip(cameras, depths, strict=True)]
     return surface_ops.count_looking_views(views, np.ascontiguousarray(points), MARGIN)

@@ -1,8 +1,8 @@
-"""Lines along which a floor ends: the sides of the rectangle that holds its points, and others within.
+"""Find the lines along which a floor ends: the sides of the rectangle around its points, and lines within it.
 
-The floor of a room that is not convex ends at its inner walls. Seen from above, points cover cells of a grid, and along
-a row of cells the floor ends at the last one that is covered. Where it does so at the same place in several rows side
-by side, well before the rectangle ends, an inner wall may rise, or a sofa stand.
+The floor of a room that is not convex ends at its inner walls. Seen from above, its points cover cells of a grid, and
+along a row of cells the floor ends at the last covered one. If adjacent rows end at the same place, well before the end
+of the rectangle, there may be an inner wall, or a sofa.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from itertools import product
 
 import numpy as np
 
-# Cells along the longer side of the rectangle. A floor is at a cell that has this share of the points of half of those
-# where it is.
+# Cells along the longer side of the rectangle. A cell is covered if it has at least the share COVERED of the median
+# point count of cells with points.
 CELLS, COVERED = 20, 0.1
-# It ends at least so many cells before its rectangle does, in so many rows side by side, at places that differ by no
-# more than so many cells.
+# An inner side ends more than BEFORE cells before the rectangle, in at least ROWS adjacent rows, whose ends differ by
+# at most SPREAD cells.
 BEFORE, ROWS, SPREAD = 2, 4, 1
 
 
@@ -24,8 +24,9 @@ BEFORE, ROWS, SPREAD = 2, 4, 1
 class FloorSide:
     """A line along which a floor ends: from `low` to `high` (2,), in the floor's coordinates, upwards along an axis.
 
-    `across` is the other axis; along it the floor is above the line if `end` is 0, and below if it is 1. An `inner` one
-    lies within the rectangle that holds the floor."""
+    `across` is the index of the other axis; along it the floor is above the line if `end` is 0, and below it if `end`
+    is 1. An `inner` line is within the rectangle around the floor.
+    """
 
     across: int
     end: int
@@ -35,7 +36,7 @@ class FloorSide:
 
 
 def outer_sides(ends: np.ndarray) -> list[FloorSide]:
-    """The sides of the rectangle between `ends` (2, 2), least and greatest coordinates."""
+    """Return the sides of the rectangle between `ends` (2, 2), the least and greatest coordinates."""
     sides = []
     for across, end in product((0, 1), (0, 1)):
         corners = ends.copy()
@@ -45,8 +46,8 @@ def outer_sides(ends: np.ndarray) -> list[FloorSide]:
 
 
 def inner_sides(ends: np.ndarray, places: np.ndarray) -> list[FloorSide]:
-    """Lines within the rectangle between `ends` (2, 2), least and greatest coordinates, along which a floor ends that
-    has points at (P, 2) `places`."""
+    """Return lines along which a floor with points at (P, 2) `places` ends within the rectangle between `ends` (2, 2),
+    the least and greatest coordinates."""
     cell = float(np.diff(ends, axis=0).max()) / CELLS
     size = np.maximum(np.ceil((ends[1] - ends[0]) / cell).astype(int), 1)
     index = np.floor((places - ends[0]) / cell).astype(int)
@@ -72,8 +73,8 @@ def inner_sides(ends: np.ndarray, places: np.ndarray) -> list[FloorSide]:
 
 
 def _runs(last: np.ndarray, length: int) -> list[tuple[int, int]]:
-    """First and one past the last of ROWS rows and more, side by side, in which a floor ends within SPREAD cells, at
-    `last` (N,), and more than BEFORE cells before `length`."""
+    """Return the first, and one past the last, of each run of at least ROWS adjacent rows whose ends `last` (N,) differ
+    by at most SPREAD cells and are more than BEFORE cells before `length`."""
     runs, first = [], 0
     while first < len(last):
         after = first

@@ -1,12 +1,10 @@
-"""Planes of edges, turned along the frame of their room.
+"""Planes fitted to points along edges, turned to the axes of their room.
 
-Depths along an edge are known to a hundredth, and what is nearly flush with a wall is before it by as much: a door and
-its frame, a row of cupboards and the refrigerator beside them. The plane with the most points on it leans from the one
-to the other. Planes with points all over know the directions of the room, and of planes along these the one with the
-most points is one of the two.
-
-Where a wall has only one edge that is known well, as the skirting along its floor goes where the camera went, the
-planes of single photographs lean by ten degrees to all sides, and no two agree. Turned along the frame they do.
+Depths along an edge are known to a hundredth, and surfaces nearly flush with a wall are in front of it by as much: a
+door and its frame, or cupboards and the refrigerator beside them. The plane with the most inliers then leans from one
+to the other. Planes with points all over fix the axes of the room, and of planes along these the one with the most
+inliers is one of the two. Where a wall has only one well known edge, such as the skirting along which the camera moved,
+the planes of single photographs lean by ten degrees to all sides and no two agree, unless they are turned to the axes.
 """
 
 from __future__ import annotations
@@ -32,17 +30,18 @@ from linprim_geo.stereo.planes.plain_regions import (
 )
 from linprim_geo.stereo.planes.right_angles import LEFT_OPEN, angles_to, frame_of
 
-# Of the points within half of TOLERANCE of a plane at least such a share is there once it is turned: of planes that
-# lean by themselves, as a sloping street does, fewer stay (DECISIONS 141).
+# A plane is turned only if it keeps more than this share of its points within half of TOLERANCE. Truly leaning planes,
+# such as a sloping street, keep fewer (DECISIONS 141).
 KEPT_SHARE = 0.75
-# Two of the views that find a plane along the frame look from directions that differ by so much: its normal is known.
+# Two of the views that find a plane along the frame have to look from directions that differ by this angle in radians:
+# less than usual, as its normal is known.
 FRAMED_SPREAD = SAME_ANGLE
 
 
 def planes_by_edges(cameras: Sequence[Camera], regions: Sequence[PlainRegion], by_points: np.ndarray) -> np.ndarray:
-    """(K, 4) planes n . x = d of the world that points along edges of plain `regions` give: those that several views
-    find, as they are or once each is turned along the frame of the planes `by_points` (N, 4), along that frame if they
-    nearly are (`along_frame`)."""
+    """Return (K, 4) planes n . x = d of the world fitted to points along edges of plain `regions`: those that several
+    views find, either as they are or once each is turned to the frame of the planes `by_points` (N, 4). Those that are
+    nearly along the frame are turned to it (`along_frame`)."""
     found = found_planes(cameras, regions)
     planes, frame = common_planes(cameras, regions, found), frame_of(by_points[:, :3])
     if frame is None:
@@ -54,8 +53,8 @@ def planes_by_edges(cameras: Sequence[Camera], regions: Sequence[PlainRegion], b
 
 
 def _turned(cameras: Sequence[Camera], one: FoundPlane, frame: np.ndarray) -> FoundPlane | None:
-    """The plane of a region along the nearest axis of a frame, None where it is not nearly along it, or loses too many
-    points."""
+    """Return the plane of a region turned to the nearest axis of a frame, or None if it is not nearly along one, or
+    loses too many points."""
     points = _edge_points(cameras, [one.region], one.plane[None])[0]
     if angles_to(frame, one.plane[None, :3])[0] >= LEFT_OPEN or not len(points.points):
         return None
@@ -66,8 +65,9 @@ def _turned(cameras: Sequence[Camera], one: FoundPlane, frame: np.ndarray) -> Fo
 def along_frame(
     cameras: Sequence[Camera], regions: Sequence[PlainRegion], planes: np.ndarray, by_points: np.ndarray
 ) -> np.ndarray:
-    """(K, 4) planes n . x = d of the world that edges of plain `regions` have given, those with more points first, of
-    which those nearly along the frame of the planes `by_points` (N, 4) are turned along it; of copies the first."""
+    """Turn those of (K, 4) planes n . x = d of edges of plain `regions`, sorted by descending inlier count, that are
+    nearly along the frame of the planes `by_points` (N, 4). Return all without duplicates, of which the first is
+    kept."""
     frame = frame_of(by_points[:, :3])
     if frame is None:
         return planes
@@ -82,15 +82,15 @@ def along_frame(
 
 
 class _EdgePoints:
-    """The `points` (P, 3) of the world along edges of regions that may lie on a plane, near it, and the vectors (P, 3)
-    to them from the cameras that see them."""
+    """Points near a plane along the edges of regions that may lie on it: `points` (P, 3) of the world, and `vectors`
+    (P, 3) to them from the cameras that see them."""
 
     def __init__(self, points: np.ndarray, vectors: np.ndarray):
         self.points, self.vectors = points, vectors
 
     def turned(self, plane: np.ndarray, frame: np.ndarray) -> np.ndarray:
-        """The plane along the nearest axis of a frame that most of the points are on; the plane as it was where it
-        loses too many."""
+        """Return the plane turned to the nearest axis of a frame and shifted to where most of the points are; unchanged
+        if it loses too many inliers."""
         axis = frame[np.abs(frame @ plane[:3]).argmax()]
         axis = axis * np.sign(axis @ plane[:3])
         turned = shifted(np.append(axis, np.median(self.points @ axis)), self.points, self.vectors)
@@ -101,7 +101,7 @@ class _EdgePoints:
         return turned
 
     def has(self, other: np.ndarray) -> bool:
-        """Whether the points lie on another plane as well, in the median."""
+        """Return whether the median residual of the points to another plane is within TOLERANCE."""
         return len(self.points) > 0 and float(np.median(np.abs(self._off(other)))) < TOLERANCE
 
     def _off(self, plane: np.ndarray) -> np.ndarray:
@@ -109,7 +109,7 @@ class _EdgePoints:
 
 
 def _edge_points(cameras: Sequence[Camera], regions: Sequence[PlainRegion], planes: np.ndarray) -> list[_EdgePoints]:
-    """Of each of (K, 4) planes."""
+    """Return the edge points of each of (K, 4) planes."""
     none = np.zeros((0, 3))
     points, vectors = [[none] for _ in planes], [[none] for _ in planes]
     for region in regions:

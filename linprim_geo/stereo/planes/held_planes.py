@@ -1,8 +1,8 @@
-"""Planes of shading, held by what else is known of them: confirmed depths along the edges of their regions, and right
-angles between walls, as far as their shading allows.
+"""Constrain planes fitted to shading by confirmed depths along the edges of their regions, and by right angles.
 
-Light that is not what the model says turns planes by some degrees. Points along edges know the normal of a plane better
-than that: shading does not turn what they have told by more than SAME_ANGLE, and right angles by more than NEARLY."""
+Lighting that differs from the model turns planes by some degrees. Points along edges fix the normal of a plane better:
+shading may turn planes by edges by at most SAME_ANGLE, and right angles by at most NEARLY.
+"""
 
 from __future__ import annotations
 
@@ -16,27 +16,29 @@ from linprim_geo.stereo.planes.plain_regions import RING, SAME_ANGLE, TOLERANCE,
 from linprim_geo.stereo.planes.right_angles import NEARLY, RIGHT, angles_to, frame_of, squared
 from linprim_geo.stereo.planes.shading import BOX, Fit, ShadedRegion, Shading, evaluate, plane_moves
 
-# Boxes of a region that are compared.
+# The most boxes of a region that are compared.
 MOST_BOXES = 800
-# A plane carries shading hardly worse than another one if it leaves no more than so many times as much.
+# A plane carries shading hardly worse than another if its residual is at most so many times as large.
 HARDLY_MORE = 1.1
-# What the plane of one region alone is off by, as a share of its distance.
+# The error of the plane of a single region, as a share of its distance.
 ALIKE_DEPTH = 5 * CONFIRMED_DEPTH
-# Confirmed depths along the edges of regions hold a plane if they are as near as NEAR, and after some steps as
-# TOLERANCE. Half of TOLERANCE is their deviation; as their errors have common causes, they count as so many at most.
+# Confirmed depths along the edges of regions constrain a plane if their residual, as a share of the depth, is below
+# NEAR; the threshold shrinks by NARROWER per step, down to TOLERANCE. HOLDING_STEPS is the number of steps. Half of
+# TOLERANCE is taken as their standard deviation; as their errors are correlated, they count as at most INDEPENDENT
+# points.
 NEAR, NARROWER, HOLDING_STEPS, INDEPENDENT = 2 * TOLERANCE, 0.8, 6, 200
-# Planes along the frame of a room leave so much more of the shading than planes that are free: light is not what the
-# model says, and nine in ten true walls of a room leave as much more at most (DECISIONS 116). Planes that are at right
-# angles to others, or on lines, leave so much more than those that they were.
+# The largest residual of shading, as a multiple of the unconstrained plane's, of planes along the frame of a room:
+# lighting differs from the model, and nine in ten true walls of a room leave at most that much (DECISIONS 116); and of
+# planes moved to other right angles or to lines.
 AS_WELL, NEARLY_AS_WELL = 1.5, 1.03
 
 
 class HeldPlanes:
-    """How planes are held that carry the shading of regions.
+    """Constrains planes that carry the shading of regions.
 
     Args:
         shadings: of every view.
-        depths: (H, W) confirmed depth of every view as large as its shading, NaN elsewhere.
+        depths: (H, W) confirmed depth of every view, of the size of its shading, NaN elsewhere.
         carried: the regions that each plane carries.
     """
 
@@ -49,8 +51,8 @@ class HeldPlanes:
         self.shadings, self.depths, self.carried = shadings, depths, carried
 
     def by_depths(self, planes: np.ndarray, staying: Container[int], told: Container[int] = ()) -> np.ndarray:
-        """The planes, but for those `staying` each held by the confirmed depths along the edges of its regions; those
-        that points have `told` turn by SAME_ANGLE at most, or stay."""
+        """Return the planes, each constrained by the confirmed depths along the edges of its regions, except those
+        `staying`. Planes that points have `told` turn by at most SAME_ANGLE, or stay."""
         result = planes.copy()
         for k, plane in enumerate(planes):
             held = plane if k in staying else self._held_plane(plane, self.carried[k])
@@ -59,16 +61,16 @@ class HeldPlanes:
         return result
 
     def at_right_angles(self, planes: np.ndarray, staying: Container[int], told: Container[int] = ()) -> np.ndarray:
-        """The planes, turned to right angles with each other, or along the frame of those `staying`, where that carries
-        the shading of their regions as well as true walls do, and then shifted to where most confirmed depths along the
-        edges of these are; but those `staying` stay, and so do those that points have `told` if they would turn by more
-        than NEARLY."""
+        """Turn planes to right angles with each other, or to the frame of those `staying`, if the turned plane carries
+        the shading of its regions as well as true walls do. Then shift each to where most confirmed depths along the
+        edges of its regions are. Those `staying` are not changed, nor those that points have `told` if they would turn
+        by more than NEARLY."""
         few = [[region.some(MOST_BOXES) for region in regions] for regions in self.carried]
         fits = [
             evaluate(plane, few[k], self.shadings) if few[k] and k not in staying else None
             for k, plane in enumerate(planes)
         ]
-        # Planes by edges that carry no shading are no reference.
+        # Planes by edges that carry no shading are not used as a reference.
         rows = [k for k, fit in enumerate(fits) if k in staying or fit is not None]
         known = [None if (fit := fits[k]) is None else fit.information for k in rows]
         frame, turned = frame_of(planes[[k for k in rows if k in staying], :3]), planes.copy()
@@ -86,8 +88,8 @@ class HeldPlanes:
         return planes
 
     def still_carrying(self, moved: dict[int, np.ndarray], planes: np.ndarray) -> dict[int, np.ndarray]:
-        """Those of `moved` planes, by their number, that carry the shading of their regions nearly as well as the
-        planes that they were do, or have no regions."""
+        """Return those `moved` planes, by their number, that carry the shading of their regions nearly as well as the
+        original planes, or have no regions."""
         result = {}
         for k, plane in moved.items():
             few = [region.some(MOST_BOXES) for region in self.carried[k]]
@@ -97,18 +99,19 @@ class HeldPlanes:
         return result
 
     def _leaves_as_little(self, plane: np.ndarray, regions: Sequence[ShadedRegion], fit: Fit, times: float) -> bool:
-        """Whether a plane leaves no more than so many times as much of the shading of regions as a fit to them does."""
+        """Return whether a plane's residual on regions is less than `times` that of a fit to them, over enough
+        boxes."""
         tried = evaluate(plane, regions, self.shadings)
         return tried is not None and tried.left < times * fit.left and tried.boxes > 0.7 * fit.boxes
 
     def _shifted(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> np.ndarray:
-        """A plane moved along its normal to where most confirmed depths along the edges of regions are."""
+        """Shift a plane along its normal to where most confirmed depths along the edges of regions are."""
         points, centers = self._points_along(regions)
         return shifted(plane, points, points - centers)
 
     def _held_plane(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> np.ndarray:
-        """A plane fitted to the shading of regions and to the confirmed depths along their edges that are near it: a
-        wall meets others there, and a floor. The plane as it was where the two contradict each other."""
+        """Fit a plane to the shading of regions and to the confirmed depths near it along their edges, where a wall
+        meets other walls and the floor. Return the plane unchanged if the two contradict each other."""
         few = [region.some(MOST_BOXES) for region in regions]
         first = evaluate(plane, few, self.shadings) if few else None
         if first is None:
@@ -133,7 +136,7 @@ class HeldPlanes:
         return fit.plane
 
     def _points_along(self, regions: Sequence[ShadedRegion]) -> tuple[np.ndarray, np.ndarray]:
-        """(P, 3) points of the world at the confirmed depths along the edges of regions, and (P, 3) the centres of the
+        """Return (P, 3) points of the world at confirmed depths along the edges of regions, and (P, 3) centres of the
         cameras that see them."""
         points, centers = [np.zeros((0, 3))], [np.zeros((0, 3))]
         for region in regions:
@@ -146,8 +149,8 @@ class HeldPlanes:
 
 
 def shifted(plane: np.ndarray, points: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """A plane moved along its normal to where most of (P, 3) points are, with the vectors (P, 3) to them from cameras
-    that see them; as it was where none is near."""
+    """Shift a plane along its normal to where most of (P, 3) points are, given the (P, 3) vectors to them from the
+    cameras that see them. Return it unchanged if no point is near."""
     off = off_plane(plane, points, vectors)
     near = np.abs(off) < ALIKE_DEPTH
     if not near.any():
@@ -156,18 +159,19 @@ def shifted(plane: np.ndarray, points: np.ndarray, vectors: np.ndarray) -> np.nd
 
 
 def off_plane(plane: np.ndarray, points: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """(P,) how far (P, 3) points are beyond a plane, as shares of the vectors (P, 3) to them along its normal."""
-    with np.errstate(divide="ignore", invalid="ignore"):  # rays along the plane
+    """Return (P,) signed distances of (P, 3) points behind a plane, as shares of the normal components of the (P, 3)
+    vectors to them from cameras."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # rays parallel to the plane
         return (points @ plane[:3] - plane[3]) / (vectors @ plane[:3])
 
 
 def _turns(plane: np.ndarray, before: np.ndarray) -> float:
-    """By what angle in radians a plane has turned."""
+    """Return the angle in radians between two planes."""
     return float(np.arccos(min(1.0, abs(plane[:3] @ before[:3]))))
 
 
 def _commonest(off: np.ndarray) -> float:
-    """Where most of (P,) values are within half of TOLERANCE."""
+    """Return the position with the most of (P,) values within half of TOLERANCE."""
     places = np.arange(-ALIKE_DEPTH, ALIKE_DEPTH, TOLERANCE / 10)
     ordered = np.sort(off)
     count = np.searchsorted(ordered, places + TOLERANCE / 2) - np.searchsorted(ordered, places - TOLERANCE / 2)

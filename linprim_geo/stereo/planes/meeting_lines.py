@@ -1,10 +1,10 @@
-"""Walls set right by the lines along which they meet the floor and each other.
+"""Correct walls by the lines along which they meet the floor and each other.
 
-Shading leaves the angle of a plain wall open by degrees, and points on what hangs on a wall give a plane that lies
-before it. A floor with texture is known exactly as a rule, and photographs show where it ends: of the lines on it near
-to where a wall meets it, views from directions that differ show one most clearly. The wall stands on that line, at
-right angles to the floor. A wall whose foot is hidden is set right by the line along which it meets one that stands.
-What leans, such as a slope under a roof, goes through the lines along which it meets several of these.
+Shading leaves the angle of a plain wall open by degrees, and points on objects that hang on a wall give a plane in
+front of it. A floor with texture is known exactly as a rule. Of the candidate lines on it near its intersection with a
+wall, the one that views from different directions show most clearly is taken. The wall is set on that line, at right
+angles to the floor. A wall whose foot is hidden is set on the line along which it meets another corrected wall. A
+leaning plane, such as a slope under a roof, is fitted to the lines along which it meets several of these.
 """
 
 from __future__ import annotations
@@ -21,31 +21,32 @@ from linprim_geo.stereo.planes.plain_regions import SAME_ANGLE, seen_enough
 from linprim_geo.stereo.planes.point_planes import confirmed_points
 from linprim_geo.stereo.planes.right_angles import LEFT_OPEN, NEARLY, at_right_angles
 
-# A line is looked for up to this share of its distance away from where planes meet: what those of shading are off by.
-# One that has points all over is known to CONFIRMED_DEPTH, with what hangs on the wall behind.
+# A line is searched within this share of its distance around the intersection of the planes: the error of planes of
+# shading. If the wall has points all over, the line is known to CONFIRMED_DEPTH, even if these are on objects that hang
+# on it.
 REACH = 5 * CONFIRMED_DEPTH
-# Lines that are tried are as far from each other, at their ends, as photographs are blurred, MOST_STEPS to either side
-# at most, and are looked at in so many samples.
+# Candidate lines are one blur of the photographs apart at their ends, with at most MOST_STEPS to either side; each is
+# sampled at SAMPLES points.
 MOST_STEPS, SAMPLES = 20, 128
-# A line of which a view shows less than so much of what it shows of another one is behind what is known there: what
-# shows through gaps is the upper edge of a skirting board, or the like.
+# A line of which a view shows less than this share of what it shows of another one is occluded: what shows through gaps
+# is the upper edge of a skirting board, or the like.
 LEAST_SHOWN = 0.5
-# Around the line that is found the strongest edges are looked for up to so many of these steps away, in quarters of a
-# pixel, and a line is fitted to them; once more around that line, as what the first is off by cuts edges off.
+# The strongest edges are searched up to AROUND steps around the line, in steps of 1 / FINER pixel, and a line is fitted
+# to them. This is done in ROUNDS, as an error of the first line cuts off edges.
 AROUND, FINER, ROUNDS = 2, 4, 2
-# Steps of a fit in which each edge counts less the farther it is from the line.
+# Iterations of a reweighted fit, in which each edge has less weight the farther it is from the line.
 FITS = 20
 
 
 def on_meeting_lines(
     planes: np.ndarray, by_points: int, maps: Sequence[DepthMap], known: Sequence[np.ndarray]
 ) -> dict[int, np.ndarray]:
-    """Those of (K, 4) planes n . x = d, by their number, that are walls on a line that photographs show, as they stand
-    there: on a floor, or else at a wall that does.
+    """Return those of (K, 4) planes n . x = d, by their number, that photographs show to be walls on a line, corrected:
+    on a floor, or else at a wall that is.
 
     Args:
-        by_points: the first so many planes have points all over; they stay, but the same planes among the others do
-            not.
+        by_points: the number of leading planes with points all over. They are not changed; duplicates of them among the
+            others may be.
         known: (H, W) confirmed depth of every view, NaN elsewhere.
     """
     points, _ = confirmed_points(maps, known)
@@ -75,7 +76,7 @@ def on_meeting_lines(
                     found[number] = _through(line, np.cross(up[:3], base[:3]), wall)
     standing = [*floors, *found.values()]
     for number in sorted(walls.keys() - found.keys()):
-        # What is nearly upright or level does not lean.
+        # Planes that are nearly upright or level do not lean.
         if has_points[number] or at_right_angles(walls[number], up) or abs(walls[number][:3] @ up[:3]) > np.cos(NEARLY):
             continue
         leaning = _leaning(walls[number], standing, seen, edges)
@@ -85,14 +86,14 @@ def on_meeting_lines(
 
 
 def is_same(plane: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two planes (4,) are one, up to the direction of their normals."""
+    """Return whether two planes (4,) are equal, up to the sign of their normals."""
     return np.allclose(plane, other) or np.allclose(plane, -other)
 
 
 def floors_of(planes: Sequence[np.ndarray], seen: KnownPoints) -> list[np.ndarray]:
-    """Those of planes with points all over, their normals towards the cameras, that are floors, with most points first:
-    nothing is below. Of those nearly parallel to one with more points, the direction is that one's: the floor below a
-    table, which hardly any view shows, may be askew."""
+    """Return those planes with points all over, their normals towards the cameras, that are floors: level, with nothing
+    below. The one with the most points comes first. A floor nearly parallel to a level plane with more points gets its
+    normal: the floor below a table, which few views show, may be askew."""
     level = sorted(filter(seen.is_level, planes), key=lambda plane: -np.count_nonzero(seen.on(plane)))
     floors: list[np.ndarray] = []
     for plane in level:
@@ -104,14 +105,15 @@ def floors_of(planes: Sequence[np.ndarray], seen: KnownPoints) -> list[np.ndarra
 
 
 def meeting_of(wall: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A point (3,) of both planes, and the direction (3,) in which they meet."""
+    """Return a point (3,) on both planes, and the unit direction (3,) of their intersection."""
     along = np.cross(base[:3], wall[:3])
     along /= np.linalg.norm(along)
     return np.linalg.solve(np.stack([base[:3], wall[:3], along]), [base[3], wall[3], 0.0]), along
 
 
 def _foot(wall: np.ndarray, floor: np.ndarray, seen: KnownPoints) -> np.ndarray | None:
-    """(2, 3) ends of the line along which a wall meets a floor, as far as there are points of the floor near it."""
+    """Return the (2, 3) ends of the line along which a wall meets a floor, as far as points of the floor are near it,
+    or None."""
     meeting, along = meeting_of(wall, floor)
     on_floor = seen.points.position[seen.points.on(floor[None], CONFIRMED_DEPTH)[:, 0]]
     apart = np.abs((on_floor - meeting) @ np.cross(along, floor[:3]))
@@ -122,7 +124,7 @@ def _foot(wall: np.ndarray, floor: np.ndarray, seen: KnownPoints) -> np.ndarray 
 
 
 def _corner(wall: np.ndarray, base: np.ndarray, floor: np.ndarray, seen: KnownPoints) -> np.ndarray:
-    """(2, 3) ends of the line along which two walls meet, from the floor as high as cameras are."""
+    """Return the (2, 3) ends of the line along which two walls meet, from the floor up to the highest camera."""
     meeting, along = meeting_of(wall, base)
     levels = np.array([floor[3], (seen.centers @ floor[:3]).max()])
     return meeting + along * ((levels - meeting @ floor[:3]) / (along @ floor[:3]))[:, None]
@@ -131,8 +133,8 @@ def _corner(wall: np.ndarray, base: np.ndarray, floor: np.ndarray, seen: KnownPo
 def _line_of_wall(
     wall: np.ndarray, base: np.ndarray, near: np.ndarray, edges: EdgeImages, has_points: bool
 ) -> np.ndarray | None:
-    """`clearest_line`, of a wall that `has_points` all over only one that is not before these: they may be on what
-    hangs on the wall, but what is before them is a skirting board, or the edge of a rug."""
+    """Return the `clearest_line`. For a wall that `has_points` all over, reject lines in front of these: the points may
+    be on objects that hang on the wall, but a line in front of them is a skirting board, or the edge of a rug."""
     line = clearest_line(wall, base, near, edges, CONFIRMED_DEPTH if has_points else REACH)
     if line is not None and has_points and line.mean(0) @ wall[:3] > wall[3]:
         return None
@@ -140,7 +142,8 @@ def _line_of_wall(
 
 
 def _through(line: np.ndarray, normal: np.ndarray, wall: np.ndarray) -> np.ndarray:
-    """The plane (4,) through the middle of (2, 3) ends of a line, its normal on the side of that of a wall."""
+    """Return the plane (4,) with this normal through the middle of a line's (2, 3) ends, on the side of a wall's
+    normal."""
     normal = normal / (np.linalg.norm(normal) * np.sign(normal @ wall[:3]))
     return np.append(normal, normal @ line.mean(0))
 
@@ -148,8 +151,8 @@ def _through(line: np.ndarray, normal: np.ndarray, wall: np.ndarray) -> np.ndarr
 def _leaning(
     wall: np.ndarray, standing: Sequence[np.ndarray], seen: KnownPoints, edges: EdgeImages
 ) -> np.ndarray | None:
-    """The plane (4,) through the lines along which a wall meets `standing` planes, but for those that others
-    contradict; None where the wall has them on it, or they do not tell its direction."""
+    """Fit a plane (4,) to the lines along which a wall meets `standing` planes, without outliers. None if the wall
+    already holds these lines, or if they do not determine its normal."""
     lines = list[np.ndarray]()
     for base in standing:
         apart = np.arccos(min(1.0, abs(wall[:3] @ base[:3])))
@@ -172,20 +175,20 @@ def _leaning(
     on_it = _off(plane, places) < CONFIRMED_DEPTH * away
     if not on_it.any() or (_off(wall, places) < CONFIRMED_DEPTH * away)[on_it].all():
         return None
-    # The normal's angle is as certain as the lines are wide across the narrower side.
+    # The normal is as certain as the lines are spread along the narrower side.
     middle, variance, _ = _spread(places[on_it], length[on_it])
     wide = np.sqrt(max(variance[1], 0)) * np.tan(SAME_ANGLE) > BLUR * edges.pixel_at(middle)
     return plane if wide and plane[:3] @ wall[:3] > np.cos(LEFT_OPEN) else None
 
 
 def _off(plane: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """(N,) mean distance of places (N, P, 3) from a plane."""
+    """Return (N,) mean distances of points (N, P, 3) from a plane."""
     return np.abs(places @ plane[:3] - plane[3]).mean(1)
 
 
 def _spread(places: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The middle (3,) of N sets of places (N, P, 3) that count as `weight` (N,) says, and how they vary along which
-    axes: ascending variances (3,) and columns (3, 3)."""
+    """Return the weighted mean (3,) of N sets of points (N, P, 3) with `weight` (N,), and their principal axes:
+    ascending variances (3,) and columns (3, 3)."""
     share = (weight / weight.sum()).repeat(places.shape[1]) / places.shape[1]
     points = places.reshape(-1, 3)
     middle = share @ points
@@ -196,8 +199,9 @@ def _spread(places: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndar
 def clearest_line(
     wall: np.ndarray, base: np.ndarray, near: np.ndarray, edges: EdgeImages, reach: float = REACH
 ) -> np.ndarray | None:
-    """(2, 3) ends of the line on a base that photographs show most clearly around the line `near` (2, 3) along which a
-    wall meets it; None where they show none, or where that is farther away than a share `reach` of its distance."""
+    """Return the (2, 3) ends of the line on a base that photographs show most clearly around the line `near` (2, 3)
+    along which a wall meets it. None if they show none, or if it is farther away than the share `reach` of its
+    distance."""
     inward = wall[:3] - base[:3] * (wall[:3] @ base[:3])
     inward /= np.linalg.norm(inward)
     middle = near.mean(0)
@@ -229,7 +233,8 @@ def clearest_line(
 def _fitted_line(
     line: np.ndarray, inward: np.ndarray, apart: float, pixel: float, edges: EdgeImages
 ) -> np.ndarray | None:
-    """(2, 3) ends of the line that is nearest to the strongest edges that photographs have around it."""
+    """Fit a line to the strongest edges of photographs around one. Return its (2, 3) ends, or None if there are too few
+    edges."""
     across = np.arange(-AROUND * apart, AROUND * apart, pixel / FINER)
     along = (np.arange(2 * SAMPLES) + 0.5) / (2 * SAMPLES)
     lines = line[0] + across[:, None] * inward

@@ -1,8 +1,9 @@
-"""Planes for regions without texture, such as painted walls.
+"""Planes of regions without texture, such as painted walls.
 
-Stereo sees the edges of a plain region and not what is inside. Planes are fitted to the confirmed depths along its
-edges, of which those of occluders lie before it and none behind it. Planes are those that several views find from
-directions that differ: a silhouette of something round gives another plane to each view, and so none.
+Stereo finds depths along the edges of a plain region, but none inside it. Plane hypotheses are therefore fitted to the
+confirmed depths along these edges. Some of these points belong to occluders and lie in front of the plane; hardly any
+may lie behind it. A plane is kept if several views from different directions find the same one. This rejects the
+silhouettes of round objects, which give a different plane in each view.
 """
 
 from __future__ import annotations
@@ -17,45 +18,56 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 
-# Regions have at least so many pixels (two windows of stereo) and so many confirmed depths within RING pixels.
+# The least area of a region in pixels (two windows of stereo), the fewest confirmed depths along its edges, and how far
+# around the region, in pixels, these depths are collected.
 LEAST_PIXELS, LEAST_POINTS, RING = 200, 30, 4
-# Stereo gives the depth of an edge to pixels up to ten beside it (DECISIONS 126): what has no edge within twice as many
-# is plain beyond doubt.
+# Stereo gives the depth of an edge to pixels up to ten beside it (DECISIONS 126). A pixel without an edge within twice
+# that distance, in pixels, is therefore certainly plain.
 WIDE = 20
-# Half of the grey values by which a cross parts two pixels (`csrc/stereo/cross.h`), and the side of the square
-# over which the grey of a region is taken.
+# Half of the grey difference that ends the arm of a cross (`csrc/stereo/cross.h`), and the side in pixels of the square
+# over which the mean grey of a region is taken.
 HALF_EDGE, AROUND = 12.5, 9
-# Stereo knows six in ten edges of a far background as farther than so many times the median depth, and of surfaces one
-# in 3,000 (DECISIONS 90).
+# Depths beyond this many times the median of the view's sure depths are taken for a far background. Six in ten depths
+# at edges of a background are, and one in 3,000 of those of surfaces (DECISIONS 90).
 BEYOND = 10.0
-# Depths are on a plane up to this share of them, and behind it from BEHIND times as much.
+# A depth is an inlier of a plane if it differs from it by at most the share TOLERANCE of the depth; it is behind the
+# plane from BEHIND times as much.
 TOLERANCE, BEHIND = CONFIRMED_DEPTH, 3.0
-# At least and at most such shares of a region's confirmed depths are on its plane, and behind it.
+# The least share of a region's confirmed depths that are inliers of its plane, and the largest share that may be behind
+# it.
 ON_SHARE, BEHIND_SHARE = 0.1, 0.1
-# Triples of points that are tried for a plane, planes that are looked for, and fits of each to what is on it.
+# Per region: random triples of points tried for each plane, planes looked for at most, and least-squares fits of each
+# plane to its inliers.
 TRIPLES, PLANES_PER_REGION, FITS = 300, 4, 3
-# Points along an edge have common errors: they count as so many independent ones at most.
+# Errors of points along one edge are correlated: all inliers together count as at most this many independent points.
 INDEPENDENT_POINTS = 20
-# A plane is one that so many views find, of which two see it from directions that differ by SPREAD.
+# A plane is accepted if at least so many views find it and two of them see it from directions that differ by at least
+# SPREAD radians.
 LEAST_VIEWS, SPREAD = 3, np.radians(10)
-# Fewer degrees are enough, but for LEAST_SPREAD, where the normals that views find turn by half as much as those of
-# silhouettes do: over a turn by t these have a standard deviation of t / sqrt 12.
+# A smaller difference of directions, down to LEAST_SPREAD radians, is enough if the normals found by the views agree:
+# their angular deviation has to be at most half of that of silhouettes, whose normals turn with the view and so have a
+# standard deviation of t / sqrt 12 over views that span an angle t.
 STEADY, LEAST_SPREAD = 2 * np.sqrt(12), np.radians(6)
-# Planes are the same if their normals differ by no more, and their distance by no more than TOLERANCE of the depth.
+# Two planes are the same if the angle of their normals is below this, in radians, and their offset is below TOLERANCE
+# times the depth.
 SAME_ANGLE = np.radians(3)
-# A plane is as certain as its points scatter if they are more than this share of all points of its regions: of fewer,
-# those near the plane were chosen, and their scatter is that of the choice.
+# The error of a plane is estimated from the scatter of its inliers only if these are more than this share of all points
+# of its regions. If they are fewer, they were selected for being near the plane, and their scatter only shows the
+# threshold.
 ALL_POINTS = 0.9
-# Rounds in which planes are chosen by regions and fitted to all points on them.
+# Rounds in which regions are assigned to planes and the planes are refitted to all inliers.
 ROUNDS = 3
 
 
 @dataclass(frozen=True)
 class PlainRegion:
-    """A region of view `view` without texture: `mask` (`grown_alike`) of a window whose first pixel is (`top`, `left`);
-    along its edges `rays` (N, 3) of depth 1 and `inverse` (N,) depths, of which those that are not `sure` (N,) are far
-    and on no plane, and those that are `inner` (N,) within the mask; `corners` (5, 3) rays to its ends and its
-    middle; `wide` of the mask what circles of WIDE pixels without an edge cover, and the edges beside these."""
+    """A connected region without texture in view number `view`.
+
+    `mask` (h, w) bool covers a window whose first pixel is (`top`, `left`), extended by `grown_alike`. Of it, `wide` is
+    the part that circles of radius WIDE without an edge cover, with the edges beside these. Of the N points along the
+    edges: `rays` (N, 3) of depth 1, `inverse` depths (N,), `sure` (N,) bool, false for far depths that can be on no
+    plane, and `inner` (N,) bool, true within the mask. `corners` (5, 3) are rays to its four ends and its middle.
+    """
 
     view: int
     top: int
@@ -69,12 +81,12 @@ class PlainRegion:
     wide: np.ndarray
 
     def pixels(self) -> tuple[np.ndarray, np.ndarray]:
-        """(P,) rows and columns of its mask in the image."""
+        """Return (P,) rows and (P,) columns of the mask's pixels in the image."""
         row, column = np.nonzero(self.mask)
         return row + self.top, column + self.left
 
     def within(self) -> PlainRegion:
-        """The region with its inner points alone."""
+        """Return the region with only its inner points."""
         return replace(
             self,
             rays=self.rays[self.inner],
@@ -84,17 +96,19 @@ class PlainRegion:
         )
 
     def off(self, planes: np.ndarray) -> np.ndarray:
-        """(N, K) by what share of their inverse depth (K, 3) planes are before the edges' points."""
+        """Return the (N, K) relative residuals of the points to (K, 3) planes: inverse depth of the plane over that of
+        the point, less 1; positive where the point is behind the plane."""
         return (self.rays @ planes.T) / self.inverse[:, None] - 1
 
     def are_on(self, off: np.ndarray) -> np.ndarray:
-        """(N, K) bool which points are on planes, by what these are `off`."""
+        """Return (N, K) bool: which points are inliers of the planes, by their residuals `off` (N, K)."""
         return (np.abs(off) < TOLERANCE) & self.sure[:, None]
 
 
 def grown_alike(region: np.ndarray, grey: np.ndarray, edge: np.ndarray) -> np.ndarray:
-    """(H, W) bool: of a plain region what no `edge` runs through, and of edges what is no farther from that than RING
-    pixels and of the same grey, up to HALF_EDGE: blur mixes pixels on an edge out of both sides."""
+    """Return the (H, W) mask of a plain region, without `edge` pixels, extended into edges: by edge pixels within RING
+    pixels of it whose grey differs from its mean there by less than HALF_EDGE. Blur mixes the colours of both sides on
+    an edge."""
     inside = region & ~edge
     if not inside.any():
         return inside
@@ -107,8 +121,8 @@ def grown_alike(region: np.ndarray, grey: np.ndarray, edge: np.ndarray) -> np.nd
 def plain_regions(
     view: int, camera: Camera, grey: np.ndarray, edge: np.ndarray, depth: np.ndarray, sure: np.ndarray
 ) -> list[PlainRegion]:
-    """Regions of (H, W) `grey` between edges; `depth` (H, W) is NaN where it is not known, and `sure` (H, W) where it
-    is no far one that may be wrong."""
+    """Return the regions of an image `grey` (H, W) between its edges. `depth` (H, W) is NaN where unknown; `sure` (H,
+    W) is false where it is only known to be far."""
     labels, _ = label(~edge)
     from_edge = distance_transform_edt(~edge)
     points, regions = np.isfinite(depth) & edge, []
@@ -134,14 +148,15 @@ def plain_regions(
 
 
 def _near(chosen: np.ndarray, reach: float) -> np.ndarray:
-    """(H, W) bool: what is no farther than so many pixels from those that are `chosen` (H, W)."""
+    """Return (H, W) bool: the pixels within `reach` pixels of `chosen` ones (H, W)."""
     return distance_transform_edt(~chosen) <= reach if chosen.any() else chosen
 
 
 def regions_of_views(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> list[list[PlainRegion]]:
-    """The plain regions of every view with its (H, W) `depths`, NaN where they are not sure.
+    """Return the plain regions of every view, given its sure `depths` (H, W), NaN elsewhere.
 
-    What is BEYOND all of these is never sure within 1 %, as it hardly moves, but it is behind every plane.
+    Depths BEYOND the median are kept as well, as not sure: they are never known within 1 %, for lack of parallax, but
+    they are certainly behind every plane.
     """
     result = []
     for number, (found, depth) in enumerate(zip(maps, depths, strict=True)):
@@ -153,13 +168,14 @@ def regions_of_views(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> 
 
 
 def rays_of(camera: Camera, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """(..., 3) points of depth 1 in the camera's frame."""
+    """Return (..., 3) rays of depth 1 through pixels, in the camera's frame."""
     x, y = np.broadcast_arrays((column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy)
     return np.stack([x, y, np.ones_like(x)], axis=-1)
 
 
 def planes_of_region(region: PlainRegion, rng: np.random.Generator) -> list[tuple[int, np.ndarray]]:
-    """Planes (3,) with ray . plane = inverse depth, and how many points are on them, by random triples of points."""
+    """Find planes of one region by RANSAC over random triples of points. Return pairs of an inlier count and a plane
+    (3,), for which ray . plane = inverse depth."""
     found, left = [], region.sure.copy()
     for _ in range(PLANES_PER_REGION):
         rest = np.nonzero(left)[0]
@@ -183,7 +199,7 @@ def planes_of_region(region: PlainRegion, rng: np.random.Generator) -> list[tupl
 
 
 def _fitted(region: PlainRegion, on: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A plane by least squares of relative inverse depth, and the (N,) points on it."""
+    """Fit a plane by least squares of relative inverse depths. Return the plane (3,) and its inliers (N,)."""
     plane = np.zeros(3)
     for _ in range(FITS):
         if np.count_nonzero(on) < LEAST_POINTS:
@@ -195,11 +211,11 @@ def _fitted(region: PlainRegion, on: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _certain(region: PlainRegion, plane: np.ndarray, on: np.ndarray) -> bool:
-    """Whether nothing is behind a plane, and the points on it say where it is all over the region."""
+    """Return whether hardly any point is behind a plane, and its inliers fix its depth all over the region."""
     if np.count_nonzero(region.off(plane[None]) > BEHIND * TOLERANCE) > BEHIND_SHARE * len(on):
         return False
     scaled = region.rays[on] / region.inverse[on, None]
-    # A point is within TOLERANCE: a standard deviation of half of it.
+    # An inlier is within TOLERANCE: half of that is taken as its standard deviation.
     information = scaled.T @ scaled / len(scaled) * min(len(scaled), INDEPENDENT_POINTS) / (TOLERANCE / 2) ** 2
     covariance = np.linalg.inv(information + 1e-9 * np.trace(information) * np.eye(3))
     inverse = region.corners @ plane
@@ -209,8 +225,8 @@ def _certain(region: PlainRegion, plane: np.ndarray, on: np.ndarray) -> bool:
 
 @dataclass(frozen=True)
 class FoundPlane:
-    """A plane (4,) n . x = d of the world that a `region` has so many `points` on, and the `depth` and place in the
-    world of the region's `middle` (3,) on it."""
+    """A plane (4,) n . x = d of the world found in one `region`, with the count of its inliers, `points`. `depth` and
+    `middle` (3,) are the depth and the position in the world of the region's middle on the plane."""
 
     region: PlainRegion
     points: int
@@ -220,14 +236,14 @@ class FoundPlane:
 
     @classmethod
     def on(cls, camera: Camera, region: PlainRegion, points: int, plane: np.ndarray) -> FoundPlane:
-        """Of a plane of the world and the camera of the region."""
+        """Make one from a plane (4,) of the world and the camera of the region."""
         ray = region.corners[4]
         depth = 1 / float(ray @ in_camera(camera, plane[None])[0])
         return cls(region, points, plane, depth, to_world(camera, ray[None] * depth)[0])
 
 
 def found_planes(cameras: Sequence[Camera], regions: Sequence[PlainRegion], seed: int = 0) -> list[FoundPlane]:
-    """Planes of single regions, those with the most points first."""
+    """Return the planes of all regions, each found by itself, sorted by descending inlier count."""
     rng, found = np.random.default_rng(seed), []
     for region in regions:
         camera = cameras[region.view]
@@ -239,8 +255,8 @@ def found_planes(cameras: Sequence[Camera], regions: Sequence[PlainRegion], seed
 def common_planes(
     cameras: Sequence[Camera], regions: Sequence[PlainRegion], found: Sequence[FoundPlane] | None = None
 ) -> np.ndarray:
-    """(K, 4) planes (n, d) of the world, n . x = d, that are found in several views, fitted to the points of all
-    regions on them. `found`: those of single regions, if they are known."""
+    """Return (K, 4) planes (n, d) of the world, n . x = d, that several views find, refitted to the inliers in all
+    regions. `found` are the planes of single regions, if they are already known."""
     result = agreeing(cameras, found_planes(cameras, regions) if found is None else found)
     for _ in range(ROUNDS):
         result = _refitted(cameras, regions, *result)
@@ -250,8 +266,9 @@ def common_planes(
 def agreeing(
     cameras: Sequence[Camera], found: Sequence[FoundPlane], spread: float | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The means (K, 4) of planes that are `found` in LEAST_VIEWS views and more, and how many radians apart two of
-    these have to look (K,): `spread`, or by how the normals turn (`_least_spread`)."""
+    """Cluster the planes of single regions. Return (K, 4) means of those found in at least LEAST_VIEWS views, and (K,)
+    by how many radians the directions of two of these views have to differ: `spread`, or by the scatter of normals
+    (`_least_spread`)."""
     weight, view = np.array([one.points for one in found]), np.array([one.region.view for one in found])
     depth, middle = np.array([one.depth for one in found]), np.array([one.middle for one in found])
     plane = np.array([one.plane for one in found])
@@ -276,8 +293,8 @@ def agreeing(
 
 
 def _least_spread(normals: np.ndarray, weight: np.ndarray) -> float:
-    """How many radians apart two views have to look that have found (N, 3) normals of one plane, with (N,) weights: the
-    plane of a round thing's silhouette turns as much as they do."""
+    """Return by how many radians the viewing directions of a plane have to differ, given the (N, 3) normals that views
+    have found and (N,) weights: normals of the silhouette of a round object turn as much as the view does."""
     mean = weight @ normals
     angle = np.arccos(np.clip(normals @ (mean / np.linalg.norm(mean)), -1, 1))
     turning = STEADY * float(np.sqrt(np.average(angle**2, weights=weight)))
@@ -285,14 +302,15 @@ def _least_spread(normals: np.ndarray, weight: np.ndarray) -> float:
 
 
 def _same(plane: np.ndarray, normals: np.ndarray, points: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """(N,) whether planes through points, seen at such depths, are this one."""
+    """Return (N,) bool: which of N planes, given by normals, points on them and the depths of these, are the same as
+    `plane`."""
     near = np.abs(points @ plane[:3] - plane[3]) < TOLERANCE * depth
     return near & (normals @ plane[:3] > np.cos(SAME_ANGLE))
 
 
 def seen_enough(cameras: Sequence[Camera], views: np.ndarray, point: np.ndarray, spread: float | None = None) -> bool:
-    """Whether LEAST_VIEWS of `views`, numbers of cameras, differ, and two see a point from directions that do, by
-    `spread` radians, SPREAD by default."""
+    """Return whether `views`, numbers of cameras, are at least LEAST_VIEWS different ones, and the directions from
+    which two of them see `point` differ by at least `spread` radians (default SPREAD)."""
     views = np.unique(views)
     if len(views) < LEAST_VIEWS:
         return False
@@ -302,8 +320,8 @@ def seen_enough(cameras: Sequence[Camera], views: np.ndarray, point: np.ndarray,
 
 
 def may_lie_on(region: PlainRegion, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of (K, 3) planes of the camera: which of a region's points are on them (N, K), and whether the region may lie on
-    them (K,): enough of its points do, and hardly any is behind."""
+    """Test (K, 3) planes of the camera. Return (N, K) bool, which points of the region are inliers, and (K,) bool,
+    whether the region may lie on the plane: it has enough inliers, and hardly any point is behind."""
     off, count = region.off(planes), len(region.inverse)
     on = region.are_on(off)
     behind = (off > BEHIND * TOLERANCE).sum(0)
@@ -313,14 +331,14 @@ def may_lie_on(region: PlainRegion, planes: np.ndarray) -> tuple[np.ndarray, np.
 def _refitted(
     cameras: Sequence[Camera], regions: Sequence[PlainRegion], planes: np.ndarray, spreads: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Planes (K, 4) fitted to all points on them in regions that they explain, and the `spreads` (K,) of each; those
-    that are uncertain or double go, and those that are not seen from directions so far apart."""
+    """Refit planes (K, 4) to their inliers in all regions assigned to them. Return those kept and their `spreads`.
+    Planes are dropped if they are uncertain, duplicates, or not seen from directions that differ by their spread."""
     points: list[list] = [[] for _ in planes]
     for region in regions if len(planes) else ():
         camera = cameras[region.view]
         on, fits = may_lie_on(region, in_camera(camera, planes))
         left = np.ones(len(on), bool)
-        while True:  # the one with the most points first, then by those that are left
+        while True:  # the plane with the most inliers first, then by the points that are left
             counts = (on & left[:, None]).sum(0) * fits
             best = int(np.argmax(counts))
             if counts[best] < max(LEAST_POINTS, ON_SHARE * len(left)):
@@ -339,7 +357,8 @@ def _refitted(
         middle = np.average(place, axis=0, weights=depth**-2)
         around = place - middle
         variance, axes = np.linalg.eigh(around.T @ (around / depth[:, None] ** 2) / (depth**-2).sum())
-        # The normal is as certain as the points are wide across the narrower side, and near to the plane.
+        # The normal is as certain as the inliers are spread along the narrower side, relative to their distance from
+        # the plane.
         wide = np.sqrt(max(variance[1], 0)) * np.tan(SAME_ANGLE) * np.sqrt(len(np.unique(views)))
         scatter = 2 * float(np.sqrt(np.mean((around @ axes[:, 0] / depth) ** 2)))
         error = min(scatter, TOLERANCE) if len(place) > ALL_POINTS * sum(counts) else TOLERANCE
@@ -356,18 +375,19 @@ def _refitted(
 
 
 def to_world(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """(..., 3) points of the camera's frame in the world's."""
+    """Transform (..., 3) points from the camera's frame to the world's."""
     return (points - camera.world_to_camera[:3, 3]) @ camera.rotation
 
 
 def in_world(camera: Camera, plane: np.ndarray) -> np.ndarray:
-    """(n, d) of the world of a plane p . x = 1 of a camera."""
+    """Transform a plane p . x = 1 of the camera's frame to (n, d) of the world, with unit normal n."""
     length = np.linalg.norm(plane)
     return np.append(camera.rotation.T @ plane, 1 - plane @ camera.world_to_camera[:3, 3]) / length
 
 
 def in_camera(camera: Camera, planes: np.ndarray) -> np.ndarray:
-    """(K, 3) planes p . x = 1 of a camera of (K, 4) planes of the world; 0 for those through its centre."""
+    """Transform (K, 4) planes of the world to (K, 3) planes p . x = 1 of the camera's frame; 0 for planes through its
+    centre."""
     normals = planes[:, :3] @ camera.rotation.T
     distance = planes[:, 3] + normals @ camera.world_to_camera[:3, 3]
     through = np.abs(distance) < 1e-9

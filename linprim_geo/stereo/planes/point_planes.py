@@ -1,8 +1,9 @@
-"""Planes of large flat surfaces, by the points that stereo confirms on them.
+"""Planes of large flat surfaces, fitted to confirmed points of stereo.
 
-A floor or a wall with weak texture is confirmed here and there, and bumpy. Planes that many confirmed points of several
-views lie on, with their normals, are found one after the other. The depth of such a plane is taken where stereo cannot
-tell it from confirmed depths, and where depths that nothing confirms lie on it as noise and mistakes would not.
+On a floor or a wall with weak texture, stereo confirms only some depths, and these are noisy. Planes with many
+confirmed points of several views, also by their normals, are found one after the other by RANSAC. The depth of such a
+plane replaces confirmed depths that stereo cannot tell from it. It is also taken where most unconfirmed depths around
+lie on it, as noise and outliers would not.
 """
 
 from __future__ import annotations
@@ -17,27 +18,31 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.planes.plain_regions import FITS, LEAST_VIEWS, TOLERANCE, in_camera, rays_of, to_world
 
-# Confirmed points of all views that planes are looked for in, of these that seeds are tried on, and seeds.
+# Confirmed points of all views used in the search, those of them on which hypotheses are scored, and the number of
+# hypotheses.
 POINTS, TRIED_ON, SEEDS = 40_000, 4_000, 300
-# Of the seeds so many are fitted. Points are on a plane within each of TOLERANCES in turn: points deviate from a true
-# plane by a share of 0.0004 to 0.002 of their distance, or 0.003 where photographs are noisy (DECISIONS 101).
+# The number of best hypotheses that are refitted, and the inlier thresholds, tried in turn. The residuals of a true
+# plane are 0.0004 to 0.002 of the distance, or 0.003 where photographs are noisy (DECISIONS 101).
 BEST_SEEDS, TOLERANCES = 10, (TOLERANCE / 4, TOLERANCE / 2, TOLERANCE)
-# Planes at most, and the least share of the points that one has.
+# The most planes, and the least share of the points that are inliers of each.
 MOST_PLANES, LEAST_SHARE = 30, 0.01
-# Normals of points on a plane are within 30 degrees of its own.
+# Normals of inliers are within 30 degrees of the plane's normal (a cosine).
 SAME_NORMAL = float(np.cos(np.radians(30)))
-# Of points within TOLERANCE of a plane so many are within half of it. Across a curved surface it is one half.
+# At least this share of the points within TOLERANCE of a plane is within half of it. Across a curved surface it is one
+# half.
 CENTRAL_SHARE = 0.7
-# Depths are taken from a plane where this share of the WINDOW by WINDOW pixels around has depths on it.
+# A pixel without a confirmed depth takes that of a plane if more than this share of the WINDOW by WINDOW pixels around
+# have depths on it.
 WINDOW, ON_SHARE = 15, 0.5
-# The least share of confirmed depths around that are on a plane where stereo cannot tell it from them, and how much of
-# their deviation they are off in the mean: what noise leaves in the mean of a few windows of stereo.
+# A confirmed depth is replaced if at least the share NEARLY_ALL of confirmed depths around are inliers, and their mean
+# residual is at most UNTOLD times their mean deviation: noise leaves as much in the mean of a few windows of stereo.
 NEARLY_ALL, UNTOLD = 0.8, 0.5
 
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Points (P, 3) of the world, their normals, the centres of the cameras that see them, and the views (P,)."""
+    """Points of surfaces: `position` (P, 3) in the world, `normal` (P, 3), `center` (P, 3) of the camera that sees
+    each, and number `view` (P,) of that camera."""
 
     position: np.ndarray
     normal: np.ndarray
@@ -54,7 +59,8 @@ class SurfacePoints:
         count: int,
         rng: np.random.Generator,
     ) -> SurfacePoints:
-        """At most `count` at the (H, W) depths of a view, NaN where unknown, with their (H, W, 3) normals."""
+        """Sample at most `count` points from the (H, W) depths of a view, NaN where unknown, with their (H, W, 3)
+        normals."""
         row, column = np.nonzero(np.isfinite(depth))
         some = rng.permutation(len(row))[:count]
         row, column = row[some], column[some]
@@ -64,6 +70,7 @@ class SurfacePoints:
 
     @classmethod
     def together(cls, parts: Iterable[SurfacePoints]) -> SurfacePoints:
+        """Concatenate several sets of points."""
         columns = zip(*((one.position, one.normal, one.center, one.view) for one in parts), strict=True)
         return cls(*map(np.concatenate, columns))
 
@@ -74,7 +81,8 @@ class SurfacePoints:
         return SurfacePoints(self.position[rows], self.normal[rows], self.center[rows], self.view[rows])
 
     def on(self, planes: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
-        """(P, K) bool which are on (K, 4) planes up to a share of their distance, with normals alike."""
+        """Return (P, K) bool: which points are inliers of (K, 4) planes, up to a share of their distance, with similar
+        normals."""
         normal = planes[:, :3].T
         off = np.abs(self.position @ normal - planes[:, 3])
         near = off < tolerance * np.abs((self.position - self.center) @ normal)
@@ -84,7 +92,8 @@ class SurfacePoints:
 def confirmed_points(
     maps: Sequence[DepthMap], depths: Sequence[np.ndarray]
 ) -> tuple[SurfacePoints, np.random.Generator]:
-    """About POINTS of the confirmed `depths` (H, W) of views, NaN elsewhere, and the generator that chose them."""
+    """Sample about POINTS of the confirmed `depths` (H, W) of all views, NaN elsewhere. Return them and the random
+    generator."""
     rng, count = np.random.default_rng(0), -(-POINTS // len(maps))
     views = enumerate(zip(maps, depths, strict=True))
     of_views = (SurfacePoints.of_view(k, found.camera, depth, found.normal, count, rng) for k, (found, depth) in views)
@@ -92,10 +101,11 @@ def confirmed_points(
 
 
 def planes_of_points(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> np.ndarray:
-    """(K, 4) planes n . x = d of the world with the most of the confirmed `depths` (H, W) of views, NaN elsewhere.
+    """Return the (K, 4) planes n . x = d of the world with the most inliers among the confirmed `depths` (H, W) of
+    views, NaN elsewhere.
 
-    Those come first that hold their points within the least of TOLERANCES: within a large one a plane may lie across
-    two surfaces, such as a picture on a wall and the head of a bed before it, and on neither.
+    Planes that hold their points within the least of TOLERANCES come first: with a large threshold, a plane may lie
+    across two surfaces, such as a picture on a wall and the head of a bed in front of it, and on neither.
     """
     points, rng = confirmed_points(maps, depths)
     least, planes, free = max(LEAST_SHARE * len(points), 3), list[np.ndarray](), np.arange(len(points))
@@ -118,12 +128,12 @@ def planes_of_points(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> 
 def _commonest_plane(
     points: SurfacePoints, tolerance: float, least: float, rng: np.random.Generator
 ) -> np.ndarray | None:
-    """The plane (4,) that holds the most of points within half of a `tolerance`, less those in its other half; None
-    if fewer than `least` are within it. Points that lie across it come out even."""
+    """Return the plane (4,) with the highest score: points within half of a `tolerance`, less those in its outer half.
+    A surface that crosses the plane scores zero. None if fewer than `least` points are inliers."""
     seeds = points[rng.integers(0, len(points), SEEDS)]
     tried = np.column_stack([seeds.normal, (seeds.normal * seeds.position).sum(1)])
     some = points[rng.permutation(len(points))[:TRIED_ON]]
-    # Normals of points alone are not exact enough for a small tolerance.
+    # Normals of single points are not exact enough for a small threshold.
     best, most = None, -len(some)
     for seed in tried[np.argsort(-some.on(tried, tolerance).sum(0), kind="stable")[:BEST_SEEDS]]:
         plane = _fitted_within(some, seed, tolerance, 3)
@@ -135,8 +145,8 @@ def _commonest_plane(
 
 
 def _fitted_within(points: SurfacePoints, plane: np.ndarray, tolerance: float, least: float) -> np.ndarray | None:
-    """A plane fitted to the points that are on it, within TOLERANCE first and then within a smaller `tolerance`; None
-    if they are fewer than `least`."""
+    """Fit a plane to its inliers, within TOLERANCE at first and then within a smaller `tolerance`. None if these are
+    fewer than `least`."""
     for step in range(FITS):
         on = points.on(plane[None], max(TOLERANCE / 2**step, tolerance))[:, 0]
         if np.count_nonzero(on) < least:
@@ -146,7 +156,7 @@ def _fitted_within(points: SurfacePoints, plane: np.ndarray, tolerance: float, l
 
 
 def _fitted(points: SurfacePoints) -> np.ndarray:
-    """The plane (4,) nearest to points, of which the far ones are less exact."""
+    """Fit a plane (4,) to points by least squares, weighted by 1 / distance, as far points are less exact."""
     weight = 1 / np.maximum(np.linalg.norm(points.position - points.center, axis=1), 1e-12)
     middle = np.average(points.position, axis=0, weights=weight**2)
     scaled = (points.position - middle) * weight[:, None]
@@ -155,10 +165,10 @@ def _fitted(points: SurfacePoints) -> np.ndarray:
 
 
 def point_plane_depth(found: DepthMap, confirmed: np.ndarray, planes: np.ndarray) -> np.ndarray:
-    """(H, W) float32 depth of the planes that most depths around lie on, NaN elsewhere.
+    """Return the (H, W) float32 depth of the plane on which most depths around lie, NaN elsewhere.
 
-    Pixels with a confirmed depth are on a plane if stereo cannot tell it from that depth: nearly all confirmed depths
-    around are on it, and are off by less, in the mean, than they deviate from those of neighbours. Relief stays.
+    A confirmed depth is replaced only if stereo cannot tell the plane from it: nearly all confirmed depths around are
+    inliers, and their mean residual is less than their deviation from those of other views. Relief thus remains.
 
     Args:
         confirmed: (H, W) confirmed depth of the view, NaN elsewhere.
@@ -188,4 +198,5 @@ def point_plane_depth(found: DepthMap, confirmed: np.ndarray, planes: np.ndarray
 
 
 def _mean_around(image: np.ndarray) -> np.ndarray:
+    """Return the (H, W) mean over WINDOW by WINDOW pixels."""
     return uniform_filter(image.astype(np.float64), WINDOW, mode="constant")

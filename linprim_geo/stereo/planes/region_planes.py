@@ -1,15 +1,11 @@
-"""Which of several planes plain regions lie on: by what is known along their edges.
+"""Assign plain regions of each view to planes, by the depths along their edges.
 
-A wall that a region shows has points along the region's edges, where it meets other walls and where things hang on it;
-the others are those of occluders. Planes that happen to go through occluders have fewer, and those through the line in
-which two walls meet have points of both, but hold little of the region. Only points on a region's own side of its edges
-count: beside a thing before a wall the others are on the wall. A plane is believed within the convex hull of its points
-alone: beyond, walls end. One through the edges of several occluders hangs in the air, and photographs that see what is
-behind it refuse it, or that show different colours of what is behind it: the plane of balusters in the gaps between
-them.
-
-Beside an edge stereo sees nothing but the edge, and its depth goes on into the region. There the plane is right, if the
-region is wide enough to tell; where a thing that no edge parts from the wall is before it, stereo is.
+A region lies on a plane if enough points on its own side of its edges are inliers; points of occluders are outliers. A
+plane holds only within the convex hull of its inliers, as walls end somewhere. Two kinds of false planes are rejected:
+those that other views see through, as the plane through the edges of several occluders; and those on which photographs
+show different colours, as the plane of balusters does in the gaps between them. Beside an edge, stereo extends the
+edge's depth into the region. There the plane replaces it if the region is wide, unless the depths form a surface of
+their own: an object in front of the wall without an edge between the two.
 """
 
 from __future__ import annotations
@@ -41,32 +37,38 @@ from linprim_geo.stereo.planes.point_planes import CENTRAL_SHARE
 from linprim_geo.stereo.planes.seen_through import KnownDepths
 from linprim_geo.stereo.planes.shown_colours import ShownColours
 
-# Of what stereo is sure of within a region so much is on its plane, if it is sure of enough.
+# A plane is laid over part of a region if at least this share of the sure depths there agree with it; fewer sure depths
+# than chance gives are ignored.
 MOST_AGREE = 0.5
-# What stereo is sure of on a true plane is off by so much of the depth in the median, at most: the least of
+# Sure depths on a true plane have a median residual of at most this share of the depth: the least of
 # `point_planes.TOLERANCES`.
 MEDIAN_OFF = TOLERANCE / 4
-# Stereo gives the depth of an edge to pixels so far beside it; regions go on to the middle of edges (`grown_alike`).
+# Within so many pixels of a region's border stereo may give the depth of the edge; regions extend to the middle of
+# edges (`grown_alike`).
 EDGE_REACH = WIDE // 2 + RING
-# Of a region so many pixels, or up to twice as many, tell how much of it a plane's hull holds.
+# About so many pixels of a region, or up to twice as many, are sampled to estimate how much of it is in a plane's hull.
 SAMPLES = 1000
-# The side of the square around a pixel in which what is off its plane is a surface of its own if it is most of it, and
-# in which a plane is shown by confirmed depths on it on this share of what is laid.
+# The side in pixels of the square around a pixel in which depths are compared with the plane: most of them off the
+# plane form a surface of their own; the plane is confirmed there if confirmed inliers exceed the share SHOWN of what is
+# laid.
 SURROUNDINGS, SHOWN = 2 * WIDE + 1, 0.1
-# Photographs refuse a plane by their colours if so many of a region's points are on it: before others there may be
-# things that hide it.
+# The colour test rejects a plane only if more than this share of the region's points are inliers. On other planes,
+# objects in front of the plane may explain the colours.
 MOSTLY_ON = 0.7
-# Of one region, by the numbers of the planes that it may lie on: which of its N points are on it (N,) bool.
+# For one region: the numbers of the planes that it may lie on, each with (N,) bool, which of its N points are inliers.
 _Lying = dict[int, np.ndarray]
 
 
 @dataclass(frozen=True)
 class RegionDepths:
-    """On which plane each pixel of a view's plain regions lies: its `number` (H, W), -1 elsewhere, and float32 `depth`
-    (H, W), NaN elsewhere; (H, W) bool where a known depth is that of the plane but for its error, so that it is to be
-    `moved` to it, where the plane `stands` against any other depth, and where it is `doubted`, as nothing confirms it
-    although stereo knows the rest of the region; and planes (3,) of the camera that are `refused` in regions which
-    stereo does not know, as photographs show different colours there."""
+    """The planes assigned to the pixels of a view's plain regions.
+
+    `number` (H, W) of the plane, -1 where none; `depth` (H, W) float32 of the plane, NaN where none. (H, W) bool:
+    `moved` where a known depth differs from the plane by no more than its error and is replaced by it; `stands` where
+    the plane overrides any other depth; `doubted` where nothing confirms the plane although stereo knows most of the
+    region. `refused` lists regions that stereo does not know, each with a plane (3,) of the camera that the colour test
+    rejected.
+    """
 
     number: np.ndarray
     depth: np.ndarray
@@ -77,13 +79,14 @@ class RegionDepths:
 
     @classmethod
     def nothing(cls, camera: Camera) -> RegionDepths:
-        """Of a view before any plane is laid."""
+        """Return one for a view without any planes yet."""
         shape = (camera.height, camera.width)
         moved, stands, doubted = (np.zeros(shape, bool) for _ in range(3))
         return cls(np.full(shape, -1, np.int32), np.full(shape, np.nan, np.float32), moved, stands, doubted, [])
 
     def refuses(self, camera: Camera, depth: np.ndarray) -> np.ndarray:
-        """(H, W) bool: which depths of the view, NaN where unknown, are those of planes that are `refused` there."""
+        """Return (H, W) bool: which depths (H, W), NaN where unknown, lie on planes that are `refused` in their
+        region."""
         result = np.zeros(depth.shape, bool)
         for region, plane in self.refused:
             row, column = region.pixels()
@@ -92,7 +95,7 @@ class RegionDepths:
         return result
 
     def without(self, taken: np.ndarray) -> RegionDepths:
-        """Nothing where pixels are `taken` (H, W)."""
+        """Return a copy without the pixels that are `taken` (H, W)."""
         return RegionDepths(
             np.where(taken, np.int32(-1), self.number),
             np.where(taken, np.float32(np.nan), self.depth),
@@ -111,17 +114,21 @@ def region_plane_depths(
     confirmed: Sequence[np.ndarray],
     colours: ShownColours,
 ) -> list[RegionDepths]:
-    """Of each view, of its plain `regions` by the (K, 4) planes of the world on which they lie, with the `known` (H, W)
-    depths and all that are `confirmed` (H, W), NaN elsewhere, and the `colours` that views show.
+    """Assign the plain `regions` of every view to the (K, 4) planes of the world.
 
-    A pixel lies on the plane with the most points along the edges of its region, which count more the nearer they are
-    (Tukey's weight), times what its hull holds of it, of those within whose hull it is and on which most known depths
-    there are. Stereo errs beside edges: in what is wide of a region the plane stands, but for what is known of surfaces
-    of their own. A known depth within TOLERANCE of a plane has its depth if all of these in the region are off by
-    MEDIAN_OFF in the median at most, and CENTRAL_SHARE of them are within half of TOLERANCE: across a curved surface a
-    half is. Nothing is laid where most of it has confirmed depths off its plane in the SURROUNDINGS: a thing in front
-    that no edge parts from the plane. Of a region of which stereo knows most what has no confirmed depth on the plane
-    around is doubted. On a plane on which most photographs show other colours of a narrow region nothing is laid.
+    Of the planes whose hull holds a pixel and with which most sure depths agree, the pixel gets the one with the
+    highest score: the sum of Tukey's weights of the region's inliers, times the number of sampled pixels within its
+    hull. Planes that other views see through are left out. In narrow regions that stereo does not know, planes on which
+    most photographs show other colours are refused. In the wide part of a region the plane overrides depths of stereo,
+    except surfaces of their own. Sure depths within TOLERANCE are moved to it, if their median residual is at most
+    MEDIAN_OFF and CENTRAL_SHARE of them are within half of TOLERANCE (on a curved surface, half are). Pixels are left
+    out where confirmed depths off the plane fill more than half of the SURROUNDINGS: an object in front of it without
+    an edge in between. In regions that stereo mostly knows, pixels without confirmed inliers around are doubted.
+
+    Args:
+        known: (H, W) sure depths of every view, NaN elsewhere.
+        confirmed: (H, W) all confirmed depths of every view, NaN elsewhere.
+        colours: compares the colours of photographs.
     """
     local = [in_camera(camera, planes) for camera in cameras]
     regions = [[region.within() for region in own] for own in regions]
@@ -148,21 +155,22 @@ def region_plane_depths(
 
 
 def _lying(region: PlainRegion, planes: np.ndarray) -> _Lying:
-    """On which of (K, 3) planes of the camera a region may lie."""
+    """Return which of (K, 3) planes of the camera the region may lie on, with its inliers."""
     on, fits = may_lie_on(region, planes)
     return {number: on[:, number].copy() for number in np.flatnonzero(fits).tolist()}
 
 
 def _tukey_sum(off: np.ndarray) -> float:
-    """Tukey's weights of (N,) points that are `off` a plane by less than TOLERANCE, added up."""
+    """Return the sum of Tukey's biweights of (N,) residuals, which are below TOLERANCE."""
     return float(((1 - (off / TOLERANCE) ** 2) ** 2).sum())
 
 
 def _limited(
     laid: RegionDepths, wide: np.ndarray, sure: np.ndarray, confirmed: np.ndarray, well_known: np.ndarray
 ) -> RegionDepths:
-    """What is laid on planes, by what stereo is `sure` of and has `confirmed` (H, W), NaN elsewhere: moved to planes
-    that stand in what is `wide` (H, W), doubted in what is `well_known` (H, W), and nothing where most is off."""
+    """Apply the depths that stereo is `sure` of or has `confirmed` (H, W), NaN elsewhere, to the laid planes: they
+    stand in the `wide` part (H, W), are doubted in `well_known` regions (H, W), and are removed where confirmed depths
+    off them fill more than half of the laid pixels around."""
     is_laid = np.isfinite(laid.depth)
     of_all = _around(is_laid)
     of_sure, of_confirmed = (depth / laid.depth - 1 for depth in (sure, confirmed))
@@ -174,8 +182,9 @@ def _limited(
 
 
 def _are_surfaces(off: np.ndarray, of_all: np.ndarray) -> np.ndarray:
-    """(H, W) bool: which depths that are `off` (H, W) the planes are surfaces of their own, and no bands along edges:
-    pieces of which most have most of what is laid in their SURROUNDINGS (`of_all`, its share) off its plane, too."""
+    """Return (H, W) bool: which pixels `off` (H, W) their plane belong to surfaces of their own, not to bands along
+    edges. They are connected components of which most pixels have more than half of the laid share around, `of_all`,
+    off the plane."""
     surrounded = off & (_around(off) > of_all / 2)
     piece, count = label(off, np.ones((3, 3)))
     sizes, inner = (np.bincount(piece[part], minlength=count + 1) for part in (off, surrounded))
@@ -183,12 +192,13 @@ def _are_surfaces(off: np.ndarray, of_all: np.ndarray) -> np.ndarray:
 
 
 def _around(part: np.ndarray) -> np.ndarray:
-    """(H, W) float32 share of a `part` (H, W) bool in the SURROUNDINGS."""
+    """Return the (H, W) float32 share of true pixels of `part` (H, W) in the SURROUNDINGS."""
     return uniform_filter(part.astype(np.float32), SURROUNDINGS)
 
 
 def _well_known(sure: np.ndarray, regions: Sequence[PlainRegion]) -> np.ndarray:
-    """(H, W) bool: the regions of which stereo is `sure` (H, W) of more than half, so that they are not plain."""
+    """Return (H, W) bool: the pixels of regions of which stereo is `sure` (H, W) of more than half, and which are thus
+    not plain."""
     result = np.zeros(sure.shape, bool)
     for region in regions:
         if _is_well_known(sure, region):
@@ -197,7 +207,7 @@ def _well_known(sure: np.ndarray, regions: Sequence[PlainRegion]) -> np.ndarray:
 
 
 def _is_well_known(sure: np.ndarray, region: PlainRegion) -> bool:
-    """Whether stereo is `sure` (H, W) of more than half of a region."""
+    """Return whether stereo is `sure` (H, W) of more than half of the region's pixels."""
     return bool(np.isfinite(sure[region.pixels()]).mean() > 0.5)
 
 
@@ -209,9 +219,10 @@ def _best_first(
     counts: Mapping[int, float],
     views: KnownDepths,
 ) -> dict[int, np.ndarray]:
-    """Of those (K, 3) planes of the camera that views do not see through in the region, by their numbers: (P, 3) points
-    of the region within the plane's hull; first of the one with the most of `counts` of points along its edges, times
-    what its hull holds of the region."""
+    """Return those (K, 3) planes of the camera that other views do not see through, as a dict from their numbers to the
+    (P, 3) sampled points of the region within the plane's hull. They are sorted by descending score: their `counts`,
+    sums of weights of inliers, times P. A plane through the line in which two walls meet has inliers on both, but holds
+    little of the region in its hull."""
     rays, held = _sampled_rays(camera, region), dict[int, np.ndarray]()
     for number in counts:
         inverse = rays @ planes[number]
@@ -226,9 +237,9 @@ def _best_first(
 def _refused(
     region: PlainRegion, on: _Lying, held: Mapping[int, np.ndarray], planes: np.ndarray, colours: ShownColours
 ) -> list[int]:
-    """The numbers of the first of those (K, 4) planes of the world that most of a region's (N,) points are `on`, and on
-    which photographs show different colours of what is `held` (P, 3) of the region: of a narrow one, as a wide
-    one, such as a door, may shine."""
+    """Return the numbers of the leading (K, 4) planes of the world that the colour test rejects: more than MOSTLY_ON of
+    the region's points are `on` them, and photographs show different colours at the `held` (P, 3) points. Only narrow
+    regions are tested, as a wide one, such as a door, may be glossy."""
     if region.wide.any():
         return []
 
@@ -239,8 +250,8 @@ def _refused(
 
 
 def beside_edges(shape: tuple[int, int], regions: Sequence[PlainRegion]) -> np.ndarray:
-    """(H, W) bool: pixels of a view's plain regions that may have the depth of an edge beside them, in regions of which
-    most is wide: of others these are all that tells."""
+    """Return (H, W) bool: pixels of a view's plain regions that may have the depth of a nearby edge. Only regions that
+    are wide for the most part are marked; others would have no depths left."""
     result = np.zeros(shape, bool)
     for region in regions:
         if np.count_nonzero(region.wide) > np.count_nonzero(region.mask) / 2:
@@ -251,14 +262,15 @@ def beside_edges(shape: tuple[int, int], regions: Sequence[PlainRegion]) -> np.n
 
 
 def _sampled_rays(camera: Camera, region: PlainRegion) -> np.ndarray:
-    """(P, 3) rays of depth 1 of about SAMPLES pixels of a region, evenly taken."""
+    """Return (P, 3) rays of depth 1 through about SAMPLES pixels of the region, evenly spaced."""
     row, column = region.pixels()
     step = max(1, len(row) // SAMPLES)
     return rays_of(camera, row[::step], column[::step])
 
 
 def _held(camera: Camera, rays: np.ndarray, inverse: np.ndarray, hull: _Hull) -> np.ndarray:
-    """The numbers of (P, 3) rays that end within a plane's hull, by their `inverse` (P,) depths."""
+    """Return the indices of those (P, 3) rays that meet the plane within its hull, given their `inverse` (P,) depths on
+    it."""
     before = np.flatnonzero(inverse > 0)
     return before[hull.holds(to_world(camera, rays[before] / inverse[before, None]))]
 
@@ -269,7 +281,8 @@ def _hulls(
     lying: Sequence[Sequence[_Lying]],
     planes: np.ndarray,
 ) -> list[_Hull]:
-    """Of each plane, around its points along the edges of regions of all views that may lie on it."""
+    """Return the hull of each plane, around its inliers along the edges of all regions of all views that may lie on
+    it."""
     points = [[np.zeros((0, 3))] for _ in planes]
     for camera, own, of_regions in zip(cameras, regions, lying, strict=True):
         for region, of_region in zip(own, of_regions, strict=True):
@@ -289,8 +302,9 @@ def _lay(
     known: np.ndarray,
     telling: np.ndarray,
 ) -> None:
-    """Lays each pixel of a region on the first of the `best` of (K, 3) planes of the camera whose hull it is in and on
-    which most (H, W) `telling` depths are there, and says where `known` (H, W) ones are moved to it."""
+    """Assign each pixel of a region, in place, to the first of the `best` (K, 3) planes of the camera that holds it in
+    its hull and with which most of the `telling` (H, W) depths agree. Mark where `known` (H, W) depths are moved to the
+    plane."""
     row, column = region.pixels()
     rays, left = rays_of(camera, row, column), np.ones(len(row), bool)
     for number in best:
@@ -312,7 +326,7 @@ def _lay(
 
 
 class _Hull:
-    """The convex hull of (P, 3) points on a plane (4,); it holds nothing if all of them are on one line."""
+    """The convex hull of (P, 3) points on a plane (4,); empty if all points are on one line."""
 
     def __init__(self, plane: np.ndarray, points: np.ndarray):
         self.axes = np.linalg.svd(plane[None, :3])[2][1:]
@@ -322,7 +336,7 @@ class _Hull:
             self.sides = np.array([[0.0, 0.0, 1.0]])
 
     def holds(self, places: np.ndarray) -> np.ndarray:
-        """(P,) whether (P, 3) places on the plane are within the hull."""
+        """Return (P,) bool: which of (P, 3) points on the plane are within the hull."""
         along = places @ self.axes.T
         inside = np.ones(len(places), bool)
         for x, y, offset in self.sides:

@@ -1,8 +1,8 @@
-"""Planes at right angles: most walls meet each other, floors and tables so.
+"""Turn planes to right angles: most walls meet each other, floors and tables so.
 
-Shading alone leaves the angle of a wall open by degrees. Where the planes of a room that are known better have a frame,
-three directions that most of them lie along, others turn along it. Else planes that are nearly at right angles are made
-so, together. Each turns and shifts as little as what is known of it allows.
+Shading alone leaves the angle of a wall open by degrees. If the better known planes of a room have a frame, three
+orthogonal directions along which most of them lie, other planes are turned to it. Without a frame, planes that are
+nearly at right angles are turned to right angles together. Each turns and shifts as little as its information allows.
 """
 
 from __future__ import annotations
@@ -13,22 +13,23 @@ import numpy as np
 
 from linprim_geo.stereo.planes.plain_regions import SAME_ANGLE
 
-# Planes are nearly at right angles if they lack no more; they are so after the last of ROUNDS if they lack RIGHT.
+# Two planes are nearly at right angles if they differ from it by less than NEARLY (radians), and count as at right
+# angles after the last of ROUNDS iterations if they differ by at most RIGHT.
 NEARLY, RIGHT, ROUNDS = 2 * SAME_ANGLE, np.radians(0.2), 5
-# What shading leaves open of the angle of a wall: nine in ten planes of single regions are off by no more.
+# The angle of a wall in radians that shading leaves open: nine in ten planes of single regions err by no more.
 LEFT_OPEN = np.radians(20)
-# By so much a right angle counts more than what is known of planes.
+# The weight of a right angle, relative to the mean information about planes.
 WEIGHT = 1e4
 
 
 def at_right_angles(first: np.ndarray, second: np.ndarray) -> bool:
-    """Whether two planes (4,), or their normals (3,), are nearly at right angles."""
+    """Return whether two planes (4,), or their normals (3,), are nearly at right angles."""
     return bool(abs(first[:3] @ second[:3]) < np.sin(NEARLY))
 
 
 def frame_of(normals: np.ndarray) -> np.ndarray | None:
-    """(3, 3) the three directions at right angles to each other that most of (K, 3) unit normals lie along: those of a
-    room. None where no two normals are nearly at right angles."""
+    """Return the frame of a room (3, 3): three orthogonal unit vectors along which most of (K, 3) unit normals lie.
+    None if no two normals are nearly at right angles."""
     found, most = None, 0.0
     for first in normals:
         for second in normals:
@@ -36,7 +37,7 @@ def frame_of(normals: np.ndarray) -> np.ndarray | None:
                 across = second - first * (first @ second)
                 across /= np.linalg.norm(across)
                 axes = np.stack([first, across, np.cross(first, across)])
-                # Tukey's weight: what is not nearly along an axis counts nothing.
+                # Tukey's weight: normals that are not nearly along an axis count nothing.
                 along = (np.maximum(0, 1 - (angles_to(axes, normals) / NEARLY) ** 2) ** 2).sum()
                 if along > most:
                     found, most = axes, along
@@ -44,12 +45,12 @@ def frame_of(normals: np.ndarray) -> np.ndarray | None:
 
 
 def angles_to(axes: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """(K,) angles between (K, 3) unit normals and the nearest of (3, 3) axes, up to directions."""
+    """Return (K,) angles between (K, 3) unit normals and the nearest of the (3, 3) axes, regardless of sign."""
     return np.arccos(np.minimum(np.abs(normals @ axes.T).max(1), 1))
 
 
 def _middle(axes: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """The axes turned to where the sum of angles to the normals that nearly lie along them is least."""
+    """Rotate the axes to the least sum of angles to the normals that are nearly along them."""
     for _ in range(10 * ROUNDS):
         angle = angles_to(axes, normals)
         near = np.flatnonzero(angle < NEARLY)
@@ -58,7 +59,7 @@ def _middle(axes: np.ndarray, normals: np.ndarray) -> np.ndarray:
         sign = np.sign(along[np.arange(len(near)), nearest])
         towards = np.zeros((3, 3))
         np.add.at(towards, nearest, (sign / np.maximum(angle[near], RIGHT))[:, None] * normals[near])
-        # An axis without normals stays where the others leave it.
+        # An axis without normals stays where the others put it.
         left, _, right = np.linalg.svd(towards + 1e-3 * axes)
         axes = left @ right
     return axes
@@ -70,17 +71,17 @@ def squared(
     moves: Callable[[int, np.ndarray], np.ndarray],
     frame: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Planes (K, 4) n . x = d of which those that may turn are at right angles where they nearly were.
+    """Return planes (K, 4) n . x = d, of which the movable ones are turned to right angles where they nearly were.
 
-    Where there is a `frame`, those that may be along one of its axes are turned along it. Others, and all without one,
-    turn to right angles with what stays and with each other: one of which no such solution is found, as right angles
-    with some others exclude each other, stays as it is. Of planes that stay and are nearly parallel, the one nearest to
-    an axis counts, or else the first.
+    With a `frame`, movable planes that may be along an axis are turned to it. The others, and all without a frame, are
+    turned to right angles with fixed planes and with each other; those without a solution, as their right angles
+    exclude each other, are not changed. Of fixed planes that are nearly parallel only one counts: the one nearest to an
+    axis, or the first.
 
     Args:
-        information: (3, 3) about each plane's three `moves`; None for one that stays.
-        moves: of a plane, by its number and what it is, (3, 4) how it changes by two turns and a shift.
-        frame: (3, 3) that of the planes that stay (`frame_of`).
+        information: (3, 3) for the three `moves` of each plane; None for a fixed plane.
+        moves: returns the (3, 4) derivatives of a plane, given its number and value, by two turns and a shift.
+        frame: (3, 3) frame of the fixed planes (`frame_of`).
     """
     free, staying = ([k for k, own in enumerate(information) if (own is None) == stays] for stays in (False, True))
     if frame is not None:
@@ -111,7 +112,7 @@ def _along(
     information: Sequence[np.ndarray | None],
     moves: Callable[[int, np.ndarray], np.ndarray],
 ) -> np.ndarray:
-    """The planes of which the `framed` ones are turned along the axis of a frame that is nearest, by as little."""
+    """Return the planes with the `framed` ones turned as little as possible to the nearest axis of a frame."""
     axes = np.column_stack([frame, np.zeros(3)])
     across = np.abs(planes[:, :3] @ frame.T)
     pairs = [(k, len(planes) + j) for k in framed for j in range(3) if j != across[k].argmax()]
@@ -125,7 +126,8 @@ def _solved(
     information: Sequence[np.ndarray | None],
     moves: Callable[[int, np.ndarray], np.ndarray],
 ) -> np.ndarray:
-    """The planes of which the `free` ones have moved as little as lets `pairs` be at right angles, by least squares."""
+    """Return the planes with the `free` ones moved as little as possible, by least squares, so that `pairs` are at
+    right angles."""
     at = {k: slice(3 * row, 3 * row + 3) for row, k in enumerate(free)}
     known, gone = np.zeros((3 * len(free), 3 * len(free))), np.zeros(3 * len(free))
     for k in free:

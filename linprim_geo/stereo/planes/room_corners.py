@@ -1,9 +1,9 @@
-"""Walls without texture, by the edges in which they meet.
+"""Find plain walls by the edges in which they meet each other and the floor.
 
-A floor that ends along a line does not say what is there: a wall that rises from it, or nothing, as at the end of a
-table. In the corner of a room two walls meet in an edge at right angles to the floor, and photographs show that edge
-however plain the walls are, as light falls on them from different sides. Such edges are looked for around the corners
-of known floors (`edge_images.py`).
+The line along which a floor ends does not tell what is there: a wall, or nothing, as at the end of a table. In the
+corner of a room, however, two walls meet in an edge at right angles to the floor. Photographs show that edge even
+between plain walls, as they are lit from different sides. Such edges are searched around the corners of known floors
+(`edge_images.py`).
 """
 
 from __future__ import annotations
@@ -25,29 +25,31 @@ from linprim_geo.stereo.planes.plain_regions import SAME_ANGLE, seen_enough
 from linprim_geo.stereo.planes.point_planes import SurfacePoints
 from linprim_geo.stereo.planes.right_angles import at_right_angles
 
-# A corner is looked for as near to that of a floor's rectangle as this share of its longer side: its ends are known to
-# END_MARGIN, and windows of stereo reach beyond an edge.
+# A corner is searched within this share of the longer side of a floor's rectangle around the rectangle's corner: its
+# ends are known to END_MARGIN, and windows of stereo reach beyond an edge.
 REACH = 0.05
-# Places that are tried are as far from each other as photographs are blurred, MOST_STEPS to either side at most. Around
-# the best they are FINER.
+# Candidate places are one blur of the photographs apart, with at most MOST_STEPS to either side. Around the best one
+# they are FINER times as dense.
 MOST_STEPS, FINER = 20, 5
-# An edge may end at each of so many heights, evenly up to the longer side of its floor, and is looked at in so many
-# samples between two of these. It is at least half as high as the cameras are, in the middle: a table's is not.
+# The number of candidate heights of an edge, evenly spaced up to the longer side of its floor; samples along the edge
+# between two of these; and the least height as a share of the median height of the cameras: a table's edges are lower.
 HEIGHTS, SAMPLES, LOWEST = 16, 8, 0.5
 STEPS = (np.arange(HEIGHTS * SAMPLES) + 0.5) / (HEIGHTS * SAMPLES)
-# An edge goes on upwards while in its next part chance alone would show one in fewer than this share of the cases.
+# An edge continues upwards while chance alone would show one in its next part in at most this share of cases.
 GOES_ON = 0.05
-# Directions of a wall that are tried, in SAME_ANGLE to either side.
+# Candidate directions of a wall, within SAME_ANGLE to either side.
 DIRECTIONS = 61
-# Behind a wall a floor has fewer points than this share of those before it, in strips as wide.
+# Behind a wall a floor has less than this share of the points in front of it, in strips of equal width.
 BEHIND_SHARE = 0.1
-# A wall is looked at in so many places each way; no more than half of the views that show one see a background there.
+# A wall is sampled at PLACES by PLACES points. It is rejected if more than MOST_BACKGROUND of the views of them see a
+# background there.
 PLACES, MOST_BACKGROUND = 16, 0.5
 
 
 @dataclass(frozen=True)
 class Corner:
-    """Where an edge stands on a floor, (2,) along its axes, and how far it reaches along the floor's normal."""
+    """An edge that stands on a floor: its `place` (2,) along the floor's axes, and its `height` along the floor's
+    normal."""
 
     place: np.ndarray
     height: float
@@ -60,18 +62,18 @@ def with_corner_walls(
     enclosing: Sequence[EnclosingPlane],
     points: SurfacePoints,
 ) -> list[EnclosingPlane]:
-    """The `enclosing` planes, and walls without one that rise from those of these planes that are floors.
+    """Return the `enclosing` planes, and plain walls that rise from those of them that are floors.
 
-    They rise on the sides of a floor's rectangle, and where the floor ends within it, as that of a room does that is
-    not convex. A wall has an edge at either end, or one and another along the floor, or one at which it meets such a
-    wall or one that is known. It is as high as its edges and goes from one to the other, or to the end of its floor.
-    The floor is known along half of it at least and ends there. A known wall on which all of it lies goes on as far. Of
-    planes that close the scene those are left that meet another one along an edge, and stand there.
+    Walls rise on the sides of a floor's rectangle, and where the floor ends within it, in a room that is not convex. A
+    wall needs an edge at either end; or one edge, and another along the floor; or one edge at which it meets such a
+    wall or a known one. It is as high as its edges and reaches from one to the other, or to the end of its floor. The
+    floor has to be known along at least half of the wall and end there. A known plane that holds all of the wall is
+    extended by it. Planes that close the scene are kept only if they meet another along an edge, and are moved there.
 
     Args:
-        known: (H, W) depth of every view, NaN where nothing is known.
+        known: (H, W) depth of every view, NaN where unknown.
         backgrounds: (H, W) bool of every view.
-        points: of what is known.
+        points: at known depths.
     """
     cameras = [found.camera for found in maps]
     seen = KnownPoints(cameras, points)
@@ -94,8 +96,8 @@ def with_corner_walls(
 
 
 def set_on_edge(plane: EnclosingPlane, others: Sequence[EnclosingPlane], edges: EdgeImages) -> EnclosingPlane | None:
-    """A plane that closes the scene, shifted to an edge along which photographs show that it meets one of others at
-    right angles: of several the nearest; None if they show none."""
+    """Shift a plane that closes the scene to an edge along which it meets one of `others` at right angles in
+    photographs; of several the nearest. None if they show none."""
     offsets = []
     for base in others:
         if not at_right_angles(plane.normal, base.normal):
@@ -113,8 +115,8 @@ def set_on_edge(plane: EnclosingPlane, others: Sequence[EnclosingPlane], edges: 
 
 @dataclass(frozen=True)
 class _Rising:
-    """A wall that may rise on a side of a floor, which of the known ones it is, the (2,) places of its corners, and
-    whether photographs show enough of it by itself."""
+    """A candidate wall on a side of a floor, the index of the known plane that it is or None, the (2,) places of its
+    corners, and whether photographs show enough of it to accept it by itself."""
 
     wall: EnclosingPlane
     same: int | None
@@ -122,14 +124,15 @@ class _Rising:
     sure: bool
 
     def meets(self, places: Sequence[np.ndarray], near: float) -> bool:
+        """Return whether a corner of the wall is within `near` of one of `places`."""
         return any(np.linalg.norm(own - other) < near for own in self.corners for other in places)
 
 
 def _walls_on(
     floor: EnclosingPlane, others: Sequence[EnclosingPlane], edges: EdgeImages, seen: KnownPoints
 ) -> list[tuple[EnclosingPlane, int | None]]:
-    """Walls on the sides of the rectangle that holds a floor's own points, and where it ends within, and which of the
-    `others` each is."""
+    """Find walls on the sides of the rectangle around a floor's own points, and where the floor ends within. Return
+    each with the index of the one of `others` that it is, or None."""
     lowest = LOWEST * float(np.median(seen.centers @ floor.normal - floor.offset))
     on_floor = seen.points.on(floor.as_vector()[None], CONFIRMED_DEPTH)[:, 0]
     places, margin = seen.points.position[on_floor] @ floor.axes.T, MARGIN * seen.distance[on_floor]
@@ -160,8 +163,8 @@ def _walls_on(
 
 
 def find_corner(floor: EnclosingPlane, near: np.ndarray, lowest: float, edges: EdgeImages) -> Corner | None:
-    """The corner of a floor around a place `near` (2,) along its axes; None if photographs show no edge there that is
-    as high as `lowest`."""
+    """Find the corner of a floor around a place `near` (2,) along its axes; None if photographs show no edge there that
+    is as high as `lowest`."""
     longer = _longer_side(floor)
     pixel, reach = edges.pixel_at(floor.at(near)), REACH * longer
     along = longer * STEPS
@@ -175,7 +178,7 @@ def find_corner(floor: EnclosingPlane, near: np.ndarray, lowest: float, edges: E
     showing = np.flatnonzero(shares[:, row, part] <= SHOWN)
     if not seen_enough(edges.cameras, showing, floor.at(places[row])):
         return None
-    # What is above may show it less clearly and count against it together, although it does show it.
+    # Higher parts may show the edge less clearly, and lower the evidence for the whole, although they show it.
     while part + 1 < HEIGHTS:
         strip = along[(part + 1) * SAMPLES : (part + 2) * SAMPLES]
         if by_chance(edges.shares(floor.at(places), floor.normal[None], strip, 1))[row, 0] > np.log(GOES_ON):
@@ -187,7 +190,7 @@ def find_corner(floor: EnclosingPlane, near: np.ndarray, lowest: float, edges: E
 
 
 def _grid(reach: float, apart: float) -> np.ndarray:
-    """(N, 2) places up to `reach` either way."""
+    """Return (N, 2) grid points up to `reach` in each direction."""
     steps = np.arange(-reach, reach + apart / 2, apart)
     return np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
 
@@ -195,11 +198,9 @@ def _grid(reach: float, apart: float) -> np.ndarray:
 def _line(
     floor: EnclosingPlane, side: FloorSide, ends: Sequence[Corner | None], edges: EdgeImages
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """(2,) ends of the wall on a side of a floor, at the corners that are given for its lower and its upper end, or
-    where the side ends; None without corners.
-
-    From one corner alone it has the direction in which photographs show the strongest edge.
-    """
+    """Return the (2,) ends of the wall on a side of a floor: at the corners given for its lower and its upper end, or
+    where the side ends. None without corners. From a single corner the wall takes the direction in which photographs
+    show the strongest edge."""
     (low, high), axis = ends, 1 - side.across
     if low and high:
         run = high.place - low.place
@@ -221,8 +222,8 @@ def _line(
 def _ends_at(
     line: tuple[np.ndarray, np.ndarray], inward: np.ndarray, places: np.ndarray, margin: np.ndarray, near: float
 ) -> bool:
-    """Whether a floor, of which (P, 2) places are known to a (P,) margin, is known along half of a line, in a strip as
-    wide as `near`, and ends there."""
+    """Return whether a floor, with points at (P, 2) `places` known to a (P,) `margin`, is known along half of a line,
+    in a strip of width `near`, and ends there."""
     start, run = line[0], line[1] - line[0]
     length = float(np.linalg.norm(run))
     across = np.array([-run[1], run[0]]) / length
@@ -239,7 +240,7 @@ def _ends_at(
 def _wall(
     floor: EnclosingPlane, line: tuple[np.ndarray, np.ndarray], inward: np.ndarray, height: float, inner: bool
 ) -> EnclosingPlane:
-    """The wall over a line on a floor, seen from the side where `inward` (3,) points."""
+    """Return the wall over a line on a floor, its normal on the side of `inward` (3,)."""
     start, end = (floor.at(place) for place in line)
     direction = (end - start) / np.linalg.norm(end - start)
     normal = np.cross(direction, floor.normal)
@@ -252,7 +253,7 @@ def _wall(
 def _is_shown(
     wall: EnclosingPlane, floor: EnclosingPlane, line: tuple[np.ndarray, np.ndarray], edges: EdgeImages
 ) -> bool:
-    """Whether photographs show the line on a floor over which a wall is."""
+    """Return whether photographs show an edge along the line on which a wall stands on a floor."""
     near = floor.at(np.stack(line))
     return clearest_line(wall.as_vector(), floor.as_vector(), near, edges, CONFIRMED_DEPTH) is not None
 
@@ -263,7 +264,7 @@ def _is_seen_past(
     known: Sequence[np.ndarray],
     backgrounds: Sequence[np.ndarray],
 ) -> bool:
-    """Whether views see a background in place of a wall."""
+    """Return whether most views see a background in place of a wall."""
     steps = (np.arange(PLACES) + 0.5) / PLACES
     share = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
     places = wall.at(wall.own[0] + share * np.diff(wall.own, axis=0))
@@ -278,4 +279,5 @@ def _is_seen_past(
 
 
 def _longer_side(floor: EnclosingPlane) -> float:
+    """Return the length of the longer side of a floor's rectangle."""
     return float(np.diff(floor.own, axis=0).max())

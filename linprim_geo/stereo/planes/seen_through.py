@@ -1,8 +1,8 @@
-"""Depths in the air: other photographs see through them.
+"""Detect false depths in the air, through which other views see surfaces behind.
 
-Beside the outline of a thing before a plain wall nothing but the outline can be matched. Stereo gives its depth to the
-wall beside it, up to ten pixels wide, and photographs from about the same place confirm that. It is a flap in the air:
-photographs from elsewhere see through it what is behind.
+Beside the outline of an object in front of a plain wall, only the outline can be matched. Stereo gives its depth to the
+wall up to ten pixels beside it, and views from nearby confirm that. Views from elsewhere see through this false
+surface.
 """
 
 from __future__ import annotations
@@ -16,17 +16,18 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels import surface_ops
 from linprim_geo.stereo.planes.plain_regions import BEHIND, TOLERANCE, rays_of, to_world
 
-# What a view knows is behind a point, and not at it, from this share of the depth on.
+# A view sees through a point if its known depth is behind the point by more than this share of the depth.
 MARGIN = BEHIND * TOLERANCE
-# A point is in the air if at least so many views see through it, and more than this share of those that know a surface
-# at it: a single depth may be wrong.
+# A point is in the air if at least SEEING views see through it, and more than the share SEEING_SHARE of the views that
+# know a surface at it: a single depth may be wrong.
 SEEING, SEEING_SHARE = 2, 0.25
-# The nearest depth of the square of this side around a pixel counts: a point beside an outline may be of either side.
+# The side in pixels of the square around a pixel of which the nearest depth counts: beside an outline, a point may be
+# on either side.
 AROUND = 3
 
 
 class KnownDepths:
-    """What views know: (H, W) `depths` of each of the `cameras`, NaN where they know nothing."""
+    """The depths that views know: (H, W) `depths` of each of the `cameras`, NaN where unknown."""
 
     def __init__(self, cameras: Sequence[Camera], depths: Iterable[np.ndarray]):
         self.cameras = cameras
@@ -35,19 +36,18 @@ class KnownDepths:
         ]
 
     def see_through(self, points: np.ndarray) -> np.ndarray:
-        """(P,) bool which of (P, 3) points of the world are in the air."""
+        """Return (P,) bool: which of (P, 3) points of the world are in the air."""
         looking, knowing = surface_ops.count_looking_views(self.views, np.ascontiguousarray(points), MARGIN)
         through = looking - knowing
         return (through >= SEEING) & (through > SEEING_SHARE * knowing)
 
     def know(self, points: np.ndarray) -> np.ndarray:
-        """(P,) bool which of (P, 3) points of the world more views know a surface at than see through."""
+        """Return (P,) bool: at which of (P, 3) points of the world more views know a surface than see through."""
         looking, knowing = surface_ops.count_looking_views(self.views, np.ascontiguousarray(points), MARGIN)
         return 2 * knowing > looking
 
     def clear(self, depths: Sequence[np.ndarray], asked: Sequence[np.ndarray]) -> None:
-        """Makes (H, W) `depths` of every view, NaN where there are none, NaN where they are in the air, too, of the
-        pixels that are `asked` (H, W) for."""
+        """Set (H, W) `depths` of every view to NaN in place where they are in the air, at the `asked` (H, W) pixels."""
         for camera, depth, where in zip(self.cameras, depths, asked, strict=True):
             row, column = np.nonzero(where & np.isfinite(depth))
             air = self.see_through(to_world(camera, rays_of(camera, row, column) * depth[row, column, None]))
@@ -55,7 +55,7 @@ class KnownDepths:
 
 
 def _nearest_around(depth: np.ndarray) -> np.ndarray:
-    """(H, W) float32, the nearest depth around each pixel that has one; 0 elsewhere, as who knows nothing sees through
-    nothing."""
+    """Return the (H, W) float32 nearest depth around each pixel that has one; 0 elsewhere, with which a view sees
+    through nothing."""
     known = np.isfinite(depth)
     return np.where(known, minimum_filter(np.where(known, depth, np.inf), AROUND), 0).astype(np.float32)

@@ -1,8 +1,9 @@
-"""Where in its view a region's shading is carried by a plane, and what points along the region's edges say against it.
+"""The pixels of a region whose shading a plane carries, and which plane the points along the region's edges favour.
 
-Faint shading is carried as well by a plane that is turned by many degrees, or by one that is some per cent farther;
-points along edges tell such planes apart. These err where an occluder's edges are taken for the region's own, which the
-shading that their plane leaves gives away."""
+Faint shading is explained as well by a plane turned by many degrees, or some per cent farther. Points along edges tell
+such planes apart, but err if the edges of an occluder are taken for the region's own. The larger residual of shading
+then shows that.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +20,8 @@ from linprim_geo.stereo.planes.shading import ShadedRegion, Shading, evaluate
 
 @dataclass(frozen=True, eq=False)
 class ShadedArea:
-    """The `number` of the plane that carries the shading of a region, in the pixels `where` (H, W) bool of its view's
-    shading."""
+    """The pixels `where` (H, W) bool, in the small photograph of a view's shading, in which plane `number` carries a
+    region's shading."""
 
     region: ShadedRegion
     number: int
@@ -28,8 +29,8 @@ class ShadedArea:
 
 
 def best_first(carriers: dict[int, np.ndarray], carried: np.ndarray) -> list[int]:
-    """The numbers of those `carriers` that carry about as many boxes of a region as any does, by (N,) bool which of
-    these: first the one with most of `carried` (K,)."""
+    """Return the numbers of those `carriers` that carry about as many boxes of a region as any does, first the one with
+    the highest `carried` (K,). `carriers` has (N,) bool of each plane: the boxes that it carries."""
     most = max(np.count_nonzero(boxes) for boxes in carriers.values())
     as_well = [k for k, boxes in carriers.items() if HARDLY_MORE * np.count_nonzero(boxes) >= most]
     return sorted(as_well, key=lambda k: carried[k], reverse=True)
@@ -38,8 +39,8 @@ def best_first(carriers: dict[int, np.ndarray], carried: np.ndarray) -> list[int
 def told_by_edges(
     area: ShadedArea, along_edges: np.ndarray, planes: np.ndarray, shadings: Sequence[Shading]
 ) -> ShadedArea:
-    """The area on the plane that points along edges tell, if it carries the region's shading as well as the area's own;
-    the area itself if it does not, or if both are the same within TOLERANCE.
+    """Return the area on the plane that points along edges favour, if it carries the region's shading as well as the
+    area's own plane. Return the area unchanged if not, or if both planes are the same within TOLERANCE.
 
     Args:
         along_edges: (H, W) numbers of the planes on which pixels of the view lie by points along edges, -1 elsewhere.

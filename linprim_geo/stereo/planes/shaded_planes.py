@@ -1,9 +1,9 @@
-"""Depth of painted walls: planes that are photo-consistent on shading alone.
+"""Planes of painted walls without texture, by photo-consistency of their shading.
 
-A plane is fitted to every plain region of every photograph that stereo says little about (`shading.py`). Where regions
-of several photographs agree their plane is fitted to all of them together, and to what stereo knows along their edges.
-Every region then gets one plane of those that explain ("carry") its shading as well as its own does. Walls without
-shading, and whatever is not flat, get none.
+A plane is fitted to each plain region of each photograph of which stereo knows little (`shading.py`). Regions of
+several photographs with similar planes are fitted together, also to confirmed depths along their edges. Each region
+then gets one of the planes that explain ("carry") its shading as well as its own plane does. Walls without shading and
+curved surfaces get none.
 """
 
 from __future__ import annotations
@@ -53,33 +53,33 @@ from linprim_geo.stereo.planes.shading import (
 )
 from linprim_geo.stereo.vignetting import vignetting
 
-# Views that a region is compared with, at most and at least.
+# The most and the fewest views with which a region is compared.
 MOST_VIEWS, LEAST_VIEWS = 8, 3
-# Boxes of a region that are compared in the first steps from every start (then MOST_BOXES), and how many steps.
+# Boxes of a region compared in the first steps from each start (later MOST_BOXES), and the number of these steps.
 FIRST_BOXES, FIRST_STEPS = 200, 6
-# A plane carries a region's shading if no more than this share of its deviation is left, and one of other regions if
-# no more than OTHERS_SHARE and hardly more than the region's own plane leaves, or AS_WELL times as much where it is
-# near that one: paint that shines makes up as much.
+# A plane carries a region's shading if its residual is at most the share LEFT_SHARE of the region's deviation; a plane
+# of other regions if at most OTHERS_SHARE and HARDLY_MORE times that of the region's own plane, or AS_WELL times where
+# it is near that one: glossy paint causes as much.
 LEFT_SHARE, OTHERS_SHARE = 0.2, 0.25
-# Noise leaves one deviation: where this is left, smoothed, another surface is. Most of a flat region is below: tone
-# curves and vignetting leave more at its ends (DECISIONS 57).
+# Noise leaves a smoothed residual of one deviation; more shows another surface. At least FLAT_SHARE of a flat region is
+# below MOST_LEFT: tone curves and vignetting leave more at its ends (DECISIONS 57).
 MOST_LEFT, FLAT_SHARE = 1.3, 0.75
-# A region's own plane is known to this share of its depth, or better; several regions know theirs better together.
+# The depth of a region's own plane is known to this share or better; several regions together know it better.
 CERTAIN = 2 * CONFIRMED_DEPTH
-# Planes of regions are taken together if they differ by no more than this, and by ALIKE_DEPTH.
+# Planes of regions are fitted together if their normals differ by at most this angle, and their depths by ALIKE_DEPTH.
 ALIKE_ANGLE = 4 * SAME_ANGLE
-# A background is so many times as far as a region's other depths.
+# The background is so many times as far as the depth of a region.
 FAR = 1e4
-# A plane by points is off by no more if these are half as wide as they are far.
+# Planes by points that are off the room's frame by more radians are askew: the error of one half as wide as far.
 ASKEW = 2 * TOLERANCE
-# A plane carries a region if it does so around half of its boxes.
+# A plane carries a region if it explains the shading around half of its boxes.
 CARRIED_SHARE = 0.5
 
 
 @dataclass(frozen=True)
 class FittedRegion:
-    """A region, what share of its deviation a plane that carries it may leave, and the fit of its own plane if that one
-    carries it and is certain."""
+    """A region, the largest residual that a plane carrying it may have as a share of its deviation, and the fit of its
+    own plane, None unless that carries it and is certain."""
 
     region: ShadedRegion
     most_left: float
@@ -87,18 +87,18 @@ class FittedRegion:
 
 
 class ShadedPlanes:
-    """`planes` (K, 4) of the world that carry the shading of plain regions in several views, the known ones first.
+    """`planes` (K, 4) of the world that carry the shading of plain regions in several views, the given ones first.
 
-    Those `standing` (K,) are walls set on the line along which they meet a floor or another wall. Those `hanging` (K,)
-    have their points on what is before such a wall, which is among the others.
+    `standing` (K,) bool marks walls set on the line where they meet a floor or another wall. `hanging` (K,) bool marks
+    planes by points that are on objects in front of such a wall, which is among the others.
 
     Args:
-        maps: of all views.
+        maps: depth maps of all views.
         depths: (H, W) confirmed depth of each view, NaN elsewhere.
-        rendered: (H, W) rendered depth of each view, 0 where there is none.
-        by_points: (K, 4) planes with confirmed points all over; they stay as they are.
-        by_edges: (K, 4) planes that points along edges have given; shading makes them more exact, but those along the
-            frame of the planes `by_points` stay beside what it makes of them.
+        rendered: (H, W) rendered depth of each view, 0 where none.
+        by_points: (K, 4) planes with confirmed points all over; they are not changed.
+        by_edges: (K, 4) planes fitted to points along edges. Shading refines them; those along the frame of the planes
+            `by_points` are kept unrefined, too.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class ShadedPlanes:
         held = HeldPlanes(self.shadings, self.depths, carried)
         off_frame, told = self._off_frame(), set(range(self.by_points, self.given_count))
         along = {k for k in told if off_frame[k] < RIGHT}
-        # Edges say well where a plane along the frame is, but the region may be of one that is nearly flush with it.
+        # Edges fix a plane along the frame well, but the region may be on another nearly flush with it.
         twice = [k for k in sorted(along) if carried[k]]
         told.update(range(len(self.planes), len(self.planes) + len(twice)))
         self.planes = np.concatenate([self.planes, self.planes[twice]])
@@ -149,9 +149,9 @@ class ShadedPlanes:
         return self.small_cameras[region.view]
 
     def _started(self, region: ShadedRegion, rendered: np.ndarray) -> tuple[ShadedRegion, list[np.ndarray]] | None:
-        """A region with its depth and the views that show it, and planes to start from; None for one whose shading is
-        lost in the noise, or that too few views show."""
-        # What noise leaves is too large a share of less.
+        """Return a region with its depth and the views that show it, and planes to start from. None if noise hides its
+        shading, or too few views show it."""
+        # Below this variance, too large a share is noise.
         if np.var(region.value) < 2 * self.shadings[region.view].noise / OTHERS_SHARE**2:
             return None
         starts = starting_planes(region, self.depths[region.view], rendered)
@@ -163,7 +163,7 @@ class ShadedPlanes:
         return (region, starts) if len(region.others) >= LEAST_VIEWS else None
 
     def _fitted(self, region: ShadedRegion, starts: Sequence[np.ndarray]) -> FittedRegion | None:
-        """None for a region that too few views show by any plane, and for a background."""
+        """Fit the region's own plane; None if too few views show it with any plane, or it is a background."""
         camera = self._camera(region)
         few = [region.some(FIRST_BOXES)]
         tried = [fit_plane(in_world(camera, start), few, self.shadings, FIRST_STEPS) for start in starts]
@@ -179,18 +179,18 @@ class ShadedPlanes:
         return FittedRegion(region, most, fit if flat and self._certain(region, fit) else None)
 
     def _is_far(self, region: ShadedRegion, fit: Fit) -> bool:
-        """Whether a plane without parallax carries a region's shading as well as a fit does: a sky."""
+        """Return whether a plane without parallax carries a region's shading as well as the fit: a sky."""
         far = self._far(region.some(MOST_BOXES))
         return far is not None and far.left < HARDLY_MORE * fit.left
 
     def _far(self, region: ShadedRegion, least: int = LEAST_VIEWS) -> Fit | None:
-        """How a background carries the shading of a region; None if too few views show it."""
+        """Evaluate a plane at infinity on the shading of a region; None if too few views show it."""
         plane = in_world(self._camera(region), np.array([0, 0, 1 / (FAR * region.depth)]))
         far = evaluate(plane, [region], self.shadings)
         return far if far is not None and far.views >= least else None
 
     def is_background(self, view: int) -> np.ndarray:
-        """(H, W) bool: regions of a view whose shading a background carries better than any plane that may move."""
+        """(H, W) bool: regions of a view whose shading a background carries better than any movable plane."""
         background = self._nowhere(view)
         for region in self.shown[view]:
             few = region.some(FIRST_BOXES)
@@ -203,8 +203,8 @@ class ShadedPlanes:
         return background
 
     def is_wall(self, view: int, asked: np.ndarray) -> np.ndarray:
-        """(H, W) bool: regions of a view, of those with a pixel that is `asked` (H, W), whose shading one of the planes
-        carries clearly better than a background. Where no other view looks past the planes that way, nothing tells."""
+        """Return (H, W) bool: regions of a view with a pixel `asked` (H, W) whose shading a plane carries clearly
+        better than a background. Where no other view looks past the planes in that direction, none is marked."""
         wall, small = self._nowhere(view), self.shadings[view].small(asked)
         for region in self.shown[view]:
             if not small[region.row, region.column].any():
@@ -217,7 +217,7 @@ class ShadedPlanes:
         return wall
 
     def _fits(self, region: ShadedRegion) -> Iterator[Fit]:
-        """How the planes that all rays of a region meet carry its shading, where enough views show it."""
+        """Yield the fit to a region's shading of each plane that all its rays meet, if enough views show it."""
         for plane, local in zip(self.planes, in_camera(self._camera(region), self.planes), strict=True):
             if (region.rays @ local > 0).all():
                 fit = evaluate(plane, [region], self.shadings)
@@ -225,23 +225,23 @@ class ShadedPlanes:
                     yield fit
 
     def _in_all_views(self, region: ShadedRegion) -> ShadedRegion:
-        """A region compared with all other views: those that show it at its depth may not show it far away."""
+        """Compare a region with all other views: those that show it at its depth may not show it at infinity."""
         return replace(region, others=tuple(k for k in range(len(self.shadings)) if k != region.view))
 
     def _nowhere(self, view: int) -> np.ndarray:
-        """(H, W) bool of a view, none of it."""
+        """Return (H, W) bool of a view, all false."""
         camera = self.cameras[view]
         return np.zeros((camera.height, camera.width), bool)
 
     def _mark(self, marked: np.ndarray, region: ShadedRegion) -> None:
-        """Marks the pixels of a region in (H, W) bool of its view."""
+        """Set the pixels of a region in a mask (H, W) of its view."""
         shading = self.shadings[region.view]
         around = binary_dilation(shading.area_of(region), iterations=BOX)
         row, column = np.nonzero(around.repeat(shading.factor, 0).repeat(shading.factor, 1))
         marked[row, column] = True
 
     def _certain(self, region: ShadedRegion, fit: Fit) -> bool:
-        """Whether a fit to a region carries its shading, is certain, and is not contradicted."""
+        """Return whether a fit carries a region's shading with a small error of depth, and is not contradicted."""
         camera = self._camera(region)
         if fit.left_share > LEFT_SHARE or depth_deviation(fit, region, camera) > CERTAIN:
             return False
@@ -249,7 +249,7 @@ class ShadedPlanes:
         return bool((inverse > 0).all()) and not self._contradicted(region, inverse)
 
     def _others(self, region: ShadedRegion) -> tuple[int, ...]:
-        """Views that show a region, from near and far places."""
+        """Return the views that show a region, from near and from far positions."""
         camera = self._camera(region)
         points, shown = to_world(camera, region.some(LEAST_BOXES).rays * region.depth), []
         for view, shading in enumerate(self.shadings):
@@ -260,14 +260,14 @@ class ShadedPlanes:
         return tuple(shown[k] for k in picked)
 
     def _contradicted(self, region: ShadedRegion, inverse: np.ndarray) -> bool:
-        """Whether stereo is sure of other depths within a region than the (N,) `inverse` ones, NaN where unknown."""
+        """Return whether sure depths of a region disagree with (N,) `inverse` depths, NaN where unknown."""
         sure = self.depths[region.view][region.row, region.column]
         known = np.isfinite(sure) & np.isfinite(inverse)
         agree = np.abs(inverse[known] * sure[known] - 1) < 3 * CONFIRMED_DEPTH
         return len(agree) >= max(SURE_DEPTHS, SURE_SHARE * len(sure)) and agree.mean() < AGREEING
 
     def _common(self, fitted: list[FittedRegion]) -> np.ndarray:
-        """The known planes, and those of regions in several views that none of these carries."""
+        """Return the given planes, and those fitted to regions of several views that none of the given ones carries."""
         planes = list(self.given)
         fitted = [one for one in fitted if not any(self._carries(plane, one) for plane in planes)]
         boxes = np.array([len(one.region.row) for one in fitted])
@@ -287,7 +287,7 @@ class ShadedPlanes:
         return np.array(planes).reshape(-1, 4)
 
     def _alike(self, fitted: list[FittedRegion]) -> np.ndarray:
-        """(N, N) bool whose planes are alike: every one with itself."""
+        """Return (N, N) bool: which regions have similar planes; each is similar to itself."""
         planes = np.array([_plane(one) for one in fitted]).reshape(-1, 4)
         alike = np.abs(planes[:, :3] @ planes[:, :3].T) > np.cos(ALIKE_ANGLE)
         for k, one in enumerate(fitted):
@@ -296,7 +296,7 @@ class ShadedPlanes:
         return alike
 
     def _of_several_views(self, plane: np.ndarray, regions: Sequence[ShadedRegion]) -> bool:
-        """Whether regions of enough views lie on a plane, and views from directions that differ were compared."""
+        """Return whether regions of enough views lie on a plane, and views from different directions were compared."""
         finding = {region.view for region in regions}
         if len(finding) < LEAST_VIEWS:
             return False
@@ -308,7 +308,7 @@ class ShadedPlanes:
         return seen_enough(self.small_cameras, views, np.mean(middles, axis=0))
 
     def _carries(self, plane: np.ndarray, one: FittedRegion) -> bool:
-        """Whether a plane leaves hardly more of a region's shading than the region's own, of as many boxes."""
+        """Return whether a plane leaves hardly more of a region's shading than its own one, of as many boxes."""
         if (one.region.rays @ in_camera(self._camera(one.region), plane[None])[0] <= 0).any():
             return False
         found, own = evaluate(plane, [one.region.some(MOST_BOXES)], self.shadings), one.fit
@@ -317,7 +317,7 @@ class ShadedPlanes:
         return found.boxes > 0.7 * own.boxes and found.left < HARDLY_MORE * own.left
 
     def _carriers(self, one: FittedRegion) -> dict[int, np.ndarray]:
-        """The planes that carry a region's shading, and (N,) bool around which of its boxes."""
+        """Return the planes that carry a region's shading, each with (N,) bool: around which of its boxes."""
         region, carriers = one.region, {}
         for k, plane in enumerate(in_camera(self._camera(region), self.planes)):
             inverse = region.rays @ plane
@@ -332,8 +332,8 @@ class ShadedPlanes:
         return carriers
 
     def _may_leave(self, one: FittedRegion, inverse: np.ndarray) -> float:
-        """What share of a region's deviation a plane with (N,) `inverse` depths there may leave: as much as true planes
-        do if it is where the region's own plane is, as far as shading tells."""
+        """Return the largest residual that a plane with (N,) `inverse` depths may leave of a region, as a share of its
+        deviation: as much as true planes do if the plane is near the region's own, within the accuracy of shading."""
         if one.fit is None:
             return one.most_left
         own = one.region.rays @ in_camera(self._camera(one.region), one.fit.plane[None])[0]
@@ -341,16 +341,16 @@ class ShadedPlanes:
         return min(AS_WELL * one.fit.left_share, OTHERS_SHARE) if near else one.most_left
 
     def _all_carriers(self) -> list[list[dict[int, np.ndarray]]]:
-        """`_carriers` of the regions of each view."""
+        """Return `_carriers` of the regions of each view."""
         return [[self._carriers(one) for one in own] for own in self.regions]
 
     def _take_originals(self, carriers: Sequence[Sequence[dict[int, np.ndarray]]]) -> list[list[ShadedRegion]]:
-        """Keeps the planes but for copies, of whose boxes another one carries most; returns the regions that each
-        carries, none where they are of too few views.
+        """Remove duplicate planes: those of whose boxes another one carries most. Return the regions that each kept
+        plane carries, none where they are of too few views.
 
-        A plane by edges that is one by points takes its place and stays as it is, as if it carried nothing, unless that
-        one is askew. Two by edges are told apart by their points, although faint shading may be carried by both; these
-        tell more than shading does of planes that shading alone has given, too.
+        A plane by edges that is the same as one by points is set to it and then not changed, as if it carried no
+        region, unless that one is askew. Two planes by edges are duplicates only if they are as near as points tell, as
+        faint shading may be carried by both. Planes by edges take precedence over those of shading alone.
         """
         count = len(self.planes)
         shared, carried = np.zeros((count, count)), [list[ShadedRegion]() for _ in range(count)]
@@ -375,17 +375,17 @@ class ShadedPlanes:
         return [carried[k] if self._of_several_views(self.planes[at], carried[k]) else [] for at, k in enumerate(kept)]
 
     def _most_apart(self, first: int, second: int, off_frame: np.ndarray) -> float:
-        """The share of the depth by which copies of each other differ at most, by how far planes are `off_frame`."""
+        """Return the share of the depth by which duplicates may differ, by the planes' angles `off_frame` (K,)."""
         by_edges = TOLERANCE if off_frame[[first, second]].max() < RIGHT else BEHIND * TOLERANCE
         return by_edges if max(first, second) < self.given_count else ALIKE_DEPTH
 
     def _off_frame(self) -> np.ndarray:
-        """(K,) by what angle planes are off the frame of those by points; infinite where these have none."""
+        """Return (K,) angles of the planes to the frame of those by points; infinite if these have no frame."""
         frame = frame_of(self.planes[: self.by_points, :3])
         return np.full(len(self.planes), np.inf) if frame is None else angles_to(frame, self.planes[:, :3])
 
     def _same(self, first: int, second: int, regions: Sequence[ShadedRegion], tolerance: float) -> bool:
-        """Whether two planes have nearly one direction, and over regions one inverse depth in the median."""
+        """Return whether two planes have nearly the same normal and, over the regions, median inverse depth."""
         planes = self.planes[[first, second]]
         if not regions or abs(planes[0, :3] @ planes[1, :3]) < np.cos(ALIKE_ANGLE):
             return False
@@ -394,19 +394,19 @@ class ShadedPlanes:
         return bool(np.median(np.abs(one / other - 1)) < tolerance)
 
     def areas(self, along_edges: Sequence[np.ndarray]) -> list[list[ShadedArea]]:
-        """Of every view, each of its regions on one plane where that carries its shading.
+        """Return for every view the areas in which one plane each carries a region's shading.
 
-        Of planes that do so as well, such as those of one wall, the one is taken on which a region lies by points
-        `along_edges` ((H, W) numbers of planes, -1 elsewhere), or that carries most in all views, but none where fewer
-        than LEAST_VIEWS, with this one, know a surface on it, or from one direction only: floors go on behind walls. Of
-        planes with points all over that has to be a confirmed one, not one that a region of another view supposes.
+        Of planes that do so equally well, as of one wall, the one counts on which the region lies by points
+        `along_edges` ((H, W) numbers of planes, -1 elsewhere), or else that carries most in all views. It has to be on
+        a surface known to LEAST_VIEWS views, this one included, from different directions: floors continue behind
+        walls. For planes with points all over, only confirmed depths of other views count, not depths supposed there.
         """
         areas = [
             [self._told_first(of_region, along) for of_region in own]
             for own, along in zip(self.candidates, along_edges, strict=True)
         ]
         supposed = [[of_region[0] for of_region in own] for own in areas]
-        # What a view has supposed that no other knows is no support for these, if it knows something else.
+        # An area that no other view knows does not support those of others if its region has another that is known.
         for _ in range(2):
             surfaces, before = self._surfaces(supposed), supposed
             known = [self._known(view, own, surfaces) for view, own in enumerate(areas)]
@@ -420,8 +420,8 @@ class ShadedPlanes:
 
     @cached_property
     def candidates(self) -> list[list[list[ShadedArea]]]:
-        """Of every view, for each region that a plane carries: the areas on the planes that carry about as many of its
-        boxes as any does, first the one that carries most in all views."""
+        """For every view and each region that a plane carries: the areas on the planes that carry about as many of its
+        boxes as any does, first the plane that carries most in all views."""
         carriers, carried = self._all_carriers(), np.zeros(len(self.planes))
         for own in carriers:
             for of_region in own:
@@ -438,16 +438,16 @@ class ShadedPlanes:
         ]
 
     def _told_first(self, areas: list[ShadedArea], along_edges: np.ndarray) -> list[ShadedArea]:
-        """The areas of a region, before them the one that points `along_edges` tell if that is another."""
+        """Return the areas of a region, first the one that points `along_edges` favour, if another."""
         told = told_by_edges(areas[0], along_edges, self.planes, self.shadings)
         return areas if told is areas[0] else [told, *areas]
 
     def _area(self, region: ShadedRegion, boxes: np.ndarray, number: int) -> ShadedArea:
-        """Around those boxes of a region that a plane carries."""
+        """Return the area around those boxes of a region that a plane carries."""
         return ShadedArea(region, number, around_boxes(self.shadings[region.view].area_of(region), region, boxes))
 
     def depth_maps(self, areas: Sequence[Sequence[ShadedArea]]) -> list[np.ndarray]:
-        """(H, W) float32 depth of every view's `areas`, NaN elsewhere."""
+        """Return the (H, W) float32 depth of every view's `areas`, NaN elsewhere."""
         result = []
         for camera, shading, own in zip(self.cameras, self.shadings, areas, strict=True):
             number = self._numbers(shading, own).repeat(shading.factor, 0).repeat(shading.factor, 1)
@@ -457,7 +457,7 @@ class ShadedPlanes:
     def _known(
         self, view: int, areas: Sequence[Sequence[ShadedArea]], surfaces: CommonSurfaces
     ) -> list[ShadedArea | None]:
-        """Of the areas of each of a view's regions the first one where enough views know a surface."""
+        """Return for each region of a view the first of its areas on a surface that enough views know, or None."""
         camera, shading = self.small_cameras[view], self.shadings[view]
         every = [area for of_region in areas for area in of_region]
         depths = [self._depth(camera, self._numbers(shading, [area])) for area in every]
@@ -473,20 +473,20 @@ class ShadedPlanes:
         return [next(iter(of_region), None) for of_region in of_regions]
 
     def _surfaces(self, supposed: Sequence[Sequence[ShadedArea]]) -> CommonSurfaces:
-        """What all views know: confirmed depths, and those of the areas that each one has `supposed`."""
+        """Return what all views know: confirmed depths, and depths of the areas that each has `supposed`."""
         views = zip(self.small_cameras, self.shadings, supposed, strict=True)
         depths = [self._depth(camera, self._numbers(shading, own)) for camera, shading, own in views]
         return CommonSurfaces(self.small_cameras, self.depths, depths)
 
     def _numbers(self, shading: Shading, areas: Sequence[ShadedArea]) -> np.ndarray:
-        """(H, W) numbers of the planes of a view's areas, -1 elsewhere."""
+        """Return (H, W) numbers of the planes of a view's areas, -1 elsewhere."""
         number = np.full(shading.plain.shape, -1)
         for area in areas:
             number[area.where] = np.maximum(number[area.where], area.number)
         return number
 
     def _depth(self, camera: Camera, number: np.ndarray) -> np.ndarray:
-        """(H, W) float32 depth of the planes that `number` names, NaN for -1."""
+        """Return the (H, W) float32 depth of the planes with these numbers (H, W), NaN for -1."""
         depth = np.full((camera.height, camera.width), np.nan, np.float32)
         row, column = np.nonzero(number >= 0)
         planes = in_camera(camera, self.planes)[number[row, column]]

@@ -1,8 +1,8 @@
-"""Surfaces on which photographs show different colours.
+"""Reject surfaces on which photographs show different colours.
 
-Between balusters stereo sees nothing but their edges, and so a plane through these closes the railing. What shows
-through it changes with the place of the camera: here the wall behind, there a door, the stairs. What is on a plane has
-one colour in all photographs, but for their exposure.
+Between balusters stereo matches only their edges, so that a plane through these closes the gaps. What shows in the gaps
+depends on the position of the camera: a wall, a door, the stairs. A point on a true surface has one colour in all
+photographs, apart from exposure.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.planes.plain_regions import LEAST_POINTS, LEAST_VIEWS, rays_of, to_world
 from linprim_geo.stereo.planes.seen_through import MARGIN
 
-# Points of a view by which its exposure is compared with those of others, and the fewest that another has to know.
+# Points of a view by which its exposure is compared with other views, and the fewest that another view has to know.
 TRIED_POINTS, COMMON_POINTS = 1000, 2 * LEAST_POINTS
-# A point has another colour if red, green or blue differs by more than this share, exposure aside, and a surface if
-# most of its points have in most views. Gloss changes dark things by less (DECISIONS 147).
+# A point has another colour if red, green or blue differs by more than this share after correction of exposure. A
+# surface has other colours in a view if most of its points do. Gloss changes dark objects by less (DECISIONS 147).
 OTHER = 0.15
-# Values from which on they are clipped, of 255, and what is added to all: what is dark shines, and is noise.
+# Values from CLIPPED of 255 on count as clipped. DARK is added to all values, as dark pixels are glossy and noisy.
 CLIPPED, DARK = 245.0, 32.0
-# Points of a surface that are compared at most, and the fewest that another view has to see.
+# The most points of a surface that are compared, and the fewest that another view has to see.
 COMPARED, FEWEST = 100, 10
-# Views that look along a surface, by the cosine to its normal, are not compared.
+# Views at grazing angles are not compared: the least cosine of the viewing direction to the normal.
 STEEPEST = 0.25
 
 
 class ShownColours:
-    """The colours that views show. (H, W) `known` depths of each, NaN elsewhere, hide what is behind them, and tell by
-    how much one photograph is lighter than another."""
+    """The colours of all views. The `known` depths (H, W) of each, NaN elsewhere, tell which points are hidden, and the
+    exposure of each view relative to others."""
 
     def __init__(self, maps: Sequence[DepthMap], known: Sequence[np.ndarray], seed: int = 0):
         self.size = np.array([[found.camera.width // 2, found.camera.height // 2] for found in maps])
@@ -58,8 +58,8 @@ class ShownColours:
                 self.gain[view, other] = np.median(ratio[other, both[other]], axis=0)
 
     def differ(self, view: int, points: np.ndarray, normal: np.ndarray) -> bool:
-        """Whether (P, 3) points that a view shows, of a plane with this normal, have other colours in most of the views
-        that look onto it from the same side; not if these are fewer than LEAST_VIEWS."""
+        """Return whether (P, 3) points of a plane with this normal, shown by a view, have other colours in most views
+        that see the same side of it. False if fewer than LEAST_VIEWS see it."""
         if not len(points):
             return False
         points = points[:: -(-len(points) // COMPARED)]
@@ -76,8 +76,8 @@ class ShownColours:
         return bool(asked.sum() >= LEAST_VIEWS and np.mean(2 * others[asked] > count[asked]) > 0.5)
 
     def _pixels(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(V, P) of points in each view: the number of its block of 2 by 2 pixels, the depth, and whether it is in the
-        image."""
+        """Project (P, 3) points to all views. Return (V, P) indices of blocks of 2 by 2 pixels, depths, and whether the
+        point is in the image."""
         local = np.einsum("vij,pj->vpi", self.pose[:, :, :3], points) + self.pose[:, None, :, 3]
         along = local[..., 2]
         before = along > 0
@@ -89,8 +89,8 @@ class ShownColours:
 
 
 def _log_colours(found: DepthMap) -> np.ndarray:
-    """(H // 2, W // 2, 3) float32 logarithms of red, green and blue in means of 2 by 2 pixels, NaN where one is
-    clipped."""
+    """Return the (H // 2, W // 2, 3) float32 logarithms of red, green and blue, DARK added, in means of 2 by 2 pixels;
+    NaN where one is clipped."""
     height, width = (size // 2 for size in found.grey.shape)
     grey = found.grey[: 2 * height, : 2 * width].reshape(height, 2, width, 2).mean((1, 3), dtype=np.float32)
     values = np.repeat(grey[..., None], 3, axis=2) if found.colours is None else rgb_of(grey, found.colours)
@@ -98,7 +98,7 @@ def _log_colours(found: DepthMap) -> np.ndarray:
 
 
 def _nearest_of_four(depth: np.ndarray) -> np.ndarray:
-    """(H // 2, W // 2) the nearest depth of each 2 by 2 pixels, infinite where none is known."""
+    """Return the (H // 2, W // 2) nearest depth of each 2 by 2 pixels, infinite where none is known."""
     height, width = (size // 2 for size in depth.shape)
     known = np.where(np.isfinite(depth), depth, np.float32(np.inf))
     return known[: 2 * height, : 2 * width].reshape(height, 2, width, 2).min((1, 3))

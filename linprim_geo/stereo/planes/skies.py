@@ -1,7 +1,8 @@
-"""Whether photographs show a plain sky, which has nothing to recognise.
+"""Detect whether photographs show a plain sky.
 
-Light falls off along a wall, and clouds and haze along a sky. What the shading of a plain region shows from other
-places says where it is (`shading.py`): a sky's is explained by a direction alone, and by no plane as well.
+The brightness of a plain region varies gradually, on walls as well as on a sky with clouds and haze. How this shading
+shifts between views tells its depth (`shading.py`): that of a sky is explained by a plane at infinity, and by no nearer
+plane as well.
 """
 
 from __future__ import annotations
@@ -32,15 +33,15 @@ from linprim_geo.stereo.planes.shading import (
     starting_planes,
 )
 
-# Planes start from the depths around a region, and at so many times the median depth of the photograph.
+# Planes are started at the depths around a region, and at so many times the median depth of the photograph.
 STARTS = (1.0, 2.0, 4.0)
 
 
 def shows_sky(maps: Sequence[DepthMap]) -> list[bool]:
-    """Of every view whether it shows a plain region whose shading a background carries better than any plane: its own,
-    and those that several regions share.
+    """Return for every view whether it shows a plain region whose shading a background carries better than any plane:
+    its own, and those that several regions share.
 
-    No walls, and no floor that reflects, are taken for it (DECISIONS 89); a sky without clouds is not seen.
+    No walls and no reflecting floors are mistaken for a sky (DECISIONS 89); a sky without clouds is not detected.
     """
     cameras = [found.camera for found in maps]
     sure = [np.where(found.is_confirmed(SURE), found.depth, np.float32(np.nan)) for found in maps]
@@ -56,8 +57,8 @@ def shows_sky(maps: Sequence[DepthMap]) -> list[bool]:
 
 
 def _is_sky(region: ShadedRegion, known: np.ndarray, planes: np.ndarray, shadings: Sequence[Shading]) -> bool:
-    """Whether a region of a view with these (H, W) sure depths, NaN elsewhere, is one, and lies on none of (K, 4)
-    planes."""
+    """Return whether a region of a view is sky, given the view's sure depths `known` (H, W), NaN elsewhere, and lies on
+    none of the (K, 4) planes."""
     shading = shadings[region.view]
     if not np.isfinite(known).any():
         return False
