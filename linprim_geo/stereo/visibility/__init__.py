@@ -1,1 +1,1 @@
-"""What other views see and see through: thin things, outlines, backgrounds and gaps."""
+"""Use what other views see, or see through: thin objects, outlines, backgrounds and gaps between known points."""

@@ -1,9 +1,10 @@
-"""Parts of photographs that are far away: other photographs show them in the same direction.
+"""Find parts of photographs that are far away: other photographs show them in the same direction.
 
-Training fills a sky beside things with fog, as few photographs look past them, and windows of stereo hold their
-outlines. What lies between edges of a photograph is of one thing: where training sees background in most of it, nothing
-is known of it, and other photographs show the same grey where they look that way past everything, all of it is far. The
-side of a table, which an environment can explain as well, shows in none of them.
+Training fills the sky beside objects with fog, as few photographs look past them, and windows of stereo extend the
+objects' outlines. A connected part between edges is assumed to be one object. All of it is far if stereo knows nothing
+of it, training sees background in most of it, and other photographs show the same grey where they look in that
+direction past everything. The side of a table, which an environment map can explain as well, is not shown there by any
+of them.
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ from linprim_geo.stereo.planes.plain_regions import HALF_EDGE, grown_alike, rays
 from linprim_geo.stereo.planes.seen_through import KnownDepths
 from linprim_geo.stereo.visibility.lone_backgrounds import FAR
 
-# Of a part that is far at most such a share is known: beside the outlines of things.
+# The largest share of a far part whose depth may be known, beside the outlines of objects.
 KNOWN_SHARE = 0.1
-# More than this share of what is not known is background, and of the pixels that are looked at other photographs show
-# more than this share as well.
+# More than this share of a part's unknown pixels has to be background, and other photographs have to show more than
+# this share of its sampled pixels.
 MOST = 0.5
-# Pixels of a part that are looked at in other photographs, at most.
+# The most pixels of a part that are compared with other photographs.
 LOOKED_AT = 100
 
 
@@ -35,14 +36,15 @@ def far_parts(
     rendered: Sequence[np.ndarray],
     far: Sequence[np.ndarray],
 ) -> list[np.ndarray]:
-    """(H, W) bool of every view: what is `far`, parts between edges that are, and pixels beside both of their grey. Not
-    those whose rendered surface more views know than look past it: edges have gaps.
+    """Return (H, W) bool of every view: pixels that are `far`, parts between edges that are, and edge pixels beside
+    both of the same grey. Pixels are excluded if more views know a surface at their rendered depth than look past it,
+    as edges have gaps.
 
     Args:
-        backgrounds: (H, W) bool of every view, where training has nothing.
-        known: (H, W) depths of every view, NaN where there is none.
-        rendered: (H, W) depths of every view, 0 where there is none.
-        far: (H, W) bool of every view, regions that are known to be far.
+        backgrounds: (H, W) bool of every view, where training has rendered nothing.
+        known: (H, W) depths of every view, NaN where unknown.
+        rendered: (H, W) depths of every view, 0 where none.
+        far: (H, W) bool of every view, regions already known to be far.
     """
     if not any(some.any() for some in (*backgrounds, *far)):
         return list(far)
@@ -71,7 +73,8 @@ def far_parts(
 
 
 def _some_of_each(part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of LOOKED_AT pixels at most of each part of (H, W) numbers, where these are not 0."""
+    """Return rows and columns of at most LOOKED_AT pixels, evenly spaced, of each part in (H, W) numbers other than
+    0."""
     row, column = np.nonzero(part)
     order = np.argsort(part[row, column], kind="stable")
     row, column = row[order], column[order]
@@ -89,7 +92,8 @@ def _shown_by_others(
     column: np.ndarray,
     distance: float,
 ) -> np.ndarray:
-    """(P,) bool: which pixels of a view another photograph shows as grey, at a distance, where it is `free` (H, W)."""
+    """Return (P,) bool: which pixels of a view, placed at `distance`, another photograph shows where it is `free` (H,
+    W), in similar grey."""
     camera, grey = maps[view].camera, maps[view].grey[row, column].astype(int)
     points, shown = camera.center + camera.world_rays()[row, column] * distance, np.zeros(len(row), bool)
     for other, found in enumerate(maps):

@@ -1,9 +1,9 @@
-"""Background that one view alone looks at, where others have a surface.
+"""Find background that one view alone has, where other views know a surface.
 
-Training explains by an environment at infinity what it had no time to find a surface for. What stands at infinity is
-there for every photograph that looks that way past the scene: where none of the others agrees, and stereo of several
-has a surface, the rays end there. Beside an outline before a true background windows of stereo have a surface, too, so
-a hole counts as a whole.
+Training explains by an environment at infinity where it has not yet found a surface. A true background is at infinity
+for all photographs that look past the scene in that direction. If none of the others agrees and stereo of several knows
+a surface, that surface is taken. Windows of stereo also give surfaces beside an outline in front of a true background,
+so that a hole is decided as a whole.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.points.view_pairs import nearest_views, visible_pixels
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 
-# Each view is compared with so many that are nearest to it; at least so many have to know the surface.
+# The number of nearest views with which each view is compared, and the fewest that have to know the surface.
 COMPARED, AGREEING = 12, 3
-# More than this share of a connected part of the background has to be so: then 0.99 of the depths are right, of a
-# garden and a facade, else 0.86 to 0.94 (DECISIONS 97).
+# More than this share of a connected part of the background has to be so. Then 0.99 of the depths of a garden and a
+# facade are right, else 0.86 to 0.94 (DECISIONS 97).
 MOST = 0.5
-# Times the largest distance between cameras: from there they see the same.
+# Infinity, as a multiple of the largest distance between cameras.
 FAR = 1e4
 
 
 def lone_backgrounds(
     cameras: Sequence[Camera], backgrounds: Sequence[np.ndarray], known: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
-    """(H, W) bool of every view: holes in its background whose `known` depths other views know as well, and that none
-    of them takes for background.
+    """Return (H, W) bool of every view: holes in its background whose `known` depths other views know as well, and
+    which none of them takes for background.
 
     Args:
         backgrounds: (H, W) bool of every view.
-        known: (H, W) depths of every view, NaN where there is none.
+        known: (H, W) depths of every view, NaN where unknown.
     """
     centers = np.array([camera.center for camera in cameras])
     far = FAR * float(np.ptp(centers, axis=0).max())

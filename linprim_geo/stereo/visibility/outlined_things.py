@@ -1,12 +1,11 @@
-"""Things that are known by their outlines: where training is right and windows of stereo see nothing but an edge.
+"""Find objects whose rendered depth is bounded by their outlines (visual hull), where stereo matches edges only.
 
-Of a plain thing before something else, such as a bronze statue before houses, windows of stereo see the outlines alone.
-Every photograph sees a round thing end along another line of its surface, so depths that join these lines are too deep,
-and confirmed all the same. Training explains all photographs at once: what it renders fills the space that the outlines
-enclose. But it fills the space before plain walls as well. A rendered surface is known by its outlines if, in most of
-the views that render it, it ends at something farther on both sides, and the photograph has an edge at both ends that
-is stronger than what lies between; and if two of these views look at right angles to each other, so that the outlines
-of one bound how deep it may lie for the other.
+On a plain object in front of others, such as a bronze statue before houses, windows of stereo match the outlines alone.
+Each photograph sees the outline of a round object along another line of its surface, so that these depths are too
+large, although confirmed. Training explains all photographs at once and fills the space within the outlines, but also
+the space in front of plain walls. A rendered surface is accepted if, in most views that render it, it ends at something
+farther on both sides, at image edges stronger than what is between them; and if two of these views look at right angles
+to each other, so that the outlines of one bound the depth in the other.
 """
 
 from __future__ import annotations
@@ -21,26 +20,27 @@ from linprim_geo.points.view_pairs import visible_pixels
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.visibility.thin_things import AGREEING, SeenDepths
 
-# A surface ends where the next pixel is farther, or nearer, by more than this share of the depth.
+# A surface ends where the next pixel's depth differs by more than this share.
 ENDS = 3 * CONFIRMED_DEPTH
-# An edge is what colours differ by over ACROSS pixels, at most REACH pixels from the end of the surface: as far as the
-# blur of photographs and errors of poses move it.
+# An edge is measured as the difference of colours over ACROSS pixels, at most REACH pixels from the end of the surface:
+# blur and errors of poses move it by as much.
 ACROSS, REACH = 3, 2
-# It is stronger than so many standard deviations of the noise, and than so many times the geometric mean of the changes
-# within the surface.
+# An edge has to exceed DEVIATIONS standard deviations of the noise, and STRONGER times the geometric mean of the
+# changes within the surface.
 DEVIATIONS, STRONGER = 5.0, 3.0
-# Of the views that render a surface more than this share see it between outlines, of which two look under this angle,
-# in degrees.
+# More than the share MOST of the views that render a surface have to see it between outlines, and the directions of two
+# of them have to differ by ANGLE degrees.
 MOST, ANGLE = 0.5, 90.0
-# Points are looked at in cubes of so many pixels: all that are rendered in one are known if more than MOST are.
+# Points are grouped in cubes with sides of so many pixels; all rendered points in a cube count as known if more than
+# MOST of them are.
 CUBE = 4.0
 POINTS_AT_A_TIME, CELLS = 1 << 15, 1 << 20
 
 
 def outlined_things(views: Sequence[SeenDepths]) -> list[np.ndarray]:
-    """(H, W) bool of every view: where its rendered depth is that of a thing that is known by its outlines.
+    """Return (H, W) bool of every view: where its rendered depth is that of an object known by its outlines.
 
-    What stereo knows (`SeenDepths.known`) has no part in it. Source of the bound: Laurentini 1994, the visual hull.
+    Depths of stereo (`SeenDepths.known`) are not used. Source of the bound: Laurentini 1994, the visual hull.
     """
     outlined = [between_outlines(view) for view in views]
     seeds = [np.zeros(between.shape, bool) for between in outlined]
@@ -74,7 +74,8 @@ def outlined_things(views: Sequence[SeenDepths]) -> list[np.ndarray]:
 
 
 def between_outlines(view: SeenDepths) -> np.ndarray:
-    """(H, W) bool: what is rendered sharply and ends, along the row or the column, at outlines on both sides."""
+    """Return (H, W) bool: pixels rendered sharply whose surface ends, along the row or the column, at outlines on both
+    sides."""
     depth = np.where(view.rendered > 0, view.rendered, np.inf)
     least = DEVIATIONS * np.sqrt(view.noise)
     rgb = view.rgb.astype(np.float32)
@@ -84,10 +85,11 @@ def between_outlines(view: SeenDepths) -> np.ndarray:
 
 
 def _along_rows(depth: np.ndarray, rgb: np.ndarray, least: float) -> np.ndarray:
-    """(H, W) bool of (H, W) depths and (H, W, 3) colours: which pixels have outlines to the left and to the right."""
+    """Return (H, W) bool, given (H, W) depths and (H, W, 3) colours: which pixels have outlines to the left and to the
+    right."""
     height, width = depth.shape
-    # Border k is that on the left of pixel k; there are width + 1 of them.
-    falls = np.zeros((2, height, width + 1), bool)  # to the left of the border, and to the right, it is farther
+    # Border k is on the left of pixel k; there are width + 1 of them.
+    falls = np.zeros((2, height, width + 1), bool)  # farther on the left of the border, on the right
     falls[0, :, 1:-1] = depth[:, :-1] > (1 + ENDS) * depth[:, 1:]
     falls[1, :, 1:-1] = depth[:, 1:] > (1 + ENDS) * depth[:, :-1]
     padded = np.pad(rgb, ((0, 0), (ACROSS - 1, ACROSS), (0, 0)), mode="edge")
@@ -100,7 +102,7 @@ def _along_rows(depth: np.ndarray, rgb: np.ndarray, least: float) -> np.ndarray:
     last = np.minimum.accumulate(np.where(ends, border, width)[:, ::-1], axis=1)[:, ::-1][:, 1:]
     row = np.arange(height)[:, None]
     outline = np.minimum((falls[0] * change)[row, first], (falls[1] * change)[row, last])
-    # Within, as far from both ends as an edge there reaches.
+    # Mean change within the surface, as far from both ends as an edge there reaches.
     sums = np.pad(np.cumsum(np.log1p(change), axis=1, dtype=np.float64), ((0, 0), (1, 0)))
     start, stop = first + REACH + ACROSS - 1, last - REACH - ACROSS + 2
     count = np.maximum(stop - start, 0)
@@ -110,13 +112,13 @@ def _along_rows(depth: np.ndarray, rgb: np.ndarray, least: float) -> np.ndarray:
 
 
 def _points(view: SeenDepths, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """(P, 3) rendered points of pixels."""
+    """Return (P, 3) rendered points of pixels."""
     rays = view.camera.world_rays()[row, column]
     return view.camera.center + rays * view.rendered[row, column, None].astype(np.float64)
 
 
 def _are_known(points: np.ndarray, views: Sequence[SeenDepths], outlined: Sequence[np.ndarray]) -> np.ndarray:
-    """(P,) bool, which of (P, 3) points their outlines tell."""
+    """Return (P,) bool: which of (P, 3) points are known by their outlines."""
     known = np.zeros(len(points), bool)
     for first in range(0, len(points), POINTS_AT_A_TIME):
         some = slice(first, first + POINTS_AT_A_TIME)
@@ -138,7 +140,7 @@ def _are_known_at_once(points: np.ndarray, views: Sequence[SeenDepths], outlined
         rays = points - view.camera.center
         towards[number] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     votes = between.sum(0)
-    # The view farthest from any of those with outlines, and the one farthest from that.
+    # Of the views with outlines: the one farthest in angle from any of them, and the one farthest from that.
     every = np.arange(len(points))
     one = between.argmax(0)
     for _ in range(2):
@@ -148,7 +150,7 @@ def _are_known_at_once(points: np.ndarray, views: Sequence[SeenDepths], outlined
 
 
 class _Cubes:
-    """The cubes of a grid of `size` in which there are points; those that are CELLS and more away from most do not
+    """The cubes of side `size` that hold points. Cubes that are CELLS or more away from the median point do not
     count."""
 
     def __init__(self, points: np.ndarray, size: float):
@@ -160,13 +162,13 @@ class _Cubes:
         return len(self.codes)
 
     def of(self, points: np.ndarray) -> np.ndarray:
-        """(P,) the number of the cube of each of (P, 3) points, -1 for none."""
+        """Return (P,) the index of the cube of each of (P, 3) points, -1 for none."""
         codes = self._codes(points)
         number = np.minimum(np.searchsorted(self.codes, codes), len(self.codes) - 1)
         return np.where((codes >= 0) & (self.codes[number] == codes), number, -1)
 
     def _codes(self, points: np.ndarray) -> np.ndarray:
-        """(P,) int64 of the grid's cells, three of 21 bits in one; -1 far away."""
+        """Return (P,) int64 codes of the grid's cells, three coordinates of 21 bits each; -1 far away."""
         cells = np.floor(points / self.size) - self.middle
         near = (np.abs(cells) < CELLS).all(1)
         x, y, z = np.where(near, cells.T, 0).astype(np.int64) + CELLS

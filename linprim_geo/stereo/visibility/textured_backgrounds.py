@@ -1,8 +1,8 @@
-"""Background in which stereo has a surface with a texture of its own.
+"""Find background of training in which stereo knows a surface with texture.
 
-Training explains what is far, and seen at a flat angle, by an environment at infinity: a square or a lawn beyond the
-things that photographs stand around. Stereo tells such ground well. Beside an outline before a sky it has depths, too,
-as its windows hold the outline; but there the sky around a pixel is plain, or goes with the photograph's direction.
+Training explains far ground seen at a grazing angle, such as a square or a lawn beyond the photographed objects, by an
+environment at infinity. Stereo matches such ground well. Beside an outline before a sky it has depths, too, as its
+windows hold the outline; but there the sky around a pixel is plain, or matches other photographs better at infinity.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.visibility.lone_backgrounds import AGREEING, COMPARED, FAR
 
-# Side in pixels of the windows in which background is looked at, of which this share at least has to be: without what
-# is nearer than so many pixels to the surfaces beside, whose colours blur into it.
+# The side in pixels of the windows in which background is examined; the least share of a window that has to be
+# background; and the distance in pixels to surfaces beside, whose colours blur into it.
 WINDOW, LEAST_SHARE, MARGIN = 7, 0.1, 2.0
-# Squared differences of neighbouring pixels are so many times those of noise: 0.92 to 0.99 of what is found is right
-# then, in four captures, at 1 it is 0.72 to 0.98 (DECISIONS 105).
+# Squared differences of neighbouring pixels have to exceed those of noise so many times. Then 0.92 to 0.99 of the
+# pixels found are right, in four captures; at 1 it is 0.72 to 0.98 (DECISIONS 105).
 TEXTURE = 4.0
-# Speckle of up to twice so many pixels, and the margin, between what is found and other surfaces belong to it.
+# Gaps of up to twice so many pixels, speckle or the margin, between the pixels found and other surfaces are filled.
 CLOSED = 3
 
 
 def textured_backgrounds(
     maps: Sequence[DepthMap], backgrounds: Sequence[np.ndarray], known: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
-    """(H, W) bool of every view: background with `known` depths that AGREEING other views know as well, that has more
-    texture than its noise, and that other photographs show at these depths rather than at infinity.
+    """Return (H, W) bool of every view: background with `known` depths that AGREEING other views know as well, that has
+    more texture than noise, and that matches other photographs better at these depths than at infinity.
 
     Args:
         backgrounds: (H, W) bool of every view.
-        known: (H, W) depths of every view, NaN where there is none.
+        known: (H, W) depths of every view, NaN where unknown.
     """
     cameras = [found.camera for found in maps]
     greys = [found.grey.astype(np.float32)[..., None] for found in maps]
@@ -62,7 +62,7 @@ def textured_backgrounds(
         nearer, number = np.zeros(background.shape), np.zeros(background.shape)
         nearer[asked], number[asked] = np.where(both, infinity.mean() - surface.mean(), 0), both
         nearer, number = uniform_filter(nearer, WINDOW), uniform_filter(number, WINDOW)
-        told = number[asked] > 0.5 / WINDOW**2  # else no photograph looks past it: there is nothing at infinity
+        told = number[asked] > 0.5 / WINDOW**2  # otherwise no photograph looks past it to infinity
         asked[asked] = (surface.views >= AGREEING) & ((nearer[asked] > 0) | ~told)
         near = np.pad(asked | ~background, CLOSED, "edge")
         between = binary_closing(near, iterations=CLOSED)[CLOSED:-CLOSED, CLOSED:-CLOSED]
@@ -72,14 +72,15 @@ def textured_backgrounds(
 
 
 class _Compared:
-    """How far the greys (P,) of pixels are from those of other photographs at points."""
+    """Mean absolute differences between the grey values (P,) of pixels and those of other photographs at the same
+    points."""
 
     def __init__(self, own: np.ndarray):
         self.own, self.sum, self.views = own, np.zeros(len(own)), np.zeros(len(own), int)
 
     def add(self, grey: np.ndarray, inside: np.ndarray, pixels: np.ndarray, count: np.ndarray) -> None:
-        """A photograph that shows those of the points that are `inside` (P,) at `pixels` (Q, 2), of which some (Q,)
-        count."""
+        """Add a photograph that shows those points that are `inside` (P,) at `pixels` (Q, 2), of which those in `count`
+        (Q,) are used."""
         counted = inside.copy()
         counted[inside] = count
         self.sum[counted] += np.abs(sample_bilinear(grey, pixels[count])[:, 0] - self.own[counted])
@@ -94,8 +95,8 @@ def _agree(known: np.ndarray, pixels: np.ndarray, along: np.ndarray) -> np.ndarr
 
 
 def _texture(grey: np.ndarray, inner: np.ndarray) -> np.ndarray:
-    """(H, W) mean squared differences of neighbouring pixels within `inner`, over windows, such that white noise has
-    its variance; 0 where too few pixels of a window are within."""
+    """Return (H, W) mean squared differences of neighbouring pixels within `inner` over windows, scaled so that white
+    noise gives its variance; 0 where too few pixels of a window are within."""
     total, number = np.zeros(grey.shape), np.zeros(grey.shape)
     for axis in (0, 1):
         second, first = (np.s_[1:], np.s_[:-1]) if axis == 0 else (np.s_[:, 1:], np.s_[:, :-1])

@@ -1,9 +1,9 @@
-"""Thin things before a wall: where training is right and windows of stereo are not.
+"""Find thin objects in front of a wall, where training is right and windows of stereo are not.
 
-A window of stereo that is wider than a wire sees the wall behind it, and the wall's depth is confirmed. Training works
-pixel by pixel and has the wire. But what it renders before a wall may be fog as well. A rendered depth that is nearer
-than the known one counts if it is sharp, if other views render the same surface there and hardly any sees through it,
-and if photographs agree about its colour clearly better than about that of the wall.
+A window of stereo wider than a wire sees the wall behind it, and the depth of the wall is confirmed. Training works per
+pixel and has the wire, but what it renders in front of a wall may be fog as well. A rendered depth nearer than the
+known one counts if it is sharp, if other views render the same surface and hardly any sees through it, and if
+photographs agree about its colour clearly better than about that of the wall.
 """
 
 from __future__ import annotations
@@ -19,28 +19,28 @@ from linprim_geo.geometry.sampling import sample_bilinear
 from linprim_geo.points.view_pairs import nearest_views, visible_pixels
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 
-# A thin thing is before the known surface by more than this share of the depth: twice what depths may be off by.
+# A thin object is in front of the known surface by more than this share of the depth: twice the error of depths.
 NEARER = 2 * CONFIRMED_DEPTH
-# Each view is compared with so many that are nearest to it, and at least so many render the same surface.
+# The number of nearest views with which each view is compared, and the fewest that have to render the same surface.
 COMPARED, AGREEING = 12, 3
-# Those that see through it are at most this share of those.
+# Views that see through the object are at most this share of those that render it.
 THROUGH = 0.25
-# Means of MEAN by MEAN pixels, as wide as a wire, differ by less than this share of what they differ by at the known
-# surface, and there by more than so many deviations of their noise. The noise of a channel is about twice that of grey
-# values, which are a weighted mean of three.
+# Colours are means over MEAN by MEAN pixels, as wide as a wire. Their difference between views has to be below BETTER
+# times that at the known surface, which has to exceed DEVIATIONS deviations of its noise. The noise variance of a
+# channel is about OF_CHANNEL times that of grey values, which are a weighted mean of three.
 MEAN, BETTER, DEVIATIONS, OF_CHANNEL = 3, 0.5, 3.0, 2.0
-# In a window as wide as the whole of a thin thing, more than this share of what is rendered before the known surface
-# passes: fog does so here and there, by chance.
+# In a window of WINDOW pixels a side, as wide as a whole thin object, more than the share MOST of the pixels rendered
+# in front of the known surface have to pass: fog passes at single pixels by chance.
 WINDOW, MOST = 7, 0.5
-# Points per view by which exposures are compared, and rounds of that.
+# Points per view by which exposures are compared, and the number of iterations.
 POINTS, ROUNDS = 400, 8
 DARKEST, BRIGHTEST = 10, 245
 
 
 @dataclass(frozen=True)
 class SeenDepths:
-    """A view: `rgb` (H, W, 3) uint8 and the variance `noise` of grey values; (H, W) depths, `rendered` ones, 0 where
-    there is none, of which some are `sharp` (bool), and `known` ones, NaN where nothing is known."""
+    """A view: `rgb` (H, W, 3) uint8 and the variance `noise` of its grey values; `rendered` depths (H, W), 0 where
+    none, of which some are `sharp` (H, W) bool; and `known` depths (H, W), NaN where unknown."""
 
     camera: Camera
     rgb: np.ndarray
@@ -52,18 +52,19 @@ class SeenDepths:
 
 @dataclass(frozen=True)
 class Colors:
-    """Means (H, W, 3) uint8 around the pixels of each photograph, and the (V, 3) `gains` of their channels."""
+    """Local means (H, W, 3) uint8 of each photograph, and the (V, 3) `gains` of their channels."""
 
     means: Sequence[np.ndarray]
     gains: np.ndarray
 
     def at(self, number: int, camera: Camera, points: np.ndarray) -> np.ndarray:
-        """(P, 3) what the photograph `number` shows of (P, 3) points, at the mean exposure."""
+        """Return the (P, 3) colours of (P, 3) points in photograph `number`, at the mean exposure."""
         return sample_bilinear(self.means[number], camera.project(points)[0]) / self.gains[number]
 
 
 def thin_things(views: Sequence[SeenDepths]) -> list[np.ndarray]:
-    """(H, W) bool of every view: where its rendered depth is that of a thin thing before the known surface."""
+    """Return (H, W) bool of every view: where its rendered depth is that of a thin object in front of the known
+    surface."""
     colors = Colors([uniform_filter(view.rgb, (MEAN, MEAN, 1), mode="nearest") for view in views], channel_gains(views))
     found = []
     for number, others in enumerate(nearest_views([view.camera for view in views], COMPARED)):
@@ -77,7 +78,8 @@ def thin_things(views: Sequence[SeenDepths]) -> list[np.ndarray]:
 def _compared(
     number: int, others: Sequence[int], views: Sequence[SeenDepths], colors: Colors
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) bool of a view: what is rendered sharply before the known surface, and where the `others` speak for it."""
+    """Return (H, W) bool of a view: pixels rendered sharply in front of the known surface, and those that the `others`
+    support."""
     view = views[number]
     with np.errstate(invalid="ignore"):
         before = view.sharp & (view.rendered > 0) & (view.rendered < (1 - NEARER) * view.known)
@@ -112,8 +114,8 @@ def _compared(
 
 
 def channel_gains(views: Sequence[SeenDepths]) -> np.ndarray:
-    """(V, 3) by what factor each channel of each photograph is brighter, of geometric mean 1: medians over known points
-    of what they differ by from their means over the views."""
+    """Return the (V, 3) relative gains of each channel of each photograph, of geometric mean 1: medians over known
+    points of the ratio to their mean over the views."""
     rng, points = np.random.default_rng(0), []
     for view in views:
         row, column = np.nonzero(np.isfinite(view.known))

@@ -1,11 +1,11 @@
-"""Depth where stereo knows none, by what the cameras see through: a surface that spans the gaps between known points.
+"""Fill unknown depths by a visibility graph cut: a surface that spans the gaps between known points.
 
-The space before what a camera sees is empty. The points are the corners of Delaunay tetrahedra. Each ray from a camera
-to a point votes for the tetrahedra that it crosses to be empty and for the one behind the point to be full, and a
-minimum cut decides. The boundary of the empty ones goes through the points and spans what lies between them, such as
-parts of walls without texture. After P. Labatut, J.-P. Pons, R. Keriven, "Robust and efficient surface reconstruction
-from range data", Computer Graphics Forum 28 (2009), with votes for tetrahedra in place of those for their faces, and
-with normals: a face costs more where it turns away from the surface at its corners.
+The space between a camera and the points it sees is empty. The points are the vertices of Delaunay tetrahedra. Each ray
+from a camera to a point votes for the tetrahedra that it crosses to be empty and for the one behind the point to be
+full, and a minimum cut decides. The boundary of the empty ones passes through the points and spans gaps, such as parts
+of walls without texture. After P. Labatut, J.-P. Pons, R. Keriven, "Robust and efficient surface reconstruction from
+range data", Computer Graphics Forum 28 (2009), with votes for tetrahedra instead of faces, and with normals: a face
+costs more if it is not parallel to the surface at its vertices.
 """
 
 from __future__ import annotations
@@ -27,28 +27,31 @@ from linprim_geo.stereo.planes.point_planes import SAME_NORMAL, SurfacePoints
 if TYPE_CHECKING:
     from scipy.spatial import Delaunay
 
-# Of all views' pixels one in so many is a point, up to MOST_POINTS; rays of the most views that vote to a point.
+# One point is taken per so many pixels of all views, at most MOST_POINTS; and the most views whose rays to a point
+# vote.
 PIXELS_PER_POINT, MOST_POINTS, RAYS_PER_POINT = 200, 40_000, 4
-# Rays end so much before a point, as a share of its depth, and it is full so much behind it: twice what depths may be
-# off by.
+# A ray ends this share of the depth before a point, and votes for full space as much behind it: twice the error of
+# depths.
 MARGIN = 2 * CONFIRMED_DEPTH
-# By so much of their distance points are moved at random before they are connected.
+# Points are moved at random by this share of their distance before triangulation.
 JITTER = 1e-4
-# Training has put nothing where primitives lie behind, by so much of their depth: what is rendered is thicker than a
-# surface.
+# The thickness of rendered surfaces, as a share of the depth: space is empty in front of rendered depths by more than
+# this.
 RENDERED_MARGIN = 0.05
-# What is rendered before a span by more, as a share of its depth, is a thing of its own, or fog if this share of the
-# views that know a depth there see through it.
+# A rendered depth in front of the spanning surface by more than THING_MARGIN, as a share of the depth, is an object of
+# its own; or fog, if the share SEEN_THROUGH of the views that know a depth there see through it.
 THING_MARGIN, SEEN_THROUGH = 0.1, 0.9
-# What a ray's vote weighs, a face of the boundary, and besides each of its corners whose surface it turns away from.
+# Weights of the cut: a ray's vote, a face of the boundary, and each vertex of a face at which it departs from the
+# surface.
 VOTE, FACE, CORNER = 8, 1, 2
-# The corners of the faces of a tetrahedron, each without the corner of the same number.
+# The vertices of the faces of a tetrahedron; face k is opposite vertex k.
 CORNERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
 @dataclass(frozen=True)
 class SpanningSurface:
-    """Faces (F, 3) between `vertices` (V, 3), and (F,) bool which of them continue the surface at all their corners."""
+    """A mesh: `faces` (F, 3) between `vertices` (V, 3); `continued` (F,) bool is true for faces parallel to the surface
+    at two or all three of their vertices."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -56,7 +59,7 @@ class SpanningSurface:
 
 
 def points_per_view(cameras: Sequence[Camera]) -> int:
-    """Known points of each view that depths are spanned between."""
+    """Return the number of known points of each view between which depths are spanned."""
     pixels = sum(camera.width * camera.height for camera in cameras)
     return -(-min(MOST_POINTS, pixels // PIXELS_PER_POINT) // len(cameras))
 
@@ -64,16 +67,17 @@ def points_per_view(cameras: Sequence[Camera]) -> int:
 def spanned_depths(
     cameras: Sequence[Camera], known: Sequence[np.ndarray], points: SurfacePoints, rendered: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
-    """(H, W) float32 depth, where it is not `known`, of the surface that spans what is; else NaN.
+    """Return the (H, W) float32 depth of the surface that spans the known points, where it is not `known`; NaN
+    elsewhere.
 
-    There is none where a face turns away from the surface at two of its corners; nor where `rendered` depths lie behind
-    it by more than RENDERED_MARGIN, as training has put nothing there; nor where they lie before it by more than
-    THING_MARGIN, as that may be a thing that stereo does not know, unless other views see through it.
+    It is NaN where a face departs from the surface at two of its vertices; where `rendered` depths are behind it by
+    more than RENDERED_MARGIN, as training has left that space empty; and where they are in front of it by more than
+    THING_MARGIN, as that may be an object unknown to stereo, unless other views see through it.
 
     Args:
-        known: (H, W) depth of every view, NaN elsewhere.
-        points: of these depths, about `points_per_view` of each, with normals, 0 where they are not known.
-        rendered: (H, W) depth of every view, 0 where there is none.
+        known: (H, W) depth of every view, NaN where unknown.
+        points: at these depths, about `points_per_view` of each view, with normals, 0 where unknown.
+        rendered: (H, W) depth of every view, 0 where none.
     """
     surface = cut_surface(cameras, known, points, rendered)
     caster = RayCaster(surface.vertices, surface.faces) if len(surface.faces) else None
@@ -93,8 +97,8 @@ def spanned_depths(
 
 
 def _seen_through(points: np.ndarray, cameras: Sequence[Camera], known: Sequence[np.ndarray]) -> np.ndarray:
-    """(N,) bool which of (N, 3) points at least LEAST_VIEWS views, and SEEN_THROUGH of those that know a depth at or
-    behind the point, see through."""
+    """Return (N,) bool: which of (N, 3) points are seen through by at least LEAST_VIEWS views, and by SEEN_THROUGH of
+    those that know a depth at or behind the point."""
     through, agree = np.zeros(len(points), int), np.zeros(len(points), int)
     for camera, depth in zip(cameras, known, strict=True):
         inside, pixels, along = visible_pixels(camera, points)
@@ -106,7 +110,7 @@ def _seen_through(points: np.ndarray, cameras: Sequence[Camera], known: Sequence
 
 
 def plane_normals(camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """(H, W, 3) unit normals in the world of the planes of depths side by side, 0 where one is NaN."""
+    """Return (H, W, 3) unit normals in the world of planes through adjacent depths, 0 where one is NaN."""
     # A plane a X + b Y + c Z = 1 has the inverse depth a x + b y + c along the ray (x, y, 1).
     inverse = 1 / depth.astype(np.float64)
     rays = camera.ray_grid()
@@ -118,7 +122,7 @@ def plane_normals(camera: Camera, depth: np.ndarray) -> np.ndarray:
 
 
 def _slope(values: np.ndarray, axis: int) -> np.ndarray:
-    """Differences along an axis, to the next pixel or else from the one before; NaN without either."""
+    """Return differences along an axis, to the next pixel or else from the previous one; NaN without either."""
     gap = np.full_like(np.take(values, [0], axis=axis), np.nan)
     step = np.diff(values, axis=axis)
     after, before = np.concatenate([step, gap], axis=axis), np.concatenate([gap, step], axis=axis)
@@ -132,7 +136,7 @@ def cut_surface(
     rendered: Sequence[np.ndarray],
     seed: int = 0,
 ) -> SpanningSurface:
-    """The boundary of the empty space, without faces that a camera is a corner of.
+    """Return the boundary of the empty space, without faces that have a camera as a vertex.
 
     Args:
         known, points, rendered: see `spanned_depths`.
@@ -142,7 +146,7 @@ def cut_surface(
     rng = np.random.default_rng(seed)
     vertices = np.concatenate([points.position, [camera.center for camera in cameras]])
     normals = np.concatenate([points.normal, np.zeros((len(cameras), 3))])
-    # Points that lie on planes exactly have tetrahedra without volume, in which Qhull finds nothing.
+    # Points exactly on planes have tetrahedra without volume, which Qhull cannot handle.
     distance = np.append(np.linalg.norm(points.position - points.center, axis=1), np.zeros(len(cameras)))
     jittered = vertices + JITTER * distance[:, None] * rng.normal(size=vertices.shape)
     try:
@@ -151,9 +155,9 @@ def cut_surface(
         return SpanningSurface(vertices, np.zeros((0, 3), int), np.zeros(0, bool))
     of_cells = cells.simplices.astype(np.int32), cells.neighbors.astype(np.int32)
     start = np.arange(len(points), len(vertices))
-    for same, _, other in cells.coplanar:  # of cameras at one place, one is a corner
+    for same, _, other in cells.coplanar:  # of cameras at one place, one is a vertex
         start[start == same] = other
-    # The last one counts for all that lies outside of the hull.
+    # The last one stands for the space outside of the hull.
     votes = np.zeros(len(cells.simplices) + 1, np.int64)
     times = np.zeros(len(points), int)
     for view in rng.permutation(len(cameras)):
@@ -177,7 +181,8 @@ def cut_surface(
 
 
 def _continued(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(C, 4) at how many of its corners each of (C, 4, 3) faces continues the surface: by normals that are alike."""
+    """Return (C, 4): at how many of its vertices each of (C, 4, 3) faces continues the surface, by normals that are
+    alike."""
     first, second, third = (vertices[faces[..., corner]] for corner in range(3))
     across = np.cross(second - first, third - first)
     length = np.linalg.norm(across, axis=-1)
@@ -186,12 +191,12 @@ def _continued(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> 
 
 
 def _empty_cells(neighbors: np.ndarray, votes: np.ndarray, cost: np.ndarray) -> np.ndarray:
-    """(C + 1,) bool which tetrahedra are empty, and last the space outside, for the least sum of votes against that and
-    costs of faces in between.
+    """Return (C + 1,) bool: which tetrahedra are empty, and last the space outside, by a minimum cut over the votes
+    against that and the costs of faces in between.
 
     Args:
         neighbors: (C, 4) numbers of the tetrahedra behind the faces of each one, -1 for outside.
-        votes: (C + 1,) for empty ones, less those for full ones.
+        votes: (C + 1,) votes for empty less votes for full.
         cost: (C, 4) of the faces.
     """
     from scipy.sparse import coo_matrix
@@ -200,7 +205,7 @@ def _empty_cells(neighbors: np.ndarray, votes: np.ndarray, cost: np.ndarray) -> 
     count = len(votes)
     source, sink = count, count + 1
     empty, full = np.flatnonzero(votes > 0), np.flatnonzero(votes < 0)
-    # No ray votes for the space outside to be empty: nothing flows from there.
+    # No ray votes for the outside to be empty, so no flow starts there.
     start = np.concatenate([np.repeat(np.arange(count - 1), 4), np.full(len(empty), source), full])
     end = np.concatenate([neighbors.ravel() % count, empty, np.full(len(full), sink)])
     capacity = np.concatenate([cost.ravel(), VOTE * votes[empty], -VOTE * votes[full]]).astype(np.int32)
@@ -215,7 +220,8 @@ def _empty_cells(neighbors: np.ndarray, votes: np.ndarray, cost: np.ndarray) -> 
 def _boundary(
     vertices: np.ndarray, points: int, cells: Delaunay, empty: np.ndarray, continued: np.ndarray
 ) -> SpanningSurface:
-    """The faces between empty tetrahedra and others, of the first so many vertices: a camera is no corner."""
+    """Return the faces between empty tetrahedra and others whose vertices are all among the first `points`: no
+    cameras."""
     cell, face = np.nonzero(empty[:-1, None] & ~empty[cells.neighbors])
     faces = cells.simplices[cell[:, None], CORNERS[face]]
     held = (faces < points).all(1)
