@@ -1,1 +1,2 @@
-"""Dense depth from photographs alone: PatchMatch stereo, and its consistency between views."""
+"""Dense depth from photographs alone: PatchMatch stereo, consistency between views, and planes of surfaces without
+texture."""

@@ -1,8 +1,9 @@
-"""Depth and normals of every photograph of a capture by PatchMatch stereo.
+"""Compute depth, normals and confidence of every photograph by PatchMatch stereo.
 
-Each photograph is matched with a few that show the same points under an angle: at half the size from random planes,
-then at full size, then twice more with the depths that its neighbours have found. Then surfaces are fitted to what lies
-around each pixel, within the edges of the photograph. A depth counts where neighbours see the same surface.
+Each photograph is matched with a few source views that show the same points with a baseline: at half the size from
+random planes, at full size, and twice more with geometric consistency to the depths found in these views. Then surfaces
+are fitted around each pixel, within the edges of the photograph. A depth counts as confirmed where other views have the
+same surface.
 """
 
 from __future__ import annotations
@@ -26,35 +27,37 @@ from linprim_geo.stereo.edges import GREY, colour_edges, colours_of, edges_of
 from linprim_geo.stereo.evidence import Glance, glance
 from linprim_geo.stereo.noise import noise_of, shared_noise
 
-# Photographs that one is matched with, at most: as many as the core takes.
+# The most source views with which a photograph is matched: as many as the core takes.
 MOST_SOURCES = 8
-# Sweeps at half the size, at full size, and in each of the passes in which depths of neighbours are compared.
+# Sweeps at half the size, at full size, and in each of the passes with geometric consistency.
 COARSE_SWEEPS, FINE_SWEEPS, GEOMETRIC_SWEEPS = 3, 1, (1, 1)
-# The nearest depth is that of the nearest points that a view shows, but for this share, divided by NEARER.
+# The nearest depth searched is the quantile NEAREST_SHARE of the depths of the points that a view shows, divided by
+# NEARER.
 NEAREST_SHARE, NEARER = 0.01, 1.5
-# Bytes per pixel of all views that are in memory at once: planes 17, images 7, depths of the last turn 4, maps 27.
+# Bytes per pixel of all views that are in memory at once: planes 17, images 7, depths of the last pass 4, maps 27.
 PIXEL_BYTES = 55
-# Of the memory that is free, no more than this share is taken.
+# The largest share of the free memory that is used.
 MEMORY_SHARE = 0.5
-# Of masks, pixels below this alpha are background, whose depth is not asked for.
+# Mask pixels of less alpha than this are background, without depth.
 FOREGROUND = 128
-# Both sides of a photograph have at least this many pixels: half of them hold a window.
+# The smallest side of a photograph in pixels: at half the size it still holds a window.
 SMALLEST = 24
-# A depth is confirmed if CONFIRMING other views confirm it and it is right with this probability; it is sure if it is
-# right with the other one.
+# A depth is confirmed if at least CONFIRMING other views confirm it and its confidence is at least CONFIDENT; it is
+# sure if its confidence is at least SURE.
 CONFIDENT, SURE = 0.7, 0.9
 
 
 @dataclass(frozen=True)
 class DepthMap:
-    """What stereo says of a photograph.
+    """The result of stereo for one photograph.
 
     `depth` (H, W) float32 along the optical axis in the scene's unit, NaN where unknown; `normal` (H, W, 3) float32 in
-    the world, towards the camera; `confidence` (H, W) float32 the probability that the depth is right within 1 %, 0
-    where it is unknown; `confirming` (H, W) uint8 how many other views have the same depth; `deviation` (H, W) float32
-    the least share of the depth by which that of another view differs, infinite where none has one. `grey` (H, W) uint8
-    is what was matched, `noise` the variance of its noise and `most_noise` what others tell of it (`shared_noise`);
-    `colours` (2, H // 2, W // 2) float32 its colour differences (`edges.colours_of`), None where they are not known.
+    the world, towards the camera; `confidence` (H, W) float32, the probability that the depth is right within 1 %, 0
+    where it is unknown; `confirming` (H, W) uint8, how many other views confirm the depth; `deviation` (H, W) float32,
+    the least relative difference to the depth of another view, infinite where none has one. `grey` (H, W) uint8 is the
+    image that was matched, `noise` the variance of its noise and `most_noise` an upper bound of that from other views
+    (`shared_noise`); `colours` (2, H // 2, W // 2) float32 are its colour differences (`edges.colours_of`), None if
+    unknown.
     """
 
     camera: Camera
@@ -70,15 +73,15 @@ class DepthMap:
 
     @cached_property
     def edges(self) -> np.ndarray:
-        """(H, W) bool: where an edge of grey runs through a pixel or beside it."""
+        """(H, W) bool: pixels on or beside an edge of grey."""
         return edges_of(self.grey, self.noise, self.most_noise)
 
     def all_edges(self) -> np.ndarray:
-        """(H, W) bool: where an edge of grey or colour runs; those of colour alone are as wide as JPEG makes them."""
+        """Return (H, W) bool: pixels on or beside an edge of grey or colour. JPEG makes edges of colour alone wider."""
         return self.edges if self.colours is None else self.edges | colour_edges(self.colours, self.grey.shape)
 
     def is_confirmed(self, probability: float = CONFIDENT) -> np.ndarray:
-        """(H, W) bool."""
+        """Return (H, W) bool: depths confirmed by CONFIRMING other views whose confidence is at least `probability`."""
         return (self.confirming >= CONFIRMING) & (self.confidence >= probability)
 
 
@@ -91,17 +94,17 @@ def depth_maps(
     seed: int = 0,
     quiet: bool = True,
 ) -> list[DepthMap]:
-    """Depth maps of all views, in their order.
+    """Return the depth maps of all views, in their order.
 
     Args:
-        views: posed photographs.
-        points: (P, 3) of the scene, by which views that see the same are found, and the range of depths.
-        hiding: (H, W) depths of the views that hide points behind them, 0 where none is known.
-        fit: surfaces are fitted within edges. Trainings hold to small copies without: DECISIONS 71.
+        views: photographs with poses.
+        points: (P, 3) of the scene, to select source views and the range of depths.
+        hiding: (H, W) depths of the views that occlude points behind them, 0 where unknown.
+        fit: whether surfaces are fitted within edges. Training uses small copies without: DECISIONS 71.
 
     Raises:
-        LinprimError: there are no two views that see the same points; photographs are too small for a window, or all
-            of them too large for the memory that is free.
+        LinprimError: no two views see the same points; photographs are too small for a window, or all of them together
+            too large for the free memory.
     """
     cameras = [view.camera for view in views]
     if any(min(camera.width, camera.height) < SMALLEST for camera in cameras):
@@ -138,7 +141,7 @@ def depth_maps(
     most = _most_noise(full, found, pairs)
     noises = [min(each) for each in zip(noises, most, strict=True)]
     for turn in range(len(GEOMETRIC_SWEEPS)):
-        # What the neighbours have found before this turn, whichever of them come first in it.
+        # Depths before this pass, so that the order of the views does not matter.
         depths = {k: planes.plane[..., 0].copy() for k, planes in enumerate(found) if planes is not None}
         for k, planes in enumerate(found):
             progress.update((1 + turn) * len(views) + k)
@@ -159,7 +162,7 @@ def depth_maps(
 
 
 def memory_of(cameras: Sequence[Camera]) -> int:
-    """Bytes that depth maps of all views take at once."""
+    """Return the bytes of memory that depth maps of all views take at once."""
     return PIXEL_BYTES * sum(camera.width * camera.height for camera in cameras)
 
 
@@ -170,8 +173,8 @@ def photometric_planes(
     noise: float,
     seed: int,
 ) -> DepthPlanes:
-    """Planes of the first of `images` by how well the others agree along them; `halves` are the same of half the
-    size."""
+    """Return the depth planes of the first of `images` by photo-consistency with the others; `halves` are the same
+    images at half the size."""
     coarse = DepthPlanes.unknown(*halves[0].grey.shape)
     patch_match(halves[0], list(halves[1:]), coarse, inverse_depths, noise / 4, COARSE_SWEEPS, seed=seed)
     planes = _doubled(coarse, images[0].grey.shape)
@@ -189,8 +192,8 @@ def geometric_planes(
     turn: int,
     seed: int,
 ) -> None:
-    """Improves planes of the first of `images` in place, by the inverse depths of the others as well; `turn` counts
-    GEOMETRIC_SWEEPS."""
+    """Improve the depth planes of the first of `images` in place, with geometric consistency to the inverse depths of
+    the others. `turn` is the index into GEOMETRIC_SWEEPS."""
     patch_match(
         images[0],
         list(images[1:]),
@@ -205,41 +208,41 @@ def geometric_planes(
 
 
 def fit_within_edges(image: StereoImage, planes: DepthPlanes, alpha: np.ndarray | None = None) -> None:
-    """Moves planes in place to surfaces fitted around them, within the edges of the photograph, of the foreground of
-    (H, W) `alpha` alone."""
+    """Move depth planes in place to surfaces fitted around each pixel, within the edges of the photograph. Only the
+    foreground of `alpha` (H, W) is fitted."""
     known = are_known(planes.plane[..., 0], planes.cost)
     fit_surfaces(image.grey, planes, known if alpha is None else known & (alpha >= FOREGROUND), RIGHT)
 
 
 def are_known(inverse: np.ndarray, cost: np.ndarray) -> np.ndarray:
-    """(H, W) bool: which inverse depths are nearer than infinity, and photographs agree about them."""
+    """Return (H, W) bool: which inverse depths are positive with a matching cost below MOST_COST."""
     return (inverse > 0) & (cost < MOST_COST)
 
 
 def grey_of(rgb: np.ndarray) -> np.ndarray:
-    """(H, W) uint8 luminance of a photograph (H, W, 3)."""
+    """Return the (H, W) uint8 luminance of a photograph (H, W, 3)."""
     return np.rint(rgb @ np.array(GREY, np.float32)).astype(np.uint8)
 
 
 def halved(image: StereoImage) -> StereoImage:
-    """Means of 2 by 2 pixels."""
+    """Return the image at half the size, in means of 2 by 2 pixels."""
     return StereoImage.of(smaller(image.camera, 2), np.rint(block_means(image.grey, 2)).astype(np.uint8))
 
 
 def block_means(grey: np.ndarray, factor: int) -> np.ndarray:
-    """(H // factor, W // factor) means of `factor` by `factor` of (H, W) values."""
+    """Return the (H // factor, W // factor) means of blocks of `factor` by `factor` of (H, W) values."""
     height, width = (size // factor for size in grey.shape)
     return grey[: factor * height, : factor * width].reshape(height, factor, width, factor).mean((1, 3))
 
 
 def _doubled(planes: DepthPlanes, shape: tuple[int, int]) -> DepthPlanes:
-    """Planes of an image of half the size as those of one of (H, W)."""
+    """Upsample the depth planes of an image of half the size to shape (H, W)."""
     rows, columns = (
         np.minimum(np.arange(size) // 2, coarse - 1) for size, coarse in zip(shape, planes.cost.shape, strict=True)
     )
     found = planes.plane[np.ix_(rows, columns)].copy()
     found[..., 1:] /= 2
-    # From the middle of the coarse pixel to that of the fine one, in fine pixels.
+    # Offset from the centre of the coarse pixel to that of the fine one, in fine pixels.
     right, down = (np.arange(size) - 2 * index - 0.5 for size, index in ((shape[1], columns), (shape[0], rows)))
     found[..., 0] += found[..., 1] * right + found[..., 2] * down[:, None]
     found[..., 0] = np.maximum(found[..., 0], 0)
@@ -247,15 +250,15 @@ def _doubled(planes: DepthPlanes, shape: tuple[int, int]) -> DepthPlanes:
 
 
 def inverse_range(camera: Camera, points: np.ndarray) -> tuple[float, float]:
-    """The least and the largest inverse depth that a camera may see; the least is infinity's."""
+    """Return the least and the largest inverse depth that is searched; the least is 0, at infinity."""
     depth = visible_pixels(camera, points)[2]
-    # A camera that sees none of the points has no pair either: its range is not used.
+    # A camera that sees none of the points has no source view either: its range is not used.
     return 0.0, NEARER / float(np.quantile(depth, NEAREST_SHARE)) if len(depth) else 1.0
 
 
 def depth_and_normal(camera: Camera, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) float64 depth, infinite where the inverse depth is 0, and (H, W, 3) unit normals in the world towards the
-    camera, of (H, W, 3) `DepthPlanes.plane`."""
+    """Convert `DepthPlanes.plane` (H, W, 3) to (H, W) float64 depth, infinite where the inverse depth is 0, and (H, W,
+    3) unit normals in the world, towards the camera."""
     inverse, slope_x, slope_y = (plane[..., k].astype(np.float64) for k in range(3))
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = 1 / inverse
@@ -273,7 +276,8 @@ def depth_and_normal(camera: Camera, plane: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def inverse_planes(camera: Camera, depth: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """(3, H, W) float32 inverse depth and its slopes, of (H, W) depth and (H, W, 3) normals in the camera's axes."""
+    """Return (3, H, W) float32: the inverse depth and its slopes, given (H, W) depth and (H, W, 3) normals in the
+    camera's axes."""
     distance = depth * (normal * camera.ray_grid()).sum(-1)  # n . X = distance: inverse depth = n . ray / distance
     slopes = [normal[..., 0] / (camera.fx * distance), normal[..., 1] / (camera.fy * distance)]
     return np.stack([1 / depth, *slopes]).astype(np.float32)
@@ -282,13 +286,13 @@ def inverse_planes(camera: Camera, depth: np.ndarray, normal: np.ndarray) -> np.
 def _most_noise(
     images: Sequence[StereoImage], found: Sequence[DepthPlanes | None], pairs: Sequence[Sequence[int]]
 ) -> list[float]:
-    """`shared_noise` of images by the depths that are found, with those that each is matched with."""
+    """Return the `shared_noise` of images, by the depths found so far and the source views of each."""
     depths = [_known_depth(image, planes) for image, planes in zip(images, found, strict=True)]
     return shared_noise([image.camera for image in images], [image.grey for image in images], depths, pairs)
 
 
 def _known_depth(image: StereoImage, planes: DepthPlanes | None) -> np.ndarray:
-    """(H, W) depth of an image, NaN where it is unknown."""
+    """Return the (H, W) depth of an image, NaN where unknown."""
     if planes is None:
         return np.full(image.grey.shape, np.nan, np.float32)
     inverse = planes.plane[..., 0]

@@ -1,4 +1,4 @@
-"""Where photographs have edges: in their grey, and in their colour, where two surfaces are as bright as each other."""
+"""Detect edges of photographs: in grey, and in colour, where two surfaces are equally bright."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from scipy.ndimage import label, uniform_filter
 
 from linprim_geo.stereo.noise import LEAST_OF_PLAIN, noise_of, plainest
 
-# What red, green and blue are of grey (ITU-R BT.601).
+# Weights of red, green and blue in grey (ITU-R BT.601).
 GREY = (0.299, 0.587, 0.114)
-# An edge runs through 3 by 3 pixels whose variance is so many times that of the noise; fewer edge pixels than SPECK
-# together are noise.
+# A pixel is on an edge if the variance of the 3 by 3 pixels around exceeds that of the noise by this factor. Connected
+# components of fewer than SPECK pixels are noise.
 EDGE_VARIANCE, SPECK = 4.0, 9
 
 
 def edges_of(grey: np.ndarray, noise: float, most: float = np.inf) -> np.ndarray:
-    """(H, W) bool: where an edge runs through a pixel or beside it.
+    """Return (H, W) bool: pixels on or beside an edge.
 
-    `noise` is the variance that differences of pixels tell. Blur, demosaicing and JPEG make it equal in neighbours,
-    whose differences tell less: where the plainest parts vary more, their variance counts, up to the `most` that noise
-    may have (`noise.shared_noise`).
+    `noise` is the variance estimated from differences of pixels. Blur, demosaicing and JPEG correlate the noise of
+    neighbours, so that differences underestimate it. Where the plainest parts vary more, their variance counts, up to
+    the upper bound `most` from other views (`noise.shared_noise`).
     """
     values = grey.astype(np.float64)
     mean = uniform_filter(values, 3, mode="nearest")
@@ -30,8 +30,8 @@ def edges_of(grey: np.ndarray, noise: float, most: float = np.inf) -> np.ndarray
 
 
 def colours_of(rgb: np.ndarray) -> np.ndarray:
-    """(2, H // 2, W // 2) float32: the colour differences (R - B) / 2 and G - (R + B) / 2 of (H, W, 3) pixels, in means
-    of 2 by 2 pixels, as JPEG keeps them."""
+    """Return (2, H // 2, W // 2) float32: the colour differences (R - B) / 2 and G - (R + B) / 2 of (H, W, 3) pixels,
+    in means of 2 by 2 pixels, as JPEG stores them."""
     height, width = (size // 2 for size in rgb.shape[:2])
     means = rgb[: 2 * height, : 2 * width].reshape(height, 2, width, 2, 3).mean((1, 3), dtype=np.float32)
     red, green, blue = np.moveaxis(means, 2, 0)
@@ -39,18 +39,20 @@ def colours_of(rgb: np.ndarray) -> np.ndarray:
 
 
 def rgb_of(grey: np.ndarray, colours: np.ndarray) -> np.ndarray:
-    """(H // 2, W // 2, 3) of means of 2 by 2 pixels: their grey by GREY, and colour differences by `colours_of`."""
+    """Return (H // 2, W // 2, 3) colours of means of 2 by 2 pixels, given their grey by GREY and colour differences by
+    `colours_of`."""
     apart, green = colours
     middle = grey - (GREY[0] - GREY[2]) * apart - GREY[1] * green  # (R + B) / 2
     return np.stack([middle + apart, middle + green, middle - apart], axis=-1)
 
 
 def colour_edges(colours: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """(H, W) bool of a photograph of this shape: where either of its colour differences (`colours_of`) has an edge."""
+    """Return (H, W) bool for a photograph of this shape: where either of its colour differences (`colours_of`) has an
+    edge."""
     result = np.zeros(shape, bool)
     height, width = colours.shape[1:]
     for colour in colours:
-        # Around 128: `edges_of` does not learn the noise from values that are nearly black or white.
+        # Shifted to 128, as `edges_of` does not estimate noise from nearly black or white values.
         edge = edges_of(colour + 128, noise_of(colour))
         result[: 2 * height, : 2 * width] |= edge.repeat(2, 0).repeat(2, 1)
     return result

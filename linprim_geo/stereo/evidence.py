@@ -1,4 +1,5 @@
-"""Agreement of depth maps: reprojection error, difference of depths and angle of every pixel in other views."""
+"""Consistency of depth maps: reprojection error, relative difference of depths and parallax of each pixel in another
+view."""
 
 from __future__ import annotations
 
@@ -8,18 +9,19 @@ import numpy as np
 
 from linprim_geo.geometry.camera import Camera
 
-# A depth is confirmed by another view that comes back to within so many pixels, and so near in depth.
+# Another view confirms a depth if the reprojection error, in pixels, and the relative difference of the depths are
+# below these.
 CONFIRMED_PX, CONFIRMED_DEPTH = 1.0, 0.01
 
 
 @dataclass(frozen=True)
 class Glance:
-    """How another photograph sees the depths of one: (H, W) float32 each.
+    """The depths of one view compared with another view, each (H, W) float32 unless noted.
 
-    `pixel` int32 is where in the other, counted along its rows, -1 outside of it; `miss` in pixels, by how far a point
-    comes back from where it is when the surface that the other has found is taken in its place, infinite where it has
-    none; `relative` the difference of both depths as a share; `parallax` by how many pixels of the other a point moves
-    if its depth changes by all of itself.
+    `pixel` int32 is the index of the pixel in the other view, row by row, -1 outside; `miss` the forward-backward
+    reprojection error in pixels, via the surface found by the other view, infinite where it has none; `relative` the
+    relative difference of both depths; `parallax` the derivative of the position in the other view, in pixels, by the
+    logarithm of the depth.
     """
 
     pixel: np.ndarray
@@ -29,12 +31,13 @@ class Glance:
 
     @property
     def confirms(self) -> np.ndarray:
-        """(H, W) bool."""
+        """(H, W) bool: depths that the other view confirms."""
         return (self.miss < CONFIRMED_PX) & (np.abs(self.relative) < CONFIRMED_DEPTH)
 
 
 def glance(camera: Camera, depth: np.ndarray, other: Camera, plane: np.ndarray) -> Glance:
-    """How `other`, whose `plane` (3, H', W') are inverse depths and their slopes, sees (H, W) depths of `camera`."""
+    """Compare (H, W) depths of `camera` with the view `other`, whose `plane` (3, H', W') holds inverse depths and their
+    slopes."""
     pixel = np.full(depth.shape, -1, np.int32)
     miss, relative, parallax = (np.full(depth.shape, value, np.float32) for value in (np.inf, np.inf, 0))
     rows, columns = np.nonzero(np.isfinite(depth) & (depth > 0))

@@ -1,7 +1,8 @@
-"""How much noise photographs have: by their own pixels, and by what others of the same surfaces differ from them.
+"""Estimate the noise of photographs: from their own pixels, and from differences between photographs of the same
+surface.
 
-One photograph does not tell noise from fine texture: a carpet all over it passes for noise. Two have texture in common,
-and no noise.
+A single photograph does not tell noise from fine texture, such as that of a carpet all over it. Two photographs have
+texture in common, but not noise.
 """
 
 from __future__ import annotations
@@ -14,23 +15,23 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.sampling import sample_bilinear
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 
-# Variance of grey values that rounding them causes, at least.
+# The least variance of noise: that of rounding grey values.
 LEAST_NOISE = 1.0
-# At least a tenth of a photograph is taken to be plain, or as good as that. There the variance of 3 by 3 pixels is that
+# At least this share of a photograph is assumed to be plain, or nearly so. There the variance of 3 by 3 pixels is that
 # of the noise times chi-square of 8 degrees of freedom over 9, whose tenth percentile is 3.49.
 PLAIN_SHARE, LEAST_OF_PLAIN = 0.1, 3.49 / 9
 DARKEST, BRIGHTEST = 3, 252
-# Windows of a photograph that are compared with another, and so many of these tell something: a tenth of 300 variances
-# with 8 degrees of freedom is known within a tenth.
+# Windows of a photograph compared with another one, and the fewest of them that count: a tenth of 300 variances with 8
+# degrees of freedom is known within a tenth.
 WINDOWS, LEAST_WINDOWS = 4000, 300
-# Rows and columns of the pixels of a window from its middle.
+# Offsets (row, column) of the pixels of a window from its middle.
 WINDOW = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 def noise_of(grey: np.ndarray) -> float:
-    """Variance of the noise of (H, W) grey values, LEAST_NOISE at least: by what a second difference across both
-    directions, which planes and edges along either cancel from, is in the median. Source: Immerkaer 1996, with the
-    median in place of the mean."""
+    """Return the variance of the noise of (H, W) grey values, at least LEAST_NOISE: from the median absolute second
+    difference along both axes, from which planes and edges along either axis cancel. Source: Immerkaer 1996, with the
+    median instead of the mean."""
     g = grey.astype(np.float32)
     across = g[:, :-2] - 2 * g[:, 1:-1] + g[:, 2:]
     both = across[:-2] - 2 * across[1:-1] + across[2:]
@@ -38,13 +39,13 @@ def noise_of(grey: np.ndarray) -> float:
 
 
 def plainest(values: np.ndarray, grey: np.ndarray) -> float:
-    """The quantile of values at PLAIN_SHARE, without pixels that are black or white: clipped ones have no noise."""
+    """Return the quantile PLAIN_SHARE of values, without black and white pixels: clipped ones have no noise."""
     varying = values[_may_vary(grey)]
     return float(np.quantile(varying, PLAIN_SHARE)) if len(varying) else 0.0
 
 
 def _may_vary(grey: np.ndarray) -> np.ndarray:
-    """(H, W) bool: what is not black or white."""
+    """Return (H, W) bool: pixels that are neither black nor white."""
     return (grey > DARKEST) & (grey < BRIGHTEST)
 
 
@@ -54,12 +55,13 @@ def shared_noise(
     depths: Sequence[np.ndarray],
     sources: Sequence[Sequence[int]],
 ) -> list[float]:
-    """Of each photograph a variance that its noise does not exceed, LEAST_NOISE at least; infinite where none of its
-    `sources`, numbers of photographs, shows enough of the same.
+    """Return for each photograph an upper bound of the variance of its noise, at least LEAST_NOISE; infinite where none
+    of its `sources`, numbers of photographs, shows enough of the same surfaces.
 
-    `greys` (H, W) uint8, `depths` (H, W) that are known, NaN elsewhere. It is the variance of what 3 by 3 pixels differ
-    by from the other photograph at the same surface, in the plainest tenth of windows, of the source that differs
-    least: the noise of both, but of the other's less as it is interpolated, and what errors of depth make of texture.
+    `greys` (H, W) uint8; `depths` (H, W), NaN where unknown. The bound is the variance over 3 by 3 pixels of the
+    difference to the other photograph at the same surface, in the plainest tenth of windows, for the source view that
+    differs least. It contains the noise of both photographs, that of the other reduced by interpolation, and texture
+    displaced by errors of depth.
     """
     rng, result = np.random.default_rng(0), []
     for camera, grey, depth, others in zip(cameras, greys, depths, sources, strict=True):
@@ -70,8 +72,8 @@ def shared_noise(
 
 
 def _windows(camera: Camera, grey: np.ndarray, depth: np.ndarray, rng) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 9) grey values of random windows whose depths are known and whose middles are not clipped, and (N, 9, 3)
-    their points."""
+    """Return (N, 9) grey values of random windows with known depths whose middles are not clipped, and their (N, 9, 3)
+    points."""
     known = np.isfinite(depth) & _may_vary(grey)
     known[[0, -1]] = known[:, [0, -1]] = False
     middles = np.unravel_index(rng.permutation(np.flatnonzero(known))[:WINDOWS], known.shape)
@@ -82,7 +84,8 @@ def _windows(camera: Camera, grey: np.ndarray, depth: np.ndarray, rng) -> tuple[
 
 
 def _difference(windows: np.ndarray, points: np.ndarray, other: Camera, grey: np.ndarray, depth: np.ndarray) -> float:
-    """See `shared_noise`; infinite where few (N, 9) windows with their (N, 9, 3) points are in `other`."""
+    """Return the bound of `shared_noise` from one view `other`; infinite if it shows too few of the (N, 9) windows,
+    given their (N, 9, 3) points."""
     pixels, away = other.project(points.reshape(-1, 3))
     seen = other.shows(pixels, away)
     column, row = np.where(seen, pixels.T, 0).astype(np.int64)

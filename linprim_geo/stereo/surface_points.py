@@ -1,5 +1,4 @@
-"""Surfaces by stereo of small copies of the photographs: dense enough to start a training from, and to hold it to
-them."""
+"""Surfaces by stereo of small copies of the photographs, to initialise and to supervise training."""
 
 from __future__ import annotations
 
@@ -15,24 +14,26 @@ from linprim_geo.stereo.confidence import RIGHT
 from linprim_geo.stereo.depth_maps import FOREGROUND, depth_maps, inverse_planes
 from linprim_geo.stereo.planes.skies import shows_sky
 
-# Photographs are averaged down until their longer side has no more pixels, and no more of them are taken: a training
-# starts with some ten thousand primitives, and a view of this size has 30,000 pixels.
+# The longest side in pixels to which photographs are averaged down, and the most photographs used: training starts with
+# some ten thousand primitives, and a view of this size has 30,000 pixels.
 LONGER_SIDE, MOST_VIEWS = 200, 100
-# A point is taken if at least this share of the pixels on its side of the photograph's edges are known and go on with
-# its surface (`support`). Beside a thing, where windows of stereo hold its depth for the wall's behind it, fewer do.
+# A point is used if at least this share of the pixels on its side of the photograph's edges is known and continues its
+# surface (`support`). Beside an object, where windows of stereo extend its depth over the wall behind, fewer do.
 LEAST_SUPPORT = 1 / 2
 
 
 def small_copies(views: Sequence[View]) -> list[SmallCopy]:
-    """Of at most MOST_VIEWS views, evenly over their order, with at most LONGER_SIDE pixels each way."""
+    """Return small copies of at most MOST_VIEWS views, evenly chosen in their order, with at most LONGER_SIDE pixels a
+    side."""
     chosen = np.unique(np.linspace(0, len(views) - 1, min(MOST_VIEWS, len(views))).round().astype(int))
     return [SmallCopy.within(views[k], LONGER_SIDE) for k in chosen]
 
 
 @dataclass(frozen=True)
 class SurfaceMap:
-    """Of a small copy: (3, H, W) float32 `planes`, the inverse depth in the scene's unit and its slopes per pixel, 0
-    where no surface is known, (H, W, 3) uint8 `rgb`, and whether it `shows_sky`, if that was asked."""
+    """The surfaces of a small copy: `planes` (3, H, W) float32, inverse depth in the scene's unit and its slopes per
+    pixel, 0 where no surface is known; `rgb` (H, W, 3) uint8; and whether it `shows_sky`, false unless that was
+    requested."""
 
     view: SmallCopy
     planes: np.ndarray
@@ -41,19 +42,19 @@ class SurfaceMap:
 
     @property
     def known(self) -> np.ndarray:
-        """(H, W) bool."""
+        """(H, W) bool: pixels with a surface."""
         return self.planes[0] > 0
 
 
 def surface_maps(
     views: Sequence[SmallCopy], points: np.ndarray, seed: int, *, skies: bool = False, quiet: bool = True
 ) -> list[SurfaceMap]:
-    """Of every view the surfaces that stereo finds, other views confirm and pixels around continue; of masked
-    photographs those of the foreground.
+    """Return for every view the surfaces that stereo finds, other views confirm and pixels around support; of masked
+    photographs only those of the foreground.
 
     Args:
         points: (P, 3) of the scene, as for `depth_maps`.
-        skies: whether photographs that show one are looked for.
+        skies: whether photographs that show a sky are detected.
 
     Raises:
         LinprimError: as `depth_maps`.
@@ -72,7 +73,7 @@ def surface_maps(
 
 
 def surface_points(maps: Sequence[SurfaceMap], count: int, seed: int) -> PointCloud:
-    """`count` points, or fewer, evenly drawn from all that are known."""
+    """Return at most `count` points, drawn uniformly from all known pixels."""
     cameras = [found.view.camera for found in maps]
     xyz = [
         camera.world_rays()[found.known] / found.planes[0][found.known].astype(np.float64)[:, None] + camera.center

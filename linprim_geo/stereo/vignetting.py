@@ -1,4 +1,4 @@
-"""Vignetting: by how much photographs are darker away from their middle, from points that several of them show."""
+"""Estimate vignetting, the darkening of photographs away from the centre, from points that several of them show."""
 
 from __future__ import annotations
 
@@ -12,40 +12,41 @@ from linprim_geo.geometry.sampling import sample_bilinear
 from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 
-# Each view is compared with those so many places after it, at so many of its points, by means of so many pixels a side.
+# Each view is compared with the views so many places after it, at POINTS points, by means over BOX by BOX pixels.
 STEPS, POINTS, BOX = (1, 2, 4, 8), 2000, 3
-# Pairs with fewer points in common say nothing; with fewer pairs nothing is known.
+# The fewest common points of a pair, and the fewest pairs.
 LEAST_POINTS, LEAST_PAIRS = 50, 3
-# Darker pixels and brighter ones are clipped, or too noisy for a logarithm.
+# Grey values outside of these are clipped, or too noisy for a logarithm.
 DARKEST, BRIGHTEST = 20, 245
-# Rounds in which differences of more than so many deviations lose weight: paint that shines, and wrong depths.
+# Rounds of robust reweighting, in which residuals above OUTLIER deviations lose weight: glossy paint, and wrong depths.
 ROUNDS, OUTLIER = 5, 2.0
-# What is found counts from so many of its standard errors, and if corners are between so many times as bright as the
-# middle: cos^4 of 45 degrees, and a correction that goes too far. What only the middle shows is not known of corners.
+# The result is used if it exceeds CERTAIN standard errors, and the brightness of corners relative to the centre is
+# within CORNERS: cos^4 of 45 degrees, and a correction that overshoots. What only the centre shows does not fix the
+# corners.
 CERTAIN, CORNERS = 3.0, (0.25, 1.1)
 
 
 def radius_square(camera: Camera, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Square of the distance of positions from the optical axis, 1 in the corner of an image that it is the middle
-    of."""
+    """Return the squared distance of pixel positions from the optical axis, 1 in the corner of an image centred on
+    it."""
     return ((x - camera.cx) ** 2 + (y - camera.cy) ** 2) / (0.25 * (camera.width**2 + camera.height**2))
 
 
 def falloff(camera: Camera, law: np.ndarray) -> np.ndarray:
-    """(H, W) what grey values are multiplied by, for what `vignetting` returns."""
+    """Return the (H, W) factor by which vignetting, as `vignetting` returns it, multiplies grey values."""
     square = radius_square(camera, np.arange(camera.width) + 0.5, np.arange(camera.height)[:, None] + 0.5)
     return np.exp(law[0] * square + law[1] * square**2)
 
 
 def vignetting(cameras: Sequence[Camera], greys: Sequence[np.ndarray], depths: Sequence[np.ndarray]) -> np.ndarray:
-    """(2,) a and b: grey values are multiplied by exp(a s + b s^2), with s as `radius_square` gives it; zeros where
-    that cannot be told from none.
+    """Return (2,) a and b: grey values are multiplied by exp(a s + b s^2), with s of `radius_square`; zeros if that is
+    not significant.
 
-    A point of a matt surface has the same brightness in all photographs but for a gain of each pair: what is left
-    depends on where in the image it lies. Weighted least squares of the logarithms, gains eliminated.
+    A point on a matt surface is equally bright in all photographs, apart from a gain per pair. The remaining difference
+    depends on its position in the images. Fitted by weighted least squares of logarithms, gains eliminated.
 
     Args:
-        greys: (H, W) of each view, as displays show them: a power of brightness only changes a and b.
+        greys: (H, W) of each view, gamma-encoded: a power of brightness only changes a and b.
         depths: (H, W) confirmed depth of each view, NaN elsewhere.
     """
     smooth: dict[int, np.ndarray] = {}  # of the views that are being compared
@@ -78,7 +79,7 @@ def vignetting(cameras: Sequence[Camera], greys: Sequence[np.ndarray], depths: S
 
 
 def _pair(cameras, greys, depths, one, other, at, points) -> np.ndarray:
-    """(P, 3) of points that two views show: difference of the logarithms of their grey values, and of s and s^2."""
+    """Return (P, 3) for points that two views show: the differences of log grey value, s and s^2."""
     inside, row, column = in_image(cameras[other], points)
     pixels, depth = cameras[other].project(points)
     with np.errstate(invalid="ignore"):
@@ -92,13 +93,13 @@ def _pair(cameras, greys, depths, one, other, at, points) -> np.ndarray:
 
 
 def _centered(pair: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Without the pair's gain."""
+    """Return the rows of a pair less their weighted mean, which eliminates its gain."""
     return pair - np.average(pair, axis=0, weights=weight)
 
 
 def _least_squares(pairs: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> tuple[np.ndarray, float]:
-    """The two factors, and the standard error of their sum: by how much pairs disagree, whose points have errors in
-    common."""
+    """Return the two factors, and the standard error of their sum from the scatter between pairs, as errors within a
+    pair are correlated."""
     normal = [(pair[:, 1:] * w[:, None]).T @ pair[:, 1:] for pair, w in zip(pairs, weights, strict=True)]
     right = [(pair[:, 1:] * w[:, None]).T @ pair[:, 0] for pair, w in zip(pairs, weights, strict=True)]
     inverse = np.linalg.pinv(np.sum(normal, 0))
