@@ -1,1 +1,1 @@
-"""Dense reconstruction of a capture: its folder, its maps on disk, its cloud of points."""
+"""Dense reconstruction of a capture: its workspace folder, its maps on disk, and its fused point cloud."""

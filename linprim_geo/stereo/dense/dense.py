@@ -1,7 +1,7 @@
-"""Dense stereo of a capture with poses: maps of every photograph and one cloud of points, in the layout of COLMAP.
+"""Dense stereo of a capture with poses: maps of every photograph and one fused point cloud, in the layout of COLMAP.
 
-`workspace.py` says which files there are. stereo.json beside them holds the options, what was planned, and in the end
-the figures. What a run that was stopped has finished is not done again with `resume`.
+`workspace.py` describes the files. Beside them, stereo.json holds the options, the plan, and in the end the results.
+With `resume`, a stopped run continues and does not repeat what it has finished.
 """
 
 from __future__ import annotations
@@ -32,13 +32,14 @@ from linprim_geo.stereo.poses.adjust_poses import adjusted_scene
 from linprim_geo.stereo.poses.refine_found_poses import prepare
 
 NOTES, POINTS, WORK = "stereo.json", "fused.ply", "work"
-# Depths are probable from here on.
+# The least confidence of a depth that counts as probable.
 PROBABLE = 0.5
 
 
 @dataclass(frozen=True)
 class Dense:
-    """What is in the folder: the workspace, the pairs of its views, and the notes of stereo.json."""
+    """The contents of the folder: the workspace, the source views of each view (`pairs`), and the notes of
+    stereo.json."""
 
     workspace: Workspace
     pairs: list[list[int]]
@@ -55,10 +56,10 @@ def run_stereo(
     resume: bool = False,
     quiet: bool = False,
 ) -> Dense:
-    """Finds depth, normals and confidence of every photograph of a capture, and points out of all of them.
+    """Compute depth, normals and confidence of every photograph of a capture, and fuse them into points.
 
-    With `resume` the folder's own options are used but for `threads` and `least_confidence`. With a `budget`
-    photographs are averaged down, then left out, by the speed of the first ones.
+    With `resume` the options saved in the folder are used, except `threads` and `least_confidence`. With a `budget`
+    photographs are averaged down, and then left out, according to the speed of a few of them.
 
     Raises:
         LinprimError: the capture or an option cannot be used, or the folder exists already.
@@ -106,10 +107,10 @@ def run_stereo(
 
 
 def _notes(output: Path, resume: bool) -> dict:
-    """What stereo.json holds; nothing where the folder is unused.
+    """Return the contents of stereo.json; empty if the folder is unused.
 
     Raises:
-        LinprimError: the folder is in use, and not to be gone on with.
+        LinprimError: the folder is in use and is not to be resumed.
     """
     used = [entry for entry in output.iterdir() if not is_leftover(entry)]
     if not used:
@@ -122,7 +123,7 @@ def _notes(output: Path, resume: bool) -> dict:
     wanted = {"names": list, "scene": str, "downscale": int}
     if not isinstance(notes, dict) or any(not isinstance(notes.get(key), kind) for key, kind in wanted.items()):
         raise LinprimError(f"{output / NOTES}: does not say which photographs were taken, wanted names and downscale")
-    for torn in output.rglob(".*.tmp*"):  # what a kill has left of files that were being written
+    for torn in output.rglob(".*.tmp*"):  # incomplete files of a killed run
         if is_leftover(torn):
             torn.unlink()
     return notes
@@ -136,7 +137,7 @@ def _photographs(
     notes: dict,
     log: Callable[[str], None],
 ) -> tuple[Photographs, dict]:
-    """The photographs to take, and the notes about them."""
+    """Return the photographs to process, and the notes about them."""
     prepare(path, scene_options, threads=options.threads, log=log)
     scene = load_scene(path, scene_options)
     scene_options = replace(scene_options, downscale=told_downscale(scene, scene_options, log))
@@ -184,11 +185,12 @@ def _photographs(
 
 
 def _sorted_views(scene: Scene) -> list[View]:
-    """All of them, so that those taken one after the other follow each other, as a rule."""
+    """Return all views sorted by name: successive photographs are then usually neighbours."""
     return sorted(scene.views, key=lambda view: view.name)
 
 
 def _told(plan: Plan, views: list[View], budget: Budget) -> str:
+    """Return a message that describes the plan."""
     changes = []
     if plan.downscale > 1:
         changes.append(f"{plan.downscale} by {plan.downscale} pixels averaged into one")
@@ -199,7 +201,7 @@ def _told(plan: Plan, views: list[View], budget: Budget) -> str:
 
 
 def _match(photographs: Photographs, workspace: Workspace, seed: int, quiet: bool) -> None:
-    """Photographs and maps of all views, as far as they are not there."""
+    """Write the photographs and maps of all views that do not exist yet."""
     views = range(len(photographs.views))
     left = [k for k in views if not workspace.has_maps(k)]
     for k in views:
@@ -218,7 +220,7 @@ def _match(photographs: Photographs, workspace: Workspace, seed: int, quiet: boo
 
 
 def _coverage(workspace: Workspace, k: int) -> dict:
-    """Of view k: its name, the share of its pixels with a depth, and of those that are probable."""
+    """Return for view k its name, the share of its pixels with a depth, and the share with a probable one."""
     maps = workspace.read_maps(k)
     return {
         "name": workspace.views[k].name,

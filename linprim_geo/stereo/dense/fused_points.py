@@ -1,8 +1,8 @@
-"""One cloud of points out of the maps of all photographs.
+"""Fuse the maps of all photographs into one point cloud.
 
-A depth that is probable enough becomes a point if so many other photographs confirm it. Of the photographs that confirm
-each other one gives the point: that with the finest pixels, in steps of two, the first of these. Its depth, normal and
-colour are the means over all of them, so that every surface is there about once.
+A depth of sufficient confidence becomes a point if enough other photographs confirm it. Of the photographs that confirm
+each other only one gives the point: the one with the smallest pixels there, in steps of two, or the first of these. Its
+depth, normal and colour are means over all of them, so that every surface is represented about once.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from linprim_geo.stereo.dense.workspace import ModelPoint, Workspace
 from linprim_geo.stereo.depth_maps import MOST_SOURCES, inverse_planes
 from linprim_geo.stereo.evidence import glance
 
-# Views whose maps are in memory: one, and those that it is compared with.
+# Views whose maps are kept in memory: one and its source views.
 KEPT = 1 + MOST_SOURCES
-# Points of the model from each view, and the most in all.
+# Points of the sparse model from each view, and the most in all.
 VIEW_POINTS, MODEL_POINTS = 200, 20_000
 COLUMNS = np.dtype(
     [
@@ -38,9 +38,9 @@ COLUMNS = np.dtype(
 
 @dataclass(frozen=True)
 class _Side:
-    """The probable depths of a view: `depth` (H, W), NaN where there are none, `plane` (3, H, W) inverse depth and its
-    slopes, `values` (H, W, 7) normal in the world, colour and confidence, `level` (H, W) the power of two that the size
-    of a pixel has at its depth, infinite where there is none, and `weight` (H, W) of a mean."""
+    """The confident depths of a view: `depth` (H, W), NaN where none; `plane` (3, H, W), inverse depth and its slopes;
+    `values` (H, W, 7), normal in the world, colour and confidence; `level` (H, W), log2 of the size of a pixel at its
+    depth, rounded down, infinite where none; and `weight` (H, W) in means."""
 
     camera: Camera
     depth: np.ndarray
@@ -51,15 +51,15 @@ class _Side:
 
 
 class PointFusion:
-    """Fuses the maps of a workspace, view by view; the maps of the last KEPT are in memory."""
+    """Fuses the maps of a workspace, view by view. The maps of the last KEPT views are kept in memory."""
 
     def __init__(self, workspace: Workspace, pairs: list[list[int]], least: float):
-        """`least` is the confidence from which on depths count."""
+        """`least` is the least confidence of depths that are used."""
         self.workspace, self.pairs, self.least = workspace, pairs, least
         self._kept: OrderedDict[int, _Side] = OrderedDict()
 
     def write(self, path: Path, progress: Progress) -> tuple[int, list[ModelPoint]]:
-        """Writes the points as PLY; how many, and some of them with the views that see them."""
+        """Write the points as PLY. Return their number, and some of them with the views that see them."""
         views = len(self.pairs)
         some, count, raw = [], 0, path.with_suffix(".raw")
         each = max(1, min(VIEW_POINTS, MODEL_POINTS // views))
@@ -79,8 +79,8 @@ class PointFusion:
         return count, some
 
     def _points(self, k: int) -> tuple[np.ndarray, list[tuple[int, np.ndarray]]]:
-        """(N,) COLUMNS of what view k gives, and for it and each of its sources (N, 2) pixels (x, y) where they are
-        seen, NaN where not."""
+        """Return the (N,) points of COLUMNS that view k gives, and for it and each of its source views the (N, 2)
+        pixels (x, y) that see them, NaN where not."""
         own = self._side(k)
         sides = [self._side(j) for j in self.pairs[k]]
         found = [glance(own.camera, own.depth, side.camera, side.plane) for side in sides]
@@ -122,7 +122,7 @@ class PointFusion:
             axis=2,
             dtype=np.float32,
         )
-        # Errors grow with the size of pixels.
+        # The error of a depth grows with the size of its pixel.
         weight = np.where(kept, maps.confidence / footprint**2, 0)
         level = np.where(kept, np.floor(np.log2(footprint)), np.inf)
         self._kept[k] = side = _Side(camera, depth, inverse_planes(camera, depth, maps.normal), values, level, weight)
@@ -132,7 +132,7 @@ class PointFusion:
 
 
 def _model_points(points: np.ndarray, seen: list[tuple[int, np.ndarray]], count: int) -> list[ModelPoint]:
-    """About `count` of the points, evenly over their order."""
+    """Return about `count` of the points, evenly spaced in their order."""
     chosen = range(0, len(points), max(1, len(points) // count))
     return [
         ModelPoint(
@@ -145,6 +145,6 @@ def _model_points(points: np.ndarray, seen: list[tuple[int, np.ndarray]], count:
 
 
 def _columns(table: np.ndarray) -> dict[str, np.ndarray]:
-    """The columns of the PLY file; coordinates are double, which is enough for a frame far from its origin."""
+    """Return the columns of the PLY file. Coordinates are double: precise enough for a frame far from its origin."""
     normal = xyz_columns(table["normal"], "nx ny nz")
     return xyz_columns(table["xyz"]) | normal | color_columns(table["rgb"]) | {"confidence": table["confidence"]}

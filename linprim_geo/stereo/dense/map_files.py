@@ -1,7 +1,7 @@
-"""Maps of one or more numbers per pixel in COLMAP's files of dense reconstruction.
+"""Read and write maps in COLMAP's file format of dense reconstruction.
 
-A line of text, `WIDTH&HEIGHT&CHANNELS&`, and float32 numbers, little-endian: rows of the first channel, then those of
-the next.
+A file is a line of text, `WIDTH&HEIGHT&CHANNELS&`, and little-endian float32 numbers: all rows of the first channel,
+then those of the next.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy as np
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write
 
-# Sizes in the header have at most so many digits.
+# The most characters of a header: three numbers of at most ten digits, and separators.
 _LONGEST_HEADER = 3 * 10 + 3
 
 
 def write_map(path: Path, values: np.ndarray) -> None:
-    """Writes (H, W) or (H, W, C) numbers."""
+    """Write (H, W) or (H, W, C) numbers."""
     channels = values[..., None] if values.ndim == 2 else values
     height, width, count = channels.shape
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
@@ -27,10 +27,10 @@ def write_map(path: Path, values: np.ndarray) -> None:
 
 
 def read_map(path: Path) -> np.ndarray:
-    """(H, W) float32 of a file with one channel, else (H, W, C).
+    """Return the (H, W) float32 map of a file with one channel, else (H, W, C).
 
     Raises:
-        LinprimError: it cannot be read, or is not such a file.
+        LinprimError: the file cannot be read, or is not such a map.
     """
     try:
         data = path.read_bytes()

@@ -1,4 +1,4 @@
-"""Depth, normals and confidence of a photograph whose planes lie on disk."""
+"""Compute depth, normals and confidence of a photograph from depth planes on disk."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from linprim_geo.stereo.evidence import glance
 
 
 def seen_depths(photographs: Photographs, planes: PlanesOnDisk, k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of view k (H, W) float64 depth, NaN where it is unknown, (H, W, 3) normals in the world, and (H, W, 6)
+    """Return for view k the (H, W) float64 depth, NaN where unknown, (H, W, 3) normals in the world, and (H, W, 6)
     `evidence`."""
     camera, layers = photographs.cameras[k], np.array(planes.read(k))
     depth, normal = depth_and_normal(camera, np.moveaxis(layers[:3], 0, 2))
@@ -27,7 +27,7 @@ def seen_depths(photographs: Photographs, planes: PlanesOnDisk, k: int) -> tuple
 
 
 def maps_of(photographs: Photographs, planes: PlanesOnDisk, k: int) -> Maps:
-    """The maps of view k."""
+    """Return the maps of view k."""
     depth, normal, found = seen_depths(photographs, planes, k)
     known = np.isfinite(depth)
     in_camera = normal @ photographs.cameras[k].rotation.T

@@ -1,5 +1,5 @@
-"""PatchMatch stereo of captures that do not fit into memory: the planes of each photograph lie in a file of their own
-after each stage, so that a run that was stopped goes on there."""
+"""PatchMatch stereo of captures that do not fit into memory. After each stage the depth planes of each photograph are
+stored in a file of their own, so that a stopped run can be resumed."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ from linprim_geo.stereo.depth_maps import (
 )
 from linprim_geo.stereo.noise import noise_of
 
-# By photographs alone, then in turns with the depths of neighbours.
+# One photometric stage, and then passes with geometric consistency.
 STAGES = 1 + len(GEOMETRIC_SWEEPS)
-# Photographs in memory: one, those that it is compared with, and as many again for the next one.
+# Photographs kept in memory: one and its source views, and as many for the next one.
 KEPT = 2 * (1 + MOST_SOURCES)
-# Bytes per pixel of the largest photograph at the peak, when points are fused: 980 on `banana`, whose photographs are
-# compared with four others at most, and 20 for each further one.
+# Bytes per pixel of the largest photograph at the peak, during fusion: 980 on `banana`, whose photographs have at most
+# four source views, and 20 for each further one.
 PIXEL_BYTES = 1100
 
 
 class Photographs:
-    """Views as stereo takes them, read when they are needed; the last KEPT are in memory."""
+    """The views of a capture, loaded when needed; the last KEPT are kept in memory."""
 
     def __init__(self, views: Sequence[View], points: np.ndarray):
         """`points` (P, 3) of the scene, by which views that see the same are found, and the range of depths.
@@ -67,15 +67,15 @@ class Photographs:
         self._kept: OrderedDict[int, tuple[StereoImage, StereoImage, float]] = OrderedDict()
 
     def image(self, k: int) -> StereoImage:
-        """View k at full size."""
+        """Return view k at full size."""
         return self._read(k)[0]
 
     def half(self, k: int) -> StereoImage:
-        """View k at half the size."""
+        """Return view k at half the size."""
         return self._read(k)[1]
 
     def noise(self, k: int) -> float:
-        """Variance of the noise of view k's grey values."""
+        """Return the variance of the noise of view k's grey values."""
         return self._read(k)[2]
 
     def _read(self, k: int) -> tuple[StereoImage, StereoImage, float]:
@@ -90,13 +90,13 @@ class Photographs:
 
 
 class PlanesOnDisk:
-    """The planes of photographs after the last stage, in files of `folder`."""
+    """The depth planes of photographs, stored in files of `folder` after each stage."""
 
     def __init__(self, photographs: Photographs, folder: Path, seed: int):
         self.photographs, self.folder, self.seed = photographs, folder, seed
 
     def compute(self, progress: Progress) -> None:
-        """Does what is left of all stages; `progress` counts photographs in stages."""
+        """Compute all stages that are not done; `progress` counts photographs times stages."""
         names = range(len(self.photographs.views))
         done = [stage for stage in range(STAGES) if all(self._file(k, stage).is_file() for k in names)]
         for stage in range(done[-1] + 1 if done else 0, STAGES):
@@ -108,7 +108,7 @@ class PlanesOnDisk:
                 self._file(k, stage - 1).unlink(missing_ok=True)
 
     def read(self, k: int) -> np.ndarray:
-        """(5, H, W) float32 of view k, mapped from its file: `DepthPlanes.plane`, its cost, and what was chosen."""
+        """Return (5, H, W) float32 of view k, memory-mapped: `DepthPlanes.plane`, its cost, and `chosen`."""
         return np.load(self._file(k, STAGES - 1), mmap_mode="r", allow_pickle=False)
 
     def _planes(self, k: int, stage: int) -> DepthPlanes:

@@ -1,4 +1,4 @@
-"""What stereo can do in a given time: smaller photographs first, then fewer of them."""
+"""Plan stereo for a given time: smaller photographs first, then fewer of them."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from linprim_geo.capture.types import View
 from linprim_geo.stereo.dense.planes_on_disk import Photographs
 from linprim_geo.stereo.depth_maps import halved, inverse_range, photometric_planes
 
-# Photographs that are timed at most, within this share of the time, each averaged down to at most so many pixels.
+# The most photographs that are timed, the share of the time budget for it, and the most pixels to which each is
+# averaged down.
 TIMED, TIMED_SHARE, TIMED_PIXELS = 3, 0.05, 200_000
-# All of stereo takes so many times as long as its first stage, which is what is timed: 3.8 times on `statue_room`, two
-# cores, and the page comes after it.
+# All of stereo takes so many times as long as its first stage, which is timed: 3.8 times on `statue_room` with two
+# cores, and then the report.
 WHOLE = 3.9
 # Photographs are not made smaller than so many pixels along the longer side.
 SMALLEST_SIDE = 240
@@ -26,7 +27,7 @@ LEAST_VIEWS = 3
 
 @dataclass(frozen=True)
 class Plan:
-    """K by K pixels are averaged into one, `views` of the photographs are taken, all of it in `seconds`."""
+    """Average `downscale` by `downscale` pixels into one and process `views` photographs, all in `seconds`."""
 
     downscale: int
     views: int
@@ -34,7 +35,8 @@ class Plan:
 
 
 def seconds_per_pixel(photographs: Photographs, budget: Budget) -> float:
-    """Of all of stereo, by the first stage of some photographs, evenly over the capture."""
+    """Estimate the time of all of stereo per pixel from the first stage of some photographs, evenly chosen from the
+    capture."""
     with_sources = [k for k, sources in enumerate(photographs.pairs) if sources]
     chosen, rates = with_sources[:: max(1, len(with_sources) // TIMED)][:TIMED], []
     begin = time.monotonic()
@@ -56,7 +58,8 @@ def seconds_per_pixel(photographs: Photographs, budget: Budget) -> float:
 
 
 def planned(views: Sequence[View], rate: float, budget: Budget) -> Plan:
-    """The least averaging down, and then the most views, that fit into what is left; `rate` is `seconds_per_pixel`.
+    """Return the plan with the least downscale, and then the most views, that fits into the time left; `rate` is
+    `seconds_per_pixel`.
 
     Raises:
         LinprimError: not even three small photographs fit.

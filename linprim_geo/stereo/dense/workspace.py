@@ -1,12 +1,12 @@
-"""The folder of a dense reconstruction, laid out as COLMAP's: undistorted photographs, a model of their cameras, and
-maps of each photograph.
+"""The folder of a dense reconstruction in COLMAP's layout: undistorted photographs, a model of their cameras, and maps
+of each photograph.
 
     images/NAME                                  photographs of pinhole cameras
     sparse/cameras.bin images.bin points3D.bin   the cameras, and points that several of them see
     stereo/depth_maps/NAME.geometric.bin         z-depth in the unit of the data set, 0 where unknown
     stereo/normal_maps/NAME.geometric.bin        normals in the camera's axes, towards the camera
     stereo/confidence_maps/NAME.geometric.bin    probability that the depth is right within 1 %
-    stereo/patch-match.cfg stereo/fusion.cfg     which photographs each was compared with, and all their names
+    stereo/patch-match.cfg stereo/fusion.cfg     source views of each photograph, and all their names
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ from linprim_geo.geometry.pycolmap_files import write_model
 from linprim_geo.imaging.photos import image_format, image_header, read_photo
 from linprim_geo.stereo.dense.map_files import read_map, write_map
 
-# Pillow's names of the formats that COLMAP reads, with the suffix that it knows them by.
+# Pillow's names of the formats that COLMAP reads, with the suffixes that it accepts.
 FORMATS = {"JPEG": (".jpg", ".jpeg"), "PNG": (".png",), "TIFF": (".tif", ".tiff"), "BMP": (".bmp",)}
 KINDS = ("depth", "normal", "confidence")
 
 
 @dataclass(frozen=True)
 class ModelPoint:
-    """A point of the model: `xyz`, `rgb`, and the photographs that see it, each with the pixel (x, y) where."""
+    """A point of the sparse model: `xyz`, `rgb`, and its track `seen`: number of a photograph and pixel (x, y) of each
+    observation."""
 
     xyz: np.ndarray
     rgb: np.ndarray
@@ -41,8 +42,8 @@ class ModelPoint:
 
 @dataclass(frozen=True)
 class Maps:
-    """Of one photograph: `depth` (H, W), 0 where unknown, `normal` (H, W, 3) in the camera's axes, `confidence`
-    (H, W)."""
+    """The maps of one photograph: `depth` (H, W), 0 where unknown, `normal` (H, W, 3) in the camera's axes,
+    `confidence` (H, W)."""
 
     depth: np.ndarray
     normal: np.ndarray
@@ -50,19 +51,19 @@ class Maps:
 
 
 class Workspace:
-    """The files of a dense reconstruction of views in `root`."""
+    """The files in `root` of a dense reconstruction of views."""
 
     def __init__(self, root: Path, views: Sequence[View]):
         self.root, self.views = root, views
         self.names = [image_name(view) for view in views]
 
     def image(self, k: int) -> Path:
-        """The photograph of view k."""
+        """Return the file of view k's photograph."""
         return self.root / "images" / self.names[k]
 
     def write_image(self, k: int) -> None:
-        """Writes the photograph of view k, unless it is there: the file itself if that is one of a pinhole camera, else
-        a PNG."""
+        """Write the photograph of view k unless it exists: a copy of the file if that is of a pinhole camera, else a
+        PNG."""
         from PIL import Image
 
         view, target = self.views[k], self.image(k)
@@ -75,29 +76,29 @@ class Workspace:
                 Image.fromarray(view.load().rgb).save(temporary, format="PNG", compress_level=1)
 
     def colors(self, k: int) -> np.ndarray:
-        """(H, W, 3) uint8 of view k."""
+        """Return the (H, W, 3) uint8 colours of view k."""
         camera = self.views[k].camera
         return read_photo(self.image(k), (camera.width, camera.height))[0]
 
     def map_file(self, kind: str, k: int) -> Path:
-        """The file of a map of view k; `kind` is one of KINDS."""
+        """Return the file of a map of view k; `kind` is one of KINDS."""
         return self.root / "stereo" / f"{kind}_maps" / f"{self.names[k]}.geometric.bin"
 
     def write_maps(self, k: int, maps: Maps) -> None:
-        """Writes all maps of view k; the last of KINDS comes last."""
+        """Write all maps of view k; the last of KINDS is written last."""
         for kind in KINDS:
             write_map(self.map_file(kind, k), getattr(maps, kind))
 
     def has_maps(self, k: int) -> bool:
-        """Whether all maps of view k are there."""
+        """Return whether all maps of view k exist."""
         return self.map_file(KINDS[-1], k).is_file()
 
     def read_maps(self, k: int) -> Maps:
-        """The maps of view k."""
+        """Return the maps of view k."""
         return Maps(*(read_map(self.map_file(kind, k)) for kind in KINDS))
 
     def write_configurations(self, pairs: Sequence[Sequence[int]]) -> None:
-        """Writes what COLMAP's programs begin with; `pairs` are the views that each is compared with."""
+        """Write the configuration files of COLMAP's programs; `pairs` are the source views of each view."""
         lines = []
         for name, sources in zip(self.names, pairs, strict=True):
             lines += [name, ", ".join(self.names[j] for j in sources)]
@@ -106,7 +107,7 @@ class Workspace:
                 temporary.write_text("".join(f"{line}\n" for line in text))
 
     def write_model(self, points: Sequence[ModelPoint]) -> None:
-        """Writes the model of the cameras, with points by which COLMAP finds photographs that see the same."""
+        """Write the sparse model of the cameras, with points by which COLMAP selects photographs that see the same."""
         from linprim_geo.geometry.load_pycolmap import pycolmap
 
         cameras = [view.camera for view in self.views]
@@ -136,16 +137,16 @@ class Workspace:
 
 
 def image_name(view: View) -> str:
-    """The name that a view's photograph has in the folder."""
+    """Return the file name of a view's photograph in the folder."""
     return view.name + (view.image_path.suffix if _fits_as_it_is(view) else ".png")
 
 
 def _fits_as_it_is(view: View) -> bool:
-    """Whether the file of a view shows what its camera does, in a format that COLMAP reads."""
+    """Return whether the file of a view shows what its camera does, in a format that COLMAP reads."""
     if view.lens is not None or view.downscale != 1:
         return False
     suffixes = FORMATS.get(image_format(view.image_path), ())
-    size = image_header(view.image_path)[:2]  # another if EXIF says that it is turned
+    size = image_header(view.image_path)[:2]  # differs if EXIF rotates the photograph
     return view.image_path.suffix.lower() in suffixes and size == (view.camera.width, view.camera.height)
 
 

@@ -1,1 +1,1 @@
-"""Poses and lenses, adjusted and refined by what photographs show of surfaces."""
+"""Adjust given poses, and refine poses and lenses of structure from motion, by what photographs show of surfaces."""

@@ -1,12 +1,11 @@
-"""Poses that come with a capture, adjusted where its photographs say that they err.
+"""Adjust the poses of a capture if its photographs show that they are wrong.
 
-Keypoints are matched and triangulated under the given poses. Poses are adjusted to half of the points; where these
-explain the other half better than the given ones do, they are adjusted to all. Exact poses fail this test: adjusted
-ones have errors of their own. Under the adjusted poses stereo of small copies finds surfaces, and the given ones are
-adjusted again, to where photographs show patches of these (`stereo.patch_tracks`), which are more exact than keypoints
-and are on walls, too. Photographs of plain walls have no keypoints and so no neighbours for stereo; what it has found
-in others says which of them show the same, and they join in another round. The half of the keypoints that took no part
-judges patches, too.
+Keypoints are matched and triangulated under the given poses. Bundle adjustment to half of the points is accepted if it
+explains the other half better than the given poses do; exact poses fail this test, as adjusted ones have errors of
+their own. Then the poses are adjusted to all points. Under these, stereo of small copies finds surfaces, and the given
+poses are adjusted again to tracks of patches on them (`stereo.patch_tracks`), which are more precise than keypoints and
+exist on walls, too. Photographs of plain walls have no keypoints and so no neighbours for stereo; further rounds add
+them by the surfaces that stereo has found in others. The unused half of the keypoints also tests the poses by patches.
 """
 
 from __future__ import annotations
@@ -30,39 +29,39 @@ from linprim_geo.points.triangulate import digest_of, write_images
 from linprim_geo.stereo.planes.point_planes import confirmed_points
 from linprim_geo.stereo.poses.patch_tracks import patch_tracks, small_depth_maps
 
-# Changed whenever poses come out differently.
+# Increased whenever results differ.
 CACHE_VERSION = 4
-# Of more photographs so many, evenly spread, tell whether poses err. Adjusting needs all; the equations of all cameras
-# at once are dense, and with MOST_VIEWS take a minute.
+# The most photographs, evenly spaced, that are used to test the poses. Adjustment needs all; its normal equations of
+# all cameras are dense and take a minute with MOST_VIEWS, the limit.
 ASKED_VIEWS, MOST_VIEWS = 60, 500
-# Keypoints of a photograph, the longer side of those that they are looked for in, and the least one: smaller ones have
-# a dozen keypoints.
+# Keypoints per photograph; the longest side in pixels of the images in which they are detected; and the smallest longer
+# side: smaller photographs have a dozen keypoints.
 KEYPOINTS, LONGER_SIDE, LEAST_SIDE = 2048, 1000, 100
-# Poses may err by this share of the longer side, matches with them.
+# The largest epipolar error of matches, as a share of the longer side: poses may be wrong by as much.
 EPIPOLAR_SHARE = 0.004
-# Points have so many observations, and so many of them are needed in either half: the median error of 200 points with
-# 5 observations each is known to 3 %.
+# The least track length, the fewest points in each half, and the accuracy of their median error: that of 200 points
+# with 5 observations each is known to 3 %.
 LEAST_TRACK, LEAST_POINTS, KNOWN_TO = 3, 200, 0.03
-# Adjusted poses are taken where they leave no more than this share of the given ones' median error, on points that took
-# no part. Errors of keypoints and of poses add up as squares: the latter are half of the former then.
+# Adjusted poses are accepted if their median error on unused points is at most this share of that of the given ones.
+# Errors of keypoints and of poses add up as squares: the latter are half of the former then.
 LEFT_SHARE = 0.9
-# Exact poses of rendered scenes err by 0.04 pixels and less by keypoints, which have systematic errors of their own:
-# less than this is none.
+# Smaller errors of poses, in pixels, count as none: exact poses of rendered scenes have 0.04 and less by keypoints,
+# which have systematic errors of their own.
 LEAST_ERROR_PX = 0.1
-# The variance of an error that all patches of a photograph share, over that of each one's own: a highlight or a wrong
-# slope moves all patches of a surface alike. The same for all, by measurement: DECISIONS 127.
+# The variance of an error common to all patches of a photograph, relative to that of each one's own: a highlight or a
+# wrong slope moves all patches of a surface alike. The same for all, by measurement: DECISIONS 127.
 COMMON_ERROR = 0.02
-# A photograph with patches in so many places goes by them: its pose has six unknowns, and a third of them may err.
+# The fewest patches by which a photograph is adjusted: its pose has six unknowns, and a third of them may be wrong.
 LEAST_PATCHES = 20
 
 
 def adjusted_scene(
     scene: Scene, seed: int = 0, *, threads: int = 0, cache: Path | None = None, log: Callable[[str], None]
 ) -> Scene:
-    """The scene with adjusted poses where its photographs call for it; what was found is kept in the cache folder.
+    """Return the scene with adjusted poses if its photographs require it. The result is kept in the cache folder.
 
     Args:
-        scene: held-out views are adjusted, too: by keypoints, their colours are not used.
+        scene: held-out views are adjusted as well, by keypoints; their colours are not used.
         seed: of what pycolmap samples.
         threads: for keypoints; 0 uses all cores.
         log: is called with a line when poses are adjusted, or cannot be.
@@ -77,7 +76,7 @@ def adjusted_scene(
     stored = cache_folder(cache) / "adjusted_poses" / f"{digest_of(scene.views, (CACHE_VERSION, seed))}.json"
     try:
         found = AdjustedPoses.read(stored)
-    except LinprimError:  # none, or damaged: made again
+    except LinprimError:  # missing or damaged: computed again
         begin = time.monotonic()
         found = _adjusted(scene.views, seed, threads, log)
         try:
@@ -95,7 +94,7 @@ def adjusted_scene(
 
 
 def _adjusted(views: Sequence[View], seed: int, threads: int, log: Callable[[str], None]) -> AdjustedPoses:
-    """Adjusted poses, or none."""
+    """Return the adjusted poses, or none."""
     none = AdjustedPoses({}, 1.0, 0.0)
     step = -(-len(views) // ASKED_VIEWS)
     points = _observed(views[::step], seed, threads)
@@ -123,9 +122,9 @@ def _adjusted(views: Sequence[View], seed: int, threads: int, log: Callable[[str
 def _by_patches(
     views: Sequence[View], keypoints: Adjusted, points: ObservedPoints, seed: int, log: Callable[[str], None]
 ) -> Adjusted | None:
-    """Poses by patches of surfaces that stereo finds under those by `keypoints`, which photographs with few patches
-    keep; None if there are none. In rounds, as what one has found lets more photographs join. Keypoints tell the focal
-    length: highlights move patches as a wrong one does."""
+    """Adjust poses to patches of surfaces that stereo finds under those by `keypoints`, which photographs with few
+    patches keep. None if there are no patches. Repeated, as surfaces found in one round let more photographs join. The
+    focal length is held to that of keypoints, as highlights move patches as a wrong one does."""
     known = placed_points(keypoints.cameras, points).xyz
     cameras, done, shown = keypoints.cameras, None, np.zeros(len(views), bool)
     while True:  # until all photographs have patches, or no more of them
@@ -161,6 +160,7 @@ def _by_patches(
 
 
 def _observed(views: Sequence[View], seed: int, threads: int) -> ObservedPoints:
+    """Match and triangulate keypoints of the views. Return the points with sufficient track length."""
     cameras = [view.camera for view in views]
     found = triangulate_features(
         cameras,
@@ -176,14 +176,14 @@ def _observed(views: Sequence[View], seed: int, threads: int) -> ObservedPoints:
 
 @dataclass(frozen=True)
 class _Check:
-    """Keypoints that took no part in an adjustment to others, and their median error under it, `left_px`."""
+    """Keypoints not used in an adjustment to the others, and their median error under it, `left_px`."""
 
     points: ObservedPoints
     left_px: float
 
 
 def _check(views: Sequence[View], points: ObservedPoints, seed: int) -> _Check | None:
-    """Of poses that are adjusted to half of the points; None unless they leave less of the others' errors than the
+    """Test poses that are adjusted to half of the points. None unless they leave less error on the other half than the
     given ones."""
     first = np.random.default_rng([seed, 14]).random(len(points.xyz)) < 0.5
     if min(np.count_nonzero(first), np.count_nonzero(~first)) < LEAST_POINTS:
@@ -196,9 +196,11 @@ def _check(views: Sequence[View], points: ObservedPoints, seed: int) -> _Check |
 
 
 def _agrees(cameras: Sequence[Camera], check: _Check) -> bool:
-    """Whether keypoints are as near under these poses as under those by others of them, as far as that is known."""
+    """Return whether the unused keypoints have as small an error under these poses as under those by the other half,
+    within KNOWN_TO."""
     return _median_px(cameras, check.points) <= (1 + KNOWN_TO) * check.left_px
 
 
 def _median_px(cameras: Sequence[Camera], points: ObservedPoints) -> float:
+    """Return the median reprojection error in pixels of points triangulated under the cameras."""
     return float(np.median(reprojection_px(cameras, placed_points(cameras, points))))

@@ -1,8 +1,8 @@
-"""Points of surfaces and where photographs see them, to some hundredths of a pixel: patches of photographs, on planes
-that stereo of small copies finds, are moved in other photographs until they look the same.
+"""Track points of surfaces in photographs to some hundredths of a pixel, by alignment of image patches.
 
-Keypoints are exact to a third of a pixel, and a wall with weak texture has few of them; a patch that shows any texture
-is exact to its noise, along the directions in which it changes. Source: Lucas and Kanade 1981; Baker and Matthews,
+Patches lie on planes that stereo of small copies finds, and are shifted in other photographs until they look the same.
+Keypoints are precise to a third of a pixel, and a wall with weak texture has few; a patch with any texture is precise
+up to its noise, along the directions in which it varies. Source: Lucas and Kanade 1981; Baker and Matthews,
 Lucas-Kanade 20 Years On, 2004 (forward additive); patches on planes: Furukawa and Ponce, Accurate Camera Calibration
 from Multi-View Stereo and Bundle Adjustment, 2009.
 """
@@ -26,34 +26,35 @@ from linprim_geo.stereo.depth_maps import DepthMap, depth_maps, grey_of, inverse
 from linprim_geo.stereo.noise import noise_of
 from linprim_geo.stereo.surface_points import LONGER_SIDE as LONGER_SIDE_OF_DEPTHS
 
-# Photographs are averaged down to this many pixels along the longer side; so many of them, decoded, are in memory.
+# The longest side in pixels to which photographs are averaged down, and how many of them, decoded, are kept in memory.
 LONGER_SIDE, IN_MEMORY = 1000, 32
-# Patches of a photograph, spread evenly, and the nearest others in which each is looked for.
+# Patches per photograph, evenly spread, and the nearest other photographs in which each is searched.
 PATCHES, OTHERS = 200, 10
-# Pixels from the middle of a patch to its border; the deviation of weights, as a share of that. Grey values are
-# smoothed by SMOOTHED pixels, so that gradients say where a patch has to go.
+# Pixels from the centre of a patch to its border; the sigma of its weights, as a share of that; and the sigma in pixels
+# by which grey values are smoothed, so that gradients show where a patch has to move.
 RADIUS, WEIGHTED, SMOOTHED = 6, 0.6, 0.7
-# The largest of the two mean squares of gradients is more than this many variances of the noise.
+# The least texture of a patch: the larger eigenvalue of the mean structure tensor, in variances of the noise.
 LEAST_TEXTURE = 1.0
-# Of the small depth map around a patch at most MOST_OFF is unknown or off the plane of the middle by this share.
+# A pixel of the small depth map is an inlier of a patch's plane within the share ON_PLANE; at most MOST_OFF of those
+# around a patch may be unknown or outliers.
 ON_PLANE, MOST_OFF = 0.01, 0.3
-# Another view has the depth of a patch up to this share of it, whose poses still err.
+# Another view shows a patch if its depth agrees up to this share, as poses still have errors.
 SAME_DEPTH = 0.02
-# Steps; the last one is no longer than CONVERGED pixels, all together are no more than LARGEST_SHIFT each way, and
-# patches correlate by more than ALIKE.
+# The number of steps; the largest last step, and the largest total shift along each axis, in pixels; and the least
+# correlation of matched patches.
 STEPS, CONVERGED, LARGEST_SHIFT, ALIKE = 8, 0.1, 3.0, 0.8
 # This many variances of the noise are added to mean squares of gradients: more than noise alone gives them, so that
 # patches without texture take short steps.
 DAMPED = 0.08
-# No patch is more exact than this many pixels: planes bend, and light changes.
+# The least error of a patch in pixels: planes are curved, and lighting changes.
 LEAST_ERROR = 0.05
-# A point is seen by so many photographs.
+# The least number of photographs that see a point.
 LEAST_TRACK = 3
 
 
 @dataclass(frozen=True)
 class _Image:
-    """A photograph, smoothed, and its gradients, (H, W) float32; the variance of its noise before."""
+    """A smoothed photograph and its gradients, (H, W) float32, and the variance of its noise before smoothing."""
 
     grey: np.ndarray
     by_x: np.ndarray
@@ -69,8 +70,8 @@ class _Image:
 
 @dataclass(frozen=True)
 class _Patches:
-    """Patches of a photograph: `middle` (P, 2) pixels, `points` (P, S, 3) of the world where their samples lie, and
-    their `values` (P, S) without what light changes, of mean square 1."""
+    """The patches of a photograph: their centres `middle` (P, 2) in pixels, `points` (P, S, 3) of the world at their
+    samples, and `values` (P, S), normalised for lighting, of mean square 1."""
 
     middle: np.ndarray
     points: np.ndarray
@@ -78,7 +79,7 @@ class _Patches:
 
 
 def small_depth_maps(views: Sequence[View], points: np.ndarray, *, seed: int = 0) -> list[DepthMap]:
-    """Depth maps of small copies of the photographs.
+    """Return depth maps of small copies of the photographs.
 
     Args:
         views: photographs whose poses are nearly right.
@@ -91,7 +92,7 @@ def small_depth_maps(views: Sequence[View], points: np.ndarray, *, seed: int = 0
 
 
 def patch_tracks(views: Sequence[View], maps: Sequence[DepthMap]) -> ObservedPoints:
-    """Where views see points of surfaces: `pixel` of the photographs in full size, and the `precision` of each.
+    """Return tracks of surface points: each `pixel` in the photographs at full size, and its `precision`.
 
     Args:
         views: photographs whose poses are nearly right.
@@ -129,7 +130,8 @@ def patch_tracks(views: Sequence[View], maps: Sequence[DepthMap]) -> ObservedPoi
 
 @lru_cache
 def _offsets() -> tuple[np.ndarray, np.ndarray]:
-    """(S, 2) pixels from the middle of a patch, and (S,) weights, whose sum is 1."""
+    """Return the (S, 2) offsets of the samples from the centre of a patch in pixels, and their (S,) weights, whose sum
+    is 1."""
     along = np.arange(-RADIUS, RADIUS + 1.0)
     offset = np.stack(np.meshgrid(along, along), -1).reshape(-1, 2)
     weight = np.exp(-0.5 * (offset**2).sum(1) / (WEIGHTED * RADIUS) ** 2)
@@ -142,19 +144,20 @@ def _middle() -> int:
 
 @lru_cache
 def _light() -> np.ndarray:
-    """(S, 3) of mean square 1: what exposure changes, and vignetting and shading along x and y."""
+    """Return (S, 3) basis functions of lighting, of mean square 1: a constant for exposure, and slopes along x and y
+    for vignetting and shading."""
     offset, weight = _offsets()
     basis = np.column_stack([np.ones(len(offset)), offset])
     return basis / np.sqrt(weight @ basis**2)  # orthogonal, as the window is symmetric
 
 
 def _without_light(values: np.ndarray) -> np.ndarray:
-    """(P, S) values without their weighted mean and slopes."""
+    """Return (P, S) values less their weighted mean and slopes."""
     return values - (values * _offsets()[1]) @ _light() @ _light().T
 
 
 def _patches(image: _Image, copy: SmallCopy, found: DepthMap) -> _Patches:
-    """Those with texture on planes of a small depth map."""
+    """Return the patches with texture that lie on planes of a small depth map."""
     camera, offset = copy.camera, _offsets()[0]
     scale = found.camera.fx / camera.fx  # not of widths: columns that were left over are cut off
     planes = inverse_planes(found.camera, found.depth, found.normal @ camera.rotation.T)
@@ -175,8 +178,8 @@ def _patches(image: _Image, copy: SmallCopy, found: DepthMap) -> _Patches:
 
 
 def _flat(known: np.ndarray, planes: np.ndarray, camera: Camera, scale: float) -> np.ndarray:
-    """(H, W) bool of a camera's pixels: those in the middle of a patch that lies on one of the `planes` (3, h, w) of a
-    depth map, which is smaller by `scale` and `known` (h, w) in part."""
+    """Return (H, W) bool for a camera's pixels: centres of patches that lie on one of the `planes` (3, h, w) of a depth
+    map, which is smaller by `scale` and partly `known` (h, w)."""
     inverse, by_x, by_y = planes
     height, width = known.shape
     reach = int(np.ceil(RADIUS * scale))
@@ -195,8 +198,8 @@ def _flat(known: np.ndarray, planes: np.ndarray, camera: Camera, scale: float) -
 
 
 def _textured(image: _Image, allowed: np.ndarray) -> np.ndarray:
-    """(P, 2) pixels in the middle of patches: of each of PATCHES equal cells the one that says most of where it is, of
-    those (H, W) that are allowed."""
+    """Return (P, 2) centres of patches: in each of PATCHES equal cells, of the (H, W) `allowed` pixels, the one whose
+    patch is best localised by its texture."""
     xx, xy, yy = (
         gaussian_filter(a * b, RADIUS / 2)
         for a, b in ((image.by_x, image.by_x), (image.by_x, image.by_y), (image.by_y, image.by_y))
@@ -206,7 +209,7 @@ def _textured(image: _Image, allowed: np.ndarray) -> np.ndarray:
     inside = np.zeros(allowed.shape, bool)
     inside[border:-border, border:-border] = True
     taken = allowed & inside & (middle + spread > LEAST_TEXTURE * image.noise)
-    # An edge says something, a corner ten times as much.
+    # An edge counts, a corner ten times as much.
     score = np.where(taken, (middle - spread) + 0.1 * (middle + spread), 0)
     height, width = score.shape
     side = max(1, int(np.sqrt(height * width / PATCHES)))
@@ -221,7 +224,7 @@ def _textured(image: _Image, allowed: np.ndarray) -> np.ndarray:
 
 
 def _showing(found: DepthMap, patches: _Patches) -> np.ndarray:
-    """The patches that another view shows, by its small depth map."""
+    """Return the indices of the patches that another view shows, according to its small depth map."""
     inside, pixel, depth = visible_pixels(found.camera, patches.points[:, _middle()])
     same = np.abs(found.depth[pixel[:, 1], pixel[:, 0]] / depth - 1) < SAME_DEPTH
     return np.flatnonzero(inside)[same]
@@ -230,7 +233,8 @@ def _showing(found: DepthMap, patches: _Patches) -> np.ndarray:
 def _matched(
     patches: _Patches, rows: np.ndarray, image: _Image, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Those `rows` of patches that are found in another photograph, their (Q, 2) pixels, and (Q, 2, 2) precision."""
+    """Align `rows` of patches with another photograph. Return those found, their (Q, 2) pixels, and (Q, 2, 2)
+    precisions (square roots of inverse covariances)."""
     weight = _offsets()[1]
     samples = len(weight)
     seen, depth = camera.project(patches.points[rows].reshape(-1, 3))
@@ -255,23 +259,23 @@ def _matched(
     still = (np.linalg.norm(step, axis=1) <= CONVERGED) & (np.abs(shift) <= LARGEST_SHIFT).all(1)
     good = still & (1 - square / 2 > ALIKE)
     matrix, square, noise, damping = matrix[good], square[good], noise[good], damping[good]
-    # The covariance of least squares, from what the noise's own gradients do not make up.
+    # The covariance of least squares, after subtracting the gradients that noise itself causes.
     own, axes = np.linalg.eigh(matrix - damping[:, None, None] * np.eye(2))
     told = np.maximum(own - 2 * _gradient_noise() * noise[:, None], 1e-9)
-    independent = 0.5 / (weight**2).sum()  # smoothing ties neighbours together
+    independent = 0.5 / (weight**2).sum()  # smoothing correlates neighbours
     variance = (square / independent)[:, None] / told + LEAST_ERROR**2
     precision = (axes / np.sqrt(variance)[:, None]) @ axes.swapaxes(1, 2)
     return rows[good], (seen[:, samples // 2] + shift)[good], precision
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
-    """(P,) weighted means of (P, S)."""
+    """Return (P,) weighted means of (P, S)."""
     return values @ _offsets()[1]
 
 
 @lru_cache
 def _gradient_noise() -> float:
-    """The mean square of gradients of smoothed noise of variance 1."""
+    """Return the mean square of the gradients of smoothed noise of variance 1."""
     impulse = np.zeros((31, 31), np.float32)
     impulse[15, 15] = 1
     return float(((sobel(gaussian_filter(impulse, SMOOTHED), 1) / 8) ** 2).sum())

@@ -1,9 +1,9 @@
-"""Poses and lenses that structure from motion has found, refined by patches of surfaces.
+"""Refine poses and lenses of structure from motion by patches of surfaces.
 
-Keypoints alone hold a photograph of plain walls by a few matches, which may put it several pixels beside its place, and
-say little of the lens. Under the found poses stereo of small copies finds surfaces, whose patches are on walls, too
-(`stereo.patch_tracks`). Cameras are adjusted to keypoints and patches together, in rounds: where a photograph has
-moved far, stereo of it was wrong. Half of the keypoints judges.
+Keypoints alone fix a photograph of plain walls by a few matches, which may leave it several pixels off, and say little
+about the lens. Under the found poses, stereo of small copies finds surfaces, whose patches also lie on walls
+(`stereo.patch_tracks`). Cameras are adjusted to keypoints and patches together. This is repeated where a photograph has
+moved far, as its stereo was wrong. Half of the keypoints test the result.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ from linprim_geo.geometry.pycolmap_files import write_model
 from linprim_geo.stereo.poses.adjust_poses import KNOWN_TO, LEAST_POINTS, MOST_VIEWS
 from linprim_geo.stereo.poses.patch_tracks import patch_tracks, small_depth_maps
 
-# How far found poses, focal lengths and distortions err is not known: these deviations, in pixels, as a share and as
-# k1 of COLMAP's models, only keep the world in its place.
+# The errors of found poses, focal lengths and distortions are unknown. These prior deviations, in pixels, as a share,
+# and of k1 of COLMAP's models, only fix the frame of the world.
 POSE_ERROR, FOCAL_ERROR, RADIAL_ERROR = 20.0, 0.1, 0.1
-# Where a photograph has moved by more pixels, its patches were looked for in wrong places: one more round, up to so
-# many.
+# If a photograph has moved by more than MOVED_FAR pixels, its patches were searched in wrong places: another round
+# follows, up to MOST_ROUNDS.
 MOVED_FAR, MOST_ROUNDS = 1.0, 4
 
 
 def prepare(path: str | os.PathLike, options: SceneOptions | None = None, **how: Any) -> None:
-    """`structure_from_motion.prepare`, with poses that are refined once they are found."""
+    """Call `structure_from_motion.prepare`, and refine the poses it finds."""
     structure_from_motion.prepare(path, options, refine=refined_model, **how)
 
 
 def refined_model(root: Path, found: Path, refined: Path, log: Callable[[str], None]) -> bool:
-    """Writes the COLMAP model `found` of the photographs in `root` with refined poses, lenses and points to the folder
-    `refined`; returns whether it did: not if there are too many photographs, or too few keypoints to judge, or these
-    contradict patches.
+    """Write the COLMAP model `found` of the photographs in `root`, with refined poses, lenses and points, to the folder
+    `refined`. Return whether that was done: not if there are too many photographs or too few keypoints for the test, or
+    if these contradict patches.
 
     Raises:
         LinprimError: a photograph cannot be read.
@@ -86,7 +86,8 @@ def refined_model(root: Path, found: Path, refined: Path, log: Callable[[str], N
 
 
 def _images_of(model, views: Sequence[View]) -> list:
-    """The image of each view in a `pycolmap.Reconstruction`, named by its path in the folder of photographs."""
+    """Return the image of each view in a `pycolmap.Reconstruction`, matched by its path in the folder of
+    photographs."""
     images = {model.images[number].name: model.images[number] for number in model.reg_image_ids()}
 
     def image_of(view: View):
@@ -98,7 +99,8 @@ def _images_of(model, views: Sequence[View]) -> list:
 
 
 def _keypoints(model, cameras: Sequence[Camera], images: Sequence) -> ObservedPoints:
-    """The points of a `pycolmap.Reconstruction`, where the cameras see them, which stand for its images."""
+    """Return the points of a `pycolmap.Reconstruction`, with their observations converted to the pinhole cameras of its
+    images."""
     rows = {image.image_id: k for k, image in enumerate(images)}
     point, image, pixel = [], [], []
     points = [model.points3D[number] for number in sorted(model.point3D_ids())]
@@ -116,7 +118,8 @@ def _keypoints(model, cameras: Sequence[Camera], images: Sequence) -> ObservedPo
 
 
 def _together(cameras: Sequence[Camera], keypoints: ObservedPoints, patches: ObservedPoints) -> ObservedPoints:
-    """Both, each as exact as they are; what keypoints miss under these cameras says that of them."""
+    """Concatenate keypoints and patches, each with its precision; that of keypoints follows from their median error
+    under these cameras."""
     noise = float(np.median(reprojection_px(cameras, keypoints))) / MEDIAN_LENGTH
     precision = np.tile(np.eye(2) / max(noise, LEAST_NOISE), (len(keypoints.point), 1, 1))
     assert patches.precision is not None
@@ -131,7 +134,8 @@ def _adjusted(cameras: Sequence[Camera], points: ObservedPoints) -> Adjusted:
 
 
 def _errors(cameras: Sequence[Camera], points: ObservedPoints, radial: float = 0.0) -> np.ndarray:
-    """(N,) pixels by which observations miss their points, where photographs have a radial distortion left."""
+    """Return the (N,) reprojection errors of observations in pixels, for photographs with the remaining radial
+    distortion `radial`."""
     inner = np.array([(camera.fx, camera.fy, camera.cx, camera.cy) for camera in cameras])[points.image]
     ray = (points.pixel - inner[:, 2:]) / inner[:, :2]
     ray *= 1 - radial * (ray**2).sum(1, keepdims=True)
@@ -140,7 +144,8 @@ def _errors(cameras: Sequence[Camera], points: ObservedPoints, radial: float = 0
 
 
 def _moved_px(before: Sequence[Camera], after: Sequence[Camera], points: ObservedPoints) -> np.ndarray:
-    """(K,) by how many pixels what a camera sees has moved, the median of its observations; 0 where it sees nothing."""
+    """Return (K,) by how many pixels the points that a camera sees have moved, the median over its observations; 0 if
+    it sees none."""
     moved = np.zeros(len(before))
     for k, (old, new) in enumerate(zip(before, after, strict=True)):
         xyz = points.xyz[points.point[points.image == k]]
@@ -150,8 +155,8 @@ def _moved_px(before: Sequence[Camera], after: Sequence[Camera], points: Observe
 
 
 def _agree(cameras: Sequence[Camera], keypoints: ObservedPoints, patches: ObservedPoints) -> bool:
-    """Whether keypoints that take no part are as near under cameras by the others and patches as under those by the
-    others alone, as far as that is known."""
+    """Return whether keypoints that are not used have as small an error under cameras by the others and patches as
+    under those by the others alone, within KNOWN_TO."""
     first = np.random.default_rng(14).random(len(keypoints.xyz)) < 0.5
     half, others = keypoints.chosen(first), keypoints.chosen(~first)
     if min(len(half.xyz), len(others.xyz)) < LEAST_POINTS:
@@ -162,10 +167,11 @@ def _agree(cameras: Sequence[Camera], keypoints: ObservedPoints, patches: Observ
 
 
 def _apply(model, images: Sequence, done: Adjusted) -> None:
-    """Puts cameras into a `pycolmap.Reconstruction`, and its points where these see them; those that err are dropped as
-    in mapping.
+    """Set the cameras of a `pycolmap.Reconstruction` and optimise its points under them; outliers are dropped as in
+    mapping.
 
-    Lenses are of one focal length and one distortion (COLMAP's SIMPLE_RADIAL)."""
+    Lenses have one focal length and one distortion (COLMAP's SIMPLE_RADIAL).
+    """
     from linprim_geo.geometry.load_pycolmap import pycolmap
 
     for lens in model.cameras.values():
@@ -175,7 +181,7 @@ def _apply(model, images: Sequence, done: Adjusted) -> None:
         image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(camera.world_to_camera[:3]))
     options = pycolmap.BundleAdjustmentOptions(print_summary=False, refine_rig_from_world=False)
     options.refine_focal_length = options.refine_extra_params = False
-    options.ceres.solver_options.num_threads = 1  # the same to the last bit
+    options.ceres.solver_options.num_threads = 1  # bitwise reproducible
     everything = pycolmap.BundleAdjustmentConfig()
     for number in model.reg_image_ids():
         everything.add_image(number)
