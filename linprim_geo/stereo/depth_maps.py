@@ -308,6 +308,7 @@ def _depth_map(
     others: list[tuple[Camera, DepthPlanes | None]],
     weights: np.ndarray,
 ) -> DepthMap:
+    """Return the depth map of an image from its depth planes, judged by those of the source views, `others`."""
     camera, shape = image.camera, image.grey.shape
     if planes is None:
         unknown, infinite = np.full(shape, np.nan, np.float32), np.full(shape, np.inf, np.float32)

@@ -59,7 +59,7 @@ def glance(camera: Camera, depth: np.ndarray, other: Camera, plane: np.ndarray) 
     pixel[rows, columns] = row * other.width + column
     w, w_x, w_y = plane[:, row, column]
     inverse = w + w_x * (u - column - 0.5) + w_y * (v - row - 0.5)
-    known = inverse > 0  # not where it is NaN
+    known = inverse > 0  # false for NaN
     rows, columns, own, u, v, inverse = (each[known] for each in (rows, columns, own, u, v, inverse))
     points = np.stack([(u - other.cx) / other.fx, (v - other.cy) / other.fy, np.ones(len(u))]) / inverse
     x, y, z = pose[:3, :3].T @ (points - pose[:3, 3:])

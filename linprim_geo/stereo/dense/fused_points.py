@@ -110,6 +110,7 @@ class PointFusion:
         return points, seen
 
     def _side(self, k: int) -> _Side:
+        """Return the confident depths of view k, loaded if they are not in memory."""
         if k in self._kept:
             self._kept.move_to_end(k)
             return self._kept[k]

@@ -42,11 +42,11 @@ class Photographs:
     """The views of a capture, loaded when needed; the last KEPT are kept in memory."""
 
     def __init__(self, views: Sequence[View], points: np.ndarray):
-        """`points` (P, 3) of the scene, by which views that see the same are found, and the range of depths.
+        """`points` (P, 3) of the scene select source views and the range of depths.
 
         Raises:
-            LinprimError: a photograph is too small for a window or too large for the memory that is free, or no two
-                see the same points.
+            LinprimError: a photograph is too small for a window or too large for the free memory, or no two see the
+                same points.
         """
         self.views, self.points = views, points
         self.cameras = [view.camera for view in views]
@@ -79,6 +79,7 @@ class Photographs:
         return self._read(k)[2]
 
     def _read(self, k: int) -> tuple[StereoImage, StereoImage, float]:
+        """Return view k at full and at half the size, and the variance of its noise."""
         if k in self._kept:
             self._kept.move_to_end(k)
         else:
@@ -112,6 +113,7 @@ class PlanesOnDisk:
         return np.load(self._file(k, STAGES - 1), mmap_mode="r", allow_pickle=False)
 
     def _planes(self, k: int, stage: int) -> DepthPlanes:
+        """Return the depth planes of view k after a stage, from those of the stage before."""
         photographs = self.photographs
         seed = self.seed * len(photographs.views) + k
         near = [k, *(j for j in photographs.pairs[k] if stage == 0 or photographs.pairs[j])]

@@ -338,7 +338,7 @@ def enclosing_depths(
             continue
         rays = rays_of(camera, row, column)
         nearest, own, whole = _first_met(camera, rays, enclosing)
-        elsewhere = np.abs(probable[row, column] * nearest - 1) > MARGIN  # not where it is NaN
+        elsewhere = np.abs(probable[row, column] * nearest - 1) > MARGIN  # false for NaN
         rows = np.flatnonzero((own | whole) & ~elsewhere)
         looking, knowing = _looking(to_world(camera, rays[rows] / nearest[rows, None]), cameras, known)
         on_it = np.abs(supposed[row[rows], column[rows]] * nearest[rows] - 1) <= ON_IT

@@ -59,7 +59,7 @@ def inner_sides(ends: np.ndarray, places: np.ndarray) -> list[FloorSide]:
     covered = count >= max(1.0, COVERED * float(np.median(count[count > 0])))
     found = []
     for across, end in product((0, 1), (0, 1)):
-        rows = covered.T if across == 0 else covered  # each of them runs along `across`
+        rows = covered.T if across == 0 else covered  # each row runs along axis `across`
         rows = rows if end == 1 else rows[:, ::-1]
         length = rows.shape[1]
         last = np.where(rows.any(1), length - np.argmax(rows[:, ::-1], axis=1), 0)

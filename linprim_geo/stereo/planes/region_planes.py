@@ -174,7 +174,7 @@ def _limited(
     is_laid = np.isfinite(laid.depth)
     of_all = _around(is_laid)
     of_sure, of_confirmed = (depth / laid.depth - 1 for depth in (sure, confirmed))
-    off, confirmed_off = np.abs(of_sure) > TOLERANCE, np.abs(of_confirmed) > TOLERANCE  # not where it is NaN
+    off, confirmed_off = np.abs(of_sure) > TOLERANCE, np.abs(of_confirmed) > TOLERANCE  # false for NaN
     stands = is_laid & wide & ~_are_surfaces(off, of_all)
     doubted = is_laid & well_known & (_around(np.abs(of_confirmed) <= TOLERANCE) <= SHOWN * of_all)
     laid = replace(laid, moved=laid.moved | (off & stands), stands=stands, doubted=doubted)

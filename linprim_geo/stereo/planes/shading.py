@@ -103,7 +103,7 @@ class Shading:
 
 def _noise_of_boxes(mean: np.ndarray, plain: np.ndarray) -> float:
     """Return the variance of the noise of plain boxes' means, by second differences along both axes of adjacent boxes,
-    from which shading cancels (`depth_maps.noise_of`); 0 if there are few boxes."""
+    from which shading cancels (`noise.noise_of`); 0 if there are few boxes."""
     mean, plain = mean[::BOX, ::BOX], plain[::BOX, ::BOX]
     across, known = mean[:, :-2] - 2 * mean[:, 1:-1] + mean[:, 2:], plain[:, :-2] & plain[:, 1:-1] & plain[:, 2:]
     both, known = across[:-2] - 2 * across[1:-1] + across[2:], known[:-2] & known[1:-1] & known[2:]

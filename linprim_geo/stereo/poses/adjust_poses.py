@@ -3,9 +3,10 @@
 Keypoints are matched and triangulated under the given poses. Bundle adjustment to half of the points is accepted if it
 explains the other half better than the given poses do; exact poses fail this test, as adjusted ones have errors of
 their own. Then the poses are adjusted to all points. Under these, stereo of small copies finds surfaces, and the given
-poses are adjusted again to tracks of patches on them (`stereo.patch_tracks`), which are more precise than keypoints and
-exist on walls, too. Photographs of plain walls have no keypoints and so no neighbours for stereo; further rounds add
-them by the surfaces that stereo has found in others. The unused half of the keypoints also tests the poses by patches.
+poses are adjusted again to tracks of patches on them (`stereo.poses.patch_tracks`), which are more precise than
+keypoints and exist on walls, too. Photographs of plain walls have no keypoints and so no neighbours for stereo; further
+rounds add them by the surfaces that stereo has found in others. The unused half of the keypoints also tests the poses
+by patches.
 """
 
 from __future__ import annotations

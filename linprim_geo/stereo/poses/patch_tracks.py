@@ -159,7 +159,7 @@ def _without_light(values: np.ndarray) -> np.ndarray:
 def _patches(image: _Image, copy: SmallCopy, found: DepthMap) -> _Patches:
     """Return the patches with texture that lie on planes of a small depth map."""
     camera, offset = copy.camera, _offsets()[0]
-    scale = found.camera.fx / camera.fx  # not of widths: columns that were left over are cut off
+    scale = found.camera.fx / camera.fx  # not the ratio of widths, as remaining columns are cut off
     planes = inverse_planes(found.camera, found.depth, found.normal @ camera.rotation.T)
     middle = _textured(image, _flat(found.is_confirmed(), planes, camera, scale))
     small = (middle * scale).astype(int)

@@ -2,8 +2,8 @@
 
 Keypoints alone fix a photograph of plain walls by a few matches, which may leave it several pixels off, and say little
 about the lens. Under the found poses, stereo of small copies finds surfaces, whose patches also lie on walls
-(`stereo.patch_tracks`). Cameras are adjusted to keypoints and patches together. This is repeated where a photograph has
-moved far, as its stereo was wrong. Half of the keypoints test the result.
+(`stereo.poses.patch_tracks`). Cameras are adjusted to keypoints and patches together. This is repeated where a
+photograph has moved far, as its stereo was wrong. Half of the keypoints test the result.
 """
 
 from __future__ import annotations

@@ -127,6 +127,7 @@ def _are_known(points: np.ndarray, views: Sequence[SeenDepths], outlined: Sequen
 
 
 def _are_known_at_once(points: np.ndarray, views: Sequence[SeenDepths], outlined: Sequence[np.ndarray]) -> np.ndarray:
+    """Return `_are_known` for few points: memory grows with views times points."""
     agree = np.zeros(len(points), int)
     between = np.zeros((len(views), len(points)), bool)
     towards = np.zeros((len(views), len(points), 3), np.float32)
