@@ -52,7 +52,7 @@ class HeldPlanes:
 
     def by_depths(self, planes: np.ndarray, staying: Container[int], told: Container[int] = ()) -> np.ndarray:
         """Return the planes, each constrained by the confirmed depths along the edges of its regions, except those
-        `staying`. Planes that points have `told` turn by at most SAME_ANGLE, or stay."""
+        `staying`. Planes known from points along edges, `told`, turn by at most SAME_ANGLE or are not changed."""
         result = planes.copy()
         for k, plane in enumerate(planes):
             held = plane if k in staying else self._held_plane(plane, self.carried[k])
@@ -63,8 +63,8 @@ class HeldPlanes:
     def at_right_angles(self, planes: np.ndarray, staying: Container[int], told: Container[int] = ()) -> np.ndarray:
         """Turn planes to right angles with each other, or to the frame of those `staying`, if the turned plane carries
         the shading of its regions as well as true walls do. Then shift each to where most confirmed depths along the
-        edges of its regions are. Those `staying` are not changed, nor those that points have `told` if they would turn
-        by more than NEARLY."""
+        edges of its regions are. Those `staying` are not changed, nor those known from points along edges, `told`, that
+        would turn by more than NEARLY."""
         few = [[region.some(MOST_BOXES) for region in regions] for regions in self.carried]
         fits = [
             evaluate(plane, few[k], self.shadings) if few[k] and k not in staying else None
