@@ -202,8 +202,8 @@ class KnownPoints:
 
     def without_copies(self, planes: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return the planes without duplicates, sorted by descending inlier count, those with points in recesses last.
-        A plane is a duplicate if most of its inliers are also near an earlier, similar one: between a floor and a board
-        above it, for example."""
+        A plane is a duplicate if most of its inliers are also near an earlier, similar one: a plane between a floor and
+        a board above it has inliers on both."""
         kept: list[np.ndarray] = []
         for plane in sorted(planes, key=lambda plane: (not self.is_before_all(plane), -self.on(plane).sum())):
             own = self.on(plane)
@@ -232,8 +232,8 @@ class KnownPoints:
         return MARGIN * float(np.median(np.linalg.norm(self.centers - place, axis=1)))
 
     def closing(self, found: Sequence[np.ndarray], every: KnownPoints) -> list[np.ndarray]:
-        """Return planes at right angles to two of those `found`, where both end, on sides without a plane. `every`
-        point counts for where they end, not only these."""
+        """Return planes at right angles to two of those `found` where both end, also by the points of `every`, on sides
+        without a plane."""
         closing: list[np.ndarray] = []
         for number, first in enumerate(found):
             for second in (other for other in found[:number] if at_right_angles(first, other)):

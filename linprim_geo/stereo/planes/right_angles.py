@@ -1,4 +1,4 @@
-"""Turn planes to right angles: most walls meet each other, floors and tables so.
+"""Turn planes to right angles: most walls, floors and tables meet at right angles.
 
 Shading alone leaves the angle of a wall open by degrees. If the better known planes of a room have a frame, three
 orthogonal directions along which most of them lie, other planes are turned to it. Without a frame, planes that are

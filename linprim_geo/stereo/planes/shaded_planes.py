@@ -70,7 +70,7 @@ CERTAIN = 2 * CONFIRMED_DEPTH
 ALIKE_ANGLE = 4 * SAME_ANGLE
 # The background is so many times as far as the depth of a region.
 FAR = 1e4
-# Planes by points that are off the room's frame by more radians are askew: the error of one half as wide as far.
+# A plane by points is askew if it is off the room's frame by more (radians): its error at a width of half its distance.
 ASKEW = 2 * TOLERANCE
 # A plane carries a region if it explains the shading around half of its boxes.
 CARRIED_SHARE = 0.5
