@@ -122,8 +122,9 @@ def region_plane_depths(
     most photographs show other colours are refused. In the wide part of a region the plane overrides depths of stereo,
     except surfaces of their own. Sure depths within TOLERANCE are moved to it, if their median residual is at most
     MEDIAN_OFF and CENTRAL_SHARE of them are within half of TOLERANCE (on a curved surface, half are). Pixels are left
-    out where confirmed depths off the plane fill more than half of the SURROUNDINGS: an object in front of it without
-    an edge in between. In regions that stereo mostly knows, pixels without confirmed inliers around are doubted.
+    out where confirmed depths off the plane fill more than half of those laid in the SURROUNDINGS: an object in front
+    of it without an edge in between. In regions that stereo mostly knows, pixels without confirmed inliers around are
+    doubted.
 
     Args:
         known: (H, W) sure depths of every view, NaN elsewhere.
