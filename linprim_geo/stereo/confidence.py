@@ -12,7 +12,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from linprim_geo.kernels.stereo_ops import support
-from linprim_geo.stereo.evidence import Glance
+from linprim_geo.stereo.evidence import ViewConsistency
 
 # A depth is right if it differs from the true one by less than this share.
 RIGHT = 0.01
@@ -28,7 +28,7 @@ MATCHED_WEIGHTS = np.array([-2.667, 0.555, 2.214, -1.144, 0.329, 4.14])
 
 
 def evidence(
-    grey: np.ndarray, plane: np.ndarray, cost: np.ndarray, known: np.ndarray, glances: Iterable[Glance]
+    grey: np.ndarray, plane: np.ndarray, cost: np.ndarray, known: np.ndarray, comparisons: Iterable[ViewConsistency]
 ) -> np.ndarray:
     """Return the (H, W, 6) float32 features of each depth.
 
@@ -37,10 +37,10 @@ def evidence(
     confirm it, or the largest if none does; and its `support` by `known` depths around, within RIGHT.
     """
     confirmed, seen, squares, best = (np.zeros(cost.shape, np.float32) for _ in range(4))
-    for each in glances:
+    for each in comparisons:
         confirms = each.confirms
         confirmed += confirms
-        seen += np.isfinite(each.miss)
+        seen += np.isfinite(each.reprojection_error)
         squares += np.where(confirms, each.parallax, 0) ** 2
         best = np.maximum(best, each.parallax)
     parallax = RIGHT * np.where(confirmed > 0, np.sqrt(squares), best)

@@ -24,7 +24,7 @@ from linprim_geo.kernels.stereo_ops import DepthPlanes, StereoImage, fit_surface
 from linprim_geo.points.view_pairs import CONFIRMING, source_views, visible_pixels
 from linprim_geo.stereo.confidence import MATCHED_WEIGHTS, MOST_COST, RIGHT, WEIGHTS, evidence, probability
 from linprim_geo.stereo.edges import GREY, colour_edges, colours_of, edges_of
-from linprim_geo.stereo.evidence import Glance, glance
+from linprim_geo.stereo.evidence import ViewConsistency, compare_depths
 from linprim_geo.stereo.noise import noise_of, shared_noise
 
 # The most source views with which a photograph is matched: as many as the core takes.
@@ -319,15 +319,15 @@ def _depth_map(
     depth = np.where(known, depth, np.nan)
     confirming, deviation = np.zeros(shape, np.uint8), np.full(shape, np.inf, np.float32)
 
-    def glances() -> Iterator[Glance]:  # one at a time is in memory
+    def comparisons() -> Iterator[ViewConsistency]:  # one at a time is in memory
         for other, theirs in others:
             if theirs is not None:
-                found = glance(camera, depth, other, np.moveaxis(theirs.plane, 2, 0))
+                found = compare_depths(camera, depth, other, np.moveaxis(theirs.plane, 2, 0))
                 np.add(confirming, found.confirms, out=confirming)
-                np.fmin(deviation, np.abs(found.relative), out=deviation)
+                np.fmin(deviation, np.abs(found.depth_difference), out=deviation)
                 yield found
 
-    found = evidence(image.grey, np.moveaxis(planes.plane, 2, 0), planes.cost, known, glances())
+    found = evidence(image.grey, np.moveaxis(planes.plane, 2, 0), planes.cost, known, comparisons())
     confidence = probability(found, weights)
     return DepthMap(
         camera,

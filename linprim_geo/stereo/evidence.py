@@ -15,31 +15,32 @@ CONFIRMED_PX, CONFIRMED_DEPTH = 1.0, 0.01
 
 
 @dataclass(frozen=True)
-class Glance:
+class ViewConsistency:
     """The depths of one view compared with another view, each (H, W) float32 unless noted.
 
-    `pixel` int32 is the index of the pixel in the other view, row by row, -1 outside; `miss` the forward-backward
-    reprojection error in pixels, via the surface found by the other view, infinite where it has none; `relative` the
-    relative difference of both depths; `parallax` the derivative of the position in the other view, in pixels, by the
-    logarithm of the depth.
+    `pixel` int32 is the index of the pixel in the other view, row by row, -1 outside; `reprojection_error` is the
+    forward-backward one in pixels, via the surface found by the other view, infinite where it has none;
+    `depth_difference` the relative difference of both depths; `parallax` the derivative of the position in the other
+    view, in pixels, by the logarithm of the depth.
     """
 
     pixel: np.ndarray
-    miss: np.ndarray
-    relative: np.ndarray
+    reprojection_error: np.ndarray
+    depth_difference: np.ndarray
     parallax: np.ndarray
 
     @property
     def confirms(self) -> np.ndarray:
         """(H, W) bool: depths that the other view confirms."""
-        return (self.miss < CONFIRMED_PX) & (np.abs(self.relative) < CONFIRMED_DEPTH)
+        return (self.reprojection_error < CONFIRMED_PX) & (np.abs(self.depth_difference) < CONFIRMED_DEPTH)
 
 
-def glance(camera: Camera, depth: np.ndarray, other: Camera, plane: np.ndarray) -> Glance:
+def compare_depths(camera: Camera, depth: np.ndarray, other: Camera, plane: np.ndarray) -> ViewConsistency:
     """Compare (H, W) depths of `camera` with the view `other`, whose `plane` (3, H', W') holds inverse depths and their
     slopes."""
     pixel = np.full(depth.shape, -1, np.int32)
-    miss, relative, parallax = (np.full(depth.shape, value, np.float32) for value in (np.inf, np.inf, 0))
+    infinite, parallax = (np.full(depth.shape, value, np.float32) for value in (np.inf, 0))
+    reprojection_error, depth_difference = infinite, infinite.copy()
     rows, columns = np.nonzero(np.isfinite(depth) & (depth > 0))
     own = depth[rows, columns].astype(np.float64)
     pose = other.world_to_camera @ camera.camera_to_world
@@ -65,6 +66,6 @@ def glance(camera: Camera, depth: np.ndarray, other: Camera, plane: np.ndarray) 
     x, y, z = pose[:3, :3].T @ (points - pose[:3, 3:])
     with np.errstate(divide="ignore", invalid="ignore"):
         back = np.hypot(camera.fx * x / z + camera.cx - columns - 0.5, camera.fy * y / z + camera.cy - rows - 0.5)
-    miss[rows, columns] = np.where(z > 0, back, np.inf)
-    relative[rows, columns] = z / own - 1
-    return Glance(pixel, miss, relative, parallax)
+    reprojection_error[rows, columns] = np.where(z > 0, back, np.inf)
+    depth_difference[rows, columns] = z / own - 1
+    return ViewConsistency(pixel, reprojection_error, depth_difference, parallax)

@@ -7,7 +7,7 @@ from helpers.captures import look_at
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.stereo.confidence import MOST_PIXELS, RIGHT, evidence
-from linprim_geo.stereo.evidence import glance
+from linprim_geo.stereo.evidence import compare_depths
 
 NORMAL = np.array([0.3, -0.25, 1.0]) / np.linalg.norm([0.3, -0.25, 1.0])
 
@@ -26,10 +26,10 @@ ONE, OTHER = camera_at((0, 0, -3)), camera_at((0.5, 0, -2.9))
 
 
 def test_another_view_of_the_same_wall_confirms_it():
-    seen = glance(ONE, 1 / plane_of(ONE)[0], OTHER, plane_of(OTHER))
+    seen = compare_depths(ONE, 1 / plane_of(ONE)[0], OTHER, plane_of(OTHER))
     inside = np.s_[10:-10, 20:-20]
     # Float32 pixels of up to 96, and slopes by differences, which are exact on planes.
-    assert seen.miss[inside].max() < 1e-3 and np.abs(seen.relative[inside]).max() < 1e-5
+    assert seen.reprojection_error[inside].max() < 1e-3 and np.abs(seen.depth_difference[inside]).max() < 1e-5
     assert seen.confirms[inside].all()
     # Where a point is in the other, to its pixel.
     points = ONE.center + ONE.world_rays() / plane_of(ONE)[0][..., None]
@@ -44,31 +44,31 @@ def test_parallax_is_how_far_a_point_moves_with_its_depth():
         for sign in (-1, 1)
     )
     moved = np.linalg.norm(far - near, axis=1).reshape(depth.shape) / (2 * step)
-    parallax = glance(ONE, depth, OTHER, plane_of(OTHER)).parallax
+    parallax = compare_depths(ONE, depth, OTHER, plane_of(OTHER)).parallax
     seen = parallax > 0
     # Differences over 2e-4 of the depth leave out its square: 1e-8.
     assert seen.mean() > 0.7 and np.allclose(parallax[seen], moved[seen], rtol=1e-4)
 
 
 def test_another_depth_is_not_confirmed_and_unknown_ones_are_not_seen():
-    seen = glance(ONE, 1.05 / plane_of(ONE)[0], OTHER, plane_of(OTHER))
+    seen = compare_depths(ONE, 1.05 / plane_of(ONE)[0], OTHER, plane_of(OTHER))
     assert not seen.confirms.any()
     # The other's wall is 5 % of the larger depth before it, along a ray that is about the same.
-    known = np.isfinite(seen.miss)
-    assert np.allclose(seen.relative[known], 1 / 1.05 - 1, atol=0.03)
-    nothing = glance(ONE, np.full((72, 96), np.nan), OTHER, plane_of(OTHER))
-    assert np.isinf(nothing.miss).all() and (nothing.pixel == -1).all()
-    nothing = glance(ONE, 1 / plane_of(ONE)[0], OTHER, np.full((3, 72, 96), np.nan))
-    assert np.isinf(nothing.miss).all() and not nothing.confirms.any()
+    known = np.isfinite(seen.reprojection_error)
+    assert np.allclose(seen.depth_difference[known], 1 / 1.05 - 1, atol=0.03)
+    nothing = compare_depths(ONE, np.full((72, 96), np.nan), OTHER, plane_of(OTHER))
+    assert np.isinf(nothing.reprojection_error).all() and (nothing.pixel == -1).all()
+    nothing = compare_depths(ONE, 1 / plane_of(ONE)[0], OTHER, np.full((3, 72, 96), np.nan))
+    assert np.isinf(nothing.reprojection_error).all() and not nothing.confirms.any()
 
 
 def test_evidence_counts_those_in_which_a_point_falls_inside_and_that_see_a_depth():
     plane, known = plane_of(ONE), np.ones((72, 96), bool)
-    same, other = (glance(ONE, scale / plane[0], OTHER, plane_of(OTHER)) for scale in (1.0, 1.05))
-    unseen = glance(ONE, 1 / plane[0], OTHER, np.full((3, 72, 96), np.nan))
+    same, other = (compare_depths(ONE, scale / plane[0], OTHER, plane_of(OTHER)) for scale in (1.0, 1.05))
+    unseen = compare_depths(ONE, 1 / plane[0], OTHER, np.full((3, 72, 96), np.nan))
     # It has a surface everywhere, but looks past the point.
     beside = camera_at((0.5, 0, -2.9), (1.5, 0, 0))
-    outside = glance(ONE, 1 / plane[0], beside, np.broadcast_to([[[0.3]], [[0.0]], [[0.0]]], (3, 72, 96)))
+    outside = compare_depths(ONE, 1 / plane[0], beside, np.broadcast_to([[[0.3]], [[0.0]], [[0.0]]], (3, 72, 96)))
     cost = np.full((72, 96), 0.1, np.float32)
     at = (36, 48)
     assert outside.pixel[at] == -1 and (outside.pixel >= 0).any()

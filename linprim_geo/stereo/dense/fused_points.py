@@ -20,7 +20,7 @@ from linprim_geo.geometry.ply import color_columns, write_ply, xyz_columns
 from linprim_geo.points.view_pairs import CONFIRMING
 from linprim_geo.stereo.dense.workspace import ModelPoint, Workspace
 from linprim_geo.stereo.depth_maps import MOST_SOURCES, inverse_planes
-from linprim_geo.stereo.evidence import glance
+from linprim_geo.stereo.evidence import compare_depths
 
 # Views whose maps are kept in memory: one and its source views.
 KEPT = 1 + MOST_SOURCES
@@ -83,7 +83,7 @@ class PointFusion:
         pixels (x, y) that see them, NaN where not."""
         own = self._side(k)
         sides = [self._side(j) for j in self.pairs[k]]
-        found = [glance(own.camera, own.depth, side.camera, side.plane) for side in sides]
+        found = [compare_depths(own.camera, own.depth, side.camera, side.plane) for side in sides]
         confirms = [each.confirms for each in found]
         gives = np.isfinite(own.depth) & (np.sum(confirms, axis=0) >= max(1, min(CONFIRMING, len(sides))))
         for j, side, each, confirmed in zip(self.pairs[k], sides, found, confirms, strict=True):
@@ -91,19 +91,19 @@ class PointFusion:
             gives &= ~(confirmed & ((theirs < own.level) | ((theirs == own.level) & (j < k))))
         rows, columns = np.nonzero(gives)
         total = own.weight[gives].astype(np.float64)
-        relative, values = np.zeros(len(rows)), total[:, None] * own.values[gives]
+        mean_difference, values = np.zeros(len(rows)), total[:, None] * own.values[gives]
         seen = [(k, np.stack([columns, rows], 1) + 0.5)]
         for j, side, each, confirmed in zip(self.pairs[k], sides, found, confirms, strict=True):
-            pixel, own_relative = each.pixel[gives], each.relative[gives]
+            pixel, difference = each.pixel[gives], each.depth_difference[gives]
             weight = np.where(confirmed[gives], side.weight.ravel()[pixel], 0).astype(np.float64)
             total += weight
-            relative += weight * np.where(weight > 0, own_relative, 0)
+            mean_difference += weight * np.where(weight > 0, difference, 0)
             values += weight[:, None] * side.values.reshape(-1, 7)[pixel]
             place = np.stack([pixel % side.camera.width, pixel // side.camera.width], 1) + 0.5
             seen.append((j, np.where(weight[:, None] > 0, place, np.nan)))
         values /= total[:, None]
         points = np.zeros(len(rows), COLUMNS)
-        depth = own.depth[gives] * (1 + relative / total)
+        depth = own.depth[gives] * (1 + mean_difference / total)
         points["xyz"] = own.camera.center + own.camera.world_rays()[gives] * depth[:, None]
         points["normal"] = values[:, :3] / np.maximum(np.linalg.norm(values[:, :3], axis=1, keepdims=True), 1e-12)
         points["rgb"], points["confidence"] = np.rint(values[:, 3:6]), values[:, 6]

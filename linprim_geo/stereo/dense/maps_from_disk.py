@@ -8,7 +8,7 @@ from linprim_geo.stereo.confidence import evidence, probability
 from linprim_geo.stereo.dense.planes_on_disk import Photographs, PlanesOnDisk
 from linprim_geo.stereo.dense.workspace import Maps
 from linprim_geo.stereo.depth_maps import FOREGROUND, are_known, depth_and_normal
-from linprim_geo.stereo.evidence import glance
+from linprim_geo.stereo.evidence import compare_depths
 
 
 def seen_depths(photographs: Photographs, planes: PlanesOnDisk, k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -22,8 +22,8 @@ def seen_depths(photographs: Photographs, planes: PlanesOnDisk, k: int) -> tuple
         known &= alpha >= FOREGROUND
     depth = np.where(known, depth, np.nan)
     others = photographs.pairs[k]
-    glances = [glance(camera, depth, photographs.cameras[j], planes.read(j)[:3]) for j in others]
-    return depth, normal, evidence(photographs.image(k).grey, layers[:3], layers[3], known, glances)
+    comparisons = [compare_depths(camera, depth, photographs.cameras[j], planes.read(j)[:3]) for j in others]
+    return depth, normal, evidence(photographs.image(k).grey, layers[:3], layers[3], known, comparisons)
 
 
 def maps_of(photographs: Photographs, planes: PlanesOnDisk, k: int) -> Maps:

@@ -17,7 +17,7 @@ STRIDE, LEAST_POINTS = 4, 30
 ON_IT = 0.05
 
 
-class CommonSurfaces:
+class SurfaceSupport:
     """Sampled points on the surfaces that views know: at `confirmed` depths (H, W) of each camera, NaN where unknown,
     and at `supposed` ones where those are unknown."""
 
@@ -32,7 +32,9 @@ class CommonSurfaces:
             sure.append(np.isfinite(own[row, column]))
         self.points, self.views, self.sure = (np.concatenate(parts) for parts in (points, views, sure))
 
-    def known_by(self, view: int, depths: Sequence[np.ndarray], only_confirmed: Sequence[bool]) -> list[np.ndarray]:
+    def supporting_views(
+        self, view: int, depths: Sequence[np.ndarray], only_confirmed: Sequence[bool]
+    ) -> list[np.ndarray]:
         """Return for each of several depths (H, W) of a view, NaN where none, the numbers of the other views with
         enough points on it; only confirmed points where `only_confirmed` is true."""
         if not depths:

@@ -120,8 +120,8 @@ def enclosing_planes(
     """
     if not len(points):
         return []
-    seen = KnownPoints(cameras, points)
-    every = seen if known is None else KnownPoints(cameras, SurfacePoints.together([points, known]))
+    seen = ScenePoints(cameras, points)
+    every = seen if known is None else ScenePoints(cameras, SurfacePoints.together([points, known]))
     standing = np.zeros(len(planes), bool) if standing is None else standing
     sides = [
         seen.facing(plane)
@@ -140,7 +140,7 @@ def enclosing_planes(
     return enclosing + [replace(plane, closes=True) for plane in closing]
 
 
-class KnownPoints:
+class ScenePoints:
     """Known points of the scene, to judge planes (4,) n . x = d with normals towards the cameras."""
 
     def __init__(self, cameras: Sequence[Camera], points: SurfacePoints):
@@ -231,7 +231,7 @@ class KnownPoints:
         """Return MARGIN in the unit of the scene, at a point (3,) seen from the median distance of the cameras."""
         return MARGIN * float(np.median(np.linalg.norm(self.centers - place, axis=1)))
 
-    def closing(self, found: Sequence[np.ndarray], every: KnownPoints) -> list[np.ndarray]:
+    def closing(self, found: Sequence[np.ndarray], every: ScenePoints) -> list[np.ndarray]:
         """Return planes at right angles to two of those `found` where both end, also by the points of `every`, on sides
         without a plane."""
         closing: list[np.ndarray] = []

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.stereo.planes.held_planes import off_plane, shifted
+from linprim_geo.stereo.planes.constrained_planes import plane_residuals, shifted
 from linprim_geo.stereo.planes.plain_regions import (
     BEHIND,
     SAME_ANGLE,
@@ -28,14 +28,14 @@ from linprim_geo.stereo.planes.plain_regions import (
     may_lie_on,
     to_world,
 )
-from linprim_geo.stereo.planes.right_angles import LEFT_OPEN, angles_to, frame_of
+from linprim_geo.stereo.planes.right_angles import MOST_ANGLE_ERROR, angles_to, frame_of
 
 # A plane is turned only if it keeps more than this share of its points within half of TOLERANCE. Truly leaning planes,
 # such as a sloping street, keep fewer (DECISIONS 141).
 KEPT_SHARE = 0.75
 # Two of the views that find a plane along the frame have to look from directions that differ by this angle in radians:
 # less than usual, as its normal is known.
-FRAMED_SPREAD = SAME_ANGLE
+FRAMED_VIEW_ANGLE = SAME_ANGLE
 
 
 def planes_by_edges(cameras: Sequence[Camera], regions: Sequence[PlainRegion], by_points: np.ndarray) -> np.ndarray:
@@ -48,7 +48,7 @@ def planes_by_edges(cameras: Sequence[Camera], regions: Sequence[PlainRegion], b
         return planes
     turned = [other for one in found if (other := _turned(cameras, one, frame)) is not None]
     return along_frame(
-        cameras, regions, np.concatenate([planes, agreeing(cameras, turned, FRAMED_SPREAD)[0]]), by_points
+        cameras, regions, np.concatenate([planes, agreeing(cameras, turned, FRAMED_VIEW_ANGLE)[0]]), by_points
     )
 
 
@@ -56,7 +56,7 @@ def _turned(cameras: Sequence[Camera], one: FoundPlane, frame: np.ndarray) -> Fo
     """Return the plane of a region turned to the nearest axis of a frame, or None if it is not nearly along one, or
     loses too many points."""
     points = _edge_points(cameras, [one.region], one.plane[None])[0]
-    if angles_to(frame, one.plane[None, :3])[0] >= LEFT_OPEN or not len(points.points):
+    if angles_to(frame, one.plane[None, :3])[0] >= MOST_ANGLE_ERROR or not len(points.points):
         return None
     plane = points.turned(one.plane, frame)
     return None if plane is one.plane else FoundPlane.on(cameras[one.region.view], one.region, one.points, plane)
@@ -74,7 +74,7 @@ def along_frame(
     kept = list[np.ndarray]()
     of_planes = zip(planes, angles_to(frame, planes[:, :3]), _edge_points(cameras, regions, planes), strict=True)
     for plane, angle, points in of_planes:
-        if angle < LEFT_OPEN and len(points.points):
+        if angle < MOST_ANGLE_ERROR and len(points.points):
             plane = points.turned(plane, frame)
         if not any(points.has(other) for other in kept if abs(other[:3] @ plane[:3]) > 1 - 1e-9):
             kept.append(plane)
@@ -105,7 +105,7 @@ class _EdgePoints:
         return len(self.points) > 0 and float(np.median(np.abs(self._off(other)))) < TOLERANCE
 
     def _off(self, plane: np.ndarray) -> np.ndarray:
-        return off_plane(plane, self.points, self.vectors)
+        return plane_residuals(plane, self.points, self.vectors)
 
 
 def _edge_points(cameras: Sequence[Camera], regions: Sequence[PlainRegion], planes: np.ndarray) -> list[_EdgePoints]:
@@ -115,7 +115,7 @@ def _edge_points(cameras: Sequence[Camera], regions: Sequence[PlainRegion], plan
     for region in regions:
         camera = cameras[region.view]
         local = in_camera(camera, planes)
-        near = region.sure[:, None] & (np.abs(region.off(local)) < BEHIND * TOLERANCE)
+        near = region.sure[:, None] & (np.abs(region.residuals(local)) < BEHIND * TOLERANCE)
         for k in np.flatnonzero(may_lie_on(region, local)[1]):
             own = near[:, k]
             points[k].append(to_world(camera, region.rays[own] / region.inverse[own, None]))

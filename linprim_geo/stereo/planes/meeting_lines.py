@@ -16,10 +16,10 @@ import numpy as np
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.planes.edge_images import BLUR, BY_CHANCE, LEAST_PIXELS, SHOWN, EdgeImages, by_chance
-from linprim_geo.stereo.planes.enclosing_planes import BEYOND, KnownPoints
-from linprim_geo.stereo.planes.plain_regions import SAME_ANGLE, seen_enough
+from linprim_geo.stereo.planes.enclosing_planes import BEYOND, ScenePoints
+from linprim_geo.stereo.planes.plain_regions import SAME_ANGLE, has_wide_baseline
 from linprim_geo.stereo.planes.point_planes import confirmed_points
-from linprim_geo.stereo.planes.right_angles import LEFT_OPEN, NEARLY, at_right_angles
+from linprim_geo.stereo.planes.right_angles import MOST_ANGLE_ERROR, NEARLY, at_right_angles
 
 # A line is searched within this share of its distance around the intersection of the planes: the error of planes of
 # shading. If the wall has points all over, the line is known to CONFIRMED_DEPTH, even if these are on objects that hang
@@ -50,7 +50,7 @@ def on_meeting_lines(
         known: (H, W) confirmed depth of every view, NaN elsewhere.
     """
     points, _ = confirmed_points(maps, known)
-    seen = KnownPoints([found.camera for found in maps], points)
+    seen = ScenePoints([found.camera for found in maps], points)
     floors = floors_of([seen.facing(plane) for plane in planes[:by_points]], seen) if len(points) else []
     if not floors:
         return {}
@@ -90,7 +90,7 @@ def is_same(plane: np.ndarray, other: np.ndarray) -> bool:
     return np.allclose(plane, other) or np.allclose(plane, -other)
 
 
-def floors_of(planes: Sequence[np.ndarray], seen: KnownPoints) -> list[np.ndarray]:
+def floors_of(planes: Sequence[np.ndarray], seen: ScenePoints) -> list[np.ndarray]:
     """Return those planes with points all over, their normals towards the cameras, that are floors: level, with nothing
     below. The one with the most points comes first. A floor nearly parallel to a level plane with more points gets its
     normal: the floor below a table, which few views show, may be askew."""
@@ -111,7 +111,7 @@ def meeting_of(wall: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return np.linalg.solve(np.stack([base[:3], wall[:3], along]), [base[3], wall[3], 0.0]), along
 
 
-def _foot(wall: np.ndarray, floor: np.ndarray, seen: KnownPoints) -> np.ndarray | None:
+def _foot(wall: np.ndarray, floor: np.ndarray, seen: ScenePoints) -> np.ndarray | None:
     """Return the (2, 3) ends of the line along which a wall meets a floor, as far as points of the floor are near it,
     or None."""
     meeting, along = meeting_of(wall, floor)
@@ -123,7 +123,7 @@ def _foot(wall: np.ndarray, floor: np.ndarray, seen: KnownPoints) -> np.ndarray 
     return meeting + along * np.quantile(beside @ along, [BEYOND, 1 - BEYOND])[:, None]
 
 
-def _corner(wall: np.ndarray, base: np.ndarray, floor: np.ndarray, seen: KnownPoints) -> np.ndarray:
+def _corner(wall: np.ndarray, base: np.ndarray, floor: np.ndarray, seen: ScenePoints) -> np.ndarray:
     """Return the (2, 3) ends of the line along which two walls meet, from the floor up to the highest camera."""
     meeting, along = meeting_of(wall, base)
     levels = np.array([floor[3], (seen.centers @ floor[:3]).max()])
@@ -149,14 +149,14 @@ def _through(line: np.ndarray, normal: np.ndarray, wall: np.ndarray) -> np.ndarr
 
 
 def _leaning(
-    wall: np.ndarray, standing: Sequence[np.ndarray], seen: KnownPoints, edges: EdgeImages
+    wall: np.ndarray, standing: Sequence[np.ndarray], seen: ScenePoints, edges: EdgeImages
 ) -> np.ndarray | None:
     """Fit a plane (4,) to the lines along which a wall meets `standing` planes, without outliers. None if the wall
     already holds these lines, or if they do not determine its normal."""
     lines = list[np.ndarray]()
     for base in standing:
         apart = np.arccos(min(1.0, abs(wall[:3] @ base[:3])))
-        near = _foot(wall, base, seen) if apart > LEFT_OPEN else None
+        near = _foot(wall, base, seen) if apart > MOST_ANGLE_ERROR else None
         line = clearest_line(wall, base, near, edges) if near is not None else None
         if line is not None:
             lines.append(line)
@@ -178,7 +178,7 @@ def _leaning(
     # The normal is as certain as the lines are spread along the narrower side.
     middle, variance, _ = _spread(places[on_it], length[on_it])
     wide = np.sqrt(max(variance[1], 0)) * np.tan(SAME_ANGLE) > BLUR * edges.pixel_at(middle)
-    return plane if wide and plane[:3] @ wall[:3] > np.cos(LEFT_OPEN) else None
+    return plane if wide and plane[:3] @ wall[:3] > np.cos(MOST_ANGLE_ERROR) else None
 
 
 def _off(plane: np.ndarray, places: np.ndarray) -> np.ndarray:
@@ -220,7 +220,7 @@ def clearest_line(
         return None
     showing = np.flatnonzero(shares[:, best, 0] <= SHOWN)
     line = np.stack([starts[best], ends[best]])
-    if not seen_enough(edges.cameras, showing, line.mean(0)):
+    if not has_wide_baseline(edges.cameras, showing, line.mean(0)):
         return None
     for _ in range(ROUNDS):
         fitted = _fitted_line(line, inward, apart, pixel, edges)

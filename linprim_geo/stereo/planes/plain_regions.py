@@ -42,12 +42,12 @@ TRIPLES, PLANES_PER_REGION, FITS = 300, 4, 3
 # Errors of points along one edge are correlated: all inliers together count as at most this many independent points.
 INDEPENDENT_POINTS = 20
 # A plane is accepted if at least so many views find it and two of them see it from directions that differ by at least
-# SPREAD radians.
-LEAST_VIEWS, SPREAD = 3, np.radians(10)
-# A smaller difference of directions, down to LEAST_SPREAD radians, is enough if the normals found by the views agree:
-# their angular deviation has to be at most half of that of silhouettes, whose normals turn with the view and so have a
-# standard deviation of t / sqrt 12 over views that span an angle t.
-STEADY, LEAST_SPREAD = 2 * np.sqrt(12), np.radians(6)
+# VIEW_ANGLE radians.
+LEAST_VIEWS, VIEW_ANGLE = 3, np.radians(10)
+# A smaller difference of directions, down to LEAST_VIEW_ANGLE radians, is enough if the normals found by the views
+# agree: their angular deviation has to be at most half of that of silhouettes, whose normals turn with the view and so
+# have a standard deviation of t / sqrt 12 over views that span an angle t.
+STEADY, LEAST_VIEW_ANGLE = 2 * np.sqrt(12), np.radians(6)
 # Two planes are the same if the angle of their normals is below this, in radians, and their offset is below TOLERANCE
 # times the depth.
 SAME_ANGLE = np.radians(3)
@@ -95,12 +95,12 @@ class PlainRegion:
             inner=self.inner[self.inner],
         )
 
-    def off(self, planes: np.ndarray) -> np.ndarray:
+    def residuals(self, planes: np.ndarray) -> np.ndarray:
         """Return the (N, K) relative residuals of the points to (K, 3) planes: inverse depth of the plane over that of
         the point, less 1; positive where the point is behind the plane."""
         return (self.rays @ planes.T) / self.inverse[:, None] - 1
 
-    def are_on(self, off: np.ndarray) -> np.ndarray:
+    def are_inliers(self, off: np.ndarray) -> np.ndarray:
         """Return (N, K) bool: which points are inliers of the planes, by their residuals `off` (N, K)."""
         return (np.abs(off) < TOLERANCE) & self.sure[:, None]
 
@@ -187,8 +187,8 @@ def planes_of_region(region: PlainRegion, rng: np.random.Generator) -> list[tupl
         if not proper.any():
             break
         tried = np.linalg.solve(corners[proper], region.inverse[triples[proper]][..., None])[..., 0]
-        off = region.off(tried)
-        on, behind = region.are_on(off), off > BEHIND * TOLERANCE
+        off = region.residuals(tried)
+        on, behind = region.are_inliers(off), off > BEHIND * TOLERANCE
         on = on[:, np.argmax((on & left[:, None]).sum(0) - 2 * behind.sum(0))]
         left &= ~on
         plane, on = _fitted(region, on)
@@ -206,13 +206,13 @@ def _fitted(region: PlainRegion, on: np.ndarray) -> tuple[np.ndarray, np.ndarray
             break
         scaled = region.rays[on] / region.inverse[on, None]
         plane = np.linalg.lstsq(scaled, np.ones(len(scaled)), rcond=None)[0]
-        on = region.are_on(region.off(plane[None]))[:, 0]
+        on = region.are_inliers(region.residuals(plane[None]))[:, 0]
     return plane, on
 
 
 def _certain(region: PlainRegion, plane: np.ndarray, on: np.ndarray) -> bool:
     """Return whether hardly any point is behind a plane, and its inliers fix its depth all over the region."""
-    if np.count_nonzero(region.off(plane[None]) > BEHIND * TOLERANCE) > BEHIND_SHARE * len(on):
+    if np.count_nonzero(region.residuals(plane[None]) > BEHIND * TOLERANCE) > BEHIND_SHARE * len(on):
         return False
     scaled = region.rays[on] / region.inverse[on, None]
     # An inlier is within TOLERANCE: half of that is taken as its standard deviation.
@@ -264,15 +264,15 @@ def common_planes(
 
 
 def agreeing(
-    cameras: Sequence[Camera], found: Sequence[FoundPlane], spread: float | None = None
+    cameras: Sequence[Camera], found: Sequence[FoundPlane], view_angle: float | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cluster the planes of single regions. Return (K, 4) means of those found in at least LEAST_VIEWS views, and (K,)
-    by how many radians the directions of two of these views have to differ: `spread`, or by the scatter of normals
-    (`_least_spread`)."""
+    by how many radians the directions of two of these views have to differ: `view_angle`, or by the scatter of normals
+    (`_least_view_angle`)."""
     weight, view = np.array([one.points for one in found]), np.array([one.region.view for one in found])
     depth, middle = np.array([one.depth for one in found]), np.array([one.middle for one in found])
     plane = np.array([one.plane for one in found])
-    planes, spreads = list[np.ndarray](), list[float]()
+    planes, view_angles = list[np.ndarray](), list[float]()
     free = np.ones(len(found), bool)
     for first in range(len(found)):
         if not free[first]:
@@ -285,20 +285,20 @@ def agreeing(
         mean = np.append(normal, np.average(middle[same] @ normal, weights=weight[same]))
         same = (_same(mean, plane[:, :3], middle, depth) | same) & free
         free &= ~same
-        least = _least_spread(plane[same, :3], weight[same]) if spread is None else spread
-        if seen_enough(cameras, view[same], np.average(middle[same], axis=0, weights=weight[same]), least):
+        least = _least_view_angle(plane[same, :3], weight[same]) if view_angle is None else view_angle
+        if has_wide_baseline(cameras, view[same], np.average(middle[same], axis=0, weights=weight[same]), least):
             planes.append(mean)
-            spreads.append(least)
-    return np.array(planes).reshape(-1, 4), np.array(spreads)
+            view_angles.append(least)
+    return np.array(planes).reshape(-1, 4), np.array(view_angles)
 
 
-def _least_spread(normals: np.ndarray, weight: np.ndarray) -> float:
+def _least_view_angle(normals: np.ndarray, weight: np.ndarray) -> float:
     """Return by how many radians the viewing directions of a plane have to differ, given the (N, 3) normals that views
     have found and (N,) weights: normals of the silhouette of a round object turn as much as the view does."""
     mean = weight @ normals
     angle = np.arccos(np.clip(normals @ (mean / np.linalg.norm(mean)), -1, 1))
     turning = STEADY * float(np.sqrt(np.average(angle**2, weights=weight)))
-    return float(np.clip(turning, LEAST_SPREAD, SPREAD))
+    return float(np.clip(turning, LEAST_VIEW_ANGLE, VIEW_ANGLE))
 
 
 def _same(plane: np.ndarray, normals: np.ndarray, points: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -308,31 +308,34 @@ def _same(plane: np.ndarray, normals: np.ndarray, points: np.ndarray, depth: np.
     return near & (normals @ plane[:3] > np.cos(SAME_ANGLE))
 
 
-def seen_enough(cameras: Sequence[Camera], views: np.ndarray, point: np.ndarray, spread: float | None = None) -> bool:
+def has_wide_baseline(
+    cameras: Sequence[Camera], views: np.ndarray, point: np.ndarray, view_angle: float | None = None
+) -> bool:
     """Return whether `views`, numbers of cameras, are at least LEAST_VIEWS different ones, and the directions from
-    which two of them see `point` differ by at least `spread` radians (default SPREAD)."""
+    which two of them see `point` differ by at least `view_angle` radians (default VIEW_ANGLE)."""
     views = np.unique(views)
     if len(views) < LEAST_VIEWS:
         return False
     towards = np.array([cameras[view].center - point for view in views])
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    return bool((towards @ towards.T).min() < np.cos(SPREAD if spread is None else spread))
+    return bool((towards @ towards.T).min() < np.cos(VIEW_ANGLE if view_angle is None else view_angle))
 
 
 def may_lie_on(region: PlainRegion, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Test (K, 3) planes of the camera. Return (N, K) bool, which points of the region are inliers, and (K,) bool,
     whether the region may lie on the plane: it has enough inliers, and hardly any point is behind."""
-    off, count = region.off(planes), len(region.inverse)
-    on = region.are_on(off)
+    off, count = region.residuals(planes), len(region.inverse)
+    on = region.are_inliers(off)
     behind = (off > BEHIND * TOLERANCE).sum(0)
     return on, (on.sum(0) >= max(LEAST_POINTS, ON_SHARE * count)) & (behind <= BEHIND_SHARE * count)
 
 
 def _refitted(
-    cameras: Sequence[Camera], regions: Sequence[PlainRegion], planes: np.ndarray, spreads: np.ndarray
+    cameras: Sequence[Camera], regions: Sequence[PlainRegion], planes: np.ndarray, view_angles: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Refit planes (K, 4) to their inliers in all regions assigned to them. Return those kept and their `spreads`.
-    Planes are dropped if they are uncertain, duplicates, or not seen from directions that differ by their spread."""
+    """Refit planes (K, 4) to their inliers in all regions assigned to them. Return those kept and their `view_angles`.
+    Planes are dropped if they are uncertain, duplicates, or not seen from directions that differ by their
+    view_angle."""
     points: list[list] = [[] for _ in planes]
     for region in regions if len(planes) else ():
         camera = cameras[region.view]
@@ -349,7 +352,7 @@ def _refitted(
             points[best].append((place, depth, region.view, len(own)))
             left &= ~own
     fitted = []
-    for plane, spread, parts in zip(planes, spreads, points, strict=True):
+    for plane, view_angle, parts in zip(planes, view_angles, points, strict=True):
         if not parts:
             continue
         places, depths, views, counts = zip(*parts, strict=True)
@@ -362,15 +365,15 @@ def _refitted(
         wide = np.sqrt(max(variance[1], 0)) * np.tan(SAME_ANGLE) * np.sqrt(len(np.unique(views)))
         scatter = 2 * float(np.sqrt(np.mean((around @ axes[:, 0] / depth) ** 2)))
         error = min(scatter, TOLERANCE) if len(place) > ALL_POINTS * sum(counts) else TOLERANCE
-        if wide < error * np.median(depth) or not seen_enough(cameras, views, middle, spread):
+        if wide < error * np.median(depth) or not has_wide_baseline(cameras, views, middle, view_angle):
             continue
         normal = axes[:, 0] * (1 if axes[:, 0] @ plane[:3] > 0 else -1)
-        fitted.append((len(place), np.append(normal, normal @ middle), middle, float(np.median(depth)), spread))
+        fitted.append((len(place), np.append(normal, normal @ middle), middle, float(np.median(depth)), view_angle))
     kept, least = list[np.ndarray](), list[float]()
-    for _, plane, middle, depth, spread in sorted(fitted, key=lambda one: -one[0]):
+    for _, plane, middle, depth, view_angle in sorted(fitted, key=lambda one: -one[0]):
         if not any(_same(other, plane[None, :3], middle[None], np.array([depth]))[0] for other in kept):
             kept.append(plane)
-            least.append(spread)
+            least.append(view_angle)
     return np.array(kept).reshape(-1, 4), np.array(least)
 
 

@@ -35,8 +35,9 @@ CENTRAL_SHARE = 0.7
 # have depths on it.
 WINDOW, ON_SHARE = 15, 0.5
 # A confirmed depth is replaced if at least the share NEARLY_ALL of confirmed depths around are inliers, and their mean
-# residual is at most UNTOLD times their mean deviation: noise leaves as much in the mean of a few windows of stereo.
-NEARLY_ALL, UNTOLD = 0.8, 0.5
+# residual is at most MOST_MEAN_RESIDUAL times their mean deviation: noise leaves as much in the mean of a few windows
+# of stereo.
+NEARLY_ALL, MOST_MEAN_RESIDUAL = 0.8, 0.5
 
 
 @dataclass(frozen=True)
@@ -181,17 +182,17 @@ def point_plane_depth(found: DepthMap, confirmed: np.ndarray, planes: np.ndarray
     inverse, most, off = np.zeros((height, width)), np.zeros((height, width)), np.ones((height, width))
     for plane, local in zip(planes, in_camera(found.camera, planes), strict=True):
         by_plane = rays @ local
-        off_plane = np.where(known & (by_plane > 0), by_plane * own - 1, 1)
-        on = (np.abs(off_plane) < TOLERANCE) & (np.abs(found.normal @ plane[:3]) > SAME_NORMAL)
+        plane_residuals = np.where(known & (by_plane > 0), by_plane * own - 1, 1)
+        on = (np.abs(plane_residuals) < TOLERANCE) & (np.abs(found.normal @ plane[:3]) > SAME_NORMAL)
         if on.any():
             share = _mean_around(on)
             better = share > most
-            most[better], inverse[better], off[better] = share[better], by_plane[better], off_plane[better]
+            most[better], inverse[better], off[better] = share[better], by_plane[better], plane_residuals[better]
     sure, on = np.isfinite(confirmed), np.abs(off) < TOLERANCE
     on_sure = on & sure
     nearly_all = _mean_around(on_sure) >= NEARLY_ALL * _mean_around(sure)
     error, deviation = (_mean_around(np.where(on_sure, image, 0)) for image in (off, found.deviation))
-    alike = np.abs(error) <= UNTOLD * deviation
+    alike = np.abs(error) <= MOST_MEAN_RESIDUAL * deviation
     taken = np.where(sure, on & nearly_all & alike, most > ON_SHARE)
     with np.errstate(divide="ignore"):
         return np.where(taken, 1 / inverse, np.nan).astype(np.float32)

@@ -34,7 +34,7 @@ from linprim_geo.stereo.planes.plain_regions import (
     to_world,
 )
 from linprim_geo.stereo.planes.point_planes import CENTRAL_SHARE
-from linprim_geo.stereo.planes.seen_through import KnownDepths
+from linprim_geo.stereo.planes.seen_through import FreeSpaceTest
 from linprim_geo.stereo.planes.shown_colours import ShownColours
 
 # A plane is laid over part of a region if at least this share of the sure depths there agree with it; fewer sure depths
@@ -136,14 +136,16 @@ def region_plane_depths(
     lying = [[_lying(region, of_view) for region in own] for own, of_view in zip(regions, local, strict=True)]
     hulls = _hulls(cameras, regions, lying, planes)
     beside = [beside_edges(depth.shape, own) for depth, own in zip(known, regions, strict=True)]
-    views = KnownDepths(cameras, (np.where(at, np.nan, depth) for at, depth in zip(beside, known, strict=True)))
+    views = FreeSpaceTest(cameras, (np.where(at, np.nan, depth) for at, depth in zip(beside, known, strict=True)))
     result = []
     of_views = zip(cameras, regions, lying, local, known, confirmed, beside, strict=True)
     for camera, own, of_regions, of_view, sure, seen, of_edges in of_views:
         laid = RegionDepths.nothing(camera)
         wide, telling = np.zeros_like(laid.moved), np.where(of_edges, np.nan, sure)
         for region, on in zip(own, of_regions, strict=True):
-            counts = {number: _tukey_sum(region.off(of_view[[number]])[points, 0]) for number, points in on.items()}
+            counts = {
+                number: _tukey_sum(region.residuals(of_view[[number]])[points, 0]) for number, points in on.items()
+            }
             best = _best_first(camera, region, of_view, hulls, counts, views)
             refused = [] if _is_well_known(sure, region) else _refused(region, on, best, planes, colours)
             laid.refused.extend((region, of_view[number]) for number in refused)
@@ -218,7 +220,7 @@ def _best_first(
     planes: np.ndarray,
     hulls: Sequence[_Hull],
     counts: Mapping[int, float],
-    views: KnownDepths,
+    views: FreeSpaceTest,
 ) -> dict[int, np.ndarray]:
     """Return those (K, 3) planes of the camera that other views do not see through, as a dict from their numbers to the
     (P, 3) sampled points of the region within the plane's hull. They are sorted by descending score: their `counts`,

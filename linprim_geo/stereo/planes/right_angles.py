@@ -17,7 +17,7 @@ from linprim_geo.stereo.planes.plain_regions import SAME_ANGLE
 # angles after the last of ROUNDS iterations if they differ by at most RIGHT.
 NEARLY, RIGHT, ROUNDS = 2 * SAME_ANGLE, np.radians(0.2), 5
 # The angle of a wall in radians that shading leaves open: nine in ten planes of single regions err by no more.
-LEFT_OPEN = np.radians(20)
+MOST_ANGLE_ERROR = np.radians(20)
 # The weight of a right angle, relative to the mean information about planes.
 WEIGHT = 1e4
 
@@ -65,7 +65,7 @@ def _middle(axes: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return axes
 
 
-def squared(
+def orthogonalised(
     planes: np.ndarray,
     information: Sequence[np.ndarray | None],
     moves: Callable[[int, np.ndarray], np.ndarray],
@@ -87,7 +87,7 @@ def squared(
     if frame is not None:
         angle = angles_to(frame, planes[:, :3])
         staying.sort(key=lambda k: angle[k])
-        framed = [k for k in free if angle[k] < LEFT_OPEN]
+        framed = [k for k in free if angle[k] < MOST_ANGLE_ERROR]
         planes = _along(planes, frame, framed, information, moves) if framed else planes
         free = [k for k in free if k not in framed]
     lacking = np.abs(planes[:, :3] @ planes[:, :3].T)

@@ -18,10 +18,10 @@ from linprim_geo.points.view_pairs import visible_pixels
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.planes.edge_images import BLUR, BY_CHANCE, SHOWN, EdgeImages, by_chance
-from linprim_geo.stereo.planes.enclosing_planes import CELLS, FILLED, MARGIN, EnclosingPlane, KnownPoints
+from linprim_geo.stereo.planes.enclosing_planes import CELLS, FILLED, MARGIN, EnclosingPlane, ScenePoints
 from linprim_geo.stereo.planes.floor_sides import FloorSide, inner_sides, outer_sides
 from linprim_geo.stereo.planes.meeting_lines import clearest_line, meeting_of
-from linprim_geo.stereo.planes.plain_regions import SAME_ANGLE, seen_enough
+from linprim_geo.stereo.planes.plain_regions import SAME_ANGLE, has_wide_baseline
 from linprim_geo.stereo.planes.point_planes import SurfacePoints
 from linprim_geo.stereo.planes.right_angles import at_right_angles
 
@@ -76,7 +76,7 @@ def with_corner_walls(
         points: at known depths.
     """
     cameras = [found.camera for found in maps]
-    seen = KnownPoints(cameras, points)
+    seen = ScenePoints(cameras, points)
     if not any(plane.closes or seen.is_level(plane.normal) for plane in enclosing):
         return list(enclosing)
     edges = EdgeImages(maps, known)
@@ -129,7 +129,7 @@ class _Rising:
 
 
 def _walls_on(
-    floor: EnclosingPlane, others: Sequence[EnclosingPlane], edges: EdgeImages, seen: KnownPoints
+    floor: EnclosingPlane, others: Sequence[EnclosingPlane], edges: EdgeImages, seen: ScenePoints
 ) -> list[tuple[EnclosingPlane, int | None]]:
     """Find walls on the sides of the rectangle around a floor's own points, and where the floor ends within. Return
     each with the index of the one of `others` that it is, or None."""
@@ -176,7 +176,7 @@ def find_corner(floor: EnclosingPlane, near: np.ndarray, lowest: float, edges: E
     if chance[row, part] + np.log(chance.size) > np.log(BY_CHANCE):
         return None
     showing = np.flatnonzero(shares[:, row, part] <= SHOWN)
-    if not seen_enough(edges.cameras, showing, floor.at(places[row])):
+    if not has_wide_baseline(edges.cameras, showing, floor.at(places[row])):
         return None
     # Higher parts may show the edge less clearly, and lower the evidence for the whole, although they show it.
     while part + 1 < HEIGHTS:

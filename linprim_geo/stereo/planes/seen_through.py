@@ -26,7 +26,7 @@ SEEING, SEEING_SHARE = 2, 0.25
 AROUND = 3
 
 
-class KnownDepths:
+class FreeSpaceTest:
     """The depths that views know: (H, W) `depths` of each of the `cameras`, NaN where unknown."""
 
     def __init__(self, cameras: Sequence[Camera], depths: Iterable[np.ndarray]):

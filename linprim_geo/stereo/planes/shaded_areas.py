@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from linprim_geo.stereo.planes.constrained_planes import FRAME_RESIDUAL_RATIO, MOST_BOXES, MOST_RESIDUAL_RATIO
 from linprim_geo.stereo.planes.enclosing_planes import SURE_SHARE
-from linprim_geo.stereo.planes.held_planes import AS_WELL, HARDLY_MORE, MOST_BOXES
 from linprim_geo.stereo.planes.plain_regions import TOLERANCE, in_camera
 from linprim_geo.stereo.planes.shading import ShadedRegion, Shading, evaluate
 
@@ -32,11 +32,11 @@ def best_first(carriers: dict[int, np.ndarray], carried: np.ndarray) -> list[int
     """Return the numbers of those `carriers` that carry about as many boxes of a region as any does, first the one with
     the highest `carried` (K,). `carriers` has (N,) bool of each plane: the boxes that it carries."""
     most = max(np.count_nonzero(boxes) for boxes in carriers.values())
-    as_well = [k for k, boxes in carriers.items() if HARDLY_MORE * np.count_nonzero(boxes) >= most]
+    as_well = [k for k, boxes in carriers.items() if MOST_RESIDUAL_RATIO * np.count_nonzero(boxes) >= most]
     return sorted(as_well, key=lambda k: carried[k], reverse=True)
 
 
-def told_by_edges(
+def preferred_by_edges(
     area: ShadedArea, along_edges: np.ndarray, planes: np.ndarray, shadings: Sequence[Shading]
 ) -> ShadedArea:
     """Return the area on the plane that points along edges favour, if it carries the region's shading as well as the
@@ -49,12 +49,12 @@ def told_by_edges(
     shading, few = shadings[area.region.view], [area.region.some(MOST_BOXES)]
     numbers = shading.small(along_edges)[area.where]
     pixels = np.bincount(numbers[numbers >= 0], minlength=len(planes))
-    told = int(np.argmax(pixels))
-    if told == area.number or pixels[told] < SURE_SHARE * len(numbers):
+    other_number = int(np.argmax(pixels))
+    if other_number == area.number or pixels[other_number] < SURE_SHARE * len(numbers):
         return area
-    by_shading, by_edges = in_camera(shading.camera, planes[[area.number, told]]) @ few[0].rays.T
+    by_shading, by_edges = in_camera(shading.camera, planes[[area.number, other_number]]) @ few[0].rays.T
     if (by_edges <= 0).any() or np.median(np.abs(by_edges / by_shading - 1)) < TOLERANCE:
         return area
-    own, other = (evaluate(planes[number], few, shadings) for number in (area.number, told))
-    carries = own is not None and other is not None and other.left_share <= AS_WELL * own.left_share
-    return replace(area, number=told) if carries else area
+    own, other = (evaluate(planes[number], few, shadings) for number in (area.number, other_number))
+    carries = own is not None and other is not None and other.left_share <= FRAME_RESIDUAL_RATIO * own.left_share
+    return replace(area, number=other_number) if carries else area

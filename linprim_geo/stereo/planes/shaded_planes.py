@@ -9,7 +9,7 @@ curved surfaces get none.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -19,28 +19,35 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.points.initial_points import in_image
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
-from linprim_geo.stereo.planes.common_surfaces import CommonSurfaces
+from linprim_geo.stereo.planes.common_surfaces import SurfaceSupport
+from linprim_geo.stereo.planes.constrained_planes import (
+    ALIKE_DEPTH,
+    FRAME_RESIDUAL_RATIO,
+    MOST_BOXES,
+    MOST_RESIDUAL_RATIO,
+    ConstrainedPlanes,
+)
 from linprim_geo.stereo.planes.enclosing_planes import AGREEING, SURE_SHARE
-from linprim_geo.stereo.planes.held_planes import ALIKE_DEPTH, AS_WELL, HARDLY_MORE, MOST_BOXES, HeldPlanes
 from linprim_geo.stereo.planes.meeting_lines import is_same, on_meeting_lines
 from linprim_geo.stereo.planes.plain_regions import (
     BEHIND,
     SAME_ANGLE,
     TOLERANCE,
+    has_wide_baseline,
     in_camera,
     in_world,
     rays_of,
-    seen_enough,
     to_world,
 )
 from linprim_geo.stereo.planes.right_angles import NEARLY, RIGHT, angles_to, frame_of
-from linprim_geo.stereo.planes.shaded_areas import ShadedArea, best_first, told_by_edges
+from linprim_geo.stereo.planes.shaded_areas import ShadedArea, best_first, preferred_by_edges
 from linprim_geo.stereo.planes.shading import (
     BOX,
     LEAST_BOXES,
     SHOWN_SHARE,
     SURE_DEPTHS,
     Fit,
+    FittedRegion,
     ShadedRegion,
     Shading,
     around_boxes,
@@ -57,10 +64,10 @@ from linprim_geo.stereo.vignetting import vignetting
 MOST_VIEWS, LEAST_VIEWS = 8, 3
 # Boxes of a region compared in the first steps from each start (later MOST_BOXES), and the number of these steps.
 FIRST_BOXES, FIRST_STEPS = 200, 6
-# A plane carries a region's shading if its residual is at most the share LEFT_SHARE of the region's deviation; a plane
-# of other regions if at most OTHERS_SHARE and HARDLY_MORE times that of the region's own plane, or AS_WELL times where
-# it is near that one: glossy paint causes as much.
-LEFT_SHARE, OTHERS_SHARE = 0.2, 0.25
+# A plane carries a region's shading if its residual is at most the share MOST_RESIDUAL_SHARE of the region's deviation;
+# a plane of other regions if at most OTHERS_SHARE and MOST_RESIDUAL_RATIO times that of the region's own plane, or
+# FRAME_RESIDUAL_RATIO times where it is near that one: glossy paint causes as much.
+MOST_RESIDUAL_SHARE, OTHERS_SHARE = 0.2, 0.25
 # Noise leaves a smoothed residual of one deviation; more shows another surface. At least FLAT_SHARE of a flat region is
 # below MOST_LEFT: tone curves and vignetting leave more at its ends (DECISIONS 57).
 MOST_LEFT, FLAT_SHARE = 1.3, 0.75
@@ -74,16 +81,6 @@ FAR = 1e4
 ASKEW = 2 * TOLERANCE
 # A plane carries a region if it explains the shading around half of its boxes.
 CARRIED_SHARE = 0.5
-
-
-@dataclass(frozen=True)
-class FittedRegion:
-    """A region, the largest residual that a plane carrying it may have as a share of its deviation, and the fit of its
-    own plane, None unless that carries it and is certain."""
-
-    region: ShadedRegion
-    most_left: float
-    fit: Fit | None
 
 
 class ShadedPlanes:
@@ -127,23 +124,23 @@ class ShadedPlanes:
             self.regions.append([one for one in fitted if one is not None])
         self.planes = self._common([one for own in self.regions for one in own if one.fit is not None])
         carried = self._take_originals(self._all_carriers())
-        held = HeldPlanes(self.shadings, self.depths, carried)
-        off_frame, told = self._off_frame(), set(range(self.by_points, self.given_count))
-        along = {k for k in told if off_frame[k] < RIGHT}
+        held = ConstrainedPlanes(self.shadings, self.depths, carried)
+        off_frame, from_edges = self._off_frame(), set(range(self.by_points, self.given_count))
+        along = {k for k in from_edges if off_frame[k] < RIGHT}
         # Edges fix a plane along the frame well, but the region may be on another nearly flush with it.
         twice = [k for k in sorted(along) if carried[k]]
-        told.update(range(len(self.planes), len(self.planes) + len(twice)))
+        from_edges.update(range(len(self.planes), len(self.planes) + len(twice)))
         self.planes = np.concatenate([self.planes, self.planes[twice]])
         carried += [carried[k] for k in twice]
         staying = along.union(range(self.by_points))
-        planes = held.at_right_angles(held.by_depths(self.planes, staying, told), staying, told)
+        planes = held.at_right_angles(held.by_depths(self.planes, staying, from_edges), staying, from_edges)
         standing = held.still_carrying(on_meeting_lines(planes, self.by_points, maps, depths), planes)
         self.standing = np.isin(np.arange(len(planes)), list(standing))
         self.hanging = np.array([any(is_same(plane, planes[k]) for k in standing) for plane in planes], bool)
         self.hanging[self.by_points :] = False
         for number, plane in standing.items():
             planes[number] = plane
-        self.planes = held.at_right_angles(planes, {*staying, *standing}, told)
+        self.planes = held.at_right_angles(planes, {*staying, *standing}, from_edges)
 
     def _camera(self, region: ShadedRegion) -> Camera:
         return self.small_cameras[region.view]
@@ -175,13 +172,13 @@ class ShadedPlanes:
             return None
         left = unexplained(region, in_camera(camera, fit.plane[None])[0], self.shadings)
         flat = np.count_nonzero(left <= MOST_LEFT) >= FLAT_SHARE * np.isfinite(left).sum()
-        most = min(HARDLY_MORE * fit.left_share, OTHERS_SHARE) if flat else OTHERS_SHARE
+        most = min(MOST_RESIDUAL_RATIO * fit.left_share, OTHERS_SHARE) if flat else OTHERS_SHARE
         return FittedRegion(region, most, fit if flat and self._certain(region, fit) else None)
 
     def _is_far(self, region: ShadedRegion, fit: Fit) -> bool:
         """Return whether a plane without parallax carries a region's shading as well as the fit: a sky."""
         far = self._far(region.some(MOST_BOXES))
-        return far is not None and far.left < HARDLY_MORE * fit.left
+        return far is not None and far.left < MOST_RESIDUAL_RATIO * fit.left
 
     def _far(self, region: ShadedRegion, least: int = LEAST_VIEWS) -> Fit | None:
         """Evaluate a plane at infinity on the shading of a region; None if too few views show it."""
@@ -195,10 +192,10 @@ class ShadedPlanes:
         for region in self.shown[view]:
             few = region.some(FIRST_BOXES)
             far = self._far(self._in_all_views(few))
-            if far is None or far.left_share > LEFT_SHARE:
+            if far is None or far.left_share > MOST_RESIDUAL_SHARE:
                 continue
             fits = (evaluate(plane, [few], self.shadings) for plane in self.planes[self.by_points :])
-            if all(fit is None or fit.left_share > HARDLY_MORE * far.left_share for fit in fits):
+            if all(fit is None or fit.left_share > MOST_RESIDUAL_RATIO * far.left_share for fit in fits):
                 self._mark(background, region)
         return background
 
@@ -211,7 +208,7 @@ class ShadedPlanes:
                 continue
             few = region.some(FIRST_BOXES)
             far = self._far(self._in_all_views(few), least=1)
-            most = 0.0 if far is None else min(LEFT_SHARE, far.left_share / AS_WELL)
+            most = 0.0 if far is None else min(MOST_RESIDUAL_SHARE, far.left_share / FRAME_RESIDUAL_RATIO)
             if most > 0 and any(fit.left_share < most for fit in self._fits(few)):
                 self._mark(wall, region)
         return wall
@@ -243,7 +240,7 @@ class ShadedPlanes:
     def _certain(self, region: ShadedRegion, fit: Fit) -> bool:
         """Return whether a fit carries a region's shading with a small error of depth, and is not contradicted."""
         camera = self._camera(region)
-        if fit.left_share > LEFT_SHARE or depth_deviation(fit, region, camera) > CERTAIN:
+        if fit.left_share > MOST_RESIDUAL_SHARE or depth_deviation(fit, region, camera) > CERTAIN:
             return False
         inverse = region.rays @ in_camera(camera, fit.plane[None])[0]
         return bool((inverse > 0).all()) and not self._contradicted(region, inverse)
@@ -305,7 +302,7 @@ class ShadedPlanes:
             camera, ray = self._camera(region), np.median(region.rays, axis=0)
             middles.append(to_world(camera, ray / (ray @ in_camera(camera, plane[None])[0])))
         views = np.array(sorted(finding.union(*(region.others for region in regions))))
-        return seen_enough(self.small_cameras, views, np.mean(middles, axis=0))
+        return has_wide_baseline(self.small_cameras, views, np.mean(middles, axis=0))
 
     def _carries(self, plane: np.ndarray, one: FittedRegion) -> bool:
         """Return whether a plane leaves hardly more of a region's shading than its own one, of as many boxes."""
@@ -314,7 +311,7 @@ class ShadedPlanes:
         found, own = evaluate(plane, [one.region.some(MOST_BOXES)], self.shadings), one.fit
         if found is None or own is None:
             return False
-        return found.boxes > 0.7 * own.boxes and found.left < HARDLY_MORE * own.left
+        return found.boxes > 0.7 * own.boxes and found.left < MOST_RESIDUAL_RATIO * own.left
 
     def _carriers(self, one: FittedRegion) -> dict[int, np.ndarray]:
         """Return the planes that carry a region's shading, each with (N,) bool: around which of its boxes."""
@@ -338,7 +335,7 @@ class ShadedPlanes:
             return one.most_left
         own = one.region.rays @ in_camera(self._camera(one.region), one.fit.plane[None])[0]
         near = np.median(np.abs(inverse / own - 1)) < ALIKE_DEPTH
-        return min(AS_WELL * one.fit.left_share, OTHERS_SHARE) if near else one.most_left
+        return min(FRAME_RESIDUAL_RATIO * one.fit.left_share, OTHERS_SHARE) if near else one.most_left
 
     def _all_carriers(self) -> list[list[dict[int, np.ndarray]]]:
         """Return `_carriers` of the regions of each view."""
@@ -402,7 +399,7 @@ class ShadedPlanes:
         walls. For planes with points all over, only confirmed depths of other views count, not depths supposed there.
         """
         areas = [
-            [self._told_first(of_region, along) for of_region in own]
+            [self._edge_preferred_first(of_region, along) for of_region in own]
             for own, along in zip(self.candidates, along_edges, strict=True)
         ]
         supposed = [[of_region[0] for of_region in own] for own in areas]
@@ -427,7 +424,7 @@ class ShadedPlanes:
             for of_region in own:
                 for k, boxes in of_region.items():
                     carried[k] += np.count_nonzero(boxes)
-        carried[: self.given_count] *= HARDLY_MORE
+        carried[: self.given_count] *= MOST_RESIDUAL_RATIO
         return [
             [
                 [self._area(one.region, boxes[k], k) for k in best_first(boxes, carried)]
@@ -437,10 +434,10 @@ class ShadedPlanes:
             for own, of_view in zip(self.regions, carriers, strict=True)
         ]
 
-    def _told_first(self, areas: list[ShadedArea], along_edges: np.ndarray) -> list[ShadedArea]:
+    def _edge_preferred_first(self, areas: list[ShadedArea], along_edges: np.ndarray) -> list[ShadedArea]:
         """Return the areas of a region, first the one that points `along_edges` favour, if another."""
-        told = told_by_edges(areas[0], along_edges, self.planes, self.shadings)
-        return areas if told is areas[0] else [told, *areas]
+        from_edges = preferred_by_edges(areas[0], along_edges, self.planes, self.shadings)
+        return areas if from_edges is areas[0] else [from_edges, *areas]
 
     def _area(self, region: ShadedRegion, boxes: np.ndarray, number: int) -> ShadedArea:
         """Return the area around those boxes of a region that a plane carries."""
@@ -455,28 +452,28 @@ class ShadedPlanes:
         return result
 
     def _known(
-        self, view: int, areas: Sequence[Sequence[ShadedArea]], surfaces: CommonSurfaces
+        self, view: int, areas: Sequence[Sequence[ShadedArea]], surfaces: SurfaceSupport
     ) -> list[ShadedArea | None]:
         """Return for each region of a view the first of its areas on a surface that enough views know, or None."""
         camera, shading = self.small_cameras[view], self.shadings[view]
         every = [area for of_region in areas for area in of_region]
         depths = [self._depth(camera, self._numbers(shading, [area])) for area in every]
-        known_by = surfaces.known_by(view, depths, [area.number < self.by_points for area in every])
+        supporting_views = surfaces.supporting_views(view, depths, [area.number < self.by_points for area in every])
         known = []
-        for depth, others in zip(depths, known_by, strict=True):
+        for depth, others in zip(depths, supporting_views, strict=True):
             row, column = np.nonzero(np.isfinite(depth))
             points = to_world(camera, rays_of(camera, row, column) * depth[row, column, None])
             views = np.append(others, view)
-            known.append(len(points) > 0 and seen_enough(self.small_cameras, views, np.median(points, axis=0)))
+            known.append(len(points) > 0 and has_wide_baseline(self.small_cameras, views, np.median(points, axis=0)))
         is_known = iter(known)
         of_regions = ([area for area in of_region if next(is_known)] for of_region in areas)
         return [next(iter(of_region), None) for of_region in of_regions]
 
-    def _surfaces(self, supposed: Sequence[Sequence[ShadedArea]]) -> CommonSurfaces:
+    def _surfaces(self, supposed: Sequence[Sequence[ShadedArea]]) -> SurfaceSupport:
         """Return what all views know: confirmed depths, and depths of the areas that each has `supposed`."""
         views = zip(self.small_cameras, self.shadings, supposed, strict=True)
         depths = [self._depth(camera, self._numbers(shading, own)) for camera, shading, own in views]
-        return CommonSurfaces(self.small_cameras, self.depths, depths)
+        return SurfaceSupport(self.small_cameras, self.depths, depths)
 
     def _numbers(self, shading: Shading, areas: Sequence[ShadedArea]) -> np.ndarray:
         """Return (H, W) numbers of the planes of a view's areas, -1 elsewhere."""

@@ -228,6 +228,16 @@ class Fit:
         return self.left / self.deviation
 
 
+@dataclass(frozen=True)
+class FittedRegion:
+    """A region, the largest residual that a plane carrying it may have as a share of its deviation, and the fit of its
+    own plane, None unless that carries it and is certain."""
+
+    region: ShadedRegion
+    most_left: float
+    fit: Fit | None
+
+
 def evaluate(plane: np.ndarray, regions: Sequence[ShadedRegion], shadings: Sequence[Shading]) -> Fit | None:
     """Evaluate a plane on the shading of regions; None if no other view shows them."""
     information, downhill = np.zeros((3, 3)), np.zeros(3)

@@ -13,14 +13,14 @@ from dataclasses import replace
 import numpy as np
 
 from linprim_geo.stereo.depth_maps import SURE, DepthMap
-from linprim_geo.stereo.planes.held_planes import HARDLY_MORE
+from linprim_geo.stereo.planes.constrained_planes import MOST_RESIDUAL_RATIO
 from linprim_geo.stereo.planes.plain_regions import common_planes, in_world, regions_of_views
 from linprim_geo.stereo.planes.point_planes import planes_of_points
 from linprim_geo.stereo.planes.shaded_planes import (
     FAR,
     FIRST_BOXES,
     LEAST_VIEWS,
-    LEFT_SHARE,
+    MOST_RESIDUAL_SHARE,
     ShadedPlanes,
 )
 from linprim_geo.stereo.planes.shading import (
@@ -70,10 +70,10 @@ def _is_sky(region: ShadedRegion, known: np.ndarray, planes: np.ndarray, shading
         return fit if fit is not None and fit.views >= LEAST_VIEWS else None
 
     far = in_views(evaluate(in_world(shading.camera, np.array([0, 0, 1 / (FAR * depth)])), [region], shadings))
-    if far is None or far.left_share > LEFT_SHARE:
+    if far is None or far.left_share > MOST_RESIDUAL_SHARE:
         return False
     starts = starting_planes(region, known, np.zeros_like(known))
     starts += [np.array([0, 0, 1 / (times * depth)]) for times in STARTS]
     fits = [in_views(fit_plane(in_world(shading.camera, start), [region], shadings)) for start in starts]
     fits += [evaluate(plane, [region], shadings) for plane in planes]
-    return all(fit.left_share > HARDLY_MORE * far.left_share for fit in fits if fit is not None)
+    return all(fit.left_share > MOST_RESIDUAL_RATIO * far.left_share for fit in fits if fit is not None)

@@ -17,7 +17,7 @@ from scipy.ndimage import label
 from linprim_geo.points.view_pairs import visible_pixels
 from linprim_geo.stereo.depth_maps import DepthMap
 from linprim_geo.stereo.planes.plain_regions import HALF_EDGE, grown_alike, rays_of, to_world
-from linprim_geo.stereo.planes.seen_through import KnownDepths
+from linprim_geo.stereo.planes.seen_through import FreeSpaceTest
 from linprim_geo.stereo.visibility.lone_backgrounds import FAR
 
 # The largest share of a far part whose depth may be known, beside the outlines of objects.
@@ -64,7 +64,7 @@ def far_parts(
         is_far = np.bincount(number[shown], minlength=parts + 1) > MOST * np.bincount(number, minlength=parts + 1)
         result.append(grown_alike(told | (is_far[part] & ~edge), found.grey, edge))
     seen = (np.where(np.isnan(depth) & past, distance, depth) for depth, past in zip(known, result, strict=True))
-    looking = KnownDepths(cameras, seen)
+    looking = FreeSpaceTest(cameras, seen)
     for camera, depth, told, past in zip(cameras, rendered, far, result, strict=True):
         row, column = np.nonzero(past & ~told & (depth > 0))
         is_surface = looking.know(to_world(camera, rays_of(camera, row, column) * depth[row, column, None]))

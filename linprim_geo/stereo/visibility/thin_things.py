@@ -38,7 +38,7 @@ DARKEST, BRIGHTEST = 10, 245
 
 
 @dataclass(frozen=True)
-class SeenDepths:
+class RenderedView:
     """A view: `rgb` (H, W, 3) uint8 and the variance `noise` of its grey values; `rendered` depths (H, W), 0 where
     none, of which some are `sharp` (H, W) bool; and `known` depths (H, W), NaN where unknown."""
 
@@ -62,7 +62,7 @@ class Colors:
         return sample_bilinear(self.means[number], camera.project(points)[0]) / self.gains[number]
 
 
-def thin_things(views: Sequence[SeenDepths]) -> list[np.ndarray]:
+def thin_things(views: Sequence[RenderedView]) -> list[np.ndarray]:
     """Return (H, W) bool of every view: where its rendered depth is that of a thin object in front of the known
     surface."""
     colors = Colors([uniform_filter(view.rgb, (MEAN, MEAN, 1), mode="nearest") for view in views], channel_gains(views))
@@ -76,7 +76,7 @@ def thin_things(views: Sequence[SeenDepths]) -> list[np.ndarray]:
 
 
 def _compared(
-    number: int, others: Sequence[int], views: Sequence[SeenDepths], colors: Colors
+    number: int, others: Sequence[int], views: Sequence[RenderedView], colors: Colors
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (H, W) bool of a view: pixels rendered sharply in front of the known surface, and those that the `others`
     support."""
@@ -113,7 +113,7 @@ def _compared(
     return before, thin
 
 
-def channel_gains(views: Sequence[SeenDepths]) -> np.ndarray:
+def channel_gains(views: Sequence[RenderedView]) -> np.ndarray:
     """Return the (V, 3) relative gains of each channel of each photograph, of geometric mean 1: medians over known
     points of the ratio to their mean over the views."""
     rng, points = np.random.default_rng(0), []

@@ -18,7 +18,7 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh
 from linprim_geo.geometry.topology import border_loops
 from linprim_geo.points.initial_points import in_image
-from linprim_geo.stereo.planes.seen_through import KnownDepths
+from linprim_geo.stereo.planes.seen_through import FreeSpaceTest
 from linprim_geo.surface.finish.mesh_process import has_crowded_edge
 from linprim_geo.surface.finish.self_intersections import crossings, edges_of
 from linprim_geo.surface.finish.slits import slit_triangles
@@ -39,7 +39,7 @@ def without_small_holes(
 
     Existing vertices and faces stay as they are; new faces are appended. No edge gets a third face, and no face crosses
     another that did not before. A hole stays open if views look through any triangle of its patch at something behind
-    it (`KnownDepths`), if most of the patch faces away from the faces around it, or if other faces are in the way. A
+    it (`FreeSpaceTest`), if most of the patch faces away from the faces around it, or if other faces are in the way. A
     slit stays open where its triangles are like that.
 
     Args:
@@ -50,12 +50,12 @@ def without_small_holes(
         return mesh, 0
     far = np.float32(FREE_DEPTH * mesh.diagonal)
     depths = (np.where(no_end & ~np.isfinite(depth), far, depth) for depth, no_end in zip(known, free, strict=True))
-    views = KnownDepths(cameras, depths)
+    views = FreeSpaceTest(cameras, depths)
     closed, holes = _without_holes(mesh, cameras, views)
     return _without_slits(closed, cameras, views), holes
 
 
-def _without_holes(mesh: Mesh, cameras: Sequence[Camera], views: KnownDepths) -> tuple[Mesh, int]:
+def _without_holes(mesh: Mesh, cameras: Sequence[Camera], views: FreeSpaceTest) -> tuple[Mesh, int]:
     """Return the mesh with the holes closed that are narrow as a whole, and their number."""
     added, hole = _patches(mesh.vertices, _small_rims(mesh, cameras))
     if not len(added):
@@ -70,7 +70,7 @@ def _without_holes(mesh: Mesh, cameras: Sequence[Camera], views: KnownDepths) ->
     return _with_faces(mesh, added[right]), len(np.unique(hole[right]))
 
 
-def _without_slits(mesh: Mesh, cameras: Sequence[Camera], views: KnownDepths) -> Mesh:
+def _without_slits(mesh: Mesh, cameras: Sequence[Camera], views: FreeSpaceTest) -> Mesh:
     """Return the mesh with slits of its boundary closed. Where a triangle is wrong (`_wrong`), nothing is added at its
     corners."""
     rims = [loop[::-1] for loop in border_loops(mesh.faces)]
@@ -87,7 +87,7 @@ def _without_slits(mesh: Mesh, cameras: Sequence[Camera], views: KnownDepths) ->
         widest[added[wrong]] = 0
 
 
-def _wrong(mesh: Mesh, added: np.ndarray, views: KnownDepths) -> np.ndarray:
+def _wrong(mesh: Mesh, added: np.ndarray, views: FreeSpaceTest) -> np.ndarray:
     """Return (N,) bool: which of the `added` faces (N, 3) must not stay, as views see through them, an edge would have
     more than two faces, or they cross another face."""
     at_rim = np.zeros(len(mesh.vertices), bool)

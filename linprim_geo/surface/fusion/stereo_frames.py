@@ -36,14 +36,14 @@ from linprim_geo.stereo.planes.plain_regions import (
 from linprim_geo.stereo.planes.point_planes import SurfacePoints, planes_of_points, point_plane_depth
 from linprim_geo.stereo.planes.region_planes import RegionDepths, beside_edges, region_plane_depths
 from linprim_geo.stereo.planes.room_corners import with_corner_walls
-from linprim_geo.stereo.planes.seen_through import KnownDepths
+from linprim_geo.stereo.planes.seen_through import FreeSpaceTest
 from linprim_geo.stereo.planes.shaded_planes import ShadedPlanes
 from linprim_geo.stereo.planes.shown_colours import ShownColours
 from linprim_geo.stereo.visibility.far_parts import far_parts
 from linprim_geo.stereo.visibility.lone_backgrounds import lone_backgrounds
-from linprim_geo.stereo.visibility.outlined_things import outlined_things
+from linprim_geo.stereo.visibility.silhouette_bounded import silhouette_bounded
 from linprim_geo.stereo.visibility.textured_backgrounds import textured_backgrounds
-from linprim_geo.stereo.visibility.thin_things import SeenDepths, thin_things
+from linprim_geo.stereo.visibility.thin_things import RenderedView, thin_things
 from linprim_geo.stereo.visibility.visibility_cut import plane_normals, points_per_view, spanned_depths
 from linprim_geo.surface.finish.small_holes import without_small_holes
 from linprim_geo.surface.fusion.tsdf_field import DepthFrame
@@ -202,7 +202,7 @@ class MergedFrames(Sequence):
     def _clear_air(self, beside: Sequence[np.ndarray], *others: Sequence[np.ndarray]) -> None:
         """Remove depths `beside` (H, W) edges of textureless regions that other views see through, from confirmed,
         planar and doubtful depths and from `others`."""
-        views = KnownDepths(self.cameras, self._known())
+        views = FreeSpaceTest(self.cameras, self._known())
         for depths in (self.depths, self.on_planes, self.doubtful_depths, *others):
             views.clear(depths, beside)
 
@@ -289,10 +289,10 @@ class MergedFrames(Sequence):
         and treat these as confirmed. Where a confirmed depth is the same within its error it stays, as it is finer."""
         known = map(_first_known, zip(self.depths, self.on_planes, self.doubtful_depths, strict=True))
         seen = [
-            SeenDepths(found.camera, view.load().rgb, found.noise, depth, is_sharp, behind)
+            RenderedView(found.camera, view.load().rgb, found.noise, depth, is_sharp, behind)
             for view, found, depth, is_sharp, behind in zip(views, maps, rendered, sharp, known, strict=True)
         ]
-        thin, outlined = thin_things(seen), outlined_things(seen)
+        thin, outlined = thin_things(seen), silhouette_bounded(seen)
         for view, thing in enumerate(map(np.logical_or, thin, outlined)):
             thing &= ~(np.abs(rendered[view] / self.depths[view] - 1) < CONFIRMED_DEPTH)
             self.depths[view] = np.where(thing, rendered[view], self.depths[view])

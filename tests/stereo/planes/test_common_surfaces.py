@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.captures import look_at
 
-from linprim_geo.stereo.planes.common_surfaces import LEAST_POINTS, STRIDE, CommonSurfaces
+from linprim_geo.stereo.planes.common_surfaces import LEAST_POINTS, STRIDE, SurfaceSupport
 from linprim_geo.stereo.planes.plain_regions import in_camera
 
 # A wall at y = 0 seen from y < 0, and the floor at z = 0 that goes on behind it.
@@ -22,9 +22,9 @@ def depth_of(camera, plane) -> np.ndarray:
 NOTHING = np.full((60, 80), np.nan)
 
 
-def known(planes) -> CommonSurfaces:
+def known(planes) -> SurfaceSupport:
     depths = [NOTHING if p is None else depth_of(c, p) for c, p in zip(CAMERAS, planes, strict=True)]
-    return CommonSurfaces(CAMERAS, depths, 5 * [NOTHING])
+    return SurfaceSupport(CAMERAS, depths, 5 * [NOTHING])
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def supposed() -> list[np.ndarray]:
 
 
 def numbers(surfaces, supposed) -> list[list[int]]:
-    return [views.tolist() for views in surfaces.known_by(0, supposed, len(supposed) * [False])]
+    return [views.tolist() for views in surfaces.supporting_views(0, supposed, len(supposed) * [False])]
 
 
 def test_views_that_see_the_same_surface_know_it(supposed):
@@ -53,21 +53,21 @@ def test_a_few_points_are_no_surface(supposed):
     few = depth_of(CAMERAS[1], WALL)
     few[STRIDE:] = np.nan  # one row of points
     assert 80 // STRIDE < LEAST_POINTS
-    surfaces = CommonSurfaces(CAMERAS[:2], [supposed[0], few], 2 * [NOTHING])
+    surfaces = SurfaceSupport(CAMERAS[:2], [supposed[0], few], 2 * [NOTHING])
     assert numbers(surfaces, supposed) == [[], []]
 
 
 def test_depths_that_differ_by_less_than_planes_are_off_by_are_one_surface():
     middle = np.full((60, 80), 3.0)
-    near, far = (CommonSurfaces(2 * CAMERAS[:1], [middle, middle * z], 2 * [NOTHING]) for z in (1.045, 1.055))
+    near, far = (SurfaceSupport(2 * CAMERAS[:1], [middle, middle * z], 2 * [NOTHING]) for z in (1.045, 1.055))
     assert numbers(near, [middle]) == [[1]] and numbers(far, [middle]) == [[]]
 
 
 def test_what_views_only_suppose_is_known_where_it_need_not_be_confirmed(supposed):
     walls = [depth_of(camera, WALL) for camera in CAMERAS]
-    surfaces = CommonSurfaces(CAMERAS, [NOTHING, walls[1], NOTHING, NOTHING, NOTHING], [NOTHING, NOTHING, *walls[2:]])
+    surfaces = SurfaceSupport(CAMERAS, [NOTHING, walls[1], NOTHING, NOTHING, NOTHING], [NOTHING, NOTHING, *walls[2:]])
     wall = [depth_of(CAMERAS[0], WALL)]
-    assert [views.tolist() for views in surfaces.known_by(0, 2 * wall, [False, True])] == [[1, 2, 3, 4], [1]]
+    assert [views.tolist() for views in surfaces.supporting_views(0, 2 * wall, [False, True])] == [[1, 2, 3, 4], [1]]
     floors = [depth_of(camera, FLOOR) for camera in CAMERAS]
-    confirmed_first = CommonSurfaces(CAMERAS, walls, floors)
+    confirmed_first = SurfaceSupport(CAMERAS, walls, floors)
     assert numbers(confirmed_first, supposed) == [[1, 2, 3, 4], []]

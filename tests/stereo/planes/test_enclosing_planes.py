@@ -13,7 +13,7 @@ from linprim_geo.stereo.planes.enclosing_planes import (
     OUTLIERS,
     RECESS,
     EnclosingPlane,
-    KnownPoints,
+    ScenePoints,
     enclosing_depths,
     enclosing_planes,
     known_on_planes,
@@ -168,7 +168,7 @@ def test_a_camera_or_points_behind_a_plane_speak_against_it():
         moved = points.position.copy()
         moved[:count] = 2 * moved[:count] - points.center[:count]  # twice as far along their rays
         behind = SurfacePoints(moved, points.normal, points.center, points.view)
-        counted = KnownPoints(CAMERAS, behind)
+        counted = ScenePoints(CAMERAS, behind)
         assert left == {tuple(plane[:3]) for plane in planes if counted.share_behind(plane, RECESS) < OUTLIERS}
         assert normals(enclosing_planes(CAMERAS, planes, behind)) == left
 
@@ -192,7 +192,7 @@ def test_a_plane_between_a_floor_and_a_board_above_is_a_copy_of_the_floor():
     points = SurfacePoints(
         places, np.tile(FLOOR[:3], (len(level), 1)), np.tile(above.center, (len(level), 1)), np.zeros(len(level), int)
     )
-    seen, between = KnownPoints([above], points), FLOOR + [0, 0, 0, 0.03]
+    seen, between = ScenePoints([above], points), FLOOR + [0, 0, 0, 0.03]
     assert seen.on(between).sum() > seen.on(FLOOR).sum()
     assert seen.is_enclosing(between) and not seen.is_before_all(between)
     assert [plane.tolist() for plane in seen.without_copies([between, FLOOR])] == [FLOOR.tolist()]
@@ -228,7 +228,7 @@ def test_two_ends_that_are_each_known_to_a_margin_are_at_the_same_place(gap, apa
     """The floor has no points up to a gap from the corner; the ends then differ by so many margins."""
     points = points_of(room(lambda place: np.abs(place[..., 0]) < 1e-6))
     points = points[(np.abs(points.position[:, 2]) > 1e-6) | (points.position[:, 0] > gap)]
-    seen = KnownPoints(CAMERAS, points)
+    seen = ScenePoints(CAMERAS, points)
     sides = [seen.on(plane) for plane in (FLOOR, WALL)]
     ends = [np.quantile(points.position[on, 0], OUTLIERS) for on in sides]
     margin = MARGIN * min(np.median(seen.distance[on]) for on in sides)

@@ -11,7 +11,7 @@ from helpers.plain_room import SIZE, no_background, noisy_maps, points_of
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.stereo.depth_maps import DepthMap
-from linprim_geo.stereo.planes.enclosing_planes import EnclosingPlane, KnownPoints, enclosing_depths
+from linprim_geo.stereo.planes.enclosing_planes import EnclosingPlane, ScenePoints, enclosing_depths
 from linprim_geo.stereo.planes.point_planes import SurfacePoints
 from linprim_geo.stereo.planes.room_corners import with_corner_walls
 
@@ -120,7 +120,7 @@ def test_what_is_known_behind_a_wall_refutes_it():
     points, normals = [], np.zeros((SIZE[1], SIZE[0], 3))
     for view, (camera, (depth, _)) in enumerate(zip(of, map(seen, of), strict=True)):
         points.append(SurfacePoints.of_view(view, camera, depth, normals, 3000, np.random.default_rng(view)))
-    room = KnownPoints(of, SurfacePoints.together(points))
+    room = ScenePoints(of, SurfacePoints.together(points))
     ends = np.array([[-6.0, 0.0], [-2.5, HEIGHT]])
     wall = EnclosingPlane(np.array([-1.0, 0, 0]), -2.0, np.array([[0.0, -1, 0], [0, 0, 1]]), ends, ends)
 

@@ -10,7 +10,7 @@ from helpers.captures import look_at
 from helpers.plain_room import GREYS, PLANES, SIZE, at_corner, cameras, floors, photographs, points_of, seen
 
 from linprim_geo.stereo.planes import meeting_lines
-from linprim_geo.stereo.planes.enclosing_planes import KnownPoints
+from linprim_geo.stereo.planes.enclosing_planes import ScenePoints
 from linprim_geo.stereo.planes.meeting_lines import clearest_line, floors_of, is_same, on_meeting_lines
 
 FLOOR, LEFT, RIGHT = PLANES[0], PLANES[1], PLANES[3]
@@ -186,7 +186,7 @@ def test_a_floor_that_is_askew_has_the_direction_of_a_table_with_more_points():
     height = float(np.median(points.position[:, 2]))
     points = points[np.abs(points.position[:, 2] - height) < 0.005 * height]
     few = points_of(of, floors(of))[::200]
-    both = KnownPoints(of, type(points).together([points, few]))
+    both = ScenePoints(of, type(points).together([points, few]))
     table = np.array([0, 0, 1, height])
     askew = np.array([np.sin(np.radians(2)), 0, np.cos(np.radians(2)), 0.03])
 

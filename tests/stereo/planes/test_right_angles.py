@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from linprim_geo.stereo.planes.right_angles import angles_to, frame_of, squared
+from linprim_geo.stereo.planes.right_angles import angles_to, frame_of, orthogonalised
 
 
 def turned(normal, degrees, axis, distance=1.0) -> np.ndarray:
@@ -30,7 +30,7 @@ FLOOR = np.array([0.0, 0, 1, 0])
 def test_walls_turn_to_a_floor_that_stays_and_to_each_other_by_what_is_known_of_them():
     one, other = turned([1, 0, 0], 3, [0, 0.6, 0.8]), turned([0, 1, 0], 2, [0, 0, -1], 2.0)
     planes = np.array([FLOOR, one, other])
-    found = squared(planes, [None, np.eye(3), 100 * np.eye(3)], moves)
+    found = orthogonalised(planes, [None, np.eye(3), 100 * np.eye(3)], moves)
     assert (found[0] == FLOOR).all()
     for i, j in ((0, 1), (0, 2), (1, 2)):
         assert angle(found[i], found[j]) == pytest.approx(90, abs=0.02)
@@ -43,15 +43,15 @@ def test_walls_turn_to_a_floor_that_stays_and_to_each_other_by_what_is_known_of_
 def test_other_angles_stay():
     for leaning in (turned([1, 0, 0], 8, [0, 1, 0]), turned([0, 1, 0], 45, [1, 0, 0]), turned([0, 0, 1], 3, [0, 1, 0])):
         planes = np.array([FLOOR, leaning])
-        assert (squared(planes, [None, np.eye(3)], moves) == planes).all()
-    assert (squared(planes[:1], [None], moves) == planes[:1]).all()
-    assert squared(np.zeros((0, 4)), [], moves).shape == (0, 4)
+        assert (orthogonalised(planes, [None, np.eye(3)], moves) == planes).all()
+    assert (orthogonalised(planes[:1], [None], moves) == planes[:1]).all()
+    assert orthogonalised(np.zeros((0, 4)), [], moves).shape == (0, 4)
 
 
 def test_angles_that_exclude_each_other_leave_a_plane_as_it_is():
     ramp = turned([0, 0, 1], 8, [0, 1, 0])
     between, clear = turned([1, 0, 0], 4, [0, 1, 0]), turned([0, 1, 0], 2, [1, 0, 0])
-    found = squared(np.array([FLOOR, ramp, between, clear]), [None, None, np.eye(3), np.eye(3)], moves)
+    found = orthogonalised(np.array([FLOOR, ramp, between, clear]), [None, None, np.eye(3), np.eye(3)], moves)
     assert (found[:3] == [FLOOR, ramp, between]).all()
     # It is at right angles to the floor and the ramp at once.
     assert angle(found[3], FLOOR) == pytest.approx(90, abs=0.02) and angle(found[3], clear) > 1.5
@@ -60,7 +60,7 @@ def test_angles_that_exclude_each_other_leave_a_plane_as_it_is():
 def test_of_planes_that_stay_and_are_nearly_parallel_the_first_counts():
     table, wall = turned([0, 0, 1], 2, [0, 1, 0]), turned([1, 0, 0], 3, [0, 1, 0])
     for stay in ([FLOOR, table], [table, FLOOR]):
-        found = squared(np.array([*stay, wall]), [None, None, np.eye(3)], moves)
+        found = orthogonalised(np.array([*stay, wall]), [None, None, np.eye(3)], moves)
         assert (found[:2] == stay).all() and angle(found[2], stay[0]) == pytest.approx(90, abs=0.02)
 
 
@@ -85,7 +85,7 @@ def test_walls_turn_along_the_frame_whatever_else_stands_about(degrees):
     stay = [chair, box, FLOOR, turned([1, 0, 0], 0, [0, 0, 1], 3.0), turned([0, 1, 0], 0, [0, 0, 1], 4.0)]
     wall, slope = turned([0, 1, 0], degrees, [0.6, 0, 0.8], 2.0), turned([0, 1, 0], 45, [1, 0, 0], 2.0)
     frame = frame_of(np.array(stay)[:, :3])
-    found = squared(np.array([*stay, wall, slope]), [*[None] * 5, np.eye(3), np.eye(3)], moves, frame)
+    found = orthogonalised(np.array([*stay, wall, slope]), [*[None] * 5, np.eye(3), np.eye(3)], moves, frame)
     assert (found[:5] == stay).all()
     assert angle(found[5], stay[4]) < 0.15 and found[5, 3] == pytest.approx(2, abs=0.05)
     # The slope is at right angles to one of the walls alone.

@@ -7,7 +7,7 @@ import pytest
 from helpers.captures import look_at
 
 from linprim_geo.stereo.planes.plain_regions import in_camera
-from linprim_geo.stereo.planes.seen_through import KnownDepths
+from linprim_geo.stereo.planes.seen_through import FreeSpaceTest
 
 # A wall at y = 0 and a board of 40 by 40 cm that is 50 cm before it, seen from y < 0.
 WALL, BOARD, HALF = np.array([0.0, 1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0, -0.5]), 0.2
@@ -31,7 +31,7 @@ def seen(camera, half: float = HALF) -> np.ndarray:
 def without_air(known: list[np.ndarray]) -> list[np.ndarray]:
     """(H, W) what is known of every view but for what is in the air."""
     left = [depth.copy() for depth in known]
-    KnownDepths(CAMERAS, known).clear(left, [np.ones(depth.shape, bool) for depth in known])
+    FreeSpaceTest(CAMERAS, known).clear(left, [np.ones(depth.shape, bool) for depth in known])
     return left
 
 
@@ -56,7 +56,7 @@ def test_what_is_not_asked_for_stays(flap):
     known, left = [depth] + [seen(camera) for camera in CAMERAS[1:]], depth.copy()
     half = np.zeros(depth.shape, bool)
     half[:45] = True
-    KnownDepths(CAMERAS, known).clear([left] + known[1:], [half] + [np.zeros_like(half)] * (len(CAMERAS) - 1))
+    FreeSpaceTest(CAMERAS, known).clear([left] + known[1:], [half] + [np.zeros_like(half)] * (len(CAMERAS) - 1))
     assert np.isfinite(left[45:]).all() and np.isnan(left[:45]).any()
 
 
@@ -74,7 +74,7 @@ def test_more_than_a_quarter_of_those_that_have_the_depth_speak_against_it(havin
     camera = CAMERAS[4]
     depths = [depth_on(camera, BOARD)] * having + [depth_on(camera, WALL)] * against
     points = camera.center + (camera.ray_grid() * depths[0][..., None]) @ camera.rotation
-    air = KnownDepths([camera] * len(depths), depths).see_through(points.reshape(-1, 3))
+    air = FreeSpaceTest([camera] * len(depths), depths).see_through(points.reshape(-1, 3))
     assert (air == goes).all()
 
 
@@ -93,4 +93,4 @@ def test_a_bar_of_a_pixel_or_two_stays():
 def test_of_no_depths_nothing_is_left():
     nothing = [np.full((90, 120), np.nan)] * len(CAMERAS)
     assert all(np.isnan(depth).all() for depth in without_air(nothing))
-    assert KnownDepths(CAMERAS, nothing).see_through(np.zeros((0, 3))).shape == (0,)
+    assert FreeSpaceTest(CAMERAS, nothing).see_through(np.zeros((0, 3))).shape == (0,)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.lit_wall import WALL, light, photographs
 
-from linprim_geo.stereo.planes.shaded_areas import ShadedArea, told_by_edges
+from linprim_geo.stereo.planes.shaded_areas import ShadedArea, preferred_by_edges
 from linprim_geo.stereo.planes.shading import Shading, shaded_regions
 
 # The wall, one that is 4 % of the depth behind it, one that is turned by 20 degrees, and one behind all cameras.
@@ -32,17 +32,17 @@ def test_points_along_edges_tell_planes_apart_that_carry_faint_light_as_well(are
     shaded, shadings = area
     along_edges = np.full(shaded.where.shape, -1)
     along_edges[60:120, 80:160] = number
-    assert told_by_edges(shaded, along_edges, PLANES, shadings).number == told
+    assert preferred_by_edges(shaded, along_edges, PLANES, shadings).number == told
 
 
 @pytest.mark.parametrize(("share", "told"), [(0.0, 1), (0.05, 1), (0.15, 0)])
 def test_points_along_edges_tell_nothing_that_may_be_by_chance(area, share, told):
     shaded, shadings = area
     taken = np.random.default_rng(0).uniform(size=shaded.where.shape) < share
-    assert told_by_edges(shaded, np.where(taken, 0, -1), PLANES, shadings).number == told
+    assert preferred_by_edges(shaded, np.where(taken, 0, -1), PLANES, shadings).number == told
 
 
 def test_a_plane_that_is_nearly_the_same_one_stays(area):
     shaded, shadings = area
     planes = np.array([WALL + [0, 0, 0, 0.01], WALL])
-    assert told_by_edges(shaded, np.zeros(shaded.where.shape, int), planes, shadings).number == 1
+    assert preferred_by_edges(shaded, np.zeros(shaded.where.shape, int), planes, shadings).number == 1

@@ -12,9 +12,9 @@ from helpers.lit_wall import CENTERS, WALL, camera_at, light, map_of, photograph
 from scipy.ndimage import gaussian_filter
 
 from linprim_geo.geometry.sampling import sample_bilinear
-from linprim_geo.stereo.planes import held_planes, plain_regions, shaded_planes, skies
-from linprim_geo.stereo.planes.common_surfaces import CommonSurfaces
-from linprim_geo.stereo.planes.held_planes import HeldPlanes
+from linprim_geo.stereo.planes import constrained_planes, plain_regions, shaded_planes, skies
+from linprim_geo.stereo.planes.common_surfaces import SurfaceSupport
+from linprim_geo.stereo.planes.constrained_planes import ConstrainedPlanes
 from linprim_geo.stereo.planes.plain_regions import in_camera
 from linprim_geo.stereo.planes.shaded_planes import LEAST_VIEWS, OTHERS_SHARE, ShadedPlanes
 from linprim_geo.stereo.planes.shading import Shading, evaluate, fit_plane, shaded_regions
@@ -147,8 +147,8 @@ def test_of_copies_the_plane_that_edges_give_is_kept(monkeypatch):
     """Not that of shading, although this one carries as many regions."""
     maps, depths = photographs(lambda points, view: 60 + 0.3 * light(points))
     monkeypatch.setattr(ShadedPlanes, "_common", lambda self, fitted: np.array([WALL - [0, 0, 0, 0.06], WALL]))
-    monkeypatch.setattr(HeldPlanes, "by_depths", lambda self, planes, *_: planes)
-    monkeypatch.setattr(HeldPlanes, "at_right_angles", lambda self, planes, *_: planes)
+    monkeypatch.setattr(ConstrainedPlanes, "by_depths", lambda self, planes, *_: planes)
+    monkeypatch.setattr(ConstrainedPlanes, "at_right_angles", lambda self, planes, *_: planes)
     found = planes_of(maps, depths, by_edges=(WALL - [0, 0, 0, 0.06])[None])
     np.testing.assert_array_equal(found.planes, [WALL - [0, 0, 0, 0.06]])
 
@@ -325,10 +325,12 @@ def test_a_known_plane_is_taken_where_it_carries_the_shading_as_well():
 def test_a_plane_that_too_few_views_know_gives_no_depth(monkeypatch, others, kept):
     """A floor goes on behind walls: two views alone may suppose it there, or some side by side. Neighbours see the
     wall's middle from directions 9 degrees apart."""
-    monkeypatch.setattr(plain_regions, "SPREAD", np.radians(22))
+    monkeypatch.setattr(plain_regions, "VIEW_ANGLE", np.radians(22))
     maps, depths = photographs(lambda points, view: light(points))
     found = planes_of(maps, depths)
-    monkeypatch.setattr(CommonSurfaces, "known_by", lambda self, view, depths, _: [np.array(others)] * len(depths))
+    monkeypatch.setattr(
+        SurfaceSupport, "supporting_views", lambda self, view, depths, _: [np.array(others)] * len(depths)
+    )
     monkeypatch.setattr(found, "regions", [found.regions[0], *[[] for _ in CENTERS[1:]]])
     assert np.isfinite(laid(found)[0]).any() == kept
 
@@ -350,12 +352,12 @@ def test_the_plane_that_points_along_edges_tell_is_taken_where_other_views_know_
     found = planes_of(maps, depths, by_edges=np.array([WALL, WALL - [0, 0, 0, 0.08]]))
     monkeypatch.setattr(found, "planes", np.array([WALL, WALL - [0, 0, 0, 0.04]]))
 
-    def known_by(_, view, supposed, __):
+    def supporting_views(_, view, supposed, __):
         """All know the wall, and the plane behind it or not."""
         behind = [np.nanmedian(depth / depths[view]) > 1.01 for depth in supposed]
         return [np.arange(9) if others or not is_behind else np.zeros(0, int) for is_behind in behind]
 
-    monkeypatch.setattr(CommonSurfaces, "known_by", known_by)
+    monkeypatch.setattr(SurfaceSupport, "supporting_views", supporting_views)
     behind = np.concatenate([own / depth - 1 for own, depth in zip(laid(found, 1), depths, strict=True)])
     assert np.isfinite(behind).mean() > 0.5 and (np.nanmedian(behind) > 0.015) == others
 
@@ -368,11 +370,11 @@ def test_what_no_other_view_knows_supports_none(monkeypatch, told_of, times):
     monkeypatch.setattr(found, "planes", np.array([WALL, WALL - [0, 0, 0, 0.04]]))
     supposed, surfaces = [], found._surfaces
 
-    def known_by(_, view, depths_of_areas, __):
+    def supporting_views(_, view, depths_of_areas, __):
         behind = [np.nanmedian(depth / depths[view]) > 1.01 for depth in depths_of_areas]
         return [np.zeros(0, int) if is_behind else np.arange(9) for is_behind in behind]
 
-    monkeypatch.setattr(CommonSurfaces, "known_by", known_by)
+    monkeypatch.setattr(SurfaceSupport, "supporting_views", supporting_views)
     monkeypatch.setattr(found, "_surfaces", lambda areas: supposed.append(areas) or surfaces(areas))
     shape = depths[0].shape
     areas = found.areas([np.full(shape, 1 if view in told_of else -1) for view in range(len(CENTERS))])
@@ -428,14 +430,14 @@ def test_what_points_along_edges_have_told_of_a_plane_bounds_how_shading_turns_i
     """Of two planes at one place the second one is told so."""
     planes, turned = np.array([WALL, WALL]), np.array([tilted(degrees), tilted(degrees)])
     region = SimpleNamespace(some=lambda count: region)
-    held = HeldPlanes([], [], [[region], [region]])
+    held = ConstrainedPlanes([], [], [[region], [region]])
     monkeypatch.setattr(held, "_held_plane", lambda plane, regions: turned[0])
-    assert (held.by_depths(planes, (), told=[1]) == [turned[0], turned[1] if by_depths else WALL]).all()
-    monkeypatch.setattr(held_planes, "evaluate", lambda *_: SimpleNamespace(information=np.eye(3)))
-    monkeypatch.setattr(held_planes, "squared", lambda *_: turned)
+    assert (held.by_depths(planes, (), from_edges=[1]) == [turned[0], turned[1] if by_depths else WALL]).all()
+    monkeypatch.setattr(constrained_planes, "evaluate", lambda *_: SimpleNamespace(information=np.eye(3)))
+    monkeypatch.setattr(constrained_planes, "orthogonalised", lambda *_: turned)
     monkeypatch.setattr(held, "_shifted", lambda plane, regions: plane)
     monkeypatch.setattr(held, "_leaves_as_little", lambda *_: True)
-    found = held.at_right_angles(planes.copy(), (), told=[1])
+    found = held.at_right_angles(planes.copy(), (), from_edges=[1])
     assert (found == [turned[0], turned[1] if by_angles else WALL]).all()
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.captures import look_at
 
-from linprim_geo.stereo.visibility.thin_things import DEVIATIONS, SeenDepths, channel_gains, thin_things
+from linprim_geo.stereo.visibility.thin_things import DEVIATIONS, RenderedView, channel_gains, thin_things
 
 # A wall at z = 0, seen from z = -3, and an upright wire of about four pixels 0.4 before it.
 WIRE, HALF_WIDTH = 0.4, 0.055
@@ -41,7 +41,7 @@ def view_of(camera, noise=0.0, seed=0, wire=(20, 30, 140)):
     rgb = np.clip(np.rint(colors), 0, 255).astype(np.uint8)
     rendered = np.where(on_wire, front, wall).astype(np.float32)
     sharp = np.ones(wall.shape, bool)
-    return SeenDepths(camera, rgb, max(1.0, noise**2 / 2), rendered, sharp, wall.astype(np.float32)), on_wire
+    return RenderedView(camera, rgb, max(1.0, noise**2 / 2), rendered, sharp, wall.astype(np.float32)), on_wire
 
 
 @pytest.fixture(scope="module")

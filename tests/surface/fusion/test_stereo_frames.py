@@ -333,7 +333,7 @@ def test_thin_things_stand_before_what_is_known(found, monkeypatch):
 def test_things_that_are_known_by_their_outlines_are_as_rendered(found, monkeypatch):
     thing = np.zeros((30, 40), bool)
     thing[4:20, 15:25] = True
-    monkeypatch.setattr(stereo_frames, "outlined_things", lambda views: [thing])
+    monkeypatch.setattr(stereo_frames, "silhouette_bounded", lambda views: [thing])
     take_region_planes(monkeypatch, np.full((30, 40), 3.5, np.float32))
     merged = MergedFrames(rendered(0.02), [VIEW], 5.0)
     frame = merged[0]

@@ -10,9 +10,9 @@ import pytest
 from helpers.captures import look_at
 
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.stereo.visibility import outlined_things as outlined_things_module
-from linprim_geo.stereo.visibility.outlined_things import between_outlines, outlined_things
-from linprim_geo.stereo.visibility.thin_things import SeenDepths
+from linprim_geo.stereo.visibility import silhouette_bounded as outlined_things_module
+from linprim_geo.stereo.visibility.silhouette_bounded import between_silhouettes, silhouette_bounded
+from linprim_geo.stereo.visibility.thin_things import RenderedView
 
 # A ball of radius 1 round the origin, seen from 5 away, and a sphere of radius 30 round all.
 RADIUS, AWAY, FAR = 1.0, 5.0, 30.0
@@ -36,7 +36,7 @@ def sphere_depth(camera: Camera, radius: float, near: bool) -> np.ndarray:
     return (-half + (-root if near else root)) / square
 
 
-def view_of(camera: Camera, seed: int, *, painted: bool = True, ball=PLAIN, stripes: float = 0.0) -> SeenDepths:
+def view_of(camera: Camera, seed: int, *, painted: bool = True, ball=PLAIN, stripes: float = 0.0) -> RenderedView:
     """The ball is rendered, `painted` says whether the photograph has it, too; `stripes` are grey values by which it
     has a texture."""
     near, behind = sphere_depth(camera, RADIUS, True), sphere_depth(camera, FAR, False)
@@ -49,17 +49,17 @@ def view_of(camera: Camera, seed: int, *, painted: bool = True, ball=PLAIN, stri
     colors += NOISE * np.random.default_rng(seed).standard_normal(colors.shape)
     rendered = np.where(on_ball, near, behind).astype(np.float32)
     rgb = np.clip(np.rint(colors), 0, 255).astype(np.uint8)
-    return SeenDepths(camera, rgb, NOISE**2, rendered, np.ones(near.shape, bool), rendered)
+    return RenderedView(camera, rgb, NOISE**2, rendered, np.ones(near.shape, bool), rendered)
 
 
-def views(count: int = 12, turn: float = 360.0, **options) -> list[SeenDepths]:
+def views(count: int = 12, turn: float = 360.0, **options) -> list[RenderedView]:
     return [view_of(camera, seed, **options) for seed, camera in enumerate(cameras(count, turn))]
 
 
-def share_found(seen: list[SeenDepths]) -> tuple[float, float]:
+def share_found(seen: list[RenderedView]) -> tuple[float, float]:
     """Of the ball, and of the sphere behind it."""
     ball = np.stack([np.isfinite(sphere_depth(view.camera, RADIUS, True)) for view in seen])
-    found = np.stack(outlined_things(seen))
+    found = np.stack(silhouette_bounded(seen))
     return found[ball].mean(), found[~ball].mean()
 
 
@@ -109,14 +109,14 @@ def test_a_run_has_an_outline_at_both_ends():
     depth[:, 38:] = 2.0
     rgb = np.where(depth[..., None] < 5, 40, 160).repeat(3, -1).astype(np.uint8)
     camera = Camera(40, 8, 30.0, 30.0, 20.0, 4.0, np.eye(4))
-    view = SeenDepths(camera, rgb, 1.0, depth, np.ones(depth.shape, bool), depth)
+    view = RenderedView(camera, rgb, 1.0, depth, np.ones(depth.shape, bool), depth)
     expected = np.zeros(depth.shape, bool)
     expected[:, 10:25] = True
-    np.testing.assert_array_equal(between_outlines(view), expected)
+    np.testing.assert_array_equal(between_silhouettes(view), expected)
     # An edge may be two pixels off, and no more.
     for shift, found in ((2, True), (-2, True), (5, False)):
         moved = replace(view, rgb=np.roll(rgb, shift, axis=1))
-        assert between_outlines(moved)[:, 10:25].all() == found
+        assert between_silhouettes(moved)[:, 10:25].all() == found
     # Along columns as along rows.
     turned = replace(
         view,
@@ -125,10 +125,10 @@ def test_a_run_has_an_outline_at_both_ends():
         rendered=depth.T,
         sharp=view.sharp.T,
     )
-    np.testing.assert_array_equal(between_outlines(turned), expected.T)
+    np.testing.assert_array_equal(between_silhouettes(turned), expected.T)
     # Nothing rendered is farther than everything.
     nothing = replace(view, rendered=np.where(depth > 5, 0, depth))
-    np.testing.assert_array_equal(between_outlines(nothing), expected)
+    np.testing.assert_array_equal(between_silhouettes(nothing), expected)
 
 
 def test_cubes_are_those_of_a_grid():

@@ -18,7 +18,7 @@ from scipy.ndimage import maximum_filter1d
 from linprim_geo.base.sorting import distinct
 from linprim_geo.points.view_pairs import visible_pixels
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
-from linprim_geo.stereo.visibility.thin_things import AGREEING, SeenDepths
+from linprim_geo.stereo.visibility.thin_things import AGREEING, RenderedView
 
 # A surface ends where the next pixel's depth differs by more than this share.
 ENDS = 3 * CONFIRMED_DEPTH
@@ -37,12 +37,12 @@ CUBE = 4.0
 POINTS_AT_A_TIME, CELLS = 1 << 15, 1 << 20
 
 
-def outlined_things(views: Sequence[SeenDepths]) -> list[np.ndarray]:
+def silhouette_bounded(views: Sequence[RenderedView]) -> list[np.ndarray]:
     """Return (H, W) bool of every view: where its rendered depth is that of an object known by its outlines.
 
-    Depths of stereo (`SeenDepths.known`) are not used. Source of the bound: Laurentini 1994, the visual hull.
+    Depths of stereo (`RenderedView.known`) are not used. Source of the bound: Laurentini 1994, the visual hull.
     """
-    outlined = [between_outlines(view) for view in views]
+    outlined = [between_silhouettes(view) for view in views]
     seeds = [np.zeros(between.shape, bool) for between in outlined]
     places, pixels = [], []
     for view, between, seed in zip(views, outlined, seeds, strict=True):
@@ -73,7 +73,7 @@ def outlined_things(views: Sequence[SeenDepths]) -> list[np.ndarray]:
     return things
 
 
-def between_outlines(view: SeenDepths) -> np.ndarray:
+def between_silhouettes(view: RenderedView) -> np.ndarray:
     """Return (H, W) bool: pixels rendered sharply whose surface ends, along the row or the column, at outlines on both
     sides."""
     depth = np.where(view.rendered > 0, view.rendered, np.inf)
@@ -111,13 +111,13 @@ def _along_rows(depth: np.ndarray, rgb: np.ndarray, least: float) -> np.ndarray:
     return (outline > least) & (outline > STRONGER * np.expm1(inside))
 
 
-def _points(view: SeenDepths, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+def _points(view: RenderedView, row: np.ndarray, column: np.ndarray) -> np.ndarray:
     """Return (P, 3) rendered points of pixels."""
     rays = view.camera.world_rays()[row, column]
     return view.camera.center + rays * view.rendered[row, column, None].astype(np.float64)
 
 
-def _are_known(points: np.ndarray, views: Sequence[SeenDepths], outlined: Sequence[np.ndarray]) -> np.ndarray:
+def _are_known(points: np.ndarray, views: Sequence[RenderedView], outlined: Sequence[np.ndarray]) -> np.ndarray:
     """Return (P,) bool: which of (P, 3) points are known by their outlines."""
     known = np.zeros(len(points), bool)
     for first in range(0, len(points), POINTS_AT_A_TIME):
@@ -126,7 +126,7 @@ def _are_known(points: np.ndarray, views: Sequence[SeenDepths], outlined: Sequen
     return known
 
 
-def _are_known_at_once(points: np.ndarray, views: Sequence[SeenDepths], outlined: Sequence[np.ndarray]) -> np.ndarray:
+def _are_known_at_once(points: np.ndarray, views: Sequence[RenderedView], outlined: Sequence[np.ndarray]) -> np.ndarray:
     """Return `_are_known` for few points: memory grows with views times points."""
     agree = np.zeros(len(points), int)
     between = np.zeros((len(views), len(points)), bool)

@@ -13,13 +13,13 @@ from scipy.ndimage import binary_dilation
 
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.planes.plain_regions import RING, SAME_ANGLE, TOLERANCE, rays_of, to_world
-from linprim_geo.stereo.planes.right_angles import NEARLY, RIGHT, angles_to, frame_of, squared
+from linprim_geo.stereo.planes.right_angles import NEARLY, RIGHT, angles_to, frame_of, orthogonalised
 from linprim_geo.stereo.planes.shading import BOX, Fit, ShadedRegion, Shading, evaluate, plane_moves
 
 # The most boxes of a region that are compared.
 MOST_BOXES = 800
 # A plane carries shading hardly worse than another if its residual is at most so many times as large.
-HARDLY_MORE = 1.1
+MOST_RESIDUAL_RATIO = 1.1
 # The error of the plane of a single region, as a share of its distance.
 ALIKE_DEPTH = 5 * CONFIRMED_DEPTH
 # Confirmed depths along the edges of regions constrain a plane if their residual, as a share of the depth, is below
@@ -30,10 +30,10 @@ NEAR, NARROWER, HOLDING_STEPS, INDEPENDENT = 2 * TOLERANCE, 0.8, 6, 200
 # The largest residual of shading, as a multiple of the unconstrained plane's, of planes along the frame of a room:
 # lighting differs from the model, and nine in ten true walls of a room leave at most that much (DECISIONS 116); and of
 # planes moved to other right angles or to lines.
-AS_WELL, NEARLY_AS_WELL = 1.5, 1.03
+FRAME_RESIDUAL_RATIO, MOVED_RESIDUAL_RATIO = 1.5, 1.03
 
 
-class HeldPlanes:
+class ConstrainedPlanes:
     """Constrains planes that carry the shading of regions.
 
     Args:
@@ -50,21 +50,23 @@ class HeldPlanes:
     ):
         self.shadings, self.depths, self.carried = shadings, depths, carried
 
-    def by_depths(self, planes: np.ndarray, staying: Container[int], told: Container[int] = ()) -> np.ndarray:
+    def by_depths(self, planes: np.ndarray, staying: Container[int], from_edges: Container[int] = ()) -> np.ndarray:
         """Return the planes, each constrained by the confirmed depths along the edges of its regions, except those
-        `staying`. Planes known from points along edges, `told`, turn by at most SAME_ANGLE or are not changed."""
+        `staying`. Planes known from points along edges, `from_edges`, turn by at most SAME_ANGLE or are not changed."""
         result = planes.copy()
         for k, plane in enumerate(planes):
             held = plane if k in staying else self._held_plane(plane, self.carried[k])
-            if k not in told or _turns(held, plane) <= SAME_ANGLE:
+            if k not in from_edges or _turns(held, plane) <= SAME_ANGLE:
                 result[k] = held
         return result
 
-    def at_right_angles(self, planes: np.ndarray, staying: Container[int], told: Container[int] = ()) -> np.ndarray:
+    def at_right_angles(
+        self, planes: np.ndarray, staying: Container[int], from_edges: Container[int] = ()
+    ) -> np.ndarray:
         """Turn planes to right angles with each other, or to the frame of those `staying`, if the turned plane carries
         the shading of its regions as well as true walls do. Then shift each to where most confirmed depths along the
-        edges of its regions are. Those `staying` are not changed, nor those known from points along edges, `told`, that
-        would turn by more than NEARLY."""
+        edges of its regions are. Those `staying` are not changed, nor those known from points along edges,
+        `from_edges`, that would turn by more than NEARLY."""
         few = [[region.some(MOST_BOXES) for region in regions] for regions in self.carried]
         fits = [
             evaluate(plane, few[k], self.shadings) if few[k] and k not in staying else None
@@ -74,15 +76,15 @@ class HeldPlanes:
         rows = [k for k, fit in enumerate(fits) if k in staying or fit is not None]
         known = [None if (fit := fits[k]) is None else fit.information for k in rows]
         frame, turned = frame_of(planes[[k for k in rows if k in staying], :3]), planes.copy()
-        turned[rows] = squared(planes[rows], known, lambda row, plane: plane_moves(plane, few[rows[row]]), frame)
+        turned[rows] = orthogonalised(planes[rows], known, lambda row, plane: plane_moves(plane, few[rows[row]]), frame)
         for k, fit in enumerate(fits):
             if fit is None or (turned[k] == planes[k]).all():
                 continue
-            if k in told and _turns(turned[k], planes[k]) > NEARLY:
+            if k in from_edges and _turns(turned[k], planes[k]) > NEARLY:
                 continue
             framed = frame is not None and angles_to(frame, turned[[k], :3])[0] < RIGHT
             for plane in (self._shifted(turned[k], self.carried[k]), turned[k]):
-                if self._leaves_as_little(plane, few[k], fit, AS_WELL if framed else NEARLY_AS_WELL):
+                if self._leaves_as_little(plane, few[k], fit, FRAME_RESIDUAL_RATIO if framed else MOVED_RESIDUAL_RATIO):
                     planes[k] = plane
                     break
         return planes
@@ -94,7 +96,7 @@ class HeldPlanes:
         for k, plane in moved.items():
             few = [region.some(MOST_BOXES) for region in self.carried[k]]
             fit = evaluate(planes[k], few, self.shadings) if few else None
-            if fit is None or self._leaves_as_little(plane, few, fit, NEARLY_AS_WELL):
+            if fit is None or self._leaves_as_little(plane, few, fit, MOVED_RESIDUAL_RATIO):
                 result[k] = plane
         return result
 
@@ -130,7 +132,7 @@ class HeldPlanes:
             step = np.linalg.pinv(information, hermitian=True) @ (fit.downhill - weight * slope.T @ off[near])
             moved = fit.plane + step @ moves
             tried = evaluate(moved / np.linalg.norm(moved[:3]), few, self.shadings)
-            if tried is None or tried.left > HARDLY_MORE * first.left or tried.boxes < 0.7 * first.boxes:
+            if tried is None or tried.left > MOST_RESIDUAL_RATIO * first.left or tried.boxes < 0.7 * first.boxes:
                 return plane
             fit = tried
         return fit.plane
@@ -151,14 +153,14 @@ class HeldPlanes:
 def shifted(plane: np.ndarray, points: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Shift a plane along its normal to where most of (P, 3) points are, given the (P, 3) vectors to them from the
     cameras that see them. Return it unchanged if no point is near."""
-    off = off_plane(plane, points, vectors)
+    off = plane_residuals(plane, points, vectors)
     near = np.abs(off) < ALIKE_DEPTH
     if not near.any():
         return plane
     return plane + np.append(np.zeros(3), _commonest(off[near]) * np.median(vectors[near] @ plane[:3]))
 
 
-def off_plane(plane: np.ndarray, points: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+def plane_residuals(plane: np.ndarray, points: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Return (P,) signed distances of (P, 3) points behind a plane, as shares of the normal components of the (P, 3)
     vectors to them from cameras."""
     with np.errstate(divide="ignore", invalid="ignore"):  # rays parallel to the plane
