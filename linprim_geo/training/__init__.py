@@ -1,1 +1,1 @@
-"""From a scene to trained primitives."""
+"""Training: from a scene to optimised primitives."""

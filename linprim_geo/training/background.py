@@ -1,4 +1,4 @@
-"""The background that a training renders over, chosen by what the photographs show."""
+"""Choose what training composites behind the primitives: a fixed, fitted or random colour, or an environment map."""
 
 from __future__ import annotations
 
@@ -14,19 +14,25 @@ from linprim_geo.points.initial_points import VolumePoints, in_image
 from linprim_geo.points.photo_evidence import observe
 from linprim_geo.training.step.training_images import TrainingImage
 
-# A backdrop is plain where this share of all border pixels lies this near to their median colour, per channel, and
-# beside no surface: a carpet of one colour has points, which are recognised from view to view. Beside are several
-# points (one may be a wrong match) within a distance in image diagonals.
+# The backdrop counts as plain if at least BACKDROP_SHARE of all border pixels lie within BACKDROP_TOLERANCE (per
+# channel, colours in [0, 1]) of their median colour and are not close to a reconstructed surface. The second condition
+# excludes, for example, a carpet of one colour: it has feature points that match between views. A pixel is close to a
+# surface if SURFACE_POINTS projected points (several, because one may be a false match) lie within BESIDE image
+# diagonals of it.
 BACKDROP_SHARE, BACKDROP_TOLERANCE = 0.8, 0.1
 SURFACE_POINTS, BESIDE = 3, 0.05
-# Photographs whose borders are looked at, spread over the capture.
+# Largest number of photographs whose border pixels are examined, spread evenly over the capture.
 BORDER_VIEWS = 60
 
 
 @dataclass(frozen=True)
 class Background:
-    """What training puts behind everything: a `color` (3,) float32 in [0, 1], which is `fitted`, or replaced by a
-    `random` one in each step or by an `environment`, which begins with the photographs' colours at infinity, `far`."""
+    """The background that training composites behind the primitives.
+
+    `color` is (3,) float32 in [0, 1]. It stays fixed unless it is `fitted`, replaced by a `random` colour in each step,
+    or replaced by a trained `environment` map. The map is initialised from `far`, the colours that the photographs show
+    at infinity.
+    """
 
     color: torch.Tensor
     fitted: bool = False
@@ -38,15 +44,20 @@ class Background:
 def chosen_background(
     text: str, scene: Scene, images: list[TrainingImage], begun: bool | None = None, sky: bool = False
 ) -> Background:
-    """What the option's text stands for. Of a training that goes on, `begun` says whether it has an environment: that
-    has its colours.
+    """Return the background that the value `text` of --background stands for.
 
-    Without alpha a random background makes everything opaque: a fitted one would let a wall of its colour become
-    transparent. It is fitted only where photographs have a plain backdrop, and an environment is trained only where
-    they say that a scene is open: by what they show at infinity, or by a `sky` that has nothing to recognise.
+    "auto" chooses by the photographs. The default is a random colour, which makes everything opaque when there is no
+    alpha: with a fitted colour, a wall of that colour could become transparent. A colour is fitted only if the
+    photographs have a plain backdrop. An environment map is trained only if the scene is open: the photographs show
+    enough at infinity, or stereo found a `sky` (which has no texture to match).
+
+    Args:
+        begun: None for a new training. For a resumed one, whether its checkpoint has an environment map, which also has
+            its colours.
+        sky: whether stereo found a sky in enough views.
 
     Raises:
-        LinprimError: the text is no name and not three numbers in [0, 1].
+        LinprimError: the text is no known name and not three numbers in [0, 1].
     """
     named = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
     has_alpha = images[0].alpha is not None
@@ -80,7 +91,7 @@ def chosen_background(
 
 
 def _border_colors(images: list[TrainingImage]) -> np.ndarray:
-    """(P, 3) colours in [0, 1] of the outermost pixels of all views."""
+    """Return (P, 3) colours in [0, 1] of the outermost pixels of all views."""
     edges = []
     for rgb in (image.rgb.numpy() for image in images):
         edges.append(np.concatenate([edge.T for edge in (rgb[:, 0], rgb[:, -1], rgb[:, :, 0], rgb[:, :, -1])]))
@@ -88,8 +99,10 @@ def _border_colors(images: list[TrainingImage]) -> np.ndarray:
 
 
 def plain_border(scene: Scene) -> float:
-    """Share of the outermost pixels of its photographs that lie near their median colour and beside no points of
-    surfaces; by their colour alone where the scene has none."""
+    """Return the share of border pixels that lie near their median colour and far from projected surface points.
+
+    If the scene has no surface points, only the colour counts.
+    """
     from scipy.spatial import cKDTree
 
     views = scene.train[:: max(1, len(scene.train) // BORDER_VIEWS)]

@@ -1,4 +1,7 @@
-"""Checkpoints of a training: written so that the latest whole one is always there, read without trusting the file."""
+"""Write and read training checkpoints.
+
+Writing always leaves a complete latest checkpoint on disk. Reading treats the file as untrusted: no code is executed.
+"""
 
 from __future__ import annotations
 
@@ -15,15 +18,16 @@ from linprim_geo.base.files import atomic_write
 from linprim_geo.training.step.trainer import SHARED, Trainer
 
 KEPT = 2
-# What a checkpoint is made of. torch knows more that is harmless to call but not to every memory: a few bytes may ask
-# for a bytearray of any size.
+# The only globals that the pickle of a checkpoint may name. torch's own allow list (weights_only) is longer: its
+# entries execute nothing harmful, but a few bytes of pickle could make it allocate a bytearray of any size.
 _MADE_OF = re.compile(r"torch\._utils _rebuild_tensor_v2|torch \w+Storage|collections OrderedDict")
 
 
 def write_checkpoint(folder: Path, trainer: Trainer) -> None:
-    """Writes step_N.pt, then `latest`, which names it, then removes all but the last KEPT."""
+    """Write step_N.pt, then `latest`, which holds its name, then delete all but the last KEPT checkpoints."""
     name = f"step_{trainer.step:06d}.pt"
-    # By an open file: its errors keep their names, and the bytes do not depend on the temporary's.
+    # An open file instead of a path: write errors keep their own exception types, and the bytes in the file do not
+    # depend on the temporary name.
     with atomic_write(folder / name) as temporary, open(temporary, "wb") as file:
         torch.save(trainer.state(), file)
     with atomic_write(folder / "latest") as temporary:
@@ -34,10 +38,11 @@ def write_checkpoint(folder: Path, trainer: Trainer) -> None:
 
 
 def read_checkpoint(path: Path) -> dict | None:
-    """The latest checkpoint of a run's folder, None where it has none yet. Nothing in it is executed.
+    """Return the latest checkpoint in a run's folder, or None if the run has none yet. Nothing in the file is executed.
 
     Raises:
-        LinprimError: it is missing, damaged (a checksum is wrong), or holds anything but tensors and plain values.
+        LinprimError: the file is missing, damaged (a checksum is wrong), or holds anything but tensors and plain
+            values.
     """
     folder = path / "checkpoints"
     try:
@@ -64,10 +69,10 @@ def read_checkpoint(path: Path) -> dict | None:
 
 
 def restore(trainer: Trainer, state: dict, folder: Path) -> None:
-    """Puts a checkpoint's state into a trainer of the same run.
+    """Put the state of a checkpoint into a trainer of the same run.
 
     Raises:
-        LinprimError: something is missing, not finite, or does not fit together.
+        LinprimError: an entry is missing, not finite, or does not fit the others.
     """
     try:
         _check_state(trainer, state)
@@ -78,7 +83,10 @@ def restore(trainer: Trainer, state: dict, folder: Path) -> None:
 
 
 def _check_archive(file: Path) -> None:
-    """torch itself compares no checksums: a flipped bit would be trained on with."""
+    """Verify the CRC checksums of the zip archive and the contents of its pickles.
+
+    torch.load compares no checksums, so training would go on with flipped bits.
+    """
     with zipfile.ZipFile(file) as archive:
         if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
             raise LinprimError(f"{file}: is damaged and cannot be read (it is compressed, which no checkpoint is)")
@@ -91,7 +99,7 @@ def _check_archive(file: Path) -> None:
 
 
 def _check_pickle(file: Path, content: bytes) -> None:
-    """Raises LinprimError unless all that unpickling would call is what a checkpoint is made of."""
+    """Raise LinprimError if unpickling would call anything but the globals in _MADE_OF."""
     for code, name, _ in genops(content):
         called = str(name or code.name)
         if code.name in ("STACK_GLOBAL", "INST", "OBJ") or (code.name == "GLOBAL" and not _MADE_OF.fullmatch(called)):
@@ -100,7 +108,10 @@ def _check_pickle(file: Path, content: bytes) -> None:
 
 
 def _check_state(trainer: Trainer, state: dict) -> None:
-    """Raises ValueError, or what a wrong type raises, unless every table is finite and has a row per primitive."""
+    """Check that every table is finite and has one row per primitive.
+
+    Raises ValueError otherwise, or whatever exception a value of the wrong type causes.
+    """
     count = len(state["parameters"]["center"])
     if count < 1:
         raise ValueError("there are no primitives")

@@ -1,5 +1,4 @@
-"""What a training would take, before it is begun: images, primitives, minutes and memory, by timing a few steps of
-it."""
+"""Predict what a training would take (images, primitives, minutes, memory) by timing a few of its steps."""
 
 from __future__ import annotations
 
@@ -25,7 +24,7 @@ from linprim_geo.training.step.trainer import Trainer
 from linprim_geo.training.step.training_images import LazyTrainingImage, load_training_images, photo_bytes, photo_limit
 from linprim_geo.training.stereo_surfaces import stereo_surfaces
 
-# Timing takes at most CALIBRATION_SHARE of so many seconds.
+# Seconds. The timing of steps takes at most CALIBRATION_SHARE of this.
 TIMING = 125.0
 
 
@@ -39,19 +38,20 @@ def dry_run(
     quiet: bool = False,
     effects: Choice | None = None,
 ) -> dict:
-    """What `train` with the same arguments would do and take. Nothing is written but the cache of points and
-    undistorted photographs.
+    """Predict what `train` would do and need if called with the same arguments.
 
-    Returns: `images` and `held_out`, `width` and `height` of the largest image, `photo_gib` that all would take,
-        `photo_limit_gib` that they may, `photos_in_memory` (how many stay there), `iterations`, `max_primitives`,
-        `minutes`, `memory_gib` (at its peak), `available_gib`, `fits`, and `advice`, what to change where it does not
-        fit, else "".
+    Nothing is written except the cache of points and undistorted photographs.
 
-    Accuracy: memory within a quarter of what a training takes, or 0.3 GiB; minutes are those of this machine as busy as
-    it is now.
+    Returns: `images` and `held_out` (numbers of views), `width` and `height` of the largest image, `photo_gib` (size of
+    all photographs in memory), `photo_limit_gib` (how much of that may stay in memory), `photos_in_memory` (number of
+    photographs kept there), `iterations`, `max_primitives`, `minutes`, `memory_gib` (peak), `available_gib`, `fits`,
+    and `advice` (what to change if it does not fit, else "").
+
+    Accuracy: memory is within a quarter of what a training takes, or within 0.3 GiB; minutes are for this machine at
+    its current load.
 
     Raises:
-        LinprimError: what `train` would raise before its first step.
+        LinprimError: whatever `train` would raise before its first step.
     """
     check_train_options(options := options or TrainOptions())
     budget, began = Budget.of(time_budget), time.monotonic()
@@ -62,7 +62,7 @@ def dry_run(
         ops.set_threads(options.threads)
         effects, scene_options = effects or Choice("none"), scene_options or SceneOptions()
         planned, loaded, _ = begin_run(Path(scene), Path(run), scene_options, options, effects, progress)
-        # What is there now is what would be there for all of it.
+        # Taken before anything is loaded: the memory that is free now is the memory that a training would start with.
         limit = photo_limit()
         images, held_out = (load_training_images(views, planned.similarity) for views in (loaded.train, loaded.test))
         surfaces = stereo_surfaces(loaded, planned.train_options, progress, budget)
@@ -123,10 +123,10 @@ def dry_run(
 
 
 def _memory(options: TrainOptions, timed: int, downscale: int) -> dict:
-    """What is needed and available, after `timed` primitives were trained for a moment on photographs that are averaged
-    down by `downscale`."""
+    """Return the memory needed and available, measured after `timed` primitives were trained briefly on photographs
+    averaged down by `downscale`."""
     per_primitive = bytes_per_primitive(options)
-    used = peak_gib() - per_primitive * timed / 2**30  # without those that were timed
+    used = peak_gib() - per_primitive * timed / 2**30  # subtract the primitives that were used for timing
     available = available_memory() / 2**30 + memory_gib()
     needed = used + per_primitive * options.max_primitives / 2**30
     return {
@@ -138,7 +138,7 @@ def _memory(options: TrainOptions, timed: int, downscale: int) -> dict:
 
 
 def describe(report: dict) -> str:
-    """The report of `dry_run` as lines for a person."""
+    """Format the report of `dry_run` as lines of text."""
     kept = "all in memory"
     if report["photos_in_memory"] < report["images"]:
         kept = (
@@ -157,8 +157,8 @@ def describe(report: dict) -> str:
 
 
 def _advice(used: float, available: float, per_primitive: float, options: TrainOptions, downscale: int) -> str:
-    """What to change so that it fits: fewer primitives if these are what does not, else smaller images than with
-    `downscale`."""
+    """Return what to change so that the training fits: fewer primitives if they are the problem, else a larger
+    downscale than `downscale`."""
     most = int((available - used) * 2**30 / per_primitive) // 1000 * 1000
     if most >= min(10_000, options.max_primitives):
         return f"it would not fit: wanted --max-primitives {most} or less, or more memory"

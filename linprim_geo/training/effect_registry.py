@@ -1,7 +1,7 @@
-"""The effects that a scene may call for: for each one the evidence in the data, the threshold, what it costs, and the
-options that it stands for.
+"""Registry of the effects that a scene may need, such as view-dependent colour, exposure or an environment map.
 
-Evidence comes from photographs, cameras, points and what else the data set brings, never from a reference surface.
+For each effect: how its evidence is measured, the threshold, its cost in time, and the options that it sets. Evidence
+comes from the photographs, cameras, points and other files of the data set, never from a reference surface.
 """
 
 from __future__ import annotations
@@ -24,33 +24,34 @@ from linprim_geo.points.start_points import initial_cloud
 from linprim_geo.training.background import BACKDROP_SHARE, plain_border
 from linprim_geo.training.step.trainer import SMALLEST_PX
 
-# Views that are enough for what is measured on the primitives of the start.
+# Number of views, spread over the capture, in which initial primitives are measured.
 START_VIEWS = 12
-# Depth maps may differ from the points' depths by this factor; beyond, their unit is another one.
+# Largest ratio between a depth map and the depth of a point for the two to agree. If most ratios are larger, the depth
+# map is in another unit.
 DEPTH_AGREES = 1.1
 
 
 class Data:
-    """A scene as the detectors see it: what they share is measured once."""
+    """A scene as the measurements see it. Quantities that several effects need are computed once."""
 
     def __init__(self, scene: Scene, options: TrainOptions):
-        """`scene` with points to start from, as `start_points.with_points` gives."""
+        """`scene` must have initial points, as returned by `start_points.with_points`."""
         self.scene, self.options = scene, options
 
     @cached_property
     def observations(self) -> Observations | None:
-        """The scene's points in its photographs; None without points on surfaces."""
+        """Return the scene's points as observed in its photographs, or None if it has no points on surfaces."""
         return observe(self.scene, self.options.seed)
 
     @cached_property
     def similarity(self):
-        """From the data set's frame to that of training."""
+        """Return the similarity transform from the data set's frame to the training frame."""
         return scene_normalization(self.scene)
 
     @cached_property
     def start(self) -> tuple[np.ndarray, np.ndarray]:
-        """(N, 3) points in the training frame, as many as primitives at the start, and their mean distance to the three
-        nearest."""
+        """Return (N, 3) positions of the initial primitives in the training frame, and (N,) their mean distances to the
+        three nearest others."""
         from scipy.spatial import cKDTree
 
         assert self.scene.points is not None
@@ -64,13 +65,16 @@ class Data:
 class Effect:
     """One entry of the registry.
 
-    `measure` returns a figure in `unit`, larger the more the effect is needed, or None where the data do not say; the
-    effect is on from `threshold` upwards. `cost` is the time of a training with the effect by that without: for
-    exact-rays from docs/accuracy_and_time.md, for the others as eval/studies/effects.py measures it. `on` and `off` are
-    the settings that it stands for; who gives an option of `off` decides by that. `needs` returns why a scene or the
-    options rule it out, "" if they do not. `on_request` says why evidence alone does not switch it on, and `kept` why
-    evidence, or none, does not switch it off, "" if it does. `left` are the settings where evidence is below the
-    threshold, if not `off`.
+    `measure` returns the evidence in `unit`, or None if the data do not allow a measurement. Larger means that the
+    effect is needed more; it is switched on from `threshold` upwards. `cost` is the time of a training with the effect
+    divided by the time without it: for exact-rays from docs/accuracy_and_time.md, for the others as measured by
+    eval/studies/effects.py.
+
+    `on` and `off` are the option values that switch the effect on and off. If the user sets an option named in `off`,
+    that decides. `needs` returns the reason why the scene or the options rule the effect out, or "". `on_request`, if
+    not empty, is the reason why evidence alone never switches it on. `kept`, if not empty, is the reason why weak or
+    missing evidence does not switch it off. `left` are the option values used instead of `off` where the evidence is
+    below the threshold.
     """
 
     name: str
@@ -89,7 +93,7 @@ class Effect:
 
     @property
     def options(self) -> set[str]:
-        """Names of the options that switch it."""
+        """Return the names of the options that switch this effect."""
         return set(self.off)
 
 
@@ -99,10 +103,12 @@ def _view_dependence(data: Data) -> float | None:
 
 
 def _affine_error(data: Data) -> float | None:
-    """Of the primitives of the start, the 90th percentile over them and the views that they are in.
+    """Return the 90th percentile, over initial primitives and the views that contain them, of the error bound below, in
+    pixels.
 
-    With z and u the depth and the image-plane position (x / z) of a centre, a point at distance e from it is drawn by
-    the affine approximation off by at most F (e / z)^2 (|u| + sqrt(1 + u^2)) / 2, to second order in e / z.
+    With depth z and image-plane position u = x / z of a centre, and focal length F in pixels, the affine approximation
+    displaces a point at distance e from the centre by at most F (e / z)^2 (|u| + sqrt(1 + u^2)) / 2, to second order in
+    e / z.
     """
     xyz, spacing = data.start
     errors = []
@@ -120,8 +126,10 @@ def _affine_error(data: Data) -> float | None:
 
 
 def _surrounded(data: Data) -> float:
-    """Solid angles of the primitives of the start together, in % of the sphere, median over cameras. Hidden ones count,
-    too."""
+    """Return the summed solid angles of the initial primitives in % of the sphere, as the median over cameras.
+
+    Occluded primitives are included.
+    """
     xyz, spacing = data.start
     shares = []
     for view in data.scene.train[:: max(1, len(data.scene.train) // START_VIEWS)]:
@@ -165,7 +173,7 @@ def _share(data: Data, name: str) -> float:
 
 
 def _depth_share(data: Data) -> float:
-    """Share of the views with depth; 0 where its unit is not that of the points."""
+    """Return the share of training views with a depth map in %, or 0 if the maps are not in the unit of the points."""
     share = _share(data, "depth_path")
     points = data.scene.points
     if share == 0 or points is None or isinstance(points, VolumePoints):
@@ -180,7 +188,7 @@ def _depth_share(data: Data) -> float:
         there = depth[row, column] > 0
         ratios.append(depth[row, column][there] / along[inside][there])
     ratio = np.concatenate(ratios)
-    # Hidden points are behind what the map shows, so most ratios, but not all, are 1.
+    # Occluded points lie behind the surface in the depth map, so most ratios, but not all, are 1 if the units agree.
     right = np.abs(np.log(ratio)) < math.log(DEPTH_AGREES) if len(ratio) else np.zeros(1)
     return share if not len(ratio) or right.mean() > 0.2 else 0.0
 
@@ -196,7 +204,8 @@ def _absent(name: str, what: str) -> Callable[[Data], str]:
     return lambda data: "" if _share(data, name) else f"the data set has no {what}"
 
 
-# A sky is looked for where training starts, in stereo of small copies, and makes a scene open, too.
+# These settings leave the choice of the background to `chosen_background` at the start of training, which also knows
+# whether stereo of reduced photographs found a sky.
 _BY_PHOTOGRAPHS: dict[str, object] = {"background": "auto"}
 _TRUTH = "the data do not say whether it is there to train by or to score by"
 _REGISTRY = (
@@ -263,7 +272,7 @@ _REGISTRY = (
         "a gain per channel for every training photograph",
         "spread of how bright the photographs show the same points",
         "%",
-        # What is shown half bright is then off by 2.5 % of white, as much as renders of 32 dB are.
+        # At this spread, mid-grey (0.5) is off by 2.5 % of white, which is the error of renders of 32 dB.
         5.0,
         1.3,
         _gain_spread,

@@ -1,6 +1,6 @@
-"""Which effects a scene calls for (effect_registry.py has them), and the options that follow.
+"""Decide which effects of effect_registry.py a scene needs, and return the options that follow.
 
-What cannot be told keeps its usual setting. An option that the user has given is never changed.
+An effect whose evidence cannot be measured keeps its usual setting. Options given by the user are never changed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ MODES = ("auto", "none", "all")
 
 @dataclass(frozen=True)
 class Decision:
-    """What was decided about an effect and why: `reason` is one of REASONS. `options` are the settings that follow."""
+    """The decision about one effect. `reason` is a key of REASONS; `options` are the option values that follow from
+    it."""
 
     name: str
     what: str
@@ -48,8 +49,11 @@ REASONS = {
 
 @dataclass(frozen=True)
 class Choice:
-    """How effects are decided: `mode` "auto" by the data, "all" on, "none" left as the options are; `asked` {name: on}
-    comes before that, and `given`, names of options that the user has set, before everything."""
+    """How effects are decided.
+
+    `mode` is "auto" (by the evidence), "all" (all on) or "none" (options stay as they are). `asked`, {name: on},
+    overrides the mode. `given`, names of options that the user has set, overrides both.
+    """
 
     mode: str = "auto"
     asked: dict[str, bool] = field(default_factory=dict)
@@ -64,10 +68,10 @@ class Choice:
 
 
 def parse_asked(words: Iterable[str]) -> dict[str, bool]:
-    """{name: on} of words such as "exposure=on".
+    """Return {name: on} from words such as "exposure=on".
 
     Raises:
-        LinprimError: not NAME=on or NAME=off, or an unknown name.
+        LinprimError: a word is not NAME=on or NAME=off, or the name is unknown.
     """
     asked = {}
     for word in words:
@@ -81,10 +85,10 @@ def parse_asked(words: Iterable[str]) -> dict[str, bool]:
 
 
 def decide(scene: Scene, scene_options: SceneOptions, options: TrainOptions, choice: Choice) -> list[Decision]:
-    """What the registry says about a scene, in its order.
+    """Return a decision for each effect, in the registry's order.
 
-    `scene` as `scene_options` read it but for `pinhole_below` 0, with points to start from. Takes seconds; the same at
-    every call.
+    `scene` must have initial points and be read with `scene_options`, except `pinhole_below` 0. Takes seconds and is
+    deterministic.
     """
     data = Data(scene, options)
     decisions = []
@@ -137,8 +141,8 @@ def _decide(effect: Effect, data: Data, settings: dict, choice: Choice) -> Decis
 
 
 def _is_on(effect: Effect, name: str, value: object) -> bool:
-    """Whether an option's value that was given stands for the effect: not that which switches it off, nor that of
-    another effect."""
+    """Return whether a value that the user gave for option `name` switches this effect on: it differs from the effect's
+    `off` value and is not the `on` value of another effect."""
     others = [other.on.get(name) for other in EFFECTS.values() if other is not effect]
     return value != effect.off.get(name, value) and value not in others
 
@@ -146,7 +150,7 @@ def _is_on(effect: Effect, name: str, value: object) -> bool:
 def settle(
     scene_options: SceneOptions, options: TrainOptions, decisions: Iterable[Decision]
 ) -> tuple[SceneOptions, TrainOptions]:
-    """The options with what was decided put in."""
+    """Return both option objects with the decided values filled in."""
     chosen = chosen_options(decisions)
     of_scene = {name: value for name, value in chosen.items() if name in vars(scene_options)}
     of_training = {name: value for name, value in chosen.items() if name in vars(options)}
@@ -154,14 +158,17 @@ def settle(
 
 
 def chosen_options(decisions: Iterable[Decision]) -> dict[str, Any]:
-    """{name: value} of the options that follow. Of two effects with the same option the one that is on counts, and of
-    two that are off the one that is so for another reason than the data."""
+    """Return {name: value} of the decided options.
+
+    If two effects set the same option, the one that is on wins. If both are off, the one decided for a reason other
+    than the data wins.
+    """
     ordered = sorted(decisions, key=lambda decision: (decision.on, decision.reason != "data"))
     return {name: value for decision in ordered for name, value in decision.options.items()}
 
 
 def summary(decisions: Iterable[Decision]) -> str:
-    """One line for the log of a training."""
+    """Return one line about all decisions for the training log."""
     decisions = list(decisions)
     shown = [f"{d.name} {'on' if d.on else 'off'}{' (as given)' if d.reason == 'option' else ''}" for d in decisions]
     return "effects: " + ", ".join(shown)

@@ -1,4 +1,4 @@
-"""Overfitting: how far held-out photographs stay behind training photographs, the likely cause, and what to do."""
+"""Detect overfitting: by how much held-out PSNR trails training PSNR, the likely cause, and what to do about it."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from collections.abc import Iterable
 
 from linprim_geo.base.options import TrainOptions
 
-# Held-out views this far behind training views, in dB, are no matter of noise: twice the error in every colour.
+# Gap in dB between training and held-out views from which advice is given. 6 dB is twice the error in every colour,
+# more than noise explains.
 LARGEST_GAP = 6.0
-# With fewer photographs than this each stands for too much of a scene.
+# Below this number of training photographs, too few photographs is given as the cause: each covers too much of the
+# scene alone.
 FEW_VIEWS = 20
-# Effects whose evidence explains a gap where they are needed and off: the cause and the option.
+# Effects that explain a gap if they are needed (by the evidence) but off: the cause and the option that remedies it.
 CAUSES = {
     "environment": (
         "what stands far behind the scene is explained by primitives before single cameras",
@@ -23,12 +25,12 @@ CAUSES = {
 def gap_advice(
     train_psnr: float, psnr: float, views: int, options: TrainOptions, decisions: Iterable[dict]
 ) -> str | None:
-    """One sentence for people where held-out views stay more than LARGEST_GAP behind training views, else None.
+    """Return one sentence of advice if held-out views trail training views by more than LARGEST_GAP, else None.
 
     Args:
-        train_psnr, psnr: mean PSNR in dB of training and of held-out views at the end of a training.
-        views: training views.
-        decisions: what was decided about effects, as config.json has it; those not measured count as not needed.
+        train_psnr, psnr: mean PSNR in dB of training and of held-out views at the end of training.
+        views: number of training views.
+        decisions: decisions about effects as stored in config.json; effects without a measurement count as not needed.
     """
     if not train_psnr - psnr > LARGEST_GAP:
         return None

@@ -1,4 +1,4 @@
-"""What `linprim-geo inspect` says: the effects that a scene calls for, with the evidence."""
+"""The report of `linprim-geo inspect`: which effects a scene needs, with the evidence."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import asdict
 from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.training.effects import REASONS, Choice, Decision, chosen_options
 
-# An effect that makes a step of training more expensive by less than this is said to cost no time.
+# Effects whose cost factor is below this are reported as costing no time.
 FREE = 1.05
 
 
@@ -18,7 +18,10 @@ def inspect_scene(
     choice: Choice = Choice(),  # noqa: B008
     log=None,
 ) -> dict:
-    """Reads a scene and decides: `effects`, a list of decisions as tables, and `options` that follow from them.
+    """Read a scene and decide about its effects.
+
+    Returns the number of views and points, `effects`, a list of decisions as tables, and `options`, the option values
+    that follow.
 
     Raises:
         LinprimError: the scene or an option cannot be used.
@@ -40,7 +43,7 @@ def inspect_scene(
 
 
 def describe(result: dict) -> str:
-    """A block per effect of what `inspect_scene` returns: on or off and why, what it costs, and the evidence."""
+    """Format the result of `inspect_scene`, one block per effect: on or off, the reason, the cost and the evidence."""
     lines = []
     for d in (Decision(**each) for each in result["effects"]):
         cost = "no time" if d.cost < FREE else f"about {d.cost:.2f} times the time"

@@ -1,4 +1,4 @@
-"""The training loop: scores of held-out views, metrics.jsonl, checkpoints, Ctrl-C."""
+"""The training loop: steps, held-out scores, metrics.jsonl, checkpoints, and saving on Ctrl-C."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from linprim_geo.training.step.exposure import Exposure, with_best_gain
 from linprim_geo.training.step.trainer import Trainer
 from linprim_geo.training.step.training_images import TrainingImage, UnreadablePhoto
 
-# Held-out views scored during training; all of them are at the end.
+# Number of held-out views scored during training, roughly: every n-th view is taken. All are scored at the end.
 QUICK_VIEWS = 16
 
 
@@ -36,16 +36,18 @@ def run_steps(
     until: int | None = None,
     advance: Callable[[Trainer], None] | None = None,
 ) -> tuple[float, float | None, float | None]:
-    """Steps until the end, or to step `until` of all, with lines in metrics.jsonl, checkpoints, and scores on
-    `held_out` now and then. `advance` makes one step in place of `Trainer.advance`.
+    """Run training steps to the end, or up to step `until`, and write metrics.jsonl, checkpoints and held-out scores.
 
-    Returns: seconds spent in steps, and the final mean held-out PSNR in dB, as rendered and, where exposures are
-        fitted, with gains; None without views.
+    Scores on `held_out` are computed every `evaluate_every` steps and at the end. `advance` performs one step instead
+    of `Trainer.advance`.
+
+    Returns: seconds spent in steps; the final mean held-out PSNR in dB as rendered; and the same after the best gain
+    per channel if exposures are fitted, else None. Both are None without held-out views.
 
     Raises:
-        LinprimError: training diverged, or a photograph or the run's folder is no longer there. What was saved is
+        LinprimError: training diverged, or a photograph or the run's folder has disappeared. Files saved before stay
             intact.
-        KeyboardInterrupt: after the step that was begun, which is saved.
+        KeyboardInterrupt: on Ctrl-C, after the current step is finished and saved.
     """
     options = trainer.options
     table = run.path / "metrics.jsonl"
@@ -89,7 +91,7 @@ def run_steps(
                     )
                 log.write(json.dumps(entry) + "\n")
                 log.flush()
-                os.fsync(log.fileno())  # before the checkpoint that follows it
+                os.fsync(log.fileno())  # so that it is on disk before the checkpoint that follows
             if last or trainer.step % options.checkpoint_every == 0:
                 save_training(trainer, run)
                 saved = trainer.step
@@ -112,7 +114,7 @@ def run_steps(
 
 
 def cut_metrics(path: Path, step: int) -> None:
-    """Drops the lines of a table of metrics after `step`, and one that was torn when the run was killed."""
+    """Remove from a metrics table the lines after `step` and incomplete lines left when the run was killed."""
     if not path.exists():
         return
     kept = []
@@ -127,10 +129,11 @@ def cut_metrics(path: Path, step: int) -> None:
 
 
 def evaluate(trainer: Trainer, images: list[TrainingImage], gains: bool = False) -> float | None:
-    """Mean PSNR over views, renders clamped and rounded to 8 bits as saved images are; None without views.
+    """Return the mean PSNR in dB over views, or None without views. Renders are clamped and rounded to 8 bits, like
+    saved images.
 
-    With `gains` each render is first multiplied by the gain per channel that brings it nearest to its photograph: what
-    a photograph of unknown exposure can say about it.
+    With `gains`, each render is first multiplied by the gain per channel that fits its photograph best, because the
+    exposure of a held-out photograph is unknown.
     """
     from linprim_geo.imaging.metrics import psnr, to_8bit
 
@@ -147,8 +150,8 @@ def evaluate(trainer: Trainer, images: list[TrainingImage], gains: bool = False)
 
 @contextmanager
 def _interrupt_flag() -> Iterator[list]:
-    """A list that becomes non-empty on the first Ctrl-C, so that a step is never torn; a second one interrupts at
-    once."""
+    """Yield a list that becomes non-empty on the first Ctrl-C, so that the current step can finish. A second Ctrl-C
+    interrupts immediately."""
     flag: list[int] = []
 
     def note(number, frame):
@@ -168,7 +171,7 @@ def _interrupt_flag() -> Iterator[list]:
 
 
 def save_training(trainer: Trainer, run: Run) -> None:
-    """Writes a checkpoint and the exported scene; every file replaces its predecessor only when it is complete.
+    """Write a checkpoint and the exported scene. Each file replaces its predecessor only once it is complete.
 
     Raises:
         LinprimError: a parameter is not finite, or a file cannot be written.
@@ -195,5 +198,5 @@ def save_training(trainer: Trainer, run: Run) -> None:
 
 
 def _gains(images: Sequence[TrainingImage], exposure: Exposure) -> dict[str, list[float]]:
-    """{name of a training view: its gain per channel}."""
+    """Return {name of a training view: its gain per channel}."""
     return {image.name: gain.tolist() for image, gain in zip(images, exposure.gains, strict=True)}

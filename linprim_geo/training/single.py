@@ -1,4 +1,4 @@
-"""One training of a whole scene, without blocks."""
+"""Train a whole scene as one model, without blocks."""
 
 from __future__ import annotations
 
@@ -34,11 +34,13 @@ def train_run(
     budget: Budget | None = None,
     advance: Callable[[Trainer], None] | None = None,
 ) -> dict:
-    """Trains from a checkpoint's `state`, or from the start: what is random does not depend on when a run was stopped.
+    """Train from a checkpoint's `state`, or from the start if it is None.
+
+    Random choices depend on the step alone, so a stopped and resumed run gives the same result.
 
     Args:
-        run: a new run has no folder yet.
-        decisions, budget: of a new run, for its config.json.
+        run: the run; the folder of a new run does not exist yet.
+        decisions, budget: for a new run; stored in its config.json.
         advance: see `train`.
 
     Returns, raises: as `train`.
@@ -53,7 +55,7 @@ def train_run(
     surfaces = Surfaces()
     if state is None or state["step"] < options.iterations:
         surfaces = stereo_surfaces(scene, options, progress, None if state else budget, started=state is not None)
-    if state is None and not surfaces.maps:  # nor when the run is resumed
+    if state is None and not surfaces.maps:  # record this, so that a resumed run does not look for surfaces either
         options = replace(options, stereo_depth=0.0)
         run = replace(run, train_options=options)
     if state is None:
@@ -80,7 +82,7 @@ def train_run(
         )
     elif "time_budget" in run.notes:
         pace = Pace.resumed(run, trainer)
-    for torn in [*run.path.glob(".*.tmp*"), *run.path.glob("checkpoints/.*.tmp*")]:  # what a kill left half-written
+    for torn in [*run.path.glob(".*.tmp*"), *run.path.glob("checkpoints/.*.tmp*")]:  # left incomplete by a kill
         torn.unlink()
     progress.note(
         f"{scene.root}: {scene.kind}, {len(scene.train)} training and {len(scene.test)} held-out views of "
@@ -131,7 +133,8 @@ def _planned(
     budget: Budget,
     progress: Progress,
 ) -> tuple[Run, Scene, Pace]:
-    """The run with options that fit into a time budget, and the scene with points for as many primitives."""
+    """Return the run with options that fit the time budget, and the scene with initial points for that number of
+    primitives."""
     volume = isinstance(scene.points, VolumePoints)
     planned, pace = plan_run(
         run,
@@ -142,11 +145,12 @@ def _planned(
         progress,
         start=lambda options: start_trainer(scene, run, images, options, None, surfaces=surfaces),
         score=evaluate,
-        # The smaller limit that is chosen leaves too many points, not too few, and volumes are filled anew.
+        # A smaller limit on primitives leaves too many points rather than too few; random points in a volume are drawn
+        # anew below.
         start_share=0.0 if volume else SFM_START,
         quick_views=len(held_out[:: max(1, len(held_out) // QUICK_VIEWS)]),
     )
-    if volume:  # as many as the population begins with
+    if volume:  # as many points as initial primitives
         scene = with_points(replace(scene, points=None), planned.train_options, progress.note)
     return planned, scene, pace
 
@@ -154,8 +158,10 @@ def _planned(
 def _beside_training_views(
     trainer: Trainer, run: Run, images: Sequence[TrainingImage], score: float, progress: Progress
 ) -> dict:
-    """The mean PSNR of some training views, and advice where the held-out `score` is far behind: with the best gain of
-    each, where photographs have gains."""
+    """Return the mean PSNR of some training views, and advice if the held-out `score` is far below it.
+
+    Where exposures are fitted, each render is first multiplied by its best gain.
+    """
     some = list(images[:: max(1, len(images) // QUICK_VIEWS)])
     train_score = evaluate(trainer, some, gains=trainer.exposure is not None)
     assert train_score is not None

@@ -1,5 +1,5 @@
-"""Where a training starts: the scene with points, the run, new or reopened, and the trainer at its first step or at a
-checkpoint."""
+"""Set up a training: read the scene and its initial points, create or reopen the run, and build the trainer at step 0
+or from a checkpoint."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ from linprim_geo.training.stereo_surfaces import NO_SURFACES, Surfaces
 def decided_scene(
     path: Path, scene_options: SceneOptions, options: TrainOptions, choice: Choice, log: Callable[[str], None]
 ) -> tuple[list[Decision], Scene, SceneOptions, TrainOptions]:
-    """Reads a scene, decides about its effects, and reads it again if that changes how.
+    """Read a scene, decide about its effects, and read it again if a decision changes how it is read.
 
-    Returns: the decisions, the scene with points to start from, and both options with what was decided put in, and
-        `downscale` as a number.
+    Returns: the decisions, the scene with initial points, and both option objects with the decided values and a numeric
+    `downscale`.
     """
 
     decoded = DecodedPhotos()
@@ -71,7 +71,7 @@ def decided_scene(
     decisions = decide(scene, scene_options, options, choice)
     settled, options = settle(scene_options, options, decisions)
     check_train_options(options)
-    if not scene.has_alpha:  # without masks there is nothing to leave out, and nothing to read again for it
+    if not scene.has_alpha:  # without masks the option changes nothing, so do not read the scene again for it
         settled = replace(settled, masks=scene_options.masks)
     distorted = any(view.lens is not None for view in scene.views)
     if replace(settled, pinhole_below=scene_options.pinhole_below) != scene_options or (
@@ -89,11 +89,11 @@ def begin_run(
     effects: Choice,
     progress: Progress,
 ) -> tuple[Run, Scene, list[Decision]]:
-    """A new run, whose folder is not made yet, its scene with points to start from, and what was decided about its
-    effects.
+    """Return a new run, its scene with initial points, and the decisions about its effects. The run's folder is not
+    created yet.
 
     Raises:
-        LinprimError: something is at `run_path` already, or the scene or an option cannot be used.
+        LinprimError: `run_path` exists already, or the scene or an option cannot be used.
     """
     refuse_used(run_path)
     decisions, loaded, scene_options, options = decided_scene(scene, scene_options, options, effects, progress.note)
@@ -113,11 +113,14 @@ def reopen_run(
     effects: Choice | None = None,
     ignored: Sequence[str] = (),
 ) -> tuple[Run, Scene]:
-    """An existing run and its scene; `ignored`, the choice of effects, and options that were given and differ from the
-    run's, but for `threads`, are named as ignored.
+    """Return an existing run and its scene.
+
+    The run keeps its own options. Given options that differ from them (except `threads`), a choice of effects, and the
+    names in `ignored` are reported as ignored.
 
     Raises:
-        LinprimError: not a run folder, a file in it is damaged, or its scene is neither where it was nor at `scene`.
+        LinprimError: not a run folder, a file in it is damaged, or its scene is neither at its recorded path nor at
+            `scene`.
     """
     opened = Run.open(run_path)
     if scene.resolve() != opened.scene_path:
@@ -146,7 +149,7 @@ def reopen_run(
 def geometry_terms(
     run: Run, scene: Scene, images: list[TrainingImage], surfaces: Surfaces, progress: Progress
 ) -> GeometryTerms | None:
-    """The terms for geometry that have a weight, None if none has."""
+    """Return the geometry terms of the loss that have a weight, or None if there are none."""
     options = run.train_options
     if not surfaces.maps and not any(getattr(options, name) > 0 for name in GEOMETRY_WEIGHTS):
         return None
@@ -163,17 +166,17 @@ def start_trainer(
     largest: float | None = None,
     surfaces: Surfaces = NO_SURFACES,
 ) -> Trainer:
-    """A trainer at step 0, or at the step of a checkpoint's `state`.
+    """Build a trainer at step 0, or at the step of a checkpoint's `state`.
 
     Args:
-        scene: with points to start from; those of a checkpoint need none.
+        scene: with initial points; not needed with a checkpoint.
         images: its training views in the training frame.
-        cloud: the points to start from; default: `filled_points` of the scene and of `surfaces`.
-        surfaces: what stereo finds, points and a sky.
-        largest: extent that a primitive may have, in the training frame; default: by what the points reach.
+        cloud: initial points; default: `filled_points` of the scene and of `surfaces`.
+        largest: largest extent of a primitive, in the training frame; default: from the radius of the points.
+        surfaces: result of stereo: points and whether there is a sky.
 
     Raises:
-        LinprimError: the background is none, or the checkpoint does not fit the options.
+        LinprimError: the background option is invalid, or the checkpoint does not fit the options.
     """
     focal = float(np.median([max(s.camera.fx, s.camera.fy) for s in images]))
     centers = np.stack([s.camera.center for s in images])
@@ -181,7 +184,7 @@ def start_trainer(
     behind = chosen_background(options.background, scene, images, begun, surfaces.sky)
     surface = state is None and not isinstance(scene.points, VolumePoints)
     if state is not None:
-        xyz, rgb, radius = np.zeros((4, 3)), np.zeros((4, 3)), 1.0  # replaced below
+        xyz, rgb, radius = np.zeros((4, 3)), np.zeros((4, 3)), 1.0  # replaced by the checkpoint's below
     else:
         if cloud is None:
             backdrop = behind.color.numpy() if behind.fitted else None
@@ -207,7 +210,7 @@ def start_trainer(
         size = texels_for([image.camera for image in images])
         environment = (
             torch.zeros(6, size, size, 3) if behind.far is None else behind.far.start(size)
-        )  # zeros: replaced below
+        )  # zeros: replaced by the checkpoint's
     trainer = Trainer(
         images,
         parameters,
@@ -225,10 +228,10 @@ def start_trainer(
 
 
 def _lay_down(parameters: dict[str, torch.Tensor], xyz: np.ndarray, seed: int, smallest: float) -> None:
-    """Lays primitives on the planes of their points, as thin across as these are flat, at least twice the smallest
-    extent.
+    """Flatten initial primitives onto the local planes of their points, along the third axis.
 
-    A ball round a point of a plain wall stands out from it by its radius, and no photograph says that it does not.
+    They become as thin as the points are flat locally, but at least twice the smallest extent. A round primitive on a
+    plain wall would stick out by its radius, and on a wall without texture no photograph contradicts that.
     """
     rotation, flat = local_planes(xyz, seed)
     parameters["rotation"].copy_(torch.from_numpy(rotation))

@@ -1,4 +1,4 @@
-"""Where stereo finds surfaces, a training starts on them and is held to them."""
+"""Run stereo on reduced training photographs, and turn it into initial points and depth supervision for training."""
 
 from __future__ import annotations
 
@@ -21,23 +21,27 @@ from linprim_geo.stereo.dense.time_plan import seconds_per_pixel
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.surface_points import SurfaceMap, small_copies, surface_maps, surface_points
 
-# Depths of small copies and points of the capture agree up to this share of the depth.
+# Largest relative difference between a stereo depth and the depth of a capture point for the two to agree.
 AGREE = 2 * CONFIRMED_DEPTH
-# Where so many points do not, stereo is taken for chance: 0.88 of them in a hall without texture, 0.08 to 0.40 on eight
-# other captures (DECISIONS 78).
+# If more than this share of the points disagrees, the stereo depths are taken for chance matches and dropped: 0.88 of
+# the points disagree in a hall without texture, 0.08 to 0.40 on eight other captures (DECISIONS 78).
 CONTRADICTING = 2 / 3
-# A scene is open if so many views show a sky, and such a share of all: 4 of 22 and 6 of 28 do of two facades, none of
-# eleven other captures (DECISIONS 89).
+# A scene is open if at least SKY_VIEWS views, and at least SKY_SHARE of all, show a sky: 4 of 22 and 6 of 28 views do
+# in two captures of facades, none in eleven other captures (DECISIONS 89).
 SKY_VIEWS, SKY_SHARE = 3, 0.1
-# Of a time budget stereo takes at most this share; steps in the rest are fewer and as long as before.
+# Stereo takes at most this share of the time that is left of a budget. The remaining time then has fewer training steps
+# of the same length.
 BUDGET_SHARE = 0.2
 
 
 @dataclass(frozen=True)
 class Surfaces:
-    """What stereo of training views finds, if it does. `points` are as many as the scene has fewer than a training
-    starts with, None where it has enough; `maps`, which a training is held to, are of some of the views, in small;
-    `sky` says whether enough of them show one, where the background depends on that."""
+    """What stereo of the training views found.
+
+    `points`: additional initial points, as many as the scene is short of, or None if it has enough. `maps`: reduced
+    depth maps of some views, used as supervision. `sky`: whether enough views show a sky; only determined if the
+    background depends on it.
+    """
 
     points: PointCloud | None = None
     maps: Sequence[SurfaceMap] = ()
@@ -50,12 +54,15 @@ NO_SURFACES = Surfaces()
 def stereo_surfaces(
     scene: Scene, options: TrainOptions, progress: Progress, budget: Budget | None = None, *, started: bool = False
 ) -> Surfaces:
-    """Surfaces by stereo of the training views; nothing where nothing wants them, where the scene's points are anywhere
-    in a volume, and where stereo has nothing to say, or the points contradict it, as in a room without any texture,
-    where it is chance. With masks there are no `maps`: they clear the space before backgrounds already.
+    """Run stereo on the training views and return the surfaces that it finds.
+
+    The result is empty if neither points nor supervision are wanted, if the scene's points are random ones in a volume,
+    if stereo fails or does not fit the budget, or if the scene's points contradict it, as in rooms without texture
+    where matches are chance. With masks there are no `maps`, because masks already clear the space in front of the
+    background.
 
     Args:
-        started: the training goes on, and wants no points.
+        started: the training is being resumed and needs no points.
     """
     if scene.points is None or isinstance(scene.points, VolumePoints):
         return Surfaces()
@@ -92,7 +99,8 @@ def stereo_surfaces(
 
 
 def contradicting(maps: Sequence[SurfaceMap], points: np.ndarray) -> float:
-    """The share of (P, 3) points where maps have a surface that are not within AGREE of it; 0 without any."""
+    """Return the share of (P, 3) points that are not within AGREE of the stereo surface, among those projected where a
+    map has one; 0 if there are none."""
     known = agreeing = 0
     for found in maps:
         _, pixel, depth = visible_pixels(found.view.camera, points)
@@ -103,7 +111,7 @@ def contradicting(maps: Sequence[SurfaceMap], points: np.ndarray) -> float:
 
 
 def _fits(views: Sequence[View], points: np.ndarray, budget: Budget) -> bool:
-    """Whether stereo takes no more than BUDGET_SHARE of what is left, by its first photographs."""
+    """Return whether stereo takes at most BUDGET_SHARE of the time left, estimated from its first photographs."""
     rate = seconds_per_pixel(Photographs(views, points), budget)
     pixels = sum(view.camera.width * view.camera.height for view in views)
     return rate * pixels <= BUDGET_SHARE * budget.left()

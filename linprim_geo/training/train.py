@@ -1,7 +1,8 @@
-"""Training a scene: photographs in, a run folder with optimised primitives out, whole or in blocks.
+"""Train a scene: photographs in, a run folder with optimised primitives out, as one model or in blocks.
 
-`single.train_run` is one training; its step is `step.trainer.Trainer.advance`: render a view, L1 + D-SSIM, Adam, and
-now and then density control. start.py makes the first primitives, loop.py runs the steps.
+`single.train_run` trains one model. A step (`step.trainer.Trainer.advance`) renders a view, computes L1 + D-SSIM, and
+updates with Adam; at intervals density control adds and moves primitives. start.py makes the initial primitives,
+loop.py runs the steps.
 """
 
 from __future__ import annotations
@@ -42,30 +43,32 @@ def train(
     workers: int = 0,
     advance: Callable[[Trainer], None] | None = None,
 ) -> dict:
-    """Trains a scene into a run folder.
+    """Train a scene into a run folder.
 
-    With `resume` the folder's own options are used (but for `threads`): learning rates and growth depend on them. A
-    capture that is no longer where it was is looked for at `scene`. Interrupted (Ctrl-C), it finishes the step, saves,
-    and raises KeyboardInterrupt.
+    With `resume`, the run's own options are used (except `threads`), because learning rates and growth depend on them.
+    If the capture is no longer at its recorded path, it is looked for at `scene`. On Ctrl-C the current step is
+    finished and saved, then KeyboardInterrupt is raised.
 
-    With `time_budget`, in seconds from now for everything, a calibration of some dozen steps says what a step costs,
-    and `budget.plan.plan_training` chooses `iterations` and `max_primitives` from it; one of the two that differs from
-    its default is kept. When growth has ended the steps that are left are counted anew, once, from the pace so far.
-    Both are in config.json under `time_budget`, so that a resumed run repeats them, with the seconds that the run took.
+    With `time_budget`, in seconds from now for everything, a calibration of some dozen steps measures the cost of a
+    step, and `budget.plan.plan_training` chooses `iterations` and `max_primitives` from it. If one of the two differs
+    from its default, it is kept. When growth has ended, the number of remaining steps is corrected once from the
+    measured pace. Plan and correction are stored in config.json under `time_budget`, with the seconds that the run
+    took, so that a resumed run repeats them.
 
-    With `effects` the options that the scene calls for take the place of those that were not given (effects.py);
-    without, all are taken as they are. What was decided is in config.json, and a resumed run keeps it.
+    With `effects`, the options that the scene calls for replace those that were not given (effects.py); without it, all
+    options are used as they are. The decisions are stored in config.json and kept by a resumed run.
 
-    With `blocks` other than 1 the scene is trained in blocks of space by several workers, see
+    With `blocks` other than 1, the scene is split in space and trained by several workers, see
     `blocks.driver.train_blocks`.
 
-    `advance` makes one step in place of `Trainer.advance`, from step 0 of a new run on: who measures steps
-    gives a function that calls that in it. Blocks are trained without it.
+    `advance` performs one step instead of `Trainer.advance`, from step 0 of a new run; to measure steps, pass a
+    function that calls `Trainer.advance`. Blocks ignore it.
 
     Returns: `run`, `iterations`, `seconds` (of training steps alone), `primitives`, `psnr` (mean over held-out views),
-    `views`; with held-out views also `train_psnr`, the mean over at most 31 training views, and `advice` where these
-    are far ahead (`held_out_gap.gap_advice`), which is in config.json, too; with `--exposure gain` also `psnr_gain`,
-    each render times the gain per channel that brings it nearest to its photograph, as it is for `train_psnr` then.
+    `views`. With held-out views also `train_psnr`, the mean over at most 31 training views, and, if it is far above
+    `psnr`, `advice` (`held_out_gap.gap_advice`), which is stored in config.json too. With `--exposure gain` also
+    `psnr_gain`, the mean PSNR after multiplying each render by its best gain per channel; `train_psnr` is then computed
+    in the same way.
 
     Raises:
         LinprimError: the scene or an option cannot be used, or the folder exists already.
@@ -97,7 +100,8 @@ def train(
     budget = Budget.of(time_budget)
     if run_path.is_file():
         refuse_used(run_path)
-    # Killed before anything was saved, there is nothing to go on from but the options that are given again.
+    # A run that was killed before anything was saved has nothing to resume from: start it anew with the options given
+    # now.
     resume = resume and not (run_path.is_dir() and is_unused(run_path))
     if resume:
         Run.open(run_path)
@@ -111,8 +115,8 @@ def train(
             "of the two"
         )
     try:
-        # torch only does small element-wise work here; its own threads would wait for each other longer than they
-        # compute.
+        # torch only does small element-wise work here; with several threads it would spend more time synchronising than
+        # computing.
         torch.set_num_threads(1)
         with locked(run_path, "trained into"):
             ops.set_threads(options.threads)
@@ -130,7 +134,7 @@ def train(
 
 
 def _notes(path: Path) -> dict:
-    """What a run's config.json holds; nothing where there is none that can be read, which is told later."""
+    """Return the contents of a run's config.json, or {} if it is missing or unreadable; the error is reported later."""
     try:
         return Run(path, path, SceneOptions(), TrainOptions(), Similarity()).notes
     except LinprimError:

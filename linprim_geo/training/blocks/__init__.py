@@ -1,1 +1,1 @@
-"""Large scenes, trained in blocks of space."""
+"""Training of large scenes, split into blocks of space."""

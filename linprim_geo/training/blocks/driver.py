@@ -1,9 +1,12 @@
-"""Trains a large scene in blocks: a coarse model of the whole, every block before the frozen coarse model of the rest,
-then in rounds beside the primitives that its neighbours have by then, and all of them as one run.
+"""Train a large scene in blocks of space.
 
-RUN/blocks holds `points.npz` (what the scene starts from), `coarse`, `plan`, and `000`, `000joined1`, ...,
-`000joined3`, `001`, ... with a run in each, and the markers of what is done. The result, in RUN itself, is like that of
-any training, but has no checkpoint.
+First a coarse model of the whole scene is trained, then each block alone with the frozen coarse model around it, then,
+in several exchange rounds, each block with its neighbours' current primitives around it. Finally the primitives of all
+blocks are merged into one run.
+
+RUN/blocks holds `points.npz` (the initial points), `coarse`, `plan`, and a folder with a run for each block and round,
+`000`, `000joined1`, ..., `000joined3`, `001`, ..., with markers of finished tasks. RUN itself is a run like any other,
+but without checkpoints.
 """
 
 from __future__ import annotations
@@ -48,8 +51,8 @@ from linprim_geo.training.effects import Choice
 from linprim_geo.training.start import begin_run, reopen_run
 from linprim_geo.training.step.training_images import MOST_KEPT, RECENT, photo_bytes
 
-# What margins make of a block's part of the primitives, where it has others on all sides of a square ground plan; fewer
-# elsewhere.
+# Factor by which the margin increases a block's primitives if the block has neighbours on all sides of a square ground
+# plan; other blocks have smaller factors.
 OVERLAP = (1 + 2 * MARGIN) ** 2
 REMEDY = "more blocks (--blocks), fewer --max-primitives, a larger --downscale, fewer --workers, or more memory"
 
@@ -67,23 +70,23 @@ def train_blocks(
     quiet: bool = False,
     effects: Choice | None = None,
 ) -> dict | None:
-    """Trains a scene in blocks of space into a run folder. None, and nothing is written, if one block is enough.
+    """Train a scene in blocks of space into a run folder. Return None, and write nothing, if one block is enough.
 
-    The steps and primitives of `options` are those of the whole: a block's cameras are those that show it, each as
-    often as in a training of the whole, and it has its part of the primitives, without those of its margin, which is
-    trained twice and dropped. The sum may miss the most by a few that have crossed a border; `--population 3dgs|mcmc`
-    limits those of the margin, too, and may miss it by percents.
+    Steps and primitives in `options` are totals for the scene. A block is trained with the views that show it, each as
+    often as in a training of the whole scene, and with its share of the primitives. The primitives of its margin come
+    on top; they are trained twice and dropped. The sum may miss `max_primitives` by a few primitives that have crossed
+    a border. With `--population 3dgs|mcmc` the limit includes the margin, and the sum may miss it by percents.
 
     Args:
-        blocks: how many; "auto": as few as a worker's memory allows.
-        cluster, workers: where and how many at once, see `jobs.open.open_executor`.
+        blocks: number of blocks; "auto": as few as a worker's memory allows.
+        cluster, workers: where to run and how many at once, see `jobs.open.open_executor`.
 
-    Returns: as `train`, and `blocks`, `block_peak_gib` (the most memory that a worker took), `coarse_seconds` and
+    Returns: as `train`, and `blocks`, `block_peak_gib` (the largest memory of a worker), `coarse_seconds` and
     `worker_seconds`.
 
     Raises:
-        LinprimError: as `train`; a block that no camera sees; an option that belongs to the whole scene; what
-            `executor` raises.
+        LinprimError: as `train`; a block that no camera sees; an option that needs the whole scene; whatever `executor`
+            raises.
     """
     run_path, where = Path(run).resolve(), Path(scene)
     check_train_options(options := options or TrainOptions())
@@ -139,15 +142,15 @@ def train_blocks(
 
 
 def check_options(options: TrainOptions, blocks: int | str, given: Collection[str] = ()) -> None:
-    """Raises LinprimError for what blocks cannot do; `given` are names of options that the user has set, to their
-    defaults or not."""
+    """Raise LinprimError for options that cannot be used with blocks. `given` are names of options that the user has
+    set, possibly to their defaults."""
     if blocks != "auto" and not 1 <= int(blocks) <= 10**6:
         raise LinprimError(f"--blocks is {blocks}, wanted auto, or a number from 1")
     if options.exposure != "none":
         raise LinprimError(
             "--exposure gain is fitted over all photographs at once: wanted --exposure none with --blocks"
         )
-    # By default the coarse scene alone is held to depths of stereo.
+    # By default only the coarse model is supervised by stereo depths.
     asked = "stereo_depth" in given or options.stereo_depth != TrainOptions.stereo_depth
     for name in (*GEOMETRY_WEIGHTS, *["stereo_depth"] * asked):
         if getattr(options, name) > 0:
@@ -157,8 +160,10 @@ def check_options(options: TrainOptions, blocks: int | str, given: Collection[st
 
 
 def blocks_that_fit(views: Sequence[View], options: TrainOptions, executor: Executor) -> int:
-    """The least number of blocks, 1 or more, each of which a worker should have the memory for. Only primitives are
-    shared out: of the photographs of a block a worker holds few."""
+    """Return the smallest number of blocks, 1 or more, for which each block should fit into a worker's memory.
+
+    Only primitives are divided among the blocks; a worker holds few of a block's photographs at a time.
+    """
     _, memory = executor.capacity()
     if memory_estimate(views, options, min(photo_bytes(tuple(views)), MOST_KEPT)) <= memory:
         return 1
@@ -174,12 +179,12 @@ def blocks_that_fit(views: Sequence[View], options: TrainOptions, executor: Exec
 
 
 def block_memory(primitives: int, coarse: int, largest: int, options: TrainOptions) -> float:
-    """GiB that a worker takes which trains so many primitives of a block and its margin, before those of the coarse
-    scene and, after an exchange, of other blocks.
+    """Return the GiB that a worker needs to train `primitives` of a block and its margin, with `coarse` frozen
+    primitives of the coarse model and, after an exchange, those of other blocks.
 
     Args:
-        largest: pixels of the largest photograph. Of all photographs a worker holds the last that were used.
-        options: of the whole.
+        largest: pixels of the largest photograph. A worker holds only the last photographs that it used.
+        options: those of the whole scene.
     """
     count = primitives + coarse + min(MOST_BESIDE, options.max_primitives)
     return memory_estimate(
@@ -191,7 +196,7 @@ def block_memory(primitives: int, coarse: int, largest: int, options: TrainOptio
 
 
 def _all(run: Run, scene: Scene, count: int, executor: Executor, progress: Progress) -> dict:
-    """What `train_blocks` does when there are several."""
+    """Run all stages of `train_blocks` if there are several blocks."""
     options, folder = run.train_options, run.path / FOLDER
     cores = options.threads or usable_cores()
     progress.note(
@@ -246,7 +251,7 @@ def _all(run: Run, scene: Scene, count: int, executor: Executor, progress: Progr
 
 
 def _step(task: Task) -> str:
-    """How far a task's training is, from its table."""
+    """Return a short progress text of a task's training, from the last line of its metrics table."""
     try:
         last = (Path(task.folder) / "run" / "metrics.jsonl").read_bytes().splitlines()[-1]
         line = json.loads(last)
@@ -256,8 +261,7 @@ def _step(task: Task) -> str:
 
 
 def _merged(run: Run, scene: Scene, coarse: dict, plan: Plan, rounds: Sequence[list[dict]], progress: Progress) -> dict:
-    """Writes the primitives that the blocks own as those of the run, and scores them; `rounds` are what the tasks
-    said."""
+    """Write the primitives that the blocks own as those of the run, and score them. `rounds` are the tasks' results."""
     from linprim_geo.imaging.metrics import psnr, to_8bit
 
     ended, results = rounds[-1], [result for each in rounds for result in each]

@@ -1,4 +1,4 @@
-"""The plan of a training in blocks: how space, primitives and photographs are shared out."""
+"""Plan a training in blocks: how space, primitives, steps and photographs are divided."""
 
 from __future__ import annotations
 
@@ -25,56 +25,58 @@ from linprim_geo.training.blocks.windows import small_depths
 from linprim_geo.training.checkpoint import read_checkpoint
 
 FOLDER = "blocks"
-# Goes up whenever tasks need what those of before have not left.
+# Version of the files in RUN/blocks. Raised whenever tasks need something that earlier versions did not write.
 FORMAT = 4
-# The coarse scene: pixels averaged, parts of the steps and of the primitives of the whole, and the most of these and of
-# the views.
+# The coarse model: its downscale factor, its shares of the steps and primitives of the whole scene, its largest numbers
+# of primitives and views, and the smallest side of a photograph in pixels after downscaling.
 COARSE_DOWNSCALE, COARSE_STEPS, COARSE_PRIMITIVES = 2, 0.25, 0.25
 MOST_COARSE_PRIMITIVES, MOST_COARSE_VIEWS, LEAST_SIDE = 20_000, 1000, 32
-# Primitives are shared out as the coarse scene has grown them, but for this part, which goes by the pixels that show a
-# block: the whole has four times as long to grow them where pixels ask for more.
+# Blocks receive primitives in proportion to those that the coarse model has grown there, except for this share, which
+# is divided in proportion to the pixels that show each block: the full training has four times as many steps to add
+# primitives where the pixels need them.
 BY_PIXELS = 0.25
-# Steps of a block at least, as far as the whole has so many.
+# Smallest number of steps of a block, or all steps if the whole training has fewer.
 LEAST_STEPS = 300
-# Blocks take up what others have become at these parts of the steps that are left once growth has ended. Then others
-# stand in full, the nearest first, up to about so many primitives with those that are trained in the margin; beyond
-# these the coarse scene does.
+# Blocks exchange their primitives at these shares of the steps that remain once growth has ended. After an exchange,
+# other blocks' primitives replace the coarse model around a block, the nearest first, up to about MOST_BESIDE
+# primitives including those trained in the margin; beyond them the coarse model remains.
 EXCHANGES, MOST_BESIDE = (0.125, 0.5, 0.8125), 100_000
 
 
 @dataclass(frozen=True)
 class Part:
-    """A block and its share. Steps, primitives and photographs are those that it and its margin are trained with."""
+    """A block and its share of the training. Steps, primitives and photographs are those used for the block with its
+    margin."""
 
     block: Block
-    views: tuple[int, ...]  # training views of the scene that show it
-    pixels: int  # of the windows of these views
-    work: float  # its part of the whole's, 0 to 1
+    views: tuple[int, ...]  # indices of the training views that show it
+    pixels: int  # sum over the crops of these views that show it
+    work: float  # its share of the `point_work` of all points, 0 to 1
     iterations: int
     max_primitives: int
-    own_primitives: int  # at most in it without its margin
+    own_primitives: int  # limit for the block without its margin
     initial_primitives: int
-    exact_radius: float  # so far from it others stand in full; may be infinite
+    exact_radius: float  # distance up to which other blocks' primitives replace the coarse model; may be infinite
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What `plan_task` has decided. Lengths are the training frame's."""
+    """The result of `plan_task`. Lengths are in the training frame."""
 
     margin: float
-    factor: int  # pixels of the whole per pixel of the coarse scene
-    background: str  # as --background says it
-    shown: tuple[float, ...]  # (3,) the colour behind everything
+    factor: int  # downscale factor of the coarse model relative to the whole
+    background: str  # value of --background for the blocks
+    shown: tuple[float, ...]  # (3,) background colour
     fitted: bool
     environment: bool
-    frozen: int  # primitives of the coarse scene
-    extent: float  # the largest that a primitive may have
+    frozen: int  # number of primitives of the coarse model
+    extent: float  # largest extent of a primitive
     largest: int  # pixels of the largest photograph
     all_pixels: int  # of all training photographs
     blocks: tuple[Part, ...]
 
     def to_json(self) -> dict:
-        """The table that the plan's task leaves; infinite numbers are null."""
+        """Return the plan as a JSON table; infinite numbers become null."""
         parts = []
         for part in self.blocks:
             plain = {entry.name: getattr(part, entry.name) for entry in fields(part) if entry.name != "block"}
@@ -85,10 +87,10 @@ class Plan:
 
     @staticmethod
     def from_json(saved: dict, run: Path) -> Plan:
-        """Reads what `to_json` made.
+        """Read a plan from the result of `to_json`.
 
         Raises:
-            LinprimError: it is of another format.
+            LinprimError: it is of another format version.
         """
         if saved.get("format") != FORMAT:
             raise LinprimError(f"{run}: was begun in blocks by another version of linprim-geo, wanted a new folder")
@@ -108,7 +110,7 @@ class Plan:
 
 
 def read_plan(run: Path) -> Plan:
-    """The plan of a run in blocks.
+    """Return the plan of a run in blocks.
 
     Raises:
         LinprimError: there is none, or it is of another version.
@@ -117,16 +119,16 @@ def read_plan(run: Path) -> Plan:
 
 
 def save_points(path: Path, cloud: PointCloud) -> None:
-    """Writes the points that a scene starts from."""
+    """Write a scene's initial points."""
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, xyz=cloud.xyz, rgb=cloud.rgb, volume=isinstance(cloud, VolumePoints))
 
 
 def load_points(path: Path) -> PointCloud:
-    """Reads what `save_points` wrote.
+    """Read points that `save_points` wrote.
 
     Raises:
-        LinprimError: it is damaged.
+        LinprimError: the file is damaged.
     """
     xyz, rgb, volume = read_named(path, {"xyz": ((None, 3), "f"), "rgb": ((None, 3), "u"), "volume": ((), "b")})
     if len(xyz) != len(rgb):
@@ -135,8 +137,8 @@ def load_points(path: Path) -> PointCloud:
 
 
 def coarse_of(run: Run, scene: Scene) -> Run:
-    """The run of the whole scene with fewer pixels, views, steps and primitives that stands for what a block does not
-    hold."""
+    """Return the run of the coarse model: the whole scene with fewer pixels, views, steps and primitives. It represents
+    the parts of the scene that a block does not hold."""
     options, scene_options = run.train_options, run.scene_options
     side = min(min(view.camera.width, view.camera.height) for view in scene.train)
     factor = COARSE_DOWNSCALE if side >= COARSE_DOWNSCALE * LEAST_SIDE else 1
@@ -158,7 +160,7 @@ def coarse_of(run: Run, scene: Scene) -> Run:
 
 
 def _opened(run: str) -> tuple[Run, Scene]:
-    """The run and its scene with the points to start from."""
+    """Return the run, and its scene with the initial points."""
     opened = Run.open(run)
     return opened, replace(opened.scene(), points=load_points(opened.path / FOLDER / "points.npz"))
 
@@ -169,7 +171,7 @@ def _prepared(options: TrainOptions) -> None:
 
 
 def plan_task(folder: Path, run: str, count: int) -> dict:
-    """Splits space, and finds the views that show each block. Returns what `read_plan` reads."""
+    """Split space into blocks and find the views that show each. Return the table that `read_plan` reads."""
     opened, scene = _opened(run)
     _prepared(opened.train_options)
     coarse = Run.open(opened.path / FOLDER / "coarse" / "run")
@@ -178,7 +180,10 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
     points = opened.similarity.apply(scene.points.xyz)
 
     def views_with_depth() -> Iterator[tuple[View, Camera, np.ndarray]]:
-        """Rendered twice: depths of all views take more memory than there may be."""
+        """Yield each view with its small camera and depth map.
+
+        The maps are rendered once per iteration, because keeping those of all views could exceed the memory.
+        """
         for view, (camera, depth) in zip(scene.train, small_depths(coarse, scene.train, factor), strict=True):
             yield view, camera, depth
 
@@ -192,7 +197,7 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
     margin = margin_of(blocks, points[used])
     seen_by, pixels, within = _visible_points(blocks, views_with_depth(), margin, factor)
     options = opened.train_options
-    # Where the coarse scene has grown primitives the whole would, too, and none larger.
+    # The full training is expected to add primitives where the coarse model has them, and to make none larger.
     grown = coarse.training_primitives().center
     state = read_checkpoint(coarse.path)
     assert state is not None
@@ -236,8 +241,8 @@ def plan_task(folder: Path, run: str, count: int) -> dict:
 def _visible_points(
     blocks: Sequence[Block], views_with_depth: Iterable[tuple[View, Camera, np.ndarray]], margin: float, factor: int
 ) -> tuple[list[list[int]], list[int], np.ndarray]:
-    """The views that show each block, the pixels of its windows in them, and (2, B) how much of the coarse scene they
-    show in it, and in it and its margin."""
+    """Return the views that show each block, the pixels of its crops in them, and (2, B) the number of visible surface
+    pixels of the coarse model in each block, without and with its margin."""
     seen_by: list[list[int]] = [[] for _ in blocks]
     pixels, within = [0] * len(blocks), np.zeros((2, len(blocks)))
     for number, (view, camera, depth) in enumerate(views_with_depth):
@@ -263,7 +268,7 @@ def _visible_points(
 
 
 def apportioned(shares: Sequence[float] | np.ndarray, total: int) -> list[int]:
-    """A total in whole parts, in the ratio of the shares: the largest remainders are rounded up."""
+    """Divide a total into whole numbers in the ratio of the shares; the largest remainders are rounded up."""
     exact = total * np.asarray(shares) / np.sum(shares)
     parts = np.floor(exact).astype(int)
     parts[np.argsort(parts - exact, kind="stable")[: total - parts.sum()]] += 1
@@ -271,12 +276,12 @@ def apportioned(shares: Sequence[float] | np.ndarray, total: int) -> list[int]:
 
 
 def exact_radius_of(distances: np.ndarray, margin: float, primitives: int) -> float:
-    """How far from a block the nearest MOST_BESIDE primitives outside of it reach, its margin at least; infinite if
-    there are fewer.
+    """Return the distance from a block within which the nearest MOST_BESIDE primitives outside of it lie, at least the
+    margin; infinite if there are fewer.
 
     Args:
-        distances: (P,) of the primitives of the coarse scene from the block, 0 in it; each stands for its part of so
-            many `primitives`.
+        distances: (P,) distances of the coarse model's primitives from the block, 0 inside; each represents an equal
+            share of `primitives` of the full model.
     """
     outside = np.sort(distances[distances > 0])
     most = int(MOST_BESIDE * len(distances) / primitives)

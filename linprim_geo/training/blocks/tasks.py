@@ -1,7 +1,7 @@
-"""What workers do in a training in blocks: train the coarse scene, train one block alone, then again with its
-neighbours' current primitives frozen around it.
+"""Tasks that workers run in a training in blocks: train the coarse model, train one block alone, then train it again
+with its neighbours' current primitives around it.
 
-Every task reads what those before it left in RUN/blocks, and goes on from its own last checkpoint.
+Each task reads the results of earlier ones from RUN/blocks, and resumes from its own last checkpoint.
 """
 
 from __future__ import annotations
@@ -37,13 +37,12 @@ from linprim_geo.training.step.trainer import CONTROLS
 from linprim_geo.training.step.training_images import load_training_images
 from linprim_geo.training.stereo_surfaces import stereo_surfaces
 
-# Arrays of primitives by name, of any number: the frozen ones may be none.
+# Arrays of primitives by name. Unlike `Primitives` they may be empty, as the frozen ones can be.
 Arrays = dict[str, np.ndarray]
 
 
 def coarse_task(folder: Path, run: str) -> dict:
-    """Trains the coarse scene. Returns the background to train with, as the option says it, its colour, and whether
-    that is fitted."""
+    """Train the coarse model. Return the background option for the blocks, its colour, and whether that is fitted."""
     opened, scene = _opened(run)
     _prepared(opened.train_options)
     coarse = coarse_of(opened, scene)
@@ -54,19 +53,19 @@ def coarse_task(folder: Path, run: str) -> dict:
             coarse.train_options.background, small, load_training_images(small.train, coarse.similarity)
         )
         state = read_checkpoint(coarse.path) if (coarse.path / "config.json").exists() else None
-        if state is not None:  # with what has been chosen at its start
+        if state is not None:  # keep the options that were chosen at its start
             begun = replace(Run.open(coarse.path).train_options, threads=coarse.train_options.threads)
             coarse = replace(coarse, train_options=begun)
         done = train_run(coarse, small, state, Progress("coarse scene", 1, quiet=True))
     shown_color = [float(x) for x in (Run.open(coarse.path).background if behind.fitted else behind.color)]
-    # What the coarse environment shows is transparent in the windows of blocks.
+    # Pixels that show the coarse model's environment map are transparent in the crops of blocks.
     background_option = "random" if behind.random or behind.environment else ",".join(map(repr, shown_color))
     about = {"fitted": behind.fitted, "environment": behind.environment, "seconds": done["seconds"]}
     return {"background": background_option, "shown": shown_color} | about
 
 
 def block_task(folder: Path, run: str, block: int) -> dict:
-    """Trains a block of the plan and its margin before the coarse scene, up to the first exchange."""
+    """Train a block of the plan and its margin, with the frozen coarse model around them, up to the first exchange."""
     opened, scene = _opened(run)
     plan = read_plan(opened.path)
     own, margin = plan.blocks[block].block, plan.margin
@@ -77,13 +76,13 @@ def block_task(folder: Path, run: str, block: int) -> dict:
 
 
 def join_task(folder: Path, run: str, block: int, exchange: int) -> dict:
-    """Trains a block from the `exchange`th of EXCHANGES, counted from 1, to the next or to the end, beside what its
-    neighbours have become.
+    """Train a block from the `exchange`th of EXCHANGES, counted from 1, to the next or to the end, with its neighbours'
+    current primitives around it.
 
-    What they own in its margin is trained with it, so that both sides of a border fit each other, and then dropped: the
-    restricted additive Schwarz method (Cai and Sarkis, SIAM J. Sci. Comput. 21, 1999). Beyond the margin their
-    primitives stand still, and farther off the coarse scene does. Returns as `_trained`, and `owned`: so many, the
-    first ones, are the block's.
+    The neighbours' primitives in its margin are trained with it, so that both sides of a border fit each other, and
+    then dropped: the restricted additive Schwarz method (Cai and Sarkis, SIAM J. Sci. Comput. 21, 1999). Beyond the
+    margin their primitives are frozen, and farther away the frozen coarse model is used. Returns as `_trained`, and
+    `owned`: the number of primitives that belong to the block, which come first.
     """
     opened, scene = _opened(run)
     plan = read_plan(opened.path)
@@ -117,19 +116,19 @@ def _centers(state: dict) -> np.ndarray:
     return state["parameters"]["center"].numpy()
 
 
-# What a checkpoint holds for every primitive, in tables by name and as tensors.
+# Entries of a checkpoint with one row per primitive: tables of tensors by name, and single tensors.
 _TABLES, _TENSORS = ("parameters", "first", "second", "accumulated"), ("steps", "filter_3d")
 
 
 def _rows(state: dict, keep: np.ndarray) -> dict:
-    """That of some of the primitives."""
+    """Return the per-primitive entries of a checkpoint for the primitives selected by `keep`."""
     rows = torch.from_numpy(keep)
     tables = {name: {key: value[rows] for key, value in state[name].items()} for name in _TABLES}
     return tables | {name: None if state[name] is None else state[name][rows] for name in _TENSORS}
 
 
 def _concatenate_rows(parts: Sequence[dict]) -> dict:
-    """That of all of them."""
+    """Return the per-primitive entries of several checkpoints, concatenated."""
     tables = {name: {key: torch.cat([part[name][key] for part in parts]) for key in parts[0][name]} for name in _TABLES}
     return tables | {
         name: None if parts[0][name] is None else torch.cat([part[name] for part in parts]) for name in _TENSORS
@@ -137,8 +136,8 @@ def _concatenate_rows(parts: Sequence[dict]) -> dict:
 
 
 def until(options: TrainOptions, exchange: int) -> float:
-    """The part of its steps that a block has behind it when the task that begins with an exchange, 0 for the first
-    task, ends."""
+    """Return the share of its steps that a block has completed at the end of a task. The task begins with the given
+    exchange; 0 is the first task."""
     grows = CONTROLS[options.population].GROWS_UNTIL
     return grows + (1 - grows) * (*EXCHANGES, 1.0)[exchange]
 
@@ -154,9 +153,12 @@ def _trained(
     end: float,
     begin: dict | None,
 ) -> dict:
-    """Trains a block in folder/run up to a part of its steps, from its last checkpoint there, else from the state
-    `begin`, else from the points in it and its margin. Up to `exact_radius` from the block the frozen primitives are
-    those that the scene will have."""
+    """Train a block in folder/run up to the share `end` of its steps.
+
+    It starts from the last checkpoint there, else from the state `begin`, else from the points in the block and its
+    margin. Up to `exact_radius` from the block, the frozen primitives are those of the full model; beyond, they are the
+    coarse model's.
+    """
     _prepared(opened.train_options)
     part, own = plan.blocks[block], plan.blocks[block].block
     options = replace(
@@ -192,8 +194,11 @@ def _trained(
 
 
 def _points_of(scene: Scene, run: Run, plan: Plan, number: int, options: TrainOptions) -> PointCloud:
-    """The scene's points in a block and its margin, filled up: at most as many in either as a training begins with that
-    has the block's own primitives in the one and the others of its `options` in the other."""
+    """Return the initial points in a block and its margin.
+
+    The block and its margin are limited separately: to the number of points from which a training of the block's own
+    primitives would start, and of the remaining primitives of `options`.
+    """
     far = far_colors(scene) if plan.environment else None
     backdrop = np.asarray(plan.shown) if plan.fitted else None
     surfaces = stereo_surfaces(scene, replace(options, stereo_depth=0.0), Progress("block", 1, quiet=True))
@@ -212,20 +217,22 @@ def _points_of(scene: Scene, run: Run, plan: Plan, number: int, options: TrainOp
 
 
 def block_folder(run: Path, block: int, exchange: int = 0) -> Path:
-    """Where the task of a block works before the first exchange, or after the `exchange`th."""
+    """Return the folder of a block's task before the first exchange, or after the `exchange`th."""
     return run / FOLDER / (f"{block:03d}joined{exchange}" if exchange else f"{block:03d}")
 
 
 def is_owned(run: Path, plan: Plan, block: int, exchange: int, state: dict) -> np.ndarray:
-    """(N,) which primitives of a block's state after an exchange are its own. That is decided at the first; later they
-    may leave it."""
+    """Return (N,) which primitives of a block's state after an exchange belong to the block.
+
+    Ownership is decided by position before the first exchange; later the primitives may leave the block.
+    """
     if exchange == 0:
         return plan.blocks[block].block.holds(_centers(state))
     return np.arange(len(_centers(state))) < worker.result_of_folder(block_folder(run, block, exchange))["owned"]
 
 
 def outside(primitives: Primitives, block: Block, margin: float) -> Arrays:
-    """Those outside of a block and its margin, but for those that reach into the block."""
+    """Return the primitives outside of a block and its margin, except those large enough to reach into the block."""
     reach = primitives.extent.max(1)[:, None]
     low, high = np.asarray(block.low), np.asarray(block.high)
     apart = ((primitives.center + reach < low) | (primitives.center - reach > high)).any(1)
@@ -233,18 +240,18 @@ def outside(primitives: Primitives, block: Block, margin: float) -> Arrays:
 
 
 def select(primitives: Primitives, rows: np.ndarray) -> Arrays:
-    """The arrays of some of the primitives."""
+    """Return the arrays of the selected primitives."""
     return {name: getattr(primitives, name)[rows] for name in ARRAYS}
 
 
 def concatenated(parts: Sequence[Arrays]) -> Arrays:
-    """All of them in one, with the harmonics of the one that has most."""
+    """Concatenate arrays of primitives. Spherical harmonics are padded to the largest number of coefficients."""
     count = max(part["sh"].shape[1] for part in parts)
     padded = [part | {"sh": np.pad(part["sh"], ((0, 0), (0, count - part["sh"].shape[1]), (0, 0)))} for part in parts]
     return {name: np.concatenate([part[name] for part in padded]) for name in ARRAYS}
 
 
 def tensors(arrays: Arrays) -> Tensors:
-    """As the rasterizer takes them."""
+    """Return the arrays as rasterizer inputs."""
     center, rotation, extent, density, sh = (torch.from_numpy(arrays[name]) for name in ARRAYS)
     return center, rotation, extent, density, sh

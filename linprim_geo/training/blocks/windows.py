@@ -1,5 +1,5 @@
-"""The photographs of a block: the parts of views that show it, and in place of the rest what the coarse scene shows
-there."""
+"""Training images of a block: crops of the photographs that show it. Pixels that show distant parts of the scene are
+replaced by renders of the frozen primitives."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ from linprim_geo.kernels import ops
 from linprim_geo.runs.run import Run
 from linprim_geo.training.step.training_images import LazyTrainingImage, TrainingImage
 
-# Transmittance at which the coarse surface is taken.
+# Transmittance at which the surface of the coarse model is taken.
 LEVEL = 0.5
 
 
 def small_depths(coarse: Run, views: Sequence[View], factor: int) -> Iterator[tuple[Camera, np.ndarray]]:
-    """For every view its camera, `factor` times as small, and the (h, w) z-depths of the coarse surface, 0 for none, in
-    the training frame."""
+    """Yield for each view its camera, reduced by `factor`, and the (h, w) z-depths of the coarse model's surface in the
+    training frame, 0 for none."""
     small = [replace(view, camera=smaller(view.camera, factor)) for view in views]
     for view, depth, _ in coarse.surface_depths(small, LEVEL):
         yield view.camera.transformed(coarse.similarity), depth * np.float32(coarse.similarity.scale)
 
 
 class Windows:
-    """Parts of photographs in a file in the system's folder for temporary ones, so that a worker's memory does not grow
-    with them; where that folder is itself memory, TMPDIR is to name another.
+    """Crops of photographs in a temporary file, so that a worker's memory does not grow with their number.
 
-    Reading one takes a hundredth of the time of a step. The file has no name: it is gone with the last of them, however
+    The file is in the system's temporary folder; if that is in memory itself, set TMPDIR to another. Reading a crop
+    takes a hundredth of the time of a training step. The file has no name and disappears with its last user, however
     this process ends.
     """
 
     def __init__(self) -> None:
-        """Raises LinprimError where no such folder can be written."""
+        """Create the file. Raises LinprimError if the temporary folder cannot be written."""
         try:
             folder = Path(tempfile.gettempdir())
         except FileNotFoundError as error:
@@ -61,7 +61,8 @@ class Windows:
     def image(
         self, name: str, camera: Camera, rgb: np.ndarray, alpha: np.ndarray, photo: tuple[int, int] | None = None
     ) -> LazyTrainingImage:
-        """Takes up (H, W, 3) and (H, W) uint8; `photo` as of a `TrainingImage`.
+        """Write (H, W, 3) and (H, W) uint8 to the file and return an image that reads them back. `photo` as in
+        `TrainingImage`.
 
         Raises:
             LinprimError: the disk is full.
@@ -92,12 +93,13 @@ def block_images(
     options: TrainOptions,
     frozen: Tensors,
 ) -> list[TrainingImage]:
-    """What a block is trained on.
+    """Return the training images of a block.
 
-    A photograph is cut to the window that shows the block and its margin, and counts by that window's share of its
-    pixels. Pixels whose surface lies farther than `exact_radius` from the block, where the frozen primitives are
-    coarse, are replaced by what these alone show there, with their opacity for alpha: a block is neither to explain the
-    rest of the scene nor to hide it. So are those that show the coarse scene's environment.
+    A photograph is cropped to the window that shows the block and its margin, and its loss is weighted by the window's
+    share of its pixels. The frozen primitives are coarse farther than `exact_radius` from the block. Pixels whose
+    surface lies there, and pixels that show the coarse model's environment map, are replaced by a render of the frozen
+    primitives with their opacity as alpha. A block's own primitives then neither explain nor hide the rest of the
+    scene.
 
     Raises:
         LinprimError: a photograph cannot be read, or the disk is full.
@@ -127,7 +129,7 @@ def block_images(
 
 
 def _rendered(frozen: Tensors, camera: Camera, how: dict) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, 3) straight colours and (H, W) opacities of the frozen primitives, uint8."""
+    """Return (H, W, 3) colours that are not premultiplied, and (H, W) opacities, of the frozen primitives, as uint8."""
     if len(frozen[0]) == 0:
         return np.zeros((camera.height, camera.width, 3), np.uint8), np.zeros((camera.height, camera.width), np.uint8)
     with torch.no_grad():

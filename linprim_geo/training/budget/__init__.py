@@ -1,1 +1,1 @@
-"""Plans for a given time and memory."""
+"""Planning a training for a given time and memory."""

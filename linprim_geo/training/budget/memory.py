@@ -1,4 +1,4 @@
-"""The memory that a training needs."""
+"""Estimate the memory that a training needs."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from linprim_geo.base.options import TrainOptions
 from linprim_geo.capture.types import View
 from linprim_geo.training.step.training_images import photo_bytes
 
-# Bytes that a primitive takes while a step is made: so many in any case, and so many for each of its numbers, with
+# Bytes per primitive during a step: PRIMITIVE_BYTES, plus NUMBER_BYTES for each of its parameters, which includes
 # Adam's moments and gradients. Fitted to 300,000 octahedra of degree 1 and 3 (1560 and 2340 bytes measured); Gaussians
 # of degree 3 take 17 % less.
 PRIMITIVE_BYTES, NUMBER_BYTES = 1060, 21.6
 
 
 def bytes_per_primitive(options: TrainOptions) -> float:
-    """What one more primitive takes in memory."""
+    """Return the bytes that one more primitive takes in memory."""
     numbers = 3 + 4 + KINDS[options.primitive].extents + 1 + 3 * (options.sh_degree + 1) ** 2
     return PRIMITIVE_BYTES + NUMBER_BYTES * numbers
 
@@ -25,10 +25,12 @@ def bytes_per_primitive(options: TrainOptions) -> float:
 def memory_estimate(
     views: Sequence[View], options: TrainOptions, photos: int | None = None, largest: int | None = None
 ) -> float:
-    """GiB that a process takes at its peak which trains these views, without trying; photographs count in full.
+    """Return the peak memory in GiB of a process that trains these views. All photographs are counted as kept in
+    memory.
 
     Args:
-        photos: bytes of the photographs, and `largest`, pixels of the largest one, if they are not those of the views.
+        photos: bytes of the photographs, and `largest`, pixels of the largest one, if they differ from those of the
+            views.
     """
     photos = photo_bytes(tuple(views)) if photos is None else photos
     largest = max((view.camera.width * view.camera.height for view in views), default=0) if largest is None else largest

@@ -1,5 +1,5 @@
-"""A training that keeps to a time: what a step costs is measured first, the run planned from it, and corrected once on
-the way."""
+"""Keep a training within a time budget: measure the cost of a step, plan the run from it, and correct the number of
+steps once during the run."""
 
 from __future__ import annotations
 
@@ -29,26 +29,27 @@ from linprim_geo.training.step.geometry_terms import GeometryTerms
 from linprim_geo.training.step.trainer import SHARED, Trainer
 from linprim_geo.training.step.training_images import TrainingImage
 
-# A calibration: steps of each of two populations, the smaller one this part of the larger, in turn after the
-# warm-up, and the share of the budget after which no further ones are timed.
+# Calibration: CALIBRATION_STEPS steps are timed for each of two populations, in turn, after CALIBRATION_WARM_UP rounds.
+# The smaller population has CALIBRATION_PART of the primitives of the larger. Timing stops early after
+# CALIBRATION_SHARE of the budget.
 CALIBRATION_STEPS, CALIBRATION_PART, CALIBRATION_WARM_UP, CALIBRATION_SHARE = 20, 0.25, 2, 0.08
-# The pace of a run is taken over the part of it between this and the end of growth.
+# The pace is measured from this share of the planned steps to the end of growth.
 PACE_FROM = 0.5
 
 
 @dataclass
 class Pace:
-    """The time budget of a run while it trains, and what config.json says of it (`record`)."""
+    """The time budget of a run while it trains, and its entry in config.json (`record`)."""
 
     budget: Budget
     record: dict
-    finish: float  # seconds from the last step to the end
-    mark: tuple[int, float] | None = None  # step and time.monotonic() from which the pace is taken
+    finish: float  # seconds needed after the last step
+    mark: tuple[int, float] | None = None  # step and time.monotonic() at which measuring the pace began
 
     @staticmethod
     def resumed(run: Run, trainer: Trainer) -> Pace:
-        """From config.json, with the seconds that the steps until now have taken; the correction that was made is
-        repeated."""
+        """Restore the pace of a resumed run from config.json and the seconds that its steps have taken. A correction
+        made earlier is applied again."""
         try:
             record = dict(run.notes["time_budget"])
             correction = record.get("correction")
@@ -67,7 +68,7 @@ class Pace:
             ) from None
 
     def watch(self, trainer: Trainer, run: Run, progress: Progress, save: Callable[[], None]) -> None:
-        """Called before every step: notes the pace, and when growth has ended corrects the number of steps, once."""
+        """Call before every step: measure the pace, and once growth has ended, correct the number of steps."""
         planned = trainer.options.iterations
         end = max(1, round(GROWTH_END * planned))
         if trainer.correction is not None or trainer.step > end:
@@ -82,7 +83,7 @@ class Pace:
         finish = self.finish - SAVE_SECONDS + saving
         since, then = self.mark if self.mark and self.mark[0] < trainer.step else (0, self.budget.began)
         per_step = (begin - then) / (trainer.step - since)
-        # What begins only after this step was measured beforehand.
+        # Terms that start only after this step are included by the factor measured in the calibration.
         late = 1 + (self.record["cost"]["late"] - 1) * self.record["cost"]["late_share"] / (1 - GROWTH_END)
         last = corrected_steps(trainer.step, planned, per_step * late, self.budget.left() - finish)
         self.record["correction"] = {
@@ -102,7 +103,7 @@ class Pace:
         )
 
     def close(self, run: Run, progress: Progress) -> dict:
-        """Notes the seconds that the run took, unless a finished run was only looked at again."""
+        """Record the seconds that the run took, unless the run had finished before."""
         if "actual_seconds" in self.record:
             return self.record
         self.record["actual_seconds"] = self.budget.elapsed()
@@ -124,15 +125,15 @@ def plan_run(
     start_share: float,
     quick_views: int,
 ) -> tuple[Run, Pace]:
-    """The run with the steps and the population that fill the budget, by what a step costs here and now.
+    """Return the run with the number of steps and primitives that fill the budget, from the measured cost of a step.
 
     Args:
-        start: makes a trainer at its start with these options. score: scores one on some views.
-        start_share: the least share of its limit that the population begins with.
-        quick_views: held-out views that are scored on the way.
+        start: makes a trainer at step 0 with the given options. score: evaluates a trainer on some views.
+        start_share: lower bound of the initial number of primitives, as a share of the limit.
+        quick_views: number of held-out views scored during training.
 
     Raises:
-        LinprimError: not even a little training fits.
+        LinprimError: not even the smallest useful training fits.
     """
     options = run.train_options
     given = {
@@ -143,7 +144,7 @@ def plan_run(
     begin = time.monotonic()
     cost, begun, starting, view_seconds = calibrate(run.train_options, images, terms, budget, start, score)
     calibrating = time.monotonic() - begin
-    # What goes on beside the steps: scores and checkpoints on the way, and both at the end.
+    # Time other than steps: scores and checkpoints during training, and both at the end.
     beside = SAVE_SECONDS / options.checkpoint_every
     beside += view_seconds * quick_views / options.evaluate_every if options.evaluate_every else 0.0
     cost = replace(cost, base=cost.base + beside)
@@ -186,10 +187,13 @@ def calibrate(
     start: Callable[[TrainOptions], Trainer],
     score: Callable[[Trainer, list[TrainingImage]], object],
 ) -> tuple[StepCost, float, float, float]:
-    """(cost of a step, population at the start as a share of its limit, seconds to make the first population, seconds
-    to score a view).
+    """Measure the cost of training steps.
 
-    Steps of two throw-away trainers in turn, at the end of growth, where all degrees of the colour take part.
+    Returns: the cost of a step, the initial population as a share of its limit, seconds to make the first population,
+    and seconds to score a view.
+
+    Two temporary trainers take steps in turn. They are set to the end of growth, where all spherical harmonics degrees
+    are in use.
     """
     options = replace(options, iterations=TrainOptions.iterations)
     begin = time.monotonic()
@@ -199,7 +203,7 @@ def calibrate(
     part = max(1, round(CALIBRATION_PART * len(large)))
     keep = torch.from_numpy(np.sort(np.random.default_rng([options.seed, 1]).choice(len(large), part, replace=False)))
     fewer = {name: value[keep].clone() for name, value in large.parameters.items() if name not in SHARED}
-    fewer["log_extent"] += float(np.log(len(large) / part)) / 2  # as many over a place of the surface
+    fewer["log_extent"] += float(np.log(len(large) / part)) / 2  # keep the number of primitives over each surface point
     fewer["log_extent"].clamp_(*(float(np.log(bound)) for bound in large.bounds))
     environment = None if large.environment is None else large.environment.clone()
     small = Trainer(

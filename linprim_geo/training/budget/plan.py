@@ -1,30 +1,33 @@
-"""How many steps and primitives fit into a given time, by the measured cost of a training step."""
+"""Choose the numbers of steps and primitives that fit into a given time, from the measured cost of a training step."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
-# Steps per primitive of a run that is planned freely, the best of four at equal time on the built-in part (40 views of
-# 128 px, 20 s of one core): 0.12, 0.35, 1.4 and 5.6 give Chamfer distances of 0.247, 0.244, 0.303 and 0.421 % of the
-# diagonal, and 32.9, 33.7, 33.2 and 30.7 dB. `train`'s own defaults have it too.
+# Steps per primitive of a freely planned run. Best of four at equal time on the built-in part (40 views of 128 px, 20 s
+# of one core): 0.12, 0.35, 1.4 and 5.6 give Chamfer distances of 0.247, 0.244, 0.303 and 0.421 % of the diagonal, and
+# 32.9, 33.7, 33.2 and 30.7 dB. The defaults of `train` have the same ratio.
 STEPS_PER_PRIMITIVE = 0.35
-# Less than this gives no surface worth a name.
+# Fewer steps or primitives than this give no useful surface.
 LEAST_STEPS, LEAST_PRIMITIVES = 300, 300
-# More primitives than one in so many pixels of all training views are not fixed by them.
+# At most one primitive per this number of pixels of all training views; more would be underdetermined.
 PIXELS_PER_PRIMITIVE = 20
-# Growth ends at this part of a run and has reached its limit at 0.9 of that (population.Growth).
+# Growth ends at the share GROWTH_END of a run and reaches its limit at 0.9 of that, FULL_AT (population.Growth).
 GROWTH_END, FULL_AT = 0.6, 0.54
-# The correction when growth has ended changes the steps that are left by at most this factor, up or down.
+# At the end of growth the number of remaining steps is changed by at most this factor, up or down.
 LARGEST_CORRECTION = 10.0
-# Writing a checkpoint and the exported scene, before it has been measured.
+# Assumed seconds to write a checkpoint and the exported scene, until they are measured.
 SAVE_SECONDS = 0.3
 
 
 @dataclass(frozen=True)
 class StepCost:
-    """Seconds of one training step: `base` + `per_primitive` times the number of primitives; `late` times that in the
-    share `late_share` of the run that has more terms or a more expensive order."""
+    """Seconds of one training step: `base` + `per_primitive` times the number of primitives.
+
+    In the last share `late_share` of the run, which has more loss terms or a more expensive blending order, a step
+    takes `late` times as long.
+    """
 
     base: float
     per_primitive: float
@@ -33,23 +36,24 @@ class StepCost:
 
     @staticmethod
     def fit(small: tuple[int, float], large: tuple[int, float], late: float = 1.0, late_share: float = 0.0) -> StepCost:
-        """Through two (primitives, seconds). Where the larger was not slower, a step costs their mean at any number."""
+        """Fit the line through two measurements (primitives, seconds). If the larger population was not slower, a step
+        costs their mean for any number of primitives."""
         (n, s), (m, t) = small, large
         slope = (t - s) / (m - n) if m > n else 0.0
         if slope <= 0:
             return StepCost((s + t) / 2, 0.0, late, late_share)
-        if slope * n > s:  # more than in proportion: a line through zero
+        if slope * n > s:  # the line would have a negative base: use a line through zero
             return StepCost(0.0, t / m, late, late_share)
         return StepCost(s - slope * n, slope, late, late_share)
 
     def seconds(self, primitives: float) -> float:
-        """Of a step, on average over the run."""
+        """Return the seconds of a step, averaged over the run."""
         return (self.base + self.per_primitive * primitives) * (1 + self.late_share * (self.late - 1))
 
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """Training steps, the limit of the population, the seconds that the steps should take, and why."""
+    """Planned steps, the limit on primitives, the seconds that the steps should take, and the reason for the choice."""
 
     iterations: int
     max_primitives: int
@@ -58,7 +62,7 @@ class TrainingPlan:
 
 
 def mean_population(start: float) -> float:
-    """Mean number of primitives over a run, as a share of the limit, of one that begins with the share `start` and
+    """Return the mean number of primitives over a run, as a share of the limit, if it starts with the share `start` and
     grows exponentially."""
     if not 0 < start < 1:
         return 1.0
@@ -73,16 +77,18 @@ def plan_training(
     iterations: int | None = None,
     max_primitives: int | None = None,
 ) -> TrainingPlan | None:
-    """Steps and population for `seconds` of training steps; None where not even LEAST_STEPS of LEAST_PRIMITIVES fit.
+    """Return the steps and primitives that fill `seconds` of training steps, or None if not even LEAST_STEPS with
+    LEAST_PRIMITIVES fit.
 
-    With P primitives at most, S = r P steps (r = STEPS_PER_PRIMITIVE) of (base + per_primitive m P) each fill the time,
-    m the mean population as a share of P: a quadratic in P. If that is less than LEAST_STEPS there are as many, of
-    fewer primitives, but no less than LEAST_PRIMITIVES; if P is more than `most`, it is that, and the steps fill the
-    time.
+    With at most P primitives and m P of them on average, S = r P steps (r = STEPS_PER_PRIMITIVE) of (base +
+    per_primitive m P) seconds each fill the time: a quadratic equation in P. If S is less than LEAST_STEPS, S is raised
+    to it and P lowered, but not below LEAST_PRIMITIVES. If P exceeds `most`, P is `most`, and the number of steps fills
+    the time.
 
     Args:
-        start: population at the start, as a share of its limit.
-        iterations, max_primitives: given ones are kept, and the other follows from the time.
+        start: initial population, as a share of its limit.
+        most: largest number of primitives, by the pixels of the training views.
+        iterations, max_primitives: a given one is kept, and the other follows from the time.
     """
     if seconds <= 0:
         return None
@@ -116,13 +122,13 @@ def plan_training(
 
 
 def least_training(cost: StepCost, iterations: int | None = None, max_primitives: int | None = None) -> float:
-    """Seconds of the least training that `plan_training` plans."""
+    """Return the seconds of the smallest training that `plan_training` accepts."""
     return (iterations or LEAST_STEPS) * cost.seconds(max_primitives or LEAST_PRIMITIVES)
 
 
 def corrected_steps(step: int, iterations: int, per_step: float, left: float) -> int:
-    """Steps of the whole run, at `step` of `iterations` planned ones, so that the rest of `per_step` seconds each fills
-    `left`."""
+    """Return the total number of steps so that the remaining ones, of `per_step` seconds each, fill `left` seconds. The
+    run is at `step` of `iterations` planned ones."""
     rest = max(1, iterations - step)
     wanted = left / per_step if per_step > 0 else rest
     return step + int(min(max(wanted, rest / LARGEST_CORRECTION, 1), rest * LARGEST_CORRECTION))

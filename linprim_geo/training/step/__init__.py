@@ -1,1 +1,1 @@
-"""One training step and its parts."""
+"""One training step: loss terms, parameter activation, density control and the optimiser state."""

@@ -1,4 +1,4 @@
-"""The environment in a training step: its loss term, and which of its texels cameras see."""
+"""The environment map in a training step: its loss term, and which of its texels cameras see past the primitives."""
 
 from __future__ import annotations
 
@@ -10,16 +10,18 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels import ops
 from linprim_geo.points.far_colors import SAME_COLOR
 
-# Texels that less than this part of a pixel sees past the primitives are not seen.
+# A texel counts as seen if its summed weight, transmittance times bilinear weight over the pixels of all views, exceeds
+# this (in pixels).
 LEAST_WEIGHT = 0.5
 
 
 def contradiction(photo: torch.Tensor, passed: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
-    """Mean over the pixels of the transmittance `left` (H, W) times how much the environment differs from the
-    photograph (3, H, W), beyond SAME_COLOR; `passed` (3, H, W) is the transmittance times the environment.
+    """Return the mean over pixels of the transmittance `left` (H, W) times the colour difference between the
+    environment and the photograph (3, H, W) beyond SAME_COLOR.
 
-    Where the two differ there is a surface, and no light of the environment: without this term a translucent surface of
-    another colour explains the photograph as well.
+    `passed` (3, H, W) is the transmittance times the environment. Where the two colours differ, a surface must hide the
+    environment. Without this term, a translucent surface of another colour in front of the environment would explain
+    the photograph as well.
 
     Gradient: to `left`.
     """
@@ -29,8 +31,10 @@ def contradiction(photo: torch.Tensor, passed: torch.Tensor, left: torch.Tensor)
 
 
 def seen_through(size: int, views: Iterable[tuple[Camera, torch.Tensor]]) -> torch.Tensor:
-    """(6, size, size, 1) bool, the texels that cameras see past primitives of (H, W) opacity, where these let most of
-    the light through."""
+    """Return (6, size, size, 1) bool: the texels of a cube map that cameras see past the primitives.
+
+    `views` are pairs of a camera and its rendered (H, W) opacity. Only pixels with opacity below 0.5 count.
+    """
     weight = torch.zeros(6, size, size, 3)
     for camera, opacity in views:
         passing = torch.where(opacity < 0.5, opacity, 1.0)

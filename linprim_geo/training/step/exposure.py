@@ -1,8 +1,8 @@
-"""Exposure and white balance of every training photograph: a gain per channel, fitted together with the scene.
+"""Exposure and white balance: one gain per colour channel of each training photograph, fitted together with the scene.
 
-A photograph of gain g shows g times the scene's colours, cut at white. Scene and gains share a factor per channel,
-which is fixed by keeping the geometric mean of the gains over the photographs at 1: that is the exposure which renders
-have.
+A photograph with gain g shows g times the scene's colours, clipped at white. A common factor of scene and gains is not
+determined by the photographs; it is fixed by keeping the geometric mean of the gains at 1 per channel. Renders have
+this mean exposure.
 """
 
 from __future__ import annotations
@@ -14,30 +14,31 @@ from torch import Tensor
 from linprim_geo.kernels.adam import adam_rows
 from linprim_geo.kernels.ops import exponential
 
-# Adam's step in the logarithm of a gain at the start of a run, and the part of it at the end.
+# Adam learning rate of the log gains at the start of a run, and the factor by which it has fallen at the end.
 RATE, RATE_END = 1e-2, 0.05
-# Where a photograph has reached this, of 1, it is white whatever the scene is.
+# Values in [0, 1] from this on count as clipped: the photograph is white however bright the scene is.
 WHITE = 254.5 / 255
 
 
 class Exposure:
-    """The gains of V photographs and what fitting them needs; `log_gain` (V, 3) float32 has mean 0 per channel."""
+    """The gains of V photographs and their optimiser state. `log_gain` (V, 3) float32 has mean 0 per channel."""
 
     TABLES = ("log_gain", "first", "second", "steps")
 
     def __init__(self, views: int, log_gain: np.ndarray | None = None):
-        """`log_gain` (V, 3) is where to begin; without it every gain is 1."""
+        """`log_gain` (V, 3) are the initial values; without it, every gain is 1."""
         start = torch.zeros(views, 3) if log_gain is None else torch.from_numpy(np.ascontiguousarray(log_gain)).float()
         self.log_gain = start - start.mean(0)
         self.first, self.second = torch.zeros(views, 3), torch.zeros(views, 3)
         self.steps = torch.zeros(views, dtype=torch.int32)
 
     def row(self, index: int) -> Tensor:
-        """(3,) log gains of a photograph, as a leaf to differentiate."""
+        """Return the (3,) log gains of a photograph as a new leaf tensor that requires gradients."""
         return self.log_gain[index].clone().requires_grad_()
 
     def update(self, index: int, gradient: Tensor, part: float) -> None:
-        """An Adam step of one photograph's gains, `part` of the run after its start, and the gauge."""
+        """Make one Adam step for the gains of one photograph, then subtract the mean log gain. `part` is the share of
+        the run that has passed."""
         gradients = torch.zeros_like(self.log_gain)
         gradients[index] = gradient
         touched = torch.zeros(len(self.steps), dtype=torch.bool)
@@ -48,15 +49,15 @@ class Exposure:
 
     @property
     def gains(self) -> np.ndarray:
-        """(V, 3) float32."""
+        """Return the (V, 3) float32 gains."""
         return exponential(self.log_gain).numpy()
 
     def state(self) -> dict:
-        """What a resumed run needs."""
+        """Return the tables that a resumed run needs."""
         return {name: getattr(self, name) for name in self.TABLES}
 
     def restore(self, state: dict) -> None:
-        """Takes back what `state` returned."""
+        """Restore what `state` returned."""
         if set(state) != set(self.TABLES) or any(state[k].shape != getattr(self, k).shape for k in self.TABLES):
             raise ValueError(f"exposure has {sorted(state)}, wanted those of {len(self.steps)} photographs")
         for name in self.TABLES:
@@ -64,10 +65,11 @@ class Exposure:
 
 
 def exposed(rgb: Tensor, log_gain: Tensor, target: Tensor, behind: Tensor | None = None) -> Tensor:
-    """(3, H, W) a rendering as a photograph with these (3,) log gains shows it.
+    """Return a (3, H, W) rendering as a photograph with (3,) log gains shows it.
 
-    `behind` (3, H, W) is the part of it that the background makes up and the camera did not take, such as a random
-    colour behind masks; it has no gain. Where `target` is white the rendering is cut at white: brighter is right, too.
+    `behind` (3, H, W) is the part of the rendering that comes from a background that the camera did not capture, such
+    as a random colour behind masks; no gain applies to it. Where `target` is white, the rendering is clipped at white,
+    so brighter values cause no error.
     Gradient: to `rgb`, `log_gain` and `behind`.
     """
     gain = exponential(log_gain)[:, None, None]
@@ -76,8 +78,8 @@ def exposed(rgb: Tensor, log_gain: Tensor, target: Tensor, behind: Tensor | None
 
 
 def best_gain(render: np.ndarray, photo: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
-    """(3,) factors of the channels of (H, W, 3) `render` that bring it nearest to `photo`: least squares over pixels,
-    weighted (H, W)."""
+    """Return the (3,) gains per channel that bring (H, W, 3) `render` nearest to `photo`, by least squares over pixels
+    with (H, W) weights."""
     weight = np.ones(render.shape[:2]) if weight is None else weight
     both = np.einsum("hwc,hwc,hw->c", render, photo, weight)
     own = np.einsum("hwc,hwc,hw->c", render, render, weight)
@@ -85,7 +87,10 @@ def best_gain(render: np.ndarray, photo: np.ndarray, weight: np.ndarray | None =
 
 
 def with_best_gain(render: np.ndarray, photo: np.ndarray, alpha: np.ndarray | None = None) -> np.ndarray:
-    """(H, W, 3) `render` times the gain that brings it nearest to `photo`; where (H, W) `alpha` in [0, 1] lets the
-    background through, this has no gain, and only what is opaque is compared."""
+    """Return (H, W, 3) `render` times the gain that brings it nearest to `photo`.
+
+    With (H, W) `alpha` in [0, 1], the gain is fitted to opaque pixels only and does not apply to the background that
+    shows through.
+    """
     gain = best_gain(render, photo, None if alpha is None else (alpha > 0.99).astype(float))
     return render * gain if alpha is None else render * (1 + alpha[..., None] * (gain - 1))

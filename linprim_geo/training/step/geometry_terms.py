@@ -1,9 +1,9 @@
-"""Terms of the training loss that photographs alone do not give: surfaces that are smooth, opaque, and where other
-evidence puts them.
+"""Geometry terms of the training loss: smooth and opaque surfaces, and surfaces where stereo, sensors or points put
+them.
 
-Every term is a mean over pixels, points or primitives, has a weight of its own, and costs nothing at weight 0: the
-renderer's geometry is not even asked for. Surfaces of stereo hold from the start. The others act in the last part of a
-run only (`--geometry-from`): early on they hold misplaced primitives where they are.
+Each term is a mean over pixels, points or primitives with its own weight. A term of weight 0 costs nothing: no geometry
+is rendered for it. Stereo supervision acts from the start; the others act only in the last part of a run
+(`--geometry-from`), because early on they would hold misplaced primitives in place.
 """
 
 from __future__ import annotations
@@ -24,20 +24,19 @@ from linprim_geo.points.view_pairs import visible_pixels
 from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.surface_points import SurfaceMap
 
-# Depths that miss a point or a measured depth by more than this share of it count as much as this: they belong to
-# another surface.
+# Cap on relative depth errors. Depths that are off by more belong to another surface and count as this much.
 DEPTH_CAP = 0.1
-# Surfaces of stereo are looked at in one of so many steps, for as many times their weight.
+# The stereo term is evaluated in every STEREO_EVERY-th step, with its weight multiplied by as much.
 STEREO_EVERY = 2
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a data set knows of a view's surface beside its photograph, in the training frame; each may be missing.
+    """Supervision of one view's surface besides its photograph, in the training frame. Each entry may be missing.
 
-    `depth` (H, W) z-depth, 0 = none; `normal` (3, H, W) unit normals in the camera's axes, 0 = none; `pixels` (P, 2)
-    int64 columns and rows of points of the scene that this view sees, their z-depths `point_depth` (P,) and weights
-    `point_weight` (P,). `planes` (3, h, w) inverse depth and its slopes per pixel of an image that is smaller by
+    `depth` (H, W): z-depth, 0 = none. `normal` (3, H, W): unit normals in camera axes, 0 = none. `pixels` (P, 2) int64:
+    columns and rows of the scene's points that this view sees, with z-depths `point_depth` (P,) and weights
+    `point_weight` (P,). `planes` (3, h, w): inverse depth and its slopes per pixel, in an image that is smaller by
     `factor`, 0 = none.
     """
 
@@ -51,21 +50,22 @@ class Evidence:
 
 
 class GeometryTerms:
-    """The weighted sum of the terms for a view at a step."""
+    """The weighted sum of the geometry terms for a view at a step."""
 
     def __init__(self, options: TrainOptions, images: list, evidence: list[Evidence]):
-        """`images` as the trainer has them, an `evidence` each."""
+        """`images` as in the trainer, with one `evidence` for each."""
         self.options, self.images, self.evidence = options, images, evidence
 
     def weights(self, index: int, step: int, late: bool) -> dict[str, float]:
-        """Of the terms that act on view `index` at a step, which is `late` in the run or not."""
+        """Return {name: weight} of the terms that act on view `index` at this step. `late`: the run is past
+        --geometry-from."""
         weights = {name: getattr(self.options, name) for name in GEOMETRY_WEIGHTS} if late else {}
         if self.evidence[index].planes is not None and step % STEREO_EVERY == 0:
             weights["stereo_depth"] = STEREO_EVERY * self.options.stereo_depth
         return {name: weight for name, weight in weights.items() if weight > 0}
 
     def loss(self, weights: dict[str, float], out: Rendering, index: int, step: int, raw_opacity: Tensor) -> Tensor:
-        """Scalar: the terms with `weights`. `out` is the rendering of view `index`, with its geometry where one of them
+        """Return the scalar sum of the terms in `weights`. `out` is the rendering of view `index`, with geometry if
         `needs_geometry`."""
         image, evidence = self.images[index], self.evidence[index]
         total = raw_opacity.new_zeros(())
@@ -96,7 +96,7 @@ class GeometryTerms:
 
 
 def needs_geometry(weights: dict[str, float]) -> bool:
-    """Whether one of the terms looks at the renderer's geometry."""
+    """Return whether any of the terms uses rendered depth, normals or distortion."""
     return any(name != "binarisation" for name in weights)
 
 
@@ -107,8 +107,10 @@ def gather_evidence(
     log: Callable[[str], None],
     surfaces: Sequence[SurfaceMap] = (),
 ) -> list[Evidence]:
-    """What the terms in use need of each training view; `surfaces` are those of stereo. A late term that finds nothing
-    of its kind is named by `log`."""
+    """Return the evidence that the terms in use need, for each training view.
+
+    `surfaces` are depth maps from stereo. If the data set has nothing for one of the late terms, `log` says so.
+    """
     by_name = {found.view.name: found for found in surfaces}
     points, cloud = None, scene.points
     if options.point_depth > 0 and cloud is not None and not isinstance(cloud, VolumePoints):
@@ -147,15 +149,15 @@ def gather_evidence(
 
 
 def depth_normals(depth: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Normals of the surface that a depth map describes: ((3, H, W) in the camera's axes towards the camera, (H, W)
-    bool where).
+    """Return the normals of the surface in a depth map: (3, H, W) in camera axes, towards the camera, and an (H, W)
+    bool mask of where they exist.
 
-    Cross product of the central differences between the points of the four neighbours; all five need a depth (> 0). Of
-    pixels without a normal the vector is 0. Gradient: to `depth`.
+    A normal is the cross product of the central differences between the points of the four neighbours; the pixel and
+    its neighbours all need a depth (> 0). Elsewhere the vector is 0. Gradient: to `depth`.
     """
     x = (torch.arange(camera.width, dtype=depth.dtype) + 0.5 - camera.cx) / camera.fx
     y = (torch.arange(camera.height, dtype=depth.dtype) + 0.5 - camera.cy) / camera.fy
-    # With p = z (x, y, 1): the cross product of its differences along rows and columns, component by component.
+    # The cross product of the differences of p = z (x, y, 1) along rows and columns, component by component.
     across, down = depth[1:-1, 2:] - depth[1:-1, :-2], depth[2:, 1:-1] - depth[:-2, 1:-1]
     px = depth[1:-1, 2:] * x[2:] - depth[1:-1, :-2] * x[:-2]
     py = across * y[1:-1, None]
@@ -173,14 +175,14 @@ def depth_normals(depth: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def _geometry(out: Rendering) -> tuple[Tensor, Tensor]:
-    """(H, W) median depth and (3, H, W) normals of a rendering that has them."""
+    """Return the (H, W) median depth and (3, H, W) normals of a rendering made with geometry."""
     assert out.depth_median is not None and out.normal is not None, "rendered without geometry"
     return out.depth_median, out.normal
 
 
 def normal_consistency(out: Rendering, camera: Camera) -> Tensor:
-    """Mean of 1 - n . N: n the blended normals of the entry faces, N the normal of the depth map; 2DGS (Huang et al.
-    2024)."""
+    """Return the mean of 1 - n . N, with n the blended normals of the entry faces and N the normals of the depth map.
+    Source: 2DGS (Huang et al. 2024)."""
     depth, normal = _geometry(out)
     surface, valid = depth_normals(depth, camera)
     cosine = (normal * surface).sum(0)
@@ -188,14 +190,14 @@ def normal_consistency(out: Rendering, camera: Camera) -> Tensor:
 
 
 def binarisation(raw_opacity: Tensor) -> Tensor:
-    """Mean entropy of the opacities, in nats: 0 where every primitive is either opaque or nothing."""
+    """Return the mean entropy of the opacities in nats. It is 0 if every primitive is either opaque or transparent."""
     opacity = torch.sigmoid(raw_opacity)
     softplus = torch.nn.functional.softplus
     return (opacity * softplus(-raw_opacity) + (1 - opacity) * softplus(raw_opacity)).mean()
 
 
 def depth_error(depth: Tensor, wanted: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Mean of |depth - wanted| / wanted, at most DEPTH_CAP, over what has both; weighted."""
+    """Return the weighted mean of |depth - wanted| / wanted, capped at DEPTH_CAP, over pixels where both exist."""
     some = (depth > 0) & (wanted > 0)
     error = ((depth - wanted).abs() / torch.where(some, wanted, torch.ones_like(wanted))).clamp_max(DEPTH_CAP) * some
     weight = some.to(depth.dtype) if weight is None else some * weight
@@ -203,14 +205,15 @@ def depth_error(depth: Tensor, wanted: Tensor, weight: Tensor | None = None) -> 
 
 
 def plane_error(depth: Tensor, planes: Tensor, factor: int, column: int, row: int) -> Tensor:
-    """Mean of what |depth - wanted| / wanted exceeds CONFIRMED_DEPTH by, at most DEPTH_CAP, over what has both.
+    """Return the mean amount by which |depth - wanted| / wanted exceeds CONFIRMED_DEPTH, capped at DEPTH_CAP, over
+    pixels where both exist.
 
-    Within CONFIRMED_DEPTH stereo is not sure, and photographs decide.
+    Stereo is not more accurate than CONFIRMED_DEPTH; within that, the photographs decide.
 
     Args:
         depth: (H, W).
-        planes: (3, h, w), see `Evidence`; they are wanted at one of the `factor` by `factor` pixels of each of their
-            own, in this `column` and `row` of them.
+        planes: (3, h, w), see `Evidence`. Each of its pixels covers `factor` by `factor` pixels of `depth`; it is
+            compared with the one in this `column` and `row` of them.
     """
     _, height, width = planes.shape
     inverse, right, down = planes
@@ -223,6 +226,7 @@ def plane_error(depth: Tensor, planes: Tensor, factor: int, column: int, row: in
 
 
 def normal_error(normal: Tensor, wanted: Tensor, opacity: Tensor) -> Tensor:
-    """Mean of opacity - n . wanted over pixels that have a wanted normal; the opacity takes no gradient."""
+    """Return the mean of opacity - n . wanted over pixels that have a wanted normal. No gradient flows to the
+    opacity."""
     some = (wanted != 0).any(0)
     return ((opacity.detach() - (normal * wanted).sum(0)) * some).sum() / some.sum().clamp_min(1)

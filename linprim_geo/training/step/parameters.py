@@ -1,4 +1,4 @@
-"""The raw parameters that are trained: where they start, what the rasterizer takes for them, and the 3D filter."""
+"""The raw trainable parameters: their initial values, their activation to rasterizer inputs, and the 3D filter."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.primitives import SH_Y0, Tensors
 from linprim_geo.kernels import ops
 
-# The 3D filter: sqrt(0.2) of a pixel, from views in which the primitive is farther than 0.2 and at most 15 % of the
-# image's size outside of it (LinPrim's box_factor and Mip-Splatting's limits); made again after so many steps.
+# The 3D filter has a length of sqrt(FILTER_VARIANCE) pixels. It counts views in which the primitive is deeper than
+# FILTER_NEAR and at most FILTER_MARGIN of the image's size outside of it (LinPrim's box_factor and Mip-Splatting's
+# limits). It is recomputed every FILTER_EVERY steps.
 FILTER_VARIANCE, FILTER_NEAR, FILTER_MARGIN, FILTER_EVERY = 0.2, 0.2, 0.15, 1000
 
 
@@ -25,10 +26,10 @@ def initial_parameters(
     bounds: tuple[float, float],
     kind: str = "octahedron",
 ) -> dict[str, torch.Tensor]:
-    """One primitive per point: opacity 0.5, random rotation, equal extents by the mean distance to the 3 nearest
-    points (`Kind.start_extent`).
+    """Return raw parameters with one primitive per point: opacity 0.5, random rotation, equal extents from the mean
+    distance to the 3 nearest points (`Kind.start_extent`).
 
-    `xyz` (P, 3) in the training frame, `rgb` (P, 3) uint8, `bounds` the least and largest extent.
+    `xyz` (P, 3) in the training frame, `rgb` (P, 3) uint8, `bounds` the smallest and largest extent.
     """
     from scipy.spatial import cKDTree
 
@@ -57,9 +58,10 @@ def activate(
     kind: str = "octahedron",
     filter_3d: torch.Tensor | None = None,
 ) -> Tensors:
-    """Raw parameters to what the rasterizer takes: center, rotation, extent, density, sh.
+    """Convert raw parameters to the rasterizer's inputs: center, rotation, extent, density, sh.
 
-    extent = exp(log_extent), `widened` by `filter_3d` (N,), a constant; the density is the kind's.
+    extent = exp(log_extent), enlarged by `filter_3d` (N,) with `Kind.widened`; `filter_3d` takes no gradient. The
+    density comes from `Kind.density`.
     """
     what, extent = KINDS[kind], ops.exponential(parameters["log_extent"])
     if filter_3d is not None:
@@ -71,10 +73,12 @@ def activate(
 
 
 def filter_lengths(center: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
-    """(N,) float32 f = sqrt(0.2) z / F: part of a pixel, at the nearest camera that sees each of the (N, 3) centres.
+    """Return (N,) float32 lengths f = sqrt(0.2) z / F of the 3D filter, a fraction of a pixel's size at the nearest
+    camera that sees each of the (N, 3) centres.
 
-    z is the least depth over those cameras, F the largest focal length of all. A centre that no camera sees has the
-    distance of the nearest camera for z. Source: Mip-Splatting (Yu et al. 2024), LinPrim's box_factor.
+    z is the smallest depth over the cameras that see the centre, F the largest focal length of all cameras. For a
+    centre that no camera sees, z is the distance to the nearest camera. Source: Mip-Splatting (Yu et al. 2024),
+    LinPrim's box_factor.
     """
     xyz = center.detach().numpy()
     least = np.full(len(xyz), np.inf, np.float32)

@@ -1,8 +1,9 @@
-"""How the number of primitives grows: the primitives with the largest screen-space gradient are cut in two.
+"""Density control: primitives with the largest screen-space gradient are split in two.
 
-Parents are drawn in proportion to the screen-space gradient accumulated since the last event. Primitives that have
-become transparent or have shrunk to nothing are not deleted but become the second half of another parent. The rules of
-the papers that this is compared with are in population_papers.py; what they all have in common is `DensityControl`.
+Parents are drawn with probability in proportion to the screen-space gradient accumulated since the last event.
+Primitives that have become transparent or have reached the smallest extent are not deleted but reused as the second
+half of a parent. `DensityControl` is the interface; population_papers.py has the rules of the papers used for
+comparison.
 """
 
 from __future__ import annotations
@@ -20,27 +21,28 @@ from linprim_geo.geometry.camera import Camera
 
 Parameters = dict[str, torch.Tensor]
 
-# The part of a run's steps after which the population stays.
+# Share of a run's steps after which the number of primitives stays constant.
 GROWS_UNTIL = 0.6
-# A primitive whose opacity along its reference length is below this is moved to where it is needed.
+# A primitive whose opacity along its reference length is below this counts as dead and is reused elsewhere.
 DEAD_OPACITY = 0.005
 
 
 @dataclass(frozen=True)
 class Growth:
-    """When and how fast the population grows; steps are training iterations."""
+    """Schedule of density control. Steps are training iterations."""
 
     first: int
     last: int
     every: int
-    rate: float  # of the present count, per event
+    rate: float  # growth per event, as a share of the current count
     cap: int
 
     @staticmethod
     def plan(iterations: int, start: int, cap: int) -> Growth:
-        """Events every 100 steps (60 in all of a shorter run) from 3 % of the run to GROWS_UNTIL.
+        """Return a schedule with an event every 100 steps (in runs of fewer than 6000 steps every 1/60 of the run, but
+        at least 10 steps apart) from 3 % of the run to GROWS_UNTIL.
 
-        The rate brings `start` to `cap` a little before the last event.
+        The rate is chosen so that `start` primitives reach `cap` shortly before the last event.
         """
         every = max(10, min(100, iterations // 60))
         first, last = max(every, round(0.03 * iterations)), round(GROWS_UNTIL * iterations)
@@ -49,17 +51,18 @@ class Growth:
         return Growth(first, last, every, min(rate, 0.25), cap)
 
     def is_due(self, step: int) -> bool:
-        """Whether the population changes after this step."""
+        """Return whether density control acts after this step."""
         return self.first <= step <= self.last and step % self.every == 0
 
 
 @dataclass(frozen=True)
 class Event:
-    """One change of the population, N primitives before it and M after it.
+    """One change of the population from N to M primitives.
 
-    Row i of the new tables, Adam's moments included, is row `source[i]` of the old ones; then `values[name]`, pairs of
-    rows of the new table and what they receive, is written. First moments become 0 in the rows `reset_momentum`, both
-    in the rows `reset_state`, and both of the opacity everywhere with `reset_opacity`.
+    Row i of the new tables, Adam's moments included, is copied from row `source[i]` of the old ones. Then
+    `values[name]`, a pair (rows of the new table, their new values), is written. First moments are zeroed in the rows
+    `reset_momentum`, both moments in the rows `reset_state`, and with `reset_opacity` both moments of the opacity in
+    all rows.
     """
 
     source: np.ndarray
@@ -70,70 +73,70 @@ class Event:
 
 
 class DensityControl:
-    """A rule of growth. Whatever it draws comes from (seed, purpose, step), so that a resumed run repeats itself.
+    """Interface of a density control rule.
 
-    `accumulated` holds a value per primitive for each name in `NAMES`; the trainer saves it and sets it to 0 after each
-    event.
+    All random numbers are seeded by (seed, purpose, step), so a resumed run repeats the same choices. `accumulated`
+    holds one value per primitive for each name in `NAMES`; the trainer saves it and resets it to 0 after each event.
     """
 
     NAMES: tuple[str, ...] = ()
-    # The part of a run's steps after which there are no more events.
+    # Share of a run's steps after which there are no more events.
     GROWS_UNTIL: float
 
     def __init__(self, options: TrainOptions, count: int, cameras: list[Camera], bounds: tuple[float, float]):
-        """`count` primitives at the start, the training `cameras`, and the `bounds` that extents stay within."""
+        """`count` initial primitives, the training `cameras`, and the `bounds` of extents."""
         self.options, self.bounds = options, bounds
         self.kind = options.primitive
         self.reset(count)
 
     def reset(self, count: int) -> None:
-        """Forgets what was accumulated; there are `count` primitives now."""
+        """Clear the accumulated values; there are now `count` primitives."""
         self.accumulated = {name: torch.zeros(count) for name in self.NAMES}
 
     def rng(self, purpose: int, step: int) -> np.random.Generator:
-        """The generator of this purpose at this step."""
+        """Return the random generator for a purpose at a step."""
         return np.random.default_rng([self.options.seed, purpose, step])
 
     def penalty(self, parameters: Parameters) -> torch.Tensor | None:
-        """What is added to the loss, differentiable in the raw parameters."""
+        """Return a term that is added to the loss, differentiable in the raw parameters, or None."""
         return None
 
     def accumulate(
         self, parameters: Parameters, camera: Camera, size: tuple[int, int], screen_grad: torch.Tensor
     ) -> None:
-        """Notes one view's gradient to the projected centres (N, 3), see `ops.rasterize`'s `screen`; `size`, (width,
-        height), is that of the photograph, of which the camera may see a part."""
+        """Accumulate one view's gradient to the projected centres (N, 3), see `screen` of `ops.rasterize`. `size` is
+        (width, height) of the whole photograph, of which the camera may show a part."""
 
     def add_noise(self, parameters: Parameters, step: int) -> None:
-        """Changes parameters in place after the optimiser's step, `step` counted from 1."""
+        """Add noise to parameters in place after the optimiser's step. `step` is counted from 1."""
 
     def is_due(self, step: int) -> bool:
-        """Whether the population changes after this step."""
+        """Return whether density control acts after this step."""
         raise NotImplementedError
 
     def grow(self, parameters: Parameters, step: int) -> Event:
-        """The change after this step."""
+        """Return the change of the population after this step."""
         raise NotImplementedError
 
     def limit_only(
         self, counts: Callable[[np.ndarray], np.ndarray], most: int, parameters: Parameters, step: int
     ) -> None:
-        """Limits to `most` those alone whose centres (N, 3) `counts` says (N,) True of, where a rule can; the others
-        limit all.
+        """Apply the limit `most` only to primitives for whose centres (N, 3) `counts` returns True (N,), if the rule
+        supports that. Other rules limit all primitives.
 
-        To be called with the parameters and the step that a training, or its resumption, begins with.
+        Call it with the parameters and the step at which a training, or its resumption, begins.
         """
 
     def state(self) -> list[float]:
-        """Numbers that follow from the run's start and not from its options."""
+        """Return numbers that depend on the start of the run and cannot be derived from its options."""
         return []
 
     def restore(self, numbers: list[float]) -> None:
-        """Takes back what `state` returned."""
+        """Restore what `state` returned."""
 
 
 class GradientControl(DensityControl):
-    """This file's rule: `grow` at the steps of a plan."""
+    """The default rule: split by screen-space gradient, with `grow`, at the steps of a schedule."""
 
     NAMES = ("screen_gradient",)
     GROWS_UNTIL = GROWS_UNTIL
@@ -151,7 +154,7 @@ class GradientControl(DensityControl):
             )
 
     def accumulate(self, parameters, camera, size, screen_grad):
-        # In units of the image's size, so that views of different resolution count alike.
+        # Gradients are scaled to units of the image's size, so that views of different resolution count alike.
         self.accumulated["screen_gradient"] += screen_grad[:, 2] * max(size)
 
     def is_due(self, step):
@@ -171,7 +174,7 @@ class GradientControl(DensityControl):
         source = np.arange(max(count, int(children.max(initial=-1)) + 1))
         source[children] = parents
         rows = np.concatenate([parents, children])
-        # A child is its parent, moments and all, but for what a half has of its own.
+        # Children copy their parent's parameters and moments, except for the values that `halves` sets.
         values = {name: (rows, np.concatenate([both[0], both[1]])) for name, both in halves.items()}
         return Event(source, values, reset_momentum=rows)
 
@@ -192,18 +195,18 @@ def grow(
     kind: str = "octahedron",
     counted: int | None = None,
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Draws the parents of one event and computes their halves.
+    """Draw the parents of one event and compute their halves.
 
     Args:
-        parameters: raw trainable tensors, `center` (N, 3), `rotation` (N, 4), `log_extent` (N, 3 or 4), `raw_opacity`
+        parameters: raw trainable tensors: `center` (N, 3), `rotation` (N, 4), `log_extent` (N, 3 or 4), `raw_opacity`
             (N,), ...
         screen_gradient: (N,) screen-space gradient accumulated since the last event, >= 0.
-        smallest_log_extent: a primitive with an extent at this floor counts as dead.
-        counted: primitives that count towards the cap; default: all.
+        smallest_log_extent: a primitive with an extent at this lower bound counts as dead.
+        counted: number of primitives that count towards the cap; default: all.
 
-    Returns: rows (P,) of the parents, overwritten by their first halves; rows (P,) that receive the second halves, from
-        N on where they are new; and what the halves have of their own, {"center": (2, P, 3), "log_extent": (2, P, 3 or
-        4), for Gaussians also "raw_opacity": (2, P)}. All other parameters of a half are its parent's.
+    Returns: rows (P,) of the parents, which are overwritten by their first halves; rows (P,) that receive the second
+    halves, from N on if they are new; and the new parameters of both halves, {"center": (2, P, 3), "log_extent": (2, P,
+    3 or 4), for Gaussians also "raw_opacity": (2, P)}. All other parameters are copied from the parent.
     """
     log_extent = parameters["log_extent"].detach().numpy().astype(np.float64)
     opacity = 1 - np.exp(-np.logaddexp(0.0, parameters["raw_opacity"].detach().numpy().astype(np.float64)))
@@ -218,8 +221,7 @@ def grow(
         empty = np.zeros(0, dtype=np.int64)
         columns = log_extent.shape[1]
         return empty, empty, {"center": np.zeros((2, 0, 3)), "log_extent": np.zeros((2, 0, columns))}
-    # Drawing without replacement in proportion to the weight: the largest of log(u) / weight (Efraimidis and Spirakis
-    # 2006).
+    # Weighted sampling without replacement: take the largest keys log(u) / weight (Efraimidis and Spirakis 2006).
     with np.errstate(divide="ignore"):
         keys = np.where(weight > 0, np.log(rng.random(count)) / np.where(weight > 0, weight, 1), -np.inf)
     parents = np.sort(np.argpartition(-keys, wanted - 1)[:wanted])

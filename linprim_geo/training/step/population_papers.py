@@ -1,9 +1,9 @@
-"""The rules of growth that the papers use, for comparison: 3DGS's clone, split, prune and reset, and MCMC's relocation.
+"""Density control rules of the papers, for comparison: clone, split, prune and reset of 3DGS, and relocation of MCMC.
 
 Source: Kerbl et al., "3D Gaussian Splatting" (2023), section 5; Kheradmand et al., "3D Gaussian Splatting as Markov
-Chain Monte Carlo" (2024); LinPrim (von Luetzow and Niessner, arXiv 2501.16312) for their constants with polyhedra.
-Steps are the papers' at 7,000 iterations and more, and shrink with shorter runs; growth ends at the papers' part of the
-run.
+Chain Monte Carlo" (2024); LinPrim (von Luetzow and Niessner, arXiv 2501.16312) for their constants with polyhedra. Step
+counts are those of the papers for runs of at least 7,000 iterations and shrink in proportion for shorter runs. Growth
+ends at the papers' share of the run.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.ops import exponential
 from linprim_geo.training.step.population import DensityControl, Event
 
-# Shorter runs have proportionally shorter intervals.
+# Runs of fewer iterations have proportionally shorter intervals.
 FULL_ITERATIONS = 7000
 FIRST = 500
-# Radius of a scene whose cameras are all in one place (LinPrim).
+# Scene radius if all cameras are in one place (LinPrim).
 LONE_RADIUS = 2.6
 
 
 def scene_radius(cameras: list[Camera]) -> float:
-    """1.1 times the largest distance of a camera from the mean of all, the length that the papers' constants are parts
-    of."""
+    """Return 1.1 times the largest distance of a camera from the mean camera position. The papers give lengths as
+    fractions of it."""
     centers = np.stack([camera.center for camera in cameras])
     return 1.1 * float(np.linalg.norm(centers - centers.mean(0), axis=1).max()) or LONE_RADIUS
 
@@ -39,18 +39,19 @@ def _steps(count: int, iterations: int) -> int:
 
 @dataclass(frozen=True)
 class ClassicConstants:
-    """Lengths are parts of `scene_radius`; sizes are full diameters of polyhedra, standard deviations of Gaussians."""
+    """Constants of 3DGS's rule. Lengths are fractions of `scene_radius`; sizes are full diameters of polyhedra and
+    standard deviations of Gaussians."""
 
     every: int
-    threshold: float  # mean gradient to the projected centre, which reaches from -1 to 1 across the image
-    small: float  # clone up to this size, split above
-    largest: float  # prune above, once opacities have been reset
-    faintest: float  # prune opacities below
-    shrink: float  # a half's extents are divided by it
+    threshold: float  # mean gradient to the projected centre in coordinates from -1 to 1 across the image
+    small: float  # largest size that is cloned; larger ones are split
+    largest: float  # prune larger ones, once opacities have been reset
+    faintest: float  # prune smaller opacities
+    shrink: float  # divisor of a half's extents
     spread: float  # standard deviation of a half's centre, in extents
 
 
-# LinPrim spreads halves by whole extents, which puts 93 % of their centres outside of the parent; by extents / 2.6 it
+# LinPrim offsets halves by whole extents, which puts 93 % of their centres outside of the parent; with extents / 2.6 it
 # is 39 %.
 POLYHEDRA = ClassicConstants(250, 1.5e-4, 0.01, 0.4, 0.025, 1.2, 1 / DIST_TO_SCALE)
 GAUSSIANS = ClassicConstants(100, 2e-4, 0.01, 0.1, 0.005, 1.6, 1.0)
@@ -58,14 +59,15 @@ RESET_EVERY = 3000
 
 
 class ClassicControl(DensityControl):
-    """3DGS's rule. Where LinPrim's code errs, this does what was meant:
+    """3DGS's rule. Where LinPrim's code has errors, this does what was intended:
 
-    * Opacities are reset to twice the prune level, 3DGS's own ratio. LinPrim's 0.01 lies below its prune level of
-      0.025, so whatever is not looked at before the next event is deleted.
-    * A clone would double the density: the two polyhedra share the optical thickness of the one, and look alike.
-      (Gaussians as in 3DGS.) Faint ones keep theirs, as they would be pruned else.
-    * Primitives that are large on the screen are not pruned: in both codes the record is cleared before it is read, so
-      no published result has it.
+    * Opacities are reset to twice the prune threshold, as in 3DGS. LinPrim's 0.01 is below its prune threshold of
+      0.025, so every primitive that no view shows before the next event is deleted.
+    * A clone would double the density. Here the two polyhedra share the optical thickness of the original, so the image
+      stays the same. (Gaussians as in 3DGS.) Faint polyhedra keep their full thickness, because they would be pruned
+      otherwise.
+    * Primitives that are large on screen are not pruned: in both codes the record is cleared before it is read, so no
+      published result includes this rule.
     """
 
     NAMES = ("gradient", "seen")
@@ -108,7 +110,7 @@ class ClassicControl(DensityControl):
             screen_gradient, seen = (self.accumulated[name].numpy().astype(np.float64) for name in self.NAMES)
             screen_gradient = np.where(alive, screen_gradient / np.maximum(seen, 1), 0)
             hot = np.flatnonzero(screen_gradient >= constants.threshold)
-            # The limit on the population is ours: the largest gradients go first.
+            # The limit on the number of primitives is not in the papers; the largest gradients go first.
             room = max(0, self.options.max_primitives - int(alive.sum()))
             hot = np.sort(hot[np.argsort(-screen_gradient[hot], kind="stable")[:room]])
             is_small = size[hot] <= constants.small * self.radius
@@ -151,12 +153,12 @@ SIZE_PENALTY = OPACITY_PENALTY = 0.01
 
 
 class McmcControl(DensityControl):
-    """MCMC's rule: dead primitives move onto opaque ones, five percent more by the same draw, noise on the centres of
-    the transparent ones, and penalties on size and opacity. A polyhedron counts as a Gaussian of standard deviations
-    extent / 2.6, as in LinPrim; relocation therefore changes its image.
+    """MCMC's rule: dead primitives are relocated onto opaque ones, 5 % more are added by the same sampling, noise is
+    added to the centres of transparent ones, and size and opacity are penalised.
 
-    LinPrim subtracts the 3D filter from a relocated primitive and takes the absolute value, so one that ought to vanish
-    grows; here extents are kept without the filter and end at their lower bound.
+    A polyhedron is treated as a Gaussian with standard deviations extent / 2.6, as in LinPrim, so relocation changes
+    its image. LinPrim subtracts the 3D filter from a relocated primitive and takes the absolute value, so one that
+    should vanish grows; here extents exclude the filter and are clamped at their lower bound.
     """
 
     GROWS_UNTIL = 5 / 6
@@ -180,8 +182,8 @@ class McmcControl(DensityControl):
         return self.first < step < self.last and step % self.every == 0
 
     def add_noise(self, parameters, step):
-        """center += covariance noise 5e5 rate S(1 - opacity), S(x) = 1 / (1 + exp(-100 (x - 0.995))), rate the papers'
-        for centres."""
+        """Add covariance * noise * 5e5 * rate * S(1 - opacity) to the centres, with S(x) = 1 / (1 + exp(-100 (x -
+        0.995))) and rate the papers' learning rate of centres."""
         opacity = torch.sigmoid(parameters["raw_opacity"]).numpy().astype(np.float64)
         # S is below 1e-9 for opacities over 0.22.
         rows = np.flatnonzero(opacity < 0.22)
@@ -229,12 +231,13 @@ class McmcControl(DensityControl):
 
 
 def relocated(opacity: np.ndarray, copies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(P,) opacity of each of N `copies` that stand for one Gaussian, and (P,) factor of its standard deviations.
+    """Return (P,) the opacity of each of N `copies` that replace one Gaussian, and (P,) the factor of its standard
+    deviations.
 
     o' = 1 - (1 - o)^(1/N);  factor = o / sum_{i=1..N} sum_{k=0..i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1).
-    The inner sums add up, by sum_{i=k+1..N} C(i-1, k) = C(N, k+1), to sum_{k=1..N} C(N, k) (-1)^(k+1) o'^k / sqrt(k).
+    With sum_{i=k+1..N} C(i-1, k) = C(N, k+1), the double sum becomes sum_{k=1..N} C(N, k) (-1)^(k+1) o'^k / sqrt(k).
 
-    o' is then kept within 0.005 and 1 - 1e-6. Source: Kheradmand et al. 2024, equation 9.
+    o' is then clamped to 0.005 and 1 - 1e-6. Source: Kheradmand et al. 2024, equation 9.
     """
     opacity = np.minimum(opacity, 1 - 1e-6)
     shared = -np.expm1(np.log1p(-opacity) / copies)
@@ -246,13 +249,15 @@ def relocated(opacity: np.ndarray, copies: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def in_view(parameters, camera: Camera, kind: str, ray_model: str = "exact") -> torch.Tensor:
-    """(N,) bool: the primitive's bounding sphere (3 standard deviations of a Gaussian) may reach into the image.
+    """Return (N,) bool: whether the bounding sphere of a primitive (3 standard deviations of a Gaussian) may reach into
+    the image.
 
     As in the kernels, a polyhedron with exact rays counts as soon as a part of it lies beyond the near plane, wherever
-    its centre is; a Gaussian, and a polyhedron with affine rays, if its centre does.
+    its centre is. A Gaussian, or a polyhedron with affine rays, counts only if its centre lies beyond it.
     """
     pose = torch.from_numpy(camera.world_to_camera[:3].astype(np.float32))
-    # A sum of three, no matrix product: the library for those has other code for the processors of each maker.
+    # A sum of three products instead of a matrix product: BLAS results differ in the last bits between processor
+    # makers.
     local = (parameters["center"].detach()[:, None] * pose[:, :3]).sum(2) + pose[:, 3]
     solid, near = KINDS[kind].solid, KINDS[kind].near
     reach = exponential(parameters["log_extent"].detach().amax(1)) * (1 if solid else 3)

@@ -1,8 +1,8 @@
-"""One training step and the state it changes: raw parameters, Adam's moments, the 3D filter, what density control has
-accumulated.
+"""One training step and the state that it changes: raw parameters, Adam's moments, the 3D filter, and the values
+accumulated for density control.
 
-Whatever is random is drawn from a generator seeded by (seed, purpose, step), so the state needs no generator and a
-resumed run repeats the interrupted one bit for bit.
+All random numbers are seeded by (seed, purpose, step). The state therefore contains no generator, and a resumed run
+repeats the interrupted one bit for bit.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ CONTROLS: dict[str, type[DensityControl]] = {
     "mcmc": McmcControl,
 }
 
-# Learning rates at the start of a run, for the training frame, where cameras see their subject from a distance of 3;
-# all fall exponentially to the given part of themselves.
+# Learning rates at the start of a run, in the training frame, in which cameras are at a distance of about 3 from their
+# subject; and the factor to which each has decayed (exponentially) at the end.
 RATES = {
     "center": (1.5e-3, 0.02),
     "rotation": (7e-3, 0.1),
@@ -52,28 +52,28 @@ RATES = {
     "background": (5e-3, 0.1),
     "environment": (5e-3, 0.1),
 }
-# Parameters of the whole scene; the others have a row per primitive.
+# Parameters with one value for the scene; all others have one row per primitive.
 SHARED = frozenset({"background", "environment"})
-# Parts of the run after which all views are looked at together, before an environment.
+# Shares of the run after which `_check_support` examines all views together, if there is an environment map.
 SUPPORT_CHECKED_AT = (0.1, 0.2, 0.35, 0.5, 0.7)
-# Light that passes primitives to this part tells little of the environment: Adam would move its texels as fast as those
-# in full view.
+# Transmittance below which a pixel says little about the environment map. With a tiny epsilon, Adam would update the
+# texels behind it as fast as texels in full view.
 FAINT = 0.5
-# Adam's epsilon elsewhere.
+# Adam's epsilon for all parameters except the environment map.
 ADAM_EPSILON = 1e-15
-# Weight of `contradiction` in the loss.
+# Weight of the `contradiction` term in the loss.
 CONTRADICTION = 0.5
-# Raw opacity of a primitive that is to be moved: an opacity of 0.0003.
+# Raw opacity given to a primitive that density control should relocate: an opacity of 0.0003.
 TRANSPARENT = -8.0
-# An octahedron's half-axes, and as large extents of the other kinds (Kind.size), stay within these: a part of a pixel
-# at the distance of the subject, and of the scene's radius.
+# Bounds of the extents, for octahedra (scaled by Kind.size for the other kinds): pixels at the distance of the subject,
+# and a fraction of the scene's radius.
 SMALLEST_PX, LARGEST_PART = 0.35, 0.5
-# Share of the run after which each further degree of view-dependent colour joins.
+# Share of the run after which the spherical harmonics degree is raised by one.
 DEGREE_EVERY = 0.07
 
 
 def _single(out: ops.Rendering) -> ops.Rendering:
-    """The rendering in float32, in which the loss and the optimiser work."""
+    """Convert a rendering to float32, in which the loss and the optimiser work."""
     if out.rgb.dtype == torch.float32:
         return out
     planes = {field.name: getattr(out, field.name) for field in fields(out)}
@@ -83,8 +83,8 @@ def _single(out: ops.Rendering) -> ops.Rendering:
 
 
 class Trainer:
-    """The state of a training and one step of it. `parameters`, `first` and `second` (Adam's moments) share their
-    keys."""
+    """The state of a training, and the step that changes it. `parameters`, `first` and `second` (Adam's moments) have
+    the same keys."""
 
     def __init__(
         self,
@@ -99,8 +99,8 @@ class Trainer:
         log_gain: np.ndarray | None = None,
         environment: torch.Tensor | None = None,
     ):
-        """`log_gain` (V, 3): where the gains of the photographs begin, with `--exposure gain`. `environment` (6, S, S,
-        3): texels of what stands behind everything, in place of a background, to begin with."""
+        """`log_gain` (V, 3): initial log gains of the photographs, for `--exposure gain`. `environment` (6, S, S, 3):
+        initial texels of an environment map that replaces the background."""
         self.images, self.options, self.bounds, self.terms = images, options, bounds, terms
         self.parameters = dict(parameters)
         self.fitted, self.random_background = fitted, random_background
@@ -108,8 +108,8 @@ class Trainer:
         if fitted:
             self.parameters["background"] = background
         self.support_checks = {round(share * options.iterations) for share in SUPPORT_CHECKED_AT}
-        # Gradient of the loss to a texel through which a pixel's light passes to this part: below it Adam's steps get
-        # small.
+        # Adam's epsilon for the environment map: the loss gradient of a texel seen by one pixel with transmittance
+        # FAINT. Texels with smaller gradients take smaller steps.
         camera = images[0].camera
         self.faint = FAINT / (3 * camera.width * camera.height)
         if environment is not None:
@@ -118,23 +118,24 @@ class Trainer:
         self.second = {k: torch.zeros_like(v) for k, v in self.parameters.items()}
         self.exposure = Exposure(len(images), log_gain) if options.exposure == "gain" else None
         self.step = 0
-        # (step, iterations): from this step on the run is to end after so many, what is left of its schedules stretched
-        # to fit.
+        # (step, iterations): from `step` on, the run is to end after `iterations` steps, and the rest of its schedules
+        # is stretched or compressed to fit.
         self.correction: tuple[int, int] | None = None
-        self.steps = torch.zeros(len(self), dtype=torch.int32)  # sparse Adam: updates of each primitive
+        self.steps = torch.zeros(len(self), dtype=torch.int32)  # sparse Adam: number of updates of each primitive
         self.seconds = 0.0
         self.loss = self.psnr = math.nan  # running means
         self.dropout = 0.0 if isinstance(options.dropout, str) else options.dropout
         self.kind, self.raster_options = options.primitive, raster_options(options)
         self.control = CONTROLS[options.population](options, len(self), [image.camera for image in images], bounds)
         self.filter_3d: torch.Tensor | None = None
-        # Primitives that stay as they are, as the rasterizer takes them: they stand for what others train.
+        # Frozen primitives as rasterizer inputs: rendered but not trained. They stand for parts of the scene that
+        # others train.
         self.frozen: Tensors | None = None
         self._refilter()
 
     @property
     def environment(self) -> torch.Tensor | None:
-        """(6, S, S, 3) texels of what stands behind everything, if there is an environment."""
+        """Return the (6, S, S, 3) texels of the environment map, or None."""
         return self.parameters.get("environment")
 
     def __len__(self) -> int:
@@ -142,13 +143,13 @@ class Trainer:
 
     @property
     def iterations(self) -> int:
-        """Steps of the whole run, as far as this step knows."""
+        """Return the number of steps of the whole run, including a correction made up to this step."""
         if self.correction is None or self.step < self.correction[0]:
             return self.options.iterations
         return self.correction[1]
 
     def part(self) -> float:
-        """Share of the run's schedules, 0 to 1, that lies behind this step: of learning rates, and of what begins
+        """Return the share of the run's schedules that has passed, 0 to 1: for learning rates and terms that start
         late."""
         if self.correction is None or self.step < self.correction[0]:
             return self.step / self.options.iterations
@@ -157,18 +158,19 @@ class Trainer:
         return begun + (1 - begun) * (self.step - bend) / (last - bend)
 
     def has_reached(self, share: float) -> bool:
-        """Whether this step lies in what follows the first `share` of the run."""
+        """Return whether at least `share` of the run has passed."""
         if self.correction is None or self.step < self.correction[0]:
             return self.step >= share * self.options.iterations
         return self.part() >= share
 
     @property
     def degree(self) -> int:
-        """Degree of the view-dependent colour at this step."""
+        """Return the spherical harmonics degree in use at this step."""
         return min(self.options.sh_degree, int(self.step / (DEGREE_EVERY * self.options.iterations)))
 
     def raster_options_now(self) -> dict:
-        """The keywords of `ops.rasterize` at this step: until --order-from blending takes the order of the centres."""
+        """Return keyword arguments for `ops.rasterize` at this step. Before --order-from, primitives are blended in the
+        order of their centres."""
         return (
             self.raster_options
             if self.has_reached(self.options.order_from)
@@ -176,12 +178,13 @@ class Trainer:
         )
 
     def view_of(self, step: int) -> int:
-        """Index of the view of a step: every view once per round, in an order drawn per round."""
+        """Return the index of the view rendered in a step. Each round visits all views once, in a random order drawn
+        per round."""
         turn, place = divmod(step, len(self.images))
         return int(np.random.default_rng([self.options.seed, 3, turn]).permutation(len(self.images))[place])
 
     def advance(self) -> None:
-        """One training step.
+        """Run one training step.
 
         Raises:
             LinprimError: a parameter or the loss is no longer finite.
@@ -206,7 +209,8 @@ class Trainer:
         behind = self._flat(background).to(active[0].dtype)
         late = self.has_reached(self.options.geometry_from)
         weights = {} if self.terms is None else self.terms.weights(index, self.step, late)
-        # Geometry has no average over the rays of a pixel: with several of them it is rendered by itself.
+        # Depth and normals are not averaged over several samples per pixel, so with supersampling they need a rendering
+        # of their own.
         needed = needs_geometry(weights)
         shared = needed and self.options.samples == 1
         how = {"stop": self.options.stop, **self.raster_options_now()}
@@ -221,7 +225,7 @@ class Trainer:
         shown, log_gain = out.rgb, None
         if self.exposure is not None:
             log_gain = self.exposure.row(index)
-            # A colour that was drawn, or that stands for what a mask left out, is not in the photograph.
+            # A random background, or one behind a mask, is not part of the photograph, so no gain applies to it.
             drawn = self.random_background or image.alpha is not None
             rest = background[:, None, None] * (1 - out.opacity) if drawn else None
             shown = exposed(out.rgb, log_gain, target, rest)
@@ -258,7 +262,7 @@ class Trainer:
         self._average(*parts.detach()[::3].tolist())
 
     def _average(self, loss: float, squared_error: float) -> None:
-        """Takes a step's loss and mean squared error into the running means."""
+        """Update the running means of loss and PSNR with a step's loss and mean squared error."""
         if not math.isfinite(loss):
             raise LinprimError(f"the loss is {loss}")
         psnr = -10 * math.log10(max(squared_error, 1e-12))
@@ -330,8 +334,8 @@ class Trainer:
 
     @torch.no_grad()
     def _check_support(self) -> None:
-        """Before an environment: makes primitives transparent that one view alone sees, so that growth moves them to
-        where they are needed, and gives texels that no view sees past the primitives the colours round them."""
+        """With an environment map: make primitives transparent that only one view sees, so that density control
+        relocates them, and give texels that no view sees past the primitives the colours of their surroundings."""
         if self.environment is None:
             return
         support = Support(self.parameters["center"])
@@ -354,14 +358,14 @@ class Trainer:
         self.parameters["raw_opacity"][support.alone()] = TRANSPARENT
 
     def _refilter(self) -> None:
-        """Makes the 3D filter for where the primitives are now."""
+        """Recompute the 3D filter for the current positions of the primitives."""
         if self.options.filter != "none":
             cameras = [image.camera for image in self.images]
             self.filter_3d = filter_lengths(self.parameters["center"], cameras)
 
     @torch.no_grad()
     def render(self, camera: Camera, background: torch.Tensor) -> torch.Tensor:
-        """(3, H, W) colour of a camera in the training frame, at the photographs' mean exposure."""
+        """Return the (3, H, W) colours for a camera in the training frame, at the photographs' mean exposure."""
         active = self._cast(*self._with_frozen(activate(self.parameters, self.degree, self.kind, self.filter_3d)))
         out = _single(
             ops.rasterize(
@@ -378,11 +382,11 @@ class Trainer:
         return out.rgb + ops.environment_light(out.opacity, self.environment, camera, self.options.stop)
 
     def _flat(self, background: torch.Tensor) -> torch.Tensor:
-        """The background that primitives are rendered over: black where an environment follows."""
+        """Return the background colour for the rasterizer: black if an environment map is added afterwards."""
         return background if self.environment is None else torch.zeros(3)
 
     def _with_frozen(self, active: Tensors) -> Tensors:
-        """The active tensors, and after them the frozen ones with as many harmonics."""
+        """Return the active tensors followed by the frozen primitives, with the same number of spherical harmonics."""
         if self.frozen is None:
             return active
         *rest, sh = self.frozen
@@ -392,24 +396,24 @@ class Trainer:
         return center, rotation, extent, density, colors
 
     def _cast(self, center: Tensor, rotation: Tensor, extent: Tensor, density: Tensor, sh: Tensor) -> Tensors:
-        """What the kernels take: with `--scalar float64` the same numbers in double."""
+        """Convert rasterizer inputs to double precision with `--scalar float64`."""
         if self.options.scalar == "float64":
             return center.double(), rotation.double(), extent.double(), density.double(), sh.double()
         return center, rotation, extent, density, sh
 
     def shown_background(self) -> torch.Tensor:
-        """(3,) the background that renders and scores use."""
+        """Return the (3,) background colour used for renders and scores."""
         return self.parameters["background"].detach() if self.fitted else self.background
 
     def primitives(self) -> Primitives:
-        """The primitives as the rasterizer takes them, the 3D filter included, in the training frame."""
+        """Return the primitives as rasterizer inputs in the training frame, with the 3D filter included."""
         with torch.no_grad():
             active = activate(self.parameters, self.options.sh_degree, self.kind, self.filter_3d)
             center, rotation, extent, density, sh = (tensor.numpy().copy() for tensor in active)
             return Primitives(center, rotation, extent, density, sh, self.kind)
 
     def state(self) -> dict:
-        """Everything a resumed run needs, as tensors and numbers."""
+        """Return everything that a resumed run needs, as tensors and numbers."""
         return {
             "parameters": self.parameters,
             "first": self.first,
@@ -426,7 +430,7 @@ class Trainer:
         } | ({} if self.exposure is None else {"exposure": self.exposure.state()})
 
     def restore(self, state: dict) -> None:
-        """Takes back what `state` returned."""
+        """Restore what `state` returned."""
         for name in ("parameters", "first", "second"):
             if set(state[name]) != set(getattr(self, name)):
                 raise ValueError(f"{name} has {sorted(state[name])}, wanted {sorted(getattr(self, name))}")

@@ -1,5 +1,4 @@
-"""Photographs as training uses them: bytes in memory as far as these take a part of it, else read from their files when
-they are due."""
+"""Training photographs: kept in memory up to a limit, the others decoded from their files each time they are needed."""
 
 from __future__ import annotations
 
@@ -17,16 +16,16 @@ from linprim_geo.base.memory import available_memory
 from linprim_geo.capture.types import View
 from linprim_geo.geometry.camera import Camera, Similarity
 
-# Photographs are kept in memory up to this share of what is available, and so many bytes: a step on large ones takes
-# tens of times as long as reading one. Of the others the last few that were read are kept.
+# Photographs are kept in memory up to MEMORY_SHARE of the available memory and at most MOST_KEPT bytes; for large ones
+# a step takes tens of times as long as reading one. Of the others, the RECENT last decoded ones are kept.
 MEMORY_SHARE, MOST_KEPT, RECENT = 0.25, 3 * 2**29, 2
 
 
 @dataclass(frozen=True)
 class TrainingImage:
-    """A view in memory: `rgb` (3, H, W) uint8, `alpha` (H, W) uint8 or None, its camera in the training frame.
+    """A view in memory: `rgb` (3, H, W) uint8, `alpha` (H, W) uint8 or None, and its camera in the training frame.
 
-    `photo` is (width, height) of the photograph that it is cut out of, None where it is the whole.
+    If it is a crop, `photo` is the (width, height) of the whole photograph, else None.
     """
 
     name: str
@@ -37,16 +36,16 @@ class TrainingImage:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) of the whole photograph."""
+        """Return (width, height) of the whole photograph."""
         return self.photo or (self.camera.width, self.camera.height)
 
     @property
     def weight(self) -> float:
-        """Its share of the pixels of the whole photograph, which its loss counts by."""
+        """Return the crop's share of the pixels of the whole photograph, by which its loss is weighted."""
         return self.camera.width * self.camera.height / (self.size[0] * self.size[1])
 
     def over(self, background: torch.Tensor) -> torch.Tensor:
-        """(3, H, W) float32 in [0, 1], over `background` (3,) where alpha lets it through."""
+        """Return the (3, H, W) float32 colours in [0, 1], composited over `background` (3,) by alpha."""
         rgb = self.rgb.to(torch.float32).mul_(1 / 255)
         if self.alpha is None:
             return rgb
@@ -55,13 +54,13 @@ class TrainingImage:
 
 
 class UnreadablePhoto(LinprimError):
-    """A photograph that could be read when training began no longer can."""
+    """A photograph that was readable when training began cannot be read any more."""
 
 
 class LazyTrainingImage(TrainingImage):
-    """The same, read whenever it is used.
+    """A training image that is decoded whenever it is used.
 
-    `read` gives it, and `recent` holds what was read last, for all that share it.
+    `read` decodes it. `recent` is a cache of the last decoded images, shared by all images.
     """
 
     _read_it: Callable[[], TrainingImage]
@@ -102,30 +101,32 @@ class LazyTrainingImage(TrainingImage):
 
     @property
     def rgb(self) -> torch.Tensor:
-        """(3, H, W) uint8."""
+        """Return (3, H, W) uint8."""
         return self._read().rgb
 
     @property
     def alpha(self) -> torch.Tensor | None:
-        """(H, W) uint8, or None."""
+        """Return (H, W) uint8, or None."""
         return self._read().alpha if self._has_alpha else None
 
 
 def photo_bytes(views: tuple[View, ...]) -> int:
-    """What all of them take in memory."""
+    """Return the bytes that all views together take in memory."""
     return sum(view.camera.width * view.camera.height * (4 if view.has_alpha else 3) for view in views)
 
 
 def photo_limit() -> int:
-    """Bytes of photographs that are kept in memory now."""
+    """Return how many bytes of photographs may be kept in memory now."""
     return min(int(MEMORY_SHARE * available_memory()), MOST_KEPT)
 
 
 def load_training_images(
     views: tuple[View, ...], similarity: Similarity, limit: int | None = None
 ) -> list[TrainingImage]:
-    """The views in their order. The first of them that take up to `limit` bytes are decoded into memory, the others
-    when they are used: the results of training are the same.
+    """Return the views as training images, in their order.
+
+    The first ones, up to `limit` bytes, are decoded into memory, the others when they are used. The result of training
+    does not depend on this.
 
     Args:
         limit: bytes; default `photo_limit()`.
