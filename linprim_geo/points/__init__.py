@@ -1,1 +1,1 @@
-"""Where a training starts: the capture's points, new ones, and what photographs say of them."""
+"""Initial points of a training: those of the capture, new ones, and what photographs show at them."""

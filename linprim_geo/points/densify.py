@@ -1,11 +1,10 @@
-"""Points to start from where features found none: on plain walls, and on things that structure from motion overlooked.
+"""Add initial points where features found none, such as plain walls and objects that structure from motion missed.
 
-Growth only splits primitives that are there, so a surface without a start is either left open or covered by primitives
-that drift in front of it. Two sources fill the gaps, both checked against all the photographs: the points that surround
-a gap, between which inverse depth is linear on a plane, and where these are too far apart or too unlike, the depth at
-which other views show the same colours. What has neither starts behind everything that is known: nearer, it would be
-fog between the cameras, which those that look past it do not see. Of a masked object it starts beside the nearest
-points.
+Density control only splits existing primitives, so a surface without initial points stays open or is covered by
+primitives that drift in front of it. Depths come from the surrounding points (inverse depth is linear on a plane);
+where these are too sparse or differ too much, from patches that match in other views. Both are checked against all
+photographs. Where neither works, points start at the far end of the scene, because nearer ones would be floaters; on
+masked objects they start at the depth of the nearest points.
 """
 
 from __future__ import annotations
@@ -21,66 +20,68 @@ from linprim_geo.geometry.sampling import sample_bilinear
 from linprim_geo.points.far_colors import FarColors
 from linprim_geo.points.initial_points import SmallView, evenly_spread_views, in_image
 
-# A cell of the image, as a share of its longer side, is to hold a point: about 1,400 cells of 4:3, fewer than the
-# primitives that a view ends up with, so that what is found by features is hardly ever doubled. Depths from colours are
-# coarser: they match patches.
+# Side of an image cell that should hold a point, as a share of the image's longer side. This makes about 1,400 cells in
+# a 4:3 image, fewer than the primitives that a view ends up with, so points found by features are rarely doubled. Cells
+# are larger for depths from colours, which are coarser because patches are matched.
 CELL, PATCH_CELL = 12 / 512, 18 / 512
-# Views that take part; more say little that is new.
+# Largest number of views used; more add little.
 MOST_VIEWS = 100
-# A triangle of three neighbouring points spans a surface if their depths differ by at most this factor ...
+# A triangle of three neighbouring points is taken for a surface if their depths differ by at most this factor ...
 _MAX_DEPTH_RATIO = 1.15
-# ... and speaks for the space in front of it if its sides are no longer than this many cells.
+# ... and shows that the space in front of it is free if its sides are no longer than this many cells.
 _TRUSTED_CELLS = 2.0
-# Inverse depths that differ by less agree; interpolated points miss a surface by less than half of it in 90 of 100
-# cases.
+# Relative difference up to which inverse depths agree. Interpolated points miss a surface by less than half of this in
+# 90 of 100 cases.
 _TOLERANCE = 0.05
-# A point in front of a surface that others see through it is dropped unless this many times as many views confirm it.
+# A point that some views see through, to a surface behind it, is dropped unless this many times as many views confirm
+# it.
 _CONFIRMATIONS = 4
-# A point is hidden in a view if two of its 8 nearest in the image, within two cells, are nearer by this factor.
+# A point is occluded in a view if at least _HIDDEN_BY of its _NEIGHBOURS nearest points in the image, within two cells,
+# are nearer to the camera by the factor _HIDDEN_RATIO.
 _HIDDEN_RATIO, _HIDDEN_BY, _NEIGHBOURS = 1.15, 2, 8
 _MIN_POINTS = 8
-# Views to compare colours with see the place from another angle, in degrees, the best of them near the middle one;
-# fewer than half of them may be hidden.
+# Smallest, best and largest angle in degrees between a view and its source views; source views must also look in a
+# similar direction (_MIN_AXIS_COSINE). There are at most _SOURCES; a point may be occluded in fewer than half of them.
 _ANGLES = (4.0, 12.0, 40.0)
 _MIN_AXIS_COSINE = 0.7
 _SOURCES = 6
-# A patch is this many by this many samples, so many pixels of a look (512 on its longer side) apart.
+# A patch has _PATCH by _PATCH samples, _PATCH_STEP pixels of a reduced photograph (512 on its longer side) apart.
 _PATCH, _PATCH_STEP = 5, 3
-# Patches are the same if their colours differ by less on average, of 255: noise and the interpolation of what is finer
-# than a pixel.
+# Two patches match if their mean colour difference, of 255, is below this: noise and interpolation of sub-pixel detail.
 _SAME_COLOR = 6.0
-# One depth explains photographs better than another by this, of 255: three standard deviations of a patch's mean
-# difference where pixels have noise of 3.
+# Smallest difference in patch error, of 255, by which one depth is better than another: three standard deviations of a
+# patch's mean difference at a pixel noise of 3.
 _BETTER = 1.5
-# Depths tried, evenly spread in inverse depth over what the view's points span, widened by the factors.
+# Number of depth hypotheses, evenly spaced in inverse depth over the range of the view's points, extended by the
+# factors _NEARER and _FARTHER.
 _DEPTHS = 64
 _NEARER, _FARTHER = 2.0, 1.2
-# Patches compared at once, at all their depths; more take memory and no less time.
+# Patches compared at once, at all their depths. Larger batches take more memory and no less time.
 _AT_ONCE = 64
-# Colours this near to a backdrop's, per channel of 255, belong to it.
+# Largest difference per channel, of 255, from a backdrop's colour for a pixel to belong to it.
 _BACKDROP = 25.5
 
 
 def densify(scene: Scene, seed: int, backdrop: np.ndarray | None = None, far: FarColors | None = None) -> PointCloud:
-    """The scene's points and, after them, new ones in the image cells of training views that hold none.
+    """Return the scene's points followed by new ones in the image cells of training views that contain none.
 
-    View by view, those with most points first, every cell that neither a given nor a new point falls into gets a
-    candidate, at a random place in it. Its depth is that between the three points round it (inverse depth is linear
-    over a plane) if theirs agree, or else, in a second round with larger cells, the one of 64 at which the patch round
-    it looks the same in other views, or else, in a third, the farthest of these, on masked objects that of the nearest
-    points. A candidate is kept if it looks the same in other views, which one of the third round need not, and if
-    hardly any view sees surfaces through it. Masked background, and pixels of the colour of a plain backdrop, get no
-    points. Colours are those of the photograph.
+    In three rounds, views are visited in order of their number of points. Each empty cell gets a candidate at a random
+    position in it. Its depth is, in the first round, interpolated between the three points around it (inverse depth is
+    linear on a plane) if theirs are similar; in the second, with larger cells, the one of 64 depths at which the patch
+    around it matches other views; in the third, the farthest of these depths, or on masked objects the depth of the
+    nearest points. A candidate is kept if hardly any view sees surfaces through it and, in the first two rounds, if its
+    patch matches in other views. Masked background and pixels with the colour of a plain backdrop get no points.
+    Colours come from the photograph.
 
     Args:
         scene: with points; held-out views are not used.
-        seed: of the places in the cells.
+        seed: for the positions in the cells.
         backdrop: (3,) colour in [0, 1] of a plain backdrop, or None.
-        far: of an open scene, what its photographs show at infinity. Then only candidates between points are made, and
-            kept where infinity does not explain the photographs better: a patch compared over all depths finds one for
-            the background, too.
+        far: colours at infinity of an open scene. Then only the first round is run, and a candidate is dropped if
+            infinity explains the photographs better: matching a patch over all depths would find one for the background
+            too.
 
-    Returns: the cloud, without errors in pixels; the scene's own if nothing was found.
+    Returns: the cloud, without errors in pixels, or the scene's own if nothing was found.
     """
     cloud = scene.points
     assert cloud is not None, "of a scene without points there is nothing to fill"
@@ -89,12 +90,12 @@ def densify(scene: Scene, seed: int, backdrop: np.ndarray | None = None, far: Fa
     rng = np.random.default_rng([seed, 8])
     sources_of_depth = [_between_points]
     if far is None:
-        # All that a mask shows is the object.
+        # On a masked scene, every foreground pixel belongs to the object.
         sources_of_depth += [_same_colors, _nearest_points if scene.has_alpha else _behind_all]
     found = [np.empty((0, 3))]
     colors = [np.empty((0, 3), np.uint8)]
     for source in sources_of_depth:
-        if source is not _between_points:  # by now there are more points, and more space is known to be free
+        if source is not _between_points:  # include the points found so far, which also extend the known free space
             views = [_Gaps(view.small_view, np.concatenate([cloud.xyz, *found])) for view in views]
         cell = CELL if source is _between_points else PATCH_CELL
         for index in np.argsort([-len(view.pixels) for view in views], kind="stable"):
@@ -121,7 +122,8 @@ def densify(scene: Scene, seed: int, backdrop: np.ndarray | None = None, far: Fa
 
 
 class _Gaps:
-    """A view, the points it sees, and the triangles between them: `pixels` (P, 2) and `inverse` (P,) depths."""
+    """A view with the points that it sees and their Delaunay triangulation: `pixels` (P, 2) and `inverse` depths
+    (P,)."""
 
     def __init__(self, small_view: SmallView, xyz: np.ndarray):
         self.small_view, self.camera = small_view, small_view.camera
@@ -138,7 +140,7 @@ class _Gaps:
 
     @property
     def usable(self) -> bool:
-        """Whether there are triangles; points may be too few, or all on a line."""
+        """Return whether there are triangles; points may be too few or collinear."""
         return self.triangulation is not None
 
     @cached_property
@@ -154,21 +156,21 @@ class _Gaps:
 
     @cached_property
     def ratio(self) -> np.ndarray:
-        """(T,) largest by smallest depth of a triangle's corners."""
+        """Return (T,) the largest divided by the smallest depth of each triangle's corners."""
         corners = self.inverse[self.triangulation.simplices]
         return corners.max(1) / corners.min(1)
 
     @cached_property
     def trusted(self) -> np.ndarray:
-        """(T,) whether a triangle is small and even enough to stand for a surface."""
+        """Return (T,) whether a triangle is small enough, and its depths similar enough, to represent a surface."""
         corners = self.pixels[self.triangulation.simplices]
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
         return (sides <= _TRUSTED_CELLS * CELL * self.longer_side) & (self.ratio <= _MAX_DEPTH_RATIO)
 
     @cached_property
     def image(self) -> np.ndarray:
-        """(H, W, 3) uint16, the sum over 3x3 pixels, so that bilinear samples of it do not alias. All views have theirs
-        in memory."""
+        """Return (H, W, 3) uint16, the sum over 3x3 pixels, so that bilinear samples of it do not alias. It is kept in
+        memory for all views."""
         from scipy.ndimage import uniform_filter
 
         return np.rint(9 * uniform_filter(self.small_view.rgb.astype(np.float32), (3, 3, 1), mode="nearest")).astype(
@@ -176,17 +178,19 @@ class _Gaps:
         )
 
     def interpolate(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """((Q,) triangle or -1, (Q,) inverse depth inside it) at (Q, 2) positions."""
+        """Return, at (Q, 2) positions, the (Q,) index of the triangle, or -1, and the (Q,) interpolated inverse
+        depth."""
         triangle = self.triangulation.find_simplex(pixels)
         affine = self.triangulation.transform[triangle]
         first = np.einsum("qij,qj->qi", affine[:, :2], pixels - affine[:, 2])
         weight = np.concatenate([first, 1.0 - first.sum(1, keepdims=True)], axis=1)
         inverse = (weight * self.inverse[self.triangulation.simplices[triangle]]).sum(1)
-        # Slivers have no transform.
+        # Degenerate triangles have no barycentric transform.
         return np.where(np.isfinite(inverse), triangle, -1), np.nan_to_num(inverse)
 
     def empty_cells(self, xyz: np.ndarray, cell: float, rng: np.random.Generator) -> np.ndarray:
-        """(Q, 2) random positions, one in each cell that neither a seen point nor one of (N, 3) `xyz` falls into."""
+        """Return (Q, 2) random positions, one in each cell that contains neither a visible point nor one of (N, 3)
+        `xyz`."""
         size = np.array([self.camera.width, self.camera.height])
         count = np.maximum(1, np.round(size / (cell * self.longer_side))).astype(np.int64)
         taken = np.zeros((count[1], count[0]), dtype=bool)
@@ -198,7 +202,7 @@ class _Gaps:
         return (np.stack([column, row], axis=1) + rng.random((len(row), 2))) * (size / count)
 
     def shows_something(self, pixels: np.ndarray, backdrop: np.ndarray | None) -> np.ndarray:
-        """(Q,) whether the photograph has neither background nor backdrop at (Q, 2) positions."""
+        """Return (Q,) whether the photograph shows neither masked background nor backdrop at (Q, 2) positions."""
         column, row = pixels.astype(np.int64).T
         shown = np.ones(len(pixels), dtype=bool)
         if self.small_view.foreground is not None:
@@ -208,17 +212,17 @@ class _Gaps:
         return shown
 
     def depths_to_try(self) -> np.ndarray:
-        """(D,) inverse depths."""
+        """Return the (D,) inverse depth hypotheses of this view."""
         far, near = np.percentile(self.inverse, [1, 99])
         return np.linspace(far / _FARTHER, near * _NEARER, _DEPTHS)
 
     def points_at(self, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-        """(..., 3) world points at (..., 2) positions and (...) inverse depths."""
+        """Return (..., 3) world points at (..., 2) positions and (...) inverse depths."""
         return self.camera.center + _rays(self.camera, pixels) / inverse[..., None]
 
     def _nearest_of_each_place(self) -> np.ndarray:
-        """(K,) rows of the point nearest to the camera in each half by half cell: triangles need no more, and take
-        time."""
+        """Return (K,) rows of the nearest point in each cell of half size: a finer triangulation is not needed and
+        takes time."""
         size = 0.5 * CELL * self.longer_side
         column, row = (self.pixels / size).astype(np.int64).T
         order = np.lexsort((-self.inverse, column, row))
@@ -241,8 +245,8 @@ class _Gaps:
 def _not_farther(
     view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray, inverse: np.ndarray, at_infinity: Callable | None
 ) -> np.ndarray:
-    """(Q,) whether photographs at (Q, 2) positions agree at these inverse depths about as well as at infinity, as far
-    as that is known."""
+    """Return (Q,) whether the photographs at (Q, 2) positions match at these inverse depths about as well as at
+    infinity, or infinity is unknown."""
     if at_infinity is None:
         return np.ones(len(pixels), dtype=bool)
     near = _differences(view, sources, pixels, inverse[:, None])[:, 0]
@@ -250,8 +254,8 @@ def _not_farther(
 
 
 def _between_points(view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Those of the (Q, 2) positions that lie in a triangle of points of similar depth, and their inverse depths
-    there."""
+    """Return the positions, of (Q, 2), inside a triangle of points of similar depth whose patches match there, and
+    their interpolated inverse depths."""
     triangle, inverse = view.interpolate(pixels)
     usable = (triangle >= 0) & (view.ratio[triangle] <= _MAX_DEPTH_RATIO)
     pixels, inverse = pixels[usable], inverse[usable]
@@ -260,8 +264,7 @@ def _between_points(view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray) -
 
 
 def _same_colors(view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Those of the (Q, 2) positions that other views show alike at some inverse depth, and the one where they do
-    best."""
+    """Return the positions, of (Q, 2), whose patches match other views at some inverse depth, and the best one."""
     tried = view.depths_to_try()
     difference = _differences(view, sources, pixels, np.broadcast_to(tried, (len(pixels), len(tried))))
     alike = difference.min(1) <= _SAME_COLOR
@@ -269,7 +272,7 @@ def _same_colors(view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray) -> t
 
 
 def _nearest_points(view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """All of the (Q, 2) positions, and the median inverse depth of the points nearest to them in the image."""
+    """Return all (Q, 2) positions and, for each, the median inverse depth of the nearest points in the image."""
     from scipy.spatial import cKDTree
 
     _, near = cKDTree(view.pixels).query(pixels, k=_NEIGHBOURS)
@@ -277,18 +280,19 @@ def _nearest_points(view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray) -
 
 
 def _behind_all(view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """All of the (Q, 2) positions, at the farthest depth that is tried."""
+    """Return all (Q, 2) positions, at the farthest depth hypothesis."""
     return pixels, np.full(len(pixels), view.depths_to_try()[0])
 
 
 def _rays(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """(..., 3) world rays of depth 1 through (..., 2) positions."""
+    """Return (..., 3) rays in world axes, of z-depth 1, through (..., 2) positions."""
     local = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     return np.concatenate([local, np.ones((*local.shape[:-1], 1))], axis=-1) @ camera.rotation
 
 
 def _sources(views: Sequence[_Gaps], index: int) -> list[_Gaps]:
-    """At most 6 other views that see what a view looks at from an angle of 4 to 40 degrees, those near 12 first."""
+    """Return at most 6 source views whose angle to what this view looks at is from 4 to 40 degrees, those closest to 12
+    first."""
     camera = views[index].camera
     target = camera.center + camera.rotation[2] / np.median(views[index].inverse)
     towards = np.array([view.camera.center for view in views]) - target
@@ -302,11 +306,11 @@ def _sources(views: Sequence[_Gaps], index: int) -> list[_Gaps]:
 
 
 def _differences(view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """(Q, D) mean difference of colour, of 255, between patches of a view and of the half of the sources where it is
-    least.
+    """Return (Q, D) mean colour differences, of 255, between patches of a view and of its source views, averaged over
+    the half of the source views where they are smallest.
 
-    Patches are parallel to the image, at (Q, 2) positions and (Q, D) inverse depths. Infinite where fewer than two
-    sources see one.
+    Patches are parallel to the image plane, at (Q, 2) positions and (Q, D) inverse depths. The result is infinite where
+    fewer than two source views see the patch.
     """
     if len(pixels) > _AT_ONCE:
         parts = [slice(begin, begin + _AT_ONCE) for begin in range(0, len(pixels), _AT_ONCE)]
@@ -319,7 +323,8 @@ def _differences(view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray, inve
     rays = _rays(view.camera, places)
     result = np.full((max(len(sources), 2), *inverse.shape), np.inf)
     for number, source in enumerate(sources):
-        # A point is center + ray / inverse; in the source's camera, up to scale, inverse * (center there) + ray there.
+        # A point is center + ray / inverse. In the source's camera it is, up to scale, inverse * (transformed centre) +
+        # rotated ray.
         start = source.camera.rotation @ view.camera.center + source.camera.world_to_camera[:3, 3]
         local = inverse[..., None, None] * start + (rays @ source.camera.rotation.T)[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -337,14 +342,19 @@ def _differences(view: _Gaps, sources: Sequence[_Gaps], pixels: np.ndarray, inve
 
 
 def _sampled(image: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """((..., 3) bilinear samples at (..., 2) positions, (...) whether they lie within the outermost pixel centres)."""
+    """Return (..., 3) bilinear samples at (..., 2) positions, and (...) whether they lie within the outermost pixel
+    centres."""
     height, width = image.shape[:2]
     inside = np.asarray(((places >= 0.5) & (places <= [width - 0.5, height - 0.5])).all(-1))
     return sample_bilinear(image, np.where(inside[..., None], places, 0.5)), inside
 
 
 def _not_in_free_space(points: np.ndarray, views: Sequence[_Gaps], own: int) -> np.ndarray:
-    """(P,) whether other views' trusted triangles do not lie behind the points, or many more pass through them."""
+    """Return (P,) whether few enough other views see through the points.
+
+    A view sees through a point if its trusted triangles lie behind it. A point is kept if at least _CONFIRMATIONS times
+    as many views confirm its depth.
+    """
     through, confirmed = np.zeros(len(points), dtype=np.int64), np.zeros(len(points), dtype=np.int64)
     for index, view in enumerate(views):
         if index == own or not view.usable:

@@ -1,8 +1,8 @@
-"""What photographs show at infinity: the colour that most of them agree on in each direction, and how much of what they
-show it explains.
+"""Colours at infinity: the colour that most photographs agree on in each direction, and how much of the photographs it
+explains.
 
-From it follow whether a scene is open, which points lie in front of the background, and where the training of the
-environment begins. `ops.environment_light` says how the six faces of its cube map lie.
+They determine whether a scene is open, which new points lie in front of the background, and the initial environment
+map. `ops.environment_light` defines the layout of the six faces of its cube map.
 """
 
 from __future__ import annotations
@@ -21,47 +21,51 @@ from linprim_geo.kernels import ops
 from linprim_geo.points.initial_points import SmallView, VolumePoints, evenly_spread_views, in_image
 from linprim_geo.points.photo_evidence import VIEWS, Observations
 
-# The photographs' own colours at infinity are gathered with fewer, from views spread over the capture.
+# Resolution of the cube map of colours at infinity (smaller than that of a trained environment), and the number of
+# views, spread over the capture, that it is made from.
 SURVEY_TEXELS, SURVEY_VIEWS = 128, VIEWS
-# A scene is open where colours at infinity, as half of its photographs show them, explain this share of the textured
-# parts of the others, beyond chance (DECISIONS 125).
+# A scene is open if colours at infinity from half of its photographs explain at least this share of the textured
+# patches of the other half, beyond chance (DECISIONS 125).
 OPEN_SHARE = 0.04
-# Where fewer of all patches are textured and known from the other half, as of few photographs, each is compared with
-# all, itself among them. It agrees with itself by chance, which varies, so what it explains counts half.
+# If less than LEAST_TEXTURED of all patches are textured and also seen by the other half, as with few photographs, each
+# photograph is compared with the colours of all, itself included. It matches itself by chance to a varying degree, so
+# the explained share is multiplied by BY_ITSELF.
 LEAST_TEXTURED, BY_ITSELF = 0.03, 0.5
-# A patch is explained by the environment if its mean difference, of 255, is below this, or below this part of its
-# variation: noise of 12 averages to this over 4 by 4 pixels, and what is finer than a texel is filtered.
+# A patch is explained by the environment if its mean difference, of 255, is below this share (EXPLAINED) of its
+# standard deviation. Colours agree up to SAME_COLOR: pixel noise of 12 averages to 3 over 4 by 4 pixels, and detail
+# finer than a texel is filtered out.
 SAME_COLOR, EXPLAINED = 3.0, 1 / 3
-# Photographs that show a direction, at least, for its colour to be known; so many of another half of them.
+# Smallest number of photographs of a direction for its colour to be known: among all, and among one half of them.
 LEAST_VIEWS, LEAST_OTHERS = 3, 2
-# Of more photographs of a direction than this, so many are compared with each other.
+# Largest number of photographs of a direction that are compared with each other.
 COMPARED = 24
-# One pixel of so many rows and columns is compared with the environment, averaged over as many by as many of these.
+# Only every STRIDE-th row and column is compared with the environment; differences are averaged over PATCH by PATCH of
+# these pixels.
 STRIDE, PATCH = 4, 3
-# Where colours vary by more than this in a patch, of 255 (standard deviation), there is something to recognise.
+# Standard deviation of the colours in a patch, of 255, above which it counts as textured.
 TEXTURED = 12.0
 
 
 class FarColors:
     """The colours that photographs show in each direction, as if everything were at infinity.
 
-    `texels` (T, 3) float32, 0 to 255, of T = 6 size^2, the colour that most photographs of a direction agree on, NaN
-    without one; `views` (T,) how many show it. Where some see past the scene that is the environment, for what stands
-    before it differs from view to view.
+    `texels` (T, 3) float32, 0 to 255, with T = 6 size^2: the colour that most photographs of a direction agree on, NaN
+    if there is none. `views` (T,): how many photographs show the direction. Where some photographs see past the scene,
+    the colour is that of the environment, because what stands in front of it differs between views.
     """
 
     def __init__(self, small_views: Sequence[SmallView]):
         self.small_views = small_views
         self.size = texels_for([small_view.camera for small_view in small_views], most=SURVEY_TEXELS)
         focal = float(np.median([small_view.camera.fx for small_view in small_views]))
-        self.width = max(3, round(2 * focal / self.size)) | 1  # of a texel in pixels
+        self.width = max(3, round(2 * focal / self.size)) | 1  # width of a texel in pixels
         directions = texel_directions(self.size).reshape(6, -1, 3)
         images = [self._image(small_view) for small_view in small_views]
         faces = [self._face(each, images) for each in directions]
         self.texels, self.views = (np.concatenate(parts) for parts in zip(*faces, strict=True))
 
     def _image(self, small_view: SmallView) -> np.ndarray:
-        """(H, W, 3) float32, averaged as a texel averages."""
+        """Return the (H, W, 3) float32 photograph, averaged over the size of a texel."""
         from scipy.ndimage import uniform_filter
 
         return uniform_filter(small_view.rgb.astype(np.float32), (self.width, self.width, 1), mode="nearest")
@@ -77,8 +81,11 @@ class FarColors:
         return _commonest(np.stack(seen[1:] or seen, 1))
 
     def compared(self, small_view: SmallView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of a look, on the lattice of STRIDE pixels: (h, w) mean difference of a patch from the environment, (h, w)
-        variation of its colours, both of 255, and (h, w) how many views show the direction."""
+        """Compare a view with the colours at infinity, on the lattice of every STRIDE-th pixel.
+
+        Returns: (h, w) mean difference of a patch from the environment, (h, w) standard deviation of its colours, both
+        of 255, and (h, w) how many views show the direction.
+        """
         from scipy.ndimage import uniform_filter
 
         image = self._image(small_view)
@@ -96,8 +103,8 @@ class FarColors:
         return uniform_filter(difference, PATCH, mode="nearest"), variation, self.views[texel]
 
     def difference(self, small_view: SmallView) -> Callable[[np.ndarray], np.ndarray]:
-        """A function of (Q, 2) positions in a look: (Q,) how much the patches there differ from the environment, of
-        255; NaN where too few views tell."""
+        """Return a function from (Q, 2) positions in a view to (Q,) mean differences of the patches there from the
+        environment, of 255; NaN where too few views show the direction."""
         difference, _, views = self.compared(small_view)
         known = np.where(views >= LEAST_VIEWS, difference, np.nan)
 
@@ -108,8 +115,8 @@ class FarColors:
         return at
 
     def start(self, size: int) -> torch.Tensor:
-        """(6, size, size, 3) texels in [0, 1] that training begins with; a direction that too few photographs show is
-        as those round it."""
+        """Return the (6, size, size, 3) initial texels in [0, 1] of an environment map. Directions that too few
+        photographs show take the colours around them."""
         square = (6, self.size, self.size, -1)
         colors, known = (
             torch.from_numpy(values.astype(np.float32)).reshape(square)
@@ -121,21 +128,24 @@ class FarColors:
 
 
 def far_colors(scene: Scene) -> FarColors:
-    """What the photographs of a scene show at infinity."""
+    """Return the colours that the photographs of a scene show at infinity."""
     return FarColors(evenly_spread_views(scene.train, SURVEY_VIEWS))
 
 
 def far_share(scene: Scene, observations: Observations | None) -> float:
-    """Share of the textured patches of a scene's photographs that what they show at infinity explains, beyond what
-    agrees by chance; 0 where they do not tell.
+    """Return the share of textured patches that colours at infinity explain, beyond chance agreement; 0 if it cannot be
+    measured.
 
-    The colours of every second photograph are compared with the others and the other way round: one that is compared
-    with its own colours agrees by chance. Where halves know too little of each other it is, and counts less. Edges
-    along the motion of the camera agree at any distance, and everything does between cameras that hardly move: taken
-    off is the share that is explained with the parallax of the scene's points turned round, which nothing has.
+    The photographs are split into every second one and the others, and each half is compared with the colours of the
+    other, because a photograph agrees with its own colours by chance. If the halves know too little of each other's
+    directions, each photograph is compared with all, and the result is weighted less.
+
+    Edges along the motion of the camera match at any depth, and everything matches if the cameras hardly move. This
+    chance level is measured with the parallax of the scene's points reversed, which no real surface has, and
+    subtracted.
 
     Args:
-        observations: of SURVEY_VIEWS views, by which exposures are made alike; None if there are none.
+        observations: of SURVEY_VIEWS views, used to equalise exposures; None if there are none.
     """
     looks = evenly_spread_views(scene.train, SURVEY_VIEWS)
     if observations is not None:
@@ -150,12 +160,12 @@ def far_share(scene: Scene, observations: Observations | None) -> float:
 
 
 def _turned_round(small_views: Sequence[SmallView], points: PointCloud | None) -> list[SmallView]:
-    """The views, with cameras for which what is at infinity moves between them as the middle of the points does, but
-    the other way.
+    """Return the views with changed cameras, so that points at infinity shift between views as the middle of the points
+    does, but in the opposite direction.
 
-    What a camera at c from the middle of all sees at (x, y, 1) in its own axes lies for it in the direction
-    depth (x, y, 1) - c, so its focal lengths are multiplied by 1 - c_z / depth and its principal point moves by
-    f c / depth. The depth is the median of those of the points, and twice the largest |c| at least.
+    What a camera at c from the mean of all camera centres sees at (x, y, 1) in its own axes is assigned the direction
+    depth (x, y, 1) - c. So its focal lengths are multiplied by 1 - c_z / depth, and its principal point moves by f c /
+    depth. The depth is the median depth of the points, and at least twice the largest |c|.
     """
     centers = np.stack([small_view.camera.center for small_view in small_views])
     centers = centers - centers.mean(0)
@@ -180,7 +190,7 @@ def _turned_round(small_views: Sequence[SmallView], points: PointCloud | None) -
 
 
 def _explained_by_halves(small_views: Sequence[SmallView]) -> tuple[float, float]:
-    """`_explained`, of every second view by the colours of the others and the other way round."""
+    """Return `_explained` for every second view with the colours of the others, and vice versa."""
     halves = small_views[::2], small_views[1::2]
     if not all(halves):
         return 0.0, 0.0
@@ -188,8 +198,11 @@ def _explained_by_halves(small_views: Sequence[SmallView]) -> tuple[float, float
 
 
 def _explained(pairs: Sequence[tuple[FarColors, Sequence[SmallView]]], least: int) -> tuple[float, float]:
-    """Of views, each with the colours at infinity that it is compared with: the share of the textured patches that
-    these explain, and the share of all patches that are textured and known from `least` views."""
+    """Compare views with the colours at infinity that they are paired with.
+
+    Returns: the share of the textured patches that the colours explain, and the share of all patches that are textured
+    and known from at least `least` views.
+    """
     good, patches = [np.zeros(0, bool)], 0
     for far, small_views in pairs:
         for small_view in small_views:
@@ -204,17 +217,17 @@ def _explained(pairs: Sequence[tuple[FarColors, Sequence[SmallView]]], least: in
 
 
 def _brighter(small_view: SmallView, factor: np.ndarray) -> SmallView:
-    """The view with (3,) factors on its channels, white where they take it beyond."""
+    """Return the view with its channels multiplied by (3,) factors and clipped at white."""
     result = copy(small_view)
     result.rgb = np.clip(small_view.rgb * factor, 0, 255).astype(np.float32)
     return result
 
 
 def _commonest(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """((T, 3) mean of the colours that lie near to the one that most of (T, V, 3) lie near to, NaN without any, (T,)
-    how many there are).
+    """Return the most common colour of each row of (T, V, 3) values: the (T, 3) mean of the colours near the one with
+    most others near it, NaN if there are none, and (T,) the number of colours in the row.
 
-    Colours of NaN are none. Source: a mean shift of one step from the best of the samples.
+    NaN marks a missing colour. Source: one mean shift step from the best sample.
     """
     shown = np.isfinite(values[..., 0])
     views = shown.sum(1)
@@ -236,12 +249,12 @@ def _commonest(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _lattice(image: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Index of one pixel of STRIDE rows and columns of an (H, W, ...) image."""
+    """Return the index of every STRIDE-th row and column of an (H, W, ...) image."""
     return np.ix_(*(np.arange(STRIDE // 2, size, STRIDE) for size in image.shape[:2]))
 
 
 def _at_origin(camera: Camera) -> Camera:
-    """The camera moved to the origin: points at infinity in the directions d project as the points d do."""
+    """Return the camera moved to the origin, so that points at infinity in directions d project as the points d do."""
     pose = camera.world_to_camera.copy()
     pose[:3, 3] = 0
     return replace(camera, world_to_camera=pose)

@@ -1,5 +1,7 @@
-"""Where a capture is and where its surfaces may be, from cameras, points and masks: the frame that training
-works in, and points to start from where no others are to be had."""
+"""The training frame, from cameras and points, and random initial points for captures without points on surfaces.
+
+Random points fill the visual hull of the masks, or the space that several cameras see.
+"""
 
 from __future__ import annotations
 
@@ -14,49 +16,48 @@ from linprim_geo.geometry.camera import Camera, Similarity
 from linprim_geo.geometry.region import focus_point
 from linprim_geo.imaging import photos
 
-# The frame of training has its cameras at this median distance from what they look at; learning rates
-# assume it.
+# In the training frame the median distance of the cameras from what they look at is this; learning rates assume it.
 CAMERA_DISTANCE = 3.0
-# Distances below this share of the coordinates are rounding errors of the poses.
+# Distances below this share of the coordinates are taken for rounding errors of the poses.
 _SAME_PLACE = 1e-9
-# A camera counts for the normalisation if it sees at least this many points.
+# Smallest number of points in a camera's image for the camera to count in the normalisation.
 _MIN_POINTS_SEEN = 8
-# Photographs are looked at with about so many pixels on the longer side, and no more than so many of them.
+# Approximate longer side of the reduced photographs in pixels, and the largest number of them.
 _SMALL_SIZE = 512
 _MOST_SMALL_VIEWS = 200
-# Alpha from here on is foreground: half-covered edge pixels are.
+# Smallest alpha that counts as foreground; half-covered edge pixels do.
 _FOREGROUND = 16
-# Of the views, this share may say background and be overruled: masks have errors.
+# A point stays in the visual hull if at most this share of the views show background there: masks have errors.
 _MASK_ERRORS = 0.02
-# A point of the hull lies inside at least this share of the images, and in two.
+# A point of the visual hull must lie inside the image of at least this share of the views, and of at least two.
 _HULL_MIN_SEEN = 0.3
 _HULL_ROUNDS = 4
 _HULL_SAMPLES = 100_000
 _HULL_MAX_BATCHES = 400
-# Depths of `frusta_points`, as shares of the typical distance to what the cameras look at.
+# Range of depths in `frusta_points`, relative to the typical distance to what the cameras look at.
 _FRUSTA_DEPTHS = (0.15, 4.0)
 _FRUSTA_SEEN = 3
 _FRUSTA_BATCHES = 20
 _COLOR_VIEWS = 24
 
 
-# The plane round a point is that of so many of its nearest, itself among them. Where they lie in a plane to within this
-# share of their spread, more is not believed: points have errors.
+# A point's plane is fitted to its _PLANE_POINTS nearest points, including itself. Flatness below _THINNEST is not
+# trusted, because points have errors.
 _PLANE_POINTS = 10
 _THINNEST = 0.1
 
 
 @dataclass(frozen=True)
 class VolumePoints(PointCloud):
-    """Points that say where surfaces may be, not where they are."""
+    """Points that mark the space where surfaces may be, not points on surfaces."""
 
 
 def local_planes(xyz: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """How (P, 3) points lie in space: (P, 4) unit quaternions (w, x, y, z) whose third axis is the normal of the plane
-    through a point and its 9 nearest, turned about it at random, and (P,) how flat these are.
+    """Fit a plane to each of (P, 3) points and its 9 nearest.
 
-    Flatness is the root of the smallest by the middle eigenvalue of their covariance: 0.1 (and not less) for a plane,
-    about 0.6 for points anywhere in a volume. Fewer than 4 points are no plane: 1.
+    Returns: (P, 4) unit quaternions (w, x, y, z) whose third axis is the plane's normal, with a random rotation about
+    it, and (P,) the flatness. Flatness is the root of the smallest divided by the middle eigenvalue of the covariance:
+    0.1 (and not less) for a plane, about 0.6 for points throughout a volume, and 1 for fewer than 4 points.
     """
     from scipy.spatial import cKDTree
     from scipy.spatial.transform import Rotation
@@ -80,12 +81,12 @@ def local_planes(xyz: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def scene_normalization(scene: Scene) -> Similarity:
-    """The similarity to the frame of training: what is looked at is round the origin, cameras at 3 (median).
+    """Return the similarity to the training frame, where the scene is centred on the origin and the median camera
+    distance is 3.
 
-    With points, a camera looks at those in its image: at their median position, from their median depth.
-    Without, at the point closest to all optical axes (least squares, outliers left out), if there is such a
-    point. Cameras that look outward or in parallel, and have no points, are centred themselves, their spread
-    taken for the distance.
+    If there are points, a camera looks at the median position of those in its image, at their median depth. Otherwise
+    all cameras look at the point closest to all optical axes (least squares without outliers), if there is one. For
+    cameras without points that look outward or in parallel, their own centre and spread are used.
 
     Raises:
         LinprimError: all cameras are in one place and there are no points.
@@ -101,7 +102,8 @@ def scene_normalization(scene: Scene) -> Similarity:
 
 
 def looked_at(scene: Scene) -> tuple[np.ndarray, float]:
-    """((3,) centre of what the training cameras look at, median distance to it), in the data set's frame."""
+    """Return the (3,) centre of what the training cameras look at, and their median distance to it, in the data set's
+    frame."""
     cameras = [view.camera for view in scene.train]
     if scene.points is not None:
         found = _looked_at_points(cameras, scene.points.xyz)
@@ -117,14 +119,13 @@ def looked_at(scene: Scene) -> tuple[np.ndarray, float]:
 
 
 def visual_hull_points(scene: Scene, count: int, seed: int) -> VolumePoints:
-    """`count` points, uniform in the volume that the masks of the training views leave, coloured from the
+    """Return `count` points distributed uniformly in the visual hull of the training views' masks, coloured from the
     images.
 
-    A point is carved away where more than 2 % of the views see background. Outside of an image is background
-    if the foreground touches none of its borders, else unknown. The box to draw from starts as the cube round
-    what the cameras look at that reaches to the farthest camera, and shrinks on what is left, with masks
-    grown by a few pixels so that no thin part is lost. A colour is the mean over views of the pixel, without
-    regard to what hides it.
+    A point is carved away if more than 2 % of the views see background there. Outside an image is background if the
+    foreground touches none of its borders, else unknown. Points are drawn from a box: it starts as the cube around what
+    the cameras look at that reaches to the farthest camera, and shrinks to what is left, with masks grown by a few
+    pixels so that no thin part is lost. A colour is the mean over views, without regard to occlusion.
 
     Raises:
         LinprimError: the views have no masks, or nothing is left.
@@ -148,26 +149,27 @@ def visual_hull_points(scene: Scene, count: int, seed: int) -> VolumePoints:
             " wanted masks that fit the cameras"
         )
     xyz = np.concatenate(kept)[:count]
-    if len(xyz) < count:  # a hull of hair-thin parts: what was found stands for the rest
+    if len(xyz) < count:  # very thin hull: repeat the points that were found
         xyz = xyz[rng.integers(0, len(xyz), count)]
     return VolumePoints(xyz, _colors(xyz, small_views))
 
 
 def frusta_points(scene: Scene, count: int, seed: int) -> VolumePoints:
-    """`count` points in the space that several training cameras see, with mean colours: the last resort.
+    """Return `count` random points in the space that several training cameras see, with mean colours. This is the last
+    resort.
 
-    Drawn along pixels of random cameras with a depth that is uniform in its logarithm, from 0.15 to 4 times
-    the distance to what the cameras look at; kept if three cameras see them, or as many as do if that leaves
-    too few.
+    They are drawn along random pixels of random cameras, with log-uniform depth from 0.15 to 4 times the distance to
+    what the cameras look at. Points that three cameras see are kept; if they are too few, points that fewer cameras see
+    fill up.
 
     Raises:
-        LinprimError: there is no scale, as for `scene_normalization`.
+        LinprimError: the scale is unknown, as in `scene_normalization`.
     """
     rng = np.random.default_rng(seed)
     distance = CAMERA_DISTANCE / scene_normalization(scene).scale
     cameras = [view.camera for view in scene.train]
     low, high = np.log(_FRUSTA_DEPTHS[0] * distance), np.log(_FRUSTA_DEPTHS[1] * distance)
-    found: list[list[np.ndarray]] = [[] for _ in range(_FRUSTA_SEEN)]  # by the number of cameras that see them
+    found: list[list[np.ndarray]] = [[] for _ in range(_FRUSTA_SEEN)]  # index: number of cameras that see them, - 1
     for _ in range(_FRUSTA_BATCHES):
         points = _along_pixels(cameras, 2 * count, low, high, rng)
         seen = np.zeros(len(points), dtype=np.int64)
@@ -183,10 +185,10 @@ def frusta_points(scene: Scene, count: int, seed: int) -> VolumePoints:
 
 
 class SmallView:
-    """A training view's camera and photograph, averaged down to what choosing points needs.
+    """A training view reduced to the resolution needed to choose points: camera and photograph.
 
-    `rgb` (h, w, 3) uint8; `foreground` (h, w) bool, None without alpha; `open` says whether the object goes on outside
-    of the image.
+    `rgb` (h, w, 3) uint8; `foreground` (h, w) bool, None without alpha; `open`: whether the foreground touches the
+    border of the image.
     """
 
     def __init__(self, view: View):
@@ -206,7 +208,7 @@ class SmallView:
 
 
 def evenly_spread_views(views: Sequence[View], limit: int) -> list[SmallView]:
-    """Looks at no more than `limit` of the views, evenly spread over their order.
+    """Return reduced copies of at most `limit` views, evenly spread over their order.
 
     Raises:
         LinprimError: a photograph cannot be read.
@@ -216,7 +218,7 @@ def evenly_spread_views(views: Sequence[View], limit: int) -> list[SmallView]:
 
 
 def _hull_box(scene: Scene, small_views: Sequence[SmallView], rng: np.random.Generator) -> np.ndarray:
-    """(2, 3) corners of a box round the visual hull, from coarse to fine."""
+    """Return (2, 3) corners of a box around the visual hull, refined in several rounds."""
     cameras = [small_view.camera for small_view in small_views]
     center, distance = looked_at(scene)
     half = max(np.linalg.norm(camera.center - center) for camera in cameras)
@@ -224,7 +226,7 @@ def _hull_box(scene: Scene, small_views: Sequence[SmallView], rng: np.random.Gen
     box = np.stack([center - half, center + half])
     for _ in range(_HULL_ROUNDS):
         points = rng.uniform(box[0], box[1], (_HULL_SAMPLES, 3))
-        # The mean distance of samples, so that masks are grown by what lies between two of them.
+        # Mean distance between samples: masks are grown by what may lie between two of them.
         spacing = (np.prod(box[1] - box[0]) / _HULL_SAMPLES) ** (1 / 3)
         grow = [int(np.ceil(spacing * camera.fx / distance)) for camera in cameras]
         grow = [
@@ -240,7 +242,7 @@ def _hull_box(scene: Scene, small_views: Sequence[SmallView], rng: np.random.Gen
 
 
 def _inside_hull(points: np.ndarray, small_views: Sequence[SmallView], grow: int | Sequence[int]) -> np.ndarray:
-    """(P,) whether enough views see the points and hardly any sees background there."""
+    """Return (P,) whether enough views see the points and hardly any shows background there."""
     allowed = int(_MASK_ERRORS * len(small_views))
     needed = max(2, int(np.ceil(_HULL_MIN_SEEN * len(small_views))))
     alive = np.arange(len(points))
@@ -263,7 +265,7 @@ def _inside_hull(points: np.ndarray, small_views: Sequence[SmallView], grow: int
 
 
 def _grown(mask: np.ndarray, radius: int) -> np.ndarray:
-    """The mask with everything within `radius` pixels (a square) added."""
+    """Return the mask dilated by `radius` pixels (a square)."""
     if radius == 0:
         return mask
     from scipy.ndimage import maximum_filter
@@ -272,8 +274,8 @@ def _grown(mask: np.ndarray, radius: int) -> np.ndarray:
 
 
 def in_image(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """((P,) whether in front and in the image, (P,) row, (P,) column; rows and columns mean nothing
-    elsewhere)."""
+    """Return (P,) whether points are in front of the camera and in its image, and their (P,) rows and (P,) columns,
+    which are valid only there."""
     pixels, depth = camera.project(points)
     inside = camera.shows(pixels, depth)
     cells = np.where(inside[:, None], pixels, 0.0).astype(np.int64)
@@ -281,7 +283,8 @@ def in_image(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _along_pixels(cameras: Sequence[Camera], count: int, low: float, high: float, rng) -> np.ndarray:
-    """(count, 3) points on rays of random pixels of random cameras, ln(depth) uniform in [low, high]."""
+    """Return (count, 3) points on rays through random pixels of random cameras, with ln(depth) uniform in [low,
+    high]."""
     which = rng.integers(0, len(cameras), count)
     position, depth = rng.uniform(0, 1, (count, 2)), np.exp(rng.uniform(low, high, count))
     points = np.empty((count, 3))
@@ -295,8 +298,8 @@ def _along_pixels(cameras: Sequence[Camera], count: int, low: float, high: float
 
 
 def _colors(points: np.ndarray, small_views: Sequence[SmallView]) -> np.ndarray:
-    """(P, 3) uint8 mean of the foreground pixels that the points fall on; the images' mean where there is
-    none."""
+    """Return (P, 3) uint8 mean colours of the foreground pixels that the points project to, or the images' mean colour
+    if there are none."""
     total, weight = np.zeros((len(points), 3)), np.zeros(len(points))
     step = max(1, len(small_views) // _COLOR_VIEWS)
     for small_view in small_views[::step]:
@@ -315,7 +318,8 @@ def _colors(points: np.ndarray, small_views: Sequence[SmallView]) -> np.ndarray:
 
 
 def _looked_at_points(cameras: Sequence[Camera], xyz: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """From the points in each image, their median position and depth, the median of both over the cameras."""
+    """Return the median, over cameras, of the median position and depth of the points in each image; None if too few
+    cameras see points."""
     targets, depths = [], []
     for camera in cameras:
         inside = in_image(camera, xyz)[0]

@@ -1,7 +1,8 @@
-"""What photographs and points say about how a scene was taken: the same points looked at from many views.
+"""Measure how a scene was photographed from points seen in many views: exposure gains, view-dependent colour, pixel
+size.
 
-Nothing here needs a trained model or a reference surface. Points may be hidden in views that they project into, so
-whatever is summed up over views is a median or is trimmed.
+Needs no trained model or reference surface. Points may be occluded in views that they project into, so everything that
+is summed over views is a median or trimmed.
 """
 
 from __future__ import annotations
@@ -17,36 +18,40 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.sampling import sample_bilinear
 from linprim_geo.points.initial_points import SmallView, VolumePoints, evenly_spread_views, in_image, local_planes
 
-# So many points and views say enough; more only take time.
+# Largest numbers of points and views used; more only take time.
 POINTS, VIEWS = 2500, 60
-# A point is hidden in a view if one of its 12 nearest in the image, within this share of its longer side, lies before
-# its plane by this share of its depth.
+# A point is occluded in a view if one of its _NEIGHBOURS nearest points in the image, within _HIDDEN_REACH of the
+# image's longer side, lies in front of the point's plane by at least _HIDDEN_BEFORE of its depth.
 _HIDDEN_REACH, _HIDDEN_BEFORE, _NEIGHBOURS = 0.04, 0.02, 12
-# Points count whose neighbours lie as flat as this, where their plane is seen under less than 66 degrees.
+# A point is used if its neighbours are at least this flat (`local_planes`), in views that see its plane at less than 66
+# degrees from its normal.
 _FLAT, _LEAST_COSINE = 0.4, 0.4
-# Colours are those of 5x5 pixels that differ by no more than this, of 1 (standard deviation): edges fall elsewhere in
-# every view.
+# A colour is the mean of 5x5 pixels whose standard deviation is below _PLAIN (colours in [0, 1]). Other patches are
+# skipped, because edges fall differently in each view.
 _PATCH, _PLAIN = 5, 0.06
-# Colours, of 1, that are neither black nor cut at white.
+# Range of colours, in [0, 1], that are neither black nor clipped at white.
 _DARKEST, _BRIGHTEST = 0.06, 0.97
-# Views that see a point, at least, for a fit of its colour over directions or of its scale.
+# Smallest number of views of a point, and of points, for fitting colour over directions or measuring scale.
 _LEAST_VIEWS, _LEAST_POINTS = 5, 30
-# Residuals beyond this, of 1, are something else in front of the point.
+# Colour residuals, in [0, 1], above this come from something else in front of the point.
 _SOMETHING_ELSE = 0.25
-# One in so many is left out at either end of what is averaged.
+# For trimmed means, one value in this many is left out at each end.
 _EXTREME = 20
 _GAIN_ROUNDS = 15
-# What holds the gain of photographs near 1 that share hardly anything with others, in points.
+# Regularisation towards a gain of 1, in numbers of points, for photographs that share few points with others.
 _GAIN_PRIOR = 0.1
-# Neighbours are the nearest points farther apart than the patches that colours are taken from, in pixels.
+# Smallest distance between neighbours in pixels, so that their colour patches do not overlap.
 _NEIGHBOUR_PX = 7
 
 
 @dataclass(frozen=True)
 class Observations:
-    """P points `xyz` (P, 3) in V views. `seen` (P, V) bool; where it holds, `footprint` (P, V), the length that a
-    pixel of the photograph covers there; where `plain` (P, V) holds, which is part of it, `color` (P, V, 3) float64 in
-    [0, 1]."""
+    """Observations of P points `xyz` (P, 3) in V views.
+
+    `seen` (P, V) bool. Where `seen`: `footprint` (P, V), the length that a pixel of the photograph covers at the point.
+    `plain` (P, V) bool, a subset of `seen`: the surroundings are uniform. Where `plain`: `color` (P, V, 3) float64 in
+    [0, 1].
+    """
 
     xyz: np.ndarray
     seen: np.ndarray
@@ -56,17 +61,17 @@ class Observations:
 
     @cached_property
     def log_gains(self) -> tuple[np.ndarray, np.ndarray]:
-        """((V, 3) logarithm of how bright each photograph shows the points, (V, 3) its standard error), of mean 0 per
-        channel.
+        """Return the (V, 3) log gains of the photographs, with mean 0 per channel, and (V, 3) their standard errors.
 
-        log colour = gain of the view + colour of the point, solved for all at once by least squares with Cauchy's
-        weights. A view that shows fewer than 30 points has a gain of 0 and an infinite error.
+        log colour = log gain of the view + log colour of the point, solved for all at once by least squares with Cauchy
+        weights. A view that shows fewer than 30 usable points has a log gain of 0 and an infinite error.
         """
         gains, errors = np.zeros((self.seen.shape[1], 3)), np.full((self.seen.shape[1], 3), np.inf)
         for channel in range(3):
             color = self.color[..., channel]
             usable = self.plain & (color > _DARKEST) & (color < _BRIGHTEST)
-            # Of points that are dark as a rule, those colours alone would be left that something made bright.
+            # Generally dark points are dropped: above the threshold only those of their colours would remain that
+            # something made brighter.
             usable &= (_median(np.where(self.plain, color, np.nan), 1) > 2 * _DARKEST)[:, None]
             usable &= (usable.sum(0) >= _LEAST_POINTS)[None]
             usable &= (usable.sum(1) >= 2)[:, None]
@@ -81,14 +86,16 @@ class Observations:
 
     @property
     def gains(self) -> np.ndarray:
-        """(V, 3) how bright each photograph shows the points, of geometric mean 1 per channel."""
+        """Return the (V, 3) gains of the photographs, with geometric mean 1 per channel."""
         return np.exp(self.log_gains[0])
 
     @property
     def gain_spread(self) -> float | None:
-        """Standard deviation over the photographs of the logarithm of their brightness, of the channel where it is
-        largest, less what the estimate itself scatters; without the most extreme of 20, which a highlight may have.
-        None if fewer than three share points."""
+        """Return the standard deviation of the log gains over the photographs, minus the variance due to estimation
+        errors, for the channel where it is largest; None if fewer than three photographs share points.
+
+        The most extreme of each 20 photographs (at least one) is left out, because a highlight may have caused it.
+        """
         gains, error = self.log_gains
         spreads = []
         for channel in range(3):
@@ -102,13 +109,13 @@ class Observations:
 
     @property
     def view_dependence(self) -> float | None:
-        """By how much of 1 the points' colour changes with the direction that they are seen from, gains removed; None
+        """Return by how much the points' colour, in [0, 1], changes with viewing direction after removing gains; None
         without enough views.
 
-        A colour's deviation from the point's median is multiplied by that of a neighbouring point in the same view,
-        some pixels away: noise and texture finer than a pixel have no part that neighbours share, highlights and
-        reflections have. The root of the mean without the largest and the smallest twentieth: few products are of
-        something else in front of both points, but those are large.
+        The deviation of a colour from the point's median is multiplied by the deviation of a neighbouring point, some
+        pixels away, in the same view. Noise and texture finer than a pixel are uncorrelated between neighbours;
+        highlights and reflections are correlated. The result is the root of the mean product, without the largest and
+        smallest twentieth: the few products where something else occludes both points are large.
         """
         from scipy.spatial import cKDTree
 
@@ -134,8 +141,8 @@ class Observations:
 
     @property
     def scale_ratio(self) -> float | None:
-        """Largest by smallest length that a pixel covers at a point, over the views that see it: what a quarter of the
-        points exceed."""
+        """Return the 75th percentile, over points, of the largest divided by the smallest pixel footprint over the
+        views that see the point; None without enough points."""
         footprint = np.where(self.seen, self.footprint, np.nan)
         rows = self.seen.sum(1) >= 3
         if rows.sum() < _LEAST_POINTS:
@@ -145,12 +152,12 @@ class Observations:
 
 
 def observe(scene: Scene, seed: int = 0, views: int = VIEWS) -> Observations | None:
-    """Looks at the scene's points in at most `views` of its training photographs, evenly spread; None if there are no
+    """Observe the scene's points in at most `views` of its training photographs, evenly spread; None if there are no
     points on surfaces.
 
-    A point is seen by a view in whose image it lies, on the foreground if there is one, where no other points are in
-    front of it, and that does not look at it from behind: from the side of the plane through its neighbours on which
-    photographs have its colour.
+    A view sees a point if the point lies in its image, on the foreground if there is one, is not occluded by other
+    points, and is seen from the front. The front is the side of the plane through its neighbours from which the
+    photographs show the point's colour.
     """
     cloud = scene.points
     if cloud is None or isinstance(cloud, VolumePoints) or len(cloud.xyz) < _LEAST_POINTS:
@@ -194,8 +201,12 @@ def _same_views(scene: Scene, small_views: Sequence[SmallView]) -> list[Camera]:
 def _colors_in(
     small_view: SmallView, xyz: np.ndarray, rows: np.ndarray, facing: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Of the points `rows` of (N, 3) `xyz` in a view, whose planes have the normals (P, 3) `facing` it: (P,) whether it
-    sees them, (P,) whether also in plain surroundings, (P, 3) colours in [0, 1], (P,) z-depths."""
+    """Sample the points `rows` of (N, 3) `xyz` in a view. `facing` (P, 3) are the normals of their planes, turned
+    towards the view.
+
+    Returns: (P,) whether the view sees them, (P,) whether their surroundings are also uniform, (P, 3) colours in [0,
+    1], (P,) z-depths.
+    """
     from scipy.ndimage import minimum_filter, uniform_filter
     from scipy.spatial import cKDTree
 
@@ -223,7 +234,8 @@ def _colors_in(
 
 
 def _normals(xyz: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """(P, 3) normals of the planes through the points' neighbours, of either sign, and (P,) how flat these are."""
+    """Return (P, 3) normals of the planes through the points' neighbours, of arbitrary sign, and (P,) how flat these
+    are."""
     from scipy.spatial.transform import Rotation
 
     rotation, flat = local_planes(xyz, seed)
@@ -231,13 +243,14 @@ def _normals(xyz: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _view_offsets(values: np.ndarray, usable: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """((V,) g, (V,) its standard error) of (P, V) values = g of the view + a of the point, where usable; g has mean
-    0."""
+    """Fit (P, V) values = g of the view + a of the point where `usable`; return (V,) g with mean 0, and (V,) its
+    standard errors."""
     views = values.shape[1]
     weight, scale = usable.astype(float), 0.0
     for _ in range(_GAIN_ROUNDS):
         total = np.maximum(weight.sum(1, keepdims=True), 1e-9)
-        # The points' own values are eliminated; what is left is a Laplacian over the views, fixed by the mean.
+        # The points' values are eliminated. The rest is a Laplacian over the views; fixing the mean makes it
+        # invertible.
         matrix = np.diag(weight.sum(0)) - weight.T @ (weight / total)
         right = (weight * (values - (weight * values).sum(1, keepdims=True) / total)).sum(0)
         inverse = np.linalg.inv(matrix + _GAIN_PRIOR * np.eye(views) + np.full((views, views), 1.0))
@@ -251,7 +264,7 @@ def _view_offsets(values: np.ndarray, usable: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _median(values: np.ndarray, axis: int) -> np.ndarray:
-    """Median without NaN, NaN where there is nothing else."""
+    """Return the median without NaN; NaN if all values are NaN."""
     import warnings
 
     with warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""The points that a training starts from: the capture's own, triangulated, or filled in."""
+"""Choose the initial points of a training: the capture's own, triangulated ones, or new ones that fill gaps."""
 
 from __future__ import annotations
 
@@ -18,19 +18,21 @@ from linprim_geo.points.initial_points import (
     visual_hull_points,
 )
 
-# Primitives at the start, as a share of the most there may be: from points on surfaces, and from random ones.
+# Initial number of primitives as a share of the limit: from points on surfaces, and from random points.
 SFM_START, RANDOM_START = 0.8, 0.25
-# Triangulated points fewer than this leave too much of a scene empty.
+# If fewer points than this are triangulated, too much of the scene is empty and random points are added.
 FEW_POINTS = 500
-# Points on surfaces by which gaps are found: cells of the image to be filled are 1,400, see `densify`.
+# Number of stereo points by which gaps are found. `densify` fills about 1,400 image cells per view, so a sample is
+# enough.
 FILLED_BY = 4000
 
 
 def with_points(scene: Scene, options: TrainOptions, log: Callable[[str], None]) -> Scene:
-    """The scene with points to start from: its own, triangulated under the known poses, or random where cameras look.
+    """Return the scene with initial points: its own, triangulated with the known poses, or random ones in view of the
+    cameras.
 
-    A scene with alpha and no points starts inside the visual hull. Without alpha, features are matched and
-    triangulated; if they are few, random points in the common field of view fill up.
+    If a scene without points has alpha, its initial points fill the visual hull. Without alpha, features are matched
+    and triangulated; if they are few, random points in the common field of view are added.
     """
     from linprim_geo.points.triangulate import triangulate_points
 
@@ -53,7 +55,7 @@ def with_points(scene: Scene, options: TrainOptions, log: Callable[[str], None])
 
 
 def initial_cloud(cloud: PointCloud, options: TrainOptions) -> PointCloud:
-    """At most as many of the points as the population starts with, drawn without replacement."""
+    """Return a random sample, without replacement, of at most as many points as there are initial primitives."""
     count = initial_count(options, SFM_START)
     if len(cloud.xyz) <= count:
         return cloud
@@ -68,14 +70,14 @@ def filled_points(
     far: FarColors | None = None,
     surfaces: PointCloud | None = None,
 ) -> PointCloud:
-    """The scene's points and those on `surfaces`, filled up (`densify`) unless they are random ones, which lie on no
-    surface."""
+    """Return the scene's points and those on `surfaces`, with gaps filled by `densify`. Random points in a volume lie
+    on no surface and are returned unchanged."""
     assert scene.points is not None
     if isinstance(scene.points, VolumePoints):
         return scene.points
     if surfaces is None:
         return densify(scene, seed, backdrop, far)
-    # Some of them say where nothing is missing.
+    # A sample of the stereo points is enough to show where points are missing.
     step = max(1, len(surfaces.xyz) // FILLED_BY)
     few = _joined(scene.points, PointCloud(surfaces.xyz[::step], surfaces.rgb[::step]))
     filled = densify(replace(scene, points=few), seed, backdrop, far)

@@ -1,5 +1,4 @@
-"""Points for a capture that comes with cameras but without points: SIFT, matching and triangulation by
-pycolmap."""
+"""Triangulate points for a capture that has cameras but no points, with SIFT features and matching by pycolmap."""
 
 from __future__ import annotations
 
@@ -18,7 +17,7 @@ from linprim_geo.capture.types import PointCloud, Scene, View
 from linprim_geo.geometry.feature_points import file_name, reliable_points, triangulate_features
 from linprim_geo.imaging.photos import cache_folder
 
-# Changed whenever the points come out differently, so that old cache entries are not found any more.
+# Raised whenever the resulting points change, so that old cache entries are not used any more.
 _CACHE_VERSION = 2
 _MIN_POINTS = 16
 
@@ -31,19 +30,19 @@ def triangulate_points(
     threads: int = -1,
     log: Callable[[str], None] | None = None,
 ) -> PointCloud:
-    """Points in the data set's frame that several training views agree on, with colours and errors in pixels.
+    """Return points that several training views agree on, in the data set's frame, with colours and errors in pixels.
 
-    Keypoints (SIFT on the CPU) of the undistorted, scaled training images are matched between views that look
-    alike, verified, and triangulated with the poses and cameras kept fixed. Kept are points seen with at most
-    1.5 px of error (0.5 px if only by two) under at least 2 degrees and not isolated. The result is kept in
-    the cache folder, keyed by the images' bytes, the cameras and the seed.
+    SIFT keypoints (on the CPU) of the undistorted, scaled training images are matched between views with similar
+    positions and directions, verified, and triangulated with poses and intrinsics kept fixed. A point is kept if its
+    error is at most 1.5 px (0.5 px if only two views see it), its rays span at least 2 degrees, and it is not isolated.
+    The result is stored in the cache folder, keyed by the images' bytes, the cameras and the seed.
 
     Args:
         scene: held-out views are not used.
         cache: see `photos.cache_folder`.
-        seed: of what pycolmap samples.
+        seed: for pycolmap's random sampling.
         threads: for keypoints and matching; -1 uses all cores.
-        log: is called with one line when it starts and one when it is done.
+        log: called with one line at the start and one at the end.
 
     Raises:
         LinprimError: fewer than 16 points survive, or an image cannot be read.
@@ -72,8 +71,8 @@ def triangulate_points(
 
 
 def write_images(views: Sequence[View], folder: Path) -> None:
-    """Lossless copies at the cameras' size; what is transparent becomes black, so that no keypoint is
-    hidden there."""
+    """Write lossless copies of the photographs at the cameras' size. Transparent pixels become black, so that masked
+    parts yield no keypoints."""
     from PIL import Image
 
     for index, view in enumerate(views):
@@ -85,7 +84,8 @@ def write_images(views: Sequence[View], folder: Path) -> None:
 
 
 def digest_of(views: Sequence[View], how: tuple) -> str:
-    """A name for what is found in views with known poses, by their bytes and cameras, and by how it is found."""
+    """Return a cache key for results from views with known poses: a hash of the views' bytes and cameras and of the
+    settings `how`."""
     digest = hashlib.blake2b(repr(how).encode(), digest_size=16)
     for view in views:
         camera = view.camera
@@ -102,12 +102,12 @@ def digest_of(views: Sequence[View], how: tuple) -> str:
 
 
 def _stored(path: Path) -> PointCloud | None:
-    """What an earlier run kept; None if there is nothing or it is damaged."""
+    """Return the points of an earlier run, or None if there are none or the file is damaged."""
     try:
         xyz, rgb, error_px = read_named(
             path, {"xyz": ((None, 3), "f"), "rgb": ((None, 3), "u"), "error_px": ((None,), "f")}
         )
-    except LinprimError:  # it is made again
+    except LinprimError:  # the points are computed again
         return None
     usable = len(xyz) == len(rgb) == len(error_px) and rgb.dtype == np.uint8
     usable = usable and bool(np.isfinite(xyz).all() and np.isfinite(error_px).all())
@@ -120,4 +120,4 @@ def _store(path: Path, cloud: PointCloud) -> None:
         with atomic_write(path) as temporary:
             np.savez(temporary, xyz=cloud.xyz, rgb=cloud.rgb, error_px=cloud.error_px)
     except (LinprimError, OSError):
-        pass  # a cache that cannot be written is no reason to stop
+        pass  # an unwritable cache is not an error

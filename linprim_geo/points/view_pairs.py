@@ -1,4 +1,4 @@
-"""Pairs of views that see the same points from different directions."""
+"""Select, for each view, source views that see the same points from other directions, for stereo."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ import numpy as np
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels import surface_ops
 
-# Views to compare with: so many for every point, whose rays to it make an angle between these, in degrees.
+# Each point should be seen by SOURCES source views, with an angle between the two rays from LEAST_ANGLE to
+# LARGEST_ANGLE degrees.
 SOURCES, LEAST_ANGLE, LARGEST_ANGLE = 4, 3.0, 30.0
-# So many other views confirm a depth, as two may be wrong about each other. Points that fewer see under such angles are
-# compared under larger ones, up to this, in degrees: of few photographs there are no others. A surface that both views
-# look onto evenly is turned by half of it.
+# A depth needs CONFIRMING other views to confirm it, because two views may be wrong together. Points with fewer source
+# views in this range of angles are also compared under larger ones, up to WIDEST_ANGLE degrees: in captures with few
+# photographs there are no others. A surface that faces both views equally is tilted by half the angle to each of them.
 CONFIRMING, WIDEST_ANGLE = 2, 60.0
-# A view that shows less than this share of the points to a camera, of those that want one, is not worth its time.
+# A source view is not worth its time if it adds less than this share of a camera's points.
 LEAST_SHARE = 0.03
-# A point that is farther than the depth map of a view by more than this share of the depth is hidden from it: three
-# times what a depth may be off by that counts as right.
+# A point is occluded in a view if it is deeper than the view's depth map by more than this share: three times the error
+# allowed for a correct depth.
 HIDDEN_SHARE = 0.03
-# Points of the scene by which views are matched with each other.
+# Largest number of scene points used to select source views.
 COMPARED_POINTS = 2000
 
 
@@ -32,12 +33,12 @@ def source_views(
     depths: Iterable[np.ndarray] | None = None,
     widest: float = WIDEST_ANGLE,
 ) -> list[list[int]]:
-    """For every camera the indices of those to compare patches with, best first, `most` at most.
+    """Return, for each camera, the indices of at most `most` source views, best first.
 
-    Each is the one that sees, under an angle of LEAST_ANGLE to LARGEST_ANGLE to the camera's own rays, most of the
-    (P, 3) points that the camera sees and that fewer than SOURCES of those before it do; then, under an angle of up to
-    `widest` degrees, most of those that fewer than CONFIRMING do. Surfaces with the (H, W) `depths` of the views hide
-    points; without them nothing does.
+    Source views are chosen greedily. First, each added view is the one that sees most of the camera's (P, 3) points,
+    under angles of LEAST_ANGLE to LARGEST_ANGLE to the camera's own rays, that fewer than SOURCES chosen views see;
+    then, with angles up to `widest` degrees, most of those that fewer than CONFIRMING see. The (H, W) `depths` of the
+    views determine which points are occluded; without them none are.
     """
     step = -(-len(points) // COMPARED_POINTS)
     points = points[::step]
@@ -65,7 +66,7 @@ def source_views(
 
 
 def nearest_views(cameras: Sequence[Camera], most: int) -> list[list[int]]:
-    """Of every view the numbers of the `most` other ones whose cameras are nearest to its own, nearest first."""
+    """Return, for each view, the indices of the `most` other views with the nearest camera centres, nearest first."""
     centers = np.array([camera.center for camera in cameras])
     result = []
     for number, center in enumerate(centers):
@@ -75,7 +76,7 @@ def nearest_views(cameras: Sequence[Camera], most: int) -> list[list[int]]:
 
 
 def _seen(camera: Camera, depth: np.ndarray | None, points: np.ndarray) -> np.ndarray:
-    """(P,) bool, which of (P, 3) points lie in the image and not behind its (H, W) depths, 0 where there is none."""
+    """Return (P,) bool: which of (P, 3) points lie in the image and not behind its (H, W) depths (0 = none)."""
     inside, pixels, along = visible_pixels(camera, points)
     if depth is not None:
         nearest = depth[pixels[:, 1], pixels[:, 0]]
@@ -84,14 +85,14 @@ def _seen(camera: Camera, depth: np.ndarray | None, points: np.ndarray) -> np.nd
 
 
 def visible_pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of (P, 3) points: (P,) bool whether they lie in the image, and of those that do (Q, 2) int64 columns and rows,
-    and (Q,) z-depths."""
+    """Return which of (P, 3) points lie in the image, (P,) bool, and for those the (Q, 2) int64 columns and rows and
+    the (Q,) z-depths."""
     inside, pixels, depth = visible_places(camera, points)
     return inside, pixels.astype(np.int64), depth
 
 
 def visible_places(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """As `visible_pixels`, with (Q, 2) positions in the image in place of pixels."""
+    """Return the same as `visible_pixels`, with exact (Q, 2) image positions instead of integer pixels."""
     pose, lens = camera.pinhole()
     points = np.ascontiguousarray(points, np.float64)
     return surface_ops.visible_points(pose, lens, camera.width, camera.height, points)
