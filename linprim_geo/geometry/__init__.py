@@ -1,1 +1,1 @@
-"""Cameras, lenses, samples of images, meshes, primitives, ray casting, and their files."""
+"""Cameras, lenses, image sampling, meshes, primitives and ray casting, with their files."""

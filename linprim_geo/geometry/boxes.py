@@ -1,4 +1,4 @@
-"""Blocks of space: boxes that share the work of training a large scene, and which pixels of a view belong to each."""
+"""Blocks: axis-aligned boxes that divide the work of training a large scene, and which pixels of a view show each."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy as np
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
 
-# A margin is this part of the longest side of what a block holds, median over the blocks.
+# Margin of blocks, as a share of the longest side of a block's content (median over the blocks).
 MARGIN = 0.2
-# A point that lies behind the depth of its pixel by more than this share is hidden there.
+# A point is occluded in a view if it lies behind the depth of its pixel by more than this share.
 HIDDEN = 0.1
-# A camera sees a block if this share of its pixels shows it.
+# A camera sees a block if at least this share of its pixels shows it.
 LEAST_SHARE = 0.005
-# Pixels beyond those that show a block which belong to it, for depths are coarse, and pixels round them that a
-# structural similarity looks at.
+# DILATION: pixels of the coarse depth map by which the region that shows a block is dilated, because depths are coarse.
+# BORDER: pixels added around the crop for the window of SSIM.
 DILATION, BORDER = 2, 8
-# Sides of the box that holds the bulk of some points are these quantiles.
+# Quantiles between which the bulk of a set of points lies, per axis.
 _BULK = (0.01, 0.99)
 
 
@@ -31,27 +31,27 @@ class Block:
     high: tuple[float, ...]
 
     def holds(self, xyz: np.ndarray, margin: float = 0.0) -> np.ndarray:
-        """(...,) bool for (..., 3) points; with `margin` those in the block grown by it on all sides."""
+        """Return (...,) bool: which of (..., 3) points lie in the block, grown by `margin` on all sides."""
         return np.all((xyz >= np.asarray(self.low) - margin) & (xyz < np.asarray(self.high) + margin), axis=-1)
 
     def distance(self, xyz: np.ndarray) -> np.ndarray:
-        """(...,) by how much the block is to grow on all sides to reach (..., 3) points."""
+        """Return (...,) by how much the block must grow on all sides to contain each of (..., 3) points."""
         return np.maximum(np.maximum(np.asarray(self.low) - xyz, xyz - np.asarray(self.high)), 0.0).max(-1)
 
     def is_apart(self, other: Block, margin: float) -> bool:
-        """Whether the other lies farther than `margin` from this one along an axis."""
+        """Return whether the other block is farther away than `margin` along an axis."""
         ends = zip(self.low, self.high, other.low, other.high, strict=True)
         return any(low - margin > far or near > high + margin for low, high, near, far in ends)
 
 
 def split_space(xyz: np.ndarray, work: np.ndarray, count: int) -> list[Block]:
-    """`count` boxes that fill space, each with about the same part of the `work` (P,) of the points `xyz` (P, 3).
+    """Split space into `count` boxes, each with about the same share of the `work` (P,) of the points `xyz` (P, 3).
 
-    A k-d tree: what holds the bulk of the points is cut across its longest side, in the ratio of the blocks that come
-    to lie on either side.
+    A k-d tree: the bulk of the points is cut across its longest side, in proportion to the number of blocks on either
+    side.
 
     Raises:
-        LinprimError: there are not so many places to cut at.
+        LinprimError: there are not enough places to cut at.
     """
     low, high = (-np.inf,) * 3, (np.inf,) * 3
     return _split(np.asarray(xyz, np.float64), np.asarray(work, np.float64), count, low, high)
@@ -69,7 +69,7 @@ def _split(xyz, work, count, low, high) -> list[Block]:
         cut = 0.5 * float(along[place - 1] + along[place])
         below = xyz[:, axis] < cut
         if below.sum() < first or (~below).sum() < count - first:
-            continue  # all in one place along this axis
+            continue  # all points have the same coordinate along this axis
         inner = [*high[:axis], cut, *high[axis + 1 :]], [*low[:axis], cut, *low[axis + 1 :]]
         return [
             *_split(xyz[below], work[below], first, low, tuple(inner[0])),
@@ -81,14 +81,14 @@ def _split(xyz, work, count, low, high) -> list[Block]:
 
 
 def margin_of(blocks: Sequence[Block], xyz: np.ndarray) -> float:
-    """MARGIN of the longest side, median over the blocks, of the bulk of the points in each."""
+    """Return MARGIN times the longest side of the bulk of the points in a block, median over the blocks."""
     inside = [xyz[block.holds(xyz)] for block in blocks]
     sides = [np.ptp(np.quantile(points, _BULK, axis=0), axis=0).max() for points in inside if len(points)]
     return MARGIN * float(np.median(sides))
 
 
 def smaller(camera: Camera, factor: int) -> Camera:
-    """The same view with `factor` by `factor` pixels averaged into one, as `capture.load.load_scene` does."""
+    """Return the same view with `factor` by `factor` pixels averaged into one, as in `capture.load.load_scene`."""
     k = factor
     width, height = camera.width // k, camera.height // k
     return replace(
@@ -97,16 +97,16 @@ def smaller(camera: Camera, factor: int) -> Camera:
 
 
 def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
-    """The part of a view of so many pixels whose first one is (left, top)."""
+    """Return the camera of a crop of `width` by `height` pixels whose first pixel is (left, top)."""
     return replace(camera, width=width, height=height, cx=camera.cx - left, cy=camera.cy - top)
 
 
 def point_work(xyz: np.ndarray, views: Iterable[tuple[Camera, np.ndarray, int]]) -> np.ndarray:
-    """(P,) work of points (P, 3): the pixels of all views that see each.
+    """Return (P,) the work of points (P, 3): the summed pixel counts of all views that see each point.
 
     Args:
-        views: camera, its z-depths (H, W), 0 where nothing is, and the pixels of its photograph. A point that lies
-            farther than the depth of its pixel, by more than HIDDEN of it, is hidden.
+        views: camera, its z-depths (H, W), 0 where there is no surface, and the number of pixels of its photograph. A
+            point deeper than its pixel by more than the share HIDDEN is occluded.
     """
     work = np.zeros(len(xyz))
     for camera, depth, pixels in views:
@@ -120,13 +120,13 @@ def point_work(xyz: np.ndarray, views: Iterable[tuple[Camera, np.ndarray, int]])
 
 
 def surface_points(camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """(H, W, 3) points of a view at z-depths (H, W), NaN where that is 0."""
+    """Return (H, W, 3) points of a view at z-depths (H, W), NaN where the depth is 0."""
     return camera.center + camera.world_rays() * np.where(depth > 0, depth, np.nan)[..., None]
 
 
 def enlarged(mask: np.ndarray, camera: Camera, factor: int) -> np.ndarray:
-    """(H, W) bool of the photograph's pixels, from a mask (h, w) of a view `factor` times as small, and those round
-    it."""
+    """Return an (H, W) bool mask in the photograph's pixels from a mask (h, w) of a view `factor` times as small,
+    dilated by DILATION."""
     from scipy.ndimage import binary_dilation
 
     mask = binary_dilation(mask, iterations=DILATION)
@@ -137,8 +137,8 @@ def enlarged(mask: np.ndarray, camera: Camera, factor: int) -> np.ndarray:
 
 
 def window(mask: np.ndarray, camera: Camera, factor: int) -> tuple[int, int, int, int] | None:
-    """(left, top, width, height) of the part of a photograph that shows a block, from a mask (h, w) of a view `factor`
-    times as small; None where less than LEAST_SHARE of the pixels show it."""
+    """Return (left, top, width, height) of the crop of a photograph that shows a block, from a mask (h, w) of a view
+    `factor` times as small; None if less than LEAST_SHARE of the pixels show it."""
     if mask.sum() < max(4, LEAST_SHARE * mask.size):
         return None
     full = enlarged(mask, camera, factor)

@@ -1,9 +1,10 @@
-"""Bundle adjustment of poses that are nearly right: the most probable ones by observed keypoints and as given.
+"""Bundle adjustment of nearly correct poses: maximum a posteriori poses from observed keypoints and the given poses as
+a prior.
 
-How far the given poses err is not known: each has an error of its own, of a variance that the observations tell, too
-(expectation maximisation). So poses that are exact stay, and where observations leave it open, as along a corridor of
-plain walls, poses stay as given instead of bending. Source: Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000
-(reduced camera system); Dempster et al., 1977.
+The accuracy of the given poses is unknown; the variance of their errors is estimated from the observations (expectation
+maximisation). So exact poses stay, and where observations leave poses undetermined, as along a corridor of plain walls,
+they stay as given instead of bending. Source: Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000 (reduced
+camera system); Dempster et al., 1977.
 """
 
 from __future__ import annotations
@@ -16,23 +17,27 @@ import numpy as np
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.feature_points import ObservedPoints
 
-# Steps of Gauss and Newton: for points alone, and for poses and points.
+# Number of Gauss-Newton steps: for points alone, and for poses and points.
 POINT_STEPS, STEPS = 10, 20
-# The constant of Cauchy's loss, in deviations of the noise: 95 % efficient where errors are normal.
+# Scale of the Cauchy loss, in standard deviations of the noise: 95 % efficient for normal errors.
 CAUCHY = 2.385
-# The median length of two normal errors of deviation 1.
+# Median length of a 2D vector of two independent normal errors with standard deviation 1.
 MEDIAN_LENGTH = float(np.sqrt(2 * np.log(2)))
-# Keypoints are no more exact than this, and poses are taken to err by so many pixels before anything is known.
+# Lower bound of the keypoint noise, and initial guess of the pose error, both in pixels.
 LEAST_NOISE, FIRST_ERROR = 0.02, 1.0
-# The deviation of focal lengths that come with poses, as a share: those of a calibration are right to some thousandths.
+# Relative standard deviation of focal lengths that come with the poses: calibrations are accurate to some thousandths.
 FOCAL_ERROR = 0.003
 
 
 @dataclass(frozen=True)
 class Adjusted:
-    """Adjusted cameras; by how many pixels the given poses err, root mean square, by their rotations and by their
-    centres together; the factor of all focal lengths and its deviation, as a share; and the radial distortion that is
-    left in the photographs, k1 of COLMAP's models, which is 0 unless it is asked for."""
+    """Result of a bundle adjustment.
+
+    `cameras`: adjusted cameras. `error_px`: root mean square error of the given poses in pixels, of rotations and
+    centres together. `focal_factor`: factor of all focal lengths, with its relative standard deviation
+    `focal_deviation`. `radial`: remaining radial distortion of the photographs, k1 of COLMAP's models; 0 unless it is
+    asked for.
+    """
 
     cameras: list[Camera]
     error_px: float
@@ -50,14 +55,14 @@ def bundle_adjusted(
     pose_error: float | None = None,
     radial_error: float = 0.0,
 ) -> Adjusted:
-    """The most probable poses and focal lengths; `points` have two observations or more each.
+    """Return the most probable poses and focal lengths. Each of `points` needs two or more observations.
 
     Args:
-        common: the variance of an error that all observations of a photograph share, over that of each one's own: n of
-            them tell as much as n / (1 + n common) without it.
-        focal: the factor of all focal lengths that is known without the observations, and its deviation, as a share.
-        pose_error: by how many pixels the given poses err, root mean square; None: the observations tell.
-        radial_error: the deviation of a radial distortion that is left in the photographs; 0: there is none.
+        common: variance of an error shared by all observations of a photograph, relative to the variance of independent
+            errors: n observations count as n / (1 + n common).
+        focal: prior of the factor of all focal lengths, and its relative standard deviation.
+        pose_error: root mean square error of the given poses in pixels; None: estimated from the observations.
+        radial_error: prior standard deviation of a remaining radial distortion; 0: there is none.
 
     Raises:
         numpy.linalg.LinAlgError: the observations determine nothing.
@@ -67,7 +72,7 @@ def bundle_adjusted(
     given, points = list(cameras), placed_points(cameras, points)
     depth = _median_depths(given, points)
     usual = np.median([(camera.fx + camera.fy) / 2 for camera in given])
-    # Deviations of rotations about an axis, in radians, and of centres along one, in depths.
+    # Standard deviations of rotations about an axis, in radians, and of centres along an axis, relative to depth.
     spread = np.full(2, (FIRST_ERROR if pose_error is None else pose_error) / 2 / usual)
     known, lens_error = np.log(focal[0]), np.array([focal[1], radial_error] if radial_error else [focal[1]])
     moves, lens = np.zeros((len(given), 6)), np.zeros(len(lens_error))
@@ -91,14 +96,15 @@ def bundle_adjusted(
         square = square / np.repeat([np.ones_like(depth), depth**2], 3, axis=0).T
         if pose_error is None:
             spread = np.sqrt(square.reshape(-1, 2, 3).mean((0, 2)))
-    # Two axes of each move what is seen.
+    # Only two of the three axes of each move points in the image.
     error = float(np.sqrt(2 * (spread**2).sum()) * usual)
     radial = float(lens[1]) if radial_error else 0.0
     return Adjusted(moved, error, float(np.exp(known + lens[0])), float(np.sqrt(covariance[of_lens])), radial)
 
 
 def placed_points(cameras: Sequence[Camera], points: ObservedPoints) -> ObservedPoints:
-    """The points where the cameras see them, by Gauss-Newton steps from where they are; with their mean errors."""
+    """Return the points after triangulation with fixed cameras, by Gauss-Newton steps from their current positions,
+    with their mean errors."""
     for _ in range(POINT_STEPS):
         found = _Equations(cameras, points)
         points = replace(points, xyz=points.xyz + found.of_points(None))
@@ -107,7 +113,7 @@ def placed_points(cameras: Sequence[Camera], points: ObservedPoints) -> Observed
 
 
 def reprojection_px(cameras: Sequence[Camera], points: ObservedPoints) -> np.ndarray:
-    """(N,) distance of every observation from where its point is seen, infinite behind the camera."""
+    """Return (N,) reprojection errors in pixels, infinite behind the camera."""
     error = np.zeros(len(points.image))
     for k, camera in enumerate(cameras):
         rows = points.image == k
@@ -117,12 +123,12 @@ def reprojection_px(cameras: Sequence[Camera], points: ObservedPoints) -> np.nda
 
 
 class _Equations:
-    """Normal equations of all observations around cameras and points, weighted by Cauchy's loss and by the variance of
-    the noise, which their median tells.
+    """Normal equations of all observations, linearised at the given cameras and points. Weights come from the Cauchy
+    loss and the noise variance, which is estimated from the median residual.
 
-    A camera moves by six numbers: it turns about its centre by three, in radians about its axes, and what it sees
-    shifts by three along them. Then comes the logarithm of a factor of all focal lengths and, where `radial` is given,
-    the radial distortion of all photographs, which `radial` is so far.
+    A camera has six parameters: a rotation about its centre, in radians about its axes, and a shift of what it sees
+    along them. Shared parameters follow: the log factor of all focal lengths and, if `radial` (its current value) is
+    given, the radial distortion of all photographs.
     """
 
     def __init__(
@@ -164,13 +170,17 @@ class _Equations:
         np.add.at(self.point_matrix, self.point, np.einsum("nki,nkj->nij", weighted, self.by_point))
         self.point_right = np.zeros((self.points, 3))
         np.add.at(self.point_right, self.point, np.einsum("nki,nk->ni", weighted, miss))
-        # Points that are seen from one direction do not leave along it.
+        # Damping, so that points with parallel rays do not run away along them.
         damping = 1e-6 * np.trace(self.point_matrix, axis1=1, axis2=2) + 1e-300
         self.point_inverse = np.linalg.inv(self.point_matrix + damping[:, None, None] * np.eye(3))
 
     def reduced(self, information: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The (6 K + L, 6 K + L) matrix and the right side for cameras and the L numbers of the lens alone, with the
-        `information` (6 K + L,) about the `moves` (6 K + L,) that they have made from what was given."""
+        """Return the reduced camera system, with points eliminated: a (6 K + L, 6 K + L) matrix and the right side, for
+        K cameras and L shared lens parameters.
+
+        `information` (6 K + L,) is the prior's inverse variance; `moves` (6 K + L,) are the changes so far from the
+        prior's mean.
+        """
         from scipy.sparse import bsr_matrix
 
         weighted, of_lens = self.weight[:, None, None] * self.by_camera, self.weight[:, None, None] * self.by_lens
@@ -179,7 +189,7 @@ class _Equations:
         np.add.at(both_kinds, self.image, np.einsum("nki,nkj->nij", self.by_camera, of_lens))
         right = np.zeros((self.cameras, 6))
         np.add.at(right, self.image, np.einsum("nki,nk->ni", weighted, self.miss))
-        # One row of blocks per observation: of its camera, times those of its point.
+        # One block row per observation: the Jacobian block of its camera times that of its point.
         order, both = np.argsort(self.image, kind="stable"), np.einsum("nki,nkj->nij", weighted, self.by_point)
         bounds = np.searchsorted(self.image[order], np.arange(self.cameras + 1))
         shape = (6 * self.cameras, 3 * self.points)
@@ -202,7 +212,8 @@ class _Equations:
         return matrix, np.append(right, lens_right) - information * moves
 
     def of_points(self, step: np.ndarray | None) -> np.ndarray:
-        """(P, 3) the points' step where cameras and the lens step by (6 K + L,), or stay."""
+        """Return the (P, 3) step of the points for a (6 K + L,) step of the cameras and the lens, or None for no
+        step."""
         right = self.point_right
         if step is not None:
             right, count = right.copy(), 6 * self.cameras
@@ -213,7 +224,7 @@ class _Equations:
 
 
 def _median_depths(cameras: Sequence[Camera], points: ObservedPoints) -> np.ndarray:
-    """(K,) of the points that a camera sees; that of all where it sees none."""
+    """Return (K,) the median depth of the points that each camera sees, or of all points if it sees none."""
     depths = [camera.project(points.xyz[points.point[points.image == k]])[1] for k, camera in enumerate(cameras)]
     usual = float(np.median(np.concatenate(depths)))
     return np.array([max(float(np.median(own)), 1e-3 * usual) if len(own) else usual for own in depths])

@@ -1,7 +1,7 @@
-"""Pinhole cameras and the similarity between the data set's frame and the one that training works in.
+"""Pinhole cameras, and the similarity transform between the data set's frame and the training frame.
 
-Conventions, said once: the camera looks along +z, x is right and y is down; pixel (row i, column j) has its
-centre at (x, y) = (j + 0.5, i + 0.5); `depth` is z along the optical axis and `distance` is along the unit ray.
+Conventions: the camera looks along +z, x is right and y is down. Pixel (row i, column j) has its centre at (x, y) = (j
++ 0.5, i + 0.5). `depth` is z along the optical axis; `distance` is along the unit ray.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera: size in pixels, focal lengths and principal point in pixels, and a rigid pose.
+    """A pinhole camera: image size, focal lengths and principal point in pixels, and a rigid pose.
 
     `world_to_camera` is (4, 4) float64 with an orthonormal rotation: x_camera = R x_world + t.
     """
@@ -28,29 +28,29 @@ class Camera:
 
     @property
     def K(self) -> np.ndarray:
-        """The (3, 3) matrix of intrinsics, in pixels."""
+        """Return the (3, 3) intrinsics matrix, in pixels."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
     def rotation(self) -> np.ndarray:
-        """(3, 3), world to camera."""
+        """Return the (3, 3) rotation from world to camera."""
         return self.world_to_camera[:3, :3]
 
     @property
     def center(self) -> np.ndarray:
-        """(3,) position of the camera in the world."""
+        """Return the (3,) position of the camera in the world."""
         return -self.rotation.T @ self.world_to_camera[:3, 3]
 
     @property
     def camera_to_world(self) -> np.ndarray:
-        """(4, 4), the inverse of `world_to_camera`."""
+        """Return the (4, 4) inverse of `world_to_camera`."""
         pose = np.eye(4)
         pose[:3, :3] = self.rotation.T
         pose[:3, 3] = self.center
         return pose
 
     def ray_grid(self) -> np.ndarray:
-        """(H, W, 3) camera-space rays through the pixel centres, scaled so that z = 1: a point is depth * ray."""
+        """Return (H, W, 3) camera-space rays through the pixel centres with z = 1: a point is depth * ray."""
         x = (np.arange(self.width) + 0.5 - self.cx) / self.fx
         y = (np.arange(self.height) + 0.5 - self.cy) / self.fy
         rays = np.ones((self.height, self.width, 3))
@@ -59,11 +59,12 @@ class Camera:
         return rays
 
     def world_rays(self) -> np.ndarray:
-        """(H, W, 3) the same rays in the world's axes; a point is `center + depth * ray`."""
+        """Return the (H, W, 3) rays of `ray_grid` in world axes; a point is `center + depth * ray`."""
         return self.ray_grid() @ self.rotation
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Projects (P, 3) world points to ((P, 2) pixel positions, (P,) depths); behind the camera gives NaN pixels."""
+        """Project (P, 3) world points to (P, 2) pixel positions and (P,) depths. Positions are NaN behind the
+        camera."""
         x, y, depth = self.rotation @ points.T + self.world_to_camera[:3, 3:]
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = np.where(depth > 0, 1.0 / depth, np.nan)
@@ -72,19 +73,20 @@ class Camera:
         return pixels, depth
 
     def shows(self, pixels: np.ndarray, depth: np.ndarray, margin: float = 0.0) -> np.ndarray:
-        """(P,) bool: which of (P, 2) pixel positions and their (P,) depths, as of `project`, are in front of the camera
-        and in the image, `margin` pixels from its border."""
+        """Return (P,) bool: which of (P, 2) pixel positions with (P,) depths, as from `project`, are in front of the
+        camera and inside the image, at least `margin` pixels from its border."""
         x, y = pixels.T
         with np.errstate(invalid="ignore"):
             inside = (x >= margin) & (y >= margin) & (x < self.width - margin) & (y < self.height - margin)
             return inside & (depth > 0)
 
     def pinhole(self) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-        """(3, 4) world to camera, and focal lengths and principal point, as the core takes them."""
+        """Return the (3, 4) world-to-camera matrix, and focal lengths and principal point, as the compiled core expects
+        them."""
         return np.ascontiguousarray(self.world_to_camera[:3], np.float64), (self.fx, self.fy, self.cx, self.cy)
 
     def magnified(self, factor: int) -> Camera:
-        """The same view with `factor` by `factor` pixels in place of each one."""
+        """Return the same view at `factor` times the resolution."""
         return replace(
             self,
             width=self.width * factor,
@@ -96,7 +98,7 @@ class Camera:
         )
 
     def transformed(self, similarity: Similarity) -> Camera:
-        """The same camera seen from the frame that `similarity` maps to."""
+        """Return the same camera in the frame that `similarity` maps to."""
         pose = np.eye(4)
         pose[:3, :3] = self.rotation
         pose[:3, 3] = -self.rotation @ similarity.apply(self.center)
@@ -111,10 +113,10 @@ class Similarity:
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Maps (..., 3) points."""
+        """Transform (..., 3) points."""
         return self.scale * (np.asarray(points, dtype=np.float64) - np.asarray(self.offset))
 
     def inverse(self) -> Similarity:
-        """The similarity that undoes this one."""
+        """Return the inverse transform."""
         x, y, z = (float(-self.scale * value) for value in self.offset)
         return Similarity(1.0 / self.scale, (x, y, z))

@@ -1,6 +1,6 @@
-"""A cube map of the colours at infinity, and its files in a run.
+"""Environment maps: cube maps of the colours at infinity, and their files in a run.
 
-`kernels.ops.environment_light` says how the six faces lie.
+`kernels.ops.environment_light` defines the layout of the six faces.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write
 from linprim_geo.geometry.camera import Camera
 
-# Its files in the folder of a run.
+# Names of the map's files in a run's folder.
 FILE, PICTURE = "environment.npy", "environment.png"
-# A texel in the middle of a face covers so many pixels of the photographs' middle, and a side of a face has no more
-# than so many.
+# TEXEL_PX: pixels at the centre of a photograph that a texel at the centre of a face covers. MOST_TEXELS: largest side
+# of a face in texels.
 TEXEL_PX, MOST_TEXELS = 4.0, 512
 
 
 def texels_for(cameras: Sequence[Camera], texel_px: float = TEXEL_PX, most: int = MOST_TEXELS) -> int:
-    """Texels on a side of a face for photographs by these cameras."""
+    """Return the number of texels on a side of a face for photographs by these cameras."""
     focal = float(np.median([max(camera.fx, camera.fy) for camera in cameras]))
     return int(np.clip(round(2 * focal / texel_px), 8, most))
 
 
 def texel_directions(size: int) -> np.ndarray:
-    """(6, size, size, 3) directions of the texels' centres, with +-1 for their largest coordinate."""
+    """Return (6, size, size, 3) directions of the texel centres; the largest coordinate of each is +-1."""
     along = 2 * (np.arange(size) + 0.5) / size - 1
     rows, columns = np.meshgrid(along, along, indexing="ij")
     faces = np.empty((6, size, size, 3))
@@ -42,7 +42,8 @@ def texel_directions(size: int) -> np.ndarray:
 
 
 def nearest_texel(directions: np.ndarray, size: int) -> np.ndarray:
-    """(...) int64 index, among the 6 size^2 texels, of the one that each of (..., 3) directions points to."""
+    """Return (...) int64 indices, among the 6 size^2 texels, of the texel that each of (..., 3) directions points
+    to."""
     axis = np.abs(directions).argmax(-1)[..., None]
     along = np.take_along_axis(directions, axis, -1)
     column, row = (np.take_along_axis(directions, (axis + step) % 3, -1) / np.abs(along) for step in (1, 2))
@@ -51,12 +52,12 @@ def nearest_texel(directions: np.ndarray, size: int) -> np.ndarray:
 
 
 def filled(texels: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """(6, S, S, C) texels, of which those without weight (6, S, S, 1) have the mean of those round them, from as near
-    as there are any.
+    """Return (6, S, S, C) texels in which those without weight (6, S, S, 1) are replaced by the mean of the nearest
+    ones with weight.
 
-    Means over 2 by 2 texels are taken again and again, then handed back from coarse to fine to where there was nothing
-    (push and pull); a face that has nothing has the mean of all. Source: Gortler et al., The Lumigraph (SIGGRAPH 1996),
-    section 3.4, its idea.
+    Means over 2 by 2 texels are computed repeatedly, then passed down from coarse to fine to fill gaps (push-pull). A
+    face without any weight takes the mean of all faces. Source: the idea of Gortler et al., The Lumigraph (SIGGRAPH
+    1996), section 3.4.
     """
     pool = torch.nn.functional.avg_pool2d
     weight = (weight > 0).to(texels.dtype)
@@ -77,7 +78,7 @@ def filled(texels: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
 
 
 def save_environment(folder: Path, texels: torch.Tensor) -> None:
-    """Writes FILE, the texels, and PICTURE, all directions to be looked at."""
+    """Write the texels to FILE and a panorama of all directions to PICTURE."""
     with atomic_write(folder / FILE) as temporary, open(temporary, "wb") as file:
         np.save(file, texels.detach().numpy())
     with atomic_write(folder / PICTURE) as temporary:
@@ -85,7 +86,7 @@ def save_environment(folder: Path, texels: torch.Tensor) -> None:
 
 
 def load_environment(folder: Path) -> torch.Tensor | None:
-    """The (6, S, S, 3) float32 texels that `save_environment` wrote; None if there are none.
+    """Return the (6, S, S, 3) float32 texels that `save_environment` wrote; None if there are none.
 
     Raises:
         LinprimError: the file is damaged.
@@ -107,7 +108,8 @@ def load_environment(folder: Path) -> torch.Tensor | None:
 
 
 def panorama(texels: torch.Tensor) -> np.ndarray:
-    """(2 S, 4 S, 3) uint8 equirectangular picture of (6, S, S, 3) texels: +x in the middle, +y left of it, +z up."""
+    """Return a (2 S, 4 S, 3) uint8 equirectangular image of (6, S, S, 3) texels: +x in the middle, +y left of it, +z
+    up."""
     size = texels.shape[1]
     azimuth, height = np.meshgrid(
         np.pi * (1 - (np.arange(4 * size) + 0.5) / (2 * size)), np.pi * (0.5 - (np.arange(2 * size) + 0.5) / (2 * size))

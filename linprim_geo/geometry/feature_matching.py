@@ -1,7 +1,7 @@
-"""Keypoints of two photographs that are each other's nearest by descriptor, by one product of matrices.
+"""Match keypoints of two photographs by mutual nearest descriptors, with one matrix product.
 
-The rule is COLMAP's: an angle between descriptors of MOST_ANGLE at most, no more than RATIO of that to the second
-nearest, both ways. Its own matcher on the CPU takes thirteen times as long.
+The rule is COLMAP's: an angle between descriptors of at most MOST_ANGLE and of at most RATIO times the angle to the
+second nearest, in both directions. COLMAP's own matcher on the CPU takes thirteen times as long.
 """
 
 from __future__ import annotations
@@ -9,18 +9,18 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-# In radians, of SIFT's descriptors; and Lowe's ratio. The defaults of COLMAP.
+# Largest angle between SIFT descriptors in radians, and Lowe's ratio: COLMAP's defaults.
 MOST_ANGLE, RATIO = 0.7, 0.8
-# Descriptors are bytes of this length, but for rounding.
+# L2 norm of a descriptor of 128 bytes, up to rounding.
 LENGTH = 512.0
-# Rows of the product in memory at a time.
+# Rows of the matrix product that are in memory at a time.
 ROWS = 1024
 
 
 def mutual_matches(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """(M, 2) uint32 rows of (N, 128) and (K, 128) uint8 descriptors that match, ordered by the first.
+    """Return (M, 2) uint32 indices of matching rows of (N, 128) and (K, 128) uint8 descriptors, ordered by the first.
 
-    Sums of products of bytes stay below 2^24: they are exact in float32, on every processor.
+    Sums of products of bytes stay below 2^24, so they are exact in float32 on every processor.
     """
     if min(len(first), len(second)) < 2:
         return np.zeros((0, 2), np.uint32)
@@ -32,7 +32,8 @@ def mutual_matches(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _nearest(ours: torch.Tensor, theirs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """For each of (N, 128) descriptors the nearest of (K, 128) others, and whether it is near enough and stands out."""
+    """Return, for each of (N, 128) descriptors, the index of the nearest of (K, 128) others, and whether it passes the
+    angle and ratio tests."""
     found = []
     for begin in range(0, len(ours), ROWS):
         alike = ours[begin : begin + ROWS] @ theirs.T

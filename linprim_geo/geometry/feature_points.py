@@ -1,4 +1,5 @@
-"""Points from photographs with known cameras: SIFT, matching, epipolar geometry and triangulation by pycolmap."""
+"""Triangulate points from photographs with known cameras: SIFT, matching, epipolar check and triangulation by
+pycolmap."""
 
 from __future__ import annotations
 
@@ -13,23 +14,23 @@ from linprim_geo.base.files import readable_write_errors
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.feature_matching import mutual_matches
 
-# Each view is matched with this many others, those that look most alike in place and direction.
+# Number of other views that each view is matched with: those with the most similar positions and directions.
 _PARTNERS = 12
-# Views whose axes differ by more are not matched: SIFT finds little beyond 60 degrees.
+# Views whose optical axes differ by more are not matched: SIFT finds little beyond 60 degrees.
 _MIN_AXIS_COSINE = 0.4
 _MAX_FEATURES = 8192
-# A third of COLMAP's: renderings and plain walls have few strong features, and the poses weed out the weak
-# ones.
+# A third of COLMAP's: renderings and plain walls have few strong features, and the known poses reject wrong matches of
+# weak ones.
 _PEAK_THRESHOLD = 0.002
-# Matches may miss their epipolar lines by so much; more than keypoints do, as poses have errors of their own.
+# Largest distance of matches from their epipolar lines; larger than keypoint noise, because poses have errors too.
 _MAX_EPIPOLAR_PX = 2.0
-# What a point must fulfil: its error over all its views, and the widest angle between the rays to it.
+# Criteria for reliable points: mean error over all views, and smallest value of the widest angle between the rays.
 _MAX_ERROR_PX = 1.5
 _MIN_ANGLE_DEGREES = 2.0
-# Two views agree on many a wrong match along the same ray, so they must agree better than three.
+# Two views often agree on a wrong match along the same epipolar line, so points of two views need a smaller error.
 _MAX_TWO_VIEW_ERROR_PX = 0.5
-# A point is dropped if its nearest points are, seen from the camera nearest to it, this many times farther
-# than usual.
+# A point is isolated if the mean distance to its nearest points, relative to the nearest camera that sees it, is this
+# many times the median.
 _NEIGHBOURS = 8
 _MAX_ISOLATION = 4.0
 _ISOLATION_ROUNDS = 3
@@ -37,9 +38,12 @@ _ISOLATION_ROUNDS = 3
 
 @dataclass(frozen=True)
 class ObservedPoints:
-    """Points and where photographs see them: `xyz` (P, 3), `rgb` (P, 3) uint8, mean `error_px` (P,), and observations,
-    ordered by point: `point` (N,), `image` (N,) and `pixel` (N, 2). `precision` (N, 2, 2) are symmetric roots of their
-    inverse covariances, up to a factor; None if all are alike."""
+    """Points and their observations in photographs.
+
+    Points: `xyz` (P, 3), `rgb` (P, 3) uint8, mean error `error_px` (P,). Observations, ordered by point: `point` (N,)
+    and `image` (N,) indices and `pixel` (N, 2). `precision` (N, 2, 2) are symmetric square roots of the inverse
+    covariances of the observations, up to a common factor; None if all are equal.
+    """
 
     xyz: np.ndarray
     rgb: np.ndarray
@@ -51,16 +55,16 @@ class ObservedPoints:
 
     @property
     def track_length(self) -> np.ndarray:
-        """(P,) how many observations each point has."""
+        """Return (P,) the number of observations of each point."""
         return np.bincount(self.point, minlength=len(self.xyz))
 
     def tracks(self) -> list[list[int]]:
-        """The photographs that see each point, in ascending order."""
+        """Return the indices of the photographs that see each point, in ascending order."""
         bounds = np.searchsorted(self.point, np.arange(len(self.xyz) + 1))
         return [np.unique(self.image[a:b]).tolist() for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
 
     def chosen(self, keep: np.ndarray) -> ObservedPoints:
-        """Those points (P,) that are True."""
+        """Return the points where `keep` (P,) is True, with their observations."""
         number = np.cumsum(keep) - 1
         rows = keep[self.point]
         kept = self.xyz[keep], self.rgb[keep], self.error_px[keep]
@@ -78,21 +82,23 @@ def triangulate_features(
     longer_side: int = 0,
     most_epipolar_px: float = _MAX_EPIPOLAR_PX,
 ) -> ObservedPoints:
-    """Keypoints (SIFT on the CPU), matched between views that look alike, verified and triangulated with the cameras
-    kept fixed; all points, reliable or not (`reliable_points`).
+    """Find SIFT keypoints (on the CPU), match them between similar views, verify the matches and triangulate with fixed
+    cameras.
+
+    Returns all points, reliable or not (see `reliable_points`).
 
     Args:
         cameras: of the photographs, without distortion.
-        write_images: puts them into a folder as `file_name` says.
-        seed: of what pycolmap samples.
+        write_images: writes them into a folder, named by `file_name`.
+        seed: for pycolmap's random sampling.
         threads: for keypoints; -1 uses all cores.
-        most_keypoints: of a photograph.
-        longer_side: larger photographs are made so small for keypoints; 0 leaves that to COLMAP.
-        most_epipolar_px: matches may miss their epipolar lines by so much.
+        most_keypoints: largest number per photograph.
+        longer_side: larger photographs are reduced to this size for keypoints; 0 leaves that to COLMAP.
+        most_epipolar_px: largest distance of matches from their epipolar lines in pixels.
     """
     from linprim_geo.geometry.load_pycolmap import pycolmap
 
-    pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, 2)  # progress of every image and pair otherwise
+    pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, 2)  # no messages per image and pair
     pycolmap.set_random_seed(seed)
     with (
         tempfile.TemporaryDirectory(prefix="linprim-points-") as name,
@@ -117,7 +123,7 @@ def triangulate_features(
 
 
 def _match(database_path: Path, images: Path, pairs: list, threads: int, most: int, longer_side: int) -> None:
-    """Finds keypoints in the photographs and matches them between the pairs."""
+    """Find keypoints in the photographs and match them between the pairs."""
     from linprim_geo.geometry.load_pycolmap import pycolmap
 
     extraction = pycolmap.FeatureExtractionOptions(num_threads=threads)
@@ -133,7 +139,7 @@ def _match(database_path: Path, images: Path, pairs: list, threads: int, most: i
 
 
 def _collected(points: list, model=None) -> ObservedPoints:
-    """The points of a pycolmap reconstruction with their observations."""
+    """Return the points of a pycolmap reconstruction with their observations."""
     elements = [(row, element) for row, point in enumerate(points) for element in point.track.elements]
     pixel = [model.image(element.image_id).points2D[element.point2D_idx].xy for _, element in elements]
     return ObservedPoints(
@@ -147,10 +153,10 @@ def _collected(points: list, model=None) -> ObservedPoints:
 
 
 def matching_pairs(cameras: Sequence[Camera], partners: int = _PARTNERS) -> list[tuple[int, int]]:
-    """Pairs (i < j) of cameras worth matching: for each the most alike, by angle between the axes and by
-    distance.
+    """Return pairs (i < j) of cameras to match: for each camera the most similar ones by angle between the optical axes
+    and by distance.
 
-    The cost is 2 (1 - cos angle) + distance / (median distance of all pairs).
+    The cost of a pair is 2 (1 - cos angle) + distance / (median distance of all pairs).
     """
     centers = np.array([camera.center for camera in cameras])
     axes = np.array([camera.rotation[2] for camera in cameras])
@@ -169,10 +175,9 @@ def matching_pairs(cameras: Sequence[Camera], partners: int = _PARTNERS) -> list
 
 
 def posed_model(cameras: Sequence[Camera], database_path: Path):
-    """A reconstruction with the cameras and no points, of which the database knows; image i + 1 is camera i.
+    """Return a reconstruction with the cameras and no points, and write it to the database; image i + 1 is camera i.
 
-    Left to itself, pycolmap numbers images in the order in which its threads finish them, and points depend
-    on that.
+    By default, pycolmap numbers images in the order in which its threads finish them, and points depend on that.
     """
     from linprim_geo.geometry.load_pycolmap import pycolmap
 
@@ -202,9 +207,9 @@ def posed_model(cameras: Sequence[Camera], database_path: Path):
 def verify_matches(
     cameras: Sequence[Camera], database_path: Path, pairs: list, most_px: float = _MAX_EPIPOLAR_PX
 ) -> None:
-    """Keeps the matches that the known poses allow: those within `most_px` of each other's epipolar lines.
+    """Keep the matches that agree with the known poses: those within `most_px` of each other's epipolar lines.
 
-    The distance is Sampson's, |x2' F x1| / sqrt(|(F x1)_xy|^2 + |(F' x2)_xy|^2), first order in pixels.
+    The distance is Sampson's, |x2' F x1| / sqrt(|(F x1)_xy|^2 + |(F' x2)_xy|^2), a first-order distance in pixels.
     """
     from linprim_geo.geometry.load_pycolmap import pycolmap
 
@@ -227,7 +232,7 @@ def verify_matches(
 
 
 def sampson_px(first: Camera, second: Camera, pixels_first: np.ndarray, pixels_second: np.ndarray) -> np.ndarray:
-    """(M,) distance in pixels of matched (M, 2) positions from the epipolar geometry of two cameras."""
+    """Return (M,) Sampson distances in pixels of matched (M, 2) positions for the epipolar geometry of two cameras."""
     relative = second.world_to_camera @ first.camera_to_world
     x, y, z = relative[:3, 3]
     essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ relative[:3, :3]
@@ -238,16 +243,16 @@ def sampson_px(first: Camera, second: Camera, pixels_first: np.ndarray, pixels_s
     scale = np.sqrt((line_two[:, :2] ** 2).sum(axis=1) + (line_one[:, :2] ** 2).sum(axis=1))
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.abs((two * line_two).sum(axis=1)) / scale
-    return np.nan_to_num(error, nan=np.inf)  # two cameras in one place match nothing
+    return np.nan_to_num(error, nan=np.inf)  # cameras in the same place match nothing
 
 
 def file_name(index: int) -> str:
-    """The name of photograph `index` in the folder that keypoints are found in."""
+    """Return the file name of photograph `index` in the folder used for keypoints."""
     return f"{index:06d}.png"
 
 
 def reliable_points(cameras: Sequence[Camera], points: ObservedPoints) -> np.ndarray:
-    """(P,) whether a point's error, angle and company are good enough."""
+    """Return (P,) whether a point passes the tests of error, ray angle and isolation."""
     xyz, tracks = points.xyz, points.tracks()
     if not len(xyz):
         return np.zeros(0, dtype=bool)
@@ -267,12 +272,12 @@ def reliable_points(cameras: Sequence[Camera], points: ObservedPoints) -> np.nda
 
 
 def not_isolated(xyz: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """(P,) whether a point has company: the mean distance to its 8 nearest, divided by `reach`, is not
-    unusual.
+    """Return (P,) whether a point is not isolated: the mean distance to its 8 nearest points, divided by `reach`, is at
+    most 4 times the median.
 
-    `reach` (P,) is the distance to the nearest camera that sees the point, so that far and thinly covered
-    parts of a scene are not taken for errors. Unusual is 4 times the median; in three rounds, as wrong points
-    keep company too.
+    `reach` (P,) is the distance to the nearest camera that sees the point, so that distant, sparsely covered parts of a
+    scene are not taken for errors. The test is repeated up to three times, because wrong points can be each other's
+    neighbours.
     """
     from scipy.spatial import cKDTree
 

@@ -1,7 +1,6 @@
-"""Camera models with distortion: which pinhole replaces one, and where that pinhole's pixels lie in the
-photograph.
+"""Camera models with distortion: the pinhole camera that replaces each, and the map from its pixels to the photograph.
 
-The models, their parameter orders and their projections are COLMAP's, evaluated by pycolmap.
+Models, parameter order and projections are COLMAP's, evaluated by pycolmap.
 """
 
 from __future__ import annotations
@@ -13,8 +12,8 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 
-# Models that are a plain pinhole when everything after focal lengths and principal point is zero,
-# with the number of parameters that come before the distortion.
+# Models that are a pinhole camera if all parameters after focal lengths and principal point are zero, with the number
+# of parameters before the distortion.
 _PINHOLE_WHEN_ZERO = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
@@ -23,14 +22,13 @@ _PINHOLE_WHEN_ZERO = {
     "OPENCV": 4,
     "FULL_OPENCV": 4,
 }
-# Positions along each side at which a distortion is checked.
+# Number of positions along each side of the image at which a distortion is checked.
 _CHECK_GRID = 65
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera model by COLMAP's name, with its parameters in COLMAP's order and the size of the
-    photographs."""
+    """A camera model by COLMAP's name, its parameters in COLMAP's order, and the size of the photographs."""
 
     model: str
     width: int
@@ -39,14 +37,14 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether this is a pinhole without any distortion, so that the photographs are used as they are."""
+        """Return whether the model has no distortion, so that the photographs are used as they are."""
         before = _PINHOLE_WHEN_ZERO.get(self.model)
         return before is not None and not any(self.params[before:])
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole without its pose: size, focal lengths and principal point in pixels."""
+    """Intrinsics of a pinhole camera: size, focal lengths and principal point in pixels."""
 
     width: int
     height: int
@@ -58,8 +56,7 @@ class Intrinsics:
 
 @lru_cache(maxsize=1)
 def model_parameter_counts() -> dict[str, tuple[int, int]]:
-    """{name: (COLMAP's number of the model, number of parameters)} of every model the installed pycolmap
-    knows."""
+    """Return {name: (COLMAP's model number, number of parameters)} of every model that the installed pycolmap knows."""
     from linprim_geo.geometry.load_pycolmap import pycolmap
 
     counts = {}
@@ -72,11 +69,10 @@ def model_parameter_counts() -> dict[str, tuple[int, int]]:
 
 
 def check_lens(lens: Lens, where: str) -> None:
-    """Refuses what cannot be a camera.
+    """Check that a lens is a valid camera.
 
     Raises:
-        LinprimError: unknown model, wrong number of parameters, or numbers that are not finite or not
-            positive.
+        LinprimError: unknown model, wrong number of parameters, or numbers that are not finite or not positive.
     """
     known = model_parameter_counts()
     if lens.model not in known:
@@ -97,8 +93,8 @@ def check_lens(lens: Lens, where: str) -> None:
 
 
 def undistorted(lens: Lens, where: str = "camera") -> Intrinsics:
-    """The pinhole that replaces `lens`: the lens itself if it is one, else the largest view without blank
-    pixels.
+    """Return the pinhole camera that replaces `lens`: the lens itself if it has no distortion, else the largest view
+    without blank pixels.
 
     Raises:
         LinprimError: the distortion leaves no image.
@@ -108,7 +104,7 @@ def undistorted(lens: Lens, where: str = "camera") -> Intrinsics:
     said = f"{where}: camera model {lens.model} with parameters {_list(lens.params)}"
     try:
         result = _undistorted(lens)
-        # A coarse grid that includes the border is enough to see whether the image folds over or is left.
+        # A coarse grid that includes the border is enough to detect whether the image folds over or is left.
         x = np.linspace(0.5, result.width - 0.5, _CHECK_GRID)
         y = np.linspace(0.5, result.height - 0.5, _CHECK_GRID)
         pixels = _project_grid(lens, result, x, y)
@@ -126,8 +122,8 @@ def undistorted(lens: Lens, where: str = "camera") -> Intrinsics:
 
 
 def largest_displacement(lens: Lens) -> float:
-    """By how many pixels, at most, a lens puts a ray beside where the pinhole of its focal lengths and principal point
-    would have it, over the image; infinite where the lens does not show what that pinhole shows."""
+    """Return the largest displacement in pixels by the distortion, over the image, compared to the pinhole camera with
+    the same focal lengths and principal point; infinite if the lens cannot show what that camera shows."""
     if lens.is_pinhole:
         return 0.0
     camera = _camera(lens)
@@ -143,7 +139,8 @@ def largest_displacement(lens: Lens) -> float:
 
 
 def straightened(lens: Lens, below: float) -> Lens:
-    """The pinhole that a lens nearly is, if it shifts no ray by `below` pixels; else the lens itself."""
+    """Return the pinhole camera that replaces a lens if its distortion shifts every ray by less than `below` pixels;
+    else the lens itself."""
     known = model_parameter_counts()
     if lens.is_pinhole or lens.model not in known or len(lens.params) != known[lens.model][1]:
         return lens
@@ -153,15 +150,14 @@ def straightened(lens: Lens, below: float) -> Lens:
 
 
 def resized(lens: Lens, width: int, height: int) -> Lens:
-    """The lens of the same photographs in another size; where there is one focal length, its scale is the mean of
-    both."""
+    """Return the lens for photographs of another size. A single focal length is scaled by the mean of both scales."""
     camera = _camera(lens)
     camera.rescale(width, height)
     return Lens(lens.model, width, height, tuple(float(value) for value in camera.params))
 
 
 def zoomed(lens: Lens, factor: float) -> Lens:
-    """The lens with focal lengths that are longer by a factor."""
+    """Return the lens with its focal lengths multiplied by a factor."""
     focal = set(_camera(lens).focal_length_idxs())
     params = tuple(value * factor if k in focal else value for k, value in enumerate(lens.params))
     return Lens(lens.model, lens.width, lens.height, params)
@@ -177,8 +173,8 @@ def _undistorted(lens: Lens) -> Intrinsics:
 
 @lru_cache(maxsize=4)
 def source_pixels(lens: Lens, target: Intrinsics) -> np.ndarray:
-    """(H, W, 2) float32: where the centre of each pixel of the pinhole `target` falls in the photograph of
-    `lens`."""
+    """Return (H, W, 2) float32: the position in the photograph of `lens` of each pixel centre of the pinhole camera
+    `target`."""
     pixels = _project_grid(lens, target, np.arange(target.width) + 0.5, np.arange(target.height) + 0.5)
     pixels = pixels.astype(np.float32)
     pixels.setflags(write=False)
@@ -186,8 +182,8 @@ def source_pixels(lens: Lens, target: Intrinsics) -> np.ndarray:
 
 
 def _project_grid(lens: Lens, target: Intrinsics, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(len(y), len(x), 2): where the pixel positions `x`, `y` of the pinhole `target` fall in the
-    photograph."""
+    """Return (len(y), len(x), 2): the positions in the photograph of pixel positions `x`, `y` of the pinhole camera
+    `target`."""
     u, v = np.meshgrid((x - target.cx) / target.fx, (y - target.cy) / target.fy)
     rays = np.stack([u, v, np.ones_like(u)], axis=-1)
     return np.asarray(_camera(lens).img_from_cam(rays.reshape(-1, 3))).reshape(len(y), len(x), 2)

@@ -1,8 +1,8 @@
-"""pycolmap, imported in the one order that is safe: the rest of the package takes it from here.
+"""Import pycolmap in the only safe order; the rest of the package imports it from here.
 
-pycolmap exports the zlib inside of it. Where it is the first to load the system's zlib, that one calls into it, and the
-next PNG that Pillow, which uses the system's, saves corrupts memory. Loaded by Pillow first, the system's zlib calls
-itself.
+pycolmap exports its bundled zlib. If pycolmap loads the system's zlib first, the system's library calls into the
+bundled one, and the next PNG that Pillow saves (with the system's) corrupts memory. If Pillow loads it first, the
+system's zlib calls itself.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""Triangle meshes: the `Mesh` that every stage passes on, its areas, normals and parts, and the checks before a library
-sees it.
+"""Triangle meshes: the `Mesh` class, areas, normals and connected components, and the checks before other libraries are
+called.
 
-Some mesh libraries crash or answer nonsense on empty meshes, foreign indices, NaN and degenerate faces, so
-whatever comes from a file or from a user goes through `validate_mesh` before igl, Open3D, pymeshlab or
-Embree.
+Some mesh libraries crash or return wrong results on empty meshes, out-of-range indices, NaN and degenerate faces.
+Therefore everything from a file or a user passes `validate_mesh` before igl, Open3D, pymeshlab or Embree.
 """
 
 from __future__ import annotations
@@ -14,22 +13,22 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 
-# Rounding of the cross product of two edges, in units of machine epsilon times the products that enter it:
-# two subtractions, two products and one difference per component, three components.
+# Rounding error of the cross product of two edges, in units of machine epsilon times the products involved: two
+# subtractions, two products and one difference per component, three components.
 CROSS_ROUNDING = 8.0
 
-# Float32 coordinates are written as long as their rounding stays below this share of the mesh's diagonal.
+# Coordinates are written as float32 if their rounding error stays below this share of the mesh's diagonal.
 FLOAT32_SHARE = 1e-6
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh in some frame; all but its vertices and faces is optional.
+    """A triangle mesh in some frame; everything except vertices and faces is optional.
 
-    `vertices` (V, 3) float64, `faces` (F, 3) int64, counter-clockwise seen from outside. `normals` (V, 3)
-    float32 of unit length (zero where a vertex has none), `colors` (V, 3) uint8 sRGB as in the photographs,
-    `quality` (V,) float32: the uncertainty of the vertex, in scene units, `primitive` (F,) int32: the row of the
-    primitive that a face is a part of, -1 for none. Arrays of other types are converted.
+    `vertices` (V, 3) float64. `faces` (F, 3) int64, counter-clockwise seen from outside. `normals` (V, 3) float32 unit
+    vectors (zero where a vertex has none). `colors` (V, 3) uint8 sRGB as in the photographs. `quality` (V,) float32:
+    uncertainty of the vertex in scene units. `primitive` (F,) int32: row of the primitive that a face belongs to, -1
+    for none. Arrays of other types are converted.
 
     Raises:
         LinprimError: an array has the wrong shape.
@@ -64,12 +63,12 @@ class Mesh:
 
     @property
     def bounds(self) -> np.ndarray:
-        """(2, 3): smallest and largest coordinate of all vertices."""
+        """Return (2, 3): the smallest and largest coordinates of all vertices."""
         return np.stack([self.vertices.min(0), self.vertices.max(0)])
 
     @property
     def diagonal(self) -> float:
-        """Length of the diagonal of the axis-aligned bounding box of all vertices."""
+        """Return the length of the diagonal of the axis-aligned bounding box of all vertices."""
         low, high = self.bounds
         return float(np.linalg.norm(high - low))
 
@@ -78,25 +77,24 @@ class Mesh:
 
 
 def validate_mesh(mesh: Mesh, name: str = "mesh") -> Mesh:
-    """`clean_mesh` without its report: the mesh as it is safe to hand to any library."""
+    """Return `clean_mesh` without its report: the mesh made safe for any library."""
     return clean_mesh(mesh, name)[0]
 
 
 def clean_mesh(mesh: Mesh, name: str = "mesh") -> tuple[Mesh, dict[str, int]]:
-    """Drops faces that libraries answer nonsense on, and vertices that no face uses.
+    """Remove faces on which libraries return wrong results, and vertices that no face uses.
 
-    Dropped are, counted in this order: faces with a NaN or infinite vertex (`not_finite`), faces without area
-    up to the rounding of float64 (`degenerate`), and faces that repeat another one's three vertices,
-    whichever way round (`duplicate`). `unreferenced` vertices are counted too. The order of what is left does
-    not change.
+    Removed are, counted in this order: faces with a NaN or infinite vertex (`not_finite`), faces whose area is zero up
+    to float64 rounding (`degenerate`), and faces with the same three vertices as an earlier one, in any order
+    (`duplicate`). `unreferenced` vertices are counted too. The order of the rest does not change.
 
-    A face without area between three different points holds its neighbours together, so a closed mesh can
-    have boundary edges afterwards: take `topology` of the mesh before, distances from the mesh after.
+    A degenerate face between three different points connects its neighbours, so a closed mesh can have boundary edges
+    afterwards: compute `topology` on the mesh before cleaning, and distances on the mesh after.
 
     Returns:
         The clean mesh and the counts.
     Raises:
-        LinprimError: nothing is left, or a face points to a vertex that does not exist.
+        LinprimError: nothing is left, or a face refers to a vertex that does not exist.
     """
     if len(mesh.vertices) == 0 or len(mesh.faces) == 0:
         raise LinprimError(
@@ -131,7 +129,7 @@ def _check_indices(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
 
 
 def _degenerate(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F,) bool: the area cannot be told from zero, given that coordinates and edges are rounded float64."""
+    """Return (F,) bool: whether the area is zero within float64 rounding of coordinates and edges."""
     if len(faces) == 0:
         return np.zeros(0, dtype=bool)
     a, b, c = (vertices[faces[:, k]] for k in range(3))
@@ -139,14 +137,14 @@ def _degenerate(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     longest = np.sqrt((edges**2).sum(2).max(1))
     size = np.abs(np.concatenate([a, b, c], axis=1)).max(1)
     twice_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-    # A coordinate of size s carries s * eps / 2, which moves the area by that times an edge; scenes start out
-    # as numbers in files, so this is the resolution they have.
+    # A coordinate of size s has an error of s * eps / 2, which changes the area by that times an edge length.
+    # Coordinates were read from files, so this is their resolution.
     bound = CROSS_ROUNDING * np.finfo(np.float64).eps * longest * (longest + size)
     return ~(twice_area > bound)
 
 
 def _first_of_equal_rows(rows: np.ndarray) -> np.ndarray:
-    """Sorted indices of the first of each set of equal rows of an integer array."""
+    """Return the sorted indices of the first of each set of equal rows of an integer array."""
     order = np.lexsort(rows.T[::-1])
     ordered = rows[order]
     new = np.ones(len(rows), dtype=bool)
@@ -158,7 +156,7 @@ def _first_of_equal_rows(rows: np.ndarray) -> np.ndarray:
 
 
 def select_faces(mesh: Mesh, keep: np.ndarray) -> Mesh:
-    """The sub-mesh of some faces (a mask or indices), with the vertices they use in their old order."""
+    """Return the sub-mesh of some faces (a mask or indices), with the vertices that they use in their old order."""
     faces = mesh.faces[keep]
     used = np.zeros(len(mesh.vertices), dtype=bool)
     used[faces] = True
@@ -174,10 +172,9 @@ def _select_vertices(mesh: Mesh, keep: np.ndarray) -> Mesh:
 
 
 def merge_vertices(mesh: Mesh) -> Mesh:
-    """Merges vertices whose coordinates are equal to the last bit and drops the faces that collapse by it.
+    """Merge vertices with bitwise equal coordinates, and remove the faces that become degenerate.
 
-    The attributes of the first of each set of equal vertices are kept, and so is the order of first
-    appearance.
+    The attributes of the first of each set of equal vertices are kept, and so is the order of first appearance.
     """
     vertices = mesh.vertices + 0.0  # turns -0 into 0
     order = np.lexsort(vertices.T[::-1])
@@ -194,7 +191,8 @@ def merge_vertices(mesh: Mesh) -> Mesh:
 
 
 def face_components(mesh: Mesh) -> tuple[int, np.ndarray]:
-    """Number of connected pieces and the (F,) piece of each face; faces that share a vertex are connected."""
+    """Return the number of connected components and the (F,) component of each face; faces that share a vertex are
+    connected."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -210,10 +208,10 @@ def face_components(mesh: Mesh) -> tuple[int, np.ndarray]:
 
 
 def remove_small_components(mesh: Mesh, min_fraction: float = 1e-3, by: str = "area") -> Mesh:
-    """Drops connected pieces smaller than a fraction of the largest one.
+    """Remove connected components smaller than a fraction of the largest one.
 
     Args:
-        min_fraction: a piece stays if its size is at least this share of the largest piece's; 0 keeps all.
+        min_fraction: smallest size to keep, as a share of the largest component; 0 keeps all.
         by: `area`, or `faces` for the number of faces.
     """
     count, label = face_components(mesh)
@@ -225,12 +223,12 @@ def remove_small_components(mesh: Mesh, min_fraction: float = 1e-3, by: str = "a
 
 
 def face_areas(mesh: Mesh) -> np.ndarray:
-    """(F,) area of each face."""
+    """Return the (F,) area of each face."""
     return 0.5 * np.linalg.norm(_face_cross(mesh), axis=1)
 
 
 def face_normals(mesh: Mesh) -> np.ndarray:
-    """(F, 3) unit normals, counter-clockwise outward; zero for faces without area."""
+    """Return (F, 3) unit normals, outward if vertices are counter-clockwise; zero for faces without area."""
     return _unit(_face_cross(mesh))
 
 
@@ -245,7 +243,8 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """(N, 2) coordinates (u, v) of points (N, 3) in triangles (N, 3, 3): point = (1-u-v) a + u b + v c."""
+    """Return (N, 2) barycentric coordinates (u, v) of points (N, 3) in triangles (N, 3, 3): point = (1-u-v) a + u b + v
+    c."""
     b, c, p = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
     bb, bc, cc = (b * b).sum(1), (b * c).sum(1), (c * c).sum(1)
     pb, pc = (p * b).sum(1), (p * c).sum(1)

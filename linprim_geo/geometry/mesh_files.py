@@ -1,4 +1,4 @@
-"""Meshes from and to files: PLY, OBJ, GLB, STL."""
+"""Read and write meshes: PLY, OBJ, GLB, STL."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from linprim_geo.geometry.mesh import FLOAT32_SHARE, Mesh, _check_indices, _unit
 from linprim_geo.geometry.ply import color_columns, write_ply, xyz_columns
 
 SUFFIXES = (".ply", ".obj", ".glb", ".stl")
-# Bytes before the first part of a .glb, and before the content of each.
+# Bytes of the header of a .glb file, and of the header of each of its chunks.
 _GLB_HEADER, _GLB_CHUNK_HEADER = 12, 8
 
 
@@ -25,12 +25,11 @@ _GLB_HEADER, _GLB_CHUNK_HEADER = 12, 8
 
 
 def load_mesh(path: str | os.PathLike) -> Mesh:
-    """Reads a PLY, OBJ, GLB or STL file (or any other that trimesh reads) as one triangle mesh.
+    """Read a PLY, OBJ, GLB or STL file (or any other that trimesh reads) as one triangle mesh.
 
-    Several objects and their transforms are flattened into one; polygons are triangulated; a texture becomes
-    vertex colours. The vertices of an STL file, which stores every triangle by itself, are merged where their
-    coordinates are equal to the last bit; other files keep their vertices, so a file that splits vertices
-    along texture seams stays split.
+    Several objects and their transforms are flattened into one; polygons are triangulated; a texture becomes vertex
+    colours. STL stores every triangle separately, so vertices with bitwise equal coordinates are merged. Other files
+    keep their vertices, so a file with vertices split along texture seams stays split.
 
     Raises:
         LinprimError: missing or unreadable file, no faces in it, or indices out of range.
@@ -39,10 +38,9 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
 
 
 def load_with_visual(path: str | os.PathLike, seams: bool = False) -> tuple[Mesh, Any]:
-    """`load_mesh`, and what trimesh knows of its colours or texture (its `visual`; None of an STL file).
+    """Return `load_mesh` and trimesh's `visual`, its colours or texture (None for an STL file).
 
-    With `seams` the vertices of an OBJ file are split where its texture has seams, so that each has one place in the
-    texture.
+    With `seams`, vertices of an OBJ file are split along texture seams, so that each has one texture coordinate.
     """
     path = Path(path)
     if not path.is_file():
@@ -51,13 +49,13 @@ def load_with_visual(path: str | os.PathLike, seams: bool = False) -> tuple[Mesh
         return _load_mesh(path, seams)
     except LinprimError:
         raise
-    except Exception as error:  # every reader of every format has its own errors
+    except Exception as error:  # each format's reader raises its own errors
         raise LinprimError(f"{path}: cannot be read as a mesh ({error or type(error).__name__})") from error
 
 
 def check_claims(path: Path) -> None:
-    """Raises LinprimError if parts or arrays of a .glb claim to be larger than the file: trimesh makes room for them
-    first. Files of other formats pass."""
+    """Raise LinprimError if chunks or arrays of a .glb claim to be larger than the file, because trimesh would allocate
+    that much. Files of other formats pass."""
     if path.suffix.lower() != ".glb":
         return
     size, start = path.stat().st_size, _GLB_HEADER
@@ -77,7 +75,7 @@ def check_claims(path: Path) -> None:
 
 
 def _load_mesh(path: Path, seams: bool) -> tuple[Mesh, Any]:
-    """`load_with_visual` with whatever errors trimesh and numpy raise for damaged files."""
+    """Load as `load_with_visual`, without converting the errors that trimesh and numpy raise for damaged files."""
     import trimesh
 
     check_claims(path)
@@ -99,7 +97,7 @@ def _load_mesh(path: Path, seams: bool) -> tuple[Mesh, Any]:
             "numbers for each"
         )
     _check_indices(vertices, faces, str(path))
-    # Normals that the file stored sit in trimesh's cache; asking for the property would compute its own.
+    # Normals stored in the file are in trimesh's cache; the property itself would compute new ones.
     normals = loaded._cache.cache.get("vertex_normals")
     if normals is not None:
         normals = _unit(np.asarray(normals, dtype=np.float64) @ np.linalg.inv(pose[:3, :3]))
@@ -109,7 +107,7 @@ def _load_mesh(path: Path, seams: bool) -> tuple[Mesh, Any]:
     quality = np.ravel(row["quality"]) if "quality" in names else None
     if quality is not None and len(quality) != len(vertices):
         quality = None
-    with np.errstate(invalid="ignore", over="ignore"):  # `clean_mesh` drops what is not finite
+    with np.errstate(invalid="ignore", over="ignore"):  # `clean_mesh` removes non-finite vertices
         vertices = vertices @ pose[:3, :3].T + pose[:3, 3]
     mesh = Mesh(vertices, faces, normals, _loaded_colors(loaded), quality)
     if path.suffix.lower() == ".stl":
@@ -118,7 +116,7 @@ def _load_mesh(path: Path, seams: bool) -> tuple[Mesh, Any]:
 
 
 def _loaded_colors(loaded) -> np.ndarray | None:
-    """(V, 3) uint8 from whatever kind of colour trimesh found, or None."""
+    """Return (V, 3) uint8 colours from any kind of colour that trimesh found, or None."""
     visual = loaded.visual
     try:
         if visual.kind == "texture":
@@ -126,20 +124,20 @@ def _loaded_colors(loaded) -> np.ndarray | None:
         if visual.kind in ("vertex", "face"):
             colors = np.asarray(visual.vertex_colors)[:, :3]
             return colors.astype(np.uint8) if len(colors) == len(loaded.vertices) else None
-    except Exception:  # a material without an image, or one that cannot be sampled: the shape is still good
+    except Exception:  # a material without an image, or that cannot be sampled: keep the shape
         return None
     return None
 
 
 def save_mesh(path: str | Path, mesh: Mesh) -> None:
-    """Writes a mesh as PLY, OBJ, GLB or STL, chosen by the suffix.
+    """Write a mesh as PLY, OBJ, GLB or STL, chosen by the suffix.
 
     PLY is binary little-endian with normals, colours, `quality` and the faces' `primitive`; coordinates are float32, or
     double where float32 would round by more than a millionth of the diagonal (a mesh far from its origin). OBJ is text
-    with nine digits (fifteen far from the origin) and colours as `v x y z r g b`. GLB stores float32 around the mesh's
-    centre and moves it back by a node, so a far origin costs nothing; colours are stored as they are, which MeshLab and
-    trimesh show unchanged (a viewer that follows glTF to the letter takes them as linear and shows them brighter). STL
-    has neither colours nor shared vertices and is float32.
+    with nine digits (fifteen far from the origin) and colours as `v x y z r g b`. GLB stores float32 relative to the
+    mesh's centre and a node with the translation, so a far origin costs no accuracy. Its colours are stored unchanged,
+    as MeshLab and trimesh show them; a viewer that follows glTF exactly takes them as linear and shows them brighter.
+    STL has neither colours nor shared vertices and is float32.
 
     Raises:
         LinprimError: unknown suffix, an empty mesh, or a folder that cannot be written.
@@ -160,7 +158,7 @@ def save_mesh(path: str | Path, mesh: Mesh) -> None:
 
 
 def needs_double(mesh: Mesh) -> bool:
-    """Whether float32 would move vertices by more than FLOAT32_SHARE of the mesh's diagonal."""
+    """Return whether float32 would move vertices by more than FLOAT32_SHARE of the mesh's diagonal."""
     return np.abs(mesh.vertices).max() * np.finfo(np.float32).eps / 2 > FLOAT32_SHARE * mesh.diagonal
 
 
@@ -180,7 +178,8 @@ def _write_obj(path: Path, mesh: Mesh) -> None:
     digits = "%.15g" if needs_double(mesh) else "%.9g"
     line, columns = "v" + f" {digits}" * 3, [mesh.vertices]
     if mesh.colors is not None:
-        # Readers make a byte by round(255 x) or, as MeshLab, by cutting 255 x off: both get the same one.
+        # Readers convert to bytes by round(255 x) or, like MeshLab, by truncating 255 x; with this offset both give the
+        # same byte.
         shades = np.minimum((mesh.colors + 0.2) / 255.0, 1.0)
         line, columns = line + " %.5f" * 3, [mesh.vertices, shades]
     corner = "%d"
@@ -195,7 +194,7 @@ def _write_obj(path: Path, mesh: Mesh) -> None:
 
 
 def write_rows(file: TextIO, line: str, rows: np.ndarray, chunk: int = 65536) -> None:
-    """Writes each of the rows (N, K) as `line`, a format of K values, `chunk` of them at a time."""
+    """Write each row of (N, K) as `line`, a format string of K values, `chunk` rows at a time."""
     for start in range(0, len(rows), chunk):
         part = rows[start : start + chunk]
         file.write(((line + "\n") * len(part)) % tuple(part.ravel().tolist()))

@@ -1,4 +1,4 @@
-"""The one writer of PLY files: named columns of numbers, and triangles."""
+"""Write PLY files: named columns of numbers, and triangles. All PLY files are written here."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import BinaryIO
 import numpy as np
 
 TYPES = {"f8": "double", "f4": "float", "i4": "int", "u1": "uchar"}
-# Rows are put together in parts, so that a large table is not held twice.
+# Rows are assembled in parts of this many, so that a large table is not in memory twice.
 PART = 65536
 
 
@@ -19,13 +19,13 @@ def write_ply(
     faces: np.ndarray | None = None,
     face_columns: Mapping[str, np.ndarray] | None = None,
 ) -> None:
-    """Writes a binary little-endian PLY.
+    """Write a binary little-endian PLY file.
 
     Args:
-        vertices: (V,) columns by their names in the file; the type of a column is that of its array, float64, float32,
-            int32 or uint8.
-        faces: (F, 3) triangles, none for points alone.
-        face_columns: (F,) columns of the faces, after `vertex_indices`.
+        vertices: (V,) columns by their names in the file. The type in the file is the array's: float64, float32, int32
+            or uint8.
+        faces: (F, 3) triangles; None for points alone.
+        face_columns: (F,) columns of the faces, written after `vertex_indices`.
     """
     header = ["ply", "format binary_little_endian 1.0", *_element("vertex", vertices)]
     if faces is not None:
@@ -42,12 +42,12 @@ def write_ply(
 
 
 def xyz_columns(points: np.ndarray, names: str = "x y z") -> dict[str, np.ndarray]:
-    """The columns of (V, 3) coordinates."""
+    """Return the columns of (V, 3) coordinates by name."""
     return dict(zip(names.split(), points.T, strict=True))
 
 
 def color_columns(colors: np.ndarray) -> dict[str, np.ndarray]:
-    """The columns of (V, 3) or, with alpha, (V, 4) uint8 colours."""
+    """Return the columns of (V, 3) or, with alpha, (V, 4) uint8 colours by name."""
     return dict(zip(("red", "green", "blue", "alpha"), colors.T, strict=False))
 
 

@@ -1,10 +1,10 @@
-"""Primitives in the PLY files of LinPrim (octahedra, tetrahedra) and of 3DGS (Gaussians), read and written without
-trusting the header.
+"""Read and write primitives in the PLY files of LinPrim (octahedra, tetrahedra) and 3DGS (Gaussians), without trusting
+the header.
 
 All properties are float32, in this order: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_0..44 (channel by channel),
 opacity (a logit); then LinPrim's dist_0..2, rot_0..3 (w x y z), filter_3D, 63 in all, or 3DGS's scale_0..2
-(logarithms), rot_0..3, 62 in all. A tetrahedron has dist_0..3, the same layout with a fourth distance: LinPrim's own
-files of them are not public. What is rendered from them:
+(logarithms), rot_0..3, 62 in all. A tetrahedron has the same layout with a fourth distance, dist_0..3; LinPrim's own
+files of tetrahedra are not public. Rendered values follow from them as:
 
     o             = 1 / (1 + exp(-opacity))
     LinPrim       extent_k = |dist_k| + filter_3D / 2, density = -ln(1 - 0.99 o) / L,
@@ -27,15 +27,14 @@ from linprim_geo.base.kinds import KINDS, Kind
 from linprim_geo.geometry.ply import write_ply
 from linprim_geo.geometry.primitives import SH_COEFFICIENTS, Primitives, unit_quaternions
 
-# The logit of the largest float32 below 1, and that of the smallest normal float32: beyond them a
-# float32 sigmoid is 1 and 0.
+# Logits of the largest float32 below 1 and of the smallest normal float32. Beyond them a float32 sigmoid is 1 or 0.
 LARGEST_LOGIT = np.float32(np.log(2.0**24 - 1.0))
 SMALLEST_LOGIT = np.float32(np.log(np.finfo(np.float32).tiny))
 
-# A header longer than this is none. (LinPrim's has 63 properties and takes about 1,500 bytes.)
+# Headers longer than this many bytes are rejected. (LinPrim's has 63 properties and takes about 1,500 bytes.)
 LONGEST_HEADER = 1 << 16
 
-# So many rows of 252 bytes stay in the cache while their columns are picked out one by one.
+# This many rows of 252 bytes stay in the cache while their columns are extracted one by one.
 ROWS_AT_ONCE = 4096
 
 _TYPES = {
@@ -60,8 +59,7 @@ _TYPES = {
 
 @dataclass(frozen=True)
 class PlyElement:
-    """One element of a PLY header: its name, row count, and (property, numpy type or None for a list)
-    pairs."""
+    """One element of a PLY header: its name, row count, and pairs (property, numpy type, or None for a list)."""
 
     name: str
     count: int
@@ -70,19 +68,19 @@ class PlyElement:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """A PLY file's header; `data_start` is the offset of the first byte after it."""
+    """The header of a PLY file; `data_start` is the offset of the first byte after it."""
 
     format: str
     elements: tuple[PlyElement, ...]
     data_start: int
 
     def element(self, name: str) -> PlyElement | None:
-        """The element of that name, or None."""
+        """Return the element of that name, or None."""
         return next((element for element in self.elements if element.name == name), None)
 
     @property
     def kind(self) -> str:
-        """A kind of primitive by the properties of the vertices, else `mesh` or `points`."""
+        """Return the kind of primitive according to the vertex properties, else `mesh` or `points`."""
         vertex = self.element("vertex")
         names = {name for name, _ in vertex.properties} if vertex else set()
         told = [kind for kind in KINDS.values() if names.issuperset(kind.told_by)]
@@ -93,10 +91,10 @@ class PlyHeader:
 
 
 def read_ply_header(path: str | os.PathLike) -> PlyHeader:
-    """Parses the header of any PLY file; nothing after it is read.
+    """Parse the header of any PLY file; nothing after it is read.
 
     Raises:
-        LinprimError: the file is missing, is no PLY, or its header is broken.
+        LinprimError: the file is missing, is not a PLY file, or its header is broken.
     """
     path = Path(path)
     try:
@@ -138,10 +136,10 @@ def read_ply_header(path: str | os.PathLike) -> PlyHeader:
 
 
 def read_primitive_ply(path: str | os.PathLike) -> tuple[Primitives, dict]:
-    """Reads primitives of the kind that the properties say, with a filter that is stored in the file applied.
+    """Read primitives; the properties determine their kind. A 3D filter stored in the file is applied.
 
-    Bands of spherical harmonics that are zero in every row are dropped. Rows that cannot be rendered, because an extent
-    is zero or infinite, are dropped and counted.
+    Spherical harmonics bands that are zero in every row are dropped. Rows that cannot be rendered, because an extent is
+    zero or infinite, are dropped and counted.
 
     Returns:
         The primitives, and {"rows": rows in the file, "dropped": rows without volume}.
@@ -212,18 +210,19 @@ def read_primitive_ply(path: str | os.PathLike) -> tuple[Primitives, dict]:
 
 
 def write_primitive_ply(path: str | os.PathLike, primitives: Primitives) -> dict:
-    """Writes LinPrim's properties, or 3DGS's of Gaussians; the filter is 0, the degree of the colours is padded to 3.
+    """Write primitives with LinPrim's properties, or Gaussians with 3DGS's. The filter is 0, and spherical harmonics
+    are padded to degree 3.
 
-    LinPrim cannot hold a reference length that is optically thicker than ln(100): such rows get the largest opacity
-    that it can hold and are counted.
+    LinPrim's format cannot store an optical thickness above ln(100) along the reference length: such rows get the
+    largest opacity that it can store and are counted.
 
-    Accuracy: reading it back gives the same centres, colours and polyhedra's extents bit by bit, rotations to float32
-    rounding, densities and opacities to 1e-5 relative and standard deviations to 1e-6 times the size of their
-    logarithm, because logits and logarithms are rounded to float32. A density of 0 comes back as one that takes less
-    than 1e-37 of the light.
+    Accuracy: centres, colours and extents of polyhedra are read back bit by bit; rotations to float32 rounding;
+    densities and opacities to 1e-5 relative and standard deviations to 1e-6 times the size of their logarithm, because
+    logits and logarithms are rounded to float32. A density of 0 is read back as one that absorbs less than 1e-37 of the
+    light.
 
     Returns:
-        {"rows": N, "clamped": rows that are thicker than LinPrim can hold}.
+        {"rows": N, "clamped": rows that are thicker than LinPrim's format can store}.
     """
     count, kind = len(primitives), KINDS[primitives.kind]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -247,7 +246,7 @@ def write_primitive_ply(path: str | os.PathLike, primitives: Primitives) -> dict
 
 
 def _names(kind: Kind) -> list[str]:
-    """All properties of a kind's file, in order."""
+    """Return all properties of a kind's file, in order."""
     return [
         *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
         *(f"f_rest_{index}" for index in range(45)),
@@ -256,8 +255,8 @@ def _names(kind: Kind) -> list[str]:
 
 
 def _vertex_table(path: Path, header: PlyHeader) -> np.ndarray:
-    """The rows of the vertices as a structured array on the file, after checking that the file has that
-    many."""
+    """Return the vertex rows as a structured array mapped from the file, after checking that the file is long
+    enough."""
     if not header.elements or header.elements[0].name != "vertex":
         raise LinprimError(f"{path}: the first PLY element is not vertex")
     vertex = header.elements[0]
@@ -276,7 +275,7 @@ def _vertex_table(path: Path, header: PlyHeader) -> np.ndarray:
 
 
 def _without_empty_bands(sh: np.ndarray) -> np.ndarray:
-    """The same colours with the fewest coefficients that hold them."""
+    """Return the coefficients without the bands that are zero everywhere."""
     for count in SH_COEFFICIENTS:
         if not sh[:, count:].any():
             return sh[:, :count]

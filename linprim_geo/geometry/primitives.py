@@ -1,4 +1,4 @@
-"""Primitives as plain arrays: what is exported, converted and meshed, apart from how they are trained."""
+"""Primitives as plain arrays, for export, conversion and meshing; independent of training."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from linprim_geo.geometry.mesh import Mesh
 
 
-# Center, rotation, extent, density, sh: what the rasterizer takes of primitives.
+# The rasterizer's inputs: center, rotation, extent, density, sh.
 Tensors = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 # The constant spherical harmonic: 1 / (2 sqrt(pi)).
@@ -32,9 +32,9 @@ SH_Y0 = 0.5 / math.sqrt(math.pi)
 
 SH_COEFFICIENTS = (1, 4, 9, 16)
 
-# Files before there were other kinds than octahedra have the first format and no array `kind`.
+# Formats of saved files. Files of the first format contain octahedra only and no array `kind`.
 FORMAT_OF_OCTAHEDRA, FORMAT = "linprim-geo octahedra 1", "linprim-geo primitives 2"
-# Primitives are never packed into fewer bytes than a part of so many; those of a file of a few bytes may be.
+# Limits against zip bombs: an array may be at most _DENSEST times as large as the file, or _SMALL bytes.
 _DENSEST, _SMALL = 32, 2**20
 ARRAYS = ("center", "rotation", "extent", "density", "sh")
 
@@ -45,14 +45,14 @@ class Primitives:
 
     `center` (N, 3); `rotation` (N, 4) unit quaternions w, x, y, z, local to world; `extent` (N, 3 or 4) lengths > 0;
     `density` (N,); `sh` (N, K, 3) spherical harmonics in 3DGS's order and signs, K in 1, 4, 9, 16: rgb = max(0, 0.5 +
-    sum_k Y_k(direction) sh_k), the direction from the camera to the centre. All float32; other float types are
+    sum_k Y_k(direction) sh_k), with the direction from the camera to the centre. All float32; other float types are
     converted. `kind` is one of KINDS:
 
     octahedron   extent (N, 3) half-axes: { p : sum_k |R^T (p - center)|_k / extent_k <= 1 }. A ray that crosses a
-                 length l of it keeps exp(-density l) of its light; density >= 0 per unit of length.
+                 length l of it has transmittance exp(-density l); density >= 0 per unit of length.
     tetrahedron  extent (N, 4) distances to the vertices center + extent_j R b_j with b = (1,1,1), (1,-1,-1), (-1,1,-1),
                  (-1,-1,1), each / sqrt 3; density as above.
-    gaussian     extent (N, 3) standard deviations along the local axes; `density` is the opacity of its middle, 0 to 1.
+    gaussian     extent (N, 3) standard deviations along the local axes; `density` is its peak opacity, 0 to 1.
 
     Raises:
         LinprimError: there is no row, a shape is wrong, or a row holds NaN, infinity, a zero quaternion, an extent that
@@ -117,7 +117,7 @@ class Primitives:
     def tensors(
         self, dtype: torch.dtype | None = None
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """The arrays as `ops.rasterize` takes them, sharing their memory unless `dtype` is another than theirs."""
+        """Return the arrays as tensors for `ops.rasterize`. They share memory unless `dtype` differs from theirs."""
         import torch
 
         center, rotation, extent, density, sh = (
@@ -130,12 +130,12 @@ class Primitives:
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the view-dependent colour, 0 to 3."""
+        """Return the spherical harmonics degree, 0 to 3."""
         return math.isqrt(self.sh.shape[1]) - 1
 
     @property
     def axes(self) -> np.ndarray:
-        """(N, 3, 3) float64 rotation matrices; column k is the local axis k in the world."""
+        """Return (N, 3, 3) float64 rotation matrices; column k is the local axis k in the world."""
         w, x, y, z = unit_quaternions(self.rotation).T
         return np.stack(
             [
@@ -148,11 +148,11 @@ class Primitives:
 
     @property
     def vertices(self) -> np.ndarray:
-        """(N, V, 3) float64 vertices: of an octahedron -x, +x, -y, +y, -z, +z along the local axes, of a tetrahedron
-        in the order of its extents.
+        """Return (N, V, 3) float64 vertices: for an octahedron -x, +x, -y, +y, -z, +z along the local axes, for a
+        tetrahedron in the order of its extents.
 
         Raises:
-            LinprimError: the primitives are Gaussians, which have none.
+            LinprimError: the primitives are Gaussians, which have no vertices.
         """
         what = KINDS[self.kind]
         if not len(what.directions):
@@ -162,22 +162,22 @@ class Primitives:
 
     @property
     def alpha(self) -> np.ndarray:
-        """(N,) float64 share of light taken along the reference length, 1 - exp(-density length); a Gaussian's
-        opacity."""
+        """Return (N,) float64 opacities along the reference length, 1 - exp(-density length); for Gaussians, the
+        opacity at the centre."""
         return KINDS[self.kind].alpha(self.density.astype(np.float64), self.extent.astype(np.float64))
 
     @property
     def base_color(self) -> np.ndarray:
-        """(N, 3) uint8 colour without its view-dependent part."""
+        """Return (N, 3) uint8 colours without the view-dependent part."""
         rgb = 0.5 + SH_Y0 * self.sh[:, 0].astype(np.float64)
         return np.rint(np.clip(rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
 
     def triangle_mesh(self, sigmas: float | None = None) -> Mesh:
-        """All primitives as one coloured mesh of N V vertices and N F outward faces; overlaps stay as they are.
+        """Return all primitives as one coloured mesh of N V vertices and N F outward faces. Overlaps are not resolved.
 
         Vertices V i .. V i + V - 1 and faces F i .. F i + F - 1 belong to primitive i. A Gaussian has no surface: with
-        `sigmas` it becomes the ellipsoid so many standard deviations large, an icosahedron refined once (V = 42, F =
-        80) with its vertices on it.
+        `sigmas` it becomes an ellipsoid of that many standard deviations, an icosahedron subdivided once (V = 42, F =
+        80) with its vertices on the ellipsoid.
 
         Raises:
             LinprimError: Gaussians without `sigmas`.
@@ -199,10 +199,10 @@ class Primitives:
         )
 
     def as_gaussians(self) -> Primitives:
-        """As Gaussians for a 3DGS viewer: standard deviations an octahedron's half-axes / 2.6, opacity alpha, the rest
-        alike.
+        """Return the primitives as Gaussians for a 3DGS viewer: standard deviations are an octahedron's half-axes /
+        2.6, opacity is `alpha`, the rest is unchanged.
 
-        An approximation to look at, not the same image. Source of the 2.6: LinPrim (see DIST_TO_SCALE).
+        This is an approximation and does not give the same image. Source of the 2.6: LinPrim (see DIST_TO_SCALE).
 
         Raises:
             LinprimError: the primitives are tetrahedra.
@@ -212,7 +212,8 @@ class Primitives:
 
 
 def _icosphere() -> tuple[np.ndarray, np.ndarray]:
-    """(42, 3) points of the unit sphere and (80, 3) outward faces: an icosahedron, each face cut in four."""
+    """Return (42, 3) points on the unit sphere and (80, 3) outward faces: an icosahedron with each face divided in
+    four."""
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=1)
@@ -220,21 +221,23 @@ def _icosphere() -> tuple[np.ndarray, np.ndarray]:
 
 
 def unit_quaternions(rotation: np.ndarray) -> np.ndarray:
-    """(N, 4) float64 quaternions divided by their lengths; scaled first, so that none under- or overflows."""
+    """Return (N, 4) float64 normalised quaternions; they are scaled first so that squares neither under- nor
+    overflow."""
     q = np.asarray(rotation, dtype=np.float64)
     q = q / np.abs(q).max(axis=1, keepdims=True)
     return q / np.linalg.norm(q, axis=1, keepdims=True)
 
 
 def save_primitives(path: str | os.PathLike, primitives: Primitives) -> None:
-    """Writes `primitives` as .npz: uncompressed float32 arrays, so that reading gives the same bits."""
+    """Write `primitives` as .npz with uncompressed float32 arrays, so that reading returns the same bits."""
     arrays = {name: getattr(primitives, name) for name in ARRAYS}
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, format=np.array(FORMAT), kind=np.array(primitives.kind), **arrays)
 
 
 def load_primitives(path: str | os.PathLike) -> Primitives:
-    """Reads what `save_primitives` wrote. Nothing in the file is executed, and a false header costs no memory.
+    """Read what `save_primitives` wrote. Nothing in the file is executed, and a false header cannot cause large
+    allocations.
 
     Raises:
         LinprimError: the file is missing, truncated, of another kind, or its values are not valid primitives.

@@ -1,4 +1,4 @@
-"""Writing models of pycolmap, which does not say so when the disk is full."""
+"""Write pycolmap models, and detect a full disk, which pycolmap does not report."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 
 def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Writes a model into a folder that there is, in COLMAP's binary format.
+    """Write a model in COLMAP's binary format into an existing folder.
 
     Raises:
-        DiskFull: a file is not as long as COLMAP's format makes it.
+        DiskFull: a file is shorter than COLMAP's format requires.
     """
     with readable_write_errors(folder / "points3D.bin"):
         model.write_binary(str(folder))

@@ -1,9 +1,9 @@
-"""First hits, occlusion and exact depth maps of a triangle mesh by Embree, without single precision's gaps.
+"""Cast rays at a triangle mesh with Embree: first hits, occlusion and exact depth maps, without the gaps of single
+precision.
 
-Embree works in float32. Here the mesh is moved to the origin and scaled to unit half-diagonal before it is
-handed over, far origins are advanced to the mesh's bounding sphere, and the distance is computed again in
-float64 from the triangle that was hit. Rays that pass between triangles sharing an edge or a vertex are found
-and re-cast.
+Embree works in float32. Therefore the mesh is moved to the origin and scaled to a half-diagonal of 1, distant ray
+origins are advanced to the mesh's bounding sphere, and the distance to the hit triangle is recomputed in float64. Rays
+that slip between triangles with a common edge or vertex are detected and cast again.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ SPHERE = 1.0 + 1e-5
 
 
 class Triangles(NamedTuple):
-    """Faces in the scaled frame: (F, 3) first corners, edges from there, and their cross products; -1 if they enclose a
-    negative volume, else 1."""
+    """Faces in the scaled frame: (F, 3) first corners, edges from there, and their cross products. `outward` is -1 if
+    the faces enclose a negative volume, else 1."""
 
     origin: np.ndarray
     edge1: np.ndarray
@@ -46,7 +46,7 @@ class Triangles(NamedTuple):
 
 
 class RayCaster:
-    """A mesh that rays can be cast at. Vertices in any unit and at any offset; results are in that unit.
+    """A mesh at which rays can be cast. Vertices have any unit and offset; results are in the same unit.
 
     Args:
         vertices: (V, 3) float.
@@ -54,18 +54,17 @@ class RayCaster:
         threads: worker threads per call; 0 uses every core. Results do not depend on it.
 
     Attributes:
-        recast: how many rays so far slipped between triangles and were answered by rays shifted by a
-            millionth of the mesh's diagonal. A ray counts as slipped if all four rays around it meet a nearer
-            surface. Looked for among rays that hit nothing and rays that meet a face from behind (from the
-            front, if the signed volume is negative and the origin outside the bounding box); a slip that ends
-            on the proper side of another face is not noticed.
+        recast: number of rays so far that slipped between triangles and were replaced by rays shifted by a millionth of
+            the mesh's diagonal. A ray counts as slipped if all four rays around it hit a nearer surface. This is tested
+            for rays that hit nothing and for rays that hit a face from behind (from the front, if the signed volume is
+            negative and the origin is outside the bounding box); a slip that ends on the proper side of another face is
+            not detected.
 
     Raises:
         LinprimError: no vertices or faces, coordinates that are not finite, indices that are out of range.
 
-    Accuracy: distances agree with float64 ray-triangle intersection to 1e-12 of the diagonal, and to 1e-6 of
-    it within that of an edge; which of two surfaces closer together than 1e-6 is hit first is left to
-    float32.
+    Accuracy: distances agree with float64 ray-triangle intersection to 1e-12 of the diagonal, and to 1e-6 of it within
+    that distance of an edge. Which of two surfaces closer together than 1e-6 is hit first is decided by float32.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, *, threads: int = 0):
@@ -86,12 +85,12 @@ class RayCaster:
 
     @property
     def diagonal(self) -> float:
-        """Length of the diagonal of the bounding box of the faces."""
+        """Return the length of the diagonal of the bounding box of the faces."""
         return 2.0 / self._scale
 
     @cached_property
     def _scene(self):
-        """Embree's, made when the first ray is cast."""
+        """Return Embree's scene, built when the first ray is cast."""
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
@@ -102,7 +101,8 @@ class RayCaster:
 
     @cached_property
     def _triangles(self) -> Triangles:
-        """Made when something exact is asked for first: single precision has Embree's own."""
+        """Return the triangles in float64, built at the first exact query; single-precision queries use Embree's
+        own."""
         corners = (self.vertices[self.faces] - self._center) * self._scale
         edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         cross = np.cross(edge1, edge2)
@@ -110,23 +110,23 @@ class RayCaster:
         return Triangles(np.ascontiguousarray(corners[:, 0]), edge1, edge2, cross, -1.0 if volume < 0 else 1.0)
 
     def face_normals(self) -> np.ndarray:
-        """(F, 3) unit geometric normals by the order of the vertices; zero for degenerate faces."""
+        """Return (F, 3) unit geometric normals by the order of the vertices; zero for degenerate faces."""
         cross = self._triangles.cross
         length = np.linalg.norm(cross, axis=1, keepdims=True)
         return cross / np.where(length > 0, length, 1.0)
 
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """First hit of each ray.
+        """Return the first hit of each ray.
 
         Args:
             origins: (R, 3), or (3,) for all rays.
             directions: (R, 3), need not be unit.
 
         Returns:
-            distance (R,) float64 in units of the length of `directions`: point = origin + distance *
-            direction, inf for a miss; face (R,) int64, -1 for a miss; bary (R, 2) float64 (u, v), clamped to
-            the triangle: point = (1-u-v) a + u b + v c, (0, 0) for a miss. A ray that starts on a surface may
-            hit it at distance 0. A ray that is not finite or has no direction misses.
+            distance (R,) float64 in units of the length of `directions`: point = origin + distance * direction, inf for
+                a miss; face (R,) int64, -1 for a miss; bary (R, 2) float64 (u, v), clamped to the triangle: point =
+                (1-u-v) a + u b + v c, (0, 0) for a miss. A ray that starts on a surface may hit it at distance 0. A ray
+                that is not finite or has no direction misses.
         """
         origins, directions = _rays(origins, directions)
         distance = np.full(len(directions), np.inf)
@@ -148,11 +148,10 @@ class RayCaster:
         tmax: np.ndarray | float = np.inf,
         tmin: float = 0.0,
     ) -> np.ndarray:
-        """(R,) bool: whether anything lies on the ray between `tmin` and `tmax`.
+        """Return (R,) bool: whether a surface lies on the ray between `tmin` and `tmax`.
 
-        Both in units of the length of `directions`. For "does this camera see this point" cast from the
-        camera with `directions = point - camera` and a tmax slightly below 1. Slipped rays are caught as in
-        `cast`.
+        Both are in units of the length of `directions`. To test whether a camera sees a point, cast from the camera
+        with `directions = point - camera` and a tmax slightly below 1. Slipped rays are detected as in `cast`.
         """
         origins, directions = _rays(origins, directions)
         tmax = np.broadcast_to(np.asarray(tmax, dtype=np.float64), (len(directions),))
@@ -166,12 +165,12 @@ class RayCaster:
         return result
 
     def render_depth(self, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What a camera sees, exactly at its pixel centres.
+        """Render exact depth, faces and normals at the pixel centres of a camera.
 
         Returns:
-            depth (H, W) float64 along the optical axis, inf where nothing is hit; face (H, W) int64, -1 for
-            nothing; normal (H, W, 3) float64, unit geometric normal in the world's axes, turned towards the
-            camera, zero for nothing.
+            depth (H, W) float64 along the optical axis, inf where nothing is hit; face (H, W) int64, -1 for nothing;
+                normal (H, W, 3) float64, unit geometric normal in world axes, turned towards the camera, zero for
+                nothing.
         """
         rays = camera.world_rays().reshape(-1, 3)
         depth, face, _ = self.cast(camera.center, rays)
@@ -185,11 +184,11 @@ class RayCaster:
         return depth.reshape(shape), face.reshape(shape), normal.reshape(*shape, 3)
 
     def cast_single(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """First hits in Embree's own single precision: for colours, not for measuring.
+        """Return first hits in Embree's single precision: for colours, not for measuring.
 
-        Returns distance (R,) float32 in units of the length of `directions` (inf: nothing), face (R,) int32
-        and bary (R, 2) float32. Slipped rays are not caught. Accuracy: 1e-6 of the larger
-        of the diagonal and the distance of the origin from the mesh.
+        Returns distance (R,) float32 in units of the length of `directions` (inf: nothing), face (R,) int32 and bary
+        (R, 2) float32. Slipped rays are not detected. Accuracy: 1e-6 of the larger of the diagonal and the distance of
+        the origin from the mesh.
         """
         start, directions = self._single(origins, directions)
         count, scale = len(directions), np.float32(1.0 / self._scale)
@@ -205,8 +204,8 @@ class RayCaster:
         return distance, face, bary
 
     def occluded_single(self, origins: np.ndarray, directions: np.ndarray, tmax: np.ndarray) -> np.ndarray:
-        """`occluded` in single precision, as `cast_single`: quick to tell most of what is hidden; the rest wants
-        `occluded`."""
+        """Return `occluded` in single precision, as `cast_single`. It quickly finds most occluded points; use
+        `occluded` for the rest."""
         start, directions = self._single(origins, directions)
         finite, blocked = np.minimum(tmax * self._scale, 1e30).astype(np.float32), np.empty(len(directions), bool)
 
@@ -218,7 +217,8 @@ class RayCaster:
         return blocked
 
     def _single(self, origins, directions):
-        """Single precision starts in the scaled frame, and directions as they are: distances have to be scaled."""
+        """Return float32 ray origins in the scaled frame, and directions unscaled; distances must be scaled
+        afterwards."""
         directions = np.ascontiguousarray(directions, dtype=np.float32)
         start = ((np.asarray(origins, dtype=np.float64) - self._center) * self._scale).astype(np.float32)
         return np.ascontiguousarray(np.broadcast_to(start, directions.shape)), directions
@@ -232,15 +232,15 @@ class RayCaster:
             return list(pool.map(work, parts))
 
     def _local(self, origins, directions):
-        """Rays in the scaled frame: origin, unit direction, distance to the bounding sphere, factor that
-        turns a scaled distance into the caller's, and whether the ray can meet the sphere at all."""
+        """Return rays in the scaled frame: origin, unit direction, distance to the bounding sphere, factor from a
+        scaled distance to the caller's, and whether the ray can meet the sphere at all."""
         length = np.sqrt(np.einsum("ij,ij->i", directions, directions))
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             unit = directions / length[:, None]
             start = (origins - self._center) * self._scale
             along = np.einsum("ij,ij->i", start, unit)
             square = np.einsum("ij,ij->i", start, start)
-            # Distance of the centre from the line, without the cancellation of along**2 - square.
+            # Distance of the centre from the ray's line, without the cancellation of along**2 - square.
             closest = start - along[:, None] * unit
             room = SPHERE**2 - np.einsum("ij,ij->i", closest, closest)
             reach = np.sqrt(np.maximum(room, 0.0))
@@ -282,17 +282,17 @@ class RayCaster:
         return distance, face, bary, slipped
 
     def _first(self, start, unit):
-        """Embree's first hits of scaled rays: face (R,) int64 (-1 = miss), float64 distance (inf = miss)."""
+        """Return Embree's first hits of scaled rays: face (R,) int64 (-1 = miss), float64 distance (inf = miss)."""
         hit = self._scene.run(start.astype(np.float32), unit.astype(np.float32), output=1)
         face = hit["primID"].astype(np.int64)
         return face, np.where(face >= 0, hit["tfar"].astype(np.float64), np.inf)
 
     def _solve(self, start, unit, face, fallback):
-        """Float64 distance, barycentrics clamped to the triangle, and normal . direction, of given triangles.
+        """Return the float64 distance, barycentric coordinates clamped to the triangle, and normal . direction, for
+        given triangles.
 
-        Solves start + t d = a + u e1 + v e2. Where rounding put the hit beside the triangle, (u, v) is
-        clamped and t is that of the ray's point nearest to the clamped one. Source: Cramer's rule, as in
-        Moeller-Trumbore 1997.
+        Solves start + t d = a + u e1 + v e2. Where rounding put the hit beside the triangle, (u, v) is clamped and t is
+        that of the ray's point nearest to the clamped one. Source: Cramer's rule, as in Moeller-Trumbore 1997.
         """
         miss = face < 0
         index = np.where(miss, 0, face)
@@ -325,7 +325,8 @@ class RayCaster:
         return t, uv, facing
 
     def _surrounded(self, start, unit, distance):
-        """Which scaled rays, with known distances, have a nearer surface on all four sides, and its face."""
+        """Return which scaled rays, with known distances, have a nearer surface on all four sides, and the face of that
+        surface."""
         side, up = _perpendicular(unit)
         alive = np.arange(len(start))
         first_face = None
@@ -369,7 +370,7 @@ class RayCaster:
 
 
 def _perpendicular(unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors across each of the (R, 3) unit vectors."""
+    """Return two unit vectors perpendicular to each of the (R, 3) unit vectors."""
     axis = np.zeros_like(unit)
     axis[np.arange(len(unit)), np.argmin(np.abs(unit), axis=1)] = 1.0
     side = np.cross(unit, axis)

@@ -1,4 +1,4 @@
-"""The part of space that --box names: by its corners, or as what the cameras look at."""
+"""The region of space that --box selects: given by its corners, or as the place that the cameras look at."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.camera import Camera
 
-# Axes meet in a focus if it lies before this share of the cameras, if they miss it by at most this share of
-# their distance (median), and if they are not parallel: the smallest eigenvalue of mean(1 - d d^T), sin^2
-# of their spread.
+# Optical axes have a common focus if it lies in front of at least this share of the cameras, if the median distance of
+# the axes from it is at most this share of the median camera distance, and if they are not parallel: the smallest
+# eigenvalue of mean(1 - d d^T), which is sin^2 of their spread, must be large enough.
 _FOCUS_IN_FRONT = 0.75
 _FOCUS_MAX_MISS = 0.35
 _FOCUS_MIN_EIGENVALUE = 1e-3
@@ -19,7 +19,7 @@ _FOCUS_ROUNDS = 5
 
 
 def read_box(text: str, cameras: Sequence[Camera] = ()) -> np.ndarray | None:
-    """(2, 3) lower and upper corner of "x0,y0,z0,x1,y1,z1", of `looked_at` for "auto", None for "".
+    """Return the (2, 3) lower and upper corners for "x0,y0,z0,x1,y1,z1", `looked_at` for "auto", or None for "".
 
     Raises:
         LinprimError: anything else, a corner that is not below the other, or what `looked_at` raises.
@@ -41,16 +41,18 @@ def read_box(text: str, cameras: Sequence[Camera] = ()) -> np.ndarray | None:
 
 
 def as_text(corners: np.ndarray) -> str:
-    """What `read_box` reads back."""
+    """Return corners as text that `read_box` reads."""
     return ",".join(f"{value:.17g}" for value in corners.ravel())
 
 
 def looked_at(cameras: Sequence[Camera]) -> np.ndarray:
-    """(2, 3) corners of the cube around the `focus_point` of the cameras, half as wide as the median of them shows
-    there, from the middle of its image to the nearer border.
+    """Return the (2, 3) corners of the cube around the `focus_point` of the cameras.
+
+    Its half side is the distance from the centre of the image to the nearer border at that depth, median over the
+    cameras.
 
     Raises:
-        LinprimError: fewer than two cameras, or they look at no one place.
+        LinprimError: fewer than two cameras, or they do not look at one place.
     """
     if len(cameras) < 2:
         raise LinprimError(f"--box auto: {len(cameras)} cameras are known, wanted two or more that look at one place")
@@ -66,11 +68,11 @@ def looked_at(cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def focus_point(centers: np.ndarray, axes: np.ndarray) -> np.ndarray | None:
-    """The (3,) point nearest to the lines through (N, 3) `centers` along unit `axes`, or None if they have no
+    """Return the (3,) point nearest to the lines through (N, 3) `centers` along unit `axes`, or None if they have no
     focus.
 
-    Minimises the sum of squared distances |(1 - d d^T)(x - c)|^2, then again over those within twice the
-    median.
+    Minimises the sum of squared distances |(1 - d d^T)(x - c)|^2, then repeats it with the lines within twice the
+    median distance.
     """
     use = np.ones(len(centers), dtype=bool)
     for _ in range(_FOCUS_ROUNDS):
@@ -91,5 +93,5 @@ def focus_point(centers: np.ndarray, axes: np.ndarray) -> np.ndarray | None:
 
 
 def inside(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """(...) bool of (..., 3) points: those in a box, its border included."""
+    """Return (...) bool: which of (..., 3) points lie in a box, including its border."""
     return ((points >= corners[0]) & (points <= corners[1])).all(-1)

@@ -1,4 +1,4 @@
-"""Samples of images at any place: bilinear and nearest. Pixel centres are at +0.5."""
+"""Sample images at arbitrary positions: bilinear and nearest. Pixel centres are at +0.5."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import numpy as np
 
 
 def sample_bilinear(image: np.ndarray, pixels: np.ndarray, *, repeat: bool = False) -> np.ndarray:
-    """(..., C) values of the (h, w, C) `image` at the (..., 2) positions, with weights in single precision.
+    """Return (..., C) values of the (h, w, C) `image` at (..., 2) positions, with single-precision weights.
 
-    Beyond the outermost pixel centres the image goes on as its border, or from its other side if it repeats.
+    Beyond the outermost pixel centres, the border values are repeated, or the image wraps around with `repeat`.
     """
     height, width = image.shape[:2]
     x, y = pixels[..., 0] - 0.5, pixels[..., 1] - 0.5
@@ -28,7 +28,8 @@ def sample_bilinear(image: np.ndarray, pixels: np.ndarray, *, repeat: bool = Fal
 
 
 def sample_nearest(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """(H, W) values of the (h, w) `image` at the pixels that hold the (H, W, 2) positions, clamped."""
+    """Return the (H, W) values of the (h, w) `image` at the pixels that contain the (H, W, 2) positions, clamped to the
+    image."""
     height, width = image.shape
     column = np.clip(np.floor(pixels[..., 0]).astype(np.int64), 0, width - 1)
     row = np.clip(np.floor(pixels[..., 1]).astype(np.int64), 0, height - 1)

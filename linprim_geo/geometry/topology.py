@@ -1,4 +1,4 @@
-"""What is wrong with a mesh: open edges, edges and vertices that are not manifold, faces that cross."""
+"""Topology of a mesh: boundary edges, non-manifold edges, genus, border loops."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from linprim_geo.geometry.mesh import Mesh, face_areas, face_components
 
 
 def topology(mesh: Mesh) -> dict:
-    """Counts and measures of a mesh, as `stats.json` holds them.
+    """Return counts and measures of a mesh, as stored in `stats.json`.
 
     Returns:
-        `vertices` (those in use), `faces`, `components` (faces that share a vertex), `boundary_edges` (one
-        face), `non_manifold_edges` (more than two faces, or two that run along it the same way), `watertight`
-        (neither of these), `genus` (summed over the pieces, None unless watertight), `area`, `volume`
-        (signed, positive if faces are counter-clockwise seen from outside; None unless watertight).
+        `vertices` (those in use), `faces`, `components` (faces that share a vertex are connected), `boundary_edges`
+            (with one face), `non_manifold_edges` (with more than two faces, or two of inconsistent orientation),
+            `watertight` (neither of these), `genus` (summed over the components, None unless watertight), `area`,
+            `volume` (signed, positive if faces are counter-clockwise seen from outside; None unless watertight).
     """
     used = len(np.unique(mesh.faces))
     pieces, _ = face_components(mesh)
@@ -44,7 +44,8 @@ def topology(mesh: Mesh) -> dict:
 
 
 def _edges(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Keys of the undirected edges, how many faces use each, and uses one way minus uses the other way."""
+    """Return the keys of the undirected edges, how many faces use each, and the number of uses in one direction minus
+    the other."""
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     keys = np.minimum(start, end) * np.int64(count) + np.maximum(start, end)
     edges, index, uses = np.unique(keys, return_inverse=True, return_counts=True)
@@ -53,9 +54,10 @@ def _edges(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def _fans_and_bodies(faces: np.ndarray) -> tuple[int, int]:
-    """Number of fans (faces around a vertex, joined by edges) and of pieces joined by edges, if watertight.
+    """Return the number of fans (faces around a vertex, connected by edges) and of components connected by edges, for a
+    watertight mesh.
 
-    Where bodies touch in a vertex it has several fans, and a manifold would hold it once for each.
+    A vertex where bodies touch has several fans; a manifold mesh would contain it once for each.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -64,7 +66,7 @@ def _fans_and_bodies(faces: np.ndarray) -> tuple[int, int]:
         graph = coo_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(size, size))
         return int(connected_components(graph, directed=False, return_labels=False))
 
-    # Corner 3f+k is face f at its k-th vertex; corners of two faces join where they share an edge there.
+    # Corner 3f+k is the k-th vertex of face f; corners of two faces are connected where the faces share an edge at it.
     corner = np.arange(faces.size).reshape(faces.shape)
     start, end = faces, np.roll(faces, -1, axis=1)
     low = np.where(start < end, corner, np.roll(corner, -1, axis=1)).ravel()
@@ -76,14 +78,15 @@ def _fans_and_bodies(faces: np.ndarray) -> tuple[int, int]:
 
 
 def border_loops(faces: np.ndarray) -> list[np.ndarray]:
-    """Closed ways along the border of a surface, as rows of vertices in the direction of its faces, each vertex once.
+    """Return the closed loops along the border of a surface, as vertex indices in the direction of its faces, each
+    vertex once.
 
-    Where borders touch in a vertex they are parted into loops without it twice.
+    Where borders touch in a vertex, they are split into loops that contain it only once each.
     """
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     width = int(faces.max(initial=0)) + 1
     keys, back = np.sort(edges[:, 0] * width + edges[:, 1]), edges[:, 1] * width + edges[:, 0]
-    # As `numpy.isin`, which takes 13 times as long for three million edges.
+    # Same as `numpy.isin`, which takes 13 times as long for three million edges.
     alone = edges[keys[np.minimum(np.searchsorted(keys, back), len(keys) - 1)] != back]
     following: dict[int, list[int]] = {}
     for a, b in alone.tolist():
@@ -94,7 +97,7 @@ def border_loops(faces: np.ndarray) -> list[np.ndarray]:
             way, place = [start], {start: 0}
             while following.get(way[-1]):
                 step = following[way[-1]].pop()
-                if step in place:  # a loop is complete; what led to it goes on from here
+                if step in place:  # a loop is complete; the path that led to it continues from here
                     begun = place[step]
                     loops.append(np.array(way[begun:]))
                     for left in way[begun + 1 :]:
@@ -107,7 +110,7 @@ def border_loops(faces: np.ndarray) -> list[np.ndarray]:
 
 
 def manifold_status(mesh: Mesh) -> str:
-    """What manifold3d says of a mesh that should be closed: `NoError`, or why it is no manifold."""
+    """Return manifold3d's status of a mesh that should be closed: `NoError`, or why it is not manifold."""
     import manifold3d
 
     body = manifold3d.Manifold(manifold3d.Mesh64(mesh.vertices, mesh.faces.astype(np.uint64)))
@@ -115,7 +118,7 @@ def manifold_status(mesh: Mesh) -> str:
 
 
 def topology_line(stats: dict) -> str:
-    """One printed line of what `topology` returns."""
+    """Return one printable line with the results of `topology`."""
     text = (
         f"{stats['vertices']} vertices, {stats['faces']} faces, {stats['components']} components, "
         f"{stats['boundary_edges']} boundary and {stats['non_manifold_edges']} non-manifold edges, "

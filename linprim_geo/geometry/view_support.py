@@ -1,4 +1,4 @@
-"""Which primitives several views see, from different directions: what one camera alone sees may lie at any depth."""
+"""Find primitives that only one view sees: seen by one camera alone, they may lie at any depth."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import torch
 
 from linprim_geo.geometry.camera import Camera
 
-# A primitive is seen by one view alone if its directions lie a hundredth as far apart as is usual in the scene: a tenth
-# of the angle.
+# A primitive counts as seen by one view alone if the spread of its viewing directions is a hundredth of the scene's
+# median: a tenth of the angle.
 SINGLE_VIEW = 0.01
-# What all views together see less of than this is hidden: nothing is known of it.
+# Summed blending weight over all views up to which a primitive counts as hidden.
 HIDDEN = 0.5
 
 
 class Support:
-    """How the weight of (N, 3) centres is spread over the directions that they are seen from.
+    """How the blending weight of (N, 3) centres is spread over viewing directions.
 
-    With the largest weight w, T alpha, that a primitive has in each view, and the unit vector u from the camera to it,
-    the spread is 1 - |sum of w u| / sum of w: 0 for one view, a^2 / 8 for two that see it alike under a small angle a,
-    1 for all around.
+    In each view, w is the largest blending weight (T alpha) of a primitive, and u the unit vector from the camera to
+    it. The spread is 1 - |sum of w u| / sum of w: 0 for one view, a^2 / 8 for two equal views separated by a small
+    angle a, 1 for views all around.
     """
 
     def __init__(self, center: torch.Tensor):
@@ -27,18 +27,18 @@ class Support:
         self.along = torch.zeros(len(center), 3, dtype=torch.float64)
 
     def add(self, camera: Camera, weight: torch.Tensor) -> None:
-        """Adds a view in which they have the weights (N,)."""
+        """Add a view in which the primitives have the weights (N,)."""
         away = self.center - torch.from_numpy(camera.center)
         away = away / torch.linalg.vector_norm(away, dim=1, keepdim=True).clamp_min(1e-12)
         self.weight += weight
         self.along += weight[:, None] * away
 
     def spread(self) -> torch.Tensor:
-        """(N,) spread of the directions; NaN where no view sees anything."""
+        """Return the (N,) spread of the directions; NaN for primitives that no view sees."""
         return (1 - torch.linalg.vector_norm(self.along, dim=1) / self.weight).clamp_min(0)
 
     def alone(self) -> torch.Tensor:
-        """(N,) bool, whether a primitive is seen, and by one view alone."""
+        """Return (N,) bool: whether a primitive is seen, and by one view alone."""
         spread, seen = self.spread(), self.weight > HIDDEN
         if not bool(seen.any()):
             return seen
